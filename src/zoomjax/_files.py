@@ -1,0 +1,33 @@
+"""Writing files whole or not at all."""
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary path beside `path`, which takes its place only if the block succeeds.
+
+    Raises:
+        OSError: the folder does not exist or cannot be written; the message names it.
+    """
+    path = Path(path)
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    except OSError as error:
+        raise type(error)(
+            error.errno, f"cannot write in the folder {path.parent}: {error.strerror}"
+        ) from error
+    os.close(handle)
+    part = Path(name)
+    try:
+        yield part
+        umask = os.umask(0)
+        os.umask(umask)
+        part.chmod(0o666 & ~umask)  # mkstemp's 0600 is for secrets; a result is an ordinary file
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,0 +1,415 @@
+"""Line primitives: sequences of image points that lie on straight lines of the scene.
+
+`AbstractLines` is what the energies and the fits see: for any distortion coefficients it gives, line
+by line, the corrected points about their mean, or rows that stand for them exactly. `Lines` holds the
+points themselves, flat over lines (not nested in frames, which hold from 5 to 108 lines: nesting
+would waste 27 times the memory on the paper's data). Compressed lines are in `compression`.
+"""
+
+import abc
+import math
+import os
+import warnings
+import zipfile
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from ._files import whole_file
+from ._types import AnyArray, Focal, FrameIndex, Mask, Point
+from .radial import radial_factor
+
+_FORMAT, _VERSION = "zoomjax.lines", 1
+
+
+class AbstractLines(eqx.Module):
+    """Lines seen in frames of known focal length, as the energies of eq. 3 and 13 need them."""
+
+    frame: eqx.AbstractVar[FrameIndex]
+    focal: eqx.AbstractVar[Focal]
+    centre: eqx.AbstractVar[Point]
+    image_size: eqx.AbstractVar[tuple[int, int]]
+    focal_unit: eqx.AbstractVar[str]
+
+    @property
+    def scale(self) -> float:
+        """The length in px that is radius 1: half the image diagonal."""
+        return math.hypot(*self.image_size) / 2
+
+    @property
+    @abc.abstractmethod
+    def counts(self) -> Float[Array, "line"]:
+        """Number of points of each line, Np(l, m); 0 marks a line that is not there."""
+
+    @abc.abstractmethod
+    def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
+        """Corrected points of each line about their mean, px, or rows with the same scatter.
+
+        `coefficients` are those of each line's own frame. Rows beyond a line's end are zero.
+        """
+
+    @abc.abstractmethod
+    def radial_moments(self, order: int) -> Float[Array, "line moment"]:
+        """``sum_p r_p^(2i)`` for i = 0 ... order, over the points of each line, r normalised."""
+
+    @abc.abstractmethod
+    def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "AbstractLines":
+        """The chosen lines as a data set of one frame; those not `present` count as empty."""
+
+    def by_frame(self) -> tuple[Int[AnyArray, "frame some"], Bool[AnyArray, "frame some"]]:
+        """For each frame the indices of its lines, padded to the fullest frame, and which are real.
+
+        Computed in NumPy: the padding is a shape. Under ``jit``, where `frame` is not known, every
+        frame is given all lines and chooses by the mask.
+        """
+        frames, number = self.focal.shape[0], self.frame.shape[0]
+        if isinstance(self.frame, jax.core.Tracer):
+            chosen = jnp.broadcast_to(jnp.arange(number), (frames, number))
+            return chosen, self.frame[None] == jnp.arange(frames)[:, None]
+        frame = np.asarray(self.frame)
+        order = np.argsort(frame, kind="stable")
+        size = np.bincount(frame, minlength=frames)
+        start = np.cumsum(size) - size
+        slot = np.arange(size.max())
+        chosen = order[np.minimum(start[:, None] + slot, number - 1)]
+        return chosen, slot < size[:, None]
+
+
+class Lines(AbstractLines):
+    """Line primitives as padded tensors; `Lines.from_ragged` makes them from sequences and checks them.
+
+    Arrays are JAX arrays in the dtype given. Where JAX cannot hold it (float64 while x64 is off) they
+    stay NumPy arrays, so that nothing is lost on saving, and computations run in float32.
+
+    Attributes:
+        points: ``(x, y)`` px; (0, 0) is the centre of the top-left pixel.
+        mask: which entries of `points` are points rather than padding.
+        frame: index of the image that each line was seen in, into `focal`.
+        focal: focal length of each image, positive, in `focal_unit`.
+        centre: centre of distortion, px; the image's centre ``((w-1)/2, (h-1)/2)`` by default.
+        image_size: (width, height) px.
+        focal_unit: "mm" or "px".
+    """
+
+    points: Float[AnyArray, "line point 2"]
+    mask: Mask
+    frame: FrameIndex
+    focal: Focal
+    centre: Point
+    image_size: tuple[int, int] = eqx.field(static=True)
+    focal_unit: str = eqx.field(static=True, default="mm")
+
+    def __check_init__(self):
+        """Check that the shapes agree."""
+        lines, points = self.points.shape[:2]
+        if self.mask.shape != (lines, points) or self.frame.shape != (lines,):
+            raise ValueError(
+                "Arguments points, mask and frame must have shapes (line, point, 2), (line, point) and "
+                f"(line,), but they are {self.points.shape}, {self.mask.shape}, {self.frame.shape}."
+            )
+
+    @classmethod
+    def from_ragged(
+        cls,
+        points: Sequence[ArrayLike],
+        frame: ArrayLike,
+        focal: ArrayLike,
+        *,
+        image_size: tuple[int, int],
+        focal_unit: str = "mm",
+        centre: ArrayLike | None = None,
+    ) -> "Lines":
+        """Lines from one array of points a line.
+
+        Args:
+            points: for each line an (n, 2) array of ``(x, y)`` px, n >= 3.
+            frame: for each line the index of its image, into `focal`.
+            focal: for each image its focal length, > 0.
+            image_size: (width, height) px.
+            focal_unit: "mm" or "px", the unit of `focal`.
+            centre: centre of distortion, px; default the centre of the image.
+
+        Raises:
+            ValueError: a point or focal length is not finite, a focal length is not positive, a frame
+                index is out of range, a frame has no line, or no usable line is left.
+
+        Warns:
+            UserWarning: lines with fewer than 3 distinct points are dropped; the message counts them.
+
+        Example:
+            >>> import numpy as np
+            >>> row = np.stack([np.arange(5.0), np.full(5, 2.0)], axis=-1)
+            >>> lines = Lines.from_ragged([row, row + 1], [0, 1], [24, 70], image_size=(6, 4))
+            >>> lines.points.shape, lines.centre.tolist()
+            ((2, 5, 2), [2.5, 1.5])
+        """
+        size = _checked_size(image_size)
+        arrays = [_checked_points(line, index) for index, line in enumerate(points)]
+        frames, focals = _checked_frames(frame, focal, len(arrays))
+        if focal_unit not in ("mm", "px"):
+            raise ValueError(f'Argument focal_unit must be "mm" or "px", but it is {focal_unit!r}.')
+
+        usable = np.array([_has_three_distinct(line) for line in arrays], bool)
+        if not usable.all():
+            if not usable.any():
+                raise ValueError(
+                    f"No usable line: none of the {len(arrays)} lines has 3 or more distinct points."
+                )
+            warnings.warn(
+                f"Dropped {np.sum(~usable)} of {len(arrays)} lines: they have fewer than 3 distinct "
+                "points, which says nothing about straightness.",
+                stacklevel=2,
+            )
+            arrays = [line for line, keep in zip(arrays, usable, strict=True) if keep]
+            frames = frames[usable]
+        empty = np.setdiff1d(np.arange(focals.size), frames)
+        if empty.size:
+            raise ValueError(
+                f"No line in {empty.size} of {focals.size} frames (the first are "
+                f"{', '.join(map(str, empty[:5]))}). Leave those frames out of frame and focal."
+            )
+
+        dtype = np.result_type(*arrays)
+        dtype = dtype if np.issubdtype(dtype, np.floating) else np.dtype(np.float64)
+        counts = [len(line) for line in arrays]
+        padded = np.zeros((len(arrays), max(counts), 2), dtype)
+        for row, line in zip(padded, arrays, strict=True):
+            row[: len(line)] = line
+        middle = (np.array(size) - 1) / 2 if centre is None else np.asarray(centre)
+        if middle.shape != (2,) or not np.isfinite(middle).all():
+            raise ValueError(f"Argument centre must be two finite numbers, but it is {centre!r}.")
+        return cls(
+            points=_held_as_given(padded),
+            mask=jnp.asarray(np.arange(max(counts)) < np.array(counts)[:, None]),
+            frame=jnp.asarray(frames, jnp.int32),
+            focal=_held_as_given(focals.astype(dtype)),
+            centre=_held_as_given(middle.astype(dtype)),
+            image_size=size,
+            focal_unit=focal_unit,
+        )
+
+    @classmethod
+    def from_grids(
+        cls,
+        corners: Float[np.ndarray, "grid row column 2"],
+        frame: ArrayLike,
+        focal: ArrayLike,
+        *,
+        image_size: tuple[int, int],
+        focal_unit: str = "mm",
+    ) -> "Lines":
+        """Every row and every column of flat grids (checkerboard corners, dots) as a line.
+
+        Args:
+            corners: positions of the grids' nodes, px.
+            frame: for each grid the index of the frame that it counts in. Grids at the same focal
+                length may share a frame: eq. 3 then averages over all their lines.
+            focal, image_size, focal_unit: as for `from_ragged`, whose errors also apply.
+        """
+        corners = np.asarray(corners)
+        if corners.ndim != 4 or corners.shape[-1] != 2:
+            raise ValueError(
+                "Argument corners must have shape (grid, row, column, 2), but its shape is "
+                f"{corners.shape}."
+            )
+        index = np.asarray(frame)
+        if index.shape != corners.shape[:1]:
+            raise ValueError(
+                f"Argument frame must hold one index for each of the {len(corners)} grids, but its "
+                f"shape is {index.shape}."
+            )
+        lines: list[ArrayLike] = []
+        for grid in corners:
+            lines += [*grid, *grid.swapaxes(0, 1)]
+        return cls.from_ragged(
+            lines,
+            np.repeat(index, corners.shape[1] + corners.shape[2]),
+            focal,
+            image_size=image_size,
+            focal_unit=focal_unit,
+        )
+
+    def to_ragged(self) -> list[np.ndarray]:
+        """The points of each line as an (n, 2) array: what `from_ragged` took."""
+        mask = np.asarray(self.mask)
+        return [line[keep] for line, keep in zip(np.asarray(self.points), mask, strict=True)]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all fields, in their dtypes, to a ``.npz`` file that `load_lines` reads."""
+        with whole_file(path) as part, part.open("wb") as file:
+            np.savez(
+                file,
+                format=_FORMAT,
+                version=_VERSION,
+                points=np.asarray(self.points)[np.asarray(self.mask)],
+                counts=np.asarray(self.mask).sum(1),
+                frame=np.asarray(self.frame),
+                focal=np.asarray(self.focal),
+                centre=np.asarray(self.centre),
+                image_size=np.array(self.image_size),
+                focal_unit=self.focal_unit,
+            )
+
+    @property
+    def counts(self) -> Float[Array, "line"]:
+        """Number of points of each line."""
+        return jnp.sum(self.mask, axis=1).astype(jnp.asarray(self.points).dtype)
+
+    def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
+        """Corrected points of each line about their mean, px."""
+        return jax.vmap(_correct_line, in_axes=(0, 0, 0, None, None))(
+            jnp.asarray(self.points), jnp.asarray(self.mask), coefficients, self.centre, self.scale
+        )
+
+    def radial_moments(self, order: int) -> Float[Array, "line moment"]:
+        """``sum_p r_p^(2i)`` for i = 0 ... order."""
+        z = jnp.where(self.mask[..., None], (self.points - self.centre) / self.scale, 0)
+        squared = jnp.sum(z * z, axis=-1)
+        moments = [self.counts]
+        power = jnp.ones_like(squared)
+        for _ in range(order):
+            power = power * squared
+            moments.append(jnp.sum(power, axis=1))
+        return jnp.stack(moments, axis=1)
+
+    def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "Lines":
+        """The chosen lines as a data set of one frame."""
+        return Lines(
+            points=jnp.asarray(self.points)[lines],
+            mask=jnp.asarray(self.mask)[lines] & present[:, None],
+            frame=jnp.zeros_like(lines, jnp.int32),
+            focal=jnp.asarray(self.focal)[self.frame[lines[jnp.argmax(present)]]][None],
+            centre=self.centre,
+            image_size=self.image_size,
+            focal_unit=self.focal_unit,
+        )
+
+
+def _correct_line(points, mask, k, centre, scale):
+    """Corrected points of one line about their mean, px; zero where masked."""
+    z = jnp.where(mask[:, None], (points - centre) / scale, 0)
+    corrected = z * radial_factor(jnp.sum(z * z, axis=1), k)[:, None]
+    mean = jnp.sum(corrected, axis=0) / jnp.maximum(jnp.sum(mask), 1)
+    return jnp.where(mask[:, None], scale * (corrected - mean), 0)
+
+
+def load_lines(path: str | os.PathLike[str]) -> Lines:
+    """Read lines that `Lines.save` wrote.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is truncated, or something else, or of a later version; the message
+            names it.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if not isinstance(file, np.lib.npyio.NpzFile):
+                raise ValueError("it is not an .npz archive")
+            stored = {name: file[name] for name in file.files}
+        if str(stored.get("format")) != _FORMAT:
+            raise ValueError("it holds no line primitives; Lines.save writes such a file")
+        if int(stored["version"]) > _VERSION:
+            raise ValueError(
+                f"its format version is {int(stored['version'])} and this zoomjax reads up to "
+                f"{_VERSION}; update zoomjax"
+            )
+        points, counts = stored["points"], stored["counts"]
+        if counts.sum() != len(points):
+            raise ValueError("its points and counts disagree")
+        width, height = (int(side) for side in stored["image_size"])
+        return Lines.from_ragged(
+            np.split(points, np.cumsum(counts)[:-1]),
+            stored["frame"],
+            stored["focal"],
+            image_size=(width, height),
+            focal_unit=str(stored["focal_unit"]),
+            centre=stored["centre"],
+        )
+    except FileNotFoundError:
+        raise
+    except (
+        ValueError,
+        TypeError,
+        KeyError,
+        IndexError,
+        EOFError,
+        OSError,
+        zipfile.BadZipFile,
+    ) as error:
+        raise ValueError(f"Cannot read lines from {os.fspath(path)}: {error}.") from error
+
+
+def _held_as_given(array: np.ndarray) -> AnyArray:
+    """A JAX array, unless that would change the values' dtype."""
+    if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
+        return jnp.asarray(array)
+    return array
+
+
+def _checked_size(image_size) -> tuple[int, int]:
+    size = tuple(image_size)
+    if len(size) != 2 or any(int(side) != side or side < 1 for side in size):
+        raise ValueError(
+            f"Argument image_size must be two positive integers (w, h), but it is {image_size!r}."
+        )
+    return int(size[0]), int(size[1])
+
+
+def _checked_points(line: ArrayLike, index: int) -> np.ndarray:
+    array = np.asarray(line)
+    if array.size == 0:
+        return np.zeros((0, 2), np.float32)
+    if array.ndim != 2 or array.shape[1] != 2 or not np.issubdtype(array.dtype, np.number):
+        raise ValueError(
+            f"Argument points must hold (n, 2) arrays of numbers, but line {index} has shape "
+            f"{array.shape} and dtype {array.dtype}."
+        )
+    if not np.isfinite(array).all():
+        bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+        raise ValueError(
+            f"Argument points must be finite, but line {index} has {bad.size} NaN or infinite points "
+            f"(the first at position {bad[0]}). Remove them."
+        )
+    return array
+
+
+def _checked_frames(frame, focal, lines: int) -> tuple[np.ndarray, np.ndarray]:
+    frames, focals = np.asarray(frame), np.asarray(focal, dtype=np.float64)
+    if focals.ndim != 1 or not focals.size:
+        raise ValueError(
+            f"Argument focal must be a sequence with one number a frame, but its shape is {focals.shape}."
+        )
+    if not (np.isfinite(focals) & (focals > 0)).all():
+        bad = int(np.flatnonzero(~(np.isfinite(focals) & (focals > 0)))[0])
+        raise ValueError(
+            f"Argument focal must hold finite positive numbers, but focal[{bad}] is {focals[bad]}."
+        )
+    if lines == 0:
+        raise ValueError("No usable line: argument points is empty.")
+    if frames.shape != (lines,) or not np.issubdtype(frames.dtype, np.integer):
+        raise ValueError(
+            f"Argument frame must hold one integer for each of the {lines} lines, but its shape is "
+            f"{frames.shape} and its dtype {frames.dtype}."
+        )
+    outside = (frames < 0) | (frames >= focals.size)
+    if outside.any():
+        bad = int(np.flatnonzero(outside)[0])
+        raise ValueError(
+            f"Argument frame must hold indices from 0 to {focals.size - 1}, one focal length each, but "
+            f"frame[{bad}] is {frames[bad]}."
+        )
+    return frames, focals
+
+
+def _has_three_distinct(line: np.ndarray) -> bool:
+    if len(line) < 3:
+        return False
+    from_first = (line != line[0]).any(axis=1)
+    if not from_first.any():
+        return False
+    second = line[np.argmax(from_first)]
+    return bool((from_first & (line != second).any(axis=1)).any())

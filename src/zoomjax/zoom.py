@@ -1,0 +1,141 @@
+"""Zoom models: how the distortion coefficients depend on the focal length.
+
+The paper's is a polynomial in 1/f for each coefficient (eq. 9-10), ``k(f) = phi(f) . a`` with the
+basis ``phi = (1, u, ..., u^n)`` of ``u = f_ref/f`` in (0, 1]. A new model is a final class of
+`AbstractZoom`, or of `AbstractLinearZoom` where it is linear in its parameters: then only its basis
+has to be written, and the algebraic estimate applies to it too.
+"""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from ._types import AnyArray, Coefficients, Focal, Scalar
+
+
+class AbstractZoom(eqx.Module):
+    """A map from a focal length to the coefficients (k1, ..., kN) of the normalised radius.
+
+    `parameters` holds what a fit adjusts, and is None in a model that has only been specified, as in
+    ``fit_zoom(lines, zoom=PolynomialZoom(degree=2))``. Other array fields stay as `prepare` set them.
+    """
+
+    parameters: eqx.AbstractVar[PyTree]
+
+    @abc.abstractmethod
+    def prepare(self, focal: Focal, terms: int) -> "AbstractZoom":
+        """This model made ready for these focal lengths: knots and references set, parameters zero.
+
+        Raises:
+            ValueError: the focal lengths cannot determine the parameters.
+        """
+
+    @abc.abstractmethod
+    def __call__(self, focal: Scalar) -> Coefficients:
+        """The coefficients at one focal length."""
+
+
+class AbstractLinearZoom(AbstractZoom):
+    """A zoom model that is linear in its parameters: ``k(f) = basis(f) @ parameters``."""
+
+    parameters: eqx.AbstractVar[Float[AnyArray, "basis terms"] | None]
+
+    @abc.abstractmethod
+    def basis(self, focal: Scalar) -> Float[Array, "basis"]:
+        """The values of the basis functions at one focal length."""
+
+    def __call__(self, focal: Scalar) -> Coefficients:
+        """The coefficients at one focal length."""
+        return self.basis(focal) @ _fitted(self)
+
+
+class PolynomialZoom(AbstractLinearZoom):
+    """The paper's model: each coefficient a polynomial of `degree` n in 1/f (eq. 9-10).
+
+    Attributes:
+        degree: n; 0 is one distortion for all focal lengths, 2 the paper's choice.
+        parameters: a, where ``k_i(f) = sum_j a[j, i] (focal_ref/f)^j``; None until fitted.
+        focal_ref: the shortest focal length fitted.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> zoom = PolynomialZoom(1, jnp.array([[0.0], [0.1]]), jnp.array(20.0))
+        >>> zoom(jnp.array(40.0)).tolist()
+        [0.05000000074505806]
+    """
+
+    degree: int = eqx.field(static=True, default=2)
+    parameters: Float[AnyArray, "basis terms"] | None = None
+    focal_ref: Scalar | None = None
+
+    def __check_init__(self):
+        """Check the degree and the shape of the parameters."""
+        if isinstance(self.degree, bool) or not isinstance(self.degree, int) or self.degree < 0:
+            raise ValueError(
+                f"Argument degree must be an integer of at least 0, but it is {self.degree!r}."
+            )
+        if self.parameters is not None and self.parameters.shape[0] != self.degree + 1:
+            raise ValueError(
+                f"Argument parameters must have {self.degree + 1} rows for degree {self.degree}, "
+                f"but its shape is {self.parameters.shape}."
+            )
+
+    @classmethod
+    def from_inverse_focal(
+        cls, coefficients: Float[AnyArray, "basis terms"], focal_ref: Scalar | float
+    ) -> "PolynomialZoom":
+        """The model ``k_i(f) = sum_j coefficients[j, i] f^(-j)``, stated about `focal_ref`."""
+        coefficients = jnp.asarray(coefficients)
+        focal_ref = jnp.asarray(focal_ref, coefficients.dtype)
+        power = jnp.arange(coefficients.shape[0])
+        return cls(
+            degree=coefficients.shape[0] - 1,
+            parameters=coefficients * focal_ref ** -power[:, None].astype(coefficients.dtype),
+            focal_ref=focal_ref,
+        )
+
+    def in_inverse_focal(self) -> Float[Array, "basis terms"]:
+        """The polynomials' coefficients of ``f^(-j)``, as the paper prints them (but normalised)."""
+        parameters = _fitted(self)
+        power = jnp.arange(self.degree + 1, dtype=parameters.dtype)
+        return parameters * self.focal_ref ** power[:, None]
+
+    def prepare(self, focal: Focal, terms: int) -> "PolynomialZoom":
+        """Zero polynomials about the shortest focal length."""
+        if not isinstance(focal, jax.core.Tracer):
+            distinct = np.unique(np.asarray(focal)).size
+            if distinct <= self.degree:
+                raise ValueError(
+                    f"A polynomial of degree {self.degree} in 1/f needs lines at {self.degree + 1} "
+                    f"or more distinct focal lengths, but there are {distinct}. Lower the degree, or "
+                    "add images at other focal lengths."
+                )
+        focal = jnp.asarray(focal)
+        return PolynomialZoom(
+            degree=self.degree,
+            parameters=jnp.zeros((self.degree + 1, terms), focal.dtype),
+            focal_ref=jnp.min(focal),
+        )
+
+    def basis(self, focal: Scalar) -> Float[Array, "basis"]:
+        """``(1, u, ..., u^n)`` with ``u = focal_ref/f``."""
+        if self.focal_ref is None:
+            raise ValueError(_UNFITTED)
+        u = self.focal_ref / focal
+        return jnp.stack([u**j for j in range(self.degree + 1)])
+
+
+_UNFITTED = (
+    "This zoom model has been specified but not fitted: pass it to fit_zoom(lines, zoom=...), and "
+    "use the model in the result, fit.lens.zoom."
+)
+
+
+def _fitted(zoom: AbstractZoom) -> PyTree:
+    if zoom.parameters is None:
+        raise ValueError(_UNFITTED)
+    return zoom.parameters
