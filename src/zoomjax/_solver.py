@@ -18,9 +18,7 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 from .lines import AbstractLines
 
 _FIRST_DAMPING = 1e-6
-_ROUNDING = (
-    128  # of a sum of squares, in units of its last digit: float32 sums of 20,000 squares vary so
-)
+_ROUNDING = 128  # of a sum of squares, in units of its last digit: float32 sums of 20,000 squares vary so
 
 
 class RoundingTrustRegion(optx.AbstractSearch):

@@ -34,9 +34,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ._types import Focal, FrameIndex, Point
 from .lines import AbstractLines, Lines
 
-Reduction = Callable[
-    [Float[Array, "2 point"], Float[Array, "point"], int], Float[Array, "rows rows"]
-]
+Reduction = Callable[[Float[Array, "2 point"], Float[Array, "point"], int], Float[Array, "rows rows"]]
 """From the normalised x and y of one line, 1 or 0 for points and padding, and the terms, to R."""
 
 
@@ -107,9 +105,7 @@ def _combine(triangle, k):
     return jnp.einsum("rjc,j->rc", columns, kappa, precision=_EXACT)
 
 
-def compress(
-    lines: Lines, terms: int = 2, *, reduction: Reduction | None = None
-) -> CompressedLines:
+def compress(lines: Lines, terms: int = 2, *, reduction: Reduction | None = None) -> CompressedLines:
     """Reduce each line to its triangle; fits then take milliseconds and give the same answer.
 
     Args:
@@ -170,9 +166,7 @@ def merge(first: CompressedLines, second: CompressedLines) -> CompressedLines:
             "Only triangles of the same lines and terms merge, but their shapes are "
             f"{first.triangle.shape} and {second.triangle.shape}."
         )
-    return eqx.tree_at(
-        lambda lines: lines.triangle, first, _merge_all(first.triangle, second.triangle)
-    )
+    return eqx.tree_at(lambda lines: lines.triangle, first, _merge_all(first.triangle, second.triangle))
 
 
 @jax.jit

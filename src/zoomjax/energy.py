@@ -52,9 +52,7 @@ def line_weights(lines: AbstractLines) -> Float[Array, "line"]:
     return present / (frames * jnp.maximum(per_frame, 1)[lines.frame] * jnp.maximum(counts, 1))
 
 
-def residuals(
-    lines: AbstractLines, coefficients: Float[Array, "frame terms"]
-) -> Float[Array, "line rows"]:
+def residuals(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "line rows"]:
     """Weighted residuals, px, whose sum of squares is the global energy of eq. 13.
 
     Args:
@@ -66,9 +64,7 @@ def residuals(
 
 
 @eqx.filter_jit
-def frame_energy(
-    lines: AbstractLines, coefficients: Float[Array, "frame terms"]
-) -> Float[Array, "frame"]:
+def frame_energy(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "frame"]:
     """The error of each frame, px^2: mean over its lines of the mean squared distance (eq. 3)."""
     frames = lines.focal.shape[0]
     of_line = jnp.sum(residuals(lines, coefficients) ** 2, axis=1)
@@ -76,8 +72,6 @@ def frame_energy(
 
 
 @eqx.filter_jit
-def global_energy(
-    lines: AbstractLines, coefficients: Float[Array, "frame terms"]
-) -> Float[Array, ""]:
+def global_energy(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, ""]:
     """The global energy, px^2: the mean of the frames' errors (eq. 13)."""
     return jnp.sum(residuals(lines, coefficients) ** 2)

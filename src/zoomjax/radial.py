@@ -18,9 +18,7 @@ from jaxtyping import Array, Bool, Float
 from ._types import Coefficients, Point, Points, Scalar
 
 
-def radial_factor(
-    squared_radius: Float[Array, "*batch"], k: Coefficients
-) -> Float[Array, "*batch"]:
+def radial_factor(squared_radius: Float[Array, "*batch"], k: Coefficients) -> Float[Array, "*batch"]:
     """L(t) of eq. 2 for normalised squared radii `t` and coefficients `k = (k1, ..., kN)`."""
     factor = jnp.zeros_like(squared_radius)
     for coefficient in k[::-1]:
@@ -101,9 +99,7 @@ def _reflect(coefficients: Float[Array, "n"]) -> Float[Array, "n"]:
 
 
 @jax.custom_jvp
-def inverse_radius(
-    rho: Float[Array, ""], k: Coefficients, limit: Float[Array, ""]
-) -> Float[Array, ""]:
+def inverse_radius(rho: Float[Array, ""], k: Coefficients, limit: Float[Array, ""]) -> Float[Array, ""]:
     """The r in [0, limit] with ``r L(r^2) = rho``, for one `rho` that has one.
 
     `limit` is the monotone radius of `k`, a constant for differentiation.
@@ -121,9 +117,7 @@ def inverse_radius(
         return (mapped(high) < rho) & jnp.isfinite(high)
 
     start = jnp.maximum(rho, 1)
-    high = jax.lax.while_loop(
-        lambda high: jnp.isinf(limit) & too_low(high), lambda high: 2 * high, start
-    )
+    high = jax.lax.while_loop(lambda high: jnp.isinf(limit) & too_low(high), lambda high: 2 * high, start)
     high = jnp.where(jnp.isinf(limit), high, limit)
 
     def unfinished(state):
@@ -220,18 +214,14 @@ def _each(function, signature, distortion, points):
     if not jnp.issubdtype(points.dtype, jnp.floating):
         points = points.astype(jnp.result_type(float))
     if points.shape[-1:] != (2,):
-        raise ValueError(
-            f"Argument points must have shape (..., 2), but its shape is {points.shape}."
-        )
+        raise ValueError(f"Argument points must have shape (..., 2), but its shape is {points.shape}.")
     k, centre, scale = (
         jnp.asarray(leaf, points.dtype)
         for leaf in (distortion.coefficients, distortion.centre, distortion.scale)
     )
     centre = jnp.broadcast_to(centre, points.shape)
     limit = monotone_radius(k)
-    mapped = jnp.vectorize(lambda z: function(z, k, limit), signature=signature)(
-        (points - centre) / scale
-    )
+    mapped = jnp.vectorize(lambda z: function(z, k, limit), signature=signature)((points - centre) / scale)
     return mapped if mapped.ndim < points.ndim else centre + scale * mapped
 
 

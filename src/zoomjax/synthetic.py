@@ -30,9 +30,7 @@ def nikkor_18_200() -> ZoomLens:
     scale = np.hypot(*size) / 2
     focal_range = jnp.array([20.56, 127.36])
     return ZoomLens(
-        zoom=PolynomialZoom.from_inverse_focal(
-            _NIKKOR_PIXELS * [scale**2, scale**4], focal_range[0]
-        ),
+        zoom=PolynomialZoom.from_inverse_focal(_NIKKOR_PIXELS * [scale**2, scale**4], focal_range[0]),
         centre=(jnp.array(size) - 1) / 2,
         focal_range=focal_range,
         image_size=size,
@@ -116,9 +114,7 @@ def board_lines(
                     error = noise * rng.standard_normal(line.shape)
                     points.append(line + error.astype(line.dtype))
                     frame.append(index)
-    return Lines.from_ragged(
-        points, frame, focal, image_size=lens.image_size, focal_unit=lens.focal_unit
-    )
+    return Lines.from_ragged(points, frame, focal, image_size=lens.image_size, focal_unit=lens.focal_unit)
 
 
 @eqx.filter_jit
