@@ -29,7 +29,8 @@ class RoundingTrustRegion(optx.AbstractSearch):
     def init(self, y: PyTree, f_info_struct: Any) -> Any:
         """The state before the first step."""
         state = self.classical.init(y, f_info_struct)
-        return eqx.tree_at(lambda s: s.step_size, state, jnp.array(1 / _FIRST_DAMPING))
+        dtype = jnp.result_type(*jax.tree.leaves(y))  # optimistix takes JAX's widest
+        return eqx.tree_at(lambda s: s.step_size, state, jnp.array(1 / _FIRST_DAMPING, dtype))
 
     def step(
         self,

@@ -251,7 +251,7 @@ def moments(
     sums = _sum_of_products(jnp.stack(powers), jnp.stack([x * x, x * y, y * y, x, y]))
 
     order = jnp.arange(terms + 1)
-    blocks = sums[:, jnp.asarray([[0, 1], [1, 2]])][order[:, None] + order]  # j, k, 2, 2
+    blocks = sums[:, jnp.asarray([[0, 1], [1, 2]])][order[:, None] + order[None]]  # j, k, 2, 2
     square = blocks.transpose(0, 2, 1, 3).reshape(2 * terms + 2, 2 * terms + 2)
     linear = sums[: terms + 1, 3:].reshape(1, -1)
     count = jnp.sum(valid)

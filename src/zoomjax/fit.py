@@ -298,7 +298,7 @@ def _covariance(lines, zoom, energy):
     k = coefficients_at(flat)
     terms = k.shape[1]
     order = jnp.arange(terms + 1)
-    moments = lines.radial_moments(2 * terms)[:, order[:, None] + order] * weights[:, None, None]
+    moments = lines.radial_moments(2 * terms)[:, order[:, None] + order[None]] * weights[:, None, None]
     kappa = jnp.concatenate([jnp.ones_like(k[:, :1]), k], axis=1)[lines.frame]
     variance_in_image = energy / jnp.einsum("li,lij,lj->", kappa, moments, kappa)
     by_parameter = jax.jacfwd(coefficients_at)(flat)[lines.frame]  # (line, terms, parameter)
@@ -318,7 +318,7 @@ def _covariance(lines, zoom, energy):
 
     values, vectors = jnp.linalg.eigh(scaled)
     good = values > 4 * eps
-    inverse = (vectors * jnp.where(good, 1 / jnp.where(good, values, 1), 0)) @ vectors.T
+    inverse = (vectors * jnp.where(good, 1 / jnp.where(good, values, 1), 0)[None]) @ vectors.T
     inverse = inverse / size[:, None] / size[None]
     freedom = jnp.sum(weights * (lines.counts - 2)) - jnp.sum(inverse * outer)
     variance = energy / jnp.where(freedom > 0, freedom, jnp.nan)

@@ -267,7 +267,7 @@ class Lines(AbstractLines):
 
     def radial_moments(self, order: int) -> Float[Array, "line moment"]:
         """``sum_p r_p^(2i)`` for i = 0 ... order."""
-        z = jnp.where(self.mask[..., None], (self.points - self.centre) / self.scale, 0)
+        z = jnp.where(self.mask[..., None], (self.points - self.centre[None, None]) / self.scale, 0)
         squared = jnp.sum(z * z, axis=-1)
         moments = [self.counts]
         power = jnp.ones_like(squared)
@@ -291,10 +291,10 @@ class Lines(AbstractLines):
 
 def _correct_line(points, mask, k, centre, scale):
     """Corrected points of one line about their mean, px; zero where masked."""
-    z = jnp.where(mask[:, None], (points - centre) / scale, 0)
+    z = jnp.where(mask[:, None], (points - centre[None]) / scale, 0)
     corrected = z * radial_factor(jnp.sum(z * z, axis=1), k)[:, None]
     mean = jnp.sum(corrected, axis=0) / jnp.maximum(jnp.sum(mask), 1)
-    return jnp.where(mask[:, None], scale * (corrected - mean), 0)
+    return jnp.where(mask[:, None], scale * (corrected - mean[None]), 0)
 
 
 def load_lines(path: str | os.PathLike[str]) -> Lines:

@@ -130,9 +130,9 @@ def _seen(
     Positions are px from the centre in the corrected image; `axis` is the one that `across` counts on.
     """
     grid = jnp.stack(jnp.meshgrid(across, along, indexing="ij"), axis=-1)
-    corrected = distortion.centre + (grid if axis == 0 else grid[..., ::-1])
+    corrected = distortion.centre[None, None] + (grid if axis == 0 else grid[..., ::-1])
     seen = distortion.distort(corrected.astype(distortion.centre.dtype))
-    last = jnp.array(image_size) - 1
+    last = jnp.array(image_size)[None, None] - 1
     return seen, jnp.all((seen >= 0) & (seen <= last), axis=-1)
 
 
@@ -140,4 +140,4 @@ def _reach(lens: ZoomLens, focal: np.ndarray) -> float:
     """How far, px, corrected images extend from the centre at any of the focal lengths."""
     corner = jnp.zeros(2, lens.centre.dtype)
     corners = jax.vmap(lambda f: lens(f).undistort(corner))(jnp.asarray(focal))
-    return float(jnp.max(jnp.linalg.norm(corners - lens.centre, axis=-1)))
+    return float(jnp.max(jnp.linalg.norm(corners - lens.centre[None], axis=-1)))

@@ -1,0 +1,48 @@
+"""The corners of a real zoom camera as lines, for `zoomjax calibrate` and for measurements.
+
+    python benchmarks/real/zoomcam.py [-o zoomcam.npz]
+
+reads the folder ``zoomcam`` of the data folder that the environment variable ZOOMJAX_DATA names: 116 photos
+of a checkerboard (22 x 15 inner corners) at five zooms of a surveillance camera, 1280 x 720 px. Every row
+and every column of corners is a straight line of the board. All photos of a zoom share one frame.
+"""
+
+import argparse
+import os
+from pathlib import Path
+
+import numpy as np
+
+from zoomjax import Lines
+
+
+def read_zoomcam(folder: Path) -> Lines:
+    """The lines of all photos, one frame a zoom, with focal lengths in px.
+
+    Args:
+        folder: holds ``corners_22x15.npz`` and ``focal_px.csv``.
+    """
+    with np.load(folder / "corners_22x15.npz") as stored:
+        zoom, corners = stored["zoom"], stored["corners"]
+    table = np.genfromtxt(folder / "focal_px.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    zooms, frame = np.unique(zoom, return_inverse=True)
+    names = table.dtype.names
+    focal = dict(zip(table[names[0]].tolist(), table[names[1]].tolist(), strict=True))
+    return Lines.from_grids(
+        corners,
+        frame,
+        [focal[z] for z in zooms.tolist()],
+        image_size=(1280, 720),
+        focal_unit="px",
+    )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path, default=Path("zoomcam.npz"))
+    output = parser.parse_args().output
+    if "ZOOMJAX_DATA" not in os.environ:
+        parser.error("set the environment variable ZOOMJAX_DATA to the folder that holds zoomcam/")
+    lines = read_zoomcam(Path(os.environ["ZOOMJAX_DATA"]) / "zoomcam")
+    lines.save(output)
+    print(f"{len(lines.frame)} lines at {len(lines.focal)} zooms written to {output}")

@@ -1,0 +1,166 @@
+"""A whole calibration: from lines to the fits, the figures worth reading, and a folder of results.
+
+This is what the command line runs; it prints nothing, and draws with `plot`.
+"""
+
+import dataclasses
+import importlib.metadata
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .algebraic import algebraic_zoom
+from .compression import compress
+from .fit import RESULTS, FrameFits, ZoomFit, fit_frames, fit_zoom, frame_rms
+from .lines import Lines
+from .plot import plot_model
+from .zoom import PolynomialZoom
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """The zoom model of some lines beside what it is compared with.
+
+    Attributes:
+        lines: the lines.
+        zoom: the zoom model's fit.
+        each: every frame by itself.
+        none, algebraic: each frame's RMS, px, without correction and with the algebraic estimate.
+    """
+
+    lines: Lines
+    zoom: ZoomFit
+    each: FrameFits
+    none: np.ndarray
+    algebraic: np.ndarray
+
+    def rows(self) -> list[tuple[str, np.ndarray]]:
+        """The lines of a table like the paper's Table 1: what was done, and each frame's RMS, px."""
+        return [
+            ("no correction", self.none),
+            ("zoom polynomial, algebraic", self.algebraic),
+            ("frame by frame", np.asarray(self.each.frame_rms)),
+            ("zoom polynomial", np.asarray(self.zoom.frame_rms)),
+        ]
+
+    def summary(self) -> dict[str, Any]:
+        """The figures, as plain numbers and strings that JSON can hold."""
+        lens = self.zoom.lens
+        low, high = (float(f) for f in lens.focal_range)
+        frame = np.asarray(self.lines.frame)
+        fits = {
+            "frame": range(len(self.none)),
+            "focal": np.asarray(self.lines.focal).tolist(),
+            "lines": np.bincount(frame, minlength=len(self.none)).tolist(),
+            "rms_none": self.none.tolist(),
+            "rms_frames": np.asarray(self.each.frame_rms).tolist(),
+            "rms_zoom": np.asarray(self.zoom.frame_rms).tolist(),
+        }
+        return {
+            "rms_none": rms_over_frames(self.none),
+            "rms_algebraic": rms_over_frames(self.algebraic),
+            "rms_frames": float(self.each.rms),
+            "rms_zoom": float(self.zoom.rms),
+            "frames": len(self.none),
+            "lines": len(frame),
+            "points": int(np.sum(np.asarray(self.lines.mask))),
+            "focal_range": [low, high],
+            "focal_unit": lens.focal_unit,
+            "image_size": list(lens.image_size),
+            "result": RESULTS[self.zoom.result] or "successful",
+            "frames_without_a_model": int(np.sum(np.asarray(self.each.result != RESULTS.successful))),
+            "pixel_polynomials": self.pixel_polynomials().tolist(),
+            "parameters": np.asarray(lens.zoom.parameters).tolist(),
+            "parameter_sigma": _finite(np.sqrt(np.diag(np.asarray(self.zoom.covariance)))),
+            "per_frame": [dict(zip(fits, row, strict=True)) for row in zip(*fits.values(), strict=True)],
+            "versions": {
+                name: importlib.metadata.version(name) for name in ("zoomjax", "jax", "optimistix")
+            },
+        }
+
+    def pixel_polynomials(self) -> np.ndarray:
+        """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as the paper prints them."""
+        normalised = np.asarray(self.zoom.lens.zoom.in_inverse_focal())
+        return normalised / self.zoom.lens.scale ** (2 * np.arange(1, normalised.shape[1] + 1))
+
+    def write(self, folder: str | os.PathLike[str]) -> None:
+        """Write lens.json, lines.npz, summary.json and model.png; all of them, or none.
+
+        Raises:
+            OSError: the folder cannot be written.
+        """
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".zoomjax-") as part:
+            part = Path(part)
+            self.zoom.lens.save(part / "lens.json")
+            self.lines.save(part / "lines.npz")
+            (part / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n")
+            plot_model(self.zoom, self.each, self.lines).savefig(part / "model.png", dpi=150)
+            for file in sorted(part.iterdir()):
+                file.replace(Path(folder) / file.name)
+
+
+def calibrate(
+    lines: Lines,
+    *,
+    degree: int = 2,
+    terms: int = 2,
+    stage: Callable[[str], None] = lambda _: None,
+) -> Calibration:
+    """Fit the zoom polynomial and what it is compared with.
+
+    Args:
+        lines: the lines; computed in float64 if that is enabled, whatever their dtype.
+        degree: of the polynomials in 1/f.
+        terms: the number of distortion coefficients.
+        stage: called with a sentence before each step that takes time.
+    """
+    model = PolynomialZoom(degree=degree)
+    model.prepare(lines.focal, terms)  # complain of too few focal lengths before any work
+    stage("Compressing the lines")
+    widest = jnp.result_type(float)
+    data = jax.tree.map(lambda a: jnp.asarray(a, widest) if jnp.issubdtype(a.dtype, float) else a, lines)
+    small = compress(data, terms)
+    stage("Fitting each frame by itself")
+    each = fit_frames(small, terms=terms, throw=False)
+    stage("Fitting the zoom polynomial")
+    zoom = fit_zoom(small, zoom=model, terms=terms)
+    return Calibration(
+        lines=lines,
+        zoom=zoom,
+        each=each,
+        none=np.asarray(frame_rms(small, None)),
+        algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=model, terms=terms))),
+    )
+
+
+def rms_over_frames(frame_rms: np.ndarray) -> float:
+    """Root of the mean of the frames' errors: eq. 13 from eq. 3."""
+    return float(np.sqrt(np.mean(np.asarray(frame_rms) ** 2)))
+
+
+def writable_folder(folder: str | os.PathLike[str]) -> Path:
+    """The folder, made if it is not there, after trying to write in it: better now than after the work.
+
+    Raises:
+        OSError: it cannot be made or written; the message names it.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(tempfile.mkdtemp(dir=folder, prefix=".zoomjax-"))
+    except OSError as error:
+        raise OSError(f"Cannot write in the folder {folder}: {error.strerror or error}.") from error
+    return folder
+
+
+def _finite(values: np.ndarray) -> list[float | None]:
+    """JSON has no infinity: None says that a value is not determined."""
+    return [float(v) if np.isfinite(v) else None for v in values]

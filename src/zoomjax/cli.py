@@ -1,0 +1,225 @@
+"""The command line: ``zoomjax demo``, ``zoomjax calibrate``.
+
+Commands import what they need when they run, so that ``--help`` answers without waiting for JAX. They
+compute in float64. Errors go to stderr with exit status 2, and leave no partial result.
+"""
+
+import contextlib
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+try:
+    import typer
+except ModuleNotFoundError:
+    sys.exit('The command line needs the extra "app": pip install "zoomjax[app]"')
+
+if TYPE_CHECKING:
+    from .calibration import Calibration
+    from .lines import Lines
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="One continuous distortion model for a zoom lens, from images of straight things.",
+)
+
+Degree = Annotated[int, typer.Option(min=0, help="Degree of the polynomials in 1/f.")]
+Terms = Annotated[int, typer.Option(min=1, help="Number of distortion coefficients, k1 to kN.")]
+
+
+def main() -> None:
+    """Run the command line; what a user can mend is one sentence on stderr and exit status 2."""
+    warnings.showwarning = _print_warning
+    try:
+        app()
+    except (ValueError, OSError, RuntimeError) as error:
+        print(f"Error: {_sentence(error)}", file=sys.stderr)
+        sys.exit(2)
+
+
+@app.command()
+def demo(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for the results.", file_okay=False)
+    ] = Path("zoomjax-demo"),
+    noise: Annotated[float, typer.Option(min=0, help="Error of the edge points, px.")] = 0.5,
+    seed: Annotated[int, typer.Option(help="Seed of that error.")] = 0,
+) -> None:
+    """The paper's first experiment: make its lines, calibrate, and show the table and the model.
+
+    A board of 31 x 23 stripes at 1185 mm, seen at 50 focal lengths through the lens that the paper measured,
+    a Nikkor 18-200. The lines are synthetic; the lens is the published one.
+    """
+    folder = _start(output)
+    from . import synthetic
+
+    lens, board = synthetic.nikkor_18_200(), synthetic.StripedBoard()
+    with _stages() as stage:
+        stage("Projecting the board")
+        lines = synthetic.board_lines(lens, synthetic.focal_sweep(), board=board, noise=noise, seed=seed)
+        calibration = _calibrate(lines, 2, 2, stage, folder)
+    _show(calibration, folder, board.magnification)
+
+
+@app.command()
+def calibrate(
+    inputs: Annotated[
+        list[Path], typer.Argument(metavar="INPUT", help="lines.npz, or a CSV: frame,line,x,y[,focal].")
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.", file_okay=False)
+    ],
+    degree: Degree = 2,
+    terms: Terms = 2,
+    focal: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Focal lengths of a CSV input: frame,focal.")
+    ] = None,
+    image_size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Image size of a CSV input, px, e.g. 1920x1080.")
+    ] = None,
+    focal_unit: Annotated[
+        str, typer.Option(help="Unit of the focal lengths of a CSV input: mm or px.")
+    ] = "mm",
+) -> None:
+    """Fit a zoom lens to line primitives and write lens.json, lines.npz, summary.json, model.png."""
+    folder = _start(output)
+    with _stages() as stage:
+        stage("Reading the lines")
+        lines = _read(inputs, focal, image_size, focal_unit)
+        calibration = _calibrate(lines, degree, terms, stage, folder)
+    _show(calibration, folder)
+
+
+def _start(output: Path) -> Path:
+    """Float64 on, and the output folder tried, before any work."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from .calibration import writable_folder
+
+    return writable_folder(output)
+
+
+def _read(inputs: list[Path], focal: Path | None, image_size: str | None, focal_unit: str) -> "Lines":
+    if len(inputs) > 1:
+        raise ValueError(f"Give one file of lines; there are {len(inputs)}.")
+    [path] = inputs
+    if path.suffix == ".npz":
+        from .lines import load_lines
+
+        return load_lines(path)
+    if path.suffix == ".csv":
+        from .io.lines_csv import read_focal_csv, read_lines_csv
+
+        if image_size is None:
+            raise ValueError(f"The image size of {path} is not known: give --image-size, e.g. 1920x1080.")
+        width, _, height = image_size.lower().partition("x")
+        if not (width.isdigit() and height.isdigit()):
+            raise ValueError(f"--image-size must be like 1920x1080, but it is {image_size!r}.")
+        return read_lines_csv(
+            path,
+            image_size=(int(width), int(height)),
+            focal=None if focal is None else read_focal_csv(focal),
+            focal_unit=focal_unit,
+        )
+    raise ValueError(f"Cannot calibrate from {path}: give lines.npz, or a CSV file frame,line,x,y[,focal].")
+
+
+def _calibrate(
+    lines: "Lines", degree: int, terms: int, stage: Callable[[str], None], folder: Path
+) -> "Calibration":
+    from .calibration import calibrate
+
+    calibration = calibrate(lines, degree=degree, terms=terms, stage=stage)
+    stage("Writing the results")
+    calibration.write(folder)
+    return calibration
+
+
+@contextlib.contextmanager
+def _stages() -> Iterator[Callable[[str], None]]:
+    """A function that shows what is being done, and how long what was done before took."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    begun: list[tuple[str, float]] = []
+
+    def finish() -> None:
+        if begun:
+            name, start = begun.pop()
+            console.print(f"  [dim]{name:<32}{time.perf_counter() - start:7.2f} s[/dim]", highlight=False)
+
+    with console.status("Starting") as status:
+
+        def stage(name: str) -> None:
+            finish()
+            begun.append((name, time.perf_counter()))
+            status.update(f"{name} …")
+
+        yield stage
+        finish()
+
+
+def _show(
+    calibration: "Calibration", folder: Path, magnification: Callable[[float], float] | None = None
+) -> None:
+    """Print the table, the polynomials and where the results are."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from .calibration import rms_over_frames
+
+    console = Console()
+    summary = calibration.summary()
+    unit = summary["focal_unit"]
+    low, high = summary["focal_range"]
+    console.print(
+        f"\n{summary['points']:,} points on {summary['lines']:,} lines in {summary['frames']} frames, "
+        f"f = {low:g} to {high:g} {unit}\n",
+        highlight=False,
+    )
+    table = Table(title="Distance of corrected points to their lines, RMS", title_justify="left", box=None)
+    table.add_column("", no_wrap=True)
+    table.add_column("px", justify="right")
+    if magnification:
+        table.add_column("mm on the board", justify="right")
+    table.add_column("over frame by frame", justify="right")
+    for name, frames in calibration.rows():
+        value = rms_over_frames(frames)
+        cells = [name, f"{value:.4f}"]
+        if magnification:
+            scale = [magnification(float(f)) for f in calibration.lines.focal]
+            cells.append(f"{rms_over_frames(frames / scale):.4f}")
+        ratio = value / summary["rms_frames"] - 1
+        cells.append("" if name == "frame by frame" else f"{100 * ratio:+.2f} %")
+        table.add_row(*cells)
+    console.print(table)
+    console.print()
+    for i, column in enumerate(calibration.pixel_polynomials().T, start=1):
+        powers = ["", *(f" /f{'' if j == 1 else f'^{j}'}" for j in range(1, len(column)))]
+        terms = " ".join(f"{value:+.4e}{power}" for value, power in zip(column, powers, strict=True))
+        console.print(f"k{i}(f) = {terms}   px^-{2 * i}", highlight=False)
+    if summary["result"] != "successful":
+        console.print(f"\n[bold]Beware:[/bold] {summary['result']}", highlight=False)
+    files = ", ".join(["lens.json", "lines.npz", "summary.json", "model.png"])
+    console.print(f"\nWritten to {folder}: {files}", highlight=False)
+
+
+def _sentence(error: BaseException) -> str:
+    """The first paragraph of an error: equinox adds to its own how to debug the compiled program."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.strerror}: {error.filename}"
+    text = str(error).strip()
+    if "EquinoxRuntimeError" in type(error).__name__ or "Equinox" in text:
+        paragraphs = [line for line in text.splitlines() if line.startswith("equinox.EquinoxRuntimeError:")]
+        text = paragraphs[0].partition(": ")[2] if paragraphs else text
+    return text
+
+
+def _print_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    print(f"Warning: {message}", file=sys.stderr)

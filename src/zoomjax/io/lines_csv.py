@@ -1,0 +1,122 @@
+"""Line primitives as text: a row a point, with the columns ``frame,line,x,y`` and perhaps ``focal``.
+
+``frame`` and ``line`` are integers of the writer's choice; a line is one pair of both, its points in the
+order of their rows. ``x,y`` are px, (0, 0) the centre of the top-left pixel. Focal lengths come from the
+column ``focal``, the same in all rows of a frame, or from a second file with the columns ``frame,focal``.
+"""
+
+import csv
+import os
+from collections.abc import Mapping
+
+import numpy as np
+
+from .._files import whole_file
+from ..lines import Lines
+
+
+def read_lines_csv(
+    path: str | os.PathLike[str],
+    *,
+    image_size: tuple[int, int],
+    focal: Mapping[int, float] | None = None,
+    focal_unit: str = "mm",
+) -> Lines:
+    """Read lines from a ``frame,line,x,y[,focal]`` file, in float64.
+
+    Args:
+        path: the file; columns in any order, others are ignored.
+        image_size: (width, height) px.
+        focal: focal length by frame number, where the file has no column ``focal``.
+        focal_unit: "mm" or "px".
+
+    Raises:
+        ValueError: a column is missing, a value is no number, or a frame has no focal length; the message
+            names the file. Also what `Lines.from_ragged` raises.
+    """
+    columns = _read(path, required=("frame", "line", "x", "y"), optional=("focal",))
+    frame, line = (_integers(columns[name], name, path) for name in ("frame", "line"))
+    frames, index = np.unique(frame, return_inverse=True)
+    if "focal" in columns:
+        lowest, highest = np.full(frames.size, np.inf), np.full(frames.size, -np.inf)
+        np.minimum.at(lowest, index, columns["focal"])
+        np.maximum.at(highest, index, columns["focal"])
+        if (lowest != highest).any():
+            bad = frames[np.argmax(lowest != highest)]
+            raise ValueError(f"Cannot read lines from {path}: frame {bad} has two focal lengths.")
+        focals = lowest
+    elif focal is None:
+        raise ValueError(
+            f"Cannot read lines from {path}: no focal lengths. Add a column focal, or give a file with the "
+            "columns frame,focal."
+        )
+    else:
+        missing = [int(f) for f in frames if int(f) not in focal]
+        if missing:
+            raise ValueError(
+                f"Cannot read lines from {path}: no focal length for {len(missing)} of {frames.size} frames "
+                f"(the first are {', '.join(map(str, missing[:5]))})."
+            )
+        focals = np.array([focal[int(f)] for f in frames])
+
+    order = np.lexsort((line, index))  # stable: points keep the order of their rows
+    starts = np.flatnonzero(np.diff(index[order]) | np.diff(line[order])) + 1
+    points = np.stack([columns["x"], columns["y"]], axis=1)[order]
+    return Lines.from_ragged(
+        np.split(points, starts),
+        index[order][np.concatenate([[0], starts])],
+        focals,
+        image_size=image_size,
+        focal_unit=focal_unit,
+    )
+
+
+def write_lines_csv(lines: Lines, path: str | os.PathLike[str]) -> None:
+    """Write lines as ``frame,line,x,y,focal``, with all the digits of their dtype."""
+    frame, focal = np.asarray(lines.frame), np.asarray(lines.focal)
+    with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["frame", "line", "x", "y", "focal"])
+        for number, points in enumerate(lines.to_ragged()):
+            m = int(frame[number])
+            writer.writerows([m, number, x, y, focal[m]] for x, y in points)
+
+
+def read_focal_csv(path: str | os.PathLike[str]) -> dict[int, float]:
+    """Read focal lengths by frame number from a file with the columns ``frame,focal``.
+
+    Raises:
+        ValueError: a column is missing, a value is no number, or a frame comes twice.
+    """
+    columns = _read(path, required=("frame", "focal"))
+    frame = _integers(columns["frame"], "frame", path)
+    if np.unique(frame).size < frame.size:
+        raise ValueError(f"Cannot read focal lengths from {path}: a frame comes twice.")
+    return dict(zip(frame.tolist(), columns["focal"].tolist(), strict=True))
+
+
+def _read(path, *, required, optional=()) -> dict[str, np.ndarray]:
+    """The named columns as float64."""
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            header = [name.strip() for name in next(csv.reader(file), [])]
+            missing = [name for name in required if name not in header]
+            if missing:
+                raise ValueError(
+                    f"the first line must name the columns {','.join(required)}, but "
+                    f"{' and '.join(missing)} is not among them"
+                )
+            names = [name for name in (*required, *optional) if name in header]
+            used = [header.index(name) for name in names]
+            table = np.loadtxt(file, delimiter=",", usecols=used, ndmin=2, comments=None)
+        if not len(table):
+            raise ValueError("there are no rows")
+    except (ValueError, UnicodeDecodeError) as error:
+        raise ValueError(f"Cannot read {os.fspath(path)}: {error}.") from error
+    return dict(zip(names, table.T, strict=True))
+
+
+def _integers(values: np.ndarray, name: str, path) -> np.ndarray:
+    if not (np.isfinite(values).all() and (values == np.floor(values)).all()):
+        raise ValueError(f"Cannot read {os.fspath(path)}: column {name} must hold integers.")
+    return values.astype(np.int64)
