@@ -24,10 +24,9 @@ def read_zoomcam(folder: Path) -> Lines:
     """
     with np.load(folder / "corners_22x15.npz") as stored:
         zoom, corners = stored["zoom"], stored["corners"]
-    table = np.genfromtxt(folder / "focal_px.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    table = np.loadtxt(folder / "focal_px.csv", delimiter=",", skiprows=1)
     zooms, frame = np.unique(zoom, return_inverse=True)
-    names = table.dtype.names
-    focal = dict(zip(table[names[0]].tolist(), table[names[1]].tolist(), strict=True))
+    focal = dict(table.tolist())
     return Lines.from_grids(
         corners,
         frame,
@@ -38,7 +37,9 @@ def read_zoomcam(folder: Path) -> Lines:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("-o", "--output", type=Path, default=Path("zoomcam.npz"))
     output = parser.parse_args().output
     if "ZOOMJAX_DATA" not in os.environ:

@@ -5,8 +5,6 @@ from .algebraic import algebraic_zoom as algebraic_zoom
 from .compression import CompressedLines as CompressedLines
 from .compression import compress as compress
 from .compression import merge as merge
-from .compression import moments as moments
-from .compression import orthogonal as orthogonal
 from .energy import frame_energy as frame_energy
 from .energy import global_energy as global_energy
 from .energy import residuals as residuals

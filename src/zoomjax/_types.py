@@ -7,7 +7,8 @@ distortion coefficients (N of eq. 2), ``rows`` rows of a line's (possibly compre
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int, Num
+from jax.core import Tracer
+from jaxtyping import Bool, Float, Int, Num, PyTree
 
 AnyArray = jax.Array | np.ndarray
 """A JAX array, or a NumPy array where JAX cannot hold the values as given (float64, x64 off)."""
@@ -19,3 +20,8 @@ Coefficients = Float[AnyArray, "terms"]
 Mask = Bool[AnyArray, "line point"]
 FrameIndex = Int[AnyArray, "line"]
 Focal = Float[AnyArray, "frame"]
+
+
+def traced(tree: PyTree) -> bool:
+    """Whether values in the tree are not known yet, being inside ``jit``, ``vmap`` or ``grad``."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))

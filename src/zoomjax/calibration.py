@@ -16,7 +16,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
+from ._types import AnyArray
 from .algebraic import algebraic_zoom
 from .compression import compress
 from .fit import RESULTS, FrameFits, ZoomFit, fit_frames, fit_zoom, frame_rms
@@ -88,7 +90,9 @@ class Calibration:
 
     def pixel_polynomials(self) -> np.ndarray:
         """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as the paper prints them."""
-        normalised = np.asarray(self.zoom.lens.zoom.in_inverse_focal())
+        model = self.zoom.lens.zoom
+        assert isinstance(model, PolynomialZoom)  # `calibrate` fits no other
+        normalised = np.asarray(model.in_inverse_focal())
         return normalised / self.zoom.lens.scale ** (2 * np.arange(1, normalised.shape[1] + 1))
 
     def write(self, folder: str | os.PathLike[str]) -> None:
@@ -141,7 +145,7 @@ def calibrate(
     )
 
 
-def rms_over_frames(frame_rms: np.ndarray) -> float:
+def rms_over_frames(frame_rms: Float[AnyArray, "frame"]) -> float:
     """Root of the mean of the frames' errors: eq. 13 from eq. 3."""
     return float(np.sqrt(np.mean(np.asarray(frame_rms) ** 2)))
 

@@ -52,8 +52,8 @@ def demo(
 ) -> None:
     """The paper's first experiment: make its lines, calibrate, and show the table and the model.
 
-    A board of 31 x 23 stripes at 1185 mm, seen at 50 focal lengths through the lens that the paper measured,
-    a Nikkor 18-200. The lines are synthetic; the lens is the published one.
+    A board of 31 x 23 stripes at 1185 mm, seen at 50 focal lengths through the lens that the paper
+    measured, a Nikkor 18-200. The lines are synthetic; the lens is the published one.
     """
     folder = _start(output)
     from . import synthetic

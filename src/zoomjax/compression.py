@@ -10,32 +10,27 @@ Once per data set: the reduction, one pass over the points. Per iteration of a f
 rows a line, whatever the number of points. Triangles of the same line `merge`, so that data larger than
 memory can be compressed in chunks of points.
 
-Two ways to R, with the same result up to rounding (`reduction` of `compress`):
-
-* `moments`: 7N + 8 sums of monomials give ``R^T R``, factored afterwards. One read of the points. It
-  squares the condition number: residuals below about 1e-4 px (float64) are lost. In float32 that floor
-  is about 0.6 px, worthless.
-* `orthogonal`: modified Gram-Schmidt on the columns, backward stable: the floor is the dtype's own,
-  1e-12 px, or 1e-3 px in float32. Three to four times slower in float64.
-
-By default float64 takes the first and float32 the second.
+R is found by modified Gram-Schmidt, not by way of the Gram matrix ``R^T R``, although sums of monomials
+would give that in one read of the points. Squaring the condition number would lose residuals below about
+1e-4 px in float64, and 0.6 px in float32, which is worthless. Gram-Schmidt takes the same time when it
+works on a run of a thousand points at a time, whose columns stay in the fastest cache, and its floor is the
+dtype's own: 1e-12 px, or 1e-3 px in float32.
 """
 
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._types import Focal, FrameIndex, Point
+from ._types import Focal, FrameIndex, Point, traced
 from .lines import AbstractLines, Lines
 
-Reduction = Callable[[Float[Array, "2 point"], Float[Array, "point"], int], Float[Array, "rows rows"]]
-"""From the normalised x and y of one line, 1 or 0 for points and padding, and the terms, to R."""
+_RUN = 1100  # points orthogonalised together: 7 columns of them fill a cache of 48 to 64 KB in float64
+
+_COMPILED: set[tuple] = set()  # shapes that have been reduced in this process
 
 
 class CompressedLines(AbstractLines):
@@ -105,13 +100,12 @@ def _combine(triangle, k):
     return jnp.einsum("rjc,j->rc", columns, kappa, precision=_EXACT)
 
 
-def compress(lines: Lines, terms: int = 2, *, reduction: Reduction | None = None) -> CompressedLines:
+def compress(lines: Lines, terms: int = 2) -> CompressedLines:
     """Reduce each line to its triangle; fits then take milliseconds and give the same answer.
 
     Args:
         lines: the lines; their `centre` is the centre the result is for.
         terms: the largest number N of coefficients that will be fitted. Fewer can be.
-        reduction: `moments` or `orthogonal`; by default the first in float64, the second in float32.
 
     Returns:
         The compressed lines, differentiable with respect to points and centre.
@@ -125,28 +119,12 @@ def compress(lines: Lines, terms: int = 2, *, reduction: Reduction | None = None
     """
     if terms < 1:
         raise ValueError(f"Argument terms must be at least 1, but it is {terms}.")
-    if reduction is None:
-        double = jax.dtypes.canonicalize_dtype(lines.points.dtype) == jnp.float64
-        reduction = moments if double else orthogonal
-    number = lines.points.shape[0]
-    # XLA runs a loop on one core. Outside of a trace, hand each core a run of lines; the last run is
-    # moved back to end with the lines, so that all have one shape and one compilation.
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(lines))
-    parts = 1 if traced or jax.default_backend() != "cpu" else min(os.cpu_count() or 1, number)
-    size = -(-number // parts)
-    starts = [min(part * size, number - size) for part in range(parts)]
-    if parts == 1:
-        triangles = [_reduce_run(lines, 0, size, terms, reduction)]
+    if traced(lines) or jax.default_backend() != "cpu":
+        triangle = _reduce_run(lines, 0, lines.points.shape[0], terms)
     else:
-        with ThreadPoolExecutor(parts) as pool:
-            run = lambda start: jax.block_until_ready(  # noqa: E731
-                _reduce_run(lines, start, size, terms, reduction)
-            )
-            triangles = list(pool.map(run, starts))
-        overlaps = [part * size - start for part, start in enumerate(starts)]
-        triangles = [r[overlap:] for r, overlap in zip(triangles, overlaps, strict=True)]
+        triangle = _reduce_in_threads(lines, terms)
     return CompressedLines(
-        triangle=jnp.concatenate(triangles) if parts > 1 else triangles[0],
+        triangle=triangle,
         frame=lines.frame,
         focal=lines.focal,
         centre=lines.centre,
@@ -172,11 +150,38 @@ def merge(first: CompressedLines, second: CompressedLines) -> CompressedLines:
 @jax.jit
 @jax.vmap
 def _merge_all(first, second):
-    return _factor(jnp.concatenate([first, second]).T)
+    return _triangle(jnp.concatenate([first, second]).T)
 
 
-@partial(eqx.filter_jit, donate="none")
-def _reduce_run(lines, start, size, terms, reduction):
+def _reduce_in_threads(lines, terms):
+    """All triangles, each core reducing a run of lines: XLA runs a loop on one.
+
+    The last run is moved back to end with the lines, so that all have one shape and one compilation, and
+    the first of a new shape goes alone, or every thread would compile.
+    """
+    number = lines.points.shape[0]
+    double = jax.config.jax_enable_x64
+    with ThreadPoolExecutor() as pool:
+        # JAX's context managers, such as that for float64, hold in their own thread alone.
+        same_context = pool.submit(lambda: jax.config.jax_enable_x64 == double).result()
+        parts = min(os.cpu_count() or 1, number) if same_context else 1
+        size = -(-number // parts)
+        starts = [min(part * size, number - size) for part in range(parts)]
+
+        def reduce_from(start):
+            return jax.block_until_ready(_reduce_run(lines, start, size, terms))
+
+        signature = (lines.points.shape, str(lines.points.dtype), size, terms, double)
+        alone = 0 if signature in _COMPILED and same_context else 1
+        triangles = [reduce_from(start) for start in starts[:alone]]
+        triangles += pool.map(reduce_from, starts[alone:])
+        _COMPILED.add(signature)
+    overlaps = [part * size - start for part, start in enumerate(starts)]
+    return jnp.concatenate([run[overlap:] for run, overlap in zip(triangles, overlaps, strict=True)])
+
+
+@eqx.filter_jit
+def _reduce_run(lines, start, size, terms):
     """Triangles of `size` consecutive lines, one after the other so that each stays in the cache."""
 
     def reduce_one(index):
@@ -187,84 +192,45 @@ def _reduce_run(lines, start, size, terms, reduction):
         # x and y apart by a product with the identity, exact: 2 times faster than slicing on the CPU.
         offset = jnp.where(mask[:, None], points - lines.centre[None], 0)
         z = jnp.einsum("pc,cd->dp", offset, jnp.eye(2, dtype=offset.dtype), precision=_EXACT)
-        return _triangle(reduction, terms, z / lines.scale, mask.astype(z.dtype))
+        return _triangle(_columns(z / lines.scale, mask.astype(z.dtype), terms))
 
     batch = None if jax.default_backend() == "cpu" else 256
     return jax.lax.map(reduce_one, start + jnp.arange(size), batch_size=batch)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _triangle(reduction, terms, z, valid):
-    return reduction(z, valid, terms)
-
-
-@_triangle.defjvp
-def _triangle_jvp(reduction, terms, primals, tangents):
-    triangle = reduction(*primals, terms)
-    columns, columns_dot = jax.jvp(partial(_columns, terms=terms), primals, tangents)
-    return triangle, _triangle_tangent(triangle, columns, columns_dot)
-
-
-@jax.custom_jvp
-def _factor(columns):
-    return _orthogonalise(columns)
-
-
-@_factor.defjvp
-def _factor_jvp(primals, tangents):
-    triangle = _orthogonalise(*primals)
-    return triangle, _triangle_tangent(triangle, *primals, *tangents)
-
-
-def _triangle_tangent(triangle, columns, columns_dot):
-    """A tangent of R that is right for every function of ``R^T R``, which is all the fits use.
-
-    R itself has no derivative at an exactly straight line, whose columns are dependent; ``R^T R`` has.
-    With ``A = Q R``, ``dR = Q^T dA`` (Q held fixed) gives ``R^T dR + dR^T R = A^T dA + dA^T A`` exactly.
-    """
-    kept = jnp.diagonal(triangle) > 0
-    regular = triangle + jnp.diag(jnp.where(kept, 0, 1).astype(triangle.dtype))
-    q = jax.scipy.linalg.solve_triangular(regular, columns, trans="T")
-    return jnp.matmul(jnp.where(kept[:, None], q, 0), columns_dot.T, precision=_EXACT)
-
-
-def orthogonal(
-    z: Float[Array, "2 point"], valid: Float[Array, "point"], terms: int
-) -> Float[Array, "rows rows"]:
-    """The triangle of one line by orthogonalising its columns: no loss of accuracy, any dtype."""
-    return _orthogonalise(_columns(z, valid, terms))
-
-
-def moments(
-    z: Float[Array, "2 point"], valid: Float[Array, "point"], terms: int
-) -> Float[Array, "rows rows"]:
-    """The triangle of one line by way of its Gram matrix, from sums of monomials: for float64.
-
-    The sums are ``r^(2j)`` times ``x^2, xy, y^2`` (j = 0 ... 2N) and times ``x, y`` (j = 0 ... N), and
-    the count. Sums add up over points, which `merge` does on triangles with no loss of accuracy.
-    """
-    x, y = z
-    squared = x * x + y * y
-    powers = [jnp.ones_like(x)]
-    for _ in range(2 * terms):
-        powers.append(powers[-1] * squared)
-    sums = _sum_of_products(jnp.stack(powers), jnp.stack([x * x, x * y, y * y, x, y]))
-
-    order = jnp.arange(terms + 1)
-    blocks = sums[:, jnp.asarray([[0, 1], [1, 2]])][order[:, None] + order[None]]  # j, k, 2, 2
-    square = blocks.transpose(0, 2, 1, 3).reshape(2 * terms + 2, 2 * terms + 2)
-    linear = sums[: terms + 1, 3:].reshape(1, -1)
-    count = jnp.sum(valid)
-    return _cholesky(jnp.block([[count[None, None], linear], [linear.T, square]]))
-
-
 def _columns(z, valid, terms):
-    """The rows [1, z, r^2 z, ..., r^(2N) z] of one line, a column a point; zero where masked."""
+    """The rows [1, z, r^2 z, ..., r^(2N) z] of one line, a column a point; zero where it has none."""
     squared = jnp.sum(z * z, axis=0, keepdims=True)
     columns = [valid[None], z]
     for _ in range(terms):
         columns.append(columns[-1] * squared)
     return jnp.concatenate(columns)
+
+
+@jax.custom_jvp
+def _triangle(columns):
+    """R of the transposed argument, by runs of points whose triangles are then reduced together."""
+    size, points = columns.shape
+    runs = -(-points // _RUN)
+    length = -(-points // runs)
+    padded = jnp.pad(columns, ((0, 0), (0, runs * length - points)))
+    triangles = jax.vmap(_orthogonalise, in_axes=1)(padded.reshape(size, runs, length))
+    return triangles[0] if runs == 1 else _orthogonalise(triangles.reshape(-1, size).T)
+
+
+@_triangle.defjvp
+def _triangle_jvp(primals, tangents):
+    """A tangent of R that is right for every function of ``R^T R``, which is all that the fits use.
+
+    R itself has no derivative at an exactly straight line, whose columns are dependent; ``R^T R`` has.
+    With ``A = Q R``, ``dR = Q^T dA`` (Q held fixed) gives ``R^T dR + dR^T R = A^T dA + dA^T A`` exactly.
+    """
+    [columns], [columns_dot] = primals, tangents
+    triangle = _triangle(columns)
+    kept = jnp.diagonal(triangle) > 0
+    regular = triangle + jnp.diag(jnp.where(kept, 0, 1).astype(triangle.dtype))
+    q = jax.scipy.linalg.solve_triangular(regular, columns, trans="T")
+    return triangle, jnp.matmul(jnp.where(kept[:, None], q, 0), columns_dot.T, precision=_EXACT)
 
 
 def _orthogonalise(columns):
@@ -283,40 +249,6 @@ def _orthogonalise(columns):
         rows.append(jnp.pad(row, (done, 0)))
         columns = columns[1:] - (row[1:] * inverse)[:, None] * columns[:1]
     return jnp.stack(rows)
-
-
-def _cholesky(gram):
-    """R of a Gram matrix that may be singular, as that of an exactly straight line is.
-
-    A direction whose remaining square is at the level of rounding gets a zero row; plain Cholesky would
-    take the root of a negative number, and a tiny positive pivot would blow rounding up.
-    """
-    floor = 16 * jnp.finfo(gram.dtype).eps * jnp.diagonal(gram)
-    rows = []
-    for i in range(gram.shape[0]):
-        pivot = gram[i, i]
-        keep = pivot > floor[i]
-        row = jnp.where(keep, gram[i] / jnp.sqrt(jnp.where(keep, pivot, 1)), 0)
-        row = jnp.where(jnp.arange(gram.shape[0]) < i, 0, row)
-        rows.append(row)
-        gram = gram - row[:, None] * row[None]
-    return jnp.stack(rows)
-
-
-def _sum_of_products(left, right, segments=16):
-    """``left @ right.T`` for a few long rows, added up in a tree of contiguous segments.
-
-    The compiler turns this into vector instructions, and neither a reduction (kept in order, one
-    addition at a time) nor a matrix product with so few rows (Eigen): 0.12 s against 0.30 and 0.25 s
-    for the 10 million points of the benchmark. Sums in a tree are also more accurate.
-    """
-    pad = -left.shape[1] % segments
-    left = jnp.pad(left, ((0, 0), (0, pad))).reshape(left.shape[0], 1, segments, -1)
-    right = jnp.pad(right, ((0, 0), (0, pad))).reshape(1, right.shape[0], segments, -1)
-    total = left[:, :, 0] * right[:, :, 0]
-    for i in range(1, segments):
-        total = total + left[:, :, i] * right[:, :, i]
-    return jnp.sum(total, axis=-1)
 
 
 _EXACT = jax.lax.Precision.HIGHEST  # some accelerators otherwise multiply float32 with 10 bits

@@ -15,10 +15,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
 from ._solver import default_solver
-from ._types import AnyArray, Point
+from ._types import AnyArray, Point, traced
 from .algebraic import algebraic_parameters, compressed
 from .compression import CompressedLines
 from .energy import frame_energy, line_weights, residuals
@@ -196,8 +197,7 @@ def frame_rms(
 def _about(lines, centre):
     if isinstance(lines, Lines):
         return eqx.tree_at(lambda data: data.centre, lines, centre)
-    known = not any(isinstance(c, jax.core.Tracer) for c in (lines.centre, centre))
-    if known and not jnp.allclose(lines.centre, centre, rtol=0, atol=1e-3):
+    if not traced((lines.centre, centre)) and not jnp.allclose(lines.centre, centre, rtol=0, atol=1e-3):
         raise ValueError(
             "The lens and the compressed lines have different centres of distortion. Compress the lines "
             "about the lens's centre, or pass the lines themselves."
@@ -213,8 +213,8 @@ def _frame_rms(lines, lens):
     elif isinstance(lens, ZoomLens):
         coefficients = jax.vmap(lens.zoom)(focal)
     else:
-        coefficients = jnp.asarray(lens)
-    return jnp.sqrt(frame_energy(lines, coefficients))
+        coefficients = lens
+    return jnp.sqrt(frame_energy(lines, jnp.asarray(coefficients)))
 
 
 @eqx.filter_jit
@@ -284,7 +284,7 @@ def _covariance(lines, zoom, energy):
     the points alone would feign: each point's error appears in the derivative by k_j, times r^(2j). (Lines
     through the centre have nothing else there, and would otherwise seem to determine k from their noise.)
     """
-    flat, unravel = jax.flatten_util.ravel_pytree(zoom.parameters)
+    flat, unravel = ravel_pytree(zoom.parameters)
 
     def coefficients_at(flat):
         return jax.vmap(_with_parameters(zoom, unravel(flat)))(lines.focal)
@@ -335,14 +335,15 @@ def _judge(lines, zoom, result, determined):
     offset = (corners - lines.centre[None]) / lines.scale
     farthest = jnp.sqrt(jnp.max(jnp.sum(offset**2, axis=1)))
     monotone = jax.vmap(monotone_radius)(jax.vmap(zoom)(lines.focal)) > farthest
-    finite = jnp.all(jnp.isfinite(jax.flatten_util.ravel_pytree(zoom.parameters)[0]))
-    about_model = RESULTS.where(jnp.all(monotone), RESULTS.successful, RESULTS.folded)
+    finite = jnp.all(jnp.isfinite(ravel_pytree(zoom.parameters)[0]))
+    successful = RESULTS.promote(optx.RESULTS.successful)
+    about_model = RESULTS.where(jnp.all(monotone), successful, RESULTS.folded)
     about_model = RESULTS.where(determined, about_model, RESULTS.undetermined)
     solved = RESULTS.promote(result)
     return RESULTS.where(
         solved != RESULTS.successful,
         solved,
-        RESULTS.where(finite, about_model, RESULTS.nonfinite),
+        RESULTS.where(finite, about_model, RESULTS.promote(optx.RESULTS.nonfinite)),
     )
 
 

@@ -6,13 +6,12 @@ import os
 import warnings
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, ScalarLike
 
 from ._files import whole_file
-from ._types import AnyArray, Point, Scalar
+from ._types import AnyArray, Point, traced
 from .lines import AbstractLines
 from .radial import Distortion
 from .zoom import AbstractZoom, PolynomialZoom
@@ -49,7 +48,7 @@ class ZoomLens(eqx.Module):
         """The length in px that is radius 1: half the image diagonal."""
         return math.hypot(*self.image_size) / 2
 
-    def __call__(self, focal: Scalar | float) -> Distortion:
+    def __call__(self, focal: ScalarLike) -> Distortion:
         """The distortion at one focal length, in `focal_unit`; ``jax.vmap`` it for many.
 
         Warns:
@@ -95,7 +94,7 @@ class ZoomLens(eqx.Module):
             part.write_text(json.dumps(content, indent=2) + "\n")
 
     def _check(self, focal):
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, focal))):
+        if traced((self, focal)):
             return
         low, high = (float(end) for end in self.focal_range)
         value = float(focal)

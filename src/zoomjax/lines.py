@@ -11,16 +11,17 @@ import math
 import os
 import warnings
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from ._files import whole_file
-from ._types import AnyArray, Focal, FrameIndex, Mask, Point
+from ._types import AnyArray, Focal, FrameIndex, Mask, Point, traced
 from .radial import radial_factor
 
 _FORMAT, _VERSION = "zoomjax.lines", 1
@@ -67,7 +68,7 @@ class AbstractLines(eqx.Module):
         frame is given all lines and chooses by the mask.
         """
         frames, number = self.focal.shape[0], self.frame.shape[0]
-        if isinstance(self.frame, jax.core.Tracer):
+        if traced(self.frame):
             chosen = jnp.broadcast_to(jnp.arange(number), (frames, number))
             return chosen, self.frame[None] == jnp.arange(frames)[:, None]
         frame = np.asarray(self.frame)
@@ -115,11 +116,11 @@ class Lines(AbstractLines):
     @classmethod
     def from_ragged(
         cls,
-        points: Sequence[ArrayLike],
+        points: Iterable[ArrayLike],
         frame: ArrayLike,
         focal: ArrayLike,
         *,
-        image_size: tuple[int, int],
+        image_size: Sequence[int],
         focal_unit: str = "mm",
         centre: ArrayLike | None = None,
     ) -> "Lines":
@@ -199,7 +200,7 @@ class Lines(AbstractLines):
         frame: ArrayLike,
         focal: ArrayLike,
         *,
-        image_size: tuple[int, int],
+        image_size: Sequence[int],
         focal_unit: str = "mm",
     ) -> "Lines":
         """Every row and every column of flat grids (checkerboard corners, dots) as a line.
@@ -306,7 +307,8 @@ def load_lines(path: str | os.PathLike[str]) -> Lines:
             names it.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as opened:
+            file = np.load(opened, allow_pickle=False)
             if not isinstance(file, np.lib.npyio.NpzFile):
                 raise ValueError("it is not an .npz archive")
             stored = {name: file[name] for name in file.files}
@@ -318,7 +320,7 @@ def load_lines(path: str | os.PathLike[str]) -> Lines:
                 f"{_VERSION}; update zoomjax"
             )
         points, counts = stored["points"], stored["counts"]
-        if counts.sum() != len(points):
+        if counts.min(initial=0) < 0 or counts.sum() != len(points):
             raise ValueError("its points and counts disagree")
         width, height = (int(side) for side in stored["image_size"])
         return Lines.from_ragged(

@@ -73,6 +73,7 @@ def _first_root_in_unit_interval(coefficients: Float[Array, "n"]) -> Float[Array
     return jnp.min(jnp.where(found, knots[1:-1], jnp.inf))
 
 
+@jax.jit
 def monotone_radius(k: Coefficients) -> Float[Array, ""]:
     """The normalised radius up to which ``r L(r^2)`` increases; inf if it does so everywhere.
 

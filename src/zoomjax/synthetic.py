@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ._types import AnyArray
 from .lens import ZoomLens
 from .lines import Lines
 from .radial import Distortion
@@ -64,7 +65,9 @@ class StripedBoard:
         return np.arange(2 * self.stripes[axis]) * period / 2 - self.size[axis] / 2
 
 
-def focal_sweep(number: int = 50, shortest: float = 20.56, longest: float = 127.36) -> np.ndarray:
+def focal_sweep(
+    number: int = 50, shortest: float | int = 20.56, longest: float | int = 127.36
+) -> np.ndarray:
     """Focal lengths spread evenly in 1/f, increasing; by default those of the paper's experiment."""
     return 1 / np.linspace(1 / shortest, 1 / longest, number)
 
@@ -74,8 +77,8 @@ def board_lines(
     focal: np.ndarray,
     *,
     board: StripedBoard | None = None,
-    spacing: float = 12.0,
-    noise: float = 0.0,
+    spacing: float | int = 12,
+    noise: float | int = 0,
     seed: int = 0,
 ) -> Lines:
     """The edges of the stripes at each focal length, as an edge detector would give them.
@@ -120,8 +123,8 @@ def board_lines(
 @eqx.filter_jit
 def _seen(
     distortion: Distortion,
-    across: Float[Array, "line"],
-    along: Float[Array, "point"],
+    across: Float[AnyArray, "line"],
+    along: Float[AnyArray, "point"],
     axis: int,
     image_size: tuple[int, int],
 ) -> tuple[Float[Array, "line point 2"], Bool[Array, "line point"]]:

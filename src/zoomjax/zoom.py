@@ -9,12 +9,11 @@ has to be written, and the algebraic estimate applies to it too.
 import abc
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, PyTree, ScalarLike
 
-from ._types import AnyArray, Coefficients, Focal, Scalar
+from ._types import AnyArray, Coefficients, Focal, Scalar, traced
 
 
 class AbstractZoom(eqx.Module):
@@ -35,7 +34,7 @@ class AbstractZoom(eqx.Module):
         """
 
     @abc.abstractmethod
-    def __call__(self, focal: Scalar) -> Coefficients:
+    def __call__(self, focal: ScalarLike) -> Coefficients:
         """The coefficients at one focal length."""
 
 
@@ -45,10 +44,10 @@ class AbstractLinearZoom(AbstractZoom):
     parameters: eqx.AbstractVar[Float[AnyArray, "basis terms"] | None]
 
     @abc.abstractmethod
-    def basis(self, focal: Scalar) -> Float[Array, "basis"]:
+    def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:
         """The values of the basis functions at one focal length."""
 
-    def __call__(self, focal: Scalar) -> Coefficients:
+    def __call__(self, focal: ScalarLike) -> Coefficients:
         """The coefficients at one focal length."""
         return self.basis(focal) @ _fitted(self)
 
@@ -86,7 +85,7 @@ class PolynomialZoom(AbstractLinearZoom):
 
     @classmethod
     def from_inverse_focal(
-        cls, coefficients: Float[AnyArray, "basis terms"], focal_ref: Scalar | float
+        cls, coefficients: Float[AnyArray, "basis terms"], focal_ref: ScalarLike
     ) -> "PolynomialZoom":
         """The model ``k_i(f) = sum_j coefficients[j, i] f^(-j)``, stated about `focal_ref`."""
         coefficients = jnp.asarray(coefficients)
@@ -102,11 +101,11 @@ class PolynomialZoom(AbstractLinearZoom):
         """The polynomials' coefficients of ``f^(-j)``, as the paper prints them (but normalised)."""
         parameters = _fitted(self)
         power = jnp.arange(self.degree + 1, dtype=parameters.dtype)
-        return parameters * self.focal_ref ** power[:, None]
+        return parameters * jnp.asarray(self.focal_ref) ** power[:, None]
 
     def prepare(self, focal: Focal, terms: int) -> "PolynomialZoom":
         """Zero polynomials about the shortest focal length."""
-        if not isinstance(focal, jax.core.Tracer):
+        if not traced(focal):
             distinct = np.unique(np.asarray(focal)).size
             if distinct <= self.degree:
                 raise ValueError(
@@ -121,7 +120,7 @@ class PolynomialZoom(AbstractLinearZoom):
             focal_ref=jnp.min(focal),
         )
 
-    def basis(self, focal: Scalar) -> Float[Array, "basis"]:
+    def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:
         """``(1, u, ..., u^n)`` with ``u = focal_ref/f``."""
         if self.focal_ref is None:
             raise ValueError(_UNFITTED)

@@ -7,7 +7,7 @@ column ``focal``, the same in all rows of a frame, or from a second file with th
 
 import csv
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from ..lines import Lines
 def read_lines_csv(
     path: str | os.PathLike[str],
     *,
-    image_size: tuple[int, int],
+    image_size: Sequence[int],
     focal: Mapping[int, float] | None = None,
     focal_unit: str = "mm",
 ) -> Lines:
@@ -54,8 +54,8 @@ def read_lines_csv(
         missing = [int(f) for f in frames if int(f) not in focal]
         if missing:
             raise ValueError(
-                f"Cannot read lines from {path}: no focal length for {len(missing)} of {frames.size} frames "
-                f"(the first are {', '.join(map(str, missing[:5]))})."
+                f"Cannot read lines from {path}: no focal length for {len(missing)} of its "
+                f"{frames.size} frames (the first are {', '.join(map(str, missing[:5]))})."
             )
         focals = np.array([focal[int(f)] for f in frames])
 

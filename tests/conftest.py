@@ -1,0 +1,129 @@
+"""What all tests share: float64, strict ranks, one seed, and small scenes with exact truth."""
+
+import os
+from pathlib import Path
+
+import equinox as eqx
+import hypothesis
+import jax
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax import synthetic
+
+SEED = 2012
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+hypothesis.settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=50)
+hypothesis.settings.load_profile("fixed")
+
+
+def pytest_report_header(config):
+    return f"zoomjax: seed {SEED}, float64 {jax.config.jax_enable_x64}, {jax.default_backend()}"
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(SEED)
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The folder of real data, which is not part of the package."""
+    folder = os.environ.get("ZOOMJAX_DATA")
+    if not folder:
+        pytest.skip("Needs real data: set ZOOMJAX_DATA to the folder that holds it.")
+    return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def truth():
+    """The lens of the paper's first experiment."""
+    return synthetic.nikkor_18_200()
+
+
+NOISE = 0.5
+
+
+@pytest.fixture(scope="session")
+def clean(truth):
+    """The paper's scene at four focal lengths, thinly sampled, without noise."""
+    return synthetic.board_lines(truth, synthetic.focal_sweep(4), spacing=60.0)
+
+
+@pytest.fixture(scope="session")
+def noisy(truth):
+    """The same points with edge noise; all shapes are those of `clean`."""
+    return synthetic.board_lines(truth, synthetic.focal_sweep(4), spacing=60.0, noise=NOISE, seed=SEED)
+
+
+@pytest.fixture(scope="session")
+def small(noisy):
+    return zj.compress(noisy)
+
+
+@pytest.fixture(scope="session")
+def fit(small):
+    return zj.fit_zoom(small)
+
+
+@pytest.fixture(scope="session")
+def full_fit(noisy):
+    return zj.fit_zoom(noisy)
+
+
+@pytest.fixture(scope="session")
+def frame_fits(small):
+    return zj.fit_frames(small)
+
+
+RAGGED_FRAMES = np.array([2, 0, 1, 2, 0, 2, 1, 2, 0])
+RAGGED_COUNTS = (3, 40, 17, 5, 101, 16, 4, 33, 8)
+RAGGED_SIZE = (640, 480)
+
+
+@pytest.fixture(scope="session")
+def ragged():
+    """Nine bent lines of very different lengths in three frames of two, three and four lines."""
+    rng = np.random.default_rng(SEED)
+    points = []
+    for count in RAGGED_COUNTS:
+        start, end = rng.uniform((0, 0), RAGGED_SIZE, (2, 2))
+        t = np.sort(rng.uniform(size=count))[:, None]
+        bend = 20 * t * (1 - t) * rng.standard_normal(2)
+        points.append(start + t * (end - start) + bend + 0.1 * rng.standard_normal((count, 2)))
+    return zj.Lines.from_ragged(
+        points, RAGGED_FRAMES, np.array([24.0, 50.0, 120.0]), image_size=RAGGED_SIZE
+    )
+
+
+@pytest.fixture(scope="session")
+def _compile_events():
+    events = []
+
+    def listen(event, duration, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            events.append(duration)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    return events
+
+
+@pytest.fixture
+def compilations(_compile_events):
+    """A function that tells how many programs were compiled since the test began or it was last called."""
+    _compile_events.clear()
+
+    def count() -> int:
+        number = len(_compile_events)
+        _compile_events.clear()
+        return number
+
+    return count
+
+
+def moved(lines, points):
+    """The same lines with other points."""
+    return eqx.tree_at(lambda data: data.points, lines, points)

@@ -1,0 +1,84 @@
+"""Calibrations as a whole: their figures, their folder, and the real zoom camera."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax import synthetic
+from zoomjax.calibration import calibrate, rms_over_frames, writable_folder
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "real"))
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    lines = synthetic.board_lines(
+        synthetic.nikkor_18_200(), synthetic.focal_sweep(5), spacing=60, noise=0.4
+    )
+    return calibrate(lines)
+
+
+def test_stages_are_told(calibration):
+    told = []
+    calibrate(calibration.lines, stage=told.append)
+    assert len(told) == 3
+
+
+def test_pixel_polynomials_give_the_coefficients_of_the_lens(calibration):
+    polynomials = calibration.pixel_polynomials()
+    for f in (20.56, 50.0, 127.0):
+        expected = calibration.zoom.lens(f).pixel_coefficients
+        np.testing.assert_allclose(f ** -np.arange(3.0) @ polynomials, expected, rtol=1e-9)
+
+
+def test_summary_is_json_and_agrees_with_the_fits(calibration):
+    summary = json.loads(json.dumps(calibration.summary(), allow_nan=False))
+    assert summary["rms_zoom"] == float(calibration.zoom.rms)
+    assert summary["rms_none"] == pytest.approx(rms_over_frames(zj.frame_rms(calibration.lines, None)))
+    assert [row["frame"] for row in summary["per_frame"]] == list(range(5))
+
+
+def test_lines_that_determine_nothing_are_reported(calibration):
+    t = np.linspace(-200, 200, 50)
+    radial = [np.stack([319.5 + t * c, 239.5 + t * s], -1) for c, s in ((1, 0), (0, 1), (0.6, 0.8))]
+    lines = zj.Lines.from_ragged(radial * 3, np.repeat([0, 1, 2], 3), [20, 40, 80], image_size=(640, 480))
+    summary = json.loads(json.dumps(calibrate(lines).summary(), allow_nan=False))
+    assert "do not determine" in summary["result"]
+    assert summary["frames_without_a_model"] == 3
+    assert None in summary["parameter_sigma"]
+
+
+def test_results_are_written_together_or_not_at_all(calibration, tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("zoomjax.calibration.plot_model", fail)  # the last of the four files
+    with pytest.raises(OSError, match="disk full"):
+        calibration.write(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folder_is_made_and_tried(tmp_path):
+    assert writable_folder(tmp_path / "new" / "deep").is_dir()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="Cannot write in the folder"):
+        writable_folder(tmp_path / "file" / "below")
+
+
+def test_zoomcam_gives_the_reference_figures(data):
+    from zoomcam import read_zoomcam
+
+    lines = read_zoomcam(data / "zoomcam")
+    assert len(lines.focal) == 5
+    assert len(lines.frame) == 116 * (15 + 22)
+    by_degree = {d: calibrate(lines, degree=d) for d in (0, 1, 2)}
+    assert float(by_degree[2].each.rms) == pytest.approx(0.8796, abs=5e-4)
+    for degree, rms in {0: 0.9969, 1: 0.8855, 2: 0.8809}.items():
+        assert float(by_degree[degree].zoom.rms) == pytest.approx(rms, abs=5e-4)
+    first, last = by_degree[2].each.coefficients[0], by_degree[2].each.coefficients[-1]
+    np.testing.assert_allclose(first, [0.0815, -0.0303], atol=1e-4)
+    np.testing.assert_allclose(last, [-0.0491, -0.0057], atol=1e-4)

@@ -1,0 +1,132 @@
+"""The command line, run as a user runs it: in a process of its own, on files."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax import synthetic
+from zoomjax.io.lines_csv import write_lines_csv
+
+
+def zoomjax(*arguments, cwd=None):
+    command = [sys.executable, "-c", "from zoomjax.cli import main; main()", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def few_lines():
+    """The paper's board at five focal lengths, 40 px between points."""
+    return synthetic.board_lines(synthetic.nikkor_18_200(), synthetic.focal_sweep(5), spacing=40, noise=0.3)
+
+
+@pytest.fixture(scope="module")
+def calibrated(few_lines, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("calibrated")
+    few_lines.save(folder / "lines.npz")
+    done = zoomjax("calibrate", folder / "lines.npz", "-o", folder / "out")
+    assert done.returncode == 0, done.stderr
+    return folder / "out", done
+
+
+def test_help_does_not_wait_for_jax():
+    probe = "import sys; sys.argv = ['zoomjax', '--help']\nfrom zoomjax.cli import main\n"
+    probe += "try:\n    main()\nexcept SystemExit:\n    pass\nassert 'jax' not in sys.modules"
+    start = time.perf_counter()
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "calibrate" in done.stdout
+    assert time.perf_counter() - start < 30  # the figure itself is measured, not tested
+
+
+def test_calibrate_writes_all_results(calibrated, few_lines):
+    out, done = calibrated
+    assert sorted(p.name for p in out.iterdir()) == ["lens.json", "lines.npz", "model.png", "summary.json"]
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["frames"] == 5
+    assert summary["lines"] == len(few_lines.frame)
+    assert summary["points"] == int(few_lines.mask.sum())
+    assert summary["focal_range"] == pytest.approx([20.56, 127.36])
+    assert summary["result"] == "successful"
+    assert summary["rms_frames"] <= summary["rms_zoom"] < 0.35 < summary["rms_none"]
+    assert f"{summary['rms_zoom']:.4f}" in done.stdout
+
+
+def test_calibrate_gives_the_lens_that_the_library_gives(calibrated, few_lines):
+    out, _ = calibrated
+    lens = zj.load_lens(out / "lens.json")
+    fit = zj.fit_zoom(zj.compress(few_lines))
+    np.testing.assert_allclose(lens.zoom.parameters, fit.lens.zoom.parameters, atol=1e-9)
+    np.testing.assert_array_equal(zj.load_lines(out / "lines.npz").points, few_lines.points)
+
+
+def test_calibrate_reads_csv(calibrated, few_lines, tmp_path):
+    write_lines_csv(few_lines, tmp_path / "lines.csv")
+    done = zoomjax("calibrate", tmp_path / "lines.csv", "--image-size", "4288x2848", "-o", tmp_path)
+    assert done.returncode == 0, done.stderr
+    of_csv = json.loads((tmp_path / "summary.json").read_text())
+    of_npz = json.loads((calibrated[0] / "summary.json").read_text())
+    assert of_csv["rms_zoom"] == pytest.approx(of_npz["rms_zoom"], rel=1e-9)
+
+
+@pytest.mark.slow
+def test_demo_finds_the_papers_lens(tmp_path):
+    done = zoomjax("demo", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    out = tmp_path / "zoomjax-demo"
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["frames"], summary["image_size"]) == (50, [4288, 2848])
+    assert summary["rms_zoom"] / summary["rms_frames"] - 1 < 0.001
+    assert (out / "model.png").stat().st_size > 10_000
+    lens, truth = zj.load_lens(out / "lens.json"), synthetic.nikkor_18_200()
+    for f in (20.56, 35.0, 127.36):
+        error = lens(f).undistort(np.zeros(2)) - truth(f).undistort(np.zeros(2))
+        assert np.abs(error).max() < 0.2
+
+
+WRONG = {
+    "no such file": (["missing.npz"], "missing.npz"),
+    "not a lines file": (["foreign.npz"], "foreign.npz"),
+    "truncated": (["truncated.npz"], "truncated.npz"),
+    "unknown kind": (["notes.txt"], "notes.txt"),
+    "two files": (["lines.npz", "lines.npz"], "one file"),
+    "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),
+    "csv without image size": (["lines.csv"], "--image-size"),
+    "csv with a bad image size": (["lines.csv", "--image-size", "big"], "1920x1080"),
+    "csv without focal lengths": (["bare.csv", "--image-size", "640x480"], "frame,focal"),
+}
+
+
+@pytest.fixture(scope="module")
+def wrong_files(few_lines, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wrong")
+    few_lines.save(folder / "lines.npz")
+    (folder / "truncated.npz").write_bytes((folder / "lines.npz").read_bytes()[:5000])
+    np.savez(folder / "foreign.npz", corners=np.zeros(3))
+    (folder / "notes.txt").write_text("straight lines")
+    write_lines_csv(few_lines, folder / "lines.csv")
+    (folder / "bare.csv").write_text("frame,line,x,y\n0,0,1,1\n0,0,2,2\n0,0,3,4\n")
+    return folder
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_mistake_is_one_sentence_and_status_2(case, wrong_files):
+    arguments, hint = WRONG[case]
+    done = zoomjax("calibrate", *arguments, "-o", "out", cwd=wrong_files)
+    assert done.returncode == 2
+    assert hint in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list((wrong_files / "out").glob("*"))
+
+
+def test_an_output_folder_that_cannot_be_written_is_told_before_the_work(wrong_files):
+    done = zoomjax("calibrate", "lines.npz", "-o", Path("lines.npz") / "out", cwd=wrong_files)
+    assert done.returncode == 2
+    assert f"lines.npz{os.sep}out" in done.stderr
+    assert "Fitting" not in done.stderr

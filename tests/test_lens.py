@@ -1,0 +1,165 @@
+import json
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from _reference import largest_difference, undistorted
+
+
+@pytest.fixture
+def lens():
+    zoom = zj.PolynomialZoom(1, jnp.array([[0.02, 0.01], [0.1, -0.03]]), jnp.array(20.0))
+    return zj.ZoomLens(zoom, jnp.array([319.5, 239.5]), jnp.array([20.0, 80.0]), (640, 480), "px")
+
+
+@pytest.fixture
+def content(lens, tmp_path):
+    """What is in the file of a lens."""
+    lens.save(tmp_path / "lens.json")
+    return json.loads((tmp_path / "lens.json").read_text())
+
+
+def load(content, folder):
+    path = folder / "lens.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return zj.load_lens(path)
+
+
+def test_lens_at_a_focal_length_is_the_distortion_there(lens):
+    d = lens(40.0)
+    np.testing.assert_allclose(d.coefficients, [0.07, -0.005])
+    np.testing.assert_array_equal(d.centre, [319.5, 239.5])
+    assert d.scale == 400
+    points = np.array([[0.0, 0.0], [600.0, 17.0]])
+    expected = undistorted(points, [0.07, -0.005], [319.5, 239.5], 400)
+    np.testing.assert_allclose(d.undistort(points), expected, rtol=1e-14)
+
+
+def test_vmap_over_focal_lengths(lens):
+    focal = jnp.array([20.0, 33.0, 80.0])
+    batched = jax.vmap(lens)(focal).coefficients
+    np.testing.assert_allclose(batched, np.stack([lens(f).coefficients for f in focal]), rtol=1e-14)
+
+
+def test_lens_goes_through_transformations_whole(lens):
+    def corner(lens, f):
+        return lens(f).undistort(jnp.zeros(2))[0]
+
+    value, gradient = eqx.filter_jit(eqx.filter_value_and_grad(corner))(lens, 30.0)
+    np.testing.assert_allclose(value, corner(lens, 30.0), rtol=1e-14)
+    assert (gradient.zoom.parameters != 0).all()
+
+
+def test_outside_of_the_fitted_range_it_warns_and_works(lens):
+    for focal in (15.0, 100.0):
+        with pytest.warns(UserWarning, match=r"20 to 80 px.*extrapolated"):
+            d = lens(focal)
+        np.testing.assert_allclose(d.coefficients, lens.zoom(jnp.asarray(focal)))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_ends_of_the_range_are_within_it(lens, dtype):
+    odd = eqx.tree_at(lambda lens: lens.focal_range, lens, jnp.array([20.56, 127.36], dtype))
+    for end in (20.56, 127.36):
+        odd(end)  # a warning would be an error
+
+
+@pytest.mark.parametrize("focal", [0.0, -35.0, np.nan, np.inf])
+def test_focal_length_that_is_none_raises(lens, focal):
+    with pytest.raises(ValueError, match="focal must be a positive number"):
+        lens(focal)
+
+
+def test_file_keeps_the_lens(lens, content, tmp_path):
+    loaded = load(content, tmp_path)
+    assert loaded.image_size == (640, 480)
+    assert loaded.focal_unit == "px"
+    np.testing.assert_array_equal(loaded.focal_range, lens.focal_range)
+    np.testing.assert_array_equal(loaded.centre, lens.centre)
+    assert largest_difference(loaded, lens, np.array([20.0, 50.0, 80.0])) == 0
+
+
+def test_float32_lens_is_kept_exactly(lens, tmp_path):
+    single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), lens)
+    single.save(tmp_path / "lens.json")
+    loaded = zj.load_lens(tmp_path / "lens.json")
+    np.testing.assert_array_equal(loaded.zoom.parameters, single.zoom.parameters)
+
+
+def test_file_says_what_its_numbers_mean(content):
+    assert content["format"] == "zoomjax.lens"
+    assert content["scale"] == 400
+    assert "k_i(f)" in content["zoom"]["formula"]
+
+
+def without(key):
+    return lambda content: {name: value for name, value in content.items() if name != key}
+
+
+SPOILED = {
+    "another version": (lambda c: c | {"version": 99}, "version is 99"),
+    "another format": (lambda c: c | {"format": "csv"}, "no zoom lens"),
+    "a list": (lambda c: [c], "no zoom lens"),
+    "not JSON": (lambda c: "lens", "Cannot read a lens"),
+    "truncated": (lambda c: json.dumps(c)[:100], "Cannot read a lens"),
+    "empty": (lambda c: "", "Cannot read a lens"),
+    "unknown model": (lambda c: c | {"zoom": c["zoom"] | {"model": "Magic"}}, "'Magic', is unknown"),
+    "no version": (without("version"), "it has no 'version'"),
+    "no centre": (without("centre"), "it has no 'centre'"),
+    "short centre": (lambda c: c | {"centre": [1.0]}, "incomplete or not finite"),
+    "NaN": (lambda c: c | {"focal_range": [np.nan, 3.0]}, "incomplete or not finite"),
+    "words": (lambda c: c | {"image_size": ["a", "b"]}, "Cannot read a lens"),
+    "ragged": (
+        lambda c: c | {"zoom": c["zoom"] | {"parameters": [[1.0], [1.0, 2.0]]}},
+        "Cannot read a lens",
+    ),
+}
+
+
+@pytest.mark.parametrize(("spoil", "message"), SPOILED.values(), ids=SPOILED)
+def test_file_that_is_no_lens_raises_and_is_named(spoil, message, content, tmp_path):
+    with pytest.raises(ValueError, match=message) as caught:
+        load(spoil(content), tmp_path)
+    assert str(tmp_path / "lens.json") in str(caught.value)
+
+
+def test_missing_file_raises(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        zj.load_lens(tmp_path / "lens.json")
+
+
+class Nameless(zj.AbstractZoom):
+    """A zoom model with no file format."""
+
+    parameters: None = None
+
+    def prepare(self, focal, terms):
+        return self
+
+    def __call__(self, focal):
+        return jnp.zeros(2)
+
+
+def test_zoom_model_without_a_format_raises_and_leaves_no_file(lens, tmp_path):
+    nameless = eqx.tree_at(lambda lens: lens.zoom, lens, Nameless())
+    with pytest.raises(TypeError, match="Nameless cannot be saved"):
+        nameless.save(tmp_path / "lens.json")
+    assert not list(tmp_path.iterdir())
+
+
+def test_saving_into_a_folder_that_is_not_there_names_it(lens, tmp_path):
+    with pytest.raises(OSError, match=r"cannot write in the folder .*absent"):
+        lens.save(tmp_path / "absent" / "lens.json")
+    assert not list(tmp_path.iterdir())
+
+
+def test_saving_replaces_an_older_file(lens, tmp_path):
+    path = tmp_path / "lens.json"
+    path.write_text("old")
+    lens.save(path)
+    assert zj.load_lens(path).image_size == (640, 480)
+    assert list(tmp_path.iterdir()) == [path]
