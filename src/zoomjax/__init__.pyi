@@ -14,6 +14,9 @@ from .fit import ZoomFit as ZoomFit
 from .fit import fit_frames as fit_frames
 from .fit import fit_zoom as fit_zoom
 from .fit import frame_rms as frame_rms
+from .io.lines_csv import read_focal_csv as read_focal_csv
+from .io.lines_csv import read_lines_csv as read_lines_csv
+from .io.lines_csv import write_lines_csv as write_lines_csv
 from .lens import ZoomLens as ZoomLens
 from .lens import load_lens as load_lens
 from .lines import AbstractLines as AbstractLines

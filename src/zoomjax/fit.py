@@ -321,7 +321,8 @@ def _covariance(lines, zoom, energy):
     inverse = (vectors * jnp.where(good, 1 / jnp.where(good, values, 1), 0)[None]) @ vectors.T
     inverse = inverse / size[:, None] / size[None]
     freedom = jnp.sum(weights * (lines.counts - 2)) - jnp.sum(inverse * outer)
-    variance = energy / jnp.where(freedom > 0, freedom, jnp.nan)
+    undetermined = undetermined | (freedom <= 0)  # nothing is left over to tell the noise by
+    variance = energy / jnp.where(freedom > 0, freedom, 1)
     covariance = variance * inverse @ outer @ inverse
     either = undetermined[:, None] | undetermined[None]
     infinite = jnp.where(jnp.eye(flat.size, dtype=bool), jnp.inf, 0)

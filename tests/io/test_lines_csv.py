@@ -43,6 +43,13 @@ def test_columns_in_any_order_rows_interleaved_frames_numbered_freely(tmp_path):
     np.testing.assert_array_equal(lines.to_ragged()[1], [[1, 1], [2, 2], [3, 4]])
 
 
+def test_focal_lengths_as_a_sequence_count_frames_from_zero(tmp_path):
+    rows = [f"{m},0,{i},{i * i}" for m in (0, 1) for i in range(4)]
+    path = write(tmp_path / "lines.csv", "\n".join(["frame,line,x,y", *rows]))
+    lines = read_lines_csv(path, image_size=SIZE, focal=[24.0, 50.0])
+    np.testing.assert_array_equal(lines.focal, [24, 50])
+
+
 REFUSED = {
     "empty": ("", "frame,line,x,y"),
     "column missing": ("frame,line,x\n0,0,1\n", "y is not among them"),

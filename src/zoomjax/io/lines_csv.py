@@ -19,7 +19,7 @@ def read_lines_csv(
     path: str | os.PathLike[str],
     *,
     image_size: Sequence[int],
-    focal: Mapping[int, float] | None = None,
+    focal: Mapping[int, float] | Sequence[float] | None = None,
     focal_unit: str = "mm",
 ) -> Lines:
     """Read lines from a ``frame,line,x,y[,focal]`` file, in float64.
@@ -27,7 +27,8 @@ def read_lines_csv(
     Args:
         path: the file; columns in any order, others are ignored.
         image_size: (width, height) px.
-        focal: focal length by frame number, where the file has no column ``focal``.
+        focal: focal length by frame number, where the file has no column ``focal``; a sequence counts
+            frames from 0.
         focal_unit: "mm" or "px".
 
     Raises:
@@ -51,6 +52,7 @@ def read_lines_csv(
             "columns frame,focal."
         )
     else:
+        focal = focal if isinstance(focal, Mapping) else dict(enumerate(focal))
         missing = [int(f) for f in frames if int(f) not in focal]
         if missing:
             raise ValueError(
