@@ -7,9 +7,10 @@ import numpy as np
 
 def undistorted(points, k, centre, scale):
     """Eq. 1-2, as printed."""
-    z = (np.asarray(points) - np.asarray(centre)) / scale
+    points, k, centre, scale = (np.asarray(argument) for argument in (points, k, centre, scale))
+    z = (points - centre) / scale
     r2 = np.sum(z**2, axis=-1, keepdims=True)
-    return np.asarray(centre) + scale * z * (1 + sum(k_i * r2 ** (i + 1) for i, k_i in enumerate(k)))
+    return centre + scale * z * (1 + sum(k_i * r2 ** (i + 1) for i, k_i in enumerate(k)))
 
 
 def squared_distances(points):

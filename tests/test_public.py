@@ -1,0 +1,100 @@
+"""The public names: they exist, say what they do, and are the ones agreed on."""
+
+import ast
+import inspect
+from pathlib import Path
+
+import jax.numpy as jnp
+import pytest
+
+import zoomjax as zj
+
+STUB = Path(zj.__file__).with_suffix(".pyi")
+PUBLIC = [
+    alias.asname
+    for node in ast.parse(STUB.read_text()).body
+    if isinstance(node, ast.ImportFrom)
+    for alias in node.names
+]
+HEADINGS = ("Args:", "Attributes:", "Returns:", "Example:")
+
+AGREED = {
+    *("Lines", "load_lines", "compress", "fit_zoom", "fit_frames", "frame_rms"),
+    *("PolynomialZoom", "ZoomLens", "load_lens", "Distortion"),
+}
+MEMBERS = {
+    "Lines": "from_ragged to_ragged save points mask frame focal image_size",
+    "ZoomLens": "save zoom centre image_size",
+    "Distortion": "undistort distort coefficients pixel_coefficients centre",
+    "ZoomFit": "lens rms frame_rms covariance result",
+    "FrameFits": "coefficients rms frame_rms",
+}
+
+
+def test_the_agreed_names_are_public():
+    assert set(PUBLIC) >= AGREED
+
+
+@pytest.mark.parametrize(("name", "members"), MEMBERS.items())
+def test_the_agreed_members_exist(name, members):
+    cls = getattr(zj, name)
+    fields = {field for base in cls.__mro__ for field in getattr(base, "__annotations__", {})}
+    assert set(members.split()) <= fields | set(dir(cls))
+
+
+def test_all_lists_the_public_names():
+    assert sorted(zj.__all__) == sorted(PUBLIC)
+    assert set(PUBLIC) <= set(dir(zj))
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_public_name_is_documented(name):
+    text = inspect.getdoc(getattr(zj, name))
+    assert text, f"{name} has no docstring"
+    summary, _, rest = text.partition("\n\n")
+    assert summary.rstrip().endswith((".", ":"))
+    assert not rest or any(heading in rest for heading in HEADINGS) or rest.rstrip().endswith(".")
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_public_methods_are_documented(name):
+    thing = getattr(zj, name)
+    if inspect.isclass(thing):
+        own = {key: value for key, value in vars(thing).items() if not key.startswith("_")}
+        undocumented = [key for key, value in own.items() if callable(value) and not inspect.getdoc(value)]
+        assert not undocumented
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_functions_take_one_or_two_things_by_position(name):
+    thing = getattr(zj, name)
+    if inspect.isfunction(thing):
+        kinds = [parameter.kind for parameter in inspect.signature(thing).parameters.values()]
+        assert kinds.count(inspect.Parameter.POSITIONAL_OR_KEYWORD) <= 2
+
+
+def test_results_are_sentences_to_act_on():
+    for result in (zj.RESULTS.undetermined, zj.RESULTS.folded):
+        assert zj.RESULTS[result].endswith("the number of terms.")
+
+
+def test_unknown_name_raises():
+    with pytest.raises(AttributeError):
+        zj.nonsense  # noqa: B018
+
+
+def test_the_design_in_ten_lines(noisy, tmp_path):
+    """The lines that the design promises, as a user would write them."""
+    lines = zj.Lines.from_ragged(
+        noisy.to_ragged(), noisy.frame, noisy.focal, image_size=noisy.image_size, focal_unit="mm"
+    )
+    lines.save(tmp_path / "lines.npz")
+    small = zj.compress(zj.load_lines(tmp_path / "lines.npz"), terms=2)
+    fit = zj.fit_zoom(small)
+    each = zj.fit_frames(small, terms=2)
+    assert each.coefficients.shape == (4, 2)
+    fit.lens.save(tmp_path / "lens.json")
+    d = zj.load_lens(tmp_path / "lens.json")(35.0)
+    points = jnp.array([[0.0, 0.0], [4287.0, 2847.0]])
+    assert jnp.allclose(d.distort(d.undistort(points)), points, rtol=0, atol=1e-9)
+    assert (zj.frame_rms(lines, fit.lens) < zj.frame_rms(lines, None)).all()
