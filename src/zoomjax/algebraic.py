@@ -25,6 +25,7 @@ from .zoom import AbstractLinearZoom, PolynomialZoom
 def compressed(lines: AbstractLines, terms: int) -> CompressedLines:
     """The lines themselves if they are compressed already, or else their exact compression."""
     if isinstance(lines, CompressedLines):
+        lines.check_terms(terms)
         return lines
     if isinstance(lines, Lines):
         return compress(lines, terms)
@@ -41,10 +42,13 @@ def algebraic_parameters(
     columns = jnp.einsum("lat,lb->labt", areas[..., 1:], basis)
     unknowns = basis.shape[1] * terms
     table = jnp.concatenate([columns.reshape(-1, unknowns), areas[..., :1].reshape(-1, 1)], axis=1)
-    # Solve with the small triangle of the table; lstsq, so that lines which do not determine the
-    # coefficients give the least of the equally good ones.
+    # Solve with the small triangle of the table. Directions that change the areas, px, by no more than
+    # rounding (lines through the centre have no others) are left at zero.
     triangle = jnp.linalg.qr(table, mode="r")
-    solution = jnp.linalg.lstsq(triangle[:, :-1], -triangle[:, -1])[0]
+    left, size, right = jnp.linalg.svd(triangle[:, :-1], full_matrices=False)
+    known = size > 64 * jnp.finfo(size.dtype).eps * (size[0] + lines.scale)
+    inverse = jnp.where(known, 1 / jnp.where(known, size, 1), 0)
+    solution = -right.T @ (inverse * (left.T @ triangle[:, -1]))
     return solution.reshape(basis.shape[1], terms)
 
 

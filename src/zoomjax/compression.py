@@ -58,18 +58,21 @@ class CompressedLines(AbstractLines):
         """Number of points of each line."""
         return jnp.round(self.triangle[:, 0, 0] ** 2)
 
+    def check_terms(self, terms: int) -> None:
+        """Raise ValueError where these triangles do not serve so many coefficients."""
+        if terms > self.terms:
+            raise ValueError(
+                f"These lines were compressed for {self.terms} terms, but {terms} are asked for: "
+                f"compress(lines, terms={terms})."
+            )
+
     def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
         """Rows, px, with the scatter of the corrected points about their mean.
 
         Raises:
             ValueError: there are more coefficients than the lines were compressed for.
         """
-        terms = coefficients.shape[1]
-        if terms > self.terms:
-            raise ValueError(
-                f"These lines were compressed for {self.terms} terms, but {terms} are asked for: "
-                f"compress(lines, terms={terms})."
-            )
+        self.check_terms(coefficients.shape[1])
         return self.scale * jax.vmap(_combine)(self.triangle, coefficients)
 
     def radial_moments(self, order: int) -> Float[Array, "line moment"]:
