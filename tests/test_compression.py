@@ -1,4 +1,5 @@
 import os
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -154,42 +155,43 @@ def test_under_vmap(ragged):
     assert_same_triangles(one, zj.compress(ragged))
 
 
-def energy_of(lines, k, *, compressed):
-    """The global energy as a function of points and centre."""
-
-    def energy(points, centre):
-        there = eqx.tree_at(lambda data: (data.points, data.centre), lines, (points, centre))
-        return zj.global_energy(zj.compress(there, k.shape[1]) if compressed else there, k)
-
-    return energy
+def energy(lines, points, centre, k, *, compressed):
+    """The global energy as a function of points, centre and coefficients."""
+    there = eqx.tree_at(lambda data: (data.points, data.centre), lines, (points, centre))
+    return zj.global_energy(zj.compress(there, k.shape[1]) if compressed else there, k)
 
 
-@pytest.mark.parametrize("factor", [1, 0])
-@pytest.mark.parametrize("scene", ["bent", "straight"])
-def test_gradients_are_those_through_all_points(scene, factor, ragged, rng):
-    lines = ragged if scene == "bent" else straight_lines(21)
-    k = factor * coefficients(rng, lines.focal.shape[0])
+SCENES = pytest.mark.parametrize("scene", ["bent", "straight"])
+
+
+def scene_named(name, ragged):
+    return ragged if name == "bent" else straight_lines(21)
+
+
+@SCENES
+def test_gradients_are_those_through_all_points(scene, ragged, rng):
+    lines = scene_named(scene, ragged)
     full, small = (
-        jax.jit(jax.grad(energy_of(lines, k, compressed=compressed), (0, 1)))(lines.points, lines.centre)
+        jax.jit(jax.grad(partial(energy, lines, compressed=compressed), (0, 1, 2)))
         for compressed in (False, True)
     )
-    for one, other in zip(small, full, strict=True):
-        assert jnp.isfinite(one).all()
-        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-10)
+    k = coefficients(rng, lines.focal.shape[0])
+    for factor in (1, 0):  # 0: a straight line's residuals and gradients vanish
+        at = (lines.points, lines.centre, factor * k)
+        for one, other in zip(small(*at), full(*at), strict=True):
+            assert jnp.isfinite(one).all()
+            np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-9)
 
 
-@pytest.mark.parametrize("scene", ["bent", "straight"])
+@SCENES
 def test_second_derivatives_for_fits_are_those_through_all_points(scene, ragged, rng):
     """d/dpoint of d/dk: what the implicit function theorem needs of a fit."""
-    lines = ragged if scene == "bent" else straight_lines(21)
+    lines = scene_named(scene, ragged)
     k = coefficients(rng, lines.focal.shape[0])
 
     def mixed(compressed):
-        def by_coefficient(points):
-            gradient = jax.grad(lambda k: energy_of(lines, k, compressed=compressed)(points, lines.centre))
-            return gradient(k)
-
-        return jax.jit(jax.jacrev(by_coefficient))(lines.points)
+        by_coefficient = jax.grad(partial(energy, lines, compressed=compressed), 2)
+        return jax.jit(jax.jacrev(by_coefficient))(lines.points, lines.centre, k)
 
     full = mixed(False)
     np.testing.assert_allclose(mixed(True), full, rtol=0, atol=1e-9 * np.max(np.abs(full)))
