@@ -211,14 +211,10 @@ def _show(
 
 
 def _sentence(error: BaseException) -> str:
-    """The first paragraph of an error: equinox adds to its own how to debug the compiled program."""
+    """What an error says, without Python's numbers for those of the operating system."""
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.strerror}: {error.filename}"
-    text = str(error).strip()
-    if "EquinoxRuntimeError" in type(error).__name__ or "Equinox" in text:
-        paragraphs = [line for line in text.splitlines() if line.startswith("equinox.EquinoxRuntimeError:")]
-        text = paragraphs[0].partition(": ")[2] if paragraphs else text
-    return text
+    return str(error)
 
 
 def _print_warning(message, category, filename, lineno, file=None, line=None) -> None:

@@ -356,4 +356,9 @@ def _thrown(fit, throw):
     about_model = (result == RESULTS.undetermined) | (result == RESULTS.folded)
     failed = jnp.atleast_1d((result != RESULTS.successful) & ~about_model)
     first = jax.tree.map(lambda value: jnp.atleast_1d(value)[jnp.argmax(failed)], result)
-    return first.error_if(fit, jnp.any(failed))
+    if traced(failed):
+        return first.error_if(fit, jnp.any(failed))
+    if failed.any():
+        where = f"Frame {int(jnp.argmax(failed))}: " if failed.size > 1 else ""
+        raise RuntimeError(f"The fit failed. {where}{RESULTS[first]}")
+    return fit
