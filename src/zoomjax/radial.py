@@ -41,7 +41,7 @@ def _polynomial(coefficients: Float[Array, "n"], x: Float[Array, "..."]) -> Floa
 
 
 def _first_root_in_unit_interval(coefficients: Float[Array, "n"]) -> Float[Array, ""]:
-    """The smallest root in (0, 1] where a polynomial that is positive at 0 changes sign, or inf.
+    """The smallest root in (0, 1] of a polynomial that is positive at 0, or inf.
 
     The roots of each derivative cut the interval into pieces on which the next one is monotone, so
     that bisection in each piece finds every sign change: exact for any degree, no eigenvalues (which
@@ -56,17 +56,18 @@ def _first_root_in_unit_interval(coefficients: Float[Array, "n"]) -> Float[Array
     knots = jnp.asarray([0, 1], dtype)
     found = jnp.asarray([False])
     for c in reversed(derivatives):
-        low, high = knots[:-1], knots[1:]
-        rising = _polynomial(c, low) < _polynomial(c, high)
-        found = _polynomial(c, low) * _polynomial(c, high) < 0
+        values = _polynomial(c, knots)
+        # A zero inside counts as negative, so that a root on a knot is not lost; one at the end does not.
+        positive = (values > 0).at[-1].set(values[-1] >= 0)
+        found = positive[:-1] != positive[1:]
 
-        def halve(_, bracket, c=c, rising=rising):
+        def halve(_, bracket, c=c, falling=positive[:-1]):
             low, high = bracket
             middle = (low + high) / 2
-            left = (_polynomial(c, middle) < 0) == rising  # the root lies to the right of middle
-            return jnp.where(left, middle, low), jnp.where(left, high, middle)
+            before_root = (_polynomial(c, middle) > 0) == falling
+            return jnp.where(before_root, middle, low), jnp.where(before_root, high, middle)
 
-        low, high = jax.lax.fori_loop(0, steps, halve, (low, high))
+        low, high = jax.lax.fori_loop(0, steps, halve, (knots[:-1], knots[1:]))
         # Where there is no root in a piece its right end stands in: a harmless extra knot.
         roots = jnp.where(found, (low + high) / 2, knots[1:])
         knots = jnp.concatenate([knots[:1], roots, knots[-1:]])
@@ -80,14 +81,15 @@ def monotone_radius(k: Coefficients) -> Float[Array, ""]:
     A constant for differentiation. For N = 1 it is ``1/sqrt(-3 k1)``, or inf for ``k1 >= 0``.
     """
     k = jax.lax.stop_gradient(jnp.asarray(k))
-    order = jnp.arange(1, k.shape[0] + 1, dtype=k.dtype)
-    slope = jnp.concatenate([jnp.ones(1, k.dtype), (2 * order + 1) * k])
-    near = _first_root_in_unit_interval(slope)
-    # Beyond t = 1 look at the reversed polynomial in 1/t, whose *largest* root there is wanted:
-    # substitute 1/t = 1 - y, so that the search again starts from the known end, y = 0 (t = 1).
+    order = jnp.arange(k.shape[0] + 1, dtype=k.dtype)
+    slope = jnp.concatenate([jnp.ones(1, k.dtype), (2 * order[1:] + 1) * k])
+    # Up to t = 2, and from t = 1 on as the reversed polynomial in 1/t = 1 - y, so that the search again
+    # starts from its known end. They overlap, or rounding could hide a root at the seam from both.
+    near = 2 * _first_root_in_unit_interval(slope * 2**order)
     far = _first_root_in_unit_interval(_reflect(slope[::-1]))
-    far_root = jnp.where(far < 1, 1 / jnp.where(far < 1, 1 - far, 1), jnp.inf)
-    return jnp.sqrt(jnp.where(jnp.isfinite(near), near, far_root))
+    seen = far < 1 - 4096 * jnp.finfo(k.dtype).eps  # or 1/t is nothing but rounding
+    far = jnp.where(seen, 1 / jnp.where(seen, 1 - far, 1), jnp.inf)
+    return jnp.sqrt(jnp.where(jnp.isfinite(near), near, far))
 
 
 def _reflect(coefficients: Float[Array, "n"]) -> Float[Array, "n"]:
