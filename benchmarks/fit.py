@@ -128,11 +128,12 @@ def growth(truth: zj.ZoomLens, base: zj.Lines) -> list[dict]:
         nonlocal spent
         for _ in range(10):
             noise = 0.1 * rng.standard_normal(base.points.shape)
-            chunk = eqx.tree_at(lambda lines: lines.points, base, base.points + noise)
+            points = jax.block_until_ready(base.points + noise)
+            chunk = eqx.tree_at(lambda lines: lines.points, base, points)
             start = time.perf_counter()
             small = jax.block_until_ready(zj.compress(chunk))
             spent += time.perf_counter() - start
-            del chunk
+            del chunk, points, noise
             yield small
 
     with PeakMemory(psutil.Process().memory_info().rss) as memory:

@@ -215,10 +215,10 @@ def _triangle(columns):
     """R of the transposed argument, by runs of points whose triangles are then reduced together."""
     size, points = columns.shape
     runs = -(-points // _RUN)
-    length = -(-points // runs)
-    padded = jnp.pad(columns, ((0, 0), (0, runs * length - points)))
-    triangles = jax.vmap(_orthogonalise, in_axes=1)(padded.reshape(size, runs, length))
-    return triangles[0] if runs == 1 else _orthogonalise(triangles.reshape(-1, size).T)
+    whole = points - points % runs
+    triangles = jax.vmap(_orthogonalise, in_axes=1)(columns[:, :whole].reshape(size, runs, -1))
+    # The few points left over join the triangles: padding thousands to fill a run is slow.
+    return _orthogonalise(jnp.concatenate([triangles.reshape(-1, size).T, columns[:, whole:]], axis=1))
 
 
 @_triangle.defjvp

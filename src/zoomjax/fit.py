@@ -312,11 +312,8 @@ def _covariance(lines, zoom, energy):
     scaled = information / size[:, None] / size[None]
     excess = scaled - 4 * feigned / size[:, None] / size[None]
     eps = jnp.finfo(flat.dtype).eps
-    values, vectors = jnp.linalg.eigh(excess)
-    bad = values <= 4 * eps
-    undetermined = jnp.any(bad[None] & (jnp.abs(vectors) > 0.05), axis=1)
-
-    values, vectors = jnp.linalg.eigh(scaled)
+    (excesses, values), (directions, vectors) = jnp.linalg.eigh(jnp.stack([excess, scaled]))
+    undetermined = jnp.any((excesses <= 4 * eps)[None] & (jnp.abs(directions) > 0.05), axis=1)
     good = values > 4 * eps
     inverse = (vectors * jnp.where(good, 1 / jnp.where(good, values, 1), 0)[None]) @ vectors.T
     inverse = inverse / size[:, None] / size[None]
