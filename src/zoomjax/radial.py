@@ -85,11 +85,10 @@ def monotone_radius(k: Coefficients) -> Float[Array, ""]:
     slope = jnp.concatenate([jnp.ones(1, k.dtype), (2 * order[1:] + 1) * k])
     # Up to t = 2, and from t = 1 on as the reversed polynomial in 1/t = 1 - y, so that the search again
     # starts from its known end. They overlap, or rounding could hide a root at the seam from both.
-    near = 2 * _first_root_in_unit_interval(slope * 2**order)
-    far = _first_root_in_unit_interval(_reflect(slope[::-1]))
+    near, far = jax.vmap(_first_root_in_unit_interval)(jnp.stack([slope * 2**order, _reflect(slope[::-1])]))
     seen = far < 1 - 4096 * jnp.finfo(k.dtype).eps  # or 1/t is nothing but rounding
     far = jnp.where(seen, 1 / jnp.where(seen, 1 - far, 1), jnp.inf)
-    return jnp.sqrt(jnp.where(jnp.isfinite(near), near, far))
+    return jnp.sqrt(jnp.where(jnp.isfinite(near), 2 * near, far))
 
 
 def _reflect(coefficients: Float[Array, "n"]) -> Float[Array, "n"]:
