@@ -11,10 +11,13 @@ import zoomjax
 LAYERS = (
     {"_types", "_files"},
     {"radial"},
+    {"inverse"},
     {"zoom"},
     {"lines"},
     {"energy"},
     {"lens"},
+    {"framing"},
+    {"positions", "warp"},
     {"_solver", "compression"},
     {"algebraic"},
     {"fit"},

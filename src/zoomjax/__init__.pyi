@@ -14,6 +14,8 @@ from .fit import ZoomFit as ZoomFit
 from .fit import fit_frames as fit_frames
 from .fit import fit_zoom as fit_zoom
 from .fit import frame_rms as frame_rms
+from .framing import Framing as Framing
+from .framing import frame_output as frame_output
 from .io.lines_csv import read_focal_csv as read_focal_csv
 from .io.lines_csv import read_lines_csv as read_lines_csv
 from .io.lines_csv import write_lines_csv as write_lines_csv
@@ -23,6 +25,8 @@ from .lines import AbstractLines as AbstractLines
 from .lines import Lines as Lines
 from .lines import load_lines as load_lines
 from .radial import Distortion as Distortion
+from .vision.undistort import undistort_image as undistort_image
+from .warp import warp_image as warp_image
 from .zoom import AbstractLinearZoom as AbstractLinearZoom
 from .zoom import AbstractZoom as AbstractZoom
 from .zoom import PolynomialZoom as PolynomialZoom

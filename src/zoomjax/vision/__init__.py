@@ -1,0 +1,1 @@
+"""Images in, images out: the only part of zoomjax that imports OpenCV."""
