@@ -163,10 +163,10 @@ def _reduce_in_threads(lines, terms):
     the first of a new shape goes alone, or every thread would compile.
     """
     number = lines.points.shape[0]
-    double = jax.config.jax_enable_x64
+    widest = jnp.result_type(float)
     with ThreadPoolExecutor() as pool:
         # JAX's context managers, such as that for float64, hold in their own thread alone.
-        same_context = pool.submit(lambda: jax.config.jax_enable_x64 == double).result()
+        same_context = pool.submit(lambda: jnp.result_type(float) == widest).result()
         parts = min(os.cpu_count() or 1, number) if same_context else 1
         size = -(-number // parts)
         starts = [min(part * size, number - size) for part in range(parts)]
@@ -174,7 +174,7 @@ def _reduce_in_threads(lines, terms):
         def reduce_from(start):
             return jax.block_until_ready(_reduce_run(lines, start, size, terms))
 
-        signature = (lines.points.shape, str(lines.points.dtype), size, terms, double)
+        signature = (lines.points.shape, str(lines.points.dtype), size, terms, str(widest))
         alone = 0 if signature in _COMPILED and same_context else 1
         triangles = [reduce_from(start) for start in starts[:alone]]
         triangles += pool.map(reduce_from, starts[alone:])

@@ -37,7 +37,7 @@ class Framing(eqx.Module):
 
     Example:
         >>> import numpy as np
-        >>> Framing(np.float32(2), np.zeros(2, np.float32), (4, 4)).corrected(np.ones(2)).tolist()
+        >>> Framing(np.array(2.0), np.zeros(2), (4, 4)).corrected(np.ones(2)).tolist()
         [0.5, 0.5]
     """
 
@@ -76,7 +76,7 @@ def frame_output(
     Example:
         >>> d = Distortion(np.array([0.1]), np.array([319.5, 239.5]), np.array(400.0))
         >>> float(frame_output(d, (640, 480), keep="all").scale)  # the corners move out by a tenth
-        0.9092...
+        0.9093...
     """
     image_size = checked_size(image_size, "image_size")
     size = image_size if size is None else checked_size(size, "size")

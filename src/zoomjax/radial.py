@@ -170,7 +170,7 @@ class Distortion(eqx.Module):
         >>> import jax.numpy as jnp
         >>> d = Distortion(jnp.array([0.1, -0.02]), jnp.array([319.5, 239.5]), jnp.array(400.0))
         >>> d.undistort(jnp.array([639.0, 479.0])).round(2).tolist()
-        [666.0, 499.25]
+        [664.48..., 498.10...]
     """
 
     coefficients: Coefficients
