@@ -140,12 +140,18 @@ def merge(first: CompressedLines, second: CompressedLines) -> CompressedLines:
     """The same lines with the points of both: for chunks of points that do not fit in memory together.
 
     Raises:
-        ValueError: the two do not hold the same number of lines and terms.
+        ValueError: the two do not hold the same lines, or not for the same terms, centre and image size.
     """
     if first.triangle.shape != second.triangle.shape:
         raise ValueError(
             "Only triangles of the same lines and terms merge, but their shapes are "
             f"{first.triangle.shape} and {second.triangle.shape}."
+        )
+    rest, other = (eqx.tree_at(lambda lines: lines.triangle, lines, None) for lines in (first, second))
+    if not traced((rest, other)) and not eqx.tree_equal(rest, other):
+        raise ValueError(
+            "Only chunks of the same lines merge, but their frames, focal lengths, centres, image sizes or "
+            "units differ."
         )
     return eqx.tree_at(lambda lines: lines.triangle, first, _merge_all(first.triangle, second.triangle))
 

@@ -59,6 +59,11 @@ def residuals(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -
         lines: the lines, or their compressed form.
         coefficients: normalised (k1, ..., kN) of each frame.
     """
+    if coefficients.shape[0] != lines.focal.shape[0]:
+        raise ValueError(
+            f"Argument coefficients must have a row for each of the {lines.focal.shape[0]} frames, but its "
+            f"shape is {coefficients.shape}."
+        )
     distances = jax.vmap(line_residuals)(lines.corrected(coefficients[lines.frame]))
     return jnp.sqrt(line_weights(lines))[:, None] * distances
 

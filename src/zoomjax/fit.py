@@ -114,7 +114,8 @@ def fit_zoom(
     Args:
         lines: the lines, or, much faster and with the same answer, ``compress(lines)``.
         zoom: the model; `PolynomialZoom` of degree 2 by default. One that has parameters already is where
-            the solver starts; one without starts from the algebraic estimate, if it is linear.
+            the solver starts, and brings its own number of terms; one without starts from the algebraic
+            estimate, if it is linear.
         terms: the number N of distortion coefficients (eq. 2).
         solver: any optimistix least-squares solver or minimiser; Levenberg-Marquardt by default, with
             tolerances for the dtype of the lines.
@@ -181,14 +182,19 @@ def frame_rms(
             its own centre of distortion.
 
     Raises:
-        ValueError: the lens is for images of another size, or the lines were compressed about another
-            centre.
+        ValueError: the lens is for images of another size or focal lengths in another unit, there are not
+            coefficients for every frame, or the lines were compressed about another centre.
     """
     if isinstance(lens, ZoomLens):
         if lens.image_size != lines.image_size:
             raise ValueError(
                 f"The lens is for images of size {lens.image_size}, but the lines are from images of size "
                 f"{lines.image_size}."
+            )
+        if lens.focal_unit != lines.focal_unit:
+            raise ValueError(
+                f"The lens takes focal lengths in {lens.focal_unit}, but those of the lines are in "
+                f"{lines.focal_unit}."
             )
         lines = _about(lines, lens.centre)
     return _frame_rms(lines, lens)
