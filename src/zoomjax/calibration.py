@@ -130,7 +130,9 @@ def calibrate(
     model.prepare(lines.focal, terms)  # complain of too few focal lengths before any work
     stage("Compressing the lines")
     widest = jnp.result_type(float)
-    data = jax.tree.map(lambda a: jnp.asarray(a, widest) if jnp.issubdtype(a.dtype, jnp.floating) else a, lines)
+    data = jax.tree.map(
+        lambda a: jnp.asarray(a, widest) if jnp.issubdtype(a.dtype, jnp.floating) else a, lines
+    )
     small = compress(data, terms)
     stage("Fitting each frame by itself")
     each = fit_frames(small, terms=terms, throw=False)

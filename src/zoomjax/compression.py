@@ -23,6 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._types import Focal, FrameIndex, Point, traced
@@ -148,12 +149,19 @@ def merge(first: CompressedLines, second: CompressedLines) -> CompressedLines:
             f"{first.triangle.shape} and {second.triangle.shape}."
         )
     rest, other = (eqx.tree_at(lambda lines: lines.triangle, lines, None) for lines in (first, second))
-    if not traced((rest, other)) and not eqx.tree_equal(rest, other):
+    if not traced((rest, other)) and not _equal(rest, other):
         raise ValueError(
             "Only chunks of the same lines merge, but their frames, focal lengths, centres, image sizes or "
             "units differ."
         )
     return eqx.tree_at(lambda lines: lines.triangle, first, _merge_all(first.triangle, second.triangle))
+
+
+def _equal(first, second):
+    """Whether two trees of known values are the same; by NumPy, so that it can be asked inside ``jit``."""
+    leaves, other_leaves = jax.tree.leaves(first), jax.tree.leaves(second)
+    same_kind = jax.tree.structure(first) == jax.tree.structure(second)
+    return same_kind and all(map(np.array_equal, leaves, other_leaves))
 
 
 @jax.jit
