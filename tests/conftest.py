@@ -6,6 +6,7 @@ from pathlib import Path
 import equinox as eqx
 import hypothesis
 import jax
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -122,6 +123,14 @@ def compilations(_compile_events):
         return number
 
     return count
+
+
+@pytest.fixture
+def unchecked():
+    """Without the types checked in tests, as users run the package: they see its own messages."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def moved(lines, points):

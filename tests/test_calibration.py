@@ -9,7 +9,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import synthetic
-from zoomjax.calibration import calibrate, rms_over_frames, writable_folder
+from zoomjax.calibration import calibrate, results_folder, rms_over_frames
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "real"))
 
@@ -50,6 +50,10 @@ def test_lines_that_determine_nothing_are_reported(calibration):
     assert "do not determine" in summary["result"]
     assert summary["frames_without_a_model"] == 3
     assert None in summary["parameter_sigma"]
+    assert summary["warnings"][0] == summary["result"]
+    assert summary["warnings"][1].startswith(
+        "3 of 3 frames have no good model of their own (frames 0, 1, 2)"
+    )
 
 
 def test_results_are_written_together_or_not_at_all(calibration, tmp_path, monkeypatch):
@@ -63,10 +67,33 @@ def test_results_are_written_together_or_not_at_all(calibration, tmp_path, monke
 
 
 def test_folder_is_made_and_tried(tmp_path):
-    assert writable_folder(tmp_path / "new" / "deep").is_dir()
+    with results_folder(tmp_path / "new" / "deep") as folder:
+        assert folder.is_dir()
+    assert folder.is_dir()
     (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match="Cannot write in the folder"):
-        writable_folder(tmp_path / "file" / "below")
+    with (
+        pytest.raises(OSError, match="Cannot write in the folder"),
+        results_folder(tmp_path / "file" / "below"),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("content", [[], ["kept.txt"]], ids=["empty", "with a result"])
+def test_folder_made_for_work_that_fails_is_removed_unless_something_is_in_it(content, tmp_path):
+    def fail_in(folder):
+        for name in content:
+            (folder / name).write_text("")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), results_folder(tmp_path / "new" / "deep") as folder:
+        fail_in(folder)
+    assert (tmp_path / "new").exists() == bool(content)
+
+
+def test_folder_that_was_there_stays(tmp_path):
+    with pytest.raises(ZeroDivisionError), results_folder(tmp_path):
+        _ = 1 / 0
+    assert tmp_path.is_dir()
 
 
 def test_zoomcam_gives_the_reference_figures(data):

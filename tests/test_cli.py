@@ -1,7 +1,9 @@
 """The command line, run as a user runs it: in a process of its own, on files."""
 
+import importlib.metadata
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -96,6 +98,7 @@ WRONG = {
     "truncated": (["truncated.npz"], "truncated.npz"),
     "unknown kind": (["notes.txt"], "notes.txt"),
     "two files": (["lines.npz", "lines.npz"], "one file"),
+    "options for another kind": (["lines.npz", "--image-size", "640x480"], "for CSV files"),
     "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),
     "csv without image size": (["lines.csv"], "--image-size"),
     "csv with a bad image size": (["lines.csv", "--image-size", "big"], "1920x1080"),
@@ -122,7 +125,43 @@ def test_a_mistake_is_one_sentence_and_status_2(case, wrong_files):
     assert done.returncode == 2
     assert hint in done.stderr
     assert "Traceback" not in done.stderr
-    assert not list((wrong_files / "out").glob("*"))
+    assert not (wrong_files / "out").exists()
+
+
+def test_calibrate_does_not_replace_its_input(wrong_files):
+    before = (wrong_files / "lines.npz").read_bytes()
+    done = zoomjax("calibrate", "lines.npz", "-o", ".", cwd=wrong_files)
+    assert done.returncode == 2
+    assert "would replace the input" in done.stderr
+    assert (wrong_files / "lines.npz").read_bytes() == before
+
+
+def test_an_interrupted_run_leaves_nothing(wrong_files):
+    """Interrupted as by Ctrl-C, at the first sign of life."""
+    command = [sys.executable, "-c", "from zoomjax.cli import main; main()"]
+    process = subprocess.Popen([*command, "demo", "-o", "new"], cwd=wrong_files, stderr=subprocess.PIPE)
+    while not (wrong_files / "new").exists():
+        time.sleep(0.05)
+        assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert stderr.decode().rstrip().endswith("Interrupted.")
+    assert not (wrong_files / "new").exists()
+
+
+def test_version():
+    assert zoomjax("--version").stdout == f"zoomjax {importlib.metadata.version('zoomjax')}\n"
+
+
+def test_what_is_wrong_with_a_model_is_told_on_stderr(tmp_path):
+    t = np.linspace(-200, 200, 50)
+    radial = [np.stack([319.5 + t * c, 239.5 + t * s], -1) for c, s in ((1, 0), (0, 1), (0.6, 0.8))]
+    lines = zj.Lines.from_ragged(radial * 3, np.repeat([0, 1, 2], 3), [20, 40, 80], image_size=(640, 480))
+    lines.save(tmp_path / "lines.npz")
+    done = zoomjax("calibrate", "lines.npz", "-o", "out", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "Beware: The lines do not determine" in " ".join(done.stderr.split())
 
 
 def test_an_output_folder_that_cannot_be_written_is_told_before_the_work(wrong_files):

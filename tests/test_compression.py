@@ -102,8 +102,11 @@ def test_fewer_terms_do_not_serve_more(ragged, rng):
 
 
 def test_no_terms_raise(ragged):
-    with pytest.raises(ValueError, match="terms must be at least 1"):
+    with pytest.raises(ValueError, match="terms must be an integer of at least 1"):
         zj.compress(ragged, 0)
+
+
+CUTS = (1, 38, 0, 5, 99, 14, 2, 33, 4)  # points of each line of `ragged` in the first of two chunks
 
 
 def chunks(lines, rng):
@@ -119,6 +122,37 @@ def test_chunks_merge_to_the_whole_in_either_order(ragged, rng):
         assert_same_triangles(merged, whole)
         assert_same_for_fits(merged, ragged, coefficients(rng, 3))
         np.testing.assert_array_equal(merged.counts, ragged.counts)
+
+
+def test_chunks_of_few_points_a_line_merge_to_the_whole(ragged):
+    """Chunk by chunk through `from_ragged`, of which each alone would drop lines, and other ones."""
+    points = ragged.to_ragged()
+    frame, focal, size = np.asarray(ragged.frame), np.asarray(ragged.focal), ragged.image_size
+    halves = [[line[:k] for k, line in zip(CUTS, points, strict=True)]]
+    halves += [[line[k:] for k, line in zip(CUTS, points, strict=True)]]
+    parts = [
+        zj.compress(zj.Lines.from_ragged(half, frame, focal, image_size=size, chunk=True))
+        for half in halves
+    ]
+    assert_same_triangles(zj.merge(*parts), zj.compress(ragged))
+
+
+def test_chunks_that_lost_different_lines_do_not_merge(ragged):
+    points = ragged.to_ragged()
+    frame, focal, size = np.asarray(ragged.frame), np.asarray(ragged.focal), ragged.image_size
+    parts = []
+    for short in (5, 8):  # both seen in the last frame
+        given = [line[:2] if index == short else line for index, line in enumerate(points)]
+        given = [given[i] for i in np.argsort(frame, kind="stable")]
+        with pytest.warns(UserWarning, match="Dropped 1"):
+            parts.append(zj.compress(zj.Lines.from_ragged(given, np.sort(frame), focal, image_size=size)))
+    with pytest.raises(ValueError, match="chunk=True"):
+        zj.merge(*parts)
+
+
+def test_compressing_twice_is_refused(small, unchecked):
+    with pytest.raises(TypeError, match="compressed already"):
+        zj.compress(small)
 
 
 def test_merge_is_differentiable(ragged, rng):

@@ -176,3 +176,11 @@ def test_lines_that_hold_next_to_nothing_have_finite_gradients(count, ragged):
     )
     assert jnp.isfinite(gradient).all()
     assert (gradient[0] == 0).all() or count == 2
+
+
+def test_one_or_two_points_are_no_line(ragged):
+    """They are straight whatever the lens, and must not dilute the mean over their frame's lines."""
+    short = eqx.tree_at(lambda lines: lines.mask, ragged, ragged.mask.at[0, 2:].set(False))
+    absent = eqx.tree_at(lambda lines: lines.mask, ragged, ragged.mask.at[0].set(False))
+    k = jnp.full((3, 2), 0.1)
+    np.testing.assert_array_equal(zj.frame_energy(short, k), zj.frame_energy(absent, k))

@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+import warnings
 
 import equinox as eqx
 import jax
@@ -38,7 +39,9 @@ def distorted_lines(lens, focal, *, offset=0.0, noise=0.0, seed=0, number=12, po
             seen = np.asarray(lens(jnp.asarray(f)).distort(straight)) if lens is not None else straight
             lines.append(seen + noise * rng.standard_normal(seen.shape))
             frame.append(index)
-    return zj.Lines.from_ragged(lines, frame, focal, image_size=SIZE)
+    with warnings.catch_warnings():  # a round image, larger than the sensor
+        warnings.filterwarnings("ignore", "[0-9,]+ of [0-9,]+ points lie outside")
+        return zj.Lines.from_ragged(lines, frame, focal, image_size=SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -341,6 +344,21 @@ def test_covariance_does_not_depend_on_the_unit_of_focal_lengths(lens):
     np.testing.assert_allclose(fit.covariance, other.covariance, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("degree", "terms"), [(2, 2), (3, 3)])
+def test_covariance_in_float32_is_that_in_float64(degree, terms, noisy):
+    """The higher ones have condition numbers whose square float32 cannot hold."""
+    single = jax.tree.map(
+        lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a, noisy
+    )
+    ours, true = (
+        zj.fit_zoom(zj.compress(lines, terms), zoom=zj.PolynomialZoom(degree), terms=terms)
+        for lines in (single, noisy)
+    )
+    assert ours.covariance.dtype == jnp.float32
+    assert ours.result == true.result == RESULTS.successful
+    np.testing.assert_allclose(np.diag(ours.covariance), np.diag(true.covariance), rtol=0.01)
+
+
 # Outcomes that the user must hear of
 
 
@@ -365,6 +383,7 @@ def test_frames_whose_lines_determine_nothing_say_so(lens):
     fits = zj.fit_frames(zj.compress(mixed))
     np.testing.assert_array_equal(fits.result == RESULTS.undetermined, [True, False, False])
     np.testing.assert_array_equal(np.isinf(fits.covariance[:, 0, 0]), [True, False, False])
+    assert [message[:22] for message in fits.messages()] == ["The lines do not deter", "", ""]
 
 
 def test_good_fits_are_successful(fit, full_fit, frame_fits):
@@ -403,3 +422,70 @@ def test_too_few_steps_raise_unless_asked_not_to(small):
     assert fit.result == RESULTS.nonlinear_max_steps_reached
     with pytest.raises(RuntimeError, match="maximum number of steps"):
         zj.fit_zoom(small, max_steps=1)
+
+
+# Plain mistakes
+
+
+MISTAKES = {
+    "terms of zero": ({"terms": 0}, ValueError, "terms must be an integer of at least 1, but it is 0"),
+    "terms with a fraction": ({"terms": 2.0}, ValueError, "but it is 2.0"),
+    "terms in words": ({"terms": "2"}, ValueError, "but it is '2'"),
+    "a degree for a model": ({"zoom": 2}, TypeError, r"such as PolynomialZoom\(degree=2\), but it is 2"),
+    "a class for a model": ({"zoom": zj.PolynomialZoom}, TypeError, "such as PolynomialZoom"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "error", "message"), MISTAKES.values(), ids=MISTAKES)
+def test_a_plain_mistake_is_told(arguments, error, message, small, unchecked):
+    with pytest.raises(error, match=message):
+        zj.fit_zoom(small, **arguments)
+
+
+def test_things_that_are_not_lines_are_refused(noisy, unchecked):
+    for function in (zj.fit_zoom, zj.fit_frames, lambda lines: zj.frame_rms(lines, None)):
+        with pytest.raises(TypeError, match="lines must be Lines"):
+            function(noisy.to_ragged())
+
+
+def test_the_fit_is_not_taken_for_its_lens(small, fit, unchecked):
+    with pytest.raises(TypeError, match=r"fit\.lens, not the fit"):
+        zj.frame_rms(small, fit)
+
+
+def test_terms_that_contradict_the_start_raise(small, fit):
+    with pytest.raises(ValueError, match="the parameters of zoom are for 2"):
+        zj.fit_zoom(small, zoom=fit.lens.zoom, terms=1)
+
+
+def test_a_start_does_not_excuse_too_few_focal_lengths(tiny, fit):
+    with pytest.raises(ValueError, match="3 or more distinct focal lengths"):
+        zj.fit_zoom(tiny, zoom=fit.lens.zoom)
+
+
+def test_numpy_integers_are_integers(small, fit, unchecked):
+    again = zj.fit_zoom(small, zoom=zj.PolynomialZoom(np.int64(2)), terms=np.int64(2))
+    np.testing.assert_array_equal(parameters(again), parameters(fit))
+
+
+def test_a_float32_model_starts_a_float64_fit(small, fit):
+    start = jax.tree.map(lambda a: a.astype(jnp.float32), fit.lens.zoom)
+    again = zj.fit_zoom(small, zoom=start)
+    assert again.lens.zoom.parameters.dtype == jnp.float64
+    np.testing.assert_allclose(parameters(again), parameters(fit), atol=1e-9)
+
+
+def test_frames_that_are_not_there_raise(frame_fits):
+    np.testing.assert_array_equal(frame_fits.distortion(-1).coefficients, frame_fits.coefficients[3])
+    with pytest.raises(IndexError, match="no frame 4: the frames fitted are 0 to 3"):
+        frame_fits.distortion(4)
+
+
+def test_messages_of_good_frames_are_empty(frame_fits):
+    assert frame_fits.messages() == [""] * 4
+
+
+def test_frame_rms_tells_of_frames_outside_of_the_range(noisy, fit):
+    narrow = eqx.tree_at(lambda lens: lens.focal_range, fit.lens, fit.lens.focal_range[:1].repeat(2))
+    with pytest.warns(UserWarning, match="focal lengths of 3 of 4 frames"):
+        zj.frame_rms(noisy, narrow)

@@ -112,12 +112,35 @@ SPOILED = {
     "no centre": (without("centre"), "it has no 'centre'"),
     "short centre": (lambda c: c | {"centre": [1.0]}, "incomplete or not finite"),
     "NaN": (lambda c: c | {"focal_range": [np.nan, 3.0]}, "incomplete or not finite"),
-    "words": (lambda c: c | {"image_size": ["a", "b"]}, "Cannot read a lens"),
+    "words": (lambda c: c | {"image_size": ["a", "b"]}, "two positive integers"),
+    "negative image size": (lambda c: c | {"image_size": [-5, 4]}, "two positive integers"),
+    "image size with a fraction": (lambda c: c | {"image_size": [640.5, 480]}, "two positive integers"),
+    "unit": (lambda c: c | {"focal_unit": "inch"}, 'must be "mm" or "px"'),
+    "reversed range": (lambda c: c | {"focal_range": c["focal_range"][::-1]}, "in order"),
+    "negative range": (lambda c: c | {"focal_range": [-1.0, 3.0]}, "not positive"),
+    "zero reference": (lambda c: c | {"zoom": c["zoom"] | {"focal_ref": 0.0}}, "not positive"),
+    "no parameters": (lambda c: c | {"zoom": c["zoom"] | {"parameters": [[], [], []]}}, "no parameters"),
+    "another scale": (lambda c: c | {"scale": 1.0}, "half the diagonal"),
+    "version in words": (lambda c: c | {"version": "1"}, "version is '1'"),
     "ragged": (
         lambda c: c | {"zoom": c["zoom"] | {"parameters": [[1.0], [1.0, 2.0]]}},
         "Cannot read a lens",
     ),
 }
+
+
+def test_many_focal_lengths_at_once_are_refused_with_a_way_out(lens, unchecked):
+    with pytest.raises(ValueError, match=r"jax.vmap\(lens\)"):
+        lens(np.array([30.0, 40.0]))
+
+
+def test_range_is_checked_of_many_focal_lengths(lens):
+    low, high = lens.focal_range
+    lens.check_range(np.array([low, high]))
+    with pytest.warns(UserWarning, match="focal lengths of 2 of 3 frames are outside"):
+        lens.check_range(np.array([low / 2, low, high * 2]))
+    with pytest.raises(ValueError, match="positive number, but it is -1"):
+        lens.check_range(np.array([low, -1.0]))
 
 
 @pytest.mark.parametrize(("spoil", "message"), SPOILED.values(), ids=SPOILED)

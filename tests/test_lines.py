@@ -1,3 +1,4 @@
+import warnings
 import zipfile
 
 import jax
@@ -149,12 +150,17 @@ BAD = {
     "only short lines": ({"points": [ROW[:2], ROW[:0]]}, "none of the 2 lines has 3"),
     "unit": ({"focal_unit": "inch"}, "focal_unit must be"),
     "image without height": ({"image_size": (6, 0)}, "image_size must be two positive integers"),
+    "no image size": ({"image_size": None}, "two positive integers"),
+    "one number as image size": ({"image_size": 640}, "two positive integers"),
+    "image size that is not finite": ({"image_size": (6.0, np.nan)}, "two positive integers"),
     "centre": ({"centre": np.array([np.nan, 1.0])}, "centre must be two finite numbers"),
+    "complex points": ({"points": [ROW, ROW + 1j]}, "real numbers, but line 1 .* complex"),
+    "focal lengths as a word": ({"focal": "24"}, "one number a frame"),
 }
 
 
 @pytest.mark.parametrize(("argument", "message"), BAD.values(), ids=BAD)
-def test_bad_input_raises(argument, message):
+def test_bad_input_raises(argument, message, unchecked):
     with pytest.raises(ValueError, match=message):
         make(**argument)
 
@@ -172,6 +178,32 @@ def test_lines_without_three_distinct_points_are_dropped_and_counted(short):
     with pytest.warns(UserWarning, match="Dropped 2 of 4 lines"):
         lines = make([short, ROW, ROW + 1, short], frame=[0, 0, 1, 1])
     assert_same(lines, make())
+
+
+def test_lines_know_which_of_those_given_they_are():
+    with pytest.warns(UserWarning, match="Dropped"):
+        lines = make([ROW[:2], ROW, ROW + 1, ROW[:1]], frame=[0, 0, 1, 1])
+    np.testing.assert_array_equal(lines.number, [1, 2])
+    chosen = lines.take(jnp.array([1, 0]), jnp.array([True, False]))
+    np.testing.assert_array_equal(chosen.number, [2, 1])
+
+
+def test_a_chunk_keeps_every_line_and_frame():
+    lines = make([ROW[:2], ROW[:0], ROW], frame=[0, 0, 0], chunk=True)
+    np.testing.assert_array_equal(lines.counts, [2, 0, 5])
+    np.testing.assert_array_equal(lines.number, [0, 1, 2])
+    with pytest.raises(ValueError, match="finite"):
+        make([ROW[:2], spoiled(np.nan)], chunk=True)
+
+
+@pytest.mark.parametrize("offset", [(-40, 0), (0, 40)])
+def test_points_far_outside_of_the_image_are_told(offset):
+    with pytest.warns(UserWarning, match=r"5 of 10 points lie outside of the image of 6 x 4 px, by up to"):
+        make([ROW, ROW + np.array(offset)])
+
+
+def test_half_precision_points_are_widened():
+    assert make([ROW.astype(np.float16)] * 2).points.dtype == np.float32
 
 
 def test_frame_whose_lines_are_all_dropped_raises():
@@ -230,6 +262,9 @@ SPOILED = {
     "foreign arrays": (lambda path: np.savez(path, corners=ROW), "no line primitives"),
     "pickled": (lambda path: rewrite(path, points=np.array([ROW, None], object)), "allow_pickle"),
     "newer version": (lambda path: rewrite(path, version=99), "version is 99"),
+    "older version": (lambda path: rewrite(path, version=0), "version is 0"),
+    "version in words": (lambda path: rewrite(path, version="one"), "version is 'one'"),
+    "several versions": (lambda path: rewrite(path, version=np.ones(2)), "Cannot read lines"),
     "no focal": (lambda path: rewrite(path, focal=None), "focal"),
     "no version": (lambda path: rewrite(path, version=None), "version"),
     "counts that disagree": (lambda path: rewrite(path, counts=np.array([5, 6])), "disagree"),
@@ -246,6 +281,22 @@ def test_file_that_holds_no_lines_raises_and_is_named(spoil, message, saved):
     with pytest.raises(ValueError, match=message) as caught:
         zj.load_lines(saved)
     assert str(saved) in str(caught.value)
+
+
+def test_damage_anywhere_is_an_error_that_names_the_file_or_does_none(saved):
+    """One byte changed, at places spread over the whole file."""
+    whole = saved.read_bytes()
+    told = []
+    for position in range(0, len(whole), 7):
+        saved.write_bytes(whole[:position] + bytes([whole[position] ^ 0x55]) + whole[position + 1 :])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                assert np.isfinite(zj.load_lines(saved).points).all()
+            except ValueError as error:
+                told.append(str(error))
+    assert len(told) > 100
+    assert all(str(saved) in message for message in told)
 
 
 def test_missing_file_raises(tmp_path):

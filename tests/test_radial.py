@@ -221,3 +221,12 @@ def test_integer_points_are_taken_as_floats(method, quadratic):
 @pytest.mark.parametrize("method", METHODS)
 def test_no_points_give_no_points(method, quadratic):
     assert getattr(quadratic, method)(jnp.zeros((0, 2))).shape == (0, 2)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_what_comes_from_within_the_fold_goes_back(dtype):
+    """Also from so near the fold that the corrected radius rounds to its largest value."""
+    d = zj.Distortion(jnp.array([-0.3, 0.02], dtype), jnp.zeros(2, dtype), jnp.array(1, dtype))
+    inside = np.linspace(0.999, 1, 4000, dtype=dtype) * np.asarray(d.monotone_radius)
+    points = np.stack([0.6 * inside, 0.8 * inside], axis=-1).astype(dtype)
+    assert np.isfinite(d.distort(d.undistort(points))).all()

@@ -19,6 +19,7 @@ Points = Num[AnyArray, "*batch 2"]
 Coefficients = Float[AnyArray, "terms"]
 Mask = Bool[AnyArray, "line point"]
 FrameIndex = Int[AnyArray, "line"]
+LineNumber = Int[AnyArray, "line"]
 Focal = Float[AnyArray, "frame"]
 
 

@@ -3,13 +3,14 @@
 This is what the command line runs; it prints nothing, and draws with `plot`.
 """
 
+import contextlib
 import dataclasses
 import importlib.metadata
 import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +49,22 @@ class Calibration:
         """The lines of a table like the paper's Table 1: what was done, and each frame's RMS, px."""
         return [
             ("no correction", self.none),
-            ("zoom polynomial, algebraic", self.algebraic),
-            ("frame by frame", np.asarray(self.each.frame_rms)),
+            ("each frame by itself", np.asarray(self.each.frame_rms)),
+            ("zoom polynomial, algebraic estimate", self.algebraic),
             ("zoom polynomial", np.asarray(self.zoom.frame_rms)),
         ]
+
+    def warnings(self) -> list[str]:
+        """What a user must hear of: sentences about the zoom model, and about frames that have none."""
+        told = [RESULTS[self.zoom.result]] if self.zoom.result != RESULTS.successful else []
+        for message in dict.fromkeys(filter(None, messages := self.each.messages())):
+            frames = [str(frame) for frame, other in enumerate(messages) if other == message]
+            which = ", ".join(frames[:8]) + (", ..." if len(frames) > 8 else "")
+            told.append(
+                f"{len(frames)} of {len(messages)} frames have no good model of their own "
+                f"(frames {which}). {message}"
+            )
+        return told
 
     def summary(self) -> dict[str, Any]:
         """The figures, as plain numbers and strings that JSON can hold."""
@@ -78,7 +91,8 @@ class Calibration:
             "focal_unit": lens.focal_unit,
             "image_size": list(lens.image_size),
             "result": RESULTS[self.zoom.result] or "successful",
-            "frames_without_a_model": int(np.sum(np.asarray(self.each.result != RESULTS.successful))),
+            "frames_without_a_model": sum(map(bool, self.each.messages())),
+            "warnings": self.warnings(),
             "pixel_polynomials": self.pixel_polynomials().tolist(),
             "parameters": np.asarray(lens.zoom.parameters).tolist(),
             "parameter_sigma": _finite(np.sqrt(np.diag(np.asarray(self.zoom.covariance)))),
@@ -96,7 +110,7 @@ class Calibration:
         return normalised / self.zoom.lens.scale ** (2 * np.arange(1, normalised.shape[1] + 1))
 
     def write(self, folder: str | os.PathLike[str]) -> None:
-        """Write lens.json, lines.npz, summary.json and model.png; all of them, or none.
+        """Write lens.json, lines.npz, summary.json and model.png, each whole, once all have been made.
 
         Raises:
             OSError: the folder cannot be written.
@@ -152,19 +166,29 @@ def rms_over_frames(frame_rms: Float[AnyArray, "frame"]) -> float:
     return float(np.sqrt(np.mean(np.asarray(frame_rms) ** 2)))
 
 
-def writable_folder(folder: str | os.PathLike[str]) -> Path:
+@contextlib.contextmanager
+def results_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
     """The folder, made if it is not there, after trying to write in it: better now than after the work.
+
+    If the block fails, folders that were made for it are removed again.
 
     Raises:
         OSError: it cannot be made or written; the message names it.
     """
     folder = Path(folder)
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(tempfile.mkdtemp(dir=folder, prefix=".zoomjax-"))
-    except OSError as error:
-        raise OSError(f"Cannot write in the folder {folder}: {error.strerror or error}.") from error
-    return folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            shutil.rmtree(tempfile.mkdtemp(dir=folder, prefix=".zoomjax-"))
+        except OSError as error:
+            raise OSError(f"Cannot write in the folder {folder}: {error.strerror or error}.") from error
+        yield folder
+    except BaseException:
+        with contextlib.suppress(OSError):  # what is not there or not empty stays as it is
+            for path in made:
+                path.rmdir()
+        raise
 
 
 def _finite(values: np.ndarray) -> list[float | None]:

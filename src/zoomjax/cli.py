@@ -5,6 +5,8 @@ compute in float64. Errors go to stderr with exit status 2, and leave no partial
 """
 
 import contextlib
+import importlib.metadata
+import os
 import sys
 import time
 import warnings
@@ -32,6 +34,9 @@ Degree = Annotated[int, typer.Option(min=0, help="Degree of the polynomials in 1
 Terms = Annotated[int, typer.Option(min=1, help="Number of distortion coefficients, k1 to kN.")]
 
 
+_INTERRUPTED = 130  # Typer's exit status for Ctrl-C
+
+
 def main() -> None:
     """Run the command line; what a user can mend is one sentence on stderr and exit status 2."""
     warnings.showwarning = _print_warning
@@ -40,6 +45,26 @@ def main() -> None:
     except (ValueError, OSError, RuntimeError) as error:
         print(f"Error: {_sentence(error)}", file=sys.stderr)
         sys.exit(2)
+    except SystemExit as exit:
+        if exit.code != _INTERRUPTED:
+            raise
+        print("Interrupted.", file=sys.stderr, flush=True)
+        os._exit(_INTERRUPTED)  # the usual way out waits for a compiler thread, and can crash in it
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"zoomjax {importlib.metadata.version('zoomjax')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """One continuous distortion model for a zoom lens, from images of straight things."""
 
 
 @app.command()
@@ -55,15 +80,16 @@ def demo(
     A board of 31 x 23 stripes at 1185 mm, seen at 50 focal lengths through the lens that the paper
     measured, a Nikkor 18-200. The lines are synthetic; the lens is the published one.
     """
-    folder = _start(output)
+    _enable_float64()
     from . import synthetic
+    from .calibration import results_folder
 
     lens, board = synthetic.nikkor_18_200(), synthetic.StripedBoard()
-    with _stages() as stage:
+    with results_folder(output) as folder, _stages() as stage:
         stage("Projecting the board")
         lines = synthetic.board_lines(lens, synthetic.focal_sweep(), board=board, noise=noise, seed=seed)
         calibration = _calibrate(lines, 2, 2, stage, folder)
-    _show(calibration, folder, board.magnification)
+    _show(calibration, output, board.magnification)
 
 
 @app.command()
@@ -83,33 +109,41 @@ def calibrate(
         str | None, typer.Option(metavar="WxH", help="Image size of a CSV input, px, e.g. 1920x1080.")
     ] = None,
     focal_unit: Annotated[
-        str, typer.Option(help="Unit of the focal lengths of a CSV input: mm or px.")
-    ] = "mm",
+        str | None, typer.Option(help="Unit of the focal lengths of a CSV input: mm (default) or px.")
+    ] = None,
 ) -> None:
     """Fit a zoom lens to line primitives and write lens.json, lines.npz, summary.json, model.png."""
-    folder = _start(output)
-    with _stages() as stage:
+    _enable_float64()
+    from .calibration import results_folder
+
+    for path in inputs:
+        if path.resolve() == (output / "lines.npz").resolve():
+            raise ValueError(f"The results would replace the input {path}: give another folder.")
+    with results_folder(output) as folder, _stages() as stage:
         stage("Reading the lines")
         lines = _read(inputs, focal, image_size, focal_unit)
         calibration = _calibrate(lines, degree, terms, stage, folder)
-    _show(calibration, folder)
+    _show(calibration, output)
 
 
-def _start(output: Path) -> Path:
-    """Float64 on, and the output folder tried, before any work."""
+def _enable_float64() -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from .calibration import writable_folder
-
-    return writable_folder(output)
 
 
-def _read(inputs: list[Path], focal: Path | None, image_size: str | None, focal_unit: str) -> "Lines":
+def _read(
+    inputs: list[Path], focal: Path | None, image_size: str | None, focal_unit: str | None
+) -> "Lines":
     if len(inputs) > 1:
         raise ValueError(f"Give one file of lines; there are {len(inputs)}.")
     [path] = inputs
     if path.suffix == ".npz":
+        if (focal, image_size, focal_unit) != (None, None, None):
+            raise ValueError(
+                f"{path} carries its own focal lengths and image size: --focal, --image-size and "
+                "--focal-unit are for CSV files."
+            )
         from .lines import load_lines
 
         return load_lines(path)
@@ -125,7 +159,7 @@ def _read(inputs: list[Path], focal: Path | None, image_size: str | None, focal_
             path,
             image_size=(int(width), int(height)),
             focal=None if focal is None else read_focal_csv(focal),
-            focal_unit=focal_unit,
+            focal_unit=focal_unit or "mm",
         )
     raise ValueError(f"Cannot calibrate from {path}: give lines.npz, or a CSV file frame,line,x,y[,focal].")
 
@@ -188,15 +222,14 @@ def _show(
     table.add_column("px", justify="right")
     if magnification:
         table.add_column("mm on the board", justify="right")
-    table.add_column("over frame by frame", justify="right")
+    table.add_column("against by itself", justify="right")
     for name, frames in calibration.rows():
         value = rms_over_frames(frames)
         cells = [name, f"{value:.4f}"]
         if magnification:
             scale = [magnification(float(f)) for f in calibration.lines.focal]
             cells.append(f"{rms_over_frames(frames / scale):.4f}")
-        ratio = value / summary["rms_frames"] - 1
-        cells.append("" if name == "frame by frame" else f"{100 * ratio:+.2f} %")
+        cells.append("" if name == "each frame by itself" else _excess(value / summary["rms_frames"]))
         table.add_row(*cells)
     console.print(table)
     console.print()
@@ -204,10 +237,14 @@ def _show(
         powers = ["", *(f" /f{'' if j == 1 else f'^{j}'}" for j in range(1, len(column)))]
         terms = " ".join(f"{value:+.4e}{power}" for value, power in zip(column, powers, strict=True))
         console.print(f"k{i}(f) = {terms}   px^-{2 * i}", highlight=False)
-    if summary["result"] != "successful":
-        console.print(f"\n[bold]Beware:[/bold] {summary['result']}", highlight=False)
+    for warning in calibration.warnings():
+        Console(stderr=True).print(f"\n[bold]Beware:[/bold] {warning}", highlight=False)
     files = ", ".join(["lens.json", "lines.npz", "summary.json", "model.png"])
     console.print(f"\nWritten to {folder}: {files}", highlight=False)
+
+
+def _excess(ratio: float) -> str:
+    return f"{100 * (ratio - 1):+.2f} %" if ratio < 2 else f"{ratio:.1f} times"
 
 
 def _sentence(error: BaseException) -> str:

@@ -26,7 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ._types import Focal, FrameIndex, Point, traced
+from ._checks import checked_terms
+from ._types import Focal, FrameIndex, LineNumber, Point, traced
 from .lines import AbstractLines, Lines
 
 _RUN = 1100  # points orthogonalised together: 7 columns of them fill a cache of 48 to 64 KB in float64
@@ -39,7 +40,7 @@ class CompressedLines(AbstractLines):
 
     Attributes:
         triangle: R of each line, in normalised lengths.
-        frame, focal, centre, image_size, focal_unit: as in `Lines`.
+        frame, focal, centre, image_size, focal_unit, number: as in `Lines`.
     """
 
     triangle: Float[Array, "line rows rows"]
@@ -48,6 +49,7 @@ class CompressedLines(AbstractLines):
     centre: Point
     image_size: tuple[int, int] = eqx.field(static=True)
     focal_unit: str = eqx.field(static=True)
+    number: LineNumber | None = None
 
     @property
     def terms(self) -> int:
@@ -94,6 +96,7 @@ class CompressedLines(AbstractLines):
             centre=self.centre,
             image_size=self.image_size,
             focal_unit=self.focal_unit,
+            number=None if self.number is None else self.number[lines],
         )
 
 
@@ -121,8 +124,9 @@ def compress(lines: Lines, terms: int = 2) -> CompressedLines:
         >>> compress(lines).triangle.shape
         (2, 7, 7)
     """
-    if terms < 1:
-        raise ValueError(f"Argument terms must be at least 1, but it is {terms}.")
+    if isinstance(lines, CompressedLines):
+        raise TypeError("These lines are compressed already: compress the Lines that they came from.")
+    terms = checked_terms(terms)
     if traced(lines) or jax.default_backend() != "cpu":
         triangle = _reduce_run(lines, 0, lines.points.shape[0], terms)
     else:
@@ -134,11 +138,15 @@ def compress(lines: Lines, terms: int = 2) -> CompressedLines:
         centre=lines.centre,
         image_size=lines.image_size,
         focal_unit=lines.focal_unit,
+        number=lines.number,
     )
 
 
 def merge(first: CompressedLines, second: CompressedLines) -> CompressedLines:
     """The same lines with the points of both: for chunks of points that do not fit in memory together.
+
+    Make the chunks by ``Lines.from_ragged(..., chunk=True)``, which keeps a line of which a chunk has few
+    points or none, so that every chunk holds all lines in the same order.
 
     Raises:
         ValueError: the two do not hold the same lines, or not for the same terms, centre and image size.
@@ -146,13 +154,15 @@ def merge(first: CompressedLines, second: CompressedLines) -> CompressedLines:
     if first.triangle.shape != second.triangle.shape:
         raise ValueError(
             "Only triangles of the same lines and terms merge, but their shapes are "
-            f"{first.triangle.shape} and {second.triangle.shape}."
+            f"{first.triangle.shape} and {second.triangle.shape}. Make chunks of points by "
+            "Lines.from_ragged(..., chunk=True), which drops no line."
         )
     rest, other = (eqx.tree_at(lambda lines: lines.triangle, lines, None) for lines in (first, second))
     if not traced((rest, other)) and not _equal(rest, other):
         raise ValueError(
-            "Only chunks of the same lines merge, but their frames, focal lengths, centres, image sizes or "
-            "units differ."
+            "Only chunks of the same lines merge, but their lines, frames, focal lengths, centres, image "
+            "sizes or units differ. Make chunks of points by Lines.from_ragged(..., chunk=True), which "
+            "drops no line."
         )
     return eqx.tree_at(lambda lines: lines.triangle, first, _merge_all(first.triangle, second.triangle))
 

@@ -44,10 +44,14 @@ def line_residuals(centred: Float[Array, "rows 2"]) -> Float[Array, "rows"]:
 
 
 def line_weights(lines: AbstractLines) -> Float[Array, "line"]:
-    """``1 / (M Nl(m) Np(l, m))`` of eq. 13 for the points of each line; 0 for lines that are not there."""
+    """``1 / (M Nl(m) Np(l, m))`` of eq. 13 for the points of each line.
+
+    0 for lines that are not there. One or two points count as none: they are straight whatever the lens,
+    and would only dilute their frame's mean. (`Lines` drops them; merged chunks may come with them.)
+    """
     counts = lines.counts
     frames = lines.focal.shape[0]
-    present = (counts > 0).astype(counts.dtype)
+    present = (counts > 2).astype(counts.dtype)
     per_frame = jax.ops.segment_sum(present, lines.frame, frames)
     return present / (frames * jnp.maximum(per_frame, 1)[lines.frame] * jnp.maximum(counts, 1))
 
@@ -71,9 +75,13 @@ def residuals(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -
 @eqx.filter_jit
 def frame_energy(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "frame"]:
     """The error of each frame, px^2: mean over its lines of the mean squared distance (eq. 3)."""
+    return energy_by_frame(lines, residuals(lines, coefficients))
+
+
+def energy_by_frame(lines: AbstractLines, weighted: Float[Array, "line rows"]) -> Float[Array, "frame"]:
+    """The error of each frame, px^2, from the weighted residuals."""
     frames = lines.focal.shape[0]
-    of_line = jnp.sum(residuals(lines, coefficients) ** 2, axis=1)
-    return frames * jax.ops.segment_sum(of_line, lines.frame, frames)
+    return frames * jax.ops.segment_sum(jnp.sum(weighted**2, axis=1), lines.frame, frames)
 
 
 @eqx.filter_jit

@@ -18,11 +18,12 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
+from ._checks import checked_terms
 from ._solver import default_solver
 from ._types import AnyArray, Point, traced
 from .algebraic import algebraic_parameters, compressed
 from .compression import CompressedLines
-from .energy import frame_energy, line_weights, residuals
+from .energy import energy_by_frame, frame_energy, line_weights, residuals
 from .lens import ZoomLens, lens_of
 from .lines import AbstractLines, Lines
 from .radial import Distortion, monotone_radius
@@ -90,8 +91,22 @@ class FrameFits(eqx.Module):
     centre: Point
     scale: float = eqx.field(static=True)
 
+    def messages(self) -> list[str]:
+        """For each frame a sentence about how its fit ended, empty where nothing is wrong."""
+        return [
+            RESULTS[jax.tree.map(lambda value, frame=frame: value[frame], self.result)]
+            for frame in range(self.coefficients.shape[0])
+        ]
+
     def distortion(self, frame: int) -> Distortion:
-        """The distortion of one frame."""
+        """The distortion of one frame.
+
+        Raises:
+            IndexError: there is no such frame.
+        """
+        frames = self.coefficients.shape[0]
+        if not -frames <= frame < frames:
+            raise IndexError(f"There is no frame {frame}: the frames fitted are 0 to {frames - 1}.")
         dtype = self.coefficients.dtype
         return Distortion(
             self.coefficients[frame],
@@ -104,7 +119,7 @@ def fit_zoom(
     lines: AbstractLines,
     *,
     zoom: AbstractZoom | None = None,
-    terms: int = 2,
+    terms: int | None = None,
     solver: Solver | None = None,
     max_steps: int = 256,
     throw: bool = True,
@@ -114,9 +129,9 @@ def fit_zoom(
     Args:
         lines: the lines, or, much faster and with the same answer, ``compress(lines)``.
         zoom: the model; `PolynomialZoom` of degree 2 by default. One that has parameters already is where
-            the solver starts, and brings its own number of terms; one without starts from the algebraic
-            estimate, if it is linear.
-        terms: the number N of distortion coefficients (eq. 2).
+            the solver starts; one without starts from the algebraic estimate, if it is linear.
+        terms: the number N of distortion coefficients (eq. 2): by default 2, or as many as a `zoom` with
+            parameters has.
         solver: any optimistix least-squares solver or minimiser; Levenberg-Marquardt by default, with
             tolerances for the dtype of the lines.
         max_steps: the most steps the solver may take.
@@ -124,8 +139,9 @@ def fit_zoom(
             (undetermined, folded) never raise.
 
     Raises:
-        ValueError: fewer distinct focal lengths than the zoom model needs, or lines compressed for fewer
-            terms.
+        ValueError: fewer distinct focal lengths than the zoom model needs, lines compressed for fewer
+            terms, or a `zoom` whose parameters are for another number of terms.
+        TypeError: `lines` or `zoom` are something else.
         RuntimeError: the solver failed (see `throw`).
 
     Example:
@@ -138,15 +154,42 @@ def fit_zoom(
         >>> bool(fit.rms < 1)
         True
     """
-    model = PolynomialZoom() if zoom is None else zoom
-    if model.parameters is None:
-        model = model.prepare(lines.focal, terms)
-        start = compressed(lines, terms) if isinstance(model, AbstractLinearZoom) else None
-    else:
-        start = None
+    _check_lines(lines)
+    model, terms = _model(lines, PolynomialZoom() if zoom is None else zoom, terms)
+    start = None
+    if isinstance(model, AbstractLinearZoom) and (zoom is None or zoom.parameters is None):
+        start = compressed(lines, terms)
     solver = default_solver(lines) if solver is None else solver
-    fit = _fit_zoom(lines, start, model, terms, solver, max_steps)
-    return _thrown(fit, throw)
+    return _thrown(*_fit_zoom(lines, start, model, terms, solver, max_steps), throw)
+
+
+def _model(lines, zoom, terms):
+    """The model ready to be fitted to these lines, in their dtype, and its number of terms."""
+    if not isinstance(zoom, AbstractZoom):
+        raise TypeError(
+            f"Argument zoom must be a zoom model such as PolynomialZoom(degree=2), but it is {zoom!r}."
+        )
+    own = None if zoom.parameters is None else jax.eval_shape(zoom, lines.focal[0]).shape[0]
+    terms = checked_terms((own or 2) if terms is None else terms)
+    if own not in (None, terms):
+        raise ValueError(
+            f"Argument terms is {terms}, but the parameters of zoom are for {own}: leave terms out, or "
+            "start from a model without parameters."
+        )
+    prepared = zoom.prepare(lines.focal, terms)  # complains of too few focal lengths
+    if own is None:
+        return prepared, terms
+    dtype = jnp.asarray(lines.focal).dtype
+    arrays, rest = eqx.partition(zoom, eqx.is_inexact_array)
+    return eqx.combine(jax.tree.map(lambda array: array.astype(dtype), arrays), rest), terms
+
+
+def _check_lines(lines):
+    if not isinstance(lines, AbstractLines):
+        raise TypeError(
+            "Argument lines must be Lines (see Lines.from_ragged) or compress(lines), but its type is "
+            f"{type(lines).__name__}."
+        )
 
 
 def fit_frames(
@@ -165,10 +208,12 @@ def fit_frames(
     Raises:
         RuntimeError: the solver failed on some frame, and `throw` is set.
     """
+    _check_lines(lines)
+    terms = checked_terms(terms)
     chosen, present = lines.by_frame()
     solver = default_solver(lines) if solver is None else solver
-    fits = _fit_frames(lines, compressed(lines, terms), chosen, present, terms, solver, max_steps)
-    return _thrown(fits, throw)
+    start = compressed(lines, terms)
+    return _thrown(*_fit_frames(lines, start, chosen, present, terms, solver, max_steps), throw)
 
 
 def frame_rms(
@@ -184,7 +229,12 @@ def frame_rms(
     Raises:
         ValueError: the lens is for images of another size or focal lengths in another unit, there are not
             coefficients for every frame, or the lines were compressed about another centre.
+        TypeError: `lens` is something else, such as the fit that holds it.
+
+    Warns:
+        UserWarning: frames at focal lengths outside of the range that the lens was fitted on.
     """
+    _check_lines(lines)
     if isinstance(lens, ZoomLens):
         if lens.image_size != lines.image_size:
             raise ValueError(
@@ -196,7 +246,13 @@ def frame_rms(
                 f"The lens takes focal lengths in {lens.focal_unit}, but those of the lines are in "
                 f"{lines.focal_unit}."
             )
+        lens.check_range(lines.focal)
         lines = _about(lines, lens.centre)
+    elif not (lens is None or eqx.is_array_like(lens)):
+        raise TypeError(
+            "Argument lens must be a ZoomLens (fit.lens, not the fit), coefficients of each frame or None, "
+            f"but its type is {type(lens).__name__}."
+        )
     return _frame_rms(lines, lens)
 
 
@@ -228,9 +284,10 @@ def _fit_zoom(lines, start, zoom, terms, solver, max_steps):
     if start is not None:
         zoom = _with_parameters(zoom, algebraic_parameters(start, zoom, terms))
     zoom, result, steps = _minimise(lines, zoom, solver, max_steps)
-    errors = frame_energy(lines, jax.vmap(zoom)(lines.focal))
-    covariance, determined = _covariance(lines, zoom, jnp.mean(errors))
-    return ZoomFit(
+    weighted, jacobian = _linearised(lines, zoom)
+    errors = energy_by_frame(lines, weighted)
+    covariance, determined = _covariance(lines, zoom, jacobian, jnp.mean(errors))
+    fit = ZoomFit(
         lens=lens_of(lines, zoom),
         rms=jnp.sqrt(jnp.mean(errors)),
         frame_rms=jnp.sqrt(errors),
@@ -238,6 +295,7 @@ def _fit_zoom(lines, start, zoom, terms, solver, max_steps):
         result=_judge(lines, zoom, result, determined),
         steps=steps,
     )
+    return fit, _first_failure(fit.result)
 
 
 @eqx.filter_jit
@@ -245,13 +303,13 @@ def _fit_frames(lines, start, chosen, present, terms, solver, max_steps):
     def fit(chosen, present):
         frame = lines.take(chosen, present)
         constant = PolynomialZoom(degree=0).prepare(frame.focal, terms)
-        return _fit_zoom(frame, start.take(chosen, present), constant, terms, solver, max_steps)
+        return _fit_zoom(frame, start.take(chosen, present), constant, terms, solver, max_steps)[0]
 
     # Small compressed frames are solved side by side; the points themselves one frame at a time, for
     # side by side they would all be in memory at once, padded to the fullest frame.
     batch = chosen.shape[0] if isinstance(lines, CompressedLines) else 1
     fits = jax.lax.map(lambda frame: fit(*frame), (chosen, present), batch_size=batch)
-    return FrameFits(
+    each = FrameFits(
         coefficients=fits.lens.zoom.parameters[:, 0],
         rms=jnp.sqrt(jnp.mean(fits.rms**2)),
         frame_rms=fits.rms,
@@ -260,6 +318,7 @@ def _fit_frames(lines, start, chosen, present, terms, solver, max_steps):
         centre=jnp.asarray(lines.centre),
         scale=lines.scale,
     )
+    return each, _first_failure(each.result)
 
 
 def _with_parameters(zoom: AbstractZoom, parameters: PyTree) -> Any:
@@ -280,56 +339,76 @@ def _minimise(lines, zoom, solver, max_steps):
     return _with_parameters(zoom, solution.value), solution.result, solution.stats["num_steps"]
 
 
-def _covariance(lines, zoom, energy):
+def _linearised(lines, zoom):
+    """The residuals and their derivatives by the flattened parameters, a row a residual."""
+    flat, unravel = ravel_pytree(zoom.parameters)
+
+    def function(flat):
+        k = jax.vmap(_with_parameters(zoom, unravel(flat)))(lines.focal)
+        return (weighted := residuals(lines, k)), weighted
+
+    jacobian, weighted = jax.jacfwd(function, has_aux=True)(flat)
+    return weighted, jacobian
+
+
+def _covariance(lines, zoom, jacobian, energy):
     """Covariance of the flattened parameters, and whether the lines determine them all.
 
     For the weights w of eq. 13, which are not the inverse variances, the covariance is the sandwich
-    ``sigma^2 (J^T W J)^-1 (J^T W^2 J) (J^T W J)^-1``.
+    ``sigma^2 (J^T W J)^-1 (J^T W^2 J) (J^T W J)^-1``. It is made from the triangles of J and of the
+    weighted J: the normal equations would square the condition number, which float32 has no room for.
 
     A parameter is *undetermined* where moving it changes the residuals by less than twice what noise in
     the points alone would feign: each point's error appears in the derivative by k_j, times r^(2j). (Lines
     through the centre have nothing else there, and would otherwise seem to determine k from their noise.)
     """
+    weights = line_weights(lines)
+    triangle, outer = (
+        jnp.linalg.qr(rows.reshape(-1, rows.shape[-1]), mode="r")
+        for rows in (jacobian, jnp.sqrt(weights)[:, None, None] * jacobian)
+    )
+    # Columns of unit length, so that one threshold serves parameters of any size.
+    size = jnp.linalg.norm(triangle, axis=0)
+    size = jnp.where(size > 0, size, 1)
+    left, values, right = jnp.linalg.svd(triangle / size[None])
+    good = values > 64 * jnp.finfo(values.dtype).eps
+    reciprocal = jnp.where(good, 1 / jnp.where(good, values, 1), 0)
+    back = right.T * reciprocal[None]  # to the parameters that change the residuals by one unit
+    # Of the directions that change them so, those in which noise would feign more than half of it.
+    feigned = _feigned(lines, zoom, weights, energy) / size[:, None] / size[None]
+    shares, directions = jnp.linalg.eigh(back.T @ feigned @ back)
+    doubtful = jnp.concatenate([back @ directions, right.T], axis=1)
+    doubtful = doubtful / jnp.maximum(jnp.linalg.norm(doubtful, axis=0), jnp.finfo(size.dtype).tiny)[None]
+    unknown = jnp.concatenate([shares >= 0.25, ~good])
+    undetermined = jnp.any(unknown[None] & (jnp.abs(doubtful) > 0.05), axis=1)
+
+    inverse = back @ left.T / size[:, None]
+    spread = outer @ inverse
+    freedom = jnp.sum(weights * (lines.counts - 2)) - jnp.sum(spread**2)
+    undetermined = undetermined | (freedom <= 0)  # nothing is left over to tell the noise by
+    half = inverse @ spread.T
+    covariance = energy / jnp.where(freedom > 0, freedom, 1) * (half @ half.T)
+    either = undetermined[:, None] | undetermined[None]
+    infinite = jnp.where(jnp.eye(size.shape[0], dtype=bool), jnp.inf, 0)
+    return jnp.where(either, infinite, covariance), ~jnp.any(undetermined)
+
+
+def _feigned(lines, zoom, weights, energy):
+    """What the points' own noise contributes to ``J^T J`` in the mean, by parameter and parameter."""
     flat, unravel = ravel_pytree(zoom.parameters)
 
     def coefficients_at(flat):
         return jax.vmap(_with_parameters(zoom, unravel(flat)))(lines.focal)
 
-    jacobian = jax.jacfwd(lambda flat: residuals(lines, coefficients_at(flat)))(flat)
-    information = jnp.einsum("lri,lrj->ij", jacobian, jacobian)
-    weights = line_weights(lines)
-    outer = jnp.einsum("l,lri,lrj->ij", weights, jacobian, jacobian)
-
-    # The noise of the points themselves: residuals are shrunk by L, so divide by its mean square.
     k = coefficients_at(flat)
     terms = k.shape[1]
     order = jnp.arange(terms + 1)
     moments = lines.radial_moments(2 * terms)[:, order[:, None] + order[None]] * weights[:, None, None]
+    # The residuals have the noise of the corrected image, shrunk by L: divide by its mean square.
     kappa = jnp.concatenate([jnp.ones_like(k[:, :1]), k], axis=1)[lines.frame]
     variance_in_image = energy / jnp.einsum("li,lij,lj->", kappa, moments, kappa)
     by_parameter = jax.jacfwd(coefficients_at)(flat)[lines.frame]  # (line, terms, parameter)
-    feigned = variance_in_image * jnp.einsum(
-        "lip,lij,ljq->pq", by_parameter, moments[:, 1:, 1:], by_parameter
-    )
-
-    # Unit diagonal, so that one threshold serves parameters of any size.
-    size = jnp.sqrt(jnp.diagonal(information))
-    size = jnp.where(size > 0, size, 1)
-    scaled = information / size[:, None] / size[None]
-    excess = scaled - 4 * feigned / size[:, None] / size[None]
-    eps = jnp.finfo(flat.dtype).eps
-    (excesses, values), (directions, vectors) = jnp.linalg.eigh(jnp.stack([excess, scaled]))
-    undetermined = jnp.any((excesses <= 4 * eps)[None] & (jnp.abs(directions) > 0.05), axis=1)
-    good = values > 4 * eps
-    inverse = (vectors * jnp.where(good, 1 / jnp.where(good, values, 1), 0)[None]) @ vectors.T
-    inverse = inverse / size[:, None] / size[None]
-    freedom = jnp.sum(weights * (lines.counts - 2)) - jnp.sum(inverse * outer)
-    undetermined = undetermined | (freedom <= 0)  # nothing is left over to tell the noise by
-    variance = energy / jnp.where(freedom > 0, freedom, 1)
-    covariance = variance * inverse @ outer @ inverse
-    either = undetermined[:, None] | undetermined[None]
-    infinite = jnp.where(jnp.eye(flat.size, dtype=bool), jnp.inf, 0)
-    return jnp.where(either, infinite, covariance), ~jnp.any(undetermined)
+    return variance_in_image * jnp.einsum("lip,lij,ljq->pq", by_parameter, moments[:, 1:, 1:], by_parameter)
 
 
 def _judge(lines, zoom, result, determined):
@@ -340,28 +419,31 @@ def _judge(lines, zoom, result, determined):
     farthest = jnp.sqrt(jnp.max(jnp.sum(offset**2, axis=1)))
     monotone = jax.vmap(monotone_radius)(jax.vmap(zoom)(lines.focal)) > farthest
     finite = jnp.all(jnp.isfinite(ravel_pytree(zoom.parameters)[0]))
-    successful = RESULTS.promote(optx.RESULTS.successful)
-    about_model = RESULTS.where(jnp.all(monotone), successful, RESULTS.folded)
+    good: Any = RESULTS.successful  # inherited members, which pyright takes for another class's
+    nonfinite: Any = RESULTS.nonfinite
+    about_model = RESULTS.where(jnp.all(monotone), good, RESULTS.folded)
     about_model = RESULTS.where(determined, about_model, RESULTS.undetermined)
+    about_model = RESULTS.where(finite, about_model, nonfinite)
     solved = RESULTS.promote(result)
-    return RESULTS.where(
-        solved != RESULTS.successful,
-        solved,
-        RESULTS.where(finite, about_model, RESULTS.promote(optx.RESULTS.nonfinite)),
-    )
+    return RESULTS.where(solved == good, about_model, solved)
 
 
-def _thrown(fit, throw):
-    """The fit, raising where its solver failed; what is said of the model itself never raises."""
-    if not throw:
-        return fit
-    result = fit.result
+def _first_failure(result):
+    """Whether a solver failed, in which frame first, and how; what is said of a model is no failure."""
     about_model = (result == RESULTS.undetermined) | (result == RESULTS.folded)
     failed = jnp.atleast_1d((result != RESULTS.successful) & ~about_model)
-    first = jax.tree.map(lambda value: jnp.atleast_1d(value)[jnp.argmax(failed)], result)
+    frame = jnp.argmax(failed)
+    return jnp.any(failed), frame, jax.tree.map(lambda value: jnp.atleast_1d(value)[frame], result)
+
+
+def _thrown(fit, failure, throw):
+    """The fit, raising where its solver failed."""
+    failed, frame, result = failure
+    if not throw:
+        return fit
     if traced(failed):
-        return first.error_if(fit, jnp.any(failed))
-    if failed.any():
-        where = f"Frame {int(jnp.argmax(failed))}: " if failed.size > 1 else ""
-        raise RuntimeError(f"The fit failed. {where}{RESULTS[first]}")
+        return result.error_if(fit, failed)
+    if failed:
+        where = f"Frame {int(frame)}: " if isinstance(fit, FrameFits) else ""
+        raise RuntimeError(f"The fit failed. {where}{RESULTS[result]}")
     return fit

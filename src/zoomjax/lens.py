@@ -8,8 +8,9 @@ import warnings
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, ScalarLike
+from jaxtyping import Float, Num, ScalarLike
 
+from ._checks import checked_size, checked_unit
 from ._files import whole_file
 from ._types import AnyArray, Point, traced
 from .lines import AbstractLines
@@ -43,6 +44,11 @@ class ZoomLens(eqx.Module):
     image_size: tuple[int, int] = eqx.field(static=True)
     focal_unit: str = eqx.field(static=True, default="mm")
 
+    def __check_init__(self):
+        """Check the geometry."""
+        checked_size(self.image_size)
+        checked_unit(self.focal_unit)
+
     @property
     def scale(self) -> float:
         """The length in px that is radius 1: half the image diagonal."""
@@ -55,9 +61,15 @@ class ZoomLens(eqx.Module):
             UserWarning: `focal` is outside of the fitted range (not under ``jit`` or ``vmap``).
 
         Raises:
-            ValueError: `focal` is not positive and finite (not under ``jit`` or ``vmap``).
+            ValueError: `focal` is not one number, positive and finite (values are not checked under
+                ``jit`` or ``vmap``).
         """
-        self._check(focal)
+        if np.ndim(focal):
+            raise ValueError(
+                f"Argument focal must be one number, but its shape is {np.shape(focal)}: "
+                "jax.vmap(lens)(focal) takes many."
+            )
+        self.check_range(focal, stacklevel=3)
         dtype = jnp.asarray(self.centre).dtype
         return Distortion(
             coefficients=self.zoom(jnp.asarray(focal, dtype)),
@@ -93,19 +105,32 @@ class ZoomLens(eqx.Module):
         with whole_file(path) as part:
             part.write_text(json.dumps(content, indent=2) + "\n")
 
-    def _check(self, focal):
+    def check_range(self, focal: Num[AnyArray | ScalarLike, "..."], *, stacklevel: int = 2) -> None:
+        """Look at focal lengths, if their values are known (not under ``jit`` or ``vmap``).
+
+        Warns:
+            UserWarning: some are outside of the fitted range.
+
+        Raises:
+            ValueError: some are not positive and finite.
+        """
         if traced((self, focal)):
             return
         low, high = (float(end) for end in self.focal_range)
-        value = float(focal)
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"Argument focal must be a positive number, but it is {value}.")
-        slack = 1e-6 * value  # the end of the range itself, through a float32 or a file
-        if value < low - slack or value > high + slack:
+        values = np.ravel(np.asarray(focal, np.float64))
+        bad = ~(np.isfinite(values) & (values > 0))
+        if bad.any():
+            raise ValueError(f"Argument focal must be a positive number, but it is {values[bad][0]}.")
+        slack = 1e-6 * values  # the end of the range itself, through a float32 or a file
+        outside = values[(values < low - slack) | (values > high + slack)]
+        if outside.size:
+            which = f"focal length {outside[0]:g} {self.focal_unit} is"
+            if values.size > 1:
+                which = f"focal lengths of {outside.size} of {values.size} frames are"
             warnings.warn(
-                f"The focal length {value:g} {self.focal_unit} is outside of the range the lens was "
-                f"fitted on, {low:g} to {high:g} {self.focal_unit}: its distortion is extrapolated.",
-                stacklevel=3,
+                f"The {which} outside of the range the lens was fitted on, {low:g} to {high:g} "
+                f"{self.focal_unit}: the distortion there is extrapolated.",
+                stacklevel=stacklevel + 1,
             )
 
 
@@ -135,28 +160,30 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
             raise ValueError("it describes no zoom lens; ZoomLens.save writes such a file")
         if content["version"] != _VERSION:
             raise ValueError(
-                f"its format version is {content['version']} and this zoomjax reads {_VERSION}"
+                f"its format version is {content['version']!r} and this zoomjax reads {_VERSION}; "
+                "update zoomjax"
             )
         zoom = content["zoom"]
         if zoom["model"] != "PolynomialZoom":
             raise ValueError(f"its zoom model, {zoom['model']!r}, is unknown; update zoomjax")
-        parameters = _array(zoom["parameters"], (None, None))
-        width, height = (int(side) for side in content["image_size"])
-        return ZoomLens(
-            zoom=PolynomialZoom(
-                degree=parameters.shape[0] - 1,
-                parameters=parameters,
-                focal_ref=_array(zoom["focal_ref"], ()),
-            ),
-            centre=_array(content["centre"], (2,)),
-            focal_range=_array(content["focal_range"], (2,)),
-            image_size=(width, height),
-            focal_unit=str(content["focal_unit"]),
+        parameters, focal_ref = _array(zoom, "parameters", (None, None)), _array(zoom, "focal_ref", ())
+        lens = ZoomLens(
+            zoom=PolynomialZoom(degree=len(parameters) - 1, parameters=parameters, focal_ref=focal_ref),
+            centre=_array(content, "centre", (2,)),
+            focal_range=_array(content, "focal_range", (2,)),
+            image_size=checked_size(content["image_size"]),
+            focal_unit=checked_unit(content["focal_unit"]),
         )
+        low, high = lens.focal_range
+        if not (0 < low <= high and focal_ref > 0 and parameters.size):
+            raise ValueError("its focal lengths are not positive and in order, or it has no parameters")
+        if not math.isclose(content["scale"], lens.scale, rel_tol=1e-6):
+            raise ValueError("its scale is not half the diagonal of its image_size")
+        return lens
     except FileNotFoundError:
         raise
-    except (ValueError, TypeError, KeyError, OSError) as error:
-        reason = f"it has no {error}" if isinstance(error, KeyError) else error
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OSError) as error:
+        reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
         raise ValueError(f"Cannot read a lens from {os.fspath(path)}: {reason}.") from error
 
 
@@ -165,11 +192,11 @@ def _numbers(array):
     return np.asarray(array, np.float64).tolist()
 
 
-def _array(numbers, shape):
-    array = np.asarray(numbers, np.float64)
+def _array(content, name, shape):
+    array = np.asarray(content[name], np.float64)
     matches = array.ndim == len(shape) and all(
         want in (None, have) for want, have in zip(shape, array.shape, strict=True)
     )
     if not matches or not np.isfinite(array).all():
-        raise ValueError("its numbers are incomplete or not finite")
+        raise ValueError(f"the numbers of its {name!r} are incomplete or not finite")
     return jnp.asarray(array, jnp.result_type(float))

@@ -10,7 +10,6 @@ import abc
 import math
 import os
 import warnings
-import zipfile
 from collections.abc import Iterable, Sequence
 
 import equinox as eqx
@@ -20,8 +19,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from ._checks import (
+    checked_centre,
+    checked_focal,
+    checked_frames,
+    checked_points,
+    checked_size,
+    checked_unit,
+)
 from ._files import whole_file
-from ._types import AnyArray, Focal, FrameIndex, Mask, Point, traced
+from ._types import AnyArray, Focal, FrameIndex, LineNumber, Mask, Point, traced
 from .radial import radial_factor
 
 _FORMAT, _VERSION = "zoomjax.lines", 1
@@ -94,6 +101,7 @@ class Lines(AbstractLines):
         centre: centre of distortion, px; the image's centre ``((w-1)/2, (h-1)/2)`` by default.
         image_size: (width, height) px.
         focal_unit: "mm" or "px".
+        number: position of each line among those that `from_ragged` was given; None if unknown.
     """
 
     points: Float[AnyArray, "line point 2"]
@@ -103,6 +111,7 @@ class Lines(AbstractLines):
     centre: Point
     image_size: tuple[int, int] = eqx.field(static=True)
     focal_unit: str = eqx.field(static=True, default="mm")
+    number: LineNumber | None = None
 
     def __check_init__(self):
         """Check that the shapes agree."""
@@ -123,6 +132,7 @@ class Lines(AbstractLines):
         image_size: Sequence[int],
         focal_unit: str = "mm",
         centre: ArrayLike | None = None,
+        chunk: bool = False,
     ) -> "Lines":
         """Lines from one array of points a line.
 
@@ -133,13 +143,16 @@ class Lines(AbstractLines):
             image_size: (width, height) px.
             focal_unit: "mm" or "px", the unit of `focal`.
             centre: centre of distortion, px; default the centre of the image.
+            chunk: whether these are only some of the lines' points, to be compressed and merged with
+                others: then every line is kept, whatever its number of points, even none.
 
         Raises:
             ValueError: a point or focal length is not finite, a focal length is not positive, a frame
                 index is out of range, a frame has no line, or no usable line is left.
 
         Warns:
-            UserWarning: lines with fewer than 3 distinct points are dropped; the message counts them.
+            UserWarning: lines with fewer than 3 distinct points are dropped; the message counts them. Or
+                points lie outside of the image.
 
         Example:
             >>> import numpy as np
@@ -148,49 +161,31 @@ class Lines(AbstractLines):
             >>> lines.points.shape, lines.centre.tolist()
             ((2, 5, 2), [2.5, 1.5])
         """
-        size = _checked_size(image_size)
-        arrays = [_checked_points(line, index) for index, line in enumerate(points)]
-        frames, focals = _checked_frames(frame, focal, len(arrays))
-        if focal_unit not in ("mm", "px"):
-            raise ValueError(f'Argument focal_unit must be "mm" or "px", but it is {focal_unit!r}.')
-
-        usable = np.array([_has_three_distinct(line) for line in arrays], bool)
-        if not usable.all():
-            if not usable.any():
-                raise ValueError(
-                    f"No usable line: none of the {len(arrays)} lines has 3 or more distinct points."
-                )
-            warnings.warn(
-                f"Dropped {np.sum(~usable)} of {len(arrays)} lines: they have fewer than 3 distinct "
-                "points, which says nothing about straightness.",
-                stacklevel=2,
-            )
-            arrays = [line for line, keep in zip(arrays, usable, strict=True) if keep]
-            frames = frames[usable]
-        empty = np.setdiff1d(np.arange(focals.size), frames)
-        if empty.size:
-            raise ValueError(
-                f"No line in {empty.size} of {focals.size} frames (the first are "
-                f"{', '.join(map(str, empty[:5]))}). Leave those frames out of frame and focal."
-            )
+        size, unit = checked_size(image_size), checked_unit(focal_unit)
+        arrays = [checked_points(line, index) for index, line in enumerate(points)]
+        focals = checked_focal(focal)
+        frames = checked_frames(frame, len(arrays), focals.size)
+        number = np.arange(len(arrays))
+        if not chunk:
+            number = _usable(arrays, frames, focals.size)
+            arrays, frames = [arrays[index] for index in number], frames[number]
 
         dtype = np.result_type(*arrays)
-        dtype = dtype if np.issubdtype(dtype, np.floating) else np.dtype(np.float64)
-        counts = [len(line) for line in arrays]
+        counts = np.array([len(line) for line in arrays])
         padded = np.zeros((len(arrays), max(counts), 2), dtype)
         for row, line in zip(padded, arrays, strict=True):
             row[: len(line)] = line
-        middle = (np.array(size) - 1) / 2 if centre is None else np.asarray(centre)
-        if middle.shape != (2,) or not np.isfinite(middle).all():
-            raise ValueError(f"Argument centre must be two finite numbers, but it is {centre!r}.")
+        mask = np.arange(max(counts)) < counts[:, None]
+        _warn_of_points_outside(padded, mask, size)
         return cls(
             points=_held_as_given(padded),
-            mask=jnp.asarray(np.arange(max(counts)) < np.array(counts)[:, None]),
+            mask=jnp.asarray(mask),
             frame=jnp.asarray(frames, jnp.int32),
             focal=_held_as_given(focals.astype(dtype)),
-            centre=_held_as_given(middle.astype(dtype)),
+            centre=_held_as_given(checked_centre(centre, size).astype(dtype)),
             image_size=size,
-            focal_unit=focal_unit,
+            focal_unit=unit,
+            number=jnp.asarray(number, jnp.int32),
         )
 
     @classmethod
@@ -287,6 +282,7 @@ class Lines(AbstractLines):
             centre=self.centre,
             image_size=self.image_size,
             focal_unit=self.focal_unit,
+            number=None if self.number is None else self.number[lines],
         )
 
 
@@ -306,43 +302,76 @@ def load_lines(path: str | os.PathLike[str]) -> Lines:
         ValueError: the file is truncated, or something else, or of a later version; the message
             names it.
     """
+    stored = _read_archive(path)
     try:
-        with open(path, "rb") as opened:
-            file = np.load(opened, allow_pickle=False)
-            if not isinstance(file, np.lib.npyio.NpzFile):
-                raise ValueError("it is not an .npz archive")
-            stored = {name: file[name] for name in file.files}
         if str(stored.get("format")) != _FORMAT:
             raise ValueError("it holds no line primitives; Lines.save writes such a file")
-        if int(stored["version"]) > _VERSION:
+        if (version := stored["version"].item()) != _VERSION:
             raise ValueError(
-                f"its format version is {int(stored['version'])} and this zoomjax reads up to "
-                f"{_VERSION}; update zoomjax"
+                f"its format version is {version!r} and this zoomjax reads {_VERSION}; update zoomjax"
             )
         points, counts = stored["points"], stored["counts"]
         if counts.min(initial=0) < 0 or counts.sum() != len(points):
             raise ValueError("its points and counts disagree")
-        width, height = (int(side) for side in stored["image_size"])
         return Lines.from_ragged(
             np.split(points, np.cumsum(counts)[:-1]),
             stored["frame"],
             stored["focal"],
-            image_size=(width, height),
+            image_size=stored["image_size"].tolist(),
             focal_unit=str(stored["focal_unit"]),
             centre=stored["centre"],
         )
-    except FileNotFoundError:
-        raise
-    except (
-        ValueError,
-        TypeError,
-        KeyError,
-        IndexError,
-        EOFError,
-        OSError,
-        zipfile.BadZipFile,
-    ) as error:
-        raise ValueError(f"Cannot read lines from {os.fspath(path)}: {error}.") from error
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+        reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
+        raise ValueError(f"Cannot read lines from {os.fspath(path)}: {reason}.") from error
+
+
+def _read_archive(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """All arrays of an ``.npz`` file, nothing unpickled."""
+    with open(path, "rb") as opened:
+        try:
+            archive = np.load(opened, allow_pickle=False)
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise ValueError("it is not an .npz archive")
+            return {name: np.asarray(archive[name]) for name in archive.files}
+        # Damaged archives raise whatever zipfile, zlib, struct or the tokenizer of headers stumbles over.
+        except Exception as error:
+            reason = str(error).rstrip(".") or type(error).__name__
+            raise ValueError(f"Cannot read lines from {os.fspath(path)}: {reason}.") from error
+
+
+def _usable(arrays: list[np.ndarray], frames: np.ndarray, number_of_frames: int) -> np.ndarray:
+    """Positions of the lines with 3 or more distinct points, of which every frame must have one."""
+    usable = np.array([_has_three_distinct(line) for line in arrays], bool)
+    if not usable.any():
+        raise ValueError(f"No usable line: none of the {len(arrays)} lines has 3 or more distinct points.")
+    if not usable.all():
+        warnings.warn(
+            f"Dropped {np.sum(~usable)} of {len(arrays)} lines: they have fewer than 3 distinct "
+            "points, which says nothing about straightness.",
+            stacklevel=3,
+        )
+    empty = np.setdiff1d(np.arange(number_of_frames), frames[usable])
+    if empty.size:
+        raise ValueError(
+            f"No line in {empty.size} of {number_of_frames} frames (the first are "
+            f"{', '.join(map(str, empty[:5]))}). Leave those frames out of frame and focal."
+        )
+    return np.flatnonzero(usable)
+
+
+def _warn_of_points_outside(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -> None:
+    """Points far outside of the image mean a wrong image size, and with it a wrong centre and scale."""
+    beyond = np.max(
+        np.maximum(-points, points - (np.array(size) - 1)), axis=-1, where=mask[..., None], initial=0
+    )
+    outside = beyond > 0.01 * max(size)  # noise alone takes a few points some px out
+    if outside.any():
+        warnings.warn(
+            f"{np.sum(outside):,} of {np.sum(mask):,} points lie outside of the image of {size[0]} x "
+            f"{size[1]} px, by up to {np.max(beyond):.3g} px. Is image_size (width, height) right?",
+            stacklevel=3,
+        )
 
 
 def _held_as_given(array: np.ndarray) -> AnyArray:
@@ -350,61 +379,6 @@ def _held_as_given(array: np.ndarray) -> AnyArray:
     if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
         return jnp.asarray(array)
     return array
-
-
-def _checked_size(image_size) -> tuple[int, int]:
-    size = tuple(image_size)
-    if len(size) != 2 or any(int(side) != side or side < 1 for side in size):
-        raise ValueError(
-            f"Argument image_size must be two positive integers (w, h), but it is {image_size!r}."
-        )
-    return int(size[0]), int(size[1])
-
-
-def _checked_points(line: ArrayLike, index: int) -> np.ndarray:
-    array = np.asarray(line)
-    if array.size == 0:
-        return np.zeros((0, 2), np.float32)
-    if array.ndim != 2 or array.shape[1] != 2 or not np.issubdtype(array.dtype, np.number):
-        raise ValueError(
-            f"Argument points must hold (n, 2) arrays of numbers, but line {index} has shape "
-            f"{array.shape} and dtype {array.dtype}."
-        )
-    if not np.isfinite(array).all():
-        bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-        raise ValueError(
-            f"Argument points must be finite, but line {index} has {bad.size} NaN or infinite points "
-            f"(the first at position {bad[0]}). Remove them."
-        )
-    return array
-
-
-def _checked_frames(frame, focal, lines: int) -> tuple[np.ndarray, np.ndarray]:
-    frames, focals = np.asarray(frame), np.asarray(focal, dtype=np.float64)
-    if focals.ndim != 1 or not focals.size:
-        raise ValueError(
-            f"Argument focal must be a sequence with one number a frame, but its shape is {focals.shape}."
-        )
-    if not (np.isfinite(focals) & (focals > 0)).all():
-        bad = int(np.flatnonzero(~(np.isfinite(focals) & (focals > 0)))[0])
-        raise ValueError(
-            f"Argument focal must hold finite positive numbers, but focal[{bad}] is {focals[bad]}."
-        )
-    if lines == 0:
-        raise ValueError("No usable line: argument points is empty.")
-    if frames.shape != (lines,) or not np.issubdtype(frames.dtype, np.integer):
-        raise ValueError(
-            f"Argument frame must hold one integer for each of the {lines} lines, but its shape is "
-            f"{frames.shape} and its dtype {frames.dtype}."
-        )
-    outside = (frames < 0) | (frames >= focals.size)
-    if outside.any():
-        bad = int(np.flatnonzero(outside)[0])
-        raise ValueError(
-            f"Argument frame must hold indices from 0 to {focals.size - 1}, one focal length each, but "
-            f"frame[{bad}] is {frames[bad]}."
-        )
-    return frames, focals
 
 
 def _has_three_distinct(line: np.ndarray) -> bool:

@@ -234,7 +234,8 @@ def _undistort(z, k, limit):
 
 def _has_inverse(z, k, limit):
     finite = jnp.where(jnp.isinf(limit), 0, limit)
-    reach = finite * radial_factor(finite * finite, k)
+    # A few last digits beyond it are the same radius: `undistort` of a point at the fold rounds to there.
+    reach = finite * radial_factor(finite * finite, k) * (1 + 8 * jnp.finfo(z.dtype).eps)
     squared = z @ z
     return (jnp.isinf(limit) & jnp.isfinite(squared)) | (squared <= reach * reach)
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, ScalarLike
 
+from ._checks import checked_integer
 from ._types import AnyArray, Coefficients, Focal, Scalar, traced
 
 
@@ -67,16 +68,14 @@ class PolynomialZoom(AbstractLinearZoom):
         [0.05000000074505806]
     """
 
-    degree: int = eqx.field(static=True, default=2)
+    degree: int = eqx.field(
+        static=True, default=2, converter=lambda degree: checked_integer("degree", degree, 0)
+    )
     parameters: Float[AnyArray, "basis terms"] | None = None
     focal_ref: Scalar | None = None
 
     def __check_init__(self):
-        """Check the degree and the shape of the parameters."""
-        if isinstance(self.degree, bool) or not isinstance(self.degree, int) or self.degree < 0:
-            raise ValueError(
-                f"Argument degree must be an integer of at least 0, but it is {self.degree!r}."
-            )
+        """Check the shape of the parameters."""
         if self.parameters is not None and self.parameters.shape[0] != self.degree + 1:
             raise ValueError(
                 f"Argument parameters must have {self.degree + 1} rows for degree {self.degree}, "
@@ -113,11 +112,11 @@ class PolynomialZoom(AbstractLinearZoom):
                     f"or more distinct focal lengths, but there are {distinct}. Lower the degree, or "
                     "add images at other focal lengths."
                 )
-        focal = jnp.asarray(focal)
+            focal = np.asarray(focal)  # its minimum then compiles nothing
         return PolynomialZoom(
             degree=self.degree,
-            parameters=jnp.zeros((self.degree + 1, terms), focal.dtype),
-            focal_ref=jnp.min(focal),
+            parameters=jnp.asarray(np.zeros((self.degree + 1, terms), focal.dtype)),
+            focal_ref=jnp.asarray(focal.min()),
         )
 
     def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:

@@ -1,0 +1,121 @@
+"""What input must be, in one place: each check returns the value in its plain form, or says what to do."""
+
+import math
+import operator
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+def checked_integer(name: str, value: Any, least: int) -> int:
+    """An integer of at least `least`, NumPy's kinds included, as Python's."""
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or number < least:
+        raise ValueError(f"Argument {name} must be an integer of at least {least}, but it is {value!r}.")
+    return number
+
+
+def checked_terms(terms: Any) -> int:
+    """The number N of distortion coefficients."""
+    return checked_integer("terms", terms, 1)
+
+
+def checked_size(image_size: Any) -> tuple[int, int]:
+    """(width, height) px."""
+    try:
+        width, height = (float(side) for side in image_size)
+    except (TypeError, ValueError):
+        width = height = math.nan
+    if not all(math.isfinite(side) and side == int(side) and side >= 1 for side in (width, height)):
+        raise ValueError(
+            f"Argument image_size must be two positive integers (w, h), but it is {image_size!r}."
+        )
+    return int(width), int(height)
+
+
+def checked_unit(focal_unit: Any) -> str:
+    """The unit of focal lengths."""
+    if focal_unit not in ("mm", "px"):
+        raise ValueError(f'Argument focal_unit must be "mm" or "px", but it is {focal_unit!r}.')
+    return str(focal_unit)
+
+
+def checked_centre(centre: Any, size: tuple[int, int]) -> np.ndarray:
+    """The centre of distortion, px; that of the image if None."""
+    if centre is None:
+        return (np.array(size) - 1) / 2
+    middle = _numbers(centre)
+    if middle is None or middle.shape != (2,) or not np.isfinite(middle).all():
+        raise ValueError(f"Argument centre must be two finite numbers, but it is {centre!r}.")
+    return middle
+
+
+def checked_points(line: ArrayLike, index: int) -> np.ndarray:
+    """The points of one line, (n, 2), in their dtype if it is float32 or float64."""
+    array = _numbers(line)
+    if array is not None and array.size == 0:
+        return np.zeros((0, 2), np.float32)
+    if array is None or array.ndim != 2 or array.shape[1] != 2:
+        what = np.asarray(line) if array is None else array
+        raise ValueError(
+            f"Argument points must hold (n, 2) arrays of real numbers, but line {index} has shape "
+            f"{what.shape} and dtype {what.dtype}."
+        )
+    if not np.isfinite(array).all():
+        bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+        raise ValueError(
+            f"Argument points must be finite, but line {index} has {bad.size} NaN or infinite points "
+            f"(the first at position {bad[0]}). Remove them."
+        )
+    return array
+
+
+def checked_focal(focal: ArrayLike) -> np.ndarray:
+    """The focal length of each frame, float64."""
+    focals = _numbers(focal)
+    if focals is None or focals.ndim != 1 or not focals.size:
+        raise ValueError(f"Argument focal must be a sequence with one number a frame, but it is {focal!r}.")
+    good = np.isfinite(focals) & (focals > 0)
+    if not good.all():
+        bad = int(np.argmin(good))
+        raise ValueError(
+            f"Argument focal must hold finite positive numbers, but focal[{bad}] is {focals[bad]}."
+        )
+    return focals.astype(np.float64)
+
+
+def checked_frames(frame: ArrayLike, lines: int, frames: int) -> np.ndarray:
+    """For each of the lines the index of its frame."""
+    index = np.asarray(frame)
+    if lines == 0:
+        raise ValueError("No usable line: argument points is empty.")
+    if index.shape != (lines,) or not np.issubdtype(index.dtype, np.integer):
+        raise ValueError(
+            f"Argument frame must hold one integer for each of the {lines} lines, but its shape is "
+            f"{index.shape} and its dtype {index.dtype}."
+        )
+    outside = (index < 0) | (index >= frames)
+    if outside.any():
+        bad = int(np.argmax(outside))
+        raise ValueError(
+            f"Argument frame must hold indices from 0 to {frames - 1}, one focal length each, but "
+            f"frame[{bad}] is {index[bad]}."
+        )
+    return index
+
+
+def _numbers(values: ArrayLike) -> np.ndarray | None:
+    """Real numbers as an array, half precision widened; None if they are something else."""
+    try:
+        array = np.asarray(values)
+    except ValueError:  # rows of different lengths
+        return None
+    if np.issubdtype(array.dtype, np.floating):
+        return array.astype(np.float32) if array.dtype.itemsize < 4 else array
+    if np.issubdtype(array.dtype, np.integer):
+        return array.astype(np.float64)
+    return array.astype(np.float64) if array.size == 0 else None
