@@ -324,3 +324,8 @@ def test_writing_that_fails_leaves_the_old_file_and_nothing_else(saved, monkeypa
         make().save(saved)
     assert saved.read_bytes() == before
     assert list(saved.parent.iterdir()) == [saved]
+
+
+def test_a_folder_is_not_replaced_by_a_file(tmp_path):
+    with pytest.raises(IsADirectoryError, match="where there is a folder"):
+        make().save(tmp_path)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 import zoomjax as zj
 from zoomjax import synthetic
@@ -27,7 +28,11 @@ powers = corner_radius ** np.array([3, 5]) * truth.scale
 
 figure = Figure(figsize=(12, 3.6), layout="constrained")
 grid = figure.add_gridspec(1, 4, width_ratios=[1, 1, 1, 1.15])
-frames = [(0, "f = 20.6 mm, as seen"), (24, "f = 127 mm, as seen"), (0, "f = 20.6 mm, corrected")]
+frames = [
+    (0, f"f = 20.6 mm, distortion × {EXAGGERATION}"),
+    (24, f"f = 127 mm, distortion × {EXAGGERATION}"),
+    (0, "f = 20.6 mm, corrected"),
+]
 for column, (frame, title) in enumerate(frames):
     axes = figure.add_subplot(grid[column])
     distortion = fit.lens(float(lines.focal[frame]))
@@ -37,9 +42,9 @@ for column, (frame, title) in enumerate(frames):
             shown = corrected if column == 2 else corrected + EXAGGERATION * (line - corrected)
             axes.plot(*shown.T, color=INK, linewidth=0.6)
     axes.set_title(title, fontsize=10, loc="left")
-    axes.set(aspect="equal", xticks=[], yticks=[], xlim=(-250, 4538), ylim=(3098, -250))
-    for spine in axes.spines.values():
-        spine.set_color("0.85")
+    axes.set(aspect="equal", xlim=(-250, 4538), ylim=(3098, -250))
+    axes.set_axis_off()
+    axes.add_patch(Rectangle((0, 0), 4287, 2847, fill=False, color="0.7", linewidth=0.8))
 
 axes = figure.add_subplot(grid[3])
 inverse = 1 / np.asarray(lines.focal)

@@ -49,8 +49,8 @@ class Calibration:
         """The lines of a table like the paper's Table 1: what was done, and each frame's RMS, px."""
         return [
             ("no correction", self.none),
-            ("each frame by itself", np.asarray(self.each.frame_rms)),
-            ("zoom polynomial, algebraic estimate", self.algebraic),
+            ("frame by frame", np.asarray(self.each.frame_rms)),
+            ("zoom polynomial (algebraic)", self.algebraic),
             ("zoom polynomial", np.asarray(self.zoom.frame_rms)),
         ]
 

@@ -222,14 +222,14 @@ def _show(
     table.add_column("px", justify="right")
     if magnification:
         table.add_column("mm on the board", justify="right")
-    table.add_column("against by itself", justify="right")
+    table.add_column("over frame by frame", justify="right", no_wrap=True)
     for name, frames in calibration.rows():
         value = rms_over_frames(frames)
         cells = [name, f"{value:.4f}"]
         if magnification:
             scale = [magnification(float(f)) for f in calibration.lines.focal]
             cells.append(f"{rms_over_frames(frames / scale):.4f}")
-        cells.append("" if name == "each frame by itself" else _excess(value / summary["rms_frames"]))
+        cells.append("" if name == "frame by frame" else _excess(value / summary["rms_frames"]))
         table.add_row(*cells)
     console.print(table)
     console.print()

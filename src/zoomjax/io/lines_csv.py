@@ -7,6 +7,7 @@ column ``focal``, the same in all rows of a frame, or from a second file with th
 
 import csv
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -101,21 +102,43 @@ def _read(path, *, required, optional=()) -> dict[str, np.ndarray]:
     """The named columns as float64."""
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
-            header = [name.strip() for name in next(csv.reader(file), [])]
+            first = file.readline()
+            header = [name.strip() for name in next(csv.reader([first]), [])]
             missing = [name for name in required if name not in header]
             if missing:
+                hint = "; separate columns by commas" if ";" in first or "\t" in first else ""
                 raise ValueError(
                     f"the first line must name the columns {','.join(required)}, but "
-                    f"{' and '.join(missing)} is not among them"
+                    f"{' and '.join(missing)} is not among them{hint}"
                 )
             names = [name for name in (*required, *optional) if name in header]
             used = [header.index(name) for name in names]
-            table = np.loadtxt(file, delimiter=",", usecols=used, ndmin=2, comments=None)
+            start = file.tell()
+            try:
+                with warnings.catch_warnings():
+                    warnings.filterwarnings("ignore", ".*input contained no data")  # told below
+                    table = np.loadtxt(file, delimiter=",", usecols=used, ndmin=2, comments=None)
+            except (ValueError, IndexError):
+                file.seek(start)
+                raise ValueError(_first_bad_row(file, header, names)) from None
         if not len(table):
             raise ValueError("there are no rows")
-    except (ValueError, UnicodeDecodeError) as error:
+    except ValueError as error:  # UnicodeDecodeError is one too
         raise ValueError(f"Cannot read {os.fspath(path)}: {error}.") from error
     return dict(zip(names, table.T, strict=True))
+
+
+def _first_bad_row(file, header, names) -> str:
+    """What is wrong with the first row that holds no numbers; rows are counted from 1, the header's."""
+    for number, row in enumerate(csv.reader(file), start=2):
+        if row and len(row) < len(header):
+            return f"row {number} has {len(row)} columns and the first has {len(header)}"
+        for name in names if row else ():
+            try:
+                float(row[header.index(name)])
+            except ValueError:
+                return f"{name} in row {number} is {row[header.index(name)]!r}, which is no number"
+    return "it holds something else than numbers"
 
 
 def _integers(values: np.ndarray, name: str, path) -> np.ndarray:
