@@ -137,8 +137,9 @@ def test_calibrate_does_not_replace_its_input(wrong_files):
 
 
 def test_an_interrupted_run_leaves_nothing(wrong_files):
-    """Interrupted as by Ctrl-C, at the first sign of life."""
-    command = [sys.executable, "-c", "from zoomjax.cli import main; main()"]
+    """Interrupted as by Ctrl-C, at the first sign of life; also where the tests themselves ignore it."""
+    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    command = [sys.executable, "-c", program + "from zoomjax.cli import main; main()"]
     process = subprocess.Popen([*command, "demo", "-o", "new"], cwd=wrong_files, stderr=subprocess.PIPE)
     while not (wrong_files / "new").exists():
         time.sleep(0.05)
