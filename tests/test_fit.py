@@ -424,6 +424,38 @@ def test_too_few_steps_raise_unless_asked_not_to(small):
         zj.fit_zoom(small, max_steps=1)
 
 
+# The paper's rivals
+
+
+def test_a_table_at_every_focal_length_is_frame_by_frame(small, frame_fits):
+    fit = zj.fit_zoom(small, zoom=zj.TableZoom())
+    np.testing.assert_allclose(parameters(fit)[::-1], frame_fits.coefficients, atol=1e-7)
+    np.testing.assert_allclose(fit.frame_rms, frame_fits.frame_rms, rtol=1e-9)
+
+
+RIVALS = {
+    "table": (zj.TableZoom(number=2, inverse=False), [[0.05], [-0.1]]),
+    "spline": (zj.SplineZoom(number=3), [[0.05], [0.02], [-0.1]]),
+    "power law": (zj.PowerZoom(), [[0.02], [-0.1], [-1.3]]),
+    "two regions": (zj.TwoRegionZoom(35.0), [[-0.3], [0.5], [-0.3], [0.08], [-0.1], [0.05]]),
+}
+
+
+@pytest.mark.parametrize(("model", "truth"), RIVALS.values(), ids=RIVALS)
+def test_a_lens_of_a_rivals_kind_comes_back(model, truth, lens):
+    focal = np.array([20.0, 25.0, 30.0, 40.0, 55.0, 80.0])
+    zoom = eqx.tree_at(
+        lambda zoom: zoom.parameters,
+        model.prepare(focal, 1),
+        jnp.asarray(truth),
+        is_leaf=lambda x: x is None,
+    )
+    lines = distorted_lines(eqx.tree_at(lambda lens: lens.zoom, lens, zoom), focal, offset=180.0)
+    fit = zj.fit_zoom(zj.compress(lines), zoom=model, terms=1)
+    np.testing.assert_allclose(parameters(fit), truth, atol=1e-6)
+    assert fit.rms < 1e-6
+
+
 # Plain mistakes
 
 

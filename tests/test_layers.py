@@ -13,6 +13,7 @@ LAYERS = (
     {"radial"},
     {"inverse"},
     {"zoom"},
+    {"rivals"},
     {"lines"},
     {"energy"},
     {"lens"},

@@ -119,7 +119,10 @@ SPOILED = {
     "reversed range": (lambda c: c | {"focal_range": c["focal_range"][::-1]}, "in order"),
     "negative range": (lambda c: c | {"focal_range": [-1.0, 3.0]}, "not positive"),
     "zero reference": (lambda c: c | {"zoom": c["zoom"] | {"focal_ref": 0.0}}, "not positive"),
-    "no parameters": (lambda c: c | {"zoom": c["zoom"] | {"parameters": [[], [], []]}}, "no parameters"),
+    "no parameters": (
+        lambda c: c | {"zoom": c["zoom"] | {"parameters": [[], [], []]}},
+        "'parameters' are incomplete",
+    ),
     "another scale": (lambda c: c | {"scale": 1.0}, "half the diagonal"),
     "version in words": (lambda c: c | {"version": "1"}, "version is '1'"),
     "ragged": (

@@ -25,6 +25,11 @@ from .lines import AbstractLines as AbstractLines
 from .lines import Lines as Lines
 from .lines import load_lines as load_lines
 from .radial import Distortion as Distortion
+from .rivals import PowerZoom as PowerZoom
+from .rivals import SplineZoom as SplineZoom
+from .rivals import TableZoom as TableZoom
+from .rivals import TwoRegionZoom as TwoRegionZoom
+from .rivals import barrel_crossover as barrel_crossover
 from .vision.undistort import undistort_image as undistort_image
 from .warp import warp_image as warp_image
 from .zoom import AbstractLinearZoom as AbstractLinearZoom

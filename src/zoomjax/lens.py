@@ -1,5 +1,6 @@
 """ZoomLens: the fitted model, from a focal length to the distortion there, and its file format."""
 
+import dataclasses
 import json
 import math
 import os
@@ -15,6 +16,7 @@ from ._files import whole_file
 from ._types import AnyArray, Point, traced
 from .lines import AbstractLines
 from .radial import Distortion
+from .rivals import PowerZoom, SplineZoom, TableZoom, TwoRegionZoom
 from .zoom import AbstractZoom, PolynomialZoom
 
 _FORMAT, _VERSION = "zoomjax.lens", 1
@@ -83,7 +85,7 @@ class ZoomLens(eqx.Module):
         Raises:
             TypeError: the zoom model is of a kind that has no file format.
         """
-        if not isinstance(self.zoom, PolynomialZoom):
+        if type(self.zoom) not in _FORMULAS:
             raise TypeError(f"A lens with a {type(self.zoom).__name__} cannot be saved.")
         content = {
             "format": _FORMAT,
@@ -96,10 +98,9 @@ class ZoomLens(eqx.Module):
             "radial": "corrected = centre + z * scale * (1 + k1 r^2 + ... + kN r^2N), "
             "z = (distorted - centre) / scale, r^2 = z.z",
             "zoom": {
-                "model": "PolynomialZoom",
-                "formula": "k_i(f) = sum_j parameters[j][i-1] * (focal_ref / f)^j",
-                "focal_ref": _numbers(self.zoom.focal_ref),
-                "parameters": _numbers(self.zoom.parameters),
+                "model": type(self.zoom).__name__,
+                "formula": _FORMULAS[type(self.zoom)],
+                **{name: _plain(value) for name, value in vars(self.zoom).items()},
             },
         }
         with whole_file(path) as part:
@@ -163,20 +164,16 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
                 f"its format version is {content['version']!r} and this zoomjax reads {_VERSION}; "
                 "update zoomjax"
             )
-        zoom = content["zoom"]
-        if zoom["model"] != "PolynomialZoom":
-            raise ValueError(f"its zoom model, {zoom['model']!r}, is unknown; update zoomjax")
-        parameters, focal_ref = _array(zoom, "parameters", (None, None)), _array(zoom, "focal_ref", ())
         lens = ZoomLens(
-            zoom=PolynomialZoom(degree=len(parameters) - 1, parameters=parameters, focal_ref=focal_ref),
+            zoom=_read_zoom(content["zoom"]),
             centre=_array(content, "centre", (2,)),
             focal_range=_array(content, "focal_range", (2,)),
             image_size=checked_size(content["image_size"]),
             focal_unit=checked_unit(content["focal_unit"]),
         )
         low, high = lens.focal_range
-        if not (0 < low <= high and focal_ref > 0 and parameters.size):
-            raise ValueError("its focal lengths are not positive and in order, or it has no parameters")
+        if not 0 < low <= high:
+            raise ValueError("its focal_range is not positive and in order")
         if not math.isclose(content["scale"], lens.scale, rel_tol=1e-6):
             raise ValueError("its scale is not half the diagonal of its image_size")
         return lens
@@ -185,6 +182,39 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OSError) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
         raise ValueError(f"Cannot read a lens from {os.fspath(path)}: {reason}.") from error
+
+
+# The zoom models that lens.json can hold, and what it says of them. Their fields are written as they are.
+_FORMULAS = {
+    PolynomialZoom: "k_i(f) = sum_j parameters[j][i-1] * (focal_ref / f)^j",
+    TableZoom: "k_i(f): parameters[.][i-1] at the knots, 1/f (or f, if not inverse), linear in between",
+    SplineZoom: "k_i(f): the natural cubic spline in 1/f through parameters[.][i-1] at the knots",
+    PowerZoom: "k_i(f) = d0 + d1 (f / focal_ref)^d2 with rows d0, d1, d2 of parameters[.][i-1]",
+    TwoRegionZoom: "k_i(f) = sum_j c_j (focal_ref / f)^j with c = parameters[0..2][i-1] for f < crossover, "
+    "parameters[3..5][i-1] from there on",
+}
+
+
+def _read_zoom(content) -> AbstractZoom:
+    models = {model.__name__: model for model in _FORMULAS}
+    if content["model"] not in models:
+        raise ValueError(f"its zoom model, {content['model']!r}, is unknown; update zoomjax")
+    model = models[content["model"]]
+    fields = {}
+    for field in dataclasses.fields(model):
+        if field.metadata.get("static"):
+            fields[field.name] = content[field.name]
+        else:
+            shape = {"parameters": (None, None), "knots": (None,), "curvature": (None, None)}
+            fields[field.name] = _array(content, field.name, shape.get(field.name, ()))
+    for name in ("focal_ref", "crossover"):
+        if name in fields and not fields[name] > 0:
+            raise ValueError(f"its {name} is not positive")
+    return model(**fields)
+
+
+def _plain(value):
+    return _numbers(value) if eqx.is_array_like(value) and not isinstance(value, bool | int) else value
 
 
 def _numbers(array):
@@ -197,6 +227,6 @@ def _array(content, name, shape):
     matches = array.ndim == len(shape) and all(
         want in (None, have) for want, have in zip(shape, array.shape, strict=True)
     )
-    if not matches or not np.isfinite(array).all():
+    if not matches or not array.size or not np.isfinite(array).all():
         raise ValueError(f"the numbers of its {name!r} are incomplete or not finite")
     return jnp.asarray(array, jnp.result_type(float))

@@ -105,13 +105,7 @@ class PolynomialZoom(AbstractLinearZoom):
     def prepare(self, focal: Focal, terms: int) -> "PolynomialZoom":
         """Zero polynomials about the shortest focal length."""
         if not traced(focal):
-            distinct = np.unique(np.asarray(focal)).size
-            if distinct <= self.degree:
-                raise ValueError(
-                    f"A polynomial of degree {self.degree} in 1/f needs lines at {self.degree + 1} "
-                    f"or more distinct focal lengths, but there are {distinct}. Lower the degree, or "
-                    "add images at other focal lengths."
-                )
+            check_distinct(f"A polynomial of degree {self.degree} in 1/f", focal, self.degree + 1)
             focal = np.asarray(focal)  # its minimum then compiles nothing
         return PolynomialZoom(
             degree=self.degree,
@@ -122,12 +116,23 @@ class PolynomialZoom(AbstractLinearZoom):
     def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:
         """``(1, u, ..., u^n)`` with ``u = focal_ref/f``."""
         if self.focal_ref is None:
-            raise ValueError(_UNFITTED)
+            raise ValueError(UNFITTED)
         u = self.focal_ref / focal
         return jnp.stack([u**j for j in range(self.degree + 1)])
 
 
-_UNFITTED = (
+def check_distinct(what: str, focal: Focal, least: int) -> None:
+    """Raise ValueError where there are fewer distinct focal lengths than a model needs."""
+    distinct = np.unique(np.asarray(focal)).size
+    if distinct < least:
+        raise ValueError(
+            f"{what} needs lines at {least} or more distinct focal lengths, but there are {distinct}. "
+            "Choose a model with fewer parameters (a lower degree, say), or add images at other focal "
+            "lengths."
+        )
+
+
+UNFITTED = (
     "This zoom model has been specified but not fitted: pass it to fit_zoom(lines, zoom=...), and "
     "use the model in the result, fit.lens.zoom."
 )
@@ -135,5 +140,5 @@ _UNFITTED = (
 
 def _fitted(zoom: AbstractZoom) -> PyTree:
     if zoom.parameters is None:
-        raise ValueError(_UNFITTED)
+        raise ValueError(UNFITTED)
     return zoom.parameters

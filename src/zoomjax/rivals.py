@@ -1,0 +1,264 @@
+"""The zoom models that the paper names as rivals of its polynomial, behind the same interface.
+
+Look-up tables [25], splines, a power law (eq. 4, [14]) and polynomials in two regions (eq. 5, [30]). All
+but the power law are linear in their parameters: they state a basis, and share the polynomial's solver.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, ScalarLike
+
+from ._checks import checked_integer
+from ._types import AnyArray, Coefficients, Focal, Scalar, traced
+from .zoom import UNFITTED, AbstractLinearZoom, AbstractZoom, check_distinct
+
+
+def _checked_number(number):
+    return None if number is None else checked_integer("number", number, 1)
+
+
+class TableZoom(AbstractLinearZoom):
+    """A look-up table: coefficients stored at some focal lengths and interpolated linearly in between [25].
+
+    Beyond its ends a table is constant.
+
+    Attributes:
+        number: of entries, spread over the focal lengths fitted; None for one at each of them, which then
+            is frame by frame, interpolated.
+        inverse: whether to interpolate in 1/f, or in f.
+        parameters: the entries; None until fitted.
+        knots: 1/f, or f, of the entries, increasing.
+
+    References:
+        [25] of the paper.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> table = TableZoom(parameters=jnp.array([[0.1], [0.2]]), knots=jnp.array([1 / 50, 1 / 25]))
+        >>> round(float(table(jnp.array(40.0))[0]), 4)
+        0.125
+    """
+
+    number: int | None = eqx.field(static=True, default=None, converter=_checked_number)
+    inverse: bool = eqx.field(static=True, default=True)
+    parameters: Float[AnyArray, "basis terms"] | None = None
+    knots: Float[AnyArray, "basis"] | None = None
+
+    def prepare(self, focal: Focal, terms: int) -> "TableZoom":
+        """A table of zeros, its entries at focal lengths that are there."""
+        knots = _spread(1 / focal if self.inverse else focal, self.number, "A table")
+        zeros = _zeros(knots.shape[0], terms, knots.dtype)
+        return TableZoom(number=self.number, inverse=self.inverse, parameters=zeros, knots=knots)
+
+    def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:
+        """Hats: 1 at one entry, falling to 0 at its neighbours."""
+        knots = _prepared(self.knots)
+        x = 1 / jnp.asarray(focal) if self.inverse else jnp.asarray(focal)
+        index, share, _ = _place(knots, jnp.clip(x, knots[0], knots[-1]))
+        return _two(knots, index, 1 - share, share)
+
+
+class SplineZoom(AbstractLinearZoom):
+    """A natural cubic spline in 1/f for each coefficient, through values at its knots.
+
+    Beyond its ends it continues along a straight line in 1/f.
+
+    Attributes:
+        number: of knots, spread over the focal lengths fitted; None for one at each of them.
+        parameters: the values at the knots; None until fitted.
+        knots: 1/f of the knots, increasing.
+        curvature: from the values at the knots to the spline's second derivatives there.
+    """
+
+    number: int | None = eqx.field(static=True, default=None, converter=_checked_number)
+    parameters: Float[AnyArray, "basis terms"] | None = None
+    knots: Float[AnyArray, "basis"] | None = None
+    curvature: Float[AnyArray, "basis basis"] | None = None
+
+    def prepare(self, focal: Focal, terms: int) -> "SplineZoom":
+        """A spline of zeros, its knots at focal lengths that are there."""
+        knots = _spread(1 / focal, self.number, "A spline")
+        zeros = _zeros(knots.shape[0], terms, knots.dtype)
+        curvature = _natural_curvature(knots)
+        return SplineZoom(number=self.number, parameters=zeros, knots=knots, curvature=curvature)
+
+    def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:
+        """The cardinal splines: 1 at one knot, 0 at the others."""
+        knots = _prepared(self.knots)
+        x = 1 / jnp.asarray(focal)
+        end = jnp.clip(x, knots[0], knots[-1])
+        value, slope = jax.jvp(self._within, (end,), (jnp.ones_like(end),))
+        return value + (x - end) * slope
+
+    def _within(self, x: Float[Array, ""]) -> Float[Array, "basis"]:
+        knots, curvature = _prepared(self.knots), _prepared(self.curvature)
+        index, share, width = _place(knots, x)
+        bent = _two(knots, index, (1 - share) ** 3 - (1 - share), share**3 - share)
+        return _two(knots, index, 1 - share, share) + width**2 / 6 * (bent @ curvature)
+
+
+class PowerZoom(AbstractZoom):
+    """A power law for each coefficient, ``k = d0 + d1 c^d2`` with ``c = f / focal_ref`` (eq. 4, [14]).
+
+    [14] uses it for k1 alone: ``fit_zoom(lines, zoom=PowerZoom(), terms=1)``.
+
+    Attributes:
+        parameters: rows d0, d1, d2; None until fitted.
+        focal_ref: the shortest focal length fitted.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> law = PowerZoom(jnp.array([[0.01], [0.1], [-2.0]]), jnp.array(20.0))
+        >>> round(float(law(jnp.array(40.0))[0]), 4)
+        0.035
+    """
+
+    parameters: Float[AnyArray, "3 terms"] | None = None
+    focal_ref: Scalar | None = None
+
+    def prepare(self, focal: Focal, terms: int) -> "PowerZoom":
+        """No distortion, with an exponent to start from that lenses have."""
+        if not traced(focal):
+            check_distinct("A power law", focal, 3)
+        focal = jnp.asarray(focal)
+        start = _zeros(3, terms, focal.dtype).at[2].set(-2)
+        return PowerZoom(parameters=start, focal_ref=jnp.min(focal))
+
+    def __call__(self, focal: ScalarLike) -> Coefficients:
+        """The coefficients at one focal length."""
+        constant, factor, exponent = _prepared(self.parameters)
+        c = jnp.broadcast_to(jnp.asarray(focal) / _prepared(self.focal_ref), exponent.shape)
+        return constant + factor * c**exponent
+
+
+class TwoRegionZoom(AbstractLinearZoom):
+    """Quadratics in 1/f, one where the lens is barrel and one where it is pincushion (eq. 5, [30]).
+
+    The transcript's exponent -2 in eq. 5 is evidently a misprint for 2. [30] has k1 alone: ``terms=1``.
+    The two need not meet: as published, the coefficients jump where the regions do.
+
+    Attributes:
+        crossover: the focal length that separates the regions; see `barrel_crossover`.
+        parameters: rows c0, c1, c2 (of ``u^j``, ``u = focal_ref / f``) below the crossover, then above it.
+        focal_ref: the shortest focal length fitted.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> parameters = jnp.array([[0.1], [0.0], [0.0], [-0.2], [0.0], [0.0]])
+        >>> zoom = TwoRegionZoom(jnp.array(35.0), parameters, jnp.array(20.0))
+        >>> float(zoom(jnp.array(24.0))[0]) > 0 > float(zoom(jnp.array(50.0))[0])
+        True
+    """
+
+    crossover: Scalar | None = eqx.field(
+        default=None, converter=lambda f: None if f is None else jnp.asarray(f)
+    )
+    parameters: Float[AnyArray, "6 terms"] | None = None
+    focal_ref: Scalar | None = None
+
+    def prepare(self, focal: Focal, terms: int) -> "TwoRegionZoom":
+        """Zero polynomials in both regions."""
+        if self.crossover is None:
+            raise ValueError(
+                "A TwoRegionZoom needs the focal length that separates its regions: with each = "
+                "fit_frames(lines), TwoRegionZoom(barrel_crossover(lines.focal, each.coefficients[:, 0]))."
+            )
+        focal = jnp.asarray(focal)
+        if not traced((focal, self.crossover)):
+            below = np.asarray(focal < self.crossover)
+            for side in (below, ~below):
+                check_distinct("Each region of a TwoRegionZoom", np.asarray(focal)[side], 3)
+        return TwoRegionZoom(
+            crossover=self.crossover.astype(focal.dtype),
+            parameters=_zeros(6, terms, focal.dtype),
+            focal_ref=jnp.min(focal),
+        )
+
+    def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:
+        """``(1, u, u^2)`` in the region of this focal length, zero in the other."""
+        u = _prepared(self.focal_ref) / jnp.asarray(focal)
+        powers = jnp.stack([jnp.ones_like(u), u, u * u])
+        below = jnp.asarray(focal) < _prepared(self.crossover)
+        return jnp.concatenate([jnp.where(below, powers, 0), jnp.where(below, 0, powers)])
+
+
+def barrel_crossover(focal: Focal, k1: Float[AnyArray, "frame"]) -> float:
+    """The focal length at which k1 changes its sign: where barrel distortion turns into pincushion.
+
+    Args:
+        focal: focal length of each frame.
+        k1: first coefficient of each frame by itself, ``fit_frames(lines).coefficients[:, 0]``.
+
+    Returns:
+        The zero of k1, interpolated linearly in 1/f; that of the shortest focal length if there are more.
+
+    Raises:
+        ValueError: k1 has one sign throughout.
+    """
+    order = np.argsort(1 / np.asarray(focal))[::-1]
+    inverse, value = 1 / np.asarray(focal)[order], np.asarray(k1)[order]
+    changes = np.flatnonzero(value[:-1] * value[1:] < 0)
+    if not changes.size:
+        raise ValueError("k1 has one sign throughout: one region is enough, PolynomialZoom(degree=2).")
+    i = changes[0]
+    share = value[i] / (value[i] - value[i + 1])
+    return float(1 / (inverse[i] + share * (inverse[i + 1] - inverse[i])))
+
+
+def _spread(values: Float[AnyArray, "frame"], number: int | None, what: str) -> AnyArray:
+    """`number` of the distinct values, or all, increasing and spread evenly over their ranks."""
+    if traced(values):
+        ordered = jnp.sort(values)
+    else:
+        ordered = np.unique(np.asarray(values))
+        check_distinct(what, ordered, number or 1)
+    if number is None:
+        return ordered
+    return ordered[np.round(np.linspace(0, ordered.shape[0] - 1, number)).astype(int)]
+
+
+def _zeros(rows: int, terms: int, dtype: np.dtype) -> Float[Array, "rows terms"]:
+    return jnp.asarray(np.zeros((rows, terms), dtype))
+
+
+def _place(
+    knots: Float[AnyArray, "basis"], x: Float[Array, ""]
+) -> tuple[Int[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Index of the interval that x lies in, how far along it, from 0 to 1, and its width."""
+    knots = jnp.asarray(knots)
+    if knots.shape[0] == 1:
+        return jnp.asarray(0), jnp.zeros_like(x), jnp.ones_like(x)
+    index = jnp.clip(jnp.searchsorted(knots, x) - 1, 0, knots.shape[0] - 2)
+    width = knots[index + 1] - knots[index]
+    known: Bool[Array, ""] = width > 0  # knots that coincide, as they may under a trace
+    return index, jnp.where(known, x - knots[index], 0) / jnp.where(known, width, 1), width
+
+
+def _two(knots, index, first, second) -> Float[Array, "basis"]:
+    """A vector with two values, at the ends of an interval."""
+    vector = jnp.zeros(knots.shape[0], jnp.result_type(first)).at[index].add(first)
+    return vector.at[index + 1].add(second)  # beyond the only knot of a table of one: dropped
+
+
+def _natural_curvature(knots: Float[AnyArray, "basis"]) -> Float[Array, "basis basis"]:
+    """The matrix from values at the knots to the natural spline's second derivatives there."""
+    knots = jnp.asarray(knots)
+    size = knots.shape[0]
+    if size < 3:
+        return jnp.zeros((size, size), knots.dtype)
+    width = jnp.diff(knots)
+    inner = jnp.arange(size - 2)
+    bands = jnp.zeros((size - 2, size), knots.dtype)
+    system = bands.at[inner, inner].set(width[:-1] / 6).at[inner, inner + 2].set(width[1:] / 6)
+    system = system.at[inner, inner + 1].set((width[:-1] + width[1:]) / 3)
+    second = bands.at[inner, inner].set(1 / width[:-1]).at[inner, inner + 2].set(1 / width[1:])
+    second = second.at[inner, inner + 1].set(-1 / width[:-1] - 1 / width[1:])
+    return jnp.pad(jnp.linalg.solve(system[:, 1:-1], second), ((1, 1), (0, 0)))
+
+
+def _prepared(value):
+    if value is None:
+        raise ValueError(UNFITTED)
+    return value
