@@ -9,7 +9,7 @@ import zoomjax
 
 # From the inside out: a module may import from layers before its own. Packages count as one module.
 LAYERS = (
-    {"_types", "_files", "_checks"},
+    {"_types", "_files", "_checks", "_linear"},
     {"radial"},
     {"inverse"},
     {"zoom"},
@@ -22,6 +22,7 @@ LAYERS = (
     {"_solver", "compression"},
     {"algebraic"},
     {"fit"},
+    {"robust"},
     {"synthetic", "metrics", "io"},
     {"plot"},
     {"calibration"},

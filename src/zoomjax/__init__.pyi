@@ -30,6 +30,8 @@ from .rivals import SplineZoom as SplineZoom
 from .rivals import TableZoom as TableZoom
 from .rivals import TwoRegionZoom as TwoRegionZoom
 from .rivals import barrel_crossover as barrel_crossover
+from .robust import RobustFit as RobustFit
+from .robust import fit_robust as fit_robust
 from .vision.undistort import undistort_image as undistort_image
 from .warp import warp_image as warp_image
 from .zoom import AbstractLinearZoom as AbstractLinearZoom

@@ -155,7 +155,7 @@ def fit_zoom(
         True
     """
     _check_lines(lines)
-    model, terms = _model(lines, PolynomialZoom() if zoom is None else zoom, terms)
+    model, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
     start = None
     if isinstance(model, AbstractLinearZoom) and (zoom is None or zoom.parameters is None):
         start = compressed(lines, terms)
@@ -163,7 +163,7 @@ def fit_zoom(
     return _thrown(*_fit_zoom(lines, start, model, terms, solver, max_steps), throw)
 
 
-def _model(lines, zoom, terms):
+def ready_model(lines, zoom, terms):
     """The model ready to be fitted to these lines, in their dtype, and its number of terms."""
     if not isinstance(zoom, AbstractZoom):
         raise TypeError(
@@ -284,7 +284,7 @@ def _fit_zoom(lines, start, zoom, terms, solver, max_steps):
     if start is not None:
         zoom = _with_parameters(zoom, algebraic_parameters(start, zoom, terms))
     zoom, result, steps = _minimise(lines, zoom, solver, max_steps)
-    weighted, jacobian = _linearised(lines, zoom)
+    weighted, jacobian = linearised(lines, zoom)
     errors = energy_by_frame(lines, weighted)
     covariance, determined = _covariance(lines, zoom, jacobian, jnp.mean(errors))
     fit = ZoomFit(
@@ -339,7 +339,7 @@ def _minimise(lines, zoom, solver, max_steps):
     return _with_parameters(zoom, solution.value), solution.result, solution.stats["num_steps"]
 
 
-def _linearised(lines, zoom):
+def linearised(lines, zoom):
     """The residuals and their derivatives by the flattened parameters, a row a residual."""
     flat, unravel = ravel_pytree(zoom.parameters)
 

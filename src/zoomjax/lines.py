@@ -11,6 +11,7 @@ import math
 import os
 import warnings
 from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -28,10 +29,12 @@ from ._checks import (
     checked_unit,
 )
 from ._files import whole_file
-from ._types import AnyArray, Focal, FrameIndex, LineNumber, Mask, Point, traced
+from ._types import AnyArray, Focal, FrameIndex, LineNumber, LineWeight, Mask, Point, traced
 from .radial import radial_factor
 
 _FORMAT, _VERSION = "zoomjax.lines", 1
+
+SomeLines = TypeVar("SomeLines", bound="AbstractLines")
 
 
 class AbstractLines(eqx.Module):
@@ -42,6 +45,7 @@ class AbstractLines(eqx.Module):
     centre: eqx.AbstractVar[Point]
     image_size: eqx.AbstractVar[tuple[int, int]]
     focal_unit: eqx.AbstractVar[str]
+    weight: eqx.AbstractVar[LineWeight | None]
 
     @property
     def scale(self) -> float:
@@ -67,6 +71,22 @@ class AbstractLines(eqx.Module):
     @abc.abstractmethod
     def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "AbstractLines":
         """The chosen lines as a data set of one frame; those not `present` count as empty."""
+
+    def weighted(self: SomeLines, weight: ArrayLike) -> SomeLines:
+        """The same lines, each counting `weight` beside the others of its frame.
+
+        Raises:
+            ValueError: there is not one finite weight of at least 0 for each line.
+        """
+        weight = jnp.asarray(weight, jnp.asarray(self.focal).dtype)
+        if weight.shape != self.frame.shape:
+            raise ValueError(
+                f"Argument weight must hold one number for each of the {self.frame.shape[0]} lines, but "
+                f"its shape is {weight.shape}."
+            )
+        if not traced(weight) and not (np.isfinite(weight) & (np.asarray(weight) >= 0)).all():
+            raise ValueError("Argument weight must hold finite numbers of at least 0, but it does not.")
+        return eqx.tree_at(lambda lines: lines.weight, self, weight, is_leaf=lambda leaf: leaf is None)
 
     def by_frame(self) -> tuple[Int[AnyArray, "frame some"], Bool[AnyArray, "frame some"]]:
         """For each frame the indices of its lines, padded to the fullest frame, and which are real.
@@ -102,6 +122,7 @@ class Lines(AbstractLines):
         image_size: (width, height) px.
         focal_unit: "mm" or "px".
         number: position of each line among those that `from_ragged` was given; None if unknown.
+        weight: how much each line counts beside the others of its frame, at least 0; None for all alike.
     """
 
     points: Float[AnyArray, "line point 2"]
@@ -112,6 +133,7 @@ class Lines(AbstractLines):
     image_size: tuple[int, int] = eqx.field(static=True)
     focal_unit: str = eqx.field(static=True, default="mm")
     number: LineNumber | None = None
+    weight: LineWeight | None = None
 
     def __check_init__(self):
         """Check that the shapes agree."""
@@ -236,9 +258,11 @@ class Lines(AbstractLines):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all fields, in their dtypes, to a ``.npz`` file that `load_lines` reads."""
+        fields: dict[str, Any] = {} if self.weight is None else {"weight": np.asarray(self.weight)}
         with whole_file(path) as part, part.open("wb") as file:
             np.savez(
                 file,
+                **fields,
                 format=_FORMAT,
                 version=_VERSION,
                 points=np.asarray(self.points)[np.asarray(self.mask)],
@@ -283,6 +307,7 @@ class Lines(AbstractLines):
             image_size=self.image_size,
             focal_unit=self.focal_unit,
             number=None if self.number is None else self.number[lines],
+            weight=None if self.weight is None else self.weight[lines],
         )
 
 
@@ -313,7 +338,7 @@ def load_lines(path: str | os.PathLike[str]) -> Lines:
         points, counts = stored["points"], stored["counts"]
         if counts.min(initial=0) < 0 or counts.sum() != len(points):
             raise ValueError("its points and counts disagree")
-        return Lines.from_ragged(
+        lines = Lines.from_ragged(
             np.split(points, np.cumsum(counts)[:-1]),
             stored["frame"],
             stored["focal"],
@@ -321,6 +346,7 @@ def load_lines(path: str | os.PathLike[str]) -> Lines:
             focal_unit=str(stored["focal_unit"]),
             centre=stored["centre"],
         )
+        return lines.weighted(stored["weight"][lines.number]) if "weight" in stored else lines
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
         raise ValueError(f"Cannot read lines from {os.fspath(path)}: {reason}.") from error
