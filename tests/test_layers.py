@@ -21,6 +21,7 @@ LAYERS = (
     {"positions", "warp"},
     {"_solver", "compression"},
     {"algebraic"},
+    {"uncertainty"},
     {"fit"},
     {"robust"},
     {"synthetic", "metrics", "io"},

@@ -20,7 +20,7 @@ from .compression import CompressedLines, compress
 from .energy import line_weights
 from .lens import ZoomLens, lens_of
 from .lines import AbstractLines, Lines
-from .zoom import AbstractLinearZoom, PolynomialZoom
+from .zoom import AbstractLinearZoom, PolynomialZoom, with_parameters
 
 
 def compressed(lines: AbstractLines, terms: int) -> CompressedLines:
@@ -88,7 +88,7 @@ def algebraic_frames(lines: AbstractLines, *, terms: int = 2) -> Float[Array, "f
 @eqx.filter_jit
 def _solve_zoom(lines, zoom, terms):
     parameters = algebraic_parameters(lines, zoom, terms)
-    return lens_of(lines, eqx.tree_at(lambda model: model.parameters, zoom, parameters))
+    return lens_of(lines, with_parameters(zoom, parameters))
 
 
 @eqx.filter_jit

@@ -9,7 +9,6 @@ would waste 27 times the memory on the paper's data). Compressed lines are in `c
 import abc
 import math
 import os
-import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
@@ -27,6 +26,8 @@ from ._checks import (
     checked_points,
     checked_size,
     checked_unit,
+    usable_lines,
+    warn_of_points_outside,
 )
 from ._files import whole_file
 from ._types import AnyArray, Focal, FrameIndex, LineNumber, LineWeight, Mask, Point, traced
@@ -189,7 +190,7 @@ class Lines(AbstractLines):
         frames = checked_frames(frame, len(arrays), focals.size)
         number = np.arange(len(arrays))
         if not chunk:
-            number = _usable(arrays, frames, focals.size)
+            number = usable_lines(arrays, frames, focals.size)
             arrays, frames = [arrays[index] for index in number], frames[number]
 
         dtype = np.result_type(*arrays)
@@ -198,7 +199,7 @@ class Lines(AbstractLines):
         for row, line in zip(padded, arrays, strict=True):
             row[: len(line)] = line
         mask = np.arange(max(counts)) < counts[:, None]
-        _warn_of_points_outside(padded, mask, size)
+        warn_of_points_outside(padded, mask, size)
         return cls(
             points=_held_as_given(padded),
             mask=jnp.asarray(mask),
@@ -366,52 +367,8 @@ def _read_archive(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             raise ValueError(f"Cannot read lines from {os.fspath(path)}: {reason}.") from error
 
 
-def _usable(arrays: list[np.ndarray], frames: np.ndarray, number_of_frames: int) -> np.ndarray:
-    """Positions of the lines with 3 or more distinct points, of which every frame must have one."""
-    usable = np.array([_has_three_distinct(line) for line in arrays], bool)
-    if not usable.any():
-        raise ValueError(f"No usable line: none of the {len(arrays)} lines has 3 or more distinct points.")
-    if not usable.all():
-        warnings.warn(
-            f"Dropped {np.sum(~usable)} of {len(arrays)} lines: they have fewer than 3 distinct "
-            "points, which says nothing about straightness.",
-            stacklevel=3,
-        )
-    empty = np.setdiff1d(np.arange(number_of_frames), frames[usable])
-    if empty.size:
-        raise ValueError(
-            f"No line in {empty.size} of {number_of_frames} frames (the first are "
-            f"{', '.join(map(str, empty[:5]))}). Leave those frames out of frame and focal."
-        )
-    return np.flatnonzero(usable)
-
-
-def _warn_of_points_outside(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -> None:
-    """Points far outside of the image mean a wrong image size, and with it a wrong centre and scale."""
-    beyond = np.max(
-        np.maximum(-points, points - (np.array(size) - 1)), axis=-1, where=mask[..., None], initial=0
-    )
-    outside = beyond > 0.01 * max(size)  # noise alone takes a few points some px out
-    if outside.any():
-        warnings.warn(
-            f"{np.sum(outside):,} of {np.sum(mask):,} points lie outside of the image of {size[0]} x "
-            f"{size[1]} px, by up to {np.max(beyond):.3g} px. Is image_size (width, height) right?",
-            stacklevel=3,
-        )
-
-
 def _held_as_given(array: np.ndarray) -> AnyArray:
     """A JAX array, unless that would change the values' dtype."""
     if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
         return jnp.asarray(array)
     return array
-
-
-def _has_three_distinct(line: np.ndarray) -> bool:
-    if len(line) < 3:
-        return False
-    from_first = (line != line[0]).any(axis=1)
-    if not from_first.any():
-        return False
-    second = line[np.argmax(from_first)]
-    return bool((from_first & (line != second).any(axis=1)).any())

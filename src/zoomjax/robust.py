@@ -26,7 +26,7 @@ from .algebraic import algebraic_zoom
 from .energy import line_residuals
 from .fit import ZoomFit, fit_zoom, linearised, ready_model
 from .lines import AbstractLines
-from .zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom
+from .zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
 
 _CUT = 6.0  # standard deviations of r among good lines, were they normal
 _NARROWING = (np.inf, 24.0, 16.0, 10.0, *(_CUT,) * 4)  # c of each turn
@@ -99,7 +99,7 @@ def _reweighted(lines, start):
         flat, unravel = ravel_pytree(model.parameters)
         matrix = jacobian.reshape(-1, flat.size)
         step = least_squares(matrix, -residuals.reshape(-1), floor=0.0)
-        return eqx.tree_at(lambda zoom: zoom.parameters, model, unravel(flat + step)), None
+        return with_parameters(model, unravel(flat + step)), None
 
     model, _ = jax.lax.scan(turn, start, jnp.asarray(_NARROWING, lines.focal.dtype))
     return lines.weighted(own * _weights(lines, model, _CUT)), model
