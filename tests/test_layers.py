@@ -17,7 +17,7 @@ LAYERS = (
     {"energy"},
     {"lens"},
     {"framing"},
-    {"positions", "warp"},
+    {"positions", "warp", "sizes"},
     {"_solver", "compression"},
     {"algebraic"},
     {"fit"},
