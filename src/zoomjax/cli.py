@@ -105,28 +105,33 @@ def undistort(
     focal: Annotated[
         str | None,
         typer.Option(
-            help="A focal length, or a CSV: time,focal or frame,focal of a video, file,focal of photos. "
-            "Photos have it in their EXIF data, too."
+            help="A focal length, or a CSV: time,focal or frame,focal of a video, image,focal of photos. "
+            "Without it, photos' EXIF data tell."
         ),
     ] = None,
     keep: Annotated[
         str, typer.Option(help="What to show: same, all or valid; one framing for all of a zoom.")
     ] = "same",
     interpolation: Annotated[str, typer.Option(help="nearest, linear, cubic or lanczos.")] = "linear",
+    border: Annotated[
+        str, typer.Option(help="What lies beyond the image: constant (black), replicate or reflect.")
+    ] = "constant",
     hold: Annotated[
         bool, typer.Option("--hold", help="Hold the first and last focal length beyond a track's ends.")
     ] = False,
 ) -> None:
     """Correct photos, or a video, each at its own focal length."""
+    import signal
+
     import jax
 
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # and leave no half file
     jax.config.update("jax_enable_x64", True)
     from .vision.files import Job, undistort_files
 
     with _progress() as progress:
         done = undistort_files(
-            Job(lens, tuple(inputs), output, focal, keep=keep, interpolation=interpolation, hold=hold),
-            progress,
+            Job(lens, tuple(inputs), output, focal, keep, interpolation, border, hold), progress
         )
     print(done)
 
@@ -135,12 +140,19 @@ def undistort(
 def _progress() -> Iterator[Callable[[int, int], None]]:
     """A function of what is done and of how much (0: unknown), shown as a bar on stderr."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total or None)
+    console = Console(stderr=True)
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=None, rate="")
+
+        def show(done: int, total: int) -> None:
+            speed = bar.tasks[0].speed
+            rate = f"{speed:.1f} per s" if speed else ""
+            bar.update(task, completed=done, total=total or None, rate=rate)
+
+        yield show
 
 
 def _start(output: Path) -> Path:

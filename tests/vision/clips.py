@@ -64,6 +64,22 @@ def write_clip(path, frames=FRAMES, *, encoder="libx264", pixels="yuv420p", vari
     return path
 
 
+def write_still(path, frames):
+    """One picture over and over, as a video of any length at no cost."""
+    one = write_clip(path.with_name("one.mkv"), 1, encoder="ffv1", sound=False)
+    with av.open(str(one)) as given, av.open(str(path), "w") as out:
+        [packet] = [p for p in given.demux(video=0) if p.size]
+        stream = out.add_stream_from_template(given.streams.video[0])
+        content = bytes(packet)
+        for number in range(frames):
+            again = av.Packet(content)
+            again.stream, again.pts, again.dts = stream, 33 * number, 33 * number
+            again.time_base, again.is_keyframe = packet.time_base, True
+            out.mux(again)
+    one.unlink()
+    return path
+
+
 def bend(grey):
     """The farthest that the edges of a picture lie from their own straight lines, px."""
     farthest = 0.0

@@ -78,7 +78,7 @@ def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> Foc
         ValueError: the file is something else; the message names it and the line.
     """
     try:
-        with Path(path).open(newline="", encoding="utf-8") as file:
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
             rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
     except UnicodeDecodeError as error:
         raise ValueError(f"Cannot read a focal track from {os.fspath(path)}: it is not text.") from error

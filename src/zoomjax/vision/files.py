@@ -8,7 +8,8 @@ from pathlib import Path
 from ..framing import frame_output
 from ..io.focal_track import read_focal_track
 from ..lens import ZoomLens, load_lens
-from .photos import SUFFIXES, exif_focal, read_photo, undistort_photo
+from .photos import SUFFIXES, photo_focal, undistort_photo
+from .undistort import check_sampling
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Job:
         inputs: photos, or one video.
         output: file for one input, else a folder.
         focal: a number, a CSV file, or None for the photos' own.
-        keep, interpolation: as for `undistort_image`; one framing for all photos of a size.
+        keep, interpolation, border: as for `undistort_image`; one framing for all photos.
         hold: whether a track's ends hold.
     """
 
@@ -30,6 +31,7 @@ class Job:
     focal: str | None = None
     keep: str = "same"
     interpolation: str = "linear"
+    border: str = "constant"
     hold: bool = False
 
 
@@ -40,6 +42,7 @@ def undistort_files(job: Job, progress: Callable[[int, int], None] = lambda done
         OSError, ValueError: as `undistort_photo` and `undistort_video` do. Photos before the one with the
             error have been written, each whole.
     """
+    check_sampling(job.interpolation, job.border)
     lens = load_lens(job.lens)
     photos = [path for path in job.inputs if path.suffix.lower() in SUFFIXES]
     if photos and len(photos) < len(job.inputs):
@@ -70,6 +73,7 @@ def _video(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> st
         focal=focal,
         keep=job.keep,
         interpolation=job.interpolation,
+        border=job.border,
         progress=progress,
     )
     return f"{done.frames} frames corrected, scale {done.scale:.4f}: {target}"
@@ -101,22 +105,16 @@ def _photos(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> s
 
 def _photo_focal(job: Job, lens: ZoomLens, path: Path) -> float:
     if job.focal is None:
-        focal = exif_focal(read_photo(path)[1]) if lens.focal_unit == "mm" else None
-        if focal is None:
-            raise ValueError(
-                f"The focal length of {path} is not known: its EXIF data have none in {lens.focal_unit}. "
-                "Give --focal, a number or a CSV file with file,focal."
-            )
-        return focal
+        return photo_focal(path, lens)
     number = _number(job.focal)
     if number is not None:
         return number
-    with open(job.focal, newline="", encoding="utf-8") as file:
+    with open(job.focal, newline="", encoding="utf-8-sig") as file:
         rows = list(csv.DictReader(file))
-    if not rows or not {"file", "focal"} <= set(rows[0]):
-        raise ValueError(f'Cannot read focal lengths from {job.focal}: its columns must be "file,focal".')
-    table = {Path(row["file"]).name: row["focal"] for row in rows}
-    if path.name not in table or _number(table[path.name] or "") is None:
+    if not rows or not {"image", "focal"} <= set(rows[0]):
+        raise ValueError(f'Cannot read focal lengths from {job.focal}: its columns must be "image,focal".')
+    table = {Path(row["image"]).name: row["focal"] for row in rows}
+    if _number(table.get(path.name) or "") is None:
         raise ValueError(f"Cannot read focal lengths from {job.focal}: it has no number for {path.name}.")
     return float(table[path.name])
 

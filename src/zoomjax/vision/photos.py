@@ -1,7 +1,11 @@
-"""Photographs from file to file, corrected at the focal length in their EXIF data, metadata kept."""
+"""Photographs from file to file, corrected at the focal length in their EXIF data, metadata kept.
+
+Pixels are taken as they are stored, before the orientation tag turns them: that is how the lens saw them.
+The tag goes over with the other metadata, so that the result is shown the same way up.
+"""
 
 import os
-import struct
+import warnings
 from pathlib import Path
 
 import cv2
@@ -9,48 +13,32 @@ import numpy as np
 
 from .._files import whole_file
 from ..framing import Framing
+from ..io.exif import exif_focal
 from ..lens import ZoomLens
 from ..sizes import lens_for_size
 from .undistort import undistort_image
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
+_FORMATS = {  # suffix: bits a sample, and numbers of channels, that the format holds
+    **dict.fromkeys([".jpg", ".jpeg"], ((8,), (1, 3))),
+    ".png": ((8, 16), (1, 3, 4)),
+    ".webp": ((8,), (3, 4)),
+    **dict.fromkeys([".tif", ".tiff"], ((8, 16, 32, 64), (1, 3, 4))),
+    ".bmp": ((8,), (1, 3, 4)),
+}
+SUFFIXES = tuple(_FORMATS)
 """Of files that count as photographs."""
 
-_FOCAL_LENGTH, _EXIF_FOLDER = 0x920A, 0x8769
-_LONG, _RATIONAL = 4, 5
+_OPTIONS = {
+    ".jpg": [
+        *(cv2.IMWRITE_JPEG_QUALITY, 97),
+        *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+    ],
+    ".webp": [cv2.IMWRITE_WEBP_QUALITY, 101],  # above 100: without loss
+}
+_OPTIONS[".jpeg"] = _OPTIONS[".jpg"]
 
-
-def read_photo(path: str | os.PathLike[str]) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
-    """The pixels as they were taken (any depth, not turned by the orientation tag), and the metadata.
-
-    Metadata are pairs of OpenCV's kind (EXIF, XMP, colour profile) and bytes; none from TIFF files.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it cannot be decoded.
-    """
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"There is no photograph {path}.")
-    kinds, blocks = [], []
-    if path.suffix.lower() in (".tif", ".tiff"):
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    else:
-        image, kinds, blocks = cv2.imreadWithMetadata(str(path), flags=cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise ValueError(f"Cannot read a photograph from {path}: it is damaged, or of an unknown format.")
-    return image, list(zip(map(int, kinds), blocks, strict=True))
-
-
-def exif_focal(metadata: list[tuple[int, np.ndarray]]) -> float | None:
-    """The focal length, mm, that the camera wrote; None if it wrote none."""
-    for kind, block in metadata:
-        if kind == cv2.IMAGE_METADATA_EXIF:
-            try:
-                return _exif_rational(np.asarray(block, np.uint8).tobytes())
-            except struct.error:
-                return None
-    return None
+_NO_METADATA = (".tif", ".tiff", ".bmp")
+"""Formats whose metadata OpenCV neither reads nor writes."""
 
 
 def undistort_photo(
@@ -61,45 +49,96 @@ def undistort_photo(
     focal: float | int | None = None,
     keep: str | Framing = "same",
     interpolation: str = "linear",
+    border: str = "constant",
 ) -> None:
     """Correct a photograph into a new file, with its metadata.
 
     Args:
-        source: the photograph; all its bits are kept.
+        source: the photograph: JPEG, PNG, WebP, TIFF or BMP. All its bits and channels are kept.
         target: the file to write, all of it or none. Its suffix tells the format; JPEG in quality 97.
         lens: the lens; for another size of the same aspect ratio it is scaled.
         focal: in the lens's unit; by default what the EXIF data say.
-        keep, interpolation: as for `undistort_image`.
+        keep, interpolation, border: as for `undistort_image`.
 
     Raises:
         FileNotFoundError: there is no such photograph.
         OSError: the target cannot be written; nothing is left of it.
         ValueError: the photograph cannot be decoded, tells no focal length, or has another aspect ratio
-            than the lens; or the target's suffix is unknown.
+            than the lens; or the target's suffix is unknown, or its format does not hold such pixels.
+
+    Warns:
+        UserWarning: as `undistort_image` and `ZoomLens` do; or metadata are lost, as TIFF's are.
     """
     target = Path(target)
-    if target.suffix.lower() not in SUFFIXES:
+    suffix = target.suffix.lower()
+    if suffix not in _FORMATS:
         raise ValueError(
             f"Argument target must end in one of {', '.join(SUFFIXES)}, but it is {target.name!r}."
         )
-    image, metadata = read_photo(source)
+    image, metadata = _read(Path(source))
+    bits, channels = 8 * image.dtype.itemsize, 1 if image.ndim == 2 else image.shape[2]
+    if bits not in _FORMATS[suffix][0] or channels not in _FORMATS[suffix][1]:
+        raise ValueError(
+            f"Cannot write {channels} channels of {bits} bits, as in {os.fspath(source)}, to a {suffix} "
+            "file: choose .png or .tif."
+        )
     if focal is None:
-        focal = exif_focal(metadata) if lens.focal_unit == "mm" else None
-        if focal is None:
-            raise ValueError(
-                f"The focal length of {os.fspath(source)} is not known: its EXIF data have none in "
-                f"{lens.focal_unit}. Give it (--focal)."
-            )
+        focal = photo_focal(source, lens)
     lens = lens_for_size(lens, (image.shape[1], image.shape[0]))
-    corrected = undistort_image(image, lens(focal), keep=keep, interpolation=interpolation)
+    corrected = undistort_image(image, lens(focal), keep=keep, interpolation=interpolation, border=border)
+    lost = Path(source).suffix.lower() in (".tif", ".tiff") or (metadata and suffix in _NO_METADATA)
+    if lost:
+        warnings.warn(
+            f"Metadata of {os.fspath(source)} are not kept: OpenCV has none of TIFF and BMP files.",
+            stacklevel=2,
+        )
     with whole_file(target) as part:
-        part.write_bytes(_encoded(corrected, target.suffix.lower(), metadata))
+        part.write_bytes(_encoded(corrected, suffix, metadata))
+
+
+def photo_focal(source: str | os.PathLike[str], lens: ZoomLens) -> float:
+    """The focal length in a photograph's EXIF data, for a lens in mm.
+
+    Raises:
+        FileNotFoundError: there is no such photograph.
+        ValueError: it cannot be decoded or tells none, or the lens is in px.
+    """
+    focal = None
+    if lens.focal_unit == "mm":
+        path = Path(source)
+        _, metadata = _read(path)
+        blocks = [data.tobytes() for kind, data in metadata if kind == cv2.IMAGE_METADATA_EXIF]
+        if path.suffix.lower() in (".tif", ".tiff"):
+            blocks = [path.read_bytes()]
+        focal = next((exif_focal(block) for block in blocks), None)
+    if focal is None:
+        raise ValueError(
+            f"The focal length of {os.fspath(source)} is not known: its EXIF data have none in "
+            f"{lens.focal_unit}. Give it: --focal, a number or a CSV file image,focal."
+        )
+    return focal
+
+
+def _read(path: Path) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
+    """The pixels as stored, and metadata (EXIF, XMP, colour profile) as pairs of kind and bytes."""
+    if not path.exists():
+        raise FileNotFoundError(f"There is no photograph {path}.")
+    kinds, blocks = [], []
+    if path.suffix.lower() in _NO_METADATA:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    else:
+        image, kinds, blocks = cv2.imreadWithMetadata(str(path), flags=cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ValueError(f"Cannot read a photograph from {path}: it is damaged, or of an unknown format.")
+    return image, [
+        (int(kind), np.asarray(data, np.uint8)) for kind, data in zip(kinds, blocks, strict=True)
+    ]
 
 
 def _encoded(image: np.ndarray, suffix: str, metadata: list[tuple[int, np.ndarray]]) -> bytes:
-    options = [cv2.IMWRITE_JPEG_QUALITY, 97] if suffix in (".jpg", ".jpeg") else []
+    options = _OPTIONS.get(suffix, [])
     try:
-        if metadata and suffix not in (".tif", ".tiff", ".bmp"):
+        if metadata and suffix not in _NO_METADATA:
             kinds, blocks = zip(*metadata, strict=True)
             done, content = cv2.imencodeWithMetadata(suffix, image, list(kinds), list(blocks), options)
         else:
@@ -109,25 +148,3 @@ def _encoded(image: np.ndarray, suffix: str, metadata: list[tuple[int, np.ndarra
     if not done:
         raise ValueError(f"Cannot write an image of {image.dtype} and shape {image.shape} as {suffix}.")
     return content.tobytes()
-
-
-def _exif_rational(block: bytes) -> float | None:
-    """The focal length in a TIFF structure: first folder, EXIF folder, one fraction."""
-    block = block.removeprefix(b"Exif\0\0")
-    order = {b"II": "<", b"MM": ">"}.get(block[:2])
-    if order is None:
-        return None
-
-    def entries(offset):
-        (count,) = struct.unpack_from(f"{order}H", block, offset)
-        for i in range(count):
-            tag, kind, _, value = struct.unpack_from(f"{order}HHII", block, offset + 2 + 12 * i)
-            yield (tag, kind), value
-
-    (first,) = struct.unpack_from(f"{order}I", block, 4)
-    folder = dict(entries(first)).get((_EXIF_FOLDER, _LONG))
-    fraction = dict(entries(folder)).get((_FOCAL_LENGTH, _RATIONAL)) if folder else None
-    if fraction is None:
-        return None
-    above, below = struct.unpack_from(f"{order}II", block, fraction)
-    return above / below if above and below else None

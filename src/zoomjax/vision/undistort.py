@@ -81,12 +81,7 @@ def undistort_image(
         (4, 6)
     """
     _check_image(image)
-    for name, value, known in (
-        ("interpolation", interpolation, _INTERPOLATION),
-        ("border", border, _BORDER),
-    ):
-        if value not in known:
-            raise ValueError(f"Argument {name} must be one of {', '.join(known)}, but it is {value!r}.")
+    check_sampling(interpolation, border)
     height, width = image.shape[:2]
     if not isinstance(keep, Framing):
         keep = frame_output(distortion, (width, height), keep=keep, size=size)
@@ -230,6 +225,20 @@ def _farthest(centre: np.ndarray, origin: np.ndarray, size: tuple[int, int], sca
     """Distance, px, from the centre to the farthest pixel of a window."""
     last = origin + (np.array(size) - 1) / scale
     return float(np.hypot(*np.maximum(abs(origin - centre), abs(last - centre))))
+
+
+def check_sampling(interpolation: str, border: str) -> None:
+    """Refuse names that are not known.
+
+    Raises:
+        ValueError: an argument is none of those that `undistort_image` takes.
+    """
+    for name, value, known in (
+        ("interpolation", interpolation, _INTERPOLATION),
+        ("border", border, _BORDER),
+    ):
+        if value not in known:
+            raise ValueError(f"Argument {name} must be one of {', '.join(known)}, but it is {value!r}.")
 
 
 def _check_image(image) -> None:

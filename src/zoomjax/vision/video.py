@@ -29,7 +29,7 @@ from ..sizes import at_focal, check_focal, lens_for_size
 from .ahead import ahead
 from .encoding import CONTAINER, FrameWriter, display_matrix
 from .planes import FrameWarper
-from .undistort import warn_of_fold
+from .undistort import check_sampling, warn_of_fold
 
 _MOST_ERRORS = 1000
 """Of one file: a demuxer may fail for ever."""
@@ -91,6 +91,7 @@ def undistort_video(
         raise ValueError(
             f"Argument target must end in one of {', '.join(CONTAINER)}, but it is {target.name!r}."
         )
+    check_sampling(interpolation, border)
     with _opened(source) as input_, whole_file(target) as part:
         video = input_.streams.best("video")
         lens = lens_for_size(lens, (video.codec_context.width, video.codec_context.height))
