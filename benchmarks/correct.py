@@ -41,7 +41,9 @@ FLAGS = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}
 
 def zoom_lens(size: tuple[int, int]) -> zj.ZoomLens:
     """Corners move out by 12 % at 20 mm, in by 2 % at 80 mm."""
-    zoom = zj.PolynomialZoom(1, jnp.array([[-0.067, 0.013], [0.187, -0.013]]), jnp.array(20.0))
+    zoom = zj.PolynomialZoom(
+        degree=1, parameters=jnp.array([[-0.067, 0.013], [0.187, -0.013]]), focal_ref=jnp.array(20.0)
+    )
     return zj.ZoomLens(zoom, (jnp.array(size) - 1) / 2, jnp.array([20.0, 80.0]), size)
 
 
@@ -163,8 +165,9 @@ def write_clip(path: Path, frames: int) -> None:
             scale = 0.95 - 0.4 * number / frames
             affine = np.array([[scale * 2, 0, 1920 * (1 - scale)], [0, scale * 2, 1080 * (1 - scale)]])
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            view = av.VideoFrame.from_ndarray(cv2.warpAffine(big, affine, HD, flags=flags), "bgr24")
-            output.mux(stream.encode(view.reformat(format="yuv420p")))
+            view: Any = cv2.warpAffine(big, affine, HD, flags=flags)
+            frame = av.VideoFrame.from_ndarray(view, "bgr24")
+            output.mux(stream.encode(frame.reformat(format="yuv420p")))
         output.mux(stream.encode(None))
 
 
