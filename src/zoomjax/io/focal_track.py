@@ -75,7 +75,14 @@ def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> Foc
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is something else; the message names it and the line.
+        ValueError: the file is something else; the message names it.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "track.csv"
+        >>> _ = path.write_text("time,focal\\n0,20\\n10,60\\n")
+        >>> read_focal_track(path).at(125, 5.0)
+        30.0
     """
     try:
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
