@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
+from zoomjax.vision.encoding import display_matrix
 from zoomjax.vision.video import undistort_video
 
 from .clips import FRAMES, SIZE, bend, focal, lens, luma, picture, write_clip
@@ -76,6 +77,69 @@ def test_pixel_formats(tmp_path, pixels):
         np.abs(frame.reformat(format="gray").to_ndarray()[inner].astype(int) - expected[inner]).max() <= 3
     )
     assert np.ptp(rgb[inner].astype(int), axis=-1).max() <= 3  # grey stayed grey
+
+
+def rotated(path, *, interlaced=False):
+    """A short clip that players turn by 90 degrees and mirror; or one of fields."""
+    options = {"crf": "6", **({"flags": "+ildct", "x264-params": "tff=1"} if interlaced else {})}
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("libx264", rate=30, options=options)
+        stream.width, stream.height = SIZE
+        if not interlaced:
+            stream.set_display_rotation(90, hflip=True)
+        for number in range(3):
+            grey = av.VideoFrame.from_ndarray(picture(number), "gray")
+            out.mux(stream.encode(grey.reformat(format="yuv420p")))
+        out.mux(stream.encode(None))
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
+def test_orientation_is_kept_and_pixels_are_not_turned(tmp_path, suffix):
+    source = rotated(tmp_path / f"in{suffix}")
+    undistort_video(source, tmp_path / f"out{suffix}", lens=lens(), focal=20.0)
+    matrices = []
+    for name in ("in", "out"):
+        with av.open(str(tmp_path / f"{name}{suffix}")) as container:
+            frame = next(container.decode(video=0))
+            assert (frame.width, frame.height, frame.rotation) == (*SIZE, 90)
+            matrices.append(display_matrix(frame))
+    assert matrices[0] == matrices[1] != [65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30]
+
+
+def test_fields_are_said(tmp_path):
+    source = rotated(tmp_path / "in.mp4", interlaced=True)
+    with pytest.warns(UserWarning, match="interlaced.* Deinterlace it first"):
+        undistort_video(source, tmp_path / "out.mp4", lens=lens(), focal=20.0)
+
+
+def test_replicated_border_has_no_black(clip, tmp_path):
+    for border, low, high in (("constant", 0, 1), ("replicate", 40, 50)):
+        undistort_video(clip, tmp_path / "out.mp4", lens=lens(), focal=80.0, border=border)
+        corner = luma(tmp_path / "out.mp4")[0][0, :4, :4]
+        assert low <= corner.min() <= corner.max() <= high
+
+
+def test_sound_that_the_container_does_not_take(clip, tmp_path):
+    with pytest.raises(ValueError, match=r"Cannot keep the sound, aac, in a \.webm file.* or \.mkv"):
+        undistort_video(clip, tmp_path / "out.webm", lens=lens(), focal=20.0)
+    assert only(tmp_path)
+
+
+def test_a_framing_of_one_s_own_and_odd_sizes(tmp_path):
+    source = write_clip(tmp_path / "in.mkv", 3, encoder="ffv1", sound=False)
+    framing = zj.frame_output(lens(), SIZE, keep="all", size=(201, 99))
+    done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=20.0, keep=framing)
+    after, _ = luma(tmp_path / "out.mkv")
+    assert after.shape == (3, 99, 201)
+    assert done.scale == float(framing.scale)
+    expected = zj.undistort_image(luma(source)[0][0], lens()(20.0), keep=framing)
+    assert np.abs(after[0].astype(int) - expected).max() <= 2  # of 219 steps, shown in 255
+    with pytest.raises(ValueError, match="Choose another encoder, container, or even size"):
+        undistort_video(
+            source, tmp_path / "no.mp4", lens=lens(), focal=20.0, keep=framing, encoder="libx264"
+        )
+    assert only(tmp_path, "in.mkv", "out.mkv")
 
 
 def test_progress_tells_frames_done_and_announced(clip, tmp_path):
