@@ -18,7 +18,7 @@ LAYERS = (
     {"energy"},
     {"lens"},
     {"framing"},
-    {"positions", "warp"},
+    {"positions", "warp", "sizes"},
     {"_solver", "compression"},
     {"algebraic"},
     {"uncertainty"},

@@ -16,6 +16,8 @@ from .fit import fit_zoom as fit_zoom
 from .fit import frame_rms as frame_rms
 from .framing import Framing as Framing
 from .framing import frame_output as frame_output
+from .io.focal_track import FocalTrack as FocalTrack
+from .io.focal_track import read_focal_track as read_focal_track
 from .io.lines_csv import read_focal_csv as read_focal_csv
 from .io.lines_csv import read_lines_csv as read_lines_csv
 from .io.lines_csv import write_lines_csv as write_lines_csv
@@ -32,7 +34,10 @@ from .rivals import TwoRegionZoom as TwoRegionZoom
 from .rivals import barrel_crossover as barrel_crossover
 from .robust import RobustFit as RobustFit
 from .robust import fit_robust as fit_robust
+from .sizes import lens_for_size as lens_for_size
+from .vision.photos import undistort_photo as undistort_photo
 from .vision.undistort import undistort_image as undistort_image
+from .vision.video import undistort_video as undistort_video
 from .warp import warp_image as warp_image
 from .zoom import AbstractLinearZoom as AbstractLinearZoom
 from .zoom import AbstractZoom as AbstractZoom
