@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
-from zoomjax.sizes import at_focal, check_focal
+from zoomjax.sizes import at_focal
 
 
 def test_same_size_is_the_same_lens(truth):
@@ -32,10 +32,7 @@ def test_other_aspect_explains(truth, size):
         zj.lens_for_size(truth, size)
 
 
-def test_range_is_checked_once_for_all(truth):
-    check_focal(truth, 20.56, 127.36)
-    with pytest.warns(UserWarning, match=r"from 18 to 50 mm are asked for.*20.56 to 127.36 mm"):
-        check_focal(truth, 18.0, 50.0)
+def test_distortion_compiled_is_the_lens_s(truth):
     np.testing.assert_allclose(
         at_focal(truth, np.asarray(30.0)).coefficients, truth(30.0).coefficients, rtol=1e-12
     )

@@ -25,16 +25,14 @@ def checked_terms(terms: Any) -> int:
     return checked_integer("terms", terms, 1)
 
 
-def checked_size(image_size: Any) -> tuple[int, int]:
+def checked_size(size: Any, name: str = "image_size") -> tuple[int, int]:
     """(width, height) px."""
     try:
-        width, height = (float(side) for side in image_size)
+        width, height = (float(side) for side in size)
     except (TypeError, ValueError):
         width = height = math.nan
     if not all(math.isfinite(side) and side == int(side) and side >= 1 for side in (width, height)):
-        raise ValueError(
-            f"Argument image_size must be two positive integers (w, h), but it is {image_size!r}."
-        )
+        raise ValueError(f"Argument {name} must be two positive integers (w, h), but it is {size!r}.")
     return int(width), int(height)
 
 

@@ -5,7 +5,7 @@ import warnings
 import equinox as eqx
 import jax.numpy as jnp
 
-from .framing import checked_size
+from ._checks import checked_size
 from .lens import ZoomLens
 
 
@@ -30,7 +30,7 @@ def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
         >>> lens_for_size(nikkor_18_200(), (4288, 2848)).image_size
         (4288, 2848)
     """
-    size = checked_size(image_size, "image_size")
+    size = checked_size(image_size)
     if size == lens.image_size:
         return lens
     (width, height), (old_width, old_height) = size, lens.image_size
@@ -54,22 +54,6 @@ def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
         image_size=size,
         focal_unit=lens.focal_unit,
     )
-
-
-def check_focal(lens: ZoomLens, shortest: float, longest: float) -> None:
-    """Say so, once, if focal lengths lie outside of the range that the lens was fitted on.
-
-    Warns:
-        UserWarning: they do; the distortion is extrapolated.
-    """
-    low, high = (float(end) for end in lens.focal_range)
-    if shortest < low * (1 - 1e-6) or longest > high * (1 + 1e-6):
-        unit = lens.focal_unit
-        warnings.warn(
-            f"Focal lengths from {shortest:g} to {longest:g} {unit} are asked for, and the lens was fitted "
-            f"on {low:g} to {high:g} {unit}: beyond that its distortion is extrapolated.",
-            stacklevel=3,
-        )
 
 
 at_focal = eqx.filter_jit(lambda lens, focal: lens(focal))

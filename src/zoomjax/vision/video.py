@@ -25,7 +25,7 @@ from .._files import whole_file
 from ..framing import Framing, frame_output
 from ..io.focal_track import FocalTrack
 from ..lens import ZoomLens
-from ..sizes import at_focal, check_focal, lens_for_size
+from ..sizes import at_focal, lens_for_size
 from .ahead import ahead
 from .encoding import CONTAINER, FrameWriter, display_matrix
 from .planes import FrameWarper
@@ -97,7 +97,7 @@ def undistort_video(
         lens = lens_for_size(lens, (video.codec_context.width, video.codec_context.height))
         track = focal if isinstance(focal, FocalTrack) else _constant(float(focal))
         _check_length(track, video)
-        check_focal(lens, float(track.focal.min()), float(track.focal.max()))
+        lens.check_range(track.focal)
         framing = keep if isinstance(keep, Framing) else _common_framing(lens, track.focal, keep)
         warper = FrameWarper(lens, framing, interpolation=interpolation, border=border)
         report = _Report(video.frames)
