@@ -8,9 +8,9 @@ import time
 import cv2
 import numpy as np
 import pytest
-from tests.io.test_exif import exif
 
 import zoomjax as zj
+from _exif import exif
 
 from . import test_photos
 from .clips import FRAMES, bend, lens, luma, picture, write_clip, write_still

@@ -6,9 +6,9 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.io.test_exif import exif
 
 import zoomjax as zj
+from _exif import exif
 from zoomjax.vision.photos import photo_focal
 
 SIZE = (192, 128)
