@@ -10,17 +10,22 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
+from _commands import COMMAND, INTERRUPTIBLE
 from _exif import exif
 
 from . import test_photos
 from .clips import FRAMES, bend, lens, luma, picture, write_clip, write_still
 
-COMMAND = [sys.executable, "-c", "from zoomjax.cli import main; main()", "undistort", "lens.json"]
+ARGUMENTS = ["undistort", "lens.json"]
 
 
 def run(folder, *arguments):
     return subprocess.run(
-        [*COMMAND, *map(str, arguments)], cwd=folder, capture_output=True, text=True, timeout=300
+        [*COMMAND, *ARGUMENTS, *map(str, arguments)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
 
 
@@ -116,7 +121,8 @@ def test_output_over_the_input_is_refused(folder):
 def test_a_signal_leaves_no_file(tmp_path, number):
     lens().save(tmp_path / "lens.json")
     write_still(tmp_path / "long.mkv", 20000)  # minutes of work
-    process = subprocess.Popen([*COMMAND, "long.mkv", "--focal", "30", "-o", "out.mp4"], cwd=tmp_path)
+    command = [*INTERRUPTIBLE, *ARGUMENTS, "long.mkv", "--focal", "30", "-o", "out.mp4"]
+    process = subprocess.Popen(command, cwd=tmp_path)
     deadline = time.monotonic() + 60
     while not any(p.stat().st_size > 0 for p in tmp_path.glob(".*.part")) and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -136,7 +142,7 @@ def test_memory_stays_flat(folder):
     for frames in (24, 240):
         name = write_still(folder / f"{frames}.mkv", frames).name
         done = subprocess.run(
-            [sys.executable, "-c", probe, *COMMAND[3:], name, "--focal", "30", "-o", "flat.mp4"],
+            [sys.executable, "-c", probe, *ARGUMENTS, name, "--focal", "30", "-o", "flat.mp4"],
             cwd=folder,
             capture_output=True,
             text=True,
