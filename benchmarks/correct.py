@@ -294,7 +294,7 @@ def markdown(r: dict) -> str:
             f"Positions of the maps: within {r['stills']['error_px']:.1e} px of the exact inverse at "
             f"1080p, {r['photo']['error_px']:.1e} px at 12 MP (float64 lens, float32 map).",
             "",
-            "| ratio | measured | asked | met |",
+            "| ratio | measured | aim | met |",
             "|---|---:|---:|---|",
             *(f"| {name} | {text} |" for name, text in rows),
             "",
