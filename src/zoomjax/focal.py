@@ -1,0 +1,249 @@
+"""Focal lengths from a plane of known geometry.
+
+Two ways, for corrected points (`Distortion.undistort`): pictures of a lens without distortion.
+
+A board parallel to the sensor, at a known distance d: the image is the board times a magnification, and
+eq. 14 of the paper, ``f = d r_c / (R + r_c)``, gives the focal length of the thin lens, which is focused
+at the board. Here r_c / R is the scale of the similarity that best maps the board's points to the image.
+
+A plane seen obliquely, at no known distance: with the principal point known, the homography
+``H = (h1 h2 h3)`` from the plane to the image relative to that point gives two equations for w = 1/f²
+(Zhang 2000): with ω = diag(w, w, 1),
+
+    h1ᵀ ω h2 = 0,    h1ᵀ ω h1 - h2ᵀ ω h2 = 0.
+
+Each homography is fitted to its points' distances in the image, by iterations that start from the linear
+solution. The covariance of its entries becomes that of the two equations, by whose inverse they are
+weighted; w is the generalised least-squares solution. The closer a view is to squarely, the less it says
+about f, and the larger is its standard deviation. This f is the distance from the centre of projection to
+the image, in px: for a lens that is focused at a distance d, it is ``d / (d - f)`` times eq. 14's.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._types import AnyArray, Scalar
+
+_ITERATIONS = 20
+"""Gauss-Newton steps for a homography, at most. From the linear start 3 or 4 reach rounding."""
+
+_WEIGHINGS = 5
+"""How often the two equations are weighted anew: their weights depend on w. The first 2 matter."""
+
+
+class FocalEstimate(eqx.Module):
+    """A focal length and how well it is known.
+
+    Attributes:
+        focal: the focal length, in the unit that the function says; NaN if it is not determined.
+        std: its standard deviation, same unit, propagated from the residuals; infinite if it is not
+            determined. It knows nothing of errors that points share: a board that is not flat.
+        rms: root mean square distance, px, of the points from where the fitted plane puts them.
+    """
+
+    focal: Float[Array, "*view"]
+    std: Float[Array, "*view"]
+    rms: Float[Array, "*view"]
+
+
+def focal_from_board(
+    points: Float[AnyArray, "point 2"],
+    board: Float[AnyArray, "point 2"],
+    *,
+    distance: float | int | Scalar,
+    pixel: float | int | Scalar,
+) -> FocalEstimate:
+    """The focal length from one picture of a board parallel to the sensor: eq. 14.
+
+    Args:
+        points: corrected positions in the image, px, at least 3.
+        board: the same points on the board, mm, x to the right and y downwards as seen by the camera;
+            it may be turned in its plane and moved.
+        distance: from the projection plane to the board, mm, > 0: eq. 14's d.
+        pixel: side of a pixel on the sensor, mm, > 0. 1 is for points measured in mm.
+
+    Returns:
+        The focal length in mm. Residuals count as independent errors of the points' coordinates; those of
+        distance, pixel and board are not included: f changes by as many per cent as the distance.
+
+    Raises:
+        ValueError: shapes differ, or there are fewer than 3 points.
+        RuntimeError: a length is not positive, or all points of the board are one.
+
+    References:
+        Eq. 14 of the paper.
+
+    Example:
+        >>> import numpy as np
+        >>> board = 10 * np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), axis=-1).reshape(-1, 2)
+        >>> image = board * 50 / (1000 - 50) / 0.005 + 100
+        >>> print(round(float(focal_from_board(image, board, distance=1000, pixel=0.005).focal), 3))
+        50.0
+    """
+    _check_pairs(points, board, fewest=3)
+    # A similarity is one complex factor: its absolute value is px in the image per mm on the board.
+    seen, known = _complex(points), _complex(board)
+    seen, known = seen - jnp.mean(seen), known - jnp.mean(known)
+    spread = jnp.sum(abs(known) ** 2)
+    positive = (jnp.asarray(distance) > 0) & (jnp.asarray(pixel) > 0) & (spread > 0)
+    spread = eqx.error_if(
+        spread,
+        ~positive,
+        "Arguments distance and pixel must be positive, and the points of board must differ.",
+    )
+    factor = jnp.sum(jnp.conj(known) * seen) / spread
+    squares = jnp.sum(abs(seen - factor * known) ** 2)
+    ratio = abs(factor) * pixel  # r_c / R
+    error = jnp.sqrt(squares / (2 * len(points) - 4) / spread) * pixel
+    return FocalEstimate(
+        focal=distance * ratio / (1 + ratio),
+        std=distance * error / (1 + ratio) ** 2,
+        rms=jnp.sqrt(squares / len(points)),
+    )
+
+
+def focal_from_planes(
+    points: Float[AnyArray, "view point 2"],
+    plane: Float[AnyArray, "point 2"],
+    *,
+    principal: Float[AnyArray, "2"],
+) -> tuple[FocalEstimate, FocalEstimate]:
+    """The focal length from oblique views of a known plane, by Zhang's two constraints.
+
+    Args:
+        points: corrected positions in the images, px, one or more views, all at the same zoom, of at
+            least 5 points, no 3 of 4 of them on a line. One view is enough if it is oblique.
+        plane: the same points on the plane, in any unit: its size and place do not matter.
+        principal: the principal point, px; the centre of distortion is the usual choice.
+
+    Returns:
+        The estimate from all views together, and those from each view alone, in px. A view that does not
+        determine a positive 1/f², being square to the plane within its noise, has focal length NaN and
+        an infinite standard deviation.
+
+    Raises:
+        ValueError: shapes differ, or there are fewer than 5 points.
+
+    References:
+        Z. Zhang, "A flexible new technique for camera calibration", IEEE PAMI 22 (2000), section 3.1.
+
+    Example:
+        >>> import numpy as np
+        >>> plane = np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), axis=-1).reshape(-1, 2)
+        >>> tilted = np.stack([0.8 * plane[:, 0], plane[:, 1], 10 + 0.6 * plane[:, 0]])
+        >>> image = 800 * (tilted[:2] / tilted[2]).T
+        >>> together, each = focal_from_planes(image[None], plane, principal=np.zeros(2))
+        >>> print(round(float(together.focal), 3), each.focal.shape)
+        800.0 (1,)
+    """
+    if points.ndim != 3:
+        raise ValueError(f"Argument points must have shape (view, point, 2), but it is {points.shape}.")
+    _check_pairs(points[0], plane, fewest=5)
+    return _focal_from_planes(jnp.asarray(points), jnp.asarray(plane), jnp.asarray(principal))
+
+
+@eqx.filter_jit
+def _focal_from_planes(points, plane, principal):
+    image = points - principal[None, None]
+    plane = plane - jnp.mean(plane, axis=0, keepdims=True)
+    # One length for all views: then w and the equations are of the order of 1 in each.
+    length = jnp.sqrt(jnp.mean(jnp.sum((points - jnp.mean(points, axis=1, keepdims=True)) ** 2, axis=-1)))
+    plane = plane / jnp.sqrt(jnp.mean(jnp.sum(plane**2, axis=-1)))
+    entries, root, squares = jax.vmap(_homography, in_axes=(0, None))(image / length, plane)
+    squares = squares * length**2
+    number = points.shape[1]
+
+    def estimate(entries, root, squares):
+        w, information = _inverse_square(entries, root)
+        variance = jnp.sum(squares) / (squares.size * (2 * number - 8)) / length**2
+        known = (w > 0) & (information > 0)
+        w = jnp.where(known, w, 1)
+        focal = length / jnp.sqrt(w)
+        error = jnp.sqrt(variance / jnp.where(known, information, 1))
+        return FocalEstimate(
+            focal=jnp.where(known, focal, jnp.nan),
+            std=jnp.where(known, focal / (2 * w) * error, jnp.inf),
+            rms=jnp.sqrt(jnp.sum(squares) / (squares.size * number)),
+        )
+
+    each = jax.vmap(estimate)(entries[:, None], root[:, None], squares[:, None])
+    return estimate(entries, root, squares), each
+
+
+def _homography(image, plane):
+    """Eight entries (the last is 1), a root S of their covariance S Sᵀ for unit noise, and the squares."""
+    x, y = plane[:, 0], plane[:, 1]
+    row = jnp.stack([x, y, jnp.ones_like(x)], axis=-1)
+    none = jnp.zeros_like(row)
+    table = jnp.concatenate(
+        [
+            jnp.concatenate([row, none, -image[:, :1] * row], axis=1),
+            jnp.concatenate([none, row, -image[:, 1:] * row], axis=1),
+        ]
+    )
+    vector = jnp.linalg.svd(table, full_matrices=False)[2][-1]
+    # The last entry is the depth of the middle of the plane, which is in front of the camera.
+    start = vector[:8] / vector[8]
+
+    def residual(entries):
+        h = jnp.append(entries, 1).reshape(3, 3)
+        mapped = row @ h.T
+        return (mapped[:, :2] / mapped[:, 2:] - image).ravel()
+
+    def solve(entries):
+        orthogonal, triangle = jnp.linalg.qr(jax.jacfwd(residual)(entries))
+        return jax.scipy.linalg.solve_triangular(triangle, orthogonal.T @ residual(entries)), triangle
+
+    def advance(state):
+        entries, _, count = state
+        step, _ = solve(entries)
+        return entries - step, jnp.max(abs(step)), count + 1
+
+    small = 64 * jnp.finfo(start.dtype).eps
+    entries, _, _ = jax.lax.while_loop(
+        lambda state: (state[1] > small) & (state[2] < _ITERATIONS),
+        advance,
+        (start, jnp.full((), jnp.inf, start.dtype), 0),
+    )
+    _, triangle = solve(entries)
+    root = jax.scipy.linalg.solve_triangular(triangle, jnp.eye(8, dtype=triangle.dtype))
+    return entries, root, jnp.sum(residual(entries) ** 2)
+
+
+def _equations(entries):
+    """The factors of w in Zhang's two equations, and what is added to them."""
+    h1, h2 = jnp.append(entries, 1).reshape(3, 3).T[:2]
+    factor = jnp.stack([jnp.sum(h1[:2] * h2[:2]), jnp.sum(h1[:2] ** 2 - h2[:2] ** 2)])
+    return factor, jnp.stack([h1[2] * h2[2], h1[2] ** 2 - h2[2] ** 2])
+
+
+def _inverse_square(entries, root):
+    """The generalised least-squares w of several views, and the inverse of its variance for unit noise."""
+    factor, constant = jax.vmap(_equations)(entries)  # (view, 2)
+    slopes = jax.vmap(jax.jacfwd(_equations))(entries)
+
+    def solve(w):
+        gradient = (w * slopes[0] + slopes[1]) @ root  # (view, 2, 8)
+        weight = jnp.linalg.inv(gradient @ gradient.swapaxes(1, 2))
+        information = jnp.einsum("vi,vij,vj", factor, weight, factor)
+        return -jnp.einsum("vi,vij,vj", factor, weight, constant) / information, information
+
+    w = -jnp.sum(factor * constant) / jnp.sum(factor**2)
+    for _ in range(_WEIGHINGS):
+        w, information = solve(jnp.maximum(w, 0))
+    return w, information
+
+
+def _complex(points):
+    return points[:, 0] + 1j * points[:, 1]
+
+
+def _check_pairs(points, plane, *, fewest: int) -> None:
+    """As many points in the image as on the plane, and enough of them."""
+    if points.shape != plane.shape or plane.ndim != 2 or plane.shape[1] != 2 or len(plane) < fewest:
+        raise ValueError(
+            f"Points in the image and on the plane must be arrays (n, 2) of one shape, n >= {fewest}, but "
+            f"their shapes are {points.shape} and {plane.shape}."
+        )
