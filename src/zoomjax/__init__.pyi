@@ -14,6 +14,9 @@ from .fit import ZoomFit as ZoomFit
 from .fit import fit_frames as fit_frames
 from .fit import fit_zoom as fit_zoom
 from .fit import frame_rms as frame_rms
+from .focal import FocalEstimate as FocalEstimate
+from .focal import focal_from_board as focal_from_board
+from .focal import focal_from_planes as focal_from_planes
 from .framing import Framing as Framing
 from .framing import frame_output as frame_output
 from .io.lines_csv import read_focal_csv as read_focal_csv
@@ -30,6 +33,8 @@ from .rivals import SplineZoom as SplineZoom
 from .rivals import TableZoom as TableZoom
 from .rivals import TwoRegionZoom as TwoRegionZoom
 from .rivals import barrel_crossover as barrel_crossover
+from .vision.detector import AbstractDetector as AbstractDetector
+from .vision.grid import GridDetector as GridDetector
 from .vision.undistort import undistort_image as undistort_image
 from .warp import warp_image as warp_image
 from .zoom import AbstractLinearZoom as AbstractLinearZoom

@@ -2,7 +2,8 @@
 
 Checkerboards: OpenCV's sector-based search lets a board grow from a small start while corners are found.
 How far it gets depends on the scale of the image, so it runs at several and the largest board counts; its
-corners are those found in the full image where that is possible.
+corners are those found in the full image where that is possible. What is found must be dark and bright in
+turn, or else it is no board.
 
 Dots: the image less its background is cut at Otsu's threshold into spots. From one spot the grid grows,
 neighbour by neighbour, each expected one step of the grid further; steps follow those found last, so that
@@ -25,6 +26,14 @@ _SCALES = (1.0, 0.75, 0.65, 0.5)
 """Scales at which checkerboards are searched. In 30 photos of 22 x 15 corners each finds 29 or 30 of the
 boards whole, not the same ones; larger scales find fewer, and take longer."""
 
+_SMALL, _LARGER = 600, 1.5
+"""Images with a side below so many px are searched at this scale too, where they give whole boards more
+often, and positions as good."""
+
+_ALTERNATE = 0.95
+"""Of neighbouring squares so many must be dark and bright in turn. Boards have all of them so; what the
+search takes for a board in dots, lawns or noise has up to 0.9, by chance more only where it is 3 x 3."""
+
 _FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 
 _FEWEST_PIXELS = 6
@@ -40,7 +49,8 @@ _SEEDS = 9
 class GridDetector(AbstractDetector):
     """Every row and every column of a checkerboard's inner corners, or of a grid of dots, as a line.
 
-    A checkerboard is searched first, then dark or bright dots. One grid an image, of any size.
+    Checkerboards, dark dots and bright dots are searched for, and the grid of most nodes counts: one an
+    image, of any size.
 
     Attributes:
         fewest: rows and columns that a grid must have to count, at least 3.
@@ -77,11 +87,10 @@ class GridDetector(AbstractDetector):
         Rows run to the right, columns downwards. Dots that are not seen are NaN.
         """
         grey = _grey(image)
-        for search in (find_checkerboard, find_dots):
-            grid = search(grey)
-            if grid is not None and min(grid.shape[:2]) >= self.fewest:
-                return grid
-        return None
+        grids = [grid for grid in (find_checkerboard(grey), find_dots(grey)) if grid is not None]
+        # A board's squares are dots of a sort, half as many; boards found by chance among dots are small.
+        best = max(grids, key=lambda grid: np.isfinite(grid[..., 0]).sum(), default=None)
+        return None if best is None or min(best.shape[:2]) < self.fewest else best
 
 
 def find_checkerboard(
@@ -97,13 +106,13 @@ def find_checkerboard(
     """
     grey = _grey(image)
     best, best_scale = None, 1.0
-    for scale in _SCALES:
+    for scale in _SCALES + ((_LARGER,) if min(grey.shape) < _SMALL else ()):
         found = _search(_resized(grey, scale), (_START, _START), cv2.CALIB_CB_LARGER)
-        if found is not None and (best is None or found[..., 0].size > best[..., 0].size):
+        if found is not None and (best is None or found.size > best.size):
             best, best_scale = (found + 0.5) / scale - 0.5, scale
     if best is None:
         return None
-    if best_scale != 1:
+    if best_scale < 1:
         rows, columns = best.shape[:2]
         for size in ((columns, rows), (rows, columns)):
             sharp = _search(grey, size, 0)
@@ -151,10 +160,11 @@ def _grey(image: np.ndarray) -> np.ndarray:
 
 
 def _resized(grey: np.ndarray, scale: float) -> np.ndarray:
-    """A smaller image; pixel (0, 0) is where its first pixel's area is."""
-    if scale == 1:
+    """The image at another scale: a position x in it was at (x + 0.5) / scale - 0.5."""
+    if scale == 1 or min(grey.shape) * scale < 1:
         return grey
-    return cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    return cv2.resize(grey, None, fx=scale, fy=scale, interpolation=way)
 
 
 def _search(grey: np.ndarray, size: tuple[int, int], flags: int) -> np.ndarray | None:
@@ -164,7 +174,19 @@ def _search(grey: np.ndarray, size: tuple[int, int], flags: int) -> np.ndarray |
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, size, _FLAGS | flags)
     if not found:
         return None
-    return corners.reshape(*meta.shape, 2).astype(np.float64)
+    grid = corners.reshape(*meta.shape, 2).astype(np.float64)
+    return grid if _alternates(grey, grid) else None
+
+
+def _alternates(grey: np.ndarray, grid: np.ndarray) -> bool:
+    """Whether the squares between the corners are dark and bright in turn."""
+    middle = (grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1] + grid[:-1, :-1]) / 4
+    bright = cv2.remap(grey, middle.astype(np.float32), None, cv2.INTER_LINEAR).astype(float)
+    odd = np.indices(bright.shape).sum(axis=0) % 2 == 1
+    rises = [bright[1:] > bright[:-1], bright[:, 1:] > bright[:, :-1]]
+    as_odd = [rises[0] == odd[1:], rises[1] == odd[:, 1:]]
+    share = float(np.mean(np.concatenate([part.ravel() for part in as_odd])))
+    return max(share, 1 - share) >= _ALTERNATE
 
 
 def _upright(grid: np.ndarray) -> np.ndarray:
