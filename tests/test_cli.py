@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
+from _commands import COMMAND, INTERRUPTIBLE
 from zoomjax import synthetic
 from zoomjax.io.lines_csv import write_lines_csv
 
 
 def zoomjax(*arguments, cwd=None):
-    command = [sys.executable, "-c", "from zoomjax.cli import main; main()", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=300)
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, cwd=cwd, timeout=300
+    )
 
 
 @pytest.fixture(scope="module")
@@ -137,10 +139,9 @@ def test_calibrate_does_not_replace_its_input(wrong_files):
 
 
 def test_an_interrupted_run_leaves_nothing(wrong_files):
-    """Interrupted as by Ctrl-C, at the first sign of life; also where the tests themselves ignore it."""
-    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    command = [sys.executable, "-c", program + "from zoomjax.cli import main; main()"]
-    process = subprocess.Popen([*command, "demo", "-o", "new"], cwd=wrong_files, stderr=subprocess.PIPE)
+    """Interrupted as by Ctrl-C, at the first sign of life."""
+    command = [*INTERRUPTIBLE, "demo", "-o", "new"]
+    process = subprocess.Popen(command, cwd=wrong_files, stderr=subprocess.PIPE)
     while not (wrong_files / "new").exists():
         time.sleep(0.05)
         assert process.poll() is None

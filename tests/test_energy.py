@@ -184,3 +184,32 @@ def test_one_or_two_points_are_no_line(ragged):
     absent = eqx.tree_at(lambda lines: lines.mask, ragged, ragged.mask.at[0].set(False))
     k = jnp.full((3, 2), 0.1)
     np.testing.assert_array_equal(zj.frame_energy(short, k), zj.frame_energy(absent, k))
+
+
+def test_lines_of_weight_zero_are_not_there(ragged):
+    absent = eqx.tree_at(lambda lines: lines.mask, ragged, ragged.mask.at[0].set(False))
+    k = jnp.full((3, 2), 0.1)
+    for lines in (ragged, zj.compress(ragged)):
+        weighted = lines.weighted(np.arange(9) > 0)
+        np.testing.assert_allclose(zj.frame_energy(weighted, k), zj.frame_energy(absent, k), rtol=1e-12)
+
+
+def test_equal_weights_change_nothing_and_whole_ones_repeat_lines(ragged):
+    k = jnp.full((3, 2), 0.1)
+    plain = zj.frame_energy(ragged, k)
+    np.testing.assert_allclose(zj.frame_energy(ragged.weighted(np.full(9, 0.3)), k), plain, rtol=1e-12)
+    points = ragged.to_ragged()
+    repeated = zj.Lines.from_ragged(
+        [*points, points[0]],
+        [*np.asarray(ragged.frame), int(ragged.frame[0])],
+        np.asarray(ragged.focal),
+        image_size=ragged.image_size,
+    )
+    twice = ragged.weighted(np.where(np.arange(9) == 0, 2, 1))
+    np.testing.assert_allclose(zj.frame_energy(twice, k), zj.frame_energy(repeated, k), rtol=1e-12)
+
+
+@pytest.mark.parametrize("weight", [np.ones(8), -np.ones(9), np.full(9, np.nan)])
+def test_weights_that_are_none_raise(weight, ragged):
+    with pytest.raises(ValueError, match="Argument weight"):
+        ragged.weighted(weight)

@@ -223,7 +223,7 @@ def test_no_views_and_few_points_raise(unchecked):
 
 
 def test_the_two_focal_lengths_differ_by_the_focus():
-    """Eq. 14 gives the thin lens's f; the homography the distance to the image, d / (d - f) times as far."""
+    """Eq. 14 gives the thin lens's f; the homography the distance to the image, d / (d - f) times it."""
     f, distance, pixel = 50.0, 1000.0, 0.005
     image_distance = f * distance / (distance - f)
     plane = 20 * (PLANE - PLANE.mean(axis=0))

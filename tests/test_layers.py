@@ -9,7 +9,7 @@ import zoomjax
 
 # From the inside out: a module may import from layers before its own. Packages count as one module.
 LAYERS = (
-    {"_types", "_files", "_checks"},
+    {"_types", "_files", "_checks", "_linear"},
     {"radial", "focal"},
     {"inverse"},
     {"zoom"},
@@ -18,10 +18,12 @@ LAYERS = (
     {"energy"},
     {"lens"},
     {"framing"},
-    {"positions", "warp"},
+    {"positions", "warp", "sizes"},
     {"_solver", "compression"},
     {"algebraic"},
+    {"uncertainty"},
     {"fit"},
+    {"robust"},
     {"synthetic", "metrics", "io"},
     {"plot"},
     {"calibration"},

@@ -79,6 +79,11 @@ def test_file_keeps_every_digit(dtype, ragged, tmp_path):
     assert_same(zj.load_lines(tmp_path / "lines.npz"), lines)
 
 
+def test_file_keeps_weights(tmp_path):
+    make().weighted([0.5, 0.0]).save(tmp_path / "lines.npz")
+    np.testing.assert_array_equal(zj.load_lines(tmp_path / "lines.npz").weight, [0.5, 0])
+
+
 def test_grids_give_every_row_and_column():
     grid = np.stack(np.meshgrid(np.arange(4.0), 10 * np.arange(3.0)), axis=-1)  # 3 rows of 4 nodes
     lines = zj.Lines.from_grids(

@@ -135,13 +135,27 @@ def test_gradients_are_finite_differences(rng, image, d, interpolation):
         np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-9)
 
 
-def test_gradient_with_respect_to_the_image_is_the_adjoint(rng, image):
-    d = LENSES[1]
-    other = jnp.asarray(rng.standard_normal(image.shape))
-    pulled = jax.vjp(lambda image: zj.warp_image(image, d), image)[1](other)[0]
-    np.testing.assert_allclose(
-        jnp.vdot(zj.warp_image(image, d), other), jnp.vdot(image, pulled), rtol=1e-12
-    )
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_gradient_with_respect_to_the_image_is_the_adjoint(rng, image, interpolation):
+    """Also where positions lie on the border, off the image, and where there is no inverse."""
+    d = bent(-0.6)
+    framing = zj.frame_output(d, SIZE, size=(60, 40))
+
+    def warp(image):
+        return zj.warp_image(image, d, framing=framing, interpolation=interpolation)
+
+    other = jnp.asarray(rng.standard_normal((40, 60, 3)))
+    pulled = jax.vjp(warp, image)[1](other)[0]
+    np.testing.assert_allclose(jnp.vdot(warp(image), other), jnp.vdot(image, pulled), rtol=1e-12)
+
+
+def test_gradients_with_many_channels_are_those_of_single_ones(rng):
+    many = jnp.asarray(rng.uniform(size=(30, 48, 6)))
+    gradient = jax.jit(jax.grad(lambda d, image: jnp.sum(zj.warp_image(image, d) ** 2)))
+    singles = [gradient(LENSES[0], many[..., i]) for i in range(6)]
+    total = jax.tree.map(lambda *each: sum(each), *singles)
+    for one, other in zip(jax.tree.leaves(gradient(LENSES[0], many)), jax.tree.leaves(total), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10)
 
 
 def test_vmap_is_a_loop(image):

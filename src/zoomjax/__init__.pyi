@@ -19,6 +19,8 @@ from .focal import focal_from_board as focal_from_board
 from .focal import focal_from_planes as focal_from_planes
 from .framing import Framing as Framing
 from .framing import frame_output as frame_output
+from .io.focal_track import FocalTrack as FocalTrack
+from .io.focal_track import read_focal_track as read_focal_track
 from .io.lines_csv import read_focal_csv as read_focal_csv
 from .io.lines_csv import read_lines_csv as read_lines_csv
 from .io.lines_csv import write_lines_csv as write_lines_csv
@@ -33,9 +35,15 @@ from .rivals import SplineZoom as SplineZoom
 from .rivals import TableZoom as TableZoom
 from .rivals import TwoRegionZoom as TwoRegionZoom
 from .rivals import barrel_crossover as barrel_crossover
+from .robust import RobustFit as RobustFit
+from .robust import fit_robust as fit_robust
+from .sizes import lens_for_size as lens_for_size
 from .vision.detector import AbstractDetector as AbstractDetector
+from .vision.edges import EdgeDetector as EdgeDetector
 from .vision.grid import GridDetector as GridDetector
+from .vision.photos import undistort_photo as undistort_photo
 from .vision.undistort import undistort_image as undistort_image
+from .vision.video import undistort_video as undistort_video
 from .warp import warp_image as warp_image
 from .zoom import AbstractLinearZoom as AbstractLinearZoom
 from .zoom import AbstractZoom as AbstractZoom

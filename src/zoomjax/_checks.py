@@ -2,6 +2,7 @@
 
 import math
 import operator
+import warnings
 from typing import Any
 
 import numpy as np
@@ -24,16 +25,14 @@ def checked_terms(terms: Any) -> int:
     return checked_integer("terms", terms, 1)
 
 
-def checked_size(image_size: Any) -> tuple[int, int]:
+def checked_size(size: Any, name: str = "image_size") -> tuple[int, int]:
     """(width, height) px."""
     try:
-        width, height = (float(side) for side in image_size)
+        width, height = (float(side) for side in size)
     except (TypeError, ValueError):
         width = height = math.nan
     if not all(math.isfinite(side) and side == int(side) and side >= 1 for side in (width, height)):
-        raise ValueError(
-            f"Argument image_size must be two positive integers (w, h), but it is {image_size!r}."
-        )
+        raise ValueError(f"Argument {name} must be two positive integers (w, h), but it is {size!r}.")
     return int(width), int(height)
 
 
@@ -106,6 +105,50 @@ def checked_frames(frame: ArrayLike, lines: int, frames: int) -> np.ndarray:
             f"frame[{bad}] is {index[bad]}."
         )
     return index
+
+
+def usable_lines(arrays: list[np.ndarray], frames: np.ndarray, number_of_frames: int) -> np.ndarray:
+    """Positions of the lines with 3 or more distinct points, of which every frame must have one."""
+    usable = np.array([_has_three_distinct(line) for line in arrays], bool)
+    if not usable.any():
+        raise ValueError(f"No usable line: none of the {len(arrays)} lines has 3 or more distinct points.")
+    if not usable.all():
+        warnings.warn(
+            f"Dropped {np.sum(~usable)} of {len(arrays)} lines: they have fewer than 3 distinct "
+            "points, which says nothing about straightness.",
+            stacklevel=3,
+        )
+    empty = np.setdiff1d(np.arange(number_of_frames), frames[usable])
+    if empty.size:
+        raise ValueError(
+            f"No line in {empty.size} of {number_of_frames} frames (the first are "
+            f"{', '.join(map(str, empty[:5]))}). Leave those frames out of frame and focal."
+        )
+    return np.flatnonzero(usable)
+
+
+def warn_of_points_outside(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -> None:
+    """Points far outside of the image mean a wrong image size, and with it a wrong centre and scale."""
+    beyond = np.max(
+        np.maximum(-points, points - (np.array(size) - 1)), axis=-1, where=mask[..., None], initial=0
+    )
+    outside = beyond > 0.01 * max(size)  # noise alone takes a few points some px out
+    if outside.any():
+        warnings.warn(
+            f"{np.sum(outside):,} of {np.sum(mask):,} points lie outside of the image of {size[0]} x "
+            f"{size[1]} px, by up to {np.max(beyond):.3g} px. Is image_size (width, height) right?",
+            stacklevel=3,
+        )
+
+
+def _has_three_distinct(line: np.ndarray) -> bool:
+    if len(line) < 3:
+        return False
+    from_first = (line != line[0]).any(axis=1)
+    if not from_first.any():
+        return False
+    second = line[np.argmax(from_first)]
+    return bool((from_first & (line != second).any(axis=1)).any())
 
 
 def _numbers(values: ArrayLike) -> np.ndarray | None:

@@ -20,6 +20,7 @@ Coefficients = Float[AnyArray, "terms"]
 Mask = Bool[AnyArray, "line point"]
 FrameIndex = Int[AnyArray, "line"]
 LineNumber = Int[AnyArray, "line"]
+LineWeight = Float[AnyArray, "line"]
 Focal = Float[AnyArray, "frame"]
 
 

@@ -15,11 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._linear import least_squares
 from .compression import CompressedLines, compress
 from .energy import line_weights
 from .lens import ZoomLens, lens_of
 from .lines import AbstractLines, Lines
-from .zoom import AbstractLinearZoom, PolynomialZoom
+from .zoom import AbstractLinearZoom, PolynomialZoom, with_parameters
 
 
 def compressed(lines: AbstractLines, terms: int) -> CompressedLines:
@@ -41,14 +42,8 @@ def algebraic_parameters(
     basis = jax.vmap(zoom.basis)(lines.focal)[lines.frame]  # (line, basis)
     columns = jnp.einsum("lat,lb->labt", areas[..., 1:], basis)
     unknowns = basis.shape[1] * terms
-    table = jnp.concatenate([columns.reshape(-1, unknowns), areas[..., :1].reshape(-1, 1)], axis=1)
-    # Solve with the small triangle of the table. Directions that change the areas, px, by no more than
-    # rounding (lines through the centre have no others) are left at zero.
-    triangle = jnp.linalg.qr(table, mode="r")
-    left, size, right = jnp.linalg.svd(triangle[:, :-1], full_matrices=False)
-    known = size > 64 * jnp.finfo(size.dtype).eps * (size[0] + lines.scale)
-    inverse = jnp.where(known, 1 / jnp.where(known, size, 1), 0)
-    solution = -right.T @ (inverse * (left.T @ triangle[:, -1]))
+    # Lines through the centre do not change the areas, px, whatever the coefficients: those stay zero.
+    solution = least_squares(columns.reshape(-1, unknowns), -areas[..., 0].reshape(-1), floor=lines.scale)
     return solution.reshape(basis.shape[1], terms)
 
 
@@ -93,7 +88,7 @@ def algebraic_frames(lines: AbstractLines, *, terms: int = 2) -> Float[Array, "f
 @eqx.filter_jit
 def _solve_zoom(lines, zoom, terms):
     parameters = algebraic_parameters(lines, zoom, terms)
-    return lens_of(lines, eqx.tree_at(lambda model: model.parameters, zoom, parameters))
+    return lens_of(lines, with_parameters(zoom, parameters))
 
 
 @eqx.filter_jit

@@ -1,4 +1,4 @@
-"""The command line: ``zoomjax demo``, ``zoomjax calibrate``.
+"""The command line: ``zoomjax demo``, ``zoomjax calibrate``, ``zoomjax undistort``.
 
 Commands import what they need when they run, so that ``--help`` answers without waiting for JAX. They
 compute in float64. Errors go to stderr with exit status 2, and leave no partial result.
@@ -124,6 +124,64 @@ def calibrate(
         lines = _read(inputs, focal, image_size, focal_unit)
         calibration = _calibrate(lines, degree, terms, stage, folder)
     _show(calibration, output)
+
+
+@app.command()
+def undistort(
+    lens: Annotated[Path, typer.Argument(metavar="lens.json", help="The lens, from zoomjax calibrate.")],
+    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help="Photos, or one video.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="OUT", help="A file for one input, else a folder.")
+    ],
+    focal: Annotated[
+        str | None,
+        typer.Option(
+            help="A focal length, or a CSV: time,focal or frame,focal of a video, image,focal of photos. "
+            "Without it, photos' EXIF data tell."
+        ),
+    ] = None,
+    keep: Annotated[
+        str, typer.Option(help="What to show: same, all or valid; one framing for all of a zoom.")
+    ] = "same",
+    interpolation: Annotated[str, typer.Option(help="nearest, linear, cubic or lanczos.")] = "linear",
+    border: Annotated[
+        str, typer.Option(help="What lies beyond the image: constant (black), replicate or reflect.")
+    ] = "constant",
+    hold: Annotated[
+        bool, typer.Option("--hold", help="Hold the first and last focal length beyond a track's ends.")
+    ] = False,
+) -> None:
+    """Correct photos, or a video, each at its own focal length."""
+    import signal
+
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # and leave no half file
+    _enable_float64()
+    from .vision.files import Job, undistort_files
+
+    with _progress() as progress:
+        done = undistort_files(
+            Job(lens, tuple(inputs), output, focal, keep, interpolation, border, hold), progress
+        )
+    print(done)
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[int, int], None]]:
+    """A function of what is done and of how much (0: unknown), shown as a bar on stderr."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=None, rate="")
+
+        def show(done: int, total: int) -> None:
+            speed = bar.tasks[0].speed
+            rate = f"{speed:.1f} per s" if speed else ""
+            bar.update(task, completed=done, total=total or None, rate=rate)
+
+        yield show
 
 
 def _enable_float64() -> None:

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._checks import checked_terms
-from ._types import Focal, FrameIndex, LineNumber, Point, traced
+from ._types import Focal, FrameIndex, LineNumber, LineWeight, Point, traced
 from .lines import AbstractLines, Lines
 
 _RUN = 1100  # points orthogonalised together: 7 columns of them fill a cache of 48 to 64 KB in float64
@@ -40,7 +40,7 @@ class CompressedLines(AbstractLines):
 
     Attributes:
         triangle: R of each line, in normalised lengths.
-        frame, focal, centre, image_size, focal_unit, number: as in `Lines`.
+        frame, focal, centre, image_size, focal_unit, number, weight: as in `Lines`.
     """
 
     triangle: Float[Array, "line rows rows"]
@@ -50,6 +50,7 @@ class CompressedLines(AbstractLines):
     image_size: tuple[int, int] = eqx.field(static=True)
     focal_unit: str = eqx.field(static=True)
     number: LineNumber | None = None
+    weight: LineWeight | None = None
 
     @property
     def terms(self) -> int:
@@ -97,6 +98,7 @@ class CompressedLines(AbstractLines):
             image_size=self.image_size,
             focal_unit=self.focal_unit,
             number=None if self.number is None else self.number[lines],
+            weight=None if self.weight is None else self.weight[lines],
         )
 
 
@@ -139,6 +141,7 @@ def compress(lines: Lines, terms: int = 2) -> CompressedLines:
         image_size=lines.image_size,
         focal_unit=lines.focal_unit,
         number=lines.number,
+        weight=lines.weight,
     )
 
 

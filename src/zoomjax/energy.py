@@ -46,14 +46,18 @@ def line_residuals(centred: Float[Array, "rows 2"]) -> Float[Array, "rows"]:
 def line_weights(lines: AbstractLines) -> Float[Array, "line"]:
     """``1 / (M Nl(m) Np(l, m))`` of eq. 13 for the points of each line.
 
+    With weights v of the lines themselves ``v_l / (M Np(l, m) sum_l v_l)``, summed over the frame's lines.
     0 for lines that are not there. One or two points count as none: they are straight whatever the lens,
     and would only dilute their frame's mean. (`Lines` drops them; merged chunks may come with them.)
     """
     counts = lines.counts
     frames = lines.focal.shape[0]
-    present = (counts > 2).astype(counts.dtype)
-    per_frame = jax.ops.segment_sum(present, lines.frame, frames)
-    return present / (frames * jnp.maximum(per_frame, 1)[lines.frame] * jnp.maximum(counts, 1))
+    share = (counts > 2).astype(counts.dtype)
+    if lines.weight is not None:
+        share = share * lines.weight
+    per_frame = jax.ops.segment_sum(share, lines.frame, frames)
+    per_frame = jnp.where(per_frame > 0, per_frame, 1)
+    return share / (frames * per_frame[lines.frame] * jnp.maximum(counts, 1))
 
 
 def residuals(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "line rows"]:

@@ -16,18 +16,19 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int
 
 from ._checks import checked_terms
 from ._solver import default_solver
 from ._types import AnyArray, Point, traced
 from .algebraic import algebraic_parameters, compressed
 from .compression import CompressedLines
-from .energy import energy_by_frame, frame_energy, line_weights, residuals
+from .energy import energy_by_frame, frame_energy, residuals
 from .lens import ZoomLens, lens_of
 from .lines import AbstractLines, Lines
 from .radial import Distortion, monotone_radius
-from .zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom
+from .uncertainty import parameter_covariance
+from .zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
 
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 
@@ -155,7 +156,7 @@ def fit_zoom(
         True
     """
     _check_lines(lines)
-    model, terms = _model(lines, PolynomialZoom() if zoom is None else zoom, terms)
+    model, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
     start = None
     if isinstance(model, AbstractLinearZoom) and (zoom is None or zoom.parameters is None):
         start = compressed(lines, terms)
@@ -163,7 +164,7 @@ def fit_zoom(
     return _thrown(*_fit_zoom(lines, start, model, terms, solver, max_steps), throw)
 
 
-def _model(lines, zoom, terms):
+def ready_model(lines, zoom, terms):
     """The model ready to be fitted to these lines, in their dtype, and its number of terms."""
     if not isinstance(zoom, AbstractZoom):
         raise TypeError(
@@ -282,11 +283,11 @@ def _frame_rms(lines, lens):
 @eqx.filter_jit
 def _fit_zoom(lines, start, zoom, terms, solver, max_steps):
     if start is not None:
-        zoom = _with_parameters(zoom, algebraic_parameters(start, zoom, terms))
+        zoom = with_parameters(zoom, algebraic_parameters(start, zoom, terms))
     zoom, result, steps = _minimise(lines, zoom, solver, max_steps)
-    weighted, jacobian = _linearised(lines, zoom)
+    weighted, jacobian = linearised(lines, zoom)
     errors = energy_by_frame(lines, weighted)
-    covariance, determined = _covariance(lines, zoom, jacobian, jnp.mean(errors))
+    covariance, determined = parameter_covariance(lines, zoom, jacobian, jnp.mean(errors))
     fit = ZoomFit(
         lens=lens_of(lines, zoom),
         rms=jnp.sqrt(jnp.mean(errors)),
@@ -321,94 +322,30 @@ def _fit_frames(lines, start, chosen, present, terms, solver, max_steps):
     return each, _first_failure(each.result)
 
 
-def _with_parameters(zoom: AbstractZoom, parameters: PyTree) -> Any:
-    return eqx.tree_at(lambda model: model.parameters, zoom, parameters)
-
-
 def _minimise(lines, zoom, solver, max_steps):
     """The model at the minimum of the global energy, from its own parameters as the start."""
 
     def function(parameters, args):
         lines, zoom = args
-        return residuals(lines, jax.vmap(_with_parameters(zoom, parameters))(lines.focal))
+        return residuals(lines, jax.vmap(with_parameters(zoom, parameters))(lines.focal))
 
     start = jax.tree.map(jax.lax.stop_gradient, zoom.parameters)
     solution = optx.least_squares(
         function, solver, start, args=(lines, zoom), max_steps=max_steps, throw=False
     )
-    return _with_parameters(zoom, solution.value), solution.result, solution.stats["num_steps"]
+    return with_parameters(zoom, solution.value), solution.result, solution.stats["num_steps"]
 
 
-def _linearised(lines, zoom):
+def linearised(lines, zoom):
     """The residuals and their derivatives by the flattened parameters, a row a residual."""
     flat, unravel = ravel_pytree(zoom.parameters)
 
     def function(flat):
-        k = jax.vmap(_with_parameters(zoom, unravel(flat)))(lines.focal)
+        k = jax.vmap(with_parameters(zoom, unravel(flat)))(lines.focal)
         return (weighted := residuals(lines, k)), weighted
 
     jacobian, weighted = jax.jacfwd(function, has_aux=True)(flat)
     return weighted, jacobian
-
-
-def _covariance(lines, zoom, jacobian, energy):
-    """Covariance of the flattened parameters, and whether the lines determine them all.
-
-    For the weights w of eq. 13, which are not the inverse variances, the covariance is the sandwich
-    ``sigma^2 (J^T W J)^-1 (J^T W^2 J) (J^T W J)^-1``. It is made from the triangles of J and of the
-    weighted J: the normal equations would square the condition number, which float32 has no room for.
-
-    A parameter is *undetermined* where moving it changes the residuals by less than twice what noise in
-    the points alone would feign: each point's error appears in the derivative by k_j, times r^(2j). (Lines
-    through the centre have nothing else there, and would otherwise seem to determine k from their noise.)
-    """
-    weights = line_weights(lines)
-    triangle, outer = (
-        jnp.linalg.qr(rows.reshape(-1, rows.shape[-1]), mode="r")
-        for rows in (jacobian, jnp.sqrt(weights)[:, None, None] * jacobian)
-    )
-    # Columns of unit length, so that one threshold serves parameters of any size.
-    size = jnp.linalg.norm(triangle, axis=0)
-    size = jnp.where(size > 0, size, 1)
-    left, values, right = jnp.linalg.svd(triangle / size[None])
-    good = values > 64 * jnp.finfo(values.dtype).eps
-    reciprocal = jnp.where(good, 1 / jnp.where(good, values, 1), 0)
-    back = right.T * reciprocal[None]  # to the parameters that change the residuals by one unit
-    # Of the directions that change them so, those in which noise would feign more than half of it.
-    feigned = _feigned(lines, zoom, weights, energy) / size[:, None] / size[None]
-    shares, directions = jnp.linalg.eigh(back.T @ feigned @ back)
-    doubtful = jnp.concatenate([back @ directions, right.T], axis=1)
-    doubtful = doubtful / jnp.maximum(jnp.linalg.norm(doubtful, axis=0), jnp.finfo(size.dtype).tiny)[None]
-    unknown = jnp.concatenate([shares >= 0.25, ~good])
-    undetermined = jnp.any(unknown[None] & (jnp.abs(doubtful) > 0.05), axis=1)
-
-    inverse = back @ left.T / size[:, None]
-    spread = outer @ inverse
-    freedom = jnp.sum(weights * (lines.counts - 2)) - jnp.sum(spread**2)
-    undetermined = undetermined | (freedom <= 0)  # nothing is left over to tell the noise by
-    half = inverse @ spread.T
-    covariance = energy / jnp.where(freedom > 0, freedom, 1) * (half @ half.T)
-    either = undetermined[:, None] | undetermined[None]
-    infinite = jnp.where(jnp.eye(size.shape[0], dtype=bool), jnp.inf, 0)
-    return jnp.where(either, infinite, covariance), ~jnp.any(undetermined)
-
-
-def _feigned(lines, zoom, weights, energy):
-    """What the points' own noise contributes to ``J^T J`` in the mean, by parameter and parameter."""
-    flat, unravel = ravel_pytree(zoom.parameters)
-
-    def coefficients_at(flat):
-        return jax.vmap(_with_parameters(zoom, unravel(flat)))(lines.focal)
-
-    k = coefficients_at(flat)
-    terms = k.shape[1]
-    order = jnp.arange(terms + 1)
-    moments = lines.radial_moments(2 * terms)[:, order[:, None] + order[None]] * weights[:, None, None]
-    # The residuals have the noise of the corrected image, shrunk by L: divide by its mean square.
-    kappa = jnp.concatenate([jnp.ones_like(k[:, :1]), k], axis=1)[lines.frame]
-    variance_in_image = energy / jnp.einsum("li,lij,lj->", kappa, moments, kappa)
-    by_parameter = jax.jacfwd(coefficients_at)(flat)[lines.frame]  # (line, terms, parameter)
-    return variance_in_image * jnp.einsum("lip,lij,ljq->pq", by_parameter, moments[:, 1:, 1:], by_parameter)
 
 
 def _judge(lines, zoom, result, determined):

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import polynomial
 
+from ._checks import checked_size
 from ._types import Point, Points, Scalar
 from .inverse import fold_radius
 from .lens import ZoomLens
@@ -78,7 +79,7 @@ def frame_output(
         >>> float(frame_output(d, (640, 480), keep="all").scale)  # the corners move out by a tenth
         0.9093...
     """
-    image_size = checked_size(image_size, "image_size")
+    image_size = checked_size(image_size)
     size = image_size if size is None else checked_size(size, "size")
     if keep not in ("same", "all", "valid"):
         raise ValueError(f'Argument keep must be "same", "all" or "valid", but it is {keep!r}.')
@@ -105,18 +106,6 @@ def frame_output(
             )
         scale = float(1 / distance)
     return _framing(scale, middle, size)
-
-
-def checked_size(size: tuple[int, int], name: str) -> tuple[int, int]:
-    """The size as two Python integers.
-
-    Raises:
-        ValueError: it is not a pair of positive whole numbers.
-    """
-    pair = tuple(size)
-    if len(pair) != 2 or any(int(side) != side or side < 1 for side in pair):
-        raise ValueError(f"Argument {name} must be two positive integers (w, h), but it is {size!r}.")
-    return int(pair[0]), int(pair[1])
 
 
 def _framing(scale: float, middle: np.ndarray, size: tuple[int, int]) -> Framing:

@@ -123,14 +123,13 @@ class ZoomLens(eqx.Module):
         if bad.any():
             raise ValueError(f"Argument focal must be a positive number, but it is {values[bad][0]}.")
         slack = 1e-6 * values  # the end of the range itself, through a float32 or a file
-        outside = values[(values < low - slack) | (values > high + slack)]
-        if outside.size:
-            which = f"focal length {outside[0]:g} {self.focal_unit} is"
+        if np.any((values < low - slack) | (values > high + slack)):
+            asked = f"The focal length {values[0]:g} {self.focal_unit} is"
             if values.size > 1:
-                which = f"focal lengths of {outside.size} of {values.size} frames are"
+                asked = f"Focal lengths from {values.min():g} to {values.max():g} {self.focal_unit} are"
             warnings.warn(
-                f"The {which} outside of the range the lens was fitted on, {low:g} to {high:g} "
-                f"{self.focal_unit}: the distortion there is extrapolated.",
+                f"{asked} asked for, and the lens was fitted on {low:g} to {high:g} {self.focal_unit}: "
+                "beyond that its distortion is extrapolated.",
                 stacklevel=stacklevel + 1,
             )
 

@@ -9,8 +9,8 @@ would waste 27 times the memory on the paper's data). Compressed lines are in `c
 import abc
 import math
 import os
-import warnings
 from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -26,12 +26,16 @@ from ._checks import (
     checked_points,
     checked_size,
     checked_unit,
+    usable_lines,
+    warn_of_points_outside,
 )
 from ._files import whole_file
-from ._types import AnyArray, Focal, FrameIndex, LineNumber, Mask, Point, traced
+from ._types import AnyArray, Focal, FrameIndex, LineNumber, LineWeight, Mask, Point, traced
 from .radial import radial_factor
 
 _FORMAT, _VERSION = "zoomjax.lines", 1
+
+SomeLines = TypeVar("SomeLines", bound="AbstractLines")
 
 
 class AbstractLines(eqx.Module):
@@ -42,6 +46,7 @@ class AbstractLines(eqx.Module):
     centre: eqx.AbstractVar[Point]
     image_size: eqx.AbstractVar[tuple[int, int]]
     focal_unit: eqx.AbstractVar[str]
+    weight: eqx.AbstractVar[LineWeight | None]
 
     @property
     def scale(self) -> float:
@@ -67,6 +72,22 @@ class AbstractLines(eqx.Module):
     @abc.abstractmethod
     def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "AbstractLines":
         """The chosen lines as a data set of one frame; those not `present` count as empty."""
+
+    def weighted(self: SomeLines, weight: ArrayLike) -> SomeLines:
+        """The same lines, each counting `weight` beside the others of its frame.
+
+        Raises:
+            ValueError: there is not one finite weight of at least 0 for each line.
+        """
+        weight = jnp.asarray(weight, jnp.asarray(self.focal).dtype)
+        if weight.shape != self.frame.shape:
+            raise ValueError(
+                f"Argument weight must hold one number for each of the {self.frame.shape[0]} lines, but "
+                f"its shape is {weight.shape}."
+            )
+        if not traced(weight) and not (np.isfinite(weight) & (np.asarray(weight) >= 0)).all():
+            raise ValueError("Argument weight must hold finite numbers of at least 0, but it does not.")
+        return eqx.tree_at(lambda lines: lines.weight, self, weight, is_leaf=lambda leaf: leaf is None)
 
     def by_frame(self) -> tuple[Int[AnyArray, "frame some"], Bool[AnyArray, "frame some"]]:
         """For each frame the indices of its lines, padded to the fullest frame, and which are real.
@@ -102,6 +123,7 @@ class Lines(AbstractLines):
         image_size: (width, height) px.
         focal_unit: "mm" or "px".
         number: position of each line among those that `from_ragged` was given; None if unknown.
+        weight: how much each line counts beside the others of its frame, at least 0; None for all alike.
     """
 
     points: Float[AnyArray, "line point 2"]
@@ -112,6 +134,7 @@ class Lines(AbstractLines):
     image_size: tuple[int, int] = eqx.field(static=True)
     focal_unit: str = eqx.field(static=True, default="mm")
     number: LineNumber | None = None
+    weight: LineWeight | None = None
 
     def __check_init__(self):
         """Check that the shapes agree."""
@@ -167,7 +190,7 @@ class Lines(AbstractLines):
         frames = checked_frames(frame, len(arrays), focals.size)
         number = np.arange(len(arrays))
         if not chunk:
-            number = _usable(arrays, frames, focals.size)
+            number = usable_lines(arrays, frames, focals.size)
             arrays, frames = [arrays[index] for index in number], frames[number]
 
         dtype = np.result_type(*arrays)
@@ -176,7 +199,7 @@ class Lines(AbstractLines):
         for row, line in zip(padded, arrays, strict=True):
             row[: len(line)] = line
         mask = np.arange(max(counts)) < counts[:, None]
-        _warn_of_points_outside(padded, mask, size)
+        warn_of_points_outside(padded, mask, size)
         return cls(
             points=_held_as_given(padded),
             mask=jnp.asarray(mask),
@@ -236,9 +259,11 @@ class Lines(AbstractLines):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all fields, in their dtypes, to a ``.npz`` file that `load_lines` reads."""
+        fields: dict[str, Any] = {} if self.weight is None else {"weight": np.asarray(self.weight)}
         with whole_file(path) as part, part.open("wb") as file:
             np.savez(
                 file,
+                **fields,
                 format=_FORMAT,
                 version=_VERSION,
                 points=np.asarray(self.points)[np.asarray(self.mask)],
@@ -283,6 +308,7 @@ class Lines(AbstractLines):
             image_size=self.image_size,
             focal_unit=self.focal_unit,
             number=None if self.number is None else self.number[lines],
+            weight=None if self.weight is None else self.weight[lines],
         )
 
 
@@ -313,7 +339,7 @@ def load_lines(path: str | os.PathLike[str]) -> Lines:
         points, counts = stored["points"], stored["counts"]
         if counts.min(initial=0) < 0 or counts.sum() != len(points):
             raise ValueError("its points and counts disagree")
-        return Lines.from_ragged(
+        lines = Lines.from_ragged(
             np.split(points, np.cumsum(counts)[:-1]),
             stored["frame"],
             stored["focal"],
@@ -321,6 +347,7 @@ def load_lines(path: str | os.PathLike[str]) -> Lines:
             focal_unit=str(stored["focal_unit"]),
             centre=stored["centre"],
         )
+        return lines.weighted(stored["weight"][lines.number]) if "weight" in stored else lines
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
         raise ValueError(f"Cannot read lines from {os.fspath(path)}: {reason}.") from error
@@ -340,52 +367,8 @@ def _read_archive(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             raise ValueError(f"Cannot read lines from {os.fspath(path)}: {reason}.") from error
 
 
-def _usable(arrays: list[np.ndarray], frames: np.ndarray, number_of_frames: int) -> np.ndarray:
-    """Positions of the lines with 3 or more distinct points, of which every frame must have one."""
-    usable = np.array([_has_three_distinct(line) for line in arrays], bool)
-    if not usable.any():
-        raise ValueError(f"No usable line: none of the {len(arrays)} lines has 3 or more distinct points.")
-    if not usable.all():
-        warnings.warn(
-            f"Dropped {np.sum(~usable)} of {len(arrays)} lines: they have fewer than 3 distinct "
-            "points, which says nothing about straightness.",
-            stacklevel=3,
-        )
-    empty = np.setdiff1d(np.arange(number_of_frames), frames[usable])
-    if empty.size:
-        raise ValueError(
-            f"No line in {empty.size} of {number_of_frames} frames (the first are "
-            f"{', '.join(map(str, empty[:5]))}). Leave those frames out of frame and focal."
-        )
-    return np.flatnonzero(usable)
-
-
-def _warn_of_points_outside(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -> None:
-    """Points far outside of the image mean a wrong image size, and with it a wrong centre and scale."""
-    beyond = np.max(
-        np.maximum(-points, points - (np.array(size) - 1)), axis=-1, where=mask[..., None], initial=0
-    )
-    outside = beyond > 0.01 * max(size)  # noise alone takes a few points some px out
-    if outside.any():
-        warnings.warn(
-            f"{np.sum(outside):,} of {np.sum(mask):,} points lie outside of the image of {size[0]} x "
-            f"{size[1]} px, by up to {np.max(beyond):.3g} px. Is image_size (width, height) right?",
-            stacklevel=3,
-        )
-
-
 def _held_as_given(array: np.ndarray) -> AnyArray:
     """A JAX array, unless that would change the values' dtype."""
     if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
         return jnp.asarray(array)
     return array
-
-
-def _has_three_distinct(line: np.ndarray) -> bool:
-    if len(line) < 3:
-        return False
-    from_first = (line != line[0]).any(axis=1)
-    if not from_first.any():
-        return False
-    second = line[np.argmax(from_first)]
-    return bool((from_first & (line != second).any(axis=1)).any())

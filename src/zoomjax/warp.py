@@ -13,6 +13,7 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, DTypeLike, Float, Num
 
 from .framing import Framing
@@ -24,6 +25,9 @@ its square."""
 
 _DEGREE = 10
 """Of the polynomial that starts Newton's method: for photographic lenses one step from it is enough."""
+
+_UNROLLED = 4
+"""Channels up to which each gets code of its own."""
 
 _OFF = -16384.0
 """A position, px, that is off any image."""
@@ -66,7 +70,7 @@ def warp_image(
         raise ValueError(
             f"Argument image must have shape (height, width, ...) with pixels, but it is {image.shape}."
         )
-    if interpolation not in ("linear", "cubic"):
+    if interpolation not in _KERNELS:
         raise ValueError(
             f'Argument interpolation must be "linear" or "cubic", but it is {interpolation!r}.'
         )
@@ -190,9 +194,13 @@ def _cubic_weights(fraction):
     return weights, slopes
 
 
+_KERNELS = {"linear": (_linear_weights, 0, 2), "cubic": (_cubic_weights, 1, 4)}
+"""Weights and slopes, pixels before the position's own, and pixels in all."""
+
+
 def _axis(position, length, interpolation):
     """Indices of the pixels to mix along one axis, their weights, and the weights' derivatives."""
-    kernel, before = (_linear_weights, 0) if interpolation == "linear" else (_cubic_weights, 1)
+    kernel, before, _ = _KERNELS[interpolation]
     position = jnp.clip(position, -8, length + 8)
     first = jnp.floor(position)
     weights, slopes = kernel(position - first)
@@ -226,21 +234,79 @@ def _sample(image, x, y, interpolation):
     return _mix(image, columns, rows, wx, wy)
 
 
-@_sample.defjvp
 def _sample_jvp(interpolation, primals, tangents):
-    """The tangent: the mix of the image's tangent, and the slopes of the kernel times those of x and y."""
+    """The tangent: the mix of the image's tangent, and the slopes of the kernel times those of x and y.
+
+    Written for its transpose: the whole gradient takes two thirds, and that of the lens alone a third, of
+    the time it takes with `_mix` for all three terms.
+    """
     image, x, y = primals
+    image_dot, *moves = tangents
+    total = jnp.zeros((*x.shape, image.shape[2]), image.dtype)
+    if not isinstance(image_dot, SymbolicZero):
+        total = total + _mix_windows(image_dot, x, y, interpolation)
+    if not all(isinstance(move, SymbolicZero) for move in moves):
+        x_dot, y_dot = (
+            jnp.zeros_like(x) if isinstance(move, SymbolicZero) else move.astype(x.dtype) for move in moves
+        )
+        total = total + _moved(image, x, y, x_dot, y_dot, interpolation).astype(image.dtype)
+    return _sample(image, x, y, interpolation), total
 
-    def term(which, dot):
-        columns, wx, sx = _axis(x, image.shape[1], interpolation)
-        rows, wy, sy = _axis(y, image.shape[0], interpolation)
-        if which == "image":
-            return _mix(dot, columns, rows, wx, wy)
-        wx, wy = (sx, wy) if which == "x" else (wx, sy)
-        return dot[..., None] * _mix(image, columns, rows, wx, wy)
 
-    terms = (term(which, dot) for which, dot in zip(("image", "x", "y"), tangents, strict=True))
-    return _sample(image, x, y, interpolation), sum(terms)
+_sample.defjvp(_sample_jvp, symbolic_zeros=True)
+
+
+def _mix_windows(image, x, y, interpolation):
+    """The samples, from windows of neighbours in a row, gathered whole.
+
+    The same values as `_sample`'s, slower; but the transpose adds whole windows, in half the time that it
+    takes to add the pixels one by one.
+    """
+    height, width, channels = image.shape
+    kernel, before, taps = _KERNELS[interpolation]
+    padded = jnp.pad(image, ((taps, taps), (taps, taps), (0, 0))).reshape(-1)
+    first_x, first_y = jnp.floor(x), jnp.floor(y)
+    wx, wy = kernel(x - first_x)[0], kernel(y - first_y)[0]
+    column, row = (
+        jnp.clip(first - before, -taps, length).astype(jnp.int32) + taps
+        for first, length in ((first_x, width), (first_y, height))
+    )
+    window = jax.lax.GatherDimensionNumbers(offset_dims=(2,), collapsed_slice_dims=(), start_index_map=(0,))
+    total = 0
+    for tap, weight in enumerate(wy):
+        start = ((row + tap) * (width + 2 * taps) + column) * channels
+        pixels = jax.lax.gather(
+            padded, start[..., None], window, (taps * channels,), mode="promise_in_bounds"
+        ).reshape(*x.shape, taps, channels)
+        weights = (jnp.stack(wx, axis=-1) * weight[..., None]).astype(image.dtype)
+        total = total + jnp.sum(weights[..., None] * pixels, axis=2)
+    return total
+
+
+def _moved(image, x, y, x_dot, y_dot, interpolation):
+    """What the samples change by when the positions move by (x_dot, y_dot).
+
+    Per channel the real part of the conjugate move times the complex slope (d/dx, d/dy): so both slopes
+    use each gathered pixel once, which is what lets XLA make one loop of it all, here and transposed.
+    """
+    columns, wx, sx = _axis(x, image.shape[1], interpolation)
+    rows, wy, sy = _axis(y, image.shape[0], interpolation)
+    # Computed before it is used: optimization_barrier does not last until XLA forms its loops on a CPU.
+    move = jax.lax.cond(x[0, 0] != jnp.inf, lambda z: z, jnp.zeros_like, jax.lax.complex(x_dot, y_dot))
+    several = image.shape[2] > _UNROLLED
+
+    def spread(plane):
+        return plane[..., None] if several else plane
+
+    changes = []
+    for channel in [slice(None)] if several else range(image.shape[2]):
+        slope = 0
+        for row, wr, sr in zip(rows, wy, sy, strict=True):
+            for column, wc, sc in zip(columns, wx, sx, strict=True):
+                pixel = image.at[row, column, channel].get(mode="promise_in_bounds").astype(x.dtype)
+                slope = slope + spread(jax.lax.complex(sc * wr, wc * sr)) * pixel
+        changes.append(jnp.real(spread(jnp.conj(move)) * slope))
+    return changes[0] if several else jnp.stack(changes, axis=-1)
 
 
 def _rounded(values, dtype):

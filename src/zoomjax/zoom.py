@@ -7,6 +7,7 @@ has to be written, and the algebraic estimate applies to it too.
 """
 
 import abc
+from typing import TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,6 +16,8 @@ from jaxtyping import Array, Float, PyTree, ScalarLike
 
 from ._checks import checked_integer
 from ._types import AnyArray, Coefficients, Focal, Scalar, traced
+
+SomeZoom = TypeVar("SomeZoom", bound="AbstractZoom")
 
 
 class AbstractZoom(eqx.Module):
@@ -119,6 +122,11 @@ class PolynomialZoom(AbstractLinearZoom):
             raise ValueError(UNFITTED)
         u = self.focal_ref / focal
         return jnp.stack([u**j for j in range(self.degree + 1)])
+
+
+def with_parameters(zoom: SomeZoom, parameters: PyTree) -> SomeZoom:
+    """The same model with other parameters."""
+    return eqx.tree_at(lambda model: model.parameters, zoom, parameters, is_leaf=lambda leaf: leaf is None)
 
 
 def check_distinct(what: str, focal: Focal, least: int) -> None:

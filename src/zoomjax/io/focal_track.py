@@ -1,0 +1,106 @@
+"""Focal lengths over time, ``time,focal`` or ``frame,focal``, interpolated in 1/f.
+
+Between two samples 1/f is taken as linear, because that is the variable in which the distortion is smooth.
+"""
+
+import csv
+import dataclasses
+import os
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class FocalTrack:
+    """A focal length for every moment from its first sample to its last.
+
+    Attributes:
+        position: increasing; seconds from the start, or frame numbers from 0.
+        focal: positive, one a position.
+        by_time: whether positions are seconds.
+        hold: whether the first and last focal length go on beyond the ends.
+
+    Example:
+        >>> FocalTrack(np.array([0.0, 10.0]), np.array([20.0, 60.0]), by_time=False).at(5, 0.2)
+        30.0
+    """
+
+    position: np.ndarray
+    focal: np.ndarray
+    by_time: bool = True
+    hold: bool = False
+
+    def __post_init__(self):
+        """Check the samples."""
+        if self.position.ndim != 1 or self.position.shape != self.focal.shape or not self.position.size:
+            raise ValueError(
+                "Arguments position and focal must hold one number a sample, at least one, but their "
+                f"shapes are {self.position.shape} and {self.focal.shape}."
+            )
+        if not (np.isfinite(self.focal) & (self.focal > 0)).all():
+            bad = int(np.flatnonzero(~(np.isfinite(self.focal) & (self.focal > 0)))[0])
+            raise ValueError(
+                f"Argument focal must hold positive numbers, but sample {bad} is {self.focal[bad]}."
+            )
+        if not np.isfinite(self.position).all() or (np.diff(self.position) <= 0).any():
+            raise ValueError(
+                "Argument position must increase from sample to sample, but it does not. Sort the track, "
+                "and give each moment once."
+            )
+
+    def at(self, frame: int, time: float) -> float:
+        """The focal length of a frame, given its number from 0 and its time in seconds.
+
+        Raises:
+            ValueError: the track begins after it or ends before it, and does not hold.
+        """
+        position = time if self.by_time else float(frame)
+        first, last = float(self.position[0]), float(self.position[-1])
+        slack = 1e-3 if self.by_time else 0.0  # times are printed with milliseconds
+        if not self.hold and not first - slack <= position <= last + slack:
+            unit = "s" if self.by_time else "frames"
+            raise ValueError(
+                f"The focal track goes from {first:g} to {last:g} {unit}, and frame {frame}, at "
+                f"{time:.3f} s, is outside of it. Give a track as long as the video, or hold its ends "
+                "(--hold)."
+            )
+        return 1 / float(np.interp(position, self.position, 1 / self.focal))
+
+
+def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> FocalTrack:
+    """A track from a CSV file with a header, ``time,focal`` (seconds) or ``frame,focal`` (from 0).
+
+    Under the header ``time_or_frame`` positions are frames if all are whole numbers, else seconds.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is something else; the message names it.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "track.csv"
+        >>> _ = path.write_text("time,focal\\n0,20\\n10,60\\n")
+        >>> read_focal_track(path).at(125, 5.0)
+        30.0
+    """
+    try:
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
+            rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+    except UnicodeDecodeError as error:
+        raise ValueError(f"Cannot read a focal track from {os.fspath(path)}: it is not text.") from error
+    header = [cell.strip().lower() for cell in rows[0]] if rows else []
+    kinds = {"time": True, "frame": False, "time_or_frame": None}
+    if len(header) < 2 or header[0] not in kinds or header[1] != "focal":
+        raise ValueError(
+            f'Cannot read a focal track from {os.fspath(path)}: its first line must be "time,focal" or '
+            f'"frame,focal", but it is {",".join(header)!r}.'
+        )
+    try:
+        numbers = np.array([[float(cell) for cell in row[:2]] for row in rows[1:]]).reshape(-1, 2)
+        by_time = kinds[header[0]]
+        if by_time is None:
+            by_time = bool((numbers[:, 0] % 1 != 0).any())
+        return FocalTrack(numbers[:, 0], numbers[:, 1], by_time=by_time, hold=hold)
+    except ValueError as error:
+        raise ValueError(f"Cannot read a focal track from {os.fspath(path)}: {error}") from error

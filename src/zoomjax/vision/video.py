@@ -1,0 +1,262 @@
+"""Zooming video, corrected frame by frame at each frame's own focal length, with PyAV.
+
+Decoding, warping (`planes`) and encoding overlap in three threads with a few frames between them, so that
+memory stays flat. Frame times, frame rate, colour description, orientation and tags go over unchanged, and
+audio packets as they are.
+"""
+
+import dataclasses
+import itertools
+import os
+import warnings
+from collections.abc import Callable, Generator, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+try:
+    import av
+    from av.error import FFmpegError
+except ModuleNotFoundError as error:  # pragma: no cover
+    raise ModuleNotFoundError('Video needs PyAV: pip install "zoomjax[app]"') from error
+
+from .._files import whole_file
+from ..framing import Framing, frame_output
+from ..io.focal_track import FocalTrack
+from ..lens import ZoomLens
+from ..sizes import at_focal, lens_for_size
+from .ahead import ahead
+from .encoding import CONTAINER, FrameWriter, display_matrix
+from .planes import FrameWarper
+from .undistort import check_sampling, warn_of_fold
+
+_MOST_ERRORS = 1000
+"""Of one file: a demuxer may fail for ever."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CorrectedVideo:
+    """What `undistort_video` did.
+
+    Attributes:
+        frames: frames written.
+        lost: frames that the file announces but that do not decode, or only with errors.
+        scale: output pixels per corrected pixel, of all frames.
+    """
+
+    frames: int
+    lost: int
+    scale: float
+
+
+def undistort_video(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    lens: ZoomLens,
+    focal: float | int | FocalTrack,
+    keep: str | Framing = "same",
+    interpolation: str = "linear",
+    border: str = "constant",
+    encoder: str | None = None,
+    options: dict[str, str] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> CorrectedVideo:
+    """Correct a video, each frame at its own focal length, into a new file.
+
+    Args:
+        source: the video. Its frames are taken as they are stored, before any rotation for display.
+        target: the file to write, all of it or none: .mp4, .mov, .m4v, .mkv, .webm, .avi, .ts.
+        lens: the lens; for frames of another size of the same aspect ratio it is scaled.
+        focal: one focal length for all frames, or a track, in the lens's unit.
+        keep: "same", "all" or "valid", one framing for all focal lengths of the track; or a `Framing`.
+        interpolation, border: as for `undistort_image`; a constant border is black.
+        encoder: FFmpeg's name of it; by default one for the source's own format, or for H.264.
+        options: of the encoder; by default ones for a quality that shows no difference.
+        progress: called after each frame with the number of frames done, and announced (0 if unknown).
+
+    Raises:
+        FileNotFoundError: there is no such video.
+        OSError: the target cannot be written; nothing is left of it.
+        ValueError: the source is no video, or none of its frames decodes; the track is shorter; the lens is
+            for another aspect ratio; or the target's suffix or encoder is unknown, or not for these frames.
+
+    Warns:
+        UserWarning: frames do not decode, or are interlaced; focal lengths are outside of the fitted range;
+            the lens was made for another size, or folds within the frames.
+    """
+    target = Path(target)
+    if target.suffix.lower() not in CONTAINER:
+        raise ValueError(
+            f"Argument target must end in one of {', '.join(CONTAINER)}, but it is {target.name!r}."
+        )
+    check_sampling(interpolation, border)
+    with _opened(source) as input_, whole_file(target) as part:
+        video = input_.streams.best("video")
+        lens = lens_for_size(lens, (video.codec_context.width, video.codec_context.height))
+        track = focal if isinstance(focal, FocalTrack) else _constant(float(focal))
+        _check_length(track, video)
+        lens.check_range(track.focal)
+        framing = keep if isinstance(keep, Framing) else _common_framing(lens, track.focal, keep)
+        warper = FrameWarper(lens, framing, interpolation=interpolation, border=border)
+        report = _Report(video.frames)
+        items = ahead(_warped(ahead(_decoded(input_, video, report)), warper, track, report))
+        try:
+            _write(items, part, target, input_, video, encoder, options, report, progress)
+        finally:
+            items.close()
+    lost = max(report.corrupt, report.announced - report.written if report.announced else 0)
+    if lost:
+        warnings.warn(
+            f"{lost} of {max(report.announced, report.written)} frames of {os.fspath(source)} do not "
+            f"decode ({report.error or 'the file ends early'}): {report.written} were written.",
+            stacklevel=2,
+        )
+    return CorrectedVideo(report.written, lost, float(framing.scale))
+
+
+@dataclasses.dataclass
+class _Report:
+    """What happened on the way, in threads."""
+
+    announced: int
+    written: int = 0
+    corrupt: int = 0
+    error: str = ""
+    orientation: list[int] | None = None
+
+
+def _opened(source: str | os.PathLike[str]) -> Any:
+    path = Path(source)
+    if not path.exists():
+        raise FileNotFoundError(f"There is no video {path}.")
+    if path.is_file() and path.stat().st_size == 0:
+        raise ValueError(f"Cannot read a video from {path}: the file is empty.")
+    try:
+        container: Any = av.open(str(path))
+    except FFmpegError as error:
+        raise ValueError(
+            f"Cannot read a video from {path}: {error.strerror}. The file is damaged, cut off, or no video."
+        ) from error
+    video = container.streams.best("video")
+    if video is None or not (video.codec_context.width and video.codec_context.height):
+        container.close()
+        why = "it has no video stream" if video is None else "none of its frames decodes"
+        raise ValueError(f"Cannot read a video from {path}: {why}.")
+    video.thread_type = "AUTO"
+    return container
+
+
+def _constant(focal: float) -> FocalTrack:
+    return FocalTrack(np.zeros(1), np.array([focal]), hold=True)
+
+
+def _check_length(track: FocalTrack, video: Any) -> None:
+    """Refuse a track that ends well before the video's announced end: now, not after all the work."""
+    rate = float(video.average_rate or 25)
+    if track.by_time:
+        length, slack = float((video.duration or 0) * video.time_base), 2 / rate  # durations are rounded
+    else:
+        length, slack = float(video.frames), 1.0
+    end = float(track.position[-1])
+    if not track.hold and end < length - slack:
+        unit = "s" if track.by_time else "frames"
+        raise ValueError(
+            f"The focal track ends at {end:g} {unit}, and the video has {length:.6g} {unit}. "
+            "Give a track as long as the video, or hold its ends (--hold)."
+        )
+
+
+def _common_framing(lens: ZoomLens, focal: np.ndarray, keep: str) -> Framing:
+    """One framing for all focal lengths from the shortest to the longest."""
+    inverse = np.linspace(1 / focal.min(), 1 / focal.max(), 65 if focal.min() < focal.max() else 1)
+    distortions = [at_focal(lens, np.asarray(1 / u, np.asarray(lens.centre).dtype)) for u in inverse]
+    for distortion in (distortions[0], distortions[-1]):
+        if warn_of_fold(distortion, lens.image_size, stacklevel=4):
+            break
+    return frame_output(distortions, lens.image_size, keep=keep)
+
+
+def _decoded(input_: Any, video: Any, report: _Report) -> Generator[Any, None, None]:
+    """Frames and audio packets, in the file's order; what is damaged is counted and passed over."""
+    packets = input_.demux([video, *input_.streams.audio])
+    while report.corrupt < _MOST_ERRORS:
+        try:
+            packet = next(packets, None)
+            if packet is None:
+                return
+            if packet.stream is not video:
+                if packet.dts is not None:
+                    yield packet
+                continue
+            frames = packet.decode()
+        except FFmpegError as error:
+            report.corrupt += 1
+            report.error = error.strerror or str(error)
+            continue
+        for frame in frames:
+            report.corrupt += bool(frame.is_corrupt)
+            yield frame
+
+
+def _warped(
+    items: Generator[Any, None, None], warper: FrameWarper, track: FocalTrack, report: _Report
+) -> Generator[Any, None, None]:
+    """Each frame corrected; packets of audio as they are."""
+    number, first = 0, None
+    try:
+        for item in items:
+            if not isinstance(item, av.VideoFrame):
+                yield item
+                continue
+            if first is None:
+                first = item.time or 0.0
+                _warn_of_fields(item)
+                report.orientation = display_matrix(item)
+            time = item.time - first if item.time is not None else number / 25
+            yield warper(item, track.at(number, time))
+            number += 1
+    finally:
+        items.close()
+
+
+def _warn_of_fields(frame: Any) -> None:
+    if frame.interlaced_frame:
+        warnings.warn(
+            "The video is interlaced: each frame holds two moments in alternate rows, which the correction "
+            "mixes. Deinterlace it first.",
+            stacklevel=2,
+        )
+
+
+def _write(
+    items: Iterable[Any],
+    part: Path,
+    target: Path,
+    input_: Any,
+    video: Any,
+    encoder: str | None,
+    options: dict[str, str] | None,
+    report: _Report,
+    progress: Callable[[int, int], None],
+) -> None:
+    """Encode the frames and copy the packets as they come."""
+    items = iter(items)
+    early = []  # audio before the first frame, of which the encoder must know the size and orientation
+    for item in items:
+        early.append(item)
+        if isinstance(item, av.VideoFrame):
+            break
+    else:
+        raise ValueError(f"Cannot read a video from {input_.name}: none of its frames decodes.")
+    with FrameWriter(
+        part, target, input_, video, early[-1], encoder, options, report.orientation
+    ) as writer:
+        for item in itertools.chain(early, items):
+            if not isinstance(item, av.VideoFrame):
+                writer.copy(item)
+                continue
+            writer.encode(item)
+            report.written += 1
+            progress(report.written, report.announced)

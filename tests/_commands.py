@@ -1,0 +1,13 @@
+"""The command line in a process of its own, as users run it."""
+
+import sys
+
+COMMAND = [sys.executable, "-c", "from zoomjax.cli import main; main()"]
+
+# As in a terminal: what runs in the background of a shell inherits that Ctrl-C is ignored.
+INTERRUPTIBLE = [
+    sys.executable,
+    "-c",
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    "from zoomjax.cli import main; main()",
+]

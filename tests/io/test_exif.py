@@ -1,0 +1,17 @@
+"""Focal lengths in EXIF data of both byte orders, and data that are cut off or something else."""
+
+import pytest
+
+from _exif import exif
+from zoomjax.io.exif import exif_focal
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("prefix", [b"", b"Exif\0\0"])
+def test_focal_length_of_both_byte_orders(order, prefix):
+    assert exif_focal(prefix + exif(order=order)) == 35.0
+
+
+@pytest.mark.parametrize("block", [exif(None), exif((0, 1)), exif((35, 0)), b"", b"no EXIF", exif()[:40]])
+def test_none_where_there_is_none(block):
+    assert exif_focal(block) is None

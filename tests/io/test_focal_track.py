@@ -1,0 +1,69 @@
+"""Focal tracks: interpolation in 1/f, their ends, and files that are none."""
+
+import numpy as np
+import pytest
+
+import zoomjax as zj
+
+
+def written(path, text):
+    path.write_text(text)
+    return path
+
+
+def test_interpolates_in_the_inverse(tmp_path):
+    track = zj.read_focal_track(written(tmp_path / "t.csv", "time,focal\n0,20\n2.5,40\n5,100\n"))
+    assert track.at(999, 0.0) == 20
+    assert track.at(0, 1.25) == pytest.approx(2 / (1 / 20 + 1 / 40))
+    assert track.at(0, 5.0) == 100
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "by_time"),
+    [
+        ("frame,focal", "0,20\n10,40\n", False),
+        ("time_or_frame,focal", "0,20\n10,40\n", False),
+        ("time_or_frame,focal", "0,20\n9.5,40\n", True),
+        ("Time , Focal", "0,20\n10,40\n", True),
+    ],
+)
+def test_positions_are_frames_or_seconds(tmp_path, header, rows, by_time):
+    track = zj.read_focal_track(written(tmp_path / "t.csv", f"{header}\n{rows}"))
+    assert track.by_time is by_time
+    assert track.at(5, 5.0) == pytest.approx(1 / np.interp(5, track.position, 1 / track.focal))
+    assert track.at(2, 4.0) != track.at(4, 2.0)
+
+
+def test_ends_are_errors_unless_held():
+    samples = (np.array([1.0, 2.0]), np.array([20.0, 40.0]))
+    for time in (0.5, 2.5):
+        with pytest.raises(ValueError, match=r"goes from 1 to 2 s, and frame 7, at .* s, is outside"):
+            zj.FocalTrack(*samples).at(7, time)
+    assert zj.FocalTrack(*samples, hold=True).at(7, 0.5) == 20
+    assert zj.FocalTrack(*samples, hold=True).at(7, 2.5) == 40
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "first line must be"),
+        ("f,t\n1,2\n", "first line must be"),
+        ("time,focal\n", "at least one"),
+        ("time,focal\n0,wide\n", "could not convert"),
+        ("time,focal\n0,20\n1,-3\n", "positive numbers, but sample 1"),
+        ("time,focal\n1,20\n0,30\n", "must increase"),
+        ("time,focal\n0,20\n0,30\n", "must increase"),
+    ],
+)
+def test_bad_files_are_named(tmp_path, text, message):
+    path = written(tmp_path / "bad.csv", text)
+    with pytest.raises(ValueError, match=f"bad.csv.*{message}"):
+        zj.read_focal_track(path)
+
+
+def test_no_file_and_no_text(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        zj.read_focal_track(tmp_path / "none.csv")
+    (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match="not text"):
+        zj.read_focal_track(tmp_path / "bytes.csv")
