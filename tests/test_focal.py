@@ -52,7 +52,7 @@ def views(focal, tilts=TILTS, plane=PLANE, depth=20.0):
 @pytest.mark.parametrize("f", [20.56, 35.0, 127.36])
 def test_projected_boards_give_their_focal_length(truth, f):
     corrected, _, board = photographed(truth, f)
-    assert len(board) > 50
+    assert len(board) > 40
     estimate = from_board(corrected, board)
     np.testing.assert_allclose(estimate.focal, f, rtol=1e-12)
     assert estimate.rms < 1e-9
@@ -98,8 +98,8 @@ def test_standard_deviation_from_a_board_is_that_of_sampled_noise(truth, rng):
     corrected, board = corrected[chosen], board[chosen]
     noise = 0.7 * rng.standard_normal((4000, *corrected.shape))
     sample = jax.vmap(lambda error: from_board(corrected + error, board))(jnp.array(noise))
-    assert sample.focal.mean() == pytest.approx(60, abs=4 * sample.focal.std() / np.sqrt(4000))
-    assert np.sqrt((sample.std**2).mean()) == pytest.approx(sample.focal.std(), rel=0.05)
+    assert sample.focal.mean() == pytest.approx(60, abs=float(4 * sample.focal.std() / np.sqrt(4000)))
+    assert np.sqrt((sample.std**2).mean()) == pytest.approx(float(sample.focal.std()), rel=0.05)
     assert (sample.rms**2).mean() == pytest.approx(2 * 0.7**2 * (1 - 4 / 24), rel=0.02)
 
 
@@ -150,10 +150,10 @@ def test_standard_deviation_from_planes_is_that_of_sampled_noise(tilts, rng):
     together, each = jax.vmap(
         lambda error: zj.focal_from_planes(exact + error, PLANE, principal=PRINCIPAL)
     )(noise)
-    assert together.focal.mean() == pytest.approx(1200, abs=0.2 * together.focal.std())
-    assert np.sqrt((together.std**2).mean()) == pytest.approx(together.focal.std(), rel=0.07)
+    assert together.focal.mean() == pytest.approx(1200, abs=float(0.2 * together.focal.std()))
+    assert np.sqrt((together.std**2).mean()) == pytest.approx(float(together.focal.std()), rel=0.07)
     for view in range(len(tilts)):
-        spread = each.focal[:, view].std()
+        spread = float(each.focal[:, view].std())
         assert np.sqrt((each.std[:, view] ** 2).mean()) == pytest.approx(spread, rel=0.1)
     assert (together.rms**2).mean() == pytest.approx(2 * 0.3**2 * (1 - 8 / 108), rel=0.02)
 
@@ -184,7 +184,7 @@ def test_a_view_closer_to_squarely_says_less(rng):
 
 def test_a_view_that_says_nothing_is_nan_and_infinitely_uncertain():
     """A bulge that no plane seen by a camera could have: both equations ask for a negative 1/f²."""
-    turned = (PLANE - PLANE.mean(axis=0)) @ np.diag([1.0, 1.5])
+    turned = (PLANE - PLANE.mean(axis=0)) @ np.diag([1.5, 1.0])
     stretched = 100 * turned / (1 + 0.02 * turned[:, :1]) + PRINCIPAL
     together, each = zj.focal_from_planes(stretched[None], PLANE, principal=PRINCIPAL)
     assert np.isnan(together.focal)
@@ -196,7 +196,7 @@ def test_a_square_view_weighs_nothing_beside_an_oblique_one(rng):
     noisy = views(1200.0, [TILTS[0], (0.0, 0.0, 0.1)]) + 0.1 * rng.standard_normal((2, len(PLANE), 2))
     together, each = zj.focal_from_planes(noisy, PLANE, principal=PRINCIPAL)
     assert not each.std[1] < 20 * each.std[0]
-    assert together.focal == pytest.approx(each.focal[0], abs=2 * each.std[0])
+    assert together.focal == pytest.approx(float(each.focal[0]), abs=float(2 * each.std[0]))
 
 
 def test_float32_is_kept_and_close():

@@ -138,8 +138,11 @@ def focal_from_planes(
         >>> print(round(float(together.focal), 3), each.focal.shape)
         800.0 (1,)
     """
-    if points.ndim != 3:
-        raise ValueError(f"Argument points must have shape (view, point, 2), but it is {points.shape}.")
+    if points.ndim != 3 or not len(points):
+        raise ValueError(
+            "Argument points must have shape (view, point, 2), with a view at least, but its shape is "
+            f"{points.shape}."
+        )
     _check_pairs(points[0], plane, fewest=5)
     return _focal_from_planes(jnp.asarray(points), jnp.asarray(plane), jnp.asarray(principal))
 
@@ -231,9 +234,9 @@ def _inverse_square(entries, root):
         return -jnp.einsum("vi,vij,vj", factor, weight, constant) / information, information
 
     w = -jnp.sum(factor * constant) / jnp.sum(factor**2)
-    for _ in range(_WEIGHINGS):
-        w, information = solve(jnp.maximum(w, 0))
-    return w, information
+    for _ in range(_WEIGHINGS - 1):
+        w, _ = solve(jnp.maximum(w, 0))
+    return solve(jnp.maximum(w, 0))
 
 
 def _complex(points):

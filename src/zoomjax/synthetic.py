@@ -192,7 +192,7 @@ def board_photo(
     photo = np.asarray(
         _expose(
             lens(float(focal)),
-            tuple(jnp.asarray(board.edges(axis), dtype) for axis in (0, 1)),
+            (jnp.asarray(board.edges(0), dtype), jnp.asarray(board.edges(1), dtype)),
             jnp.asarray(board.magnification(float(focal)), dtype),
             jnp.asarray(max(blur, 1e-6), dtype),
             jnp.asarray([*levels, vignetting], dtype),

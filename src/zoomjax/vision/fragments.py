@@ -21,6 +21,9 @@ _ASIDE = 0.7
 """px across the edge from a point to the next."""
 
 _LEAST_POINTS = 8
+_HALVINGS = 8
+"""How often what is crooked is halved before it is dropped."""
+
 _CROOKED = 0.35
 """px, RMS about the best parabola: noise of 5 levels on an edge of 40 gives 0.2."""
 
@@ -52,20 +55,18 @@ class Fragments:
 
 def fragments(edges: EdgePoints) -> Fragments:
     """The gently bent pieces of at least 8 points that the edge points make."""
-    label = _linked(edges)
-    points = edges.position
-    for _ in range(8):
-        pieces, label, points = _ordered(points, label)
+    pieces, label, points = _ordered(edges.position, _linked(edges))
+    for _ in range(_HALVINGS):
         if not len(pieces.start):
-            break
-        rms, halves = _straightness(pieces)
-        crooked = rms > _CROOKED
+            return pieces
+        rms, second_half = _straightness(pieces)
+        crooked = (rms > _CROOKED)[label]
         if not crooked.any():
-            break
-        label = 2 * label + (halves & crooked[label])
-    else:
-        good = ~crooked[label]
-        pieces, _, _ = _ordered(points[good], label[good])
+            return pieces
+        pieces, label, points = _ordered(points, 2 * label + (second_half & crooked))
+    if len(pieces.start):
+        straight = (_straightness(pieces)[0] <= _CROOKED)[label]
+        pieces, _, _ = _ordered(points[straight], label[straight])
     return pieces
 
 

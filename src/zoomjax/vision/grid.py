@@ -181,7 +181,10 @@ def _search(grey: np.ndarray, size: tuple[int, int], flags: int) -> np.ndarray |
 def _alternates(grey: np.ndarray, grid: np.ndarray) -> bool:
     """Whether the squares between the corners are dark and bright in turn."""
     middle = (grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1] + grid[:-1, :-1]) / 4
-    bright = cv2.remap(grey, middle.astype(np.float32), None, cv2.INTER_LINEAR).astype(float)
+    x, y = np.moveaxis(middle.astype(np.float32), -1, 0)
+    bright = cv2.remap(grey, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_LINEAR).astype(
+        float
+    )
     odd = np.indices(bright.shape).sum(axis=0) % 2 == 1
     rises = [bright[1:] > bright[:-1], bright[:, 1:] > bright[:, :-1]]
     as_odd = [rises[0] == odd[1:], rises[1] == odd[:, 1:]]
@@ -215,7 +218,7 @@ def _spots(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     usual = np.median(area[fits])
     fits &= (area > usual / 5) & (area < 5 * usual)
     new = np.where(fits, np.cumsum(fits), 0)
-    centres = _centroids(grey, new[label], int(fits.sum()), float(np.sqrt(usual)))
+    centres = _centroids(grey, new[np.asarray(label, np.intp)], int(fits.sum()), float(np.sqrt(usual)))
     return centres, _nearest(centres, (height, width))
 
 
@@ -247,6 +250,7 @@ def _nearest(centres: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     _, label = cv2.distanceTransformWithLabels(
         apart, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
+    label = np.asarray(label, np.intp)
     index = np.zeros(label.max() + 1, np.int32)
     index[label[y, x]] = np.arange(len(centres))
     return index[label]

@@ -9,7 +9,7 @@ not count: along the border of a checkerboard it changes at every square.
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from .fragments import Fragments, main_direction
 
@@ -46,7 +46,7 @@ def joined(pieces: Fragments, radius: float) -> np.ndarray:
         return np.arange(number)
     tip, middle, direction, error = (np.concatenate(both) for both in zip(*_ends(pieces), strict=True))
     nearest = min(_NEAREST, 2 * number)
-    other = cKDTree(tip).query(tip, nearest)[1]
+    other = np.asarray(KDTree(tip).query(tip, nearest)[1])
     own = np.arange(2 * number)[:, None]
     chord = middle[other] - middle[own]
     length = np.maximum(np.hypot(*np.moveaxis(chord, -1, 0)), 1e-9)
