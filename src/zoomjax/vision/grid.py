@@ -72,7 +72,11 @@ class GridDetector(AbstractDetector):
 
     def __call__(self, image: UInt8[np.ndarray, "height width *channels"]) -> list[np.ndarray]:
         """The rows of the grid, then its columns, each with at least 3 points."""
-        grid = self.find(image)
+        return self.lines(self.find(image))
+
+    @staticmethod
+    def lines(grid: Float[np.ndarray, "row column 2"] | None) -> list[np.ndarray]:
+        """The rows and columns of what `find` found, each with at least 3 points."""
         if grid is None:
             return []
         lines = [*grid, *grid.swapaxes(0, 1)]
