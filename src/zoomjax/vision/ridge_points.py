@@ -30,12 +30,15 @@ _OF_GRASS = 2.0
 _BESIDE = np.array([2, 3, 4])
 """px beyond the points at half height, where a side's level and colour are read."""
 
-_UNEVEN = 1.0
+_UNEVEN = 2.0
 """How much the sides may differ, as a share of the height above the brighter one."""
 
-_WHITER = 0.4
+_WHITER = 0.7
 """Least rise of the darkest of the three colours, as a share of the rise of the grey level: grass lacks blue,
 white does not, and shirts and light patches of grass do."""
+
+_BORDER = 3
+"""px along the image's border without points."""
 
 _NEAR = 6.0
 """px, how far the points are that tell a ridge's direction."""
@@ -46,25 +49,29 @@ _SCATTER = 0.8
 
 def ridge_points(image: np.ndarray, grass: Grass) -> EdgePoints:
     """Points in the middle of white ridges on the grass of an image (h, w, 3), uint8 BGR: one a row or column."""
-    height, width = image.shape[:2]
-    grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (0, 0), _SMOOTHING)
-    widest = _WIDEST * min(height, width)
+    size = image.shape[1::-1]
+    widest = _WIDEST * min(size)
     reach = round(widest) + 2
-    hat = cv2.morphologyEx(grey, cv2.MORPH_TOPHAT, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    margin = reach + _BESIDE[-1] + 2  # profiles and what is beside them end within the padded image
+    image = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
+    grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (0, 0), _SMOOTHING)
+    hat = cv2.morphologyEx(grey, cv2.MORPH_TOPHAT, np.ones((reach, reach), np.uint8))
     hat = cv2.blur(hat, (3, 3))
-    margin = 2 * reach  # profiles and sides end inside of the image
     inside = (slice(margin, -margin), slice(margin, -margin))
     bright = np.zeros_like(hat)
-    bright[inside] = cv2.threshold(hat[inside], _least_height(hat, grass), 255, cv2.THRESH_TOZERO)[1]
+    least = _least_height(hat[inside], grass)
+    bright[inside] = cv2.threshold(hat[inside], least, 255, cv2.THRESH_TOZERO)[1]
     at = np.flatnonzero(bright)
-    at = at[grass.holds(_pixels(at, width), (width, height))]
+    at = at[grass.holds(_pixels(at, bright.shape[1]) - margin, size)]
     parts = [_middles(image, grey, grass, hat, at, axis, reach) for axis in (0, 1)]
     position, axis, across = (np.concatenate(part) for part in zip(*parts, strict=True))
     normal, scatter = _directions(position)
     steep = abs(normal[np.arange(len(axis)), axis])
     keep = (steep > np.sqrt(0.49)) & (across * steep < widest) & (scatter < _SCATTER)
-    position, normal = position[keep], normal[keep]
-    return EdgePoints(position, normal, np.rint(position).astype(np.intp), (width, height), polar=False)
+    position -= margin
+    keep &= ((position > _BORDER) & (position < np.subtract(size, _BORDER + 1))).all(axis=1)
+    position = position[keep]
+    return EdgePoints(position, normal[keep], np.rint(position).astype(np.intp), size, polar=False)
 
 
 def _pixels(at: np.ndarray, width: int) -> np.ndarray:
