@@ -23,6 +23,10 @@ _LEAST_SATURATION = 40
 _OF_USUAL_SATURATION = 0.35
 _LEAST_BRIGHTNESS = 30
 
+_OF_FIELD = 0.72
+"""Share of the usual saturation that grass has in the field of play: beyond its lines there may be other or
+trodden turf, and nets veil what is behind them."""
+
 _LEAST_AREA = 0.1
 """Share of the image below which there is no pitch in it."""
 
@@ -51,6 +55,11 @@ class Grass:
         """Whether colours (n, 3), uint8 BGR, are colours of this grass."""
         hsv = cv2.cvtColor(colours[:, None], cv2.COLOR_BGR2HSV)
         return cv2.inRange(hsv, *_bounds(self.hue, self.saturation))[:, 0] > 0
+
+    def is_usual(self, colours: np.ndarray) -> np.ndarray:
+        """Which of such colours are about as saturated as most of the grass: not seen through nets or haze."""
+        least = _OF_FIELD * self.saturation
+        return cv2.cvtColor(colours[:, None], cv2.COLOR_BGR2HSV)[:, 0, 1] >= least
 
     def holds(self, pixel: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
         """Whether pixels (n, 2) of an image of that size are on the pitch."""

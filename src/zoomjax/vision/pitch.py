@@ -1,48 +1,107 @@
-"""The white markings of a pitch: the lines that broadcast football is seen with.
+"""The white markings of a pitch: the straight lines in broadcast football.
 
 Grass first (`grass`), then the middles of white ridges on it (`ridge_points`), linked into smooth pieces
-(`fragments`), and the pieces of one marking joined where players stand on it (`joining`). Circles on the
-pitch are ellipses in the image, and their flattest parts are tempting: a marking is a line only if it bends
-no more than a lens makes it bend.
+(`fragments`), and the pieces of one marking joined where players stand on it (`joining`). Circles on a pitch
+are ellipses in the image, and their flattest parts are almost straight: what bends more than a lens bends a
+line is none.
 """
 
-import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from .detector import AbstractDetector
 from .edges import as_grey
 from .fragments import fragments
 from .grass import find_grass
-from .joining import joined
+from .joining import border_lines, joined
+from .one_frame import normals
 from .ridge_points import ridge_points
 
-_LEAST_RADIUS = 4.0
-"""Of the arc that a lens may bend a line to, in halves of the image's diagonal."""
+_LEAST_RADIUS = 5.0
+"""Of the arc that a lens may bend a line to, in halves of the image's diagonal: k1 = 0.1 bends a line halfway
+between the middle of the image and its corner to 10. Where a whole penalty area is in sight, the flattest
+parts of its arc have 1 to 2."""
+
+_CROOKED = 1.5
+"""px, RMS about the best parabola, that a line of joined pieces may have."""
+
+_LEAST_COVER = 0.4
+"""Share of a line that must be visible."""
 
 
 class PitchDetector(AbstractDetector):
-    least_length: float = 0.08
+    """Finds the straight white markings on the grass of a pitch, in colour images of broadcast football.
 
-    def __call__(self, image: np.ndarray) -> list[np.ndarray]:
+    Points are in the middle of the markings. Circles and arcs, players, goals, boards and captions are left
+    out; a marking that a player interrupts is one line. Thresholds follow the grass of each image.
+
+    Attributes:
+        least_length: share of the image's diagonal that a line must extend over, 0 to 1.
+
+    Example:
+        >>> import cv2
+        >>> import numpy as np
+        >>> image = np.full((360, 640, 3), (50, 140, 70), np.uint8)
+        >>> image = cv2.line(image, (40, 60), (600, 290), (230, 240, 235), 5, cv2.LINE_AA)
+        >>> image = cv2.ellipse(image, (250, 230), (120, 60), 0, 0, 360, (230, 240, 235), 5, cv2.LINE_AA)
+        >>> lines = PitchDetector()(image)
+        >>> len(lines), lines[0].shape[1]
+        (1, 2)
+    """
+
+    least_length: float = 0.06
+
+    def __check_init__(self):
+        """Check that it is a share."""
+        if not 0 <= self.least_length <= 1:
+            raise ValueError(f"Argument least_length must be 0 to 1, but it is {self.least_length}.")
+
+    def __call__(self, image: UInt8[np.ndarray, "height width *channels"]) -> list[np.ndarray]:
+        """Sub-pixel points in the middle of the markings in an image, the longest line first.
+
+        Args:
+            image: (height, width, 3), uint8 BGR, at least 32 px a side.
+
+        Returns:
+            For each line an (n, 2) array of ``(x, y)``, px, in order along the line; none without grass.
+
+        Raises:
+            ValueError: the image is none, or not in colour.
+        """
+        _check(image)
         grass = find_grass(image)
         if grass is None:
             return []
+        half_diagonal = np.hypot(*image.shape[:2]) / 2
+        radius = _LEAST_RADIUS * half_diagonal
         pieces = fragments(ridge_points(image, grass))
-        radius = _LEAST_RADIUS * np.hypot(*image.shape[:2]) / 2
-        marking = joined(pieces, radius)
-        label = marking[pieces.piece()]
-        lines = []
-        for m in np.unique(label):
-            l = pieces.points[label == m]
-            c = l - l.mean(0); _, _, v = np.linalg.svd(c, full_matrices=False)
-            o = np.argsort(c @ v[0]); l = l[o]; t = (c @ v[0])[o]; d = (c @ v[1])[o]
-            L = t[-1] - t[0]
-            if L < self.least_length * np.hypot(*image.shape[:2]):
-                continue
-            q = np.polyfit(t, d, 2)
-            R = 1 / max(abs(2 * q[0]), 1e-9)
-            rms = np.sqrt(np.mean((d - np.polyval(q, t)) ** 2))
-            if R < radius or rms > 2:
-                continue
-            lines.append(l)
-        return lines
+        lines = border_lines(pieces, joined(pieces, radius))
+        lengths = [np.hypot(*(line[-1] - line[0])) for line in lines]
+        return [
+            lines[index]
+            for index in np.argsort(lengths)[::-1]
+            if lengths[index] >= 2 * half_diagonal * self.least_length and _is_line(lines[index], radius)
+        ]
+
+
+def _check(image) -> None:
+    """Check that this is an image in colour."""
+    as_grey(image)
+    if image.ndim != 3:
+        raise ValueError(
+            f"Argument image must be a colour image (height, width, 3), blue, green, red, as grass is told by "
+            f"its colour, but its shape is {image.shape}."
+        )
+
+
+def _is_line(points: np.ndarray, radius: float) -> bool:
+    """Whether points follow an arc of at least that radius, px, without too large gaps."""
+    centred = points - points.mean(axis=0)
+    normal = normals(centred[None])[0]
+    along, across = centred @ (normal[1], -normal[0]), centred @ normal
+    powers = np.vander(along / np.ptp(along), 3)
+    bend = np.linalg.lstsq(powers, across, rcond=None)[0]
+    rms = np.sqrt(np.mean((across - powers @ bend) ** 2))
+    steps = np.max(abs(points[-1] - points[0]))  # a marking has a point in each row or column
+    flat = abs(bend[0]) * 2 * radius <= np.ptp(along) ** 2
+    return bool(flat and rms <= _CROOKED and len(points) >= _LEAST_COVER * steps)

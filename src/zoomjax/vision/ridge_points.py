@@ -107,7 +107,9 @@ def _middles(image, grey, grass: Grass, hat, at, axis: int, reach: int):
     shift = (far[:, 1] - far[:, 0]) / 2
     middle = at + step * np.rint(shift).astype(np.intp)
     found &= (height > _FLOOR) & (abs(side[:, 1] - side[:, 0]) < _UNEVEN * height)
-    found &= grass.has_colour(np.rint(colour).astype(np.uint8).reshape(-1, 3)).reshape(-1, 2).all(axis=1)
+    beside = np.rint(colour).astype(np.uint8).reshape(-1, 3)
+    found &= grass.has_colour(beside).reshape(-1, 2).all(axis=1)
+    found &= grass.is_usual(beside).reshape(-1, 2).any(axis=1)
     found &= colours[middle].min(axis=1) - colour.min(axis=-1).max(axis=1) > _WHITER * height
     # Flat ridges have several maxima side by side, with one middle.
     _, first = np.unique(middle[found], return_index=True)
