@@ -23,7 +23,7 @@ _LEAST_SATURATION = 40
 _OF_USUAL_SATURATION = 0.35
 _LEAST_BRIGHTNESS = 30
 
-_OF_FIELD = 0.72
+_OF_FIELD = 0.75
 """Share of the usual saturation that grass has in the field of play: beyond its lines there may be other or
 trodden turf, and nets veil what is behind them."""
 
@@ -56,10 +56,12 @@ class Grass:
         hsv = cv2.cvtColor(colours[:, None], cv2.COLOR_BGR2HSV)
         return cv2.inRange(hsv, *_bounds(self.hue, self.saturation))[:, 0] > 0
 
-    def is_usual(self, colours: np.ndarray) -> np.ndarray:
-        """Which of such colours are about as saturated as most of the grass: not seen through nets or haze."""
-        least = _OF_FIELD * self.saturation
-        return cv2.cvtColor(colours[:, None], cv2.COLOR_BGR2HSV)[:, 0, 1] >= least
+    def is_field(self, colours: np.ndarray) -> np.ndarray:
+        """Whether colours (n, 3) are colours of this grass, as saturated as about all of it in the field of play."""
+        hsv = cv2.cvtColor(colours[:, None], cv2.COLOR_BGR2HSV)
+        least, greatest = _bounds(self.hue, self.saturation)
+        least[1] = max(least[1], _OF_FIELD * self.saturation)
+        return cv2.inRange(hsv, least, greatest)[:, 0] > 0
 
     def holds(self, pixel: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
         """Whether pixels (n, 2) of an image of that size are on the pitch."""

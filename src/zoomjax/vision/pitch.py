@@ -12,10 +12,10 @@ from jaxtyping import UInt8
 from .detector import AbstractDetector
 from .edges import as_grey
 from .fragments import fragments
-from .grass import find_grass
+from .grass import Grass, find_grass
 from .joining import border_lines, joined
 from .one_frame import normals
-from .ridge_points import ridge_points
+from .ridge_points import WIDEST, ridge_points
 
 _LEAST_RADIUS = 5.0
 """Of the arc that a lens may bend a line to, in halves of the image's diagonal: k1 = 0.1 bends a line halfway
@@ -24,6 +24,9 @@ parts of its arc have 1 to 2."""
 
 _CROOKED = 1.5
 """px, RMS about the best parabola, that a line of joined pieces may have."""
+
+_BESIDE = 3
+"""px beyond the side of the widest marking, where the grass beside a line is looked at."""
 
 _LEAST_COVER = 0.4
 """Share of a line that must be visible."""
@@ -77,11 +80,9 @@ class PitchDetector(AbstractDetector):
         pieces = fragments(ridge_points(image, grass))
         lines = border_lines(pieces, joined(pieces, radius))
         lengths = [np.hypot(*(line[-1] - line[0])) for line in lines]
-        return [
-            lines[index]
-            for index in np.argsort(lengths)[::-1]
-            if lengths[index] >= 2 * half_diagonal * self.least_length and _is_line(lines[index], radius)
-        ]
+        longest_first = [lines[index] for index in np.argsort(lengths)[::-1]]
+        long = longest_first[: np.sum(lengths >= 2 * half_diagonal * self.least_length)]
+        return [line for line in long if _is_line(line, radius) and _bounds_field(line, image, grass)]
 
 
 def _check(image) -> None:
@@ -105,3 +106,13 @@ def _is_line(points: np.ndarray, radius: float) -> bool:
     steps = np.max(abs(points[-1] - points[0]))  # a marking has a point in each row or column
     flat = abs(bend[0]) * 2 * radius <= np.ptp(along) ** 2
     return bool(flat and rms <= _CROOKED and len(points) >= _LEAST_COVER * steps)
+
+
+def _bounds_field(points: np.ndarray, image: np.ndarray, grass: Grass) -> bool:
+    """Whether the field of play is on one side of most points at least: what is behind a goal is no marking."""
+    along = points[-1] - points[0]
+    aside = (WIDEST * min(image.shape[:2]) / 2 + _BESIDE) * np.array([-along[1], along[0]]) / np.hypot(*along)
+    greatest = np.subtract(image.shape[1::-1], 1)
+    sides = [np.clip(np.rint(points + offset).astype(int), 0, greatest) for offset in (aside, -aside)]
+    field = [grass.is_field(image[side[:, 1], side[:, 0]]) for side in sides]
+    return bool(np.mean(field[0] | field[1]) > 0.5)

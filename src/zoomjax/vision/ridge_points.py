@@ -18,7 +18,7 @@ from .grass import Grass
 _SMOOTHING = 1.0
 """px, standard deviation."""
 
-_WIDEST = 0.02
+WIDEST = 0.02
 """Share of the image's shorter side that a marking may be wide."""
 
 _FLOOR = 8.0
@@ -50,7 +50,7 @@ _SCATTER = 0.8
 def ridge_points(image: np.ndarray, grass: Grass) -> EdgePoints:
     """Points in the middle of white ridges on the grass of an image (h, w, 3), uint8 BGR: one a row or column."""
     size = image.shape[1::-1]
-    widest = _WIDEST * min(size)
+    widest = WIDEST * min(size)
     reach = round(widest) + 2
     margin = reach + _BESIDE[-1] + 2  # profiles and what is beside them end within the padded image
     image = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
@@ -94,10 +94,11 @@ def _middles(image, grey, grass: Grass, hat, at, axis: int, reach: int):
     step = (1, width)[axis]
     flat, levels, colours = hat.ravel(), grey.ravel(), image.reshape(-1, 3)
     at = at[(flat[at] > flat[at - step]) & (flat[at] >= flat[at + step])]
-    profile = levels[at[:, None] + step * np.arange(-reach, reach + 1)].astype(np.float32)
+    profile = levels[at[:, None] + step * np.arange(-reach, reach + 1)]
+    lowest = np.maximum(profile[:, :reach].min(axis=1), profile[:, reach + 1 :].min(axis=1))
+    profile = profile.astype(np.float32)
     peak = profile[:, reach : reach + 1]
-    lowest = np.stack([profile[:, :reach].min(axis=1), profile[:, reach + 1 :].min(axis=1)], axis=-1)
-    far, found = _crossings(profile, (peak + lowest.max(axis=1, keepdims=True)) / 2)
+    far, found = _crossings(profile, (peak + lowest[:, None]) / 2)
     at, profile, peak, far = at[found], profile[found], peak[found], far[found]
     beside = np.rint(far).astype(np.intp)[..., None] + _BESIDE
     beside = at[:, None, None] + step * beside * np.array([-1, 1])[:, None]
@@ -107,9 +108,7 @@ def _middles(image, grey, grass: Grass, hat, at, axis: int, reach: int):
     shift = (far[:, 1] - far[:, 0]) / 2
     middle = at + step * np.rint(shift).astype(np.intp)
     found &= (height > _FLOOR) & (abs(side[:, 1] - side[:, 0]) < _UNEVEN * height)
-    beside = np.rint(colour).astype(np.uint8).reshape(-1, 3)
-    found &= grass.has_colour(beside).reshape(-1, 2).all(axis=1)
-    found &= grass.is_usual(beside).reshape(-1, 2).any(axis=1)
+    found &= grass.has_colour(np.rint(colour).astype(np.uint8).reshape(-1, 3)).reshape(-1, 2).all(axis=1)
     found &= colours[middle].min(axis=1) - colour.min(axis=-1).max(axis=1) > _WHITER * height
     # Flat ridges have several maxima side by side, with one middle.
     _, first = np.unique(middle[found], return_index=True)
