@@ -53,22 +53,21 @@ class Grass:
 
     def has_colour(self, colours: np.ndarray) -> np.ndarray:
         """Whether colours (n, 3), uint8 BGR, are colours of this grass."""
-        hsv = cv2.cvtColor(colours[:, None], cv2.COLOR_BGR2HSV)
-        return cv2.inRange(hsv, *_bounds(self.hue, self.saturation))[:, 0] > 0
+        return self._within(colours, _OF_USUAL_SATURATION)
 
     def is_field(self, colours: np.ndarray) -> np.ndarray:
-        """Whether colours (n, 3) are colours of this grass, as saturated as about all of it in the field of play."""
-        hsv = cv2.cvtColor(colours[:, None], cv2.COLOR_BGR2HSV)
-        least, greatest = _bounds(self.hue, self.saturation)
-        least[1] = max(least[1], _OF_FIELD * self.saturation)
-        return cv2.inRange(hsv, least, greatest)[:, 0] > 0
+        """Whether colours are as saturated as well, as about all grass in the field of play is."""
+        return self._within(colours, _OF_FIELD)
 
-    def holds(self, pixel: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
-        """Whether pixels (n, 2) of an image of that size are on the pitch."""
-        height, width = self.region.shape
-        x = pixel[:, 0] * width // image_size[0]
-        y = pixel[:, 1] * height // image_size[1]
-        return self.region[y, x] > 0
+    def mask(self, image_size: tuple[int, int]) -> np.ndarray:
+        """The region in an image of that size, (w, h) px."""
+        return cv2.resize(self.region, image_size, interpolation=cv2.INTER_NEAREST)
+
+    def _within(self, colours: np.ndarray, saturation: float) -> np.ndarray:
+        if not len(colours):
+            return np.zeros(0, bool)
+        hsv = cv2.cvtColor(colours[:, None], cv2.COLOR_BGR2HSV)
+        return cv2.inRange(hsv, *_bounds(self.hue, saturation * self.saturation))[:, 0] > 0
 
 
 def find_grass(image: np.ndarray) -> Grass | None:
@@ -82,14 +81,14 @@ def find_grass(image: np.ndarray) -> Grass | None:
     hues = np.bincount(hsv[green, 0], minlength=180)
     hue = float(np.argmax(np.convolve(hues, np.ones(5), "same")))
     saturation = float(np.median(hsv[green & (abs(hsv[..., 0] - hue) <= _HUE_WIDTH), 1]))
-    region = _region(cv2.inRange(hsv, *_bounds(hue, saturation)))
+    region = _region(cv2.inRange(hsv, *_bounds(hue, _OF_USUAL_SATURATION * saturation)))
     return Grass(region, hue, saturation) if np.mean(region > 0) >= _LEAST_AREA else None
 
 
 def _bounds(hue: float, saturation: float) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the greatest hue, saturation and brightness of grass."""
-    least = max(_LEAST_SATURATION, _OF_USUAL_SATURATION * saturation)
-    return np.array([hue - _HUE_WIDTH, least, _LEAST_BRIGHTNESS]), np.array([hue + _HUE_WIDTH, 255, 255])
+    """The least and the greatest hue, saturation and brightness of grass at least so saturated."""
+    least = (hue - _HUE_WIDTH, max(_LEAST_SATURATION, saturation), _LEAST_BRIGHTNESS)
+    return np.array(least), np.array([hue + _HUE_WIDTH, 255.0, 255.0])
 
 
 def _region(grass: np.ndarray) -> np.ndarray:

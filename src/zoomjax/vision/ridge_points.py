@@ -58,11 +58,10 @@ def ridge_points(image: np.ndarray, grass: Grass) -> EdgePoints:
     hat = cv2.morphologyEx(grey, cv2.MORPH_TOPHAT, np.ones((reach, reach), np.uint8))
     hat = cv2.blur(hat, (3, 3))
     inside = (slice(margin, -margin), slice(margin, -margin))
-    bright = np.zeros_like(hat)
-    least = _least_height(hat[inside], grass)
-    bright[inside] = cv2.threshold(hat[inside], least, 255, cv2.THRESH_TOZERO)[1]
-    at = np.flatnonzero(bright)
-    at = at[grass.holds(_pixels(at, bright.shape[1]) - margin, size)]
+    mask = np.zeros_like(hat)
+    mask[inside] = grass.mask(size)
+    least = _least_height(hat[inside], mask[inside])
+    at = np.flatnonzero(cv2.compare(cv2.min(hat, mask), least, cv2.CMP_GT))
     parts = [_middles(image, grey, grass, hat, at, axis, reach) for axis in (0, 1)]
     position, axis, across = (np.concatenate(part) for part in zip(*parts, strict=True))
     normal, scatter = _directions(position)
@@ -74,18 +73,10 @@ def ridge_points(image: np.ndarray, grass: Grass) -> EdgePoints:
     return EdgePoints(position, normal[keep], np.rint(position).astype(np.intp), size, polar=False)
 
 
-def _pixels(at: np.ndarray, width: int) -> np.ndarray:
-    """(n, 2), columns and rows of places in a flat image."""
-    return np.stack([at % width, at // width], axis=-1)
-
-
-def _least_height(hat: np.ndarray, grass: Grass) -> float:
+def _least_height(hat: np.ndarray, mask: np.ndarray) -> float:
     """Grey levels that a ridge must be high, by how uneven the grass is."""
-    step = 7
-    thin = hat[::step, ::step]
-    y, x = np.indices(thin.shape).reshape(2, -1) * step
-    on = grass.holds(np.stack([x, y], axis=-1), hat.shape[::-1])
-    return max(_FLOOR, _OF_GRASS * float(np.quantile(thin.ravel()[on], 0.85)))
+    thin = hat[::7, ::7][mask[::7, ::7] > 0]
+    return max(_FLOOR, _OF_GRASS * float(np.quantile(thin, 0.85))) if len(thin) else _FLOOR
 
 
 def _middles(image, grey, grass: Grass, hat, at, axis: int, reach: int):
@@ -94,12 +85,11 @@ def _middles(image, grey, grass: Grass, hat, at, axis: int, reach: int):
     step = (1, width)[axis]
     flat, levels, colours = hat.ravel(), grey.ravel(), image.reshape(-1, 3)
     at = at[(flat[at] > flat[at - step]) & (flat[at] >= flat[at + step])]
-    profile = levels[at[:, None] + step * np.arange(-reach, reach + 1)]
-    lowest = np.maximum(profile[:, :reach].min(axis=1), profile[:, reach + 1 :].min(axis=1))
-    profile = profile.astype(np.float32)
-    peak = profile[:, reach : reach + 1]
-    far, found = _crossings(profile, (peak + lowest[:, None]) / 2)
-    at, profile, peak, far = at[found], profile[found], peak[found], far[found]
+    profile = levels[at + step * np.arange(-reach, reach + 1)[:, None]]
+    lowest = np.maximum(profile[:reach].min(axis=0), profile[reach + 1 :].min(axis=0))
+    peak = profile[reach].astype(np.float32)
+    far, found = _crossings(profile, np.stack([(peak + lowest) / 2] * 2, axis=-1))
+    at, profile, peak, far = at[found], profile[:, found], peak[found, None], far[found]
     beside = np.rint(far).astype(np.intp)[..., None] + _BESIDE
     beside = at[:, None, None] + step * beside * np.array([-1, 1])[:, None]
     side, colour = levels[beside].mean(axis=-1), colours[beside].mean(axis=2)
@@ -113,23 +103,21 @@ def _middles(image, grey, grass: Grass, hat, at, axis: int, reach: int):
     # Flat ridges have several maxima side by side, with one middle.
     _, first = np.unique(middle[found], return_index=True)
     at, shift, far = (values[found][first] for values in (at, shift, far))
-    position = _pixels(at, width).astype(float)
+    position = np.stack([at % width, at // width], axis=-1).astype(float)
     position[:, axis] += shift
     return position, np.full(len(at), axis), far.sum(axis=1)
 
 
 def _crossings(profile: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far from the middle of each profile it falls below a level to both sides (n, 2), and where it does."""
-    reach = profile.shape[1] // 2
-    rows = np.arange(len(profile))
-    level = np.broadcast_to(level, (len(profile), 2))
-    ends, found = [], np.ones(len(profile), bool)
-    for side, part in enumerate((profile[:, reach::-1], profile[:, reach:])):
-        below = part < level[:, side, None]
-        first = np.maximum(below.argmax(axis=1), 1)
-        before, after = part[rows, first - 1], part[rows, first]
+    """How far from its middle each profile (2 r + 1, n) falls below levels (n, 2) to its sides, and where it does."""
+    reach, number = profile.shape[0] // 2, profile.shape[1]
+    ends, found = [], np.ones(number, bool)
+    for side, part in enumerate((profile[reach::-1], profile[reach:])):
+        below = part < level[:, side]
+        first = np.maximum(below.argmax(axis=0), 1)
+        before, after = (part[row, np.arange(number)].astype(float) for row in (first - 1, first))
         ends.append(first - 1 + (before - level[:, side]) / np.maximum(before - after, 1e-3))
-        found &= below.any(axis=1) & ~below[:, 0]
+        found &= below.any(axis=0) & ~below[0]
     return np.clip(np.stack(ends, axis=-1), 0, reach), found
 
 
