@@ -1,5 +1,6 @@
-"""Markings of pitches: rendered ones, whose middles are known exactly, and broadcast frames labelled by hand."""
+"""Markings of pitches: rendered ones, whose middles are known, and broadcast frames labelled by hand."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -26,7 +27,7 @@ class Scene:
 
     def _at(self, point):
         """A position at the scale of the drawing, in units of 1/16 px."""
-        return tuple(int(round(16 * ((value + 0.5) * FINER - 0.5))) for value in point)
+        return tuple(round(16 * ((value + 0.5) * FINER - 0.5)) for value in point)
 
     def line(self, start, end, width):
         """A marking whose middle runs between two positions."""
@@ -37,7 +38,7 @@ class Scene:
 
     def curve(self, points, width):
         """A marking along many positions."""
-        for start, end in zip(points, points[1:], strict=False):
+        for start, end in itertools.pairwise(points):
             self.line(np.array(start), np.array(end), width)
 
     def blob(self, middle, axes, colour):
@@ -201,7 +202,7 @@ def sampled(lines):
     """Points along polylines, every half px."""
     parts = []
     for line in lines:
-        for start, end in zip(np.array(line), np.array(line)[1:], strict=False):
+        for start, end in itertools.pairwise(np.array(line)):
             number = max(int(2 * np.hypot(*(end - start))), 1)
             parts.append(start + (end - start) * np.arange(number)[:, None] / number)
     return np.concatenate(parts)

@@ -154,7 +154,7 @@ def _extent(line: np.ndarray) -> float:
 
 
 def _steps(line: np.ndarray) -> float:
-    """Rows or columns from the first point to the last, whichever are more: a border has a point in each."""
+    """Rows or columns from end to end, whichever are more: a border has a point in each."""
     return float(np.max(abs(line[-1] - line[0])))
 
 

@@ -1,9 +1,9 @@
 """The white markings of a pitch: the straight lines in broadcast football.
 
 Grass first (`grass`), then the middles of white ridges on it (`ridge_points`), linked into smooth pieces
-(`fragments`), and the pieces of one marking joined where players stand on it (`joining`). Circles on a pitch
-are ellipses in the image, and their flattest parts are almost straight: what bends more than a lens bends a
-line is none.
+(`fragments`), and the pieces of one marking joined where players stand on it (`joining`). Circles on a
+pitch are ellipses in the image, and their flattest parts are almost straight: what bends more than a lens
+bends a line is none.
 """
 
 import numpy as np
@@ -18,9 +18,9 @@ from .one_frame import normals
 from .ridge_points import WIDEST, ridge_points
 
 _LEAST_RADIUS = 5.0
-"""Of the arc that a lens may bend a line to, in halves of the image's diagonal: k1 = 0.1 bends a line halfway
-between the middle of the image and its corner to 10. Where a whole penalty area is in sight, the flattest
-parts of its arc have 1 to 2."""
+"""Of the arc that a lens may bend a line to, in halves of the image's diagonal: k1 = 0.1 makes it 10 for a
+line halfway between the middle of the image and a corner. Where a whole penalty area is in sight, the
+flattest part of its arc has 1 to 2."""
 
 _CROOKED = 1.5
 """px, RMS about the best parabola, that a line of joined pieces may have."""
@@ -90,8 +90,8 @@ def _check(image) -> None:
     as_grey(image)
     if image.ndim != 3:
         raise ValueError(
-            f"Argument image must be a colour image (height, width, 3), blue, green, red, as grass is told by "
-            f"its colour, but its shape is {image.shape}."
+            "Argument image must be a colour image (height, width, 3), blue, green, red, as grass is told "
+            f"by its colour, but its shape is {image.shape}."
         )
 
 
@@ -109,9 +109,10 @@ def _is_line(points: np.ndarray, radius: float) -> bool:
 
 
 def _bounds_field(points: np.ndarray, image: np.ndarray, grass: Grass) -> bool:
-    """Whether the field of play is on one side of most points at least: what is behind a goal is no marking."""
-    along = points[-1] - points[0]
-    aside = (WIDEST * min(image.shape[:2]) / 2 + _BESIDE) * np.array([-along[1], along[0]]) / np.hypot(*along)
+    """Whether the field of play is beside most points: what is behind a goal is no marking."""
+    away = WIDEST * min(image.shape[:2]) / 2 + _BESIDE
+    along = (points[-1] - points[0]) / np.hypot(*(points[-1] - points[0]))
+    aside = away * np.array([-along[1], along[0]])
     greatest = np.subtract(image.shape[1::-1], 1)
     sides = [np.clip(np.rint(points + offset).astype(int), 0, greatest) for offset in (aside, -aside)]
     field = [grass.is_field(image[side[:, 1], side[:, 0]]) for side in sides]

@@ -3,14 +3,14 @@
 A top-hat leaves what is brighter than its surroundings and narrow; its maxima along rows and columns are
 where a ridge is crossed. There the profile of the grey levels is read, along the row or the column that
 crosses the ridge more steeply. Its middle is midway between the two points at half of its height, each
-above its own side's level: light grass on one side and dark on the other do not move it, nor does the width.
+above its own side's level: light grass on one side and dark on the other do not move it.
 
-Work a pixel: one smoothing and one top-hat, by OpenCV in bytes; all else is done for the few pixels on ridges.
+Work a pixel: a smoothing and a top-hat, by OpenCV in bytes; all else is done for the few pixels on ridges.
 """
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from .edge_points import EdgePoints
 from .grass import Grass
@@ -34,11 +34,14 @@ _UNEVEN = 2.0
 """How much the sides may differ, as a share of the height above the brighter one."""
 
 _WHITER = 0.7
-"""Least rise of the darkest of the three colours, as a share of the rise of the grey level: grass lacks blue,
-white does not, and shirts and light patches of grass do."""
+"""Least rise of the weakest of the three colours, as a share of the rise of the grey level: grass lacks
+blue, white does not, and yellow shirts and light patches of grass do. Markings have 1.1 to 2.2."""
 
 _BORDER = 3
 """px along the image's border without points."""
+
+_STEEP = 0.7
+"""Cosine between a ridge's normal and the row or column that crosses it: at 45 degrees both do."""
 
 _NEAR = 6.0
 """px, how far the points are that tell a ridge's direction."""
@@ -48,7 +51,10 @@ _SCATTER = 0.8
 
 
 def ridge_points(image: np.ndarray, grass: Grass) -> EdgePoints:
-    """Points in the middle of white ridges on the grass of an image (h, w, 3), uint8 BGR: one a row or column."""
+    """Points in the middle of white ridges on the grass of an image (h, w, 3), uint8 BGR.
+
+    One a row for steep ridges, one a column for level ones.
+    """
     size = image.shape[1::-1]
     widest = WIDEST * min(size)
     reach = round(widest) + 2
@@ -61,12 +67,12 @@ def ridge_points(image: np.ndarray, grass: Grass) -> EdgePoints:
     mask = np.zeros_like(hat)
     mask[inside] = grass.mask(size)
     least = _least_height(hat[inside], mask[inside])
-    at = np.flatnonzero(cv2.compare(cv2.min(hat, mask), least, cv2.CMP_GT))
+    at = np.flatnonzero(cv2.threshold(cv2.min(hat, mask), least, 255, cv2.THRESH_BINARY)[1])
     parts = [_middles(image, grey, grass, hat, at, axis, reach) for axis in (0, 1)]
     position, axis, across = (np.concatenate(part) for part in zip(*parts, strict=True))
     normal, scatter = _directions(position)
     steep = abs(normal[np.arange(len(axis)), axis])
-    keep = (steep > np.sqrt(0.49)) & (across * steep < widest) & (scatter < _SCATTER)
+    keep = (steep > _STEEP) & (across * steep < widest) & (scatter < _SCATTER)
     position -= margin
     keep &= ((position > _BORDER) & (position < np.subtract(size, _BORDER + 1))).all(axis=1)
     position = position[keep]
@@ -90,9 +96,9 @@ def _middles(image, grey, grass: Grass, hat, at, axis: int, reach: int):
     peak = profile[reach].astype(np.float32)
     far, found = _crossings(profile, np.stack([(peak + lowest) / 2] * 2, axis=-1))
     at, profile, peak, far = at[found], profile[:, found], peak[found, None], far[found]
-    beside = np.rint(far).astype(np.intp)[..., None] + _BESIDE
-    beside = at[:, None, None] + step * beside * np.array([-1, 1])[:, None]
-    side, colour = levels[beside].mean(axis=-1), colours[beside].mean(axis=2)
+    beside = _BESIDE[:, None, None] + np.rint(far).astype(np.intp)
+    beside = at[:, None] + step * beside * np.array([-1, 1])
+    side, colour = levels[beside].mean(axis=0), colours[beside].mean(axis=0)
     height = peak[:, 0] - side.max(axis=1)
     far, found = _crossings(profile, (peak + side) / 2)
     shift = (far[:, 1] - far[:, 0]) / 2
@@ -109,7 +115,7 @@ def _middles(image, grey, grass: Grass, hat, at, axis: int, reach: int):
 
 
 def _crossings(profile: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far from its middle each profile (2 r + 1, n) falls below levels (n, 2) to its sides, and where it does."""
+    """How far from the middle profiles (2 r + 1, n) fall below levels (n, 2) to both sides, and which do."""
     reach, number = profile.shape[0] // 2, profile.shape[1]
     ends, found = [], np.ones(number, bool)
     for side, part in enumerate((profile[reach::-1], profile[reach:])):
@@ -122,9 +128,9 @@ def _crossings(profile: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _directions(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals (n, 2) of the lines that the points around each point make, and their RMS from there, px."""
+    """Unit normals (n, 2) of what the points around each point make, and their RMS along these, px."""
     number = len(points)
-    pairs = cKDTree(points).query_pairs(_NEAR, output_type="ndarray")
+    pairs = KDTree(points).query_pairs(_NEAR, output_type="ndarray")
     first, second = np.concatenate([pairs, pairs[:, ::-1]]).T
     x, y = (points[second] - points[first]).T
 
@@ -133,7 +139,11 @@ def _directions(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     count = total(np.ones(len(x))) + 1
     mx, my = total(x) / count, total(y) / count
-    xx, xy, yy = total(x * x) / count - mx * mx, total(x * y) / count - mx * my, total(y * y) / count - my * my
+    xx, xy, yy = (
+        total(x * x) / count - mx * mx,
+        total(x * y) / count - mx * my,
+        total(y * y) / count - my * my,
+    )
     angle = np.arctan2(2 * xy, xx - yy) / 2
     least = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
     return np.stack([-np.sin(angle), np.cos(angle)], axis=-1), np.sqrt(np.maximum(least, 0))
