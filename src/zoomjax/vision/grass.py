@@ -2,7 +2,7 @@
 
 The pitch is the largest thing of one green in an image of it. Its hue is the peak of the histogram of hues
 among greens; light, shadow and mowing change saturation and brightness far more than hue. The region is
-found in a small copy of the image, where markings and players are closed over and narrow outgrowths cut off.
+found in a small copy of the image, with markings and players closed over and narrow outgrowths cut off.
 """
 
 import dataclasses

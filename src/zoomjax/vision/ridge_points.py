@@ -115,7 +115,7 @@ def _middles(image, grey, grass: Grass, hat, at, axis: int, reach: int):
 
 
 def _crossings(profile: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far from the middle profiles (2 r + 1, n) fall below levels (n, 2) to both sides, and which do."""
+    """How far from the middle profiles (2 r + 1, n) fall below levels (n, 2) on both sides; which do."""
     reach, number = profile.shape[0] // 2, profile.shape[1]
     ends, found = [], np.ones(number, bool)
     for side, part in enumerate((profile[reach::-1], profile[reach:])):
