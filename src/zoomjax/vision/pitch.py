@@ -35,8 +35,9 @@ _LEAST_COVER = 0.4
 class PitchDetector(AbstractDetector):
     """Finds the straight white markings on the grass of a pitch, in colour images of broadcast football.
 
-    Points are in the middle of the markings. Circles and arcs, players, goals, boards and captions are left
-    out; a marking that a player interrupts is one line. Thresholds follow the grass of each image.
+    Points are in the middle of the markings, which may be up to 2 % of the image's shorter side
+    wide. Circles and arcs, players, goals, boards and captions are left out; a marking that a player
+    interrupts is one line. Thresholds follow the grass of each image.
 
     Attributes:
         least_length: share of the image's diagonal that a line must extend over, 0 to 1.
@@ -45,8 +46,8 @@ class PitchDetector(AbstractDetector):
         >>> import cv2
         >>> import numpy as np
         >>> image = np.full((360, 640, 3), (50, 140, 70), np.uint8)
-        >>> image = cv2.line(image, (40, 60), (600, 290), (230, 240, 235), 5, cv2.LINE_AA)
-        >>> image = cv2.ellipse(image, (250, 230), (120, 60), 0, 0, 360, (230, 240, 235), 5, cv2.LINE_AA)
+        >>> image = cv2.line(image, (40, 60), (600, 290), (230, 240, 235), 3, cv2.LINE_AA)
+        >>> image = cv2.ellipse(image, (250, 230), (120, 60), 0, 0, 360, (230, 240, 235), 3, cv2.LINE_AA)
         >>> lines = PitchDetector()(image)
         >>> len(lines), lines[0].shape[1]
         (1, 2)
