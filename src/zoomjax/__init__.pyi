@@ -42,6 +42,7 @@ from .vision.detector import AbstractDetector as AbstractDetector
 from .vision.edges import EdgeDetector as EdgeDetector
 from .vision.grid import GridDetector as GridDetector
 from .vision.photos import undistort_photo as undistort_photo
+from .vision.pitch import PitchDetector as PitchDetector
 from .vision.undistort import undistort_image as undistort_image
 from .vision.video import undistort_video as undistort_video
 from .warp import warp_image as warp_image

@@ -24,8 +24,13 @@ from .detector import AbstractDetector
 from .edges import EdgeDetector
 from .grid import GridDetector
 from .images import Source
+from .pitch import PitchDetector
 
-DETECTORS: dict[str, type[AbstractDetector]] = {"edges": EdgeDetector, "grid": GridDetector}
+DETECTORS: dict[str, type[AbstractDetector]] = {
+    "edges": EdgeDetector,
+    "grid": GridDetector,
+    "pitch": PitchDetector,
+}
 """By name, as the command line calls them."""
 
 _SPACING = 4.0

@@ -52,12 +52,14 @@ class EdgePoints:
         normal: (n, 2), unit vectors towards the brighter side.
         pixel: (n, 2), the column and row of the pixel that holds each point.
         image_size: (width, height) px.
+        polar: whether one side differs from the other, so that opposite normals are no neighbours.
     """
 
     position: np.ndarray
     normal: np.ndarray
     pixel: np.ndarray
     image_size: tuple[int, int]
+    polar: bool = True
 
 
 def edge_points(grey: np.ndarray) -> EdgePoints:

@@ -13,7 +13,7 @@ import numpy as np
 from .detector import AbstractDetector
 from .edge_points import edge_points
 from .fragments import Fragments, fragments
-from .joining import joined
+from .joining import border_lines, joined
 from .one_frame import OneFrame, normals
 
 _LONG = 0.2
@@ -42,7 +42,7 @@ class EdgeDetector(AbstractDetector):
         >>> photo = board_photo(nikkor_18_200((1072, 712)), 127.36, blur=1, noise=2)
         >>> lines = EdgeDetector()(photo)
         >>> len(lines), lines[0].shape[1]
-        (20, 2)
+        (14, 2)
     """
 
     least_length: float = 0.2
@@ -74,14 +74,14 @@ class EdgeDetector(AbstractDetector):
         least = _LONG * min(size)
         tolerance = _GREATEST_TOLERANCE
         for _ in range(2):
-            long = [line for line in _lines(pieces, border) if _extent(line) >= least]
+            long = [line for line in border_lines(pieces, border) if _extent(line) >= least]
             if len(long) < _LEAST_LINES:
                 break
             model.fit(long)
             rms = np.median([_rms(model.undistort(line)) for line in long])
             tolerance = float(np.clip(3 * rms, _LEAST_TOLERANCE, _GREATEST_TOLERANCE))
             border = _absorbed(pieces, border, model, tolerance)
-        return self._good(_lines(pieces, border), model, tolerance, min(size))
+        return self._good(border_lines(pieces, border), model, tolerance, min(size))
 
     def _good(self, lines, model: OneFrame, tolerance: float, side: int) -> list[np.ndarray]:
         """The lines that are long, visible and straight enough, the longest first."""
@@ -114,22 +114,6 @@ def as_grey(image: np.ndarray) -> np.ndarray:
             f"shape is {image.shape}."
         )
     return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
-
-
-def _lines(pieces: Fragments, border: np.ndarray) -> list[np.ndarray]:
-    """The points of each border, in order along it."""
-    if not len(border):
-        return []
-    label = border[pieces.piece()]
-    order = np.argsort(label, kind="stable")
-    cuts = np.flatnonzero(np.diff(label[order])) + 1
-    return [_sorted(line) for line in np.split(pieces.points[order], cuts)]
-
-
-def _sorted(line: np.ndarray) -> np.ndarray:
-    centred = line - line.mean(axis=0)
-    normal = normals(centred[None])[0]
-    return line[np.argsort(centred @ (normal[1], -normal[0]), kind="stable")]
 
 
 def _absorbed(pieces: Fragments, border: np.ndarray, model: OneFrame, tolerance: float) -> np.ndarray:
@@ -170,7 +154,7 @@ def _extent(line: np.ndarray) -> float:
 
 
 def _steps(line: np.ndarray) -> float:
-    """Rows or columns from the first point to the last, whichever are more: a border is seen in each."""
+    """Rows or columns from end to end, whichever are more: a border has a point in each."""
     return float(np.max(abs(line[-1] - line[0])))
 
 

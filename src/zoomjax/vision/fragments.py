@@ -84,7 +84,8 @@ def _linked(edges: EdgePoints) -> np.ndarray:
         first = np.flatnonzero(other >= 0)
         second = other[first]
         step, n = position[second] - position[first], normal[first]
-        along = np.einsum("pc,pc->p", n, normal[second]) > _TURN
+        turn = np.einsum("pc,pc->p", n, normal[second])
+        along = (turn if edges.polar else abs(turn)) > _TURN
         along &= abs(np.einsum("pc,pc->p", n, step)) < _ASIDE
         pairs.append(np.stack([first[along], second[along]]))
     first, second = np.concatenate(pairs, axis=1)

@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from .fragments import Fragments, main_direction
+from .one_frame import normals
 
 _END = 40
 """Points of a fragment that tell its direction at an end: fewer if it is shorter."""
@@ -66,6 +67,22 @@ def joined(pieces: Fragments, radius: float) -> np.ndarray:
     first, second = own[mutual, 0] % number, partner[mutual] % number
     graph = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(number, number))
     return connected_components(graph, directed=False)[1]
+
+
+def border_lines(pieces: Fragments, border: np.ndarray) -> list[np.ndarray]:
+    """The points of each border, in order along it."""
+    if not len(border):
+        return []
+    label = border[pieces.piece()]
+    order = np.argsort(label, kind="stable")
+    cuts = np.flatnonzero(np.diff(label[order])) + 1
+    return [_sorted(line) for line in np.split(pieces.points[order], cuts)]
+
+
+def _sorted(line: np.ndarray) -> np.ndarray:
+    centred = line - line.mean(axis=0)
+    normal = normals(centred[None])[0]
+    return line[np.argsort(centred @ (normal[1], -normal[0]), kind="stable")]
 
 
 def _ends(pieces: Fragments) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
