@@ -93,10 +93,8 @@ def demo(
 
     board = synthetic.StripedBoard.before(truth := synthetic.nikkor_18_200(demo.IMAGE_SIZE))
     with results_folder(output) as folder:
-        shots = folder / "photos"
-        shots.mkdir(exist_ok=True)
         with _progress("Photographing the board") as progress:
-            made = demo.write_photos(shots, number=photos, seed=seed, progress=progress)
+            made = demo.write_photos(folder / "photos", number=photos, seed=seed, progress=progress)
         done = _calibrate_images(ImageJob(tuple(made), workers=_cores()), folder)
         focal = sorted(done.focals.focal.values())
         lens = done.calibration.zoom.lens

@@ -34,6 +34,7 @@ def write_photos(
     2 grey levels, vignetting, and the focal length in their EXIF data.
     """
     lens = synthetic.nikkor_18_200(image_size)
+    Path(folder).mkdir(parents=True, exist_ok=True)
     paths = []
     for index, focal in enumerate(np.round(synthetic.focal_sweep(number), 2)):
         photo = synthetic.board_photo(

@@ -13,6 +13,7 @@ import io
 import multiprocessing
 import os
 import signal
+import zipfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -205,7 +206,7 @@ def _save(detection: Detection, file: Path) -> None:
 def _load(file: Path, source: Source) -> Detection | None:
     """What was found before, under the image's present name; None if nothing was."""
     try:
-        with np.load(file) as stored:
+        with file.open("rb") as opened, np.load(opened) as stored:
             lines = np.split(stored["points"], np.cumsum(stored["counts"])[:-1])
             width, height = stored["image_size"].tolist()
             focal = float(stored["focal"])
@@ -217,5 +218,5 @@ def _load(file: Path, source: Source) -> Detection | None:
                 nodes=stored["nodes"] if stored["nodes"].size else None,
                 problem=str(stored["problem"]),
             )
-    except (OSError, ValueError, KeyError, EOFError):
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None

@@ -138,12 +138,12 @@ def video_frames(
 
     stem = Path(path).stem
     with decode_video(path) as (announced, frames):
-        step = max(1, -(-announced // number))  # 0 if it is not announced: then every frame
-        kept, last = 0, -1
+        # From the first to the last; where the number is not announced, the first ones.
+        wanted = set(np.linspace(0, (announced or number) - 1, number).round().astype(int).tolist())
+        last = -1
         for last, (time, image) in enumerate(frames):
-            if last % step or kept == number:
+            if last not in wanted:
                 continue
-            kept += 1
             at = focal.at(last, time) if isinstance(focal, FocalTrack) else float(focal)
             yield Source(f"{stem}-{last:06d}.jpg", None, image(), at)
         if last + 1 < announced:
