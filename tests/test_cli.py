@@ -113,11 +113,11 @@ def test_calibrate_takes_photographs(tmp_path, monkeypatch):
     first = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert first["focal_range"] == pytest.approx([20.56, 127.36])
     assert len(list((tmp_path / "out" / "lines").iterdir())) == first["frames"] == 4
-    cached = {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").iterdir()}
+    cached = {p: p.stat().st_mtime_ns for p in (tmp_path / "cache" / "detections").iterdir()}
     assert len(cached) == 4
     again = zoomjax("calibrate", "shots/*.jpg", "-o", "again", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
-    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").iterdir()} == cached
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "cache" / "detections").iterdir()} == cached
     assert json.loads((tmp_path / "again" / "summary.json").read_text())["rms_zoom"] == first["rms_zoom"]
 
 

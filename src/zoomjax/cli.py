@@ -8,6 +8,7 @@ import contextlib
 import importlib.metadata
 import os
 import sys
+import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -38,6 +39,7 @@ Degree = Annotated[int, typer.Option(min=0, help="Degree of the polynomials in 1
 Terms = Annotated[int, typer.Option(min=1, help="Number of distortion coefficients, k1 to kN.")]
 
 
+_MOST_COMPILED = 100_000_000  # bytes; a run with new shapes adds about a million
 _INTERRUPTED = 130  # Typer's exit status for Ctrl-C
 
 
@@ -85,20 +87,26 @@ def demo(
     the paper measured, a Nikkor 18-200. The photographs are rendered; what then runs on them is
     zoomjax calibrate.
     """
-    _enable_float64()
+    _set_up_jax()
     from . import synthetic
     from .calibration import results_folder
     from .vision import demo
     from .vision.image_calibration import ImageJob
 
     board = synthetic.StripedBoard.before(truth := synthetic.nikkor_18_200(demo.IMAGE_SIZE))
-    with results_folder(output) as folder:
+    with (
+        results_folder(output) as folder,
+        tempfile.TemporaryDirectory(dir=folder, prefix=".zoomjax-") as part,
+    ):
         with _progress("Photographing the board") as progress:
-            made = demo.write_photos(folder / "photos", number=photos, seed=seed, progress=progress)
+            made = demo.write_photos(part, number=photos, seed=seed, progress=progress)
         done = _calibrate_images(ImageJob(tuple(made), workers=_cores()), folder)
         focal = sorted(done.focals.focal.values())
         lens = done.calibration.zoom.lens
         demo.write_before_after(made[0], folder / "before-after.jpg", lens, focal[0])
+        (folder / "photos").mkdir(exist_ok=True)
+        for photo in made:
+            photo.replace(folder / "photos" / photo.name)
     _show(done.calibration, board.magnification)
     _show_images(done, output, also=["before-after.jpg", "photos/"])
     worst = demo.worst_error(lens, truth, focal)
@@ -156,7 +164,7 @@ def calibrate(
 
     Writes lens.json, summary.json, model.png and lines.npz; and lines/, what was found in each image.
     """
-    _enable_float64()
+    _set_up_jax()
     from .calibration import results_folder
 
     if any(path.endswith((".npz", ".csv")) for path in inputs):
@@ -176,7 +184,7 @@ def calibrate(
         return
     if image_size is not None:
         raise ValueError("--image-size is for a CSV of lines: images have their own.")
-    from .vision.detection import cache_folder
+    from ._files import cache_folder
     from .vision.image_calibration import ImageJob
 
     job = ImageJob(
@@ -189,7 +197,7 @@ def calibrate(
         terms=terms,
         frames=frames,
         workers=jobs or _cores(),
-        cache=cache_folder() if cache else None,
+        cache=cache_folder("detections") if cache else None,
     )
     with results_folder(output) as folder:
         done = _calibrate_images(job, folder)
@@ -226,7 +234,7 @@ def undistort(
     import signal
 
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # and leave no half file
-    _enable_float64()
+    _set_up_jax()
     from .vision.files import Job, undistort_files
 
     with _progress("Correcting") as progress:
@@ -267,10 +275,24 @@ def _stage_done(console: "Console", name: str, start: float) -> None:
     console.print(f"  [dim]{name:<40}{time.perf_counter() - start:7.2f} s[/dim]", highlight=False)
 
 
-def _enable_float64() -> None:
+def _set_up_jax() -> None:
+    """Compute in float64, and keep what is compiled for the next run: most of a short run is compiling."""
     import jax
 
+    from ._files import cache_folder
+
     jax.config.update("jax_enable_x64", True)
+    folder = cache_folder("compiled")
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ and _can_write(folder):
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_compilation_cache_max_size", _MOST_COMPILED)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def _can_write(folder: Path) -> bool:
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    return os.access(folder, os.W_OK)
 
 
 def _read(inputs: list[Path], focal: str | None, image_size: str | None, focal_unit: str | None) -> "Lines":

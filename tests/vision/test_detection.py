@@ -8,7 +8,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax.vision import detection as module
-from zoomjax.vision.detection import Detection, cache_folder, detect
+from zoomjax.vision.detection import Detection, detect
 from zoomjax.vision.images import Source, find_photos
 
 
@@ -115,15 +115,6 @@ def test_a_damaged_cache_is_no_cache(photos, marker, tmp_path):
 def test_a_cache_that_cannot_be_written_does_no_harm(photos, marker, tmp_path):
     (tmp_path / "file").write_text("no folder")
     assert len(next(detect(photos[:1], marker, cache=tmp_path / "file" / "cache")).lines) == 1
-
-
-def test_where_the_cache_is(monkeypatch, tmp_path):
-    monkeypatch.setenv("ZOOMJAX_CACHE", str(tmp_path))
-    assert cache_folder() == tmp_path
-    monkeypatch.delenv("ZOOMJAX_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path))
-    assert cache_folder() == tmp_path / "zoomjax" / "detections"
 
 
 @pytest.mark.slow

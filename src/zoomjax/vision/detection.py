@@ -11,7 +11,6 @@ import functools
 import hashlib
 import io
 import multiprocessing
-import os
 import signal
 import zipfile
 from collections.abc import Iterable, Iterator
@@ -89,14 +88,6 @@ def detect(
                 yield _finished(*pending.popleft())
         while pending:
             yield _finished(*pending.popleft())
-
-
-def cache_folder() -> Path:
-    """Where detections are kept by default: the user's cache, or ``ZOOMJAX_CACHE``."""
-    if named := os.environ.get("ZOOMJAX_CACHE"):
-        return Path(named)
-    base = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "zoomjax" / "detections"
 
 
 class _pool:
