@@ -185,6 +185,16 @@ def test_colour_is_grey_in_three_channels(pattern):
         np.testing.assert_array_equal(line, same)
 
 
+@pytest.mark.parametrize(("pattern", "find"), [(squares, find_checkerboard), (dots, find_dots)])
+def test_nodes_of_large_images_are_where_they_are(pattern, find):
+    """They are searched at a smaller size."""
+    image = rendered(pattern, OBLIQUE)
+    large = cv2.resize(image, None, fx=6, fy=6, interpolation=cv2.INTER_LINEAR)
+    found = find(large)
+    assert found.shape == (ROWS, COLUMNS, 2)
+    assert rms((found + 0.5) / 6 - 0.5 - mapped(OBLIQUE, nodes())) < 0.05
+
+
 def test_strided_views_are_read_as_they_are():
     image = rendered(dots, OBLIQUE)
     wide = np.repeat(image, 2, axis=1)
