@@ -312,6 +312,7 @@ def _homography(image, plane):
 def _refined(residual, start):
     """The entries of least squares, a root of their covariance for unit noise, and the squares.
 
+    All are NaN if the iterations do not converge: if the squares are least in a degenerate homography.
     Differentiable as the solution of "the gradient of the squares is 0", both ways and exactly: Gauss and
     Newton's approximation is in the steps alone.
     """
@@ -340,9 +341,11 @@ def _refined(residual, start):
         return jnp.linalg.solve(jax.jacfwd(map)(right), right)
 
     entries = jax.lax.custom_root(gradient, start, solve, solve_linear)
-    triangle = factors(entries)[1]
+    orthogonal, triangle = factors(entries)
     root = jax.scipy.linalg.solve_triangular(triangle, jnp.eye(8, dtype=triangle.dtype))
-    return entries, root, jnp.sum(residual(entries) ** 2)
+    left = jnp.max(abs(root @ (orthogonal.T @ residual(entries))))  # of a step
+    found = (entries, root, jnp.sum(residual(entries) ** 2))
+    return jax.tree.map(lambda leaf: jnp.where(left**2 < jnp.finfo(left.dtype).eps, leaf, jnp.nan), found)
 
 
 def _estimate(entries, root, squares, number, coordinates, length):
@@ -351,9 +354,9 @@ def _estimate(entries, root, squares, number, coordinates, length):
     Each of the points has one or two coordinates that the homographies, of 8 unknowns each, should give.
     Lengths in the image are in units of length px.
     """
-    w, information = _inverse_square(entries, root)
-    freedom = coordinates * number - 8 * len(entries)
-    variance = jnp.where(freedom > 0, squares / jnp.maximum(freedom, 1), jnp.inf)
+    w, information, misfit = _inverse_square(entries, root)
+    # What one camera can see of the plane has 6 unknowns a view, and f.
+    variance = (squares + misfit) / (coordinates * number - 6 * len(entries) - 1)
     known = (w > 0) & (information > 0)
     w = jnp.where(known, w, 1)
     focal = length / jnp.sqrt(w)
@@ -377,7 +380,9 @@ def _equations(entries):
 
 
 def _inverse_square(entries, root):
-    """The generalised least-squares w of several views, and the inverse of its variance for unit noise."""
+    """The generalised least-squares w of several views, for unit noise the inverse of its variance, and by
+    how much the sum of squares would be larger if the homographies obeyed the equations exactly.
+    """
     factor, constant = jax.vmap(_equations)(entries)  # (view, 2)
     slopes = jax.vmap(jax.jacfwd(_equations))(entries)
 
@@ -385,12 +390,14 @@ def _inverse_square(entries, root):
         gradient = (w * slopes[0] + slopes[1]) @ root  # (view, 2, 8)
         weight = jnp.linalg.inv(gradient @ gradient.swapaxes(1, 2))
         information = jnp.einsum("vi,vij,vj", factor, weight, factor)
-        return -jnp.einsum("vi,vij,vj", factor, weight, constant) / information, information
+        return -jnp.einsum("vi,vij,vj", factor, weight, constant) / information, information, weight
 
     w = -jnp.sum(factor * constant) / jnp.sum(factor**2)
     for _ in range(_WEIGHINGS - 1):
-        w, _ = solve(jnp.maximum(w, 0))
-    return solve(jnp.maximum(w, 0))
+        w, *_ = solve(jnp.maximum(w, 0))
+    w, information, weight = solve(jnp.maximum(w, 0))
+    wrong = w * factor + constant
+    return w, information, jnp.einsum("vi,vij,vj", wrong, weight, wrong)
 
 
 def _complex(points):
