@@ -244,8 +244,8 @@ def _homography_from_lines(image, present, ends):
     NaN if it is not determined: if another homography has the same lines, in first order.
     """
     matrix, origin, unit = jax.lax.stop_gradient(_linear_homography(image, present, ends))
-    start = matrix.ravel()[:8]
-    ends = _homogeneous((ends - origin) / unit)
+    entries = matrix.ravel()[:8]
+    ends = _homogeneous((ends - origin[None, None]) / unit)
 
     def residual(entries):
         first, second = jnp.moveaxis(ends @ _matrix(entries).T, 1, 0)
@@ -253,9 +253,9 @@ def _homography_from_lines(image, present, ends):
         across = jnp.sum(line * _homogeneous(image), axis=1) / jnp.hypot(line[:, 0], line[:, 1])
         return across * present[:, 0]
 
-    sizes = jnp.linalg.svd(jax.lax.stop_gradient(jax.jacfwd(residual)(start)), compute_uv=False)
-    determined = sizes[-1] > _SINGULAR * jnp.finfo(start.dtype).eps * sizes[0]
-    return jax.tree.map(lambda leaf: jnp.where(determined, leaf, jnp.nan), _refined(residual, start))
+    sizes = jnp.linalg.svd(jax.lax.stop_gradient(jax.jacfwd(residual)(entries)), compute_uv=False)
+    determined = sizes[-1] > _SINGULAR * jnp.finfo(entries.dtype).eps * sizes[0]
+    return _refined(residual, jnp.where(determined, entries, jnp.nan))
 
 
 def _linear_homography(image, present, ends):
@@ -265,9 +265,10 @@ def _linear_homography(image, present, ends):
     as large as the image's unit there.
     """
     total = jnp.sum(present)
-    origin = jnp.sum(present[..., None] * ends, axis=(0, 1), keepdims=True) / (2 * total)
-    unit = jnp.sqrt(jnp.sum(present[..., None] * (ends - origin) ** 2) / (2 * total))
-    first, second = jnp.moveaxis(_homogeneous((ends - origin) / unit), 1, 0)
+    origin = jnp.sum(present[..., None] * ends, axis=(0, 1)) / (2 * total)
+    ends = ends - origin[None, None]
+    unit = jnp.sqrt(jnp.sum(present[..., None] * ends**2) / (2 * total))
+    first, second = jnp.moveaxis(_homogeneous(ends / unit), 1, 0)
     line = jnp.cross(first, second)
     line = line / jnp.hypot(line[:, :1], line[:, 1:2])
     table = (line[:, :, None] * _homogeneous(image)[:, None, :]).reshape(-1, 9) * present
@@ -320,13 +321,16 @@ def _refined(residual, start):
     def gradient(entries):
         return jax.grad(lambda entries: jnp.sum(residual(entries) ** 2) / 2)(entries)
 
-    def factors(entries):
-        return jnp.linalg.qr(jax.jacfwd(residual)(entries))
+    def step_and_root(entries):
+        orthogonal, triangle = jnp.linalg.qr(jax.jacfwd(residual)(entries))
+        sides = jnp.column_stack([orthogonal.T @ residual(entries), jnp.eye(8, dtype=entries.dtype)])
+        # At once: XLA on few cores can wait forever for two of LAPACK's batches that run side by side.
+        solved = jax.scipy.linalg.solve_triangular(triangle, sides)
+        return solved[:, 0], solved[:, 1:]
 
     def advance(state):
         entries, _, count = state
-        orthogonal, triangle = factors(entries)
-        step = jax.scipy.linalg.solve_triangular(triangle, orthogonal.T @ residual(entries))
+        step, _ = step_and_root(entries)
         return entries - step, jnp.max(abs(step)), count + 1
 
     def solve(_, start):
@@ -341,11 +345,10 @@ def _refined(residual, start):
         return jnp.linalg.solve(jax.jacfwd(map)(right), right)
 
     entries = jax.lax.custom_root(gradient, start, solve, solve_linear)
-    orthogonal, triangle = factors(entries)
-    root = jax.scipy.linalg.solve_triangular(triangle, jnp.eye(8, dtype=triangle.dtype))
-    left = jnp.max(abs(root @ (orthogonal.T @ residual(entries))))  # of a step
+    step, root = step_and_root(entries)
+    converged = jnp.max(step**2) < jnp.finfo(step.dtype).eps
     found = (entries, root, jnp.sum(residual(entries) ** 2))
-    return jax.tree.map(lambda leaf: jnp.where(left**2 < jnp.finfo(left.dtype).eps, leaf, jnp.nan), found)
+    return jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), found)
 
 
 def _estimate(entries, root, squares, number, coordinates, length):
@@ -388,7 +391,9 @@ def _inverse_square(entries, root):
 
     def solve(w):
         gradient = (w * slopes[0] + slopes[1]) @ root  # (view, 2, 8)
-        weight = jnp.linalg.inv(gradient @ gradient.swapaxes(1, 2))
+        spread = gradient @ gradient.swapaxes(1, 2)
+        a, b, c = spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1]
+        weight = jnp.stack([c, -b, -b, a], axis=1).reshape(-1, 2, 2) / (a * c - b**2)[:, None, None]
         information = jnp.einsum("vi,vij,vj", factor, weight, factor)
         return -jnp.einsum("vi,vij,vj", factor, weight, constant) / information, information, weight
 
@@ -397,7 +402,7 @@ def _inverse_square(entries, root):
         w, *_ = solve(jnp.maximum(w, 0))
     w, information, weight = solve(jnp.maximum(w, 0))
     wrong = w * factor + constant
-    return w, information, jnp.einsum("vi,vij,vj", wrong, weight, wrong)
+    return w, information, jnp.sum(wrong[:, :, None] * weight * wrong[:, None, :])
 
 
 def _complex(points):
