@@ -20,7 +20,7 @@ the image, in px: for a lens that is focused at a distance d, it is ``d / (d - f
 
 Known lines of a plane, of which points are seen that nobody can tell where on the line they are: markings
 of a sports pitch. The homography brings the points p as close as it can to the images of their lines. The
-image of the line through e1 and e2 is m = H e1 × H e2; the distance of p from it is ``m·p / hypot(m1, m2)``.
+image of the line through e1 and e2 is m = H e1 × H e2, and p is ``m·p / hypot(m1, m2)`` away from it.
 It is linear in G = H⁻¹ but for its denominator: ``l·G p = 0`` for the line l = e1 × e2 is the linear start.
 Then as above.
 """
@@ -48,7 +48,8 @@ class FocalEstimate(eqx.Module):
     Attributes:
         focal: the focal length, in the unit that the function says; NaN if it is not determined.
         std: its standard deviation, same unit, propagated from the residuals; infinite if it is not
-            determined. It knows nothing of errors that points share: a board that is not flat.
+            determined. It knows nothing of errors that points share: a board that is not flat, a lens
+            whose distortion is left in, another principal point.
         rms: root mean square distance, px, of the points from where the fitted plane puts them, or from
             where it puts their lines.
     """
@@ -177,9 +178,8 @@ def focal_from_lines(
 
     Returns:
         The focal length in px. It is NaN, and its standard deviation infinite, if the view does not
-        determine a homography (it takes 4 lines, no 3 of them parallel or through one point, with 2 points
-        each, or as much from more lines) or not a positive 1/f², being square to the plane within its
-        noise. From 8 points the standard deviation is infinite too: nothing is left to tell the noise.
+        determine a homography, or not a positive 1/f², being square to the plane within its noise. A
+        homography takes 4 lines with 2 points each, no 3 of the lines parallel or through one point.
 
     Raises:
         ValueError: shapes differ.
@@ -192,13 +192,12 @@ def focal_from_lines(
         >>> lines = np.array([[[0, 0], [5, 0]], [[0, 3], [5, 3]], [[0, 0], [0, 3]], [[5, 0], [5, 3.0]]])
         >>> along = np.array([0.1, 0.5, 0.8])[:, None]
         >>> x, y = np.moveaxis(lines[:, :1] + along * (lines[:, 1:] - lines[:, :1]), -1, 0)
-        >>> depth = 10 + 0.6 * x + 0.3 * y
-        >>> image = 800 * np.stack([0.8 * x, y - 0.2 * x], axis=-1) / depth[..., None]
-        >>> float(focal_from_lines(image, lines, principal=np.zeros(2)).focal) > 0
-        True
+        >>> image = 800 * np.stack([0.8 * x, y], axis=-1) / (10 + 0.6 * x)[..., None]
+        >>> print(round(float(focal_from_lines(image, lines, principal=np.zeros(2)).focal), 3))
+        800.0
     """
     if mask is None:
-        mask = np.ones(points.shape[:2], bool)
+        mask = jnp.ones(points.shape[:2], bool)
     if points.ndim != 3 or points.shape != (*mask.shape, 2) or lines.shape != (len(points), 2, 2):
         raise ValueError(
             "Arguments points, mask and lines must have shapes (line, point, 2), (line, point) and "
@@ -229,7 +228,8 @@ def _focal_from_lines(points, mask, lines, principal):
     extra = max(0, 9 - mask.size)  # with as many rows as the table below has columns, or more
     present = jnp.pad(mask.ravel(), (0, extra))[:, None]
     image = jnp.pad(points.reshape(-1, 2), ((0, extra), (0, 0)))
-    ends = jnp.pad(jnp.repeat(lines, mask.shape[1], axis=0), ((0, extra), (0, 0), (0, 0)), mode="edge")
+    any_line = jnp.broadcast_to(jnp.eye(2, dtype=lines.dtype), (extra, 2, 2))
+    ends = jnp.concatenate([jnp.repeat(lines, mask.shape[1], axis=0), any_line])
     number = jnp.sum(present)
     image = jnp.where(present, image - principal[None], 0)
     middle = jnp.sum(image, axis=0, keepdims=True) / number

@@ -1,4 +1,4 @@
-"""The focal length from named lines of a football pitch: 105 m by 68 m, as international matches are played.
+"""The focal length from named lines of a football pitch of 105 m by 68 m, that of international matches.
 
 The names are those of the SoccerNet annotations. "Left" and "right" are the halves as the main camera sees
 them, "top" is far from it and "bottom" near; "Big rect." is the penalty area, "Small rect." the goal area,
@@ -41,9 +41,11 @@ def _pitch_lines() -> dict[str, tuple[tuple[float, float], tuple[float, float]]]
     return lines
 
 
-PITCH_LINES: Mapping[str, tuple[tuple[float, float], tuple[float, float]]] = MappingProxyType(_pitch_lines())
-"""The straight lines on the ground and their end points (x, y), m: x to the right and y towards the camera,
-from the middle of the pitch. Markings are up to 0.12 m wide; the areas are measured to their outer edges."""
+PITCH_LINES: Mapping[str, tuple[tuple[float, float], tuple[float, float]]] = MappingProxyType(
+    _pitch_lines()
+)
+"""The straight lines on the ground and their end points (x, y), m, from the middle of the pitch: x to the
+right and y towards the camera. Markings are up to 0.12 m wide and the areas measured to their outer edges."""
 
 
 def focal_from_pitch(
@@ -53,7 +55,7 @@ def focal_from_pitch(
 
     Args:
         annotations: for each name corrected positions in the image, px, (n, 2), anywhere on that line.
-            Names that `PITCH_LINES` does not have are left out: curves, goal posts and crossbars.
+            Names that `zoomjax.pitch.PITCH_LINES` does not have are left out: curves, posts, crossbars.
         principal: the principal point, px; the centre of distortion is the usual choice.
 
     Returns:
@@ -65,11 +67,14 @@ def focal_from_pitch(
 
     Example:
         >>> import numpy as np
+        >>> from zoomjax.pitch import PITCH_LINES
         >>> annotations = {}
         >>> for name in ("Side line top", "Side line left", "Big rect. left main", "Big rect. left top"):
         ...     x, y = np.linspace(*PITCH_LINES[name], 4).T
-        ...     depth = 90 - 0.8 * y + 0.36 * x
-        ...     annotations[name] = np.stack([0.91 * x, 0], axis=-1)
+        ...     depth = 80 - 0.96 * y
+        ...     annotations[name] = 3000 * np.stack([x + 30, 0.28 * y], axis=-1) / depth[:, None]
+        >>> print(round(float(focal_from_pitch(annotations, principal=np.zeros(2)).focal), 3))
+        3000.0
     """
     used = {name: _positions(name, annotations[name]) for name in PITCH_LINES if name in annotations}
     if not used:
@@ -89,7 +94,11 @@ def focal_from_pitch(
 
 
 def _positions(name: str, points: ArrayLike) -> np.ndarray:
-    positions = np.asarray(points, float)
+    try:
+        positions = np.asarray(points, float)
+    except ValueError:  # rows of different lengths, or words
+        positions = np.full(2, np.nan)
+    positions = positions.reshape(-1, 2) if positions.size == 0 else positions
     if positions.ndim != 2 or positions.shape[1] != 2 or not np.isfinite(positions).all():
         raise ValueError(f"Positions on {name!r} must be a finite array (n, 2), but they are {points!r}.")
     return positions
