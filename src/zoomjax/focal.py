@@ -376,10 +376,15 @@ def _matrix(entries):
 
 
 def _equations(entries):
-    """The factors of w in Zhang's two equations, and what is added to them."""
+    """The factors of w in Zhang's two equations, and what is added to them.
+
+    Divided by what makes them the same for all multiples of the matrix: otherwise the choice of the entry
+    that is 1, and with it of the plane's origin, would have a part in the weights.
+    """
     h1, h2 = _matrix(entries).T[:2]
+    size = jnp.sum(h1[:2] ** 2 + h2[:2] ** 2)
     factor = jnp.stack([jnp.sum(h1[:2] * h2[:2]), jnp.sum(h1[:2] ** 2 - h2[:2] ** 2)])
-    return factor, jnp.stack([h1[2] * h2[2], h1[2] ** 2 - h2[2] ** 2])
+    return factor / size, jnp.stack([h1[2] * h2[2], h1[2] ** 2 - h2[2] ** 2]) / size
 
 
 def _inverse_square(entries, root):

@@ -45,7 +45,7 @@ PITCH_LINES: Mapping[str, tuple[tuple[float, float], tuple[float, float]]] = Map
     _pitch_lines()
 )
 """The straight lines on the ground and their end points (x, y), m, from the middle of the pitch: x to the
-right and y towards the camera. Markings are up to 0.12 m wide and the areas measured to their outer edges."""
+right and y towards the camera. Markings are up to 0.12 m wide; areas are measured to their outer edges."""
 
 
 def focal_from_pitch(
@@ -73,7 +73,7 @@ def focal_from_pitch(
         ...     x, y = np.linspace(*PITCH_LINES[name], 4).T
         ...     depth = 80 - 0.96 * y
         ...     annotations[name] = 3000 * np.stack([x + 30, 0.28 * y], axis=-1) / depth[:, None]
-        >>> print(round(float(focal_from_pitch(annotations, principal=np.zeros(2)).focal), 3))
+        >>> print(f"{focal_from_pitch(annotations, principal=np.zeros(2)).focal:.1f}")
         3000.0
     """
     used = {name: _positions(name, annotations[name]) for name in PITCH_LINES if name in annotations}
