@@ -132,9 +132,8 @@ def pitch(folder: Path) -> None:
         estimates = [focal_from_pitch(lines, principal=PRINCIPAL) for lines in annotations]
         print_frames(title, estimates, frames)
     missed = np.array([_rms_distance(*pair) for pair in zip(seen, feet, strict=True)])
-    print(
-        f"\nk1 = {float(distortion.coefficients[0]):.4f}; straightness {rms[0]:.2f} px, with it {rms[1]:.2f}"
-    )
+    k1 = float(distortion.coefficients[0])
+    print(f"\nk1 = {k1:.4f}; straightness {rms[0]:.2f} px, with it {rms[1]:.2f}")
     print(
         f"The other program's camera: {np.median(missed):.2f} px from the points in the median frame, more "
         f"than 50 px in {np.sum(missed > 50)}"

@@ -95,7 +95,7 @@ def focal_from_pitch(
 
 def _positions(name: str, points: ArrayLike) -> np.ndarray:
     try:
-        positions = np.asarray(points, float)
+        positions: np.ndarray = np.asarray(points, float)
     except ValueError:  # rows of different lengths, or words
         positions = np.full(2, np.nan)
     positions = positions.reshape(-1, 2) if positions.size == 0 else positions
