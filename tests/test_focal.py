@@ -234,6 +234,168 @@ def test_the_two_focal_lengths_differ_by_the_focus():
     assert together.focal * pixel == pytest.approx(image_distance)
 
 
+# Lines of a plane.
+
+FIELD = np.array(
+    [
+        [[0.0, 0.0], [8.0, 0.0]],
+        [[0.0, 5.0], [8.0, 5.0]],
+        [[0.0, 0.0], [0.0, 5.0]],
+        [[8.0, 0.0], [8.0, 5.0]],
+        [[0.0, 0.0], [8.0, 5.0]],
+    ]
+)
+"""A rectangle and a diagonal."""
+
+
+def seen_on(lines, focal=1200.0, tilt=TILTS[0], number=5):
+    """Places on the lines, and where they are in the image, px."""
+    along = np.linspace(0.1, 0.8, number)[:, None]
+    places = lines[:, :1] + along * (lines[:, 1:] - lines[:, :1])
+    return views(focal, [tilt], places.reshape(-1, 2))[0].reshape(places.shape)
+
+
+def from_lines(points, lines=FIELD, **settings):
+    return zj.focal_from_lines(points, lines, principal=PRINCIPAL, **settings)
+
+
+@pytest.mark.parametrize("tilt", TILTS)
+@pytest.mark.parametrize("focal", [300.0, 1200.0, 7000.0])
+def test_exact_lines_give_their_focal_length(focal, tilt):
+    estimate = from_lines(seen_on(FIELD, focal, tilt))
+    np.testing.assert_allclose(estimate.focal, focal, rtol=1e-9)
+    assert estimate.std < 1e-6
+    assert estimate.rms < 1e-9
+
+
+def test_four_lines_of_two_points_are_enough():
+    estimate = from_lines(seen_on(FIELD[:4], number=2), FIELD[:4])
+    np.testing.assert_allclose(estimate.focal, 1200, rtol=1e-9)
+
+
+def test_which_points_describe_a_line_and_its_unit_do_not_matter(rng):
+    noisy = seen_on(FIELD) + 0.3 * rng.standard_normal((5, 5, 2))
+    known = from_lines(noisy)
+    slid = FIELD[:, :1] + np.array([[-0.5], [30.0]]) * (FIELD[:, 1:] - FIELD[:, :1])
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    for lines in (slid, FIELD[:, ::-1], 25 * FIELD @ turn.T + 1000, FIELD * [1, -1]):
+        for one, same in zip(
+            jax.tree.leaves(known), jax.tree.leaves(from_lines(noisy, lines)), strict=True
+        ):
+            np.testing.assert_allclose(one, same, rtol=1e-7)
+
+
+def test_masked_points_change_nothing(rng):
+    noisy = seen_on(FIELD) + 0.3 * rng.standard_normal((5, 5, 2))
+    known = from_lines(noisy)
+    points = np.full((7, 9, 2), np.nan)
+    points[:5, 2:7] = noisy
+    lines = np.concatenate([FIELD, FIELD[:2] + np.array([3.0, 0.1])])
+    for one, same in zip(
+        jax.tree.leaves(known),
+        jax.tree.leaves(from_lines(points, lines, mask=np.isfinite(points[..., 0]))),
+        strict=True,
+    ):
+        np.testing.assert_allclose(one, same, rtol=1e-9)
+
+
+@pytest.mark.parametrize("number", [3, 12])
+def test_standard_deviation_from_lines_is_that_of_sampled_noise(number, rng):
+    exact = seen_on(FIELD, tilt=(0.8, 0.5, 0.2), number=number)
+    noise = jnp.array(0.2 * rng.standard_normal((2000, *exact.shape)))
+    sample = jax.vmap(lambda error: from_lines(exact + error))(noise)
+    assert sample.focal.mean() == pytest.approx(1200, abs=float(0.2 * sample.focal.std()))
+    assert np.sqrt((sample.std**2).mean()) == pytest.approx(float(sample.focal.std()), rel=0.1)
+    freedom = 1 - 8 / (5 * number)
+    assert (sample.rms**2).mean() == pytest.approx(0.2**2 * freedom, rel=0.04)
+
+
+def test_points_at_the_same_places_say_more_if_the_places_are_known(rng):
+    places = FIELD[:, :1] + np.linspace(0.1, 0.8, 5)[:, None] * (FIELD[:, 1:] - FIELD[:, :1])
+    noisy = seen_on(FIELD) + 0.3 * rng.standard_normal((5, 5, 2))
+    together, _ = zj.focal_from_planes(noisy.reshape(1, -1, 2), places.reshape(-1, 2), principal=PRINCIPAL)
+    lines = from_lines(noisy)
+    assert together.std < lines.std
+    assert abs(together.focal - lines.focal) < 3 * lines.std
+
+
+def test_gradients_are_finite_differences(rng):
+    """Far from an exact fit, where the squares' second derivatives are not Gauss and Newton's."""
+    noisy = seen_on(FIELD) + 5 * rng.standard_normal((5, 5, 2))
+    flat = views(1200.0, TILTS[:1]) + 5 * rng.standard_normal((1, len(PLANE), 2))
+    for solve, points in (
+        (from_lines, noisy),
+        (lambda points: zj.focal_from_planes(points, PLANE, principal=PRINCIPAL)[0], flat),
+    ):
+        direction = rng.standard_normal(points.shape)
+        for of in (lambda points, solve=solve: solve(points).focal, lambda p, s=solve: s(p).std):
+            backward = jnp.sum(jax.grad(of)(jnp.array(points)) * direction)
+            forward = jax.jvp(of, (jnp.array(points),), (jnp.array(direction),))[1]
+            step = 1e-4
+            difference = (of(points + step * direction) - of(points - step * direction)) / (2 * step)
+            np.testing.assert_allclose(backward, forward, rtol=1e-9)
+            np.testing.assert_allclose(backward, difference, rtol=1e-6)
+
+
+def test_under_jit_and_in_float32(rng):
+    noisy = seen_on(FIELD) + 0.3 * rng.standard_normal((5, 5, 2))
+    known = from_lines(noisy).focal
+    np.testing.assert_allclose(jax.jit(from_lines)(noisy).focal, known, rtol=1e-9)
+    single = zj.focal_from_lines(
+        *(jnp.asarray(array, jnp.float32) for array in (noisy, FIELD)),
+        principal=jnp.asarray(PRINCIPAL, jnp.float32),
+    )
+    assert single.focal.dtype == single.std.dtype == jnp.float32
+    assert single.focal == pytest.approx(float(known), rel=1e-3)
+
+
+SPOKES = np.stack([np.full((6, 2), 3.0), 3 + 2 * np.stack([np.cos(range(6)), np.sin(range(6))], -1)], 1)
+PARALLELS = FIELD[:1] + np.array([0, 1, 2.5, 4, 7])[:, None, None] * [0.2, 1.0]
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+@pytest.mark.parametrize(
+    ("lines", "number"),
+    [
+        (FIELD[:3], 5),
+        (FIELD[:1], 2),
+        (np.zeros((0, 2, 2)), 3),
+        (PARALLELS, 4),
+        (np.concatenate([PARALLELS, FIELD[3:4]]), 4),
+        (SPOKES, 4),
+        (np.concatenate([SPOKES, FIELD[:1]]), 4),
+        (np.concatenate([FIELD[:3], 0.5 * (FIELD[:1] + FIELD[:1, ::-1]) + [[0.0, 0.0], [4.0, 0.0]]]), 5),
+        (FIELD[:4], 1),
+        (FIELD, 1),
+        (FIELD[[0, 0, 0, 0]], 9),
+    ],
+    ids=[
+        *("three", "one", "none", "parallel", "parallel and one", "through a point"),
+        *("through a point and one", "one twice", "four points", "five points", "the same"),
+    ],
+)
+def test_lines_that_determine_nothing_are_nan_and_infinitely_uncertain(lines, number, noise, rng):
+    points = seen_on(lines, number=number) if len(lines) else np.zeros((0, 3, 2))
+    estimate = from_lines(points + noise * rng.standard_normal(points.shape), lines)
+    assert np.isnan(estimate.focal)
+    assert np.isposinf(estimate.std)
+
+
+@pytest.mark.parametrize(
+    ("points", "lines", "mask"),
+    [
+        (np.zeros((4, 2)), FIELD[:4], None),
+        (np.zeros((4, 3, 3)), FIELD[:4], None),
+        (np.zeros((4, 3, 2)), FIELD, None),
+        (np.zeros((4, 3, 2)), FIELD[:4, 0], None),
+        (np.zeros((4, 3, 2)), FIELD[:4], np.ones((4, 2), bool)),
+    ],
+)
+def test_lines_of_other_shapes_raise(points, lines, mask, unchecked):
+    with pytest.raises(ValueError, match="must have shapes"):
+        from_lines(points, lines, mask=mask)
+
+
 # A real zoom camera.
 
 

@@ -11,7 +11,7 @@ import zoomjax
 LAYERS = (
     {"_types", "_files", "_checks", "_linear"},
     {"radial", "focal"},
-    {"inverse"},
+    {"inverse", "pitch"},
     {"zoom"},
     {"rivals"},
     {"lines"},

@@ -16,6 +16,7 @@ from .fit import fit_zoom as fit_zoom
 from .fit import frame_rms as frame_rms
 from .focal import FocalEstimate as FocalEstimate
 from .focal import focal_from_board as focal_from_board
+from .focal import focal_from_lines as focal_from_lines
 from .focal import focal_from_planes as focal_from_planes
 from .framing import Framing as Framing
 from .framing import frame_output as frame_output
@@ -29,6 +30,7 @@ from .lens import load_lens as load_lens
 from .lines import AbstractLines as AbstractLines
 from .lines import Lines as Lines
 from .lines import load_lines as load_lines
+from .pitch import focal_from_pitch as focal_from_pitch
 from .radial import Distortion as Distortion
 from .rivals import PowerZoom as PowerZoom
 from .rivals import SplineZoom as SplineZoom

@@ -1,6 +1,6 @@
 """Focal lengths from a plane of known geometry.
 
-Two ways, for corrected points (`Distortion.undistort`): pictures of a lens without distortion.
+Three ways, for corrected points (`Distortion.undistort`): pictures of a lens without distortion.
 
 A board parallel to the sensor, at a known distance d: the image is the board times a magnification, and
 eq. 14 of the paper, ``f = d r_c / (R + r_c)``, gives the focal length of the thin lens, which is focused
@@ -17,17 +17,26 @@ solution. The covariance of its entries becomes that of the two equations, by wh
 weighted; w is the generalised least-squares solution. The closer a view is to squarely, the less it says
 about f, and the larger is its standard deviation. This f is the distance from the centre of projection to
 the image, in px: for a lens that is focused at a distance d, it is ``d / (d - f)`` times eq. 14's.
+
+Known lines of a plane, of which points are seen that nobody can tell where on the line they are: markings
+of a sports pitch. The homography brings the points p as close as it can to the images of their lines. The
+image of the line through e1 and e2 is m = H e1 × H e2, and p is ``m·p / hypot(m1, m2)`` away from it.
+It is linear in G = H⁻¹ but for its denominator: ``l·G p = 0`` for the line l = e1 × e2 is the linear start.
+Then as above.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ._types import AnyArray, Scalar
 
 _ITERATIONS = 20
 """Gauss-Newton steps for a homography, at most. From the linear start 3 or 4 reach rounding."""
+
+_SINGULAR = 1000
+"""Singular values below as many roundings of the largest one are zero: of a Jacobian of a homography."""
 
 _WEIGHINGS = 5
 """How often the two equations are weighted anew: their weights depend on w. The first 2 matter."""
@@ -38,9 +47,11 @@ class FocalEstimate(eqx.Module):
 
     Attributes:
         focal: the focal length, in the unit that the function says; NaN if it is not determined.
-        std: its standard deviation, same unit, propagated from the residuals; infinite if it is not
-            determined. It knows nothing of errors that points share: a board that is not flat.
-        rms: root mean square distance, px, of the points from where the fitted plane puts them.
+        std: its standard deviation, same unit, propagated from the residuals, and for a homography also from
+            how far it is from what a camera sees; infinite if it is not determined. It knows nothing of errors that points share: a board that is not flat, a lens
+            whose distortion is left in, another principal point.
+        rms: root mean square distance, px, of the points from where the fitted plane puts them, or from
+            where it puts their lines.
     """
 
     focal: Float[Array, "*view"]
@@ -147,6 +158,54 @@ def focal_from_planes(
     return _focal_from_planes(jnp.asarray(points), jnp.asarray(plane), jnp.asarray(principal))
 
 
+def focal_from_lines(
+    points: Float[AnyArray, "line point 2"],
+    lines: Float[AnyArray, "line 2 2"],
+    *,
+    principal: Float[AnyArray, "2"],
+    mask: Bool[AnyArray, "line point"] | None = None,
+) -> FocalEstimate:
+    """The focal length from one oblique view of known lines of a plane, by Zhang's two constraints.
+
+    Where on its line each point is, need not be known. For several views use `jax.vmap`.
+
+    Args:
+        points: corrected positions in the image, px: for each line those that are seen on it.
+        lines: for each line two points of it, on the plane, in any unit: its size and place do not matter,
+            nor whether the two are seen.
+        principal: the principal point, px; the centre of distortion is the usual choice.
+        mask: which of the points there are; all, if it is not given. A line may have none.
+
+    Returns:
+        The focal length in px. It is NaN, and its standard deviation infinite, if the view does not
+        determine a homography, or not a positive 1/f², being square to the plane within its noise. A
+        homography takes 4 lines with 2 points each, no 3 of the lines parallel or through one point.
+
+    Raises:
+        ValueError: shapes differ.
+
+    References:
+        Z. Zhang, "A flexible new technique for camera calibration", IEEE PAMI 22 (2000), section 3.1.
+
+    Example:
+        >>> import numpy as np
+        >>> lines = np.array([[[0, 0], [5, 0]], [[0, 3], [5, 3]], [[0, 0], [0, 3]], [[5, 0], [5, 3.0]]])
+        >>> along = np.array([0.1, 0.5, 0.8])[:, None]
+        >>> x, y = np.moveaxis(lines[:, :1] + along * (lines[:, 1:] - lines[:, :1]), -1, 0)
+        >>> image = 800 * np.stack([0.8 * x, y], axis=-1) / (10 + 0.6 * x)[..., None]
+        >>> print(round(float(focal_from_lines(image, lines, principal=np.zeros(2)).focal), 3))
+        800.0
+    """
+    if mask is None:
+        mask = jnp.ones(points.shape[:2], bool)
+    if points.ndim != 3 or points.shape != (*mask.shape, 2) or lines.shape != (len(points), 2, 2):
+        raise ValueError(
+            "Arguments points, mask and lines must have shapes (line, point, 2), (line, point) and "
+            f"(line, 2, 2), but their shapes are {points.shape}, {mask.shape} and {lines.shape}."
+        )
+    return _focal_from_lines(*map(jnp.asarray, (points, mask, lines, principal)))
+
+
 @eqx.filter_jit
 def _focal_from_planes(points, plane, principal):
     image = points - principal[None, None]
@@ -155,24 +214,78 @@ def _focal_from_planes(points, plane, principal):
     length = jnp.sqrt(jnp.mean(jnp.sum((points - jnp.mean(points, axis=1, keepdims=True)) ** 2, axis=-1)))
     plane = plane / jnp.sqrt(jnp.mean(jnp.sum(plane**2, axis=-1)))
     entries, root, squares = jax.vmap(_homography, in_axes=(0, None))(image / length, plane)
-    squares = squares * length**2
     number = points.shape[1]
 
     def estimate(entries, root, squares):
-        w, information = _inverse_square(entries, root)
-        variance = jnp.sum(squares) / (squares.size * (2 * number - 8)) / length**2
-        known = (w > 0) & (information > 0)
-        w = jnp.where(known, w, 1)
-        focal = length / jnp.sqrt(w)
-        error = jnp.sqrt(variance / jnp.where(known, information, 1))
-        return FocalEstimate(
-            focal=jnp.where(known, focal, jnp.nan),
-            std=jnp.where(known, focal / (2 * w) * error, jnp.inf),
-            rms=jnp.sqrt(jnp.sum(squares) / (squares.size * number)),
-        )
+        return _estimate(entries, root, jnp.sum(squares), squares.size * number, 2, length)
 
     each = jax.vmap(estimate)(entries[:, None], root[:, None], squares[:, None])
     return estimate(entries, root, squares), each
+
+
+@eqx.filter_jit
+def _focal_from_lines(points, mask, lines, principal):
+    extra = max(0, 9 - mask.size)  # with as many rows as the table below has columns, or more
+    present = jnp.pad(mask.ravel(), (0, extra))[:, None]
+    image = jnp.pad(points.reshape(-1, 2), ((0, extra), (0, 0)))
+    any_line = jnp.broadcast_to(jnp.eye(2, dtype=lines.dtype), (extra, 2, 2))
+    ends = jnp.concatenate([jnp.repeat(lines, mask.shape[1], axis=0), any_line])
+    number = jnp.sum(present)
+    image = jnp.where(present, image - principal[None], 0)
+    middle = jnp.sum(image, axis=0, keepdims=True) / number
+    length = jnp.sqrt(jnp.sum(jnp.where(present, image - middle, 0) ** 2) / number)
+    entries, root, squares = _homography_from_lines(image / length, present.astype(image.dtype), ends)
+    return _estimate(entries[None], root[None], squares, number, 1, length)
+
+
+def _homography_from_lines(image, present, ends):
+    """As `_homography`, for points on the lines through the ends, in a unit of the plane of its own.
+
+    NaN if it is not determined: if another homography has the same lines, in first order.
+    """
+    matrix, origin, unit = jax.lax.stop_gradient(_linear_homography(image, present, ends))
+    entries = matrix.ravel()[:8]
+    ends = _homogeneous((ends - origin[None, None]) / unit)
+
+    def residual(entries):
+        first, second = jnp.moveaxis(ends @ _matrix(entries).T, 1, 0)
+        line = jnp.cross(first, second)
+        across = jnp.sum(line * _homogeneous(image), axis=1) / jnp.hypot(line[:, 0], line[:, 1])
+        return across * present[:, 0]
+
+    sizes = jnp.linalg.svd(jax.lax.stop_gradient(jax.jacfwd(residual)(entries)), compute_uv=False)
+    determined = sizes[-1] > _SINGULAR * jnp.finfo(entries.dtype).eps * sizes[0]
+    return _refined(residual, jnp.where(determined, entries, jnp.nan))
+
+
+def _linear_homography(image, present, ends):
+    """A homography near that of least squares, from a plane with origin and unit of the last two.
+
+    The origin is what is seen in the middle of the points, where depth is positive, and the unit what looks
+    as large as the image's unit there.
+    """
+    total = jnp.sum(present)
+    origin = jnp.sum(present[..., None] * ends, axis=(0, 1)) / (2 * total)
+    ends = ends - origin[None, None]
+    unit = jnp.sqrt(jnp.sum(present[..., None] * ends**2) / (2 * total))
+    first, second = jnp.moveaxis(_homogeneous(ends / unit), 1, 0)
+    line = jnp.cross(first, second)
+    line = line / jnp.hypot(line[:, :1], line[:, 1:2])
+    table = (line[:, :, None] * _homogeneous(image)[:, None, :]).reshape(-1, 9) * present
+    to_plane = jnp.linalg.svd(table, full_matrices=False)[2][-1].reshape(3, 3)
+    middle = jnp.append(jnp.sum(present * image, axis=0) / total, 1)
+    place = to_plane @ middle
+    place = place[:2] / place[2]
+    columns = jnp.linalg.inv(to_plane)
+    columns = columns[:, :2] / (columns[2] @ jnp.append(place, 1))  # the last one becomes the middle
+    enlarged = jnp.linalg.det(columns[:2] - middle[:2, None] * columns[2:])
+    scale = 1 / jnp.sqrt(abs(enlarged))
+    matrix = jnp.concatenate([scale * columns, middle[:, None]], axis=1)
+    return matrix, origin + unit * place, unit * scale
+
+
+def _homogeneous(points):
+    return jnp.concatenate([points, jnp.ones_like(points[..., :1])], axis=-1)
 
 
 def _homography(image, plane):
@@ -188,55 +301,113 @@ def _homography(image, plane):
     )
     vector = jnp.linalg.svd(table, full_matrices=False)[2][-1]
     # The last entry is the depth of the middle of the plane, which is in front of the camera.
-    start = vector[:8] / vector[8]
+    start = jax.lax.stop_gradient(vector[:8] / vector[8])
 
     def residual(entries):
-        h = jnp.append(entries, 1).reshape(3, 3)
-        mapped = row @ h.T
+        mapped = row @ _matrix(entries).T
         return (mapped[:, :2] / mapped[:, 2:] - image).ravel()
 
-    def solve(entries):
+    return _refined(residual, start)
+
+
+def _refined(residual, start):
+    """The entries of least squares, a root of their covariance for unit noise, and the squares.
+
+    All are NaN if the iterations do not converge: if the squares are least in a degenerate homography.
+    Differentiable as the solution of "the gradient of the squares is 0", both ways and exactly: Gauss and
+    Newton's approximation is in the steps alone.
+    """
+
+    def gradient(entries):
+        return jax.grad(lambda entries: jnp.sum(residual(entries) ** 2) / 2)(entries)
+
+    def step_and_root(entries):
         orthogonal, triangle = jnp.linalg.qr(jax.jacfwd(residual)(entries))
-        return jax.scipy.linalg.solve_triangular(triangle, orthogonal.T @ residual(entries)), triangle
+        sides = jnp.column_stack([orthogonal.T @ residual(entries), jnp.eye(8, dtype=entries.dtype)])
+        # At once: XLA on few cores can wait forever for two of LAPACK's batches that run side by side.
+        solved = jax.scipy.linalg.solve_triangular(triangle, sides)
+        return solved[:, 0], solved[:, 1:]
 
     def advance(state):
         entries, _, count = state
-        step, _ = solve(entries)
+        step, _ = step_and_root(entries)
         return entries - step, jnp.max(abs(step)), count + 1
 
-    small = 64 * jnp.finfo(start.dtype).eps
-    entries, _, _ = jax.lax.while_loop(
-        lambda state: (state[1] > small) & (state[2] < _ITERATIONS),
-        advance,
-        (start, jnp.full((), jnp.inf, start.dtype), 0),
+    def solve(_, start):
+        small = 64 * jnp.finfo(start.dtype).eps
+        return jax.lax.while_loop(
+            lambda state: (state[1] > small) & (state[2] < _ITERATIONS),
+            advance,
+            (start, jnp.full((), jnp.inf, start.dtype), 0),
+        )[0]
+
+    def solve_linear(map, right):
+        return jnp.linalg.solve(jax.jacfwd(map)(right), right)
+
+    entries = jax.lax.custom_root(gradient, start, solve, solve_linear)
+    step, root = step_and_root(entries)
+    converged = jnp.max(step**2) < jnp.finfo(step.dtype).eps
+    found = (entries, root, jnp.sum(residual(entries) ** 2))
+    return jax.tree.map(lambda leaf: jnp.where(converged, leaf, jnp.nan), found)
+
+
+def _estimate(entries, root, squares, number, coordinates, length):
+    """From the homographies of views, with the sum of squares of all their points' distances.
+
+    Each of the points has one or two coordinates that the homographies, of 8 unknowns each, should give.
+    Lengths in the image are in units of length px.
+    """
+    w, information, misfit = _inverse_square(entries, root)
+    # What one camera can see of the plane has 6 unknowns a view, and f.
+    variance = (squares + misfit) / (coordinates * number - 6 * len(entries) - 1)
+    known = (w > 0) & (information > 0)
+    w = jnp.where(known, w, 1)
+    focal = length / jnp.sqrt(w)
+    error = jnp.sqrt(variance / jnp.where(known, information, 1))
+    return FocalEstimate(
+        focal=jnp.where(known, focal, jnp.nan),
+        std=jnp.where(known, focal / (2 * w) * error, jnp.inf),
+        rms=jnp.sqrt(squares / number) * length,
     )
-    _, triangle = solve(entries)
-    root = jax.scipy.linalg.solve_triangular(triangle, jnp.eye(8, dtype=triangle.dtype))
-    return entries, root, jnp.sum(residual(entries) ** 2)
+
+
+def _matrix(entries):
+    return jnp.append(entries, 1).reshape(3, 3)
 
 
 def _equations(entries):
-    """The factors of w in Zhang's two equations, and what is added to them."""
-    h1, h2 = jnp.append(entries, 1).reshape(3, 3).T[:2]
+    """The factors of w in Zhang's two equations, and what is added to them.
+
+    Divided by what makes them the same for all multiples of the matrix: otherwise the choice of the entry
+    that is 1, and with it of the plane's origin, would have a part in the weights.
+    """
+    h1, h2 = _matrix(entries).T[:2]
+    size = jnp.sum(h1[:2] ** 2 + h2[:2] ** 2)
     factor = jnp.stack([jnp.sum(h1[:2] * h2[:2]), jnp.sum(h1[:2] ** 2 - h2[:2] ** 2)])
-    return factor, jnp.stack([h1[2] * h2[2], h1[2] ** 2 - h2[2] ** 2])
+    return factor / size, jnp.stack([h1[2] * h2[2], h1[2] ** 2 - h2[2] ** 2]) / size
 
 
 def _inverse_square(entries, root):
-    """The generalised least-squares w of several views, and the inverse of its variance for unit noise."""
+    """The generalised least-squares w of several views, for unit noise the inverse of its variance, and by
+    how much the sum of squares would be larger if the homographies obeyed the equations exactly.
+    """
     factor, constant = jax.vmap(_equations)(entries)  # (view, 2)
     slopes = jax.vmap(jax.jacfwd(_equations))(entries)
 
     def solve(w):
         gradient = (w * slopes[0] + slopes[1]) @ root  # (view, 2, 8)
-        weight = jnp.linalg.inv(gradient @ gradient.swapaxes(1, 2))
+        spread = gradient @ gradient.swapaxes(1, 2)
+        a, b, c = spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1]
+        weight = jnp.stack([c, -b, -b, a], axis=1).reshape(-1, 2, 2) / (a * c - b**2)[:, None, None]
         information = jnp.einsum("vi,vij,vj", factor, weight, factor)
-        return -jnp.einsum("vi,vij,vj", factor, weight, constant) / information, information
+        return -jnp.einsum("vi,vij,vj", factor, weight, constant) / information, information, weight
 
     w = -jnp.sum(factor * constant) / jnp.sum(factor**2)
     for _ in range(_WEIGHINGS - 1):
-        w, _ = solve(jnp.maximum(w, 0))
-    return solve(jnp.maximum(w, 0))
+        w, *_ = solve(jnp.maximum(w, 0))
+    w, information, weight = solve(jnp.maximum(w, 0))
+    wrong = w * factor + constant
+    return w, information, jnp.sum(wrong[:, :, None] * weight * wrong[:, None, :])
 
 
 def _complex(points):
