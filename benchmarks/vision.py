@@ -423,10 +423,9 @@ def markdown(r: dict) -> str:
             "",
             f"2560 × 2160 px, dark bars on white, {grid['lines']} lines found. The aim is the number of "
             "changes between dark and bright along one row and one column between bars, counted without "
-            "the detector; it misses borders along the image's edge, as those of the outermost bar. Those "
-            "found extend over 95 % of the image or more; where they cross its middle the "
+            "the detector. Those found extend over 95 % of the image or more; where they cross its middle the "
             f"nearest two are {grid['upright']['nearest_px']:.1f} px (upright) and "
-            f"{grid['level']['nearest_px']:.1f} px (level) apart, so that none is counted twice.",
+            f"{grid['level']['nearest_px']:.1f} px (level) apart.",
             "",
             "## Broadcast football",
             "",
@@ -469,8 +468,8 @@ def rendered_part(results: dict) -> list[str]:
         "true focal lengths; its distance to the true one is the greatest on 20 × 20 points of all 12 "
         "images.",
         "",
-        "Borders that are missed run along the image's edge: in their middle they are within "
-        f"{max(x['missed_within_px'] for x in results.values()):.1f} px of it.",
+        "The middles of the borders that are missed are within "
+        f"{max(x['missed_within_px'] for x in results.values()):.1f} px of the image's edge.",
         "",
         "| | lines | borders found | in pieces | RMS, px | worst photo | mean | lens, px |",
         "|---|---:|---:|---:|---:|---:|---:|---:|",
