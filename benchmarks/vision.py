@@ -423,8 +423,8 @@ def markdown(r: dict) -> str:
             "",
             f"2560 × 2160 px, dark bars on white, {grid['lines']} lines found. The aim is the number of "
             "changes between dark and bright along one row and one column between bars, counted without "
-            "the detector. Those found extend over 95 % of the image or more; where they cross its middle the "
-            f"nearest two are {grid['upright']['nearest_px']:.1f} px (upright) and "
+            "the detector. Those found extend over 95 % of the image or more; where they cross its middle "
+            f"the nearest two are {grid['upright']['nearest_px']:.1f} px (upright) and "
             f"{grid['level']['nearest_px']:.1f} px (level) apart.",
             "",
             "## Broadcast football",
