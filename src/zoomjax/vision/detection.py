@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import hashlib
 import io
+import math
 import multiprocessing
 import signal
 import zipfile
@@ -146,7 +147,7 @@ def _thinned(line: np.ndarray) -> np.ndarray:
     if len(line) < 3:
         return line
     length = float(np.hypot(*(line[-1] - line[0])))
-    return line[:: max(1, int(_SPACING * (len(line) - 1) / max(length, 1e-9)))]
+    return line[:: math.ceil(_SPACING * (len(line) - 1) / max(length, 1e-9))]
 
 
 def _finished(file: Path | None, result: concurrent.futures.Future | Detection) -> Detection:

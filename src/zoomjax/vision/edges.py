@@ -19,7 +19,7 @@ from .one_frame import OneFrame, normals
 _LONG = 0.2
 """Share of the image's shorter side that a border must extend over to inform the frame's distortion."""
 
-_LEAST_LINES = 6
+_LEAST_LINES = 3
 """With fewer long borders a frame says too little of its distortion."""
 
 _LEAST_TOLERANCE = 0.5

@@ -180,6 +180,7 @@ def _search(grey: np.ndarray, size: tuple[int, int], flags: int) -> np.ndarray |
     """Corners (row, column, 2) of a board of (columns, rows), or a larger one if the flags say so."""
     if min(grey.shape) < 4 * _START:
         return None
+    cv2.setRNGSeed(0)  # the search draws samples: the same image shall have the same corners
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, size, _FLAGS | flags)
     if not found:
         return None

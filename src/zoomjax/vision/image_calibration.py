@@ -168,12 +168,15 @@ class ImageCalibration:
 
     def _draw(self, folder: Path, progress: Progress) -> list[Path]:
         used = {d.name: (d, r) for d, r in zip(self.used, self.rejected(), strict=True)}
+        stems = Counter(Path(name).with_suffix("") for name in used)
         made: list[Path] = []
 
         def draw(source: Source) -> Path:
             detection, rejected = used[source.name]
             picture = draw_lines(source.read()[0], detection.lines, rejected.tolist())
-            target = folder / Path(source.name).with_suffix(".jpg")
+            name = Path(source.name)
+            alone = stems[name.with_suffix("")] == 1  # a.jpg beside a.png are two pictures
+            target = folder / (name.with_suffix(".jpg") if alone else f"{name}.jpg")
             target.parent.mkdir(parents=True, exist_ok=True)
             done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
             assert done

@@ -26,8 +26,14 @@ class OneFrame:
 
     def undistort(self, points: np.ndarray) -> np.ndarray:
         """Corrected positions of points (..., 2), px."""
-        z = (points - self.centre) / self.scale
-        return self.centre + self.scale * (z + np.tensordot(self.k, _columns(z), 1))
+        x, y = ((points[..., axis] - self.centre[axis]) / self.scale for axis in (0, 1))
+        t = x * x + y * y
+        k1, k2, p1, p2 = self.k
+        factor = 1 + t * (k1 + t * k2) + 2 * (p1 * x + p2 * y)
+        corrected = np.empty(points.shape)
+        corrected[..., 0] = self.centre[0] + self.scale * (x * factor + p1 * t)
+        corrected[..., 1] = self.centre[1] + self.scale * (y * factor + p2 * t)
+        return corrected
 
     def fit(self, lines: list[np.ndarray], samples: int = 64) -> None:
         """Find the coefficients that straighten lines, (n, 2) px each; leave them if there is none.
