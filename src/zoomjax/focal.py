@@ -47,7 +47,7 @@ class FocalEstimate(eqx.Module):
 
     Attributes:
         focal: the focal length, in the unit that the function says; NaN if it is not determined.
-        std: its standard deviation, same unit, propagated from the residuals, and for a homography also from
+        std: its standard deviation, same unit, propagated from the residuals, and of a homography also from
             how far it is from a camera's; infinite if it is not determined. It knows nothing of errors that
             points share: a board that is not flat, distortion that is left in, another principal point.
         rms: root mean square distance, px, of the points from where the fitted plane puts them, or from
