@@ -47,9 +47,9 @@ class FocalEstimate(eqx.Module):
 
     Attributes:
         focal: the focal length, in the unit that the function says; NaN if it is not determined.
-        std: its standard deviation, same unit, propagated from the residuals, and for a homography also from
-            how far it is from what a camera sees; infinite if it is not determined. It knows nothing of errors that points share: a board that is not flat, a lens
-            whose distortion is left in, another principal point.
+        std: its standard deviation, same unit, propagated from the residuals, and of a homography also from
+            how far it is from a camera's; infinite if it is not determined. It knows nothing of errors that
+            points share: a board that is not flat, distortion that is left in, another principal point.
         rms: root mean square distance, px, of the points from where the fitted plane puts them, or from
             where it puts their lines.
     """
@@ -167,7 +167,7 @@ def focal_from_lines(
 ) -> FocalEstimate:
     """The focal length from one oblique view of known lines of a plane, by Zhang's two constraints.
 
-    Where on its line each point is, need not be known. For several views use `jax.vmap`.
+    Where on its line each point is, need not be known. For many pictures alike use `jax.vmap`.
 
     Args:
         points: corrected positions in the image, px: for each line those that are seen on it.
