@@ -1,6 +1,7 @@
 """What all tests share: float64, strict ranks, one seed, and small scenes with exact truth."""
 
 import os
+import tempfile
 from pathlib import Path
 
 import equinox as eqx
@@ -14,6 +15,10 @@ import zoomjax as zj
 from zoomjax import synthetic
 
 SEED = 2012
+
+# What the command line compiles, and finds in images, is kept between the tests, and not beyond them.
+_CACHE = tempfile.TemporaryDirectory(prefix="zoomjax-tests-")
+os.environ["ZOOMJAX_CACHE"] = _CACHE.name
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -16,6 +16,7 @@ import zoomjax as zj
 from _commands import COMMAND, INTERRUPTIBLE
 from zoomjax import synthetic
 from zoomjax.io.lines_csv import write_lines_csv
+from zoomjax.vision.demo import write_photos
 
 
 def zoomjax(*arguments, cwd=None):
@@ -80,25 +81,57 @@ def test_calibrate_reads_csv(calibrated, few_lines, tmp_path):
 
 
 @pytest.mark.slow
-def test_demo_finds_the_papers_lens(tmp_path):
+def test_demo_photographs_the_board_and_finds_the_papers_lens(tmp_path):
+    """And calibrating its photographs again takes what was found in them from the cache."""
     done = zoomjax("demo", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     out = tmp_path / "zoomjax-demo"
     summary = json.loads((out / "summary.json").read_text())
-    assert (summary["frames"], summary["image_size"]) == (50, [4288, 2848])
-    assert summary["rms_zoom"] / summary["rms_frames"] - 1 < 0.001
+    assert (summary["frames"], summary["image_size"]) == (12, [2144, 1424])
+    assert summary["rms_zoom"] / summary["rms_frames"] - 1 < 0.015
     assert (out / "model.png").stat().st_size > 10_000
-    lens, truth = zj.load_lens(out / "lens.json"), synthetic.nikkor_18_200()
+    assert (out / "before-after.jpg").stat().st_size > 10_000
+    photos = sorted((out / "photos").iterdir())
+    assert [p.name for p in photos] == [p.name for p in sorted((out / "lines").iterdir())]
+    lens, truth = zj.load_lens(out / "lens.json"), synthetic.nikkor_18_200((2144, 1424))
     for f in (20.56, 35.0, 127.36):
         error = lens(f).undistort(np.zeros(2)) - truth(f).undistort(np.zeros(2))
-        assert np.abs(error).max() < 0.2
+        assert np.abs(error).max() < 0.1
+    assert "of the true one" in done.stdout
+
+
+def test_calibrate_takes_photographs(tmp_path, monkeypatch):
+    """Two processes, one bad file, the default source of focal lengths; then once more, from the cache."""
+    monkeypatch.setenv("ZOOMJAX_CACHE", str(tmp_path / "cache"))
+    write_photos(tmp_path / "shots", number=4, image_size=(1072, 712))
+    (tmp_path / "shots" / "broken.jpg").write_bytes(b"")
+    done = zoomjax("calibrate", "shots", "-o", "out", "--jobs", "2", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Focal lengths: EXIF data." in done.stdout
+    assert "1 of 5 images are not used" in done.stderr
+    assert "broken.jpg" in done.stderr
+    first = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert first["focal_range"] == pytest.approx([20.56, 127.36])
+    assert len(list((tmp_path / "out" / "lines").iterdir())) == first["frames"] == 4
+    cached = {p: p.stat().st_mtime_ns for p in (tmp_path / "cache" / "detections").iterdir()}
+    assert len(cached) == 4
+    again = zoomjax("calibrate", "shots/*.jpg", "-o", "again", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "cache" / "detections").iterdir()} == cached
+    assert json.loads((tmp_path / "again" / "summary.json").read_text())["rms_zoom"] == first["rms_zoom"]
 
 
 WRONG = {
     "no such file": (["missing.npz"], "missing.npz"),
     "not a lines file": (["foreign.npz"], "foreign.npz"),
     "truncated": (["truncated.npz"], "truncated.npz"),
-    "unknown kind": (["notes.txt"], "notes.txt"),
+    "unknown kind": (["notes.txt"], "notes.txt is no photograph"),
+    "a folder without photos": (["."], "no photographs in the folder"),
+    "options of images for lines": (["lines.npz", "--pitch", "3"], "--pitch are for images"),
+    "an option of lines for images": (["a.jpg", "--image-size", "640x480"], "images have their own"),
+    "half a board": (["a.jpg", "--pitch", "20"], "--distance and --pixel is not"),
+    "a unit that is none": (["a.jpg", "--focal-unit", "km"], "mm or px"),
+    "no such detector": (["a.jpg", "--detector", "circles"], "edges, grid, pitch"),
     "two files": (["lines.npz", "lines.npz"], "one file"),
     "options for another kind": (["lines.npz", "--image-size", "640x480"], "for CSV files"),
     "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),

@@ -10,8 +10,8 @@ import zoomjax
 # From the inside out: a module may import from layers before its own. Packages count as one module.
 LAYERS = (
     {"_types", "_files", "_checks", "_linear"},
-    {"radial"},
-    {"inverse"},
+    {"radial", "focal"},
+    {"inverse", "pitch"},
     {"zoom"},
     {"rivals"},
     {"lines"},

@@ -99,3 +99,97 @@ def test_dtype_is_that_of_the_lens(truth):
     lines = synthetic.board_lines(single, np.array([60.0]), spacing=80.0, noise=0.1)
     assert isinstance(lines, zj.Lines)
     assert lines.points.dtype == jnp.float32
+
+
+def test_nikkor_of_smaller_images_is_the_same_lens(truth):
+    small = synthetic.nikkor_18_200((2144, 1424))
+    for f in ENDS:
+        scaled = np.array([4, 16]) * truth(f).pixel_coefficients
+        np.testing.assert_allclose(small(f).pixel_coefficients, scaled)
+    board = synthetic.StripedBoard.before(small)
+    assert board.magnification(30.0) == pytest.approx(synthetic.StripedBoard().magnification(30.0) / 2)
+
+
+SMALL = (96, 64)
+
+
+def in_white(position, board):
+    """Whether positions, mm from the middle of the board, are on a stripe of it: by definition."""
+    stripe, on, within = [], [], []
+    for axis in (0, 1):
+        edges = board.edges(axis)
+        count = np.searchsorted(edges, position[..., axis], side="right")
+        on.append(count % 2 == 1)
+        within.append((count > 0) & (count < len(edges)))
+        stripe.append(edges[1] - edges[0])
+    return (on[0] & within[1]) | (on[1] & within[0])
+
+
+@pytest.mark.parametrize("focal", [30.0, 127.36])
+def test_photo_is_the_integral_of_the_scene_over_each_pixel(focal):
+    lens = synthetic.nikkor_18_200(SMALL)
+    board = synthetic.StripedBoard.before(lens)
+    photo = synthetic.board_photo(lens, focal, blur=0, noise=0, vignetting=0, levels=(0, 250))
+    fine = (np.arange(40) + 0.5) / 40 - 0.5
+    x, y = np.meshgrid(np.add.outer(np.arange(96), fine).ravel(), np.add.outer(np.arange(64), fine).ravel())
+    d = lens(focal)
+    seen = undistorted(np.stack([x, y], axis=-1), d.coefficients, d.centre, d.scale)
+    white = in_white((seen - np.asarray(d.centre)) / board.magnification(focal), board)
+    exact = 250 * white.reshape(64, 40, 96, 40).mean((1, 3))
+    # 40 samples a side tell coverage to 1/80 a border at worst, and two borders meet in a corner.
+    assert np.abs(photo - exact).max() <= 1 + 250 * 2 / 80
+    assert abs(np.mean(photo - exact)) < 0.02
+    assert np.ptp(photo) == 250
+
+
+def test_photo_has_the_blur_noise_and_vignetting_asked_for():
+    large = synthetic.nikkor_18_200((536, 356))
+    sharp, soft = (
+        synthetic.board_photo(large, 127.36, blur=blur, noise=0, vignetting=0).astype(float)
+        for blur in (0, 1.5)
+    )
+    row = int(np.argmax(sharp.std(axis=1)))
+    step = int(np.argmax(np.abs(np.diff(sharp[row, 20:-20])))) + 20
+    slope = np.gradient(soft[row])[step - 9 : step + 11]
+    position = np.arange(20)
+    mean = np.average(position, weights=slope)
+    variance = np.average((position - mean) ** 2, weights=slope)
+    # Central differences of a step have variance 1/4; how it falls on the pixels adds 0 to 1/4.
+    assert 1.5**2 + 0.22 < variance < 1.5**2 + 0.53
+    lens = synthetic.nikkor_18_200(SMALL)
+    plain, noisy, other = (
+        synthetic.board_photo(lens, 30.0, noise=noise, seed=seed).astype(float)
+        for noise, seed in ((0, 0), (5, 1), (5, 2))
+    )
+    assert np.std(noisy - plain) == pytest.approx(5, rel=0.05)
+    assert np.std(noisy - other) == pytest.approx(5 * np.sqrt(2), rel=0.05)
+    full, dimmed = (
+        synthetic.board_photo(lens, 127.36, noise=0, vignetting=v).astype(float) for v in (0, 0.4)
+    )
+    corner = np.hypot(*SMALL) / 2
+    squared = ((np.arange(96) - 47.5) ** 2 + (np.arange(64) - 31.5)[:, None] ** 2) / corner**2
+    np.testing.assert_allclose(dimmed, full * (1 - 0.4 * squared), atol=2.5)
+
+
+def test_photo_shows_its_edges_where_the_lines_say(truth):
+    lens = synthetic.nikkor_18_200((536, 356))
+    photo = synthetic.board_photo(lens, 60.0, blur=0, noise=0, vignetting=0, levels=(0, 250)).astype(float)
+    lines = synthetic.board_lines(lens, np.array([60.0]), spacing=1)
+    distances = []
+    for line in lines.to_ragged():
+        axis = int(np.argmin(np.ptp(line, axis=0)))  # the coordinate that hardly changes
+        image = photo if axis else photo.T
+        for point in line[::7]:
+            place, other = point[axis], round(point[1 - axis])
+            window = slice(int(place) - 4, int(place) + 5)
+            if window.start < 0 or window.stop > image.shape[0]:
+                continue
+            profile = image[window, other]
+            if {profile[0], profile[-1]} == {0.0, 250.0} and len(np.unique(profile)) <= 4:
+                dark = profile[0] == 0
+                white = profile.sum() / 250  # px of white in the window
+                found = window.start - 0.5 + (9 - white if dark else white)
+                distances.append(found - place)
+    assert len(distances) > 100
+    assert np.abs(distances).max() < 0.06  # other is rounded, and lines are tilted
+    assert abs(np.mean(distances)) < 0.005

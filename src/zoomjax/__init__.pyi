@@ -14,6 +14,10 @@ from .fit import ZoomFit as ZoomFit
 from .fit import fit_frames as fit_frames
 from .fit import fit_zoom as fit_zoom
 from .fit import frame_rms as frame_rms
+from .focal import FocalEstimate as FocalEstimate
+from .focal import focal_from_board as focal_from_board
+from .focal import focal_from_lines as focal_from_lines
+from .focal import focal_from_planes as focal_from_planes
 from .framing import Framing as Framing
 from .framing import frame_output as frame_output
 from .io.focal_track import FocalTrack as FocalTrack
@@ -26,6 +30,7 @@ from .lens import load_lens as load_lens
 from .lines import AbstractLines as AbstractLines
 from .lines import Lines as Lines
 from .lines import load_lines as load_lines
+from .pitch import focal_from_pitch as focal_from_pitch
 from .radial import Distortion as Distortion
 from .rivals import PowerZoom as PowerZoom
 from .rivals import SplineZoom as SplineZoom
@@ -35,7 +40,11 @@ from .rivals import barrel_crossover as barrel_crossover
 from .robust import RobustFit as RobustFit
 from .robust import fit_robust as fit_robust
 from .sizes import lens_for_size as lens_for_size
+from .vision.detector import AbstractDetector as AbstractDetector
+from .vision.edges import EdgeDetector as EdgeDetector
+from .vision.grid import GridDetector as GridDetector
 from .vision.photos import undistort_photo as undistort_photo
+from .vision.pitch import PitchDetector as PitchDetector
 from .vision.undistort import undistort_image as undistort_image
 from .vision.video import undistort_video as undistort_video
 from .warp import warp_image as warp_image

@@ -1,4 +1,4 @@
-"""Writing files whole or not at all."""
+"""Writing files whole or not at all; where what can be made again is kept."""
 
 import contextlib
 import errno
@@ -6,6 +6,14 @@ import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+
+def cache_folder(kind: str) -> Path:
+    """A folder for what can be made again: in ``ZOOMJAX_CACHE``, else in the user's cache."""
+    if named := os.environ.get("ZOOMJAX_CACHE"):
+        return Path(named) / kind
+    base = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "zoomjax" / kind
 
 
 @contextlib.contextmanager

@@ -25,6 +25,7 @@ from .compression import compress
 from .fit import RESULTS, FrameFits, ZoomFit, fit_frames, fit_zoom, frame_rms
 from .lines import Lines
 from .plot import plot_model
+from .robust import fit_robust
 from .zoom import PolynomialZoom
 
 
@@ -37,6 +38,7 @@ class Calibration:
         zoom: the zoom model's fit.
         each: every frame by itself.
         none, algebraic: each frame's RMS, px, without correction and with the algebraic estimate.
+        rejected: which lines count nothing, being not straight in the scene.
     """
 
     lines: Lines
@@ -44,6 +46,7 @@ class Calibration:
     each: FrameFits
     none: np.ndarray
     algebraic: np.ndarray
+    rejected: np.ndarray
 
     def rows(self) -> list[tuple[str, np.ndarray]]:
         """The lines of a table like the paper's Table 1: what was done, and each frame's RMS, px."""
@@ -86,6 +89,7 @@ class Calibration:
             "rms_zoom": float(self.zoom.rms),
             "frames": len(self.none),
             "lines": len(frame),
+            "rejected_lines": int(self.rejected.sum()),
             "points": int(np.sum(np.asarray(self.lines.mask))),
             "focal_range": [low, high],
             "focal_unit": lens.focal_unit,
@@ -109,8 +113,12 @@ class Calibration:
         normalised = np.asarray(model.in_inverse_focal())
         return normalised / self.zoom.lens.scale ** (2 * np.arange(1, normalised.shape[1] + 1))
 
-    def write(self, folder: str | os.PathLike[str]) -> None:
+    def write(self, folder: str | os.PathLike[str], about: dict[str, Any] | None = None) -> None:
         """Write lens.json, lines.npz, summary.json and model.png, each whole, once all have been made.
+
+        Args:
+            folder: where to.
+            about: what summary.json says besides.
 
         Raises:
             OSError: the folder cannot be written.
@@ -119,7 +127,7 @@ class Calibration:
             part = Path(part)
             self.zoom.lens.save(part / "lens.json")
             self.lines.save(part / "lines.npz")
-            (part / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n")
+            (part / "summary.json").write_text(json.dumps(self.summary() | (about or {}), indent=2) + "\n")
             plot_model(self.zoom, self.each, self.lines).savefig(part / "model.png", dpi=150)
             for file in sorted(part.iterdir()):
                 file.replace(Path(folder) / file.name)
@@ -130,6 +138,7 @@ def calibrate(
     *,
     degree: int = 2,
     terms: int = 2,
+    robust: bool = False,
     stage: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
     """Fit the zoom polynomial and what it is compared with.
@@ -138,6 +147,8 @@ def calibrate(
         lines: the lines; computed in float64 if that is enabled, whatever their dtype.
         degree: of the polynomials in 1/f.
         terms: the number of distortion coefficients.
+        robust: whether to reject lines that are not straight in the scene; all figures are then those of
+            the others.
         stage: called with a sentence before each step that takes time.
     """
     model = PolynomialZoom(degree=degree)
@@ -148,6 +159,12 @@ def calibrate(
         lambda a: jnp.asarray(a, widest) if jnp.issubdtype(a.dtype, jnp.floating) else a, lines
     )
     small = compress(data, terms)
+    rejected = np.zeros(len(lines.frame), bool)
+    if robust:
+        stage("Rejecting lines that are not straight")
+        weight = fit_robust(small, zoom=model, terms=terms, throw=False).weight
+        small, lines = small.weighted(weight), lines.weighted(weight)
+        rejected = np.asarray(weight) == 0
     stage("Fitting each frame by itself")
     each = fit_frames(small, terms=terms, throw=False)
     stage("Fitting the zoom polynomial")
@@ -158,6 +175,7 @@ def calibrate(
         each=each,
         none=np.asarray(frame_rms(small, None)),
         algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=model, terms=terms))),
+        rejected=rejected,
     )
 
 

@@ -8,9 +8,10 @@ import contextlib
 import importlib.metadata
 import os
 import sys
+import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,8 +21,12 @@ except ModuleNotFoundError:
     sys.exit('The command line needs the extra "app": pip install "zoomjax[app]"')
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from .calibration import Calibration
     from .lines import Lines
+    from .vision.focals import Board
+    from .vision.image_calibration import ImageCalibration, ImageJob
 
 app = typer.Typer(
     add_completion=False,
@@ -34,6 +39,7 @@ Degree = Annotated[int, typer.Option(min=0, help="Degree of the polynomials in 1
 Terms = Annotated[int, typer.Option(min=1, help="Number of distortion coefficients, k1 to kN.")]
 
 
+_MOST_COMPILED = 100_000_000  # bytes; a run with new shapes adds about a million
 _INTERRUPTED = 130  # Typer's exit status for Ctrl-C
 
 
@@ -72,58 +78,131 @@ def demo(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder for the results.", file_okay=False)
     ] = Path("zoomjax-demo"),
-    noise: Annotated[float, typer.Option(min=0, help="Error of the edge points, px.")] = 0.5,
-    seed: Annotated[int, typer.Option(help="Seed of that error.")] = 0,
+    photos: Annotated[int, typer.Option(min=3, help="Number of photographs, one a focal length.")] = 12,
+    seed: Annotated[int, typer.Option(help="Seed of the photographs' noise.")] = 0,
 ) -> None:
-    """The paper's first experiment: make its lines, calibrate, and show the table and the model.
+    """The paper's first experiment: photograph its board through a known lens, then calibrate the photos.
 
-    A board of 31 x 23 stripes at 1185 mm, seen at 50 focal lengths through the lens that the paper
-    measured, a Nikkor 18-200. The lines are synthetic; the lens is the published one.
+    A board of 31 x 23 stripes at 1185 mm, at focal lengths from 20.56 to 127.36 mm, through the lens that
+    the paper measured, a Nikkor 18-200. The photographs are rendered; what then runs on them is
+    zoomjax calibrate.
     """
-    _enable_float64()
+    _set_up_jax()
     from . import synthetic
     from .calibration import results_folder
+    from .vision import demo
+    from .vision.image_calibration import ImageJob
 
-    lens, board = synthetic.nikkor_18_200(), synthetic.StripedBoard()
-    with results_folder(output) as folder, _stages() as stage:
-        stage("Projecting the board")
-        lines = synthetic.board_lines(lens, synthetic.focal_sweep(), board=board, noise=noise, seed=seed)
-        calibration = _calibrate(lines, 2, 2, stage, folder)
-    _show(calibration, output, board.magnification)
+    board = synthetic.StripedBoard.before(truth := synthetic.nikkor_18_200(demo.IMAGE_SIZE))
+    with (
+        results_folder(output) as folder,
+        tempfile.TemporaryDirectory(dir=folder, prefix=".zoomjax-") as part,
+    ):
+        with _progress("Photographing the board") as progress:
+            made = demo.write_photos(part, number=photos, seed=seed, progress=progress)
+        done = _calibrate_images(ImageJob(tuple(made), workers=_cores()), folder)
+        focal = sorted(done.focals.focal.values())
+        lens = done.calibration.zoom.lens
+        demo.write_before_after(made[0], folder / "before-after.jpg", lens, focal[0])
+        (folder / "photos").mkdir(exist_ok=True)
+        for photo in made:
+            photo.replace(folder / "photos" / photo.name)
+    _show(done.calibration, board.magnification)
+    _show_images(done, output, also=["before-after.jpg", "photos/"])
+    worst = demo.worst_error(lens, truth, focal)
+    print(f"The lens is within {worst:.3f} px of the true one, everywhere in all {len(focal)} images.")
 
 
 @app.command()
 def calibrate(
     inputs: Annotated[
-        list[Path], typer.Argument(metavar="INPUT", help="lines.npz, or a CSV: frame,line,x,y[,focal].")
+        list[str],
+        typer.Argument(
+            metavar="INPUT...",
+            help="Photos, folders of them or patterns; or a video; or lines: lines.npz, or a CSV "
+            "frame,line,x,y[,focal].",
+        ),
     ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.", file_okay=False)
     ],
     degree: Degree = 2,
     terms: Terms = 2,
+    detector: Annotated[
+        str, typer.Option(help="What to look for in images: edges, grid or pitch.")
+    ] = "edges",
     focal: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Focal lengths of a CSV input: frame,focal.")
-    ] = None,
-    image_size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Image size of a CSV input, px, e.g. 1920x1080.")
+        str | None,
+        typer.Option(
+            help="Where focal lengths come from: a CSV (image,focal; of a video time,focal or frame,focal; "
+            "of CSV lines frame,focal), a number, exif, board or plane. Without it: the best there is."
+        ),
     ] = None,
     focal_unit: Annotated[
-        str | None, typer.Option(help="Unit of the focal lengths of a CSV input: mm (default) or px.")
+        str | None, typer.Option(help="Unit of the focal lengths of a CSV or a number: mm (default) or px.")
+    ] = None,
+    pitch: Annotated[
+        float | None,
+        typer.Option(metavar="MM", help="--focal board: from one line on it to the next."),
+    ] = None,
+    distance: Annotated[
+        float | None, typer.Option(metavar="MM", help="--focal board: from the camera to the board.")
+    ] = None,
+    pixel: Annotated[
+        float | None, typer.Option(metavar="MM", help="--focal board: side of a pixel on the sensor.")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Of a video: how many frames, at most.")] = 60,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes that look at images; by default one a core.")
+    ] = None,
+    cache: Annotated[bool, typer.Option(help="Remember what was found in images.")] = True,
+    image_size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Image size of a CSV of lines, px, e.g. 1920x1080.")
     ] = None,
 ) -> None:
-    """Fit a zoom lens to line primitives and write lens.json, lines.npz, summary.json, model.png."""
-    _enable_float64()
+    """Calibrate a zoom lens from images of straight things, or from lines.
+
+    Writes lens.json, summary.json, model.png and lines.npz; and lines/, what was found in each image.
+    """
+    _set_up_jax()
     from .calibration import results_folder
 
-    for path in inputs:
-        if path.resolve() == (output / "lines.npz").resolve():
-            raise ValueError(f"The results would replace the input {path}: give another folder.")
-    with results_folder(output) as folder, _stages() as stage:
-        stage("Reading the lines")
-        lines = _read(inputs, focal, image_size, focal_unit)
-        calibration = _calibrate(lines, degree, terms, stage, folder)
-    _show(calibration, output)
+    if any(path.endswith((".npz", ".csv")) for path in inputs):
+        _refuse_image_options(
+            {"--pitch": pitch, "--distance": distance, "--pixel": pixel, "--jobs": jobs}, inputs
+        )
+        for path in map(Path, inputs):
+            if path.resolve() == (output / "lines.npz").resolve():
+                raise ValueError(f"The results would replace the input {path}: give another folder.")
+        with results_folder(output) as folder, _stages() as stage:
+            stage("Reading the lines")
+            lines = _read([Path(path) for path in inputs], focal, image_size, focal_unit)
+            calibration = _calibrate(lines, degree, terms, stage, folder)
+        _show(calibration)
+        _tell(calibration.warnings())
+        _written(output)
+        return
+    if image_size is not None:
+        raise ValueError("--image-size is for a CSV of lines: images have their own.")
+    from ._files import cache_folder
+    from .vision.image_calibration import ImageJob
+
+    job = ImageJob(
+        tuple(inputs),
+        detector=detector,
+        focal=focal,
+        focal_unit=_unit(focal_unit),
+        board=_board(pitch, distance, pixel),
+        degree=degree,
+        terms=terms,
+        frames=frames,
+        workers=jobs or _cores(),
+        cache=cache_folder("detections") if cache else None,
+    )
+    with results_folder(output) as folder:
+        done = _calibrate_images(job, folder)
+    _show(done.calibration)
+    _show_images(done, output)
 
 
 @app.command()
@@ -155,10 +234,10 @@ def undistort(
     import signal
 
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # and leave no half file
-    _enable_float64()
+    _set_up_jax()
     from .vision.files import Job, undistort_files
 
-    with _progress() as progress:
+    with _progress("Correcting") as progress:
         done = undistort_files(
             Job(lens, tuple(inputs), output, focal, keep, interpolation, border, hold), progress
         )
@@ -166,15 +245,22 @@ def undistort(
 
 
 @contextlib.contextmanager
-def _progress() -> Iterator[Callable[[int, int], None]]:
+def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
     """A function of what is done and of how much (0: unknown), shown as a bar on stderr."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    start = time.perf_counter()
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=None, rate="")
+        task = bar.add_task(what, total=None, rate="")
 
         def show(done: int, total: int) -> None:
             speed = bar.tasks[0].speed
@@ -182,17 +268,34 @@ def _progress() -> Iterator[Callable[[int, int], None]]:
             bar.update(task, completed=done, total=total or None, rate=rate)
 
         yield show
+    _stage_done(console, what, start)
 
 
-def _enable_float64() -> None:
+def _stage_done(console: "Console", name: str, start: float) -> None:
+    console.print(f"  [dim]{name:<40}{time.perf_counter() - start:7.2f} s[/dim]", highlight=False)
+
+
+def _set_up_jax() -> None:
+    """Compute in float64, and keep what is compiled for the next run: most of a short run is compiling."""
     import jax
 
+    from ._files import cache_folder
+
     jax.config.update("jax_enable_x64", True)
+    folder = cache_folder("compiled")
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ and _can_write(folder):
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_compilation_cache_max_size", _MOST_COMPILED)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
-def _read(
-    inputs: list[Path], focal: Path | None, image_size: str | None, focal_unit: str | None
-) -> "Lines":
+def _can_write(folder: Path) -> bool:
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    return os.access(folder, os.W_OK)
+
+
+def _read(inputs: list[Path], focal: str | None, image_size: str | None, focal_unit: str | None) -> "Lines":
     if len(inputs) > 1:
         raise ValueError(f"Give one file of lines; there are {len(inputs)}.")
     [path] = inputs
@@ -216,7 +319,7 @@ def _read(
         return read_lines_csv(
             path,
             image_size=(int(width), int(height)),
-            focal=None if focal is None else read_focal_csv(focal),
+            focal=None if focal is None else read_focal_csv(Path(focal)),
             focal_unit=focal_unit or "mm",
         )
     raise ValueError(f"Cannot calibrate from {path}: give lines.npz, or a CSV file frame,line,x,y[,focal].")
@@ -233,6 +336,61 @@ def _calibrate(
     return calibration
 
 
+def _calibrate_images(job: "ImageJob", folder: Path) -> "ImageCalibration":
+    from .vision.image_calibration import calibrate_images
+
+    with contextlib.ExitStack() as shown:
+        progress = shown.enter_context(_progress("Looking for lines"))
+
+        def stage(name: str) -> None:
+            nonlocal current
+            if current is None:  # the bar makes way for the stages
+                shown.close()
+                current = shown.enter_context(_stages())
+            current(name)
+
+        current: Callable[[str], None] | None = None
+        done = calibrate_images(job, progress=progress, stage=stage)
+        stage("Drawing the lines and writing the results")
+        done.write(folder)
+    return done
+
+
+def _cores() -> int:
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def _unit(given: str | None) -> str:
+    if given not in (None, "mm", "px"):
+        raise ValueError(f"--focal-unit must be mm or px, but it is {given!r}.")
+    return given or "mm"
+
+
+def _board(pitch: float | None, distance: float | None, pixel: float | None) -> "Board | None":
+    from .vision.focals import Board
+
+    given = {"--pitch": pitch, "--distance": distance, "--pixel": pixel}
+    if not any(value is not None for value in given.values()):
+        return None
+    bad = [name for name, value in given.items() if value is None or not value > 0]
+    if bad:
+        raise ValueError(
+            f"A board needs its --pitch, its --distance and the sensor's --pixel, all in mm and positive: "
+            f"{' and '.join(bad)} is not."
+        )
+    assert pitch is not None
+    assert distance is not None
+    assert pixel is not None
+    return Board(pitch, distance, pixel)
+
+
+def _refuse_image_options(options: dict[str, object], inputs: list[str]) -> None:
+    given = [name for name, value in options.items() if value is not None]
+    if given:
+        raise ValueError(f"{' and '.join(given)} are for images, but {inputs[0]} holds lines.")
+
+
 @contextlib.contextmanager
 def _stages() -> Iterator[Callable[[str], None]]:
     """A function that shows what is being done, and how long what was done before took."""
@@ -243,8 +401,7 @@ def _stages() -> Iterator[Callable[[str], None]]:
 
     def finish() -> None:
         if begun:
-            name, start = begun.pop()
-            console.print(f"  [dim]{name:<32}{time.perf_counter() - start:7.2f} s[/dim]", highlight=False)
+            _stage_done(console, *begun.pop())
 
     with console.status("Starting") as status:
 
@@ -257,10 +414,8 @@ def _stages() -> Iterator[Callable[[str], None]]:
         finish()
 
 
-def _show(
-    calibration: "Calibration", folder: Path, magnification: Callable[[float], float] | None = None
-) -> None:
-    """Print the table, the polynomials and where the results are."""
+def _show(calibration: "Calibration", magnification: Callable[[float], float] | None = None) -> None:
+    """Print the table and the polynomials."""
     from rich.console import Console
     from rich.table import Table
 
@@ -295,10 +450,39 @@ def _show(
         powers = ["", *(f" /f{'' if j == 1 else f'^{j}'}" for j in range(1, len(column)))]
         terms = " ".join(f"{value:+.4e}{power}" for value, power in zip(column, powers, strict=True))
         console.print(f"k{i}(f) = {terms}   px^-{2 * i}", highlight=False)
-    for warning in calibration.warnings():
+
+
+def _show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()) -> None:
+    """Print what became of the images and their lines, and where the results are."""
+    from rich.console import Console
+
+    found = sum(len(detection.lines) for detection in done.used)
+    rejected = int(done.calibration.rejected.sum())
+    print(
+        f"\nLines found in {len(done.used)} images: {found}, of which {rejected} are not straight in the "
+        f"scene and were rejected.\nFocal lengths: {done.focals.origin}."
+    )
+    deviation = sorted(s / done.focals.focal[name] for name, s in done.focals.deviation.items())
+    if deviation:
+        print(f"Their standard deviations: {deviation[0]:.2%} to {deviation[-1]:.2%}.")
+    _tell(done.warnings())
+    Console().print(
+        f"\nLook at {folder / 'lines'} before you believe: the lines found, drawn over each image.",
+        highlight=False,
+    )
+    _written(folder, ["lines/", *also])
+
+
+def _tell(warnings: Sequence[str]) -> None:
+    from rich.console import Console
+
+    for warning in warnings:
         Console(stderr=True).print(f"\n[bold]Beware:[/bold] {warning}", highlight=False)
-    files = ", ".join(["lens.json", "lines.npz", "summary.json", "model.png"])
-    console.print(f"\nWritten to {folder}: {files}", highlight=False)
+
+
+def _written(folder: Path, also: Sequence[str] = ()) -> None:
+    files = ["lens.json", "lines.npz", "summary.json", "model.png", *also]
+    print(f"\nWritten to {folder}: {', '.join(files)}")
 
 
 def _excess(ratio: float) -> str:

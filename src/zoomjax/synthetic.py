@@ -4,37 +4,46 @@ The paper's first experiment: a board of 31 x 23 white stripes, 1330 x 1010 mm, 
 from the camera, photographed with a Nikon D90 (4288 x 2848 px, sensor 23.7 mm wide) and a Nikkor 18-200 at
 50 focal lengths from 20.56 to 127.36 mm. The truth here is the pair of polynomials that the paper
 published for that lens. Every stripe has two edges, each a straight line of the scene.
+
+`board_lines` gives those edges as an ideal detector would; `board_photo` takes the photograph.
 """
 
 import dataclasses
+import math
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt8
 
 from ._types import AnyArray
 from .lens import ZoomLens
 from .lines import Lines
-from .radial import Distortion
+from .radial import Distortion, radial_factor, radial_slope
 from .zoom import PolynomialZoom
 
 _NIKKOR_PIXELS = np.array(  # section 5.1: rows are powers of 1/f, columns k1 (px^-2) and k2 (px^-4)
     [[2.26e-9, 1.74e-17], [-7.19e-7, 7.36e-15], [2.14e-5, -6.55e-13]]
 )
+_SENSOR = (23.7, 4288)
+"""Width of the sensor, mm and px, for which the polynomials are."""
 
 
-def nikkor_18_200() -> ZoomLens:
-    """The lens of the paper's first experiment, from its published polynomials (section 5.1)."""
-    size = (4288, 2848)
-    scale = np.hypot(*size) / 2
+def nikkor_18_200(image_size: tuple[int, int] = (4288, 2848)) -> ZoomLens:
+    """The lens of the paper's first experiment, from its published polynomials (section 5.1).
+
+    Args:
+        image_size: (width, height) px of its images, of which the width always covers the whole sensor.
+    """
+    width, height = image_size
+    scale = np.hypot(width, height) / 2 * _SENSOR[1] / width  # half the diagonal, in the paper's pixels
     focal_range = jnp.array([20.56, 127.36])
     return ZoomLens(
         zoom=PolynomialZoom.from_inverse_focal(_NIKKOR_PIXELS * [scale**2, scale**4], focal_range[0]),
-        centre=(jnp.array(size) - 1) / 2,
+        centre=(jnp.array([width, height]) - 1) / 2,
         focal_range=focal_range,
-        image_size=size,
+        image_size=(width, height),
         focal_unit="mm",
     )
 
@@ -53,7 +62,12 @@ class StripedBoard:
     stripes: tuple[int, int] = (31, 23)
     size: tuple[float, float] = (1330.0, 1010.0)
     distance: float = 1185.0
-    pixel: float = 23.7 / 4288
+    pixel: float = _SENSOR[0] / _SENSOR[1]
+
+    @classmethod
+    def before(cls, lens: ZoomLens) -> "StripedBoard":
+        """The paper's board, for a camera whose images have the size of the lens's."""
+        return cls(pixel=_SENSOR[0] / lens.image_size[0])
 
     def magnification(self, focal: float) -> float:
         """Pixels per mm on the board: eq. 7, ``r_c / R = f / (d - f)``."""
@@ -86,7 +100,7 @@ def board_lines(
     Args:
         lens: the true lens; its dtype is the result's.
         focal: focal lengths, one image each.
-        board: the board and the camera's pixels.
+        board: the board and the camera's pixels; by default the paper's, whatever the image size.
         spacing: distance between neighbouring points of a line, px. 12 gives about the paper's number of
             points, 0.8 million; 1, about an edge point a pixel, gives 10 million.
         noise: standard deviation, px, of the error of each coordinate of each point.
@@ -95,7 +109,7 @@ def board_lines(
     Returns:
         All edges at least a tenth of the image's height long.
     """
-    board = StripedBoard() if board is None else board
+    board = StripedBoard.before(lens) if board is None else board
     rng = np.random.default_rng(seed)
     reach = _reach(lens, focal)
     along = spacing * np.arange(-np.ceil(reach / spacing), np.ceil(reach / spacing) + 1)
@@ -144,3 +158,112 @@ def _reach(lens: ZoomLens, focal: np.ndarray) -> float:
     corner = jnp.zeros(2, lens.centre.dtype)
     corners = jax.vmap(lambda f: lens(f).undistort(corner))(jnp.asarray(focal))
     return float(jnp.max(jnp.linalg.norm(corners - lens.centre[None], axis=-1)))
+
+
+def board_photo(
+    lens: ZoomLens,
+    focal: float,
+    *,
+    board: StripedBoard | None = None,
+    blur: float | int = 1.0,
+    noise: float | int = 2.0,
+    vignetting: float | int = 0.3,
+    levels: tuple[float | int, float | int] = (35, 215),
+    seed: int = 0,
+) -> UInt8[np.ndarray, "height width"]:
+    """A photograph of the board: white stripes of both directions, all else dark, as the sensor sees it.
+
+    Each pixel integrates the blurred scene over its own square: analytically across a border, and by two
+    Gauss points along it. Blurring an image of pixels instead would move its borders by up to 0.02 px.
+
+    Args:
+        lens: the true lens; its dtype is that of the computation, its image size the photograph's.
+        focal: the focal length.
+        board: the board and the camera's pixels; by default the paper's, whatever the image size.
+        blur: standard deviation, px, of the Gaussian blur of the optics; at most an eighth of a stripe, for
+            each border is blurred by itself.
+        noise: standard deviation, grey levels, of the noise of each pixel.
+        vignetting: the part of the light that is missing in the corners.
+        levels: grey levels of dark and white in the middle, of 255.
+        seed: of the noise.
+    """
+    board = StripedBoard.before(lens) if board is None else board
+    dtype = lens.centre.dtype
+    photo = np.asarray(
+        _expose(
+            lens(float(focal)),
+            (jnp.asarray(board.edges(0), dtype), jnp.asarray(board.edges(1), dtype)),
+            jnp.asarray(board.magnification(float(focal)), dtype),
+            jnp.asarray(max(blur, 1e-6), dtype),
+            jnp.asarray([*levels, vignetting], dtype),
+            lens.image_size,
+        )
+    )
+    if noise:
+        rng = np.random.default_rng(seed)
+        photo = photo + noise * rng.standard_normal(photo.shape, dtype=np.float32)
+    return np.clip(np.rint(photo), 0, 255).astype(np.uint8)
+
+
+@eqx.filter_jit
+def _expose(
+    distortion: Distortion,
+    edges: tuple[Float[Array, "vertical"], Float[Array, "horizontal"]],
+    magnification: Float[Array, ""],
+    blur: Float[Array, ""],
+    light: Float[Array, "3"],
+    image_size: tuple[int, int],
+) -> Float[Array, "height width"]:
+    """Light on each pixel, grey levels: coverage by white, and vignetting."""
+    k, scale = distortion.coefficients, distortion.scale
+    x, y = (
+        (jnp.arange(side) - centre) / scale
+        for side, centre in zip(image_size, distortion.centre, strict=True)
+    )
+    columns, rows = x[None, :], y[:, None]
+    gauss = 0.5 / math.sqrt(3) / scale
+
+    def covered(across, along, edges):
+        """Coverage of a pixel by the stripes and by the board, as far as one coordinate tells."""
+
+        def at(along):
+            squared = across**2 + along**2
+            factor = radial_factor(squared, k)
+            # d(z L)/dz across, by L's derivative: (slope - L) / (2 t) per unit of t.
+            growth = (radial_slope(squared, k) - factor) / jnp.where(squared > 0, squared, 1)
+            span = (factor + across**2 * growth) / magnification
+            return _coverage(across * factor * scale / magnification, span, blur, edges)
+
+        both = zip(at(along - gauss), at(along + gauss), strict=True)
+        return [(a + b) / 2 for a, b in both]
+
+    in_vertical, within_x = covered(columns, rows, edges[0])
+    in_horizontal, within_y = covered(rows, columns, edges[1])
+    white = in_vertical * within_y + within_x * in_horizontal - in_vertical * in_horizontal
+    dark_level, white_level, vignetting = light
+    return (dark_level + (white_level - dark_level) * white) * (1 - vignetting * (columns**2 + rows**2))
+
+
+def _coverage(
+    position: Float[Array, "..."],
+    span: Float[Array, "..."],
+    blur: Float[Array, ""],
+    edges: Float[Array, "edge"],
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """How much of pixels at these positions, mm, `span` mm wide, is in the stripes, and in the board."""
+
+    def passed(edge):
+        """Integral over the pixel of a blurred step, from -1/2 to 1/2."""
+        low, high = (
+            t * jax.lax.erf(t / (math.sqrt(2) * blur))
+            + math.sqrt(2 / math.pi) * blur * jnp.exp(-0.5 * (t / blur) ** 2)
+            for t in ((position - edge) / span - 0.5, (position - edge) / span + 0.5)
+        )
+        return (high - low) / 2
+
+    stripe, last = edges[1] - edges[0], edges.shape[0] - 1
+    nearest = jnp.clip(jnp.round((position - edges[0]) / stripe), 0, last)
+    rising = 1 - 2 * (nearest % 2)
+    left = position < (edges[0] + edges[-1]) / 2
+    within = 0.5 + jnp.where(left, 1, -1) * passed(jnp.where(left, edges[0], edges[-1]))
+    return 0.5 + rising * passed(edges[0] + nearest * stripe), within

@@ -3,7 +3,7 @@
 import pytest
 
 from _exif import exif
-from zoomjax.io.exif import exif_focal
+from zoomjax.io.exif import exif_focal, exif_with_focal
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -15,3 +15,8 @@ def test_focal_length_of_both_byte_orders(order, prefix):
 @pytest.mark.parametrize("block", [exif(None), exif((0, 1)), exif((35, 0)), b"", b"no EXIF", exif()[:40]])
 def test_none_where_there_is_none(block):
     assert exif_focal(block) is None
+
+
+@pytest.mark.parametrize("focal", [20.56, 35.0, 600.0, 4.25])
+def test_a_written_focal_length_is_read_back(focal):
+    assert exif_focal(exif_with_focal(focal)) == pytest.approx(focal, abs=1e-4)

@@ -1,9 +1,10 @@
-"""The focal length in EXIF data, read from the bytes of their TIFF structure."""
+"""The focal length in EXIF data, read from and written to the bytes of their TIFF structure."""
 
 import struct
 
 _FOCAL_LENGTH, _EXIF_FOLDER = 0x920A, 0x8769
 _LONG, _RATIONAL = 4, 5
+_FINENESS = 10_000  # parts of a mm
 
 
 def exif_focal(block: bytes) -> float | None:
@@ -12,6 +13,18 @@ def exif_focal(block: bytes) -> float | None:
         return _focal(block.removeprefix(b"Exif\0\0"))
     except struct.error:  # cut off, or offsets that lead nowhere
         return None
+
+
+def exif_with_focal(focal: float) -> bytes:
+    """EXIF data that hold a focal length, mm, and nothing else."""
+    folder, fraction = 26, 44  # where the EXIF folder and the fraction begin
+    return (
+        b"II"
+        + struct.pack("<HI", 42, 8)
+        + struct.pack("<HHHIII", 1, _EXIF_FOLDER, _LONG, 1, folder, 0)
+        + struct.pack("<HHHIII", 1, _FOCAL_LENGTH, _RATIONAL, 1, fraction, 0)
+        + struct.pack("<II", round(focal * _FINENESS), _FINENESS)
+    )
 
 
 def _focal(block: bytes) -> float | None:

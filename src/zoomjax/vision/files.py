@@ -1,11 +1,11 @@
 """Files in, corrected files out: what ``zoomjax undistort`` does, checked before any work."""
 
-import csv
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
 from ..framing import frame_output
+from ..io.focal_table import read_focal_table
 from ..io.focal_track import read_focal_track
 from ..lens import ZoomLens, load_lens
 from .photos import SUFFIXES, photo_focal, undistort_photo
@@ -109,14 +109,7 @@ def _photo_focal(job: Job, lens: ZoomLens, path: Path) -> float:
     number = _number(job.focal)
     if number is not None:
         return number
-    with open(job.focal, newline="", encoding="utf-8-sig") as file:
-        rows = list(csv.DictReader(file))
-    if not rows or not {"image", "focal"} <= set(rows[0]):
-        raise ValueError(f'Cannot read focal lengths from {job.focal}: its columns must be "image,focal".')
-    table = {Path(row["image"]).name: row["focal"] for row in rows}
-    if _number(table.get(path.name) or "") is None:
-        raise ValueError(f"Cannot read focal lengths from {job.focal}: it has no number for {path.name}.")
-    return float(table[path.name])
+    return read_focal_table(job.focal).need(path)
 
 
 def _number(text: str) -> float | None:

@@ -75,7 +75,7 @@ def undistort_photo(
         raise ValueError(
             f"Argument target must end in one of {', '.join(SUFFIXES)}, but it is {target.name!r}."
         )
-    image, metadata = _read(Path(source))
+    image, metadata = read_photo(source)
     bits, channels = 8 * image.dtype.itemsize, 1 if image.ndim == 2 else image.shape[2]
     if bits not in _FORMATS[suffix][0] or channels not in _FORMATS[suffix][1]:
         raise ValueError(
@@ -103,14 +103,7 @@ def photo_focal(source: str | os.PathLike[str], lens: ZoomLens) -> float:
         FileNotFoundError: there is no such photograph.
         ValueError: it cannot be decoded or tells none, or the lens is in px.
     """
-    focal = None
-    if lens.focal_unit == "mm":
-        path = Path(source)
-        _, metadata = _read(path)
-        blocks = [data.tobytes() for kind, data in metadata if kind == cv2.IMAGE_METADATA_EXIF]
-        if path.suffix.lower() in (".tif", ".tiff"):
-            blocks = [path.read_bytes()]
-        focal = next((exif_focal(block) for block in blocks), None)
+    focal = metadata_focal(source, read_photo(source)[1]) if lens.focal_unit == "mm" else None
     if focal is None:
         raise ValueError(
             f"The focal length of {os.fspath(source)} is not known: its EXIF data have none in "
@@ -119,10 +112,26 @@ def photo_focal(source: str | os.PathLike[str], lens: ZoomLens) -> float:
     return focal
 
 
-def _read(path: Path) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
-    """The pixels as stored, and metadata (EXIF, XMP, colour profile) as pairs of kind and bytes."""
+def metadata_focal(source: str | os.PathLike[str], metadata: list[tuple[int, np.ndarray]]) -> float | None:
+    """The focal length, mm, that a photograph's EXIF data tell, given what `read_photo` found in it."""
+    blocks = [data.tobytes() for kind, data in metadata if kind == cv2.IMAGE_METADATA_EXIF]
+    path = Path(source)
+    if path.suffix.lower() in (".tif", ".tiff"):
+        blocks = [path.read_bytes()]
+    return next((exif_focal(block) for block in blocks), None)
+
+
+def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
+    """The pixels as stored, and metadata (EXIF, XMP, colour profile) as pairs of kind and bytes.
+
+    Raises:
+        FileNotFoundError: there is no such photograph.
+        ValueError: it cannot be decoded.
+    """
+    path = Path(source)
     if not path.exists():
         raise FileNotFoundError(f"There is no photograph {path}.")
+    _check_whole(path)
     kinds, blocks = [], []
     if path.suffix.lower() in _NO_METADATA:
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -133,6 +142,19 @@ def _read(path: Path) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
     return image, [
         (int(kind), np.asarray(data, np.uint8)) for kind, data in zip(kinds, blocks, strict=True)
     ]
+
+
+def _check_whole(path: Path) -> None:
+    """Refuse an empty file, and a JPEG that is cut off: OpenCV fills up what is missing with grey.
+
+    Within compressed pixels a byte 255 is followed by 0, so that the marks of a picture's begin and end are
+    found nowhere else; the last picture of a whole file ends.
+    """
+    content = path.read_bytes()
+    if not content:
+        raise ValueError(f"Cannot read a photograph from {path}: the file is empty.")
+    if content[:2] == b"\xff\xd8" and content.rfind(b"\xff\xd9") < content.rfind(b"\xff\xda"):
+        raise ValueError(f"Cannot read a photograph from {path}: the file is cut off.")
 
 
 def _encoded(image: np.ndarray, suffix: str, metadata: list[tuple[int, np.ndarray]]) -> bytes:

@@ -5,11 +5,13 @@ memory stays flat. Frame times, frame rate, colour description, orientation and 
 audio packets as they are.
 """
 
+import contextlib
 import dataclasses
+import functools
 import itertools
 import os
 import warnings
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,37 @@ from .undistort import check_sampling, warn_of_fold
 
 _MOST_ERRORS = 1000
 """Of one file: a demuxer may fail for ever."""
+
+
+@contextlib.contextmanager
+def decode_video(
+    source: str | os.PathLike[str],
+) -> Iterator[tuple[int, Iterator[tuple[float, Callable[[], np.ndarray]]]]]:
+    """The announced number of frames (0 if unknown), and for each its time, s, and what decodes its pixels.
+
+    Pixels are (height, width, 3) blue, green, red bytes, as stored: before any rotation for display.
+    Damaged frames are passed over.
+
+    Raises:
+        FileNotFoundError: there is no such video.
+        ValueError: the source is no video, or none of its frames decodes.
+    """
+    with _opened(source) as input_:
+        video = input_.streams.best("video")
+        report = _Report(video.frames)
+
+        def frames() -> Iterator[tuple[float, Callable[[], np.ndarray]]]:
+            first: float | None = None
+            for item in _decoded(input_, video, report):
+                if not isinstance(item, av.VideoFrame):
+                    continue
+                time = float(item.time or 0.0)
+                if first is None:
+                    first = time
+                    _warn_of_fields(item)
+                yield time - first, functools.partial(item.to_ndarray, format="bgr24")
+
+        yield video.frames, frames()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,8 +257,8 @@ def _warped(
 def _warn_of_fields(frame: Any) -> None:
     if frame.interlaced_frame:
         warnings.warn(
-            "The video is interlaced: each frame holds two moments in alternate rows, which the correction "
-            "mixes. Deinterlace it first.",
+            "The video is interlaced: each frame holds two moments in alternate rows, which are taken for "
+            "one. Deinterlace it first.",
             stacklevel=2,
         )
 

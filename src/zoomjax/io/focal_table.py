@@ -1,0 +1,85 @@
+"""Focal lengths of images: a CSV file ``image,focal``."""
+
+import csv
+import math
+import os
+from pathlib import Path, PurePath
+
+
+class FocalTable:
+    """Focal lengths by the names of images.
+
+    An image is looked up by its name with as many of its folders as the table gives: ``3x/board.png`` or,
+    where that is enough to tell it from others, ``board.png``.
+    """
+
+    def __init__(self, focals: dict[str, float], path: str | os.PathLike[str] = "the table"):
+        self._focals = focals
+        self._path = os.fspath(path)
+
+    def of(self, image: str | os.PathLike[str]) -> float | None:
+        """The focal length of an image, or None if the table has none."""
+        parts = PurePath(image).parts
+        for start in range(len(parts)):
+            found = self._focals.get("/".join(parts[start:]))
+            if found is not None:
+                return found
+        return None
+
+    def need(self, image: str | os.PathLike[str]) -> float:
+        """The focal length of an image.
+
+        Raises:
+            ValueError: the table has none.
+        """
+        found = self.of(image)
+        if found is None:
+            raise ValueError(
+                f"Cannot read focal lengths from {self._path}: it has no number for {PurePath(image).name}."
+            )
+        return found
+
+
+def read_focal_table(path: str | os.PathLike[str]) -> FocalTable:
+    """Read a CSV file whose first line names the columns ``image`` and ``focal``.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is something else, a focal length is no positive number, or an image comes twice
+            with different ones; the message names the row.
+    """
+    try:
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
+            rows = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
+    except UnicodeDecodeError as error:
+        raise ValueError(f"Cannot read focal lengths from {os.fspath(path)}: it is not text.") from error
+    header = [name.lower() for name in rows[0]] if rows else []
+    if not {"image", "focal"} <= set(header):
+        raise ValueError(
+            f'Cannot read focal lengths from {os.fspath(path)}: its columns must be "image,focal", but '
+            f"they are {','.join(header)!r}."
+        )
+    image, focal = header.index("image"), header.index("focal")
+    table: dict[str, float] = {}
+    for number, row in enumerate(rows[1:], start=2):
+        name = "/".join(PurePath(row[image].replace("\\", "/")).parts) if image < len(row) else ""
+        value = _positive(row[focal]) if focal < len(row) else None
+        if not name or value is None:
+            raise ValueError(
+                f"Cannot read focal lengths from {os.fspath(path)}: row {number} must hold an image and a "
+                f"positive number, but it is {','.join(row)!r}."
+            )
+        if table.setdefault(name, value) != value:
+            raise ValueError(
+                f"Cannot read focal lengths from {os.fspath(path)}: {name} comes twice, with "
+                f"{table[name]:g} and, in row {number}, {value:g}."
+            )
+    return FocalTable(table, path)
+
+
+def _positive(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) and value > 0 else None

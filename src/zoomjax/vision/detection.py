@@ -1,0 +1,214 @@
+"""Lines in many images: over processes, with a cache, one bad image at a time reported and passed over.
+
+Only points are kept of an image, and of these no more than one every `_SPACING` px of a line: detectors
+smooth over some px, so that nearer neighbours share their noise and say little more.
+"""
+
+import collections
+import concurrent.futures
+import dataclasses
+import functools
+import hashlib
+import io
+import math
+import multiprocessing
+import signal
+import zipfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from .._files import whole_file
+from .detector import AbstractDetector
+from .edges import EdgeDetector
+from .grid import GridDetector
+from .images import Source
+from .pitch import PitchDetector
+
+DETECTORS: dict[str, type[AbstractDetector]] = {
+    "edges": EdgeDetector,
+    "grid": GridDetector,
+    "pitch": PitchDetector,
+}
+"""By name, as the command line calls them."""
+
+_SPACING = 4.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Detection:
+    """What one image showed.
+
+    Attributes:
+        name: of the image.
+        image_size: (width, height) px; (0, 0) if it could not be read.
+        lines: for each line an (n, 2) array of points, px.
+        focal: the focal length that the image itself or the video's track tells, or None.
+        nodes: (row, column, 2) px, of the checkerboard or grid of dots in it, if that was looked for and
+            is there: NaN where a dot is not seen.
+        problem: why the image cannot be used; empty if it can.
+    """
+
+    name: str
+    image_size: tuple[int, int] = (0, 0)
+    lines: tuple[np.ndarray, ...] = ()
+    focal: float | None = None
+    nodes: np.ndarray | None = None
+    problem: str = ""
+
+
+def detect(
+    sources: Iterable[Source],
+    detector: AbstractDetector,
+    *,
+    grid: str = "none",
+    workers: int = 1,
+    cache: Path | None = None,
+) -> Iterator[Detection]:
+    """The lines in each image, in order.
+
+    Args:
+        sources: the images.
+        detector: what finds lines.
+        grid: where to look for a grid, too, whose nodes tell the focal length: in "all" images, those
+            "without focal length" of their own, or "none".
+        workers: number of processes; 1: no others than this one.
+        cache: folder of what was found before in the same images by the same detector; None: no cache.
+    """
+    task = functools.partial(_detected, detector=detector, grid=grid)
+    with _pool(workers) as submit:
+        pending: collections.deque[tuple[Path | None, concurrent.futures.Future | Detection]]
+        pending = collections.deque()
+        for source in sources:
+            file = None if cache is None else cache / f"{_key(source, detector, grid)}.npz"
+            known = None if file is None else _load(file, source)
+            pending.append((file, submit(task, source) if known is None else known))
+            while len(pending) > 2 * workers or (pending and isinstance(pending[0][1], Detection)):
+                yield _finished(*pending.popleft())
+        while pending:
+            yield _finished(*pending.popleft())
+
+
+class _pool:
+    """A function like `Executor.submit`: of processes, begun with the first task, or of this one."""
+
+    def __init__(self, workers: int):
+        self._workers = workers
+        self._executor: concurrent.futures.ProcessPoolExecutor | None = None
+
+    def __enter__(self):
+        return self._submit
+
+    def _submit(self, task, source: Source) -> concurrent.futures.Future:
+        if self._workers <= 1:
+            future: concurrent.futures.Future = concurrent.futures.Future()
+            future.set_result(task(source))
+            return future
+        if self._executor is None:
+            self._executor = concurrent.futures.ProcessPoolExecutor(
+                self._workers, multiprocessing.get_context("spawn"), _begin_worker
+            )
+        return self._executor.submit(task, source)
+
+    def __exit__(self, *_) -> None:
+        if self._executor is not None:
+            self._executor.shutdown(cancel_futures=True)
+
+
+def _begin_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that shuts the workers down
+    cv2.setNumThreads(1)
+
+
+def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detection:
+    try:
+        image, focal = source.read()
+        focal = source.focal if focal is None else focal
+        wanted = grid == "all" or (grid == "without focal length" and focal is None)
+        own = isinstance(detector, GridDetector)
+        nodes = (detector if own else GridDetector()).find(image) if own or wanted else None
+        lines = tuple(_thinned(line) for line in (detector.lines(nodes) if own else detector(image)))
+    except (ValueError, OSError, cv2.error) as error:
+        return Detection(source.name, problem=str(error).strip())
+    problem = "" if lines else _NO_LINES
+    return Detection(source.name, (image.shape[1], image.shape[0]), lines, focal, nodes, problem)
+
+
+_NO_LINES = (
+    "no lines were found. Is what should be straight in focus, well lit and large in the image? Or try "
+    "another --detector"
+)
+
+
+def _thinned(line: np.ndarray) -> np.ndarray:
+    """Points of a line, in order, `_SPACING` px apart or more."""
+    if len(line) < 3:
+        return line
+    length = float(np.hypot(*(line[-1] - line[0])))
+    return line[:: math.ceil(_SPACING * (len(line) - 1) / max(length, 1e-9))]
+
+
+def _finished(file: Path | None, result: concurrent.futures.Future | Detection) -> Detection:
+    if isinstance(result, Detection):
+        return result
+    detection = result.result()
+    if file is not None and detection.image_size != (0, 0):  # what cannot be read may be mended
+        _save(detection, file)
+    return detection
+
+
+@functools.cache
+def _code() -> bytes:
+    """The source of everything that detects: what it found before is of no use once it has changed."""
+    folder = Path(__file__).parent
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(folder.glob("*.py")))).digest()
+
+
+def _key(source: Source, detector: AbstractDetector, grid: str) -> str:
+    digest = hashlib.sha256(_code() + cv2.__version__.encode() + repr((detector, grid)).encode())
+    try:
+        digest.update(source.content())
+    except OSError as error:  # told when it is read
+        digest.update(repr(error).encode())
+    return digest.hexdigest()
+
+
+def _save(detection: Detection, file: Path) -> None:
+    lines = detection.lines
+    content = io.BytesIO()
+    np.savez(
+        content,
+        points=np.concatenate(lines) if lines else np.zeros((0, 2)),
+        counts=np.array([len(line) for line in lines], int),
+        image_size=np.array(detection.image_size),
+        focal=np.array(np.nan if detection.focal is None else detection.focal),
+        nodes=np.zeros((0, 0, 2)) if detection.nodes is None else detection.nodes,
+        problem=np.array(detection.problem),
+    )
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(file) as part:
+            part.write_bytes(content.getvalue())
+    except OSError:  # a cache that cannot be written saves no time, and does no harm
+        pass
+
+
+def _load(file: Path, source: Source) -> Detection | None:
+    """What was found before, under the image's present name; None if nothing was."""
+    try:
+        with file.open("rb") as opened, np.load(opened) as stored:
+            lines = np.split(stored["points"], np.cumsum(stored["counts"])[:-1])
+            width, height = stored["image_size"].tolist()
+            focal = float(stored["focal"])
+            return Detection(
+                name=source.name,
+                image_size=(width, height),
+                lines=tuple(lines) if len(stored["counts"]) else (),
+                focal=source.focal if np.isnan(focal) else focal,
+                nodes=stored["nodes"] if stored["nodes"].size else None,
+                problem=str(stored["problem"]),
+            )
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None

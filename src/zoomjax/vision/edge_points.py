@@ -1,0 +1,138 @@
+"""Sub-pixel edge points: where the slope of the grey levels is steepest, pixel by pixel.
+
+In the manner of Canny and Devernay: smooth, differentiate, keep the maxima of the slope across the edge,
+refine each to a fraction of a pixel. Two things differ. The maximum is sought along the row or the column
+that crosses the edge more steeply, not along the gradient: the profile of a straight edge along a row is
+the profile across it, stretched, so nothing has to be interpolated, and a row or column gives one point.
+And the peak is that of the Gaussian, not the parabola, through three slopes: an edge smoothed by a Gaussian
+has a Gaussian slope, and Devernay's parabola is biased towards the pixel's centre by up to 0.03 px.
+
+Work a pixel: one smoothing, two Sobel filters, one threshold, by OpenCV in bytes and 16-bit integers; all
+else is done for the few pixels on edges.
+"""
+
+import dataclasses
+
+import cv2
+import numpy as np
+
+_SMOOTHING = 1.0
+"""px, standard deviation. With Sobel's own it makes 1.4: noise of 5 levels moves an edge
+of 160 by 0.04 px."""
+
+_APERTURE = 5
+"""Of Sobel's filter. 3 is less of a Gaussian: errors without noise grow from 0.017 to 0.023 px."""
+
+_TO_BYTE = 1 / 32
+"""Takes the slope of the steepest edge there can be, 7600 in units of Sobel's filter, to a byte."""
+
+_FLOOR = 320.0
+"""Least slope of an edge, in those units: a sharp step of 11 grey levels. Below lies dither."""
+
+_NOISE_LEVELS = 4.0
+"""Least slope in standard deviations of the slope of the noise."""
+
+_OF_STRONGEST = 0.1
+"""Least slope as a share of the strong edges' (the 99.5th percentile of all slopes)."""
+
+_STRIDE = 3.0
+"""px along the edge to both sides at which it must still run the same way, or this is a corner."""
+
+_TURN = np.radians(12)
+_FADE = 0.6
+_BORDER = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class EdgePoints:
+    """Points on edges, one a row or a column.
+
+    Attributes:
+        position: (n, 2), px.
+        normal: (n, 2), unit vectors towards the brighter side.
+        pixel: (n, 2), the column and row of the pixel that holds each point.
+        image_size: (width, height) px.
+        polar: whether one side differs from the other, so that opposite normals are no neighbours.
+    """
+
+    position: np.ndarray
+    normal: np.ndarray
+    pixel: np.ndarray
+    image_size: tuple[int, int]
+    polar: bool = True
+
+
+def edge_points(grey: np.ndarray) -> EdgePoints:
+    """All edge points of a grey image (height, width), uint8, but those near corners and crossings."""
+    height, width = grey.shape
+    smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTHING, borderType=cv2.BORDER_REPLICATE)
+    slopes = [cv2.Sobel(smooth, cv2.CV_16S, *order, ksize=_APERTURE) for order in ((1, 0), (0, 1))]
+    steep = [cv2.convertScaleAbs(slope, alpha=_TO_BYTE) for slope in slopes]
+    strength = cv2.max(*steep)
+    noise = _noise(slopes)
+    least = _least_slope(strength, noise)
+    inner = np.zeros_like(strength)
+    inside = (slice(_BORDER, -_BORDER), slice(_BORDER, -_BORDER))
+    inner[inside] = strength[inside]
+    candidates = np.flatnonzero(inner > min(least * _TO_BYTE, 254))
+    flat = [slope.ravel() for slope in slopes]
+    magnitude = [byte.ravel()[candidates] for byte in steep]
+    parts = [
+        _maxima(candidates[rows], flat[axis], axis, step)
+        for rows, axis, step in (
+            (magnitude[0] >= magnitude[1], 0, 1),
+            (magnitude[0] < magnitude[1], 1, width),
+        )
+    ]
+    at, shift = (np.concatenate(part) for part in zip(*parts, strict=True))
+    gradient = np.stack([slope[at] for slope in flat], axis=-1).astype(np.float32)
+    length = np.hypot(*gradient.T)
+    normal = gradient / length[:, None]
+    keep = _runs_on(at, flat, normal, length, width, noise)
+    at, shift, normal = at[keep], shift[keep], normal[keep]
+    pixel = np.stack([at % width, at // width], axis=-1)
+    return EdgePoints(pixel + shift, normal.astype(float), pixel, (width, height))
+
+
+def _noise(slopes: list[np.ndarray]) -> float:
+    """Standard deviation of the slopes in flat parts, by their lower quartile: few edges are as flat."""
+    thin = np.concatenate([np.abs(slope[::5, ::7]).ravel() for slope in slopes])
+    return float(np.quantile(thin, 0.25)) / 0.3186
+
+
+def _least_slope(strength: np.ndarray, noise: float) -> float:
+    strong = float(np.quantile(strength[::5, ::7], 0.995)) / _TO_BYTE
+    return max(_FLOOR, _NOISE_LEVELS * noise, _OF_STRONGEST * strong)
+
+
+def _maxima(at: np.ndarray, slope: np.ndarray, axis: int, step: int) -> tuple[np.ndarray, np.ndarray]:
+    """Those pixels where the slope along an axis is steepest, and the peaks' shifts from there (n, 2), px.
+
+    `step` leads from a pixel to the next one along the axis, in the flat array of slopes.
+    """
+    middle = slope[at].astype(np.int32)
+    sign = np.sign(middle)
+    middle *= sign
+    before, after = (slope[at + side] * sign for side in (-step, step))
+    peak = (middle > before) & (middle >= after) & (before > 0) & (after > 0)
+    at = at[peak]
+    low, mid, high = (np.log(value[peak].astype(float)) for value in (before, middle, after))
+    shift = np.zeros((len(at), 2))
+    shift[:, axis] = (high - low) / np.maximum(2 * (2 * mid - low - high), 1e-9)
+    return at, np.clip(shift, -0.5, 0.5)
+
+
+def _runs_on(at, flat, normal, length, width: int, noise: float) -> np.ndarray:
+    """Whether the edge runs on the same way, and as steep, to both sides of each point."""
+    row, column = at // width, at % width
+    keep = np.ones(len(at), bool)
+    tolerance = np.cos(np.minimum(_TURN + 4 * noise / length, np.radians(35)))
+    for stride in (-_STRIDE, _STRIDE):
+        x = np.rint(column - stride * normal[:, 1]).astype(np.intp)
+        y = np.rint(row + stride * normal[:, 0]).astype(np.intp)
+        there = y * width + x
+        gx, gy = (slope[there].astype(np.float32) for slope in flat)
+        other = np.hypot(gx, gy)
+        keep &= gx * normal[:, 0] + gy * normal[:, 1] > tolerance * other
+        keep &= other > _FADE * length - 3 * noise
+    return keep

@@ -1,0 +1,275 @@
+"""The focal length of each image, from the best source that there is.
+
+EXIF data, a table, a number, or the images themselves: a board parallel to the sensor at a known distance
+(eq. 14), or oblique views of a flat grid (Zhang's constraints). The last two need corrected points, and the
+correction is what is sought: so it comes first from each image by itself, which needs no focal length, and
+then once more from the zoom model of the focal lengths found.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..compression import compress
+from ..fit import fit_frames
+from ..focal import FocalEstimate, focal_from_board, focal_from_planes
+from ..io.focal_table import read_focal_table
+from ..lines import Lines
+from ..radial import Distortion
+from ..robust import fit_robust
+from ..zoom import PolynomialZoom
+from .detection import Detection
+
+WAYS = (
+    'a CSV file with the columns "image,focal" (--focal focal.csv); EXIF data in the photos '
+    "(--focal exif); a board parallel to the sensor (--focal board --pitch MM --distance MM --pixel MM); "
+    "or oblique photos of a flat checkerboard or dot grid (--focal plane)"
+)
+
+_MOST_UNCERTAIN = 0.2
+"""Standard deviation over focal length above which a view says too little of it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Board:
+    """A board parallel to the sensor.
+
+    Attributes:
+        pitch: mm between neighbouring lines on it: from one edge of a stripe to the next one, or from
+            corner to corner, or from dot to dot.
+        distance: mm from the camera's projection plane to it.
+        pixel: mm, side of a pixel on the sensor.
+    """
+
+    pitch: float
+    distance: float
+    pixel: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Focals:
+    """Focal lengths of images.
+
+    Attributes:
+        focal: by the images' names; those without one are not in it.
+        unit: "mm" or "px".
+        origin: where they come from, in words.
+        absent: why an image may have none.
+        deviation: standard deviations by name, of those that were estimated from images.
+    """
+
+    focal: dict[str, float]
+    unit: str
+    origin: str
+    absent: str
+    deviation: dict[str, float] = dataclasses.field(default_factory=dict)
+
+
+def choose_focals(
+    detections: Sequence[Detection],
+    way: str | None = None,
+    *,
+    unit: str = "mm",
+    board: Board | None = None,
+) -> Focals:
+    """The focal length of each image.
+
+    Args:
+        detections: of the images, all of one size and with lines.
+        way: "exif", "board", "plane", a number, a CSV file; or None for what there is: a `board`'s, if one
+            is given, else EXIF data, else an oblique grid.
+        unit: of a number's or a CSV file's focal lengths.
+        board: for "board".
+
+    Raises:
+        FileNotFoundError: there is no such CSV file.
+        ValueError: no focal length is to be had that way; the message names the others.
+    """
+    if way is None:
+        way = "board" if board else "exif" if any(d.focal for d in detections) else "plane"
+    if way == "exif":
+        found = Focals(_own(detections), "mm", "EXIF data", "its EXIF data hold no focal length")
+    elif way == "track":
+        found = Focals(_own(detections), unit, "the track of the video", "the track has none")
+    elif way == "board":
+        if board is None:
+            raise ValueError(
+                "--focal board needs the board's --pitch and --distance, and the sensor's --pixel, in mm."
+            )
+        found = _estimated(
+            detections, "mm", "the board's pitch (eq. 14)", "too few lines of a board", _from_board(board)
+        )
+    elif way == "plane":
+        found = _estimated(detections, "px", "homographies of the grid", _NO_PLANE, _from_plane)
+    elif (number := _number(way)) is not None:
+        found = Focals({d.name: number for d in detections}, unit, "--focal", "")
+    elif not Path(way).suffix:
+        raise ValueError(f"--focal is {way!r}, which is no way to a focal length. Give {WAYS}.")
+    else:
+        table = read_focal_table(way)
+        known = {d.name: table.of(d.name) for d in detections}
+        found = Focals(
+            {name: focal for name, focal in known.items() if focal},
+            unit,
+            Path(way).name,
+            f"{Path(way).name} has no row for it",
+        )
+    if not found.focal:
+        raise ValueError(
+            f"No focal length is to be had of any image from {found.origin} ({found.absent}). Give {WAYS}."
+        )
+    return found
+
+
+_NO_PLANE = "it shows no flat grid, or one too squarely to tell a focal length"
+
+
+def _own(detections: Sequence[Detection]) -> dict[str, float]:
+    return {detection.name: detection.focal for detection in detections if detection.focal}
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    if not (np.isfinite(value) and value > 0):
+        raise ValueError(f"--focal must be a positive number, but it is {text}.")
+    return value
+
+
+Estimator = Callable[[Detection, Distortion], FocalEstimate | None]
+
+
+def _estimated(
+    detections: Sequence[Detection], unit: str, origin: str, absent: str, estimate: Estimator
+) -> Focals:
+    """Focal lengths from corrected images, corrected twice."""
+    each = fit_frames(compress(lines_of(detections, np.ones(len(detections)), unit)), throw=False)
+    corrections = [each.distortion(frame) for frame in range(len(detections))]
+    found = _all(detections, corrections, estimate)
+    usable = [d for d in detections if d.name in found]
+    if len(usable) > 2:
+        focal = np.array([float(found[d.name].focal) for d in usable])
+        lines = compress(lines_of(usable, focal, unit))
+        degree = min(2, np.unique(focal).size - 1)
+        lens = fit_robust(lines, zoom=PolynomialZoom(degree=degree), terms=2, throw=False).fit.lens
+        found = _all(usable, [lens(float(f)) for f in focal], estimate) or found
+    return Focals(
+        {name: float(f.focal) for name, f in found.items()},
+        unit,
+        origin,
+        absent,
+        {name: float(f.std) for name, f in found.items()},
+    )
+
+
+def _all(
+    detections: Sequence[Detection], corrections: Sequence[Distortion], estimate: Estimator
+) -> dict[str, FocalEstimate]:
+    """The estimates that say something, by the names of the images."""
+    found = {}
+    for detection, correction in zip(detections, corrections, strict=True):
+        if not np.isfinite(np.asarray(correction.coefficients)).all():
+            continue
+        value = estimate(detection, correction)
+        if value is not None and float(value.std) < _MOST_UNCERTAIN * float(value.focal):
+            found[detection.name] = value
+    return found
+
+
+def lines_of(detections: Sequence[Detection], focal: np.ndarray, unit: str) -> Lines:
+    """The lines of all images, a frame each."""
+    return Lines.from_ragged(
+        [line for detection in detections for line in detection.lines],
+        np.repeat(np.arange(len(detections)), [len(detection.lines) for detection in detections]),
+        jnp.asarray(focal, float),
+        image_size=detections[0].image_size,
+        focal_unit=unit,
+    )
+
+
+def _nodes(detection: Detection, correction: Distortion) -> tuple[np.ndarray, np.ndarray] | None:
+    """Corrected nodes, px, and their places in the grid, steps; None if there are too few."""
+    if detection.nodes is None:
+        return None
+    seen = np.isfinite(detection.nodes[..., 0])
+    row, column = np.nonzero(seen)
+    if np.unique(row).size < 3 or np.unique(column).size < 3:
+        return None
+    corrected = correction.undistort(jnp.asarray(detection.nodes[seen]))
+    return np.asarray(corrected), np.stack([column, row], axis=-1).astype(float)
+
+
+def _from_plane(detection: Detection, correction: Distortion) -> FocalEstimate | None:
+    known = _nodes(detection, correction)
+    if known is None:
+        return None
+    points, places = known
+    _, each = focal_from_planes(points[None], places, principal=np.asarray(correction.centre))
+    return jax.tree.map(lambda a: a[0], each)
+
+
+def _from_board(board: Board) -> Estimator:
+    def estimate(detection: Detection, correction: Distortion) -> FocalEstimate | None:
+        known = _nodes(detection, correction)
+        if known is not None:
+            parts = [known]
+        else:
+            corrected = [np.asarray(correction.undistort(jnp.asarray(line))) for line in detection.lines]
+            parts = _parallels(corrected)
+        if not parts:
+            return None
+        found = [
+            focal_from_board(points, board.pitch * places, distance=board.distance, pixel=board.pixel)
+            for points, places in parts
+        ]
+        weight = np.array([1 / max(float(f.std), 1e-12) ** 2 for f in found])
+        weight /= weight.sum()
+        return FocalEstimate(
+            *(
+                jnp.asarray(sum(w * getattr(f, name) for w, f in zip(weight, found, strict=True)))
+                for name in ("focal", "std", "rms")
+            )
+        )
+
+    return estimate
+
+
+def _parallels(lines: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For both directions of a board, the lines' positions across, px, and which lines of it they are.
+
+    Each as points (n, 2) on an axis: what `focal_from_board` compares.
+    """
+    middle = np.array([line.mean(axis=0) for line in lines])
+    along = np.array([line[-1] - line[0] for line in lines])
+    length = np.hypot(*along.T)
+    twice = 2 * np.arctan2(along[:, 1], along[:, 0])
+    # Squared once more, both directions of a board are one.
+    main = np.angle(np.sum(length * np.exp(2j * twice))) / 4
+    result = []
+    for direction in (main, main + np.pi / 2):
+        chosen = np.cos(twice - 2 * direction) > 0.9
+        if chosen.sum() < 3:
+            continue
+        unit = np.array([np.cos(direction), np.sin(direction)])
+        position = np.sort(middle[chosen] @ (-unit[1], unit[0]))
+        index = _counted(position)
+        axis = np.array([1.0, 0.0])
+        result.append((position[:, None] * axis, index[:, None] * axis))
+    return result
+
+
+def _counted(position: np.ndarray) -> np.ndarray:
+    """Which line of evenly spaced ones each is, by positions in order; some may be missing."""
+    step = float(np.median(np.diff(position)))
+    index = np.zeros(len(position))
+    for number in range(1, len(position)):  # the step is known better and better
+        index[number] = index[number - 1] + np.rint((position[number] - position[number - 1]) / step)
+        if number > 3:
+            step = float(np.polyfit(index[: number + 1], position[: number + 1], 1)[0])
+    return index

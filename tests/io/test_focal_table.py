@@ -1,0 +1,61 @@
+"""CSV files with the focal lengths of images."""
+
+import pytest
+
+from zoomjax.io.focal_table import read_focal_table
+
+
+def table(tmp_path, text):
+    (tmp_path / "focal.csv").write_text(text)
+    return read_focal_table(tmp_path / "focal.csv")
+
+
+def test_images_have_their_focal_lengths(tmp_path):
+    read = table(tmp_path, "image,focal\na.jpg,24\nb.jpg, 70.5\n")
+    assert (read.of("a.jpg"), read.of("shots/b.jpg"), read.of("c.jpg")) == (24, 70.5, None)
+
+
+def test_other_columns_and_orders_do_not_matter(tmp_path):
+    read = table(tmp_path, "focal,note,image\n24,wide,a.jpg\n\n70,long,b.jpg\n")
+    assert (read.of("a.jpg"), read.of("b.jpg")) == (24, 70)
+
+
+def test_folders_tell_images_of_one_name_apart(tmp_path):
+    read = table(tmp_path, "image,focal\n1x/board.png,24\n3x\\board.png,70\nother.png,35\n")
+    assert (read.of("1x/board.png"), read.of("/data/3x/board.png")) == (24, 70)
+    assert read.of("board.png") is None
+    assert read.of("9x/other.png") == 35
+
+
+def test_a_needed_image_that_is_absent_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"focal.csv: it has no number for c\.jpg"):
+        table(tmp_path, "image,focal\na.jpg,24\n").need("c.jpg")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "columns must be"),
+        ("file,focal\na.jpg,24\n", "columns must be .image,focal."),
+        ("image,focal\na.jpg\n", "row 2 must hold"),
+        ("image,focal\na.jpg,24\nb.jpg,wide\n", "row 3 must hold"),
+        ("image,focal\na.jpg,-24\n", "positive number"),
+        ("image,focal\na.jpg,nan\n", "positive number"),
+        ("image,focal\n,24\n", "row 2 must hold an image"),
+        ("image,focal\na.jpg,24\na.jpg,25\n", r"a\.jpg comes twice, with 24 and, in row 3, 25"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        table(tmp_path, text)
+
+
+def test_what_is_no_text_is_refused(tmp_path):
+    (tmp_path / "focal.csv").write_bytes(b"\xff\xfe\x00\x01\x80")
+    with pytest.raises(ValueError, match="not text"):
+        read_focal_table(tmp_path / "focal.csv")
+
+
+def test_an_absent_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing\.csv"):
+        read_focal_table(tmp_path / "nothing.csv")

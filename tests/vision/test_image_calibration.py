@@ -1,0 +1,147 @@
+"""From images on disk to a lens: rendered photographs of the paper's board, and a clip that zooms."""
+
+import json
+import warnings
+
+import cv2
+import numpy as np
+import pytest
+
+from zoomjax import synthetic
+from zoomjax.vision import demo
+from zoomjax.vision.image_calibration import ImageJob, calibrate_images
+
+from . import clips
+
+SIZE = (1072, 712)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Five good photographs, and one of everything that can be wrong with one."""
+    folder = tmp_path_factory.mktemp("photos")
+    good = demo.write_photos(folder, number=5, image_size=SIZE)
+    image = cv2.imread(str(good[0]), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(folder / "no-exif.png"), image)
+    cv2.imwrite(str(folder / "small.png"), cv2.resize(image, None, fx=0.5, fy=0.5))
+    cv2.imwrite(str(folder / "turned.png"), np.rot90(image))
+    cv2.imwrite(str(folder / "blank.png"), np.full_like(image, 90))
+    (folder / "empty.jpg").write_bytes(b"")
+    (folder / "cut.jpg").write_bytes(good[1].read_bytes()[:20000])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(folder):
+    steps = []
+    calibrated = calibrate_images(ImageJob((folder,)), progress=lambda *step: steps.append(step))
+    assert steps == [(number, 11) for number in range(1, 12)]
+    return calibrated
+
+
+def test_the_lens_is_that_of_the_photographs(done):
+    lens, truth = done.calibration.zoom.lens, synthetic.nikkor_18_200(SIZE)
+    assert demo.worst_error(lens, truth, done.focals.focal.values()) < 0.1
+    assert (lens.image_size, lens.focal_unit) == (SIZE, "mm")
+    np.testing.assert_allclose(lens.focal_range, [20.56, 127.36])
+
+
+def test_bad_images_are_reported_and_do_not_matter(done):
+    assert [d.name[:5] for d in done.used] == ["board"] * 5
+    expected = {
+        "no-exif.png": "EXIF data hold no focal length",
+        "small.png": "its size is 536x356 px, most images' 1072x712: use images as the camera stored them",
+        "turned.png": "its size is 712x1072 px, most images' 1072x712: it was turned, so turn it back",
+        "blank.png": "no lines were found",
+        "empty.jpg": "the file is empty",
+        "cut.jpg": "the file is cut off",
+    }
+    assert set(done.unused) == set(expected)
+    for name, reason in expected.items():
+        assert reason in done.unused[name]
+    [told, *_] = done.warnings()
+    assert told.startswith("6 of 11 images are not used.")
+    assert all(name in told for name in expected)
+
+
+def test_results_are_written_with_the_lines_over_each_image(done, tmp_path):
+    done.write(tmp_path)
+    written = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file())
+    overlays = sorted(f"lines/{d.name}" for d in done.used)
+    assert written == sorted(["lens.json", "lines.npz", "summary.json", "model.png", *overlays])
+    for detection in done.used:
+        assert cv2.imread(str(tmp_path / "lines" / detection.name)).shape == (SIZE[1], SIZE[0], 3)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["focal_source"] == "EXIF data"
+    assert [image["name"] for image in summary["images"]] == [d.name for d in done.used]
+    assert sum(image["lines"] for image in summary["images"]) == summary["lines"]
+    assert summary["unused"] == done.unused
+    assert summary["rms_frames"] <= summary["rms_zoom"] < 0.1 < summary["rms_none"]
+
+
+def test_lines_that_are_not_straight_are_rejected(folder, tmp_path):
+    """A stripe bent by 2.5 px in one of the photographs: too little for the detector."""
+    for path in sorted(folder.glob("board*")):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    target = tmp_path / sorted(folder.glob("board*"))[-1].name
+    image, metadata = cv2.imread(str(target)), cv2.imreadWithMetadata(str(target), flags=1)
+    t = np.linspace(0, 1, 200)
+    for side, level in ((0, 255), (14, 0)):
+        arc = np.stack([330 + side + 2.5 * (2 * t - 1) ** 2, 20 + 670 * t], axis=-1)
+        cv2.polylines(image, [np.rint(arc * 16).astype(np.int32)], False, (level,) * 3, 14, cv2.LINE_AA, 4)
+    _, content = cv2.imencodeWithMetadata(".jpg", image, list(metadata[1]), list(metadata[2]))
+    target.write_bytes(content.tobytes())
+    spoiled = calibrate_images(ImageJob((tmp_path,)))
+    rejected = spoiled.rejected()
+    assert [int(r.sum()) for r in rejected[:-1]] == [0] * 4
+    assert 1 <= rejected[-1].sum() <= 4
+    truth = synthetic.nikkor_18_200(SIZE)
+    assert demo.worst_error(spoiled.calibration.zoom.lens, truth, [20.56, 50.0, 127.36]) < 0.1
+
+
+def test_a_zooming_video_is_calibrated(tmp_path):
+    clips.write_clip(tmp_path / "zoom.mp4", sound=False)
+    track = [f"{n},{clips.focal(n)}" for n in range(clips.FRAMES)]
+    (tmp_path / "track.csv").write_text("\n".join(["frame,focal", *track]))
+    job = ImageJob((tmp_path / "zoom.mp4",), focal=str(tmp_path / "track.csv"), degree=1, frames=8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        done = calibrate_images(job)
+    assert done.focals.origin == "the track of the video"
+    assert len(done.used) == 8
+    lens, truth = done.calibration.zoom.lens, clips.lens()
+    assert demo.worst_error(lens, truth, [20.0, 35.0, 80.0]) < 1.5  # 320 px wide, few lines
+    done.write(tmp_path)
+    assert len(list((tmp_path / "lines").glob("zoom-*.jpg"))) == 8
+
+
+WRONG = {
+    "unknown detector": (
+        {"detector": "circles"},
+        ValueError,
+        "--detector must be one of edges, grid, pitch",
+    ),
+    "photos and a video": ({"inputs": ("a.jpg", "b.mp4")}, ValueError, "photographs, or one video"),
+    "two videos": ({"inputs": ("a.mp4", "b.mp4")}, ValueError, "one video"),
+    "no such photo": ({"inputs": ("nothing.jpg",)}, FileNotFoundError, "nothing.jpg"),
+    "no such table": ({"focal": "nothing.csv"}, FileNotFoundError, "nothing.csv"),
+    "video without focal": ({"inputs": ("a.mp4",)}, ValueError, "A video needs --focal"),
+    "no such video": ({"inputs": ("a.mp4",), "focal": "3"}, FileNotFoundError, "no video a.mp4"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_mistakes_are_told_before_any_work(case, folder):
+    settings, error, message = WRONG[case]
+    with pytest.raises(error, match=message):
+        calibrate_images(ImageJob(**{"inputs": (folder,)} | settings))
+
+
+def test_when_no_image_can_be_used_the_reason_is_told(tmp_path):
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), np.full((100, 100), 90, np.uint8))
+    with pytest.raises(ValueError, match="None of the 2 images can be used: no lines were found"):
+        calibrate_images(ImageJob((tmp_path,)))
+    (tmp_path / "c.png").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"a\.png: no lines.*c\.png: .*empty"):
+        calibrate_images(ImageJob((tmp_path,)))
