@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from zoomjax import synthetic
+from zoomjax.io.exif import exif_with_focal
 from zoomjax.vision import demo
 from zoomjax.vision.image_calibration import ImageJob, calibrate_images
 
@@ -97,6 +98,29 @@ def test_lines_that_are_not_straight_are_rejected(folder, tmp_path):
     assert 1 <= rejected[-1].sum() <= 4
     truth = synthetic.nikkor_18_200(SIZE)
     assert demo.worst_error(spoiled.calibration.zoom.lens, truth, [20.56, 50.0, 127.36]) < 0.1
+
+
+def test_an_image_none_of_whose_lines_agrees_is_not_used(folder, tmp_path):
+    """One line, drawn by hand."""
+    for path in sorted(folder.glob("board*")):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    t = np.linspace(0, 1, 200)
+    arc = np.stack([500 + 12 * (2 * t - 1) ** 2, 20 + 670 * t], axis=-1)
+    image = np.full((SIZE[1], SIZE[0]), 60, np.uint8)
+    cv2.fillPoly(
+        image,
+        [np.rint(np.vstack([arc, [[1100, 690], [1100, 20]]]) * 16).astype(np.int32)],
+        200,
+        cv2.LINE_AA,
+        4,
+    )
+    exif = np.frombuffer(exif_with_focal(60.0), np.uint8)
+    _, content = cv2.imencodeWithMetadata(".png", image, [cv2.IMAGE_METADATA_EXIF], [exif])
+    (tmp_path / "bent.png").write_bytes(content.tobytes())
+    done = calibrate_images(ImageJob((tmp_path,)))
+    assert list(done.unused) == ["bent.png"]
+    assert "none of its lines is straight" in done.unused["bent.png"]
+    assert len(done.used) == 5
 
 
 def test_a_zooming_video_is_calibrated(tmp_path):

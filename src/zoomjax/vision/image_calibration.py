@@ -234,9 +234,20 @@ def calibrate_images(
     focals = choose_focals(usable, way, unit=job.focal_unit, board=job.board)
     unused |= {d.name: focals.absent for d in usable if d.name not in focals.focal}
     used = tuple(d for d in usable if d.name in focals.focal)
-    lines = lines_of(used, np.array([focals.focal[d.name] for d in used]), focals.unit)
-    calibration = calibrate(lines, degree=job.degree, terms=job.terms, robust=True, stage=stage)
-    return ImageCalibration(job, calibration, used, focals, unused)
+    while True:
+        lines = lines_of(used, np.array([focals.focal[d.name] for d in used]), focals.unit)
+        calibration = calibrate(lines, degree=job.degree, terms=job.terms, robust=True, stage=stage)
+        done = ImageCalibration(job, calibration, used, focals, unused)
+        hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}
+        if not hopeless:
+            return done
+        unused = unused | dict.fromkeys(sorted(hopeless), _NONE_AGREES)
+        used = tuple(d for d in used if d.name not in hopeless)
+
+
+_NONE_AGREES = (
+    "none of its lines is straight under the distortion of the others. Is its focal length right?"
+)
 
 
 def _is_video(path: str | os.PathLike[str]) -> bool:
