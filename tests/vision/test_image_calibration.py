@@ -55,7 +55,7 @@ def test_bad_images_are_reported_and_do_not_matter(done):
         "turned.png": "its size is 712x1072 px, most images' 1072x712: it was turned, so turn it back",
         "blank.png": "no lines were found",
         "empty.jpg": "the file is empty",
-        "cut.jpg": "the file is cut off",
+        "cut.jpg": "the file is damaged or cut off",
     }
     assert set(done.unused) == set(expected)
     for name, reason in expected.items():
@@ -139,6 +139,13 @@ def test_a_zooming_video_is_calibrated(tmp_path):
     assert len(list((tmp_path / "lines").glob("zoom-*.jpg"))) == 8
 
 
+def test_a_second_run_leaves_nothing_of_the_first(done, tmp_path):
+    done.write(tmp_path)
+    (tmp_path / "lines" / "old.jpg").write_bytes(b"of a photo that is no longer used")
+    done.write(tmp_path)
+    assert sorted(p.name for p in (tmp_path / "lines").iterdir()) == sorted(d.name for d in done.used)
+
+
 WRONG = {
     "unknown detector": (
         {"detector": "circles"},
@@ -150,6 +157,8 @@ WRONG = {
     "no such photo": ({"inputs": ("nothing.jpg",)}, FileNotFoundError, "nothing.jpg"),
     "no such table": ({"focal": "nothing.csv"}, FileNotFoundError, "nothing.csv"),
     "video without focal": ({"inputs": ("a.mp4",)}, ValueError, "A video needs --focal"),
+    "a number that is none": ({"focal": "-3"}, ValueError, "positive number"),
+    "video with exif": ({"inputs": ("a.mp4",), "focal": "exif"}, ValueError, "A video needs --focal"),
     "no such video": ({"inputs": ("a.mp4",), "focal": "3"}, FileNotFoundError, "no video a.mp4"),
 }
 
