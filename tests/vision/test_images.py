@@ -56,7 +56,7 @@ def test_results_of_a_calibration_are_no_photographs(tmp_path, image):
         (folder / "lens.json").write_text("{}")
         for name in ("a.png", "model.png", "lines/a.png"):
             cv2.imwrite(str(folder / name), image)
-    assert names(find_photos([tmp_path])) == ["a.png", "out/a.png"]
+    assert names(find_photos([tmp_path])) == [f"{tmp_path.name}/a.png", "out/a.png"]
 
 
 def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path, image):
