@@ -189,3 +189,15 @@ def test_saving_replaces_an_older_file(lens, tmp_path):
     lens.save(path)
     assert zj.load_lens(path).image_size == (640, 480)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_centre_that_moves(lens, tmp_path):
+    shift = zj.PolynomialZoom(1, jnp.array([[0.01, 0.0], [-0.02, 0.005]]), jnp.array(20.0))
+    moving = eqx.tree_at(lambda lens: lens.shift, lens, shift, is_leaf=lambda leaf: leaf is None)
+    np.testing.assert_allclose(moving(40.0).centre, [319.5 + 400 * 0.0, 239.5 + 400 * 0.0025])
+    np.testing.assert_allclose(moving(20.0).centre, [319.5 - 4, 239.5 + 2])
+    moving.save(tmp_path / "lens.json")
+    again = zj.load_lens(tmp_path / "lens.json")
+    assert eqx.tree_equal(again, moving)
+    batched = jax.vmap(again)(jnp.array([20.0, 40.0]))
+    np.testing.assert_allclose(batched.centre[1], moving(40.0).centre)

@@ -36,3 +36,12 @@ def test_distortion_compiled_is_the_lens_s(truth):
     np.testing.assert_allclose(
         at_focal(truth, np.asarray(30.0)).coefficients, truth(30.0).coefficients, rtol=1e-12
     )
+
+
+@pytest.mark.filterwarnings("ignore:The lens is for images")
+def test_a_centre_that_moves_does_so_in_the_scaled_image(truth):
+    shift = zj.PolynomialZoom(0, np.array([[0.01, -0.005]]), np.array(20.0))
+    moving = zj.ZoomLens(truth.zoom, truth.centre, truth.focal_range, truth.image_size, shift=shift)
+    quarter = zj.lens_for_size(moving, (1072, 712))
+    expected = (np.asarray(moving(30.0).centre) + 0.5) / 4 - 0.5
+    np.testing.assert_allclose(quarter(30.0).centre, expected, atol=1e-9)

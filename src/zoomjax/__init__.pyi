@@ -2,6 +2,12 @@
 
 from .algebraic import algebraic_frames as algebraic_frames
 from .algebraic import algebraic_zoom as algebraic_zoom
+from .any_centre import AnyCentreLines as AnyCentreLines
+from .any_centre import compress_any_centre as compress_any_centre
+from .centre import CentreFit as CentreFit
+from .centre import FrameCentres as FrameCentres
+from .centre import fit_centre as fit_centre
+from .centre import fit_frame_centres as fit_frame_centres
 from .compression import CompressedLines as CompressedLines
 from .compression import compress as compress
 from .compression import merge as merge

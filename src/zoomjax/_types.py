@@ -15,6 +15,7 @@ AnyArray = jax.Array | np.ndarray
 
 Scalar = Float[AnyArray, ""]
 Point = Float[AnyArray, "2"]
+Centres = Float[AnyArray, "2"] | Float[AnyArray, "frame 2"]
 Points = Num[AnyArray, "*batch 2"]
 Coefficients = Float[AnyArray, "terms"]
 Mask = Bool[AnyArray, "line point"]

@@ -18,6 +18,7 @@ dtype's own: 1e-12 px, or 1e-3 px in float32.
 """
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
@@ -27,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._checks import checked_terms
-from ._types import Focal, FrameIndex, LineNumber, LineWeight, Point, traced
+from ._types import Centres, Focal, FrameIndex, LineNumber, LineWeight, Point, traced
 from .lines import AbstractLines, Lines
 
 _RUN = 1100  # points orthogonalised together: 7 columns of them fill a cache of 48 to 64 KB in float64
@@ -88,6 +89,19 @@ class CompressedLines(AbstractLines):
             moments.append(jnp.sum(columns[:, :, j] * columns[:, :, total - j], axis=(1, 2)))
         return jnp.stack(moments, axis=1)
 
+    def about(self, centre: Centres) -> "CompressedLines":
+        """These lines, if `centre` is theirs, px.
+
+        Raises:
+            ValueError: it is another, which these triangles do not serve.
+        """
+        if not traced((self.centre, centre)) and not np.allclose(self.centre, centre, rtol=0, atol=1e-3):
+            raise ValueError(
+                "The compressed lines have another centre of distortion than is asked for. Compress the "
+                "lines about that centre, or by compress_any_centre, or pass the lines themselves."
+            )
+        return self
+
     def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "CompressedLines":
         """The chosen lines as a data set of one frame."""
         return CompressedLines(
@@ -106,7 +120,7 @@ def _combine(triangle, k):
     """The corrected points' rows from one line's triangle: linear in (1, k1, ..., kN)."""
     kappa = jnp.concatenate([jnp.ones(1, k.dtype), k])
     columns = triangle[1:, 1 : 1 + 2 * kappa.shape[0]].reshape(-1, kappa.shape[0], 2)
-    return jnp.einsum("rjc,j->rc", columns, kappa, precision=_EXACT)
+    return jnp.einsum("rjc,j->rc", columns, kappa, precision=EXACT)
 
 
 def compress(lines: Lines, terms: int = 2) -> CompressedLines:
@@ -128,13 +142,8 @@ def compress(lines: Lines, terms: int = 2) -> CompressedLines:
     """
     if isinstance(lines, CompressedLines):
         raise TypeError("These lines are compressed already: compress the Lines that they came from.")
-    terms = checked_terms(terms)
-    if traced(lines) or jax.default_backend() != "cpu":
-        triangle = _reduce_run(lines, np.asarray(0), lines.points.shape[0], terms)
-    else:
-        triangle = _reduce_in_threads(lines, terms)
     return CompressedLines(
-        triangle=triangle,
+        triangle=triangles_of(lines, _columns, checked_terms(terms)),
         frame=lines.frame,
         focal=lines.focal,
         centre=lines.centre,
@@ -180,10 +189,17 @@ def _equal(first, second):
 @jax.jit
 @jax.vmap
 def _merge_all(first, second):
-    return _triangle(jnp.concatenate([first, second]).T)
+    return triangle(jnp.concatenate([first, second]).T)
 
 
-def _reduce_in_threads(lines, terms):
+def triangles_of(lines: Lines, columns: Callable[..., Array], terms: int) -> Float[Array, "line rows rows"]:
+    """R of each line, for ``columns(z, valid, terms)``: what is made of its points, a row a column of A."""
+    if traced(lines) or jax.default_backend() != "cpu":
+        return _reduce_run(lines, np.asarray(0), lines.points.shape[0], columns, terms)
+    return _reduce_in_threads(lines, columns, terms)
+
+
+def _reduce_in_threads(lines, columns, terms):
     """All triangles, each core reducing a run of lines: XLA runs a loop on one.
 
     The last run is moved back to end with the lines, so that all have one shape and one compilation, and
@@ -200,9 +216,9 @@ def _reduce_in_threads(lines, terms):
 
         def reduce_from(start):
             # An array, for a Python number would be a constant of the program: one compilation each.
-            return jax.block_until_ready(_reduce_run(lines, np.asarray(start), size, terms))
+            return jax.block_until_ready(_reduce_run(lines, np.asarray(start), size, columns, terms))
 
-        signature = (lines.points.shape, str(lines.points.dtype), size, terms, str(widest))
+        signature = (lines.points.shape, str(lines.points.dtype), size, columns, terms, str(widest))
         alone = 0 if signature in _COMPILED and same_context else 1
         triangles = [reduce_from(start) for start in starts[:alone]]
         triangles += pool.map(reduce_from, starts[alone:])
@@ -212,7 +228,7 @@ def _reduce_in_threads(lines, terms):
 
 
 @eqx.filter_jit
-def _reduce_run(lines, start, size, terms):
+def _reduce_run(lines, start, size, columns, terms):
     """Triangles of `size` consecutive lines, one after the other so that each stays in the cache."""
 
     def reduce_one(index):
@@ -222,8 +238,8 @@ def _reduce_run(lines, start, size, terms):
         )
         # x and y apart by a product with the identity, exact: 2 times faster than slicing on the CPU.
         offset = jnp.where(mask[:, None], points - lines.centre[None], 0)
-        z = jnp.einsum("pc,cd->dp", offset, jnp.eye(2, dtype=offset.dtype), precision=_EXACT)
-        return _triangle(_columns(z / lines.scale, mask.astype(z.dtype), terms))
+        z = jnp.einsum("pc,cd->dp", offset, jnp.eye(2, dtype=offset.dtype), precision=EXACT)
+        return triangle(columns(z / lines.scale, mask.astype(z.dtype), terms))
 
     batch = None if jax.default_backend() == "cpu" else 256
     return jax.lax.map(reduce_one, start + jnp.arange(size), batch_size=batch)
@@ -239,7 +255,7 @@ def _columns(z, valid, terms):
 
 
 @jax.custom_jvp
-def _triangle(columns):
+def triangle(columns: Float[Array, "rows point"]) -> Float[Array, "rows rows"]:
     """R of the transposed argument, by runs of points whose triangles are then reduced together."""
     size, points = columns.shape
     runs = -(-points // _RUN)
@@ -249,7 +265,7 @@ def _triangle(columns):
     return _orthogonalise(jnp.concatenate([triangles.reshape(-1, size).T, columns[:, whole:]], axis=1))
 
 
-@_triangle.defjvp
+@triangle.defjvp
 def _triangle_jvp(primals, tangents):
     """A tangent of R that is right for every function of ``R^T R``, which is all that the fits use.
 
@@ -257,11 +273,11 @@ def _triangle_jvp(primals, tangents):
     With ``A = Q R``, ``dR = Q^T dA`` (Q held fixed) gives ``R^T dR + dR^T R = A^T dA + dA^T A`` exactly.
     """
     [columns], [columns_dot] = primals, tangents
-    triangle = _triangle(columns)
-    kept = jnp.diagonal(triangle) > 0
-    regular = triangle + jnp.diag(jnp.where(kept, 0, 1).astype(triangle.dtype))
+    r = triangle(columns)
+    kept = jnp.diagonal(r) > 0
+    regular = r + jnp.diag(jnp.where(kept, 0, 1).astype(r.dtype))
     q = jax.scipy.linalg.solve_triangular(regular, columns, trans="T")
-    return triangle, jnp.matmul(jnp.where(kept[:, None], q, 0), columns_dot.T, precision=_EXACT)
+    return r, jnp.matmul(jnp.where(kept[:, None], q, 0), columns_dot.T, precision=EXACT)
 
 
 def _orthogonalise(columns):
@@ -273,7 +289,7 @@ def _orthogonalise(columns):
     size = columns.shape[0]
     rows = []
     for done in range(size):
-        products = jnp.matmul(columns, columns[0], precision=_EXACT)
+        products = jnp.matmul(columns, columns[0], precision=EXACT)
         norm = jnp.sqrt(products[0])
         inverse = jnp.where(norm > 0, 1 / jnp.where(norm > 0, norm, 1), 0)
         row = products * inverse
@@ -282,4 +298,4 @@ def _orthogonalise(columns):
     return jnp.stack(rows)
 
 
-_EXACT = jax.lax.Precision.HIGHEST  # some accelerators otherwise multiply float32 with 10 bits
+EXACT = jax.lax.Precision.HIGHEST  # some accelerators otherwise multiply float32 with 10 bits

@@ -20,12 +20,12 @@ from jaxtyping import Array, Float, Int
 
 from ._checks import checked_terms
 from ._solver import default_solver
-from ._types import AnyArray, Point, traced
+from ._types import AnyArray, Centres, traced
 from .algebraic import algebraic_parameters, compressed
 from .compression import CompressedLines
 from .energy import energy_by_frame, frame_energy, residuals
 from .lens import ZoomLens, lens_of
-from .lines import AbstractLines, Lines
+from .lines import AbstractLines
 from .radial import Distortion, monotone_radius
 from .uncertainty import parameter_covariance
 from .zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
@@ -80,7 +80,7 @@ class FrameFits(eqx.Module):
         frame_rms: root of each frame's error (eq. 3), px.
         covariance: of each frame's coefficients; see `ZoomFit`.
         result: how each frame's fit ended.
-        centre: centre of distortion, px.
+        centre: centre of distortion, px: of all frames, or of each.
         scale: the length in px that is radius 1.
     """
 
@@ -89,7 +89,7 @@ class FrameFits(eqx.Module):
     frame_rms: Float[Array, "frame"]
     covariance: Float[Array, "frame terms terms"]
     result: RESULTS
-    centre: Point
+    centre: Centres
     scale: float = eqx.field(static=True)
 
     def messages(self) -> list[str]:
@@ -111,7 +111,7 @@ class FrameFits(eqx.Module):
         dtype = self.coefficients.dtype
         return Distortion(
             self.coefficients[frame],
-            jnp.asarray(self.centre, dtype),
+            jnp.broadcast_to(jnp.asarray(self.centre, dtype), (frames, 2))[frame],
             jnp.asarray(self.scale, dtype),
         )
 
@@ -248,24 +248,13 @@ def frame_rms(
                 f"{lines.focal_unit}."
             )
         lens.check_range(lines.focal)
-        lines = _about(lines, lens.centre)
+        lines = lines.about(lens.centre if lens.shift is None else jax.vmap(lens)(lines.focal).centre)
     elif not (lens is None or eqx.is_array_like(lens)):
         raise TypeError(
             "Argument lens must be a ZoomLens (fit.lens, not the fit), coefficients of each frame or None, "
             f"but its type is {type(lens).__name__}."
         )
     return _frame_rms(lines, lens)
-
-
-def _about(lines, centre):
-    if isinstance(lines, Lines):
-        return eqx.tree_at(lambda data: data.centre, lines, centre)
-    if not traced((lines.centre, centre)) and not jnp.allclose(lines.centre, centre, rtol=0, atol=1e-3):
-        raise ValueError(
-            "The lens and the compressed lines have different centres of distortion. Compress the lines "
-            "about the lens's centre, or pass the lines themselves."
-        )
-    return lines
 
 
 @eqx.filter_jit
@@ -284,7 +273,7 @@ def _frame_rms(lines, lens):
 def _fit_zoom(lines, start, zoom, terms, solver, max_steps):
     if start is not None:
         zoom = with_parameters(zoom, algebraic_parameters(start, zoom, terms))
-    zoom, result, steps = _minimise(lines, zoom, solver, max_steps)
+    zoom, result, steps = minimise(lines, zoom, solver, max_steps)
     weighted, jacobian = linearised(lines, zoom)
     errors = energy_by_frame(lines, weighted)
     covariance, determined = parameter_covariance(lines, zoom, jacobian, jnp.mean(errors))
@@ -322,7 +311,7 @@ def _fit_frames(lines, start, chosen, present, terms, solver, max_steps):
     return each, _first_failure(each.result)
 
 
-def _minimise(lines, zoom, solver, max_steps):
+def minimise(lines, zoom, solver, max_steps):
     """The model at the minimum of the global energy, from its own parameters as the start."""
 
     def function(parameters, args):

@@ -28,6 +28,8 @@ class ZoomLens(eqx.Module):
     Attributes:
         zoom: from a focal length to the normalised coefficients.
         centre: centre of distortion, px.
+        shift: from a focal length to the offset of its own centre of distortion from `centre`, in units of
+            `scale`; None where the centre stays.
         focal_range: the shortest and longest focal length fitted.
         image_size: (width, height) px of the images it is for.
         focal_unit: "mm" or "px".
@@ -45,6 +47,7 @@ class ZoomLens(eqx.Module):
     focal_range: Float[AnyArray, "2"]
     image_size: tuple[int, int] = eqx.field(static=True)
     focal_unit: str = eqx.field(static=True, default="mm")
+    shift: AbstractZoom | None = None
 
     def __check_init__(self):
         """Check the geometry."""
@@ -73,9 +76,11 @@ class ZoomLens(eqx.Module):
             )
         self.check_range(focal, stacklevel=3)
         dtype = jnp.asarray(self.centre).dtype
+        focal = jnp.asarray(focal, dtype)
+        centre = jnp.asarray(self.centre)
         return Distortion(
-            coefficients=self.zoom(jnp.asarray(focal, dtype)),
-            centre=jnp.asarray(self.centre),
+            coefficients=self.zoom(focal),
+            centre=centre if self.shift is None else centre + self.scale * self.shift(focal),
             scale=jnp.asarray(self.scale, dtype),
         )
 
@@ -85,8 +90,9 @@ class ZoomLens(eqx.Module):
         Raises:
             TypeError: the zoom model is of a kind that has no file format.
         """
-        if type(self.zoom) not in _FORMULAS:
-            raise TypeError(f"A lens with a {type(self.zoom).__name__} cannot be saved.")
+        for model in (self.zoom, self.shift):
+            if model is not None and type(model) not in _FORMULAS:
+                raise TypeError(f"A lens with a {type(model).__name__} cannot be saved.")
         content = {
             "format": _FORMAT,
             "version": _VERSION,
@@ -97,12 +103,11 @@ class ZoomLens(eqx.Module):
             "focal_range": _numbers(self.focal_range),
             "radial": "corrected = centre + z * scale * (1 + k1 r^2 + ... + kN r^2N), "
             "z = (distorted - centre) / scale, r^2 = z.z",
-            "zoom": {
-                "model": type(self.zoom).__name__,
-                "formula": _FORMULAS[type(self.zoom)],
-                **{name: _plain(value) for name, value in vars(self.zoom).items()},
-            },
+            "zoom": _described(self.zoom),
         }
+        if self.shift is not None:
+            content["shift"] = _described(self.shift)
+            content["shift_meaning"] = "centre at f = centre + scale (k_1(f), k_2(f)) of the model in shift"
         with whole_file(path) as part:
             part.write_text(json.dumps(content, indent=2) + "\n")
 
@@ -169,6 +174,7 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
             focal_range=_array(content, "focal_range", (2,)),
             image_size=checked_size(content["image_size"]),
             focal_unit=checked_unit(content["focal_unit"]),
+            shift=_read_zoom(content["shift"]) if "shift" in content else None,
         )
         low, high = lens.focal_range
         if not 0 < low <= high:
@@ -192,6 +198,14 @@ _FORMULAS = {
     TwoRegionZoom: "k_i(f) = sum_j c_j (focal_ref / f)^j with c = parameters[0..2][i-1] for f < crossover, "
     "parameters[3..5][i-1] from there on",
 }
+
+
+def _described(model: AbstractZoom) -> dict[str, object]:
+    return {
+        "model": type(model).__name__,
+        "formula": _FORMULAS[type(model)],
+        **{name: _plain(value) for name, value in vars(model).items()},
+    }
 
 
 def _read_zoom(content) -> AbstractZoom:

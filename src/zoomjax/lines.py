@@ -30,7 +30,7 @@ from ._checks import (
     warn_of_points_outside,
 )
 from ._files import whole_file
-from ._types import AnyArray, Focal, FrameIndex, LineNumber, LineWeight, Mask, Point, traced
+from ._types import AnyArray, Centres, Focal, FrameIndex, LineNumber, LineWeight, Mask, Point, traced
 from .radial import radial_factor
 
 _FORMAT, _VERSION = "zoomjax.lines", 1
@@ -68,6 +68,14 @@ class AbstractLines(eqx.Module):
     @abc.abstractmethod
     def radial_moments(self, order: int) -> Float[Array, "line moment"]:
         """``sum_p r_p^(2i)`` for i = 0 ... order, over the points of each line, r normalised."""
+
+    @abc.abstractmethod
+    def about(self, centre: Centres) -> "AbstractLines":
+        """The same lines about another centre of distortion, px: that of all frames, or of each frame.
+
+        Raises:
+            ValueError: they were compressed for one centre, and this is another.
+        """
 
     @abc.abstractmethod
     def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "AbstractLines":
@@ -296,6 +304,18 @@ class Lines(AbstractLines):
             power = power * squared
             moments.append(jnp.sum(power, axis=1))
         return jnp.stack(moments, axis=1)
+
+    def about(self, centre: Centres) -> "Lines":
+        """The same lines about another centre of distortion, px: that of all frames, or of each frame.
+
+        In the latter case points are moved, frame by frame, so that one centre, the mean, serves all.
+        """
+        centre = jnp.asarray(centre, jnp.asarray(self.centre).dtype)
+        if centre.ndim == 1:
+            return eqx.tree_at(lambda lines: lines.centre, self, centre)
+        mean = jnp.mean(centre, axis=0)
+        points = jnp.asarray(self.points) - (centre - mean[None])[self.frame][:, None]
+        return eqx.tree_at(lambda lines: (lines.points, lines.centre), self, (points, mean))
 
     def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "Lines":
         """The chosen lines as a data set of one frame."""

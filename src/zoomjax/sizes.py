@@ -1,5 +1,6 @@
 """A lens for images of another size than it was fitted on."""
 
+import dataclasses
 import warnings
 
 import equinox as eqx
@@ -47,13 +48,7 @@ def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
     )
     centre = jnp.asarray(lens.centre)
     ratio = jnp.asarray([width / old_width, height / old_height], centre.dtype)
-    return ZoomLens(
-        zoom=lens.zoom,
-        centre=(centre + 0.5) * ratio - 0.5,
-        focal_range=lens.focal_range,
-        image_size=size,
-        focal_unit=lens.focal_unit,
-    )
+    return dataclasses.replace(lens, centre=(centre + 0.5) * ratio - 0.5, image_size=size)
 
 
 at_focal = eqx.filter_jit(lambda lens, focal: lens(focal))
