@@ -25,9 +25,10 @@ LAYERS = (
     {"uncertainty"},
     {"fit"},
     {"robust", "centre"},
-    {"synthetic", "metrics", "io"},
+    {"synthetic", "broadcast", "metrics", "io"},
     {"plot"},
     {"calibration"},
+    {"reproduce"},
     {"vision"},
     {"report"},
     {"cli"},
@@ -36,6 +37,7 @@ OUTER = {
     "plot": {"matplotlib"},
     "vision": {"cv2", "av"},
     "report": {"matplotlib"},
+    "reproduce": {"matplotlib"},
     "cli": {"typer", "rich"},
 }
 HEAVY = set().union(*OUTER.values())

@@ -1,13 +1,19 @@
 """Plots, with matplotlib (the extra ``zoomjax[app]``). Figures are returned, not shown or saved."""
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from .centre import FrameCentres
 from .fit import FrameFits, ZoomFit
-from .lines import AbstractLines
+from .lens import ZoomLens
+from .lines import AbstractLines, Lines
 
 _MODEL, _FRAMES = "#c2410c", "#1e3a5f"
 
@@ -58,6 +64,100 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
         below.set_xlabel(f"$1/f$  (1/{lens.focal_unit})")
         _show_focal_lengths(above, focal, lens.focal_unit)
     figure.axes[0].legend(frameon=False)
+    return figure
+
+
+def plot_residues(
+    lines: AbstractLines,
+    none: Float[np.ndarray, "frame"],
+    each: Float[np.ndarray, "frame"],
+    zoom: Float[np.ndarray, "frame"],
+    *,
+    unit: str = "px",
+) -> Figure:
+    """What is left of each frame against 1/f: uncorrected, frame by frame, zoom model (Figures 9 and 10).
+
+    Args:
+        lines: only their focal lengths are used.
+        none, each, zoom: each frame's RMS.
+        unit: theirs.
+    """
+    focal = np.asarray(lines.focal)
+    order = np.argsort(focal)
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(1 / focal[order], none[order], "--", color="0.45", label="no correction")
+    axes.plot(1 / focal[order], zoom[order], color=_MODEL, linewidth=1.8, label="zoom model")
+    axes.plot(1 / focal[order], each[order], ":", color=_FRAMES, linewidth=2.2, label="frame by frame")
+    axes.set_ylim(0)
+    axes.set_ylabel(f"RMS distance to the lines  ({unit})")
+    axes.set_xlabel(f"$1/f$  (1/{lines.focal_unit})")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+    _show_focal_lengths(axes, focal, lines.focal_unit)
+    return figure
+
+
+def plot_primitives(lines: Lines, lens: ZoomLens, frames: Sequence[int]) -> Figure:
+    """The points of some frames as they were seen, and as a lens corrects them (Figures 5 and 6).
+
+    The frame around them is the border of the image, which the correction bends. A row is a frame.
+    """
+    figure = Figure(figsize=(9, 3.1 * len(frames)), layout="constrained")
+    width, height = lines.image_size
+    border = np.concatenate(
+        [
+            np.linspace(start, end, 100)
+            for start, end in pairwise(
+                np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * [width - 1, height - 1]
+            )
+        ]
+    )
+    mask, index = np.asarray(lines.mask), np.asarray(lines.frame)
+    for row, frame in zip(figure.subplots(len(frames), 2, squeeze=False), frames, strict=True):
+        number = range(len(lines.focal))[frame]
+        focal = float(np.asarray(lines.focal)[number])
+        chosen = index == number
+        points = np.asarray(lines.points)[chosen][mask[chosen]].astype(float)
+        distortion = lens(focal)
+        for axes, mapped in zip(row, (np.asarray, distortion.undistort), strict=True):
+            axes.plot(*np.asarray(mapped(points)).T, ".", markersize=0.5, color=_FRAMES, rasterized=True)
+            axes.plot(*np.asarray(mapped(border)).T, color=_MODEL, linewidth=1)
+            axes.set_aspect("equal")
+            axes.invert_yaxis()
+            axes.set_axis_off()
+        row[0].set_title(f"$f$ = {focal:.2f} {lines.focal_unit}: {chosen.sum()} lines", fontsize=9)
+        row[1].set_title("corrected", fontsize=9)
+    return figure
+
+
+def plot_centres(centres: FrameCentres, lines: AbstractLines) -> Figure:
+    """Each frame's centre of distortion, and how much it lowers the frame's RMS (Figure 7).
+
+    Crosses are standard deviations; frames whose lines do not determine a centre are left out.
+    """
+    known = np.asarray(centres.determined)
+    away = (np.asarray(centres.each.centre) - np.asarray(lines.centre))[known]
+    gain = 100 * (1 - np.asarray(centres.each.frame_rms) / np.asarray(centres.rms_fixed))[known]
+    focal = np.asarray(lines.focal)
+    figure = Figure(figsize=(9.6, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    std = np.asarray(centres.std)[known]
+    left.errorbar(*away.T, xerr=std[:, 0], yerr=std[:, 1], fmt="none", ecolor="0.85", elinewidth=0.8)
+    dots = left.scatter(*away.T, c=1 / focal[known], s=16, cmap="viridis", zorder=2)
+    left.plot(0, 0, "+", color=_MODEL, markersize=12, label="the image's centre")
+    figure.colorbar(dots, label=f"$1/f$  (1/{lines.focal_unit})", shrink=0.85)
+    left.set_aspect("equal", adjustable="datalim")
+    left.set_xlabel("centre of distortion, $x$  (px from the image's)")
+    left.set_ylabel("$y$  (px)")
+    left.invert_yaxis()
+    left.legend(frameon=False)
+    right.plot(1 / focal[known], gain, "o", markersize=3.5, color=_FRAMES)
+    right.axhline(0, color="0.85", linewidth=0.8, zorder=0)
+    right.set_ylabel("RMS lower by  (%)")
+    right.set_xlabel(f"$1/f$  (1/{lines.focal_unit})")
+    for axes in (left, right):
+        axes.spines[["top", "right"]].set_visible(False)
     return figure
 
 

@@ -93,6 +93,7 @@ def board_lines(
     board: StripedBoard | None = None,
     spacing: float | int = 12,
     noise: float | int = 0,
+    imperfection: float | int = 0,
     seed: int = 0,
 ) -> Lines:
     """The edges of the stripes at each focal length, as an edge detector would give them.
@@ -104,13 +105,17 @@ def board_lines(
         spacing: distance between neighbouring points of a line, px. 12 gives about the paper's number of
             points, 0.8 million; 1, about an edge point a pixel, gives 10 million.
         noise: standard deviation, px, of the error of each coordinate of each point.
-        seed: of the noise.
+        imperfection: RMS, mm, by which the board's edges are bent: smoothly, each in its own way, and the
+            same in all images.
+        seed: of the noise and of the bends.
 
     Returns:
         All edges at least a tenth of the image's height long.
     """
     board = StripedBoard.before(lens) if board is None else board
     rng = np.random.default_rng(seed)
+    own = np.random.default_rng((seed, 1))  # so that bends leave the noise as it is
+    bends = [imperfection * _bends(2 * number, own) for number in board.stripes]
     reach = _reach(lens, focal)
     along = spacing * np.arange(-np.ceil(reach / spacing), np.ceil(reach / spacing) + 1)
     points: list[np.ndarray] = []
@@ -118,10 +123,11 @@ def board_lines(
     for index, f in enumerate(focal):
         magnification = board.magnification(float(f))
         for axis in (0, 1):
+            place = along / magnification / board.size[1 - axis]  # from -1/2 to 1/2 along the board
             seen, inside = _seen(
                 lens(float(f)),
-                magnification * board.edges(axis),
-                np.where(abs(along) <= magnification * board.size[1 - axis] / 2, along, np.nan),
+                magnification * (board.edges(axis)[:, None] + bends[axis] @ _waves(place)),
+                np.where(abs(place) <= 0.5, along, np.nan),
                 axis,
                 lens.image_size,
             )
@@ -134,10 +140,24 @@ def board_lines(
     return Lines.from_ragged(points, frame, focal, image_size=lens.image_size, focal_unit=lens.focal_unit)
 
 
+_WAVES = np.arange(1, 4)
+"""Half waves along an edge that is bent."""
+
+
+def _bends(edges: int, rng: np.random.Generator) -> Float[np.ndarray, "edge wave"]:
+    """How each edge is bent, of RMS 1 on the average."""
+    return rng.standard_normal((edges, len(_WAVES))) * np.sqrt(2 / len(_WAVES))
+
+
+def _waves(place: Float[np.ndarray, "point"]) -> Float[np.ndarray, "wave point"]:
+    """The shapes of bends at places along a board, from -1/2 to 1/2."""
+    return np.sin(np.pi * _WAVES[:, None] * (place + 0.5))
+
+
 @eqx.filter_jit
 def _seen(
     distortion: Distortion,
-    across: Float[AnyArray, "line"],
+    across: Float[AnyArray, "line point"],
     along: Float[AnyArray, "point"],
     axis: int,
     image_size: tuple[int, int],
@@ -146,7 +166,7 @@ def _seen(
 
     Positions are px from the centre in the corrected image; `axis` is the one that `across` counts on.
     """
-    grid = jnp.stack(jnp.meshgrid(across, along, indexing="ij"), axis=-1)
+    grid = jnp.stack(jnp.broadcast_arrays(jnp.asarray(across), jnp.asarray(along)[None]), axis=-1)
     corrected = distortion.centre[None, None] + (grid if axis == 0 else grid[..., ::-1])
     seen = distortion.distort(corrected.astype(distortion.centre.dtype))
     last = jnp.array(image_size)[None, None] - 1
