@@ -2,6 +2,8 @@
 
 from .algebraic import algebraic_frames as algebraic_frames
 from .algebraic import algebraic_zoom as algebraic_zoom
+from .certificate import Certificate as Certificate
+from .certificate import certify as certify
 from .compression import CompressedLines as CompressedLines
 from .compression import compress as compress
 from .compression import merge as merge

@@ -38,12 +38,14 @@ def power_controls(low: ScalarLike, high: ScalarLike, degree: int) -> Float[Arra
     for place, power, highs in np.ndindex(ways.shape):
         if highs <= power:
             ways[place, power, highs] = (
-                math.comb(place, highs) * math.comb(degree - place, power - highs) / math.comb(degree, power)
+                math.comb(place, highs)
+                * math.comb(degree - place, power - highs)
+                / math.comb(degree, power)
             )
     high = jnp.asarray(high)
     exponent = np.arange(degree + 1)
     lows = jnp.asarray(low) ** np.maximum(exponent[:, None] - exponent[None], 0)
-    return jnp.sum(jnp.asarray(ways, high.dtype) * (lows * high**exponent[None])[None], axis=-1)
+    return jnp.sum(jnp.asarray(ways, high.dtype) * (lows * high ** exponent[None])[None], axis=-1)
 
 
 def cut(degree: int, cells: int) -> Float[np.ndarray, "cell control control"]:

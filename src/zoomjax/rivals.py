@@ -125,7 +125,9 @@ class SplineZoom(AbstractLinearZoom):
         ends = jnp.stack([knots[:-1], knots[1:]], axis=1)
         # What follows on either side is straight; nothing where the range ends at the last knot.
         low, high = 1 / jnp.asarray(focal_range)[::-1]
-        beyond = jnp.asarray([[jnp.minimum(low, knots[0]), knots[0]], [knots[-1], jnp.maximum(high, knots[-1])]])
+        beyond = jnp.asarray(
+            [[jnp.minimum(low, knots[0]), knots[0]], [knots[-1], jnp.maximum(high, knots[-1])]]
+        )
         values = jax.vmap(jax.vmap(lambda x: self.basis(1 / x)))(beyond)
         outside = (1 - share) * values[:, :1] + share * values[:, 1:]
         controls = jnp.concatenate([within, outside])
