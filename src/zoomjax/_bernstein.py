@@ -1,7 +1,7 @@
 """Polynomials by their Bernstein coefficients, between whose least and greatest they stay.
 
-On an interval ``[low, high]`` a polynomial of degree n has n + 1 such *controls*. The first and the last are
-its values at the ends; all of it lies between the least and the greatest, the closer the shorter the
+On an interval ``[low, high]`` a polynomial of degree n has n + 1 such *controls*. The first and the last
+are its values at the ends; all of it lies between the least and the greatest, the closer the shorter the
 interval. Controls are linear in the polynomial, and made here from sums of terms of one sign, so that they
 have errors of a few last digits.
 """

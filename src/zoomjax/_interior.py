@@ -1,8 +1,8 @@
 """Least squares under inequalities, by a primal-dual interior-point method.
 
 Minimise ``|r(x)|^2 / 2`` where ``slack(x) > 0``, element by element. Every iterate satisfies the
-inequalities; the barrier ``-mu sum log slack`` keeps it from their border, and mu falls tenfold a step. A step is
-Gauss-Newton's for residuals and barrier together, with multipliers z of the inequalities (so that
+inequalities; the barrier ``-mu sum log slack`` keeps it from their border, and mu falls tenfold a step. A
+step is Gauss-Newton's for residuals and barrier together, with multipliers z of the inequalities (so that
 ``z slack = mu`` at the minimum) in place of the barrier's own curvature, solved by QR of the stacked rows
 
     [ sqrt(z / slack) slack' ]        [ mu / sqrt(z slack) ]
@@ -40,7 +40,7 @@ def least_squares_within(
     start: Float[Array, "unknown"],
     max_steps: int,
 ) -> tuple[Float[Array, "unknown"], Float[Array, "inequality"], Bool[Array, ""], Int[Array, ""]]:
-    """The minimum, the barrier's strength ``z slack`` of each inequality, whether it was reached, and steps.
+    """The minimum, the barrier's strength ``z slack`` at each inequality, whether it is reached, and steps.
 
     Reached means that neither the inequalities nor the last step hold back more than 1e-8 of the energy
     (1e-5 in float32).

@@ -16,7 +16,8 @@ from ._types import AnyArray, Coefficients, Focal, Scalar, traced
 from .zoom import UNFITTED, AbstractLinearZoom, AbstractZoom, check_distinct, inverse_powers
 
 _POWER_PIECES = 128
-"""Straight lines below a power law, in log f: 128 over a tenfold zoom are at most 2e-4 of it too low (d2 = -2)."""
+"""Straight lines below a power law, in log f: over a tenfold zoom, and with d2 = -2, at most 2e-4 of its
+largest value too low."""
 
 
 def _checked_number(number):
@@ -181,8 +182,8 @@ class PowerZoom(AbstractZoom):
         controls = constant[None, None] + factor[None, None] * jnp.where(factor > 0, tangent, power)
         digits = 1 + jnp.abs(exponent) * jnp.max(jnp.abs(x))  # that the exponential loses
         size = jnp.abs(constant) + jnp.abs(factor) * jnp.max(power * digits, axis=(0, 1))
-        ref = jnp.asarray(_prepared(self.focal_ref))
-        return Pieces(controls, ref * jnp.exp(x[..., 0]), jnp.asarray, size)
+        ends = x[..., 0] + jnp.log(_prepared(self.focal_ref))
+        return Pieces(controls, ends, jnp.exp, size)
 
 
 class TwoRegionZoom(AbstractLinearZoom):

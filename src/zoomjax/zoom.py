@@ -156,7 +156,7 @@ class PolynomialZoom(AbstractLinearZoom):
 def inverse_powers(focal_ref: ScalarLike, focal_range: Float[AnyArray, "2"], degree: int) -> Pieces:
     """The powers of ``focal_ref / f`` over a range of focal lengths: one piece."""
     ends = 1 / jnp.asarray(focal_range)[::-1]
-    controls = power_controls(*(focal_ref * ends), degree)
+    controls = power_controls(focal_ref * ends[0], focal_ref * ends[1], degree)
     return Pieces(controls[None], ends[None], jnp.reciprocal, controls[-1])
 
 
