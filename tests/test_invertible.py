@@ -187,7 +187,7 @@ def barrel():
 
 @pytest.mark.slow
 def test_differentiable_with_respect_to_the_points(barrel):
-    """The slope at the corner stays where it is forced to be; the rest moves as it does for finite steps."""
+    """Where the slope is forced to be what it is it stays; the rest moves as with finite steps."""
 
     def fitted(points):
         small = zj.compress(moved(barrel, points), 2)

@@ -276,6 +276,8 @@ def frame_rms(
 
     Warns:
         UserWarning: frames at focal lengths outside of the range that the lens was fitted on.
+
+    Points beyond the fold of a lens that has one are corrected by formula.
     """
     _check_lines(lines)
     if isinstance(lens, ZoomLens):
