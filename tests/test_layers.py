@@ -9,7 +9,7 @@ import zoomjax
 
 # From the inside out: a module may import from layers before its own. Packages count as one module.
 LAYERS = (
-    {"_types", "_files", "_checks", "_linear"},
+    {"_types", "_files", "_checks", "_linear", "_bernstein", "_interior"},
     {"radial", "focal"},
     {"inverse", "pitch"},
     {"zoom"},
@@ -17,6 +17,7 @@ LAYERS = (
     {"lines"},
     {"energy"},
     {"lens"},
+    {"certificate"},
     {"framing"},
     {"positions", "warp", "sizes"},
     {"_solver", "compression"},

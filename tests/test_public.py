@@ -74,7 +74,7 @@ def test_functions_take_one_or_two_things_by_position(name):
 
 
 def test_results_are_sentences_to_act_on():
-    for result in (zj.RESULTS.undetermined, zj.RESULTS.folded):
+    for result in (zj.RESULTS.undetermined, zj.RESULTS.folded, zj.RESULTS.constrained):
         assert zj.RESULTS[result].endswith("the number of terms.")
 
 

@@ -175,6 +175,20 @@ def test_beyond_the_fold_is_nan_and_said_to_be(folding):
     assert jnp.isnan(d.distort(beyond)).all()
 
 
+def test_points_beyond_the_fold_have_no_corrected_position(folding):
+    d, _, _ = folding
+    fold = float(d.monotone_radius)
+    points = CENTRE + np.array([[0.999 * fold, 0], [0, -1.001 * fold], [fold, fold]])
+    np.testing.assert_array_equal(jnp.isfinite(d.undistort(points)), [[True] * 2, [False] * 2, [False] * 2])
+
+    def total(k):
+        bent = eqx.tree_at(lambda d: d.coefficients, d, k)
+        return jnp.nansum(bent.undistort(jnp.asarray(points)))
+
+    alone = jax.grad(lambda k: distortion(k).undistort(jnp.asarray(points[0])).sum())(d.coefficients)
+    np.testing.assert_allclose(jax.grad(total)(d.coefficients), alone, rtol=1e-12)
+
+
 def test_points_that_are_not_finite_have_no_inverse(quadratic):
     points = jnp.array([[jnp.nan, 0.0], [jnp.inf, 0.0]])
     assert not quadratic.has_inverse(points).any()

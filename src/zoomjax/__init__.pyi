@@ -8,6 +8,8 @@ from .centre import CentreFit as CentreFit
 from .centre import FrameCentres as FrameCentres
 from .centre import fit_centre as fit_centre
 from .centre import fit_frame_centres as fit_frame_centres
+from .certificate import Certificate as Certificate
+from .certificate import certify as certify
 from .compression import CompressedLines as CompressedLines
 from .compression import compress as compress
 from .compression import merge as merge

@@ -11,6 +11,7 @@ that is too uncertain to be believed is left where it was, and the result says s
 """
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,7 +22,8 @@ from jaxtyping import Array, Bool, Float, PyTree, ScalarLike
 from ._solver import default_solver
 from ._types import Coefficients, Focal
 from .any_centre import AnyCentreLines, compress_any_centre
-from .fit import FrameFits, Solver, ZoomFit, fit_zoom, linearised, minimise
+from .certificate import certify
+from .fit import RESULTS, FrameFits, Solver, ZoomFit, collected, fit_zoom, linearised, minimise
 from .lens import ZoomLens
 from .lines import Lines
 from .zoom import AbstractZoom, PolynomialZoom, with_parameters
@@ -140,12 +142,18 @@ def fit_centre(
     # Once more about these centres, for all else that is to know of a fit: the same compiled program.
     fit = fit_zoom(lines.about(each), zoom=zoom, terms=terms, solver=solver, **options)
     own = fit.covariance.shape[0]
+    lens = _lens(lines, fit.lens, moved, each)
+    certificate = fit.certificate if lens.shift is None else certify(lens)
+    good: Any = RESULTS.successful  # an inherited member, which pyright takes for another class's
+    folded = certificate.folded & (fit.result == good)
     fit = eqx.tree_at(
-        lambda fit: (fit.lens, fit.covariance),
+        lambda fit: (fit.lens, fit.covariance, fit.certificate, fit.result),
         fit,
         (
-            _lens(lines, fit.lens, moved, each),
+            lens,
             jnp.where(determined & jnp.isfinite(fit.covariance), covariance[:own, :own], fit.covariance),
+            certificate,
+            RESULTS.where(folded, RESULTS.folded, fit.result),
         ),
     )
     return CentreFit(fit, each, std, determined, fixed.rms, covariance)
@@ -177,15 +185,7 @@ def _fit_frame_centres(lines, chosen, present, terms, solver, max_steps):
         )
 
     found = jax.lax.map(one, (chosen, present), batch_size=chosen.shape[0])
-    each = FrameFits(
-        coefficients=found.fit.lens.zoom.parameters[:, 0],
-        rms=jnp.sqrt(jnp.mean(found.fit.rms**2)),
-        frame_rms=found.fit.rms,
-        covariance=found.fit.covariance,
-        result=found.fit.result,
-        centre=found.centre[:, 0],
-        scale=lines.scale,
-    )
+    each = eqx.tree_at(lambda fits: fits.centre, collected(lines, found.fit), found.centre[:, 0])
     return FrameCentres(each, found.std[:, 0], found.determined, found.rms_fixed)
 
 

@@ -5,8 +5,12 @@ optimistix', with Jacobians by automatic differentiation; a fitted model is diff
 the points through the implicit function theorem. A frame by itself is a zoom polynomial of degree 0 on
 the lines of that frame, so that one solver serves both, `vmap`\\ ped over the frames.
 
-Compiled once for a shape of the lines; once per fit an algebraic start and, after it, the covariance;
-per iteration one Jacobian of the residuals.
+A model that is not certified to be invertible is replaced by the best one that is: the same energy is
+minimised again, the slope of the radius kept above `LEAST_SLOPE` all over the image and focal range, by an
+interior-point method. For a linear zoom model the inequalities are linear, and hold without distortion.
+
+Compiled once for a shape of the lines; once per fit an algebraic start and, after it, the covariance and
+the certificate; per iteration one Jacobian of the residuals.
 """
 
 from typing import Any
@@ -19,22 +23,31 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from ._checks import checked_terms
+from ._interior import implicit, least_squares_within
 from ._solver import default_solver
 from ._types import AnyArray, Centres, traced
 from .algebraic import algebraic_parameters, compressed
+from .certificate import Certificate, certificate_of, slope_controls
 from .compression import CompressedLines
 from .energy import energy_by_frame, frame_energy, residuals
 from .lens import ZoomLens, lens_of
 from .lines import AbstractLines
-from .radial import Distortion, monotone_radius
+from .radial import Distortion
 from .uncertainty import parameter_covariance
 from .zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
 
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 
+LEAST_SLOPE = 0.02
+"""What the slope of the radius is kept above where a fit has to be made invertible: the inverse then
+magnifies distances at most 50 times. Real lenses are far from it (the Nikkor 18-200 of the paper: 0.91)."""
+
+_MOST_STEPS = 200
+"""Of the interior-point method, which takes 10 to 20."""
+
 
 class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a fit ended: optimistix' results, and two about the model that came out."""
+    """How a fit ended: optimistix' results, and three about the model that came out."""
 
     undetermined = (
         "The lines do not determine all coefficients: some can change without bending any line by more "
@@ -42,9 +55,15 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "centre of distortion, at more focal lengths, or lower the degree or the number of terms."
     )
     folded = (
-        "The fitted distortion is not invertible over the whole image at every fitted focal length: beyond "
-        "its monotone radius the corrected image folds over. Add lines near the corners, remove lines that "
-        "are not straight in the scene, or lower the degree or the number of terms."
+        "The fitted distortion is not invertible over the whole image and the range of focal lengths: its "
+        "`certificate` says where the corrected image folds over. Add lines near the corners, remove lines "
+        "that are not straight in the scene, or lower the degree or the number of terms."
+    )
+    constrained = (
+        "The lines fit best with a distortion that is not invertible over the whole image and the range of "
+        "focal lengths; this is the best one that is, and `rms_unconstrained` tells what that cost. Add "
+        "lines near the corners, remove lines that are not straight in the scene, or lower the degree or "
+        "the number of terms."
     )
 
 
@@ -59,8 +78,12 @@ class ZoomFit(eqx.Module):
             polynomial: all terms of power 0, then of power 1, ...). Points are taken to have independent
             errors of one size, estimated from the residuals. An undetermined parameter has infinite
             variance and zero covariances.
+            variance and zero covariances. What invertibility forbids is not taken into account.
         result: how the fit ended; ``RESULTS[fit.result]`` is a sentence.
         steps: number of steps the solver took.
+        certificate: whether the lens is invertible over its image and focal range.
+        rms_unconstrained: what `rms` is without the demand that the lens be invertible: the same, unless
+            the result is `constrained`.
     """
 
     lens: ZoomLens
@@ -69,6 +92,8 @@ class ZoomFit(eqx.Module):
     covariance: Float[Array, "parameter parameter"]
     result: RESULTS
     steps: Int[Array, ""]
+    certificate: Certificate
+    rms_unconstrained: Float[Array, ""]
 
 
 class FrameFits(eqx.Module):
@@ -80,6 +105,8 @@ class FrameFits(eqx.Module):
         frame_rms: root of each frame's error (eq. 3), px.
         covariance: of each frame's coefficients; see `ZoomFit`.
         result: how each frame's fit ended.
+        certificate: of each frame, whether it is invertible over the image.
+        rms_unconstrained: what `rms` is without the demand that every frame be invertible.
         centre: centre of distortion, px: of all frames, or of each.
         scale: the length in px that is radius 1.
     """
@@ -89,6 +116,8 @@ class FrameFits(eqx.Module):
     frame_rms: Float[Array, "frame"]
     covariance: Float[Array, "frame terms terms"]
     result: RESULTS
+    certificate: Certificate
+    rms_unconstrained: Float[Array, ""]
     centre: Centres
     scale: float = eqx.field(static=True)
 
@@ -123,9 +152,10 @@ def fit_zoom(
     terms: int | None = None,
     solver: Solver | None = None,
     max_steps: int = 256,
+    invertible: bool = True,
     throw: bool = True,
 ) -> ZoomFit:
-    """The zoom model that minimises the global energy (eq. 13).
+    """The zoom model that minimises the global energy (eq. 13), among those that are invertible.
 
     Args:
         lines: the lines, or, much faster and with the same answer, ``compress(lines)``.
@@ -136,8 +166,13 @@ def fit_zoom(
         solver: any optimistix least-squares solver or minimiser; Levenberg-Marquardt by default, with
             tolerances for the dtype of the lines.
         max_steps: the most steps the solver may take.
+        invertible: whether a model that is not certified to be invertible, over the whole image and the
+            range of focal lengths, gives way to the best one that is, with a slope of the radius (see
+            `Certificate`) of at least 0.02. A model that is certified stays as it is, to the last bit. For
+            zoom models that do not state their `pieces` this does nothing; for a `PowerZoom`, which is not
+            linear, it gives an invertible model that need not be the very best.
         throw: raise where the solver fails. Otherwise `ZoomFit.result` says so. Results about the model
-            (undetermined, folded) never raise.
+            (undetermined, folded, constrained) never raise.
 
     Raises:
         ValueError: fewer distinct focal lengths than the zoom model needs, lines compressed for fewer
@@ -161,7 +196,10 @@ def fit_zoom(
     if isinstance(model, AbstractLinearZoom) and (zoom is None or zoom.parameters is None):
         start = compressed(lines, terms)
     solver = default_solver(lines) if solver is None else solver
-    return _thrown(*_fit_zoom(lines, start, model, terms, solver, max_steps), throw)
+    fit, outcome = _fit_zoom(lines, start, model, terms, solver, max_steps)
+    if invertible:
+        fit, outcome = _or_else(fit, outcome, lambda: _refit_zoom(compressed(lines, terms), fit))
+    return _thrown(fit, outcome, throw)
 
 
 def ready_model(lines, zoom, terms):
@@ -199,12 +237,13 @@ def fit_frames(
     terms: int = 2,
     solver: Solver | None = None,
     max_steps: int = 256,
+    invertible: bool = True,
     throw: bool = True,
 ) -> FrameFits:
     """The distortion of each frame by itself (eq. 3 and 6): what a zoom model is compared with.
 
     Args:
-        lines, terms, solver, max_steps, throw: as for `fit_zoom`.
+        lines, terms, solver, max_steps, invertible, throw: as for `fit_zoom`, frame by frame.
 
     Raises:
         RuntimeError: the solver failed on some frame, and `throw` is set.
@@ -214,7 +253,10 @@ def fit_frames(
     chosen, present = lines.by_frame()
     solver = default_solver(lines) if solver is None else solver
     start = compressed(lines, terms)
-    return _thrown(*_fit_frames(lines, start, chosen, present, terms, solver, max_steps), throw)
+    fits, outcome = _fit_frames(lines, start, chosen, present, terms, solver, max_steps)
+    if invertible:
+        fits, outcome = _or_else(fits, outcome, lambda: _refit_frames(start, chosen, present, terms, fits))
+    return _thrown(fits, outcome, throw)
 
 
 def frame_rms(
@@ -234,6 +276,8 @@ def frame_rms(
 
     Warns:
         UserWarning: frames at focal lengths outside of the range that the lens was fitted on.
+
+    Points beyond the fold of a lens that has one are corrected by formula.
     """
     _check_lines(lines)
     if isinstance(lens, ZoomLens):
@@ -274,18 +318,27 @@ def _fit_zoom(lines, start, zoom, terms, solver, max_steps):
     if start is not None:
         zoom = with_parameters(zoom, algebraic_parameters(start, zoom, terms))
     zoom, result, steps = minimise(lines, zoom, solver, max_steps)
+    fit = _described(lines, zoom, result, steps)
+    return fit, _outcome(fit)
+
+
+def _described(lines, zoom, result, steps):
+    """A fitted zoom model with all that is to be said of it."""
     weighted, jacobian = linearised(lines, zoom)
     errors = energy_by_frame(lines, weighted)
     covariance, determined = parameter_covariance(lines, zoom, jacobian, jnp.mean(errors))
-    fit = ZoomFit(
-        lens=lens_of(lines, zoom),
-        rms=jnp.sqrt(jnp.mean(errors)),
+    lens, rms = lens_of(lines, zoom), jnp.sqrt(jnp.mean(errors))
+    certificate = certificate_of(zoom, lens.centre, lens.focal_range, lens.image_size)
+    return ZoomFit(
+        lens=lens,
+        rms=rms,
         frame_rms=jnp.sqrt(errors),
         covariance=covariance,
-        result=_judge(lines, zoom, result, determined),
+        result=_judge(zoom, result, determined, certificate),
         steps=steps,
+        certificate=certificate,
+        rms_unconstrained=rms,
     )
-    return fit, _first_failure(fit.result)
 
 
 @eqx.filter_jit
@@ -299,16 +352,78 @@ def _fit_frames(lines, start, chosen, present, terms, solver, max_steps):
     # side by side they would all be in memory at once, padded to the fullest frame.
     batch = chosen.shape[0] if isinstance(lines, CompressedLines) else 1
     fits = jax.lax.map(lambda frame: fit(*frame), (chosen, present), batch_size=batch)
-    each = FrameFits(
+    each = collected(lines, fits)
+    return each, _outcome(each)
+
+
+def collected(lines, fits):
+    """Fits of one frame each, stacked, as one; about the centre of the lines."""
+    return FrameFits(
         coefficients=fits.lens.zoom.parameters[:, 0],
         rms=jnp.sqrt(jnp.mean(fits.rms**2)),
         frame_rms=fits.rms,
         covariance=fits.covariance,
         result=fits.result,
+        certificate=fits.certificate,
+        rms_unconstrained=jnp.sqrt(jnp.mean(fits.rms_unconstrained**2)),
         centre=jnp.asarray(lines.centre),
         scale=lines.scale,
     )
-    return each, _first_failure(each.result)
+
+
+@eqx.filter_jit
+def _refit_zoom(lines, free):
+    """The best invertible model in the place of one that is not."""
+    zoom = free.lens.zoom
+    nothing = jax.tree.map(jnp.zeros_like, zoom.parameters)
+    if not isinstance(zoom, AbstractLinearZoom):
+        nothing = zoom.prepare(
+            jnp.asarray(lines.focal), jax.eval_shape(zoom, lines.focal[0]).shape[0]
+        ).parameters
+    start, unravel = ravel_pytree(nothing)
+
+    def functions(lines, zoom):
+        def errors(flat):
+            k = jax.vmap(with_parameters(zoom, unravel(flat)))(lines.focal)
+            return residuals(lines, k).reshape(-1)
+
+        def slack(flat):
+            lens = lens_of(lines, with_parameters(zoom, unravel(flat)))
+            controls = slope_controls(lens.zoom, lens.centre, lens.focal_range, lens.image_size)
+            assert controls is not None  # or the model would not have come here
+            return controls - LEAST_SLOPE
+
+        return errors, slack
+
+    constant = functions(*jax.lax.stop_gradient((lines, zoom)))
+    flat, strength, reached, steps = least_squares_within(*constant, start, _MOST_STEPS)
+    errors, slack = functions(lines, zoom)
+    flat = implicit(lambda flat: jnp.sum(errors(flat) ** 2) / 2, slack, flat, strength)
+    good: Any = RESULTS.successful  # inherited members, which pyright takes for another class's
+    unfinished: Any = RESULTS.nonlinear_max_steps_reached
+    # Curved inequalities, of models that are not linear, may keep it from the last digits.
+    near_enough = reached | (not isinstance(zoom, AbstractLinearZoom))
+    result = RESULTS.where(near_enough, good, unfinished)
+    fit = _described(lines, with_parameters(zoom, unravel(flat)), result, free.steps + steps)
+    result = RESULTS.where(fit.result == good, RESULTS.constrained, fit.result)
+    fit = eqx.tree_at(lambda fit: (fit.result, fit.rms_unconstrained), fit, (result, free.rms))
+    return fit, _outcome(fit)
+
+
+@eqx.filter_jit
+def _refit_frames(lines, chosen, present, terms, free):
+    """All frames as they are, if they are invertible, and otherwise the best that is."""
+
+    def fit(chosen, present, result, coefficients):
+        frame = lines.take(chosen, present)
+        constant = PolynomialZoom(degree=0).prepare(frame.focal, terms)
+        own = _described(frame, with_parameters(constant, coefficients[None]), result, jnp.asarray(0))
+        other, _ = _refit_zoom(frame, own)
+        keep = _invertible(own)
+        return jax.tree.map(lambda own, other: jnp.where(keep, own, other), own, other)
+
+    each = collected(lines, jax.vmap(fit)(chosen, present, free.result, free.coefficients))
+    return each, _outcome(each)
 
 
 def minimise(lines, zoom, solver, max_steps):
@@ -337,34 +452,49 @@ def linearised(lines, zoom):
     return weighted, jacobian
 
 
-def _judge(lines, zoom, result, determined):
+def _judge(zoom, result, determined, certificate):
     """The worst of what the solver says and of what the model looks like."""
-    width, height = lines.image_size
-    corners = jnp.asarray([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]])
-    offset = (corners - lines.centre[None]) / lines.scale
-    farthest = jnp.sqrt(jnp.max(jnp.sum(offset**2, axis=1)))
-    monotone = jax.vmap(monotone_radius)(jax.vmap(zoom)(lines.focal)) > farthest
     finite = jnp.all(jnp.isfinite(ravel_pytree(zoom.parameters)[0]))
     good: Any = RESULTS.successful  # inherited members, which pyright takes for another class's
     nonfinite: Any = RESULTS.nonfinite
-    about_model = RESULTS.where(jnp.all(monotone), good, RESULTS.folded)
+    about_model = RESULTS.where(certificate.folded, RESULTS.folded, good)
     about_model = RESULTS.where(determined, about_model, RESULTS.undetermined)
     about_model = RESULTS.where(finite, about_model, nonfinite)
-    solved = RESULTS.promote(result)
+    solved = result if isinstance(result, RESULTS) else RESULTS.promote(result)
     return RESULTS.where(solved == good, about_model, solved)
 
 
-def _first_failure(result):
-    """Whether a solver failed, in which frame first, and how; what is said of a model is no failure."""
-    about_model = (result == RESULTS.undetermined) | (result == RESULTS.folded)
-    failed = jnp.atleast_1d((result != RESULTS.successful) & ~about_model)
+def _invertible(fit):
+    """Whether there is nothing to be made invertible: it is, or there is no model, or none that can be."""
+    stated = ~jnp.isneginf(fit.certificate.least)
+    return fit.certificate.certified | ~stated | _failed(fit.result)
+
+
+def _or_else(fit, outcome, other):
+    """The fit and its outcome where it is invertible, and otherwise another, not even begun where it is."""
+    invertible, _ = outcome
+    if traced(invertible):
+        return jax.lax.cond(invertible, lambda: (fit, outcome), other)
+    return (fit, outcome) if invertible else other()
+
+
+def _failed(result):
+    """Whether a solver failed; what is said of a model is no failure."""
+    told = (result == RESULTS.undetermined) | (result == RESULTS.folded) | (result == RESULTS.constrained)
+    return (result != RESULTS.successful) & ~told
+
+
+def _outcome(fit):
+    """Whether it is invertible, and whether a solver failed, in which frame first, and how."""
+    failed = jnp.atleast_1d(_failed(fit.result))
     frame = jnp.argmax(failed)
-    return jnp.any(failed), frame, jax.tree.map(lambda value: jnp.atleast_1d(value)[frame], result)
+    result = jax.tree.map(lambda value: jnp.atleast_1d(value)[frame], fit.result)
+    return jnp.all(_invertible(fit)), (jnp.any(failed), frame, result)
 
 
-def _thrown(fit, failure, throw):
+def _thrown(fit, outcome, throw):
     """The fit, raising where its solver failed."""
-    failed, frame, result = failure
+    _, (failed, frame, result) = outcome
     if not throw:
         return fit
     if traced(failed):

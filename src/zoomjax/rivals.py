@@ -10,9 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
+from ._bernstein import Pieces
 from ._checks import checked_integer
 from ._types import AnyArray, Coefficients, Focal, Scalar, traced
-from .zoom import UNFITTED, AbstractLinearZoom, AbstractZoom, check_distinct
+from .zoom import UNFITTED, AbstractLinearZoom, AbstractZoom, check_distinct, inverse_powers
+
+_POWER_PIECES = 128
+"""Straight lines below a power law, in log f: over a tenfold zoom, and with d2 = -2, at most 2e-4 of its
+largest value too low."""
 
 
 def _checked_number(number):
@@ -59,6 +64,16 @@ class TableZoom(AbstractLinearZoom):
         index, share, _ = _place(knots, jnp.clip(x, knots[0], knots[-1]))
         return _two(knots, index, 1 - share, share)
 
+    def basis_pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces:
+        """The intervals between entries, in which it is linear: all of them, whatever the range."""
+        del focal_range  # beyond its ends it is what it is there
+        knots = jnp.asarray(_prepared(self.knots))
+        one = jnp.eye(knots.shape[0], dtype=knots.dtype)
+        first, last = (one[:-1], one[1:]) if knots.shape[0] > 1 else (one, one)
+        ends = jnp.stack([knots[:-1], knots[1:]], 1) if knots.shape[0] > 1 else jnp.stack([knots, knots], 1)
+        focal_of = jnp.reciprocal if self.inverse else jnp.asarray
+        return Pieces(jnp.stack([first, last], axis=1), ends, focal_of, jnp.ones_like(knots))
+
 
 class SplineZoom(AbstractLinearZoom):
     """A natural cubic spline in 1/f for each coefficient, through values at its knots.
@@ -98,6 +113,28 @@ class SplineZoom(AbstractLinearZoom):
         bent = _two(knots, index, (1 - share) ** 3 - (1 - share), share**3 - share)
         return _two(knots, index, 1 - share, share) + width**2 / 6 * (bent @ curvature)
 
+    def basis_pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces:
+        """Cubics between all neighbouring knots, and what of the range lies before and after them."""
+        knots, curvature = (jnp.asarray(_prepared(a)) for a in (self.knots, self.curvature))
+        one = jnp.eye(knots.shape[0], dtype=knots.dtype)
+        share = jnp.asarray([0, 1 / 3, 2 / 3, 1], knots.dtype)[None, :, None]
+        bent = jnp.asarray([[0, 0], [2, 1], [1, 2], [0, 0]], knots.dtype)
+        width = jnp.diff(knots)[:, None, None]
+        straight = (1 - share) * one[:-1, None] + share * one[1:, None]
+        neighbours = jnp.stack([curvature[:-1], curvature[1:]], axis=1)
+        within = straight - width**2 / 18 * jnp.einsum("cn,pnb->pcb", bent, neighbours, precision="highest")
+        ends = jnp.stack([knots[:-1], knots[1:]], axis=1)
+        # What follows on either side is straight; nothing where the range ends at the last knot.
+        low, high = 1 / jnp.asarray(focal_range)[::-1]
+        beyond = jnp.asarray(
+            [[jnp.minimum(low, knots[0]), knots[0]], [knots[-1], jnp.maximum(high, knots[-1])]]
+        )
+        values = jax.vmap(jax.vmap(lambda x: self.basis(1 / x)))(beyond)
+        outside = (1 - share) * values[:, :1] + share * values[:, 1:]
+        controls = jnp.concatenate([within, outside])
+        size = jnp.max(jnp.abs(controls), axis=(0, 1))
+        return Pieces(controls, jnp.concatenate([ends, beyond]), jnp.reciprocal, size)
+
 
 class PowerZoom(AbstractZoom):
     """A power law for each coefficient, ``k = d0 + d1 c^d2`` with ``c = f / focal_ref`` (eq. 4, [14]).
@@ -131,6 +168,22 @@ class PowerZoom(AbstractZoom):
         constant, factor, exponent = _prepared(self.parameters)
         c = jnp.broadcast_to(jnp.asarray(focal) / _prepared(self.focal_ref), exponent.shape)
         return constant + factor * c**exponent
+
+    def pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces:
+        """Straight lines in log f below the coefficients: tangents where those are convex, or chords."""
+        constant, factor, exponent = jnp.asarray(_prepared(self.parameters))
+        low, high = jnp.log(jnp.asarray(focal_range) / _prepared(self.focal_ref))
+        x = low + (high - low) * jnp.linspace(0, 1, _POWER_PIECES + 1, dtype=factor.dtype)
+        x = jnp.stack([x[:-1], x[1:]], axis=1)[..., None]  # (piece, end, 1)
+        middle = jnp.mean(x, axis=1, keepdims=True)
+        exponent = exponent[None, None]
+        power, centre = jnp.exp(exponent * x), jnp.exp(exponent * middle)
+        tangent = centre * (1 + exponent * (x - middle))
+        controls = constant[None, None] + factor[None, None] * jnp.where(factor > 0, tangent, power)
+        digits = 1 + jnp.abs(exponent) * jnp.max(jnp.abs(x))  # that the exponential loses
+        size = jnp.abs(constant) + jnp.abs(factor) * jnp.max(power * digits, axis=(0, 1))
+        ends = x[..., 0] + jnp.log(_prepared(self.focal_ref))
+        return Pieces(controls, ends, jnp.exp, size)
 
 
 class TwoRegionZoom(AbstractLinearZoom):
@@ -182,6 +235,20 @@ class TwoRegionZoom(AbstractLinearZoom):
         powers = jnp.stack([jnp.ones_like(u), u, u * u])
         below = jnp.asarray(focal) < _prepared(self.crossover)
         return jnp.concatenate([jnp.where(below, powers, 0), jnp.where(below, 0, powers)])
+
+    def basis_pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces:
+        """The two regions, as far as the range goes into them."""
+        low, high = jnp.asarray(focal_range)
+        ref, crossover = _prepared(self.focal_ref), _prepared(self.crossover)
+        below = inverse_powers(ref, jnp.stack([low, jnp.clip(crossover, low, high)]), 2)
+        above = inverse_powers(ref, jnp.stack([jnp.clip(crossover, low, high), high]), 2)
+        first = jnp.where(low < crossover, below.controls, 0)
+        second = jnp.where(high >= crossover, above.controls, 0)
+        controls = jnp.concatenate(
+            [jnp.pad(first, ((0, 0), (0, 0), (0, 3))), jnp.pad(second, ((0, 0), (0, 0), (3, 0)))]
+        )
+        size = jnp.concatenate([below.size, above.size])
+        return Pieces(controls, jnp.concatenate([below.ends, above.ends]), jnp.reciprocal, size)
 
 
 def barrel_crossover(focal: Focal, k1: Float[AnyArray, "frame"]) -> float:

@@ -57,14 +57,19 @@ class RobustFit(eqx.Module):
 
 
 def fit_robust(
-    lines: AbstractLines, *, zoom: AbstractZoom | None = None, terms: int | None = None, throw: bool = True
+    lines: AbstractLines,
+    *,
+    zoom: AbstractZoom | None = None,
+    terms: int | None = None,
+    invertible: bool = True,
+    throw: bool = True,
 ) -> RobustFit:
     """The zoom model of the lines that agree on one; those not straight in the scene are rejected.
 
     Args:
         lines: the lines, or, much faster and with the same answer, ``compress(lines)``. Weights that they
             have already are kept as factors.
-        zoom, terms, throw: as for `fit_zoom`, whose errors also apply.
+        zoom, terms, invertible, throw: as for `fit_zoom`, whose errors also apply.
 
     Returns:
         The fit of the lines that are left, with the weight of each line.
@@ -83,7 +88,7 @@ def fit_robust(
     if isinstance(start, AbstractLinearZoom) and (zoom is None or zoom.parameters is None):
         start = algebraic_zoom(lines, zoom=start, terms=terms).zoom
     weighted, model = _reweighted(lines, start)
-    fit = fit_zoom(weighted, zoom=model, throw=throw)
+    fit = fit_zoom(weighted, zoom=model, invertible=invertible, throw=throw)
     line_rms, median = _line_rms(lines, fit.lens.zoom)
     return RobustFit(fit=fit, weight=weighted.weight, line_rms=line_rms, scale=median)
 

@@ -175,8 +175,13 @@ def _seen(
 
 def _reach(lens: ZoomLens, focal: np.ndarray) -> float:
     """How far, px, corrected images extend from the centre at any of the focal lengths."""
-    corner = jnp.zeros(2, lens.centre.dtype)
-    corners = jax.vmap(lambda f: lens(f).undistort(corner))(jnp.asarray(focal))
+
+    def corner(f):
+        distortion = lens(f)
+        to_fold = distortion.monotone_radius / jnp.linalg.norm(lens.centre)
+        return distortion.undistort(lens.centre * (1 - jnp.minimum(1, to_fold)))
+
+    corners = jax.vmap(corner)(jnp.asarray(focal))
     return float(jnp.max(jnp.linalg.norm(corners - lens.centre[None], axis=-1)))
 
 

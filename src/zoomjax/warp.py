@@ -51,7 +51,8 @@ def warp_image(
         distortion: of this image, in its pixels. May be traced.
         framing: what part to show (`frame_output`); by default the geometry of the input.
         interpolation: "linear", or "cubic" (Catmull-Rom's kernel, a = -0.5; OpenCV's has a = -0.75).
-        border_value: beyond the image, and where the distortion has no inverse.
+        border_value: beyond the image, and where the distortion has no inverse: a lens that folds shows
+            nothing beyond its fold (see `Distortion.has_inverse`).
 
     Returns:
         An image of the same dtype and channels.

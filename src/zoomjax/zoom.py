@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, ScalarLike
 
+from ._bernstein import Pieces, power_controls
 from ._checks import checked_integer
 from ._types import AnyArray, Coefficients, Focal, Scalar, traced
 
@@ -41,6 +42,14 @@ class AbstractZoom(eqx.Module):
     def __call__(self, focal: ScalarLike) -> Coefficients:
         """The coefficients at one focal length."""
 
+    def pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces | None:
+        """The coefficients from the shortest to the longest of these focal lengths, as polynomials.
+
+        What `certify` proves invertibility from. None in a model that does not state them.
+        """
+        del focal_range
+        return None
+
 
 class AbstractLinearZoom(AbstractZoom):
     """A zoom model that is linear in its parameters: ``k(f) = basis(f) @ parameters``."""
@@ -51,9 +60,23 @@ class AbstractLinearZoom(AbstractZoom):
     def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:
         """The values of the basis functions at one focal length."""
 
+    def basis_pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces | None:
+        """The basis functions over a range of focal lengths, as polynomials; see `AbstractZoom.pieces`."""
+        del focal_range
+        return None
+
     def __call__(self, focal: ScalarLike) -> Coefficients:
         """The coefficients at one focal length."""
         return self.basis(focal) @ _fitted(self)
+
+    def pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces | None:
+        """The coefficients over a range of focal lengths, as polynomials."""
+        basis = self.basis_pieces(focal_range)
+        if basis is None:
+            return None
+        parameters = jnp.asarray(_fitted(self))
+        controls = jnp.einsum("pcb,bt->pct", basis.controls, parameters, precision="highest")
+        return Pieces(controls, basis.ends, basis.focal_of, (1 + basis.size) @ jnp.abs(parameters))
 
 
 class PolynomialZoom(AbstractLinearZoom):
@@ -122,6 +145,19 @@ class PolynomialZoom(AbstractLinearZoom):
             raise ValueError(UNFITTED)
         u = self.focal_ref / focal
         return jnp.stack([u**j for j in range(self.degree + 1)])
+
+    def basis_pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces:
+        """One piece, in 1/f."""
+        if self.focal_ref is None:
+            raise ValueError(UNFITTED)
+        return inverse_powers(self.focal_ref, focal_range, self.degree)
+
+
+def inverse_powers(focal_ref: ScalarLike, focal_range: Float[AnyArray, "2"], degree: int) -> Pieces:
+    """The powers of ``focal_ref / f`` over a range of focal lengths: one piece."""
+    ends = 1 / jnp.asarray(focal_range)[::-1]
+    controls = power_controls(focal_ref * ends[0], focal_ref * ends[1], degree)
+    return Pieces(controls[None], ends[None], jnp.reciprocal, controls[-1])
 
 
 def with_parameters(zoom: SomeZoom, parameters: PyTree) -> SomeZoom:

@@ -1,0 +1,199 @@
+"""Fits whose best model folds: the best one that does not takes its place."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+import zoomjax as zj
+from _reference import assert_derivatives_agree
+from conftest import moved
+from test_certificate import SomeZoom
+from test_fit import CENTRE, SIZE, distorted_lines, parameters
+from zoomjax import RESULTS
+from zoomjax.certificate import slope_controls
+from zoomjax.fit import LEAST_SLOPE
+
+FOCAL = np.array([20.0, 25.0, 30.0, 40.0, 55.0, 80.0])
+
+
+@pytest.fixture(scope="module")
+def folding():
+    """A lens that folds near the corners at its short end, and noisy lines in the middle of its images."""
+    zoom = zj.PolynomialZoom(2, jnp.array([[0.1, 0.0], [-0.1, 0.0], [-0.6, 0.1]]), jnp.asarray(20.0))
+    lens = zj.ZoomLens(zoom, jnp.asarray(CENTRE), jnp.array([20.0, 80.0]), SIZE)
+    return distorted_lines(lens, FOCAL, offset=120.0, noise=0.3, reach=0.45)
+
+
+@pytest.fixture(scope="module")
+def lines(folding):
+    return zj.compress(folding)
+
+
+@pytest.fixture(scope="module")
+def free(lines):
+    return zj.fit_zoom(lines, invertible=False)
+
+
+@pytest.fixture(scope="module")
+def best(lines):
+    return zj.fit_zoom(lines)
+
+
+def test_without_the_demand_the_fit_folds_and_says_where(free):
+    assert free.result == RESULTS.folded
+    assert not free.certificate.certified
+    d = free.lens(float(free.certificate.focal))
+    assert float(d.monotone_radius) < float(free.certificate.radius) <= 400.001
+    assert free.rms_unconstrained == free.rms
+
+
+def test_the_fit_is_invertible_and_says_what_that_cost(free, best):
+    assert best.result == RESULTS.constrained
+    assert "best one that is" in RESULTS[best.result]
+    assert best.certificate.certified
+    assert best.certificate.least == pytest.approx(LEAST_SLOPE, abs=1e-6)
+    assert best.rms_unconstrained == free.rms
+    assert free.rms < best.rms < 1.05 * free.rms
+    assert best.steps > free.steps
+    corner = best.lens(20.0).undistort(jnp.zeros(2))
+    np.testing.assert_allclose(best.lens(20.0).distort(corner), [0, 0], atol=1e-8)
+
+
+@pytest.mark.parametrize("terms", [1, 2])
+def test_there_is_no_better_one(terms, folding):
+    """By SciPy, from no distortion, under the same inequalities."""
+    lines = zj.compress(folding, terms)
+    best = zj.fit_zoom(lines, terms=terms)
+    zoom = best.lens.zoom
+
+    def model(flat):
+        return eqx.tree_at(lambda zoom: zoom.parameters, zoom, flat.reshape(3, terms))
+
+    @jax.jit
+    def slack(flat):
+        return slope_controls(model(flat), lines.centre, best.lens.focal_range, SIZE) - LEAST_SLOPE
+
+    energy = jax.jit(
+        jax.value_and_grad(lambda flat: zj.global_energy(lines, jax.vmap(model(flat))(lines.focal)))
+    )
+    slopes = np.asarray(jax.jacfwd(slack)(jnp.zeros(3 * terms)))
+    solution = scipy.optimize.minimize(
+        lambda flat: tuple(map(np.asarray, energy(flat))),
+        np.zeros(3 * terms),
+        jac=True,
+        method="SLSQP",
+        constraints=[
+            {"type": "ineq", "fun": lambda flat: np.asarray(slack(flat)), "jac": lambda _: slopes}
+        ],
+        options={"ftol": 1e-14, "maxiter": 500},
+    )
+    assert solution.success
+    assert float(best.rms) ** 2 == pytest.approx(solution.fun, rel=1e-8)
+    assert slack(zoom.parameters.ravel()).min() > 0
+
+
+def test_a_good_fit_stays_as_it_is_to_the_last_bit(small, fit):
+    free = zj.fit_zoom(small, invertible=False)
+    assert fit.result == RESULTS.successful
+    assert fit.certificate.certified
+    assert fit.rms_unconstrained == fit.rms
+    for one, other in zip(jax.tree.leaves(fit), jax.tree.leaves(free), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_good_frames_stay_as_they_are(small, frame_fits):
+    free = zj.fit_frames(small, invertible=False)
+    assert np.asarray(frame_fits.certificate.certified).all()
+    for one, other in zip(jax.tree.leaves(frame_fits), jax.tree.leaves(free), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.slow
+def test_frames_that_fold_become_invertible_and_others_stay(lines):
+    free, best = zj.fit_frames(lines, invertible=False), zj.fit_frames(lines)
+    folds = np.asarray(free.result == RESULTS.folded)
+    assert 0 < folds.sum() < len(FOCAL)
+    np.testing.assert_array_equal(best.result == RESULTS.constrained, folds)
+    assert np.asarray(best.certificate.certified).all()
+    np.testing.assert_array_equal(best.coefficients[~folds], free.coefficients[~folds])
+    assert (np.asarray(best.frame_rms)[folds] > np.asarray(free.frame_rms)[folds]).all()
+    assert best.rms_unconstrained == pytest.approx(float(free.rms))
+
+
+RIVALS = {
+    "table": zj.TableZoom(),
+    "spline": zj.SplineZoom(4),
+    "two regions": zj.TwoRegionZoom(35.0),
+    "power law": zj.PowerZoom(),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("terms", [1, 2])
+@pytest.mark.parametrize("model", RIVALS.values(), ids=RIVALS)
+def test_rivals_become_invertible_too(model, terms, folding):
+    lines = zj.compress(folding, terms)
+    free = zj.fit_zoom(lines, zoom=model, terms=terms, invertible=False)
+    best = zj.fit_zoom(lines, zoom=model, terms=terms)
+    assert free.result == RESULTS.folded
+    assert best.result == RESULTS.constrained
+    assert best.certificate.certified
+    assert free.rms < best.rms < (1.05 if terms == 2 else 5) * free.rms
+
+
+def test_models_without_pieces_are_left_as_they_are(folding):
+    fit = zj.fit_zoom(zj.compress(folding, 1), zoom=SomeZoom(), terms=1)
+    assert fit.result == RESULTS.folded
+    assert fit.certificate.slope < 0
+
+
+@pytest.mark.slow
+def test_robust_fits_are_invertible_unless_asked_not_to_be(lines):
+    assert zj.fit_robust(lines).fit.result == RESULTS.constrained
+    assert zj.fit_robust(lines, invertible=False).fit.result == RESULTS.folded
+
+
+@pytest.mark.slow
+def test_full_tensors_give_the_same(folding, best):
+    full = zj.fit_zoom(folding)
+    np.testing.assert_allclose(parameters(full), parameters(best), rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_float32(folding, best):
+    single = jax.tree.map(
+        lambda a: jnp.asarray(a, jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a, folding
+    )
+    fit = zj.fit_zoom(zj.compress(single))
+    assert fit.result == RESULTS.constrained
+    assert fit.certificate.certified
+    assert fit.lens.zoom.parameters.dtype == jnp.float32
+    assert float(fit.rms) == pytest.approx(float(best.rms), rel=1e-5)
+
+
+# Under a trace, where both ways are compiled
+
+
+@pytest.fixture(scope="module")
+def barrel():
+    """A barrel that folds, one distortion for all focal lengths, in few lines and points."""
+    zoom = zj.PolynomialZoom(0, jnp.array([[-0.44]]), jnp.asarray(20.0))
+    lens = zj.ZoomLens(zoom, jnp.asarray(CENTRE), jnp.array([20.0, 80.0]), SIZE)
+    return distorted_lines(lens, FOCAL[:1], offset=150.0, noise=0.5, reach=0.4, number=4, points=5)
+
+
+@pytest.mark.slow
+def test_differentiable_with_respect_to_the_points(barrel):
+    """Where the slope is forced to be what it is it stays; the rest moves as with finite steps."""
+
+    def fitted(points):
+        small = zj.compress(moved(barrel, points), 2)
+        return 100 * zj.fit_zoom(small, zoom=zj.PolynomialZoom(0)).lens.zoom.parameters.ravel()
+
+    fit = zj.fit_zoom(zj.compress(barrel), zoom=zj.PolynomialZoom(0))
+    assert fit.result == RESULTS.constrained
+    np.testing.assert_allclose(jax.jit(fitted)(barrel.points), 100 * parameters(fit).ravel(), rtol=1e-7)
+    assert_derivatives_agree(fitted, barrel.points, step=1e-2, rtol=1e-4)
