@@ -56,9 +56,11 @@ class ZoomFit(eqx.Module):
         rms: root of the global energy (eq. 13), px of the corrected image.
         frame_rms: root of each frame's error (eq. 3), px.
         covariance: of the zoom model's parameters in normalised units, flattened row by row (for a
-            polynomial: all terms of power 0, then of power 1, ...). Points are taken to have independent
-            errors of one size, estimated from the residuals. An undetermined parameter has infinite
-            variance and zero covariances.
+            polynomial: all terms of power 0, then of power 1, ...). Lines are taken to have independent
+            errors, points of a line are not: it is the line-by-line sandwich of the residuals, its shape
+            shrunk to what independent points would give by as much as its own scatter demands. Where
+            there are too few lines for that, points are taken to be independent. An undetermined
+            parameter has infinite variance and zero covariances.
         result: how the fit ended; ``RESULTS[fit.result]`` is a sentence.
         steps: number of steps the solver took.
     """
@@ -287,7 +289,7 @@ def _fit_zoom(lines, start, zoom, terms, solver, max_steps):
     zoom, result, steps = _minimise(lines, zoom, solver, max_steps)
     weighted, jacobian = linearised(lines, zoom)
     errors = energy_by_frame(lines, weighted)
-    covariance, determined = parameter_covariance(lines, zoom, jacobian, jnp.mean(errors))
+    covariance, determined = parameter_covariance(lines, zoom, weighted, jacobian)
     fit = ZoomFit(
         lens=lens_of(lines, zoom),
         rms=jnp.sqrt(jnp.mean(errors)),

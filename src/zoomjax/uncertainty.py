@@ -1,7 +1,15 @@
 """How well the lines determine the parameters of a zoom model.
 
-Covariance of the parameters from the Jacobian of the residuals, and which of them the lines do not
+Covariance of the parameters from the residuals and their Jacobian, and which of them the lines do not
 determine at all; work of one or two iterations of the fit, once after it.
+
+Neighbouring points of an edge err together, and lines that are not quite straight bend as a whole: points
+are not independent, lines are taken to be. What a line as a whole pulls at the parameters with is its score
+``g_l = J_l^T r_l``, the same from its compressed rows, and the squares of the scores are the line-by-line
+sandwich ``H^-1 (sum_l g_l g_l^T) H^-1``. By itself it is as uncertain as the few lines are few that decide a
+parameter, and too small; so it is drawn towards the shape that independent points would give, as far as its
+own scatter demands (Ledoit and Wolf 2004). Measured coverages of this and of what was tried instead are in
+docs/trust.md.
 """
 
 import jax
@@ -17,19 +25,26 @@ from .zoom import AbstractZoom, with_parameters
 def parameter_covariance(
     lines: AbstractLines,
     zoom: AbstractZoom,
+    weighted: Float[Array, "line rows"],
     jacobian: Float[Array, "line rows parameter"],
-    energy: Float[Array, ""],
 ) -> tuple[Float[Array, "parameter parameter"], Bool[Array, ""]]:
     """Covariance of the flattened parameters, and whether the lines determine them all.
 
-    For the weights w of eq. 13, which are not the inverse variances, the covariance is the sandwich
-    ``sigma^2 (J^T W J)^-1 (J^T W^2 J) (J^T W J)^-1``. It is made from the triangles of J and of the
-    weighted J: the normal equations would square the condition number, which float32 has no room for.
+    Were points independent, with errors of one size, it would be the sandwich of the weights w of eq. 13,
+    ``A = sigma^2 (J^T W J)^-1 (J^T W^2 J) (J^T W J)^-1``, with sigma from the residuals and their degrees of
+    freedom. It is made from the triangles of J and of the weighted J: the normal equations would square
+    the condition number, which float32 has no room for. `_between_lines` then puts lines for points.
 
     A parameter is *undetermined* where moving it changes the residuals by less than twice what noise in
     the points alone would feign: each point's error appears in the derivative by k_j, times r^(2j). (Lines
     through the centre have nothing else there, and would otherwise seem to determine k from their noise.)
+
+    Args:
+        lines: what was fitted.
+        zoom: the fitted model.
+        weighted, jacobian: the residuals, times the root of their weights, and their derivatives.
     """
+    energy = jnp.sum(weighted**2)
     weights = line_weights(lines)
     triangle, outer = (
         jnp.linalg.qr(rows.reshape(-1, rows.shape[-1]), mode="r")
@@ -54,11 +69,51 @@ def parameter_covariance(
     spread = outer @ inverse
     freedom = jnp.sum(weights * (lines.counts - 2)) - jnp.sum(spread**2)
     undetermined = undetermined | (freedom <= 0)  # nothing is left over to tell the noise by
-    half = inverse @ spread.T
-    covariance = energy / jnp.where(freedom > 0, freedom, 1) * (half @ half.T)
+    independent = energy / jnp.where(freedom > 0, freedom, 1) * (spread.T @ spread)
+    terms = jax.eval_shape(zoom, lines.focal[0]).shape[0]
+    scores = terms * jnp.sum(weights > 0) - jnp.sum(good)
+    whole = _of_whole_lines(weights, weighted, jacobian @ inverse, independent, scores)
+    covariance = inverse @ whole @ inverse.T
     either = undetermined[:, None] | undetermined[None]
     infinite = jnp.where(jnp.eye(size.shape[0], dtype=bool), jnp.inf, 0)
     return jnp.where(either, infinite, covariance), ~jnp.any(undetermined)
+
+
+def _of_whole_lines(weights, weighted, jacobian, independent, scores):
+    """The covariance from the scores of whole lines, of parameters in which ``J^T J`` is the identity.
+
+    A line draws the fit to itself: its score is divided by ``sqrt(1 - h)``, h being its leverage along the
+    score (Bell and McCaffrey 2002 have a matrix there). Of the sum S of the squares the trace is kept, c
+    times that of `independent`: n points of a line count as n/c independent ones. The shape of S is
+    shrunk to that of `independent` by the part of their difference that the scatter of the scores explains.
+
+    c has nu degrees of freedom, few where a few long lines at the border decide all, and no more than
+    `scores`, the number of them less the parameters. Its own uncertainty is added, ``2 max(c, 1) / nu``, so
+    that two standard deviations keep their meaning. With none left, `independent` is all that is known.
+    """
+    leverage = jnp.einsum("lri,lrj->lij", jacobian, jacobian)
+    score = jnp.einsum("lri,lr->li", jacobian, weighted)
+    length = jnp.sum(score**2, axis=1)
+    along = jnp.einsum("li,lij,lj->l", score, leverage, score) / jnp.where(length > 0, length, 1)
+    kept = jnp.maximum(1 - along, 0.01)  # a line that alone decides a parameter says nothing of its noise
+    score, length = score / jnp.sqrt(kept)[:, None], length / kept
+    total = score.T @ score
+    c = jnp.sum(length) / _positive(jnp.trace(independent))
+    apart = jnp.sum((total - c * independent) ** 2)
+    by_chance = jnp.sum(length**2) - jnp.sum(total**2) / jnp.sum(weights > 0)
+    shrink = jnp.clip(by_chance / _positive(apart), 0, 1)
+    shape = shrink * independent + (1 - shrink) * total / _positive(c)
+
+    share = weights[:, None, None] * leverage
+    nu = jnp.trace(jnp.sum(share, axis=0)) ** 2 / _positive(jnp.sum(share**2))
+    nu = jnp.minimum(nu, scores)
+    size = c + 2 * jnp.maximum(c, 1) / _positive(nu)
+    return jnp.where((nu > 0) & (c > 0), size * shape, independent)
+
+
+def _positive(value):
+    """A divisor: the value, or 1 where it is not positive."""
+    return jnp.where(value > 0, value, 1)
 
 
 def _feigned(lines, zoom, weights, energy):
