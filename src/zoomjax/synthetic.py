@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt8
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, UInt8
 
 from ._types import AnyArray
 from .lens import ZoomLens
@@ -132,6 +132,33 @@ def board_lines(
                     points.append(line + error.astype(line.dtype))
                     frame.append(index)
     return Lines.from_ragged(points, frame, focal, image_size=lens.image_size, focal_unit=lens.focal_unit)
+
+
+def with_noise(
+    lines: Lines, key: PRNGKeyArray, *, std: Float[AnyArray, "line"] | float, correlation: float = 0.0
+) -> Lines:
+    """The lines with Gaussian errors in their points; for `jax.vmap` and `jax.lax.map` over many draws.
+
+    Args:
+        lines: the lines.
+        key: of `jax.random`.
+        std: standard deviation, px, of each coordinate of each point; of all lines, or of each.
+        correlation: of the error of a point with that of the next on its line, from 0 to less than 1. With
+            0.8 an edge of many points is known as well as from a ninth of them, were they independent.
+    """
+    fresh = jax.random.normal(key, lines.points.shape, jnp.asarray(lines.points).dtype)
+    share = math.sqrt(1 - correlation**2)
+
+    def follow(before, new):
+        error = correlation * before + share * new
+        return error, error
+
+    along = jnp.swapaxes(fresh, 0, 1)
+    _, error = jax.lax.scan(follow, along[0], along[1:])
+    error = jnp.swapaxes(jnp.concatenate([along[:1], error]), 0, 1)
+    size = jnp.broadcast_to(jnp.asarray(std, error.dtype), lines.frame.shape)[:, None, None]
+    points = lines.points + jnp.where(lines.mask[..., None], size * error, 0)
+    return eqx.tree_at(lambda data: data.points, lines, points)
 
 
 @eqx.filter_jit
