@@ -182,8 +182,9 @@ def _each_point(function, result, fit, points, focal):
     points, focal = jnp.asarray(points, dtype), jnp.asarray(focal, dtype)
     if points.shape[-1:] != (2,):
         raise ValueError(f"Argument points must have shape (..., 2), but its shape is {points.shape}.")
+    both = jnp.broadcast_shapes(points.shape[:-1], focal.shape)
     over = jnp.vectorize(lambda *one: function(fit, *one), signature=f"(c),()->{result}")
-    return over(points, focal)
+    return over(jnp.broadcast_to(points, (*both, 2)), jnp.broadcast_to(focal, both))
 
 
 def _point_covariance(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 2"]:
@@ -204,8 +205,8 @@ def _point_covariance(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 2"]:
 def _variance(covariance, rows):
     """The diagonal of ``rows C rows^T``, infinite where a row uses a parameter of infinite variance."""
     finite = jnp.einsum("...p,pq,...q->...", rows, _finite(covariance), rows)
-    uses = jnp.any((rows != 0) & jnp.isinf(jnp.diagonal(covariance)), axis=-1)
-    return jnp.where(uses, jnp.inf, jnp.maximum(finite, 0))
+    unknown = jnp.isinf(jnp.diagonal(covariance)).astype(rows.dtype)
+    return jnp.where((rows != 0).astype(rows.dtype) @ unknown > 0, jnp.inf, jnp.maximum(finite, 0))
 
 
 def _finite(covariance):

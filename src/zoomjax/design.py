@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .bands import displacement_std
 from .energy import line_residuals, line_weights
@@ -112,10 +112,12 @@ def suggest_next(
             f"{focal_range!r}."
         )
     focals = np.unique(1 / np.linspace(1 / low, 1 / high, _FOCALS))
-    typical = _typical(lines)
-    now, table = _bands(fit, lines, jnp.asarray(focals, fit.covariance.dtype), typical)
-    points, grid = _image_grid(fit.lens.image_size), jnp.asarray(focals, fit.covariance.dtype)
-    before = float(jnp.max(displacement_std(fit, points[:, None], focal=grid)))
+    number, length, counts = _typical(lines)
+    dtype = fit.covariance.dtype
+    candidates = jnp.asarray(candidate_lines(fit.lens.image_size, length), dtype)
+    grid = jnp.asarray(focals, dtype)
+    now, table = _bands(fit, lines, candidates, grid, jnp.asarray(number), jnp.asarray(counts))
+    before = float(jnp.max(displacement_std(fit, _image_grid(fit.lens.image_size)[:, None], focal=grid)))
     # What was measured of the noise is in `before`; how a photo changes it is the ratio.
     table = before * (np.asarray(table) / float(now)) if np.isfinite(before) else np.asarray(table)
     at_focal, _, in_direction = np.unravel_index(np.argmin(table), table.shape)
@@ -148,52 +150,47 @@ def _named(stds, region):
 
 def _typical(lines):
     """Of the lines there are: how many a frame, how long (px) and of how many points, the medians."""
-    there = np.asarray(line_weights(lines)) > 0
-    counts = np.asarray(lines.counts)[there]
-    zero = jnp.zeros((lines.frame.shape[0], 1), lines.focal.dtype)
-    squares = np.asarray(jnp.sum(lines.corrected(zero) ** 2, axis=(1, 2)))[there]
+    weights, counts, squares = (np.asarray(array) for array in _sizes(lines))
+    there = weights > 0
     per_frame = np.bincount(np.asarray(lines.frame)[there])
-    length = np.sqrt(12 * squares / counts)  # of points spread evenly
-    return tuple(
-        jnp.asarray(np.median(values), lines.focal.dtype) for values in (per_frame, length, counts)
-    )
-
-
-def candidate_lines(
-    fit: ZoomFit, focal: Float[Array, ""], length: Float[Array, ""]
-) -> Float[Array, "region direction line point 2"]:
-    """Lines of the scene through each part of the image, level and upright, as the lens would show them.
-
-    Three lines across each part, 25 points each, `length` px where the image is as wide; NaN where a point
-    would fall outside of it.
-    """
-    size = jnp.asarray(fit.lens.image_size, length.dtype)
-    distortion = fit.lens(focal)
-    along = jnp.linspace(-0.5, 0.5, 25, dtype=length.dtype) * length
-
-    def seen(region, direction, line):
-        column_row = jnp.stack([region % 3, region // 3])
-        across = jnp.arange(2) != direction
-        middle = size * (2 * column_row + 1 + jnp.where(across, line, 0)) / 6 - 0.5
-        reach = jnp.where(across, 0, jnp.minimum(length, size) / 2)
-        middle = jnp.clip(middle, reach, size - 1 - reach)
-        step = along[:, None] * jnp.where(across, 0, 1)[None]
-        points = distortion.distort(distortion.undistort(middle)[None] + step)
-        inside = jnp.all((points >= 0) & (points <= size[None] - 1), axis=1)
-        return jnp.where(inside[:, None], points, jnp.nan)
-
-    lines = jnp.asarray([-0.67, 0.0, 0.67], length.dtype)
-    over = jax.vmap(jax.vmap(jax.vmap(seen, (None, None, 0)), (None, 0, None)), (0, None, None))
-    return over(jnp.arange(9), jnp.arange(2), lines)
+    length = np.sqrt(12 * squares[there] / counts[there])  # of points spread evenly
+    return tuple(float(np.median(values)) for values in (per_frame[per_frame > 0], length, counts[there]))
 
 
 @eqx.filter_jit
-def _bands(fit, lines, focals, typical):
+def _sizes(lines):
+    unchanged = lines.corrected(jnp.zeros((lines.frame.shape[0], 1), lines.focal.dtype))
+    return line_weights(lines), lines.counts, jnp.sum(unchanged**2, axis=(1, 2))
+
+
+def candidate_lines(
+    image_size: tuple[int, int], length: float
+) -> Float[np.ndarray, "region direction line point 2"]:
+    """Lines through each part of the image, level and upright: three across each, 25 points on each.
+
+    They are `length` px long, or as long as the image; moved along themselves to lie within it.
+    """
+    size = np.array(image_size, float)
+    steps = np.linspace(-0.5, 0.5, 25)
+    lines = np.empty((len(_REGIONS), len(_DIRECTIONS), 3, 25, 2))
+    for region, direction, line in np.ndindex(lines.shape[:3]):
+        along, across = direction, 1 - direction  # 0 is x
+        parts = np.array([region % 3, region // 3]) + 0.5
+        parts[across] += (line - 1) / 3
+        middle = size * parts / 3 - 0.5
+        reach = min(length, size[along] - 1) / 2
+        middle[along] = np.clip(middle[along], reach, size[along] - 1 - reach)
+        lines[region, direction, line] = middle
+        lines[region, direction, line, :, along] += 2 * reach * steps
+    return lines
+
+
+@eqx.filter_jit
+def _bands(fit, lines, candidates, focals, number, counts):
     """The largest standard deviation of the displacement now, and with each candidate.
 
-    For independent points; of `typical` the number of lines a frame, their length and number of points.
+    For independent points, and candidates with so many lines of so many points.
     """
-    number, length, counts = typical
     zoom = fit.lens.zoom
     flat, unravel = ravel_pytree(zoom.parameters)
     weights, frames = line_weights(lines), lines.focal.shape[0]
@@ -213,35 +210,24 @@ def _bands(fit, lines, focals, typical):
 
     def of_line(points, focal):
         """Mean over a line's points of the squared derivatives of their residuals."""
-        inside = jnp.isfinite(points[:, 0])
-        share = inside / jnp.maximum(jnp.sum(inside), 1)
-        points = jnp.where(inside[:, None], points, 0)
 
         def residuals(flat):
             lens = eqx.tree_at(lambda lens: lens.zoom, fit.lens, with_parameters(zoom, unravel(flat)))
             corrected = lens(focal).undistort(points)
-            centred = corrected - (share @ corrected)[None]
-            return line_residuals(jnp.where(inside[:, None], centred, 0))
+            return line_residuals(corrected - jnp.mean(corrected, axis=0)[None])
 
         derivative = jax.jacfwd(residuals)(flat)
-        return derivative.T @ derivative / jnp.maximum(jnp.sum(inside), 1), jnp.mean(inside)
+        return derivative.T @ derivative / points.shape[0]
 
     def with_photo(points, focal):
         """A frame more: eq. 13 gives it the weight of one, and its lines and points equal shares."""
-        squared, inside = jax.vmap(of_line, (0, None))(points, focal)
-        of_points = squared / jnp.where(inside > 0, inside, 1)[:, None, None]
-        old = frames / (frames + 1)
-        more = jnp.mean(squared, axis=0) / (frames + 1)
-        more_noise = jnp.mean(of_points, axis=0) / ((frames + 1) ** 2 * number * counts)
-        return largest(old * information + more, old**2 * noise + more_noise)
+        squared = jnp.mean(jax.vmap(of_line, (0, None))(points, focal), axis=0)
+        old, new = frames / (frames + 1), 1 / (frames + 1)
+        more_noise = new**2 / (number * counts) * squared
+        return largest(old * information + new * squared, old**2 * noise + more_noise)
 
-    def at_focal(focal):
-        candidates = candidate_lines(fit, focal, length)
-        shape = candidates.shape
-        return jax.lax.map(lambda photo: with_photo(photo, focal), candidates.reshape(-1, *shape[2:]))
-
-    table = jax.lax.map(at_focal, focals)
-    return largest(information, noise), table.reshape(focals.shape[0], len(_REGIONS), len(_DIRECTIONS))
+    over = jax.vmap(jax.vmap(jax.vmap(with_photo, (0, None)), (0, None)), (None, 0))
+    return largest(information, noise), over(candidates, focals)
 
 
 def _displacement_rows(fit, flat, unravel, focals):

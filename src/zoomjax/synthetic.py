@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, ScalarLike, UInt8
 
 from ._types import AnyArray
 from .lens import ZoomLens
@@ -135,7 +135,11 @@ def board_lines(
 
 
 def with_noise(
-    lines: Lines, key: PRNGKeyArray, *, std: Float[AnyArray, "line"] | float, correlation: float = 0.0
+    lines: Lines,
+    key: PRNGKeyArray,
+    *,
+    std: Float[AnyArray, "line"] | ScalarLike,
+    correlation: ScalarLike = 0.0,
 ) -> Lines:
     """The lines with Gaussian errors in their points; for `jax.vmap` and `jax.lax.map` over many draws.
 
@@ -147,7 +151,8 @@ def with_noise(
             0.8 an edge of many points is known as well as from a ninth of them, were they independent.
     """
     fresh = jax.random.normal(key, lines.points.shape, jnp.asarray(lines.points).dtype)
-    share = math.sqrt(1 - correlation**2)
+    correlation = jnp.asarray(correlation, fresh.dtype)
+    share = jnp.sqrt(1 - correlation**2)
 
     def follow(before, new):
         error = correlation * before + share * new
