@@ -4,6 +4,11 @@ from .algebraic import algebraic_frames as algebraic_frames
 from .algebraic import algebraic_zoom as algebraic_zoom
 from .any_centre import AnyCentreLines as AnyCentreLines
 from .any_centre import compress_any_centre as compress_any_centre
+from .bands import coefficient_std as coefficient_std
+from .bands import displacement_band as displacement_band
+from .bands import displacement_covariance as displacement_covariance
+from .bands import displacement_std as displacement_std
+from .bands import std_of as std_of
 from .centre import CentreFit as CentreFit
 from .centre import FrameCentres as FrameCentres
 from .centre import fit_centre as fit_centre
@@ -13,6 +18,8 @@ from .certificate import certify as certify
 from .compression import CompressedLines as CompressedLines
 from .compression import compress as compress
 from .compression import merge as merge
+from .design import Suggestion as Suggestion
+from .design import suggest_next as suggest_next
 from .energy import frame_energy as frame_energy
 from .energy import global_energy as global_energy
 from .energy import residuals as residuals

@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,9 @@ from jaxtyping import Float
 
 from ._types import AnyArray
 from .algebraic import algebraic_zoom
+from .bands import displacement_std
 from .compression import compress
+from .design import Suggestion, suggest_next
 from .fit import RESULTS, FrameFits, ZoomFit, fit_frames, fit_zoom, frame_rms
 from .lines import Lines
 from .plot import plot_model
@@ -39,6 +41,7 @@ class Calibration:
         each: every frame by itself.
         none, algebraic: each frame's RMS, px, without correction and with the algebraic estimate.
         rejected: which lines count nothing, being not straight in the scene.
+        next: the photo that would help most.
     """
 
     lines: Lines
@@ -47,6 +50,24 @@ class Calibration:
     none: np.ndarray
     algebraic: np.ndarray
     rejected: np.ndarray
+    next: Suggestion
+
+    def corner(self) -> list[tuple[float, float, float]]:
+        """Focal lengths at both ends of the range and in its middle, and what becomes of a corner there.
+
+        With each the displacement away from the centre, px, of the corner farthest from it, and its
+        standard deviation.
+        """
+        lens = self.zoom.lens
+        low, high = (float(f) for f in lens.focal_range)
+        centre = np.asarray(lens.centre)
+        last = np.array(lens.image_size) - 1
+        corner = np.where(centre > last / 2, 0.0, last)
+        focal = [low, *([float(np.sqrt(low * high)), high] if high > low else [])]
+        std = np.asarray(displacement_std(self.zoom, corner, focal=np.array(focal)))
+        corrected = [np.asarray(lens(f).undistort(corner)) for f in focal]
+        moved = [np.hypot(*(point - centre)) - np.hypot(*(corner - centre)) for point in corrected]
+        return list(zip(focal, map(float, moved), std.tolist(), strict=True))
 
     def rows(self) -> list[tuple[str, np.ndarray]]:
         """The lines of a table like the paper's Table 1: what was done, and each frame's RMS, px."""
@@ -106,6 +127,17 @@ class Calibration:
             "warnings": self.warnings(),
             "pixel_polynomials": self.pixel_polynomials().tolist(),
             "parameters": np.asarray(lens.zoom.parameters).tolist(),
+            "corner_displacement": [
+                {"focal": f, "px": moved, "std": _finite([std])[0]} for f, moved, std in self.corner()
+            ],
+            "next_photo": {
+                "focal": self.next.focal,
+                "direction": self.next.direction,
+                "region": self.next.region,
+                "displacement_std": _finite([self.next.before])[0],
+                "displacement_std_with_it": _finite([self.next.after])[0],
+                "sentence": self.next.sentence,
+            },
             "parameter_sigma": _finite(np.sqrt(np.diag(np.asarray(self.zoom.covariance)))),
             "per_frame": [dict(zip(fits, row, strict=True)) for row in zip(*fits.values(), strict=True)],
             "versions": {
@@ -183,6 +215,7 @@ def calibrate(
         none=np.asarray(frame_rms(small, None)),
         algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=model, terms=terms))),
         rejected=rejected,
+        next=suggest_next(zoom, small),
     )
 
 
@@ -216,6 +249,6 @@ def results_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
-def _finite(values: np.ndarray) -> list[float | None]:
+def _finite(values: Iterable[float]) -> list[float | None]:
     """JSON has no infinity: None says that a value is not determined."""
     return [float(v) if np.isfinite(v) else None for v in values]

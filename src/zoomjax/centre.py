@@ -26,6 +26,7 @@ from .certificate import certify
 from .fit import RESULTS, FrameFits, Solver, ZoomFit, collected, fit_zoom, linearised, minimise
 from .lens import ZoomLens
 from .lines import Lines
+from .uncertainty import parameter_covariance
 from .zoom import AbstractZoom, PolynomialZoom, with_parameters
 
 _MOST_UNCERTAIN = 0.05
@@ -193,7 +194,7 @@ def _fit_frame_centres(lines, chosen, present, terms, solver, max_steps):
 def _search(lines, start, solver, max_steps):
     """The joint minimum, or the start where the centre found is not to be believed."""
     found, _, _ = minimise(lines, start, solver, max_steps)
-    covariance = _covariance(*linearised(lines, found))
+    covariance, _ = parameter_covariance(lines, found, *linearised(lines, found), extra=2)
 
     def offsets(parameters):
         centre = with_parameters(found, parameters).parts()[1]
@@ -209,24 +210,6 @@ def _search(lines, start, solver, max_steps):
         lambda new, old: jnp.where(determined, new, old), found.parameters, start.parameters
     )
     return with_parameters(found, parameters), covariance, lines.scale * std, determined
-
-
-def _covariance(weighted, jacobian):
-    """Of all parameters, from how much the lines pull apart: errors along one line may go together.
-
-    The sandwich ``H^-1 (sum_l g_l g_l^T) H^-1`` with ``H = J^T J`` and a line's pull ``g_l = J_l^T r_l``.
-    What the lines do not determine gets an enormous variance.
-    """
-    triangle = jnp.linalg.qr(jacobian.reshape(-1, jacobian.shape[-1]), mode="r")
-    size = jnp.linalg.norm(triangle, axis=0)
-    size = jnp.where(size > 0, size, 1)
-    _, values, right = jnp.linalg.svd(triangle / size[None])
-    reciprocal = 1 / jnp.maximum(values, jnp.finfo(values.dtype).eps)
-    inverse = (right.T * reciprocal[None] ** 2) @ right / size[:, None] / size[None]
-    pulls = jnp.einsum("lrp,lr->lp", jacobian, weighted) @ inverse
-    number = jnp.sum(jnp.any(weighted != 0, axis=1))
-    spare = jnp.maximum(number - size.shape[0], 1)
-    return number / spare * pulls.T @ pulls
 
 
 def _lens(

@@ -508,6 +508,9 @@ def _show(calibration: "Calibration", magnification: Callable[[float], float] | 
         powers = ["", *(f" /f{'' if j == 1 else f'^{j}'}" for j in range(1, len(column)))]
         terms = " ".join(f"{value:+.4e}{power}" for value, power in zip(column, powers, strict=True))
         console.print(f"k{i}(f) = {terms}   px^-{2 * i}", highlight=False)
+    corner = [f"{moved:+.2f} ± {std:.2g} px at {f:.4g} {unit}" for f, moved, std in calibration.corner()]
+    console.print(f"\nCorrected, a corner moves by {', '.join(corner)}.", highlight=False)
+    console.print(calibration.next.sentence, highlight=False)
 
 
 def _show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()) -> None:

@@ -75,10 +75,12 @@ class ZoomFit(eqx.Module):
         rms: root of the global energy (eq. 13), px of the corrected image.
         frame_rms: root of each frame's error (eq. 3), px.
         covariance: of the zoom model's parameters in normalised units, flattened row by row (for a
-            polynomial: all terms of power 0, then of power 1, ...). Points are taken to have independent
-            errors of one size, estimated from the residuals. An undetermined parameter has infinite
-            variance and zero covariances.
-            variance and zero covariances. What invertibility forbids is not taken into account.
+            polynomial: all terms of power 0, then of power 1, ...). Lines are taken to have independent
+            errors, points of a line are not: it is the line-by-line sandwich of the residuals, its shape
+            shrunk to what independent points would give by as much as its own scatter demands. Where
+            there are too few lines for that, points are taken to be independent. An undetermined
+            parameter has infinite variance and zero covariances. What invertibility forbids is not taken
+            into account.
         result: how the fit ended; ``RESULTS[fit.result]`` is a sentence.
         steps: number of steps the solver took.
         certificate: whether the lens is invertible over its image and focal range.
@@ -326,7 +328,7 @@ def _described(lines, zoom, result, steps):
     """A fitted zoom model with all that is to be said of it."""
     weighted, jacobian = linearised(lines, zoom)
     errors = energy_by_frame(lines, weighted)
-    covariance, determined = parameter_covariance(lines, zoom, jacobian, jnp.mean(errors))
+    covariance, determined = parameter_covariance(lines, zoom, weighted, jacobian)
     lens, rms = lens_of(lines, zoom), jnp.sqrt(jnp.mean(errors))
     certificate = certificate_of(zoom, lens.centre, lens.focal_range, lens.image_size)
     return ZoomFit(

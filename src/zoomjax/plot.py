@@ -10,6 +10,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from .bands import coefficient_std
 from .centre import FrameCentres
 from .fit import FrameFits, ZoomFit
 from .lens import ZoomLens
@@ -22,7 +23,8 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
     """The distortion coefficients against 1/f: each frame by itself, and the zoom model (Figure 8).
 
     Below each coefficient stands by how much the frames differ from the model, with bars of one standard
-    deviation of the frame's own fit; frames whose lines do not determine it have no dot.
+    deviation of the frame's own fit; frames whose lines do not determine it have no dot. Around the model
+    are shaded one and two of its standard deviations, where the lines determine it.
 
     Args:
         zoom: the fitted zoom model.
@@ -43,6 +45,7 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
         )
 
     curve, expected = model(1 / grid), model(focal)
+    spread = np.asarray(coefficient_std(zoom, 1 / grid)) * to_pixel
     figure = Figure(figsize=(4.8 * terms, 5.2), layout="constrained")
     figure.suptitle(
         f"RMS {float(zoom.rms):.3f} px by the zoom model, {float(each.rms):.3f} px frame by frame",
@@ -54,11 +57,13 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
         x, unit = 1 / focal[known], f"px$^{{-{2 * i + 2}}}$"
         above.plot(x, frames[known, i], "o", markersize=3.5, color=_FRAMES, label="each frame by itself")
         above.plot(grid, curve[:, i], color=_MODEL, linewidth=1.8, label="zoom model")
+        _shade(above, grid, curve[:, i], spread[:, i])
         _label(above, f"$k_{i + 1}$", unit, curve[:, i])
         difference = frames[known, i] - expected[known, i]
         below.errorbar(
             x, difference, sigma[known, i], fmt="o", markersize=2.5, linewidth=0.9, color=_FRAMES
         )
+        _shade(below, grid, 0, spread[:, i])
         _label(below, "frame − model", unit, np.append(difference, sigma[known, i]))
         below.axhline(0, color=_MODEL, linewidth=1.2, zorder=0)
         below.set_xlabel(f"$1/f$  (1/{lens.focal_unit})")
@@ -159,6 +164,22 @@ def plot_centres(centres: FrameCentres, lines: AbstractLines) -> Figure:
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
     return figure
+
+
+def _shade(axes: Axes, x: np.ndarray, middle: np.ndarray | float, std: np.ndarray) -> None:
+    """The bands of one and of two standard deviations, the inner one darker."""
+    if not np.isfinite(std).all():
+        return
+    for times, label in ((2, "±1 and ±2 standard deviations"), (1, None)):
+        axes.fill_between(
+            x,
+            middle - times * std,
+            middle + times * std,
+            color=_MODEL,
+            alpha=0.16,
+            linewidth=0,
+            label=label,
+        )
 
 
 def _label(axes: Axes, quantity: str, unit: str, values: np.ndarray) -> None:
