@@ -188,10 +188,10 @@ def coverage(draws: int) -> Table:
     return Table(
         "Coverage of the corner's displacement",
         f"{draws} draws. Per cent of them in which the truth is within 1 and within 1.96 standard "
-        "deviations (68.3 and 95 are right), mean over the two ends and the middle of the focal "
-        "range, with its Monte-Carlo error: by `fit.covariance`, and by two that were not chosen. Bias is "
-        f"the mean error, in standard deviations, where it is largest (known to {draws**-0.5:.2f}): the shrinkage "
-        "of the paper's metric, which no covariance knows of.",
+        "deviations (68.3 and 95 are right), mean over the two ends and the middle of the focal range, "
+        "with its Monte-Carlo error: by `fit.covariance`, and by two that were not chosen. Bias is the "
+        f"mean error, in standard deviations, where it is largest (known to {draws**-0.5:.2f}): the "
+        "shrinkage of the paper's metric, which no covariance knows of.",
         ["scene", "noise", *COVARIANCES, "bias"],
         rows,
         data,

@@ -2,7 +2,6 @@
 
 import json
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -41,9 +40,9 @@ def central(lens):
     """At focal lengths over the whole range, lines in the middle of the image only."""
     lines, frame = [], []
     focal = synthetic.focal_sweep(5)
-    t = np.linspace(-60, 60, 40)
+    t = np.linspace(-110, 110, 40)
     for index, f in enumerate(focal):
-        for offset in (-60.0, -35.0, 35.0, 60.0):
+        for offset in (-110.0, -60.0, 60.0, 110.0):
             for straight in ((t, np.full(40, offset)), (np.full(40, offset), t)):
                 seen = lens(f).distort(np.stack(straight, -1) + np.asarray(lens.centre))
                 lines.append(noisy(np.asarray(seen), len(lines)))
@@ -58,18 +57,22 @@ def test_photos_at_the_wide_end_want_one_at_the_long_end(wide):
     assert "f = 127.4 mm" in suggestion.sentence
 
 
-def test_lines_in_the_middle_want_some_in_the_corners(central):
+def test_lines_in_the_middle_want_some_at_the_border(central):
+    """Upright lines along the left or right edge, or through the corners, which is nearly as good."""
     suggestion = zj.suggest_next(*fitted(central))
-    assert suggestion.region == "the corners"
+    assert suggestion.region in ("the left or right edge", "the corners")
     assert suggestion.table.shape == (5, 9, 2)
-    middle = suggestion.table[:, suggestion.regions.index("the middle")]
-    assert suggestion.after < 0.7 * middle.min()
+    in_part = dict(zip(suggestion.regions, suggestion.table.min(axis=(0, 2)), strict=True))
+    assert suggestion.after < 0.7 * in_part["the middle"]
+    for name, std in in_part.items():
+        assert std < 1.1 * suggestion.after if "corner" in name else std > 0.99 * suggestion.after
 
 
-def largest_std(fit, focals):
-    x, y = (np.linspace(0, side - 1, 5) for side in SIZE)
+def mean_std(fit, focals):
+    """The geometric mean over image and range."""
+    x, y = (np.linspace(0, side - 1, 6) for side in SIZE)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
-    return float(jnp.max(zj.displacement_std(fit, points, focal=focals)))
+    return float(jnp.exp(jnp.mean(jnp.log(zj.displacement_std(fit, points, focal=focals)))))
 
 
 @pytest.mark.parametrize("scene", ["wide", "central"])
@@ -97,11 +100,10 @@ def test_adding_what_is_suggested_helps_more_than_adding_others(scene, lens, req
             [*np.asarray(lines.focal), suggestion.focals[at[0]]],
             image_size=SIZE,
         )
-        found[at] = (largest_std(fitted(both)[0], suggestion.focals), float(suggestion.table[at]))
+        found[at] = (mean_std(fitted(both)[0], suggestion.focals), float(suggestion.table[at]))
     real, predicted = np.array(list(found.values())).T
-    assert real[np.argmin(predicted)] == pytest.approx(min(real), rel=0.05)
-    assert min(real) < 0.8 * np.sort(real)[1] or np.sort(predicted)[1] < 1.3 * min(predicted)
-    np.testing.assert_allclose(real, predicted, rtol=0.35)  # the noise of each is estimated anew
+    assert np.argmin(real) == np.argmin(predicted)
+    np.testing.assert_allclose(real, predicted, rtol=0.3)  # the noise of each is estimated anew
 
 
 def photographed(line, distortion, number):
@@ -125,16 +127,6 @@ def test_where_nothing_is_determined_something_is_suggested_all_the_same(lens):
     assert suggestion.before == suggestion.after == np.inf
     assert np.isfinite(suggestion.table).all()
     assert suggestion.sentence.endswith("would determine the lens best.")
-
-
-def test_the_prior_is_not_felt_where_lines_decide(central):
-    """Ten thousand times the noise's variance, and with it the prior's weight, changes no choice."""
-    fit, small = fitted(central)
-    louder = eqx.tree_at(
-        lambda lines: lines.points, central, central.points + 5 * noisy(np.zeros(central.points.shape), 1)
-    )
-    other = zj.suggest_next(*fitted(louder))
-    assert other.region == zj.suggest_next(fit, small).region
 
 
 @pytest.mark.parametrize("bad", [(0.0, 50.0), (50.0, 20.0), (20.0, np.inf)])

@@ -48,8 +48,8 @@ class Suggestion:
         focal: the focal length to photograph at.
         direction: "horizontal" or "vertical": of the lines.
         region: the part of the image that they should run through, in words.
-        before, after: the largest standard deviation, px, of the displacement over image and focal range,
-            as it is and as it would be. Infinite where the lines do not determine the lens.
+        before, after: the standard deviation of the displacement, px, as it is and as it would be: the
+            geometric mean over image and focal range. Infinite where the lines do not determine the lens.
         focals: the candidates' focal lengths.
         regions: their parts of the image, in words.
         table: `after` of each candidate: of each focal length, region and direction.
@@ -76,8 +76,8 @@ class Suggestion:
         if not np.isfinite(self.before):
             return f"{photo}: of all there is to add, that would determine the lens best."
         return (
-            f"{photo}: the largest standard deviation of the displacement would fall from "
-            f"{self.before:.2g} to {self.after:.2g} px."
+            f"{photo}: the standard deviation of the displacement, in the mean over image and range, would "
+            f"fall from {self.before:.2g} to {self.after:.2g} px."
         )
 
 
@@ -117,7 +117,7 @@ def suggest_next(
     candidates = jnp.asarray(candidate_lines(fit.lens.image_size, length), dtype)
     grid = jnp.asarray(focals, dtype)
     now, table = _bands(fit, lines, candidates, grid, jnp.asarray(number), jnp.asarray(counts))
-    before = float(jnp.max(displacement_std(fit, _image_grid(fit.lens.image_size)[:, None], focal=grid)))
+    before = float(_average(displacement_std(fit, _image_grid(fit.lens.image_size)[:, None], focal=grid)))
     # What was measured of the noise is in `before`; how a photo changes it is the ratio.
     table = before * (np.asarray(table) / float(now)) if np.isfinite(before) else np.asarray(table)
     at_focal, _, in_direction = np.unravel_index(np.argmin(table), table.shape)
@@ -187,7 +187,7 @@ def candidate_lines(
 
 @eqx.filter_jit
 def _bands(fit, lines, candidates, focals, number, counts):
-    """The largest standard deviation of the displacement now, and with each candidate.
+    """The mean standard deviation of the displacement now, and with each candidate.
 
     For independent points, and candidates with so many lines of so many points.
     """
@@ -200,13 +200,15 @@ def _bands(fit, lines, candidates, focals, number, counts):
     variance = jnp.sum(weighted**2) / _positive(jnp.sum(weights * (lines.counts - 2)))
     rows = _displacement_rows(fit, flat, unravel, focals)
 
-    def largest(information, noise):
+    def typical(information, noise):
         """Of the estimate with the prior: a variance of 1 for each parameter, weighed as a point is."""
         ridge = variance / jnp.sum(jnp.where(weights > 0, lines.counts, 0))
+        rounding = 64 * jnp.finfo(flat.dtype).eps * jnp.trace(information)
+        ridge = jnp.maximum(ridge, rounding)  # lines without noise would leave nothing
         eye = jnp.eye(flat.size, dtype=flat.dtype)
         inverse = jnp.linalg.inv(information + ridge * eye)
         covariance = inverse @ (variance * noise + ridge**2 * eye) @ inverse
-        return jnp.sqrt(jnp.max(jnp.einsum("ndp,pq,ndq->n", rows, covariance, rows)))
+        return _average(jnp.sqrt(jnp.einsum("ndp,pq,ndq->n", rows, covariance, rows)))
 
     def of_line(points, focal):
         """Mean over a line's points of the squared derivatives of their residuals."""
@@ -224,10 +226,10 @@ def _bands(fit, lines, candidates, focals, number, counts):
         squared = jnp.mean(jax.vmap(of_line, (0, None))(points, focal), axis=0)
         old, new = frames / (frames + 1), 1 / (frames + 1)
         more_noise = new**2 / (number * counts) * squared
-        return largest(old * information + new * squared, old**2 * noise + more_noise)
+        return typical(old * information + new * squared, old**2 * noise + more_noise)
 
     over = jax.vmap(jax.vmap(jax.vmap(with_photo, (0, None)), (0, None)), (None, 0))
-    return largest(information, noise), over(candidates, focals)
+    return typical(information, noise), over(candidates, focals)
 
 
 def _displacement_rows(fit, flat, unravel, focals):
@@ -242,9 +244,18 @@ def _displacement_rows(fit, flat, unravel, focals):
     return rows.reshape(-1, 2, flat.size)
 
 
+def _average(stds):
+    """The geometric mean.
+
+    The largest, or the plain mean, is that of the worst focal length; a photo elsewhere then gains nothing,
+    and one there as much wherever its lines are, for the next worst is left.
+    """
+    return jnp.exp(jnp.mean(jnp.log(stds)))
+
+
 def _image_grid(image_size):
-    """Points all over the image, its corners among them."""
-    x, y = (jnp.linspace(0, side - 1, 5) for side in image_size)
+    """Points all over the image, its corners among them, and not its centre, which is always certain."""
+    x, y = (jnp.linspace(0, side - 1, 6) for side in image_size)
     return jnp.stack(jnp.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 

@@ -63,7 +63,7 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
         below.errorbar(
             x, difference, sigma[known, i], fmt="o", markersize=2.5, linewidth=0.9, color=_FRAMES
         )
-        _shade(below, grid, 0, spread[:, i])
+        _shade(below, grid, 0.0, spread[:, i])
         _label(below, "frame − model", unit, np.append(difference, sigma[known, i]))
         below.axhline(0, color=_MODEL, linewidth=1.2, zorder=0)
         below.set_xlabel(f"$1/f$  (1/{lens.focal_unit})")
