@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from ._types import AnyArray
 from .algebraic import algebraic_zoom
+from .certificate import Certificate
 from .compression import compress
 from .fit import RESULTS, FrameFits, ZoomFit, fit_frames, fit_zoom, frame_rms
 from .lines import Lines
@@ -102,6 +103,8 @@ class Calibration:
             "focal_unit": lens.focal_unit,
             "image_size": list(lens.image_size),
             "result": RESULTS[self.zoom.result] or "successful",
+            "certificate": _plain(self.zoom.certificate),
+            "rms_unconstrained": float(self.zoom.rms_unconstrained),
             "frames_without_a_model": sum(map(bool, self.each.messages())),
             "warnings": self.warnings(),
             "pixel_polynomials": self.pixel_polynomials().tolist(),
@@ -214,6 +217,13 @@ def results_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
             for path in made:
                 path.rmdir()
         raise
+
+
+def _plain(certificate: Certificate) -> dict[str, bool | float]:
+    """For JSON."""
+    return {
+        field.name: getattr(certificate, field.name).item() for field in dataclasses.fields(certificate)
+    }
 
 
 def _finite(values: np.ndarray) -> list[float | None]:
