@@ -38,6 +38,7 @@ def test_pixel_polynomials_give_the_coefficients_of_the_lens(calibration):
 def test_summary_is_json_and_agrees_with_the_fits(calibration):
     summary = json.loads(json.dumps(calibration.summary(), allow_nan=False))
     assert summary["rms_zoom"] == float(calibration.zoom.rms)
+    assert summary["certificate"]["certified"] is True
     assert summary["rms_none"] == pytest.approx(rms_over_frames(zj.frame_rms(calibration.lines, None)))
     assert [row["frame"] for row in summary["per_frame"]] == list(range(5))
 

@@ -145,9 +145,12 @@ def test_rivals_become_invertible_too(model, terms, folding):
 
 
 def test_models_without_pieces_are_left_as_they_are(folding):
-    fit = zj.fit_zoom(zj.compress(folding, 1), zoom=SomeZoom(), terms=1)
+    lines = zj.compress(folding, 1)
+    fit = zj.fit_zoom(lines, zoom=SomeZoom(), terms=1)
     assert fit.result == RESULTS.folded
     assert fit.certificate.slope < 0
+    traced = eqx.filter_jit(lambda lines: zj.fit_zoom(lines, zoom=SomeZoom(), terms=1))(lines)
+    np.testing.assert_allclose(parameters(traced), parameters(fit), rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ from jaxtyping import Float
 from ._types import AnyArray
 from .algebraic import algebraic_zoom
 from .bands import displacement_std
+from .certificate import Certificate
 from .compression import compress
 from .design import Suggestion, suggest_next
 from .fit import RESULTS, FrameFits, ZoomFit, fit_frames, fit_zoom, frame_rms
@@ -123,6 +124,8 @@ class Calibration:
             "focal_unit": lens.focal_unit,
             "image_size": list(lens.image_size),
             "result": RESULTS[self.zoom.result] or "successful",
+            "certificate": _plain(self.zoom.certificate),
+            "rms_unconstrained": float(self.zoom.rms_unconstrained),
             "frames_without_a_model": sum(map(bool, self.each.messages())),
             "warnings": self.warnings(),
             "pixel_polynomials": self.pixel_polynomials().tolist(),
@@ -247,6 +250,13 @@ def results_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
             for path in made:
                 path.rmdir()
         raise
+
+
+def _plain(certificate: Certificate) -> dict[str, bool | float]:
+    """For JSON."""
+    return {
+        field.name: getattr(certificate, field.name).item() for field in dataclasses.fields(certificate)
+    }
 
 
 def _finite(values: Iterable[float]) -> list[float | None]:

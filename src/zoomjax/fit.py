@@ -377,6 +377,8 @@ def collected(lines, fits):
 def _refit_zoom(lines, free):
     """The best invertible model in the place of one that is not."""
     zoom = free.lens.zoom
+    if zoom.pieces(free.lens.focal_range) is None:  # there is nothing to demand
+        return free, _outcome(free)
     nothing = jax.tree.map(jnp.zeros_like, zoom.parameters)
     if not isinstance(zoom, AbstractLinearZoom):
         nothing = zoom.prepare(
@@ -392,7 +394,7 @@ def _refit_zoom(lines, free):
         def slack(flat):
             lens = lens_of(lines, with_parameters(zoom, unravel(flat)))
             controls = slope_controls(lens.zoom, lens.centre, lens.focal_range, lens.image_size)
-            assert controls is not None  # or the model would not have come here
+            assert controls is not None
             return controls - LEAST_SLOPE
 
         return errors, slack
