@@ -86,30 +86,25 @@ def _at(zoom, focal):
     return jax.vmap(zoom)(focal)
 
 
-def choose(lines: zj.CompressedLines, frames: np.ndarray, room: int | None = None) -> zj.CompressedLines:
+def choose(lines: zj.CompressedLines, frames: np.ndarray, room: int) -> zj.CompressedLines:
     """The lines of some frames, which are numbered anew.
 
     Args:
         lines: of all frames.
         frames: those chosen.
-        room: number of lines of the result, padded with empty ones: what is compiled for it then serves
-            other choices as well.
+        room: lines that every frame is given, the missing ones empty. Other choices of as many frames then
+            have the same shape, and what is compiled for one serves all.
     """
-    place = np.full(len(lines.focal), -1)
-    place[frames] = np.arange(len(frames))
-    frame = place[np.asarray(lines.frame)]
-    index = np.flatnonzero(frame >= 0)
-    padding = np.zeros((len(index) if room is None else room) - len(index), int)
-    triangle = np.asarray(lines.triangle)[index]
-    triangle = np.concatenate([triangle, np.zeros((len(padding), *triangle.shape[1:]))])
+    index, present = (np.asarray(array)[frames] for array in lines.by_frame())
+    padding = ((0, 0), (0, room - index.shape[1]))
+    index, present = np.pad(index, padding).ravel(), np.pad(present, padding).ravel()
     return zj.CompressedLines(
-        triangle=jnp.asarray(triangle),
-        frame=jnp.asarray(np.concatenate([frame[index], padding]), jnp.int32),
-        focal=jnp.asarray(lines.focal)[frames],
+        triangle=jnp.where(present[:, None, None], lines.triangle[index], 0),
+        frame=jnp.asarray(np.repeat(np.arange(len(frames)), room), jnp.int32),
+        focal=lines.focal[frames],
         centre=lines.centre,
         image_size=lines.image_size,
         focal_unit=lines.focal_unit,
-        weight=None if lines.weight is None else jnp.pad(lines.weight[index], (0, len(padding))),
     )
 
 
