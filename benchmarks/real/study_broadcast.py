@@ -95,13 +95,14 @@ def corrected(bent: np.ndarray, focal: np.ndarray, k: np.ndarray) -> np.ndarray:
         RuntimeError: it does not converge.
     """
     target = np.linalg.norm(bent, axis=-1) / focal[:, None]
-    r = target.copy()
-    k1, k2 = k.T[..., None]
+    r, k1, k2 = target, *k.T[..., None]
+
+    def bend(r):
+        return r * (1 + r**2 * (k1 + r**2 * k2))
+
     for _ in range(20):
-        squared = r * r
-        error = r * (1 + squared * (k1 + squared * k2)) - target
-        r -= error / (1 + squared * (3 * k1 + 5 * squared * k2))
-    if not np.all(abs(error) < 1e-12):
+        r = r - (bend(r) - target) / (1 + r**2 * (3 * k1 + 5 * r**2 * k2))
+    if not np.all(abs(bend(r) - target) < 1e-12):
         raise RuntimeError("OpenCV's distortion has no inverse in some frame.")
     return bent * (r / np.where(target > 0, target, 1))[..., None]
 

@@ -3,8 +3,8 @@
     python benchmarks/real/study_pitch.py [--output FILE]
 
 93 frames of broadcasts of the World Cup 2014, 1280 x 720 px (see pitch.py). Straight lines of the pitch
-with 3 marks or more, most have 3, and the focal length of a camera that another program predicts, which is no
-truth. The frames are parted into five at random; every model is fitted to four parts and tested on the
+with 3 marks or more, most have 3, and the focal length of a camera that another program predicts, which is
+no truth. The frames are parted into five at random; every model is fitted to four parts and tested on the
 fifth, and so on for each, in `PARTINGS` partings. Figures are RMS distances of the corrected marks from
 straight lines, px, every frame weighing the same (eq. 13), with 95 % intervals by bootstrap over frames;
 differences from the zoom polynomial of degree 2 are of the same frames drawn.
@@ -56,7 +56,9 @@ def in_sample(lines: zj.CompressedLines) -> dict[str, float]:
     k = {NONE: np.zeros((len(focal), TERMS)), EACH: np.asarray(zj.fit_frames(lines).coefficients)}
     k[f"{EACH}, k1 alone"] = np.asarray(zj.fit_frames(lines, terms=1).coefficients)
     k |= {model.name: model.coefficients(lines, focal) for model in fitting(lines, ENTRIES)[0]}
-    return {name: float(root_mean(zj.frame_rms(lines, values) ** 2)) for name, values in k.items()}
+    return {
+        name: float(root_mean(np.asarray(zj.frame_rms(lines, values)) ** 2)) for name, values in k.items()
+    }
 
 
 def line_left_out(lines: zj.CompressedLines, terms: int) -> np.ndarray:
@@ -111,10 +113,10 @@ def page(r: dict) -> list[str]:
         "# Frames not seen: pitch lines marked by hand",
         "",
         f"{r['points']:.0f} marks on {r['lines']} straight lines in {r['frames']} frames of football "
-        f"broadcasts, 1280 × 720 px, most lines with 3 marks. Focal lengths, {low:.0f} to "
-        f"{high:.0f} px, are another program's guesses. Five parts by frame, {PARTINGS} random partings; RMS distances from "
-        "straight lines, px, with 95 % intervals by bootstrap over frames, and paired differences from "
-        "degree 2. *Each frame by itself* is tested on each of its lines, fitted to its others.",
+        f"broadcasts, 1280 × 720 px, most lines with 3 marks. Focal lengths, {low:.0f} to {high:.0f} px, "
+        f"are another program's guesses. Five parts by frame, {PARTINGS} random partings; RMS distances "
+        "from straight lines, px, with 95 % intervals by bootstrap over frames, and paired differences "
+        "from degree 2. *Each frame by itself* is tested on each of its lines, fitted to its others.",
         "",
         *table(
             ["model", "in sample", "held out", "95 %", "less degree 2", "95 %"],

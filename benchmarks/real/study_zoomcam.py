@@ -25,8 +25,8 @@ from zoomcam import read_zoomcam
 
 import zoomjax as zj
 
-HALVES = 40
-LEFT_OUT_HALVES = 20
+HALVES = 30
+LEFT_OUT_HALVES = 10
 ROWS_AND_COLUMNS = 15 + 22
 ZOOMS = (1, 3, 5, 7, 9)
 
@@ -75,7 +75,7 @@ def zoom_left_out(
     for left, (number, half) in itertools.product(zooms, enumerate(halves)):
         # Its lines count nothing, and its focal length is another's: all shapes are those of five zooms.
         train = lines.weighted(half * (np.asarray(lines.frame) != left))
-        other = train.focal.at[left].set(train.focal[left - 1])
+        other = jnp.asarray(train.focal).at[left].set(train.focal[left - 1])
         train = eqx.tree_at(lambda lines: lines.focal, train, other)
         for name, rms in frame_rms(train, lines.weighted(1 - half), models).items():
             found.setdefault(name, np.zeros((len(halves), len(zooms))))[number, left] = rms[left]
