@@ -76,8 +76,9 @@ def candidates(entries: int | None = None) -> list[Candidate]:
 
 
 def _two_regions(lines: zj.AbstractLines) -> zj.AbstractZoom:
-    each = zj.fit_frames(lines, terms=1)
-    crossover = zj.barrel_crossover(lines.focal, each.coefficients[:, 0])
+    """Parted where a single quadratic changes its sign: single frames may tell it from their noise."""
+    whole = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=2), terms=1).lens.zoom
+    crossover = zj.barrel_crossover(lines.focal, _at(whole, lines.focal)[:, 0])
     return zj.TwoRegionZoom(crossover=jnp.asarray(crossover))
 
 

@@ -354,15 +354,15 @@ def together(clips: dict, place: str, name: str) -> np.ndarray | None:
 
 
 def better(clips: dict, place: str, names: list[str]) -> list[str]:
-    """In what other models are ahead of degree 2, in digits that the table does not show, too."""
+    """In what other models are ahead of degree 2 by more than the last digits."""
     default = together(clips, place, DEFAULT)
     assert default is not None
     sentences = []
     for column, what in enumerate(("Straighter", "Nearer to the truth over the image")):
         figures = {name: together(clips, place, name) for name in names if name not in (TRUE, EACH)}
         gains = {name: 1 - x[column] / default[column] for name, x in figures.items() if x is not None}
-        ahead = [f"{name} (by {100 * gain:.2f} %)" for name, gain in gains.items() if gain > 0]
-        sentences.append(f"{what} than degree 2: {', '.join(ahead) or 'none'}.")
+        ahead = [f"{name} (by {100 * gain:.2f} %)" for name, gain in gains.items() if gain > 0.0005]
+        sentences.append(f"{what} than degree 2 by 0.05 % or more: {', '.join(ahead) or 'none'}.")
     return sentences
 
 
