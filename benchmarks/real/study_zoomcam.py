@@ -170,7 +170,12 @@ def page(r: dict) -> list[str]:
 def left_out_row(name: str, each: list[tuple[float, float]]) -> list[str]:
     mean = np.array([zoom[0] for zoom in each])
     inner, ends = root_mean(mean[1:-1] ** 2), root_mean(mean[[0, -1]] ** 2)
-    return [name, *(f"{one:.3f}" for one in mean), f"{inner:.4f}", f"{ends:.3f}"]
+    return [name, *map(pixels, mean), pixels(inner), pixels(ends)]
+
+
+def pixels(value: float) -> str:
+    """Of an extrapolation that went astray no digits are worth anything."""
+    return f"{value:.4f}" if value < 100 else "> 100"
 
 
 def plus_minus(values: tuple[float, float]) -> str:
