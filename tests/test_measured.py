@@ -115,6 +115,7 @@ def test_chosen_frames_have_the_lines_and_figures_that_they_had(small):
     )
 
 
+@pytest.mark.slow
 def test_a_line_left_out_is_corrected_as_the_others_of_its_frame_ask_for(ragged):
     lines = zj.compress(ragged, terms=1)
     frame = np.asarray(lines.frame)

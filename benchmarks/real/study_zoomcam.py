@@ -173,7 +173,7 @@ def left_out_row(name: str, each: list[tuple[float, float]]) -> list[str]:
     return [name, *map(pixels, mean), pixels(inner), pixels(ends)]
 
 
-def pixels(value: float) -> str:
+def pixels(value: float | np.ndarray) -> str:
     """Of an extrapolation that went astray no digits are worth anything."""
     return f"{value:.4f}" if value < 100 else "> 100"
 
