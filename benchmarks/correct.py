@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import zoomjax as zj
-from fit import RESULTS, machine
+from shared import RESULTS, machine, write
 from zoomjax.positions import OUTSIDE
 from zoomjax.vision.ahead import ahead
 from zoomjax.vision.undistort import position_map
@@ -344,6 +344,4 @@ if __name__ == "__main__":
     }
     print(json.dumps(measured, indent=1), flush=True)
     measured["video"] = video(given.frames, rounds=2)
-    given.output.write_text(markdown(measured))
-    given.output.with_suffix(".json").write_text(json.dumps(measured, indent=2) + "\n")
-    print(given.output.read_text())
+    write(given.output, markdown(measured), measured)

@@ -10,9 +10,7 @@ the fitted displacement at the image's corner, px. Results go to benchmarks/resu
 
 import argparse
 import ctypes
-import importlib.metadata
 import json
-import os
 import platform
 import statistics
 import threading
@@ -29,9 +27,8 @@ import psutil
 import scipy.optimize
 
 import zoomjax as zj
+from shared import RESULTS, machine, write
 from zoomjax import synthetic
-
-RESULTS = Path(__file__).parent / "results"
 
 
 def seconds(function: Callable, *arguments, repeats: int = 7) -> float:
@@ -228,23 +225,6 @@ def run(spacing: float) -> dict:
     return results
 
 
-def machine() -> dict:
-    """What the figures were measured on."""
-    model = platform.processor()
-    if Path("/proc/cpuinfo").exists():
-        names = [x for x in Path("/proc/cpuinfo").read_text().splitlines() if x.startswith("model name")]
-        model = names[0].partition(":")[2].strip() if names else model
-    packages = ("zoomjax", "jax", "jaxlib", "optimistix", "equinox", "numpy", "scipy")
-    return {
-        "cpu": model,
-        "cores": os.cpu_count(),
-        "memory_GB": round(psutil.virtual_memory().total / 1e9),
-        "device": str(jax.devices()[0]),
-        "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in packages},
-    }
-
-
 def markdown(results: dict) -> str:
     """The results as a page."""
     r, m = results, results["machine"]
@@ -318,6 +298,4 @@ if __name__ == "__main__":
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     measured = {"machine": machine(), **run(options.spacing)}
-    options.output.write_text(markdown(measured))
-    options.output.with_suffix(".json").write_text(json.dumps(measured, indent=2) + "\n")
-    print(options.output.read_text())
+    write(options.output, markdown(measured), measured)

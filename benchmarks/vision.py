@@ -24,7 +24,7 @@ from scipy.spatial import KDTree
 
 import zoomjax as zj
 from correct import HD, in_turn, summary
-from fit import RESULTS, machine
+from shared import RESULTS, machine, write
 from zoomjax import synthetic
 from zoomjax.vision.demo import IMAGE_SIZE, worst_error
 
@@ -537,6 +537,4 @@ if __name__ == "__main__":
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     measured = {"machine": machine() | {"opencv": cv2.__version__}, **run(given.rounds)}
-    given.output.write_text(markdown(measured))
-    given.output.with_suffix(".json").write_text(json.dumps(measured, indent=2) + "\n")
-    print(given.output.read_text())
+    write(given.output, markdown(measured), measured)

@@ -46,21 +46,31 @@ def straight_lines(frame: dict) -> dict[str, np.ndarray]:
     return {name: np.array(points) for name, points in frame["lines"].items() if name in PITCH_LINES}
 
 
-def fitted_distortion(frames: list[dict]) -> tuple[Distortion, np.ndarray]:
-    """One coefficient for all frames, and the RMS distances from straightness, px, without and with it."""
+def read_pitch(folder: Path) -> list[dict]:
+    """The annotated frames, as the file has them."""
+    return list(json.loads((folder / "wc14_half.json").read_text()).values())
+
+
+def annotated_lines(frames: list[dict]) -> Lines:
+    """The straight lines of 3 points or more, with the focal lengths of the predicted cameras."""
     lines = [[points for points in straight_lines(frame).values() if len(points) > 2] for frame in frames]
     predicted = np.array([frame["camera_pred"]["f_px"] for frame in frames])
     used = [number for number, points in enumerate(lines) if points]
-    primitives = Lines.from_ragged(
+    return Lines.from_ragged(
         [points for number in used for points in lines[number]],
         np.repeat(np.arange(len(used)), [len(lines[number]) for number in used]),
         predicted[used],
         image_size=SIZE,
         focal_unit="px",
     )
+
+
+def fitted_distortion(frames: list[dict]) -> tuple[Distortion, np.ndarray]:
+    """One coefficient for all frames, and the RMS distances from straightness, px, without and with it."""
+    primitives = annotated_lines(frames)
     fit = fit_zoom(primitives, zoom=PolynomialZoom(degree=0), terms=1)
     rms = [np.sqrt(np.mean(frame_rms(primitives, lens) ** 2)) for lens in (None, fit.lens)]
-    return fit.lens(predicted[used[0]]), np.array(rms)
+    return fit.lens(float(primitives.focal[0])), np.array(rms)
 
 
 def predicted_feet(frame: dict) -> dict[str, np.ndarray]:
@@ -112,7 +122,7 @@ def print_frames(title: str, estimates: list[FocalEstimate], frames: list[dict])
 
 def pitch(folder: Path) -> None:
     """The two tables of broadcasts."""
-    frames = list(json.loads((folder / "pitch_lines" / "wc14_half.json").read_text()).values())
+    frames = read_pitch(folder / "pitch_lines")
     distortion, rms = fitted_distortion(frames)
     seen = [straight_lines(frame) for frame in frames]
     corrected = [
