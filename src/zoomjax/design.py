@@ -203,12 +203,14 @@ def _bands(fit, lines, candidates, focals, number, counts):
     def typical(information, noise):
         """Of the estimate with the prior: a variance of 1 for each parameter, weighed as a point is."""
         ridge = variance / jnp.sum(jnp.where(weights > 0, lines.counts, 0))
-        rounding = 64 * jnp.finfo(flat.dtype).eps * jnp.trace(information)
+        eps = jnp.finfo(flat.dtype).eps
+        rounding = 64 * eps * jnp.trace(information)
         ridge = jnp.maximum(ridge, rounding)  # lines without noise would leave nothing
         eye = jnp.eye(flat.size, dtype=flat.dtype)
         inverse = jnp.linalg.inv(information + ridge * eye)
-        covariance = inverse @ (variance * noise + ridge**2 * eye) @ inverse
-        return _average(jnp.sqrt(jnp.einsum("ndp,pq,ndq->n", rows, covariance, rows)))
+        covariance = inverse @ (variance * noise + ridge**2 * eye) @ inverse.T
+        squares = jnp.einsum("ndp,pq,ndq->n", rows, covariance, rows)
+        return _average(jnp.sqrt(jnp.maximum(squares, eps * jnp.max(squares))))  # or rounding is negative
 
     def of_line(points, focal):
         """Mean over a line's points of the squared derivatives of their residuals."""
