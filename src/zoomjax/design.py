@@ -119,7 +119,9 @@ def suggest_next(
     now, table = _bands(fit, lines, candidates, grid, jnp.asarray(number), jnp.asarray(counts))
     before = float(_average(displacement_std(fit, _image_grid(fit.lens.image_size)[:, None], focal=grid)))
     # What was measured of the noise is in `before`; how a photo changes it is the ratio.
-    table = before * (np.asarray(table) / float(now)) if np.isfinite(before) else np.asarray(table)
+    table = np.nan_to_num(np.asarray(table, np.float64), nan=np.inf)  # what rounding alone is left of
+    if np.isfinite(before) and float(now) > 0:
+        table = before * (table / float(now))
     at_focal, _, in_direction = np.unravel_index(np.argmin(table), table.shape)
     region = _simplest(table[at_focal, :, in_direction])
     return Suggestion(
