@@ -23,7 +23,7 @@ from ._solver import default_solver
 from ._types import AnyArray, Point, traced
 from .algebraic import algebraic_parameters, compressed
 from .compression import CompressedLines
-from .energy import energy_by_frame, frame_energy, residuals
+from .energy import energy_by_frame, frame_energy, prior_residuals, residuals
 from .lens import ZoomLens, lens_of
 from .lines import AbstractLines, Lines
 from .radial import Distortion, monotone_radius
@@ -58,7 +58,8 @@ class ZoomFit(eqx.Module):
         covariance: of the zoom model's parameters in normalised units, flattened row by row (for a
             polynomial: all terms of power 0, then of power 1, ...). Points are taken to have independent
             errors of one size, estimated from the residuals. An undetermined parameter has infinite
-            variance and zero covariances.
+            variance and zero covariances. With a prior (`AbstractPriorZoom`), the mean square of both
+            what noise and what the prior does to the parameters.
         result: how the fit ended; ``RESULTS[fit.result]`` is a sentence.
         steps: number of steps the solver took.
     """
@@ -327,7 +328,8 @@ def _minimise(lines, zoom, solver, max_steps):
 
     def function(parameters, args):
         lines, zoom = args
-        return residuals(lines, jax.vmap(with_parameters(zoom, parameters))(lines.focal))
+        zoom = with_parameters(zoom, parameters)
+        return residuals(lines, jax.vmap(zoom)(lines.focal)), prior_residuals(lines, zoom)
 
     start = jax.tree.map(jax.lax.stop_gradient, zoom.parameters)
     solution = optx.least_squares(

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from .energy import line_weights
+from .energy import line_weights, prior_error, prior_jacobian
 from .lines import AbstractLines
-from .zoom import AbstractZoom, with_parameters
+from .zoom import AbstractPriorZoom, AbstractZoom, with_parameters
 
 
 def parameter_covariance(
@@ -31,9 +31,14 @@ def parameter_covariance(
     through the centre have nothing else there, and would otherwise seem to determine k from their noise.)
     """
     weights = line_weights(lines)
+    prior = prior_jacobian(lines, zoom)
+    flat = jacobian.reshape(-1, jacobian.shape[-1])
     triangle, outer = (
-        jnp.linalg.qr(rows.reshape(-1, rows.shape[-1]), mode="r")
-        for rows in (jacobian, jnp.sqrt(weights)[:, None, None] * jacobian)
+        jnp.linalg.qr(rows, mode="r")
+        for rows in (
+            jnp.concatenate([flat, prior]),
+            (jnp.sqrt(weights)[:, None, None] * jacobian).reshape(flat.shape),
+        )
     )
     # Columns of unit length, so that one threshold serves parameters of any size.
     size = jnp.linalg.norm(triangle, axis=0)
@@ -56,6 +61,10 @@ def parameter_covariance(
     undetermined = undetermined | (freedom <= 0)  # nothing is left over to tell the noise by
     half = inverse @ spread.T
     covariance = energy / jnp.where(freedom > 0, freedom, 1) * (half @ half.T)
+    if isinstance(zoom, AbstractPriorZoom):
+        # The prior draws the parameters to its mean: by how much, in the mean over what it expects.
+        half = prior_error(lines, zoom) * inverse @ (prior @ inverse).T
+        covariance = covariance + half @ half.T
     either = undetermined[:, None] | undetermined[None]
     infinite = jnp.where(jnp.eye(size.shape[0], dtype=bool), jnp.inf, 0)
     return jnp.where(either, infinite, covariance), ~jnp.any(undetermined)
