@@ -13,7 +13,7 @@ LAYERS = (
     {"radial", "focal"},
     {"inverse", "pitch"},
     {"zoom"},
-    {"rivals"},
+    {"rivals", "smooth"},
     {"lines"},
     {"energy"},
     {"lens"},

@@ -55,6 +55,7 @@ from .rivals import barrel_crossover as barrel_crossover
 from .robust import RobustFit as RobustFit
 from .robust import fit_robust as fit_robust
 from .sizes import lens_for_size as lens_for_size
+from .smooth import SmoothZoom as SmoothZoom
 from .vision.detector import AbstractDetector as AbstractDetector
 from .vision.edges import EdgeDetector as EdgeDetector
 from .vision.grid import GridDetector as GridDetector
@@ -64,5 +65,6 @@ from .vision.undistort import undistort_image as undistort_image
 from .vision.video import undistort_video as undistort_video
 from .warp import warp_image as warp_image
 from .zoom import AbstractLinearZoom as AbstractLinearZoom
+from .zoom import AbstractPriorZoom as AbstractPriorZoom
 from .zoom import AbstractZoom as AbstractZoom
 from .zoom import PolynomialZoom as PolynomialZoom

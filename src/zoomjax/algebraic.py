@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from ._linear import least_squares
 from .compression import CompressedLines, compress
-from .energy import line_weights
+from .energy import line_weights, prior_jacobian
 from .lens import ZoomLens, lens_of
 from .lines import AbstractLines, Lines
 from .zoom import AbstractLinearZoom, PolynomialZoom, with_parameters
@@ -42,8 +42,11 @@ def algebraic_parameters(
     basis = jax.vmap(zoom.basis)(lines.focal)[lines.frame]  # (line, basis)
     columns = jnp.einsum("lat,lb->labt", areas[..., 1:], basis)
     unknowns = basis.shape[1] * terms
+    prior = prior_jacobian(lines, with_parameters(zoom, jnp.zeros((basis.shape[1], terms), basis.dtype)))
+    matrix = jnp.concatenate([columns.reshape(-1, unknowns), prior])
+    right = jnp.concatenate([-areas[..., 0].reshape(-1), jnp.zeros(prior.shape[0], basis.dtype)])
     # Lines through the centre do not change the areas, px, whatever the coefficients: those stay zero.
-    solution = least_squares(columns.reshape(-1, unknowns), -areas[..., 0].reshape(-1), floor=lines.scale)
+    solution = least_squares(matrix, right, floor=lines.scale)
     return solution.reshape(basis.shape[1], terms)
 
 

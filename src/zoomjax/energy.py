@@ -13,9 +13,11 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .lines import AbstractLines
+from .zoom import AbstractPriorZoom, AbstractZoom, with_parameters
 
 # The angle of a line, ½ atan2, jumps by half a turn at one direction: harmless to derivatives, but the
 # residuals change sign there and finite differences across it are wrong. Left alone the jump sits at
@@ -74,6 +76,26 @@ def residuals(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -
         )
     distances = jax.vmap(line_residuals)(lines.corrected(coefficients[lines.frame]))
     return jnp.sqrt(line_weights(lines))[:, None] * distances
+
+
+def prior_residuals(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "row"] | None:
+    """What the prior of a zoom model adds to the residuals, px; None for a model without a prior."""
+    if not isinstance(zoom, AbstractPriorZoom):
+        return None
+    return prior_error(lines, zoom) * zoom.standardised()
+
+
+def prior_error(lines: AbstractLines, zoom: AbstractPriorZoom) -> Float[Array, ""]:
+    """The size, px, that a standardised parameter has among the residuals of eq. 13."""
+    return lines.scale * jnp.asarray(zoom.error) / math.sqrt(lines.focal.shape[0])
+
+
+def prior_jacobian(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "row parameter"]:
+    """Derivatives of `prior_residuals` by the flattened parameters; no rows for a model without a prior."""
+    flat, unravel = ravel_pytree(zoom.parameters)
+    if not isinstance(zoom, AbstractPriorZoom):
+        return jnp.zeros((0, flat.size), flat.dtype)
+    return jax.jacfwd(lambda flat: prior_residuals(lines, with_parameters(zoom, unravel(flat))))(flat)
 
 
 @eqx.filter_jit

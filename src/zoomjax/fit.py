@@ -29,7 +29,7 @@ from ._types import AnyArray, Centres, traced
 from .algebraic import algebraic_parameters, compressed
 from .certificate import Certificate, certificate_of, slope_controls
 from .compression import CompressedLines
-from .energy import energy_by_frame, frame_energy, residuals
+from .energy import energy_by_frame, frame_energy, prior_residuals, residuals
 from .lens import ZoomLens, lens_of
 from .lines import AbstractLines
 from .radial import Distortion
@@ -79,8 +79,9 @@ class ZoomFit(eqx.Module):
             errors, points of a line are not: it is the line-by-line sandwich of the residuals, its shape
             shrunk to what independent points would give by as much as its own scatter demands. Where
             there are too few lines for that, points are taken to be independent. An undetermined
-            parameter has infinite variance and zero covariances. What invertibility forbids is not taken
-            into account.
+            parameter has infinite variance and zero covariances. With a prior (`AbstractPriorZoom`), the
+            mean square of both what noise and what the prior does to the parameters. What invertibility
+            forbids is not taken into account.
         result: how the fit ended; ``RESULTS[fit.result]`` is a sentence.
         steps: number of steps the solver took.
         certificate: whether the lens is invertible over its image and focal range.
@@ -388,8 +389,10 @@ def _refit_zoom(lines, free):
 
     def functions(lines, zoom):
         def errors(flat):
-            k = jax.vmap(with_parameters(zoom, unravel(flat)))(lines.focal)
-            return residuals(lines, k).reshape(-1)
+            model = with_parameters(zoom, unravel(flat))
+            distances = residuals(lines, jax.vmap(model)(lines.focal)).reshape(-1)
+            prior = prior_residuals(lines, model)
+            return distances if prior is None else jnp.concatenate([distances, prior])
 
         def slack(flat):
             lens = lens_of(lines, with_parameters(zoom, unravel(flat)))
@@ -435,7 +438,8 @@ def minimise(lines, zoom, solver, max_steps):
 
     def function(parameters, args):
         lines, zoom = args
-        return residuals(lines, jax.vmap(with_parameters(zoom, parameters))(lines.focal))
+        zoom = with_parameters(zoom, parameters)
+        return residuals(lines, jax.vmap(zoom)(lines.focal)), prior_residuals(lines, zoom)
 
     start = jax.tree.map(jax.lax.stop_gradient, zoom.parameters)
     solution = optx.least_squares(

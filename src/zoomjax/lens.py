@@ -17,6 +17,7 @@ from ._types import AnyArray, Point, traced
 from .lines import AbstractLines
 from .radial import Distortion
 from .rivals import PowerZoom, SplineZoom, TableZoom, TwoRegionZoom
+from .smooth import SmoothZoom
 from .zoom import AbstractZoom, PolynomialZoom
 
 _FORMAT, _VERSION = "zoomjax.lens", 1
@@ -197,7 +198,19 @@ _FORMULAS = {
     PowerZoom: "k_i(f) = d0 + d1 (f / focal_ref)^d2 with rows d0, d1, d2 of parameters[.][i-1]",
     TwoRegionZoom: "k_i(f) = sum_j c_j (focal_ref / f)^j with c = parameters[0..2][i-1] for f < crossover, "
     "parameters[3..5][i-1] from there on",
+    SmoothZoom: "k_i(f) = sum_j parameters[j][i-1] P_j(2 focal_ref / f - 1), P_j Legendre's polynomials; the "
+    "rest is the prior",
 }
+
+_TABLE = (None, None)
+_SHAPES = {
+    "parameters": _TABLE,
+    "knots": (None,),
+    "curvature": _TABLE,
+    "quadratic": _TABLE,
+    "beyond": _TABLE,
+}
+"""Of their fields that are not single numbers."""
 
 
 def _described(model: AbstractZoom) -> dict[str, object]:
@@ -218,8 +231,7 @@ def _read_zoom(content) -> AbstractZoom:
         if field.metadata.get("static"):
             fields[field.name] = content[field.name]
         else:
-            shape = {"parameters": (None, None), "knots": (None,), "curvature": (None, None)}
-            fields[field.name] = _array(content, field.name, shape.get(field.name, ()))
+            fields[field.name] = _array(content, field.name, _SHAPES.get(field.name, ()))
     for name in ("focal_ref", "crossover"):
         if name in fields and not fields[name] > 0:
             raise ValueError(f"its {name} is not positive")

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from ._linear import least_squares
 from .algebraic import algebraic_zoom
-from .energy import line_residuals
+from .energy import line_residuals, prior_jacobian
 from .fit import ZoomFit, fit_zoom, linearised, ready_model
 from .lines import AbstractLines
 from .zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
@@ -102,8 +102,10 @@ def _reweighted(lines, start):
         weighted = lines.weighted(own * _weights(lines, model, cut))
         residuals, jacobian = linearised(weighted, model)
         flat, unravel = ravel_pytree(model.parameters)
-        matrix = jacobian.reshape(-1, flat.size)
-        step = least_squares(matrix, -residuals.reshape(-1), floor=0.0)
+        prior = prior_jacobian(weighted, model)  # a prior's residuals are linear in the parameters
+        matrix = jnp.concatenate([jacobian.reshape(-1, flat.size), prior])
+        right = jnp.concatenate([residuals.reshape(-1), prior @ flat])
+        step = least_squares(matrix, -right, floor=0.0)
         return with_parameters(model, unravel(flat + step)), None
 
     model, _ = jax.lax.scan(turn, start, jnp.asarray(_NARROWING, lines.focal.dtype))

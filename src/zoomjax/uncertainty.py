@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from .energy import line_weights
+from .energy import line_weights, prior_error, prior_jacobian
 from .lines import AbstractLines
-from .zoom import AbstractZoom, with_parameters
+from .zoom import AbstractPriorZoom, AbstractZoom, with_parameters
 
 
 def parameter_covariance(
@@ -47,7 +47,9 @@ def parameter_covariance(
     """
     energy = jnp.sum(weighted**2)
     weights = line_weights(lines)
-    triangle = jnp.linalg.qr(jacobian.reshape(-1, jacobian.shape[-1]), mode="r")
+    prior = prior_jacobian(lines, zoom)
+    rows = jnp.concatenate([jacobian.reshape(-1, jacobian.shape[-1]), prior])
+    triangle = jnp.linalg.qr(rows, mode="r")
     # Columns of unit length, so that one threshold serves parameters of any size.
     size = jnp.linalg.norm(triangle, axis=0)
     size = jnp.where(size > 0, size, 1)
@@ -64,7 +66,7 @@ def parameter_covariance(
     undetermined = jnp.any(unknown[None] & (jnp.abs(doubtful) > 0.05), axis=1)
 
     inverse = back @ left.T / size[:, None]
-    jacobian = jacobian @ inverse  # by parameters in which J^T W J is the identity
+    jacobian = jacobian @ inverse  # by parameters in which J^T W J, with the prior, is the identity
     leverage = jnp.einsum("lri,lrj->lij", jacobian, jacobian)
     share = weights[:, None, None] * leverage
     freedom = jnp.sum(weights * (lines.counts - 2)) - jnp.trace(jnp.sum(share, axis=0))
@@ -74,6 +76,10 @@ def parameter_covariance(
     scores = terms * jnp.sum(weights > 0) - jnp.sum(good)
     score = jnp.einsum("lri,lr->li", jacobian, weighted)
     covariance = inverse @ _of_whole_lines(score, leverage, share, scores) @ inverse.T
+    if isinstance(zoom, AbstractPriorZoom):
+        # The prior draws the parameters to its mean: by how much, in the mean over what it expects.
+        half = prior_error(lines, zoom) * inverse @ (prior @ inverse).T
+        covariance = covariance + half @ half.T
     either = undetermined[:, None] | undetermined[None]
     infinite = jnp.where(jnp.eye(size.shape[0], dtype=bool), jnp.inf, 0)
     return jnp.where(either, infinite, covariance), ~jnp.any(undetermined)

@@ -79,6 +79,24 @@ class AbstractLinearZoom(AbstractZoom):
         return Pieces(controls, basis.ends, basis.focal_of, (1 + basis.size) @ jnp.abs(parameters))
 
 
+class AbstractPriorZoom(AbstractLinearZoom):
+    """A linear zoom model that knows, before any line is seen, what its parameters are likely to be.
+
+    A fit minimises the energy (eq. 13) and ``error^2 / M`` times the sum of squares of the `standardised`
+    parameters, for M frames: the mode of their posterior, if each frame by itself is wrong by an RMS of
+    `error`. So frames outweigh the prior as they become more, and with an error of 0 it has no weight.
+
+    Attributes:
+        error: RMS distance to straightness, in half image diagonals, that a frame is wrong by.
+    """
+
+    error: eqx.AbstractVar[Scalar]
+
+    @abc.abstractmethod
+    def standardised(self) -> Float[Array, "row"]:
+        """The parameters as numbers that are independent a priori, of mean 0 and variance 1."""
+
+
 class PolynomialZoom(AbstractLinearZoom):
     """The paper's model: each coefficient a polynomial of `degree` n in 1/f (eq. 9-10).
 
