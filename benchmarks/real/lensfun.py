@@ -1,7 +1,7 @@
 """Six hundred real zoom lenses: which zoom model predicts a focal length that was left out?
 
     pip install zoomjax[bench]
-    python benchmarks/real/lensfun.py [--output FILE] [--prior]
+    python benchmarks/real/lensfun.py [--output FILE] [--prior | --forms]
 
 The lensfun database (through the package `lensfunpy`, CC BY-SA 3.0; none of it is stored here) holds zoom
 lenses that people calibrated by hand at several focal lengths. Its models map corrected to distorted radii,
@@ -17,12 +17,13 @@ and prints the numbers that `zoomjax/smooth.py` has.
 
 Once: lines, their compression, each frame's own optimum, and the second derivatives of its energy. Fits of
 models linear in their parameters then are least squares of the frames' coefficients in that metric, which
-have the answer without each frame in closed form, all lenses at once. What is reported is the true energy of
-the lines left out; how far such fits are from `zoomjax.fit_zoom`, one by one, is measured too.
+have the answer without each frame in closed form, all lenses at once. What is reported is the true energy
+of the lines left out; how far such fits are from `zoomjax.fit_zoom`, one by one, is measured too.
 """
 
 import argparse
 import importlib.metadata
+import itertools
 import json
 import os
 import sys
@@ -43,7 +44,7 @@ import zoomjax as zj
 from zoomjax.energy import line_residuals
 
 sys.path.append(str(Path(__file__).parents[1]))
-from fit import RESULTS, machine  # noqa: E402
+from fit import RESULTS, machine
 
 SIZE = (4288, 2848)
 SCALE = float(np.hypot(*SIZE)) / 2
@@ -204,9 +205,9 @@ def _inverse_jvp(primals, tangents):
 def fit_linear(basis, frames, penalty):
     """One lens: coefficients (frame, 2) fitted to all frames, and to all but the frame itself.
 
-    Without frame m the residual ``d = k - k_m`` becomes ``(1 - Q H)^-1 d``, with its second derivatives H and
-    ``Q = basis_m G^-1 basis_m``, G those of the whole fit by the parameters; and Q becomes ``(1 - Q H)^-1 Q``,
-    the third result: the covariance of the prediction, where each frame has that of 1/H.
+    Without frame m the residual ``d = k - k_m`` becomes ``(1 - Q H)^-1 d``, with its second derivatives H
+    and ``Q = basis_m G^-1 basis_m``, G those of the whole fit by the parameters; and Q becomes
+    ``(1 - Q H)^-1 Q``, the third result: the covariance of the prediction, each frame's being 1/H.
     """
     size = 2 * basis.shape[1]
     matrix = jnp.einsum("fa,fij,fb->aibj", basis, frames.second, basis).reshape(size, size) + penalty
@@ -310,7 +311,7 @@ def triangle_of(numbers, size):
     return jnp.tril(matrix, -1) + jnp.diag(jnp.exp(jnp.diag(matrix)))
 
 
-def prior_of(numbers, degree=DEGREE):
+def prior_of(numbers, degree):
     """The SmoothZoom that 25 numbers describe, in units in which a frame's energy is about isotropic."""
     unit = jnp.asarray(np.linalg.inv(np.linalg.cholesky(TYPICAL).T))  # from px to coefficients
     quadratic = jnp.kron(jnp.eye(3), unit) @ triangle_of(numbers[:21], 6)
@@ -342,19 +343,19 @@ def fit_smooth(frames, zoom):
     return jax.vmap(fit_linear, in_axes=(0, 0, None))(basis, frames, penalty_of(zoom))
 
 
-@jax.jit
+@partial(jax.jit, static_argnums=3)
 @jax.value_and_grad
-def prior_loss(numbers, batches, weights):
+def prior_loss(numbers, batches, weights, degree):
     """How badly a prior predicts the frames left out: the mean logarithm of the lenses' errors.
 
     Not how unlikely it makes them: a few lenses with wild tables decide that, and the rest do worse.
     """
-    zoom = prior_of(numbers)
+    zoom = prior_of(numbers, degree)
     errors = jnp.concatenate([lens_error(frames, fit_smooth(frames, zoom)[1]) for frames in batches])
     return weights @ jnp.log(errors + 0.01) / jnp.sum(weights) + 1e-4 * jnp.sum(numbers**2)
 
 
-def learn(lenses: list[Frames], chosen: np.ndarray) -> zj.SmoothZoom:
+def learn(lenses: list[Frames], chosen: np.ndarray, degree: int = DEGREE) -> zj.SmoothZoom:
     """The prior that predicts the frames left out of the chosen lenses best."""
     members, batches = zip(*batches_of(lenses, np.arange(len(lenses))), strict=True)
     weights = jnp.asarray(chosen[np.concatenate(members)], float)
@@ -362,19 +363,20 @@ def learn(lenses: list[Frames], chosen: np.ndarray) -> zj.SmoothZoom:
     start[[0, 2, 5, 9, 14, 20]] = np.log(5)
     start[24] = -2
     found = scipy.optimize.minimize(
-        lambda x: tuple(np.asarray(a, float) for a in prior_loss(x, batches, weights)),
+        lambda x: tuple(np.asarray(a, float) for a in prior_loss(x, batches, weights, degree)),
         start,
         jac=True,
         method="L-BFGS-B",
         options={"maxiter": 120},
     )
     return calibrated(
-        prior_of(jnp.asarray(found.x)), [lens for _, lens in batches_of(lenses, np.flatnonzero(chosen))]
+        prior_of(jnp.asarray(found.x), degree),
+        [lens for _, lens in batches_of(lenses, np.flatnonzero(chosen))],
     )
 
 
 def calibrated(zoom: zj.SmoothZoom, batches: list[Frames]) -> zj.SmoothZoom:
-    """The same prior and error, both larger or smaller until errors are as large as they are expected to be.
+    """The same prior and error, both so much larger or smaller that errors are as large as expected.
 
     Fits depend on their ratio alone. In the median over the frames left out, for a few lenses are wild.
     """
@@ -399,7 +401,8 @@ def calibrated(zoom: zj.SmoothZoom, batches: list[Frames]) -> zj.SmoothZoom:
 
 
 def interpolate(frames: Frames, asked: np.ndarray, kind: str) -> np.ndarray:
-    """Tables and splines through the frames' own coefficients: what their fits are, a knot at each frame."""
+    """Tables and splines through the frames' own coefficients: what their fits are, a knot at each "
+    "frame."""
     x = frames.focal if kind == "table in f" else 1 / frames.focal
     at = asked if kind == "table in f" else 1 / asked
     order = np.argsort(x)
@@ -466,7 +469,8 @@ def two_regions(frames: Frames, asked: np.ndarray) -> np.ndarray | None:
 
 
 def one_by_one(lens: Frames, model: Callable[[Frames, np.ndarray], np.ndarray | None]):
-    """Coefficients fitted to all frames, and to all but the frame itself (interior ones); NaN: cannot be."""
+    """Coefficients fitted to all frames, and to all but the frame itself (interior ones); NaN: cannot "
+    "be."""
     number = len(lens.focal)
     fitted, left_out = np.full((number, 2), np.nan), np.full((number, 2), np.nan)
     whole = model(lens, lens.focal)
@@ -525,10 +529,10 @@ def families(lenses: list[Lens]) -> np.ndarray:
     return first
 
 
-def halves(family: np.ndarray) -> np.ndarray:
+def halves(family: np.ndarray, seed: int = 0) -> np.ndarray:
     """0 or 1 for each lens, a family together."""
     names = np.unique(family)
-    side = np.random.default_rng(0).permutation(len(names)) % 2
+    side = np.random.default_rng(seed).permutation(len(names)) % 2
     return side[np.searchsorted(names, family)]
 
 
@@ -660,10 +664,7 @@ def study() -> dict:
 
     def by_lens(frame_values, chosen):
         return np.array(
-            [
-                np.sqrt(np.mean(frame_values[a:b][chosen[a:b]]))
-                for a, b in zip(start[:-1], start[1:], strict=True)
-            ]
+            [np.sqrt(np.mean(frame_values[a:b][chosen[a:b]])) for a, b in itertools.pairwise(start)]
         )
 
     every = np.ones(start[-1], bool)
@@ -765,6 +766,47 @@ def print_prior() -> None:
         )
 
 
+def print_forms() -> None:
+    """How much the degree matters, and what comes out if each half of the lenses chooses its own.
+
+    In a half the degree is chosen by priors that one part of it learns and the other tests; so the lenses
+    tested in the end have no part in the choice. (The family, Legendre polynomials with variances that fall
+    with the fourth power of the order, was found with all lenses at hand.)
+    """
+    lenses, _, data = read()
+    family = families(lenses)
+    side, quarter = halves(family), halves(family, seed=7)
+
+    def tested(zoom, chosen):
+        fits = all_lenses(data, partial(fit_smooth, zoom=zoom))
+        errors = [
+            float(np.sqrt(lens_error(Frames(*map(jnp.asarray, lens)), jnp.asarray(fit[1]))))
+            for lens, fit, c in zip(data, fits, chosen, strict=True)
+            if c
+        ]
+        return np.array(errors)
+
+    inside: dict[int, dict[int, float]] = {0: {}, 1: {}}
+    outside: dict[int, dict[int, np.ndarray]] = {0: {}, 1: {}}
+    for degree in (4, 5, 6, 8):
+        for half in (0, 1):
+            logs = [
+                np.log(
+                    tested(learn(data, mine & (quarter != part), degree), mine & (quarter == part)) ** 2
+                    + 0.01
+                )
+                for mine in (side == half,)
+                for part in (0, 1)
+            ]
+            inside[half][degree] = float(np.mean(np.concatenate(logs)))
+            outside[half][degree] = tested(learn(data, side == half, degree), side != half)
+        both = np.concatenate([outside[half][degree] for half in (0, 1)])
+        print(f"degree {degree}:", np.quantile(both, QUANTILES).round(3), flush=True)
+    chosen = [min(inside[half], key=lambda degree: inside[half][degree]) for half in (0, 1)]
+    both = np.concatenate([outside[half][chosen[half]] for half in (0, 1)])
+    print(f"chosen in each half, {chosen}:", np.quantile(both, QUANTILES).round(3))
+
+
 def markdown(r: dict) -> str:
     """The results as a page."""
     m = r["machine"]
@@ -784,15 +826,22 @@ def markdown(r: dict) -> str:
         "# Six hundred real zoom lenses",
         "",
         f"`python benchmarks/real/lensfun.py`: {r['lenses']} rectilinear zooms of the lensfun database "
-        f"(lensfunpy {m['lensfunpy']}) calibrated at five or more focal lengths, {r['frames']:,} in all, of which "
-        f"{r['left_out']:,} are interior and left out in turn. {r['tables']} of the tables are distinct, and "
-        f"{r['families']} families of lenses have neither a name nor a table in common: intervals (95 %) are by "
-        f"bootstrap over families. {UPRIGHT + LEVEL} lines a focal length, seen in {SIZE[0]} × {SIZE[1]} px, no noise "
-        "but that of the calibrations. RMS distance to straightness, px, of each lens; quantiles over the lenses.",
+        f"(lensfunpy {m['lensfunpy']}) calibrated at five or more focal lengths, {r['frames']:,} in "
+        "all, of which "
+        f"{r['left_out']:,} are interior and left out in turn. {r['tables']} of the tables are "
+        "distinct, and "
+        f"{r['families']} families of lenses have neither a name nor a table in common: intervals (95 "
+        "%) are by "
+        f"bootstrap over families. {UPRIGHT + LEVEL} lines a focal length, seen in {SIZE[0]} × "
+        f"{SIZE[1]} px, no noise "
+        "but that of the calibrations. RMS distance to straightness, px, of each lens; quantiles over "
+        "the lenses.",
         "",
         f"{m['cpu']}, {m['cores']} cores, {m['memory_GB']} GB; Python {m['python']}, jax {m['jax']}, numpy "
-        f"{m['numpy']}, scipy {m['scipy']}; on {m['device']}. The study took {r['seconds']:.0f} s, compilation "
-        f"included, and {r['processor']:.0f} s of processor time, on a machine with a load of {r['load']:.1f} ("
+        f"{m['numpy']}, scipy {m['scipy']}; on {m['device']}. The study took {r['seconds']:.0f} s, "
+        "compilation "
+        f"included, and {r['processor']:.0f} s of processor time, on a machine with a load of "
+        f"{r['load']:.1f} ("
         + ", ".join(
             f"{name} {seconds:.0f} s" for name, seconds in r["times"].items() if "fit_zoom" not in name
         )
@@ -820,16 +869,23 @@ def markdown(r: dict) -> str:
             for name in order
         ),
         "",
-        "`corner` is how far, px, the displacement at the image's corner is from that of the frame's own optimum. "
-        "The prior of `SmoothZoom` was learned from the other half of the lenses, families kept together; as it "
-        "is in the package it was learned from all of them, so that its row is in sample. Monotone cubics and "
-        "the nearest frame are no models of the package; `degree chosen inside` takes the degree, 1 to 3, that "
-        "predicts best within the focal lengths it may see. Power law and two regions are fitted to k1 and k2.",
+        "`corner` is how far, px, the displacement at the image's corner is from that of the frame's "
+        "own optimum. "
+        "The prior of `SmoothZoom` was learned from the other half of the lenses, families kept "
+        "together; as it "
+        "is in the package it was learned from all of them, so that its row is in sample. What shape "
+        "the prior has was found with all lenses at hand (see docs/zoom-models.md). Monotone cubics and "
+        "the nearest frame are no models of the package; `degree chosen inside` takes the degree, 1 to "
+        "3, that "
+        "predicts best within the focal lengths it may see. Power law and two regions are fitted to k1 "
+        "and k2.",
         "",
         "## Lens by lens",
         "",
-        "`SmoothZoom` with the other half's prior against each model, on the same lenses: the geometric mean of the "
-        "ratio of their errors, the part of the lenses on which it is better, and the difference of the quantiles, "
+        "`SmoothZoom` with the other half's prior against each model, on the same lenses: the "
+        "geometric mean of the "
+        "ratio of their errors, the part of the lenses on which it is better, and the difference of "
+        "the quantiles, "
         "px, with paired intervals.",
         "",
         "| against | ratio | interval | better | 25 % | median | 75 % | 90 % |",
@@ -867,17 +923,24 @@ def markdown(r: dict) -> str:
         "",
         "## The floor",
         "",
-        f"{r['twice']['pairs']} times the database has a lens twice, calibrated by hand on sensors of different sizes. "
-        "Corrected by the one calibration, lines of the other at the same focal lengths (within 2 %) are less "
+        f"{r['twice']['pairs']} times the database has a lens twice, calibrated by hand on sensors of "
+        "different sizes. "
+        "Corrected by the one calibration, lines of the other at the same focal lengths (within 2 %) "
+        "are less "
         "straight than by its own; over √2, that is what one calibration is wrong by: "
-        f"25 / 50 / 75 / 90 %: {' / '.join(f'{x:.3f}' for x in r['twice']['rms'])} px (two copies of the lens differ, "
-        "too). The frame left out is one calibration, and the prediction is made from others: even the true curve "
-        f"would be off by about {np.hypot(r['twice']['rms'][1], r['frames_alone_interior'][1]):.2f} px in the median, with "
+        f"25 / 50 / 75 / 90 %: {' / '.join(f'{x:.3f}' for x in r['twice']['rms'])} px (two copies of "
+        "the lens differ, "
+        "too). The frame left out is one calibration, and the prediction is made from others: even the "
+        "true curve "
+        f"would be off by about {np.hypot(r['twice']['rms'][1], r['frames_alone_interior'][1]):.2f} px "
+        "in the median, with "
         "what two coefficients cannot follow.",
         "",
         "## How far the study's fits are from those of fit_zoom",
         "",
-        "Every 16th lens, if it has up to 8 focal lengths, its middle one left out: difference, px, of the RMS there.",
+        "Every 16th lens, if it has up to 8 focal lengths, its middle one left out: difference, px, of "
+        "the RMS there. It is rounding, for the scene's lines are symmetric about the image's axes: "
+        "their direction then does not depend on k, and the energy is exactly quadratic in it.",
         "",
         "| | fits | median | largest |",
         "|---|---:|---:|---:|",
@@ -896,10 +959,13 @@ if __name__ == "__main__":
     )
     parser.add_argument("--output", type=Path, default=RESULTS / "lensfun.md")
     parser.add_argument("--prior", action="store_true", help="learn the prior from all lenses and print it")
+    parser.add_argument("--forms", action="store_true", help="compare degrees of SmoothZoom and print them")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if options.prior:
         print_prior()
+    elif options.forms:
+        print_forms()
     else:
         versions = {"lensfunpy": importlib.metadata.version("lensfunpy")}
         measured = {"machine": machine() | versions, **study()}
