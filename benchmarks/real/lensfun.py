@@ -67,10 +67,10 @@ class Frames(NamedTuple):
     Also a batch of lenses, with one more axis. Frames that only pad have zero second derivatives.
     """
 
-    focal: np.ndarray  # (frame,), increasing
-    k: np.ndarray  # (frame, 2), the optimum
-    energy: np.ndarray  # (frame,)
-    second: np.ndarray  # (frame, 2, 2)
+    focal: Any  # (frame,), increasing; arrays of NumPy for one lens, of JAX for a batch
+    k: Any  # (frame, 2), the optimum
+    energy: Any  # (frame,)
+    second: Any  # (frame, 2, 2)
 
 
 def read_lenses() -> list[Lens]:
@@ -78,7 +78,7 @@ def read_lenses() -> list[Lens]:
     import lensfunpy
 
     lenses = []
-    for lens in lensfunpy.Database().lenses:
+    for lens in lensfunpy.Database().lenses:  # pyright: ignore[reportAttributeAccessIssue]
         frames = {c.focal: (c.focal, c.model.name, tuple(c.terms)) for c in lens.calib_distortion}
         if len(frames) >= 5 and lens.type.name == "RECTILINEAR":
             lenses.append(Lens(lens.model, lens.crop_factor, sorted(frames.values())))
