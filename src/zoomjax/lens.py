@@ -198,8 +198,8 @@ _FORMULAS = {
     PowerZoom: "k_i(f) = d0 + d1 (f / focal_ref)^d2 with rows d0, d1, d2 of parameters[.][i-1]",
     TwoRegionZoom: "k_i(f) = sum_j c_j (focal_ref / f)^j with c = parameters[0..2][i-1] for f < crossover, "
     "parameters[3..5][i-1] from there on",
-    SmoothZoom: "k_i(f) = sum_j parameters[j][i-1] P_j(2 focal_ref / f - 1), P_j Legendre's polynomials; the "
-    "rest is the prior",
+    SmoothZoom: "k_i(f) = sum_j parameters[j][i-1] P_j(2 focal_ref / f - 1), P_j Legendre's polynomials; "
+    "the rest is the prior",
 }
 
 _TABLE = (None, None)

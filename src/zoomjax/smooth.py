@@ -1,12 +1,12 @@
 """A polynomial of high degree, held back by what six hundred real zoom lenses look like.
 
 Degree 2 is too stiff for many lenses, and the degree that is not has as many numbers as there are focal
-lengths. `SmoothZoom` has degree 6 and a Gaussian prior instead: a Gaussian process in 1/f, joint over k1 and
-k2, in the finite basis of the Legendre polynomials of ``u = f_ref/f``. Few focal lengths give a curve that
-lenses have; many determine it by themselves.
+lengths. `SmoothZoom` has degree 6 and a Gaussian prior instead: a Gaussian process in 1/f, joint over k1
+and k2, in the finite basis of the Legendre polynomials of ``u = f_ref/f``. Few focal lengths give a curve
+that lenses have; many determine it by themselves.
 
-The prior's numbers come from `benchmarks/real/lensfun.py`, which learns them from zoom lenses of the lensfun
-database as those that predict best the focal lengths that are left out.
+The prior's numbers come from `benchmarks/real/lensfun.py`, which learns them from zoom lenses of the
+lensfun database as those that predict best the focal lengths that are left out.
 """
 
 import math
@@ -39,22 +39,22 @@ class SmoothZoom(AbstractPriorZoom):
     """Each coefficient a polynomial of high degree in 1/f, with a prior on all of them together.
 
     ``k_i(f) = sum_j parameters[j, i] P_j(2u - 1)`` with Legendre's P_j and ``u = focal_ref/f`` in (0, 1]. A
-    priori the parameters have mean 0 and the covariance ``quadratic quadratic^T`` for j = 0, 1, 2 (flattened
-    row by row), and ``(3/j)^4 beyond beyond^T``, independently, for each j from 3 to the degree. `error` is
-    what that is weighed against: see `AbstractPriorZoom`.
+    priori the parameters have mean 0 and the covariance ``quadratic quadratic^T`` for j = 0, 1, 2
+    (flattened row by row), and ``(3/j)^4 beyond beyond^T``, independently, for each j from 3 to the degree.
+    `error` is what that is weighed against: see `AbstractPriorZoom`.
 
-    The defaults are learned from the 618 rectilinear zooms that the lensfun database (of lensfunpy 1.18) has
-    at five or more focal lengths. Learned from half of the lenses and tested on the other half, and the
-    other way round, it predicts a focal length that was left out better than all other zoom models here
-    (docs/zoom-models.md). They are for two coefficients, and for focal lengths of one lens: with other
-    `terms` the prior has to be given. A `error` of 1e-5 is 0.026 px at 4288 x 2848; where single frames have
-    few or rough lines, take about the RMS of their residuals over the root of the number of their lines.
+    The defaults are learned from the 618 rectilinear zooms that the lensfun database (of lensfunpy 1.18)
+    has at five or more focal lengths. Learned from half of the lenses and tested on the other half, and the
+    other way round, it predicts a focal length that was left out better in the median than all other zoom
+    models here (docs/zoom-models.md, with what was chosen on all lenses). They are for two coefficients:
+    with other `terms` the prior has to be given. The default `error` is 0.24 px at 4288 x 2848, that of
+    calibrations by hand; a smaller one trusts each frame more.
 
     Attributes:
         degree: of the polynomials, at least 3.
         parameters: Legendre coefficients; None until fitted.
         focal_ref: the shortest focal length fitted.
-        error: RMS distance to straightness, in half image diagonals, that a frame is wrong by; 0 for no prior.
+        error: RMS distance to straightness, in half diagonals, that a frame is wrong by; 0 for no prior.
         quadratic: lower triangular factor of the covariance of the first three rows of the parameters.
         beyond: the same for the fourth row.
 
@@ -92,8 +92,8 @@ class SmoothZoom(AbstractPriorZoom):
         """Zero polynomials about the shortest focal length; any number of focal lengths will do."""
         if terms != self.beyond.shape[0]:
             raise ValueError(
-                f"The prior of this SmoothZoom is for {self.beyond.shape[0]} terms, but {terms} are asked for: "
-                "give it the arguments quadratic and beyond for them, or choose a PolynomialZoom."
+                f"The prior of this SmoothZoom is for {self.beyond.shape[0]} terms, but {terms} are asked "
+                "for: give it the arguments quadratic and beyond for them, or choose a PolynomialZoom."
             )
         focal = jnp.asarray(focal)
         return SmoothZoom(
