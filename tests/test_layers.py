@@ -21,7 +21,7 @@ LAYERS = (
     {"framing"},
     {"positions", "warp", "sizes"},
     {"_solver", "compression"},
-    {"any_centre"},
+    {"any_centre", "image_metric"},
     {"algebraic"},
     {"uncertainty"},
     {"fit"},

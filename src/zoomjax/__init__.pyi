@@ -35,6 +35,8 @@ from .focal import focal_from_lines as focal_from_lines
 from .focal import focal_from_planes as focal_from_planes
 from .framing import Framing as Framing
 from .framing import frame_output as frame_output
+from .image_metric import ImageLines as ImageLines
+from .image_metric import in_image as in_image
 from .io.focal_track import FocalTrack as FocalTrack
 from .io.focal_track import read_focal_track as read_focal_track
 from .io.lines_csv import read_focal_csv as read_focal_csv

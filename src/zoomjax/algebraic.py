@@ -18,13 +18,19 @@ from jaxtyping import Array, Float
 from ._linear import least_squares
 from .compression import CompressedLines, compress
 from .energy import line_weights, prior_jacobian
+from .image_metric import ImageLines
 from .lens import ZoomLens, lens_of
 from .lines import AbstractLines, Lines
 from .zoom import AbstractLinearZoom, PolynomialZoom, with_parameters
 
 
 def compressed(lines: AbstractLines, terms: int) -> CompressedLines:
-    """The lines themselves if they are compressed already, or else their exact compression."""
+    """The lines themselves if they are compressed already, or else their exact compression.
+
+    Of lines measured in the image, those that they are.
+    """
+    if isinstance(lines, ImageLines):
+        lines = lines.as_weighted()
     if isinstance(lines, CompressedLines):
         lines.check_terms(terms)
         return lines

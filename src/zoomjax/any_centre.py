@@ -59,9 +59,9 @@ class AnyCentreLines(AbstractLines):
         combine = jax.vmap(lambda r, k: r[1:] @ _corrected_point(self.terms, k[:-2], k[-2:]).T)
         return self.scale * combine(self.triangle, coefficients)
 
-    def radial_moments(self, order: int) -> Float[Array, "line moment"]:
-        """``sum_p r_p^(2i)`` for i = 0 ... order, at most 2 N + 1, r from `centre`."""
-        return self.about(self.centre).radial_moments(order)
+    def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
+        """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1, at most 2 N + 1, z from `centre`."""
+        return self.about(self.centre).second_moments(order)
 
     def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "AnyCentreLines":
         """The chosen lines as a data set of one frame."""

@@ -80,14 +80,12 @@ class CompressedLines(AbstractLines):
         self.check_terms(coefficients.shape[1])
         return self.scale * jax.vmap(_combine)(self.triangle, coefficients)
 
-    def radial_moments(self, order: int) -> Float[Array, "line moment"]:
-        """``sum_p r_p^(2i)`` for i = 0 ... order, at most 2 N + 1."""
+    def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
+        """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1, with an order of at most 2 N + 1."""
         columns = self.triangle[..., 1:].reshape(*self.triangle.shape[:2], -1, 2)
-        moments = [self.counts]
-        for total in range(order):
-            j = total // 2
-            moments.append(jnp.sum(columns[:, :, j] * columns[:, :, total - j], axis=(1, 2)))
-        return jnp.stack(moments, axis=1)
+        halves = [(total // 2, total - total // 2) for total in range(order)]
+        products = [jnp.einsum("lrc,lrd->lcd", columns[:, :, i], columns[:, :, j]) for i, j in halves]
+        return jnp.stack(products, axis=1)
 
     def about(self, centre: Centres) -> "CompressedLines":
         """These lines, if `centre` is theirs, px.

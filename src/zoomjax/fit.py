@@ -28,10 +28,10 @@ from ._solver import default_solver
 from ._types import AnyArray, Centres, traced
 from .algebraic import algebraic_parameters, compressed
 from .certificate import Certificate, certificate_of, slope_controls
-from .compression import CompressedLines
 from .energy import energy_by_frame, frame_energy, prior_residuals, residuals
+from .image_metric import ImageLines, in_image
 from .lens import ZoomLens, lens_of
-from .lines import AbstractLines
+from .lines import AbstractLines, Lines
 from .radial import Distortion
 from .uncertainty import parameter_covariance
 from .zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
@@ -201,7 +201,7 @@ def fit_zoom(
     solver = default_solver(lines) if solver is None else solver
     fit, outcome = _fit_zoom(lines, start, model, terms, solver, max_steps)
     if invertible:
-        fit, outcome = _or_else(fit, outcome, lambda: _refit_zoom(compressed(lines, terms), fit))
+        fit, outcome = _or_else(fit, outcome, lambda: _refit_zoom(_small(lines, terms), fit))
     return _thrown(fit, outcome, throw)
 
 
@@ -224,6 +224,12 @@ def ready_model(lines, zoom, terms):
     dtype = jnp.asarray(lines.focal).dtype
     arrays, rest = eqx.partition(zoom, eqx.is_inexact_array)
     return eqx.combine(jax.tree.map(lambda array: array.astype(dtype), arrays), rest), terms
+
+
+def _small(lines, terms):
+    """The lines compressed, measured as they were."""
+    small = compressed(lines, terms)
+    return in_image(small) if isinstance(lines, ImageLines) else small
 
 
 def _check_lines(lines):
@@ -258,7 +264,8 @@ def fit_frames(
     start = compressed(lines, terms)
     fits, outcome = _fit_frames(lines, start, chosen, present, terms, solver, max_steps)
     if invertible:
-        fits, outcome = _or_else(fits, outcome, lambda: _refit_frames(start, chosen, present, terms, fits))
+        small = _small(lines, terms)
+        fits, outcome = _or_else(fits, outcome, lambda: _refit_frames(small, chosen, present, terms, fits))
     return _thrown(fits, outcome, throw)
 
 
@@ -353,7 +360,7 @@ def _fit_frames(lines, start, chosen, present, terms, solver, max_steps):
 
     # Small compressed frames are solved side by side; the points themselves one frame at a time, for
     # side by side they would all be in memory at once, padded to the fullest frame.
-    batch = chosen.shape[0] if isinstance(lines, CompressedLines) else 1
+    batch = 1 if isinstance(lines.lines if isinstance(lines, ImageLines) else lines, Lines) else len(chosen)
     fits = jax.lax.map(lambda frame: fit(*frame), (chosen, present), batch_size=batch)
     each = collected(lines, fits)
     return each, _outcome(each)

@@ -66,8 +66,13 @@ class AbstractLines(eqx.Module):
         """
 
     @abc.abstractmethod
+    def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
+        """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1, over each line's points, normalised."""
+
     def radial_moments(self, order: int) -> Float[Array, "line moment"]:
-        """``sum_p r_p^(2i)`` for i = 0 ... order, over the points of each line, r normalised."""
+        """``sum_p r_p^(2i)`` for i = 0 ... order, over the points of each line, normalised."""
+        traces = jnp.trace(self.second_moments(order), axis1=2, axis2=3)
+        return jnp.concatenate([self.counts[:, None].astype(traces.dtype), traces], axis=1)
 
     @abc.abstractmethod
     def about(self, centre: Centres) -> "AbstractLines":
@@ -294,16 +299,11 @@ class Lines(AbstractLines):
             jnp.asarray(self.points), jnp.asarray(self.mask), coefficients, self.centre, self.scale
         )
 
-    def radial_moments(self, order: int) -> Float[Array, "line moment"]:
-        """``sum_p r_p^(2i)`` for i = 0 ... order."""
+    def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
+        """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1."""
         z = jnp.where(self.mask[..., None], (self.points - self.centre[None, None]) / self.scale, 0)
-        squared = jnp.sum(z * z, axis=-1)
-        moments = [self.counts]
-        power = jnp.ones_like(squared)
-        for _ in range(order):
-            power = power * squared
-            moments.append(jnp.sum(power, axis=1))
-        return jnp.stack(moments, axis=1)
+        squared = jnp.sum(z * z, axis=-1, keepdims=True)
+        return jnp.stack([jnp.einsum("lpc,lpd->lcd", squared**i * z, z) for i in range(order)], axis=1)
 
     def about(self, centre: Centres) -> "Lines":
         """The same lines about another centre of distortion, px: that of all frames, or of each frame.
