@@ -30,6 +30,18 @@ def pytest_report_header(config):
     return f"zoomjax: seed {SEED}, float64 {jax.config.jax_enable_x64}, {jax.default_backend()}"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _programs_are_dropped():
+    """Let go of what one file's tests compiled.
+
+    A compiled program holds several memory maps, and Linux allows a process 65530 of them: XLA crashes
+    at the next.
+    """
+    yield
+    eqx.clear_caches()
+    jax.clear_caches()
+
+
 @pytest.fixture
 def rng():
     return np.random.default_rng(SEED)

@@ -130,6 +130,11 @@ WRONG = {
     "options of images for lines": (["lines.npz", "--pitch", "3"], "--pitch are for images"),
     "an option of lines for images": (["a.jpg", "--image-size", "640x480"], "images have their own"),
     "half a board": (["a.jpg", "--pitch", "20"], "--distance and --pixel is not"),
+    "a pitch that is none": (
+        ["a.jpg", "--pitch", "20x", "--distance", "9", "--pixel", "1"],
+        "--pitch is not",
+    ),
+    "no way to a focal length": (["a.jpg", "--focal", "zoom"], "no way to a focal length"),
     "a unit that is none": (["a.jpg", "--focal-unit", "km"], "mm or px"),
     "no such detector": (["a.jpg", "--detector", "circles"], "edges, grid, pitch"),
     "two files": (["lines.npz", "lines.npz"], "one file"),
@@ -169,6 +174,15 @@ def test_calibrate_does_not_replace_its_input(wrong_files):
     assert done.returncode == 2
     assert "would replace the input" in done.stderr
     assert (wrong_files / "lines.npz").read_bytes() == before
+
+
+def test_calibrate_does_not_replace_photographs(tmp_path):
+    write_photos(tmp_path / "lines", number=3, image_size=(536, 356))
+    before = {p: p.read_bytes() for p in (tmp_path / "lines").iterdir()}
+    done = zoomjax("calibrate", "lines", "-o", ".", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "would replace the photograph" in done.stderr
+    assert {p: p.read_bytes() for p in (tmp_path / "lines").iterdir()} == before
 
 
 def test_an_interrupted_run_leaves_nothing(wrong_files):

@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,11 +57,18 @@ class Calibration:
             ("zoom polynomial", np.asarray(self.zoom.frame_rms)),
         ]
 
-    def warnings(self) -> list[str]:
-        """What a user must hear of: sentences about the zoom model, and about frames that have none."""
+    def warnings(self, names: Sequence[str] | None = None) -> list[str]:
+        """What a user must hear of: sentences about the zoom model, and about frames that have none.
+
+        `names` are those of the frames; by default their numbers, from 0.
+        """
         told = [RESULTS[self.zoom.result]] if self.zoom.result != RESULTS.successful else []
         for message in dict.fromkeys(filter(None, messages := self.each.messages())):
-            frames = [str(frame) for frame, other in enumerate(messages) if other == message]
+            frames = [
+                names[frame] if names else str(frame)
+                for frame, other in enumerate(messages)
+                if other == message
+            ]
             which = ", ".join(frames[:8]) + (", ..." if len(frames) > 8 else "")
             told.append(
                 f"{len(frames)} of {len(messages)} frames have no good model of their own "

@@ -7,6 +7,7 @@ compute in float64. Errors go to stderr with exit status 2, and leave no partial
 import contextlib
 import importlib.metadata
 import os
+import signal
 import sys
 import tempfile
 import time
@@ -46,6 +47,7 @@ _INTERRUPTED = 130  # Typer's exit status for Ctrl-C
 def main() -> None:
     """Run the command line; what a user can mend is one sentence on stderr and exit status 2."""
     warnings.showwarning = _print_warning
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # and leave no half file
     try:
         app()
     except (ValueError, OSError, RuntimeError) as error:
@@ -105,6 +107,8 @@ def demo(
         lens = done.calibration.zoom.lens
         demo.write_before_after(made[0], folder / "before-after.jpg", lens, focal[0])
         (folder / "photos").mkdir(exist_ok=True)
+        for old in (folder / "photos").glob("board-*mm.jpg"):
+            old.unlink()
         for photo in made:
             photo.replace(folder / "photos" / photo.name)
     _show(done.calibration, board.magnification)
@@ -142,8 +146,10 @@ def calibrate(
         str | None, typer.Option(help="Unit of the focal lengths of a CSV or a number: mm (default) or px.")
     ] = None,
     pitch: Annotated[
-        float | None,
-        typer.Option(metavar="MM", help="--focal board: from one line on it to the next."),
+        str | None,
+        typer.Option(
+            metavar="MM[xMM]", help="--focal board: from one line on it to the next, across and down."
+        ),
     ] = None,
     distance: Annotated[
         float | None, typer.Option(metavar="MM", help="--focal board: from the camera to the board.")
@@ -167,7 +173,7 @@ def calibrate(
     _set_up_jax()
     from .calibration import results_folder
 
-    if any(path.endswith((".npz", ".csv")) for path in inputs):
+    if any(path.lower().endswith((".npz", ".csv")) for path in inputs):
         _refuse_image_options(
             {"--pitch": pitch, "--distance": distance, "--pixel": pixel, "--jobs": jobs}, inputs
         )
@@ -199,6 +205,7 @@ def calibrate(
         workers=jobs or _cores(),
         cache=cache_folder("detections") if cache else None,
     )
+    _refuse_to_replace(job, output)
     with results_folder(output) as folder:
         done = _calibrate_images(job, folder)
     _show(done.calibration)
@@ -231,13 +238,10 @@ def undistort(
     ] = False,
 ) -> None:
     """Correct photos, or a video, each at its own focal length."""
-    import signal
-
-    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # and leave no half file
     _set_up_jax()
     from .vision.files import Job, undistort_files
 
-    with _progress("Correcting") as progress:
+    with _progress("Correcting", timed=False) as progress:
         done = undistort_files(
             Job(lens, tuple(inputs), output, focal, keep, interpolation, border, hold), progress
         )
@@ -245,8 +249,11 @@ def undistort(
 
 
 @contextlib.contextmanager
-def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A function of what is done and of how much (0: unknown), shown as a bar on stderr."""
+def _progress(what: str, timed: bool = True) -> Iterator[Callable[[int, int], None]]:
+    """A function of what is done and of how much (0: unknown), shown as a bar on stderr.
+
+    If `timed`, the bar leaves behind how long it took, as a stage does.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -268,7 +275,8 @@ def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
             bar.update(task, completed=done, total=total or None, rate=rate)
 
         yield show
-    _stage_done(console, what, start)
+    if timed:
+        _stage_done(console, what, start)
 
 
 def _stage_done(console: "Console", name: str, start: float) -> None:
@@ -367,22 +375,41 @@ def _unit(given: str | None) -> str:
     return given or "mm"
 
 
-def _board(pitch: float | None, distance: float | None, pixel: float | None) -> "Board | None":
+def _board(pitch: str | None, distance: float | None, pixel: float | None) -> "Board | None":
     from .vision.focals import Board
 
-    given = {"--pitch": pitch, "--distance": distance, "--pixel": pixel}
-    if not any(value is not None for value in given.values()):
+    if pitch is distance is pixel is None:
         return None
-    bad = [name for name, value in given.items() if value is None or not value > 0]
-    if bad:
+    pitches = [_positive(part) for part in (pitch or "").lower().split("x")]
+    given = {"--pitch": all(pitches), "--distance": (distance or 0) > 0, "--pixel": (pixel or 0) > 0}
+    bad = [name for name, good in given.items() if not good]
+    if bad or len(pitches) > 2 or distance is None or pixel is None:
         raise ValueError(
-            f"A board needs its --pitch, its --distance and the sensor's --pixel, all in mm and positive: "
-            f"{' and '.join(bad)} is not."
+            "A board needs its --pitch (MM, or MMxMM across and down), its --distance and the sensor's "
+            f"--pixel, all in mm and positive: {' and '.join(bad or ['--pitch'])} is not."
         )
-    assert pitch is not None
-    assert distance is not None
-    assert pixel is not None
-    return Board(pitch, distance, pixel)
+    return Board((pitches[0], pitches[-1]), distance, pixel)
+
+
+def _positive(text: str) -> float:
+    """The number, or 0 if it is none or not positive."""
+    try:
+        return max(float(text), 0.0)
+    except ValueError:
+        return 0.0
+
+
+def _refuse_to_replace(job: "ImageJob", output: Path) -> None:
+    """Refuse to write over photographs that are calibrated from."""
+    from .vision.images import RESULTS
+
+    results = {(output / name).resolve() for name in RESULTS}
+    for source in job.sources()[0] if job.video is None else ():
+        real = (source.path or Path()).resolve()
+        if results.intersection((real, *real.parents)):
+            raise ValueError(
+                f"The results would replace the photograph {source.path}: give another folder."
+            )
 
 
 def _refuse_image_options(options: dict[str, object], inputs: list[str]) -> None:

@@ -12,19 +12,24 @@ def table(tmp_path, text):
 
 def test_images_have_their_focal_lengths(tmp_path):
     read = table(tmp_path, "image,focal\na.jpg,24\nb.jpg, 70.5\n")
-    assert (read.of("a.jpg"), read.of("shots/b.jpg"), read.of("c.jpg")) == (24, 70.5, None)
+    assert read.of(["a.jpg", "shots/b.jpg", "c.jpg"]) == {"a.jpg": 24, "shots/b.jpg": 70.5}
 
 
 def test_other_columns_and_orders_do_not_matter(tmp_path):
     read = table(tmp_path, "focal,note,image\n24,wide,a.jpg\n\n70,long,b.jpg\n")
-    assert (read.of("a.jpg"), read.of("b.jpg")) == (24, 70)
+    assert (read.need("a.jpg"), read.need("b.jpg")) == (24, 70)
 
 
 def test_folders_tell_images_of_one_name_apart(tmp_path):
     read = table(tmp_path, "image,focal\n1x/board.png,24\n3x\\board.png,70\nother.png,35\n")
-    assert (read.of("1x/board.png"), read.of("/data/3x/board.png")) == (24, 70)
-    assert read.of("board.png") is None
-    assert read.of("9x/other.png") == 35
+    assert (read.need("1x/board.png"), read.need("/data/3x/board.png")) == (24, 70)
+    assert read.of(["board.png"]) == {}
+    assert read.need("9x/other.png") == 35
+
+
+def test_one_row_for_two_images_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"one row a\.png for two images, 1x/a\.png and 3x/a\.png"):
+        table(tmp_path, "image,focal\na.png,24\n").of(["1x/a.png", "3x/a.png"])
 
 
 def test_a_needed_image_that_is_absent_is_named(tmp_path):

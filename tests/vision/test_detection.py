@@ -117,6 +117,42 @@ def test_a_cache_that_cannot_be_written_does_no_harm(photos, marker, tmp_path):
     assert len(next(detect(photos[:1], marker, cache=tmp_path / "file" / "cache")).lines) == 1
 
 
+def test_the_cache_does_not_keep_a_videos_track(marker, tmp_path):
+    image = np.zeros((40, 120), np.uint8)
+    image[7] = 255
+    for focal in (20.0, 200.0):
+        [found] = detect([Source("a", image=image, focal=focal)], marker, cache=tmp_path / "cache")
+        assert found.focal == focal
+    assert looks(marker) == 1
+
+
+def test_what_no_detector_can_do_with_an_image_is_told(tmp_path):
+    grey, small = np.zeros((100, 100), np.uint8), np.zeros((20, 100, 3), np.uint8)
+    [found] = detect([Source("a", image=grey)], zj.PitchDetector())
+    assert "grey" in found.problem
+    assert "--detector edges" in found.problem
+    [found] = detect([Source("a", image=small)], zj.EdgeDetector())
+    assert found.problem == "it is 100x20 px: at least 32 px a side are needed"
+
+
+class Broken(zj.AbstractDetector):
+    def __call__(self, image):
+        raise IndexError("out of bounds.")
+
+
+def test_a_detector_that_fails_is_one_images_problem(photos):
+    found = list(detect(photos, Broken()))
+    assert [d.problem for d in found[:4]] == ["the detector failed: IndexError: out of bounds"] * 4
+
+
+def test_a_file_that_may_not_be_read_is_told_in_words(photos, marker, monkeypatch):
+    def denied(self):
+        raise PermissionError(13, "Permission denied", str(self.path))
+
+    monkeypatch.setattr(Source, "read", denied)
+    assert next(detect(photos, marker)).problem == "Permission denied"
+
+
 @pytest.mark.slow
 def test_processes_find_what_one_does(tmp_path):
     folder = tmp_path / "photos"

@@ -7,7 +7,7 @@ import pytest
 import zoomjax as zj
 from zoomjax import synthetic
 from zoomjax.vision.detection import Detection, detect
-from zoomjax.vision.focals import Board, choose_focals
+from zoomjax.vision.focals import Board, check_way, choose_focals
 from zoomjax.vision.images import Source
 
 SIZE = (1072, 712)
@@ -16,7 +16,7 @@ PRINCIPAL = (np.array(SIZE) - 1) / 2
 
 def of(name, focal=None):
     line = np.stack([np.full(9, 30.0), np.arange(10.0, 100, 10)], axis=-1)
-    return Detection(name, SIZE, (line,), focal)
+    return Detection(name, name, SIZE, (line,), focal)
 
 
 def test_exif_data_come_first():
@@ -38,21 +38,50 @@ def test_one_number_is_that_of_all():
 
 
 @pytest.mark.parametrize(
-    ("way", "error", "message"),
+    ("way", "message"),
     [
-        (None, ValueError, "no flat grid.*image,focal.*EXIF.*parallel.*oblique"),
-        ("exif", ValueError, "EXIF data.*image,focal.*EXIF.*parallel.*oblique"),
-        ("plane", ValueError, "homographies"),
-        ("board", ValueError, "--pitch and --distance"),
-        ("zoom", ValueError, "'zoom', which is no way"),
-        ("-3", ValueError, "positive number"),
-        ("nan", ValueError, "positive number"),
-        ("nothing.csv", FileNotFoundError, "nothing.csv"),
+        (None, "no flat grid.*image,focal.*EXIF.*parallel.*oblique"),
+        ("exif", "EXIF data.*image,focal.*EXIF.*parallel.*oblique"),
+        ("plane", "homographies"),
+        ("board", "--pitch and --distance"),
     ],
 )
-def test_without_a_focal_length_the_ways_are_named(way, error, message):
-    with pytest.raises(error, match=message):
+def test_without_a_focal_length_the_ways_are_named(way, message):
+    with pytest.raises(ValueError, match=message):
         choose_focals([of("a.jpg"), of("b.jpg")], way)
+
+
+@pytest.mark.parametrize("video", [False, True])
+@pytest.mark.parametrize(
+    ("way", "error", "message"),
+    [
+        ("board", ValueError, "--pitch and --distance"),
+        ("zoom", ValueError, "'zoom', which is no way"),
+        ("focal.txt", ValueError, "which is no way"),
+        ("-3", ValueError, "positive number"),
+        ("0", ValueError, "positive number"),
+        ("nan", ValueError, "positive number"),
+        ("nothing.csv", FileNotFoundError, r"nothing\.csv"),
+    ],
+)
+def test_what_is_no_way_is_told_before_any_work(way, video, error, message):
+    with pytest.raises(error, match=message):
+        check_way(way, None, video=video)
+
+
+def test_the_ways_that_there_are(tmp_path):
+    (tmp_path / "f.csv").write_text("image,focal\na.jpg,1200\n")
+    (tmp_path / "t.csv").write_text("frame,focal\n0,1200\n")
+    board = Board((20.0, 20.0), 1000.0, 0.005)
+    for way in (None, "exif", "plane", "35", str(tmp_path / "f.csv")):
+        check_way(way, None, video=False)
+    for way in ("plane", "35", str(tmp_path / "t.csv")):
+        check_way(way, None, video=True)
+    for way in (None, "board"):
+        check_way(way, board, video=True)
+    for way in (None, "exif"):
+        with pytest.raises(ValueError, match=r"A video needs --focal.*time,focal"):
+            check_way(way, None, video=True)
 
 
 @pytest.fixture(scope="module")
@@ -66,22 +95,46 @@ def striped():
     return focal, list(detect(photos, zj.EdgeDetector()))
 
 
+BOARD = synthetic.StripedBoard.before(synthetic.nikkor_18_200(SIZE))
+PITCHES = tuple(BOARD.size[axis] / BOARD.stripes[axis] / 2 for axis in (0, 1))  # 21.45 and 21.96 mm
+
+
 def test_the_pitch_of_a_board_gives_the_focal_length_within_a_thousandth(striped):
     focal, detections = striped
-    board = synthetic.StripedBoard.before(synthetic.nikkor_18_200(SIZE))
-    # The stripes of the paper's board are not quite as wide one way as the other: 21.45 and 21.96 mm.
-    widths = [board.size[axis] / board.stripes[axis] / 2 for axis in (0, 1)]
-    upright = [
-        Detection(
-            d.name, d.image_size, tuple(line for line in d.lines if np.diff(np.ptp(line, axis=0)) > 0)
-        )
-        for d in detections
-    ]
-    found = choose_focals(upright, board=Board(widths[0], board.distance, board.pixel))
+    found = choose_focals(detections, board=Board(PITCHES, BOARD.distance, BOARD.pixel))
     assert (found.unit, found.origin) == ("mm", "the board's pitch (eq. 14)")
     for d, f in zip(detections, focal, strict=True):
         assert found.focal[d.name] == pytest.approx(f, rel=1e-3)
         assert 0 < found.deviation[d.name] < 1e-3 * f
+
+
+def test_a_board_whose_directions_disagree_is_refused(striped):
+    """As the paper's board does, taken for one of square fields."""
+    _, detections = striped  # of the first, only borders across are found evenly spaced
+    with pytest.raises(ValueError, match=r"differs between its two directions.*ACROSSxDOWN"):
+        choose_focals(detections[1:], board=Board((PITCHES[0],) * 2, BOARD.distance, BOARD.pixel))
+
+
+def upright(*positions):
+    y = np.arange(10.0, 700, 10)
+    lines = tuple(np.stack([np.full_like(y, x), y], axis=-1) for x in positions)
+    return Detection("a.png", "a.png", SIZE, lines)
+
+
+def test_lines_that_are_no_boards_tell_nothing():
+    board = Board((20.0, 20.0), 1000.0, 0.01)
+    with pytest.raises(ValueError, match="no evenly spaced lines of a board"):
+        choose_focals([upright(30, 77, 190, 260, 500, 900)], board=board)
+    with pytest.raises(ValueError, match="no evenly spaced lines of a board"):
+        choose_focals([upright(30, 30, 30)], board=board)
+
+
+def test_missing_lines_and_lines_in_pieces_do_not_matter():
+    board = Board((20.0, 20.0), 1000.0, 0.01)
+    [even] = choose_focals([upright(100, 200, 300, 400, 500, 600, 700)], board=board).focal.values()
+    [gaps] = choose_focals([upright(100, 200, 200.01, 400, 500, 600, 700)], board=board).focal.values()
+    assert even == pytest.approx(1000 * 1 / 21)  # a step of 100 px, 1 mm, is 20 mm on the board
+    assert gaps == pytest.approx(even, rel=1e-3)
 
 
 def oblique(focal, tilts, k=(0.05, -0.02)):
@@ -93,7 +146,8 @@ def oblique(focal, tilts, k=(0.05, -0.02)):
         depth = 1.3 * focal / 1000 + np.sin(a) * x + np.sin(b) * y
         corrected = PRINCIPAL + focal * np.stack([np.cos(a) * x, np.cos(b) * y], -1) / depth[..., None]
         seen = np.asarray(lens.distort(jnp.asarray(corrected)))
-        yield Detection(f"{focal:g}-{index}.png", SIZE, tuple(zj.GridDetector.lines(seen)), None, seen)
+        name = f"{focal:g}-{index}.png"
+        yield Detection(name, name, SIZE, tuple(zj.GridDetector.lines(seen)), None, seen)
 
 
 def test_oblique_views_of_a_grid_give_focal_lengths():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from zoomjax import synthetic
+from zoomjax.io.exif import exif_with_focal
 from zoomjax.vision import demo
 from zoomjax.vision.image_calibration import ImageJob, calibrate_images
 
@@ -54,7 +55,7 @@ def test_bad_images_are_reported_and_do_not_matter(done):
         "turned.png": "its size is 712x1072 px, most images' 1072x712: it was turned, so turn it back",
         "blank.png": "no lines were found",
         "empty.jpg": "the file is empty",
-        "cut.jpg": "the file is cut off",
+        "cut.jpg": "the file is damaged or cut off",
     }
     assert set(done.unused) == set(expected)
     for name, reason in expected.items():
@@ -99,6 +100,29 @@ def test_lines_that_are_not_straight_are_rejected(folder, tmp_path):
     assert demo.worst_error(spoiled.calibration.zoom.lens, truth, [20.56, 50.0, 127.36]) < 0.1
 
 
+def test_an_image_none_of_whose_lines_agrees_is_not_used(folder, tmp_path):
+    """One line, drawn by hand."""
+    for path in sorted(folder.glob("board*")):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    t = np.linspace(0, 1, 200)
+    arc = np.stack([500 + 12 * (2 * t - 1) ** 2, 20 + 670 * t], axis=-1)
+    image = np.full((SIZE[1], SIZE[0]), 60, np.uint8)
+    cv2.fillPoly(
+        image,
+        [np.rint(np.vstack([arc, [[1100, 690], [1100, 20]]]) * 16).astype(np.int32)],
+        200,
+        cv2.LINE_AA,
+        4,
+    )
+    exif = np.frombuffer(exif_with_focal(60.0), np.uint8)
+    _, content = cv2.imencodeWithMetadata(".png", image, [cv2.IMAGE_METADATA_EXIF], [exif])
+    (tmp_path / "bent.png").write_bytes(content.tobytes())
+    done = calibrate_images(ImageJob((tmp_path,)))
+    assert list(done.unused) == ["bent.png"]
+    assert "none of its lines is straight" in done.unused["bent.png"]
+    assert len(done.used) == 5
+
+
 def test_a_zooming_video_is_calibrated(tmp_path):
     clips.write_clip(tmp_path / "zoom.mp4", sound=False)
     track = [f"{n},{clips.focal(n)}" for n in range(clips.FRAMES)]
@@ -115,6 +139,13 @@ def test_a_zooming_video_is_calibrated(tmp_path):
     assert len(list((tmp_path / "lines").glob("zoom-*.jpg"))) == 8
 
 
+def test_a_second_run_leaves_nothing_of_the_first(done, tmp_path):
+    done.write(tmp_path)
+    (tmp_path / "lines" / "old.jpg").write_bytes(b"of a photo that is no longer used")
+    done.write(tmp_path)
+    assert sorted(p.name for p in (tmp_path / "lines").iterdir()) == sorted(d.name for d in done.used)
+
+
 WRONG = {
     "unknown detector": (
         {"detector": "circles"},
@@ -126,6 +157,8 @@ WRONG = {
     "no such photo": ({"inputs": ("nothing.jpg",)}, FileNotFoundError, "nothing.jpg"),
     "no such table": ({"focal": "nothing.csv"}, FileNotFoundError, "nothing.csv"),
     "video without focal": ({"inputs": ("a.mp4",)}, ValueError, "A video needs --focal"),
+    "a number that is none": ({"focal": "-3"}, ValueError, "positive number"),
+    "video with exif": ({"inputs": ("a.mp4",), "focal": "exif"}, ValueError, "A video needs --focal"),
     "no such video": ({"inputs": ("a.mp4",), "focal": "3"}, FileNotFoundError, "no video a.mp4"),
 }
 

@@ -2,6 +2,7 @@
 
 import warnings
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -38,6 +39,26 @@ def test_patterns_are_expanded(tmp_path, image):
     assert names(find_photos([str(tmp_path / "*.png"), tmp_path / "c.jpg"])) == ["a.png", "b.png", "c.jpg"]
 
 
+def test_of_a_pattern_only_photographs_count(tmp_path, image):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "notes.txt").write_text("straight")
+    (tmp_path / "gone.png").symlink_to(tmp_path / "nowhere.png")
+    for name in ("a.png", "sub/b.png"):
+        cv2.imwrite(str(tmp_path / name), image)
+    assert names(find_photos([str(tmp_path / "*")])) == ["a.png"]
+    assert names(find_photos([str(tmp_path / "**")])) == ["a.png", "b.png"]
+    assert names(find_photos([str(tmp_path / "s*")])) == ["b.png"]
+
+
+def test_results_of_a_calibration_are_no_photographs(tmp_path, image):
+    for folder in (tmp_path, tmp_path / "out"):
+        (folder / "lines").mkdir(parents=True)
+        (folder / "lens.json").write_text("{}")
+        for name in ("a.png", "model.png", "lines/a.png"):
+            cv2.imwrite(str(folder / name), image)
+    assert names(find_photos([tmp_path])) == [f"{tmp_path.name}/a.png", "out/a.png"]
+
+
 def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path, image):
     for folder in ("1x", "3x"):
         (tmp_path / folder).mkdir()
@@ -55,7 +76,7 @@ def test_the_same_file_twice_is_refused(tmp_path, image):
     ("given", "error", "message"),
     [
         ("nothing.jpg", FileNotFoundError, r"no file or folder .*nothing\.jpg"),
-        ("*.jpg", FileNotFoundError, "no file fits the pattern"),
+        ("*.jpg", FileNotFoundError, "no photograph fits the pattern"),
         ("notes.txt", ValueError, r"notes\.txt is no photograph"),
         ("empty", ValueError, "no photographs in the folder"),
     ],
@@ -84,7 +105,15 @@ def test_images_of_any_depth_and_channels_become_bytes(tmp_path, image, kind):
     assert read.dtype == np.uint8
     assert read.shape == expected.shape
     assert own is None
-    np.testing.assert_allclose(read.astype(float), expected * (255 / expected.max()), atol=1)
+    np.testing.assert_allclose(read.astype(float), expected, atol=12)
+
+
+def test_a_hot_pixel_does_not_darken_the_rest(image):
+    deep = image.astype(np.uint16) * 16
+    deep[3, 4] = 65535
+    found, expected = as_bytes(deep).astype(float), image.astype(float)
+    found[3, 4] = expected[3, 4] = 0
+    np.testing.assert_allclose(found, expected, atol=12)
 
 
 def test_values_that_are_no_numbers_are_dark():
@@ -111,6 +140,22 @@ def test_a_file_that_is_cut_off_or_empty_or_something_else_is_refused(tmp_path, 
             find_photos([tmp_path / f"a{suffix}"])[0].read()
 
 
+def test_what_follows_a_photograph_in_its_file_does_not_matter(tmp_path, image, rng):
+    """As films do in phones' files; and a thumbnail within it is not its end."""
+    whole = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    path = tmp_path / "a.jpg"
+    for _ in range(5):
+        path.write_bytes(whole + rng.bytes(20000))
+        find_photos([path])[0].read()
+    thumbnail = cv2.imencode(".jpg", image[:8, :8])[1].tobytes()
+    segment = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
+    path.write_bytes(whole[:2] + segment + whole[2:])
+    find_photos([path])[0].read()
+    path.write_bytes(whole[:2] + segment + whole[2 : len(whole) // 2])
+    with pytest.raises(ValueError, match="cut off"):
+        find_photos([path])[0].read()
+
+
 # Video.
 
 
@@ -131,6 +176,19 @@ def test_frames_of_a_video_are_spread_over_it_with_their_focal_lengths(clip):
         image, own = source.read()
         assert own is None
         assert abs(image.astype(float) - picture(number)[..., None]).mean() < 3
+
+
+def test_frames_are_spread_where_their_number_is_not_announced(clip, tmp_path):
+    """As in Matroska files, which have a length."""
+    with av.open(str(clip)) as given, av.open(str(tmp_path / "a.mkv"), "w") as out:
+        stream = out.add_stream_from_template(given.streams.video[0])
+        for packet in given.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                out.mux(packet)
+    numbers = [int(source.name[-10:-4]) for source in video_frames(tmp_path / "a.mkv", 30.0, 6)]
+    assert len(numbers) >= 5
+    assert (numbers[0], numbers[-1] >= FRAMES - 3) == (0, True)
 
 
 def test_more_frames_than_there_are_are_all_frames(clip):

@@ -117,7 +117,7 @@ def wrong(case, tmp_path, rng):
     return {
         "missing": (tmp_path / "none.jpg", out, {}, FileNotFoundError, "no photograph"),
         "empty": (tmp_path / "empty.jpg", out, {}, ValueError, r"Cannot read a photograph from .*empty"),
-        "damaged": (tmp_path / "damaged.jpg", out, {}, ValueError, "damaged, or of an unknown format"),
+        "damaged": (tmp_path / "damaged.jpg", out, {}, ValueError, "damaged"),
         "suffix": (good, tmp_path / "out.gif", {}, ValueError, r"must end in one of \.jpg"),
         "16 bits": (deep, out, {"focal": 30.0}, ValueError, r"3 channels of 16 bits.*choose \.png"),
         "alpha": (clear, out, {"focal": 30.0}, ValueError, r"4 channels of 8 bits"),

@@ -3,6 +3,7 @@
 import csv
 import math
 import os
+from collections.abc import Iterable
 from pathlib import Path, PurePath
 
 
@@ -17,14 +18,11 @@ class FocalTable:
         self._focals = focals
         self._path = os.fspath(path)
 
-    def of(self, image: str | os.PathLike[str]) -> float | None:
-        """The focal length of an image, or None if the table has none."""
+    def row(self, image: str | os.PathLike[str]) -> str | None:
+        """The name by which the table knows an image, or None if it does not."""
         parts = PurePath(image).parts
-        for start in range(len(parts)):
-            found = self._focals.get("/".join(parts[start:]))
-            if found is not None:
-                return found
-        return None
+        names = ("/".join(parts[start:]) for start in range(len(parts)))
+        return next((name for name in names if name in self._focals), None)
 
     def need(self, image: str | os.PathLike[str]) -> float:
         """The focal length of an image.
@@ -32,12 +30,31 @@ class FocalTable:
         Raises:
             ValueError: the table has none.
         """
-        found = self.of(image)
-        if found is None:
+        row = self.row(image)
+        if row is None:
             raise ValueError(
                 f"Cannot read focal lengths from {self._path}: it has no number for {PurePath(image).name}."
             )
-        return found
+        return self._focals[row]
+
+    def of(self, images: Iterable[str]) -> dict[str, float]:
+        """The focal lengths of those images that the table knows.
+
+        Raises:
+            ValueError: one row is the only one for two images.
+        """
+        found: dict[str, str] = {}
+        for image in images:
+            row = self.row(image)
+            if row is None:
+                continue
+            if row in found:
+                raise ValueError(
+                    f"{self._path} has one row {row} for two images, {found[row]} and {image}: write the "
+                    "folder before the name, in a row for each."
+                )
+            found[row] = image
+        return {image: self._focals[row] for row, image in found.items()}
 
 
 def read_focal_table(path: str | os.PathLike[str]) -> FocalTable:

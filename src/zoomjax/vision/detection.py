@@ -15,6 +15,7 @@ import multiprocessing
 import signal
 import zipfile
 from collections.abc import Iterable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import cv2
@@ -35,6 +36,7 @@ DETECTORS: dict[str, type[AbstractDetector]] = {
 """By name, as the command line calls them."""
 
 _SPACING = 4.0
+_SMALLEST = 32
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +45,7 @@ class Detection:
 
     Attributes:
         name: of the image.
+        file: the image's path, or its name if it has none.
         image_size: (width, height) px; (0, 0) if it could not be read.
         lines: for each line an (n, 2) array of points, px.
         focal: the focal length that the image itself or the video's track tells, or None.
@@ -52,6 +55,7 @@ class Detection:
     """
 
     name: str
+    file: str = ""
     image_size: tuple[int, int] = (0, 0)
     lines: tuple[np.ndarray, ...] = ()
     focal: float | None = None
@@ -123,17 +127,32 @@ def _begin_worker() -> None:
 
 
 def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detection:
+    found = functools.partial(Detection, source.name, source.file)
     try:
         image, focal = source.read()
+    except (ValueError, OSError) as error:
+        return found(problem=_sentence(error))
+    size = (image.shape[1], image.shape[0])
+    if min(size) < _SMALLEST:
+        return found(problem=f"it is {size[0]}x{size[1]} px: at least {_SMALLEST} px a side are needed")
+    if isinstance(detector, PitchDetector) and image.ndim == 2:
+        return found(size, problem="it is grey, and grass is told by its colour. Try --detector edges")
+    try:
         focal = source.focal if focal is None else focal
         wanted = grid == "all" or (grid == "without focal length" and focal is None)
         own = isinstance(detector, GridDetector)
         nodes = (detector if own else GridDetector()).find(image) if own or wanted else None
         lines = tuple(_thinned(line) for line in (detector.lines(nodes) if own else detector(image)))
-    except (ValueError, OSError, cv2.error) as error:
-        return Detection(source.name, problem=str(error).strip())
-    problem = "" if lines else _NO_LINES
-    return Detection(source.name, (image.shape[1], image.shape[0]), lines, focal, nodes, problem)
+    except Exception as error:  # whatever it is, it is one image's
+        return found(size, problem=f"the detector failed: {type(error).__name__}: {_sentence(error)}")
+    return found(size, lines, focal, nodes, "" if lines else _NO_LINES)
+
+
+def _sentence(error: Exception) -> str:
+    """What an error says, without the numbers of the operating system and a full stop."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return str(error).strip().rstrip(".")
 
 
 _NO_LINES = (
@@ -153,7 +172,13 @@ def _thinned(line: np.ndarray) -> np.ndarray:
 def _finished(file: Path | None, result: concurrent.futures.Future | Detection) -> Detection:
     if isinstance(result, Detection):
         return result
-    detection = result.result()
+    try:
+        detection = result.result()
+    except BrokenProcessPool:
+        raise RuntimeError(
+            "A process that looked at images was ended from outside, probably for want of memory. Try "
+            "again with --jobs 1."
+        ) from None
     if file is not None and detection.image_size != (0, 0):  # what cannot be read may be mended
         _save(detection, file)
     return detection
@@ -163,7 +188,8 @@ def _finished(file: Path | None, result: concurrent.futures.Future | Detection) 
 def _code() -> bytes:
     """The source of everything that detects: what it found before is of no use once it has changed."""
     folder = Path(__file__).parent
-    return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(folder.glob("*.py")))).digest()
+    files = [*sorted(folder.glob("*.py")), folder.parent / "io" / "exif.py"]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).digest()
 
 
 def _key(source: Source, detector: AbstractDetector, grid: str) -> str:
@@ -204,9 +230,10 @@ def _load(file: Path, source: Source) -> Detection | None:
             focal = float(stored["focal"])
             return Detection(
                 name=source.name,
+                file=source.file,
                 image_size=(width, height),
                 lines=tuple(lines) if len(stored["counts"]) else (),
-                focal=source.focal if np.isnan(focal) else focal,
+                focal=source.focal or (None if np.isnan(focal) else focal),
                 nodes=stored["nodes"] if stored["nodes"].size else None,
                 problem=str(stored["problem"]),
             )

@@ -71,10 +71,10 @@ def edge_points(grey: np.ndarray) -> EdgePoints:
     strength = cv2.max(*steep)
     noise = _noise(slopes)
     least = _least_slope(strength, noise)
-    inner = np.zeros_like(strength)
-    inside = (slice(_BORDER, -_BORDER), slice(_BORDER, -_BORDER))
-    inner[inside] = strength[inside]
-    candidates = np.flatnonzero(inner > min(least * _TO_BYTE, 254))
+    _, strong = cv2.threshold(strength, min(least * _TO_BYTE, 254), 1, cv2.THRESH_BINARY)
+    for side in (strong[:_BORDER], strong[-_BORDER:], strong[:, :_BORDER], strong[:, -_BORDER:]):
+        side[:] = 0
+    candidates = np.flatnonzero(strong.view(bool))
     flat = [slope.ravel() for slope in slopes]
     magnitude = [byte.ravel()[candidates] for byte in steep]
     parts = [

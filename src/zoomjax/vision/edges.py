@@ -22,6 +22,9 @@ _LONG = 0.2
 _LEAST_LINES = 3
 """With fewer long borders a frame says too little of its distortion."""
 
+_ENOUGH = 100
+"""Points that tell how a line runs."""
+
 _LEAST_TOLERANCE = 0.5
 _GREATEST_TOLERANCE = 2.0
 """px, bounds of the distance at which a piece is still on a border: three times the borders' RMS."""
@@ -78,7 +81,7 @@ class EdgeDetector(AbstractDetector):
             if len(long) < _LEAST_LINES:
                 break
             model.fit(long)
-            rms = np.median([_rms(model.undistort(line)) for line in long])
+            rms = np.median([_rms(model.undistort(_few(line))) for line in long])
             tolerance = float(np.clip(3 * rms, _LEAST_TOLERANCE, _GREATEST_TOLERANCE))
             border = _absorbed(pieces, border, model, tolerance)
         return self._good(border_lines(pieces, border), model, tolerance, min(size))
@@ -90,7 +93,7 @@ class EdgeDetector(AbstractDetector):
             extent = _extent(line)
             if extent < self.least_length * side or len(line) < self.least_cover * _steps(line):
                 continue
-            if _rms(model.undistort(line)) <= 2 * tolerance:
+            if _rms(model.undistort(_few(line))) <= 2 * tolerance:
                 kept.append((extent, line))
         kept.sort(key=lambda entry: -entry[0])
         return [line for _, line in kept]
@@ -124,6 +127,7 @@ def _absorbed(pieces: Fragments, border: np.ndarray, model: OneFrame, tolerance:
     order = np.argsort(label, kind="stable")
     names, start = np.unique(label[order], return_index=True)
     groups = np.split(corrected[order], start[1:])
+    groups = [_few(group) for group in groups]
     lengths = [np.hypot(*np.ptp(group, axis=0)) for group in groups]
     result = np.full(len(border), -1)
     for number, index in enumerate(np.argsort(lengths)[::-1]):
@@ -146,6 +150,13 @@ def _is_smooth(centred: np.ndarray, normal: np.ndarray, tolerance: float) -> boo
     powers = np.vander(along / max(np.ptp(along), 1e-9), 4)
     rest = across - powers @ np.linalg.lstsq(powers, across, rcond=None)[0]
     return float(np.sqrt(np.mean(rest**2))) < tolerance / 2
+
+
+def _few(points: np.ndarray) -> np.ndarray:
+    """Enough of a line's points, spread over it, to tell how it runs and how rough it is."""
+    if len(points) <= _ENOUGH:
+        return points
+    return points[np.linspace(0, len(points) - 1, _ENOUGH).round().astype(int)]
 
 
 def _extent(line: np.ndarray) -> float:

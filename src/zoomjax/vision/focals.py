@@ -18,6 +18,7 @@ from ..compression import compress
 from ..fit import fit_frames
 from ..focal import FocalEstimate, focal_from_board, focal_from_planes
 from ..io.focal_table import read_focal_table
+from ..io.focal_track import read_focal_track
 from ..lines import Lines
 from ..radial import Distortion
 from ..robust import fit_robust
@@ -30,6 +31,10 @@ WAYS = (
     "or oblique photos of a flat checkerboard or dot grid (--focal plane)"
 )
 
+_VIDEO_WAYS = (
+    "one focal length, a CSV file with time,focal or frame,focal, or plane or board, as photos may have"
+)
+
 _MOST_UNCERTAIN = 0.2
 """Standard deviation over focal length above which a view says too little of it."""
 
@@ -39,13 +44,13 @@ class Board:
     """A board parallel to the sensor.
 
     Attributes:
-        pitch: mm between neighbouring lines on it: from one edge of a stripe to the next one, or from
-            corner to corner, or from dot to dot.
+        pitch: mm between neighbouring lines on it, across and down: from one edge of a stripe to the next
+            one, or from corner to corner, or from dot to dot.
         distance: mm from the camera's projection plane to it.
         pixel: mm, side of a pixel on the sensor.
     """
 
-    pitch: float
+    pitch: tuple[float, float]
     distance: float
     pixel: float
 
@@ -67,6 +72,30 @@ class Focals:
     origin: str
     absent: str
     deviation: dict[str, float] = dataclasses.field(default_factory=dict)
+
+
+def check_way(way: str | None, board: Board | None, *, video: bool) -> None:
+    """Check what can be known of a way to focal lengths before any image is looked at.
+
+    Raises:
+        FileNotFoundError: there is no such CSV file.
+        ValueError: the way is none, or lacks something; the message names the ways.
+    """
+    if way == "board" or (way is None and board):
+        if board is None:
+            raise ValueError(_NO_BOARD)
+    elif video and way in (None, "exif"):
+        raise ValueError(f"A video needs --focal: {_VIDEO_WAYS}.")
+    elif way not in (None, "exif", "plane") and _number(way) is None:
+        if not way.lower().endswith(".csv"):
+            raise ValueError(
+                f"--focal is {way!r}, which is no way to a focal length. Give "
+                f"{_VIDEO_WAYS if video else WAYS}."
+            )
+        read_focal_track(way) if video else read_focal_table(way)
+
+
+_NO_BOARD = "--focal board needs the board's --pitch and --distance, and the sensor's --pixel, in mm."
 
 
 def choose_focals(
@@ -97,23 +126,18 @@ def choose_focals(
         found = Focals(_own(detections), unit, "the track of the video", "the track has none")
     elif way == "board":
         if board is None:
-            raise ValueError(
-                "--focal board needs the board's --pitch and --distance, and the sensor's --pixel, in mm."
-            )
+            raise ValueError(_NO_BOARD)
         found = _estimated(
-            detections, "mm", "the board's pitch (eq. 14)", "too few lines of a board", _from_board(board)
+            detections, "mm", "the board's pitch (eq. 14)", _NOT_THE_BOARD, _from_board(board)
         )
     elif way == "plane":
         found = _estimated(detections, "px", "homographies of the grid", _NO_PLANE, _from_plane)
     elif (number := _number(way)) is not None:
         found = Focals({d.name: number for d in detections}, unit, "--focal", "")
-    elif not Path(way).suffix:
-        raise ValueError(f"--focal is {way!r}, which is no way to a focal length. Give {WAYS}.")
     else:
-        table = read_focal_table(way)
-        known = {d.name: table.of(d.name) for d in detections}
+        known = read_focal_table(way).of([d.file for d in detections])
         found = Focals(
-            {name: focal for name, focal in known.items() if focal},
+            {d.name: known[d.file] for d in detections if d.file in known},
             unit,
             Path(way).name,
             f"{Path(way).name} has no row for it",
@@ -126,6 +150,17 @@ def choose_focals(
 
 
 _NO_PLANE = "it shows no flat grid, or one too squarely to tell a focal length"
+
+
+_NOT_THE_BOARD = (
+    "it shows no evenly spaced lines of a board, or their pitch differs between its two directions (then "
+    "give both: --pitch ACROSSxDOWN)"
+)
+_EVEN = 0.1
+"""Steps, RMS, that lines of a board may be from where they are expected."""
+
+_DISAGREE = 3e-3
+"""Share of the focal length by which a board's two directions may disagree, beside three deviations."""
 
 
 def _own(detections: Sequence[Detection]) -> dict[str, float]:
@@ -216,60 +251,74 @@ def _from_plane(detection: Detection, correction: Distortion) -> FocalEstimate |
 
 def _from_board(board: Board) -> Estimator:
     def estimate(detection: Detection, correction: Distortion) -> FocalEstimate | None:
+        pitch = np.array(board.pitch)
         known = _nodes(detection, correction)
         if known is not None:
-            parts = [known]
+            points, places = known
+            parts = [(points, pitch * places)]
         else:
             corrected = [np.asarray(correction.undistort(jnp.asarray(line))) for line in detection.lines]
-            parts = _parallels(corrected)
-        if not parts:
-            return None
+            parts = [(points, pitch * places) for points, places in _parallels(corrected)]
         found = [
-            focal_from_board(points, board.pitch * places, distance=board.distance, pixel=board.pixel)
+            focal_from_board(points, places, distance=board.distance, pixel=board.pixel)
             for points, places in parts
         ]
-        weight = np.array([1 / max(float(f.std), 1e-12) ** 2 for f in found])
-        weight /= weight.sum()
-        return FocalEstimate(
-            *(
-                jnp.asarray(sum(w * getattr(f, name) for w, f in zip(weight, found, strict=True)))
-                for name in ("focal", "std", "rms")
-            )
-        )
+        return _combined(found)
 
     return estimate
 
 
-def _parallels(lines: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For both directions of a board, the lines' positions across, px, and which lines of it they are.
+def _combined(found: Sequence[FocalEstimate]) -> FocalEstimate | None:
+    """The mean of estimates by their weights; None if there is none, or if they disagree."""
+    if not found:
+        return None
+    focal, std, rms = (
+        np.array([float(getattr(f, name)) for f in found]) for name in ("focal", "std", "rms")
+    )
+    weight = 1 / np.maximum(std, 1e-12) ** 2
+    mean = weight @ focal / weight.sum()
+    if np.any(abs(focal - mean) > np.maximum(3 * std, _DISAGREE * mean)):
+        return None
+    return FocalEstimate(jnp.asarray(mean), jnp.asarray(weight.sum() ** -0.5), jnp.asarray(rms.max()))
 
-    Each as points (n, 2) on an axis: what `focal_from_board` compares.
+
+def _parallels(lines: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For each direction of a board, its lines' positions across, px, and which lines of it they are.
+
+    Positions (n, 2) are on the x axis for what runs down, on the y axis for what runs across; so are the
+    places: what `focal_from_board` compares. A direction whose lines are not evenly spaced is left out.
     """
     middle = np.array([line.mean(axis=0) for line in lines])
     along = np.array([line[-1] - line[0] for line in lines])
-    length = np.hypot(*along.T)
     twice = 2 * np.arctan2(along[:, 1], along[:, 0])
     # Squared once more, both directions of a board are one.
-    main = np.angle(np.sum(length * np.exp(2j * twice))) / 4
+    main = np.angle(np.sum(np.hypot(*along.T) * np.exp(2j * twice))) / 4
     result = []
     for direction in (main, main + np.pi / 2):
         chosen = np.cos(twice - 2 * direction) > 0.9
-        if chosen.sum() < 3:
-            continue
-        unit = np.array([np.cos(direction), np.sin(direction)])
-        position = np.sort(middle[chosen] @ (-unit[1], unit[0]))
-        index = _counted(position)
-        axis = np.array([1.0, 0.0])
-        result.append((position[:, None] * axis, index[:, None] * axis))
+        normal = np.array([-np.sin(direction), np.cos(direction)])
+        counted = _counted(np.sort(middle[chosen] @ normal))
+        if counted is not None:
+            axis = np.eye(2)[int(np.argmax(abs(normal)))]
+            result.append(tuple(values[:, None] * axis for values in counted))
     return result
 
 
-def _counted(position: np.ndarray) -> np.ndarray:
-    """Which line of evenly spaced ones each is, by positions in order; some may be missing."""
-    step = float(np.median(np.diff(position)))
-    index = np.zeros(len(position))
+def _counted(position: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Positions of evenly spaced lines, in order, and which of them each is; None if they are none.
+
+    Some may be missing, and some seen in two pieces.
+    """
+    if len(position) < 3:
+        return None
+    usual = float(np.median(np.diff(position)))
+    position = position[np.append(True, np.diff(position) > 0.2 * usual)]
+    if len(position) < 3 or usual < 1:
+        return None
+    step, index = float(np.median(np.diff(position))), np.zeros(len(position))
     for number in range(1, len(position)):  # the step is known better and better
         index[number] = index[number - 1] + np.rint((position[number] - position[number - 1]) / step)
         if number > 3:
             step = float(np.polyfit(index[: number + 1], position[: number + 1], 1)[0])
-    return index
+    rest = position - np.polyval(np.polyfit(index, position, 1), index)
+    return (position, index) if np.sqrt(np.mean(rest**2)) < _EVEN * step else None

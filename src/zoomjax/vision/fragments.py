@@ -42,6 +42,11 @@ class Fragments:
     start: np.ndarray
     count: np.ndarray
 
+    @classmethod
+    def of(cls, points: np.ndarray, count: np.ndarray) -> "Fragments":
+        """Pieces of so many points each, one after the other."""
+        return cls(points, np.cumsum(count) - count, count)
+
     def piece(self) -> np.ndarray:
         """(n,), the piece that each point belongs to."""
         return np.repeat(np.arange(len(self.count)), self.count)
@@ -55,19 +60,20 @@ class Fragments:
 
 def fragments(edges: EdgePoints) -> Fragments:
     """The gently bent pieces of at least 8 points that the edge points make."""
-    pieces, label, points = _ordered(edges.position, _linked(edges))
-    for _ in range(_HALVINGS):
+    pieces = _ordered(edges.position, _linked(edges))
+    straight = []
+    for _ in range(_HALVINGS + 1):
         if not len(pieces.start):
-            return pieces
+            break
         rms, second_half = _straightness(pieces)
-        crooked = (rms > _CROOKED)[label]
-        if not crooked.any():
-            return pieces
-        pieces, label, points = _ordered(points, 2 * label + (second_half & crooked))
-    if len(pieces.start):
-        straight = (_straightness(pieces)[0] <= _CROOKED)[label]
-        pieces, _, _ = _ordered(points[straight], label[straight])
-    return pieces
+        piece = pieces.piece()
+        crooked = (rms > _CROOKED)[piece]
+        straight.append(Fragments.of(pieces.points[~crooked], pieces.count[rms <= _CROOKED]))
+        pieces = _ordered(pieces.points[crooked], (2 * piece + second_half)[crooked])
+    if not straight:
+        return pieces
+    points, count = (np.concatenate([getattr(f, name) for f in straight]) for name in ("points", "count"))
+    return Fragments.of(points, count)
 
 
 def _linked(edges: EdgePoints) -> np.ndarray:
@@ -93,22 +99,22 @@ def _linked(edges: EdgePoints) -> np.ndarray:
     return connected_components(graph, directed=False)[1]
 
 
-def _ordered(points: np.ndarray, label: np.ndarray) -> tuple[Fragments, np.ndarray, np.ndarray]:
+def _ordered(points: np.ndarray, label: np.ndarray) -> Fragments:
     """Pieces by label, each in order along its main direction, without the short ones."""
-    _, label, count = np.unique(label, return_inverse=True, return_counts=True)
-    long = count[label] >= _LEAST_POINTS
-    points = points[long]
-    _, label, count = np.unique(label[long], return_inverse=True, return_counts=True)
+    count = np.bincount(label)
+    long = count >= _LEAST_POINTS
+    kept = long[label]
+    points, label = points[kept], (np.cumsum(long) - 1)[label[kept]]
     order = np.argsort(label, kind="stable")
-    points, label = points[order], label[order]
-    pieces = Fragments(points, np.cumsum(count) - count, count)
-    if not len(count):
-        return pieces, label, points
-    mean = pieces.sums(points) / count[:, None]
+    pieces = Fragments.of(points[order], count[long])
+    if not len(pieces.count):
+        return pieces
+    label = label[order]
+    mean = pieces.sums(pieces.points) / pieces.count[:, None]
     direction = main_direction(pieces, mean)
-    along = np.einsum("pc,pc->p", points - mean[label], direction[label])
-    order = np.lexsort([along, label])
-    return dataclasses.replace(pieces, points=points[order]), label, points[order]
+    along = np.einsum("pc,pc->p", pieces.points - mean[label], direction[label])
+    order = np.argsort(label * (2 * np.ptp(along) + 1) + along)  # by label, then along
+    return Fragments.of(pieces.points[order], pieces.count)
 
 
 def main_direction(pieces: Fragments, mean: np.ndarray) -> np.ndarray:

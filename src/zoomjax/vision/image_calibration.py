@@ -3,6 +3,7 @@
 import concurrent.futures
 import dataclasses
 import os
+import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -13,10 +14,9 @@ import cv2
 import numpy as np
 
 from ..calibration import Calibration, calibrate
-from ..io.focal_table import read_focal_table
 from ..io.focal_track import FocalTrack, read_focal_track
 from .detection import DETECTORS, Detection, detect
-from .focals import Board, Focals, choose_focals, lines_of
+from .focals import Board, Focals, check_way, choose_focals, lines_of
 from .images import VIDEO_SUFFIXES, Source, find_photos, video_frames
 from .overlay import draw_lines
 
@@ -65,8 +65,7 @@ class ImageJob:
             )
         if len(self.inputs) > 1 and any(map(_is_video, self.inputs)):
             raise ValueError("Give photographs, or one video.")
-        if self.focal is not None and self.focal.lower().endswith(".csv") and not self.video:
-            read_focal_table(self.focal)
+        check_way(self.focal, self.board, video=self.video is not None)
 
     @property
     def video(self) -> Path | None:
@@ -89,12 +88,7 @@ class ImageJob:
 
     def _track(self) -> FocalTrack | float:
         """Of a video; 1 where its own frames tell."""
-        if self.focal is None or self.focal == "exif":
-            raise ValueError(
-                "A video needs --focal: one focal length, a CSV file with time,focal or frame,focal, or "
-                "plane or board."
-            )
-        if self.focal in ("plane", "board"):
+        if self.focal in (None, "plane", "board"):
             return 1.0
         try:
             return float(self.focal)
@@ -154,15 +148,21 @@ class ImageCalibration:
                 f"{len(listed)} of {len(listed) + len(self.used)} images are not used.\n  "
                 + "\n  ".join(listed[:8] + ([f"and {rest} more, in summary.json"] if rest > 0 else []))
             )
-        return told + self.calibration.warnings()
+        return told + self.calibration.warnings([detection.name for detection in self.used])
 
     def write(self, folder: str | os.PathLike[str], progress: Progress = lambda done, total: None) -> None:
-        """Write what `Calibration.write` does, and the lines drawn over each image, in ``lines/``."""
+        """Write what `Calibration.write` does, and the lines drawn over each image, in ``lines/``.
+
+        What an earlier calibration drew there is removed.
+        """
+        lines = Path(folder) / "lines"
         with tempfile.TemporaryDirectory(dir=folder, prefix=".zoomjax-") as part:
             made = self._draw(Path(part), progress)
+            if (Path(folder) / "summary.json").exists():
+                shutil.rmtree(lines, ignore_errors=True)
             self.calibration.write(folder, about=self.about())
             for file in made:
-                target = Path(folder) / "lines" / file.relative_to(part)
+                target = lines / file.relative_to(part)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 file.replace(target)
 
@@ -230,13 +230,26 @@ def calibrate_images(
     if not usable:
         raise ValueError(_nothing(detections))
     stage("Finding the focal lengths")
-    way = "track" if job.video and job.focal not in ("plane", "board") else job.focal
+    way = "track" if job.video and job.focal not in (None, "plane", "board") else job.focal
+    if job.video and job.focal is None:
+        way = "board"
     focals = choose_focals(usable, way, unit=job.focal_unit, board=job.board)
     unused |= {d.name: focals.absent for d in usable if d.name not in focals.focal}
     used = tuple(d for d in usable if d.name in focals.focal)
-    lines = lines_of(used, np.array([focals.focal[d.name] for d in used]), focals.unit)
-    calibration = calibrate(lines, degree=job.degree, terms=job.terms, robust=True, stage=stage)
-    return ImageCalibration(job, calibration, used, focals, unused)
+    while True:
+        lines = lines_of(used, np.array([focals.focal[d.name] for d in used]), focals.unit)
+        calibration = calibrate(lines, degree=job.degree, terms=job.terms, robust=True, stage=stage)
+        done = ImageCalibration(job, calibration, used, focals, unused)
+        hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}
+        if not hopeless:
+            return done
+        unused = unused | dict.fromkeys(sorted(hopeless), _NONE_AGREES)
+        used = tuple(d for d in used if d.name not in hopeless)
+
+
+_NONE_AGREES = (
+    "none of its lines is straight under the distortion of the others. Is its focal length right?"
+)
 
 
 def _is_video(path: str | os.PathLike[str]) -> bool:
@@ -265,7 +278,7 @@ def _of_one_size(detections: Sequence[Detection]) -> tuple[list[Detection], dict
 
 def _nothing(detections: Sequence[Detection]) -> str:
     """Why no image can be used."""
-    problems = Counter(d.problem for d in detections)
+    problems = Counter(d.problem.rstrip(".") for d in detections)
     if len(problems) == 1 and len(detections) > 1:
         return f"None of the {len(detections)} images can be used: {next(iter(problems))}."
     listed = "; ".join(f"{d.name}: {d.problem}" for d in detections[:4])

@@ -17,6 +17,9 @@ from .photos import SUFFIXES, metadata_focal, read_photo
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".m2ts", ".mpg", ".mxf", ".ts")
 """Of files that count as videos."""
 
+RESULTS = ("lines", "model.png", "before-after.jpg")
+"""What a calibration puts beside its ``lens.json`` that might be taken for photographs."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Source:
@@ -33,6 +36,11 @@ class Source:
     path: Path | None = None
     image: UInt8[np.ndarray, "height width *channels"] | None = None
     focal: float | None = None
+
+    @property
+    def file(self) -> str:
+        """The path, or the name of what has none."""
+        return self.name if self.path is None else str(self.path)
 
     def content(self) -> bytes:
         """What the image is made from, to tell it from others."""
@@ -58,19 +66,23 @@ class Source:
 def as_bytes(image: np.ndarray) -> UInt8[np.ndarray, "height width *channels"]:
     """An image of any depth and number of channels as grey or blue, green, red bytes.
 
-    Other depths are scaled so that their brightest value becomes 255: 16-bit files often hold 12 bits.
-    Alpha is dropped.
+    Other depths are scaled so that all but the brightest thousandth of the values fit in: 16-bit files
+    often hold 12 bits, and a hot pixel. Alpha is dropped.
     """
     if image.ndim == 3:
         image = image[..., 0] if image.shape[2] < 3 else image[..., :3]
     if image.dtype != np.uint8:
         known = np.nan_to_num(image.astype(np.float32), posinf=0, neginf=0)
-        image = np.clip(known * (255 / max(float(known.max(initial=0)), 1e-30)), 0, 255).astype(np.uint8)
+        brightest = float(np.quantile(known, 0.999, method="higher")) if known.size else 0.0
+        image = np.clip(known * (255 / max(brightest, 1e-30)), 0, 255).astype(np.uint8)
     return np.ascontiguousarray(image)
 
 
 def find_photos(inputs: Iterable[str | os.PathLike[str]]) -> list[Source]:
     """The photographs among files, folders (and the folders in them) and patterns like ``shots/*.jpg``.
+
+    In a folder, what else is in it does not matter, and the results of a calibration are passed over; of
+    a pattern, only photographs and folders count.
 
     Raises:
         FileNotFoundError: an input does not exist, or no file fits a pattern.
@@ -91,22 +103,33 @@ def find_photos(inputs: Iterable[str | os.PathLike[str]]) -> list[Source]:
 def _expanded(given: str) -> list[Path]:
     path = Path(given)
     if path.is_dir():
-        inside = (p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
-        found = sorted(
-            p for p in inside if not any(part.startswith(".") for part in p.relative_to(path).parts)
-        )
-        if not found:
-            raise ValueError(f"There are no photographs in the folder {path} ({', '.join(SUFFIXES)}).")
-        return found
+        return _within(path)
     if path.exists():
         if path.suffix.lower() not in SUFFIXES:
             raise ValueError(f"{path} is no photograph: the file name must end in {', '.join(SUFFIXES)}.")
         return [path]
-    found = sorted(map(Path, glob.glob(given, recursive=True)))
-    if not found:
-        what = "no file fits the pattern" if glob.has_magic(given) else "there is no file or folder"
+    found = [Path(name) for name in sorted(glob.glob(given, recursive=True))]
+    photos = [p for p in found if p.suffix.lower() in SUFFIXES and p.is_file()]
+    photos = photos or [inner for p in found if p.is_dir() for inner in _within(p)]
+    if not photos:
+        what = "no photograph fits the pattern" if glob.has_magic(given) else "there is no file or folder"
         raise FileNotFoundError(f"Cannot find photographs: {what} {given}.")
-    return [inner for path in found for inner in _expanded(os.fspath(path))]
+    return photos
+
+
+def _within(folder: Path) -> list[Path]:
+    results = {lens.with_name(name) for lens in folder.rglob("lens.json") for name in RESULTS}
+    found = sorted(
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in SUFFIXES
+        and path.is_file()
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        and not results.intersection((path, *path.parents))
+    )
+    if not found:
+        raise ValueError(f"There are no photographs in the folder {folder} ({', '.join(SUFFIXES)}).")
+    return found
 
 
 def _names(paths: list[Path]) -> list[str]:
@@ -138,7 +161,7 @@ def video_frames(
 
     stem = Path(path).stem
     with decode_video(path) as (announced, frames):
-        # From the first to the last; where the number is not announced, the first ones.
+        # From the first to the last; where not even the length is known, the first ones.
         wanted = set(np.linspace(0, (announced or number) - 1, number).round().astype(int).tolist())
         last = -1
         for last, (time, image) in enumerate(frames):
@@ -146,7 +169,7 @@ def video_frames(
                 continue
             at = focal.at(last, time) if isinstance(focal, FocalTrack) else float(focal)
             yield Source(f"{stem}-{last:06d}.jpg", None, image(), at)
-        if last + 1 < announced:
+        if last + 1 < 0.98 * announced - 2:  # lengths are rounded
             warnings.warn(
                 f"{os.fspath(path)} ends early, after {last + 1} of {announced} frames: it is cut off or "
                 "damaged. The frames before that are used.",

@@ -5,6 +5,7 @@ The tag goes over with the other metadata, so that the result is shown the same 
 """
 
 import os
+import re
 import warnings
 from pathlib import Path
 
@@ -145,16 +146,26 @@ def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, list[tuple[i
 
 
 def _check_whole(path: Path) -> None:
-    """Refuse an empty file, and a JPEG that is cut off: OpenCV fills up what is missing with grey.
-
-    Within compressed pixels a byte 255 is followed by 0, so that the marks of a picture's begin and end are
-    found nowhere else; the last picture of a whole file ends.
-    """
+    """Refuse an empty file, and a JPEG that is cut off: OpenCV fills up what is missing with grey."""
     content = path.read_bytes()
     if not content:
         raise ValueError(f"Cannot read a photograph from {path}: the file is empty.")
-    if content[:2] == b"\xff\xd8" and content.rfind(b"\xff\xd9") < content.rfind(b"\xff\xda"):
-        raise ValueError(f"Cannot read a photograph from {path}: the file is cut off.")
+    if content[:2] == b"\xff\xd8" and not _ends(content):
+        raise ValueError(f"Cannot read a photograph from {path}: the file is damaged or cut off.")
+
+
+def _ends(jpeg: bytes) -> bool:
+    """Whether a JPEG's first picture comes to its end; phones append films and other pictures."""
+    at = 2
+    while (mark := _MARK.search(jpeg, at)) is not None:
+        if mark[0][1] == 0xD9:
+            return True
+        at = mark.end() + int.from_bytes(jpeg[mark.end() : mark.end() + 2], "big")
+    return False
+
+
+_MARK = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]", re.DOTALL)
+"""What begins a segment, or ends the picture: not what pixels contain, nor what has no length."""
 
 
 def _encoded(image: np.ndarray, suffix: str, metadata: list[tuple[int, np.ndarray]]) -> bytes:

@@ -41,7 +41,7 @@ _MOST_ERRORS = 1000
 def decode_video(
     source: str | os.PathLike[str],
 ) -> Iterator[tuple[int, Iterator[tuple[float, Callable[[], np.ndarray]]]]]:
-    """The announced number of frames (0 if unknown), and for each its time, s, and what decodes its pixels.
+    """The number of frames by the file's own account, and for each its time, s, and what decodes them.
 
     Pixels are (height, width, 3) blue, green, red bytes, as stored: before any rotation for display.
     Damaged frames are passed over.
@@ -65,7 +65,7 @@ def decode_video(
                     _warn_of_fields(item)
                 yield time - first, functools.partial(item.to_ndarray, format="bgr24")
 
-        yield video.frames, frames()
+        yield video.frames or _counted(source), frames()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,6 +179,16 @@ def _opened(source: str | os.PathLike[str]) -> Any:
         raise ValueError(f"Cannot read a video from {path}: {why}.")
     video.thread_type = "AUTO"
     return container
+
+
+def _counted(source: str | os.PathLike[str]) -> int:
+    """How many frames there are, where the file does not tell: by reading, without decoding."""
+    with _opened(source) as input_, contextlib.suppress(FFmpegError):
+        number = 0
+        for packet in input_.demux(input_.streams.best("video")):
+            number += packet.size > 0
+        return number
+    return 0
 
 
 def _constant(focal: float) -> FocalTrack:
