@@ -181,6 +181,15 @@ def test_number_of_cores_does_not_matter(cores, ragged, monkeypatch):
     assert_same_triangles(zj.compress(ragged), eqx.filter_jit(zj.compress)(ragged))
 
 
+def test_one_program_serves_all_cores(ragged, compilations, monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    zj.compress(ragged, terms=4)
+    several = compilations()  # the reduction, and what puts the runs together
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    zj.compress(ragged, terms=4)
+    assert several <= 1 + compilations()
+
+
 def test_under_vmap(ragged):
     batched = jax.vmap(lambda points: zj.compress(moved(ragged, points)))(
         jnp.stack([ragged.points, ragged.points[:, ::-1]])

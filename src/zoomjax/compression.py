@@ -130,7 +130,7 @@ def compress(lines: Lines, terms: int = 2) -> CompressedLines:
         raise TypeError("These lines are compressed already: compress the Lines that they came from.")
     terms = checked_terms(terms)
     if traced(lines) or jax.default_backend() != "cpu":
-        triangle = _reduce_run(lines, 0, lines.points.shape[0], terms)
+        triangle = _reduce_run(lines, np.asarray(0), lines.points.shape[0], terms)
     else:
         triangle = _reduce_in_threads(lines, terms)
     return CompressedLines(
@@ -199,7 +199,8 @@ def _reduce_in_threads(lines, terms):
         starts = [min(part * size, number - size) for part in range(parts)]
 
         def reduce_from(start):
-            return jax.block_until_ready(_reduce_run(lines, start, size, terms))
+            # An array, for a Python number would be a constant of the program: one compilation each.
+            return jax.block_until_ready(_reduce_run(lines, np.asarray(start), size, terms))
 
         signature = (lines.points.shape, str(lines.points.dtype), size, terms, str(widest))
         alone = 0 if signature in _COMPILED and same_context else 1
