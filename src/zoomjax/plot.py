@@ -67,6 +67,7 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
         _label(below, "frame − model", unit, np.append(difference, sigma[known, i]))
         below.axhline(0, color=_MODEL, linewidth=1.2, zorder=0)
         below.set_xlabel(f"$1/f$  (1/{lens.focal_unit})")
+        below.locator_params(axis="x", nbins=6)  # labels of focal lengths in px are long
         _show_focal_lengths(above, focal, lens.focal_unit)
     figure.axes[0].legend(frameon=False)
     return figure
