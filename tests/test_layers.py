@@ -14,6 +14,7 @@ LAYERS = (
     {"inverse", "pitch"},
     {"zoom"},
     {"rivals", "smooth"},
+    {"focus"},
     {"lines"},
     {"energy"},
     {"lens"},

@@ -1,9 +1,18 @@
 """Interpolation between knots, as weights of the values there: hats, and natural cubic splines."""
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ._types import AnyArray
+from ._types import AnyArray, traced
+
+
+def spread(values: Float[AnyArray, "value"], number: int | None) -> Float[AnyArray, "knot"]:
+    """`number` of the distinct values, or all, increasing and spread evenly over their ranks."""
+    ordered = jnp.sort(values) if traced(values) else np.unique(np.asarray(values))
+    if number is None:
+        return ordered
+    return ordered[np.round(np.linspace(0, ordered.shape[0] - 1, number)).astype(int)]
 
 
 def place(

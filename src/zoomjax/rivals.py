@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, ScalarLike
 
 from ._bernstein import Pieces
 from ._checks import checked_integer
-from ._splines import at_ends, natural_basis, natural_controls, natural_curvature, place
+from ._splines import at_ends, natural_basis, natural_controls, natural_curvature, place, spread
 from ._types import AnyArray, Coefficients, Focal, Scalar, traced
 from .zoom import UNFITTED, AbstractLinearZoom, AbstractZoom, check_distinct, inverse_powers
 
@@ -56,7 +56,8 @@ class TableZoom(AbstractLinearZoom):
 
     def prepare(self, focal: Focal, terms: int) -> "TableZoom":
         """A table of zeros, its entries at focal lengths that are there."""
-        knots = _spread(1 / focal if self.inverse else focal, self.number, "A table")
+        _check_knots("A table", focal, self.number)
+        knots = spread(1 / focal if self.inverse else focal, self.number)
         zeros = _zeros(knots.shape[0], terms, knots.dtype)
         return TableZoom(number=self.number, inverse=self.inverse, parameters=zeros, knots=knots)
 
@@ -97,7 +98,8 @@ class SplineZoom(AbstractLinearZoom):
 
     def prepare(self, focal: Focal, terms: int) -> "SplineZoom":
         """A spline of zeros, its knots at focal lengths that are there."""
-        knots = _spread(1 / focal, self.number, "A spline")
+        _check_knots("A spline", focal, self.number)
+        knots = spread(1 / focal, self.number)
         zeros = _zeros(knots.shape[0], terms, knots.dtype)
         curvature = natural_curvature(knots)
         return SplineZoom(number=self.number, parameters=zeros, knots=knots, curvature=curvature)
@@ -267,16 +269,9 @@ def barrel_crossover(focal: Focal, k1: Float[AnyArray, "frame"]) -> float:
     return float(1 / (inverse[i] + share * (inverse[i + 1] - inverse[i])))
 
 
-def _spread(values: Float[AnyArray, "frame"], number: int | None, what: str) -> AnyArray:
-    """`number` of the distinct values, or all, increasing and spread evenly over their ranks."""
-    if traced(values):
-        ordered = jnp.sort(values)
-    else:
-        ordered = np.unique(np.asarray(values))
-        check_distinct(what, ordered, number or 1)
-    if number is None:
-        return ordered
-    return ordered[np.round(np.linspace(0, ordered.shape[0] - 1, number)).astype(int)]
+def _check_knots(what: str, focal: Focal, number: int | None) -> None:
+    if not traced(focal):
+        check_distinct(what, focal, number or 1)
 
 
 def _zeros(rows: int, terms: int, dtype: np.dtype) -> Float[Array, "rows terms"]:
