@@ -10,10 +10,11 @@ import zoomjax
 # From the inside out: a module may import from layers before its own. Packages count as one module.
 LAYERS = (
     {"_types", "_files", "_checks", "_linear", "_bernstein", "_interior"},
-    {"radial", "focal"},
+    {"radial", "focal", "_splines"},
     {"inverse", "pitch"},
     {"zoom"},
     {"rivals", "smooth"},
+    {"focus"},
     {"lines"},
     {"energy"},
     {"lens"},

@@ -33,6 +33,7 @@ from .focal import FocalEstimate as FocalEstimate
 from .focal import focal_from_board as focal_from_board
 from .focal import focal_from_lines as focal_from_lines
 from .focal import focal_from_planes as focal_from_planes
+from .focus import FocusSplineZoom as FocusSplineZoom
 from .framing import Framing as Framing
 from .framing import frame_output as frame_output
 from .image_metric import ImageLines as ImageLines
@@ -66,6 +67,7 @@ from .vision.pitch import PitchDetector as PitchDetector
 from .vision.undistort import undistort_image as undistort_image
 from .vision.video import undistort_video as undistort_video
 from .warp import warp_image as warp_image
+from .zoom import AbstractFocusZoom as AbstractFocusZoom
 from .zoom import AbstractLinearZoom as AbstractLinearZoom
 from .zoom import AbstractPriorZoom as AbstractPriorZoom
 from .zoom import AbstractZoom as AbstractZoom

@@ -87,6 +87,17 @@ def checked_focal(focal: ArrayLike) -> np.ndarray:
     return focals.astype(np.float64)
 
 
+def checked_focus(focus: ArrayLike, frames: int) -> np.ndarray:
+    """The focus of each frame, float64."""
+    values = _numbers(focus)
+    if values is None or values.shape != (frames,) or not np.isfinite(values).all():
+        raise ValueError(
+            f"Argument focus must hold one finite number for each of the {frames} frames, but it is "
+            f"{focus!r}."
+        )
+    return values.astype(np.float64)
+
+
 def checked_frames(frame: ArrayLike, lines: int, frames: int) -> np.ndarray:
     """For each of the lines the index of its frame."""
     index = np.asarray(frame)

@@ -23,6 +23,7 @@ FrameIndex = Int[AnyArray, "line"]
 LineNumber = Int[AnyArray, "line"]
 LineWeight = Float[AnyArray, "line"]
 Focal = Float[AnyArray, "frame"]
+Focus = Float[AnyArray, "frame"]
 
 
 def traced(tree: PyTree) -> bool:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from ._linear import least_squares
 from .compression import CompressedLines, compress
-from .energy import line_weights, prior_jacobian
+from .energy import line_weights, prior_jacobian, settings
 from .image_metric import ImageLines
 from .lens import ZoomLens, lens_of
 from .lines import AbstractLines, Lines
@@ -45,7 +45,7 @@ def algebraic_parameters(
     """The parameters of a prepared linear zoom model that the algebraic estimate gives."""
     areas = jax.vmap(_areas, in_axes=(0, None))(lines.triangle, terms)  # (line, area, 1 + terms)
     areas = lines.scale * jnp.sqrt(line_weights(lines))[:, None, None] * areas
-    basis = jax.vmap(zoom.basis)(lines.focal)[lines.frame]  # (line, basis)
+    basis = jax.vmap(zoom.basis)(*settings(zoom, lines))[lines.frame]  # (line, basis)
     columns = jnp.einsum("lat,lb->labt", areas[..., 1:], basis)
     unknowns = basis.shape[1] * terms
     prior = prior_jacobian(lines, with_parameters(zoom, jnp.zeros((basis.shape[1], terms), basis.dtype)))
@@ -85,7 +85,9 @@ def algebraic_zoom(
         L. Alvarez, L. Gómez, J. R. Sendra, "An algebraic approach to lens distortion by line
         rectification", J. Math. Imaging Vis. 35 (2009): [9] of the paper.
     """
-    prepared = (PolynomialZoom() if zoom is None else zoom).prepare(lines.focal, terms)
+    model = PolynomialZoom() if zoom is None else zoom
+    focal, *focus = settings(model, lines)
+    prepared = model.prepare(focal, terms, *focus)
     return _solve_zoom(compressed(lines, terms), prepared, terms)
 
 

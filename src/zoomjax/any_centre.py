@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._checks import checked_terms
-from ._types import Centres, Focal, FrameIndex, LineNumber, LineWeight, Point
+from ._types import Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Point
 from .compression import EXACT, CompressedLines, triangle, triangles_of
-from .lines import AbstractLines, Lines
+from .lines import AbstractLines, Lines, focus_of
 
 
 class AnyCentreLines(AbstractLines):
@@ -28,7 +28,7 @@ class AnyCentreLines(AbstractLines):
 
     Attributes:
         triangle: R of each line's monomials, about `centre`, in normalised lengths.
-        frame, focal, centre, image_size, focal_unit, number, weight: as in `Lines`.
+        frame, focal, centre, image_size, focal_unit, number, weight, focus: as in `Lines`.
     """
 
     triangle: Float[Array, "line rows rows"]
@@ -39,6 +39,7 @@ class AnyCentreLines(AbstractLines):
     focal_unit: str = eqx.field(static=True)
     number: LineNumber | None = None
     weight: LineWeight | None = None
+    focus: Focus | None = None
 
     @property
     def terms(self) -> int:
@@ -74,6 +75,7 @@ class AnyCentreLines(AbstractLines):
             focal_unit=self.focal_unit,
             number=None if self.number is None else self.number[lines],
             weight=None if self.weight is None else self.weight[lines],
+            focus=focus_of(self, lines, present),
         )
 
     def about(self, centre: Centres) -> CompressedLines:
@@ -94,6 +96,7 @@ class AnyCentreLines(AbstractLines):
             focal_unit=self.focal_unit,
             number=self.number,
             weight=self.weight,
+            focus=self.focus,
         )
 
 
@@ -123,6 +126,7 @@ def compress_any_centre(lines: Lines, terms: int = 2) -> AnyCentreLines:
         focal_unit=lines.focal_unit,
         number=lines.number,
         weight=lines.weight,
+        focus=lines.focus,
     )
 
 

@@ -28,8 +28,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._checks import checked_terms
-from ._types import Centres, Focal, FrameIndex, LineNumber, LineWeight, Point, traced
-from .lines import AbstractLines, Lines
+from ._types import Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Point, traced
+from .lines import AbstractLines, Lines, focus_of
 
 _RUN = 1100  # points orthogonalised together: 7 columns of them fill a cache of 48 to 64 KB in float64
 
@@ -41,7 +41,7 @@ class CompressedLines(AbstractLines):
 
     Attributes:
         triangle: R of each line, in normalised lengths.
-        frame, focal, centre, image_size, focal_unit, number, weight: as in `Lines`.
+        frame, focal, centre, image_size, focal_unit, number, weight, focus: as in `Lines`.
     """
 
     triangle: Float[Array, "line rows rows"]
@@ -52,6 +52,7 @@ class CompressedLines(AbstractLines):
     focal_unit: str = eqx.field(static=True)
     number: LineNumber | None = None
     weight: LineWeight | None = None
+    focus: Focus | None = None
 
     @property
     def terms(self) -> int:
@@ -111,6 +112,7 @@ class CompressedLines(AbstractLines):
             focal_unit=self.focal_unit,
             number=None if self.number is None else self.number[lines],
             weight=None if self.weight is None else self.weight[lines],
+            focus=focus_of(self, lines, present),
         )
 
 
@@ -149,6 +151,7 @@ def compress(lines: Lines, terms: int = 2) -> CompressedLines:
         focal_unit=lines.focal_unit,
         number=lines.number,
         weight=lines.weight,
+        focus=lines.focus,
     )
 
 

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from ._types import AnyArray
 from .lines import AbstractLines
-from .zoom import AbstractPriorZoom, AbstractZoom, with_parameters
+from .zoom import AbstractFocusZoom, AbstractPriorZoom, AbstractZoom, with_parameters
 
 # The angle of a line, ½ atan2, jumps by half a turn at one direction: harmless to derivatives, but the
 # residuals change sign there and finite differences across it are wrong. Left alone the jump sits at
@@ -76,6 +77,27 @@ def residuals(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -
         )
     distances = jax.vmap(line_residuals)(lines.corrected(coefficients[lines.frame]))
     return jnp.sqrt(line_weights(lines))[:, None] * distances
+
+
+def settings(zoom: AbstractZoom, lines: AbstractLines) -> tuple[Float[AnyArray, "frame"], ...]:
+    """What a zoom model's coefficients depend on, frame by frame: the focal length, and perhaps the focus.
+
+    Raises:
+        ValueError: the model needs the focus, and the lines do not have it.
+    """
+    if not isinstance(zoom, AbstractFocusZoom):
+        return (lines.focal,)
+    if lines.focus is None:
+        raise ValueError(
+            f"A {type(zoom).__name__} needs the focus of each frame: Lines.from_ragged(..., focus=...), or "
+            "choose a model of the focal length alone."
+        )
+    return lines.focal, lines.focus
+
+
+def coefficients_by(zoom: AbstractZoom, lines: AbstractLines) -> Float[Array, "frame terms"]:
+    """The coefficients of each frame, by a zoom model."""
+    return jnp.asarray(jax.vmap(zoom)(*settings(zoom, lines)))
 
 
 def prior_residuals(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "row"] | None:

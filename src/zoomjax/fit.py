@@ -28,7 +28,7 @@ from ._solver import default_solver
 from ._types import AnyArray, Centres, traced
 from .algebraic import algebraic_parameters, compressed
 from .certificate import Certificate, certificate_of, slope_controls
-from .energy import energy_by_frame, frame_energy, prior_residuals, residuals
+from .energy import coefficients_by, energy_by_frame, frame_energy, prior_residuals, residuals, settings
 from .image_metric import ImageLines, in_image
 from .lens import ZoomLens, lens_of
 from .lines import AbstractLines, Lines
@@ -211,14 +211,15 @@ def ready_model(lines, zoom, terms):
         raise TypeError(
             f"Argument zoom must be a zoom model such as PolynomialZoom(degree=2), but it is {zoom!r}."
         )
-    own = None if zoom.parameters is None else jax.eval_shape(zoom, lines.focal[0]).shape[0]
+    own = None if zoom.parameters is None else jax.eval_shape(coefficients_by, zoom, lines).shape[1]
     terms = checked_terms((own or 2) if terms is None else terms)
     if own not in (None, terms):
         raise ValueError(
             f"Argument terms is {terms}, but the parameters of zoom are for {own}: leave terms out, or "
             "start from a model without parameters."
         )
-    prepared = zoom.prepare(lines.focal, terms)  # complains of too few focal lengths
+    focal, *focus = settings(zoom, lines)
+    prepared = zoom.prepare(focal, terms, *focus)  # complains of too few focal lengths
     if own is None:
         return prepared, terms
     dtype = jnp.asarray(lines.focal).dtype
@@ -317,7 +318,7 @@ def _frame_rms(lines, lens):
     if lens is None:
         coefficients = jnp.zeros((focal.shape[0], 1), focal.dtype)
     elif isinstance(lens, ZoomLens):
-        coefficients = jax.vmap(lens.zoom)(focal)
+        coefficients = coefficients_by(lens.zoom, lines)
     else:
         coefficients = lens
     return jnp.sqrt(frame_energy(lines, jnp.asarray(coefficients)))
@@ -389,15 +390,14 @@ def _refit_zoom(lines, free):
         return free, _outcome(free)
     nothing = jax.tree.map(jnp.zeros_like, zoom.parameters)
     if not isinstance(zoom, AbstractLinearZoom):
-        nothing = zoom.prepare(
-            jnp.asarray(lines.focal), jax.eval_shape(zoom, lines.focal[0]).shape[0]
-        ).parameters
+        terms = jax.eval_shape(coefficients_by, zoom, lines).shape[1]
+        nothing = zoom.prepare(jnp.asarray(lines.focal), terms).parameters
     start, unravel = ravel_pytree(nothing)
 
     def functions(lines, zoom):
         def errors(flat):
             model = with_parameters(zoom, unravel(flat))
-            distances = residuals(lines, jax.vmap(model)(lines.focal)).reshape(-1)
+            distances = residuals(lines, coefficients_by(model, lines)).reshape(-1)
             prior = prior_residuals(lines, model)
             return distances if prior is None else jnp.concatenate([distances, prior])
 
@@ -446,7 +446,7 @@ def minimise(lines, zoom, solver, max_steps):
     def function(parameters, args):
         lines, zoom = args
         zoom = with_parameters(zoom, parameters)
-        return residuals(lines, jax.vmap(zoom)(lines.focal)), prior_residuals(lines, zoom)
+        return residuals(lines, coefficients_by(zoom, lines)), prior_residuals(lines, zoom)
 
     start = jax.tree.map(jax.lax.stop_gradient, zoom.parameters)
     solution = optx.least_squares(
@@ -460,7 +460,7 @@ def linearised(lines, zoom):
     flat, unravel = ravel_pytree(zoom.parameters)
 
     def function(flat):
-        k = jax.vmap(with_parameters(zoom, unravel(flat)))(lines.focal)
+        k = coefficients_by(with_parameters(zoom, unravel(flat)), lines)
         return (weighted := residuals(lines, k)), weighted
 
     jacobian, weighted = jax.jacfwd(function, has_aux=True)(flat)

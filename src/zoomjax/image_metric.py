@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ._types import Centres, Focal, FrameIndex, LineWeight, Point
+from ._types import Centres, Focal, Focus, FrameIndex, LineWeight, Point
 from .energy import line_normal
 from .lines import AbstractLines
 
@@ -29,12 +29,13 @@ class ImageLines(AbstractLines):
 
     Attributes:
         lines: the lines.
-        frame, focal, centre, image_size, focal_unit, weight: theirs.
+        frame, focal, focus, centre, image_size, focal_unit, weight: theirs.
     """
 
     lines: AbstractLines
     frame: FrameIndex
     focal: Focal
+    focus: Focus | None
     centre: Point
     image_size: tuple[int, int] = eqx.field(static=True)
     focal_unit: str = eqx.field(static=True)
@@ -96,6 +97,7 @@ def in_image(lines: AbstractLines) -> ImageLines:
         lines=lines,
         frame=lines.frame,
         focal=lines.focal,
+        focus=lines.focus,
         centre=lines.centre,
         image_size=lines.image_size,
         focal_unit=lines.focal_unit,

@@ -14,11 +14,12 @@ from jaxtyping import Float, Num, ScalarLike
 from ._checks import checked_size, checked_unit
 from ._files import whole_file
 from ._types import AnyArray, Point, traced
+from .focus import FocusSplineZoom
 from .lines import AbstractLines
 from .radial import Distortion
 from .rivals import PowerZoom, SplineZoom, TableZoom, TwoRegionZoom
 from .smooth import SmoothZoom
-from .zoom import AbstractZoom, PolynomialZoom
+from .zoom import AbstractFocusZoom, AbstractZoom, PolynomialZoom
 
 _FORMAT, _VERSION = "zoomjax.lens", 1
 
@@ -34,6 +35,7 @@ class ZoomLens(eqx.Module):
         focal_range: the shortest and longest focal length fitted.
         image_size: (width, height) px of the images it is for.
         focal_unit: "mm" or "px".
+        focus_range: the least and greatest focus fitted, where the zoom model depends on it.
 
     Example:
         >>> import jax.numpy as jnp
@@ -49,6 +51,7 @@ class ZoomLens(eqx.Module):
     image_size: tuple[int, int] = eqx.field(static=True)
     focal_unit: str = eqx.field(static=True, default="mm")
     shift: AbstractZoom | None = None
+    focus_range: Float[AnyArray, "2"] | None = None
 
     def __check_init__(self):
         """Check the geometry."""
@@ -60,15 +63,20 @@ class ZoomLens(eqx.Module):
         """The length in px that is radius 1: half the image diagonal."""
         return math.hypot(*self.image_size) / 2
 
-    def __call__(self, focal: ScalarLike) -> Distortion:
+    def __call__(self, focal: ScalarLike, focus: ScalarLike | None = None) -> Distortion:
         """The distortion at one focal length, in `focal_unit`; ``jax.vmap`` it for many.
+
+        Args:
+            focal: the focal length.
+            focus: where the lens is focused, for models that depend on it (`AbstractFocusZoom`), which hold
+                it within the fitted range.
 
         Warns:
             UserWarning: `focal` is outside of the fitted range (not under ``jit`` or ``vmap``).
 
         Raises:
             ValueError: `focal` is not one number, positive and finite (values are not checked under
-                ``jit`` or ``vmap``).
+                ``jit`` or ``vmap``), or the zoom model depends on the focus and none is given.
         """
         if np.ndim(focal):
             raise ValueError(
@@ -80,10 +88,24 @@ class ZoomLens(eqx.Module):
         focal = jnp.asarray(focal, dtype)
         centre = jnp.asarray(self.centre)
         return Distortion(
-            coefficients=self.zoom(focal),
+            coefficients=self.zoom(focal, focus)
+            if isinstance(self.zoom, AbstractFocusZoom)
+            else self.zoom(focal),
             centre=centre if self.shift is None else centre + self.scale * self.shift(focal),
             scale=jnp.asarray(self.scale, dtype),
         )
+
+    def at_focus(self, focus: ScalarLike) -> "ZoomLens":
+        """The lens focused at one place, a lens of the focal length alone: to correct images and video by.
+
+        Raises:
+            TypeError: the zoom model does not depend on the focus.
+        """
+        if not isinstance(self.zoom, AbstractFocusZoom):
+            raise TypeError(
+                f"A {type(self.zoom).__name__} does not depend on the focus: use the lens as it is."
+            )
+        return dataclasses.replace(self, zoom=self.zoom.at_focus(focus), focus_range=None)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the lens to a JSON file that `load_lens` reads, all digits kept.
@@ -106,6 +128,8 @@ class ZoomLens(eqx.Module):
             "z = (distorted - centre) / scale, r^2 = z.z",
             "zoom": _described(self.zoom),
         }
+        if self.focus_range is not None:
+            content["focus_range"] = _numbers(self.focus_range)
         if self.shift is not None:
             content["shift"] = _described(self.shift)
             content["shift_meaning"] = "centre at f = centre + scale (k_1(f), k_2(f)) of the model in shift"
@@ -149,7 +173,13 @@ def lens_of(lines: AbstractLines, zoom: AbstractZoom) -> ZoomLens:
         focal_range=jnp.stack([jnp.min(focal), jnp.max(focal)]),
         image_size=lines.image_size,
         focal_unit=lines.focal_unit,
+        focus_range=_focus_range(lines) if isinstance(zoom, AbstractFocusZoom) else None,
     )
+
+
+def _focus_range(lines):
+    focus = jnp.asarray(lines.focus)
+    return jnp.stack([jnp.min(focus), jnp.max(focus)])
 
 
 def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
@@ -176,6 +206,7 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
             image_size=checked_size(content["image_size"]),
             focal_unit=checked_unit(content["focal_unit"]),
             shift=_read_zoom(content["shift"]) if "shift" in content else None,
+            focus_range=_array(content, "focus_range", (2,)) if "focus_range" in content else None,
         )
         low, high = lens.focal_range
         if not 0 < low <= high:
@@ -200,6 +231,8 @@ _FORMULAS = {
     "parameters[3..5][i-1] from there on",
     SmoothZoom: "k_i(f) = sum_j parameters[j][i-1] P_j(2 focal_ref / f - 1), P_j Legendre's polynomials; "
     "the rest is the prior",
+    FocusSplineZoom: "k_i(f, d) = sum over knots z of 1/f and e of the focus d of "
+    "parameters[z * focus_number + e][i-1] S_z(1/f) T_e(d), S and T the cardinal natural cubic splines",
 }
 
 _TABLE = (None, None)
@@ -207,6 +240,8 @@ _SHAPES = {
     "parameters": _TABLE,
     "knots": (None,),
     "curvature": _TABLE,
+    "focus_knots": (None,),
+    "focus_curvature": _TABLE,
     "quadratic": _TABLE,
     "beyond": _TABLE,
 }

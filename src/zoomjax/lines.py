@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from ._checks import (
     checked_centre,
     checked_focal,
+    checked_focus,
     checked_frames,
     checked_points,
     checked_size,
@@ -30,7 +31,7 @@ from ._checks import (
     warn_of_points_outside,
 )
 from ._files import whole_file
-from ._types import AnyArray, Centres, Focal, FrameIndex, LineNumber, LineWeight, Mask, Point, traced
+from ._types import AnyArray, Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Mask, Point, traced
 from .radial import radial_factor
 
 _FORMAT, _VERSION = "zoomjax.lines", 1
@@ -43,6 +44,7 @@ class AbstractLines(eqx.Module):
 
     frame: eqx.AbstractVar[FrameIndex]
     focal: eqx.AbstractVar[Focal]
+    focus: eqx.AbstractVar[Focus | None]
     centre: eqx.AbstractVar[Point]
     image_size: eqx.AbstractVar[tuple[int, int]]
     focal_unit: eqx.AbstractVar[str]
@@ -137,6 +139,8 @@ class Lines(AbstractLines):
         focal_unit: "mm" or "px".
         number: position of each line among those that `from_ragged` was given; None if unknown.
         weight: how much each line counts beside the others of its frame, at least 0; None for all alike.
+        focus: where the lens is focused in each image, for models that depend on it (`AbstractFocusZoom`):
+            any number that grows or falls with it, such as the reciprocal of the distance; None if unknown.
     """
 
     points: Float[AnyArray, "line point 2"]
@@ -148,6 +152,7 @@ class Lines(AbstractLines):
     focal_unit: str = eqx.field(static=True, default="mm")
     number: LineNumber | None = None
     weight: LineWeight | None = None
+    focus: Focus | None = None
 
     def __check_init__(self):
         """Check that the shapes agree."""
@@ -168,6 +173,7 @@ class Lines(AbstractLines):
         image_size: Sequence[int],
         focal_unit: str = "mm",
         centre: ArrayLike | None = None,
+        focus: ArrayLike | None = None,
         chunk: bool = False,
     ) -> "Lines":
         """Lines from one array of points a line.
@@ -179,6 +185,7 @@ class Lines(AbstractLines):
             image_size: (width, height) px.
             focal_unit: "mm" or "px", the unit of `focal`.
             centre: centre of distortion, px; default the centre of the image.
+            focus: for each image where the lens is focused, a finite number, 1/distance say, or None.
             chunk: whether these are only some of the lines' points, to be compressed and merged with
                 others: then every line is kept, whatever its number of points, even none.
 
@@ -222,6 +229,9 @@ class Lines(AbstractLines):
             image_size=size,
             focal_unit=unit,
             number=jnp.asarray(number, jnp.int32),
+            focus=None
+            if focus is None
+            else _held_as_given(checked_focus(focus, focals.size).astype(dtype)),
         )
 
     @classmethod
@@ -272,7 +282,10 @@ class Lines(AbstractLines):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all fields, in their dtypes, to a ``.npz`` file that `load_lines` reads."""
-        fields: dict[str, Any] = {} if self.weight is None else {"weight": np.asarray(self.weight)}
+        optional: dict[str, Any] = {"weight": self.weight, "focus": self.focus}
+        fields: dict[str, Any] = {
+            name: np.asarray(value) for name, value in optional.items() if value is not None
+        }
         with whole_file(path) as part, part.open("wb") as file:
             np.savez(
                 file,
@@ -329,7 +342,17 @@ class Lines(AbstractLines):
             focal_unit=self.focal_unit,
             number=None if self.number is None else self.number[lines],
             weight=None if self.weight is None else self.weight[lines],
+            focus=focus_of(self, lines, present),
         )
+
+
+def focus_of(
+    lines: AbstractLines, chosen: Int[Array, "some"], present: Bool[Array, "some"]
+) -> Float[Array, "1"] | None:
+    """The focus of the one frame that the chosen lines are seen in."""
+    if lines.focus is None:
+        return None
+    return jnp.asarray(lines.focus)[lines.frame[chosen[jnp.argmax(present)]]][None]
 
 
 def _correct_line(points, mask, k, centre, scale):
@@ -366,6 +389,7 @@ def load_lines(path: str | os.PathLike[str]) -> Lines:
             image_size=stored["image_size"].tolist(),
             focal_unit=str(stored["focal_unit"]),
             centre=stored["centre"],
+            focus=stored.get("focus"),
         )
         return lines.weighted(stored["weight"][lines.number]) if "weight" in stored else lines
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:

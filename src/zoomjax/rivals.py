@@ -4,14 +4,17 @@ Look-up tables [25], splines, a power law (eq. 4, [14]) and polynomials in two r
 but the power law are linear in their parameters: they state a basis, and share the polynomial's solver.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, ScalarLike
+from jaxtyping import Array, Float, ScalarLike
 
 from ._bernstein import Pieces
 from ._checks import checked_integer
+from ._splines import at_ends, natural_basis, natural_controls, natural_curvature, place, spread
 from ._types import AnyArray, Coefficients, Focal, Scalar, traced
 from .zoom import UNFITTED, AbstractLinearZoom, AbstractZoom, check_distinct, inverse_powers
 
@@ -53,7 +56,8 @@ class TableZoom(AbstractLinearZoom):
 
     def prepare(self, focal: Focal, terms: int) -> "TableZoom":
         """A table of zeros, its entries at focal lengths that are there."""
-        knots = _spread(1 / focal if self.inverse else focal, self.number, "A table")
+        _check_knots("A table", focal, self.number)
+        knots = spread(1 / focal if self.inverse else focal, self.number)
         zeros = _zeros(knots.shape[0], terms, knots.dtype)
         return TableZoom(number=self.number, inverse=self.inverse, parameters=zeros, knots=knots)
 
@@ -61,8 +65,8 @@ class TableZoom(AbstractLinearZoom):
         """Hats: 1 at one entry, falling to 0 at its neighbours."""
         knots = _prepared(self.knots)
         x = 1 / jnp.asarray(focal) if self.inverse else jnp.asarray(focal)
-        index, share, _ = _place(knots, jnp.clip(x, knots[0], knots[-1]))
-        return _two(knots, index, 1 - share, share)
+        index, share, _ = place(knots, jnp.clip(x, knots[0], knots[-1]))
+        return at_ends(knots, index, 1 - share, share)
 
     def basis_pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces:
         """The intervals between entries, in which it is linear: all of them, whatever the range."""
@@ -94,9 +98,10 @@ class SplineZoom(AbstractLinearZoom):
 
     def prepare(self, focal: Focal, terms: int) -> "SplineZoom":
         """A spline of zeros, its knots at focal lengths that are there."""
-        knots = _spread(1 / focal, self.number, "A spline")
+        _check_knots("A spline", focal, self.number)
+        knots = spread(1 / focal, self.number)
         zeros = _zeros(knots.shape[0], terms, knots.dtype)
-        curvature = _natural_curvature(knots)
+        curvature = natural_curvature(knots)
         return SplineZoom(number=self.number, parameters=zeros, knots=knots, curvature=curvature)
 
     def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:
@@ -104,25 +109,14 @@ class SplineZoom(AbstractLinearZoom):
         knots = _prepared(self.knots)
         x = 1 / jnp.asarray(focal)
         end = jnp.clip(x, knots[0], knots[-1])
-        value, slope = jax.jvp(self._within, (end,), (jnp.ones_like(end),))
+        within = functools.partial(natural_basis, knots, _prepared(self.curvature))
+        value, slope = jax.jvp(within, (end,), (jnp.ones_like(end),))
         return value + (x - end) * slope
-
-    def _within(self, x: Float[Array, ""]) -> Float[Array, "basis"]:
-        knots, curvature = _prepared(self.knots), _prepared(self.curvature)
-        index, share, width = _place(knots, x)
-        bent = _two(knots, index, (1 - share) ** 3 - (1 - share), share**3 - share)
-        return _two(knots, index, 1 - share, share) + width**2 / 6 * (bent @ curvature)
 
     def basis_pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces:
         """Cubics between all neighbouring knots, and what of the range lies before and after them."""
         knots, curvature = (jnp.asarray(_prepared(a)) for a in (self.knots, self.curvature))
-        one = jnp.eye(knots.shape[0], dtype=knots.dtype)
-        share = jnp.asarray([0, 1 / 3, 2 / 3, 1], knots.dtype)[None, :, None]
-        bent = jnp.asarray([[0, 0], [2, 1], [1, 2], [0, 0]], knots.dtype)
-        width = jnp.diff(knots)[:, None, None]
-        straight = (1 - share) * one[:-1, None] + share * one[1:, None]
-        neighbours = jnp.stack([curvature[:-1], curvature[1:]], axis=1)
-        within = straight - width**2 / 18 * jnp.einsum("cn,pnb->pcb", bent, neighbours, precision="highest")
+        within = natural_controls(knots, curvature)
         ends = jnp.stack([knots[:-1], knots[1:]], axis=1)
         # What follows on either side is straight; nothing where the range ends at the last knot.
         low, high = 1 / jnp.asarray(focal_range)[::-1]
@@ -130,6 +124,7 @@ class SplineZoom(AbstractLinearZoom):
             [[jnp.minimum(low, knots[0]), knots[0]], [knots[-1], jnp.maximum(high, knots[-1])]]
         )
         values = jax.vmap(jax.vmap(lambda x: self.basis(1 / x)))(beyond)
+        share = jnp.asarray([0, 1 / 3, 2 / 3, 1], knots.dtype)[None, :, None]
         outside = (1 - share) * values[:, :1] + share * values[:, 1:]
         controls = jnp.concatenate([within, outside])
         size = jnp.max(jnp.abs(controls), axis=(0, 1))
@@ -274,55 +269,13 @@ def barrel_crossover(focal: Focal, k1: Float[AnyArray, "frame"]) -> float:
     return float(1 / (inverse[i] + share * (inverse[i + 1] - inverse[i])))
 
 
-def _spread(values: Float[AnyArray, "frame"], number: int | None, what: str) -> AnyArray:
-    """`number` of the distinct values, or all, increasing and spread evenly over their ranks."""
-    if traced(values):
-        ordered = jnp.sort(values)
-    else:
-        ordered = np.unique(np.asarray(values))
-        check_distinct(what, ordered, number or 1)
-    if number is None:
-        return ordered
-    return ordered[np.round(np.linspace(0, ordered.shape[0] - 1, number)).astype(int)]
+def _check_knots(what: str, focal: Focal, number: int | None) -> None:
+    if not traced(focal):
+        check_distinct(what, focal, number or 1)
 
 
 def _zeros(rows: int, terms: int, dtype: np.dtype) -> Float[Array, "rows terms"]:
     return jnp.asarray(np.zeros((rows, terms), dtype))
-
-
-def _place(
-    knots: Float[AnyArray, "basis"], x: Float[Array, ""]
-) -> tuple[Int[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Index of the interval that x lies in, how far along it, from 0 to 1, and its width."""
-    knots = jnp.asarray(knots)
-    if knots.shape[0] == 1:
-        return jnp.asarray(0), jnp.zeros_like(x), jnp.ones_like(x)
-    index = jnp.clip(jnp.searchsorted(knots, x) - 1, 0, knots.shape[0] - 2)
-    width = knots[index + 1] - knots[index]
-    known: Bool[Array, ""] = width > 0  # knots that coincide, as they may under a trace
-    return index, jnp.where(known, x - knots[index], 0) / jnp.where(known, width, 1), width
-
-
-def _two(knots, index, first, second) -> Float[Array, "basis"]:
-    """A vector with two values, at the ends of an interval."""
-    vector = jnp.zeros(knots.shape[0], jnp.result_type(first)).at[index].add(first)
-    return vector.at[index + 1].add(second)  # beyond the only knot of a table of one: dropped
-
-
-def _natural_curvature(knots: Float[AnyArray, "basis"]) -> Float[Array, "basis basis"]:
-    """The matrix from values at the knots to the natural spline's second derivatives there."""
-    knots = jnp.asarray(knots)
-    size = knots.shape[0]
-    if size < 3:
-        return jnp.zeros((size, size), knots.dtype)
-    width = jnp.diff(knots)
-    inner = jnp.arange(size - 2)
-    bands = jnp.zeros((size - 2, size), knots.dtype)
-    system = bands.at[inner, inner].set(width[:-1] / 6).at[inner, inner + 2].set(width[1:] / 6)
-    system = system.at[inner, inner + 1].set((width[:-1] + width[1:]) / 3)
-    second = bands.at[inner, inner].set(1 / width[:-1]).at[inner, inner + 2].set(1 / width[1:])
-    second = second.at[inner, inner + 1].set(-1 / width[:-1] - 1 / width[1:])
-    return jnp.pad(jnp.linalg.solve(system[:, 1:-1], second), ((1, 1), (0, 0)))
 
 
 def _prepared(value):

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from ._linear import least_squares
 from .algebraic import algebraic_zoom
-from .energy import line_residuals, prior_jacobian
+from .energy import coefficients_by, line_residuals, prior_jacobian
 from .fit import ZoomFit, fit_zoom, linearised, ready_model
 from .lines import AbstractLines
 from .zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
@@ -126,7 +126,7 @@ def _weights(lines, model, cut):
 @eqx.filter_jit
 def _line_rms(lines, model):
     """RMS distance of each line, px, over its degrees of freedom, and the median over lines."""
-    corrected = lines.corrected(jax.vmap(model)(lines.focal)[lines.frame])
+    corrected = lines.corrected(coefficients_by(model, lines)[lines.frame])
     squares = jnp.sum(jax.vmap(line_residuals)(corrected) ** 2, axis=1)
     line_rms = jnp.sqrt(squares / jnp.maximum(lines.counts - 2, 1))
     return line_rms, jnp.nanmedian(jnp.where(lines.counts > 2, line_rms, jnp.nan))

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from .energy import line_weights, prior_error, prior_jacobian
+from .energy import coefficients_by, line_weights, prior_error, prior_jacobian
 from .lines import AbstractLines
 from .zoom import AbstractPriorZoom, AbstractZoom, with_parameters
 
@@ -72,7 +72,7 @@ def parameter_covariance(
     freedom = jnp.sum(weights * (lines.counts - 2)) - jnp.trace(jnp.sum(share, axis=0))
     undetermined = undetermined | (freedom <= 0)  # nothing is left over to tell the noise by
     share = energy / _positive(freedom) * share
-    terms = jax.eval_shape(zoom, lines.focal[0]).shape[0]
+    terms = jax.eval_shape(coefficients_by, zoom, lines).shape[1]
     scores = terms * jnp.sum(weights > 0) - jnp.sum(good)
     score = jnp.einsum("lri,lr->li", jacobian, weighted)
     covariance = inverse @ _of_whole_lines(score, leverage, share, scores) @ inverse.T
@@ -123,7 +123,7 @@ def _feigned(lines, zoom, weights, energy, extra):
     flat, unravel = ravel_pytree(zoom.parameters)
 
     def coefficients_at(flat):
-        k = jax.vmap(with_parameters(zoom, unravel(flat)))(lines.focal)
+        k = coefficients_by(with_parameters(zoom, unravel(flat)), lines)
         return k[:, : k.shape[1] - extra]
 
     k = coefficients_at(flat)

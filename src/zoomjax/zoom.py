@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, PyTree, ScalarLike
 
 from ._bernstein import Pieces, power_controls
 from ._checks import checked_integer
-from ._types import AnyArray, Coefficients, Focal, Scalar, traced
+from ._types import AnyArray, Coefficients, Focal, Focus, Scalar, traced
 
 SomeZoom = TypeVar("SomeZoom", bound="AbstractZoom")
 
@@ -95,6 +95,34 @@ class AbstractPriorZoom(AbstractLinearZoom):
     @abc.abstractmethod
     def standardised(self) -> Float[Array, "row"]:
         """The parameters as numbers that are independent a priori, of mean 0 and variance 1."""
+
+
+class AbstractFocusZoom(AbstractLinearZoom):
+    """A linear zoom model whose coefficients depend on the focus, too: ``k(f, d)``.
+
+    The focus d is any number that grows or falls with it, such as the reciprocal of the distance focused
+    on; lines carry one a frame (``Lines.from_ragged(..., focus=...)``). `at_focus` gives the model at one.
+    """
+
+    @abc.abstractmethod
+    def prepare(self, focal: Focal, terms: int, focus: Focus | None = None) -> "AbstractFocusZoom":
+        """This model made ready for these focal lengths and focuses, a pair a frame."""
+
+    @abc.abstractmethod
+    def basis(self, focal: ScalarLike, focus: ScalarLike | None = None) -> Float[Array, "basis"]:
+        """The values of the basis functions at one focal length and focus."""
+
+    @abc.abstractmethod
+    def at_focus(self, focus: ScalarLike) -> AbstractLinearZoom:
+        """The model of the focal length alone that this one is at one focus."""
+
+    def __call__(self, focal: ScalarLike, focus: ScalarLike | None = None) -> Coefficients:
+        """The coefficients at one focal length and focus.
+
+        Raises:
+            ValueError: the focus is missing.
+        """
+        return self.basis(focal, focus) @ _fitted(self)
 
 
 class PolynomialZoom(AbstractLinearZoom):
