@@ -25,7 +25,7 @@ LAYERS = (
     {"algebraic"},
     {"uncertainty"},
     {"fit"},
-    {"bands", "robust", "centre"},
+    {"bands", "robust", "centre", "focal_error"},
     {"design"},
     {"synthetic", "broadcast", "metrics", "io"},
     {"plot"},

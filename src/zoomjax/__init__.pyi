@@ -33,6 +33,9 @@ from .focal import FocalEstimate as FocalEstimate
 from .focal import focal_from_board as focal_from_board
 from .focal import focal_from_lines as focal_from_lines
 from .focal import focal_from_planes as focal_from_planes
+from .focal_error import FocalFit as FocalFit
+from .focal_error import fit_focal as fit_focal
+from .focal_error import with_focal_sigma as with_focal_sigma
 from .framing import Framing as Framing
 from .framing import frame_output as frame_output
 from .image_metric import ImageLines as ImageLines
