@@ -26,7 +26,7 @@ LAYERS = (
     {"uncertainty"},
     {"fit"},
     {"bands", "robust", "centre", "focal_error"},
-    {"design"},
+    {"design", "blunders"},
     {"synthetic", "broadcast", "metrics", "io"},
     {"plot"},
     {"calibration"},

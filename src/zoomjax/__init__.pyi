@@ -9,6 +9,8 @@ from .bands import displacement_band as displacement_band
 from .bands import displacement_covariance as displacement_covariance
 from .bands import displacement_std as displacement_std
 from .bands import std_of as std_of
+from .blunders import PointRejection as PointRejection
+from .blunders import reject_points as reject_points
 from .centre import CentreFit as CentreFit
 from .centre import FrameCentres as FrameCentres
 from .centre import fit_centre as fit_centre
