@@ -125,6 +125,6 @@ def test_lines_of_few_points_keep_them():
     assert found.fit.rejected.tolist() == [3]
 
 
-def test_compressed_lines_raise_and_say_what_to_do(small):
+def test_compressed_lines_raise_and_say_what_to_do(small, unchecked):
     with pytest.raises(TypeError, match="reject points first, then compress"):
         zj.reject_points(small)

@@ -43,11 +43,11 @@ def refined(rounded):
 # What errors do to the parameters
 
 
-@pytest.mark.parametrize("zoom", [None, zj.PowerZoom(), zj.SplineZoom(number=3), zj.SmoothZoom()])
+@pytest.mark.parametrize("zoom", [None, zj.SmoothZoom()])
 def test_response_is_that_of_fits_at_other_focal_lengths(sweep, zoom):
     model = zj.fit_zoom(sweep, zoom=zoom).lens.zoom
     response = eqx.filter_jit(_response)(sweep, model)
-    for frame in (0, 4):
+    for frame in (0, 7):
 
         def refit(t, frame=frame):
             moved = at_focal(sweep, sweep.focal.at[frame].multiply(np.exp(t)))
@@ -61,7 +61,7 @@ def test_covariance_grows_by_the_response(sweep):
     fit = zj.fit_zoom(sweep)
     sigma = np.linspace(0.0, 0.9, 10)
     wide = zj.with_focal_sigma(fit, sweep, focal_sigma=sigma)
-    response = _response(sweep, fit.lens.zoom) * (sigma / sweep.focal)
+    response = np.asarray(_response(sweep, fit.lens.zoom)) * (sigma / np.asarray(sweep.focal))
     np.testing.assert_allclose(wide.covariance, fit.covariance + response @ response.T, rtol=1e-9)
     same = zj.with_focal_sigma(fit, sweep, focal_sigma=0)
     np.testing.assert_array_equal(same.covariance, fit.covariance)

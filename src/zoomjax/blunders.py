@@ -7,10 +7,10 @@ from least absolute distances to Tukey's weights), the standard deviation is 1.4
 of the line's points, drawn, as much as `_BORROWED` points weigh, to that of the typical line. Lens and
 decisions are found in turns, each anew from all points, so that those first misjudged can come back.
 
-Points are dropped rather than weighed. Weights of points would end the exact compression, and would have to be
-known to counts, covariance and figures; a line with fewer points is a line. And as nothing within the cut is
-touched, it costs good points next to nothing: one in sixteen thousand lies beyond four standard deviations.
-Tukey's weights at their usual width lose 5 % of what the points tell.
+Points are dropped rather than weighed. Weights of points would end the exact compression, and would have
+to be known to counts, covariance and figures; a line with fewer points is a line. And as nothing within the
+cut is touched, it costs next to nothing: of good points one in sixteen thousand lies beyond four standard
+deviations. Tukey's weights at their usual width lose 5 % of what the points tell.
 """
 
 from typing import NamedTuple

@@ -7,6 +7,7 @@ import os
 import warnings
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Num, ScalarLike
@@ -170,12 +171,12 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
                 "update zoomjax"
             )
         lens = ZoomLens(
-            zoom=_read_zoom(content["zoom"]),
+            zoom=_read_zoom(content["zoom"], None),
             centre=_array(content, "centre", (2,)),
             focal_range=_array(content, "focal_range", (2,)),
             image_size=checked_size(content["image_size"]),
             focal_unit=checked_unit(content["focal_unit"]),
-            shift=_read_zoom(content["shift"]) if "shift" in content else None,
+            shift=_read_zoom(content["shift"], 2) if "shift" in content else None,
         )
         low, high = lens.focal_range
         if not 0 < low <= high:
@@ -185,7 +186,15 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
         return lens
     except FileNotFoundError:
         raise
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OSError) as error:
+    except (
+        ValueError,
+        TypeError,
+        KeyError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+        OSError,
+    ) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
         raise ValueError(f"Cannot read a lens from {os.fspath(path)}: {reason}.") from error
 
@@ -221,7 +230,8 @@ def _described(model: AbstractZoom) -> dict[str, object]:
     }
 
 
-def _read_zoom(content) -> AbstractZoom:
+def _read_zoom(content, numbers: int | None) -> AbstractZoom:
+    """A zoom model that gives so many numbers, or as many as it has parameters for."""
     models = {model.__name__: model for model in _FORMULAS}
     if content["model"] not in models:
         raise ValueError(f"its zoom model, {content['model']!r}, is unknown; update zoomjax")
@@ -235,7 +245,17 @@ def _read_zoom(content) -> AbstractZoom:
     for name in ("focal_ref", "crossover"):
         if name in fields and not fields[name] > 0:
             raise ValueError(f"its {name} is not positive")
-    return model(**fields)
+    if not isinstance(fields.get("inverse", True), bool):
+        raise ValueError("its 'inverse' is neither true nor false")
+    rows, columns = fields["parameters"].shape
+    if "knots" in fields and not (fields["knots"].size == rows and (np.diff(fields["knots"]) > 0).all()):
+        raise ValueError("its knots do not increase, or are not as many as its parameters")
+    if "curvature" in fields and fields["curvature"].shape != (rows, rows):
+        raise ValueError("its curvature is not that of its knots")
+    zoom = model(**fields)
+    if jax.eval_shape(zoom, jnp.ones(())).shape != (numbers or columns,):
+        raise ValueError("its parameters are not those of its model")
+    return zoom
 
 
 def _plain(value):
@@ -252,6 +272,7 @@ def _array(content, name, shape):
     matches = array.ndim == len(shape) and all(
         want in (None, have) for want, have in zip(shape, array.shape, strict=True)
     )
-    if not matches or not array.size or not np.isfinite(array).all():
+    dtype = jnp.result_type(float)
+    if not matches or not array.size or not (abs(array) <= jnp.finfo(dtype).max).all():
         raise ValueError(f"the numbers of its {name!r} are incomplete or not finite")
-    return jnp.asarray(array, jnp.result_type(float))
+    return jnp.asarray(array, dtype)

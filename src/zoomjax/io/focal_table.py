@@ -77,7 +77,7 @@ def read_focal_table(path: str | os.PathLike[str]) -> FocalTable:
     try:
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
             rows = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
-    except UnicodeDecodeError as error:
+    except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"Cannot read focal lengths from {os.fspath(path)}: it is not text.") from error
     header = [name.lower() for name in rows[0]] if rows else []
     if not {"image", "focal"} <= set(header):
