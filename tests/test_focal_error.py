@@ -135,7 +135,7 @@ def test_a_focal_length_that_nobody_knows_is_found(sweep):
 
 def test_without_noise_rounding_is_undone_but_for_scale_and_shift(truth):
     """Of 1/f, which no line can tell apart; what is left of the errors is a straight line in 1/f."""
-    clean = zj.compress(synthetic.board_lines(truth, synthetic.focal_sweep(8), spacing=150.0))
+    clean = zj.compress(synthetic.board_lines(truth, synthetic.focal_sweep(10), spacing=150.0))
     found = zj.fit_focal(at_focal(clean, np.round(clean.focal)), ROUNDED)
     u, off = 1 / np.asarray(clean.focal), np.asarray(1 / found.focal - 1 / clean.focal)
     left = off - np.polyval(np.polyfit(u, off, 1), u)
@@ -143,14 +143,18 @@ def test_without_noise_rounding_is_undone_but_for_scale_and_shift(truth):
     assert np.abs(left[:5]).max() < 0.02 * np.abs(given[:5]).max()
 
 
-def test_float32_stays_float32(rounded, refined):
+def test_float32_bands_agree_and_refining_wants_float64(sweep):
     single = jax.tree.map(
-        lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a, rounded
+        lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a, sweep
     )
-    found = zj.fit_focal(single, ROUNDED)
-    assert found.focal.dtype == found.std.dtype == found.fit.covariance.dtype == jnp.float32
-    np.testing.assert_allclose(found.focal, refined.focal, atol=0.02)
-    np.testing.assert_allclose(found.std, refined.std, rtol=0.02)
+    wide = zj.with_focal_sigma(zj.fit_zoom(single), single, focal_sigma=0.3)
+    assert wide.covariance.dtype == jnp.float32
+    focal, corner = np.array([25.0, 60.0]), np.zeros(2)
+    double = zj.with_focal_sigma(zj.fit_zoom(sweep), sweep, focal_sigma=0.3)
+    std = [zj.displacement_std(fit, corner, focal=focal) for fit in (wide, double)]
+    np.testing.assert_allclose(std[0], std[1], rtol=0.02)
+    with pytest.raises(ValueError, match="float64 only.*jax_enable_x64"):
+        zj.fit_focal(single, ROUNDED)
 
 
 # Coverage
@@ -178,7 +182,7 @@ def test_bands_with_rounded_focal_lengths_hold_the_truth_as_often_as_they_say():
 
 
 @pytest.mark.parametrize("sigma", [None, np.inf, np.nan, np.where(np.arange(10) == 3, 0.1, np.inf)])
-def test_focal_lengths_that_nobody_knows_raise_and_say_why(rounded, sigma):
+def test_focal_lengths_that_nobody_knows_raise_and_say_why(rounded, sigma, unchecked):
     with pytest.raises(ValueError, match=r"(?s)focal_sigma.*Straightness alone cannot tell.*EXIF.*board"):
         zj.fit_focal(rounded, sigma)
     with pytest.raises(ValueError, match=r"focal_sigma.*Straightness alone cannot tell"):
@@ -188,7 +192,7 @@ def test_focal_lengths_that_nobody_knows_raise_and_say_why(rounded, sigma):
 @pytest.mark.parametrize(
     ("sigma", "message"), [(-0.1, "at least 0"), (np.ones(3), "each of the 10 frames")]
 )
-def test_sigma_that_is_none_raises(rounded, sigma, message):
+def test_sigma_that_is_none_raises(rounded, sigma, message, unchecked):
     with pytest.raises(ValueError, match=message):
         zj.fit_focal(rounded, sigma)
 

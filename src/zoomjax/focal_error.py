@@ -26,15 +26,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int
-from numpy.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int, Num, ScalarLike
 
-from ._types import Focal, traced
+from ._types import AnyArray, Focal, traced
 from .energy import line_weights, prior_error, prior_residuals, residuals
 from .fit import ZoomFit, fit_zoom, linearised
 from .lines import AbstractLines
 from .uncertainty import parameter_covariance
 from .zoom import AbstractPriorZoom, AbstractZoom, with_parameters
+
+Sigma = ScalarLike | Num[AnyArray, "frame"]
 
 _MOST_STEPS = 100
 """Of the joint minimisation, which takes 5 to 15."""
@@ -61,7 +62,7 @@ class FocalFit(eqx.Module):
     steps: Int[Array, ""]
 
 
-def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: ArrayLike) -> ZoomFit:
+def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma) -> ZoomFit:
     """The same fit, its covariance, and so all bands, enlarged by what is unknown of the focal lengths.
 
     Args:
@@ -102,7 +103,7 @@ def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: ArrayLi
 
 def fit_focal(
     lines: AbstractLines,
-    focal_sigma: ArrayLike,
+    focal_sigma: Sigma,
     *,
     zoom: AbstractZoom | None = None,
     terms: int | None = None,
@@ -125,7 +126,8 @@ def fit_focal(
         zoom, terms, invertible, throw: as for `fit_zoom`, whose errors also apply.
 
     Raises:
-        ValueError: `focal_sigma` is not such, or is infinite for all frames but those at one focal length.
+        ValueError: `focal_sigma` is not such, or is infinite for all frames but those at one focal length;
+            or the lines are in float32, whose rounding outweighs the prior where lines say nothing.
         RuntimeError: the solver failed (see `throw`).
 
     Example:
@@ -140,6 +142,11 @@ def fit_focal(
     """
     sigma = _checked_sigma(focal_sigma, lines.focal)
     given = jnp.asarray(lines.focal)
+    if given.dtype != jnp.float64:
+        raise ValueError(
+            'Focal lengths are refined in float64 only: jax.config.update("jax_enable_x64", True), and give '
+            f"lines in float64; these are in {given.dtype}."
+        )
     if not traced((sigma, given)) and np.unique(given[np.isfinite(sigma)]).size < 2:
         raise ValueError(
             "Argument focal_sigma must be finite for frames at two different focal lengths or more, but it "

@@ -391,13 +391,15 @@ def _read_archive(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """All arrays of an ``.npz`` file, nothing unpickled."""
     with open(path, "rb") as opened:
         try:
-            archive = np.load(opened, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
+            if not zipfile.is_zipfile(opened):
                 raise ValueError("it is not an .npz archive")
-            members = archive.zip.infolist()
-            _check_unpacked(sum(m.file_size for m in members), os.fstat(opened.fileno()).st_size)
-            for member in members:
-                _check_header(archive.zip, member)
+            with zipfile.ZipFile(opened) as members:
+                size = sum(member.file_size for member in members.infolist())
+                _check_unpacked(size, os.fstat(opened.fileno()).st_size)
+                for member in members.infolist():
+                    _check_header(members, member)
+            opened.seek(0)
+            archive = np.load(opened, allow_pickle=False)
             return {name: np.asarray(archive[name]) for name in archive.files}
         # Damaged archives raise whatever zipfile, zlib, struct or the tokenizer of headers stumbles over.
         except Exception as error:
