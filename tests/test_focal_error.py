@@ -153,7 +153,7 @@ def test_float32_bands_agree_and_refining_wants_float64(sweep):
     double = zj.with_focal_sigma(zj.fit_zoom(sweep), sweep, focal_sigma=0.3)
     std = [zj.displacement_std(fit, corner, focal=focal) for fit in (wide, double)]
     np.testing.assert_allclose(std[0], std[1], rtol=0.02)
-    with pytest.raises(ValueError, match="float64 only.*jax_enable_x64"):
+    with pytest.raises(ValueError, match=r"float64 only.*jax_enable_x64"):
         zj.fit_focal(single, ROUNDED)
 
 

@@ -131,21 +131,22 @@ def fit_focal(
         RuntimeError: the solver failed (see `throw`).
 
     Example:
-        >>> import jax.numpy as jnp
+        >>> import jax
         >>> from zoomjax import compress, synthetic
-        >>> truth, focal = synthetic.nikkor_18_200(), synthetic.focal_sweep(8)
-        >>> lines = compress(synthetic.board_lines(truth, focal, spacing=99, noise=0.1))
-        >>> given = eqx.tree_at(lambda lines: lines.focal, lines, jnp.round(lines.focal))
-        >>> found = fit_focal(given, 0.29)
-        >>> bool(abs(found.focal - focal).mean() < abs(given.focal - focal).mean())
+        >>> with jax.experimental.enable_x64():
+        ...     truth, focal = synthetic.nikkor_18_200(), synthetic.focal_sweep(8)
+        ...     lines = synthetic.board_lines(truth, focal, spacing=99, noise=0.1)
+        ...     lines = eqx.tree_at(lambda lines: lines.focal, lines, focal.round())
+        ...     found = fit_focal(compress(lines), 0.29)
+        >>> bool(abs(found.focal - focal).mean() < abs(found.given - focal).mean())
         True
     """
     sigma = _checked_sigma(focal_sigma, lines.focal)
     given = jnp.asarray(lines.focal)
     if given.dtype != jnp.float64:
         raise ValueError(
-            'Focal lengths are refined in float64 only: jax.config.update("jax_enable_x64", True), and give '
-            f"lines in float64; these are in {given.dtype}."
+            "Focal lengths are refined in float64 only: "
+            f'jax.config.update("jax_enable_x64", True), and not lines in {given.dtype}.'
         )
     if not traced((sigma, given)) and np.unique(given[np.isfinite(sigma)]).size < 2:
         raise ValueError(
