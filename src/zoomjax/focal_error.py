@@ -133,13 +133,14 @@ def fit_focal(
     Example:
         >>> import jax
         >>> from zoomjax import compress, synthetic
-        >>> with jax.experimental.enable_x64():
-        ...     truth, focal = synthetic.nikkor_18_200(), synthetic.focal_sweep(8)
-        ...     lines = synthetic.board_lines(truth, focal, spacing=99, noise=0.1)
-        ...     lines = eqx.tree_at(lambda lines: lines.focal, lines, focal.round())
-        ...     found = fit_focal(compress(lines), 0.29)
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> truth, focal = synthetic.nikkor_18_200(), synthetic.focal_sweep(8)
+        >>> lines = synthetic.board_lines(truth, focal, spacing=99, noise=0.1)
+        >>> given = eqx.tree_at(lambda lines: lines.focal, lines, jax.numpy.asarray(focal.round()))
+        >>> found = fit_focal(compress(given), 0.29)
         >>> bool(abs(found.focal - focal).mean() < abs(found.given - focal).mean())
         True
+        >>> jax.config.update("jax_enable_x64", False)
     """
     sigma = _checked_sigma(focal_sigma, lines.focal)
     given = jnp.asarray(lines.focal)
