@@ -9,6 +9,8 @@ from .bands import displacement_band as displacement_band
 from .bands import displacement_covariance as displacement_covariance
 from .bands import displacement_std as displacement_std
 from .bands import std_of as std_of
+from .blunders import PointRejection as PointRejection
+from .blunders import reject_points as reject_points
 from .centre import CentreFit as CentreFit
 from .centre import FrameCentres as FrameCentres
 from .centre import fit_centre as fit_centre
@@ -33,6 +35,9 @@ from .focal import FocalEstimate as FocalEstimate
 from .focal import focal_from_board as focal_from_board
 from .focal import focal_from_lines as focal_from_lines
 from .focal import focal_from_planes as focal_from_planes
+from .focal_error import FocalFit as FocalFit
+from .focal_error import fit_focal as fit_focal
+from .focal_error import with_focal_sigma as with_focal_sigma
 from .focus import FocusSplineZoom as FocusSplineZoom
 from .framing import Framing as Framing
 from .framing import frame_output as frame_output

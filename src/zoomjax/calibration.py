@@ -26,6 +26,7 @@ from .certificate import Certificate
 from .compression import compress
 from .design import Suggestion, suggest_next
 from .fit import RESULTS, FrameFits, ZoomFit, fit_frames, fit_zoom, frame_rms
+from .focal_error import with_focal_sigma
 from .lines import Lines
 from .plot import plot_model
 from .robust import fit_robust
@@ -43,6 +44,7 @@ class Calibration:
         none, algebraic: each frame's RMS, px, without correction and with the algebraic estimate.
         rejected: which lines count nothing, being not straight in the scene.
         next: the photo that would help most.
+        focal_sigma: standard deviation of each frame's focal length, which the bands allow for; 0: exact.
     """
 
     lines: Lines
@@ -52,6 +54,7 @@ class Calibration:
     algebraic: np.ndarray
     rejected: np.ndarray
     next: Suggestion
+    focal_sigma: np.ndarray
 
     def corner(self) -> list[tuple[float, float, float]]:
         """Focal lengths at both ends of the range and in its middle, and what becomes of a corner there.
@@ -106,6 +109,7 @@ class Calibration:
         fits = {
             "frame": range(len(self.none)),
             "focal": np.asarray(self.lines.focal).tolist(),
+            "focal_sigma": self.focal_sigma.tolist(),
             "lines": np.bincount(frame, minlength=len(self.none)).tolist(),
             "rms_none": self.none.tolist(),
             "rms_frames": np.asarray(self.each.frame_rms).tolist(),
@@ -181,6 +185,7 @@ def calibrate(
     degree: int = 2,
     terms: int = 2,
     robust: bool = False,
+    focal_sigma: float | Float[np.ndarray, "frame"] = 0.0,
     stage: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
     """Fit the zoom polynomial and what it is compared with.
@@ -191,6 +196,7 @@ def calibrate(
         terms: the number of distortion coefficients.
         robust: whether to reject lines that are not straight in the scene; all figures are then those of
             the others.
+        focal_sigma: standard deviation of the focal lengths: a number, or one a frame; 0 where exact.
         stage: called with a sentence before each step that takes time.
     """
     model = PolynomialZoom(degree=degree)
@@ -211,15 +217,33 @@ def calibrate(
     each = fit_frames(small, terms=terms, throw=False)
     stage("Fitting the zoom polynomial")
     zoom = fit_zoom(small, zoom=model, terms=terms)
+    sigma = np.broadcast_to(focal_sigma, lines.focal.shape)
     return Calibration(
         lines=lines,
-        zoom=zoom,
+        zoom=with_focal_sigma(zoom, small, focal_sigma=sigma) if sigma.any() else zoom,
         each=each,
         none=np.asarray(frame_rms(small, None)),
         algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=model, terms=terms))),
         rejected=rejected,
-        next=suggest_next(zoom, small),
+        next=suggest_next(zoom, small),  # a further photo's worth is counted in noise alone
+        focal_sigma=sigma,
     )
+
+
+def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray, "frame"]:
+    """Standard deviations as a user writes them: a number in the unit of f, or per cent such as "1%".
+
+    Raises:
+        ValueError: it is neither, or negative.
+    """
+    number, percent, rest = text.strip().partition("%")
+    try:
+        value = float(number)
+    except ValueError:
+        value = np.nan
+    if rest or not 0 <= value < np.inf:
+        raise ValueError(f"--focal-sigma must be a number such as 0.3, or 1%, but it is {text!r}.")
+    return value / 100 * np.asarray(focal) if percent else np.full(np.shape(focal), value)
 
 
 def rms_over_frames(frame_rms: Float[AnyArray, "frame"]) -> float:

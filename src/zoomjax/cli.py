@@ -145,6 +145,13 @@ def calibrate(
     focal_unit: Annotated[
         str | None, typer.Option(help="Unit of the focal lengths of a CSV or a number: mm (default) or px.")
     ] = None,
+    focal_sigma: Annotated[
+        str | None,
+        typer.Option(
+            help="Standard deviation of the focal lengths, in their unit or per cent, e.g. 0.3 or 1%: what "
+            "the bands allow for. Without it: what plane, board or a CSV column sigma tell, or none."
+        ),
+    ] = None,
     pitch: Annotated[
         str | None,
         typer.Option(
@@ -183,7 +190,7 @@ def calibrate(
         with results_folder(output) as folder, _stages() as stage:
             stage("Reading the lines")
             lines = _read([Path(path) for path in inputs], focal, image_size, focal_unit)
-            calibration = _calibrate(lines, degree, terms, stage, folder)
+            calibration = _calibrate(lines, degree, terms, focal_sigma, stage, folder)
         _show(calibration)
         _tell(calibration.warnings())
         _written(output)
@@ -198,6 +205,7 @@ def calibrate(
         detector=detector,
         focal=focal,
         focal_unit=_unit(focal_unit),
+        focal_sigma=focal_sigma,
         board=_board(pitch, distance, pixel),
         degree=degree,
         terms=terms,
@@ -365,11 +373,17 @@ def _read(inputs: list[Path], focal: str | None, image_size: str | None, focal_u
 
 
 def _calibrate(
-    lines: "Lines", degree: int, terms: int, stage: Callable[[str], None], folder: Path
+    lines: "Lines",
+    degree: int,
+    terms: int,
+    focal_sigma: str | None,
+    stage: Callable[[str], None],
+    folder: Path,
 ) -> "Calibration":
-    from .calibration import calibrate
+    from .calibration import calibrate, focal_sigmas
 
-    calibration = calibrate(lines, degree=degree, terms=terms, stage=stage)
+    sigma = focal_sigmas(focal_sigma or "0", lines.focal)
+    calibration = calibrate(lines, degree=degree, terms=terms, focal_sigma=sigma, stage=stage)
     stage("Writing the results")
     calibration.write(folder)
     return calibration
@@ -474,6 +488,7 @@ def _stages() -> Iterator[Callable[[str], None]]:
 
 def _show(calibration: "Calibration", magnification: Callable[[float], float] | None = None) -> None:
     """Print the table and the polynomials."""
+    import numpy as np
     from rich.console import Console
     from rich.table import Table
 
@@ -510,6 +525,12 @@ def _show(calibration: "Calibration", magnification: Callable[[float], float] | 
         console.print(f"k{i}(f) = {terms}   px^-{2 * i}", highlight=False)
     corner = [f"{moved:+.2f} ± {std:.2g} px at {f:.4g} {unit}" for f, moved, std in calibration.corner()]
     console.print(f"\nCorrected, a corner moves by {', '.join(corner)}.", highlight=False)
+    if (share := calibration.focal_sigma / np.asarray(calibration.lines.focal)).any():
+        console.print(
+            f"That allows for focal lengths with standard deviations of {share.min():.2%} to "
+            f"{share.max():.2%}.",
+            highlight=False,
+        )
     console.print(calibration.next.sentence, highlight=False)
 
 

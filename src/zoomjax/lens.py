@@ -7,6 +7,7 @@ import os
 import warnings
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Num, ScalarLike
@@ -200,12 +201,12 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
                 "update zoomjax"
             )
         lens = ZoomLens(
-            zoom=_read_zoom(content["zoom"]),
+            zoom=_read_zoom(content["zoom"], None),
             centre=_array(content, "centre", (2,)),
             focal_range=_array(content, "focal_range", (2,)),
             image_size=checked_size(content["image_size"]),
             focal_unit=checked_unit(content["focal_unit"]),
-            shift=_read_zoom(content["shift"]) if "shift" in content else None,
+            shift=_read_zoom(content["shift"], 2) if "shift" in content else None,
             focus_range=_array(content, "focus_range", (2,)) if "focus_range" in content else None,
         )
         low, high = lens.focal_range
@@ -216,7 +217,15 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
         return lens
     except FileNotFoundError:
         raise
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OSError) as error:
+    except (
+        ValueError,
+        TypeError,
+        KeyError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+        OSError,
+    ) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
         raise ValueError(f"Cannot read a lens from {os.fspath(path)}: {reason}.") from error
 
@@ -256,7 +265,8 @@ def _described(model: AbstractZoom) -> dict[str, object]:
     }
 
 
-def _read_zoom(content) -> AbstractZoom:
+def _read_zoom(content, numbers: int | None) -> AbstractZoom:
+    """A zoom model that gives so many numbers, or as many as it has parameters for."""
     models = {model.__name__: model for model in _FORMULAS}
     if content["model"] not in models:
         raise ValueError(f"its zoom model, {content['model']!r}, is unknown; update zoomjax")
@@ -270,7 +280,23 @@ def _read_zoom(content) -> AbstractZoom:
     for name in ("focal_ref", "crossover"):
         if name in fields and not fields[name] > 0:
             raise ValueError(f"its {name} is not positive")
-    return model(**fields)
+    if not isinstance(fields.get("inverse", True), bool):
+        raise ValueError("its 'inverse' is neither true nor false")
+    rows, columns = fields["parameters"].shape
+    for name in ("", "focus_"):
+        knots, curvature = fields.get(f"{name}knots"), fields.get(f"{name}curvature")
+        if knots is not None and not (np.diff(knots) > 0).all():
+            raise ValueError(f"its {name}knots do not increase")
+        if curvature is not None and curvature.shape != (knots.size, knots.size):
+            raise ValueError(f"its {name}curvature is not that of its {name}knots")
+    knots = [fields[name].size for name in ("knots", "focus_knots") if name in fields]
+    if knots and math.prod(knots) != rows:
+        raise ValueError("its knots are not as many as its parameters")
+    zoom = model(**fields)
+    setting = [jnp.ones(())] * (2 if isinstance(zoom, AbstractFocusZoom) else 1)
+    if jax.eval_shape(zoom, *setting).shape != (numbers or columns,):
+        raise ValueError("its parameters are not those of its model")
+    return zoom
 
 
 def _plain(value):
@@ -287,6 +313,7 @@ def _array(content, name, shape):
     matches = array.ndim == len(shape) and all(
         want in (None, have) for want, have in zip(shape, array.shape, strict=True)
     )
-    if not matches or not array.size or not np.isfinite(array).all():
+    dtype = jnp.result_type(float)
+    if not matches or not array.size or not (abs(array) <= jnp.finfo(dtype).max).all():
         raise ValueError(f"the numbers of its {name!r} are incomplete or not finite")
-    return jnp.asarray(array, jnp.result_type(float))
+    return jnp.asarray(array, dtype)

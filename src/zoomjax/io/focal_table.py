@@ -1,4 +1,4 @@
-"""Focal lengths of images: a CSV file ``image,focal``."""
+"""Focal lengths of images: a CSV file ``image,focal``, perhaps with their deviations, ``sigma``."""
 
 import csv
 import math
@@ -14,8 +14,13 @@ class FocalTable:
     where that is enough to tell it from others, ``board.png``.
     """
 
-    def __init__(self, focals: dict[str, float], path: str | os.PathLike[str] = "the table"):
-        self._focals = focals
+    def __init__(
+        self,
+        focals: dict[str, float],
+        path: str | os.PathLike[str] = "the table",
+        sigmas: dict[str, float] | None = None,
+    ):
+        self._focals, self._sigmas = focals, sigmas or {}
         self._path = os.fspath(path)
 
     def row(self, image: str | os.PathLike[str]) -> str | None:
@@ -36,6 +41,10 @@ class FocalTable:
                 f"Cannot read focal lengths from {self._path}: it has no number for {PurePath(image).name}."
             )
         return self._focals[row]
+
+    def sigma(self, image: str | os.PathLike[str]) -> float | None:
+        """The standard deviation of an image's focal length, or None if the table tells none."""
+        return self._sigmas.get(self.row(image) or "")
 
     def of(self, images: Iterable[str]) -> dict[str, float]:
         """The focal lengths of those images that the table knows.
@@ -58,7 +67,7 @@ class FocalTable:
 
 
 def read_focal_table(path: str | os.PathLike[str]) -> FocalTable:
-    """Read a CSV file whose first line names the columns ``image`` and ``focal``.
+    """Read a CSV file whose first line names the columns ``image`` and ``focal``, and perhaps ``sigma``.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -68,7 +77,7 @@ def read_focal_table(path: str | os.PathLike[str]) -> FocalTable:
     try:
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
             rows = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
-    except UnicodeDecodeError as error:
+    except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"Cannot read focal lengths from {os.fspath(path)}: it is not text.") from error
     header = [name.lower() for name in rows[0]] if rows else []
     if not {"image", "focal"} <= set(header):
@@ -77,11 +86,13 @@ def read_focal_table(path: str | os.PathLike[str]) -> FocalTable:
             f"they are {','.join(header)!r}."
         )
     image, focal = header.index("image"), header.index("focal")
+    column = header.index("sigma") if "sigma" in header else None
     table: dict[str, float] = {}
+    sigmas: dict[str, float] = {}
     for number, row in enumerate(rows[1:], start=2):
         name = "/".join(PurePath(row[image].replace("\\", "/")).parts) if image < len(row) else ""
-        value = _positive(row[focal]) if focal < len(row) else None
-        if not name or value is None:
+        value = _number(row[focal]) if focal < len(row) else None
+        if not name or value is None or value <= 0:
             raise ValueError(
                 f"Cannot read focal lengths from {os.fspath(path)}: row {number} must hold an image and a "
                 f"positive number, but it is {','.join(row)!r}."
@@ -91,12 +102,21 @@ def read_focal_table(path: str | os.PathLike[str]) -> FocalTable:
                 f"Cannot read focal lengths from {os.fspath(path)}: {name} comes twice, with "
                 f"{table[name]:g} and, in row {number}, {value:g}."
             )
-    return FocalTable(table, path)
+        if column is None or not (text := row[column] if column < len(row) else ""):
+            continue
+        sigma = _number(text)
+        if sigma is None or sigma < 0:
+            raise ValueError(
+                f"Cannot read focal lengths from {os.fspath(path)}: sigma in row {number} must be a number "
+                f"of at least 0, but it is {text!r}."
+            )
+        sigmas[name] = sigma
+    return FocalTable(table, path, sigmas)
 
 
-def _positive(text: str) -> float | None:
+def _number(text: str) -> float | None:
     try:
         value = float(text)
     except ValueError:
         return None
-    return value if math.isfinite(value) and value > 0 else None
+    return value if math.isfinite(value) else None

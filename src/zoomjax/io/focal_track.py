@@ -38,8 +38,9 @@ class FocalTrack:
                 "Arguments position and focal must hold one number a sample, at least one, but their "
                 f"shapes are {self.position.shape} and {self.focal.shape}."
             )
-        if not (np.isfinite(self.focal) & (self.focal > 0)).all():
-            bad = int(np.flatnonzero(~(np.isfinite(self.focal) & (self.focal > 0)))[0])
+        good = np.isfinite(self.focal) & (self.focal >= np.finfo(np.float64).tiny)  # and so is 1/f
+        if not good.all():
+            bad = int(np.argmin(good))
             raise ValueError(
                 f"Argument focal must hold positive numbers, but sample {bad} is {self.focal[bad]}."
             )
@@ -87,7 +88,7 @@ def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> Foc
     try:
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
             rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
-    except UnicodeDecodeError as error:
+    except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"Cannot read a focal track from {os.fspath(path)}: it is not text.") from error
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     kinds = {"time": True, "frame": False, "time_or_frame": None}
@@ -100,7 +101,7 @@ def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> Foc
         numbers = np.array([[float(cell) for cell in row[:2]] for row in rows[1:]]).reshape(-1, 2)
         by_time = kinds[header[0]]
         if by_time is None:
-            by_time = bool((numbers[:, 0] % 1 != 0).any())
+            by_time = bool((numbers[:, 0] != np.floor(numbers[:, 0])).any())
         return FocalTrack(numbers[:, 0], numbers[:, 1], by_time=by_time, hold=hold)
     except ValueError as error:
         raise ValueError(f"Cannot read a focal track from {os.fspath(path)}: {error}") from error

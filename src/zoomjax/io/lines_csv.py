@@ -33,13 +33,14 @@ def read_lines_csv(
         focal_unit: "mm" or "px".
 
     Raises:
-        ValueError: a column is missing, a value is no number, or a frame has no focal length; the message
-            names the file. Also what `Lines.from_ragged` raises.
+        ValueError: a column is missing, a value is no number, or a frame has no focal length, or
+            `Lines.from_ragged` raises one; the message names the file.
     """
     columns = _read(path, required=("frame", "line", "x", "y"), optional=("focal",))
     frame, line = (_integers(columns[name], name, path) for name in ("frame", "line"))
     frames, index = np.unique(frame, return_inverse=True)
     if "focal" in columns:
+        _check_focal(columns["focal"], path)
         lowest, highest = np.full(frames.size, np.inf), np.full(frames.size, -np.inf)
         np.minimum.at(lowest, index, columns["focal"])
         np.maximum.at(highest, index, columns["focal"])
@@ -65,13 +66,16 @@ def read_lines_csv(
     order = np.lexsort((line, index))  # stable: points keep the order of their rows
     starts = np.flatnonzero(np.diff(index[order]) | np.diff(line[order])) + 1
     points = np.stack([columns["x"], columns["y"]], axis=1)[order]
-    return Lines.from_ragged(
-        np.split(points, starts),
-        index[order][np.concatenate([[0], starts])],
-        focals,
-        image_size=image_size,
-        focal_unit=focal_unit,
-    )
+    try:
+        return Lines.from_ragged(
+            np.split(points, starts),
+            index[order][np.concatenate([[0], starts])],
+            focals,
+            image_size=image_size,
+            focal_unit=focal_unit,
+        )
+    except ValueError as error:
+        raise ValueError(f"Cannot read lines from {os.fspath(path)}: {error}") from error
 
 
 def write_lines_csv(lines: Lines, path: str | os.PathLike[str]) -> None:
@@ -89,13 +93,23 @@ def read_focal_csv(path: str | os.PathLike[str]) -> dict[int, float]:
     """Read focal lengths by frame number from a file with the columns ``frame,focal``.
 
     Raises:
-        ValueError: a column is missing, a value is no number, or a frame comes twice.
+        ValueError: a column is missing, a value is no number, or not positive, or a frame comes twice.
     """
     columns = _read(path, required=("frame", "focal"))
     frame = _integers(columns["frame"], "frame", path)
     if np.unique(frame).size < frame.size:
         raise ValueError(f"Cannot read focal lengths from {path}: a frame comes twice.")
+    _check_focal(columns["focal"], path)
     return dict(zip(frame.tolist(), columns["focal"].tolist(), strict=True))
+
+
+def _check_focal(focal: np.ndarray, path) -> None:
+    good = np.isfinite(focal) & (focal > 0)
+    if not good.all():
+        raise ValueError(
+            f"Cannot read focal lengths from {os.fspath(path)}: they must be finite positive numbers, but "
+            f"one is {focal[np.argmin(good)]}."
+        )
 
 
 def _read(path, *, required, optional=()) -> dict[str, np.ndarray]:
@@ -123,7 +137,7 @@ def _read(path, *, required, optional=()) -> dict[str, np.ndarray]:
                 raise ValueError(_first_bad_row(file, header, names)) from None
         if not len(table):
             raise ValueError("there are no rows")
-    except ValueError as error:  # UnicodeDecodeError is one too
+    except (ValueError, csv.Error) as error:  # UnicodeDecodeError is one too
         raise ValueError(f"Cannot read {os.fspath(path)}: {error}.") from error
     return dict(zip(names, table.T, strict=True))
 
@@ -142,6 +156,6 @@ def _first_bad_row(file, header, names) -> str:
 
 
 def _integers(values: np.ndarray, name: str, path) -> np.ndarray:
-    if not (np.isfinite(values).all() and (values == np.floor(values)).all()):
+    if not (abs(values) < 2**53).all() or (values != np.floor(values)).any():
         raise ValueError(f"Cannot read {os.fspath(path)}: column {name} must hold integers.")
     return values.astype(np.int64)

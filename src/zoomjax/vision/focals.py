@@ -64,7 +64,8 @@ class Focals:
         unit: "mm" or "px".
         origin: where they come from, in words.
         absent: why an image may have none.
-        deviation: standard deviations by name, of those that were estimated from images.
+        deviation: standard deviations by name, of those of which they are known: estimated from images, or
+            told.
     """
 
     focal: dict[str, float]
@@ -135,12 +136,15 @@ def choose_focals(
     elif (number := _number(way)) is not None:
         found = Focals({d.name: number for d in detections}, unit, "--focal", "")
     else:
-        known = read_focal_table(way).of([d.file for d in detections])
+        table = read_focal_table(way)
+        known = table.of([d.file for d in detections])
+        sigma = {d.name: table.sigma(d.file) for d in detections if d.file in known}
         found = Focals(
             {d.name: known[d.file] for d in detections if d.file in known},
             unit,
             Path(way).name,
             f"{Path(way).name} has no row for it",
+            {name: value for name, value in sigma.items() if value is not None},
         )
     if not found.focal:
         raise ValueError(

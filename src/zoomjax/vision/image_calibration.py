@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..calibration import Calibration, calibrate
+from ..calibration import Calibration, calibrate, focal_sigmas
 from ..io.focal_track import FocalTrack, read_focal_track
 from .detection import DETECTORS, Detection, detect
 from .focals import Board, Focals, check_way, choose_focals, lines_of
@@ -33,6 +33,8 @@ class ImageJob:
         detector: "edges", "grid" or "pitch".
         focal: where focal lengths come from, as for `choose_focals`; of a video also a track.
         focal_unit: of a number's, a table's or a track's.
+        focal_sigma: standard deviation of the focal lengths: a number in their unit, or per cent such as
+            "1%"; None for what is known from where they come from.
         board: for ``focal="board"``.
         degree: of the polynomials in 1/f.
         terms: number of distortion coefficients.
@@ -45,6 +47,7 @@ class ImageJob:
     detector: str = "edges"
     focal: str | None = None
     focal_unit: str = "mm"
+    focal_sigma: str | None = None
     board: Board | None = None
     degree: int = 2
     terms: int = 2
@@ -66,6 +69,7 @@ class ImageJob:
         if len(self.inputs) > 1 and any(map(_is_video, self.inputs)):
             raise ValueError("Give photographs, or one video.")
         check_way(self.focal, self.board, video=self.video is not None)
+        focal_sigmas(self.focal_sigma or "0", np.ones(1))
 
     @property
     def video(self) -> Path | None:
@@ -235,10 +239,16 @@ def calibrate_images(
         way = "board"
     focals = choose_focals(usable, way, unit=job.focal_unit, board=job.board)
     unused |= {d.name: focals.absent for d in usable if d.name not in focals.focal}
+    if job.focal_sigma is not None:
+        sigma = focal_sigmas(job.focal_sigma, np.array(list(focals.focal.values())))
+        focals = dataclasses.replace(focals, deviation=dict(zip(focals.focal, sigma.tolist(), strict=True)))
     used = tuple(d for d in usable if d.name in focals.focal)
     while True:
         lines = lines_of(used, np.array([focals.focal[d.name] for d in used]), focals.unit)
-        calibration = calibrate(lines, degree=job.degree, terms=job.terms, robust=True, stage=stage)
+        sigma = np.array([focals.deviation.get(d.name, 0.0) for d in used])
+        calibration = calibrate(
+            lines, degree=job.degree, terms=job.terms, robust=True, focal_sigma=sigma, stage=stage
+        )
         done = ImageCalibration(job, calibration, used, focals, unused)
         hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}
         if not hopeless:
