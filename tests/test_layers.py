@@ -10,7 +10,8 @@ import zoomjax
 # From the inside out: a module may import from layers before its own. Packages count as one module.
 LAYERS = (
     {"_types", "_files", "_checks", "_linear", "_bernstein", "_interior"},
-    {"radial", "focal"},
+    {"families", "focal"},
+    {"radial"},
     {"inverse", "pitch"},
     {"zoom"},
     {"rivals", "smooth"},
@@ -22,6 +23,7 @@ LAYERS = (
     {"positions", "warp", "sizes"},
     {"_solver", "compression"},
     {"any_centre", "image_metric"},
+    {"family_lines"},
     {"algebraic"},
     {"uncertainty"},
     {"fit"},

@@ -7,6 +7,7 @@ import os
 import warnings
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Num, ScalarLike
@@ -14,13 +15,14 @@ from jaxtyping import Float, Num, ScalarLike
 from ._checks import checked_size, checked_unit
 from ._files import whole_file
 from ._types import AnyArray, Point, traced
+from .families import AbstractFamily, BrownConrady, Division, RadialPolynomial
 from .lines import AbstractLines
 from .radial import Distortion
 from .rivals import PowerZoom, SplineZoom, TableZoom, TwoRegionZoom
 from .smooth import SmoothZoom
 from .zoom import AbstractZoom, PolynomialZoom
 
-_FORMAT, _VERSION = "zoomjax.lens", 1
+_FORMAT, _VERSION = "zoomjax.lens", 2
 
 
 class ZoomLens(eqx.Module):
@@ -34,6 +36,7 @@ class ZoomLens(eqx.Module):
         focal_range: the shortest and longest focal length fitted.
         image_size: (width, height) px of the images it is for.
         focal_unit: "mm" or "px".
+        family: what the coefficients mean: by default the radial polynomial.
 
     Example:
         >>> import jax.numpy as jnp
@@ -49,6 +52,7 @@ class ZoomLens(eqx.Module):
     image_size: tuple[int, int] = eqx.field(static=True)
     focal_unit: str = eqx.field(static=True, default="mm")
     shift: AbstractZoom | None = None
+    family: AbstractFamily = RadialPolynomial()
 
     def __check_init__(self):
         """Check the geometry."""
@@ -83,27 +87,32 @@ class ZoomLens(eqx.Module):
             coefficients=self.zoom(focal),
             centre=centre if self.shift is None else centre + self.scale * self.shift(focal),
             scale=jnp.asarray(self.scale, dtype),
+            family=self.family,
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the lens to a JSON file that `load_lens` reads, all digits kept.
 
         Raises:
-            TypeError: the zoom model is of a kind that has no file format.
+            TypeError: the zoom model, or the family, is of a kind that has no file format.
         """
+        if type(self.family) not in _FAMILIES.values():
+            raise TypeError(f"A lens with a {type(self.family).__name__} cannot be saved.")
         for model in (self.zoom, self.shift):
             if model is not None and type(model) not in _FORMULAS:
                 raise TypeError(f"A lens with a {type(model).__name__} cannot be saved.")
+        polynomial = isinstance(self.family, RadialPolynomial)
         content = {
             "format": _FORMAT,
-            "version": _VERSION,
+            # Older readers know no families, and must not take this one's coefficients for a polynomial's.
+            "version": 1 if polynomial else _VERSION,
             "image_size": list(self.image_size),
             "centre": _numbers(self.centre),
             "scale": self.scale,
             "focal_unit": self.focal_unit,
             "focal_range": _numbers(self.focal_range),
-            "radial": "corrected = centre + z * scale * (1 + k1 r^2 + ... + kN r^2N), "
-            "z = (distorted - centre) / scale, r^2 = z.z",
+            **({} if polynomial else {"family": type(self.family).__name__}),
+            "radial": self.family.formula,
             "zoom": _described(self.zoom),
         }
         if self.shift is not None:
@@ -149,6 +158,7 @@ def lens_of(lines: AbstractLines, zoom: AbstractZoom) -> ZoomLens:
         focal_range=jnp.stack([jnp.min(focal), jnp.max(focal)]),
         image_size=lines.image_size,
         focal_unit=lines.focal_unit,
+        family=lines.family,
     )
 
 
@@ -164,11 +174,14 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
             content = json.load(file)
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise ValueError("it describes no zoom lens; ZoomLens.save writes such a file")
-        if content["version"] != _VERSION:
+        if content["version"] not in range(1, _VERSION + 1):
             raise ValueError(
-                f"its format version is {content['version']!r} and this zoomjax reads {_VERSION}; "
+                f"its format version is {content['version']!r} and this zoomjax reads up to {_VERSION}; "
                 "update zoomjax"
             )
+        family = content.get("family", "RadialPolynomial")
+        if family not in _FAMILIES:
+            raise ValueError(f"its family of distortions, {family!r}, is unknown; update zoomjax")
         lens = ZoomLens(
             zoom=_read_zoom(content["zoom"]),
             centre=_array(content, "centre", (2,)),
@@ -176,7 +189,11 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
             image_size=checked_size(content["image_size"]),
             focal_unit=checked_unit(content["focal_unit"]),
             shift=_read_zoom(content["shift"]) if "shift" in content else None,
+            family=_FAMILIES[family](),
         )
+        size = jax.eval_shape(lens.zoom, lens.focal_range[0]).shape[0]
+        if size < lens.family.size(1):
+            raise ValueError(f"it has {size} coefficients, and {family} has {lens.family.size(1)} or more")
         low, high = lens.focal_range
         if not 0 < low <= high:
             raise ValueError("its focal_range is not positive and in order")
@@ -201,6 +218,9 @@ _FORMULAS = {
     SmoothZoom: "k_i(f) = sum_j parameters[j][i-1] P_j(2 focal_ref / f - 1), P_j Legendre's polynomials; "
     "the rest is the prior",
 }
+
+_FAMILIES = {family.__name__: family for family in (RadialPolynomial, Division, BrownConrady)}
+"""The families that it can hold."""
 
 _TABLE = (None, None)
 _SHAPES = {
