@@ -175,7 +175,7 @@ def lines_of(lens, bend=0.0, noise=0.0):
     for m, f in enumerate(focal):
         d = lens(float(f))
         for axis in (0, 1):
-            for at in (0.02, 0.2, 0.5, 0.75, 0.97):
+            for at in (0.12, 0.3, 0.5, 0.7, 0.88):
                 line = np.empty((60, 2))
                 line[:, axis] = along * (SIZE[axis] - 1)
                 line[:, 1 - axis] = (
