@@ -7,10 +7,11 @@ monomials; those of `Division` become the 8 of a polynomial, as good as exact (`
 """
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._checks import checked_terms
-from ._types import Centres, Focal, FrameIndex, LineWeight, Point
+from ._types import Centres, Focal, FrameIndex, LineWeight, Point, traced
 from .any_centre import AnyCentreLines, compress_any_centre
 from .compression import CompressedLines, compress
 from .families import AbstractFamily, AbstractRadial, RadialPolynomial
@@ -92,9 +93,11 @@ class FamilyLines(AbstractLines):
     def about(self, centre: Centres) -> "FamilyLines":
         """The same lines about another centre of distortion; see `AbstractLines.about`."""
         if isinstance(self.lines, AnyCentreLines):
+            if traced((self.centre, centre)) or np.allclose(self.centre, centre, rtol=0, atol=1e-3):
+                return self
             raise ValueError(
-                "Lines compressed with all monomials serve one centre where their family is not radial. "
-                "Pass the lines themselves."
+                "Lines compressed with all monomials serve one centre where their family is not radial, and "
+                "another is asked for. Compress the lines about that centre, or pass the lines themselves."
             )
         return _wrapped(self._weighted().about(centre), self.family)
 
@@ -132,7 +135,7 @@ def with_family(lines: AbstractLines, family: AbstractFamily) -> AbstractLines:
     return lines if isinstance(family, RadialPolynomial) else _wrapped(lines, family)
 
 
-def compress_family(lines: Lines, family: AbstractFamily, terms: int = 2) -> AbstractLines:
+def compress_family(lines: Lines, family: AbstractFamily, *, terms: int = 2) -> AbstractLines:
     """What `compress` is for the radial polynomial, for any family; the result remembers it.
 
     Args:
