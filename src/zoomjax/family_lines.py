@@ -97,7 +97,7 @@ class FamilyLines(AbstractLines):
                 return self
             raise ValueError(
                 "Lines compressed with all monomials serve one centre where their family is not radial, and "
-                "another is asked for. Compress the lines about that centre, or pass the lines themselves."
+                "another is asked for. Compress the lines about that one, or pass the lines themselves."
             )
         return _wrapped(self._weighted().about(centre), self.family)
 
