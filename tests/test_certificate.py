@@ -10,7 +10,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax.certificate import Certificate, slope_controls
-from zoomjax.radial import radial_slope
+from zoomjax.families import radial_slope
 
 SIZE, CENTRE, RANGE = (640, 480), np.array([319.5, 239.5]), np.array([20.0, 120.0])
 MODELS = {

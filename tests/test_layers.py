@@ -10,7 +10,8 @@ import zoomjax
 # From the inside out: a module may import from layers before its own. Packages count as one module.
 LAYERS = (
     {"_types", "_files", "_checks", "_linear", "_bernstein", "_interior"},
-    {"radial", "focal", "_splines"},
+    {"families", "focal", "_splines"},
+    {"radial"},
     {"inverse", "pitch"},
     {"zoom"},
     {"rivals", "smooth"},
@@ -23,6 +24,7 @@ LAYERS = (
     {"positions", "warp", "sizes"},
     {"_solver", "compression"},
     {"any_centre", "image_metric"},
+    {"family_lines"},
     {"algebraic"},
     {"uncertainty"},
     {"fit"},

@@ -25,6 +25,13 @@ from .design import suggest_next as suggest_next
 from .energy import frame_energy as frame_energy
 from .energy import global_energy as global_energy
 from .energy import residuals as residuals
+from .families import AbstractFamily as AbstractFamily
+from .families import BrownConrady as BrownConrady
+from .families import Division as Division
+from .families import RadialPolynomial as RadialPolynomial
+from .family_lines import FamilyLines as FamilyLines
+from .family_lines import compress_family as compress_family
+from .family_lines import with_family as with_family
 from .fit import RESULTS as RESULTS
 from .fit import FrameFits as FrameFits
 from .fit import ZoomFit as ZoomFit

@@ -24,12 +24,14 @@ class Pieces(eqx.Module):
         ends: of the pieces, in the variable in which they are polynomials.
         focal_of: from that variable to the focal length.
         size: for each coefficient, how large the numbers get that it is computed from, for rounding errors.
+        exact: whether the controls are those of the coefficients, and not of what is below them.
     """
 
     controls: Float[Array, "piece control terms"]
     ends: Float[Array, "piece 2"]
     focal_of: Callable[[Array], Array] = eqx.field(static=True)
     size: Float[Array, "terms"]
+    exact: bool = eqx.field(static=True, default=True)
 
 
 def power_controls(low: ScalarLike, high: ScalarLike, degree: int) -> Float[Array, "control power"]:

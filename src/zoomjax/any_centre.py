@@ -60,6 +60,22 @@ class AnyCentreLines(AbstractLines):
         combine = jax.vmap(lambda r, k: r[1:] @ _corrected_point(self.terms, k[:-2], k[-2:]).T)
         return self.scale * combine(self.triangle, coefficients)
 
+    def decentred(
+        self, k: Float[Array, "line terms"], tangential: Float[Array, "line 2"]
+    ) -> Float[Array, "line rows 2"]:
+        """Such rows about `centre`, of the radial polynomial and the coefficients (p1, p2) of each line."""
+
+        def combine(r, k, p):
+            none = jnp.zeros_like(p)
+            # The rows of R after the first hold the points about their mean; columns 3-5 are x^2, xy, y^2.
+            squares = jnp.stack(
+                [jnp.stack([3 * p[1], 2 * p[0], p[1]]), jnp.stack([p[0], 2 * p[1], 3 * p[0]])]
+            )
+            radial = _corrected_point(self.terms, k, none)
+            return r[1:] @ radial.at[:, 3:6].add(squares).T
+
+        return self.scale * jax.vmap(combine)(self.triangle, k, tangential)
+
     def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
         """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1, at most 2 N + 1, z from `centre`."""
         return self.about(self.centre).second_moments(order)

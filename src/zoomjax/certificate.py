@@ -1,6 +1,7 @@
 """Proof that a zoom lens is invertible: ``r L(r^2)`` increases over its whole image and focal range.
 
-The slope of the radius is a polynomial in ``t = r^2``, with the coefficients of the zoom model,
+For the radial polynomial the slope of the radius is a polynomial in ``t = r^2``, with the coefficients of
+the zoom model,
 
     g(t, f) = 1 + 3 k1(f) t + 5 k2(f) t^2 + ... + (2N+1) kN(f) t^N,
 
@@ -10,6 +11,8 @@ in both variables, and lies above the least of them. In t nothing is lost for N 
 of the parabola of each row of controls is known in closed form. Boxes whose bound is not good enough are
 halved, the lowest first, which makes the bound better by a factor of four. Rounding errors are bounded by
 the size of the numbers and subtracted.
+
+Other families state what must be positive likewise (`AbstractFamily.conditions`): linear in k, too.
 
 Once per fit; a fit of a usual lens needs a few boxes, and 256 halvings are the most.
 """
@@ -25,6 +28,7 @@ from jaxtyping import Array, Bool, Float
 
 from ._bernstein import Pieces, cut, power_controls
 from ._types import AnyArray, Point, Scalar
+from .families import AbstractFamily, RadialPolynomial
 from .lens import ZoomLens
 from .zoom import AbstractZoom
 
@@ -49,7 +53,8 @@ class Certificate(eqx.Module):
     """Whether a zoom lens is invertible over its image and focal range, and where it is nearest to not.
 
     The slope is the derivative of the corrected by the distorted radius: 1 where there is no distortion,
-    and negative where the corrected image is folded over.
+    and negative where the corrected image is folded over. Of `Division` it is its numerator, or the divisor
+    where that is smaller; of `BrownConrady` the slope less what decentering may take off it.
 
     Attributes:
         certified: whether it is proved to be positive everywhere. If not, the lens folds, or comes within
@@ -82,7 +87,9 @@ def certify(lens: ZoomLens) -> Certificate:
         >>> bool(certify(nikkor_18_200()).certified)
         True
     """
-    return certificate_of(lens.zoom, lens.centre, lens.focal_range, lens.image_size, lens.shift)
+    return certificate_of(
+        lens.zoom, lens.centre, lens.focal_range, lens.image_size, lens.shift, lens.family
+    )
 
 
 @eqx.filter_jit
@@ -92,10 +99,11 @@ def certificate_of(
     focal_range: Float[AnyArray, "2"],
     image_size: tuple[int, int],
     shift: AbstractZoom | None = None,
+    family: AbstractFamily = RadialPolynomial(),  # noqa: B008, it has no state
 ) -> Certificate:
     """`certify` for the parts of a lens; constant for differentiation."""
     zoom, centre, focal_range, shift = jax.lax.stop_gradient((zoom, centre, focal_range, shift))
-    stated = zoom.pieces(focal_range)
+    stated = stated_pieces(zoom, focal_range, family)
     pieces = _sampled(zoom, focal_range) if stated is None else stated
     scale = math.hypot(*image_size) / 2
     reach = _squared_reach(centre, image_size)
@@ -104,12 +112,13 @@ def certificate_of(
         stated = None if path is None else stated
         # As if the centre were farthest off at every focal length: a bound, and near enough.
         reach = _squared_reach(centre, image_size, scale * _farthest(path or _sampled(shift, focal_range)))
-    nets = _slope_nets(pieces, reach)
-    terms = pieces.controls.shape[-1]
-    size = 1 + jnp.sum(_orders(terms, nets) * reach ** np.arange(1, terms + 1) * pieces.size)
+    nets = _slope_nets(pieces, reach, family)
+    number = pieces.controls.shape[-1]
+    largest = np.abs(family.conditions(number)).max(axis=0).astype(nets.dtype)
+    size = 1 + jnp.sum(largest * reach ** (family.orders(number) / 2).astype(nets.dtype) * pieces.size)
     rounding = _ROUNDING * (nets.shape[1] + nets.shape[2]) * float(jnp.finfo(nets.dtype).eps) * size
-    bound, slope, piece, place = _search(nets, rounding)
-    low, high = pieces.ends[piece]
+    bound, slope, net, place = _search(nets, rounding)
+    low, high = pieces.ends[net % pieces.ends.shape[0]]
     least = bound - rounding if stated is not None else jnp.full_like(bound, -jnp.inf)
     return Certificate(
         certified=least > 0,
@@ -121,17 +130,21 @@ def certificate_of(
 
 
 def slope_controls(
-    zoom: AbstractZoom, centre: Point, focal_range: Float[AnyArray, "2"], image_size: tuple[int, int]
+    zoom: AbstractZoom,
+    centre: Point,
+    focal_range: Float[AnyArray, "2"],
+    image_size: tuple[int, int],
+    family: AbstractFamily = RadialPolynomial(),  # noqa: B008, it has no state
 ) -> Float[Array, "control"] | None:
     """Numbers such that the slope is nowhere below the least of them; None if the model states no pieces.
 
     Linear, but for a constant, in the parameters of a linear zoom model.
     """
-    pieces = zoom.pieces(focal_range)
+    pieces = stated_pieces(zoom, focal_range, family)
     if pieces is None:
         return None
-    nets = _slope_nets(pieces, _squared_reach(centre, image_size))
-    number, rows, columns = nets.shape
+    nets = _slope_nets(pieces, _squared_reach(centre, image_size), family)
+    number, (_, rows, columns) = pieces.ends.shape[0], nets.shape
     along = cut(rows - 1, -(-_CELLS // number) if rows > 2 else 1)
     across = cut(columns - 1, _CELLS if columns > 2 else 1)
     return jnp.einsum(
@@ -163,17 +176,37 @@ def _squared_reach(
     )
 
 
-def _orders(terms: int, like: Array) -> Float[Array, "terms"]:
-    """3, 5, ..., 2N + 1."""
-    return 2 * jnp.arange(1, terms + 1, dtype=like.dtype) + 1
+def stated_pieces(
+    zoom: AbstractZoom, focal_range: Float[AnyArray, "2"], family: AbstractFamily
+) -> Pieces | None:
+    """`AbstractZoom.pieces`, if they are of use for this family.
+
+    Those that are below the coefficients bound only what grows with every coefficient.
+    """
+    pieces = zoom.pieces(focal_range)
+    if pieces is None or pieces.exact:
+        return pieces
+    growing = bool((family.conditions(pieces.controls.shape[-1]) >= 0).all())
+    return pieces if growing else None
 
 
-def _slope_nets(pieces: Pieces, reach: Scalar) -> Float[Array, "piece control column"]:
-    """The controls of the slope: of each piece, in its variable and in t from 0 to `reach`."""
-    terms = pieces.controls.shape[-1]
-    powers = power_controls(jnp.zeros_like(reach), reach, terms)[:, 1:]
-    powers = powers * _orders(terms, powers)[None]
-    return 1 + jnp.einsum("pci,ti->pct", pieces.controls, powers, precision="highest")
+def _slope_nets(
+    pieces: Pieces, reach: Scalar, family: AbstractFamily
+) -> Float[Array, "net control column"]:
+    """The controls of the family's conditions: of each piece, in its variable and in t from 0 to `reach`.
+
+    One net a piece for the slope of the polynomial; all pieces, condition by condition, for others.
+    """
+    number = pieces.controls.shape[-1]
+    orders = family.orders(number)
+    powers = power_controls(jnp.zeros_like(reach), reach, int(orders.max()) // 2)
+    # The radius itself, of decentering, is taken at its largest.
+    powers = jnp.where((orders == 1)[None], jnp.sqrt(reach), powers[:, orders // 2])
+    nets = [
+        1 + jnp.einsum("pci,ti->pct", pieces.controls, powers * row[None], precision="highest")
+        for row in family.conditions(number).astype(powers.dtype)
+    ]
+    return jnp.concatenate(nets)
 
 
 def _sampled(zoom: AbstractZoom, focal_range: Float[AnyArray, "2"]) -> Pieces:

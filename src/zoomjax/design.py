@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from .bands import displacement_std
 from .energy import line_residuals, line_weights
+from .family_lines import with_family
 from .fit import ZoomFit, linearised
 from .lines import AbstractLines
 from .zoom import with_parameters
@@ -111,6 +112,7 @@ def suggest_next(
             "Argument focal_range must be two positive numbers, the shorter first, but it is "
             f"{focal_range!r}."
         )
+    lines = with_family(lines, fit.lens.family)
     focals = np.unique(1 / np.linspace(1 / low, 1 / high, _FOCALS))
     number, length, counts = _typical(lines)
     dtype = fit.covariance.dtype
@@ -161,7 +163,7 @@ def _typical(lines):
 
 @eqx.filter_jit
 def _sizes(lines):
-    unchanged = lines.corrected(jnp.zeros((lines.frame.shape[0], 1), lines.focal.dtype))
+    unchanged = lines.corrected(jnp.zeros((lines.frame.shape[0], lines.family.size(1)), lines.focal.dtype))
     return line_weights(lines), lines.counts, jnp.sum(unchanged**2, axis=(1, 2))
 
 

@@ -27,8 +27,11 @@ from ._interior import implicit, least_squares_within
 from ._solver import default_solver
 from ._types import AnyArray, Centres, traced
 from .algebraic import algebraic_parameters, compressed
-from .certificate import Certificate, certificate_of, slope_controls
+from .certificate import Certificate, certificate_of, slope_controls, stated_pieces
+from .compression import CompressedLines
 from .energy import coefficients_by, energy_by_frame, frame_energy, prior_residuals, residuals, settings
+from .families import AbstractFamily, RadialPolynomial
+from .family_lines import FamilyLines, points_of, with_family
 from .image_metric import ImageLines, in_image
 from .lens import ZoomLens, lens_of
 from .lines import AbstractLines, Lines
@@ -112,6 +115,7 @@ class FrameFits(eqx.Module):
         rms_unconstrained: what `rms` is without the demand that every frame be invertible.
         centre: centre of distortion, px: of all frames, or of each.
         scale: the length in px that is radius 1.
+        family: what the coefficients mean.
     """
 
     coefficients: Float[Array, "frame terms"]
@@ -123,6 +127,7 @@ class FrameFits(eqx.Module):
     rms_unconstrained: Float[Array, ""]
     centre: Centres
     scale: float = eqx.field(static=True)
+    family: AbstractFamily = RadialPolynomial()
 
     def messages(self) -> list[str]:
         """For each frame a sentence about how its fit ended, empty where nothing is wrong."""
@@ -145,6 +150,7 @@ class FrameFits(eqx.Module):
             self.coefficients[frame],
             jnp.broadcast_to(jnp.asarray(self.centre, dtype), (frames, 2))[frame],
             jnp.asarray(self.scale, dtype),
+            self.family,
         )
 
 
@@ -152,6 +158,7 @@ def fit_zoom(
     lines: AbstractLines,
     *,
     zoom: AbstractZoom | None = None,
+    family: AbstractFamily | None = None,
     terms: int | None = None,
     solver: Solver | None = None,
     max_steps: int = 256,
@@ -163,9 +170,12 @@ def fit_zoom(
     Args:
         lines: the lines, or, much faster and with the same answer, ``compress(lines)``.
         zoom: the model; `PolynomialZoom` of degree 2 by default. One that has parameters already is where
-            the solver starts; one without starts from the algebraic estimate, if it is linear.
-        terms: the number N of distortion coefficients (eq. 2): by default 2, or as many as a `zoom` with
-            parameters has.
+            the solver starts; one without starts from the algebraic estimate, if it is linear and the
+            family the radial polynomial, and otherwise from no distortion.
+        family: what the coefficients mean, `RadialPolynomial` (eq. 2) unless lines have another already
+            (`compress_family`): `Division` or `BrownConrady`, which has two coefficients besides.
+        terms: the number N of radial distortion coefficients (eq. 2): by default 2, or as many as a `zoom`
+            with parameters has.
         solver: any optimistix least-squares solver or minimiser; Levenberg-Marquardt by default, with
             tolerances for the dtype of the lines.
         max_steps: the most steps the solver may take.
@@ -194,10 +204,11 @@ def fit_zoom(
         True
     """
     _check_lines(lines)
+    lines = lines if family is None else with_family(lines, family)
     model, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
     start = None
     if isinstance(model, AbstractLinearZoom) and (zoom is None or zoom.parameters is None):
-        start = compressed(lines, terms)
+        start = algebraic_start(lines, terms)
     solver = default_solver(lines) if solver is None else solver
     fit, outcome = _fit_zoom(lines, start, model, terms, solver, max_steps)
     if invertible:
@@ -206,20 +217,21 @@ def fit_zoom(
 
 
 def ready_model(lines, zoom, terms):
-    """The model ready to be fitted to these lines, in their dtype, and its number of terms."""
+    """The model ready to be fitted to these lines, in their dtype, and its number of radial terms."""
     if not isinstance(zoom, AbstractZoom):
         raise TypeError(
             f"Argument zoom must be a zoom model such as PolynomialZoom(degree=2), but it is {zoom!r}."
         )
     own = None if zoom.parameters is None else jax.eval_shape(coefficients_by, zoom, lines).shape[1]
-    terms = checked_terms((own or 2) if terms is None else terms)
-    if own not in (None, terms):
+    besides = lines.family.size(0)
+    terms = checked_terms((2 if own is None else own - besides) if terms is None else terms)
+    if own not in (None, terms + besides):
         raise ValueError(
-            f"Argument terms is {terms}, but the parameters of zoom are for {own}: leave terms out, or "
-            "start from a model without parameters."
+            f"Argument terms is {terms}, but the parameters of zoom are for {own - besides}: leave terms "
+            "out, or start from a model without parameters."
         )
     focal, *focus = settings(zoom, lines)
-    prepared = zoom.prepare(focal, terms, *focus)  # complains of too few focal lengths
+    prepared = zoom.prepare(focal, terms + besides, *focus)  # complains of too few focal lengths
     if own is None:
         return prepared, terms
     dtype = jnp.asarray(lines.focal).dtype
@@ -229,8 +241,14 @@ def ready_model(lines, zoom, terms):
 
 def _small(lines, terms):
     """The lines compressed, measured as they were."""
-    small = compressed(lines, terms)
+    plain = lines.as_weighted() if isinstance(lines, ImageLines) else lines
+    small = plain.compressed(terms) if isinstance(plain, FamilyLines) else compressed(plain, terms)
     return in_image(small) if isinstance(lines, ImageLines) else small
+
+
+def algebraic_start(lines: AbstractLines, terms: int) -> CompressedLines | None:
+    """What the algebraic estimate is made from; None for a family that it does not know."""
+    return compressed(lines, terms) if isinstance(lines.family, RadialPolynomial) else None
 
 
 def _check_lines(lines):
@@ -244,6 +262,7 @@ def _check_lines(lines):
 def fit_frames(
     lines: AbstractLines,
     *,
+    family: AbstractFamily | None = None,
     terms: int = 2,
     solver: Solver | None = None,
     max_steps: int = 256,
@@ -253,16 +272,17 @@ def fit_frames(
     """The distortion of each frame by itself (eq. 3 and 6): what a zoom model is compared with.
 
     Args:
-        lines, terms, solver, max_steps, invertible, throw: as for `fit_zoom`, frame by frame.
+        lines, family, terms, solver, max_steps, invertible, throw: as for `fit_zoom`, frame by frame.
 
     Raises:
         RuntimeError: the solver failed on some frame, and `throw` is set.
     """
     _check_lines(lines)
     terms = checked_terms(terms)
+    lines = lines if family is None else with_family(lines, family)
     chosen, present = lines.by_frame()
     solver = default_solver(lines) if solver is None else solver
-    start = compressed(lines, terms)
+    start = algebraic_start(lines, terms)
     fits, outcome = _fit_frames(lines, start, chosen, present, terms, solver, max_steps)
     if invertible:
         small = _small(lines, terms)
@@ -303,6 +323,7 @@ def frame_rms(
                 f"{lines.focal_unit}."
             )
         lens.check_range(lines.focal)
+        lines = with_family(lines, lens.family)
         lines = lines.about(lens.centre if lens.shift is None else jax.vmap(lens)(lines.focal).centre)
     elif not (lens is None or eqx.is_array_like(lens)):
         raise TypeError(
@@ -316,7 +337,7 @@ def frame_rms(
 def _frame_rms(lines, lens):
     focal = jnp.asarray(lines.focal)
     if lens is None:
-        coefficients = jnp.zeros((focal.shape[0], 1), focal.dtype)
+        coefficients = jnp.zeros((focal.shape[0], lines.family.size(1)), focal.dtype)
     elif isinstance(lens, ZoomLens):
         coefficients = coefficients_by(lens.zoom, lines)
     else:
@@ -339,7 +360,7 @@ def _described(lines, zoom, result, steps):
     errors = energy_by_frame(lines, weighted)
     covariance, determined = parameter_covariance(lines, zoom, weighted, jacobian)
     lens, rms = lens_of(lines, zoom), jnp.sqrt(jnp.mean(errors))
-    certificate = certificate_of(zoom, lens.centre, lens.focal_range, lens.image_size)
+    certificate = certificate_of(zoom, lens.centre, lens.focal_range, lens.image_size, family=lens.family)
     return ZoomFit(
         lens=lens,
         rms=rms,
@@ -356,12 +377,13 @@ def _described(lines, zoom, result, steps):
 def _fit_frames(lines, start, chosen, present, terms, solver, max_steps):
     def fit(chosen, present):
         frame = lines.take(chosen, present)
-        constant = PolynomialZoom(degree=0).prepare(frame.focal, terms)
-        return _fit_zoom(frame, start.take(chosen, present), constant, terms, solver, max_steps)[0]
+        constant = PolynomialZoom(degree=0).prepare(frame.focal, lines.family.size(terms))
+        own = None if start is None else start.take(chosen, present)
+        return _fit_zoom(frame, own, constant, terms, solver, max_steps)[0]
 
     # Small compressed frames are solved side by side; the points themselves one frame at a time, for
     # side by side they would all be in memory at once, padded to the fullest frame.
-    batch = 1 if isinstance(lines.lines if isinstance(lines, ImageLines) else lines, Lines) else len(chosen)
+    batch = 1 if isinstance(points_of(lines), Lines) else len(chosen)
     fits = jax.lax.map(lambda frame: fit(*frame), (chosen, present), batch_size=batch)
     each = collected(lines, fits)
     return each, _outcome(each)
@@ -379,6 +401,7 @@ def collected(lines, fits):
         rms_unconstrained=jnp.sqrt(jnp.mean(fits.rms_unconstrained**2)),
         centre=jnp.asarray(lines.centre),
         scale=lines.scale,
+        family=lines.family,
     )
 
 
@@ -386,7 +409,7 @@ def collected(lines, fits):
 def _refit_zoom(lines, free):
     """The best invertible model in the place of one that is not."""
     zoom = free.lens.zoom
-    if zoom.pieces(free.lens.focal_range) is None:  # there is nothing to demand
+    if stated_pieces(zoom, free.lens.focal_range, lines.family) is None:  # there is nothing to demand
         return free, _outcome(free)
     nothing = jax.tree.map(jnp.zeros_like, zoom.parameters)
     if not isinstance(zoom, AbstractLinearZoom):
@@ -403,7 +426,9 @@ def _refit_zoom(lines, free):
 
         def slack(flat):
             lens = lens_of(lines, with_parameters(zoom, unravel(flat)))
-            controls = slope_controls(lens.zoom, lens.centre, lens.focal_range, lens.image_size)
+            controls = slope_controls(
+                lens.zoom, lens.centre, lens.focal_range, lens.image_size, lens.family
+            )
             assert controls is not None
             return controls - LEAST_SLOPE
 
@@ -430,7 +455,7 @@ def _refit_frames(lines, chosen, present, terms, free):
 
     def fit(chosen, present, result, coefficients):
         frame = lines.take(chosen, present)
-        constant = PolynomialZoom(degree=0).prepare(frame.focal, terms)
+        constant = PolynomialZoom(degree=0).prepare(frame.focal, lines.family.size(terms))
         own = _described(frame, with_parameters(constant, coefficients[None]), result, jnp.asarray(0))
         other, _ = _refit_zoom(frame, own)
         keep = _invertible(own)

@@ -13,7 +13,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.polynomial import polynomial
 
 from ._checks import checked_size
 from ._types import Point, Points, Scalar
@@ -144,9 +143,10 @@ def _outline(distortion: Distortion, image_size: tuple[int, int], inset: float) 
     away = border - centre
     fold = fold_radius(distortion)
     away *= np.minimum(1, fold / np.maximum(np.hypot(*away.T), 1e-12))[:, None]
-    squared = np.sum((away / float(distortion.scale)) ** 2, axis=1)
-    factor = polynomial.polyval(squared, np.append(1.0, np.asarray(distortion.coefficients, float)))
-    return centre + away * factor[:, None]
+    scale = float(distortion.scale)
+    squared = np.sum((away / scale) ** 2, axis=1)
+    k = np.asarray(distortion.coefficients, float)
+    return centre + scale * distortion.family.correct(away / scale, squared, k)
 
 
 def _clearance(apart: np.ndarray) -> float:

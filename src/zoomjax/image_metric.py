@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._types import Centres, Focal, Focus, FrameIndex, LineWeight, Point
 from .energy import line_normal
+from .families import AbstractFamily, AbstractRadial
 from .lines import AbstractLines
 
 
@@ -42,6 +43,11 @@ class ImageLines(AbstractLines):
     weight: LineWeight | None
 
     @property
+    def family(self) -> AbstractFamily:
+        """What the coefficients mean."""
+        return self.lines.family
+
+    @property
     def counts(self) -> Float[Array, "line"]:
         """Number of points of each line."""
         return self.lines.counts
@@ -49,9 +55,10 @@ class ImageLines(AbstractLines):
     def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
         """Corrected points of each line about their mean, divided by the stretch across the line."""
         rows = self.lines.corrected(coefficients)
-        moments = self.lines.second_moments(2 * coefficients.shape[1])
+        powers, _ = self.lines.expansion(coefficients)
+        moments = self.lines.second_moments(2 * powers.shape[1])
         squared = jax.vmap(_squared_stretch)(
-            coefficients, jax.vmap(line_normal)(rows), moments, self.lines.counts
+            powers, jax.vmap(line_normal)(rows), moments, self.lines.counts
         )
         # Beyond a fold, where it may vanish, nothing is to be gained either.
         return rows / jnp.sqrt(jnp.maximum(squared, 1e-4))[:, None, None]
@@ -82,6 +89,9 @@ def in_image(lines: AbstractLines) -> ImageLines:
     Args:
         lines: the lines, or their compressed form, about a fixed centre.
 
+    Raises:
+        ValueError: their family is not radial: the stretch of the others is not made of these moments.
+
     Example:
         >>> import numpy as np
         >>> from zoomjax import Lines, compress, fit_zoom
@@ -93,6 +103,11 @@ def in_image(lines: AbstractLines) -> ImageLines:
     """
     if isinstance(lines, ImageLines):
         return lines
+    if not isinstance(lines.family, AbstractRadial):
+        raise ValueError(
+            "Distances are measured in the image for radial families, but this one is "
+            f"{type(lines.family).__name__}: leave in_image out."
+        )
     return ImageLines(
         lines=lines,
         frame=lines.frame,

@@ -17,6 +17,7 @@ import math
 import numpy as np
 from numpy.polynomial import chebyshev, polynomial
 
+from .families import AbstractRadial
 from .radial import Distortion
 
 TOLERANCE = 0.01
@@ -36,13 +37,14 @@ class RadialInverse:
     Attributes:
         powers: coefficients of the powers of ``v = 2 τ/reach² - 1``, lowest first, float32.
         steps: steps of Newton's method that follow.
-        coefficients: (k1, ..., kN) of the distortion, float32.
+        family, coefficients: of the distortion, float32.
         reach: the corrected radius, normalised, up to which it holds; beyond it nothing is seen.
         error: the largest distance, px, between its distorted positions and the exact ones.
     """
 
     powers: np.ndarray
     steps: int
+    family: AbstractRadial
     coefficients: np.ndarray
     reach: float
     error: float
@@ -53,20 +55,25 @@ def fit_inverse(
 ) -> RadialInverse | None:
     """The polynomial for corrected points up to `radius` px from the centre; None if none is accurate.
 
+    None, too, where the family is not radial.
+
     Args:
         distortion: with concrete values (this is NumPy, in float64).
         radius: px; beyond the fold's image nothing exists, and nothing is fitted.
         seen: the distorted radius, px, beyond which positions are of no interest: all off the image.
         tolerance: the largest error allowed, px.
     """
+    family = distortion.family
+    if not isinstance(family, AbstractRadial):
+        return None
     k = np.asarray(distortion.coefficients, float)
     scale = float(distortion.scale)
-    top = min(_first_radius(k, radius / scale), seen / scale)
+    top = min(_first_radius(family, k, radius / scale), seen / scale)
     # Exact pairs, denser towards the end, where polynomials go wrong first.
     r = top * np.sin(np.linspace(0, np.pi / 2, 64)[1:])
-    rho = _corrected(r, k)
+    rho = _corrected(family, r, k)
     between = top * np.sin((np.arange(512) + 0.5) * np.pi / 1024)
-    rho_between = _corrected(between, k)
+    rho_between = _corrected(family, between, k)
     reach = float(rho[-1])
     squared = (rho_between**2).astype(np.float32)
     single = k.astype(np.float32)
@@ -76,19 +83,19 @@ def fit_inverse(
         powers = np.zeros(degree + 1, np.float32)
         trimmed = chebyshev.cheb2poly(fitted)
         powers[: len(trimmed)] = trimmed
-        ratio = radius_ratio(squared, np.float32(reach), powers, steps, single)
+        ratio = radius_ratio(squared, np.float32(reach), powers, steps, family, single)
         error = float(scale * np.max(np.abs(rho_between * ratio - between)))
         if error <= tolerance:
-            return RadialInverse(powers, steps, single, reach, error)
+            return RadialInverse(powers, steps, family, single, reach, error)
     return None
 
 
-def radius_ratio(squared, reach, powers, steps, k):
+def radius_ratio(squared, reach, powers, steps, family, k):
     """Distorted over corrected radius at squared corrected radii: the same code for NumPy and JAX."""
     ratio = _horner(powers, squared * (2 / (reach * reach)) - 1)
     for _ in range(steps):  # on q L(τ q²) - 1 = 0, in the ratio q
-        t = squared * ratio * ratio
-        ratio = ratio - (ratio * _horner(_with_one(k), t) - 1) / _horner(_with_one(k, slope=True), t)
+        error, slope = family.equation(ratio, squared * ratio * ratio, 1, k)
+        ratio = ratio - error / slope
     return ratio
 
 
@@ -97,8 +104,12 @@ def fold_radius(distortion: Distortion) -> float:
 
     `Distortion.monotone_radius` is for tracing, in JAX's precision and on its device. Here eigenvalues from
     NumPy do: in float64 whatever JAX's setting, with nothing to compile, once for each frame of a video.
+    (Not for families that are not radial.)
     """
-    return float(distortion.scale) * _fold(np.asarray(distortion.coefficients, float))
+    family = distortion.family
+    if not isinstance(family, AbstractRadial):
+        return float(distortion.monotone_radius)
+    return float(distortion.scale) * _fold(family, np.asarray(distortion.coefficients, float))
 
 
 def _horner(powers, x):
@@ -109,26 +120,25 @@ def _horner(powers, x):
     return value
 
 
-def _with_one(k, slope=False):
-    """Coefficients of L(t), or of the derivative of r L(r²), in the powers of t."""
-    return [k.dtype.type(1), *((2 * i + 3 if slope else 1) * k[i] for i in range(len(k)))]
-
-
-def _corrected(r, k):
+def _corrected(family, r, k):
     """``r L(r²)``."""
-    return r * _horner(_with_one(k), r * r)
+    return r * family.factor(r * r, k)
 
 
-def _fold(k: np.ndarray) -> float:
-    roots = polynomial.polyroots(np.trim_zeros(_with_one(k, slope=True), "b"))
-    folds = roots.real[(abs(roots.imag) < 1e-9 * (1 + abs(roots.real))) & (roots.real > 0)]
-    return math.sqrt(folds.min()) if folds.size else math.inf
+def _fold(family: AbstractRadial, k: np.ndarray) -> float:
+    """The first positive root of what must stay positive, as a radius."""
+    first = math.inf
+    for row in family.conditions(len(k)):
+        roots = polynomial.polyroots(np.trim_zeros(np.append(1.0, row * k), "b"))
+        folds = roots.real[(abs(roots.imag) < 1e-9 * (1 + abs(roots.real))) & (roots.real > 0)]
+        first = min(first, folds.min(initial=math.inf))
+    return math.sqrt(first)
 
 
-def _first_radius(k: np.ndarray, rho: float) -> float:
+def _first_radius(family: AbstractRadial, k: np.ndarray, rho: float) -> float:
     """A distorted radius just large enough to be corrected to `rho`, or that of the fold before it."""
-    limit, end = _fold(k), rho
-    while end < limit and _corrected(end, k) < rho:
+    limit, end = _fold(family, k), rho
+    while end < limit and _corrected(family, end, k) < rho:
         end *= 2
     r = np.linspace(0, min(end, limit), 1025)
-    return float(r[min(np.searchsorted(_corrected(r, k), rho), 1024)])
+    return float(r[min(np.searchsorted(_corrected(family, r, k), rho), 1024)])

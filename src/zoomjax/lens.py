@@ -15,6 +15,7 @@ from jaxtyping import Float, Num, ScalarLike
 from ._checks import checked_size, checked_unit
 from ._files import whole_file
 from ._types import AnyArray, Point, traced
+from .families import AbstractFamily, BrownConrady, Division, RadialPolynomial
 from .focus import FocusSplineZoom
 from .lines import AbstractLines
 from .radial import Distortion
@@ -22,7 +23,7 @@ from .rivals import PowerZoom, SplineZoom, TableZoom, TwoRegionZoom
 from .smooth import SmoothZoom
 from .zoom import AbstractFocusZoom, AbstractZoom, PolynomialZoom
 
-_FORMAT, _VERSION = "zoomjax.lens", 1
+_FORMAT, _VERSION = "zoomjax.lens", 2
 
 
 class ZoomLens(eqx.Module):
@@ -37,6 +38,7 @@ class ZoomLens(eqx.Module):
         image_size: (width, height) px of the images it is for.
         focal_unit: "mm" or "px".
         focus_range: the least and greatest focus fitted, where the zoom model depends on it.
+        family: what the coefficients mean: by default the radial polynomial.
 
     Example:
         >>> import jax.numpy as jnp
@@ -53,6 +55,7 @@ class ZoomLens(eqx.Module):
     focal_unit: str = eqx.field(static=True, default="mm")
     shift: AbstractZoom | None = None
     focus_range: Float[AnyArray, "2"] | None = None
+    family: AbstractFamily = RadialPolynomial()
 
     def __check_init__(self):
         """Check the geometry."""
@@ -94,6 +97,7 @@ class ZoomLens(eqx.Module):
             else self.zoom(focal),
             centre=centre if self.shift is None else centre + self.scale * self.shift(focal),
             scale=jnp.asarray(self.scale, dtype),
+            family=self.family,
         )
 
     def at_focus(self, focus: ScalarLike) -> "ZoomLens":
@@ -112,21 +116,25 @@ class ZoomLens(eqx.Module):
         """Write the lens to a JSON file that `load_lens` reads, all digits kept.
 
         Raises:
-            TypeError: the zoom model is of a kind that has no file format.
+            TypeError: the zoom model, or the family, is of a kind that has no file format.
         """
+        if type(self.family) not in _FAMILIES.values():
+            raise TypeError(f"A lens with a {type(self.family).__name__} cannot be saved.")
         for model in (self.zoom, self.shift):
             if model is not None and type(model) not in _FORMULAS:
                 raise TypeError(f"A lens with a {type(model).__name__} cannot be saved.")
+        polynomial = isinstance(self.family, RadialPolynomial)
         content = {
             "format": _FORMAT,
-            "version": _VERSION,
+            # Older readers know no families, and must not take this one's coefficients for a polynomial's.
+            "version": 1 if polynomial else _VERSION,
             "image_size": list(self.image_size),
             "centre": _numbers(self.centre),
             "scale": self.scale,
             "focal_unit": self.focal_unit,
             "focal_range": _numbers(self.focal_range),
-            "radial": "corrected = centre + z * scale * (1 + k1 r^2 + ... + kN r^2N), "
-            "z = (distorted - centre) / scale, r^2 = z.z",
+            **({} if polynomial else {"family": type(self.family).__name__}),
+            "radial": self.family.formula,
             "zoom": _described(self.zoom),
         }
         if self.focus_range is not None:
@@ -175,6 +183,7 @@ def lens_of(lines: AbstractLines, zoom: AbstractZoom) -> ZoomLens:
         image_size=lines.image_size,
         focal_unit=lines.focal_unit,
         focus_range=_focus_range(lines) if isinstance(zoom, AbstractFocusZoom) else None,
+        family=lines.family,
     )
 
 
@@ -195,11 +204,14 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
             content = json.load(file)
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise ValueError("it describes no zoom lens; ZoomLens.save writes such a file")
-        if content["version"] != _VERSION:
+        if content["version"] not in range(1, _VERSION + 1):
             raise ValueError(
-                f"its format version is {content['version']!r} and this zoomjax reads {_VERSION}; "
+                f"its format version is {content['version']!r} and this zoomjax reads up to {_VERSION}; "
                 "update zoomjax"
             )
+        family = content.get("family", "RadialPolynomial")
+        if family not in _FAMILIES:
+            raise ValueError(f"its family of distortions, {family!r}, is unknown; update zoomjax")
         lens = ZoomLens(
             zoom=_read_zoom(content["zoom"], None),
             centre=_array(content, "centre", (2,)),
@@ -208,7 +220,11 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
             focal_unit=checked_unit(content["focal_unit"]),
             shift=_read_zoom(content["shift"], 2) if "shift" in content else None,
             focus_range=_array(content, "focus_range", (2,)) if "focus_range" in content else None,
+            family=_FAMILIES[family](),
         )
+        size = jax.eval_shape(lens.zoom, *[jnp.ones(())] * _settings(lens.zoom)).shape[0]
+        if size < lens.family.size(1):
+            raise ValueError(f"it has {size} coefficients, and {family} has {lens.family.size(1)} or more")
         low, high = lens.focal_range
         if not 0 < low <= high:
             raise ValueError("its focal_range is not positive and in order")
@@ -243,6 +259,9 @@ _FORMULAS = {
     FocusSplineZoom: "k_i(f, d) = sum over knots z of 1/f and e of the focus d of "
     "parameters[z * focus_number + e][i-1] S_z(1/f) T_e(d), S and T the cardinal natural cubic splines",
 }
+
+_FAMILIES = {family.__name__: family for family in (RadialPolynomial, Division, BrownConrady)}
+"""The families that it can hold."""
 
 _TABLE = (None, None)
 _SHAPES = {
@@ -293,10 +312,14 @@ def _read_zoom(content, numbers: int | None) -> AbstractZoom:
     if knots and math.prod(knots) != rows:
         raise ValueError("its knots are not as many as its parameters")
     zoom = model(**fields)
-    setting = [jnp.ones(())] * (2 if isinstance(zoom, AbstractFocusZoom) else 1)
-    if jax.eval_shape(zoom, *setting).shape != (numbers or columns,):
+    if jax.eval_shape(zoom, *[jnp.ones(())] * _settings(zoom)).shape != (numbers or columns,):
         raise ValueError("its parameters are not those of its model")
     return zoom
+
+
+def _settings(zoom):
+    """How many numbers a zoom model's coefficients depend on: the focal length, and perhaps the focus."""
+    return 2 if isinstance(zoom, AbstractFocusZoom) else 1
 
 
 def _plain(value):

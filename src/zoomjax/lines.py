@@ -33,7 +33,7 @@ from ._checks import (
 )
 from ._files import whole_file
 from ._types import AnyArray, Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Mask, Point, traced
-from .radial import radial_factor
+from .families import AbstractFamily, RadialPolynomial
 
 _FORMAT, _VERSION = "zoomjax.lines", 1
 
@@ -60,6 +60,18 @@ class AbstractLines(eqx.Module):
     def scale(self) -> float:
         """The length in px that is radius 1: half the image diagonal."""
         return math.hypot(*self.image_size) / 2
+
+    @property
+    def family(self) -> AbstractFamily:
+        """What the coefficients mean: the radial polynomial, except for `FamilyLines`."""
+        return RadialPolynomial()
+
+    def expansion(
+        self, coefficients: Float[Array, "some size"]
+    ) -> tuple[Float[Array, "some power"], Float[Array, "some tangential"]]:
+        """The family's coefficients as what corrected points are linear in, up to the image's corners."""
+        far = jnp.maximum(self.centre, jnp.asarray(self.image_size) - 1 - self.centre) / self.scale
+        return jax.vmap(lambda k: self.family.expansion(k, far @ far))(coefficients)
 
     @property
     @abc.abstractmethod
@@ -314,9 +326,7 @@ class Lines(AbstractLines):
 
     def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
         """Corrected points of each line about their mean, px."""
-        return jax.vmap(_correct_line, in_axes=(0, 0, 0, None, None))(
-            jnp.asarray(self.points), jnp.asarray(self.mask), coefficients, self.centre, self.scale
-        )
+        return corrected_points(self, self.family, coefficients)
 
     def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
         """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1."""
@@ -361,10 +371,19 @@ def focus_of(
     return jnp.asarray(lines.focus)[lines.frame[chosen[jnp.argmax(present)]]][None]
 
 
-def _correct_line(points, mask, k, centre, scale):
+def corrected_points(
+    lines: Lines, family: AbstractFamily, coefficients: Float[Array, "line size"]
+) -> Float[Array, "line point 2"]:
+    """Points of each line, corrected by a family's `coefficients` of each, about their mean, px."""
+    return jax.vmap(_correct_line, in_axes=(0, 0, 0, None, None, None))(
+        jnp.asarray(lines.points), jnp.asarray(lines.mask), coefficients, lines.centre, lines.scale, family
+    )
+
+
+def _correct_line(points, mask, k, centre, scale, family):
     """Corrected points of one line about their mean, px; zero where masked."""
     z = jnp.where(mask[:, None], (points - centre[None]) / scale, 0)
-    corrected = z * radial_factor(jnp.sum(z * z, axis=1), k)[:, None]
+    corrected = jax.vmap(family.correct, (0, 0, None))(z, jnp.sum(z * z, axis=1), k)
     mean = jnp.sum(corrected, axis=0) / jnp.maximum(jnp.sum(mask), 1)
     return jnp.where(mask[:, None], scale * (corrected - mean[None]), 0)
 

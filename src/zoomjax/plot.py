@@ -33,7 +33,8 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
     """
     lens = zoom.lens
     terms = each.coefficients.shape[1]
-    to_pixel = lens.scale ** (-2.0 * np.arange(1, terms + 1))
+    orders = lens.family.orders(terms)
+    to_pixel = lens.scale ** (-1.0 * orders)
     focal = np.asarray(lines.focal)
     grid = np.linspace(1 / focal.max(), 1 / focal.min(), 200)
     frames = np.asarray(each.coefficients) * to_pixel
@@ -54,11 +55,12 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
     axes = figure.subplots(2, terms, sharex=True, squeeze=False, height_ratios=[2.2, 1])
     for i, (above, below) in enumerate(axes.T):
         known = np.isfinite(sigma[:, i])
-        x, unit = 1 / focal[known], f"px$^{{-{2 * i + 2}}}$"
+        x, unit = 1 / focal[known], f"px$^{{-{orders[i]}}}$"
         above.plot(x, frames[known, i], "o", markersize=3.5, color=_FRAMES, label="each frame by itself")
         above.plot(grid, curve[:, i], color=_MODEL, linewidth=1.8, label="zoom model")
         _shade(above, grid, curve[:, i], spread[:, i])
-        _label(above, f"$k_{i + 1}$", unit, curve[:, i])
+        name = f"k_{i + 1}" if orders[i] > 1 else f"p_{i + 1 - np.sum(orders > 1)}"
+        _label(above, f"${name}$", unit, curve[:, i])
         difference = frames[known, i] - expected[known, i]
         below.errorbar(
             x, difference, sigma[known, i], fmt="o", markersize=2.5, linewidth=0.9, color=_FRAMES

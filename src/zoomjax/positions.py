@@ -69,17 +69,23 @@ def source_positions(
     )
     reach = np.float32(inverse.reach)
     return _positions(
-        inverse.powers, inverse.coefficients, reach, geometry.astype(np.float32), inverse.steps, plane.size
+        inverse.powers,
+        inverse.coefficients,
+        reach,
+        geometry.astype(np.float32),
+        inverse.steps,
+        inverse.family,
+        plane.size,
     )
 
 
-@functools.partial(jax.jit, static_argnames=("steps", "size"))
-def _positions(powers, k, reach, geometry, steps, size):
+@functools.partial(jax.jit, static_argnames=("steps", "family", "size"))
+def _positions(powers, k, reach, geometry, steps, family, size):
     start, step, centre, scale = geometry
     x = start[0] + step[0] * jax.lax.broadcasted_iota(jnp.float32, size[::-1], 1)
     y = start[1] + step[1] * jax.lax.broadcasted_iota(jnp.float32, size[::-1], 0)
     squared = x * x + y * y
-    ratio = radius_ratio(squared, reach, powers, steps, k)
+    ratio = radius_ratio(squared, reach, powers, steps, family, k)
     seen = squared <= reach * reach * (1 + 1e-6)
     return (
         jnp.where(seen, centre[0] + scale[0] * x * ratio, OUTSIDE),

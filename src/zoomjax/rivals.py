@@ -178,7 +178,7 @@ class PowerZoom(AbstractZoom):
         digits = 1 + jnp.abs(exponent) * jnp.max(jnp.abs(x))  # that the exponential loses
         size = jnp.abs(constant) + jnp.abs(factor) * jnp.max(power * digits, axis=(0, 1))
         ends = x[..., 0] + jnp.log(_prepared(self.focal_ref))
-        return Pieces(controls, ends, jnp.exp, size)
+        return Pieces(controls, ends, jnp.exp, size, exact=False)
 
 
 class TwoRegionZoom(AbstractLinearZoom):

@@ -24,6 +24,8 @@ from jaxtyping import Array, Float, Int
 from ._linear import least_squares
 from .algebraic import algebraic_zoom
 from .energy import coefficients_by, line_residuals, prior_jacobian
+from .families import AbstractFamily, RadialPolynomial
+from .family_lines import with_family
 from .fit import ZoomFit, fit_zoom, linearised, ready_model
 from .lines import AbstractLines
 from .zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
@@ -60,6 +62,7 @@ def fit_robust(
     lines: AbstractLines,
     *,
     zoom: AbstractZoom | None = None,
+    family: AbstractFamily | None = None,
     terms: int | None = None,
     invertible: bool = True,
     throw: bool = True,
@@ -69,7 +72,7 @@ def fit_robust(
     Args:
         lines: the lines, or, much faster and with the same answer, ``compress(lines)``. Weights that they
             have already are kept as factors.
-        zoom, terms, invertible, throw: as for `fit_zoom`, whose errors also apply.
+        zoom, family, terms, invertible, throw: as for `fit_zoom`, whose errors also apply.
 
     Returns:
         The fit of the lines that are left, with the weight of each line.
@@ -84,8 +87,10 @@ def fit_robust(
         >>> fit_robust(compress(lines), zoom=PolynomialZoom(degree=0), terms=1).rejected.tolist()
         [10]
     """
+    lines = lines if family is None else with_family(lines, family)
     start, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
-    if isinstance(start, AbstractLinearZoom) and (zoom is None or zoom.parameters is None):
+    known = isinstance(start, AbstractLinearZoom) and isinstance(lines.family, RadialPolynomial)
+    if known and (zoom is None or zoom.parameters is None):
         start = algebraic_zoom(lines, zoom=start, terms=terms).zoom
     weighted, model = _reweighted(lines, start)
     fit = fit_zoom(weighted, zoom=model, invertible=invertible, throw=throw)

@@ -18,9 +18,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, ScalarLike, UInt8
 
 from ._types import AnyArray
+from .families import RadialPolynomial, radial_factor, radial_slope
 from .lens import ZoomLens
 from .lines import Lines
-from .radial import Distortion, radial_factor, radial_slope
+from .radial import Distortion
 from .zoom import PolynomialZoom
 
 _NIKKOR_PIXELS = np.array(  # section 5.1: rows are powers of 1/f, columns k1 (px^-2) and k2 (px^-4)
@@ -243,7 +244,15 @@ def board_photo(
         vignetting: the part of the light that is missing in the corners.
         levels: grey levels of dark and white in the middle, of 255.
         seed: of the noise.
+
+    Raises:
+        ValueError: the lens is of another family than the radial polynomial.
     """
+    if not isinstance(lens.family, RadialPolynomial):
+        raise ValueError(
+            "Argument lens must be a radial polynomial to be photographed with, but it is "
+            f"{type(lens.family).__name__}."
+        )
     board = StripedBoard.before(lens) if board is None else board
     dtype = lens.centre.dtype
     photo = np.asarray(

@@ -124,14 +124,18 @@ def _feigned(lines, zoom, weights, energy, extra):
 
     def coefficients_at(flat):
         k = coefficients_by(with_parameters(zoom, unravel(flat)), lines)
-        return k[:, : k.shape[1] - extra]
+        return lines.expansion(k[:, : k.shape[1] - extra])
 
-    k = coefficients_at(flat)
+    k, _ = coefficients_at(flat)
     terms = k.shape[1]
     order = jnp.arange(terms + 1)
     moments = lines.radial_moments(2 * terms)[:, order[:, None] + order[None]] * weights[:, None, None]
     # The residuals have the noise of the corrected image, shrunk by L: divide by its mean square.
     kappa = jnp.concatenate([jnp.ones_like(k[:, :1]), k], axis=1)[lines.frame]
     variance_in_image = energy / jnp.einsum("li,lij,lj->", kappa, moments, kappa)
-    by_parameter = jax.jacfwd(coefficients_at)(flat)[lines.frame]  # (line, terms, parameter)
-    return variance_in_image * jnp.einsum("lip,lij,ljq->pq", by_parameter, moments[:, 1:, 1:], by_parameter)
+    by_parameter, tangential = (rows[lines.frame] for rows in jax.jacfwd(coefficients_at)(flat))
+    # (line, terms, parameter). Decentering moves points by squares of x and y: noise enters its derivative
+    # by matrices whose mean square over all directions is 12 r^2.
+    decentred = 12 * jnp.einsum("lip,l,liq->pq", tangential, moments[:, 0, 1], tangential)
+    radial = jnp.einsum("lip,lij,ljq->pq", by_parameter, moments[:, 1:, 1:], by_parameter)
+    return variance_in_image * (radial + decentred)

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, DTypeLike, Float, Num
 
+from .families import AbstractRadial, inverse_radius
 from .framing import Framing
-from .radial import Distortion, inverse_radius, monotone_radius, radial_factor, radial_slope
+from .radial import Distortion
 
 _TOLERANCE = 1e-3
 """px: the last Newton step where the iteration has arrived; the error left is of the order of
@@ -95,6 +96,9 @@ def sample_positions(
     from a polynomial, iterated together until it has arrived on a sample of radii, and a last time for the
     derivative.
     """
+    family = distortion.family
+    if not isinstance(family, AbstractRadial):
+        return _exact_positions(distortion, framing, dtype)
     k, centre, scale, origin, zoom = (
         jnp.asarray(leaf, dtype)
         for leaf in (
@@ -110,9 +114,9 @@ def sample_positions(
     y = ((origin[1] + jnp.arange(height, dtype=dtype) / zoom) - centre[1]) / scale
     squared = x[None, :] ** 2 + y[:, None] ** 2
     fixed = jax.lax.stop_gradient((k, squared, scale))
-    ratio, seen = _arrived_ratio(*fixed)
+    ratio, seen = _arrived_ratio(family, *fixed)
     squared = jnp.where(seen, squared, 0)
-    value, slope = _equation(ratio, squared, k)
+    value, slope = _equation(family, ratio, squared, k)
     ratio = ratio - value / jax.lax.stop_gradient(slope)
     return (
         jnp.where(seen, centre[0] + scale * x[None, :] * ratio, _OFF),
@@ -120,23 +124,33 @@ def sample_positions(
     )
 
 
-def _equation(q, squared, k):
+def _exact_positions(distortion, framing, dtype):
+    """The same by the inverse of each pixel by itself, for families that are not radial."""
+    width, height = framing.size
+    pixels = jnp.stack(jnp.meshgrid(jnp.arange(width), jnp.arange(height)), axis=-1).astype(dtype)
+    positions = distortion.distort(
+        jnp.broadcast_to(jnp.asarray(framing.origin, dtype), pixels.shape)
+        + pixels / jnp.asarray(framing.scale, dtype)
+    )
+    positions = jnp.where(jnp.isnan(positions), _OFF, positions)
+    return positions[..., 0], positions[..., 1]
+
+
+def _equation(family, q, squared, k):
     """``q L(τ q²) - 1`` and its derivative with respect to q, kept off zero."""
-    t = squared * q * q
-    slope = radial_slope(t, k)
-    return q * radial_factor(t, k) - 1, jnp.maximum(slope, jnp.finfo(slope.dtype).eps)
+    value, slope = family.equation(q, squared * q * q, 1, k)
+    return value, jnp.maximum(slope, jnp.finfo(slope.dtype).eps)
 
 
-def _arrived_ratio(k, squared, scale):
+def _arrived_ratio(family, k, squared, scale):
     """The ratio q, at most one Newton step from its solution, and which τ have one."""
-    limit = monotone_radius(k)
+    limit = family.limit(k)
     farthest = jnp.sqrt(jnp.max(squared))
-    fold = jnp.where(jnp.isinf(limit), 0, limit)
-    reach = jnp.where(jnp.isinf(limit), jnp.inf, fold * radial_factor(fold * fold, k))
-    top = inverse_radius(jnp.minimum(farthest, reach), k, limit)
+    reach = family.reach(k, limit)
+    top = inverse_radius(family, jnp.minimum(farthest, reach), k, limit)
     # Exact pairs of radii, and the least-squares polynomial through them, in Chebyshev's basis.
     r = top * jnp.sin(jnp.linspace(0, jnp.pi / 2, 65, dtype=k.dtype)[1:])
-    rho = r * radial_factor(r * r, k)
+    rho = r * family.factor(r * r, k)
     v = 2 * (rho / rho[-1]) ** 2 - 1
     angle = jnp.arccos(jnp.clip(v, -1, 1))
     design = jnp.cos(jnp.outer(angle, jnp.arange(_DEGREE + 1, dtype=k.dtype)))
@@ -148,7 +162,7 @@ def _arrived_ratio(k, squared, scale):
         return _chebyshev(powers, jnp.clip(2 * squared / bound - 1, -1, 1))
 
     def step(q, squared):
-        value, slope = _equation(q, squared, k)
+        value, slope = _equation(family, q, squared, k)
         return q - value / slope
 
     def unfinished(state):
