@@ -17,7 +17,7 @@ LAYERS = (
     {"lines"},
     {"energy"},
     {"lens"},
-    {"certificate"},
+    {"certificate", "bounds"},
     {"framing"},
     {"positions", "warp", "sizes"},
     {"_solver", "compression"},
