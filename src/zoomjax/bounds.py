@@ -59,15 +59,16 @@ def cramer_rao(
     std = jnp.broadcast_to(jnp.asarray(std, lens.centre.dtype), lines.frame.shape)
     focal = jnp.asarray(lines.focal)[lines.frame]
     each = (jnp.asarray(lines.points), lines.mask, focal, std)
-    each = jax.lax.map(lambda line: _information(lens, *line), each, batch_size=64)
-    information, most = (jnp.sum(of_lines, axis=0) for of_lines in each)
-    size = jnp.sqrt(jnp.diagonal(information))
-    eps = jnp.finfo(size.dtype).eps
-    told = size > 64 * eps * jnp.sqrt(most)  # or rounding is all that the lines say
+    rows, most = jax.lax.map(lambda line: _derivatives(lens, *line), each, batch_size=64)
+    # The triangle of the derivatives, not their squares: float32 has no room for the condition of those.
+    triangle = jnp.linalg.qr(rows.reshape(-1, rows.shape[-1]), mode="r")
+    size = jnp.linalg.norm(triangle, axis=0)
+    eps = 64 * jnp.finfo(size.dtype).eps
+    told = size > eps * jnp.sqrt(jnp.sum(most, axis=0))  # or rounding is all that the lines say
     size = jnp.where(told, size, 1)
-    values, vectors = jnp.linalg.eigh(information / size[:, None] / size[None])
-    determined = jnp.all(told) & (values[0] > 64 * size.shape[0] * eps)
-    root = vectors / jnp.sqrt(jnp.where(determined, values, 1))[None] / size[:, None]
+    _, values, right = jnp.linalg.svd(triangle / size[None])
+    determined = jnp.all(told) & (values[-1] > eps)
+    root = right.T / jnp.where(determined, values, 1)[None] / size[:, None]
     unknown = jnp.diag(jnp.full_like(size, jnp.inf))
     return jnp.where(determined, root @ root.T, unknown)
 
@@ -98,8 +99,7 @@ def displacement_bound(
 
     rows = jax.vmap(derivatives)(focal)
     squared = jnp.einsum("fncp,fncq,fn->pq", rows, rows, weight)
-    covariance = cramer_rao(lens, lines, std=std)
-    return jnp.sqrt(jnp.sum(covariance * squared))
+    return jnp.sqrt(jnp.sum(cramer_rao(lens, lines, std=std) * squared))
 
 
 @eqx.filter_jit
@@ -137,10 +137,10 @@ def _field(lens):
     return points, 1 / (low + (high - low) * jnp.asarray(share, dtype)), weights
 
 
-def _information(lens, points, mask, focal, std):
-    """What one line tells of the model's parameters, its angle and offset being unknown.
+def _derivatives(lens, points, mask, focal, std):
+    """A line's derivatives by the model's parameters, its angle and offset being unknown, a row a point.
 
-    And the most that it could, for scale: the sum of squares of all that the parameters move.
+    And for scale the squares, summed, of all that the parameters move, also along the line.
     """
     flat, unravel = ravel_pytree(lens.zoom.parameters)
 
@@ -164,7 +164,7 @@ def _information(lens, points, mask, focal, std):
     turned = along * of_points
     own = _unit(turned - own * (own @ turned))
     rows = rows - jnp.outer(own, own @ rows)
-    return rows.T @ rows, jnp.sum(moved**2, axis=(0, 1))
+    return rows, jnp.sum(moved**2, axis=(0, 1))
 
 
 def _unit(column):
