@@ -395,7 +395,7 @@ def certificates(draws: int) -> Table:
     parameters = 0.3 * np.random.default_rng(2).standard_normal((number, 3, 2))
 
     def one(parameters):
-        zoom = zj.PolynomialZoom(2, parameters, jnp.asarray(low))
+        zoom = zj.PolynomialZoom(degree=2, parameters=parameters, focal_ref=jnp.asarray(low))
         lens = zj.ZoomLens(zoom, jnp.array([319.5, 239.5]), jnp.array([low, high]), (640, 480))
         return zj.certify(lens)
 
