@@ -19,7 +19,7 @@ LAYERS = (
     {"lines"},
     {"energy"},
     {"lens"},
-    {"certificate"},
+    {"certificate", "bounds"},
     {"framing"},
     {"positions", "warp", "sizes"},
     {"_solver", "compression"},

@@ -11,6 +11,9 @@ from .bands import displacement_std as displacement_std
 from .bands import std_of as std_of
 from .blunders import PointRejection as PointRejection
 from .blunders import reject_points as reject_points
+from .bounds import cramer_rao as cramer_rao
+from .bounds import displacement_bound as displacement_bound
+from .bounds import displacement_rms as displacement_rms
 from .centre import CentreFit as CentreFit
 from .centre import FrameCentres as FrameCentres
 from .centre import fit_centre as fit_centre
