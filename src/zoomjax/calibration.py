@@ -26,9 +26,11 @@ from .certificate import Certificate
 from .compression import compress
 from .design import Suggestion, suggest_next
 from .fit import RESULTS, FrameFits, ZoomFit, fit_frames, fit_zoom, frame_rms
+from .held_out import held_out_frames, held_out_zoom
 from .lines import Lines
 from .plot import plot_model
 from .robust import fit_robust
+from .selection import Selection, default_candidates, select_model
 from .zoom import PolynomialZoom
 
 
@@ -43,6 +45,9 @@ class Calibration:
         none, algebraic: each frame's RMS, px, without correction and with the algebraic estimate.
         rejected: which lines count nothing, being not straight in the scene.
         next: the photo that would help most.
+        held_out: each frame's RMS, px, under the zoom model of all others; NaN where these do not make one.
+        each_held_out: each frame's RMS, px, each tenth of its lines under the model of its others.
+        selection: how the model was chosen, if it was.
     """
 
     lines: Lines
@@ -52,6 +57,9 @@ class Calibration:
     algebraic: np.ndarray
     rejected: np.ndarray
     next: Suggestion
+    held_out: np.ndarray
+    each_held_out: np.ndarray
+    selection: Selection | None = None
 
     def corner(self) -> list[tuple[float, float, float]]:
         """Focal lengths at both ends of the range and in its middle, and what becomes of a corner there.
@@ -78,6 +86,10 @@ class Calibration:
             ("zoom polynomial (algebraic)", self.algebraic),
             ("zoom polynomial", np.asarray(self.zoom.frame_rms)),
         ]
+
+    def held_out_rows(self) -> dict[str, np.ndarray]:
+        """Of some of the `rows`, each frame's RMS, px, of lines that were not fitted."""
+        return {"frame by frame": self.each_held_out, "zoom polynomial": self.held_out}
 
     def warnings(self, names: Sequence[str] | None = None) -> list[str]:
         """What a user must hear of: sentences about the zoom model, and about frames that have none.
@@ -110,12 +122,16 @@ class Calibration:
             "rms_none": self.none.tolist(),
             "rms_frames": np.asarray(self.each.frame_rms).tolist(),
             "rms_zoom": np.asarray(self.zoom.frame_rms).tolist(),
+            "rms_held_out": _finite(self.held_out),
+            "rms_frames_held_out": _finite(self.each_held_out),
         }
         return {
             "rms_none": rms_over_frames(self.none),
             "rms_algebraic": rms_over_frames(self.algebraic),
             "rms_frames": float(self.each.rms),
             "rms_zoom": float(self.zoom.rms),
+            "rms_held_out": _finite([rms_over_frames(self.held_out)])[0],
+            "rms_frames_held_out": _finite([rms_over_frames(self.each_held_out)])[0],
             "frames": len(self.none),
             "lines": len(frame),
             "rejected_lines": int(self.rejected.sum()),
@@ -146,7 +162,7 @@ class Calibration:
             "versions": {
                 name: importlib.metadata.version(name) for name in ("zoomjax", "jax", "optimistix")
             },
-        }
+        } | ({"selection": self.selection.summary()} if self.selection else {})
 
     def pixel_polynomials(self) -> np.ndarray:
         """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as the paper prints them."""
@@ -181,6 +197,7 @@ def calibrate(
     degree: int = 2,
     terms: int = 2,
     robust: bool = False,
+    select: bool = False,
     stage: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
     """Fit the zoom polynomial and what it is compared with.
@@ -191,8 +208,12 @@ def calibrate(
         terms: the number of distortion coefficients.
         robust: whether to reject lines that are not straight in the scene; all figures are then those of
             the others.
+        select: whether to choose degree and terms by `select_model`, among the polynomials. Lines are then
+            rejected under the quadratic.
         stage: called with a sentence before each step that takes time.
     """
+    if select:
+        degree, terms = min(2, np.unique(np.asarray(lines.focal)).size - 1), 2
     model = PolynomialZoom(degree=degree)
     model.prepare(lines.focal, terms)  # complain of too few focal lengths before any work
     stage("Compressing the lines")
@@ -200,31 +221,44 @@ def calibrate(
     data = jax.tree.map(
         lambda a: jnp.asarray(a, widest) if jnp.issubdtype(a.dtype, jnp.floating) else a, lines
     )
-    small = compress(data, terms)
+    choices = [c for c in default_candidates() if isinstance(c.zoom, PolynomialZoom)] if select else []
+    small = compress(data, max([terms, *(choice.terms for choice in choices)]))
     rejected = np.zeros(len(lines.frame), bool)
     if robust:
         stage("Rejecting lines that are not straight")
         weight = fit_robust(small, zoom=model, terms=terms, throw=False).weight
         small, lines = small.weighted(weight), lines.weighted(weight)
         rejected = np.asarray(weight) == 0
+    selection = None
+    if choices:
+        stage("Choosing the model")
+        selection = select_model(small, choices)
+        model, terms = selection.chosen.zoom, selection.chosen.terms
+        assert isinstance(model, PolynomialZoom)
     stage("Fitting each frame by itself")
     each = fit_frames(small, terms=terms, throw=False)
     stage("Fitting the zoom polynomial")
-    zoom = fit_zoom(small, zoom=model, terms=terms)
+    zoom = selection.fit if selection else fit_zoom(small, zoom=model, terms=terms)
+    none = np.asarray(frame_rms(small, None))
+    several = len(none) > 1
     return Calibration(
         lines=lines,
         zoom=zoom,
         each=each,
-        none=np.asarray(frame_rms(small, None)),
+        none=none,
         algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=model, terms=terms))),
         rejected=rejected,
         next=suggest_next(zoom, small),
+        held_out=held_out_zoom(small, zoom=model, terms=terms) if several else np.full_like(none, np.nan),
+        each_held_out=held_out_frames(small, terms=terms),
+        selection=selection,
     )
 
 
 def rms_over_frames(frame_rms: Float[AnyArray, "frame"]) -> float:
-    """Root of the mean of the frames' errors: eq. 13 from eq. 3."""
-    return float(np.sqrt(np.mean(np.asarray(frame_rms) ** 2)))
+    """Root of the mean of the frames' errors: eq. 13 from eq. 3. NaN frames do not count."""
+    known = np.asarray(frame_rms)[~np.isnan(frame_rms)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
 
 
 @contextlib.contextmanager

@@ -8,8 +8,9 @@ that are linear in their parameters every fold starts from the fit of all lines,
 Gauss-Newton steps are enough, and there is no covariance and no certificate. Nothing is approximated: a
 fold's model is the one that `fit_zoom` (``invertible=False``) finds on its lines.
 
-Once: the compression, and each fold's basis. Per fold and step: one pass over the compressed lines. Folds
-run one after the other (`jax.lax.scan`), and models of one padded size share one compiled program.
+Once: the compression, and each fold's basis. Per fold and step: one pass over the compressed lines. It is
+NumPy, float64 whatever the lines' dtype: with sums as small as these, compiling would take longer than
+50 folds of 12 models do.
 """
 
 from typing import Literal, NamedTuple, get_args
@@ -24,7 +25,7 @@ from jaxtyping import Array, Float, Int
 from ._checks import checked_integer, checked_terms
 from .algebraic import compressed
 from .compression import CompressedLines
-from .energy import line_residuals, line_weights, prior_error
+from .energy import line_residuals, prior_jacobian
 from .fit import RESULTS, fit_zoom
 from .image_metric import ImageLines
 from .lines import AbstractLines
@@ -191,9 +192,7 @@ def folds_of(lines: CompressedLines, hold_out: HoldOut, folds: int | None, seed:
     return Folds(np.where(group >= 0, fold[group], -1), group, parts)
 
 
-def judge(
-    lines: CompressedLines, zoom: AbstractZoom, terms: int, parts: Folds
-) -> Judged:
+def judge(lines: CompressedLines, zoom: AbstractZoom, terms: int, parts: Folds) -> Judged:
     """A model's errors on lines that it has seen and has not.
 
     Args:
@@ -209,13 +208,30 @@ def judge(
 
 def _by_frame(lines, of_line):
     """Root of the mean over each frame's lines, by their weights; NaN if one that counts is not known."""
-    share, frame = np.asarray(line_weights(lines) * lines.counts), np.asarray(lines.frame)
+    share, frame = shares(lines), np.asarray(lines.frame)
     kept = share > 0
     total, squares = (
         np.bincount(frame[kept], values[kept], minlength=len(lines.focal))
         for values in (share, share * of_line)
     )
     return np.sqrt(squares / np.where(total > 0, total, np.nan))
+
+
+def shares(lines: CompressedLines) -> Float[np.ndarray, "line"]:
+    """The part of each line in the energy of eq. 13: every frame weighs the same."""
+    frame, own = np.asarray(lines.frame), _own_weights(lines)
+    total = np.bincount(frame, own, minlength=len(lines.focal))
+    return own / (np.where(total > 0, total, 1) * len(total))[frame]
+
+
+def _own_weights(lines):
+    own = np.ones(lines.frame.shape) if lines.weight is None else np.asarray(lines.weight, float)
+    return np.where(_counts(lines) > 2, own, 0)
+
+
+def _counts(lines):
+    """`CompressedLines.counts` in NumPy: of what JAX does once, most is compiling."""
+    return np.round(np.asarray(lines.triangle)[:, 0, 0].astype(float) ** 2)
 
 
 # ---- Models that are linear in their parameters
@@ -264,25 +280,25 @@ def _design(lines, zoom, left, terms):
         model = zoom.prepare(focal[left], terms)
     except ValueError as error:
         return str(error)
-    values, whitener = (np.asarray(a, float) for a in _basis_of(model, focal))
+    values = np.asarray(_basis_of(with_parameters(model, None), focal), float)
     size = values.shape[1]
     precision = np.zeros((size * terms, size * terms))
     if isinstance(model, AbstractPriorZoom):
-        whitener = float(prior_error(lines, model)) * whitener
+        whitener = np.asarray(_whitener(lines, model), float)
         precision = whitener.T @ whitener
     project = np.zeros((size, len(focal)))
     project[:, left] = np.linalg.pinv(values[left])
     return _Design(values, project, precision)
 
 
+_basis_of = eqx.filter_jit(lambda model, focal: jax.vmap(model.basis)(focal))
+"""Of a model without its parameters: one compiled program for any number of terms."""
+
+
 @eqx.filter_jit
-def _basis_of(model, focal):
-    """The basis at each frame, and what whitens the flattened parameters, if anything does."""
-    values = jax.vmap(model.basis)(jnp.asarray(focal))
-    flat, unravel = ravel_pytree(jnp.zeros_like(model.parameters))
-    if not isinstance(model, AbstractPriorZoom):
-        return values, jnp.zeros((0, flat.size), values.dtype)
-    return values, jax.jacfwd(lambda flat: with_parameters(model, unravel(flat)).standardised())(flat)
+def _whitener(lines, model):
+    """What makes of the flattened parameters what their prior adds to the residuals, px."""
+    return prior_jacobian(lines, model)
 
 
 class _Lanes(NamedTuple):
@@ -304,15 +320,14 @@ class _Lanes(NamedTuple):
 
 
 def _lanes(lines, fold, terms):
-    frame, counts = np.asarray(lines.frame), np.asarray(lines.counts, float)
-    own = np.ones(len(frame)) if lines.weight is None else np.asarray(lines.weight, float)
+    frame = np.asarray(lines.frame)
     order = np.argsort(frame, kind="stable")
     rows = np.asarray(lines.triangle, float)[order, 1:, 1 : 3 + 2 * terms] * lines.scale
     columns = rows.reshape(*rows.shape[:2], terms + 1, 2).transpose(3, 2, 1, 0)
     x, y = columns = np.ascontiguousarray(columns)
     gram = np.stack([np.einsum("irl,jrl->ijl", one, other) for one, other in ((x, x), (x, y), (y, y))])
-    weight = np.where(counts > 2, own, 0)
-    frame, *others = (a[order] for a in (frame, np.maximum(counts, 1), weight, np.asarray(fold)))
+    planes = frame, np.maximum(_counts(lines), 1), _own_weights(lines), np.asarray(fold)
+    frame, *others = (a[order] for a in planes)
     starts = np.flatnonzero(np.diff(frame, prepend=-1))
     return _Lanes(columns, gram, frame, *others, starts, len(lines.focal))
 
@@ -447,7 +462,7 @@ def _pass(lanes, coefficients):
 
 def _judge_by_fits(lines, zoom, terms, parts):
     """By a fit of its own for each fold, starting from that of all lines."""
-    own = np.ones(lines.frame.shape) if lines.weight is None else np.asarray(lines.weight)
+    own = _own_weights(lines)
     everything = fit_zoom(lines, zoom=zoom, terms=terms, invertible=False, throw=False)
     seen = np.asarray(_squares(lines, everything.lens.zoom))
     unseen, failed = np.full(seen.shape, np.nan), 0

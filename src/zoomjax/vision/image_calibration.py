@@ -36,6 +36,7 @@ class ImageJob:
         board: for ``focal="board"``.
         degree: of the polynomials in 1/f.
         terms: number of distortion coefficients.
+        select: whether to choose degree and terms.
         frames: of a video, at most.
         workers: number of processes.
         cache: folder for what was detected; None: no cache.
@@ -48,6 +49,7 @@ class ImageJob:
     board: Board | None = None
     degree: int = 2
     terms: int = 2
+    select: bool = False
     frames: int = 60
     workers: int = 1
     cache: Path | None = None
@@ -238,7 +240,9 @@ def calibrate_images(
     used = tuple(d for d in usable if d.name in focals.focal)
     while True:
         lines = lines_of(used, np.array([focals.focal[d.name] for d in used]), focals.unit)
-        calibration = calibrate(lines, degree=job.degree, terms=job.terms, robust=True, stage=stage)
+        calibration = calibrate(
+            lines, degree=job.degree, terms=job.terms, robust=True, select=job.select, stage=stage
+        )
         done = ImageCalibration(job, calibration, used, focals, unused)
         hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}
         if not hopeless:
