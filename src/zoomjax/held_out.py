@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float
 
 from ._checks import checked_integer, checked_terms
 from .algebraic import compressed
@@ -135,8 +135,16 @@ def held_out_frames(
     one = _Design(np.ones((1, 1)), np.ones((1, 1)), np.zeros((terms, terms)))
     for frame in np.unique(lanes.frame):
         own = lanes.frame == frame
-        alone = (a[..., own] for a in lanes[:-2])
-        alone = _Lanes(*alone, np.zeros(1, int), 1)._replace(frame=np.zeros(own.sum(), int))
+        alone = _Lanes(
+            lanes.columns[..., own],
+            lanes.gram[..., own],
+            np.zeros(own.sum(), int),
+            lanes.counts[own],
+            lanes.weight[own],
+            lanes.fold[own],
+            starts=np.zeros(1, int),
+            frames=1,
+        )
         unseen[own] = _cross_validated(alone, [one] * (parts.number + 1))[1]
     return _by_frame(small, _as_given(small, unseen))
 
@@ -175,17 +183,15 @@ def folds_of(lines: CompressedLines, hold_out: HoldOut, folds: int | None, seed:
         fold[order] = np.arange(len(frame)) % most
         return Folds(fold, np.arange(len(frame)), most)
     if hold_out == "frame":
-        group, number = frame, len(focal)
+        group, number, needed = frame, len(focal), "two or more frames"
     else:
         distinct, place = np.unique(focal, return_inverse=True)
-        number = len(distinct) - 2
-        inside = (place > 0) & (place <= number)
-        group = np.where(inside, place - 1, -1)[frame]
+        number, needed = len(distinct) - 2, "4 distinct focal lengths or more, for both ends stay"
+        group = np.where((place > 0) & (place <= number), place - 1, -1)[frame]
     if number < 2:
-        what = {"frame": "2 frames", "focal": "4 distinct focal lengths, for both ends stay"}[hold_out]
         raise ValueError(
-            f'To hold out by "{hold_out}" takes {what}, but there are {number + 2 * (hold_out == "focal")}. '
-            'Ask for hold_out="line", or add images at other focal lengths.'
+            f'Argument hold_out is "{hold_out}", which takes {needed}; there are fewer. Ask for '
+            'hold_out="line", or add images at other focal lengths.'
         )
     parts = min(most, number)
     fold = np.arange(number) if parts == number else rng.permutation(number) % parts
@@ -326,10 +332,10 @@ def _lanes(lines, fold, terms):
     columns = rows.reshape(*rows.shape[:2], terms + 1, 2).transpose(3, 2, 1, 0)
     x, y = columns = np.ascontiguousarray(columns)
     gram = np.stack([np.einsum("irl,jrl->ijl", one, other) for one, other in ((x, x), (x, y), (y, y))])
-    planes = frame, np.maximum(_counts(lines), 1), _own_weights(lines), np.asarray(fold)
-    frame, *others = (a[order] for a in planes)
+    counts = np.maximum(_counts(lines), 1)
+    frame, counts, weight, fold = (a[order] for a in (frame, counts, _own_weights(lines), np.asarray(fold)))
     starts = np.flatnonzero(np.diff(frame, prepend=-1))
-    return _Lanes(columns, gram, frame, *others, starts, len(lines.focal))
+    return _Lanes(columns, gram, frame, counts, weight, fold, starts, len(lines.focal))
 
 
 class _Pass(NamedTuple):
@@ -434,8 +440,8 @@ def _pass(lanes, coefficients):
 
     With the direction t of a line and its normal n, the residuals are r = n.c and ``sum r (t.c) = 0``. A
     change of k_j turns the line, by the derivative of that sum, by ``phi_j = sum (t.A_j) r + (t.c)(n.A_j)``
-    over ``sum (t.c)^2 - r^2``, and r changes by ``n.A_j - phi_j (t.c)``. Residuals, and with them energy and
-    gradient, come from the triangles; the rest, which need not be exact, from their Gram matrices.
+    over ``sum (t.c)^2 - r^2``, and r changes by ``n.A_j - phi_j (t.c)``. Residuals, and with them energy
+    and gradient, come from the triangles; the rest, which need not be exact, from their Gram matrices.
     """
     kappa = np.concatenate([np.ones((1, lanes.frames)), coefficients.T])[:, lanes.frame]
     (x, y), (xx, xy, yy) = lanes.columns, lanes.gram

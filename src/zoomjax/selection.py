@@ -15,7 +15,6 @@ simplest of the models whose R is above the best one's by no more than s.
 import dataclasses
 from collections.abc import Sequence
 
-import equinox as eqx
 import numpy as np
 
 from ._checks import checked_terms
@@ -24,7 +23,7 @@ from .fit import ZoomFit, fit_zoom
 from .held_out import HoldOut, Judged, folds_of, judge, shares, small_lines
 from .lines import AbstractLines
 from .smooth import SmoothZoom
-from .zoom import AbstractZoom, PolynomialZoom
+from .zoom import AbstractZoom, PolynomialZoom, with_parameters
 
 _TERMS = 3  # of the default candidates, at most
 _DEGREES = 4
@@ -46,7 +45,7 @@ class Candidate:
         """Check what it is made of."""
         if not isinstance(self.zoom, AbstractZoom):
             raise TypeError(
-                f"A candidate must be a zoom model such as PolynomialZoom(degree=2), but it is {self.zoom!r}."
+                f"A candidate must be a zoom model, as PolynomialZoom(degree=2) is, not {self.zoom!r}."
             )
         checked_terms(self.terms)
 
@@ -78,13 +77,13 @@ class Verdict:
     """
 
     candidate: Candidate
-    parameters: float
-    rms: float
-    held_out: float
-    held_out_std: float
-    difference: float
-    difference_std: float
-    problem: str
+    parameters: float = np.nan
+    rms: float = np.nan
+    held_out: float = np.nan
+    held_out_std: float = np.nan
+    difference: float = np.nan
+    difference_std: float = np.nan
+    problem: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -204,7 +203,7 @@ def select_model(
             none of those above.
         TypeError: `lines` or a candidate is something else.
 
-    The folds' fits are not made invertible, and the chosen one is, by `fit_zoom`. Candidates that are linear
+    The fits of folds are not made invertible, the chosen one is, by `fit_zoom`. Candidates that are linear
     in their parameters are cross-validated at hundreds of fits a second; others fit by fit.
 
     References:
@@ -241,7 +240,7 @@ def select_model(
 def default_candidates(terms: int = _TERMS) -> tuple[Candidate, ...]:
     """Polynomials of degree 0 to 3 with up to so many coefficients, and `SmoothZoom`."""
     polynomials = [
-        Candidate(PolynomialZoom(degree), number)
+        Candidate(PolynomialZoom(degree=degree), number)
         for number in range(1, terms + 1)
         for degree in range(_DEGREES)
     ]
@@ -250,7 +249,7 @@ def default_candidates(terms: int = _TERMS) -> tuple[Candidate, ...]:
 
 def _judged(lines, candidate, parts):
     """The errors, or why there are none."""
-    zoom = eqx.tree_at(lambda zoom: zoom.parameters, candidate.zoom, None, is_leaf=lambda x: x is None)
+    zoom = with_parameters(candidate.zoom, None)
     try:
         lines.check_terms(candidate.terms)
         zoom.prepare(np.asarray(lines.focal), candidate.terms)
@@ -286,10 +285,10 @@ def _compared(lines, candidates, errors, parts):
 
 def _verdict(candidate, judged, unseen, best, weight, by_unit):
     if isinstance(judged, str):
-        return Verdict(candidate, *[np.nan] * 6, judged)
+        return Verdict(candidate, problem=judged)
     rms = float(np.sqrt(weight @ by_unit(judged.seen)))
     if unseen is None:
-        return Verdict(candidate, judged.parameters, rms, *[np.nan] * 4, judged.problem)
+        return Verdict(candidate, judged.parameters, rms, problem=judged.problem)
     own, own_part = _root(weight, unseen)
     least, least_part = _root(weight, best)
     return Verdict(
@@ -300,7 +299,6 @@ def _verdict(candidate, judged, unseen, best, weight, by_unit):
         _standard_error(weight, own_part),
         own - least,
         _standard_error(weight, own_part - least_part),
-        "",
     )
 
 
