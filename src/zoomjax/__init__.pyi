@@ -51,6 +51,8 @@ from .focal_error import with_focal_sigma as with_focal_sigma
 from .focus import FocusSplineZoom as FocusSplineZoom
 from .framing import Framing as Framing
 from .framing import frame_output as frame_output
+from .held_out import held_out_frames as held_out_frames
+from .held_out import held_out_zoom as held_out_zoom
 from .image_metric import ImageLines as ImageLines
 from .image_metric import in_image as in_image
 from .io.focal_track import FocalTrack as FocalTrack
@@ -72,6 +74,10 @@ from .rivals import TwoRegionZoom as TwoRegionZoom
 from .rivals import barrel_crossover as barrel_crossover
 from .robust import RobustFit as RobustFit
 from .robust import fit_robust as fit_robust
+from .selection import Candidate as Candidate
+from .selection import Selection as Selection
+from .selection import Verdict as Verdict
+from .selection import select_model as select_model
 from .sizes import lens_for_size as lens_for_size
 from .smooth import SmoothZoom as SmoothZoom
 from .vision.detector import AbstractDetector as AbstractDetector

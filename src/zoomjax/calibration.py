@@ -27,9 +27,11 @@ from .compression import compress
 from .design import Suggestion, suggest_next
 from .fit import RESULTS, FrameFits, ZoomFit, fit_frames, fit_zoom, frame_rms
 from .focal_error import with_focal_sigma
+from .held_out import held_out_frames, held_out_zoom
 from .lines import Lines
 from .plot import plot_model
 from .robust import fit_robust
+from .selection import Selection, default_candidates, select_model
 from .zoom import PolynomialZoom
 
 
@@ -45,6 +47,9 @@ class Calibration:
         rejected: which lines count nothing, being not straight in the scene.
         next: the photo that would help most.
         focal_sigma: standard deviation of each frame's focal length, which the bands allow for; 0: exact.
+        held_out: each frame's RMS, px, under the zoom model of all others; NaN where these do not make one.
+        each_held_out: each frame's RMS, px, each tenth of its lines under the model of its others.
+        selection: how the model was chosen, if it was.
     """
 
     lines: Lines
@@ -55,6 +60,9 @@ class Calibration:
     rejected: np.ndarray
     next: Suggestion
     focal_sigma: np.ndarray
+    held_out: np.ndarray
+    each_held_out: np.ndarray
+    selection: Selection | None = None
 
     def corner(self) -> list[tuple[float, float, float]]:
         """Focal lengths at both ends of the range and in its middle, and what becomes of a corner there.
@@ -81,6 +89,10 @@ class Calibration:
             ("zoom polynomial (algebraic)", self.algebraic),
             ("zoom polynomial", np.asarray(self.zoom.frame_rms)),
         ]
+
+    def held_out_rows(self) -> dict[str, np.ndarray]:
+        """Of some of the `rows`, each frame's RMS, px, of lines that were not fitted."""
+        return {"frame by frame": self.each_held_out, "zoom polynomial": self.held_out}
 
     def warnings(self, names: Sequence[str] | None = None) -> list[str]:
         """What a user must hear of: sentences about the zoom model, and about frames that have none.
@@ -114,12 +126,16 @@ class Calibration:
             "rms_none": self.none.tolist(),
             "rms_frames": np.asarray(self.each.frame_rms).tolist(),
             "rms_zoom": np.asarray(self.zoom.frame_rms).tolist(),
+            "rms_held_out": _finite(self.held_out),
+            "rms_frames_held_out": _finite(self.each_held_out),
         }
         return {
             "rms_none": rms_over_frames(self.none),
             "rms_algebraic": rms_over_frames(self.algebraic),
             "rms_frames": float(self.each.rms),
             "rms_zoom": float(self.zoom.rms),
+            "rms_held_out": _finite([rms_over_frames(self.held_out)])[0],
+            "rms_frames_held_out": _finite([rms_over_frames(self.each_held_out)])[0],
             "frames": len(self.none),
             "lines": len(frame),
             "rejected_lines": int(self.rejected.sum()),
@@ -150,7 +166,7 @@ class Calibration:
             "versions": {
                 name: importlib.metadata.version(name) for name in ("zoomjax", "jax", "optimistix")
             },
-        }
+        } | ({"selection": self.selection.summary()} if self.selection else {})
 
     def pixel_polynomials(self) -> np.ndarray:
         """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as the paper prints them."""
@@ -186,6 +202,7 @@ def calibrate(
     terms: int = 2,
     robust: bool = False,
     focal_sigma: float | Float[np.ndarray, "frame"] = 0.0,
+    select: bool = False,
     stage: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
     """Fit the zoom polynomial and what it is compared with.
@@ -197,8 +214,12 @@ def calibrate(
         robust: whether to reject lines that are not straight in the scene; all figures are then those of
             the others.
         focal_sigma: standard deviation of the focal lengths: a number, or one a frame; 0 where exact.
+        select: whether to choose degree and terms by `select_model`, among the polynomials. Lines are then
+            rejected under the quadratic.
         stage: called with a sentence before each step that takes time.
     """
+    if select:
+        degree, terms = min(2, np.unique(np.asarray(lines.focal)).size - 1), 2
     model = PolynomialZoom(degree=degree)
     model.prepare(lines.focal, terms)  # complain of too few focal lengths before any work
     stage("Compressing the lines")
@@ -206,27 +227,39 @@ def calibrate(
     data = jax.tree.map(
         lambda a: jnp.asarray(a, widest) if jnp.issubdtype(a.dtype, jnp.floating) else a, lines
     )
-    small = compress(data, terms)
+    choices = [c for c in default_candidates() if isinstance(c.zoom, PolynomialZoom)] if select else []
+    small = compress(data, max([terms, *(choice.terms for choice in choices)]))
     rejected = np.zeros(len(lines.frame), bool)
     if robust:
         stage("Rejecting lines that are not straight")
         weight = fit_robust(small, zoom=model, terms=terms, throw=False).weight
         small, lines = small.weighted(weight), lines.weighted(weight)
         rejected = np.asarray(weight) == 0
+    selection = None
+    if choices:
+        stage("Choosing the model")
+        selection = select_model(small, choices)
+        model, terms = selection.chosen.zoom, selection.chosen.terms
+        assert isinstance(model, PolynomialZoom)
     stage("Fitting each frame by itself")
     each = fit_frames(small, terms=terms, throw=False)
     stage("Fitting the zoom polynomial")
-    zoom = fit_zoom(small, zoom=model, terms=terms)
+    zoom = selection.fit if selection else fit_zoom(small, zoom=model, terms=terms)
     sigma = np.broadcast_to(focal_sigma, lines.focal.shape)
+    none = np.asarray(frame_rms(small, None))
+    several = len(none) > 1
     return Calibration(
         lines=lines,
         zoom=with_focal_sigma(zoom, small, focal_sigma=sigma) if sigma.any() else zoom,
         each=each,
-        none=np.asarray(frame_rms(small, None)),
+        none=none,
         algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=model, terms=terms))),
         rejected=rejected,
         next=suggest_next(zoom, small),  # a further photo's worth is counted in noise alone
         focal_sigma=sigma,
+        held_out=held_out_zoom(small, zoom=model, terms=terms) if several else np.full_like(none, np.nan),
+        each_held_out=held_out_frames(small, terms=terms),
+        selection=selection,
     )
 
 
@@ -247,8 +280,9 @@ def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray
 
 
 def rms_over_frames(frame_rms: Float[AnyArray, "frame"]) -> float:
-    """Root of the mean of the frames' errors: eq. 13 from eq. 3."""
-    return float(np.sqrt(np.mean(np.asarray(frame_rms) ** 2)))
+    """Root of the mean of the frames' errors: eq. 13 from eq. 3. NaN frames do not count."""
+    known = np.asarray(frame_rms)[~np.isnan(frame_rms)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ compute in float64. Errors go to stderr with exit status 2, and leave no partial
 
 import contextlib
 import importlib.metadata
+import math
 import os
 import signal
 import sys
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from .calibration import Calibration
     from .lines import Lines
+    from .selection import Selection
     from .vision.focals import Board
     from .vision.image_calibration import ImageCalibration, ImageJob
 
@@ -132,6 +134,9 @@ def calibrate(
     ],
     degree: Degree = 2,
     terms: Terms = 2,
+    select: Annotated[
+        bool, typer.Option("--select", help="Choose degree and terms: see what lines left out prefer.")
+    ] = False,
     detector: Annotated[
         str, typer.Option(help="What to look for in images: edges, grid or pitch.")
     ] = "edges",
@@ -180,6 +185,8 @@ def calibrate(
     _set_up_jax()
     from .calibration import results_folder
 
+    if select and (degree, terms) != (2, 2):
+        raise ValueError("--select chooses degree and terms: leave --degree and --terms out.")
     if any(path.lower().endswith((".npz", ".csv")) for path in inputs):
         _refuse_image_options(
             {"--pitch": pitch, "--distance": distance, "--pixel": pixel, "--jobs": jobs}, inputs
@@ -190,7 +197,7 @@ def calibrate(
         with results_folder(output) as folder, _stages() as stage:
             stage("Reading the lines")
             lines = _read([Path(path) for path in inputs], focal, image_size, focal_unit)
-            calibration = _calibrate(lines, degree, terms, focal_sigma, stage, folder)
+            calibration = _calibrate(lines, degree, terms, focal_sigma, stage, folder, select)
         _show(calibration)
         _tell(calibration.warnings())
         _written(output)
@@ -209,6 +216,7 @@ def calibrate(
         board=_board(pitch, distance, pixel),
         degree=degree,
         terms=terms,
+        select=select,
         frames=frames,
         workers=jobs or _cores(),
         cache=cache_folder("detections") if cache else None,
@@ -379,11 +387,14 @@ def _calibrate(
     focal_sigma: str | None,
     stage: Callable[[str], None],
     folder: Path,
+    select: bool,
 ) -> "Calibration":
     from .calibration import calibrate, focal_sigmas
 
     sigma = focal_sigmas(focal_sigma or "0", lines.focal)
-    calibration = calibrate(lines, degree=degree, terms=terms, focal_sigma=sigma, stage=stage)
+    calibration = calibrate(
+        lines, degree=degree, terms=terms, focal_sigma=sigma, select=select, stage=stage
+    )
     stage("Writing the results")
     calibration.write(folder)
     return calibration
@@ -509,6 +520,8 @@ def _show(calibration: "Calibration", magnification: Callable[[float], float] | 
     if magnification:
         table.add_column("mm on the board", justify="right")
     table.add_column("over frame by frame", justify="right", no_wrap=True)
+    table.add_column("px, held out", justify="right", no_wrap=True)
+    held_out = {name: rms_over_frames(frames) for name, frames in calibration.held_out_rows().items()}
     for name, frames in calibration.rows():
         value = rms_over_frames(frames)
         cells = [name, f"{value:.4f}"]
@@ -516,9 +529,12 @@ def _show(calibration: "Calibration", magnification: Callable[[float], float] | 
             scale = [magnification(float(f)) for f in calibration.lines.focal]
             cells.append(f"{rms_over_frames(frames / scale):.4f}")
         cells.append("" if name == "frame by frame" else _excess(value / summary["rms_frames"]))
+        cells.append(f"{held_out[name]:.4f}" if held_out.get(name, math.nan) > 0 else "")
         table.add_row(*cells)
     console.print(table)
     console.print()
+    if calibration.selection:
+        _show_selection(console, calibration.selection)
     for i, column in enumerate(calibration.pixel_polynomials().T, start=1):
         powers = ["", *(f" /f{'' if j == 1 else f'^{j}'}" for j in range(1, len(column)))]
         terms = " ".join(f"{value:+.4e}{power}" for value, power in zip(column, powers, strict=True))
@@ -532,6 +548,21 @@ def _show(calibration: "Calibration", magnification: Callable[[float], float] | 
             highlight=False,
         )
     console.print(calibration.next.sentence, highlight=False)
+
+
+def _show_selection(console: "Console", selection: "Selection") -> None:
+    """Print how the model was chosen."""
+    from rich.table import Table
+
+    from .selection import COLUMNS
+
+    table = Table(title=selection.title, title_justify="left", box=None)
+    for column in COLUMNS:
+        table.add_column(column, justify="left" if column in COLUMNS[::5] else "right")
+    for row in selection.rows():
+        table.add_row(*row)
+    console.print(table, highlight=False)
+    console.print()
 
 
 def _show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()) -> None:

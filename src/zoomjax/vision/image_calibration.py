@@ -38,6 +38,7 @@ class ImageJob:
         board: for ``focal="board"``.
         degree: of the polynomials in 1/f.
         terms: number of distortion coefficients.
+        select: whether to choose degree and terms.
         frames: of a video, at most.
         workers: number of processes.
         cache: folder for what was detected; None: no cache.
@@ -51,6 +52,7 @@ class ImageJob:
     board: Board | None = None
     degree: int = 2
     terms: int = 2
+    select: bool = False
     frames: int = 60
     workers: int = 1
     cache: Path | None = None
@@ -247,7 +249,13 @@ def calibrate_images(
         lines = lines_of(used, np.array([focals.focal[d.name] for d in used]), focals.unit)
         sigma = np.array([focals.deviation.get(d.name, 0.0) for d in used])
         calibration = calibrate(
-            lines, degree=job.degree, terms=job.terms, robust=True, focal_sigma=sigma, stage=stage
+            lines,
+            degree=job.degree,
+            terms=job.terms,
+            robust=True,
+            focal_sigma=sigma,
+            select=job.select,
+            stage=stage,
         )
         done = ImageCalibration(job, calibration, used, focals, unused)
         hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}
