@@ -193,13 +193,16 @@ def _frames(calibration: Calibration, images: "ImageCalibration | None") -> list
     for number in shown.tolist():
         frame, rejected = summary[number], calibration.rejected[members[number]]
         counted = f"{frame['lines']:,}" + (f" ({rejected.sum()} rejected)" if rejected.any() else "")
-        values = (f"{frame[key]:.3f}" for key in ("rms_none", "rms_frames", "rms_zoom"))
+        values = (f"{frame[key]:.3f}" for key in ("rms_zoom", "rms_frames", "rms_none"))
         name = _frame_name(number, images)
         rows.append(
-            (name, f"{frame['focal']:.4g}", counted, *values, _worst_lines(calibration, members[number]))
+            (name, f"{frame['focal']:.4g}", *values, counted, _worst_lines(calibration, members[number]))
         )
-    head = ["frame", f"f, {lines.focal_unit}", "lines", "uncorrected", "by itself", "zoom polynomial"]
-    told = "RMS distances, px. The worst lines are given with their row in lines.npz and a place, px."
+    head = ["frame", f"f, {lines.focal_unit}", "polynomial", "by itself", "uncorrected", "lines"]
+    told = (
+        "RMS distances, px, as corrected by the zoom polynomial, by the frame's own model, and not at all. "
+        "The worst lines are given with their row in lines.npz and a place, px."
+    )
     if len(shown) < len(summary):
         told += f" Of {len(summary):,} frames, these are the {len(shown)} that the polynomial fits worst."
     if images:
@@ -370,5 +373,7 @@ th:first-child { text-align: left; font-weight: 500; }
 #frames td span { display: block; }
 .rejected { color: var(--soft); }
 .rejected b { color: var(--model); font-weight: 600; }
+@media (max-width: 32rem) { th, td { padding: 0.4rem 0.6rem; } }
+sub, sup { line-height: 0; }
 @media print { body { background: none; } .box { overflow: visible; } }
 """
