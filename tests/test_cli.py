@@ -4,6 +4,7 @@ import contextlib
 import importlib.metadata
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -53,7 +54,8 @@ def test_help_does_not_wait_for_jax():
 
 def test_calibrate_writes_all_results(calibrated, few_lines):
     out, done = calibrated
-    assert sorted(p.name for p in out.iterdir()) == ["lens.json", "lines.npz", "model.png", "summary.json"]
+    expected = ["lens.json", "lines.npz", "model.png", "report.html", "summary.json"]
+    assert sorted(p.name for p in out.iterdir()) == expected
     summary = json.loads((out / "summary.json").read_text())
     assert summary["frames"] == 5
     assert summary["lines"] == len(few_lines.frame)
@@ -114,6 +116,9 @@ def test_calibrate_takes_photographs(tmp_path, monkeypatch):
     first = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert first["focal_range"] == pytest.approx([20.56, 127.36])
     assert len(list((tmp_path / "out" / "lines").iterdir())) == first["frames"] == 4
+    pictures = re.findall(r'href="(lines/[^"]+)"', (tmp_path / "out" / "report.html").read_text())
+    assert len(pictures) == 4
+    assert all((tmp_path / "out" / picture).is_file() for picture in pictures)
     cached = {p: p.stat().st_mtime_ns for p in (tmp_path / "cache" / "detections").iterdir()}
     assert len(cached) == 4
     again = zoomjax("calibrate", "shots/*.jpg", "-o", "again", cwd=tmp_path)

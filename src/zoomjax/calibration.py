@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from .bands import displacement_std
 from .certificate import Certificate
 from .compression import compress
 from .design import Suggestion, suggest_next
+from .energy import coefficients_by, line_rms
 from .fit import RESULTS, FrameFits, ZoomFit, fit_frames, fit_zoom, frame_rms
 from .focal_error import with_focal_sigma
 from .held_out import held_out_frames, held_out_zoom
@@ -45,6 +46,7 @@ class Calibration:
         each: every frame by itself.
         none, algebraic: each frame's RMS, px, without correction and with the algebraic estimate.
         rejected: which lines count nothing, being not straight in the scene.
+        line_rms: of each line as the zoom model corrects it, px; of rejected ones, too.
         next: the photo that would help most.
         focal_sigma: standard deviation of each frame's focal length, which the bands allow for; 0: exact.
         held_out: each frame's RMS, px, under the zoom model of all others; NaN where these do not make one.
@@ -58,6 +60,7 @@ class Calibration:
     none: np.ndarray
     algebraic: np.ndarray
     rejected: np.ndarray
+    line_rms: np.ndarray
     next: Suggestion
     focal_sigma: np.ndarray
     held_out: np.ndarray
@@ -175,12 +178,18 @@ class Calibration:
         normalised = np.asarray(model.in_inverse_focal())
         return normalised / self.zoom.lens.scale ** (2 * np.arange(1, normalised.shape[1] + 1))
 
-    def write(self, folder: str | os.PathLike[str], about: dict[str, Any] | None = None) -> None:
+    def write(
+        self,
+        folder: str | os.PathLike[str],
+        about: dict[str, Any] | None = None,
+        pages: Mapping[str, str] | None = None,
+    ) -> None:
         """Write lens.json, lines.npz, summary.json and model.png, each whole, once all have been made.
 
         Args:
             folder: where to.
             about: what summary.json says besides.
+            pages: further files' texts, by their names.
 
         Raises:
             OSError: the folder cannot be written.
@@ -191,6 +200,8 @@ class Calibration:
             self.lines.save(part / "lines.npz")
             (part / "summary.json").write_text(json.dumps(self.summary() | (about or {}), indent=2) + "\n")
             plot_model(self.zoom, self.each, self.lines).savefig(part / "model.png", dpi=150)
+            for name, text in (pages or {}).items():
+                (part / name).write_text(text, encoding="utf-8")
             for file in sorted(part.iterdir()):
                 file.replace(Path(folder) / file.name)
 
@@ -255,6 +266,7 @@ def calibrate(
         none=none,
         algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=model, terms=terms))),
         rejected=rejected,
+        line_rms=np.asarray(line_rms(small, coefficients_by(zoom.lens.zoom, small))),
         next=suggest_next(zoom, small),  # a further photo's worth is counted in noise alone
         focal_sigma=sigma,
         held_out=held_out_zoom(small, zoom=model, terms=terms) if several else np.full_like(none, np.nan),

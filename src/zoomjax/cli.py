@@ -180,7 +180,8 @@ def calibrate(
 ) -> None:
     """Calibrate a zoom lens from images of straight things, or from lines.
 
-    Writes lens.json, summary.json, model.png and lines.npz; and lines/, what was found in each image.
+    Writes lens.json, summary.json, report.html, model.png and lines.npz; and lines/, what was found in
+    each image.
     """
     _set_up_jax()
     from .calibration import results_folder
@@ -390,17 +391,19 @@ def _calibrate(
     select: bool,
 ) -> "Calibration":
     from .calibration import calibrate, focal_sigmas
+    from .report import report
 
     sigma = focal_sigmas(focal_sigma or "0", lines.focal)
     calibration = calibrate(
         lines, degree=degree, terms=terms, focal_sigma=sigma, select=select, stage=stage
     )
     stage("Writing the results")
-    calibration.write(folder)
+    calibration.write(folder, pages={"report.html": report(calibration)})
     return calibration
 
 
 def _calibrate_images(job: "ImageJob", folder: Path) -> "ImageCalibration":
+    from .report import report
     from .vision.image_calibration import calibrate_images
 
     with contextlib.ExitStack() as shown:
@@ -416,7 +419,7 @@ def _calibrate_images(job: "ImageJob", folder: Path) -> "ImageCalibration":
         current: Callable[[str], None] | None = None
         done = calibrate_images(job, progress=progress, stage=stage)
         stage("Drawing the lines and writing the results")
-        done.write(folder)
+        done.write(folder, pages={"report.html": report(done.calibration, done)})
     return done
 
 
@@ -594,7 +597,7 @@ def _tell(warnings: Sequence[str]) -> None:
 
 
 def _written(folder: Path, also: Sequence[str] = ()) -> None:
-    files = ["lens.json", "lines.npz", "summary.json", "model.png", *also]
+    files = ["report.html", "lens.json", "lines.npz", "summary.json", "model.png", *also]
     print(f"\nWritten to {folder}: {', '.join(files)}")
 
 

@@ -133,6 +133,13 @@ def energy_by_frame(lines: AbstractLines, weighted: Float[Array, "line rows"]) -
 
 
 @eqx.filter_jit
+def line_rms(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "line"]:
+    """Root of the mean squared distance of each line's corrected points to it, px, whatever its weight."""
+    distances = jax.vmap(line_residuals)(lines.corrected(coefficients[lines.frame]))
+    return jnp.sqrt(jnp.sum(distances**2, axis=1) / jnp.maximum(lines.counts, 1))
+
+
+@eqx.filter_jit
 def global_energy(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, ""]:
     """The global energy, px^2: the mean of the frames' errors (eq. 13)."""
     return jnp.sum(residuals(lines, coefficients) ** 2)

@@ -8,15 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
-from .bands import coefficient_std
+from .bands import coefficient_std, displacement_std
 from .centre import FrameCentres
 from .fit import FrameFits, ZoomFit
 from .lens import ZoomLens
 from .lines import AbstractLines, Lines
 
 _MODEL, _FRAMES = "#c2410c", "#1e3a5f"
+_DEPTHS = LinearSegmentedColormap.from_list("zoomjax", ["#ffffff", "#7da3c8"])
+_EXAGGERATIONS = np.outer(10.0 ** np.arange(7), (1, 2, 5)).ravel()
+_VISIBLE = 0.03  # of the image's longer side: how far the drawn grid is bent at least
+_STEP = 7  # from one arrow to the next, in points at which the field is known
+_ROUNDING = 1e-6  # of half the diagonal: smaller displacements are none
 
 
 def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
@@ -167,6 +175,139 @@ def plot_centres(centres: FrameCentres, lines: AbstractLines) -> Figure:
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
     return figure
+
+
+def plot_distortion(
+    lens: ZoomLens | ZoomFit, *, focal: float | Sequence[float], exaggeration: float | None = None
+) -> Figure:
+    """How a lens bends a straight grid, and how far each pixel is from where it belongs.
+
+    A row is a focal length. On the left is a straight grid, and over it the same grid as the lens shows
+    it. On the right is the distance of each pixel to its corrected point, with arrows towards it, and for
+    a fit contours of its standard deviation. Beyond a fold, where there is no corrected point, lines of
+    the grid end, and the right is hatched.
+
+    Args:
+        lens: a lens, or a fit.
+        focal: one focal length or several, in the lens's unit.
+        exaggeration: how many times farther from the straight grid the bent one is drawn than it is; by
+            default the first of 1, 2, 5, 10, ... that makes it visible.
+    """
+    fit, lens = (lens, lens.lens) if isinstance(lens, ZoomFit) else (None, lens)
+    focals = np.atleast_1d(np.asarray(focal, float)).tolist()
+    width, height = lens.image_size
+    figure = Figure(figsize=(9.6, len(focals) * (1.2 + 4 * height / width)), layout="constrained")
+    for f, (left, right) in zip(focals, figure.subplots(len(focals), 2, squeeze=False), strict=True):
+        _draw_grid(left, lens, f, exaggeration)
+        _draw_field(figure, right, lens, fit, f)
+        for axes in (left, right):
+            axes.set_aspect("equal")
+            axes.invert_yaxis()
+            axes.set_xlabel("$x$  (px)", fontsize=8)
+            axes.set_ylabel("$y$  (px)", fontsize=8)
+            axes.tick_params(labelsize=8)
+            axes.locator_params(nbins=5)
+    return figure
+
+
+def _draw_grid(axes: Axes, lens: ZoomLens, focal: float, exaggeration: float | None) -> None:
+    """A straight grid in grey, and how the lens shows it."""
+    width, height = lens.image_size
+    cells = np.maximum(2, np.round(12 * np.array([width, height]) / max(width, height)).astype(int))
+    x, y = (np.linspace(0, side - 1, 8 * n + 1) for side, n in zip((width, height), cells, strict=True))
+    straight = [np.stack(np.broadcast_arrays(at, y), -1) for at in x[::8]]
+    straight += [np.stack(np.broadcast_arrays(x, at), -1) for at in y[::8]]
+    points = np.concatenate(straight)
+    off = np.asarray(lens(focal).distort(points)) - points
+    farthest = np.max(np.nan_to_num(_lengths(off)))
+    if exaggeration is None:
+        enough = _EXAGGERATIONS[_EXAGGERATIONS * farthest >= _VISIBLE * max(width, height)]
+        exaggeration = float(enough[0]) if len(enough) else 1.0
+    bent = np.split(points + exaggeration * off, np.cumsum([len(line) for line in straight])[:-1])
+    for line, seen in zip(straight, bent, strict=True):
+        axes.plot(*line.T, color="0.75", linewidth=0.8, zorder=1)
+        axes.plot(*seen.T, color=_MODEL, linewidth=1.1, zorder=2)
+    axes.set_title(f"$f$ = {focal:.4g} {lens.focal_unit}: a straight grid as the lens shows it", fontsize=9)
+    more = "" if exaggeration == 1 else f", distortion × {exaggeration:g}"
+    _explain(
+        axes,
+        Line2D([], [], color="0.75", label="straight"),
+        Line2D([], [], color=_MODEL, label=f"as the lens shows it{more}"),
+    )
+    axes.spines[:].set_visible(False)
+
+
+def _draw_field(figure: Figure, axes: Axes, lens: ZoomLens, fit: ZoomFit | None, focal: float) -> None:
+    """How far pixels are from their corrected points, in which direction, and how certain that is."""
+    points = _raster(lens)
+    moved = np.asarray(lens(focal).undistort(points)) - points
+    distance = np.ma.masked_invalid(_lengths(moved))
+    distance[distance < _ROUNDING * lens.scale] = 0
+    levels = MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]).tick_values(0, float(distance.filled(0).max()) or 1)
+    axes.patch.set(hatch="////", edgecolor="0.75")  # what shows beyond a fold
+    filled = axes.contourf(*np.moveaxis(points, -1, 0), distance, levels, cmap=_DEPTHS)
+    bar = figure.colorbar(filled, ax=axes, shrink=0.8)
+    bar.set_label("displacement  (px)", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    some = np.s_[_STEP // 2 :: _STEP, _STEP // 2 :: _STEP]
+    at, arrows = points[some], np.ma.masked_invalid(moved[some])
+    longest = float(distance[some].filled(0).max())
+    if longest > 0:
+        scale = longest / (at[0, 1, 0] - at[0, 0, 0])  # the longest reaches to the next
+        axes.quiver(
+            *np.moveaxis(at, -1, 0),
+            *np.moveaxis(arrows, -1, 0),
+            color=_FRAMES,
+            angles="xy",
+            scale_units="xy",
+            scale=scale,
+            width=0.004,
+        )
+    fold = " (hatched: folded over)" if distance.mask.any() else ""
+    axes.set_title(
+        f"$f$ = {focal:.4g} {lens.focal_unit}: from pixels to where they belong{fold}", fontsize=9
+    )
+    if fit is not None:
+        std = np.asarray(displacement_std(fit, points, focal=focal))
+        _draw_std(axes, points, np.ma.masked_where(distance.mask | ~np.isfinite(std), std))
+    axes.set(xlim=(0, lens.image_size[0] - 1), ylim=(0, lens.image_size[1] - 1))
+
+
+def _draw_std(axes: Axes, points: np.ndarray, std: np.ma.MaskedArray) -> None:
+    """Contours of the standard deviation, each with its px."""
+    largest = float(std.filled(0).max())
+    if largest == 0:
+        _explain(axes, Line2D([], [], linestyle="", label="The lines do not determine its uncertainty."))
+        return
+    levels = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(0, largest)[1:-1]
+    drawn = axes.contour(
+        *np.moveaxis(points, -1, 0), std, levels, colors=_MODEL, linestyles="--", linewidths=1.1
+    )
+    axes.clabel(drawn, fmt="%g", fontsize=7)
+    _explain(axes, Line2D([], [], color=_MODEL, linestyle="--", label="standard deviation  (px)"))
+
+
+def _explain(axes: Axes, *handles: Line2D) -> None:
+    """A legend below the axes."""
+    axes.legend(
+        handles=handles,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.17),
+        ncols=len(handles),
+        frameon=False,
+        fontsize=8,
+    )
+
+
+def _raster(lens: ZoomLens) -> np.ndarray:
+    """Evenly spaced points over the image: (row, column, 2) px."""
+    number = [max(2, round(14 * side / max(lens.image_size))) * _STEP for side in lens.image_size]
+    sides = (np.linspace(0, side - 1, n) for side, n in zip(lens.image_size, number, strict=True))
+    return np.stack(np.meshgrid(*sides), axis=-1)
+
+
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    return np.hypot(vectors[..., 0], vectors[..., 1])
 
 
 def _shade(axes: Axes, x: np.ndarray, middle: np.ndarray | float, std: np.ndarray) -> None:

@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -156,7 +156,23 @@ class ImageCalibration:
             )
         return told + self.calibration.warnings([detection.name for detection in self.used])
 
-    def write(self, folder: str | os.PathLike[str], progress: Progress = lambda done, total: None) -> None:
+    def overlays(self) -> list[str]:
+        """For each used image the picture of its lines, relative to ``lines/``, with slashes."""
+        paths = [Path(detection.name) for detection in self.used]
+        stems = Counter(path.with_suffix("") for path in paths)
+        return [  # a.jpg beside a.png are two pictures
+            (
+                path.with_suffix(".jpg") if stems[path.with_suffix("")] == 1 else Path(f"{path}.jpg")
+            ).as_posix()
+            for path in paths
+        ]
+
+    def write(
+        self,
+        folder: str | os.PathLike[str],
+        progress: Progress = lambda done, total: None,
+        pages: Mapping[str, str] | None = None,
+    ) -> None:
         """Write what `Calibration.write` does, and the lines drawn over each image, in ``lines/``.
 
         What an earlier calibration drew there is removed.
@@ -166,23 +182,22 @@ class ImageCalibration:
             made = self._draw(Path(part), progress)
             if (Path(folder) / "summary.json").exists():
                 shutil.rmtree(lines, ignore_errors=True)
-            self.calibration.write(folder, about=self.about())
+            self.calibration.write(folder, about=self.about(), pages=pages)
             for file in made:
                 target = lines / file.relative_to(part)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 file.replace(target)
 
     def _draw(self, folder: Path, progress: Progress) -> list[Path]:
-        used = {d.name: (d, r) for d, r in zip(self.used, self.rejected(), strict=True)}
-        stems = Counter(Path(name).with_suffix("") for name in used)
+        used = {
+            detection.name: (detection, rejected, folder / target)
+            for detection, rejected, target in zip(self.used, self.rejected(), self.overlays(), strict=True)
+        }
         made: list[Path] = []
 
         def draw(source: Source) -> Path:
-            detection, rejected = used[source.name]
+            detection, rejected, target = used[source.name]
             picture = draw_lines(source.read()[0], detection.lines, rejected.tolist())
-            name = Path(source.name)
-            alone = stems[name.with_suffix("")] == 1  # a.jpg beside a.png are two pictures
-            target = folder / (name.with_suffix(".jpg") if alone else f"{name}.jpg")
             target.parent.mkdir(parents=True, exist_ok=True)
             done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
             assert done
