@@ -96,8 +96,8 @@ class FamilyLines(AbstractLines):
             if traced((self.centre, centre)) or np.allclose(self.centre, centre, rtol=0, atol=1e-3):
                 return self
             raise ValueError(
+                "Lines compressed with all monomials serve one centre if their family is not radial, and "
                 "another is asked for. Compress the lines about that, or pass the lines themselves."
-                "another is asked for. Compress the lines about that one, or pass the lines themselves."
             )
         return _wrapped(self._weighted().about(centre), self.family)
 
