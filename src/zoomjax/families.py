@@ -64,8 +64,8 @@ class AbstractFamily(eqx.Module):
 
     @abc.abstractmethod
     def correct(
-        self, z: Float[Array, "2"], squared: Float[Array, ""], k: Coefficients
-    ) -> Float[Array, "2"]:
+        self, z: Float[AnyArray, "*batch 2"], squared: Float[AnyArray, "*batch"], k: Coefficients
+    ) -> Float[AnyArray, "*batch 2"]:
         """The corrected point, by formula, also beyond the limit; `squared` is z.z.
 
         Of NumPy arrays (..., 2) it is that of each point.
@@ -133,8 +133,8 @@ class AbstractRadial(AbstractFamily):
         return 2 * _order(size)
 
     def correct(
-        self, z: Float[Array, "2"], squared: Float[Array, ""], k: Coefficients
-    ) -> Float[Array, "2"]:
+        self, z: Float[AnyArray, "*batch 2"], squared: Float[AnyArray, "*batch"], k: Coefficients
+    ) -> Float[AnyArray, "*batch 2"]:
         """``z L(t)``."""
         return z * self.factor(squared, k)[..., None]
 
@@ -317,8 +317,8 @@ class BrownConrady(AbstractFamily):
         return np.append(2 * _order(size - 2), [1, 1])
 
     def correct(
-        self, z: Float[Array, "2"], squared: Float[Array, ""], k: Coefficients
-    ) -> Float[Array, "2"]:
+        self, z: Float[AnyArray, "*batch 2"], squared: Float[AnyArray, "*batch"], k: Coefficients
+    ) -> Float[AnyArray, "*batch 2"]:
         """``z L(t) + t q + 2 (q.z) z``."""
         q = k[:-3:-1]
         return z * (radial_factor(squared, k[:-2]) + 2 * (z @ q))[..., None] + squared[..., None] * q

@@ -97,8 +97,8 @@ class FamilyLines(AbstractLines):
             if traced((self.centre, centre)) or np.allclose(self.centre, centre, rtol=0, atol=1e-3):
                 return self
             raise ValueError(
-                "The compressed lines of a family that is not radial have one centre of distortion, and "
-                "another is asked for. Compress the lines about that one, or pass the lines themselves."
+                "Lines compressed with all monomials serve one centre if their family is not radial, and "
+                "another is asked for. Compress the lines about that, or pass the lines themselves."
             )
         return _wrapped(self._weighted().about(centre), self.family)
 

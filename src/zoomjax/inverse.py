@@ -138,7 +138,7 @@ def _fold(family: AbstractRadial, k: np.ndarray) -> float:
 def _first_radius(family: AbstractRadial, k: np.ndarray, rho: float) -> float:
     """A distorted radius just large enough to be corrected to `rho`, or that of the fold before it."""
     limit, end = _fold(family, k), rho
-    while end < limit and _corrected(family, end, k) < rho:
+    while end < limit and _corrected(family, np.array([end]), k)[0] < rho:
         end *= 2
     r = np.linspace(0, min(end, limit), 1025)
     return float(r[min(np.searchsorted(_corrected(family, r, k), rho), 1024)])

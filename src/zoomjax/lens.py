@@ -308,8 +308,8 @@ def _read_zoom(content, numbers: int | None) -> AbstractZoom:
             raise ValueError(f"its {name}knots do not increase")
         if curvature is not None and curvature.shape != (knots.size, knots.size):
             raise ValueError(f"its {name}curvature is not that of its {name}knots")
-    knots = [fields[name].size for name in ("knots", "focus_knots") if name in fields]
-    if knots and math.prod(knots) != rows:
+    numbers_of_knots = [fields[name].size for name in ("knots", "focus_knots") if name in fields]
+    if numbers_of_knots and math.prod(numbers_of_knots) != rows:
         raise ValueError("its knots are not as many as its parameters")
     zoom = model(**fields)
     if jax.eval_shape(zoom, *[jnp.ones(())] * _settings(zoom)).shape != (numbers or columns,):
