@@ -242,7 +242,7 @@ def test_crooked_lines_are_rejected(fitted):
     lens, lines, _, terms, _ = fitted
     points = lines.to_ragged()
     middle = points[7][:, :1] * 0 + np.linspace(-1, 1, len(points[7]))[:, None] ** 2
-    points[7] = points[7] + 12 * middle
+    points[7] = points[7] + middle * np.array([12.0, 0.0])  # upright, in the middle
     crooked = zj.Lines.from_ragged(
         points, np.asarray(lines.frame), np.asarray(lines.focal), image_size=SIZE
     )
