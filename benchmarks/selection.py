@@ -135,8 +135,8 @@ def markdown(results: dict) -> str:
     lines = [
         "# Choosing the model",
         "",
-        f"`python benchmarks/selection.py --draws {draws}`. {machine_line(results['machine'])} Other work "
-        f"may run beside it (load average {results['load']:.0f}): processor time is what this took.",
+        f"`python benchmarks/selection.py --draws {draws}`. {machine_line(results['machine'])} Load average "
+        f"{results['load']:.0f}, so that the clock also counts other work; the processor time does not.",
         "",
         f"The paper's scene, 50 frames, {t['lines']:,} lines; {speed:.0f} fits a second of processor time.",
         "",

@@ -51,7 +51,7 @@ class Candidate:
 
     @property
     def name(self) -> str:
-        """What it is called in a table: "degree 2, 2 terms" of a polynomial in 1/f, others with their kind."""
+        """What it is called: "degree 2, 2 terms" if it is a polynomial in 1/f; others with their kind."""
         settings = [
             f"{field.name} {value}"
             for field in dataclasses.fields(self.zoom)
