@@ -136,15 +136,16 @@ def markdown(results: dict) -> str:
         "# Choosing the model",
         "",
         f"`python benchmarks/selection.py --draws {draws}`. {machine_line(results['machine'])} "
-        f"Load average {results['load']:.0f}, of other work on the same cores: the clock counts it, the processor time not.",
+        f"Load average {results['load']:.0f}, mostly of other work, which the clock counts and the processor "
+        "time does not.",
         "",
         f"The paper's scene, 50 frames, {t['lines']:,} lines; {speed:.0f} fits a second of processor time.",
         "",
         *table(["", "clock", "processor"], rows),
         "",
         f"Scenes of 10 focal lengths at {SIZE[0]} x {SIZE[1]} px, noise 0.2 px, {draws} draws. How often "
-        "the truth (2 terms) is chosen by the one-standard-error rule, and is the best; the held-out RMS of "
-        "the chosen over that of degree 2 with 2 terms, in the mean.",
+        "the truth (2 terms) is chosen by the one-standard-error rule, and is the best; the held-out RMS "
+        "of the chosen over that of degree 2 with 2 terms, in the mean.",
         "",
         *table(["truth, held out", "chosen", "best", "over degree 2", "all that were chosen"], found),
         "",
