@@ -46,7 +46,7 @@ def times() -> dict:
     lines = synthetic.board_lines(synthetic.nikkor_18_200(), synthetic.focal_sweep(), spacing=40, noise=0.5)
     small = zj.compress(lines, terms=3)
     parts = folds_of(small, "frame", None, 0)
-    runs = [seconds(lambda: compare(small, CANDIDATES, parts)) for _ in range(4)]
+    runs = [seconds(lambda: compare(small, CANDIDATES, parts)) for _ in range(3)]
     return {
         "lines": len(small.frame),
         "fits": len(CANDIDATES) * (parts.number + 1),
@@ -136,8 +136,8 @@ def markdown(results: dict) -> str:
         "# Choosing the model",
         "",
         f"`python benchmarks/selection.py --draws {draws}`. {machine_line(results['machine'])} "
-        f"Load average {results['load']:.0f}, mostly of other work, which the clock counts and the processor "
-        "time does not.",
+        f"Load average {results['load']:.0f}, mostly of other work, which the clock counts and the "
+        "processor time does not.",
         "",
         f"The paper's scene, 50 frames, {t['lines']:,} lines; {speed:.0f} fits a second of processor time.",
         "",
