@@ -41,6 +41,19 @@ def test_summary_is_json_and_agrees_with_the_fits(calibration):
     assert summary["certificate"]["certified"] is True
     assert summary["rms_none"] == pytest.approx(rms_over_frames(zj.frame_rms(calibration.lines, None)))
     assert [row["frame"] for row in summary["per_frame"]] == list(range(5))
+    assert summary["rms_zoom"] < summary["rms_held_out"] < 1.1 * summary["rms_zoom"]
+    assert summary["rms_frames"] < summary["rms_frames_held_out"]
+    held_out = [row["rms_held_out"] for row in summary["per_frame"]]
+    assert rms_over_frames(held_out) == summary["rms_held_out"]
+    assert "selection" not in summary
+
+
+def test_the_model_can_be_chosen(calibration):
+    chosen = calibrate(calibration.lines, select=True)
+    summary = json.loads(json.dumps(chosen.summary(), allow_nan=False))
+    assert summary["selection"]["chosen"] == "degree 2, 2 terms"
+    assert len(summary["selection"]["candidates"]) == 12
+    assert summary["rms_zoom"] == pytest.approx(float(calibration.zoom.rms), rel=1e-9)
 
 
 def test_lines_that_determine_nothing_are_reported(calibration):
@@ -50,6 +63,7 @@ def test_lines_that_determine_nothing_are_reported(calibration):
     summary = json.loads(json.dumps(calibrate(lines).summary(), allow_nan=False))
     assert "do not determine" in summary["result"]
     assert summary["frames_without_a_model"] == 3
+    assert summary["rms_held_out"] is None  # two focal lengths do not make a quadratic
     assert None in summary["parameter_sigma"]
     assert summary["warnings"][0] == summary["result"]
     assert summary["warnings"][1].startswith(

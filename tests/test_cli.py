@@ -146,6 +146,7 @@ WRONG = {
     "two files": (["lines.npz", "lines.npz"], "one file"),
     "options for another kind": (["lines.npz", "--image-size", "640x480"], "for CSV files"),
     "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),
+    "a model chosen and given": (["lines.npz", "--select", "--degree", "1"], "leave --degree"),
     "csv without image size": (["lines.csv"], "--image-size"),
     "csv with a bad image size": (["lines.csv", "--image-size", "big"], "1920x1080"),
     "csv without focal lengths": (["bare.csv", "--image-size", "640x480"], "frame,focal"),

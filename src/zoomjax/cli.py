@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     from .calibration import Calibration
     from .lines import Lines
-    from .selection import Selection
     from .vision.focals import Board
     from .vision.image_calibration import ImageCalibration, ImageJob
 
@@ -537,7 +536,7 @@ def _show(calibration: "Calibration", magnification: Callable[[float], float] | 
     console.print(table)
     console.print()
     if calibration.selection:
-        _show_selection(console, calibration.selection)
+        print(calibration.selection, end="\n\n")
     for i, column in enumerate(calibration.pixel_polynomials().T, start=1):
         powers = ["", *(f" /f{'' if j == 1 else f'^{j}'}" for j in range(1, len(column)))]
         terms = " ".join(f"{value:+.4e}{power}" for value, power in zip(column, powers, strict=True))
@@ -551,21 +550,6 @@ def _show(calibration: "Calibration", magnification: Callable[[float], float] | 
             highlight=False,
         )
     console.print(calibration.next.sentence, highlight=False)
-
-
-def _show_selection(console: "Console", selection: "Selection") -> None:
-    """Print how the model was chosen."""
-    from rich.table import Table
-
-    from .selection import COLUMNS
-
-    table = Table(title=selection.title, title_justify="left", box=None)
-    for column in COLUMNS:
-        table.add_column(column, justify="left" if column in COLUMNS[::5] else "right")
-    for row in selection.rows():
-        table.add_row(*row)
-    console.print(table, highlight=False)
-    console.print()
 
 
 def _show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()) -> None:

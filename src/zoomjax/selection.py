@@ -20,7 +20,7 @@ import numpy as np
 from ._checks import checked_terms
 from .compression import CompressedLines
 from .fit import ZoomFit, fit_zoom
-from .held_out import HoldOut, Judged, folds_of, judge, shares, small_lines
+from .held_out import Folds, HoldOut, Judged, folds_of, judge, shares, small_lines
 from .lines import AbstractLines
 from .smooth import SmoothZoom
 from .zoom import AbstractZoom, PolynomialZoom, with_parameters
@@ -51,14 +51,14 @@ class Candidate:
 
     @property
     def name(self) -> str:
-        """What it is called in a table: "PolynomialZoom, degree 2, 2 terms"."""
+        """What it is called: "degree 2, 2 terms" if it is a polynomial in 1/f; others with their kind."""
         settings = [
             f"{field.name} {value}"
             for field in dataclasses.fields(self.zoom)
             if field.metadata.get("static") and (value := getattr(self.zoom, field.name)) is not None
         ]
-        parts = [type(self.zoom).__name__, *settings, f"{self.terms} term{'s' * (self.terms > 1)}"]
-        return ", ".join(parts)
+        kind = [] if isinstance(self.zoom, PolynomialZoom) else [type(self.zoom).__name__]
+        return ", ".join([*kind, *settings, f"{self.terms} term{'s' * (self.terms > 1)}"])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,11 +107,10 @@ class Selection:
     folds: int
 
     def rows(self) -> list[tuple[str, str, str, str, str, str]]:
-        """The table: candidate, parameters, in-sample RMS, held-out RMS, difference to the best, mark."""
+        """The table: candidate, parameters, RMS as fitted and held out, difference to the best, mark."""
         return [self._row(verdict) for verdict in self.verdicts]
 
     def _row(self, v: Verdict) -> tuple[str, str, str, str, str, str]:
-        marks = {"chosen": v.candidate is self.chosen, "best": v.candidate is self.best}
         if v.problem:
             return v.candidate.name, "", "", "", "", f"not compared: {v.problem.partition('. ')[0]}"
         return (
@@ -119,8 +118,8 @@ class Selection:
             f"{v.parameters:.1f}".removesuffix(".0"),
             f"{v.rms:.4f}",
             f"{v.held_out:.4f} ± {v.held_out_std:.4f}",
-            "" if v.candidate is self.best else f"{v.difference:+.5f} ± {v.difference_std:.5f}",
-            ", ".join(mark for mark, given in marks.items() if given),
+            "best" if v.candidate is self.best else f"{v.difference:+.5f} ± {v.difference_std:.5f}",
+            "chosen" if v.candidate is self.chosen else "",
         )
 
     def __str__(self) -> str:
@@ -136,9 +135,8 @@ class Selection:
     @property
     def title(self) -> str:
         """What the table shows."""
-        what = {"focal": "focal lengths", "frame": "frames", "line": "lines"}[self.hold_out]
-        ends = ", but the shortest and the longest" if self.hold_out == "focal" else ""
-        return f"RMS distance to straight lines, px; all {what}{ends} left out in {self.folds} parts"
+        what = {"focal": "inner focal lengths", "frame": "frames", "line": "lines"}[self.hold_out]
+        return f"RMS distance to straight lines, px; {what} left out in {self.folds} parts"
 
     def summary(self) -> dict:
         """The figures, as plain numbers and strings that JSON can hold."""
@@ -159,7 +157,7 @@ class Selection:
         }
 
 
-COLUMNS = ("candidate", "parameters", "in sample", "held out", "to the best", "")
+COLUMNS = ("candidate", "parameters", "fitted", "held out", "to the best", "")
 """Heads of `Selection.rows`."""
 
 
@@ -215,7 +213,7 @@ def select_model(
         ...     synthetic.nikkor_18_200(), synthetic.focal_sweep(8), spacing=100, noise=0.2
         ... )
         >>> select_model(compress(scene, terms=2)).chosen.name
-        'PolynomialZoom, degree 2, 2 terms'
+        'degree 2, 2 terms'
     """
     if candidates is None:
         most = min(_TERMS, lines.terms) if isinstance(lines, CompressedLines) else _TERMS
@@ -229,10 +227,7 @@ def select_model(
     if hold_out is None:
         hold_out = "focal" if np.unique(np.asarray(small.focal)).size > 3 else "line"
     parts = folds_of(small, hold_out, folds, seed)
-    errors = [_judged(small, candidate, parts) for candidate in compared]
-    verdicts, best = _compared(small, compared, errors, parts)
-    within = [v for v in verdicts if not v.problem and v.difference <= v.difference_std]
-    chosen = min(within, key=lambda v: (round(v.parameters, 6), v.held_out)).candidate
+    verdicts, best, chosen = compare(small, compared, parts)
     fit = fit_zoom(small, zoom=chosen.zoom, terms=chosen.terms)
     return Selection(chosen, best, fit, verdicts, hold_out, parts.number)
 
@@ -258,8 +253,11 @@ def _judged(lines, candidate, parts):
         return str(error)
 
 
-def _compared(lines, candidates, errors, parts):
-    """The verdicts, and which candidate is the best."""
+def compare(
+    lines: CompressedLines, candidates: Sequence[Candidate], parts: Folds
+) -> tuple[tuple[Verdict, ...], Candidate, Candidate]:
+    """The verdicts, the best candidate and the chosen one; see `select_model`."""
+    errors = [_judged(lines, candidate, parts) for candidate in candidates]
     share = shares(lines)
     counted = (parts.unit >= 0) & (share > 0)
     unit, share = parts.unit[counted], share[counted] / share[counted].sum()
@@ -280,7 +278,9 @@ def _compared(lines, candidates, errors, parts):
         _verdict(candidate, judged, unseen.get(i), unseen[best], weight, by_unit)
         for i, (candidate, judged) in enumerate(zip(candidates, errors, strict=True))
     ]
-    return tuple(verdicts), candidates[best]
+    within = [v for v in verdicts if not v.problem and v.difference <= v.difference_std]
+    chosen = min(within, key=lambda v: (round(v.parameters, 6), v.held_out)).candidate
+    return tuple(verdicts), candidates[best], chosen
 
 
 def _verdict(candidate, judged, unseen, best, weight, by_unit):
