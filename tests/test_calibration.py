@@ -9,7 +9,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import synthetic
-from zoomjax.calibration import calibrate, results_folder, rms_over_frames
+from zoomjax.calibration import calibrate, focal_sigmas, results_folder, rms_over_frames
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "real"))
 
@@ -124,3 +124,22 @@ def test_zoomcam_gives_the_reference_figures(data):
     first, last = by_degree[2].each.coefficients[0], by_degree[2].each.coefficients[-1]
     np.testing.assert_allclose(first, [0.0815, -0.0303], atol=1e-4)
     np.testing.assert_allclose(last, [-0.0491, -0.0057], atol=1e-4)
+
+
+def test_bands_allow_for_uncertain_focal_lengths(calibration):
+    sigma = 0.01 * np.asarray(calibration.lines.focal)
+    allowed = calibrate(calibration.lines, focal_sigma=focal_sigmas("1%", calibration.lines.focal))
+    expected = zj.with_focal_sigma(calibration.zoom, zj.compress(calibration.lines), focal_sigma=sigma)
+    np.testing.assert_allclose(allowed.zoom.covariance, expected.covariance, rtol=1e-6)
+    assert all(a[2] > b[2] for a, b in zip(allowed.corner(), calibration.corner(), strict=True))
+    told = [row["focal_sigma"] for row in allowed.summary()["per_frame"]]
+    np.testing.assert_allclose(told, sigma)
+    assert allowed.next.sentence == calibration.next.sentence
+
+
+def test_deviations_are_numbers_or_per_cent():
+    np.testing.assert_allclose(focal_sigmas("0.3", np.array([20.0, 50.0])), [0.3, 0.3])
+    np.testing.assert_allclose(focal_sigmas(" 2 %", np.array([20.0, 50.0])), [0.4, 1.0])
+    for text in ("", "%", "-1", "nan", "1%%", "inf", "a bit"):
+        with pytest.raises(ValueError, match=r"--focal-sigma must be a number such as 0.3, or 1%"):
+            focal_sigmas(text, np.ones(2))

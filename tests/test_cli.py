@@ -74,6 +74,22 @@ def test_calibrate_gives_the_lens_that_the_library_gives(calibrated, few_lines):
     np.testing.assert_array_equal(zj.load_lines(out / "lines.npz").points, few_lines.points)
 
 
+def test_calibrate_allows_for_uncertain_focal_lengths(calibrated, tmp_path):
+    exact = json.loads((calibrated[0] / "summary.json").read_text())
+    done = zoomjax("calibrate", calibrated[0] / "lines.npz", "-o", tmp_path, "--focal-sigma", "1%")
+    assert done.returncode == 0, done.stderr
+    assert "allows for focal lengths with standard deviations of 1.00% to 1.00%" in done.stdout
+    told = json.loads((tmp_path / "summary.json").read_text())
+    assert [row["focal_sigma"] / row["focal"] for row in told["per_frame"]] == pytest.approx([0.01] * 5)
+    assert told["corner_displacement"][0]["std"] > 2 * exact["corner_displacement"][0]["std"]
+    assert told["parameters"] == pytest.approx(exact["parameters"])
+    refused = zoomjax(
+        "calibrate", calibrated[0] / "lines.npz", "-o", tmp_path / "no", "--focal-sigma", "a bit"
+    )
+    assert refused.returncode == 2
+    assert "--focal-sigma must be a number such as 0.3, or 1%" in refused.stderr
+
+
 def test_calibrate_reads_csv(calibrated, few_lines, tmp_path):
     write_lines_csv(few_lines, tmp_path / "lines.csv")
     done = zoomjax("calibrate", tmp_path / "lines.csv", "--image-size", "4288x2848", "-o", tmp_path)

@@ -43,7 +43,7 @@ def refined(rounded):
 # What errors do to the parameters
 
 
-@pytest.mark.parametrize("zoom", [None, zj.SmoothZoom()])
+@pytest.mark.parametrize("zoom", [None, pytest.param(zj.SmoothZoom(), marks=pytest.mark.slow)])
 def test_response_is_that_of_fits_at_other_focal_lengths(sweep, zoom):
     model = zj.fit_zoom(sweep, zoom=zoom).lens.zoom
     response = eqx.filter_jit(_response)(sweep, model)

@@ -64,3 +64,16 @@ def test_what_is_no_text_is_refused(tmp_path):
 def test_an_absent_file_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nothing\.csv"):
         read_focal_table(tmp_path / "nothing.csv")
+
+
+def test_deviations_may_be_told(tmp_path):
+    read = table(tmp_path, "image,focal,sigma\na.jpg,24,0.3\nb.jpg,70,\nc.jpg,90,0\n")
+    assert [read.sigma(image) for image in ("shots/a.jpg", "b.jpg", "c.jpg", "d.jpg")] == [
+        0.3,
+        None,
+        0,
+        None,
+    ]
+    for sigma in ("-1", "wide", "nan"):
+        with pytest.raises(ValueError, match=r"focal\.csv: sigma in row 2 must be a number of at least 0"):
+            table(tmp_path, f"image,focal,sigma\na.jpg,24,{sigma}\n")

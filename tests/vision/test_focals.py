@@ -26,6 +26,12 @@ def test_exif_data_come_first():
     assert "EXIF" in found.absent
 
 
+def test_deviations_of_a_table_are_read(tmp_path):
+    (tmp_path / "f.csv").write_text("image,focal,sigma\na.jpg,1200,9\nb.jpg,4000,\n")
+    found = choose_focals([of("a.jpg"), of("b.jpg")], str(tmp_path / "f.csv"), unit="px")
+    assert found.deviation == {"a.jpg": 9.0}
+
+
 def test_a_table_is_read(tmp_path):
     (tmp_path / "f.csv").write_text("image,focal\na.jpg,1200\nb.jpg,4000\n")
     found = choose_focals([of("a.jpg", 24.0), of("b.jpg"), of("c.jpg")], str(tmp_path / "f.csv"), unit="px")
