@@ -14,7 +14,7 @@ certificates, files and images go through these methods alone.
 """
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -52,7 +52,7 @@ def _order(terms: int, dtype: Any = int) -> np.ndarray:
 class AbstractFamily(eqx.Module):
     """What coefficients k make of a normalised point z. It has no fields: the coefficients are k alone."""
 
-    formula: eqx.AbstractClassVar[str]
+    formula: ClassVar[str]
 
     @abc.abstractmethod
     def size(self, terms: int) -> int:
@@ -99,7 +99,7 @@ class AbstractFamily(eqx.Module):
     @abc.abstractmethod
     def expansion(
         self, k: Coefficients, reach: Float[Array, ""]
-    ) -> tuple[Float[Array, "power"], Float[Array, "tangential"]]:
+    ) -> tuple[Float[AnyArray, "power"], Float[AnyArray, "tangential"]]:
         """The distortion, up to ``t = reach``, as coefficients of powers of t, and (p1, p2) or none.
 
         Corrected points are linear in these: what compressed lines, and sums over points, can be used for.
@@ -175,7 +175,7 @@ class AbstractRadial(AbstractFamily):
 class RadialPolynomial(AbstractRadial):
     """``L = 1 + k1 t + ... + kN t^N``: the paper's (eq. 1-2)."""
 
-    formula = (
+    formula: ClassVar[str] = (
         "corrected = centre + z * scale * (1 + k1 r^2 + ... + kN r^2N), "
         "z = (distorted - centre) / scale, r^2 = z.z"
     )
@@ -202,7 +202,7 @@ class RadialPolynomial(AbstractRadial):
 
     def expansion(
         self, k: Coefficients, reach: Float[Array, ""]
-    ) -> tuple[Float[Array, "power"], Float[Array, "tangential"]]:
+    ) -> tuple[Float[AnyArray, "power"], Float[AnyArray, "tangential"]]:
         """Itself."""
         del reach
         return k, k[:0]
@@ -226,7 +226,7 @@ class Division(AbstractRadial):
         ([125.0, 0.0], [100.0, 0.0])
     """
 
-    formula = (
+    formula: ClassVar[str] = (
         "corrected = centre + z * scale / (1 + k1 r^2 + ... + kN r^2N), "
         "z = (distorted - centre) / scale, r^2 = z.z"
     )
@@ -260,7 +260,7 @@ class Division(AbstractRadial):
 
     def expansion(
         self, k: Coefficients, reach: Float[Array, ""]
-    ) -> tuple[Float[Array, "power"], Float[Array, "tangential"]]:
+    ) -> tuple[Float[AnyArray, "power"], Float[AnyArray, "tangential"]]:
         """L's Taylor polynomial T, and the interpolation of the rest in Chebyshev's nodes.
 
         The rest is ``(1 - D T)/D`` for the divisor D, and its first powers are known to vanish. It is small
@@ -269,7 +269,7 @@ class Division(AbstractRadial):
         size, terms = k.shape[0], self.expansion_terms(k.shape[0])
         powers = jnp.asarray(reach, k.dtype) ** np.arange(1, terms + 1)
         scaled = k * powers[:size]  # now t is from 0 to 1
-        series = [jnp.ones((), k.dtype)]
+        series: list[Any] = [jnp.ones((), k.dtype)]
         for _ in range(terms):
             series.append(-sum(c * s for c, s in zip(scaled, series[::-1], strict=False)))
         # What 1 - D T is made of: its powers terms + 1, ..., terms + size.
@@ -303,7 +303,7 @@ class BrownConrady(AbstractFamily):
     If, for the certificate, ``(r L)' > 6 |q| R`` up to R, then also ``L = 1/r int (r L)' > 6 |q| R``.
     """
 
-    formula = (
+    formula: ClassVar[str] = (
         "corrected = centre + scale * (z (1 + k1 r^2 + ... + kN r^2N) + r^2 q + 2 (q.z) z), "
         "z = (distorted - centre) / scale, r^2 = z.z, q = (p2, p1), coefficients (k1, ..., kN, p1, p2)"
     )
@@ -363,7 +363,7 @@ class BrownConrady(AbstractFamily):
 
     def expansion(
         self, k: Coefficients, reach: Float[Array, ""]
-    ) -> tuple[Float[Array, "power"], Float[Array, "tangential"]]:
+    ) -> tuple[Float[AnyArray, "power"], Float[AnyArray, "tangential"]]:
         """Itself."""
         del reach
         return k[:-2], k[-2:]
