@@ -44,7 +44,7 @@ def test_summary_is_json_and_agrees_with_the_fits(calibration):
     assert summary["rms_zoom"] < summary["rms_held_out"] < 1.1 * summary["rms_zoom"]
     assert summary["rms_frames"] < summary["rms_frames_held_out"]
     held_out = [row["rms_held_out"] for row in summary["per_frame"]]
-    assert rms_over_frames(held_out) == summary["rms_held_out"]
+    assert rms_over_frames(np.array(held_out)) == summary["rms_held_out"]
     assert "selection" not in summary
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import synthetic
-from zoomjax.held_out import folds_of, held_out_frames, held_out_zoom, judge
+from zoomjax.held_out import HoldOut, folds_of, held_out_frames, held_out_zoom, judge
 from zoomjax.selection import compare, default_candidates
 
 FOCALS = 7
@@ -42,7 +42,7 @@ def selection(lines):
     return zj.select_model(lines, POLYNOMIALS)
 
 
-def compared(lines, candidates, hold_out="focal"):
+def compared(lines, candidates, hold_out: HoldOut = "focal"):
     """The verdicts and the names of the best and the chosen, without the fit."""
     verdicts, best, chosen = compare(lines, candidates, folds_of(lines, hold_out, None, 0))
     return verdicts, best.name, chosen.name
