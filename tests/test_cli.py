@@ -82,7 +82,7 @@ def test_calibrate_allows_for_uncertain_focal_lengths(calibrated, tmp_path):
     told = json.loads((tmp_path / "summary.json").read_text())
     assert [row["focal_sigma"] / row["focal"] for row in told["per_frame"]] == pytest.approx([0.01] * 5)
     assert told["corner_displacement"][0]["std"] > 2 * exact["corner_displacement"][0]["std"]
-    assert told["parameters"] == pytest.approx(exact["parameters"])
+    np.testing.assert_allclose(told["parameters"], exact["parameters"])
     refused = zoomjax(
         "calibrate", calibrated[0] / "lines.npz", "-o", tmp_path / "no", "--focal-sigma", "a bit"
     )
