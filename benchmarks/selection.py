@@ -24,7 +24,7 @@ import numpy as np
 import zoomjax as zj
 from shared import RESULTS, machine, machine_line, table, write
 from zoomjax import synthetic
-from zoomjax.held_out import folds_of, held_out_frames, held_out_zoom
+from zoomjax.held_out import HoldOut, folds_of, held_out_frames, held_out_zoom
 from zoomjax.selection import compare, default_candidates
 
 SIZE = (1072, 712)
@@ -69,7 +69,7 @@ def truth(degree: int) -> zj.ZoomLens:
     return dataclasses.replace(lens, zoom=zoom)
 
 
-def choices(degree: int, hold_out: str, draws: int) -> dict:
+def choices(degree: int, hold_out: HoldOut, draws: int) -> dict:
     """What is chosen, and how straight it makes what was left out, over new noise."""
     scene = synthetic.board_lines(truth(degree), synthetic.focal_sweep(10), spacing=24)
     chosen, best, ratio = Counter(), Counter(), []

@@ -304,7 +304,9 @@ def _read_zoom(content, numbers: int | None) -> AbstractZoom:
     rows, columns = fields["parameters"].shape
     for name in ("", "focus_"):
         knots, curvature = fields.get(f"{name}knots"), fields.get(f"{name}curvature")
-        if knots is not None and not (np.diff(knots) > 0).all():
+        if knots is None:
+            continue
+        if not (np.diff(knots) > 0).all():
             raise ValueError(f"its {name}knots do not increase")
         if curvature is not None and curvature.shape != (knots.size, knots.size):
             raise ValueError(f"its {name}curvature is not that of its {name}knots")

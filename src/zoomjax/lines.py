@@ -71,7 +71,7 @@ class AbstractLines(eqx.Module):
     ) -> tuple[Float[Array, "some power"], Float[Array, "some tangential"]]:
         """The family's coefficients as what corrected points are linear in, up to the image's corners."""
         far = jnp.maximum(self.centre, jnp.asarray(self.image_size) - 1 - self.centre) / self.scale
-        return jax.vmap(lambda k: self.family.expansion(k, far @ far))(coefficients)
+        return jax.vmap(lambda k: self.family.expansion(k, far @ far))(jnp.asarray(coefficients))
 
     @property
     @abc.abstractmethod

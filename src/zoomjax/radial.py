@@ -52,7 +52,7 @@ class Distortion(eqx.Module):
 
         For `BrownConrady` a bound of it: up to there it is certain not to.
         """
-        return self.scale * self.family.limit(self.coefficients)
+        return jnp.asarray(self.scale) * self.family.limit(self.coefficients)
 
     def undistort(self, points: Points) -> Float[Array, "*batch 2"]:
         """Corrected positions of distorted `points` (eq. 1).

@@ -89,8 +89,8 @@ def fit_robust(
     """
     lines = lines if family is None else with_family(lines, family)
     start, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
-    known = isinstance(start, AbstractLinearZoom) and isinstance(lines.family, RadialPolynomial)
-    if known and (zoom is None or zoom.parameters is None):
+    new = zoom is None or zoom.parameters is None
+    if new and isinstance(start, AbstractLinearZoom) and isinstance(lines.family, RadialPolynomial):
         start = algebraic_zoom(lines, zoom=start, terms=terms).zoom
     weighted, model = _reweighted(lines, start)
     fit = fit_zoom(weighted, zoom=model, invertible=invertible, throw=throw)
