@@ -314,3 +314,26 @@ def test_frames_that_cannot_be_left_out_are_nan(lines):
     few = without(lines, [1, 3, 4, 5])
     assert np.isnan(held_out_zoom(few, zoom=zj.PolynomialZoom(degree=2))).all()
     assert np.isfinite(held_out_zoom(few, zoom=zj.PolynomialZoom(degree=1))).all()
+
+
+def test_families_are_compared(scene):
+    """A lens that the division model describes, and the polynomial not so well, with one term each."""
+    zoom = zj.PolynomialZoom(1, jnp.array([[0.0], [-0.25]]), jnp.asarray(20.0))
+    lens = zj.ZoomLens(zoom, scene.centre, jnp.array([20.0, 80.0]), scene.image_size, family=zj.Division())
+    focal = np.array([20.0, 28.0, 45.0, 80.0])
+    bent = synthetic.board_lines(lens, focal, spacing=150, noise=0.05)
+    candidates = [
+        zj.Candidate(zj.PolynomialZoom(degree=1), 1, family)
+        for family in (zj.RadialPolynomial(), zj.Division())
+    ]
+    selection = zj.select_model(bent, candidates, hold_out="line", folds=3)
+    assert selection.chosen.name == "Division, degree 1, 1 term"
+    assert isinstance(selection.fit.lens.family, zj.Division)
+    assert selection.verdicts[0].held_out > 1.5 * selection.verdicts[1].held_out
+    np.testing.assert_allclose(selection.fit.lens.zoom.parameters, zoom.parameters, atol=0.01)
+
+
+def test_a_family_that_the_triangles_do_not_serve_says_so(lines):
+    candidates = [zj.PolynomialZoom(), zj.Candidate(zj.PolynomialZoom(), 1, zj.Division())]
+    _, verdict = zj.select_model(lines, candidates, hold_out="line", folds=2).verdicts
+    assert "compress(lines, terms=8)" in verdict.problem

@@ -25,7 +25,8 @@ from jaxtyping import Float
 from ._checks import checked_integer, checked_terms
 from .algebraic import compressed
 from .compression import CompressedLines
-from .energy import line_residuals, prior_jacobian
+from .energy import coefficients_by, line_residuals, prior_jacobian
+from .family_lines import FamilyLines
 from .fit import RESULTS, fit_zoom
 from .image_metric import ImageLines
 from .lines import AbstractLines
@@ -198,16 +199,16 @@ def folds_of(lines: CompressedLines, hold_out: HoldOut, folds: int | None, seed:
     return Folds(np.where(group >= 0, fold[group], -1), group, parts)
 
 
-def judge(lines: CompressedLines, zoom: AbstractZoom, terms: int, parts: Folds) -> Judged:
+def judge(lines: CompressedLines | FamilyLines, zoom: AbstractZoom, terms: int, parts: Folds) -> Judged:
     """A model's errors on lines that it has seen and has not.
 
     Args:
-        lines: from `small_lines`.
+        lines: from `small_lines`, or those lines with another family.
         zoom: a model without parameters.
         terms: its number of coefficients.
         parts: the folds.
     """
-    if isinstance(zoom, AbstractLinearZoom):
+    if isinstance(zoom, AbstractLinearZoom) and isinstance(lines, CompressedLines):
         return _judge_linear(lines, zoom, terms, parts)
     return _judge_by_fits(lines, zoom, terms, parts)
 
@@ -236,7 +237,9 @@ def _own_weights(lines):
 
 
 def _counts(lines):
-    """`CompressedLines.counts` in NumPy: of what JAX does once, most is compiling."""
+    """Numbers of points; of `CompressedLines` in NumPy: of what JAX does once, most is compiling."""
+    if not isinstance(lines, CompressedLines):
+        return np.asarray(lines.counts)
     return np.round(np.asarray(lines.triangle)[:, 0, 0].astype(float) ** 2)
 
 
@@ -496,5 +499,5 @@ def _judge_by_fits(lines, zoom, terms, parts):
 @eqx.filter_jit
 def _squares(lines, zoom):
     """Mean squared distance of each line, px^2."""
-    corrected = lines.corrected(jax.vmap(zoom)(lines.focal)[lines.frame])
+    corrected = lines.corrected(coefficients_by(zoom, lines)[lines.frame])
     return jnp.sum(jax.vmap(line_residuals)(corrected) ** 2, axis=1) / jnp.maximum(lines.counts, 1)

@@ -1,4 +1,4 @@
-"""Choosing the model: which zoom model, of which degree and how many coefficients, the lines ask for.
+"""Choosing the model: which zoom model, degree, number of coefficients and family the lines ask for.
 
 More parameters always bring the lines that were fitted closer to straightness; what tells is how straight a
 model makes lines that it has not seen (`held_out`). Their mean squared distance E is known to a standard
@@ -13,15 +13,17 @@ simplest of the models whose R is above the best one's by no more than s.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from ._checks import checked_terms
 from .compression import CompressedLines
+from .families import AbstractFamily, RadialPolynomial
+from .family_lines import compress_family, with_family
 from .fit import ZoomFit, fit_zoom
 from .held_out import Folds, HoldOut, Judged, folds_of, judge, shares, small_lines
-from .lines import AbstractLines
+from .lines import AbstractLines, Lines
 from .smooth import SmoothZoom
 from .zoom import AbstractZoom, PolynomialZoom, with_parameters
 
@@ -36,10 +38,12 @@ class Candidate:
     Attributes:
         zoom: such as ``PolynomialZoom(degree=2)``.
         terms: N, of eq. 2.
+        family: what the coefficients mean, such as ``Division()``.
     """
 
     zoom: AbstractZoom
     terms: int = 2
+    family: AbstractFamily = RadialPolynomial()  # noqa: RUF009, it has no state
 
     def __post_init__(self):
         """Check what it is made of."""
@@ -57,7 +61,9 @@ class Candidate:
             for field in dataclasses.fields(self.zoom)
             if field.metadata.get("static") and (value := getattr(self.zoom, field.name)) is not None
         ]
-        kind = [] if isinstance(self.zoom, PolynomialZoom) else [type(self.zoom).__name__]
+        other = [self.zoom] * (not isinstance(self.zoom, PolynomialZoom))
+        other += [self.family] * (not isinstance(self.family, RadialPolynomial))
+        kind = [type(model).__name__ for model in other]
         return ", ".join([*kind, *settings, f"{self.terms} term{'s' * (self.terms > 1)}"])
 
 
@@ -177,7 +183,7 @@ def select_model(
 
     Args:
         lines: the lines, or ``compress(lines, terms=3)``.
-        candidates: zoom models, or `Candidate` where `terms` is not 2. By default polynomials in 1/f of
+        candidates: zoom models, or `Candidate` where `terms` is not 2 or the family another. By default polynomials in 1/f of
             degree 0 to 3 with 1 to 3 coefficients (or as many as the lines are compressed for), and
             `SmoothZoom`.
         hold_out: what is left out. "focal": focal lengths, with all of their frames, but never the shortest
@@ -202,7 +208,8 @@ def select_model(
         TypeError: `lines` or a candidate is something else.
 
     The fits of folds are not made invertible, the chosen one is, by `fit_zoom`. Candidates that are linear
-    in their parameters are cross-validated at hundreds of fits a second; others fit by fit.
+    in their parameters are cross-validated at hundreds of fits a second; others, and those of another
+    family, fit by fit.
 
     References:
         L. Breiman, J. Friedman, R. Olshen, C. Stone, "Classification and regression trees" (1984), 3.4.3.
@@ -224,11 +231,12 @@ def select_model(
         raise ValueError("Argument candidates must hold one or more zoom models, but it is empty.")
     own = lines.terms if isinstance(lines, CompressedLines) else max(c.terms for c in compared)
     small = small_lines(lines, own)
+    forms = {c.family: _in_family(lines, small, c.family, own) for c in compared}
     if hold_out is None:
         hold_out = "focal" if np.unique(np.asarray(small.focal)).size > 3 else "line"
     parts = folds_of(small, hold_out, folds, seed)
-    verdicts, best, chosen = compare(small, compared, parts)
-    fit = fit_zoom(small, zoom=chosen.zoom, terms=chosen.terms)
+    verdicts, best, chosen = compare(small, compared, parts, forms)
+    fit = fit_zoom(forms[chosen.family], zoom=chosen.zoom, terms=chosen.terms)
     return Selection(chosen, best, fit, verdicts, hold_out, parts.number)
 
 
@@ -242,11 +250,23 @@ def default_candidates(terms: int = _TERMS) -> tuple[Candidate, ...]:
     return (*polynomials, *([Candidate(SmoothZoom(), 2)] if terms > 1 else []))
 
 
+def _in_family(lines, small, family, terms):
+    """The lines as fits of a family need them."""
+    if isinstance(family, RadialPolynomial):
+        return small
+    return (
+        compress_family(lines, family, terms=terms)
+        if isinstance(lines, Lines)
+        else with_family(small, family)
+    )
+
+
 def _judged(lines, candidate, parts):
     """The errors, or why there are none."""
     zoom = with_parameters(candidate.zoom, None)
     try:
-        lines.check_terms(candidate.terms)
+        if isinstance(lines, CompressedLines):
+            lines.check_terms(candidate.terms)
         zoom.prepare(np.asarray(lines.focal), candidate.terms)
         return judge(lines, zoom, candidate.terms, parts)
     except ValueError as error:
@@ -254,10 +274,16 @@ def _judged(lines, candidate, parts):
 
 
 def compare(
-    lines: CompressedLines, candidates: Sequence[Candidate], parts: Folds
+    lines: CompressedLines,
+    candidates: Sequence[Candidate],
+    parts: Folds,
+    forms: Mapping[AbstractFamily, AbstractLines] | None = None,
 ) -> tuple[tuple[Verdict, ...], Candidate, Candidate]:
-    """The verdicts, the best candidate and the chosen one; see `select_model`."""
-    errors = [_judged(lines, candidate, parts) for candidate in candidates]
+    """The verdicts, the best candidate and the chosen one; see `select_model`.
+
+    `forms` are the same lines for other families than the radial polynomial.
+    """
+    errors = [_judged((forms or {}).get(c.family, lines), c, parts) for c in candidates]
     share = shares(lines)
     counted = (parts.unit >= 0) & (share > 0)
     unit, share = parts.unit[counted], share[counted] / share[counted].sum()
