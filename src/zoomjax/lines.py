@@ -68,10 +68,12 @@ class AbstractLines(eqx.Module):
 
     def expansion(
         self, coefficients: Float[Array, "some size"]
-    ) -> tuple[Float[AnyArray, "some power"], Float[AnyArray, "some tangential"]]:
+    ) -> tuple[Float[Array, "some power"], Float[Array, "some tangential"]]:
         """The family's coefficients as what corrected points are linear in, up to the image's corners."""
         far = jnp.maximum(self.centre, jnp.asarray(self.image_size) - 1 - self.centre) / self.scale
-        return jax.vmap(lambda k: self.family.expansion(k, far @ far))(jnp.asarray(coefficients))
+        expand = jax.vmap(lambda k: self.family.expansion(k, far @ far))
+        powers, tangential = expand(coefficients)
+        return jnp.asarray(powers), jnp.asarray(tangential)
 
     @property
     @abc.abstractmethod
