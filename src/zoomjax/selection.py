@@ -183,9 +183,9 @@ def select_model(
 
     Args:
         lines: the lines, or ``compress(lines, terms=3)``.
-        candidates: zoom models, or `Candidate` where `terms` is not 2 or the family another. By default polynomials in 1/f of
-            degree 0 to 3 with 1 to 3 coefficients (or as many as the lines are compressed for), and
-            `SmoothZoom`.
+        candidates: zoom models, or `Candidate` where `terms` is not 2 or the family another. By default
+            polynomials in 1/f of degree 0 to 3 with 1 to 3 coefficients (or as many as the lines are
+            compressed for), and `SmoothZoom`.
         hold_out: what is left out. "focal": focal lengths, with all of their frames, but never the shortest
             and the longest, so that nothing is extrapolated; it tells how well a model does between the
             focal lengths photographed, which is what it is for. "frame": frames, those at both ends too,
