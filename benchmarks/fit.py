@@ -202,6 +202,12 @@ def run(spacing: float) -> dict:
     results["corner_error"] = corner_error(fit.lens.zoom, truth)
     print(json.dumps(results, indent=1))
 
+    results["any_centre_first"] = once(zj.compress_any_centre, made)[1]
+    results["any_centre"] = seconds(zj.compress_any_centre, made, repeats=3)
+    any_centre = zj.compress_any_centre(made)
+    results["centre_fit"] = seconds(zj.fit_centre, any_centre, repeats=5)
+    results["robust_fit"] = seconds(zj.fit_robust, small, repeats=5)
+
     full = zj.fit_zoom(made)
     results["full_fit"] = seconds(zj.fit_zoom, made, repeats=1)
     results["full_difference"] = float(
@@ -238,6 +244,21 @@ def markdown(results: dict) -> str:
             "certificate of invertibility",
             f"{r['certificate'] * 1e3:.2f} ms",
             f"{100 * r['certificate'] / r['fit']:.1f} % of the zoom fit, which makes it",
+        ),
+        (
+            "robust fit, compressed",
+            f"{r['robust_fit'] * 1e3:.0f} ms",
+            f"{r['robust_fit'] / r['fit']:.1f} times the zoom fit",
+        ),
+        (
+            "compression for any centre",
+            f"{r['any_centre'] * 1e3:.0f} ms",
+            f"{r['any_centre'] / r['compress']:.1f} times that for one; {r['any_centre_first']:.0f} s at first",
+        ),
+        (
+            "zoom and centre fit after it",
+            f"{r['centre_fit'] * 1e3:.0f} ms",
+            "with its covariance and guard",
         ),
         (
             "zoom fit, full tensors",
