@@ -253,7 +253,8 @@ def markdown(results: dict) -> str:
         (
             "compression for any centre",
             f"{r['any_centre'] * 1e3:.0f} ms",
-            f"{r['any_centre'] / r['compress']:.1f} times that for one; {r['any_centre_first']:.0f} s at first",
+            f"{r['any_centre'] / r['compress']:.1f} times that for one, "
+            f"{r['any_centre_first']:.0f} s with compiling",
         ),
         (
             "zoom and centre fit after it",

@@ -1,6 +1,6 @@
 """Six hundred real zoom lenses: which zoom model predicts a focal length that was left out?
 
-    pip install zoomjax[bench]
+    pip install '.[bench]'
     python benchmarks/real/lensfun.py [--output FILE] [--prior | --forms]
 
 The lensfun database (through the package `lensfunpy`, CC BY-SA 3.0; none of it is stored here) holds zoom
@@ -44,7 +44,7 @@ import zoomjax as zj
 from zoomjax.energy import line_residuals
 
 sys.path.append(str(Path(__file__).parents[1]))
-from fit import RESULTS, machine
+from shared import RESULTS, machine
 
 SIZE = (4288, 2848)
 SCALE = float(np.hypot(*SIZE)) / 2
@@ -401,8 +401,7 @@ def calibrated(zoom: zj.SmoothZoom, batches: list[Frames]) -> zj.SmoothZoom:
 
 
 def interpolate(frames: Frames, asked: np.ndarray, kind: str) -> np.ndarray:
-    """Tables and splines through the frames' own coefficients: what their fits are, a knot at each "
-    "frame."""
+    """Tables and splines through the frames' own coefficients: what fits with a knot at each frame are."""
     x = frames.focal if kind == "table in f" else 1 / frames.focal
     at = asked if kind == "table in f" else 1 / asked
     order = np.argsort(x)
@@ -469,8 +468,7 @@ def two_regions(frames: Frames, asked: np.ndarray) -> np.ndarray | None:
 
 
 def one_by_one(lens: Frames, model: Callable[[Frames, np.ndarray], np.ndarray | None]):
-    """Coefficients fitted to all frames, and to all but the frame itself (interior ones); NaN: cannot "
-    "be."""
+    """Coefficients fitted to all frames, and to all but the frame itself (interior ones); NaN: cannot be."""
     number = len(lens.focal)
     fitted, left_out = np.full((number, 2), np.nan), np.full((number, 2), np.nan)
     whole = model(lens, lens.focal)

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from ._checks import checked_integer, checked_terms
 from .algebraic import compressed
 from .compression import CompressedLines
-from .energy import coefficients_by, line_residuals, prior_jacobian
+from .energy import coefficients_by, line_residuals, prior_jacobian, settings
 from .family_lines import FamilyLines
 from .fit import RESULTS, fit_zoom
 from .image_metric import ImageLines
@@ -105,7 +105,8 @@ def held_out_zoom(
     """
     terms = checked_terms(terms)
     zoom = PolynomialZoom() if zoom is None else zoom
-    zoom.prepare(lines.focal, terms)  # complains of too few focal lengths
+    focal, *focus = settings(zoom, lines)
+    zoom.prepare(focal, terms, *focus)  # complains of too few focal lengths
     small = small_lines(lines, terms)
     parts = folds_of(small, hold_out, folds, seed)
     judged = judge(small, zoom, terms, parts)
@@ -284,12 +285,12 @@ class _Design(NamedTuple):
 
 def _design(lines, zoom, left, terms):
     """The model as made ready for the frames that are left, or why it cannot be."""
-    focal = np.asarray(lines.focal)
     try:
-        model = zoom.prepare(focal[left], terms)
+        focal, *focus = map(np.asarray, settings(zoom, lines))
+        model = zoom.prepare(focal[left], terms, *(values[left] for values in focus))
     except ValueError as error:
         return str(error)
-    values = np.asarray(_basis_of(with_parameters(model, None), focal), float)
+    values = np.asarray(_basis_of(with_parameters(model, None), focal, *focus), float)
     size = values.shape[1]
     precision = np.zeros((size * terms, size * terms))
     if isinstance(model, AbstractPriorZoom):
@@ -300,7 +301,7 @@ def _design(lines, zoom, left, terms):
     return _Design(values, project, precision)
 
 
-_basis_of = eqx.filter_jit(lambda model, focal: jax.vmap(model.basis)(focal))
+_basis_of = eqx.filter_jit(lambda model, *settings: jax.vmap(model.basis)(*settings))
 """Of a model without its parameters: one compiled program for any number of terms."""
 
 
@@ -480,7 +481,8 @@ def _judge_by_fits(lines, zoom, terms, parts):
         kept = own * (parts.fold != fold)
         left = np.unique(np.asarray(lines.frame)[kept > 0])
         try:
-            zoom.prepare(np.asarray(lines.focal)[left], terms)
+            focal, *focus = (np.asarray(values)[left] for values in settings(zoom, lines))
+            zoom.prepare(focal, terms, *focus)
         except ValueError as error:
             problem = problem or str(error)
             continue

@@ -19,6 +19,7 @@ import numpy as np
 
 from ._checks import checked_terms
 from .compression import CompressedLines
+from .energy import settings
 from .families import AbstractFamily, RadialPolynomial
 from .family_lines import compress_family, with_family
 from .fit import ZoomFit, fit_zoom
@@ -267,7 +268,8 @@ def _judged(lines, candidate, parts):
     try:
         if isinstance(lines, CompressedLines):
             lines.check_terms(candidate.terms)
-        zoom.prepare(np.asarray(lines.focal), candidate.terms)
+        focal, *focus = settings(zoom, lines)
+        zoom.prepare(np.asarray(focal), candidate.terms, *focus)
         return judge(lines, zoom, candidate.terms, parts)
     except ValueError as error:
         return str(error)
