@@ -468,7 +468,7 @@ def two_regions(frames: Frames, asked: np.ndarray) -> np.ndarray | None:
 
 
 def one_by_one(lens: Frames, model: Callable[[Frames, np.ndarray], np.ndarray | None]):
-    """Coefficients fitted to all frames, and to all but the frame itself (interior ones); NaN: cannot be."""
+    """Coefficients fitted to all frames, and to all but the frame itself, if interior; NaN: cannot be."""
     number = len(lens.focal)
     fitted, left_out = np.full((number, 2), np.nan), np.full((number, 2), np.nan)
     whole = model(lens, lens.focal)

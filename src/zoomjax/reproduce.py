@@ -37,8 +37,8 @@ NOTES = (
     "The paper counts 816,660 points in its 50 images, but also 52,433 in the one with the fewest lines, "
     "which makes 2.6 million at the least. We take the former.",
     "With the published polynomials the broadcast is less distorted than Table 2 says, whichever way a "
-    "camera looks at the pitch: without noise, 0.91 px RMS would be needed before correction. So that row comes "
-    "out lower; the two that the paper compares do not.",
+    "camera looks at the pitch: without noise, 0.91 px RMS would be needed before correction. So that row "
+    "comes out lower; the two that the paper compares do not.",
 )
 
 
