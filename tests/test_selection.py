@@ -298,7 +298,7 @@ def test_bad_arguments_are_told(options, message, lines):
 def test_other_types_are_told(lines):
     with pytest.raises(TypeError, match="must be Lines"):
         zj.select_model(np.zeros(3))  # pyright: ignore[reportArgumentType]
-    with pytest.raises(TypeError, match="must be Lines"):
+    with pytest.raises(TypeError, match="without in_image"):
         zj.select_model(zj.in_image(lines))
     with pytest.raises(TypeError, match="zoom model"):
         zj.select_model(lines, ["quadratic"])  # pyright: ignore[reportArgumentType]

@@ -36,7 +36,10 @@ def compressed(lines: AbstractLines, terms: int) -> CompressedLines:
         return lines
     if isinstance(lines, Lines):
         return compress(lines, terms)
-    raise TypeError(f"Lines of type {type(lines).__name__} cannot be compressed.")
+    raise TypeError(
+        f"Lines of type {type(lines).__name__} do not serve here: pass Lines or compress(lines); of "
+        "compress_any_centre(lines), those about one centre, .about(centre)."
+    )
 
 
 def algebraic_parameters(

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .compression import compress
-from .energy import line_normal
+from .energy import coefficients_by, line_normal
 from .fit import ready_model
 from .lines import Lines
 from .robust import RobustFit, fit_robust
@@ -105,7 +105,7 @@ def reject_points(
 @eqx.filter_jit
 def _distances(lines, zoom):
     """Signed distance of each corrected point from the line that most agree on, and each line's spread."""
-    corrected = lines.corrected(jax.vmap(zoom)(lines.focal)[lines.frame])
+    corrected = lines.corrected(coefficients_by(zoom, lines)[lines.frame])
     distance, spread = jax.vmap(_from_most)(corrected, lines.mask)
     counts = lines.counts
     typical = jnp.nanmedian(jnp.where(counts >= _FEWEST, spread, jnp.nan))

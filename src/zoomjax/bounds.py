@@ -84,6 +84,9 @@ def displacement_bound(
     Args:
         lens, lines, std: as for `cramer_rao`.
 
+    Returns:
+        The bound; infinite where the lines do not determine the lens.
+
     Example:
         >>> from zoomjax import synthetic
         >>> lens, focal = synthetic.nikkor_18_200(), synthetic.focal_sweep(3)
@@ -99,7 +102,9 @@ def displacement_bound(
 
     rows = jax.vmap(derivatives)(focal)
     squared = jnp.einsum("fncp,fncq,fn->pq", rows, rows, weight)
-    return jnp.sqrt(jnp.sum(cramer_rao(lens, lines, std=std) * squared))
+    covariance = cramer_rao(lens, lines, std=std)
+    determined = jnp.all(jnp.isfinite(covariance))
+    return jnp.sqrt(jnp.where(determined, jnp.sum(jnp.where(determined, covariance, 0) * squared), jnp.inf))
 
 
 @eqx.filter_jit

@@ -84,6 +84,16 @@ class Calibration:
         moved = [np.hypot(*(point - centre)) - np.hypot(*(corner - centre)) for point in corrected]
         return list(zip(focal, map(float, moved), std.tolist(), strict=True))
 
+    def allowed_for(self) -> str:
+        """What the bands allow for besides noise, in a sentence; nothing if that is nothing."""
+        share = self.focal_sigma / np.asarray(self.lines.focal)
+        if not share.any():
+            return ""
+        return (
+            "Standard deviations allow for those of the focal lengths, "
+            f"{share.min():.2%} to {share.max():.2%}; the next photo is chosen by noise alone."
+        )
+
     def rows(self) -> list[tuple[str, np.ndarray]]:
         """The lines of a table like the paper's Table 1: what was done, and each frame's RMS, px."""
         return [
@@ -142,6 +152,10 @@ class Calibration:
             "frames": len(self.none),
             "lines": len(frame),
             "rejected_lines": int(self.rejected.sum()),
+            "rejected": [
+                {"line": int(line), "frame": int(frame[line]), "rms": float(self.line_rms[line])}
+                for line in np.flatnonzero(self.rejected)[np.argsort(-self.line_rms[self.rejected])]
+            ],
             "points": int(np.sum(np.asarray(self.lines.mask))),
             "focal_range": [low, high],
             "focal_unit": lens.focal_unit,

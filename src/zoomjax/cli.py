@@ -1,4 +1,4 @@
-"""The command line: ``zoomjax demo``, ``zoomjax calibrate``, ``zoomjax undistort``.
+"""The command line: ``zoomjax demo``, ``calibrate``, ``undistort`` and ``reproduce``.
 
 Commands import what they need when they run, so that ``--help`` answers without waiting for JAX. They
 compute in float64. Errors go to stderr with exit status 2, and leave no partial result.
@@ -136,6 +136,12 @@ def calibrate(
     select: Annotated[
         bool, typer.Option("--select", help="Choose degree and terms: see what lines left out prefer.")
     ] = False,
+    robust: Annotated[
+        bool,
+        typer.Option(
+            "--robust", help="Reject lines that are not straight in the scene, as is done in photos."
+        ),
+    ] = False,
     detector: Annotated[
         str, typer.Option(help="What to look for in images: edges, grid or pitch.")
     ] = "edges",
@@ -197,8 +203,12 @@ def calibrate(
         with results_folder(output) as folder, _stages() as stage:
             stage("Reading the lines")
             lines = _read([Path(path) for path in inputs], focal, image_size, focal_unit)
-            calibration = _calibrate(lines, degree, terms, focal_sigma, stage, folder, select)
+            calibration = _calibrate(lines, degree, terms, focal_sigma, stage, folder, select, robust)
         _show(calibration)
+        if robust:
+            print(
+                f"\n{int(calibration.rejected.sum())} lines are not straight in the scene and were rejected."
+            )
         _tell(calibration.warnings())
         _written(output)
         return
@@ -388,13 +398,14 @@ def _calibrate(
     stage: Callable[[str], None],
     folder: Path,
     select: bool,
+    robust: bool,
 ) -> "Calibration":
     from .calibration import calibrate, focal_sigmas
     from .report import report
 
     sigma = focal_sigmas(focal_sigma or "0", lines.focal)
     calibration = calibrate(
-        lines, degree=degree, terms=terms, focal_sigma=sigma, select=select, stage=stage
+        lines, degree=degree, terms=terms, focal_sigma=sigma, select=select, robust=robust, stage=stage
     )
     stage("Writing the results")
     calibration.write(folder, pages={"report.html": report(calibration)})
@@ -501,7 +512,6 @@ def _stages() -> Iterator[Callable[[str], None]]:
 
 def _show(calibration: "Calibration", magnification: Callable[[float], float] | None = None) -> None:
     """Print the table and the polynomials."""
-    import numpy as np
     from rich.console import Console
     from rich.table import Table
 
@@ -543,12 +553,8 @@ def _show(calibration: "Calibration", magnification: Callable[[float], float] | 
         console.print(f"k{i}(f) = {terms}   px^-{2 * i}", highlight=False)
     corner = [f"{moved:+.2f} ± {std:.2g} px at {f:.4g} {unit}" for f, moved, std in calibration.corner()]
     console.print(f"\nCorrected, a corner moves by {', '.join(corner)}.", highlight=False)
-    if (share := calibration.focal_sigma / np.asarray(calibration.lines.focal)).any():
-        console.print(
-            f"That allows for focal lengths with standard deviations of {share.min():.2%} to "
-            f"{share.max():.2%}.",
-            highlight=False,
-        )
+    if allowed_for := calibration.allowed_for():
+        console.print(allowed_for, highlight=False)
     console.print(calibration.next.sentence, highlight=False)
 
 

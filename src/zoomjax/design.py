@@ -23,7 +23,7 @@ from .energy import line_residuals, line_weights
 from .family_lines import with_family
 from .fit import ZoomFit, linearised
 from .lines import AbstractLines
-from .zoom import with_parameters
+from .zoom import AbstractFocusZoom, with_parameters
 
 _FOCALS = 5  # over the range, evenly in 1/f
 _DIRECTIONS = ("horizontal", "vertical")
@@ -112,7 +112,12 @@ def suggest_next(
             "Argument focal_range must be two positive numbers, the shorter first, but it is "
             f"{focal_range!r}."
         )
-    lines = with_family(lines, fit.lens.family)
+    if isinstance(fit.lens.zoom, AbstractFocusZoom) or fit.lens.shift is not None:
+        raise ValueError(
+            "Photos are suggested for lenses that depend on the focal length alone, about one centre of "
+            "distortion: this one depends on the focus, or its centre moves along the zoom."
+        )
+    lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
     focals = np.unique(1 / np.linspace(1 / low, 1 / high, _FOCALS))
     number, length, counts = _typical(lines)
     dtype = fit.covariance.dtype

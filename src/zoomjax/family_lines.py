@@ -16,7 +16,7 @@ from .any_centre import AnyCentreLines, compress_any_centre
 from .compression import CompressedLines, compress
 from .families import AbstractFamily, AbstractRadial, RadialPolynomial
 from .image_metric import ImageLines, in_image
-from .lines import AbstractLines, Lines, corrected_points
+from .lines import AbstractLines, Lines, corrected_points, with_fields_of
 
 
 class FamilyLines(AbstractLines):
@@ -107,8 +107,8 @@ class FamilyLines(AbstractLines):
         return _wrapped(self._weighted().take(lines, present), self.family)
 
     def _weighted(self):
-        """The lines with the weights that these have been given."""
-        return eqx.tree_at(lambda lines: lines.weight, self.lines, self.weight, is_leaf=lambda x: x is None)
+        """The lines with the weights and focal lengths that these have been given."""
+        return with_fields_of(self.lines, self)
 
 
 def with_family(lines: AbstractLines, family: AbstractFamily) -> AbstractLines:

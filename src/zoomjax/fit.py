@@ -27,6 +27,7 @@ from ._interior import implicit, least_squares_within
 from ._solver import default_solver
 from ._types import AnyArray, Centres, traced
 from .algebraic import algebraic_parameters, compressed
+from .any_centre import AnyCentreLines
 from .certificate import Certificate, certificate_of, slope_controls, stated_pieces
 from .compression import CompressedLines
 from .energy import coefficients_by, energy_by_frame, frame_energy, prior_residuals, residuals, settings
@@ -89,7 +90,7 @@ class ZoomFit(eqx.Module):
         steps: number of steps the solver took.
         certificate: whether the lens is invertible over its image and focal range.
         rms_unconstrained: what `rms` is without the demand that the lens be invertible: the same, unless
-            the result is `constrained`.
+            the lens had to be made so. The result is then `constrained`, if there is nothing worse to say.
     """
 
     lens: ZoomLens
@@ -183,7 +184,8 @@ def fit_zoom(
             range of focal lengths, gives way to the best one that is, with a slope of the radius (see
             `Certificate`) of at least 0.02. A model that is certified stays as it is, to the last bit. For
             zoom models that do not state their `pieces` this does nothing; for a `PowerZoom`, which is not
-            linear, it gives an invertible model that need not be the very best.
+            linear, it gives an invertible model that need not be the very best, and of another family than
+            the polynomial nothing is proved of it.
         throw: raise where the solver fails. Otherwise `ZoomFit.result` says so. Results about the model
             (undetermined, folded, constrained) never raise.
 
@@ -203,7 +205,7 @@ def fit_zoom(
         >>> bool(fit.rms < 1)
         True
     """
-    _check_lines(lines)
+    check_lines(lines)
     lines = lines if family is None else with_family(lines, family)
     model, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
     start = None
@@ -251,7 +253,8 @@ def algebraic_start(lines: AbstractLines, terms: int) -> CompressedLines | None:
     return compressed(lines, terms) if isinstance(lines.family, RadialPolynomial) else None
 
 
-def _check_lines(lines):
+def check_lines(lines):
+    """Raise TypeError where something else is given for lines."""
     if not isinstance(lines, AbstractLines):
         raise TypeError(
             "Argument lines must be Lines (see Lines.from_ragged) or compress(lines), but its type is "
@@ -277,7 +280,7 @@ def fit_frames(
     Raises:
         RuntimeError: the solver failed on some frame, and `throw` is set.
     """
-    _check_lines(lines)
+    check_lines(lines)
     terms = checked_terms(terms)
     lines = lines if family is None else with_family(lines, family)
     chosen, present = lines.by_frame()
@@ -310,7 +313,7 @@ def frame_rms(
 
     Points beyond the fold of a lens that has one are corrected by formula.
     """
-    _check_lines(lines)
+    check_lines(lines)
     if isinstance(lens, ZoomLens):
         if lens.image_size != lines.image_size:
             raise ValueError(
@@ -330,6 +333,8 @@ def frame_rms(
             "Argument lens must be a ZoomLens (fit.lens, not the fit), coefficients of each frame or None, "
             f"but its type is {type(lens).__name__}."
         )
+    elif isinstance(lines, AnyCentreLines):
+        lines = lines.about(lines.centre)  # or the last two coefficients would be taken for a centre
     return _frame_rms(lines, lens)
 
 

@@ -30,6 +30,7 @@ from jaxtyping import Array, Bool, Float, Int, Num, ScalarLike
 
 from ._types import AnyArray, Focal, traced
 from .energy import coefficients_by, line_weights, prior_error, prior_residuals, residuals
+from .family_lines import with_family
 from .fit import ZoomFit, fit_zoom, linearised
 from .lines import AbstractLines
 from .uncertainty import parameter_covariance
@@ -67,7 +68,7 @@ def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma) 
 
     Args:
         fit: the fit.
-        lines: the lines that it was fitted to, with their weights.
+        lines: the lines that it was fitted to, with their weights; measured in the image, if they were.
         focal_sigma: standard deviation of the focal lengths, in the lines' unit: a number, or one a frame;
             0 where they are exact. A focal length rounded to whole mm has 0.29, 1/sqrt(12). Errors of
             frames count as independent.
@@ -98,7 +99,8 @@ def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma) 
         raise ValueError(
             "The lens has a centre that moves along the zoom, for which this is not worked out."
         )
-    return _widened(fit, lines.about(fit.lens.centre), jnp.diag(sigma / jnp.asarray(lines.focal)) ** 2)
+    lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
+    return _widened(fit, lines, jnp.diag(sigma / jnp.asarray(lines.focal)) ** 2)
 
 
 def fit_focal(

@@ -158,7 +158,12 @@ def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
         TypeError: they are no lines, or measured in another way than eq. 3.
         ValueError: they are compressed already, for fewer terms.
     """
-    if isinstance(lines, ImageLines) or not isinstance(lines, AbstractLines):
+    if isinstance(lines, ImageLines | FamilyLines):
+        raise TypeError(
+            "Lines held out are measured in the corrected image, and of the radial polynomial: pass the lines "
+            "without in_image or with_family. (select_model compares families: Candidate(zoom, terms, family).)"
+        )
+    if not isinstance(lines, AbstractLines):
         raise TypeError(
             "Argument lines must be Lines (see Lines.from_ragged) or compress(lines), but its type is "
             f"{type(lines).__name__}."

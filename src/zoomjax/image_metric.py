@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ._types import Centres, Focal, Focus, FrameIndex, LineWeight, Point
 from .energy import line_normal
 from .families import AbstractFamily, AbstractRadial
-from .lines import AbstractLines
+from .lines import AbstractLines, with_fields_of
 
 
 class ImageLines(AbstractLines):
@@ -76,8 +76,8 @@ class ImageLines(AbstractLines):
         return in_image(self.as_weighted().take(lines, present))
 
     def as_weighted(self) -> AbstractLines:
-        """The lines with the weights that these have been given."""
-        return eqx.tree_at(lambda lines: lines.weight, self.lines, self.weight, is_leaf=lambda x: x is None)
+        """The lines with the weights and focal lengths that these have been given."""
+        return with_fields_of(self.lines, self)
 
 
 def in_image(lines: AbstractLines) -> ImageLines:

@@ -364,6 +364,16 @@ class Lines(AbstractLines):
         )
 
 
+def with_fields_of(lines: SomeLines, other: AbstractLines) -> SomeLines:
+    """The lines with the focal lengths, focus and weights of a wrapper of them."""
+    return eqx.tree_at(
+        lambda lines: (lines.focal, lines.focus, lines.weight),
+        lines,
+        (other.focal, other.focus, other.weight),
+        is_leaf=lambda leaf: leaf is None,
+    )
+
+
 def focus_of(
     lines: AbstractLines, chosen: Int[Array, "some"], present: Bool[Array, "some"]
 ) -> Float[Array, "1"] | None:

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 
 from .calibration import Calibration, rms_over_frames
 from .plot import plot_distortion, plot_model, plot_primitives, plot_residues
+from .selection import COLUMNS
 
 if TYPE_CHECKING:
     from .vision.image_calibration import ImageCalibration
@@ -90,8 +91,14 @@ def _headline(calibration: Calibration) -> "_Html":
 
 def _straightness(calibration: Calibration) -> list["_Html"]:
     each = rms_over_frames(calibration.each.frame_rms)
+    held_out = {name: rms_over_frames(frames) for name, frames in calibration.held_out_rows().items()}
     rows = [
-        (name, f"{value:.4f}", "" if name == "frame by frame" else _excess(value, each))
+        (
+            name,
+            f"{value:.4f}",
+            f"{held_out[name]:.4f}" if held_out.get(name, np.nan) > 0 else "",
+            "" if name == "frame by frame" else _excess(value, each),
+        )
         for name, value in ((name, rms_over_frames(frames)) for name, frames in calibration.rows())
     ]
     figure = plot_residues(
@@ -101,10 +108,24 @@ def _straightness(calibration: Calibration) -> list["_Html"]:
         np.asarray(calibration.zoom.frame_rms),
     )
     return [
-        _element("p", "Distance of corrected points to the straight lines through them, over all frames."),
-        _table("Straightness", ["", "RMS, px", "over frame by frame"], rows),
+        _element(
+            "p",
+            "Distance of corrected points to the straight lines through them, over all frames. Held out: of "
+            "lines that were not fitted, each frame under the polynomial of all others, and a tenth of its "
+            "lines at a time under its own model.",
+        ),
+        _table("Straightness", ["", "RMS, px", "held out, px", "over frame by frame"], rows),
+        *_choice(calibration),
         _plot(figure, "What is left of each frame against 1/f", class_="box plot"),
     ]
+
+
+def _choice(calibration: Calibration) -> list["_Html"]:
+    """How the model was chosen, if it was."""
+    if calibration.selection is None:
+        return []
+    rows = calibration.selection.rows()
+    return [_element("p", f"{calibration.selection.title}:"), _table("The choice", [*COLUMNS], rows)]
 
 
 def _lens(calibration: Calibration) -> list["_Html"]:
@@ -167,6 +188,7 @@ def _distortion(calibration: Calibration) -> list["_Html"]:
     return [
         _element("p", "Corrected, the corner farthest from the centre moves outwards (−: inwards) by"),
         _table("The corner", ["f", "px", "± px"], rows),
+        *([_element("p", calibration.allowed_for())] if calibration.allowed_for() else []),
         _plot(
             plot_distortion(calibration.zoom, focal=ends),
             "A straight grid as the lens shows it, and where pixels belong, at both ends of the zoom",

@@ -26,7 +26,7 @@ from .algebraic import algebraic_zoom
 from .energy import coefficients_by, line_residuals, prior_jacobian
 from .families import AbstractFamily, RadialPolynomial
 from .family_lines import with_family
-from .fit import ZoomFit, fit_zoom, linearised, ready_model
+from .fit import ZoomFit, check_lines, fit_zoom, linearised, ready_model
 from .lines import AbstractLines
 from .zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
 
@@ -87,6 +87,7 @@ def fit_robust(
         >>> fit_robust(compress(lines), zoom=PolynomialZoom(degree=0), terms=1).rejected.tolist()
         [10]
     """
+    check_lines(lines)
     lines = lines if family is None else with_family(lines, family)
     start, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
     new = zoom is None or zoom.parameters is None

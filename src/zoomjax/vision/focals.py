@@ -148,7 +148,9 @@ def choose_focals(
         )
     if not found.focal:
         raise ValueError(
-            f"No focal length is to be had of any image from {found.origin} ({found.absent}). Give {WAYS}."
+            f"No focal length is to be had of any image from {found.origin} ({found.absent}). Give {WAYS}. "
+            "(Straightness alone cannot tell: with focal lengths relabelled, and the model accordingly, "
+            "every line is as straight as before.)"
         )
     return found
 
