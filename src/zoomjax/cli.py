@@ -206,9 +206,8 @@ def calibrate(
             calibration = _calibrate(lines, degree, terms, focal_sigma, stage, folder, select, robust)
         _show(calibration)
         if robust:
-            print(
-                f"\n{int(calibration.rejected.sum())} lines are not straight in the scene and were rejected."
-            )
+            rejected = int(calibration.rejected.sum())
+            print(f"\n{rejected} lines are not straight in the scene and were rejected.")
         _tell(calibration.warnings())
         _written(output)
         return

@@ -160,8 +160,9 @@ def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
     """
     if isinstance(lines, ImageLines | FamilyLines):
         raise TypeError(
-            "Lines held out are measured in the corrected image, and of the radial polynomial: pass the lines "
-            "without in_image or with_family. (select_model compares families: Candidate(zoom, terms, family).)"
+            "Lines held out are measured in the corrected image, and by the radial polynomial: pass the "
+            "lines without in_image or with_family. (select_model compares families, given "
+            "Candidate(zoom, terms, family).)"
         )
     if not isinstance(lines, AbstractLines):
         raise TypeError(

@@ -110,9 +110,9 @@ def _straightness(calibration: Calibration) -> list["_Html"]:
     return [
         _element(
             "p",
-            "Distance of corrected points to the straight lines through them, over all frames. Held out: of "
-            "lines that were not fitted, each frame under the polynomial of all others, and a tenth of its "
-            "lines at a time under its own model.",
+            "Distance of corrected points to the straight lines through them, over all frames. Held out: "
+            "of lines that were not fitted, each frame under the polynomial of all others, and a tenth of "
+            "its lines at a time under its own model.",
         ),
         _table("Straightness", ["", "RMS, px", "held out, px", "over frame by frame"], rows),
         *_choice(calibration),
