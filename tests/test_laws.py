@@ -11,6 +11,11 @@ import pytest
 
 import zoomjax as zj
 
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:.*outside of the image:UserWarning"
+)  # lines may reach there
+
+few = hypothesis.settings(max_examples=20)
 SIZE = (640, 480)
 CENTRE, SCALE = np.array([319.5, 239.5]), 400.0
 FRAMES, LINES, POINTS = 4, 5, 12  # one shape: compiled once
@@ -73,6 +78,7 @@ def same(first, second, focal):
             np.testing.assert_allclose(corner(first.lens, f), corner(second.lens, f), atol=1e-3)
 
 
+@few
 @hypothesis.given(scenes(), st.randoms(use_true_random=False))
 def test_the_order_of_lines_and_frames_does_not_matter(scene, random):
     points, focal = scene
@@ -84,6 +90,7 @@ def test_the_order_of_lines_and_frames_does_not_matter(scene, random):
     same(fitted(lines_of(points, focal)), fitted(moved), focal)
 
 
+@few
 @hypothesis.given(scenes())
 def test_padding_does_not_matter(scene):
     points, focal = scene
@@ -99,6 +106,7 @@ def test_padding_does_not_matter(scene):
     same(fitted(lines), fitted(wider), focal)
 
 
+@few
 @hypothesis.given(scenes())
 def test_the_size_of_a_pixel_does_not_matter(scene):
     points, focal = scene
@@ -111,6 +119,7 @@ def test_the_size_of_a_pixel_does_not_matter(scene):
             np.testing.assert_allclose((far - 0.5) / 2, corner(first.lens, f), atol=1e-3)
 
 
+@few
 @pytest.mark.parametrize("invertible", [False, True], ids=["free", "invertible"])
 @hypothesis.given(scene=scenes())
 def test_a_higher_degree_is_never_worse_in_sample(scene, invertible):
@@ -127,8 +136,6 @@ def _good(fit):
     return zj.RESULTS[fit.result] == "" or fit.result in (zj.RESULTS.undetermined, zj.RESULTS.constrained)
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")  # points outside of the image
-@hypothesis.settings(suppress_health_check=[hypothesis.HealthCheck.filter_too_much])
 @hypothesis.given(scenes(KINDS))
 def test_finite_input_never_gives_nan(scene):
     points, focal = scene

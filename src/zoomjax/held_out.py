@@ -418,7 +418,7 @@ def _minimised(lanes, weight, design, parameters, known=None):
 
 def _move(at, damping):
     """The damped Gauss-Newton step, and by how much it should lower the energy."""
-    size = np.sqrt(np.diagonal(at.matrix))
+    size = np.sqrt(np.maximum(np.diagonal(at.matrix), 0))  # rounding alone may be negative
     size = np.where(size > 0, size, 1)
     values, vectors = np.linalg.eigh(at.matrix / size[:, None] / size)
     known = values > 64 * np.finfo(float).eps * values[-1]
