@@ -30,6 +30,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -640,22 +641,33 @@ def study() -> dict:
 
     family = families(lenses)
     side = halves(family)
-    learned = [learn(data, side != part) for part in (0, 1)]
+    # What is independent goes side by side: half of the time is compiling, which takes one core.
+    with ThreadPoolExecutor(2) as pool:
+        learned = list(pool.map(lambda part: learn(data, side != part), (0, 1)))
     lap("priors of both halves")
 
-    fits = {f"degree {n}": all_lenses(data, partial(fit_polynomials, degree=n)) for n in range(4)}
-    fits["degree chosen inside"] = all_lenses(data, partial(fit_chosen_degree, degrees=(1, 2, 3)))
+    def cross_fitted():
+        smooth: list[Any] = [None] * len(data)
+        for part, zoom in enumerate(learned):
+            mine = all_lenses(data, partial(fit_smooth, zoom=zoom), np.flatnonzero(side == part))
+            smooth = [new or old for new, old in zip(mine, smooth, strict=True)]
+        return smooth
+
     kinds = ("nearest frame", "table in f", "table in 1/f", "spline in 1/f", "monotone cubic in 1/f")
-    for kind in kinds:
-        fits[kind] = [one_by_one(lens, partial(interpolate, kind=kind)) for lens in data]
-    fits["power law"] = [one_by_one(lens, power_law) for lens in data]
-    fits["two regions"] = [one_by_one(lens, two_regions) for lens in data]
-    smooth: list[Any] = [None] * len(data)
-    for part, zoom in enumerate(learned):
-        mine = all_lenses(data, partial(fit_smooth, zoom=zoom), np.flatnonzero(side == part))
-        smooth = [new or old for new, old in zip(mine, smooth, strict=True)]
-    fits["SmoothZoom, other half's prior"] = smooth
-    fits["SmoothZoom, as in the package"] = all_lenses(data, partial(fit_smooth, zoom=zj.SmoothZoom()))
+    every_fit: dict[str, Callable[[], list]] = {
+        **{f"degree {n}": partial(all_lenses, data, partial(fit_polynomials, degree=n)) for n in range(4)},
+        "degree chosen inside": partial(all_lenses, data, partial(fit_chosen_degree, degrees=(1, 2, 3))),
+        **{k: lambda k=k: [one_by_one(lens, partial(interpolate, kind=k)) for lens in data] for k in kinds},
+        "power law": lambda: [one_by_one(lens, power_law) for lens in data],
+        "two regions": lambda: [one_by_one(lens, two_regions) for lens in data],
+        "SmoothZoom, other half's prior": cross_fitted,
+        "SmoothZoom, as in the package": partial(
+            all_lenses, data, partial(fit_smooth, zoom=zj.SmoothZoom())
+        ),
+    }
+    with ThreadPoolExecutor(2) as pool:
+        running = {name: pool.submit(fit) for name, fit in every_fit.items()}
+    fits = {name: future.result() for name, future in running.items()}
     lap("fits")
 
     interior = np.concatenate([np.r_[False, np.ones(len(d.focal) - 2, bool), False] for d in data])
