@@ -65,7 +65,6 @@ def candidates(entries: int | None = None) -> list[Candidate]:
     ]
     return [
         *polynomials,
-        Candidate("SmoothZoom", always(zj.SmoothZoom())),
         Candidate("degree 2, k1 alone", always(zj.PolynomialZoom(degree=2)), 1),
         Candidate(f"table in f{note} [25]", always(zj.TableZoom(number=entries, inverse=False))),
         Candidate(f"table in 1/f{note} [25]", always(zj.TableZoom(number=entries))),
