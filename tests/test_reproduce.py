@@ -97,6 +97,7 @@ def test_json_holds_the_same_figures(done):
     ("row", "cells"),
     [
         (reproduce.Row("a", 2.0, 2.1, "px"), ("2.0000 px", "2.1000 px", "+5.0 %")),
+        (reproduce.Row("a", 4.0, 145.0, "px"), ("4.0000 px", "145.0000 px", "36 times")),
         (reproduce.Row("a", 1.5, 1.0, "%"), ("1.50 %", "1.00 %", "-0.50 points")),
         (reproduce.Row("a", float("nan"), 1.0, "px"), ("", "1.0000 px", "")),
     ],

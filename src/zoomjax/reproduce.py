@@ -59,8 +59,10 @@ class Row:
             return "", ours, ""
         if self.unit == "%":
             difference = f"{self.ours - self.paper:+.2f} points"
-        else:
+        elif self.ours < 10 * self.paper:
             difference = f"{100 * (self.ours / self.paper - 1):+.1f} %"
+        else:
+            difference = f"{self.ours / self.paper:.0f} times"
         return f"{self.paper:.{decimals}f} {self.unit}", ours, difference
 
 
