@@ -123,7 +123,7 @@ def fit_centre(
         >>> t = np.linspace(0.0, 479.0, 50)
         >>> straight = [np.stack([np.full(50, x), t], -1) for x in (9.0, 320.0, 599.0)]
         >>> straight += [np.stack([t, np.full(50, y)], -1) for y in (9.0, 240.0, 470.0)]
-        >>> bent = Distortion(np.array([-0.1]), np.array([310.0, 250.0]), np.array(400.0)).distort(
+        >>> bent = Distortion(np.array([0.1]), np.array([310.0, 250.0]), np.array(400.0)).distort(
         ...     np.stack(straight)
         ... )
         >>> lines = Lines.from_ragged(list(bent), [0] * 6, [50], image_size=(640, 480))
