@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
+from zoomjax import synthetic
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -133,3 +134,38 @@ def test_what_is_not_determined_is_infinite(fit):
 def test_points_that_are_none_raise(fit, unchecked):
     with pytest.raises(ValueError, match=r"must have shape \(\.\.\., 2\)"):
         zj.displacement_std(fit, np.zeros((4, 3)), focal=50.0)
+
+
+# Rounding
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_bands_are_never_narrower_than_rounding_allows(dtype, truth):
+    """Focal lengths that are nearly the same: parameters with huge variances, of which a small one is left.
+
+    The band of a lens of one focal length, from the same lines, is what the band should be, at least.
+    """
+    scene = synthetic.board_lines(truth, FOCAL[:1].repeat(4), spacing=400.0, noise=2.0, seed=5)
+    corner = np.array([0.0, 0.0])
+    outcomes = []
+    for step in (1e-1, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4):
+        focal = (20.56 + step * np.arange(4)).astype(dtype)
+        lines = zj.Lines.from_ragged(
+            [line.astype(dtype) for line in scene.to_ragged()],
+            scene.frame,
+            focal,
+            image_size=scene.image_size,
+        )
+        fit = zj.fit_zoom(zj.compress(lines), invertible=False)
+        one = zj.fit_zoom(zj.compress(lines), zoom=zj.PolynomialZoom(degree=0))
+        least = 0.5 * float(zj.displacement_std(one, corner, focal=focal[0]))
+        std = zj.displacement_std(fit, corner, focal=focal)
+        low, high = zj.displacement_band(fit, corner, focal=focal, level=0.6827)
+        assert (std > least).all()
+        assert ((high - low) / 2 > least).all()
+        assert (
+            jnp.diagonal(zj.displacement_covariance(fit, corner, focal=focal), axis1=-2, axis2=-1) > 0
+        ).all()
+        assert (zj.coefficient_std(fit, focal) > 0.5 * zj.coefficient_std(one, focal[:1])).all()
+        outcomes.append(float(std[0]))
+    assert outcomes[0] < 10 * least  # and of use where there are digits left

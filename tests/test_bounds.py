@@ -147,3 +147,17 @@ def test_float32_stays_float32(lens, scene):
     bound = zj.displacement_bound(*single, std=0.5)
     assert bound.dtype == jnp.float32
     assert float(bound) == pytest.approx(float(zj.displacement_bound(lens, scene, std=0.5)), rel=1e-2)
+
+
+@pytest.mark.parametrize("std", [0.0, -0.5, np.nan, np.inf, "one is 0", "one is negative", "too few"])
+@pytest.mark.parametrize("bound", [zj.cramer_rao, zj.displacement_bound])
+def test_errors_of_points_that_are_none_are_refused(bound, std, clean, truth, unchecked):
+    """A negative one was taken for a positive, and 0 said that the lines determine nothing."""
+    each = np.full(len(clean.frame), 0.5)
+    stds = {
+        "one is 0": np.where(np.arange(each.size) == 3, 0, each),
+        "one is negative": np.where(np.arange(each.size) == 3, -0.5, each),
+        "too few": each[1:],
+    }
+    with pytest.raises(ValueError, match="Argument std must hold"):
+        bound(truth, clean, std=stds.get(std, std))

@@ -2,14 +2,17 @@
 
 import json
 import sys
+import warnings
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 import pytest
 
 import zoomjax as zj
 from zoomjax import synthetic
-from zoomjax.calibration import calibrate, focal_sigmas, results_folder, rms_over_frames
+from zoomjax.calibration import calibrate, focal_sigmas, rms_over_frames
+from zoomjax.report import report
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "real"))
 
@@ -81,36 +84,6 @@ def test_results_are_written_together_or_not_at_all(calibration, tmp_path, monke
     assert list(tmp_path.iterdir()) == []
 
 
-def test_folder_is_made_and_tried(tmp_path):
-    with results_folder(tmp_path / "new" / "deep") as folder:
-        assert folder.is_dir()
-    assert folder.is_dir()
-    (tmp_path / "file").write_text("")
-    with (
-        pytest.raises(OSError, match="Cannot write in the folder"),
-        results_folder(tmp_path / "file" / "below"),
-    ):
-        pass
-
-
-@pytest.mark.parametrize("content", [[], ["kept.txt"]], ids=["empty", "with a result"])
-def test_folder_made_for_work_that_fails_is_removed_unless_something_is_in_it(content, tmp_path):
-    def fail_in(folder):
-        for name in content:
-            (folder / name).write_text("")
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt), results_folder(tmp_path / "new" / "deep") as folder:
-        fail_in(folder)
-    assert (tmp_path / "new").exists() == bool(content)
-
-
-def test_folder_that_was_there_stays(tmp_path):
-    with pytest.raises(ZeroDivisionError), results_folder(tmp_path):
-        _ = 1 / 0
-    assert tmp_path.is_dir()
-
-
 def test_zoomcam_gives_the_reference_figures(data):
     from zoomcam import read_zoomcam
 
@@ -143,3 +116,27 @@ def test_deviations_are_numbers_or_per_cent():
     for text in ("", "%", "-1", "nan", "1%%", "inf", "a bit"):
         with pytest.raises(ValueError, match=r"--focal-sigma must be a number such as 0.3, or 1%"):
             focal_sigmas(text, np.ones(2))
+
+
+def test_a_frame_whose_lines_are_all_rejected_has_no_figures():
+    """In `summary.json`, which is JSON without NaN, and in the tables."""
+    lines = synthetic.board_lines(
+        synthetic.nikkor_18_200(), synthetic.focal_sweep(5), spacing=60, noise=0.4
+    )
+    wave = 80 * np.sin(np.linspace(0, 9, lines.points.shape[1]))[None, :, None]
+    bad = np.asarray(lines.frame) == 1
+    lines = eqx.tree_at(
+        lambda data: data.points, lines, lines.points + np.where(bad[:, None, None], wave, 0)
+    )
+    spoiled = calibrate(lines, robust=True)
+    assert spoiled.rejected[bad].all()
+    summary = json.loads(json.dumps(spoiled.summary(), allow_nan=False))
+    for key in ("rms_none", "rms_frames", "rms_zoom"):
+        per_frame = [row[key] for row in summary["per_frame"]]
+        assert per_frame[1] is None
+        known = np.array([value for value in per_frame if value is not None])
+        assert len(known) == 4
+        assert summary[key] == pytest.approx(rms_over_frames(known), rel=1e-9)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert ">nan<" not in report(spoiled)

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +55,7 @@ def test_help_does_not_wait_for_jax():
 
 def test_calibrate_writes_all_results(calibrated, few_lines):
     out, done = calibrated
-    expected = ["lens.json", "lines.npz", "model.png", "report.html", "summary.json"]
+    expected = [".zoomjax.json", "lens.json", "lines.npz", "model.png", "report.html", "summary.json"]
     assert sorted(p.name for p in out.iterdir()) == expected
     summary = json.loads((out / "summary.json").read_text())
     assert summary["frames"] == 5
@@ -64,6 +65,37 @@ def test_calibrate_writes_all_results(calibrated, few_lines):
     assert summary["result"] == "successful"
     assert summary["rms_frames"] <= summary["rms_zoom"] < 0.35 < summary["rms_none"]
     assert f"{summary['rms_zoom']:.4f}" in done.stdout
+
+
+STAGE = re.compile(r"  \S.* +\d+\.\d\d s")
+
+
+@pytest.mark.slow
+def test_on_a_fresh_machine_a_terminal_shows_nothing_but_stages(few_lines, tmp_path):
+    """All of stderr: with nothing kept, with what was compiled damaged, and with no home at all."""
+    few_lines.save(tmp_path / "lines.npz")
+    (tmp_path / "home").mkdir()
+    kept = tmp_path / "home" / ".cache" / "zoomjax" / "compiled"
+    own = {"HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR", "ZOOMJAX_CACHE"}
+    bare = {name: value for name, value in os.environ.items() if name not in own}
+    for home in (tmp_path / "lines.npz" / "none", tmp_path / "home", tmp_path / "home"):
+        done = subprocess.run(
+            [*COMMAND, "calibrate", "lines.npz", "-o", "out"],
+            capture_output=True, text=True, cwd=tmp_path, timeout=600, env=bare | {"HOME": str(home)},
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert [line for line in done.stderr.splitlines() if not STAGE.fullmatch(line)] == []
+        programs = list(kept.glob("*-cache"))
+        assert (len(programs) > 3) == kept.exists() == (home.name == "home")
+        assert all(file.stat().st_size > 100 for file in programs)  # those cut off were made again
+        for file in programs:
+            file.write_bytes(b"cut off")
+
+
+def test_every_package_that_a_command_needs_is_declared():
+    """JAX keeps nothing compiled, and complains at each program, where filelock is missing."""
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    assert any(line.startswith("filelock") for line in project["optional-dependencies"]["app"])
 
 
 def test_calibrate_gives_the_lens_that_the_library_gives(calibrated, few_lines):
@@ -111,7 +143,7 @@ def test_demo_photographs_the_board_and_finds_the_papers_lens(tmp_path):
     assert (out / "model.png").stat().st_size > 10_000
     assert (out / "before-after.jpg").stat().st_size > 10_000
     photos = sorted((out / "photos").iterdir())
-    assert [p.name for p in photos] == [p.name for p in sorted((out / "lines").iterdir())]
+    assert [p.name for p in photos] == [p.name[5:] for p in sorted((out / "lines").iterdir())]
     lens, truth = zj.load_lens(out / "lens.json"), synthetic.nikkor_18_200((2144, 1424))
     for f in (20.56, 35.0, 127.36):
         error = lens(f).undistort(np.zeros(2)) - truth(f).undistort(np.zeros(2))

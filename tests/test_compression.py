@@ -1,5 +1,8 @@
 import os
+import subprocess
+import sys
 from functools import partial
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -151,7 +154,7 @@ def test_chunks_that_lost_different_lines_do_not_merge(ragged):
 
 
 def test_compressing_twice_is_refused(small, unchecked):
-    with pytest.raises(TypeError, match="compressed already"):
+    with pytest.raises(TypeError, match="compressed already; pass the Lines"):
         zj.compress(small)
 
 
@@ -238,3 +241,16 @@ def test_second_derivatives_for_fits_are_those_through_all_points(scene, ragged,
 
     full = mixed(False)
     np.testing.assert_allclose(mixed(True), full, rtol=0, atol=1e-9 * np.max(np.abs(full)))
+
+
+def test_lines_spread_over_devices_stay_where_they_are():
+    """The same triangles, bit by bit, without an exchange of points; energies exchange a sum a frame."""
+    devices = "--xla_force_host_platform_device_count=4"
+    ran = subprocess.run(
+        [sys.executable, str(Path(__file__).with_name("_sharded.py"))],
+        env={**os.environ, "XLA_FLAGS": devices, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ran.returncode, ran.stdout.strip()) == (0, "as on one device"), ran.stderr

@@ -154,3 +154,8 @@ def test_candidates_are_in_their_part_of_the_image():
     np.testing.assert_allclose(np.linalg.norm(lines[..., -1, :] - lines[..., 0, :], axis=-1), 100)
     longest = candidate_lines(SIZE, 1e4)
     np.testing.assert_allclose(longest[1, 0, 1, [0, -1], 0], [0, SIZE[0] - 1])
+
+
+def test_without_lines_that_count_nothing_is_suggested(fit, small):
+    with pytest.raises(ValueError, match="must have a line that counts"):
+        zj.suggest_next(fit, small.weighted(np.zeros(len(small.frame))))

@@ -213,3 +213,57 @@ def test_equal_weights_change_nothing_and_whole_ones_repeat_lines(ragged):
 def test_weights_that_are_none_raise(weight, ragged):
     with pytest.raises(ValueError, match="Argument weight"):
         ragged.weighted(weight)
+
+
+WITHOUT_A_FRAME = pytest.mark.parametrize(
+    ("weight", "left"),
+    [
+        (np.array(RAGGED_FRAMES != 1, float), [0, 2]),
+        (np.array(RAGGED_FRAMES == 1, float), [1]),
+        (np.zeros(9), []),
+        (np.full(9, 1e300), [0, 1, 2]),
+        (np.full(9, 1e-300), [0, 1, 2]),
+    ],
+    ids=["one without weight", "one with weight", "no weight at all", "huge weights", "tiny weights"],
+)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@WITHOUT_A_FRAME
+def test_frames_without_weight_do_not_dilute_the_energy(weight, left, compressed, ragged):
+    """Their own error is not known, and the mean is that of the others."""
+    lines = (zj.compress(ragged) if compressed else ragged).weighted(weight)
+    frames = frame_energies(ragged, COEFFICIENTS)
+    expected = np.where(np.isin(np.arange(3), left), frames, np.nan)
+    close(zj.frame_energy(lines, COEFFICIENTS), expected, rtol=1e-9)
+    close(zj.frame_rms(lines, COEFFICIENTS) ** 2, expected, rtol=1e-9)
+    close(zj.global_energy(lines, COEFFICIENTS), frames[left].mean() if left else 0, rtol=1e-9)
+
+
+@WITHOUT_A_FRAME
+def test_gradients_past_frames_without_weight_are_finite(weight, left, ragged):
+    lines = ragged.weighted(weight)
+
+    def known(points):
+        return jnp.nansum(jnp.sqrt(zj.frame_energy(moved(lines, points), COEFFICIENTS)))
+
+    gradient = np.asarray(jax.grad(known)(lines.points))
+    assert np.isfinite(gradient).all()
+    assert (gradient[~np.isin(RAGGED_FRAMES, left)] == 0).all()
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_energies_of_float32_lines_are_float32(weighted, ragged):
+    points = [line.astype(np.float32) for line in ragged.to_ragged()]
+    lines = zj.Lines.from_ragged(points, ragged.frame, ragged.focal, image_size=ragged.image_size)
+    lines = lines.weighted(np.ones(9)) if weighted else lines
+    k = COEFFICIENTS.astype(jnp.float32)
+    for measured in (lines, zj.compress(lines)):
+        for values in (
+            line_weights(measured),
+            zj.residuals(measured, k),
+            zj.frame_energy(measured, k),
+            zj.global_energy(measured, k),
+            zj.frame_rms(measured, None),
+        ):
+            assert values.dtype == jnp.float32

@@ -464,7 +464,11 @@ MISTAKES = {
     "terms of zero": ({"terms": 0}, ValueError, "terms must be an integer of at least 1, but it is 0"),
     "terms with a fraction": ({"terms": 2.0}, ValueError, "but it is 2.0"),
     "terms in words": ({"terms": "2"}, ValueError, "but it is '2'"),
-    "a degree for a model": ({"zoom": 2}, TypeError, r"such as PolynomialZoom\(degree=2\), but it is 2"),
+    "a degree for a model": (
+        {"zoom": 2},
+        TypeError,
+        r"such as PolynomialZoom\(degree=2\), but its type is int",
+    ),
     "a class for a model": ({"zoom": zj.PolynomialZoom}, TypeError, "such as PolynomialZoom"),
 }
 

@@ -180,12 +180,17 @@ def test_float32(folding, best):
 # Under a trace, where both ways are compiled
 
 
-@pytest.fixture(scope="module")
-def barrel():
-    """A barrel that folds, one distortion for all focal lengths, in few lines and points."""
-    zoom = zj.PolynomialZoom(0, jnp.array([[-0.44]]), jnp.asarray(20.0))
+def barrel_of(k):
+    """A barrel, one distortion for all focal lengths, in few lines and points."""
+    zoom = zj.PolynomialZoom(0, jnp.array([[k]]), jnp.asarray(20.0))
     lens = zj.ZoomLens(zoom, jnp.asarray(CENTRE), jnp.array([20.0, 80.0]), SIZE)
     return distorted_lines(lens, FOCAL[:1], offset=150.0, noise=0.5, reach=0.4, number=4, points=5)
+
+
+@pytest.fixture(scope="module")
+def barrel():
+    """One that folds."""
+    return barrel_of(-0.44)
 
 
 @pytest.mark.slow
@@ -200,3 +205,60 @@ def test_differentiable_with_respect_to_the_points(barrel):
     assert fit.result == RESULTS.constrained
     np.testing.assert_allclose(jax.jit(fitted)(barrel.points), 100 * parameters(fit).ravel(), rtol=1e-7)
     assert_derivatives_agree(fitted, barrel.points, step=1e-2, rtol=1e-4)
+
+
+def batch_of(*several):
+    """Data sets of one shape as one with an axis more."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
+
+
+def conditions(jaxpr):
+    """The predicates' shapes, and the size of what is computed, of all conditions in a program."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "cond":
+            yield (
+                equation.invars[0].aval.shape,
+                max(len(str(branch)) for branch in equation.params["branches"]),
+            )
+        for value in jax.tree.leaves(equation.params, is_leaf=lambda p: hasattr(p, "eqns")):
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                yield from conditions(inner)
+
+
+def test_under_vmap_the_search_stays_conditional(barrel):
+    """Of the whole batch: as a choice for each of it, both would be computed for all, always."""
+    small = zj.compress(barrel)
+    zoom = zj.PolynomialZoom(0)
+
+    def fitted(lines):
+        return zj.fit_zoom(lines, zoom=zoom, throw=False).lens.zoom.parameters
+
+    arrays, rest = eqx.partition(batch_of(small, small), eqx.is_array)
+    program = jax.make_jaxpr(jax.vmap(lambda arrays: fitted(eqx.combine(arrays, rest))))(arrays)
+    largest = max(conditions(program.jaxpr), key=lambda one: one[1])
+    assert largest[0] == ()
+    assert largest[1] > 20_000  # it holds the interior-point method
+
+
+@pytest.mark.slow
+def test_under_vmap_each_fit_is_what_it_is_alone(barrel):
+    """Some of a batch fold and some do not; or none does."""
+    folding, good = zj.compress(barrel, 1), zj.compress(barrel_of(-0.1), 1)
+    zoom = zj.PolynomialZoom(0)
+
+    def fitted(lines):
+        return zj.fit_zoom(lines, zoom=zoom, terms=1, throw=False)
+
+    assert fitted(folding).result == RESULTS.constrained
+    assert fitted(good).result != RESULTS.constrained
+    together = eqx.filter_jit(eqx.filter_vmap(fitted))
+    for several in ((folding, good, folding), (good, good, good)):
+        fits = together(batch_of(*several))
+        for index, lines in enumerate(several):
+            alone = fitted(lines)
+            np.testing.assert_allclose(
+                fits.lens.zoom.parameters[index], parameters(alone), rtol=1e-7, atol=1e-10
+            )
+            assert jax.tree.map(lambda leaf, index=index: leaf[index], fits.result) == alone.result
+            np.testing.assert_allclose(fits.rms_unconstrained[index], alone.rms_unconstrained, rtol=1e-9)

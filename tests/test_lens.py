@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import equinox as eqx
@@ -116,9 +117,15 @@ SPOILED = {
     "negative image size": (lambda c: c | {"image_size": [-5, 4]}, "two positive integers"),
     "image size with a fraction": (lambda c: c | {"image_size": [640.5, 480]}, "two positive integers"),
     "unit": (lambda c: c | {"focal_unit": "inch"}, 'must be "mm" or "px"'),
-    "reversed range": (lambda c: c | {"focal_range": c["focal_range"][::-1]}, "in order"),
-    "negative range": (lambda c: c | {"focal_range": [-1.0, 3.0]}, "not positive"),
-    "zero reference": (lambda c: c | {"zoom": c["zoom"] | {"focal_ref": 0.0}}, "not positive"),
+    "reversed range": (lambda c: c | {"focal_range": c["focal_range"][::-1]}, "focal_range .* in order"),
+    "negative range": (
+        lambda c: c | {"focal_range": [-1.0, 3.0]},
+        "must be finite and positive",
+    ),
+    "zero reference": (
+        lambda c: c | {"zoom": c["zoom"] | {"focal_ref": 0.0}},
+        "must be finite and positive",
+    ),
     "no parameters": (
         lambda c: c | {"zoom": c["zoom"] | {"parameters": [[], [], []]}},
         "'parameters' are incomplete",
@@ -132,9 +139,93 @@ SPOILED = {
 }
 
 
-def test_many_focal_lengths_at_once_are_refused_with_a_way_out(lens, unchecked):
-    with pytest.raises(ValueError, match=r"jax.vmap\(lens\)"):
-        lens(np.array([30.0, 40.0]))
+@pytest.mark.parametrize("kind", [list, np.asarray, jnp.asarray])
+def test_several_focal_lengths_give_several_distortions(truth, kind):
+    focal = [24.0, 50.0, 100.0]
+    several = truth(kind(focal))
+    assert several.coefficients.shape == (3, 2)
+    points = np.random.default_rng(0).uniform(0, 600, (3, 4, 5, 2))
+    for method in ("undistort", "distort", "has_inverse"):
+        ours = getattr(several, method)(points)
+        loop = [getattr(truth(f), method)(p) for f, p in zip(focal, points, strict=True)]
+        np.testing.assert_allclose(ours, loop, rtol=1e-13, atol=1e-11)
+        one = getattr(several, method)(points[0, 0, 0])  # a single point is one for all
+        np.testing.assert_allclose(
+            one, [getattr(truth(f), method)(points[0, 0, 0]) for f in focal], rtol=1e-13
+        )
+    np.testing.assert_allclose(several.monotone_radius, [truth(f).monotone_radius for f in focal])
+    assert several.pixel_coefficients.shape == (3, 2)
+
+
+def test_several_distortions_need_a_set_of_points_each(truth):
+    with pytest.raises(ValueError, match=r"must begin with the axes \(2,\)"):
+        truth([24.0, 50.0]).undistort(np.zeros((3, 2)))
+
+
+@pytest.mark.parametrize("kind", [np.asarray, jnp.asarray], ids=["NumPy", "JAX"])
+@pytest.mark.parametrize("method", ["undistort", "distort"])
+def test_a_focal_length_for_each_point(truth, method, kind, rng):
+    points, focal = rng.uniform(0, 600, (4, 3, 2)), rng.uniform(21, 120, (4, 3))
+    ours = getattr(truth, method)(kind(points), kind(focal))
+    assert isinstance(ours, type(kind(points)))
+    loop = [
+        getattr(truth(f), method)(p) for p, f in zip(points.reshape(-1, 2), focal.reshape(-1), strict=True)
+    ]
+    np.testing.assert_allclose(ours.reshape(-1, 2), loop, rtol=1e-13, atol=1e-11)
+    by_column = getattr(truth, method)(kind(points), kind(focal[0]))  # broadcast as in NumPy
+    np.testing.assert_allclose(by_column[0], ours[0], rtol=1e-13, atol=1e-11)
+    one = getattr(truth, method)(kind(points), 35.0)
+    np.testing.assert_allclose(one, getattr(truth(35.0), method)(kind(points)), rtol=1e-13, atol=1e-11)
+
+
+def test_a_moving_centre_follows_each_focal_length(truth, rng):
+    shift = zj.PolynomialZoom(1, jnp.array([[0.0, 0.0], [0.03, -0.02]]), jnp.asarray(20.56))
+    lens = dataclasses.replace(truth, shift=shift)
+    points, focal = rng.uniform(0, 600, (5, 2)), rng.uniform(21, 120, 5)
+    loop = [lens(f).undistort(p) for p, f in zip(points, focal, strict=True)]
+    np.testing.assert_allclose(lens.undistort(points, focal), loop, rtol=1e-13, atol=1e-11)
+    np.testing.assert_allclose(lens(focal).undistort(points), loop, rtol=1e-13, atol=1e-11)
+
+
+def test_a_lens_may_be_closed_over(truth):
+    points = jnp.array([[3.0, 4.0], [500.0, 40.0]])
+    expected = truth(35.0).undistort(points)
+    np.testing.assert_allclose(
+        jax.jit(lambda p: truth(35.0).undistort(p))(points), expected, rtol=1e-13, atol=1e-11
+    )
+    np.testing.assert_allclose(
+        jax.jit(lambda f: truth(f).undistort(points))(35.0), expected, rtol=1e-13, atol=1e-11
+    )
+    np.testing.assert_allclose(
+        jax.jit(lambda p: truth.undistort(p, 35.0))(points), expected, rtol=1e-13, atol=1e-11
+    )
+
+
+def test_beyond_the_range_is_nan_where_nobody_can_be_warned(truth):
+    low, high = truth.focal_range
+    points = jnp.array([[3.0, 4.0], [500.0, 40.0]])
+    inside = jnp.array([low, 50.0, high])
+    outside = jnp.array([0.9 * low, 1.1 * high, -35.0, 0.0, jnp.nan, jnp.inf])
+    many = jax.jit(jax.vmap(lambda f: truth(f).undistort(points)))
+    assert jnp.isfinite(many(inside)).all()
+    assert jnp.isnan(many(outside)).all()
+    compiled = jax.jit(lambda points, focal: truth.undistort(points, focal))
+    assert jnp.isfinite(compiled(points, jnp.array([low, high]))).all()
+    assert jnp.isnan(compiled(points, jnp.array([1.1 * high, -low]))).all()
+    wider = truth.extended(10.0, 200.0)
+    assert jnp.isfinite(jax.jit(lambda f: wider(f).undistort(points))(0.9 * low)).all()
+    with pytest.warns(UserWarning, match="extrapolated"):
+        truth.undistort(points, 1.1 * high)
+    with pytest.raises(ValueError, match="positive"):
+        truth.undistort(points, -35.0)
+
+
+def test_numpy_points_at_another_focal_length_compile_nothing(truth, compilations, rng):
+    truth.undistort(rng.uniform(0, 600, (3, 2)), 35.0)
+    compilations()
+    for number in (5, 50, 500):
+        truth.distort(rng.uniform(0, 600, (number, 2)), 30.0 + number / 10)
+    assert compilations() == 0
 
 
 def test_range_is_checked_of_many_focal_lengths(lens):

@@ -1,7 +1,10 @@
 """The public names: they exist, say what they do, and are the ones agreed on."""
 
 import ast
+import importlib.metadata
 import inspect
+import subprocess
+import sys
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -13,7 +16,7 @@ STUB = Path(zj.__file__).with_suffix(".pyi")
 PUBLIC = [
     alias.asname
     for node in ast.parse(STUB.read_text()).body
-    if isinstance(node, ast.ImportFrom)
+    if isinstance(node, ast.ImportFrom) and node.module  # from . import x: a module
     for alias in node.names
 ]
 HEADINGS = ("Args:", "Attributes:", "Returns:", "Example:")
@@ -76,6 +79,52 @@ def test_functions_take_one_or_two_things_by_position(name):
 def test_results_are_sentences_to_act_on():
     for result in (zj.RESULTS.undetermined, zj.RESULTS.folded, zj.RESULTS.constrained):
         assert zj.RESULTS[result].endswith("the number of terms.")
+
+
+@pytest.mark.parametrize("missing", ["av", "matplotlib"])
+def test_without_an_extra_all_names_but_its_own_are_there(missing):
+    """In a process that cannot import it, as where it is not installed."""
+    code = f"""
+import sys
+sys.modules[{missing!r}] = None
+import importlib.util
+find = importlib.util.find_spec
+importlib.util.find_spec = lambda name, *more: None if name == {missing!r} else find(name, *more)
+import pydoc
+import zoomjax
+pydoc.render_doc(zoomjax)
+from zoomjax import *
+assert set(zoomjax.__all__) <= set(globals()), "names are missing"
+assert "synthetic" not in globals(), "modules are no part of it"
+try:
+    undistort_video(sys.executable, "out.mp4", lens=zoomjax.synthetic.nikkor_18_200(), focal=35.0)
+except ModuleNotFoundError as error:
+    print(error)
+except ValueError as error:
+    print("decoder asked")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    expected = 'Video needs PyAV: pip install "zoomjax[app]"' if missing == "av" else "decoder asked"
+    assert done.stdout.strip().splitlines()[-1] == expected
+
+
+def test_modules_are_reached_as_attributes():
+    assert zj.synthetic.nikkor_18_200().focal_unit == "mm"
+    assert callable(zj.plot.plot_model)
+    assert {"synthetic", "plot", "__version__"} <= set(dir(zj))
+    assert not {"synthetic", "plot"} & set(zj.__all__)
+
+
+def test_version_is_that_of_the_package():
+    assert zj.__version__ == importlib.metadata.version("zoomjax")
+
+
+def test_python_m_is_the_command_line():
+    done = subprocess.run(
+        [sys.executable, "-m", "zoomjax", "--version"], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, f"zoomjax {zj.__version__}\n"), done.stderr
 
 
 def test_unknown_name_raises():

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 import zoomjax as zj
@@ -110,3 +111,34 @@ def test_own_weights_are_kept_as_factors(board):
     robust = zj.fit_robust(zj.compress(board).weighted(own))
     assert (np.asarray(robust.weight) <= own).all()
     assert np.median(np.asarray(robust.weight)[own == 0.5]) == pytest.approx(0.5, rel=0.1)
+
+
+def test_solver_and_steps_are_those_of_the_last_fit(small):
+    robust = zj.fit_robust(small)
+    gauss = zj.fit_robust(small, solver=optx.GaussNewton(rtol=1e-9, atol=1e-9))
+    np.testing.assert_allclose(
+        gauss.fit.lens.zoom.parameters, robust.fit.lens.zoom.parameters, rtol=0, atol=1e-9
+    )
+    with pytest.raises(RuntimeError, match="The fit failed"):
+        zj.fit_robust(small, solver=optx.NonlinearCG(rtol=1e-12, atol=1e-12), max_steps=1)
+    assert zj.fit_robust(small, max_steps=1, throw=False).fit.steps <= 1
+
+
+def test_a_frame_of_which_nothing_is_left_has_no_error(board):
+    """Not the best of all errors, 0, nor a share in the mean."""
+    wave = 60 * np.sin(np.linspace(0, 9, board.points.shape[1]))[None, :, None]
+    bad = np.asarray(board.frame) == 2
+    small = zj.compress(moved(board, board.points + jnp.asarray(np.where(bad[:, None, None], wave, 0))))
+    robust = zj.fit_robust(small)
+    assert (np.asarray(robust.weight)[bad] == 0).all()
+    fit, others = robust.fit, np.arange(6) != 2
+    assert np.isnan(fit.frame_rms[2])
+    assert np.isfinite(fit.frame_rms[others]).all()
+    assert float(fit.rms) == pytest.approx(
+        np.sqrt(np.mean(np.asarray(fit.frame_rms)[others] ** 2)), rel=1e-9
+    )
+    each = zj.fit_frames(small.weighted(robust.weight), throw=False)
+    np.testing.assert_array_equal(np.isnan(each.frame_rms), ~others)
+    assert zj.RESULTS[fit.result] == ""
+    assert "do not determine" in each.messages()[2]
+    assert float(each.rms) == pytest.approx(float(fit.rms), rel=0.05)

@@ -337,3 +337,18 @@ def test_a_family_that_the_triangles_do_not_serve_says_so(lines):
     candidates = [zj.PolynomialZoom(), zj.Candidate(zj.PolynomialZoom(), 1, zj.Division())]
     _, verdict = zj.select_model(lines, candidates, hold_out="line", folds=2).verdicts
     assert "compress(lines, terms=8)" in verdict.problem
+
+
+def without_any_weight(lines):
+    return lines.weighted(np.zeros(len(lines.frame)))
+
+
+def with_a_point_that_is_nan(lines):
+    return eqx.tree_at(lambda lines: lines.triangle, lines, lines.triangle.at[3, 1, 1].set(np.nan))
+
+
+@pytest.mark.parametrize("spoiled", [without_any_weight, with_a_point_that_is_nan])
+@pytest.mark.parametrize("measure", [held_out_zoom, held_out_frames, zj.select_model])
+def test_lines_that_say_nothing_are_refused(measure, spoiled, lines):
+    with pytest.raises(ValueError, match="Argument lines must"):
+        measure(spoiled(lines))

@@ -214,3 +214,18 @@ def test_dtypes(image):
 def test_bad_arguments(image, interpolation, message):
     with pytest.raises((ValueError, TypeError), match=message):
         zj.warp_image(image, LENSES[0], interpolation=interpolation)
+
+
+@pytest.mark.parametrize("k", [(1.290903, -0.486014), (0.55, -0.28), (-0.33, 0.0), (0.1, -0.02)])
+def test_every_pixel_has_arrived(k):
+    """Also where Newton's method jumps between two points for ever, and at the fold."""
+    size = (160, 120)
+    d = zj.Distortion(jnp.array(k), jnp.array([79.5, 59.5]), jnp.array(80.0))
+    framing = zj.Framing(jnp.ones(()), jnp.zeros(2), size)
+    x, y = sample_positions(d, framing, jnp.float64)
+    pixels = np.stack(np.meshgrid(*map(np.arange, size)), axis=-1).astype(float)
+    exact = d.distort(pixels)
+    seen = np.isfinite(exact[..., 0])
+    np.testing.assert_array_equal(np.asarray(x) > -1000, seen)
+    again = d.undistort(np.stack([x, y], axis=-1)[seen])
+    np.testing.assert_allclose(again, pixels[seen], rtol=0, atol=1e-9)

@@ -1,5 +1,8 @@
 # The public names, one place: read by type checkers, and by lazy_loader at run time.
 
+from . import plot as plot
+from . import synthetic as synthetic
+from ._bernstein import Pieces as Pieces
 from .algebraic import algebraic_frames as algebraic_frames
 from .algebraic import algebraic_zoom as algebraic_zoom
 from .any_centre import AnyCentreLines as AnyCentreLines
@@ -14,6 +17,7 @@ from .blunders import reject_points as reject_points
 from .bounds import cramer_rao as cramer_rao
 from .bounds import displacement_bound as displacement_bound
 from .bounds import displacement_rms as displacement_rms
+from .camera import Camera as Camera
 from .centre import CentreFit as CentreFit
 from .centre import FrameCentres as FrameCentres
 from .centre import fit_centre as fit_centre
@@ -23,12 +27,14 @@ from .certificate import certify as certify
 from .compression import CompressedLines as CompressedLines
 from .compression import compress as compress
 from .compression import merge as merge
+from .concatenation import concatenate as concatenate
 from .design import Suggestion as Suggestion
 from .design import suggest_next as suggest_next
 from .energy import frame_energy as frame_energy
 from .energy import global_energy as global_energy
 from .energy import residuals as residuals
 from .families import AbstractFamily as AbstractFamily
+from .families import AbstractRadial as AbstractRadial
 from .families import BrownConrady as BrownConrady
 from .families import Division as Division
 from .families import RadialPolynomial as RadialPolynomial
@@ -65,6 +71,7 @@ from .lens import load_lens as load_lens
 from .lines import AbstractLines as AbstractLines
 from .lines import Lines as Lines
 from .lines import load_lines as load_lines
+from .models import register_model as register_model
 from .pitch import focal_from_pitch as focal_from_pitch
 from .radial import Distortion as Distortion
 from .rivals import PowerZoom as PowerZoom
@@ -80,6 +87,7 @@ from .selection import Verdict as Verdict
 from .selection import select_model as select_model
 from .sizes import lens_for_size as lens_for_size
 from .smooth import SmoothZoom as SmoothZoom
+from .training import trainable as trainable
 from .vision.detector import AbstractDetector as AbstractDetector
 from .vision.edges import EdgeDetector as EdgeDetector
 from .vision.grid import GridDetector as GridDetector
@@ -93,3 +101,5 @@ from .zoom import AbstractLinearZoom as AbstractLinearZoom
 from .zoom import AbstractPriorZoom as AbstractPriorZoom
 from .zoom import AbstractZoom as AbstractZoom
 from .zoom import PolynomialZoom as PolynomialZoom
+
+__version__: str

@@ -1,44 +1,187 @@
-"""Writing files whole or not at all; where what can be made again is kept."""
+"""Writing files whole or not at all, where nothing is lost; where what can be made again is kept.
+
+Until it is whole, a file has a temporary name, ``.zoomjax-*``, in the folder that it is for. A run that is
+killed leaves it there; the next one removes it. That no process uses it any more is told by a lock, which
+the operating system lets go of with the process.
+"""
 
 import contextlib
 import errno
+import functools
 import os
+import re
+import shutil
+import stat
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+try:
+    import fcntl
+except ModuleNotFoundError:  # Windows
+    fcntl = None
 
-def cache_folder(kind: str) -> Path:
-    """A folder for what can be made again: in ``ZOOMJAX_CACHE``, else in the user's cache."""
+TEMPORARY = ".zoomjax-"
+"""How temporary names begin."""
+
+_LEFT = re.compile(re.escape(TEMPORARY) + r"[a-z0-9_]{8}(\.part)?")
+_FRESH = 60.0  # s, that a process has to lock what it made
+_OLD = 7 * 86400.0  # s, after which what cannot be locked counts as left
+
+
+def cache_folder(kind: str) -> Path | None:
+    """A folder for what can be made again: in ``ZOOMJAX_CACHE``, else in the user's cache.
+
+    None if there is no home to have one in: never a folder that others could fill.
+    """
     if named := os.environ.get("ZOOMJAX_CACHE"):
         return Path(named) / kind
-    base = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "zoomjax" / kind
+    base = Path(os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME") or "")
+    if not base.is_absolute():  # to be passed over, says the standard
+        try:
+            base = Path.home() / ".cache"
+        except RuntimeError:
+            return None
+    return base / "zoomjax" / kind if base.is_absolute() else None
+
+
+_unfinished: list[Path] = []
+
+
+@contextlib.contextmanager
+def unfinished(path: Path) -> Iterator[None]:
+    """While the block runs, something is there that it must remove again."""
+    _unfinished.append(path)
+    try:
+        yield
+    finally:
+        _unfinished.remove(path)
+
+
+def is_unfinished() -> bool:
+    """Whether anything is: if not, a process may be left at once."""
+    return bool(_unfinished)
 
 
 @contextlib.contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary path beside `path`, which takes its place only if the block succeeds.
 
+    A link to a file is replaced, and not followed.
+
     Raises:
-        OSError: the folder does not exist or cannot be written; the message names it.
+        OSError: the folder does not exist or cannot be written, or `path` is no ordinary file; the message
+            names it.
     """
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "cannot write a file where there is a folder", str(path))
+    if path.exists() and not path.is_file():
+        raise FileExistsError(errno.EEXIST, "cannot write a file in place of a device", str(path))
+    _remove_left_once(path.parent.absolute())
+    with unfinished(path):
+        try:
+            handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=".part")
+        except OSError as error:
+            raise type(error)(
+                error.errno, f"cannot write in the folder {path.parent}: {error.strerror}"
+            ) from error
+        os.close(handle)
+        part = Path(name)
+        try:
+            with locked(part):
+                yield part
+            umask = os.umask(0)
+            os.umask(umask)
+            part.chmod(0o666 & ~umask)  # mkstemp's 0600 is for secrets; a result is an ordinary file
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def refuse_existing(targets: Iterable[Path], *, overwrite: bool) -> None:
+    """Refuse to replace what is there: to be called before any work.
+
+    A link counts as what is there, wherever it leads.
+
+    Raises:
+        FileExistsError: one of `targets` is there, and `overwrite` is not given.
+    """
+    there = [] if overwrite else [path for path in dict.fromkeys(targets) if os.path.lexists(path)]
+    if there:
+        raise FileExistsError(
+            f"{_several(there)} there already and would be replaced: choose another place, or give "
+            "overwrite."
+        )
+
+
+def refuse_inputs(targets: Iterable[Path], inputs: Iterable[str | os.PathLike[str]]) -> None:
+    """Refuse to write to a file that is read, whatever it is called: through links, ``..`` or upper case.
+
+    Raises:
+        ValueError: one of `targets` is one of `inputs`.
+    """
+    read = {}
+    for path in inputs:
+        with contextlib.suppress(OSError):
+            about = os.stat(path)
+            read[about.st_dev, about.st_ino] = path
+    for target in targets:
+        with contextlib.suppress(OSError):
+            about = os.stat(target)
+            if (same := read.get((about.st_dev, about.st_ino))) is not None:
+                what = "" if os.fspath(same) == str(target) else f" {os.fspath(same)}"
+                raise ValueError(f"The output {target} is the input{what}. Choose another place.")
+
+
+def _several(paths: list[Path]) -> str:
+    """The first and how many more, with their verb."""
+    more = len(paths) - 1
+    return (
+        f"{paths[0]} and {more} more {'file' if more == 1 else 'files'} are" if more else f"{paths[0]} is"
+    )
+
+
+@contextlib.contextmanager
+def locked(path: Path, *, wait: bool = False) -> Iterator[None]:
+    """Lock a file or folder, if need be after a `wait`; some network file systems have no locks."""
+    with contextlib.ExitStack() as stack:
+        if fcntl:
+            with contextlib.suppress(OSError):
+                handle = os.open(path, os.O_RDONLY)
+                stack.callback(os.close, handle)
+                fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        yield
+
+
+def remove_left(folder: Path) -> None:
+    """Remove what runs that were killed left in a folder; what is in use, or not of zoomjax, stays."""
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            if name := _LEFT.fullmatch(entry.name):
+                with contextlib.suppress(OSError):
+                    _remove_if_left(Path(entry.path), is_file=bool(name[1]))
+
+
+_remove_left_once = functools.lru_cache(maxsize=64)(remove_left)
+
+
+def _remove_if_left(path: Path, *, is_file: bool) -> None:
+    state = path.lstat()
+    if not (stat.S_ISREG if is_file else stat.S_ISDIR)(state.st_mode):
+        return
+    age = time.time() - state.st_mtime
+    if age < (_FRESH if fcntl else _OLD):
+        return
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW) if fcntl else None
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    except OSError as error:
-        raise type(error)(
-            error.errno, f"cannot write in the folder {path.parent}: {error.strerror}"
-        ) from error
-    os.close(handle)
-    part = Path(name)
-    try:
-        yield part
-        umask = os.umask(0)
-        os.umask(umask)
-        part.chmod(0o666 & ~umask)  # mkstemp's 0600 is for secrets; a result is an ordinary file
-        part.replace(path)
+        if fcntl and handle is not None:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # else somebody uses it
+        if is_file:
+            path.unlink()
+        else:
+            shutil.rmtree(path, ignore_errors=True)
     finally:
-        part.unlink(missing_ok=True)
+        if handle is not None:
+            os.close(handle)

@@ -1,5 +1,6 @@
 """Linear least squares with many rows and few columns."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -17,3 +18,41 @@ def least_squares(
     known = size > 64 * jnp.finfo(size.dtype).eps * (size[0] + floor)
     inverse = jnp.where(known, 1 / jnp.where(known, size, 1), 0)
     return rows.T @ (inverse * (left.T @ triangle[:, -1]))
+
+
+def gram_schmidt(
+    matrix: Float[Array, "row column"],
+) -> tuple[Float[Array, "row column"], Float[Array, "column column"]]:
+    """Q and R of a matrix by modified Gram-Schmidt; rows of zeros in R for columns that are dependent."""
+
+    def reduce(left, column):
+        own = left[:, column]
+        products = jnp.matmul(own, left, precision="highest")
+        norm = jnp.sqrt(products[column])
+        inverse = jnp.where(norm > 0, 1 / jnp.where(norm > 0, norm, 1), 0)
+        unit, row = own * inverse, products * inverse
+        return (left - jnp.outer(unit, row)).at[:, column].set(0), (unit, row)
+
+    _, (units, triangle) = jax.lax.scan(reduce, matrix, jnp.arange(matrix.shape[1]))
+    return units.T, triangle
+
+
+def solved(
+    orthogonal: Float[Array, "row column"],
+    triangle: Float[Array, "column column"],
+    right: Float[Array, "row"],
+) -> Float[Array, "column"]:
+    """The x of least ``|Q R x - right|``, with Q and R of `gram_schmidt`.
+
+    Each column is taken off `right` before the next is looked at: so the error is that of Householder's QR
+    (Björck 1967), though Q is orthogonal only as far as the condition allows.
+    """
+
+    def take_off(left, unit):
+        part = jnp.vdot(unit, left, precision="highest")
+        return left - part * unit, part
+
+    parts = jax.lax.scan(take_off, right, orthogonal.T)[1]
+    missing = jnp.diagonal(triangle) == 0
+    regular = triangle + jnp.diag(missing.astype(triangle.dtype))
+    return jax.scipy.linalg.solve_triangular(regular, parts)

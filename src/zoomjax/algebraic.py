@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._arguments import kinds_checked
 from ._linear import least_squares
 from .compression import CompressedLines, compress
 from .energy import line_weights, prior_jacobian, settings
@@ -74,6 +75,7 @@ def _areas(triangle, terms):
     return areas / jnp.sqrt(jnp.where(squared_length > 0, squared_length, 1))
 
 
+@kinds_checked
 def algebraic_zoom(
     lines: AbstractLines, *, zoom: AbstractLinearZoom | None = None, terms: int = 2
 ) -> ZoomLens:
@@ -94,6 +96,7 @@ def algebraic_zoom(
     return _solve_zoom(compressed(lines, terms), prepared, terms)
 
 
+@kinds_checked
 def algebraic_frames(lines: AbstractLines, *, terms: int = 2) -> Float[Array, "frame terms"]:
     """The normalised coefficients of each frame by itself, by the algebraic estimate."""
     return _solve_frames(compressed(lines, terms), *lines.by_frame(), terms)

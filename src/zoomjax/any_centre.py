@@ -17,7 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ._checks import checked_terms
+from ._arguments import kinds_checked
+from ._checks import checked_size, checked_terms
+from ._fields import check_shapes, integers, numbers
 from ._types import Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Point
 from .compression import EXACT, CompressedLines, triangle, triangles_of
 from .lines import AbstractLines, Lines, focus_of
@@ -31,15 +33,32 @@ class AnyCentreLines(AbstractLines):
         frame, focal, centre, image_size, focal_unit, number, weight, focus: as in `Lines`.
     """
 
-    triangle: Float[Array, "line rows rows"]
-    frame: FrameIndex
-    focal: Focal
-    centre: Point
-    image_size: tuple[int, int] = eqx.field(static=True)
+    triangle: Float[Array, "line rows rows"] = eqx.field(converter=numbers("triangle"))
+    frame: FrameIndex = eqx.field(converter=integers("frame"))
+    focal: Focal = eqx.field(converter=numbers("focal"))
+    centre: Point = eqx.field(converter=numbers("centre"))
+    image_size: tuple[int, int] = eqx.field(static=True, converter=checked_size)
     focal_unit: str = eqx.field(static=True)
-    number: LineNumber | None = None
-    weight: LineWeight | None = None
-    focus: Focus | None = None
+    number: LineNumber | None = eqx.field(default=None, converter=integers("number"))
+    weight: LineWeight | None = eqx.field(default=None, converter=numbers("weight"))
+    focus: Focus | None = eqx.field(default=None, converter=numbers("focus"))
+
+    def __check_init__(self):
+        """Check that the shapes agree."""
+        check_shapes(
+            {
+                "triangle": (self.triangle, ("line", "rows", "rows")),
+                "frame": (self.frame, ("line",)),
+                "number": (self.number, ("line",)),
+            }
+        )
+        if hasattr(self.triangle, "shape"):
+            terms = self.terms
+            if terms < 1 or self.triangle.shape[-1] != (2 * terms + 2) * (2 * terms + 3) // 2:
+                raise ValueError(
+                    "Argument triangle must have (2 N + 2)(2 N + 3) / 2 rows for N terms, N >= 1, but its "
+                    f"shape is {self.triangle.shape}."
+                )
 
     @property
     def terms(self) -> int:
@@ -116,6 +135,7 @@ class AnyCentreLines(AbstractLines):
         )
 
 
+@kinds_checked
 def compress_any_centre(lines: Lines, terms: int = 2) -> AnyCentreLines:
     """Reduce each line to a triangle that serves every centre of distortion: for `fit_centre`.
 
@@ -131,8 +151,6 @@ def compress_any_centre(lines: Lines, terms: int = 2) -> AnyCentreLines:
         >>> small.triangle.shape, small.about(np.array([320.0, 250.0])).triangle.shape
         ((2, 21, 21), (2, 7, 7))
     """
-    if not isinstance(lines, Lines):
-        raise TypeError(f"Argument lines must be Lines, but its type is {type(lines).__name__}.")
     return AnyCentreLines(
         triangle=triangles_of(lines, _monomials, checked_terms(terms)),
         frame=lines.frame,

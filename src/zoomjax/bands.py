@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, Num, PyTree, ScalarLike
 
+from ._arguments import kinds_checked
 from ._types import AnyArray, Points
 from .fit import ZoomFit
 from .lens import ZoomLens
@@ -25,6 +26,7 @@ from .zoom import with_parameters
 Focals = Num[AnyArray | ScalarLike, "*focal"]
 
 
+@kinds_checked
 def std_of(fit: ZoomFit, function: Callable[[ZoomLens], PyTree]) -> PyTree:
     """Standard deviations of anything computed from a fitted lens.
 
@@ -59,6 +61,7 @@ def std_of(fit: ZoomFit, function: Callable[[ZoomLens], PyTree]) -> PyTree:
     return jax.tree.map(lambda rows: _root(_variance(fit.covariance, rows)), derivatives)
 
 
+@kinds_checked
 @eqx.filter_jit
 def coefficient_std(fit: ZoomFit, focal: Focals) -> Float[Array, "*focal terms"]:
     """Standard deviations of the normalised coefficients k1(f), ..., kN(f).
@@ -82,6 +85,7 @@ def coefficient_std(fit: ZoomFit, focal: Focals) -> Float[Array, "*focal terms"]
     return _each_focal(lambda f: std_of(fit, lambda lens: lens.zoom(f)), fit, focal)
 
 
+@kinds_checked
 @eqx.filter_jit
 def displacement_covariance(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Array, "*both 2 2"]:
     """Covariance, px^2, of where the lens puts points: of corrected positions, and so of displacements.
@@ -106,6 +110,7 @@ def displacement_covariance(fit: ZoomFit, points: Points, *, focal: Focals) -> F
     return _each_point(_point_covariance, "(c,d)", fit, points, focal)
 
 
+@kinds_checked
 @eqx.filter_jit
 def displacement_std(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Array, "*both"]:
     """Standard deviation, px, of where the lens puts points: the root of the mean squared distance.
@@ -129,6 +134,7 @@ def displacement_std(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Ar
     return _each_point(lambda *one: _root(jnp.trace(_point_covariance(*one))), "()", fit, points, focal)
 
 
+@kinds_checked
 @eqx.filter_jit
 def displacement_band(
     fit: ZoomFit, points: Points, *, focal: Focals, level: ScalarLike = 0.95
@@ -160,9 +166,7 @@ def displacement_band(
         offset = point - jnp.asarray(fit.lens.centre, point.dtype)
         squared = offset @ offset
         outward = offset / jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 1)
-        covariance = _point_covariance(fit, point, f)
-        variance = outward @ jnp.where(jnp.isinf(covariance), 0, covariance) @ outward
-        variance = jnp.where(jnp.any(jnp.isinf(covariance)), jnp.inf, variance)
+        variance = _variance(fit.covariance, outward @ _point_rows(fit, point, f))
         middle = (fit.lens(f).undistort(point) - point) @ outward
         half = quantile.astype(point.dtype) * _root(variance)
         return jnp.stack([middle - half, middle + half])
@@ -187,26 +191,38 @@ def _each_point(function, result, fit, points, focal):
     return over(jnp.broadcast_to(points, (*both, 2)), jnp.broadcast_to(focal, both))
 
 
-def _point_covariance(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 2"]:
-    """Of one corrected point."""
+def _point_rows(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 parameter"]:
+    """Derivatives of one corrected point by the parameters."""
     flat, unravel = ravel_pytree(fit.lens.zoom.parameters)
 
     def corrected(flat):
         zoom = with_parameters(fit.lens.zoom, unravel(flat))
         return eqx.tree_at(lambda lens: lens.zoom, fit.lens, zoom)(f).undistort(point)
 
-    rows = jax.jacfwd(corrected)(flat)
+    return jax.jacfwd(corrected)(flat)
+
+
+def _point_covariance(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 2"]:
+    """Of one corrected point."""
+    rows = _point_rows(fit, point, f)
     variance = _variance(fit.covariance, rows)
     covariance = rows @ _finite(fit.covariance) @ rows.T
     unknown = jnp.any(jnp.isinf(variance))
-    return jnp.where(unknown, jnp.where(jnp.eye(2, dtype=bool), variance, 0), covariance)
+    off_diagonal = jnp.where(unknown, 0, covariance)
+    return jnp.where(jnp.eye(2, dtype=bool), variance[:, None], off_diagonal)
 
 
 def _variance(covariance, rows):
-    """The diagonal of ``rows C rows^T``, infinite where a row uses a parameter of infinite variance."""
+    """The diagonal of ``rows C rows^T``, infinite where a row uses a parameter of infinite variance.
+
+    Never below what rounding may make of it. Focal lengths that are nearly the same give parameters with
+    variances of 1e18, say, whose sum cancels: its last digits, or a negative number, say nothing.
+    """
     finite = jnp.einsum("...p,pq,...q->...", rows, _finite(covariance), rows)
+    size = jnp.einsum("...p,pq,...q->...", *map(jnp.abs, (rows, _finite(covariance), rows)))
+    rounding = jax.lax.stop_gradient(rows.shape[-1] * jnp.finfo(rows.dtype).eps * size)
     unknown = jnp.isinf(jnp.diagonal(covariance)).astype(rows.dtype)
-    return jnp.where((rows != 0).astype(rows.dtype) @ unknown > 0, jnp.inf, jnp.maximum(finite, 0))
+    return jnp.where((rows != 0).astype(rows.dtype) @ unknown > 0, jnp.inf, jnp.maximum(finite, rounding))
 
 
 def _finite(covariance):

@@ -21,6 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ._arguments import kinds_checked
+from ._types import of_known_values
 from .compression import compress
 from .energy import coefficients_by, line_normal
 from .fit import ready_model
@@ -60,6 +62,8 @@ class PointRejection(NamedTuple):
     spread: Float[np.ndarray, "line"]
 
 
+@kinds_checked
+@of_known_values
 def reject_points(
     lines: Lines, *, zoom: AbstractZoom | None = None, terms: int | None = None, throw: bool = True
 ) -> PointRejection:

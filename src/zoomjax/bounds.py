@@ -24,7 +24,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, ScalarLike
 
-from ._types import AnyArray
+from ._arguments import kinds_checked
+from ._types import AnyArray, traced
 from .energy import line_normal
 from .lens import ZoomLens
 from .lines import Lines
@@ -33,7 +34,7 @@ from .zoom import with_parameters
 _NODES = 8  # of Gauss and Legendre, along x, y and 1/f: exact where the square has a degree of at most 15
 
 
-@eqx.filter_jit
+@kinds_checked
 def cramer_rao(
     lens: ZoomLens, lines: Lines, *, std: Float[AnyArray, "line"] | ScalarLike
 ) -> Float[Array, "parameter parameter"]:
@@ -48,7 +49,10 @@ def cramer_rao(
 
     Returns:
         Of the flattened parameters, in the order of `ZoomFit.covariance`; all infinite on the diagonal
-        where the lines do not determine them.
+        where the lines do not determine them, or the lens folds at one of their points.
+
+    Raises:
+        ValueError: `std` is not positive and finite, or not one number or one a line.
 
     Example:
         >>> from zoomjax import synthetic
@@ -56,7 +60,13 @@ def cramer_rao(
         >>> cramer_rao(lens, synthetic.board_lines(lens, focal, spacing=99.0), std=0.5).shape
         (6, 6)
     """
+    return _cramer_rao(lens, lines, _checked_std(std, lines))
+
+
+@eqx.filter_jit
+def _cramer_rao(lens, lines, std):
     std = jnp.broadcast_to(jnp.asarray(std, lens.centre.dtype), lines.frame.shape)
+    std = jnp.where(std > 0, std, jnp.nan)  # where it could not be checked: nothing is known
     focal = jnp.asarray(lines.focal)[lines.frame]
     each = (jnp.asarray(lines.points), lines.mask, focal, std)
     rows, most = jax.lax.map(lambda line: _derivatives(lens, *line), each, batch_size=64)
@@ -73,7 +83,7 @@ def cramer_rao(
     return jnp.where(determined, root @ root.T, unknown)
 
 
-@eqx.filter_jit
+@kinds_checked
 def displacement_bound(
     lens: ZoomLens, lines: Lines, *, std: Float[AnyArray, "line"] | ScalarLike
 ) -> Float[Array, ""]:
@@ -82,7 +92,7 @@ def displacement_bound(
     The mean is over noise, image and focal range, as in `displacement_rms`, which tells the error itself.
 
     Args:
-        lens, lines, std: as for `cramer_rao`.
+        lens, lines, std: as for `cramer_rao`, whose errors also apply.
 
     Returns:
         The bound; infinite where the lines do not determine the lens.
@@ -94,6 +104,11 @@ def displacement_bound(
         >>> bool(displacement_bound(lens, lines, std=0.5) < 0.3)
         True
     """
+    return _displacement_bound(lens, lines, _checked_std(std, lines))
+
+
+@eqx.filter_jit
+def _displacement_bound(lens, lines, std):
     flat, unravel = ravel_pytree(lens.zoom.parameters)
     points, focal, weight = _field(lens)
 
@@ -102,11 +117,12 @@ def displacement_bound(
 
     rows = jax.vmap(derivatives)(focal)
     squared = jnp.einsum("fncp,fncq,fn->pq", rows, rows, weight)
-    covariance = cramer_rao(lens, lines, std=std)
+    covariance = _cramer_rao(lens, lines, std)
     determined = jnp.all(jnp.isfinite(covariance))
     return jnp.sqrt(jnp.where(determined, jnp.sum(jnp.where(determined, covariance, 0) * squared), jnp.inf))
 
 
+@kinds_checked
 @eqx.filter_jit
 def displacement_rms(lens: ZoomLens, other: ZoomLens) -> Float[Array, ""]:
     """How far apart, px, two lenses correct the same point to: the RMS over image and focal range.
@@ -123,6 +139,19 @@ def displacement_rms(lens: ZoomLens, other: ZoomLens) -> Float[Array, ""]:
     points, focal, weight = _field(lens)
     apart = jax.vmap(lambda f: lens(f).undistort(points) - other(f).undistort(points))(focal)
     return jnp.sqrt(jnp.sum(weight * jnp.sum(apart**2, axis=-1)))
+
+
+def _checked_std(std, lines):
+    """Standard deviations of points, positive and finite."""
+    std = jnp.asarray(std)
+    if std.shape not in ((), lines.frame.shape):
+        raise ValueError(
+            f"Argument std must hold one number, or one for each of the {lines.frame.shape[0]} lines, but "
+            f"its shape is {std.shape}."
+        )
+    if not traced(std) and not (np.isfinite(std) & (np.asarray(std) > 0)).all():
+        raise ValueError(f"Argument std must hold finite positive numbers, but it is {std}.")
+    return std
 
 
 def _with(lens, parameters):

@@ -3,14 +3,11 @@
 This is what the command line runs; it prints nothing, and draws with `plot`.
 """
 
-import contextlib
 import dataclasses
 import importlib.metadata
 import json
 import os
-import shutil
-import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ._results import results_folder
 from ._types import AnyArray
 from .algebraic import algebraic_zoom
 from .bands import displacement_std
@@ -34,6 +32,12 @@ from .plot import plot_model
 from .robust import fit_robust
 from .selection import Selection, default_candidates, select_model
 from .zoom import PolynomialZoom
+
+FILES = ("lens.json", "lines.npz", "summary.json", "model.png")
+"""What `Calibration.write` writes."""
+
+CLEARS = ("lines/*",)
+"""What it removes of what an earlier calibration wrote: pictures of other lines."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,9 +140,9 @@ class Calibration:
             "focal": np.asarray(self.lines.focal).tolist(),
             "focal_sigma": self.focal_sigma.tolist(),
             "lines": np.bincount(frame, minlength=len(self.none)).tolist(),
-            "rms_none": self.none.tolist(),
-            "rms_frames": np.asarray(self.each.frame_rms).tolist(),
-            "rms_zoom": np.asarray(self.zoom.frame_rms).tolist(),
+            "rms_none": _finite(self.none),
+            "rms_frames": _finite(np.asarray(self.each.frame_rms)),
+            "rms_zoom": _finite(np.asarray(self.zoom.frame_rms)),
             "rms_held_out": _finite(self.held_out),
             "rms_frames_held_out": _finite(self.each_held_out),
         }
@@ -197,27 +201,38 @@ class Calibration:
         folder: str | os.PathLike[str],
         about: dict[str, Any] | None = None,
         pages: Mapping[str, str] | None = None,
+        *,
+        overwrite: bool = False,
     ) -> None:
-        """Write lens.json, lines.npz, summary.json and model.png, each whole, once all have been made.
+        """Write lens.json, lines.npz, summary.json and model.png, which appear together.
 
         Args:
             folder: where to.
             about: what summary.json says besides.
             pages: further files' texts, by their names.
+            overwrite: whether to replace files that zoomjax did not write, or that were changed since.
 
         Raises:
-            OSError: the folder cannot be written.
+            OSError: the folder cannot be written, or such a file is there.
         """
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".zoomjax-") as part:
-            part = Path(part)
-            self.zoom.lens.save(part / "lens.json")
-            self.lines.save(part / "lines.npz")
-            (part / "summary.json").write_text(json.dumps(self.summary() | (about or {}), indent=2) + "\n")
-            plot_model(self.zoom, self.each, self.lines).savefig(part / "model.png", dpi=150)
-            for name, text in (pages or {}).items():
-                (part / name).write_text(text, encoding="utf-8")
-            for file in sorted(part.iterdir()):
-                file.replace(Path(folder) / file.name)
+        names = [*FILES, *(pages or {})]
+        with results_folder(folder, names, clears=CLEARS, overwrite=overwrite) as part:
+            self.make(part, about, pages)
+
+    def make(
+        self,
+        folder: str | os.PathLike[str],
+        about: dict[str, Any] | None = None,
+        pages: Mapping[str, str] | None = None,
+    ) -> None:
+        """The same in an empty folder: that of a `results_folder`, say."""
+        folder = Path(folder)
+        self.zoom.lens.save(folder / "lens.json")
+        self.lines.save(folder / "lines.npz")
+        (folder / "summary.json").write_text(json.dumps(self.summary() | (about or {}), indent=2) + "\n")
+        plot_model(self.zoom, self.each, self.lines).savefig(folder / "model.png", dpi=150)
+        for name, text in (pages or {}).items():
+            (folder / name).write_text(text, encoding="utf-8")
 
 
 def calibrate(
@@ -309,31 +324,6 @@ def rms_over_frames(frame_rms: Float[AnyArray, "frame"]) -> float:
     """Root of the mean of the frames' errors: eq. 13 from eq. 3. NaN frames do not count."""
     known = np.asarray(frame_rms)[~np.isnan(frame_rms)]
     return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
-
-
-@contextlib.contextmanager
-def results_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
-    """The folder, made if it is not there, after trying to write in it: better now than after the work.
-
-    If the block fails, folders that were made for it are removed again.
-
-    Raises:
-        OSError: it cannot be made or written; the message names it.
-    """
-    folder = Path(folder)
-    made = [path for path in (folder, *folder.parents) if not path.exists()]
-    try:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            shutil.rmtree(tempfile.mkdtemp(dir=folder, prefix=".zoomjax-"))
-        except OSError as error:
-            raise OSError(f"Cannot write in the folder {folder}: {error.strerror or error}.") from error
-        yield folder
-    except BaseException:
-        with contextlib.suppress(OSError):  # what is not there or not empty stays as it is
-            for path in made:
-                path.rmdir()
-        raise
 
 
 def _plain(certificate: Certificate) -> dict[str, bool | float]:

@@ -11,7 +11,7 @@ that is too uncertain to be believed is left where it was, and the result says s
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NoReturn
 
 import equinox as eqx
 import jax
@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree, ScalarLike
 
+from ._arguments import kinds_checked
 from ._solver import default_solver
 from ._types import Coefficients, Focal
 from .any_centre import AnyCentreLines, compress_any_centre
@@ -56,6 +57,10 @@ class CentreFit(eqx.Module):
     rms_fixed: Float[Array, ""]
     covariance: Float[Array, "parameter parameter"]
 
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: the lens of its fit is asked."""
+        raise TypeError("A CentreFit is not a lens: use found.fit.lens, as in found.fit.lens(35.0).")
+
 
 class FrameCentres(eqx.Module):
     """Each frame fitted by itself, its centre of distortion included.
@@ -71,6 +76,10 @@ class FrameCentres(eqx.Module):
     std: Float[Array, "frame 2"]
     determined: Bool[Array, "frame"]
     rms_fixed: Float[Array, "frame"]
+
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: there is a distortion of each frame, and none between them."""
+        raise TypeError("FrameCentres are not a lens: use found.each.distortion(frame).")
 
 
 class _CentredZoom(AbstractZoom):
@@ -98,6 +107,7 @@ def _both(zoom: AbstractZoom, centre: AbstractZoom) -> _CentredZoom:
     return _CentredZoom(zoom=zoom, centre=centre, parameters=(zoom.parameters, centre.parameters))
 
 
+@kinds_checked
 def fit_centre(
     lines: Lines | AnyCentreLines,
     *,
@@ -160,6 +170,7 @@ def fit_centre(
     return CentreFit(fit, each, std, determined, fixed.rms, covariance)
 
 
+@kinds_checked
 def fit_frame_centres(
     lines: Lines | AnyCentreLines, *, terms: int = 2, solver: Solver | None = None, max_steps: int = 256
 ) -> FrameCentres:

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ._arguments import kinds_checked
 from ._bernstein import Pieces, cut, power_controls
 from ._types import AnyArray, Point, Scalar
 from .families import AbstractFamily, RadialPolynomial
@@ -76,6 +77,7 @@ class Certificate(eqx.Module):
         return ~self.certified & ~(jnp.isneginf(self.least) & (self.slope > 0))
 
 
+@kinds_checked
 def certify(lens: ZoomLens) -> Certificate:
     """Prove that a lens is invertible over its image, to the pixels' outer corners, and its focal range.
 
@@ -238,15 +240,18 @@ def _search(nets, rounding):
     number = nets.shape[0]
     bound, value, place = jax.vmap(_examined)(nets)
     first = jnp.argmin(value)
+    zero = jnp.where(
+        nets[0, 0, 0] > 0, 0, 0
+    )  # under shard_map it differs from device to device, as nets do
     boxes = _Boxes(
         nets=jnp.pad(nets, ((0, _BUDGET), (0, 0), (0, 0))),
         bound=jnp.pad(bound, (0, _BUDGET), constant_values=jnp.inf),
-        piece=jnp.pad(jnp.arange(number), (0, _BUDGET)),
-        corner=jnp.zeros((number + _BUDGET, 2), nets.dtype),
-        extent=jnp.ones((number + _BUDGET, 2), nets.dtype),
+        piece=zero + jnp.pad(jnp.arange(number), (0, _BUDGET)),
+        corner=jnp.broadcast_to(zero, (number + _BUDGET, 2)).astype(nets.dtype),
+        extent=1 + jnp.broadcast_to(zero, (number + _BUDGET, 2)).astype(nets.dtype),
         slope=value[first],
         where=(first, place[first]),
-        used=jnp.asarray(number),
+        used=zero + number,
     )
 
     def unfinished(boxes):

@@ -5,22 +5,29 @@ compute in float64. Errors go to stderr with exit status 2, and leave no partial
 """
 
 import contextlib
+import glob
 import importlib.metadata
+import io
+import logging
 import math
 import os
+import re
+import shutil
 import signal
 import sys
-import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 try:
     import typer
 except ModuleNotFoundError:
     sys.exit('The command line needs the extra "app": pip install "zoomjax[app]"')
+
+from ._files import cache_folder, is_unfinished
+from ._text import plain
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -37,28 +44,77 @@ app = typer.Typer(
     help="One continuous distortion model for a zoom lens, from images of straight things.",
 )
 
+Overwrite = Annotated[
+    bool,
+    typer.Option(
+        "--overwrite",
+        help="Replace files of these names, too, that zoomjax did not write or that were changed since.",
+    ),
+]
 Degree = Annotated[int, typer.Option(min=0, help="Degree of the polynomials in 1/f.")]
 Terms = Annotated[int, typer.Option(min=1, help="Number of distortion coefficients, k1 to kN.")]
 
 
 _MOST_COMPILED = 100_000_000  # bytes; a run with new shapes adds about a million
-_INTERRUPTED = 130  # Typer's exit status for Ctrl-C
+_REPORT = "report.html"
+_INTERRUPTED = 128 + signal.SIGINT  # Typer's exit status for Ctrl-C, too
+_LAST_WORDS: dict[int, str] = {
+    _INTERRUPTED: "Interrupted.",
+    128 + signal.SIGTERM: "Ended by a signal.",
+}
 
 
 def main() -> None:
     """Run the command line; what a user can mend is one sentence on stderr and exit status 2."""
     warnings.showwarning = _print_warning
-    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # and leave no half file
+    sys.unraisablehook = _swallowed
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal that cannot show a sign ends no run
+    signal.signal(signal.SIGTERM, _end)  # and leave no half file
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else a shell had it ignored
+        signal.signal(signal.SIGINT, _end)
     try:
         app()
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError, MemoryError) as error:
         print(f"Error: {_sentence(error)}", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:  # where Typer does not see it
+        _leave(_INTERRUPTED)
     except SystemExit as exit:
-        if exit.code != _INTERRUPTED:
-            raise
-        print("Interrupted.", file=sys.stderr, flush=True)
-        os._exit(_INTERRUPTED)  # the usual way out waits for a compiler thread, and can crash in it
+        if isinstance(exit.code, int) and exit.code in _LAST_WORDS:
+            _leave(exit.code)
+        raise
+
+
+_signals: list[int] = []
+
+
+def _end(number: int, _: object) -> NoReturn:
+    _signals.append(number)
+    if not is_unfinished():  # an exception in the midst of importing JAX can abort the process
+        _leave(128 + number)
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
+    sys.exit(128 + number)
+
+
+def _swallowed(unraisable: "sys.UnraisableHookArgs") -> None:
+    if not isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):  # those are for `_go_on`
+        sys.__unraisablehook__(unraisable)
+
+
+def _go_on() -> None:
+    """Between two steps: end after all if what `_end` raised was swallowed, as in callbacks of JAX."""
+    if _signals:
+        _end(_signals[0], None)
+
+
+def _leave(status: int) -> NoReturn:
+    """At once: the usual way out waits for a compiler thread, and can crash in it."""
+    with contextlib.suppress(OSError):
+        os.write(2, f"{_LAST_WORDS[status]}\n".encode())  # a handler may be within print
+    os._exit(status)
 
 
 def _print_version(wanted: bool) -> None:
@@ -83,6 +139,7 @@ def demo(
     ] = Path("zoomjax-demo"),
     photos: Annotated[int, typer.Option(min=3, help="Number of photographs, one a focal length.")] = 12,
     seed: Annotated[int, typer.Option(help="Seed of the photographs' noise.")] = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """The paper's first experiment: photograph its board through a known lens, then calibrate the photos.
 
@@ -92,26 +149,20 @@ def demo(
     """
     _set_up_jax()
     from . import synthetic
-    from .calibration import results_folder
+    from ._results import results_folder
+    from .calibration import CLEARS, FILES
     from .vision import demo
     from .vision.image_calibration import ImageJob
 
     board = synthetic.StripedBoard.before(truth := synthetic.nikkor_18_200(demo.IMAGE_SIZE))
-    with (
-        results_folder(output) as folder,
-        tempfile.TemporaryDirectory(dir=folder, prefix=".zoomjax-") as part,
-    ):
+    names = [*FILES, _REPORT, "before-after.jpg", *(f"photos/{name}" for name in demo.photo_names(photos))]
+    with results_folder(output, names, clears=[*CLEARS, "photos/*"], overwrite=overwrite) as folder:
         with _progress("Photographing the board") as progress:
-            made = demo.write_photos(part, number=photos, seed=seed, progress=progress)
+            made = demo.write_photos(folder / "photos", number=photos, seed=seed, progress=progress)
         done = _calibrate_images(ImageJob(tuple(made), workers=_cores()), folder)
         focal = sorted(done.focals.focal.values())
         lens = done.calibration.zoom.lens
         demo.write_before_after(made[0], folder / "before-after.jpg", lens, focal[0])
-        (folder / "photos").mkdir(exist_ok=True)
-        for old in (folder / "photos").glob("board-*mm.jpg"):
-            old.unlink()
-        for photo in made:
-            photo.replace(folder / "photos" / photo.name)
     _show(done.calibration, board.magnification)
     _show_images(done, output, also=["before-after.jpg", "photos/"])
     worst = demo.worst_error(lens, truth, focal)
@@ -182,14 +233,16 @@ def calibrate(
     image_size: Annotated[
         str | None, typer.Option(metavar="WxH", help="Image size of a CSV of lines, px, e.g. 1920x1080.")
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Calibrate a zoom lens from images of straight things, or from lines.
 
     Writes lens.json, summary.json, report.html, model.png and lines.npz; and lines/, what was found in
-    each image.
+    each image. Its own results of an earlier run in the same folder are replaced.
     """
     _set_up_jax()
-    from .calibration import results_folder
+    from ._results import results_folder
+    from .calibration import CLEARS, FILES
 
     if select and (degree, terms) != (2, 2):
         raise ValueError("--select chooses degree and terms: leave --degree and --terms out.")
@@ -200,7 +253,8 @@ def calibrate(
         for path in map(Path, inputs):
             if path.resolve() == (output / "lines.npz").resolve():
                 raise ValueError(f"The results would replace the input {path}: give another folder.")
-        with results_folder(output) as folder, _stages() as stage:
+        results = results_folder(output, [*FILES, _REPORT], clears=CLEARS, overwrite=overwrite)
+        with results as folder, _stages() as stage:
             stage("Reading the lines")
             lines = _read([Path(path) for path in inputs], focal, image_size, focal_unit)
             calibration = _calibrate(lines, degree, terms, focal_sigma, stage, folder, select, robust)
@@ -213,7 +267,6 @@ def calibrate(
         return
     if image_size is not None:
         raise ValueError("--image-size is for a CSV of lines: images have their own.")
-    from ._files import cache_folder
     from .vision.image_calibration import ImageJob
 
     job = ImageJob(
@@ -231,7 +284,8 @@ def calibrate(
         cache=cache_folder("detections") if cache else None,
     )
     _refuse_to_replace(job, output)
-    with results_folder(output) as folder:
+    names = [*job.results(), _REPORT]
+    with results_folder(output, names, clears=CLEARS, overwrite=overwrite) as folder:
         done = _calibrate_images(job, folder)
     _show(done.calibration)
     _show_images(done, output)
@@ -261,16 +315,26 @@ def undistort(
     hold: Annotated[
         bool, typer.Option("--hold", help="Hold the first and last focal length beyond a track's ends.")
     ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace files that are there, but never an input.")
+    ] = False,
 ) -> None:
-    """Correct photos, or a video, each at its own focal length."""
+    """Correct photos, or a video, each at its own focal length.
+
+    Photos that cannot be corrected are named and skipped; the exit status is then 1, or 2 if none is left.
+    """
     _set_up_jax()
     from .vision.files import Job, undistort_files
 
     with _progress("Correcting", timed=False) as progress:
         done = undistort_files(
-            Job(lens, tuple(inputs), output, focal, keep, interpolation, border, hold), progress
+            Job(lens, tuple(inputs), output, focal, keep, interpolation, border, hold, overwrite), progress
         )
-    print(done)
+    print(plain(done.sentence))
+    for path, reason in done.skipped.items():
+        print(plain(f"Skipped {path}: {reason}"), file=sys.stderr)
+    if done.skipped:
+        raise typer.Exit(2 if len(done.skipped) == len(inputs) else 1)
 
 
 @app.command()
@@ -278,6 +342,7 @@ def reproduce(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.", file_okay=False)
     ],
+    overwrite: Overwrite = False,
 ) -> None:
     """The paper's two experiments done again, its tables and figures beside ours.
 
@@ -289,9 +354,9 @@ def reproduce(
     from rich.table import Table
 
     from . import reproduce as again
-    from .calibration import results_folder
+    from ._results import results_folder
 
-    with results_folder(output) as folder, _stages() as stage:
+    with results_folder(output, again.FILES, overwrite=overwrite) as folder, _stages() as stage:
         experiments = again.reproduce(folder, stage)
     console = Console()
     for title, experiment in zip(("Table 1, striped board", "Table 2, football"), experiments, strict=True):
@@ -301,7 +366,10 @@ def reproduce(
         for row in experiment.rows:
             table.add_row(row.name, *row.cells())
         console.print(table, highlight=False)
-    print(f"\nAll scenes are synthetic: what is whose is in {output / 'reproduce.md'}, with the figures.")
+    print(
+        f"\nAll scenes are synthetic: what is whose is in {plain(str(output / 'reproduce.md'))}, "
+        "with the figures."
+    )
 
 
 @contextlib.contextmanager
@@ -326,6 +394,7 @@ def _progress(what: str, timed: bool = True) -> Iterator[Callable[[int, int], No
         task = bar.add_task(what, total=None, rate="")
 
         def show(done: int, total: int) -> None:
+            _go_on()
             speed = bar.tasks[0].speed
             rate = f"{speed:.1f} per s" if speed else ""
             bar.update(task, completed=done, total=total or None, rate=rate)
@@ -340,23 +409,27 @@ def _stage_done(console: "Console", name: str, start: float) -> None:
 
 
 def _set_up_jax() -> None:
-    """Compute in float64, and keep what is compiled for the next run: most of a short run is compiling."""
-    import jax
+    """Compute in float64, and keep what is compiled for the next run: most of a short run is compiling.
 
-    from ._files import cache_folder
+    What cannot be kept, or read again, is compiled anew: a loss of time, of which nobody need hear.
+    """
+    import jax
 
     jax.config.update("jax_enable_x64", True)
     folder = cache_folder("compiled")
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ and _can_write(folder):
+    if folder and "JAX_COMPILATION_CACHE_DIR" not in os.environ and _can_write(folder):
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_compilation_cache_max_size", _MOST_COMPILED)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    logging.getLogger("matplotlib").setLevel(
+        logging.ERROR
+    )  # else it tells of fonts and of folders of its own
 
 
 def _can_write(folder: Path) -> bool:
     with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
-    return os.access(folder, os.W_OK)
+    return folder.is_dir() and os.access(folder, os.W_OK)
 
 
 def _read(inputs: list[Path], focal: str | None, image_size: str | None, focal_unit: str | None) -> "Lines":
@@ -407,7 +480,7 @@ def _calibrate(
         lines, degree=degree, terms=terms, focal_sigma=sigma, select=select, robust=robust, stage=stage
     )
     stage("Writing the results")
-    calibration.write(folder, pages={"report.html": report(calibration)})
+    calibration.make(folder, pages={_REPORT: report(calibration)})
     return calibration
 
 
@@ -428,7 +501,7 @@ def _calibrate_images(job: "ImageJob", folder: Path) -> "ImageCalibration":
         current: Callable[[str], None] | None = None
         done = calibrate_images(job, progress=progress, stage=stage)
         stage("Drawing the lines and writing the results")
-        done.write(folder, pages={"report.html": report(done.calibration, done)})
+        done.make(folder, pages={_REPORT: report(done.calibration, done)})
     return done
 
 
@@ -501,11 +574,13 @@ def _stages() -> Iterator[Callable[[str], None]]:
     with console.status("Starting") as status:
 
         def stage(name: str) -> None:
+            _go_on()
             finish()
             begun.append((name, time.perf_counter()))
             status.update(f"{name} …")
 
         yield stage
+        _go_on()
         finish()
 
 
@@ -559,35 +634,34 @@ def _show(calibration: "Calibration", magnification: Callable[[float], float] | 
 
 def _show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()) -> None:
     """Print what became of the images and their lines, and where the results are."""
-    from rich.console import Console
-
     found = sum(len(detection.lines) for detection in done.used)
     rejected = int(done.calibration.rejected.sum())
     print(
         f"\nLines found in {len(done.used)} images: {found}, of which {rejected} are not straight in the "
-        f"scene and were rejected.\nFocal lengths: {done.focals.origin}."
+        f"scene and were rejected.\nFocal lengths: {plain(done.focals.origin)}."
     )
     deviation = sorted(s / done.focals.focal[name] for name, s in done.focals.deviation.items())
     if deviation:
         print(f"Their standard deviations: {deviation[0]:.2%} to {deviation[-1]:.2%}.")
     _tell(done.warnings())
-    Console().print(
-        f"\nLook at {folder / 'lines'} before you believe: the lines found, drawn over each image.",
-        highlight=False,
+    print(
+        f"\nLook at {plain(str(folder / 'lines'))} before you believe: the lines found, drawn over each "
+        "image."
     )
     _written(folder, ["lines/", *also])
 
 
 def _tell(warnings: Sequence[str]) -> None:
     from rich.console import Console
+    from rich.text import Text
 
-    for warning in warnings:
-        Console(stderr=True).print(f"\n[bold]Beware:[/bold] {warning}", highlight=False)
+    for warning in warnings:  # names in it may look like markup
+        Console(stderr=True).print(Text.assemble("\n", ("Beware:", "bold"), " ", warning))
 
 
 def _written(folder: Path, also: Sequence[str] = ()) -> None:
-    files = ["report.html", "lens.json", "lines.npz", "summary.json", "model.png", *also]
-    print(f"\nWritten to {folder}: {', '.join(files)}")
+    files = [_REPORT, "lens.json", "lines.npz", "summary.json", "model.png", *also]
+    print(f"\nWritten to {plain(str(folder))}: {', '.join(files)}")
 
 
 def _excess(ratio: float) -> str:
@@ -596,10 +670,31 @@ def _excess(ratio: float) -> str:
 
 def _sentence(error: BaseException) -> str:
     """What an error says, without Python's numbers for those of the operating system."""
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.strerror}: {error.filename}"
-    return str(error)
+    text = str(error)
+    if isinstance(error, MemoryError):
+        text = f"There is not enough memory. {text}".strip()
+    elif isinstance(error, OSError) and error.strerror:
+        text = error.strerror + (f": {os.fspath(error.filename)}" if error.filename is not None else ".")
+    return plain(text).replace("give overwrite.", "give --overwrite.")
 
 
 def _print_warning(message, category, filename, lineno, file=None, line=None) -> None:
-    print(f"Warning: {message}", file=sys.stderr)
+    unkept = _UNKEPT.match(str(message))
+    if unkept and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        _forget_compiled(unkept[1])
+        return
+    print(f"Warning: {plain(str(message))}", file=sys.stderr)
+
+
+_UNKEPT = re.compile(r"Error (?:reading|writing) persistent compilation cache entry for '([^']*)'")
+
+
+def _forget_compiled(name: str) -> None:
+    """Remove what was kept of a program: JAX would never replace what a full disk has cut off."""
+    folder = cache_folder("compiled")
+    for path in folder.glob(f"{glob.escape(name)}-*") if folder else ():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with contextlib.suppress(OSError):
+                path.unlink()

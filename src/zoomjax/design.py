@@ -18,8 +18,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
+from ._arguments import kinds_checked
+from ._types import of_known_values
 from .bands import displacement_std
-from .energy import line_residuals, line_weights
+from .energy import counted_frames, line_residuals, line_weights, number_counted
 from .family_lines import with_family
 from .fit import ZoomFit, linearised
 from .lines import AbstractLines
@@ -82,6 +84,8 @@ class Suggestion:
         )
 
 
+@kinds_checked
+@of_known_values
 def suggest_next(
     fit: ZoomFit, lines: AbstractLines, *, focal_range: tuple[float, float] | None = None
 ) -> Suggestion:
@@ -97,7 +101,7 @@ def suggest_next(
         The best of the candidates, and all of them.
 
     Raises:
-        ValueError: `focal_range` is not two positive numbers in order.
+        ValueError: `focal_range` is not two positive numbers in order, or no line counts.
 
     Example:
         >>> from zoomjax import compress, fit_zoom, synthetic
@@ -118,6 +122,10 @@ def suggest_next(
             "distortion: this one depends on the focus, or its centre moves along the zoom."
         )
     lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
+    if not np.any(counted_frames(lines)):
+        raise ValueError(
+            "Argument lines must have a line that counts, but all have a weight of 0 or too few points."
+        )
     focals = np.unique(1 / np.linspace(1 / low, 1 / high, _FOCALS))
     number, length, counts = _typical(lines)
     dtype = fit.covariance.dtype
@@ -202,7 +210,7 @@ def _bands(fit, lines, candidates, focals, number, counts):
     """
     zoom = fit.lens.zoom
     flat, unravel = ravel_pytree(zoom.parameters)
-    weights, frames = line_weights(lines), lines.focal.shape[0]
+    weights, frames = line_weights(lines), number_counted(counted_frames(lines)).astype(flat.dtype)
     weighted, jacobian = linearised(lines, zoom)
     information = jnp.einsum("lri,lrj->ij", jacobian, jacobian)
     noise = jnp.einsum("l,lri,lrj->ij", weights, jacobian, jacobian)

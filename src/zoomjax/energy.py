@@ -5,7 +5,7 @@ through the mean of the corrected points, with the normal of least variance, and
 point is its signed distance ``n . (x - mean)``. Residuals are differentiated through ``n``.
 
 Weights are the paper's: a point counts ``1 / (M Nl(m) Np(l, m))``, so that every frame weighs the same,
-and within it every line.
+and within it every line. The M frames are those that have a line of a weight above 0.
 """
 
 import math
@@ -14,8 +14,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from ._arguments import kinds_checked
 from ._types import AnyArray
 from .lines import AbstractLines
 from .zoom import AbstractFocusZoom, AbstractPriorZoom, AbstractZoom, with_parameters
@@ -47,22 +48,41 @@ def line_residuals(centred: Float[Array, "rows 2"]) -> Float[Array, "rows"]:
 
 
 def line_weights(lines: AbstractLines) -> Float[Array, "line"]:
-    """``1 / (M Nl(m) Np(l, m))`` of eq. 13 for the points of each line.
+    """``1 / (M Nl(m) Np(l, m))`` of eq. 13 for the points of each line, of the M frames that count.
 
     With weights v of the lines themselves ``v_l / (M Np(l, m) sum_l v_l)``, summed over the frame's lines.
     0 for lines that are not there. One or two points count as none: they are straight whatever the lens,
-    and would only dilute their frame's mean. (`Lines` drops them; merged chunks may come with them.)
+    and would only dilute their frame's mean. (`Lines` drops them; merged chunks may come with them.) A
+    frame of which no line counts would dilute the mean over frames likewise: see `counted_frames`.
     """
+    share, per_frame = _shares(lines)
+    number = number_counted(per_frame > 0).astype(share.dtype)
+    per_frame = jnp.where(per_frame > 0, per_frame, 1)
+    return share / (number * per_frame[lines.frame] * jnp.maximum(lines.counts, 1))
+
+
+def counted_frames(lines: AbstractLines) -> Bool[Array, "frame"]:
+    """Which frames have a line that counts: one of three points or more and a weight above 0."""
+    return _shares(lines)[1] > 0
+
+
+def number_counted(counted: Bool[Array, "frame"]) -> Int[Array, ""]:
+    """M of eq. 13: the number of frames that count, but 1 if none does."""
+    return jnp.maximum(jnp.sum(counted), 1)
+
+
+def _shares(lines: AbstractLines) -> tuple[Float[Array, "line"], Float[Array, "frame"]]:
+    """What each line counts beside the others of its frame, and the frames' sums."""
     counts = lines.counts
-    frames = lines.focal.shape[0]
     share = (counts > 2).astype(counts.dtype)
     if lines.weight is not None:
         share = share * lines.weight
-    per_frame = jax.ops.segment_sum(share, lines.frame, frames)
-    per_frame = jnp.where(per_frame > 0, per_frame, 1)
-    return share / (frames * per_frame[lines.frame] * jnp.maximum(counts, 1))
+        largest = jnp.max(share)  # so that sums of large weights do not overflow
+        share = share / jnp.where(largest > 0, largest, 1)
+    return share, jax.ops.segment_sum(share, lines.frame, lines.focal.shape[0])
 
 
+@kinds_checked
 def residuals(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "line rows"]:
     """Weighted residuals, px, whose sum of squares is the global energy of eq. 13.
 
@@ -109,7 +129,8 @@ def prior_residuals(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "r
 
 def prior_error(lines: AbstractLines, zoom: AbstractPriorZoom) -> Float[Array, ""]:
     """The size, px, that a standardised parameter has among the residuals of eq. 13."""
-    return lines.scale * jnp.asarray(zoom.error) / math.sqrt(lines.focal.shape[0])
+    error = jnp.asarray(zoom.error)
+    return lines.scale * error / jnp.sqrt(number_counted(counted_frames(lines)).astype(error.dtype))
 
 
 def prior_jacobian(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "row parameter"]:
@@ -120,16 +141,21 @@ def prior_jacobian(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "ro
     return jax.jacfwd(lambda flat: prior_residuals(lines, with_parameters(zoom, unravel(flat))))(flat)
 
 
+@kinds_checked
 @eqx.filter_jit
 def frame_energy(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "frame"]:
-    """The error of each frame, px^2: mean over its lines of the mean squared distance (eq. 3)."""
+    """The error of each frame, px^2: mean over its lines of the mean squared distance (eq. 3).
+
+    NaN for a frame of which no line counts: its error is not known.
+    """
     return energy_by_frame(lines, residuals(lines, coefficients))
 
 
 def energy_by_frame(lines: AbstractLines, weighted: Float[Array, "line rows"]) -> Float[Array, "frame"]:
-    """The error of each frame, px^2, from the weighted residuals."""
-    frames = lines.focal.shape[0]
-    return frames * jax.ops.segment_sum(jnp.sum(weighted**2, axis=1), lines.frame, frames)
+    """The error of each frame, px^2, from the weighted residuals; NaN for frames that do not count."""
+    counted = counted_frames(lines)
+    squares = jax.ops.segment_sum(jnp.sum(weighted**2, axis=1), lines.frame, counted.shape[0])
+    return jnp.where(counted, number_counted(counted).astype(squares.dtype) * squares, jnp.nan)
 
 
 @eqx.filter_jit
@@ -139,6 +165,7 @@ def line_rms(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) ->
     return jnp.sqrt(jnp.sum(distances**2, axis=1) / jnp.maximum(lines.counts, 1))
 
 
+@kinds_checked
 @eqx.filter_jit
 def global_energy(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, ""]:
     """The global energy, px^2: the mean of the frames' errors (eq. 13)."""

@@ -8,9 +8,13 @@ being invertible. Radial families have ``z L(t)``, ``t = z.z``, and state L; all
     BrownConrady        the polynomial, and p1, p2 for a decentred lens, which is not radial
 
 The radius maps as ``r -> r L(r^2)``, and the *limit* is where that first stops growing; beyond it the image
-folds over and no inverse exists. Inverses are iterated to convergence, per point, and differentiated by the
-implicit function theorem. A new family is a final class of `AbstractRadial` or `AbstractFamily`; fits,
-certificates, files and images go through these methods alone.
+folds over and no inverse exists. Inverses are iterated until their residual is one of rounding, or are
+NaN, and are differentiated by the implicit function theorem. A new family is a final class of
+`AbstractRadial` or `AbstractFamily`; fits, certificates, files and images go through these methods alone.
+
+Formulas are written for one point, with coefficients ``k[0], k[1], ...``, in operations that NumPy and JAX
+share. They are also called for many points at once: ``k`` then has further axes, which broadcast against
+those of the points.
 """
 
 import abc
@@ -22,13 +26,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ._types import AnyArray, Coefficients
+from ._arrays import namespace, together
+from ._roots import first_positive_root, increasing_root, until
+from ._types import AnyArray, Elements
 
 _DIRECTIONS = 8
 """Half-planes that stand in for the length of (p1, p2): up to 8 % longer, and linear."""
 
 
-def radial_factor(squared_radius: Float[AnyArray, "*batch"], k: Coefficients) -> Float[AnyArray, "*batch"]:
+def radial_factor(squared_radius: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
     """L(t) of eq. 2 for normalised squared radii `t` and coefficients `k = (k1, ..., kN)`.
 
     The same code for NumPy and JAX, as all of a radial family's formulas.
@@ -39,20 +45,33 @@ def radial_factor(squared_radius: Float[AnyArray, "*batch"], k: Coefficients) ->
     return 1 + factor
 
 
-def radial_slope(squared_radius: Float[AnyArray, "*batch"], k: Coefficients) -> Float[AnyArray, "*batch"]:
+def radial_slope(squared_radius: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
     """The derivative of ``r L(r^2)`` with respect to r, at ``t = r^2``."""
-    return radial_factor(squared_radius, (2 * _order(k.shape[0], k.dtype) + 1) * k)
+    return radial_factor(squared_radius, _times(2 * _order(len(k)) + 1, k))
 
 
-def _order(terms: int, dtype: Any = int) -> np.ndarray:
+def _order(terms: int) -> np.ndarray:
     """1, 2, ..., N."""
-    return np.arange(1, terms + 1, dtype=dtype)
+    return np.arange(1, terms + 1)
+
+
+def _times(factors: np.ndarray, k: Elements) -> Elements:
+    """Each coefficient times a number of its own."""
+    return factors.astype(k.dtype).reshape(-1, *[1] * (k.ndim - 1)) * k
+
+
+def _first_root(rows: np.ndarray, k: Elements) -> Float[AnyArray, "..."]:
+    """The first positive root of ``1 + sum_i rows[j, i] k_i x^i``, i from 1, over all rows j."""
+    xp = namespace(k)
+    polynomials = xp.stack([xp.concatenate([xp.ones_like(k[:1]), _times(row, k)]) for row in rows])
+    return first_positive_root(xp.moveaxis(polynomials, (0, 1), (-2, -1)))
 
 
 class AbstractFamily(eqx.Module):
     """What coefficients k make of a normalised point z. It has no fields: the coefficients are k alone."""
 
     formula: ClassVar[str]
+    most_terms: ClassVar[int] = 4
 
     @abc.abstractmethod
     def size(self, terms: int) -> int:
@@ -64,26 +83,19 @@ class AbstractFamily(eqx.Module):
 
     @abc.abstractmethod
     def correct(
-        self, z: Float[AnyArray, "*batch 2"], squared: Float[AnyArray, "*batch"], k: Coefficients
-    ) -> Float[AnyArray, "*batch 2"]:
-        """The corrected point, by formula, also beyond the limit; `squared` is z.z.
-
-        Of NumPy arrays (..., 2) it is that of each point.
-        """
+        self, z: Float[AnyArray, "... 2"], squared: Float[AnyArray, "..."], k: Elements
+    ) -> Float[AnyArray, "... 2"]:
+        """The corrected point, by formula, also beyond the limit; `squared` is z.z."""
 
     @abc.abstractmethod
-    def limit(self, k: Coefficients) -> Float[Array, ""]:
+    def limit(self, k: Elements) -> Float[AnyArray, "..."]:
         """The radius up to which `correct` is invertible; inf if everywhere. Constant for derivatives."""
 
     @abc.abstractmethod
-    def distort(self, z: Float[Array, "2"], k: Coefficients, limit: Float[Array, ""]) -> Float[Array, "2"]:
-        """The point within the limit that is corrected to z; NaN where there is none."""
-
-    @abc.abstractmethod
-    def has_inverse(
-        self, z: Float[Array, "2"], k: Coefficients, limit: Float[Array, ""]
-    ) -> Bool[Array, ""]:
-        """Whether there is one."""
+    def distort(
+        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
+    ) -> Float[AnyArray, "... 2"]:
+        """The point within the limit that is corrected to z; NaN where there is none. See `inverse`."""
 
     @abc.abstractmethod
     def conditions(self, size: int) -> np.ndarray:
@@ -98,7 +110,7 @@ class AbstractFamily(eqx.Module):
 
     @abc.abstractmethod
     def expansion(
-        self, k: Coefficients, reach: Float[Array, ""]
+        self, k: Elements, reach: Float[Array, ""]
     ) -> tuple[Float[AnyArray, "power"], Float[AnyArray, "tangential"]]:
         """The distortion, up to ``t = reach``, as coefficients of powers of t, and (p1, p2) or none.
 
@@ -110,15 +122,15 @@ class AbstractRadial(AbstractFamily):
     """A family with ``z L(t)``."""
 
     @abc.abstractmethod
-    def factor(self, squared: Float[AnyArray, "*batch"], k: Coefficients) -> Float[AnyArray, "*batch"]:
+    def factor(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
         """L at squared radii t."""
 
     @abc.abstractmethod
-    def slope(self, squared: Float[AnyArray, "*batch"], k: Coefficients) -> Float[AnyArray, "*batch"]:
+    def slope(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
         """The derivative of ``r L(r^2)`` with respect to r."""
 
     @abc.abstractmethod
-    def equation(self, r: Any, squared: Any, rho: Any, k: Coefficients) -> tuple[Any, Any]:
+    def equation(self, r: Any, squared: Any, rho: Any, k: Elements) -> tuple[Any, Any]:
         """A number with the sign of ``r L(t) - rho``, smooth up to the limit, and its derivative by r.
 
         ``t = r^2`` is given; with ``t = (r rho)^2`` and 1 for rho, it is about the ratio of both radii.
@@ -133,43 +145,58 @@ class AbstractRadial(AbstractFamily):
         return 2 * _order(size)
 
     def correct(
-        self, z: Float[AnyArray, "*batch 2"], squared: Float[AnyArray, "*batch"], k: Coefficients
-    ) -> Float[AnyArray, "*batch 2"]:
+        self, z: Float[AnyArray, "... 2"], squared: Float[AnyArray, "..."], k: Elements
+    ) -> Float[AnyArray, "... 2"]:
         """``z L(t)``."""
-        return z * self.factor(squared, k)[..., None]
+        factor = self.factor(squared, k)
+        return together(z[..., 0] * factor, z[..., 1] * factor)
 
-    def limit(self, k: Coefficients) -> Float[Array, ""]:
+    def limit(self, k: Elements) -> Float[AnyArray, "..."]:
         """The monotone radius: the first root of a condition in t."""
-        k = jax.lax.stop_gradient(jnp.asarray(k))
-        rows = self.conditions(k.shape[0]).astype(k.dtype) * k[None]
-        return jnp.sqrt(first_positive_root(jnp.concatenate([jnp.ones_like(rows[:, :1]), rows], axis=1)))
+        return namespace(k).sqrt(_first_root(self.conditions(len(k)), k))
 
-    def reach(self, k: Coefficients, limit: Float[Array, ""]) -> Float[Array, ""]:
+    def reach(self, k: Elements, limit: Float[AnyArray, "..."]) -> Float[AnyArray, "..."]:
         """The corrected radius that the limit goes to; inf if there is none, or at a pole."""
-        finite = jnp.where(jnp.isinf(limit), 0, limit)
+        xp = namespace(k, limit)
+        finite = xp.where(xp.isinf(limit), 0, limit)
         factor = self.factor(finite * finite, k)
-        end = jnp.isinf(limit) | ~((factor > 0) & (factor < jnp.finfo(factor.dtype).eps ** -0.5))
-        return jnp.where(end, jnp.inf, finite * factor)
+        end = xp.isinf(limit) | ~((factor > 0) & (factor < np.finfo(factor.dtype).eps ** -0.5))
+        return xp.where(end, np.inf, finite * factor)
 
-    def has_inverse(
-        self, z: Float[Array, "2"], k: Coefficients, limit: Float[Array, ""]
-    ) -> Bool[Array, ""]:
-        """Whether z is not beyond the `reach`."""
-        squared = z @ z
+    def ratio(
+        self, squared: Float[AnyArray, "..."], k: Elements, limit: Float[AnyArray, "..."]
+    ) -> tuple[Float[AnyArray, "..."], Bool[AnyArray, "..."]]:
+        """The distorted radius over the corrected one, whose square is given, and whether there is one.
+
+        It solves ``q L(t q^2) = 1``, which needs no root of the squared radius and is regular at 0.
+        """
+        xp = namespace(squared, k)
+        eps = np.finfo(squared.dtype).eps
+        reach = self.reach(k, limit)
         # A few last digits beyond it are the same radius: what is corrected at the fold rounds to there.
-        reach = self.reach(k, limit) * (1 + 8 * jnp.finfo(z.dtype).eps)
-        return jnp.isfinite(squared) & (squared <= reach * reach)
+        exists = xp.isfinite(squared) & (squared <= (reach * (1 + 8 * eps)) ** 2)
+        squared = xp.where(exists, squared, 0)
+        farthest = (limit * (1 + 8 * eps)) ** 2
 
-    def distort(self, z: Float[Array, "2"], k: Coefficients, limit: Float[Array, ""]) -> Float[Array, "2"]:
-        """By `inverse_radius`."""
-        squared = z @ z
-        exists = self.has_inverse(z, k, limit)
-        # Guard the input of the root and of the quotient, not their output: a where() on a NaN result
-        # still has a NaN gradient.
-        regular = exists & (squared > 0)
-        rho = jnp.sqrt(jnp.where(regular, squared, 1))
-        r = inverse_radius(self, jnp.where(regular, rho, 0), k, limit)
-        return z * jnp.where(regular, r / rho, jnp.where(exists, 1, jnp.nan))
+        def equation(q):
+            return self.equation(q, squared * q * q, 1, k)
+
+        def high():
+            off_centre = squared > 0
+            return xp.where(off_centre, limit / xp.sqrt(xp.where(off_centre, squared, 1)), np.inf)
+
+        q, found = increasing_root(
+            equation, xp.ones_like(squared), high, lambda q: squared * q * q <= farthest
+        )
+        return q, exists & found
+
+    def distort(
+        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
+    ) -> Float[AnyArray, "... 2"]:
+        """By the `ratio` of the radii."""
+        q, found = self.ratio(_square(z), k, limit)
+        q = namespace(z, k).where(found, q, np.nan)
+        return together(z[..., 0] * q, z[..., 1] * q)
 
 
 class RadialPolynomial(AbstractRadial):
@@ -180,15 +207,15 @@ class RadialPolynomial(AbstractRadial):
         "z = (distorted - centre) / scale, r^2 = z.z"
     )
 
-    def factor(self, squared: Float[AnyArray, "*batch"], k: Coefficients) -> Float[AnyArray, "*batch"]:
+    def factor(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
         """L."""
         return radial_factor(squared, k)
 
-    def slope(self, squared: Float[AnyArray, "*batch"], k: Coefficients) -> Float[AnyArray, "*batch"]:
+    def slope(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
         """``1 + 3 k1 t + ... + (2N+1) kN t^N``."""
         return radial_slope(squared, k)
 
-    def equation(self, r: Any, squared: Any, rho: Any, k: Coefficients) -> tuple[Any, Any]:
+    def equation(self, r: Any, squared: Any, rho: Any, k: Elements) -> tuple[Any, Any]:
         """``r L(t) - rho``."""
         return r * radial_factor(squared, k) - rho, radial_slope(squared, k)
 
@@ -201,7 +228,7 @@ class RadialPolynomial(AbstractRadial):
         return size
 
     def expansion(
-        self, k: Coefficients, reach: Float[Array, ""]
+        self, k: Elements, reach: Float[Array, ""]
     ) -> tuple[Float[AnyArray, "power"], Float[AnyArray, "tangential"]]:
         """Itself."""
         del reach
@@ -231,16 +258,16 @@ class Division(AbstractRadial):
         "z = (distorted - centre) / scale, r^2 = z.z"
     )
 
-    def factor(self, squared: Float[AnyArray, "*batch"], k: Coefficients) -> Float[AnyArray, "*batch"]:
+    def factor(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
         """L."""
         return 1 / radial_factor(squared, k)
 
-    def slope(self, squared: Float[AnyArray, "*batch"], k: Coefficients) -> Float[AnyArray, "*batch"]:
+    def slope(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
         """``(1 - k1 t - 3 k2 t^2 - ...) / (1 + k1 t + ...)^2``."""
-        numerator = radial_factor(squared, (1 - 2 * _order(k.shape[0], k.dtype)) * k)
+        numerator = radial_factor(squared, _times(1 - 2 * _order(len(k)), k))
         return numerator / radial_factor(squared, k) ** 2
 
-    def equation(self, r: Any, squared: Any, rho: Any, k: Coefficients) -> tuple[Any, Any]:
+    def equation(self, r: Any, squared: Any, rho: Any, k: Elements) -> tuple[Any, Any]:
         """``r - rho (1 + k1 t + ...)``, which has no pole."""
         divisor = radial_factor(squared, k)
         growth = radial_slope(squared, k) - divisor  # by r, times r
@@ -259,7 +286,7 @@ class Division(AbstractRadial):
         return max(8, size)
 
     def expansion(
-        self, k: Coefficients, reach: Float[Array, ""]
+        self, k: Elements, reach: Float[Array, ""]
     ) -> tuple[Float[AnyArray, "power"], Float[AnyArray, "tangential"]]:
         """L's Taylor polynomial T, and the interpolation of the rest in Chebyshev's nodes.
 
@@ -317,38 +344,91 @@ class BrownConrady(AbstractFamily):
         return np.append(2 * _order(size - 2), [1, 1])
 
     def correct(
-        self, z: Float[AnyArray, "*batch 2"], squared: Float[AnyArray, "*batch"], k: Coefficients
-    ) -> Float[AnyArray, "*batch 2"]:
+        self, z: Float[AnyArray, "... 2"], squared: Float[AnyArray, "..."], k: Elements
+    ) -> Float[AnyArray, "... 2"]:
         """``z L(t) + t q + 2 (q.z) z``."""
-        q = k[:-3:-1]
-        return z * (radial_factor(squared, k[:-2]) + 2 * (z @ q))[..., None] + squared[..., None] * q
+        qx, qy = k[-1], k[-2]
+        x, y = z[..., 0], z[..., 1]
+        factor = radial_factor(squared, k[:-2]) + 2 * (qx * x + qy * y)
+        return together(x * factor + squared * qx, y * factor + squared * qy)
 
-    def limit(self, k: Coefficients) -> Float[Array, ""]:
+    def limit(self, k: Elements) -> Float[AnyArray, "..."]:
         """The first root of ``min(L, (r L)') - 6 |q| r``."""
-        k = jax.lax.stop_gradient(jnp.asarray(k))
-        size = k.shape[0] - 2
-        rows = jnp.zeros((2, 2 * size + 1), k.dtype).at[:, 0].set(1)
-        rows = rows.at[:, 2::2].set(
-            np.stack([np.ones(size), 2 * _order(size) + 1]).astype(k.dtype) * k[None, :-2]
-        )
-        return first_positive_root(rows.at[:, 1].set(-6 * jnp.linalg.norm(k[-2:])))
+        xp, terms = namespace(k), len(k) - 2
+        across = -6 * xp.sqrt(k[-1:] ** 2 + k[-2:-1] ** 2)
+        powers = [across]  # of r, from the first on
+        for index in range(terms):
+            powers += [k[index : index + 1], 0 * across]
+        rows = np.ones((2, 2 * terms + 1), int)
+        rows[1, 1::2] = 2 * _order(terms) + 1
+        return _first_root(rows, xp.concatenate(powers))
 
-    def distort(self, z: Float[Array, "2"], k: Coefficients, limit: Float[Array, ""]) -> Float[Array, "2"]:
-        """By Newton's method; see `_undecentred`."""
-        finite = jnp.all(jnp.isfinite(z))
-        z = jnp.where(finite, z, 0)
-        w = _undecentred(z, k, limit)
-        return jnp.where(finite & self._arrived(w, z, k), w, jnp.nan)
+    def distort(
+        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
+    ) -> Float[AnyArray, "... 2"]:
+        """By Newton's method from the inverse without decentering; see `_solve`."""
+        xp = namespace(z, k)
+        finite = xp.all(xp.isfinite(z), axis=-1)
+        zx, zy = xp.where(finite, z[..., 0], 0), xp.where(finite, z[..., 1], 0)
+        x, y, found = self._solve(zx, zy, k, limit)
+        found = finite & found
+        return together(xp.where(found, x, np.nan), xp.where(found, y, np.nan))
 
-    def has_inverse(
-        self, z: Float[Array, "2"], k: Coefficients, limit: Float[Array, ""]
-    ) -> Bool[Array, ""]:
-        """Whether Newton's method finds it."""
-        return jnp.all(jnp.isfinite(self.distort(z, k, limit)))
+    def _solve(self, zx, zy, k, limit):
+        """The point of the disc that is corrected to (zx, zy), and whether it was found.
 
-    def _arrived(self, w, z, k):
-        missed = self.correct(w, w @ w, k) - z
-        return missed @ missed <= (256 * jnp.finfo(z.dtype).eps) ** 2 * jnp.maximum(z @ z, w @ w)
+        A step of Newton's method is halved until it comes nearer, and brought back to the disc.
+        """
+        xp, eps = namespace(zx, k), np.finfo(zx.dtype).eps
+        qx, qy = k[-1], k[-2]
+        slopes = _times(2 * _order(len(k) - 2), k[:-2])
+        size = zx * zx + zy * zy
+
+        def missed(x, y):
+            """By how much, its square, and the Jacobian, which is symmetric."""
+            squared = x * x + y * y
+            along = 2 * (qx * x + qy * y)
+            factor = radial_factor(squared, k[:-2]) + along
+            bend = 0 * squared  # 2 dL/dt
+            for slope in slopes[::-1]:
+                bend = bend * squared + slope
+            ex, ey = x * factor + squared * qx - zx, y * factor + squared * qy - zy
+            a = factor + bend * x * x + 4 * qx * x
+            b = bend * x * y + 2 * (qx * y + qy * x)
+            d = factor + bend * y * y + 4 * qy * y
+            return ex, ey, ex * ex + ey * ey, a, b, d
+
+        def unfinished(state):
+            x, y, length, _, _, error, *_ = state
+            return (error > eps**2 * xp.maximum(size, x * x + y * y)) & (length > 1e-6)
+
+        def step(state):
+            x, y, length, ex, ey, error, a, b, d = state
+            determinant = a * d - b * b
+            scaled = length / xp.where(determinant > 0, determinant, 1)
+            new_x, new_y = x - scaled * (d * ex - b * ey), y - scaled * (a * ey - b * ex)
+            squared = new_x * new_x + new_y * new_y
+            out = squared > limit * limit
+            back = xp.where(out, limit / xp.sqrt(xp.where(out, squared, 1)), 1)
+            new_x, new_y = new_x * back, new_y * back
+            new = missed(new_x, new_y)
+            better = new[2] < error
+            kept = [
+                xp.where(better, one, other)
+                for one, other in zip((new_x, new_y, *new), (x, y, *state[3:]), strict=True)
+            ]
+            return kept[0], kept[1], xp.where(better, 1, length / 2), *kept[2:]
+
+        radial = RadialPolynomial()
+        reach = radial.reach(k[:-2], limit)
+        shrunk = xp.where(size > reach * reach, reach * reach, size)
+        q, _ = radial.ratio(shrunk, k[:-2], limit)
+        q = q * xp.sqrt(shrunk / xp.where(size > 0, size, 1))
+        q = xp.where(size > 0, q, 1)
+        x, y = zx * q, zy * q
+        state = (x, y, 0 * x + 1, *missed(x, y))
+        x, y, _, _, _, error, *_ = until(xp, unfinished, step, state, 200)
+        return x, y, error <= (64 * eps) ** 2 * xp.maximum(size, x * x + y * y)
 
     def conditions(self, size: int) -> np.ndarray:
         """The slope of the radius less ``6 q.d r``, for directions d of which one is nearly q's."""
@@ -362,190 +442,56 @@ class BrownConrady(AbstractFamily):
         return size - 2
 
     def expansion(
-        self, k: Coefficients, reach: Float[Array, ""]
+        self, k: Elements, reach: Float[Array, ""]
     ) -> tuple[Float[AnyArray, "power"], Float[AnyArray, "tangential"]]:
         """Itself."""
         del reach
         return k[:-2], k[-2:]
 
 
-def _polynomial(coefficients: Float[Array, "n"], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Evaluate ``sum_i coefficients[i] x^i`` (Horner)."""
-    value = jnp.zeros_like(x)
-    for coefficient in coefficients[::-1]:
-        value = value * x + coefficient
-    return value
-
-
-def _first_root_in_unit_interval(coefficients: Float[Array, "n"]) -> Float[Array, ""]:
-    """The smallest root in (0, 1] of a polynomial that is positive at 0, or inf.
-
-    The roots of each derivative cut the interval into pieces on which the next one is monotone, so
-    that bisection in each piece finds every sign change: exact for any degree, no eigenvalues (which
-    JAX has on the CPU alone), a fixed amount of work set by the degree and the dtype.
-    """
-    dtype = coefficients.dtype
-    steps = jnp.finfo(dtype).nmant + 3
-    derivatives = [coefficients]
-    while derivatives[-1].shape[0] > 2:
-        c = derivatives[-1]
-        derivatives.append(c[1:] * jnp.arange(1, c.shape[0], dtype=dtype))
-    knots = jnp.asarray([0, 1], dtype)
-    found = jnp.asarray([False])
-    for c in reversed(derivatives):
-        values = _polynomial(c, knots)
-        # A zero inside counts as negative, so that a root on a knot is not lost; one at the end does not.
-        positive = (values > 0).at[-1].set(values[-1] >= 0)
-        found = positive[:-1] != positive[1:]
-
-        def halve(_, bracket, c=c, falling=positive[:-1]):
-            low, high = bracket
-            middle = (low + high) / 2
-            before_root = (_polynomial(c, middle) > 0) == falling
-            return jnp.where(before_root, middle, low), jnp.where(before_root, high, middle)
-
-        low, high = jax.lax.fori_loop(0, steps, halve, (knots[:-1], knots[1:]))
-        # Where there is no root in a piece its right end stands in: a harmless extra knot.
-        roots = jnp.where(found, (low + high) / 2, knots[1:])
-        knots = jnp.concatenate([knots[:1], roots, knots[-1:]])
-    return jnp.min(jnp.where(found, knots[1:-1], jnp.inf))
-
-
-@jax.jit
-def first_positive_root(polynomials: Float[Array, "row n"]) -> Float[Array, ""]:
-    """The smallest positive root of polynomials that are 1 at 0, coefficients upwards; inf without one."""
-    power = jnp.arange(polynomials.shape[1], dtype=polynomials.dtype)
-
-    def first(c):
-        # Up to x = 2, and from x = 1 on as the reversed polynomial in 1/x = 1 - y, so that the search again
-        # starts from its known end. They overlap, or rounding could hide a root at the seam from both.
-        near, far = jax.vmap(_first_root_in_unit_interval)(jnp.stack([c * 2**power, _reflect(c[::-1])]))
-        seen = far < 1 - 4096 * jnp.finfo(c.dtype).eps  # or 1/x is nothing but rounding
-        far = jnp.where(seen, 1 / jnp.where(seen, 1 - far, 1), jnp.inf)
-        return jnp.where(jnp.isfinite(near), 2 * near, far)
-
-    return jnp.min(jax.vmap(first)(polynomials))
-
-
-def _reflect(coefficients: Float[Array, "n"]) -> Float[Array, "n"]:
-    """The coefficients of ``p(1 - y)``, from those of ``p(x)``, both in increasing order."""
-    reflected = jnp.zeros_like(coefficients)
-    for coefficient in coefficients[::-1]:  # Horner, multiplying by (1 - y)
-        shifted = jnp.concatenate([jnp.zeros(1, coefficients.dtype), reflected[:-1]])
-        reflected = (reflected - shifted).at[0].add(coefficient)
-    return reflected
+def _square(z: Float[AnyArray, "... 2"]) -> Float[AnyArray, "..."]:
+    """z.z."""
+    return z[..., 0] * z[..., 0] + z[..., 1] * z[..., 1]
 
 
 @jax.custom_jvp
-def inverse_radius(
-    family: AbstractRadial, rho: Float[Array, ""], k: Coefficients, limit: Float[Array, ""]
-) -> Float[Array, ""]:
-    """The r in [0, limit] with ``r L(r^2) = rho``, for one `rho` that has one.
+def inverse(
+    family: AbstractFamily,
+    z: Float[AnyArray, "... 2"],
+    k: Elements,
+    limit: Float[AnyArray, "..."],
+) -> Float[AnyArray, "... 2"]:
+    """`AbstractFamily.distort`, differentiable: by the implicit function theorem, whatever its iterations.
 
-    `limit` is that of the family at `k`, a constant for differentiation.
-
-    Newton's method kept inside a bracket by bisection, until a step no longer changes r. Fixed
-    counts of plain Newton or fixed-point steps, as elsewhere, are wrong by up to hundreds of pixels
-    near a fold without a word. Outside its domain the result is an end of the bracket: callers mask.
+    Where there is no inverse the result is NaN and its derivatives are zero: then
+    ``where(has_inverse, distort, 0)`` has derivatives. At the fold itself they would be infinite, and are
+    1/eps of the dtype at most.
     """
-    eps = jnp.finfo(rho.dtype).eps
-
-    def equation(r):
-        return family.equation(r, r * r, rho, k)
-
-    def too_low(high):
-        return (equation(high)[0] < 0) & jnp.isfinite(high)
-
-    start = jnp.maximum(rho, 1)
-    high = jax.lax.while_loop(lambda high: jnp.isinf(limit) & too_low(high), lambda high: 2 * high, start)
-    high = jnp.where(jnp.isinf(limit), high, limit)
-
-    def unfinished(state):
-        _, _, _, change, count = state
-        return (change > 0) & (count < 200)
-
-    def step(state):
-        r, low, high, _, count = state
-        error, slope = equation(r)
-        low, high = jnp.where(error < 0, r, low), jnp.where(error < 0, high, r)
-        newton = r - error / jnp.where(slope > 0, slope, 1)
-        inside = (slope > 0) & (newton >= low) & (newton <= high)
-        new = jnp.where(inside, newton, (low + high) / 2)
-        change = jnp.where(jnp.abs(new - r) <= 2 * eps * new, 0, jnp.abs(new - r))
-        return new, low, high, change, count + 1
-
-    first = jnp.minimum(rho, high)
-    state = (first, jnp.zeros_like(rho), high, jnp.ones_like(rho), 0)
-    return jax.lax.while_loop(unfinished, step, state)[0]
+    return family.distort(z, k, limit)
 
 
-@inverse_radius.defjvp
-def _inverse_radius_jvp(primals, tangents):
-    family, rho, k, limit = primals
-    _, rho_dot, k_dot, _ = tangents
-    r = inverse_radius(family, rho, k, limit)
-    # d(r L) = 0 along the solution: slope dr + r (dL/dk) dk = d rho. At the fold itself the slope is
-    # zero and the derivative truly infinite.
-    _, factor_dot = jax.jvp(lambda k: family.factor(r * r, k), (k,), (k_dot,))
-    return r, (rho_dot - r * factor_dot) / family.slope(r * r, k)
+@inverse.defjvp
+def _inverse_jvp(primals, tangents):
+    family, z, k, limit = primals
+    _, z_dot, k_dot, _ = tangents
+    w = inverse(family, z, k, limit)
+    exists = jnp.isfinite(w[..., 0])
+    at = together(*(jnp.where(exists, w[..., i], 0) for i in (0, 1)))
+    one, zero = jnp.ones_like(w[..., 0]), jnp.zeros_like(w[..., 0])
 
+    def correct(w):
+        return family.correct(w, _square(w), k)
 
-@jax.custom_jvp
-def _undecentred(z: Float[Array, "2"], k: Coefficients, limit: Float[Array, ""]) -> Float[Array, "2"]:
-    """The point w of the disc within `limit` that `BrownConrady` corrects to z, or one that misses it.
-
-    Newton's method from the inverse without decentering, a step halved until it comes nearer, and brought
-    back to the disc.
-    """
-    correct = BrownConrady().correct
-    eps = jnp.finfo(z.dtype).eps
-
-    def missed(w):
-        return correct(w, w @ w, k) - z
-
-    def unfinished(state):
-        _, error, length, count = state
-        return (error @ error > (2 * eps) ** 2 * (z @ z)) & (length > 1e-5) & (count < 200)
-
-    def step(state):
-        w, error, length, count = state
-        new = w - length * _solved(jax.jacfwd(missed)(w), error)
-        squared = new @ new
-        out = squared > limit * limit
-        new = new * jnp.where(out, limit / jnp.sqrt(jnp.where(out, squared, 1)), 1)
-        new_error = missed(new)
-        better = new_error @ new_error < error @ error
-        return (
-            jnp.where(better, new, w),
-            jnp.where(better, new_error, error),
-            jnp.where(better, 1, length / 2),
-            count + 1,
+    # F(w, k) = z along the solution: dF/dw dw = dz - dF/dk dk.
+    _, by_k = jax.jvp(lambda k: family.correct(at, _square(at), k), (k,), (k_dot,))
+    (ax, ay), (bx, by), (rx, ry) = (
+        (part[..., 0], part[..., 1])
+        for part in (
+            jax.jvp(correct, (at,), (together(one, zero),))[1],
+            jax.jvp(correct, (at,), (together(zero, one),))[1],
+            z_dot - by_k,
         )
-
-    radial = RadialPolynomial()
-    squared = z @ z
-    regular = squared > 0
-    rho = jnp.sqrt(jnp.where(regular, squared, 1))
-    start = inverse_radius(radial, jnp.minimum(rho, radial.reach(k[:-2], limit)), k[:-2], limit)
-    start = z * jnp.where(regular, start / rho, 1)
-    state = (start, missed(start), jnp.ones_like(rho), 0)
-    return jax.lax.while_loop(unfinished, step, state)[0]
-
-
-@_undecentred.defjvp
-def _undecentred_jvp(primals, tangents):
-    z, k, limit = primals
-    z_dot, k_dot, _ = tangents
-    w = _undecentred(z, k, limit)
-    correct = BrownConrady().correct
-    _, by_k = jax.jvp(lambda k: correct(w, w @ w, k), (k,), (k_dot,))
-    return w, _solved(jax.jacfwd(lambda w: correct(w, w @ w, k))(w), z_dot - by_k)
-
-
-def _solved(matrix, right):
-    """The solution of two equations; zero where they have none."""
-    (a, b), (c, d) = matrix
-    determinant = a * d - b * c
-    regular = determinant != 0
-    solution = jnp.stack([d * right[0] - b * right[1], a * right[1] - c * right[0]])
-    return jnp.where(regular, solution / jnp.where(regular, determinant, 1), 0)
+    )
+    determinant = ax * by - ay * bx
+    weight = jnp.where(exists, 1 / jnp.maximum(determinant, jnp.finfo(w.dtype).eps), 0)
+    return w, together(weight * (by * rx - bx * ry), weight * (ax * ry - ay * rx))

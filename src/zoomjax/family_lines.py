@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ._arguments import kinds_checked
 from ._checks import checked_terms
 from ._types import Centres, Focal, Focus, FrameIndex, LineWeight, Point, traced
 from .any_centre import AnyCentreLines, compress_any_centre
@@ -100,17 +101,18 @@ class FamilyLines(AbstractLines):
                 "Lines compressed with all monomials serve one centre if their family is not radial, and "
                 "another is asked for. Compress the lines about that, or pass the lines themselves."
             )
-        return _wrapped(self._weighted().about(centre), self.family)
+        return _wrapped(self.as_weighted().about(centre), self.family)
 
     def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "FamilyLines":
         """The chosen lines as a data set of one frame."""
-        return _wrapped(self._weighted().take(lines, present), self.family)
+        return _wrapped(self.as_weighted().take(lines, present), self.family)
 
-    def _weighted(self):
+    def as_weighted(self) -> AbstractLines:
         """The lines with the weights and focal lengths that these have been given."""
         return with_fields_of(self.lines, self)
 
 
+@kinds_checked
 def with_family(lines: AbstractLines, family: AbstractFamily) -> AbstractLines:
     """The same lines, coefficients for them to be those of a family.
 
@@ -132,10 +134,11 @@ def with_family(lines: AbstractLines, family: AbstractFamily) -> AbstractLines:
     if isinstance(lines, ImageLines):
         return in_image(with_family(lines.as_weighted(), family))
     if isinstance(lines, FamilyLines):
-        lines = lines._weighted()
+        lines = lines.as_weighted()
     return lines if isinstance(family, RadialPolynomial) else _wrapped(lines, family)
 
 
+@kinds_checked
 def compress_family(lines: Lines, family: AbstractFamily, *, terms: int = 2) -> AbstractLines:
     """What `compress` is for the radial polynomial, for any family; the result remembers it.
 

@@ -13,15 +13,17 @@ Compiled once for a shape of the lines; once per fit an algebraic start and, aft
 the certificate; per iteration one Jacobian of the residuals.
 """
 
-from typing import Any
+from typing import Any, NoReturn
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
+from ._arguments import kinds_checked
 from ._checks import checked_terms
 from ._interior import implicit, least_squares_within
 from ._solver import default_solver
@@ -77,7 +79,7 @@ class ZoomFit(eqx.Module):
     Attributes:
         lens: from a focal length to the distortion there.
         rms: root of the global energy (eq. 13), px of the corrected image.
-        frame_rms: root of each frame's error (eq. 3), px.
+        frame_rms: root of each frame's error (eq. 3), px; NaN for a frame whose lines all weigh nothing.
         covariance: of the zoom model's parameters in normalised units, flattened row by row (for a
             polynomial: all terms of power 0, then of power 1, ...). Lines are taken to have independent
             errors, points of a line are not: it is the line-by-line sandwich of the residuals, its shape
@@ -102,6 +104,10 @@ class ZoomFit(eqx.Module):
     certificate: Certificate
     rms_unconstrained: Float[Array, ""]
 
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: the lens of a fit is asked, not the fit."""
+        raise TypeError("A ZoomFit is not a lens: use fit.lens, as in fit.lens(35.0).")
+
 
 class FrameFits(eqx.Module):
     """Each frame fitted by itself (eq. 6).
@@ -109,7 +115,7 @@ class FrameFits(eqx.Module):
     Attributes:
         coefficients: normalised (k1, ..., kN) of each frame.
         rms: root of the mean of the frames' errors, px: what a zoom model's `rms` is compared with.
-        frame_rms: root of each frame's error (eq. 3), px.
+        frame_rms: root of each frame's error (eq. 3), px; NaN for a frame whose lines all weigh nothing.
         covariance: of each frame's coefficients; see `ZoomFit`.
         result: how each frame's fit ended.
         certificate: of each frame, whether it is invertible over the image.
@@ -129,6 +135,13 @@ class FrameFits(eqx.Module):
     centre: Centres
     scale: float = eqx.field(static=True)
     family: AbstractFamily = RadialPolynomial()
+
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: there is a distortion of each frame, and none between them."""
+        raise TypeError(
+            "FrameFits are not a lens: use each.distortion(frame) for one frame's distortion, or fit_zoom "
+            "for a lens at any focal length."
+        )
 
     def messages(self) -> list[str]:
         """For each frame a sentence about how its fit ended, empty where nothing is wrong."""
@@ -155,6 +168,7 @@ class FrameFits(eqx.Module):
         )
 
 
+@kinds_checked
 def fit_zoom(
     lines: AbstractLines,
     *,
@@ -185,14 +199,15 @@ def fit_zoom(
             `Certificate`) of at least 0.02. A model that is certified stays as it is, to the last bit. For
             zoom models that do not state their `pieces` this does nothing; for a `PowerZoom`, which is not
             linear, it gives an invertible model that need not be the very best, and of another family than
-            the polynomial nothing is proved of it.
+            the polynomial nothing is proved of it. Under ``vmap`` the search for the best one that is runs
+            for the whole batch if one fit of it needs it, and not at all if none does.
         throw: raise where the solver fails. Otherwise `ZoomFit.result` says so. Results about the model
             (undetermined, folded, constrained) never raise.
 
     Raises:
         ValueError: fewer distinct focal lengths than the zoom model needs, lines compressed for fewer
             terms, or a `zoom` whose parameters are for another number of terms.
-        TypeError: `lines` or `zoom` are something else.
+        TypeError: an argument is of another kind, such as the class PolynomialZoom for an instance.
         RuntimeError: the solver failed (see `throw`).
 
     Example:
@@ -205,7 +220,6 @@ def fit_zoom(
         >>> bool(fit.rms < 1)
         True
     """
-    check_lines(lines)
     lines = lines if family is None else with_family(lines, family)
     model, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
     start = None
@@ -220,10 +234,6 @@ def fit_zoom(
 
 def ready_model(lines, zoom, terms):
     """The model ready to be fitted to these lines, in their dtype, and its number of radial terms."""
-    if not isinstance(zoom, AbstractZoom):
-        raise TypeError(
-            f"Argument zoom must be a zoom model such as PolynomialZoom(degree=2), but it is {zoom!r}."
-        )
     own = None if zoom.parameters is None else jax.eval_shape(coefficients_by, zoom, lines).shape[1]
     besides = lines.family.size(0)
     terms = checked_terms((2 if own is None else own - besides) if terms is None else terms)
@@ -253,15 +263,7 @@ def algebraic_start(lines: AbstractLines, terms: int) -> CompressedLines | None:
     return compressed(lines, terms) if isinstance(lines.family, RadialPolynomial) else None
 
 
-def check_lines(lines):
-    """Raise TypeError where something else is given for lines."""
-    if not isinstance(lines, AbstractLines):
-        raise TypeError(
-            "Argument lines must be Lines (see Lines.from_ragged) or compress(lines), but its type is "
-            f"{type(lines).__name__}."
-        )
-
-
+@kinds_checked
 def fit_frames(
     lines: AbstractLines,
     *,
@@ -280,7 +282,6 @@ def fit_frames(
     Raises:
         RuntimeError: the solver failed on some frame, and `throw` is set.
     """
-    check_lines(lines)
     terms = checked_terms(terms)
     lines = lines if family is None else with_family(lines, family)
     chosen, present = lines.by_frame()
@@ -293,10 +294,11 @@ def fit_frames(
     return _thrown(fits, outcome, throw)
 
 
+@kinds_checked
 def frame_rms(
     lines: AbstractLines, lens: ZoomLens | Float[AnyArray, "frame terms"] | None
 ) -> Float[Array, "frame"]:
-    """Root of the error (eq. 3) of each frame, px, as corrected by a lens.
+    """Root of the error (eq. 3) of each frame, px, as corrected by a lens; NaN where no line counts.
 
     Args:
         lines: the lines, or their compressed form.
@@ -313,7 +315,6 @@ def frame_rms(
 
     Points beyond the fold of a lens that has one are corrected by formula.
     """
-    check_lines(lines)
     if isinstance(lens, ZoomLens):
         if lens.image_size != lines.image_size:
             raise ValueError(
@@ -364,7 +365,7 @@ def _described(lines, zoom, result, steps):
     weighted, jacobian = linearised(lines, zoom)
     errors = energy_by_frame(lines, weighted)
     covariance, determined = parameter_covariance(lines, zoom, weighted, jacobian)
-    lens, rms = lens_of(lines, zoom), jnp.sqrt(jnp.mean(errors))
+    lens, rms = lens_of(lines, zoom), jnp.sqrt(jnp.nanmean(errors))
     certificate = certificate_of(zoom, lens.centre, lens.focal_range, lens.image_size, family=lens.family)
     return ZoomFit(
         lens=lens,
@@ -398,12 +399,12 @@ def collected(lines, fits):
     """Fits of one frame each, stacked, as one; about the centre of the lines."""
     return FrameFits(
         coefficients=fits.lens.zoom.parameters[:, 0],
-        rms=jnp.sqrt(jnp.mean(fits.rms**2)),
+        rms=jnp.sqrt(jnp.nanmean(fits.rms**2)),
         frame_rms=fits.rms,
         covariance=fits.covariance,
         result=fits.result,
         certificate=fits.certificate,
-        rms_unconstrained=jnp.sqrt(jnp.mean(fits.rms_unconstrained**2)),
+        rms_unconstrained=jnp.sqrt(jnp.nanmean(fits.rms_unconstrained**2)),
         centre=jnp.asarray(lines.centre),
         scale=lines.scale,
         family=lines.family,
@@ -516,11 +517,19 @@ def _invertible(fit):
 
 
 def _or_else(fit, outcome, other):
-    """The fit and its outcome where it is invertible, and otherwise another, not even begun where it is."""
+    """The fit and its outcome where it is invertible, and otherwise another, not even begun where it is.
+
+    Under `vmap` it is begun if one of the batch needs it, and then for all: a condition on the batch as a
+    whole stays one, where a condition of each would make XLA compute both ways for all, always.
+    """
     invertible, _ = outcome
-    if traced(invertible):
-        return jax.lax.cond(invertible, lambda: (fit, outcome), other)
-    return (fit, outcome) if invertible else other()
+    if not traced(invertible):
+        return (fit, outcome) if invertible else other()
+
+    def chosen():
+        return jax.tree.map(lambda own, new: jnp.where(invertible, own, new), (fit, outcome), other())
+
+    return jax.lax.cond(eqxi.unvmap_all(invertible), lambda: (fit, outcome), chosen)
 
 
 def _failed(result):

@@ -335,10 +335,11 @@ def _refined(residual, start):
 
     def solve(_, start):
         small = 64 * jnp.finfo(start.dtype).eps
+        # Infinity is made of `start`, so that under shard_map it differs from device to device, too.
         return jax.lax.while_loop(
             lambda state: (state[1] > small) & (state[2] < _ITERATIONS),
             advance,
-            (start, jnp.full((), jnp.inf, start.dtype), 0),
+            (start, jnp.where(start[0] == start[0], jnp.inf, jnp.inf).astype(start.dtype), 0),
         )[0]
 
     def solve_linear(map, right):

@@ -19,7 +19,7 @@ is independent of the others. The fit's own covariance C tells s: with G = J^T J
 the lines, ``tr(G C) = s^2 sum_l w_l h_l``. So noise that goes together along a line counts as what it is.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import equinox as eqx
 import jax
@@ -28,6 +28,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Num, ScalarLike
 
+from ._arguments import kinds_checked
 from ._types import AnyArray, Focal, traced
 from .energy import coefficients_by, line_weights, prior_error, prior_residuals, residuals
 from .family_lines import with_family
@@ -62,7 +63,12 @@ class FocalFit(eqx.Module):
     given: Float[Array, "frame"]
     steps: Int[Array, ""]
 
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: the lens of its fit is asked."""
+        raise TypeError("A FocalFit is not a lens: use found.fit.lens, as in found.fit.lens(35.0).")
 
+
+@kinds_checked
 def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma) -> ZoomFit:
     """The same fit, its covariance, and so all bands, enlarged by what is unknown of the focal lengths.
 
@@ -103,6 +109,7 @@ def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma) 
     return _widened(fit, lines, jnp.diag(sigma / jnp.asarray(lines.focal)) ** 2)
 
 
+@kinds_checked
 def fit_focal(
     lines: AbstractLines,
     focal_sigma: Sigma,

@@ -5,6 +5,8 @@ tensor-product spline to the coefficients of images that have been calibrated on
 are the unknowns of the global energy, like the parameters of any other linear zoom model.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,7 @@ from jaxtyping import Array, Float, ScalarLike
 
 from ._bernstein import Pieces, cut
 from ._checks import checked_integer
+from ._fields import check_finite, check_increasing, check_positive, check_shapes, numbers
 from ._splines import natural_basis, natural_controls, natural_curvature, spread
 from ._types import AnyArray, Focal, Focus, traced
 from .rivals import SplineZoom
@@ -46,15 +49,45 @@ class FocusSplineZoom(AbstractFocusZoom):
         [0.0, 0.0, 0.0, 1.0]
     """
 
+    formula: ClassVar[str] = (
+        "k_i(f, d) = sum over knots z of 1/f and e of the focus d of "
+        "parameters[z * focus_number + e][i-1] S_z(1/f) T_e(d), S and T the cardinal natural cubic splines"
+    )
     number: int = eqx.field(static=True, default=3, converter=lambda n: checked_integer("number", n, 1))
     focus_number: int = eqx.field(
         static=True, default=3, converter=lambda n: checked_integer("focus_number", n, 1)
     )
-    parameters: Float[AnyArray, "basis terms"] | None = None
-    knots: Float[AnyArray, "zooms"] | None = None
-    curvature: Float[AnyArray, "zooms zooms"] | None = None
-    focus_knots: Float[AnyArray, "focuses"] | None = None
-    focus_curvature: Float[AnyArray, "focuses focuses"] | None = None
+    parameters: Float[AnyArray, "basis terms"] | None = eqx.field(
+        default=None, converter=numbers("parameters")
+    )
+    knots: Float[AnyArray, "zooms"] | None = eqx.field(default=None, converter=numbers("knots"))
+    curvature: Float[AnyArray, "zooms zooms"] | None = eqx.field(
+        default=None, converter=numbers("curvature")
+    )
+    focus_knots: Float[AnyArray, "focuses"] | None = eqx.field(
+        default=None, converter=numbers("focus_knots")
+    )
+    focus_curvature: Float[AnyArray, "focuses focuses"] | None = eqx.field(
+        default=None, converter=numbers("focus_curvature")
+    )
+
+    def __check_init__(self):
+        """Check the knots, which increase, and that the rest is for as many."""
+        zooms, focuses = self.number, self.focus_number
+        check_shapes(
+            {
+                "knots": (self.knots, (zooms,)),
+                "curvature": (self.curvature, (zooms, zooms)),
+                "focus_knots": (self.focus_knots, (focuses,)),
+                "focus_curvature": (self.focus_curvature, (focuses, focuses)),
+                "parameters": (self.parameters, (zooms * focuses, "terms")),
+            }
+        )
+        check_positive("knots", self.knots)
+        check_increasing("knots", self.knots)
+        check_increasing("focus_knots", self.focus_knots)
+        check_finite("curvature", self.curvature)
+        check_finite("focus_curvature", self.focus_curvature)
 
     def prepare(self, focal: Focal, terms: int, focus: Focus | None = None) -> "FocusSplineZoom":
         """A spline of zeros, its knots spread over what is there."""

@@ -15,10 +15,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._checks import checked_size
-from ._types import Point, Points, Scalar
+from ._types import Point, Points, Scalar, of_known_values
 from .inverse import fold_radius
 from .lens import ZoomLens
 from .radial import Distortion
+from .sizes import check_aspect, check_image_size, checked_distortion, lens_for_size
 
 _INSET = 0.02
 """px: how far inside the border "valid" stays, so that errors of positions do not mix the border in."""
@@ -34,6 +35,8 @@ class Framing(eqx.Module):
         scale: output pixels per corrected pixel; above 1 enlarges.
         origin: the corrected point, px, shown at the centre of the output's top-left pixel.
         size: (width, height) of the output, px.
+        image_size: (width, height) px of the distorted images that it was made for; None for a framing of
+            your own, which is taken as it is meant.
 
     Example:
         >>> import numpy as np
@@ -44,6 +47,7 @@ class Framing(eqx.Module):
     scale: Scalar
     origin: Point
     size: tuple[int, int] = eqx.field(static=True)
+    image_size: tuple[int, int] | None = eqx.field(static=True, default=None)
 
     def corrected(self, pixels: Points) -> Float[Array, "*batch 2"]:
         """The corrected points, px, that output pixels show."""
@@ -51,6 +55,7 @@ class Framing(eqx.Module):
         return jnp.broadcast_to(self.origin, pixels.shape) + pixels / self.scale
 
 
+@of_known_values
 def frame_output(
     distortions: Distortion | Iterable[Distortion] | ZoomLens,
     image_size: tuple[int, int],
@@ -63,15 +68,18 @@ def frame_output(
     Args:
         distortions: those of the images; of a `ZoomLens`, 65 focal lengths spread evenly in 1/f over
             the fitted range.
-        image_size: (width, height) px of the distorted images.
+        image_size: (width, height) px of the distorted images. A `ZoomLens` for others is scaled.
         keep: "same" for the geometry of the input, "all" to show every pixel of every input, "valid" to
             show nothing beyond any input's border. Where a lens folds (see `Distortion.monotone_radius`)
             only what lies within the fold counts.
         size: (width, height) px of the output; by default `image_size`.
 
     Raises:
-        ValueError: a size or `keep` is not one of those, there is no distortion, or ("valid") nothing is
-            seen in all the images.
+        ValueError: a size or `keep` is not one of those, there is no distortion, one is that of images of
+            another size or aspect ratio, or ("valid") nothing is seen in all the images.
+
+    Warns:
+        UserWarning: the lens is for images of another size, and was scaled.
 
     Example:
         >>> d = Distortion(np.array([0.1]), np.array([319.5, 239.5]), np.array(400.0))
@@ -80,12 +88,15 @@ def frame_output(
     """
     image_size = checked_size(image_size)
     size = image_size if size is None else checked_size(size, "size")
-    if keep not in ("same", "all", "valid"):
-        raise ValueError(f'Argument keep must be "same", "all" or "valid", but it is {keep!r}.')
+    check_keep(keep)
     middle, reach = (np.array(image_size) - 1) / 2, (np.array(size) - 1) / 2
-    if keep == "same":
-        return _framing(1.0, middle, size)
+    if isinstance(distortions, ZoomLens):
+        distortions = lens_for_size(distortions, image_size)
     each = _each(distortions)
+    for distortion in each:
+        check_image_size(distortion, image_size)
+    if keep == "same":
+        return _framing(1.0, middle, size, image_size)
     inset = _INSET if keep == "valid" else 0.0
     outlines = [_outline(d, image_size, inset) for d in each]
     if keep == "all":
@@ -104,23 +115,69 @@ def frame_output(
                 'about their middle. Use keep="same".'
             )
         scale = float(1 / distance)
-    return _framing(scale, middle, size)
+    return _framing(scale, middle, size, image_size)
 
 
-def _framing(scale: float, middle: np.ndarray, size: tuple[int, int]) -> Framing:
+def check_keep(keep: str) -> None:
+    """Refuse names that are not known.
+
+    Raises:
+        ValueError: it is none of those that `frame_output` takes.
+    """
+    if keep not in ("same", "all", "valid"):
+        raise ValueError(f'Argument keep must be "same", "all" or "valid", but it is {keep!r}.')
+
+
+def check_framing(framing: Framing, image_size: tuple[int, int], name: str) -> None:
+    """Refuse a framing that was made for images of another size.
+
+    Raises:
+        ValueError: it was, and would show another part; the message names the argument.
+    """
+    if framing.image_size not in (None, image_size):
+        old, new = (f"{width} x {height}" for width, height in (framing.image_size, image_size))
+        raise ValueError(
+            f"Argument {name} must be a framing for images of {new} px, as this one is, but it was made "
+            f"for {old}. Make one by frame_output for this size."
+        )
+
+
+def framing_for_size(framing: Framing, image_size: tuple[int, int]) -> Framing:
+    """The same framing for images that show the same view with more or fewer pixels.
+
+    A framing of your own, which does not tell the size of its images, is left as it is.
+
+    Raises:
+        ValueError: the images have another aspect ratio.
+    """
+    if framing.image_size in (None, image_size):
+        return framing
+    check_aspect(image_size, framing.image_size)
+    ratio = np.array(image_size) / np.array(framing.image_size)
+    half = 0.5 - 0.5 / float(framing.scale)  # both pixels (0, 0) have their corners at -1/2
+    origin = (np.asarray(framing.origin, float) + half) * ratio - half
+    width, height = (max(1, round(side)) for side in np.array(framing.size) * ratio)
+    return Framing(framing.scale, origin, (width, height), image_size)
+
+
+def _framing(
+    scale: float, middle: np.ndarray, size: tuple[int, int], image_size: tuple[int, int]
+) -> Framing:
     """The framing that shows the corrected point `middle` in the middle of the output."""
     origin = middle - (np.array(size) - 1) / 2 / scale
-    return Framing(np.asarray(scale, np.float64), origin.astype(np.float64), size)
+    return Framing(np.asarray(scale, np.float64), origin.astype(np.float64), size, image_size)
 
 
 def _each(distortions: Distortion | Iterable[Distortion] | ZoomLens) -> list[Distortion]:
     if isinstance(distortions, Distortion):
-        return [distortions]
+        return [checked_distortion(distortions, "distortions")]
     if isinstance(distortions, ZoomLens):
         low, high = (float(f) for f in distortions.focal_range)
         focal = np.clip(1 / np.linspace(1 / low, 1 / high, 65), low, high)
         return [distortions(f) for f in focal]
-    distortions = list(distortions)
+    if not isinstance(distortions, Iterable):
+        checked_distortion(distortions, "distortions")
+    distortions = [checked_distortion(each, "distortions") for each in distortions]
     if not distortions:
         raise ValueError("Argument distortions must hold at least one distortion, but it is empty.")
     return distortions

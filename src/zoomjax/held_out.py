@@ -22,7 +22,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
+from ._arguments import kinds_checked
 from ._checks import checked_integer, checked_terms
+from ._types import of_known_values
 from .algebraic import compressed
 from .compression import CompressedLines
 from .energy import coefficients_by, line_residuals, prior_jacobian, settings
@@ -70,6 +72,8 @@ class Judged(NamedTuple):
     problem: str
 
 
+@kinds_checked
+@of_known_values
 def held_out_zoom(
     lines: AbstractLines,
     *,
@@ -113,6 +117,8 @@ def held_out_zoom(
     return _by_frame(small, np.where(parts.fold >= 0, judged.unseen, np.nan))
 
 
+@kinds_checked
+@of_known_values
 def held_out_frames(
     lines: AbstractLines, *, terms: int = 2, folds: int | None = None, seed: int = 0
 ) -> Float[np.ndarray, "frame"]:
@@ -156,7 +162,7 @@ def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
 
     Raises:
         TypeError: they are no lines, or measured in another way than eq. 3.
-        ValueError: they are compressed already, for fewer terms.
+        ValueError: they are compressed already, for fewer terms; a point is not finite; or no line counts.
     """
     if isinstance(lines, ImageLines | FamilyLines):
         raise TypeError(
@@ -169,7 +175,14 @@ def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
             "Argument lines must be Lines (see Lines.from_ragged) or compress(lines), but its type is "
             f"{type(lines).__name__}."
         )
-    return compressed(lines, terms)
+    small = compressed(lines, terms)
+    if not np.isfinite(small.triangle).all():
+        raise ValueError("Argument lines must hold finite points, but it holds NaN or infinite ones.")
+    if not _own_weights(small).any():
+        raise ValueError(
+            "Argument lines must have a line that counts, but all have a weight of 0 or too few points."
+        )
+    return small
 
 
 def folds_of(lines: CompressedLines, hold_out: HoldOut, folds: int | None, seed: int) -> Folds:
@@ -232,10 +245,10 @@ def _by_frame(lines, of_line):
 
 
 def shares(lines: CompressedLines) -> Float[np.ndarray, "line"]:
-    """The part of each line in the energy of eq. 13: every frame weighs the same."""
+    """The part of each line in the energy of eq. 13: every frame that counts weighs the same."""
     frame, own = np.asarray(lines.frame), _own_weights(lines)
     total = np.bincount(frame, own, minlength=len(lines.focal))
-    return own / (np.where(total > 0, total, 1) * len(total))[frame]
+    return own / (np.where(total > 0, total, 1) * max(np.sum(total > 0), 1))[frame]
 
 
 def _own_weights(lines):
@@ -400,7 +413,9 @@ def _minimised(lanes, weight, design, parameters, known=None):
     """
     in_frame = lanes.total(weight)
     share = np.zeros(lanes.frames)
-    share[lanes.frame[lanes.starts]] = 1 / np.where(in_frame > 0, in_frame, 1) / lanes.frames
+    # M of eq. 13 as of all lines, those left out included: a prior in `_Design` is in the same unit.
+    counted = max(np.sum(lanes.total(lanes.weight) > 0), 1)
+    share[lanes.frame[lanes.starts]] = 1 / np.where(in_frame > 0, in_frame, 1) / counted
     weights = weight * share[lanes.frame] / lanes.counts
     eps = np.finfo(float).eps
     at, damping = _state(lanes, weights, design, parameters, known), 0.0

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ._arguments import kinds_checked
 from ._types import Centres, Focal, Focus, FrameIndex, LineWeight, Point
 from .energy import line_normal
 from .families import AbstractFamily, AbstractRadial
@@ -80,6 +81,7 @@ class ImageLines(AbstractLines):
         return with_fields_of(self.lines, self)
 
 
+@kinds_checked
 def in_image(lines: AbstractLines) -> ImageLines:
     """The same lines, their distances to be measured in the image, px: without the paper's bias.
 

@@ -1,6 +1,7 @@
 """ZoomLens: the fitted model, from a focal length to the distortion there, and its file format."""
 
 import dataclasses
+import functools
 import json
 import math
 import os
@@ -12,18 +13,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Num, ScalarLike
 
+from ._arguments import check_kind, kinds_checked
+from ._arrays import aligned
 from ._checks import checked_size, checked_unit
+from ._fields import check_finite, check_positive, check_range, check_shapes, numbers
 from ._files import whole_file
-from ._types import AnyArray, Point, traced
-from .families import AbstractFamily, BrownConrady, Division, RadialPolynomial
-from .focus import FocusSplineZoom
+from ._types import AnyArray, FocalLike, Point, Points, traced
+from .families import AbstractFamily, RadialPolynomial
 from .lines import AbstractLines
-from .radial import Distortion
-from .rivals import PowerZoom, SplineZoom, TableZoom, TwoRegionZoom
-from .smooth import SmoothZoom
-from .zoom import AbstractFocusZoom, AbstractZoom, PolynomialZoom
+from .models import array_of, coefficients_shape, described, family_name, family_named, zoom_from
+from .radial import Distortion, as_points, mapped
+from .zoom import AbstractFocusZoom, AbstractLinearZoom, AbstractZoom
 
 _FORMAT, _VERSION = "zoomjax.lens", 2
+
+_SLACK = 1e-6
+"""Share of a focal length by which it may be beyond the range: the end itself, through a float32."""
 
 
 class ZoomLens(eqx.Module):
@@ -42,6 +47,7 @@ class ZoomLens(eqx.Module):
 
     Example:
         >>> import jax.numpy as jnp
+        >>> from zoomjax import PolynomialZoom
         >>> zoom = PolynomialZoom(1, jnp.array([[0.0], [0.1]]), jnp.array(20.0))
         >>> lens = ZoomLens(zoom, jnp.array([319.5, 239.5]), jnp.array([20.0, 80.0]), (640, 480))
         >>> lens(40.0).coefficients.round(3).tolist()
@@ -49,56 +55,145 @@ class ZoomLens(eqx.Module):
     """
 
     zoom: AbstractZoom
-    centre: Point
-    focal_range: Float[AnyArray, "2"]
-    image_size: tuple[int, int] = eqx.field(static=True)
-    focal_unit: str = eqx.field(static=True, default="mm")
+    centre: Point = eqx.field(converter=numbers("centre"))
+    focal_range: Float[AnyArray, "2"] = eqx.field(converter=numbers("focal_range"))
+    image_size: tuple[int, int] = eqx.field(static=True, converter=checked_size)
+    focal_unit: str = eqx.field(static=True, default="mm", converter=checked_unit)
     shift: AbstractZoom | None = None
-    focus_range: Float[AnyArray, "2"] | None = None
+    focus_range: Float[AnyArray, "2"] | None = eqx.field(default=None, converter=numbers("focus_range"))
     family: AbstractFamily = RadialPolynomial()
 
     def __check_init__(self):
-        """Check the geometry."""
-        checked_size(self.image_size)
-        checked_unit(self.focal_unit)
+        """Check the geometry, and that the zoom model gives the family's coefficients."""
+        for name, kinds in (
+            ("zoom", (AbstractZoom,)),
+            ("family", (AbstractFamily,)),
+            ("shift", (AbstractZoom, type(None))),
+        ):
+            value = getattr(self, name)
+            # Booleans stand for modules in filters, bare objects in JAX's own handling of trees.
+            if not (isinstance(value, bool) or type(value) is object):
+                check_kind(name, value, kinds)
+        check_shapes(
+            {
+                "centre": (self.centre, (2,)),
+                "focal_range": (self.focal_range, (2,)),
+                "focus_range": (self.focus_range, (2,)),
+            }
+        )
+        check_finite("centre", self.centre)
+        check_positive("focal_range", self.focal_range)
+        check_range("focal_range", self.focal_range)
+        check_range("focus_range", self.focus_range)
+        one = getattr(self.centre, "ndim", 0) == 1  # or it is a batch of lenses, or stands in for one
+        size, shift = (_coefficients(model) if one else None for model in (self.zoom, self.shift))
+        if shift not in (None, 2):
+            raise ValueError(
+                f"Argument shift must give two numbers, the offset of the centre, but it gives {shift}."
+            )
+        if size is not None and isinstance(self.family, AbstractFamily) and size < self.family.size(1):
+            raise ValueError(
+                f"Argument zoom must give {self.family.size(1)} or more coefficients for the family "
+                f"{type(self.family).__name__}, but it gives {size}."
+            )
 
     @property
     def scale(self) -> float:
         """The length in px that is radius 1: half the image diagonal."""
         return math.hypot(*self.image_size) / 2
 
-    def __call__(self, focal: ScalarLike, focus: ScalarLike | None = None) -> Distortion:
-        """The distortion at one focal length, in `focal_unit`; ``jax.vmap`` it for many.
+    def __call__(self, focal: FocalLike, focus: FocalLike | None = None) -> Distortion:
+        """The distortion at a focal length, in `focal_unit`; or those at several, in one.
 
         Args:
-            focal: the focal length.
+            focal: the focal length, or an array or list of them: the distortion then has its axes in front.
             focus: where the lens is focused, for models that depend on it (`AbstractFocusZoom`), which hold
                 it within the fitted range.
 
+        Under ``jit``, ``vmap`` and ``grad``, where values are not known and nobody can be warned, focal
+        lengths outside of the fitted range give NaN; see `extended`.
+
         Warns:
-            UserWarning: `focal` is outside of the fitted range (not under ``jit`` or ``vmap``).
+            UserWarning: `focal` is outside of the fitted range, and the distortion extrapolated.
 
         Raises:
-            ValueError: `focal` is not one number, positive and finite (values are not checked under
-                ``jit`` or ``vmap``), or the zoom model depends on the focus and none is given.
+            ValueError: `focal` is not positive and finite, or the zoom model depends on the focus and there
+                is none.
         """
-        if np.ndim(focal):
-            raise ValueError(
-                f"Argument focal must be one number, but its shape is {np.shape(focal)}: "
-                "jax.vmap(lens)(focal) takes many."
-            )
-        self.check_range(focal, stacklevel=3)
+        focal = self._checked(focal, stacklevel=4)
+        if traced((self, focal, focus)):
+            return self._distortion(focal, focus)
+        with jax.ensure_compile_time_eval():  # what is known stays known inside of ``jit``
+            return self._distortion(focal, focus)
+
+    def undistort(
+        self,
+        points: Points,
+        focal: FocalLike,
+        focus: FocalLike | None = None,
+    ) -> Float[AnyArray, "*points 2"]:
+        """Corrected positions of distorted `points`, each at its own focal length.
+
+        Args:
+            points: (..., 2) px.
+            focal: focal lengths, which broadcast with the points: one for all, or one for each, as rays of
+                a radiance field need them.
+            focus: as for a call of the lens.
+
+        Returns:
+            Points of the shape that both have together; see `Distortion.undistort`.
+        """
+        return self._mapped("undistort", points, focal, focus)
+
+    def distort(
+        self,
+        points: Points,
+        focal: FocalLike,
+        focus: FocalLike | None = None,
+    ) -> Float[AnyArray, "*points 2"]:
+        """Distorted positions of corrected `points`, each at its own focal length; see `undistort`."""
+        return self._mapped("distort", points, focal, focus)
+
+    def extended(self, low: float, high: float) -> "ZoomLens":
+        """The same lens with another focal range: to extrapolate on purpose.
+
+        Nothing vouches for the distortion beyond the range fitted; `certify` it.
+        """
+        return dataclasses.replace(self, focal_range=np.array([low, high], float))
+
+    def _mapped(self, method, points, focal, focus):
+        points = as_points(points)
+        focal = self._checked(focal, stacklevel=5)
+        if isinstance(points, np.ndarray) and not traced((self, focal, focus)):
+            d = self._distortion(focal, focus)
+            return mapped(method, d.family, points, d.coefficients, d.centre, d.scale)
+        return _compiled(self, method, jnp.asarray(points), focal, focus)
+
+    def _checked(self, focal, stacklevel):
+        """Focal lengths as an array: looked at where they are known, NaN outside of the range elsewhere."""
+        if not isinstance(focal, jax.Array):
+            try:
+                focal = np.asarray(focal, float)
+            except (TypeError, ValueError) as error:
+                raise ValueError(
+                    f"Argument focal must be a number or an array, but it is {focal!r}."
+                ) from error
+        self.check_range(focal, stacklevel=stacklevel)
+        if not traced((self, focal)):
+            return focal
+        low, high = jnp.moveaxis(jnp.asarray(self.focal_range), -1, 0)
+        within = (focal > 0) & (focal >= low * (1 - _SLACK)) & (focal <= high * (1 + _SLACK))
+        return jnp.where(within, focal, jnp.nan)
+
+    def _distortion(self, focal, focus):
+        """The distortion, whatever the range."""
         dtype = jnp.asarray(self.centre).dtype
-        focal = jnp.asarray(focal, dtype)
         centre = jnp.asarray(self.centre)
-        return Distortion(
-            coefficients=self.zoom(focal, focus)
-            if isinstance(self.zoom, AbstractFocusZoom)
-            else self.zoom(focal),
-            centre=centre if self.shift is None else centre + self.scale * self.shift(focal),
-            scale=jnp.asarray(self.scale, dtype),
-            family=self.family,
-        )
+        k = _at(self.zoom, focal, focus, dtype)
+        if self.shift is not None:
+            centre, moved = aligned((centre, 1), (_at(self.shift, focal, None, dtype), 1))
+            centre = centre + self.scale * moved
+        return Distortion(k, centre, jnp.asarray(self.scale, dtype), self.family)
 
     def at_focus(self, focus: ScalarLike) -> "ZoomLens":
         """The lens focused at one place, a lens of the focal length alone: to correct images and video by.
@@ -116,13 +211,10 @@ class ZoomLens(eqx.Module):
         """Write the lens to a JSON file that `load_lens` reads, all digits kept.
 
         Raises:
-            TypeError: the zoom model, or the family, is of a kind that has no file format.
+            TypeError: the class of the zoom model or of the family is not registered (`register_model`), or
+                has fields that a file cannot hold.
         """
-        if type(self.family) not in _FAMILIES.values():
-            raise TypeError(f"A lens with a {type(self.family).__name__} cannot be saved.")
-        for model in (self.zoom, self.shift):
-            if model is not None and type(model) not in _FORMULAS:
-                raise TypeError(f"A lens with a {type(model).__name__} cannot be saved.")
+        check_kind("path", path, (str, os.PathLike))
         polynomial = isinstance(self.family, RadialPolynomial)
         content = {
             "format": _FORMAT,
@@ -133,14 +225,14 @@ class ZoomLens(eqx.Module):
             "scale": self.scale,
             "focal_unit": self.focal_unit,
             "focal_range": _numbers(self.focal_range),
-            **({} if polynomial else {"family": type(self.family).__name__}),
+            **({} if polynomial else {"family": family_name(self.family)}),
             "radial": self.family.formula,
-            "zoom": _described(self.zoom),
+            "zoom": described(self.zoom),
         }
         if self.focus_range is not None:
             content["focus_range"] = _numbers(self.focus_range)
         if self.shift is not None:
-            content["shift"] = _described(self.shift)
+            content["shift"] = described(self.shift)
             content["shift_meaning"] = "centre at f = centre + scale (k_1(f), k_2(f)) of the model in shift"
         with whole_file(path) as part:
             part.write_text(json.dumps(content, indent=2) + "\n")
@@ -156,12 +248,15 @@ class ZoomLens(eqx.Module):
         """
         if traced((self, focal)):
             return
-        low, high = (float(end) for end in self.focal_range)
+        # By NumPy alone: under ``jit`` even an operation of JAX on known arrays is traced.
+        low, high = np.asarray(self.focal_range, np.float64).tolist()
         values = np.ravel(np.asarray(focal, np.float64))
+        if not values.size:
+            return
         bad = ~(np.isfinite(values) & (values > 0))
         if bad.any():
             raise ValueError(f"Argument focal must be a positive number, but it is {values[bad][0]}.")
-        slack = 1e-6 * values  # the end of the range itself, through a float32 or a file
+        slack = _SLACK * values
         if np.any((values < low - slack) | (values > high + slack)):
             asked = f"The focal length {values[0]:g} {self.focal_unit} is"
             if values.size > 1:
@@ -171,6 +266,49 @@ class ZoomLens(eqx.Module):
                 "beyond that its distortion is extrapolated.",
                 stacklevel=stacklevel + 1,
             )
+
+
+def _at(zoom, focal, focus, dtype):
+    """The coefficients of a zoom model at focal lengths of any shape, which come first."""
+    focal = jnp.asarray(focal, dtype)
+    if isinstance(zoom, AbstractFocusZoom):
+        if focus is None:
+            return zoom(focal.reshape(-1)[0], None)  # says what is missing
+        focal, focus = jnp.broadcast_arrays(focal, jnp.asarray(focus, dtype))
+        function, arguments = zoom, (focal, focus)
+    else:
+        function, arguments = zoom, (focal,)
+    for _ in range(focal.ndim):
+        function = jax.vmap(function)
+    return function(*arguments)
+
+
+@eqx.filter_jit
+def _compiled(lens, method, points, focal, focus):
+    d = lens._distortion(jnp.asarray(focal, points.dtype), focus)
+    return mapped(method, d.family, points, d.coefficients, d.centre, d.scale)
+
+
+def _coefficients(zoom: AbstractZoom | None) -> int | None:
+    """How many coefficients a zoom model gives; None where its arrays are not there, or a batch."""
+    leaves = jax.tree.leaves(zoom)
+    if not isinstance(zoom, AbstractZoom) or not all(eqx.is_array(leaf) for leaf in leaves):
+        return None
+    if isinstance(zoom, AbstractLinearZoom) and zoom.parameters is not None:
+        return zoom.parameters.shape[1] if zoom.parameters.ndim == 2 else None
+    kinds = tuple((leaf.shape, np.dtype(leaf.dtype)) for leaf in leaves)
+    return _number_of(jax.tree.structure(zoom), kinds, jnp.result_type(float))
+
+
+@functools.lru_cache(maxsize=1024)
+def _number_of(structure, kinds, _):
+    """How many coefficients there are, of a model known by its shapes: to trace it takes milliseconds."""
+    zoom = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*kind) for kind in kinds])
+    try:
+        shape = coefficients_shape(zoom)
+    except (jax.errors.JAXTypeError, IndexError, TypeError):  # that cannot be traced, or is a batch
+        return None
+    return shape[0] if len(shape) == 1 else None
 
 
 def lens_of(lines: AbstractLines, zoom: AbstractZoom) -> ZoomLens:
@@ -192,8 +330,15 @@ def _focus_range(lines):
     return jnp.stack([jnp.min(focus), jnp.max(focus)])
 
 
+def _pair(content, name):
+    return array_of(name, np.asarray(content[name], np.float64), (2,))
+
+
+@kinds_checked
 def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
     """Read a lens that `ZoomLens.save` wrote.
+
+    Models of users' own have to be registered before, by the module that defines them (`register_model`).
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -209,25 +354,16 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
                 f"its format version is {content['version']!r} and this zoomjax reads up to {_VERSION}; "
                 "update zoomjax"
             )
-        family = content.get("family", "RadialPolynomial")
-        if family not in _FAMILIES:
-            raise ValueError(f"its family of distortions, {family!r}, is unknown; update zoomjax")
         lens = ZoomLens(
-            zoom=_read_zoom(content["zoom"], None),
-            centre=_array(content, "centre", (2,)),
-            focal_range=_array(content, "focal_range", (2,)),
-            image_size=checked_size(content["image_size"]),
-            focal_unit=checked_unit(content["focal_unit"]),
-            shift=_read_zoom(content["shift"], 2) if "shift" in content else None,
-            focus_range=_array(content, "focus_range", (2,)) if "focus_range" in content else None,
-            family=_FAMILIES[family](),
+            zoom=zoom_from(content["zoom"]),
+            centre=_pair(content, "centre"),
+            focal_range=_pair(content, "focal_range"),
+            image_size=content["image_size"],
+            focal_unit=content["focal_unit"],
+            shift=zoom_from(content["shift"], 2) if "shift" in content else None,
+            focus_range=_pair(content, "focus_range") if "focus_range" in content else None,
+            family=family_named(content.get("family", "RadialPolynomial")),
         )
-        size = jax.eval_shape(lens.zoom, *[jnp.ones(())] * _settings(lens.zoom)).shape[0]
-        if size < lens.family.size(1):
-            raise ValueError(f"it has {size} coefficients, and {family} has {lens.family.size(1)} or more")
-        low, high = lens.focal_range
-        if not 0 < low <= high:
-            raise ValueError("its focal_range is not positive and in order")
         if not math.isclose(content["scale"], lens.scale, rel_tol=1e-6):
             raise ValueError("its scale is not half the diagonal of its image_size")
         return lens
@@ -246,99 +382,6 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
         raise ValueError(f"Cannot read a lens from {os.fspath(path)}: {reason}.") from error
 
 
-# The zoom models that lens.json can hold, and what it says of them. Their fields are written as they are.
-_FORMULAS = {
-    PolynomialZoom: "k_i(f) = sum_j parameters[j][i-1] * (focal_ref / f)^j",
-    TableZoom: "k_i(f): parameters[.][i-1] at the knots, 1/f (or f, if not inverse), linear in between",
-    SplineZoom: "k_i(f): the natural cubic spline in 1/f through parameters[.][i-1] at the knots",
-    PowerZoom: "k_i(f) = d0 + d1 (f / focal_ref)^d2 with rows d0, d1, d2 of parameters[.][i-1]",
-    TwoRegionZoom: "k_i(f) = sum_j c_j (focal_ref / f)^j with c = parameters[0..2][i-1] for f < crossover, "
-    "parameters[3..5][i-1] from there on",
-    SmoothZoom: "k_i(f) = sum_j parameters[j][i-1] P_j(2 focal_ref / f - 1), P_j Legendre's polynomials; "
-    "the rest is the prior",
-    FocusSplineZoom: "k_i(f, d) = sum over knots z of 1/f and e of the focus d of "
-    "parameters[z * focus_number + e][i-1] S_z(1/f) T_e(d), S and T the cardinal natural cubic splines",
-}
-
-_FAMILIES = {family.__name__: family for family in (RadialPolynomial, Division, BrownConrady)}
-"""The families that it can hold."""
-
-_TABLE = (None, None)
-_SHAPES = {
-    "parameters": _TABLE,
-    "knots": (None,),
-    "curvature": _TABLE,
-    "focus_knots": (None,),
-    "focus_curvature": _TABLE,
-    "quadratic": _TABLE,
-    "beyond": _TABLE,
-}
-"""Of their fields that are not single numbers."""
-
-
-def _described(model: AbstractZoom) -> dict[str, object]:
-    return {
-        "model": type(model).__name__,
-        "formula": _FORMULAS[type(model)],
-        **{name: _plain(value) for name, value in vars(model).items()},
-    }
-
-
-def _read_zoom(content, numbers: int | None) -> AbstractZoom:
-    """A zoom model that gives so many numbers, or as many as it has parameters for."""
-    models = {model.__name__: model for model in _FORMULAS}
-    if content["model"] not in models:
-        raise ValueError(f"its zoom model, {content['model']!r}, is unknown; update zoomjax")
-    model = models[content["model"]]
-    fields = {}
-    for field in dataclasses.fields(model):
-        if field.metadata.get("static"):
-            fields[field.name] = content[field.name]
-        else:
-            fields[field.name] = _array(content, field.name, _SHAPES.get(field.name, ()))
-    for name in ("focal_ref", "crossover"):
-        if name in fields and not fields[name] > 0:
-            raise ValueError(f"its {name} is not positive")
-    if not isinstance(fields.get("inverse", True), bool):
-        raise ValueError("its 'inverse' is neither true nor false")
-    rows, columns = fields["parameters"].shape
-    for name in ("", "focus_"):
-        knots, curvature = fields.get(f"{name}knots"), fields.get(f"{name}curvature")
-        if knots is None:
-            continue
-        if not (np.diff(knots) > 0).all():
-            raise ValueError(f"its {name}knots do not increase")
-        if curvature is not None and curvature.shape != (knots.size, knots.size):
-            raise ValueError(f"its {name}curvature is not that of its {name}knots")
-    numbers_of_knots = [fields[name].size for name in ("knots", "focus_knots") if name in fields]
-    if numbers_of_knots and math.prod(numbers_of_knots) != rows:
-        raise ValueError("its knots are not as many as its parameters")
-    zoom = model(**fields)
-    if jax.eval_shape(zoom, *[jnp.ones(())] * _settings(zoom)).shape != (numbers or columns,):
-        raise ValueError("its parameters are not those of its model")
-    return zoom
-
-
-def _settings(zoom):
-    """How many numbers a zoom model's coefficients depend on: the focal length, and perhaps the focus."""
-    return 2 if isinstance(zoom, AbstractFocusZoom) else 1
-
-
-def _plain(value):
-    return _numbers(value) if eqx.is_array_like(value) and not isinstance(value, bool | int) else value
-
-
 def _numbers(array):
     """Nested lists of floats; JSON keeps every digit of them."""
     return np.asarray(array, np.float64).tolist()
-
-
-def _array(content, name, shape):
-    array = np.asarray(content[name], np.float64)
-    matches = array.ndim == len(shape) and all(
-        want in (None, have) for want, have in zip(shape, array.shape, strict=True)
-    )
-    dtype = jnp.result_type(float)
-    if not matches or not array.size or not (abs(array) <= jnp.finfo(dtype).max).all():
-        raise ValueError(f"the numbers of its {name!r} are incomplete or not finite")
-    return jnp.asarray(array, dtype)

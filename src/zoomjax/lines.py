@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from ._arguments import check_kind, kinds_checked
 from ._checks import (
     checked_centre,
     checked_focal,
@@ -30,6 +31,17 @@ from ._checks import (
     checked_unit,
     usable_lines,
     warn_of_points_outside,
+)
+from ._fields import (
+    booleans,
+    check_finite,
+    check_indices,
+    check_not_negative,
+    check_positive,
+    check_shapes,
+    integers,
+    known,
+    numbers,
 )
 from ._files import whole_file
 from ._types import AnyArray, Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Mask, Point, traced
@@ -55,6 +67,26 @@ class AbstractLines(eqx.Module):
     image_size: eqx.AbstractVar[tuple[int, int]]
     focal_unit: eqx.AbstractVar[str]
     weight: eqx.AbstractVar[LineWeight | None]
+
+    def __check_init__(self):
+        """Check what all kinds of lines have."""
+        checked_size(self.image_size)
+        checked_unit(self.focal_unit)
+        check_shapes(
+            {
+                "frame": (self.frame, ("line",)),
+                "weight": (self.weight, ("line",)),
+                "focal": (self.focal, ("frame",)),
+                "focus": (self.focus, ("frame",)),
+                "centre": (self.centre, (2,)),
+            }
+        )
+        check_positive("focal", self.focal)
+        check_finite("focus", self.focus)
+        check_finite("centre", self.centre)
+        check_not_negative("weight", self.weight)
+        if hasattr(self.focal, "shape"):
+            check_indices("frame", self.frame, self.focal.shape[-1], "one focal length each")
 
     @property
     def scale(self) -> float:
@@ -163,25 +195,36 @@ class Lines(AbstractLines):
             any number that grows or falls with it, such as the reciprocal of the distance; None if unknown.
     """
 
-    points: Float[AnyArray, "line point 2"]
-    mask: Mask
-    frame: FrameIndex
-    focal: Focal
-    centre: Point
-    image_size: tuple[int, int] = eqx.field(static=True)
+    points: Float[AnyArray, "line point 2"] = eqx.field(converter=numbers("points"))
+    mask: Mask = eqx.field(converter=booleans("mask"))
+    frame: FrameIndex = eqx.field(converter=integers("frame"))
+    focal: Focal = eqx.field(converter=numbers("focal"))
+    centre: Point = eqx.field(converter=numbers("centre"))
+    image_size: tuple[int, int] = eqx.field(static=True, converter=checked_size)
     focal_unit: str = eqx.field(static=True, default="mm")
-    number: LineNumber | None = None
-    weight: LineWeight | None = None
-    focus: Focus | None = None
+    number: LineNumber | None = eqx.field(default=None, converter=integers("number"))
+    weight: LineWeight | None = eqx.field(default=None, converter=numbers("weight"))
+    focus: Focus | None = eqx.field(default=None, converter=numbers("focus"))
 
     def __check_init__(self):
-        """Check that the shapes agree."""
-        lines, points = self.points.shape[:2]
-        if self.mask.shape != (lines, points) or self.frame.shape != (lines,):
-            raise ValueError(
-                "Arguments points, mask and frame must have shapes (line, point, 2), (line, point) and "
-                f"(line,), but they are {self.points.shape}, {self.mask.shape}, {self.frame.shape}."
-            )
+        """Check that the shapes agree, and that points are numbers where they are few."""
+        check_shapes(
+            {
+                "points": (self.points, ("line", "point", 2)),
+                "mask": (self.mask, ("line", "point")),
+                "frame": (self.frame, ("line",)),
+                "number": (self.number, ("line",)),
+            }
+        )
+        points, mask = known(self.points), known(self.mask)
+        if points is not None and mask is not None and not np.isfinite(points).all():
+            bad = np.argwhere(mask & ~np.isfinite(points).all(axis=-1))
+            if bad.size:
+                where = ", ".join(map(str, bad[0]))
+                raise ValueError(
+                    f"Argument points must be finite where mask is set, but points[{where}] is "
+                    f"{points[tuple(bad[0])]}: remove such points, or clear their mask."
+                )
 
     @classmethod
     def from_ragged(
@@ -302,6 +345,7 @@ class Lines(AbstractLines):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all fields, in their dtypes, to a ``.npz`` file that `load_lines` reads."""
+        check_kind("path", path, (str, os.PathLike))
         optional: dict[str, Any] = {"weight": self.weight, "focus": self.focus}
         fields: dict[str, Any] = {
             name: np.asarray(value) for name, value in optional.items() if value is not None
@@ -400,6 +444,7 @@ def _correct_line(points, mask, k, centre, scale, family):
     return jnp.where(mask[:, None], scale * (corrected - mean[None]), 0)
 
 
+@kinds_checked
 def load_lines(path: str | os.PathLike[str]) -> Lines:
     """Read lines that `Lines.save` wrote.
 

@@ -7,20 +7,32 @@ With ``z = (x - c)/s`` the corrected point is ``c + s F(z)``: F is the family's 
 Here are lengths in px, arrays of points and dtypes; formulas and inverses are there.
 """
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from typing import Any
 
-from ._types import Coefficients, Point, Points, Scalar
-from .families import AbstractFamily, RadialPolynomial
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ._arguments import check_kind
+from ._arrays import aligned, as_array, finite, namespace, together
+from ._types import AnyArray, Points, traced
+from .families import AbstractFamily, RadialPolynomial, inverse
 
 
 class Distortion(eqx.Module):
-    """Distortion of one frame (eq. 1-2), radial unless its family says otherwise.
+    """Distortion of one frame (eq. 1-2), radial unless its family says otherwise, or of several frames.
 
     ``undistort`` maps distorted to corrected points, the paper's L; ``distort`` is its inverse. Points
-    are ``(x, y)`` px with (0, 0) at the centre of the top-left pixel, in arrays of any leading shape;
-    results have the points' dtype.
+    are ``(x, y)`` px with (0, 0) at the centre of the top-left pixel, in arrays of any leading shape.
+
+    NumPy arrays, and lists, give NumPy arrays, computed at once, without compilation; JAX arrays give JAX
+    arrays. Results have the points' dtype; integers give float64, half precision (which has steps of
+    0.5 px at 1,000) float32.
+
+    Several distortions in one, as ``lens([24, 35, 50])`` makes them, have leading axes. Points then begin
+    with the same axes: ``points[0]`` are those of the first. A single point is one for all.
 
     Attributes:
         coefficients: (k1, ..., kN), or those of another family, for radii in units of `scale`.
@@ -29,83 +41,189 @@ class Distortion(eqx.Module):
         family: what the coefficients mean.
 
     Example:
-        >>> import jax.numpy as jnp
-        >>> d = Distortion(jnp.array([0.1, -0.02]), jnp.array([319.5, 239.5]), jnp.array(400.0))
-        >>> d.undistort(jnp.array([639.0, 479.0])).round(2).tolist()
-        [664.48..., 498.10...]
+        >>> d = Distortion([0.1, -0.02], [319.5, 239.5], 400.0)
+        >>> d.undistort([639.0, 479.0]).round(2).tolist()
+        [664.49, 498.11]
     """
 
-    coefficients: Coefficients
-    centre: Point
-    scale: Scalar
+    coefficients: Float[AnyArray, "*batch terms"] = eqx.field(converter=as_array)
+    centre: Float[AnyArray, "... 2"] = eqx.field(converter=as_array)
+    scale: Float[AnyArray, "..."] = eqx.field(converter=as_array)
     family: AbstractFamily = RadialPolynomial()
 
-    @property
-    def pixel_coefficients(self) -> Coefficients:
-        """The coefficients in the paper's units, ``k_i / scale^(2i)``, px^(-2i); p1 and p2 in px^-1."""
-        order = jnp.asarray(self.family.orders(self.coefficients.shape[0]))
-        return self.coefficients / self.scale**order
+    def __check_init__(self):
+        """Check shapes, and values where they are known."""
+        _check(self.coefficients, self.centre, self.scale, self.family)
 
     @property
-    def monotone_radius(self) -> Float[Array, ""]:
+    def pixel_coefficients(self) -> Float[AnyArray, "*batch terms"]:
+        """The coefficients in the paper's units, ``k_i / scale^(2i)``, px^(-2i); p1 and p2 in px^-1."""
+        order = self.family.orders(self.coefficients.shape[-1])
+        scale = namespace(self.scale).asarray(self.scale)[..., None]
+        lengths, order, k = aligned((scale, 0), (order, 0), (self.coefficients, 0))
+        return k / lengths**order
+
+    @property
+    def monotone_radius(self) -> Float[AnyArray, "*batch"]:
         """Distance in px from the centre at which the distorted image begins to fold; inf if never.
 
         For `BrownConrady` a bound of it: up to there it is certain not to.
         """
-        return jnp.asarray(self.scale) * self.family.limit(self.coefficients)
+        radius = self.scale * _limit(self.family, self.coefficients)
+        return namespace(radius).asarray(radius)
 
-    def undistort(self, points: Points) -> Float[Array, "*batch 2"]:
+    def undistort(self, points: Points) -> Float[AnyArray, "*points 2"]:
         """Corrected positions of distorted `points` (eq. 1).
 
         Beyond `monotone_radius` the result is NaN: there the formula folds the plane over, and two points
         would share one corrected position. `certify` proves that a lens has no such points in its images.
         """
-        return _each(_undistort, "(c)->(c)", self, points)
+        return self._mapped("undistort", points)
 
-    def distort(self, points: Points) -> Float[Array, "*batch 2"]:
+    def distort(self, points: Points) -> Float[AnyArray, "*points 2"]:
         """Distorted positions of corrected `points`: the exact inverse of `undistort`.
 
-        Where none exists within the monotone radius the result is NaN, and `has_inverse` is False.
-        Derivatives are those of the implicit function theorem.
+        Iterated until the residual is one of rounding. Where there is no inverse within the monotone radius
+        the result is NaN, its derivatives are zero, and `has_inverse` is False. Derivatives elsewhere are
+        those of the implicit function theorem.
         """
-        return _each(_distort, "(c)->(c)", self, points)
+        return self._mapped("distort", points)
 
-    def has_inverse(self, points: Points) -> Bool[Array, "*batch"]:
+    def has_inverse(self, points: Points) -> Bool[AnyArray, "*points"]:
         """Whether corrected `points` are the image of a distorted point inside the monotone radius."""
-        return _each(_has_inverse, "(c)->()", self, points)
+        return finite(self.distort(points)[..., 0])
+
+    def _mapped(self, method, points):
+        points = as_points(points)
+        batch = self.coefficients.ndim - 1
+        if batch and points.ndim > 1:
+            leading = self.coefficients.shape[:batch]
+            if points.shape[:batch] != leading or points.ndim == batch:
+                raise ValueError(
+                    f"Argument points must begin with the axes {leading} of the distortions, a set of "
+                    f"points for each, but its shape is {points.shape}. ZoomLens.undistort(points, focal) "
+                    "broadcasts both."
+                )
+        between = max(points.ndim - 1 - batch, 0)
+
+        def spread(leaf, own):
+            return leaf.reshape(*leaf.shape[:batch], *[1] * between, *leaf.shape[batch:]) if own else leaf
+
+        k, centre, scale = (
+            spread(leaf, leaf.ndim > own)
+            for leaf, own in ((self.coefficients, 1), (self.centre, 1), (self.scale, 0))
+        )
+        return mapped(method, self.family, points, k, centre, scale)
+
+
+def as_points(points: Any) -> Any:
+    """Points as an array (..., 2) of float32 or float64.
+
+    Raises:
+        ValueError: they are not real numbers, or of another shape.
+    """
+    if not isinstance(points, jax.Array):
+        try:
+            points = np.asarray(points)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"Argument points must be an array of shape (..., 2): {error}.") from error
+    if points.shape[-1:] != (2,):
+        raise ValueError(f"Argument points must have shape (..., 2), but its shape is {points.shape}.")
+    if not jnp.issubdtype(points.dtype, jnp.integer) and not jnp.issubdtype(points.dtype, jnp.floating):
+        raise ValueError(f"Argument points must hold real numbers, but its dtype is {points.dtype}.")
+    if jnp.issubdtype(points.dtype, jnp.integer):
+        return points.astype(float)
+    return points.astype(np.float32) if points.dtype.itemsize < 4 else points
+
+
+def mapped(method: str, family: AbstractFamily, points: Any, k: Any, centre: Any, scale: Any) -> Any:
+    """``undistort`` or ``distort`` for points and distortions that broadcast.
+
+    In NumPy where everything is known and the points are NumPy's, else compiled.
+    """
+    if isinstance(points, np.ndarray) and not traced((k, centre, scale)):
+        with np.errstate(all="ignore"):  # NaN and inf are answers
+            # With one more axis, as NumPy makes plain numbers of arrays without any.
+            leaves = ((points, 1), (np.asarray(k), 1), (np.asarray(centre), 1), (np.asarray(scale), 0))
+            return _mapped(method, family, *(leaf[None] for leaf in aligned(*leaves)))[0]
+    return _compiled(method, family, jnp.asarray(points), k, centre, scale)
+
+
+def _mapped(method, family, points, k, centre, scale):
+    leaves = ((points, 1), (k, 1), (centre, 1), (scale, 0))
+    points, k, centre, scale = aligned(*((leaf.astype(points.dtype), own) for leaf, own in leaves))
+    xp = namespace(k)
+    # JAX's know of symbolic shapes, for `jax.export`; and NumPy's do not wait for JAX.
+    broadcast_shapes = (jnp if xp is jnp else np).broadcast_shapes
+    first = xp.moveaxis(k, -1, 0)
+    shape = broadcast_shapes(points.shape[:-1], k.shape[:-1], centre.shape[:-1], scale.shape)
+    x, y = (xp.broadcast_to((points[..., i] - centre[..., i]) / scale, shape) for i in (0, 1))
+    function = _undistort if method == "undistort" else _distort
+    x, y = function(family, together(x, y), first, _limit_of(family, first))
+    return together(centre[..., 0] + scale * x, centre[..., 1] + scale * y)
 
 
 @eqx.filter_jit
-def _each(function, signature, distortion, points):
-    """Apply a function of one point, normalised, to all of them, in the points' dtype."""
-    points = jnp.asarray(points)
-    if not jnp.issubdtype(points.dtype, jnp.floating):
-        points = points.astype(jnp.result_type(float))
-    if points.shape[-1:] != (2,):
-        raise ValueError(f"Argument points must have shape (..., 2), but its shape is {points.shape}.")
-    k, centre, scale = (
-        jnp.asarray(leaf, points.dtype)
-        for leaf in (distortion.coefficients, distortion.centre, distortion.scale)
-    )
-    centre = jnp.broadcast_to(centre, points.shape)
-    family = distortion.family
-    limit = family.limit(k)
-    mapped = jnp.vectorize(lambda z: function(family, z, k, limit), signature=signature)(
-        (points - centre) / scale
-    )
-    return mapped if mapped.ndim < points.ndim else centre + scale * mapped
+def _compiled(method, family, points, k, centre, scale):
+    return _mapped(method, family, points, *(jnp.asarray(leaf) for leaf in (k, centre, scale)))
+
+
+def _limit_of(family, k):
+    """The family's limit, a constant for derivatives."""
+    return family.limit(jax.lax.stop_gradient(k) if isinstance(k, jax.Array) else k)
+
+
+def _limit(family, k):
+    if isinstance(k, np.ndarray):
+        with np.errstate(all="ignore"):
+            return _limit_of(family, np.moveaxis(k[None], -1, 0))[0]
+    return _limit_of(family, jnp.moveaxis(k, -1, 0))
 
 
 def _undistort(family, z, k, limit):
-    squared = z @ z
+    xp = namespace(z, k)
+    squared = z[..., 0] * z[..., 0] + z[..., 1] * z[..., 1]
     # A few last digits beyond it are the same radius: what `distort` puts at the fold rounds to there.
-    within = squared <= limit * limit * (1 + 8 * jnp.finfo(z.dtype).eps)
-    return jnp.where(within, family.correct(z, squared, k), jnp.nan)
+    within = squared <= (limit * (1 + 4 * np.finfo(z.dtype).eps)) ** 2
+    corrected = family.correct(z, squared, k)
+    x, y = corrected[..., 0], corrected[..., 1]
+    # An invertible correction is monotone, and never goes to the other side; at a pole rounding does.
+    within = within & (z[..., 0] * x + z[..., 1] * y >= 0)
+    return xp.where(within, x, np.nan), xp.where(within, y, np.nan)
 
 
 def _distort(family, z, k, limit):
-    return family.distort(z, k, limit)
+    distorted = inverse(family, z, k, limit) if isinstance(z, jax.Array) else family.distort(z, k, limit)
+    return distorted[..., 0], distorted[..., 1]
 
 
-def _has_inverse(family, z, k, limit):
-    return family.has_inverse(z, k, limit)
+def _check(coefficients, centre, scale, family):
+    """What a `Distortion` is made of: shapes, and values where they are known."""
+    if isinstance(family, bool) or type(family) is object:
+        return  # stands for one in filters and trees
+    check_kind("family", family, (AbstractFamily,))
+    parts = {"coefficients": coefficients, "centre": centre, "scale": scale}
+    if not all(hasattr(part, "shape") and hasattr(part, "dtype") for part in parts.values()):
+        return  # a stand-in, of a pytree's structure
+    for name, part in parts.items():
+        if not jnp.issubdtype(part.dtype, jnp.floating):
+            raise ValueError(f"Argument {name} must hold real numbers, but its dtype is {part.dtype}.")
+    size = coefficients.shape[-1] if coefficients.ndim else 0
+    sizes = [family.size(terms) for terms in range(1, family.most_terms + 1)]
+    if size not in sizes:
+        opencv = ": OpenCV's (k1, k2, p1, p2, k3, ...) are of another model" * (size in (5, 8, 12, 14))
+        raise ValueError(
+            f"Argument coefficients must hold from {min(sizes)} to {max(sizes)} numbers for a "
+            f"{type(family).__name__}, but its shape is {coefficients.shape}{opencv}."
+        )
+    if centre.shape[-1:] != (2,):
+        raise ValueError(f"Argument centre must be (x, y), but its shape is {centre.shape}.")
+    batch = coefficients.shape[:-1]
+    for name, shape in (("centre", centre.shape[:-1]), ("scale", scale.shape)):
+        if shape not in ((), batch):
+            raise ValueError(
+                f"Argument {name} must be one for all distortions or one for each of {batch}, but its "
+                f"shape is {parts[name].shape}."
+            )
+    if isinstance(scale, np.ndarray) and not (np.isfinite(scale) & (scale > 0)).all():
+        raise ValueError(f"Argument scale must be positive and finite, but it is {scale}.")

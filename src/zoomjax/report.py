@@ -18,6 +18,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from ._text import plain
 from .calibration import Calibration, rms_over_frames
 from .plot import plot_distortion, plot_model, plot_primitives, plot_residues
 from .selection import COLUMNS
@@ -215,7 +216,10 @@ def _frames(calibration: Calibration, images: "ImageCalibration | None") -> list
     for number in shown.tolist():
         frame, rejected = summary[number], calibration.rejected[members[number]]
         counted = f"{frame['lines']:,}" + (f" ({rejected.sum()} rejected)" if rejected.any() else "")
-        values = (f"{frame[key]:.3f}" for key in ("rms_zoom", "rms_frames", "rms_none"))
+        values = (
+            "" if frame[key] is None else f"{frame[key]:.3f}"  # of a frame whose lines are all rejected
+            for key in ("rms_zoom", "rms_frames", "rms_none")
+        )
         name = _frame_name(number, images)
         rows.append(
             (name, f"{frame['focal']:.4g}", *values, counted, _worst_lines(calibration, members[number]))
@@ -298,7 +302,12 @@ def _text(content: _Content) -> _Html:
     """Escaped, unless it is HTML; of several parts, each."""
     if isinstance(content, _Html):
         return content
-    return _Html(escape(content) if isinstance(content, str) else "".join(map(_text, content)))
+    return _Html(escape(_shown(content)) if isinstance(content, str) else "".join(map(_text, content)))
+
+
+def _shown(text: str) -> str:
+    """Without orders to whoever reads it; warnings have lines."""
+    return "\n".join(map(plain, text.split("\n")))
 
 
 def _joined(parts: Sequence[str]) -> _Html:

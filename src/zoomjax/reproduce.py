@@ -9,7 +9,6 @@ were left frame by frame. `NOTES` says where the paper's own figures do not agre
 import dataclasses
 import json
 import os
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -173,7 +172,7 @@ def reproduce(
     """Do both experiments, and write reproduce.md, reproduce.json and Figures 5 to 10, as PNG and PDF.
 
     Args:
-        folder: where to; it exists.
+        folder: where to; it exists, and is best one of `results_folder`, as files are replaced.
         stage: called with a sentence before each step that takes time.
 
     Returns:
@@ -188,14 +187,12 @@ def reproduce(
     board = dataclasses.replace(board, rows=board.rows + more)
     football = broadcast_experiment(stage)
     stage("Drawing the figures")
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".zoomjax-") as part:
-        for name, figure in _figures(board, centres, football).items():
-            for kind in ("png", "pdf"):
-                figure.savefig(Path(part) / f"{name}.{kind}", dpi=150)
-        (Path(part) / "reproduce.md").write_text(_page(board, football), encoding="utf-8")
-        (Path(part) / "reproduce.json").write_text(_plain(board, football))
-        for file in sorted(Path(part).iterdir()):
-            file.replace(Path(folder) / file.name)
+    folder = Path(folder)
+    for name, figure in _figures(board, centres, football).items():
+        for kind in ("png", "pdf"):
+            figure.savefig(folder / f"{name}.{kind}", dpi=150)
+    (folder / "reproduce.md").write_text(_page(board, football), encoding="utf-8")
+    (folder / "reproduce.json").write_text(_plain(board, football))
     return board, football
 
 
@@ -215,6 +212,13 @@ def _figures(board: Experiment, centres: FrameCentres, football: Experiment) -> 
         "figure-10": residues(football, np.ones(1), "px"),
     }
 
+
+FILES = (
+    "reproduce.md",
+    "reproduce.json",
+    *(f"figure-{number:02d}.{kind}" for number in range(5, 11) for kind in ("png", "pdf")),
+)
+"""What `reproduce` writes."""
 
 _ABOUT = f"""Made by `zoomjax reproduce`. All scenes are synthetic: the paper's images are not public.
 From the paper are the lenses (its fitted polynomials are the truth here), the focal ranges, the sizes of

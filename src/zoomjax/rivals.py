@@ -5,6 +5,7 @@ but the power law are linear in their parameters: they state a basis, and share 
 """
 
 import functools
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -14,8 +15,9 @@ from jaxtyping import Array, Float, ScalarLike
 
 from ._bernstein import Pieces
 from ._checks import checked_integer
+from ._fields import check_finite, check_increasing, check_positive, check_shapes, numbers
 from ._splines import at_ends, natural_basis, natural_controls, natural_curvature, place, spread
-from ._types import AnyArray, Coefficients, Focal, Scalar, traced
+from ._types import AnyArray, Coefficients, Focal, Scalar, of_known_values, traced
 from .zoom import UNFITTED, AbstractLinearZoom, AbstractZoom, check_distinct, inverse_powers
 
 _POWER_PIECES = 128
@@ -49,10 +51,26 @@ class TableZoom(AbstractLinearZoom):
         0.125
     """
 
+    formula: ClassVar[str] = (
+        "k_i(f): parameters[.][i-1] at the knots, 1/f (or f, if not inverse), linear in between"
+    )
     number: int | None = eqx.field(static=True, default=None, converter=_checked_number)
     inverse: bool = eqx.field(static=True, default=True)
-    parameters: Float[AnyArray, "basis terms"] | None = None
-    knots: Float[AnyArray, "basis"] | None = None
+    parameters: Float[AnyArray, "basis terms"] | None = eqx.field(
+        default=None, converter=numbers("parameters")
+    )
+    knots: Float[AnyArray, "basis"] | None = eqx.field(default=None, converter=numbers("knots"))
+
+    def __check_init__(self):
+        """Check the entries: a row of parameters for each of the knots, which increase."""
+        if not isinstance(self.inverse, bool):
+            raise ValueError(f"Argument inverse must be True or False, but it is {self.inverse!r}.")
+        entries = "entries" if self.number is None else self.number
+        check_shapes(
+            {"knots": (self.knots, (entries,)), "parameters": (self.parameters, (entries, "terms"))}
+        )
+        check_positive("knots", self.knots)
+        check_increasing("knots", self.knots)
 
     def prepare(self, focal: Focal, terms: int) -> "TableZoom":
         """A table of zeros, its entries at focal lengths that are there."""
@@ -91,10 +109,31 @@ class SplineZoom(AbstractLinearZoom):
         curvature: from the values at the knots to the spline's second derivatives there.
     """
 
+    formula: ClassVar[str] = (
+        "k_i(f): the natural cubic spline in 1/f through parameters[.][i-1] at the knots"
+    )
     number: int | None = eqx.field(static=True, default=None, converter=_checked_number)
-    parameters: Float[AnyArray, "basis terms"] | None = None
-    knots: Float[AnyArray, "basis"] | None = None
-    curvature: Float[AnyArray, "basis basis"] | None = None
+    parameters: Float[AnyArray, "basis terms"] | None = eqx.field(
+        default=None, converter=numbers("parameters")
+    )
+    knots: Float[AnyArray, "basis"] | None = eqx.field(default=None, converter=numbers("knots"))
+    curvature: Float[AnyArray, "basis basis"] | None = eqx.field(
+        default=None, converter=numbers("curvature")
+    )
+
+    def __check_init__(self):
+        """Check the knots, which increase, and that the rest is for as many."""
+        size = "knots" if self.number is None else self.number
+        check_shapes(
+            {
+                "knots": (self.knots, (size,)),
+                "curvature": (self.curvature, (size, size)),
+                "parameters": (self.parameters, (size, "terms")),
+            }
+        )
+        check_positive("knots", self.knots)
+        check_increasing("knots", self.knots)
+        check_finite("curvature", self.curvature)
 
     def prepare(self, focal: Focal, terms: int) -> "SplineZoom":
         """A spline of zeros, its knots at focal lengths that are there."""
@@ -147,8 +186,16 @@ class PowerZoom(AbstractZoom):
         0.035
     """
 
-    parameters: Float[AnyArray, "3 terms"] | None = None
-    focal_ref: Scalar | None = None
+    formula: ClassVar[str] = (
+        "k_i(f) = d0 + d1 (f / focal_ref)^d2 with rows d0, d1, d2 of parameters[.][i-1]"
+    )
+    parameters: Float[AnyArray, "3 terms"] | None = eqx.field(default=None, converter=numbers("parameters"))
+    focal_ref: Scalar | None = eqx.field(default=None, converter=numbers("focal_ref"))
+
+    def __check_init__(self):
+        """Check the parameters' shape: d0, d1 and d2 of each coefficient."""
+        check_shapes({"parameters": (self.parameters, (3, "terms")), "focal_ref": (self.focal_ref, ())})
+        check_positive("focal_ref", self.focal_ref)
 
     def prepare(self, focal: Focal, terms: int) -> "PowerZoom":
         """No distortion, with an exponent to start from that lenses have."""
@@ -200,11 +247,25 @@ class TwoRegionZoom(AbstractLinearZoom):
         True
     """
 
-    crossover: Scalar | None = eqx.field(
-        default=None, converter=lambda f: None if f is None else jnp.asarray(f)
+    formula: ClassVar[str] = (
+        "k_i(f) = sum_j c_j (focal_ref / f)^j with c = parameters[0..2][i-1] for f < crossover, "
+        "parameters[3..5][i-1] from there on"
     )
-    parameters: Float[AnyArray, "6 terms"] | None = None
-    focal_ref: Scalar | None = None
+    crossover: Scalar | None = eqx.field(default=None, converter=numbers("crossover"))
+    parameters: Float[AnyArray, "6 terms"] | None = eqx.field(default=None, converter=numbers("parameters"))
+    focal_ref: Scalar | None = eqx.field(default=None, converter=numbers("focal_ref"))
+
+    def __check_init__(self):
+        """Check the parameters' shape: three rows for each region."""
+        check_shapes(
+            {
+                "parameters": (self.parameters, (6, "terms")),
+                "focal_ref": (self.focal_ref, ()),
+                "crossover": (self.crossover, ()),
+            }
+        )
+        check_positive("focal_ref", self.focal_ref)
+        check_positive("crossover", self.crossover)
 
     def prepare(self, focal: Focal, terms: int) -> "TwoRegionZoom":
         """Zero polynomials in both regions."""
@@ -246,6 +307,7 @@ class TwoRegionZoom(AbstractLinearZoom):
         return Pieces(controls, jnp.concatenate([below.ends, above.ends]), jnp.reciprocal, size)
 
 
+@of_known_values
 def barrel_crossover(focal: Focal, k1: Float[AnyArray, "frame"]) -> float:
     """The focal length at which k1 changes its sign: where barrel distortion turns into pincushion.
 

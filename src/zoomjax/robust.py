@@ -14,6 +14,8 @@ a wide c that narrows to `_CUT`, so that lines spoiled by the first, unweighted 
 back; then `fit_zoom` converges with the weights as they are.
 """
 
+from typing import Any, NoReturn
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,12 +23,13 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
+from ._arguments import kinds_checked
 from ._linear import least_squares
 from .algebraic import algebraic_zoom
 from .energy import coefficients_by, line_residuals, prior_jacobian
 from .families import AbstractFamily, RadialPolynomial
 from .family_lines import with_family
-from .fit import ZoomFit, check_lines, fit_zoom, linearised, ready_model
+from .fit import Solver, ZoomFit, fit_zoom, linearised, ready_model
 from .lines import AbstractLines
 from .zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
 
@@ -51,6 +54,10 @@ class RobustFit(eqx.Module):
     line_rms: Float[Array, "line"]
     scale: Float[Array, ""]
 
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: the lens of its fit is asked."""
+        raise TypeError("A RobustFit is not a lens: use robust.fit.lens, as in robust.fit.lens(35.0).")
+
     @property
     def rejected(self) -> Int[np.ndarray, "rejected"]:
         """Indices of the lines that count nothing, the roughest first."""
@@ -58,12 +65,15 @@ class RobustFit(eqx.Module):
         return lines[np.argsort(-np.asarray(self.line_rms)[lines], kind="stable")]
 
 
+@kinds_checked
 def fit_robust(
     lines: AbstractLines,
     *,
     zoom: AbstractZoom | None = None,
     family: AbstractFamily | None = None,
     terms: int | None = None,
+    solver: Solver | None = None,
+    max_steps: int = 256,
     invertible: bool = True,
     throw: bool = True,
 ) -> RobustFit:
@@ -73,6 +83,8 @@ def fit_robust(
         lines: the lines, or, much faster and with the same answer, ``compress(lines)``. Weights that they
             have already are kept as factors.
         zoom, family, terms, invertible, throw: as for `fit_zoom`, whose errors also apply.
+        solver, max_steps: of the last fit, with the weights as they then are; as for `fit_zoom`. The turns
+            before it are single Gauss-Newton steps.
 
     Returns:
         The fit of the lines that are left, with the weight of each line.
@@ -87,14 +99,15 @@ def fit_robust(
         >>> fit_robust(compress(lines), zoom=PolynomialZoom(degree=0), terms=1).rejected.tolist()
         [10]
     """
-    check_lines(lines)
     lines = lines if family is None else with_family(lines, family)
     start, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
     new = zoom is None or zoom.parameters is None
     if new and isinstance(start, AbstractLinearZoom) and isinstance(lines.family, RadialPolynomial):
         start = algebraic_zoom(lines, zoom=start, terms=terms).zoom
     weighted, model = _reweighted(lines, start)
-    fit = fit_zoom(weighted, zoom=model, invertible=invertible, throw=throw)
+    fit = fit_zoom(
+        weighted, zoom=model, solver=solver, max_steps=max_steps, invertible=invertible, throw=throw
+    )
     line_rms, median = _line_rms(lines, fit.lens.zoom)
     return RobustFit(fit=fit, weight=weighted.weight, line_rms=line_rms, scale=median)
 

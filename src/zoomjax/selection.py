@@ -17,7 +17,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ._arguments import kinds_checked
 from ._checks import checked_terms
+from ._types import of_known_values
 from .compression import CompressedLines
 from .energy import settings
 from .families import AbstractFamily, RadialPolynomial
@@ -168,6 +170,8 @@ COLUMNS = ("candidate", "parameters", "fitted", "held out", "to the best", "")
 """Heads of `Selection.rows`."""
 
 
+@kinds_checked
+@of_known_values
 def select_model(
     lines: AbstractLines,
     candidates: Sequence[AbstractZoom | Candidate] | None = None,

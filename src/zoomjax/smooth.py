@@ -10,6 +10,7 @@ lensfun database as those that predict best the focal lengths that are left out.
 """
 
 import math
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from jaxtyping import Array, Float, ScalarLike
 
 from ._bernstein import Pieces
 from ._checks import checked_integer
+from ._fields import check_finite, check_not_negative, check_positive, check_shapes, numbers
 from ._types import AnyArray, Focal, Scalar
 from .zoom import UNFITTED, AbstractPriorZoom, inverse_powers
 
@@ -65,28 +67,38 @@ class SmoothZoom(AbstractPriorZoom):
         (7, 2)
     """
 
+    formula: ClassVar[str] = (
+        "k_i(f) = sum_j parameters[j][i-1] P_j(2 focal_ref / f - 1), P_j Legendre's polynomials; "
+        "the rest is the prior"
+    )
     degree: int = eqx.field(
         static=True, default=6, converter=lambda degree: checked_integer("degree", degree, 3)
     )
-    parameters: Float[AnyArray, "basis terms"] | None = None
-    focal_ref: Scalar | None = None
-    error: Scalar = eqx.field(default=_ERROR, converter=jnp.asarray)
-    quadratic: Float[AnyArray, "low low"] = eqx.field(default=_QUADRATIC, converter=jnp.asarray)
-    beyond: Float[AnyArray, "terms terms"] = eqx.field(default=_BEYOND, converter=jnp.asarray)
+    parameters: Float[AnyArray, "basis terms"] | None = eqx.field(
+        default=None, converter=numbers("parameters")
+    )
+    focal_ref: Scalar | None = eqx.field(default=None, converter=numbers("focal_ref"))
+    error: Scalar = eqx.field(default=_ERROR, converter=numbers("error"))
+    quadratic: Float[AnyArray, "low low"] = eqx.field(default=_QUADRATIC, converter=numbers("quadratic"))
+    beyond: Float[AnyArray, "terms terms"] = eqx.field(default=_BEYOND, converter=numbers("beyond"))
 
     def __check_init__(self):
-        """Check the shapes of the prior and the parameters."""
-        terms = self.beyond.shape[0]
-        if self.quadratic.shape != (3 * terms, 3 * terms):
-            raise ValueError(
-                f"Argument quadratic must have shape {(3 * terms, 3 * terms)} where beyond is for {terms} "
-                f"terms, but its shape is {self.quadratic.shape}."
-            )
-        if self.parameters is not None and self.parameters.shape != (self.degree + 1, terms):
-            raise ValueError(
-                f"Argument parameters must have shape {(self.degree + 1, terms)}, but its shape is "
-                f"{self.parameters.shape}."
-            )
+        """Check the shapes of the prior and the parameters, which `beyond` gives the number of terms."""
+        terms = self.beyond.shape[-1] if getattr(self.beyond, "shape", ()) else "terms"
+        low = 3 * terms if isinstance(terms, int) else "low"
+        check_shapes(
+            {
+                "beyond": (self.beyond, (terms, terms)),
+                "quadratic": (self.quadratic, (low, low)),
+                "parameters": (self.parameters, (self.degree + 1, terms)),
+                "focal_ref": (self.focal_ref, ()),
+                "error": (self.error, ()),
+            }
+        )
+        check_positive("focal_ref", self.focal_ref)
+        check_not_negative("error", self.error)
+        check_finite("quadratic", self.quadratic)
+        check_finite("beyond", self.beyond)
 
     def prepare(self, focal: Focal, terms: int) -> "SmoothZoom":
         """Zero polynomials about the shortest focal length; any number of focal lengths will do."""

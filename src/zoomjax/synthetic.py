@@ -201,7 +201,7 @@ def _seen(
     """
     grid = jnp.stack(jnp.broadcast_arrays(jnp.asarray(across), jnp.asarray(along)[None]), axis=-1)
     corrected = distortion.centre[None, None] + (grid if axis == 0 else grid[..., ::-1])
-    seen = distortion.distort(corrected.astype(distortion.centre.dtype))
+    seen = jnp.asarray(distortion.distort(corrected.astype(distortion.centre.dtype)))
     last = jnp.array(image_size)[None, None] - 1
     return seen, jnp.all((seen >= 0) & (seen <= last), axis=-1)
 

@@ -16,9 +16,10 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, DTypeLike, Float, Num
 
-from .families import AbstractRadial, inverse_radius
-from .framing import Framing
+from .families import AbstractRadial
+from .framing import Framing, check_framing
 from .radial import Distortion
+from .sizes import check_channels_last, check_image_size, checked_distortion
 
 _TOLERANCE = 1e-3
 """px: the last Newton step where the iteration has arrived; the error left is of the order of
@@ -34,7 +35,6 @@ _OFF = -16384.0
 """A position, px, that is off any image."""
 
 
-@eqx.filter_jit
 def warp_image(
     image: Num[Array, "height width *channels"],
     distortion: Distortion,
@@ -59,7 +59,9 @@ def warp_image(
         An image of the same dtype and channels.
 
     Raises:
-        ValueError: the image has no pixels, or `interpolation` is unknown.
+        ValueError: the image has no pixels, or its channels first; `interpolation` is unknown; the
+            distortion is plainly that of images of another size (not under ``jit`` or ``vmap``), or is
+            none; or the framing was made for images of another size.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -76,6 +78,18 @@ def warp_image(
         raise ValueError(
             f'Argument interpolation must be "linear" or "cubic", but it is {interpolation!r}.'
         )
+    check_channels_last(image.shape)
+    height, width = image.shape[:2]
+    checked_distortion(distortion)
+    if framing is not None:
+        check_framing(framing, (width, height), "framing")
+    if framing is None or framing.image_size is not None:
+        check_image_size(distortion, (width, height))
+    return _warped(image, distortion, framing, interpolation, border_value)
+
+
+@eqx.filter_jit
+def _warped(image, distortion, framing, interpolation, border_value):
     height, width = image.shape[:2]
     values = image if jnp.issubdtype(image.dtype, jnp.floating) else image.astype(jnp.float32)
     if framing is None:
@@ -147,7 +161,8 @@ def _arrived_ratio(family, k, squared, scale):
     limit = family.limit(k)
     farthest = jnp.sqrt(jnp.max(squared))
     reach = family.reach(k, limit)
-    top = inverse_radius(family, jnp.minimum(farthest, reach), k, limit)
+    end = jnp.minimum(farthest, reach)
+    top = end * family.ratio(end * end, k, limit)[0]
     # Exact pairs of radii, and the least-squares polynomial through them, in Chebyshev's basis.
     r = top * jnp.sin(jnp.linspace(0, jnp.pi / 2, 65, dtype=k.dtype)[1:])
     rho = r * family.factor(r * r, k)
@@ -176,7 +191,19 @@ def _arrived_ratio(family, k, squared, scale):
 
     state = (start(squared), start(rho * rho), 0)
     seen = squared <= reach * reach
-    return jnp.where(seen, jax.lax.while_loop(unfinished, improve, state)[0], 1), seen
+    ratio = jnp.where(seen, jax.lax.while_loop(unfinished, improve, state)[0], 1)
+    # What has arrived on the sample may not have between: where the next step is long, the safe method. As
+    # a loop, so that also under vmap it costs nothing where no pixel needs it.
+    move = jnp.abs(step(ratio, squared) - ratio) * jnp.sqrt(squared) * scale
+    late = seen & ~(move <= _TOLERANCE)
+
+    def replaced(state):
+        exact, found = family.ratio(jnp.where(late, squared, 0), k, limit)
+        return jnp.where(late, jnp.where(found, exact, jnp.nan), state[0]), False
+
+    ratio, _ = jax.lax.while_loop(lambda state: state[1], replaced, (ratio, jnp.any(late)))
+    seen = seen & jnp.isfinite(ratio)
+    return jnp.where(seen, ratio, 1), seen
 
 
 def _chebyshev(coefficients, v):

@@ -7,7 +7,7 @@ has to be written, and the algebraic estimate applies to it too.
 """
 
 import abc
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, PyTree, ScalarLike
 
 from ._bernstein import Pieces, power_controls
 from ._checks import checked_integer
+from ._fields import check_positive, check_shapes, numbers
 from ._types import AnyArray, Coefficients, Focal, Focus, Scalar, traced
 
 SomeZoom = TypeVar("SomeZoom", bound="AbstractZoom")
@@ -26,8 +27,11 @@ class AbstractZoom(eqx.Module):
 
     `parameters` holds what a fit adjusts, and is None in a model that has only been specified, as in
     ``fit_zoom(lines, zoom=PolynomialZoom(degree=2))``. Other array fields stay as `prepare` set them.
+    Lenses with a model of one's own are saved once its class is registered (`register_model`), with a class
+    attribute ``formula`` that says what its numbers mean.
     """
 
+    formula: ClassVar[str]
     parameters: eqx.AbstractVar[PyTree]
 
     @abc.abstractmethod
@@ -67,7 +71,7 @@ class AbstractLinearZoom(AbstractZoom):
 
     def __call__(self, focal: ScalarLike) -> Coefficients:
         """The coefficients at one focal length."""
-        return self.basis(focal) @ _fitted(self)
+        return _combined(self.basis(focal), _fitted(self))
 
     def pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces | None:
         """The coefficients over a range of focal lengths, as polynomials."""
@@ -77,6 +81,20 @@ class AbstractLinearZoom(AbstractZoom):
         parameters = jnp.asarray(_fitted(self))
         controls = jnp.einsum("pcb,bt->pct", basis.controls, parameters, precision="highest")
         return Pieces(controls, basis.ends, basis.focal_of, (1 + basis.size) @ jnp.abs(parameters))
+
+
+def _combined(basis, parameters):
+    """``basis @ parameters``; few functions are written out, which XLA fuses with what uses them."""
+    if basis.shape[0] > _WRITTEN_OUT:
+        return basis @ parameters
+    coefficients = basis[0] * parameters[0]
+    for value, row in zip(basis[1:], parameters[1:], strict=True):
+        coefficients = coefficients + value * row
+    return coefficients
+
+
+_WRITTEN_OUT = 8
+"""Basis functions up to which their sum is written out."""
 
 
 class AbstractPriorZoom(AbstractLinearZoom):
@@ -122,7 +140,7 @@ class AbstractFocusZoom(AbstractLinearZoom):
         Raises:
             ValueError: the focus is missing.
         """
-        return self.basis(focal, focus) @ _fitted(self)
+        return _combined(self.basis(focal, focus), _fitted(self))
 
 
 class PolynomialZoom(AbstractLinearZoom):
@@ -140,19 +158,21 @@ class PolynomialZoom(AbstractLinearZoom):
         [0.05000000074505806]
     """
 
+    formula: ClassVar[str] = "k_i(f) = sum_j parameters[j][i-1] * (focal_ref / f)^j"
     degree: int = eqx.field(
         static=True, default=2, converter=lambda degree: checked_integer("degree", degree, 0)
     )
-    parameters: Float[AnyArray, "basis terms"] | None = None
-    focal_ref: Scalar | None = None
+    parameters: Float[AnyArray, "basis terms"] | None = eqx.field(
+        default=None, converter=numbers("parameters")
+    )
+    focal_ref: Scalar | None = eqx.field(default=None, converter=numbers("focal_ref"))
 
     def __check_init__(self):
-        """Check the shape of the parameters."""
-        if self.parameters is not None and self.parameters.shape[0] != self.degree + 1:
-            raise ValueError(
-                f"Argument parameters must have {self.degree + 1} rows for degree {self.degree}, "
-                f"but its shape is {self.parameters.shape}."
-            )
+        """Check the parameters' shape: a row for each power, 0 to the degree."""
+        check_shapes(
+            {"parameters": (self.parameters, (self.degree + 1, "terms")), "focal_ref": (self.focal_ref, ())}
+        )
+        check_positive("focal_ref", self.focal_ref)
 
     @classmethod
     def from_inverse_focal(

@@ -12,7 +12,13 @@ def test_focal_length_of_both_byte_orders(order, prefix):
     assert exif_focal(prefix + exif(order=order)) == 35.0
 
 
-@pytest.mark.parametrize("block", [exif(None), exif((0, 1)), exif((35, 0)), b"", b"no EXIF", exif()[:40]])
+@pytest.mark.parametrize(
+    "block",
+    [
+        *(exif(focal) for focal in (None, (0, 1), (35, 0), (0, 0), (2**32 - 1, 1), (2**32 - 1, 2**32 - 1))),
+        *(b"", b"no EXIF", exif()[:40]),
+    ],
+)
 def test_none_where_there_is_none(block):
     assert exif_focal(block) is None
 

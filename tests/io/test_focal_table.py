@@ -40,13 +40,16 @@ def test_a_needed_image_that_is_absent_is_named(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "columns must be"),
-        ("file,focal\na.jpg,24\n", "columns must be .image,focal."),
-        ("image,focal\na.jpg\n", "row 2 must hold"),
-        ("image,focal\na.jpg,24\nb.jpg,wide\n", "row 3 must hold"),
+        ("", r'must name the columns "image,focal"'),
+        ("file,focal\na.jpg,24\n", r'columns "image,focal", .* but it is .file,focal.'),
+        ("image,focal\na.jpg\n", "row 2 has 1 fields, and the first line has 2"),
+        ("image,focal\na.jpg,24\nb.jpg,wide\n", "focal in row 3 is .wide., which is no number"),
         ("image,focal\na.jpg,-24\n", "positive number"),
-        ("image,focal\na.jpg,nan\n", "positive number"),
-        ("image,focal\n,24\n", "row 2 must hold an image"),
+        ("image,focal\na.jpg,nan\n", "focal in row 2 is .nan., which is no number"),
+        ("image,focal\n,24\n", "row 2 must name an image"),
+        ("image,focal\na.jpg,20,5\n", "row 2 has 3 fields, .* decimal commas"),
+        ("image,focal,sigma\na.jpg,24,1\na.jpg,24,2\n", r"comes twice, with 24 ± 1 and, in row 3, 24 ± 2"),
+        ("image,focal\na.jpg,24\n./a.jpg,25\n", r"a\.jpg comes twice"),
         ("image,focal\na.jpg,24\na.jpg,25\n", r"a\.jpg comes twice, with 24 and, in row 3, 25"),
     ],
 )
@@ -74,6 +77,20 @@ def test_deviations_may_be_told(tmp_path):
         0,
         None,
     ]
-    for sigma in ("-1", "wide", "nan"):
-        with pytest.raises(ValueError, match=r"focal\.csv: sigma in row 2 must be a number of at least 0"):
+    for sigma, reason in (
+        ("-1", "must be a number of at least 0"),
+        ("wide", "is .wide., which is no number"),
+        ("nan", "is .nan., which is no number"),
+    ):
+        with pytest.raises(ValueError, match=rf"focal\.csv: sigma in row 2 {reason}"):
             table(tmp_path, f"image,focal,sigma\na.jpg,24,{sigma}\n")
+
+
+def test_of_two_rows_that_fit_the_one_with_more_folders_counts(tmp_path):
+    read = table(tmp_path, "image,focal\na.png,24\n3x/a.png,70\n")
+    assert (read.need("/data/3x/a.png"), read.need("/data/1x/a.png")) == (70, 24)
+
+
+def test_a_name_in_quotes_may_begin_with_a_hash_or_hold_separators(tmp_path):
+    read = table(tmp_path, 'image,focal\n"#1.jpg",24\n#1.jpg,25\n"a, b.jpg",70\n')
+    assert (read.need("#1.jpg"), read.need("a, b.jpg")) == (24, 70)

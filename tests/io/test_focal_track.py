@@ -46,13 +46,16 @@ def test_ends_are_errors_unless_held():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "first line must be"),
-        ("f,t\n1,2\n", "first line must be"),
-        ("time,focal\n", "at least one"),
-        ("time,focal\n0,wide\n", "could not convert"),
-        ("time,focal\n0,20\n1,-3\n", "positive numbers, but sample 1"),
-        ("time,focal\n1,20\n0,30\n", "must increase"),
-        ("time,focal\n0,20\n0,30\n", "must increase"),
+        ("", r'first line must name the columns "time,focal" or "frame,focal"'),
+        ("f,t\n1,2\n", r"first line must name .* but it is .f,t."),
+        ("time,focal\n", "there are no rows"),
+        ("time,focal\n0,wide\n", "focal in row 2 is .wide., which is no number"),
+        ("time,focal\n0,20\n1,-3\n", "focal in row 3 must be a positive number"),
+        ("time,focal\n0,20,5\n", "row 2 has 3 fields, .* decimal commas"),
+        ("frame,focal\n0,20\n0.04,30\n", "frame in row 3 must be a whole number"),
+        ("frame,time,focal\n0,0,20\n", "columns time and frame: keep one of them"),
+        ("time,focal\n1,20\n0,30\n", "time in row 3 must be greater than in the row before: sort"),
+        ("time,focal\n0,20\n0,30\n", "time in row 3 must be greater than in the row before: sort"),
     ],
 )
 def test_bad_files_are_named(tmp_path, text, message):
@@ -67,3 +70,11 @@ def test_no_file_and_no_text(tmp_path):
     (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ValueError, match="not text"):
         zj.read_focal_track(tmp_path / "bytes.csv")
+
+
+@pytest.mark.parametrize("hold", [False, True])
+def test_frames_without_times_have_no_place_in_seconds(hold):
+    samples = (np.array([0.0, 2.0]), np.array([20.0, 40.0]))
+    with pytest.raises(ValueError, match="frames of the video have no times"):
+        zj.FocalTrack(*samples, hold=hold).at(1, np.nan)
+    assert zj.FocalTrack(*samples, by_time=False, hold=hold).at(2, np.nan) == 40

@@ -8,9 +8,11 @@ import copy
 import io
 import json
 import math
+import sys
 import tracemalloc
 import warnings
 import zipfile
+from pathlib import Path
 
 import jaxtyping
 import numpy as np
@@ -19,8 +21,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import zoomjax as zj
-from zoomjax import synthetic
 from zoomjax.io.focal_table import read_focal_table
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from mutations import (
+    CSV_LINES,
+    READERS,
+    Outcomes,
+    damaged,
+    every_model,
+    read_lines_csv,
+    sound_lines,
+    sound_mapping,
+    sound_table,
+    sound_track,
+)
 
 MANY = settings(max_examples=200)
 
@@ -117,15 +132,6 @@ def fields(folder):
     lines.save(folder / "sound.npz")
     with np.load(folder / "sound.npz") as file:
         return {name: file[name] for name in file.files}
-
-
-def sound_lines(lines):
-    mask = np.asarray(lines.mask)
-    assert np.isfinite(np.asarray(lines.points)[mask]).all()
-    assert (mask.sum(1) >= 3).all()
-    assert (np.isfinite(lines.focal) & (np.asarray(lines.focal) > 0)).all()
-    assert set(np.unique(lines.frame)) == set(range(len(lines.focal)))
-    assert lines.weight is None or np.isfinite(lines.weight).all()
 
 
 @MANY
@@ -293,22 +299,6 @@ def test_lines_whose_padding_would_fill_the_memory_are_refused(fields, folder):
 # lens.json
 
 
-def every_model():
-    """A lens of each zoom model that has a file format."""
-    lens, focal = synthetic.nikkor_18_200((640, 427)), np.linspace(20.0, 120.0, 7)
-    made = []
-    for zoom in (
-        zj.PolynomialZoom(),
-        zj.TableZoom(number=3),
-        zj.SplineZoom(number=4),
-        zj.PowerZoom(),
-        zj.TwoRegionZoom(60.0),
-        zj.SmoothZoom(),
-    ):
-        made.append(zj.ZoomLens(**vars(lens) | {"zoom": zoom.prepare(focal, 2)}))
-    return [*made, zj.ZoomLens(**vars(lens) | {"shift": zj.PolynomialZoom(1).prepare(focal, 2)})]
-
-
 @pytest.fixture(scope="module")
 def lenses(folder):
     contents = []
@@ -393,32 +383,8 @@ def test_deep_nesting_is_an_error(opening, folder):
 # CSV
 
 
-def sound_table(table):
-    assert all(math.isfinite(table.need(name)) and table.need(name) > 0 for name in table._focals)
-
-
-def sound_track(track):
-    first = float(track.position[0])
-    assert 0 < track.at(int(first), first) < math.inf
-
-
-def sound_mapping(focal):
-    assert all(isinstance(frame, int) and 0 < f < math.inf for frame, f in focal.items())
-
-
-def read_lines_csv(path):
-    return zj.read_lines_csv(path, image_size=(64, 64))
-
-
 CSV = {
-    "lines": (
-        b"frame,line,x,y,focal\n"
-        + b"".join(
-            b"%d,%d,%d.5,%d,2%d\n" % (m, n, i, i * i, m) for m in (0, 1) for n in (0, 1) for i in range(5)
-        ),
-        read_lines_csv,
-        sound_lines,
-    ),
+    "lines": (CSV_LINES, read_lines_csv, sound_lines),
     "focal": (b"frame,focal\n0,20\n1,35.5\n7,5e1\n", zj.read_focal_csv, sound_mapping),
     "table": (b"image,focal,sigma\na.jpg,20,0.3\nb/c.jpg,35.5,\n", read_focal_table, sound_table),
     "track": (b"time,focal\n0,20\n0.5,30\n2,5e1\n", zj.read_focal_track, sound_track),
@@ -451,3 +417,56 @@ def test_cells_of_csv(kind, cell, folder):
         path = folder / f"{kind}-cell.csv"
         path.write_text("\n".join([rows[0], ",".join(cells), *rows[2:]]), encoding="utf-8")
         survives(read, path, sound)
+
+
+# Every reader, of photographs and video too, in another process: what decodes them is foreign code.
+
+
+@pytest.fixture(scope="module")
+def outcomes():
+    with Outcomes() as started:
+        yield started
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_damaged_files_are_read_soundly_or_refused_by_name(name, outcomes, folder):
+    """As many as a test has time for; the benchmark `reliability_fuzz` tries more of the same."""
+    if name == "video":
+        pytest.importorskip("av")
+    corpus, rng = READERS[name].corpus(folder), np.random.default_rng(2012)
+    assert [text for _, text in outcomes.of(name, corpus)] == ["read"] * len(corpus)
+    number = 40 if name in ("lens.json", "lines.npz") else 300  # those are tried above
+    files = [
+        damaged(corpus[rng.integers(len(corpus))], rng, corpus[rng.integers(len(corpus))])
+        for _ in range(number)
+    ]
+    bad = {text: content for content, text in outcomes.of(name, files) if text not in ("read", "refused")}
+    assert bad == {}
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif", ".bmp"])
+def test_a_photograph_cut_off_anywhere_is_the_whole_one_or_none(suffix, folder):
+    """Never one that is filled up with grey."""
+    reader = next(reader for reader in READERS.values() if reader.suffix == suffix)
+    for content in reader.corpus(folder):
+        path = folder / f"cut{suffix}"
+        path.write_bytes(content)
+        _, whole = reader.read(path)
+        for keep in np.linspace(0, len(content) - 1, 60).astype(int):
+            path.write_bytes(content[:keep])
+            try:
+                _, found = reader.read(path)
+            except ValueError:
+                continue
+            np.testing.assert_array_equal(found, whole)
+
+
+def test_a_video_of_which_nothing_decodes_is_refused(folder):
+    """Its header and its index are whole; its pictures are not."""
+    pytest.importorskip("av")
+    content = next(content for content in READERS["video"].corpus(folder) if content[:4] == b"RIFF")
+    start = content.index(b"movi") + 4
+    path = folder / "nothing.avi"
+    path.write_bytes(content[:start] + bytes(len(content) - start))
+    with pytest.raises(ValueError, match=r"nothing\.avi"):
+        READERS["video"].read(path)

@@ -52,15 +52,32 @@ def test_focal_lengths_as_a_sequence_count_frames_from_zero(tmp_path):
 
 REFUSED = {
     "empty": ("", "frame,line,x,y"),
-    "column missing": ("frame,line,x\n0,0,1\n", "y is not among them"),
+    "column missing": (
+        "frame,line,x\n0,0,1\n",
+        r'must name the columns "frame,line,x,y", .* but it is .frame,line,x.',
+    ),
     "no rows": ("frame,line,x,y,focal\n", "no rows"),
     "not a number": ("frame,line,x,y,focal\n0,0,1,2,20\n0,0,1,two,20\n", "y in row 3 is 'two'"),
-    "short row": ("frame,line,x,y,focal\n0,0,1\n", "row 2 has 3 columns and the first has 5"),
-    "other separators": ("frame;line;x;y;focal\n0;0;1;1;20\n", "separate columns by commas"),
-    "frame not an integer": ("frame,line,x,y,focal\n0.5,0,1,1,20\n", "column frame must hold integers"),
+    "short row": ("frame,line,x,y,focal\n0,0,1\n", "row 2 has 3 fields, and the first line has 5 columns"),
+    "other separators": ("frame line x y focal\n0 0 1 1 20\n", "separated by commas, semicolons or tabs"),
+    "decimal commas": (
+        "frame,line,x,y,focal\n0,0,1,1,20,5\n",
+        "row 2 has 6 .* decimal commas, write decimal",
+    ),
+    "negative focal": (
+        "frame,line,x,y,focal\n0,0,1,1,20\n\n0,0,1,1,-2\n",
+        "focal in row 4 must be positive",
+    ),
+    "frame not an integer": (
+        "frame,line,x,y,focal\n0.5,0,1,1,20\n",
+        "frame in row 2 must be an integer, but it is 0.5",
+    ),
     "focal changes": ("frame,line,x,y,focal\n0,0,1,1,20\n0,0,1,2,30\n", "two focal lengths"),
     "no focal": ("frame,line,x,y\n0,0,1,1\n", "no focal lengths"),
-    "not finite": ("frame,line,x,y,focal\n0,0,1,nan,20\n0,0,2,2,20\n0,0,3,3,20\n", "finite"),
+    "not finite": (
+        "frame,line,x,y,focal\n0,0,1,nan,20\n0,0,2,2,20\n0,0,3,3,20\n",
+        "y in row 2 is 'nan', which is no number",
+    ),
 }
 
 
@@ -78,5 +95,15 @@ def test_frames_without_focal_length_are_named(tmp_path):
 
 
 def test_a_frame_given_twice_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="a frame comes twice"):
+    with pytest.raises(ValueError, match="frame 1 comes twice, the second time in row 3"):
         read_focal_csv(write(tmp_path / "focal.csv", "frame,focal\n1,50\n1,24\n"))
+
+
+def test_focal_lengths_in_the_file_and_beside_it_are_refused(tmp_path):
+    rows = "".join(f"0,0,{i},{i * i},24\n" for i in range(4))
+    path = write(tmp_path / "lines.csv", "frame,line,x,y,focal\n" + rows)
+    with pytest.raises(
+        ValueError, match=r"lines\.csv: it has a column focal, and .* Leave one of them out"
+    ):
+        read_lines_csv(path, image_size=SIZE, focal={0: 50.0})
+    assert read_lines_csv(path, image_size=SIZE).focal.tolist() == [24]

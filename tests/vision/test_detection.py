@@ -1,5 +1,6 @@
 """Lines of many images: the same over processes and from the cache, and bad images in between."""
 
+import io
 import multiprocessing
 
 import cv2
@@ -103,13 +104,41 @@ def test_another_detector_or_program_looks_again(photos, marker, tmp_path, monke
     assert looks(marker) == 2
 
 
-def test_a_damaged_cache_is_no_cache(photos, marker, tmp_path):
+def _rezipped(content, **changed):
+    stored = dict(np.load(io.BytesIO(content))) | changed
+    np.savez(file := io.BytesIO(), **stored)
+    return file.getvalue()
+
+
+POISON = {
+    "cut": lambda good: good[:100],
+    "empty": lambda good: b"",
+    "no archive": lambda good: b"PK\x03\x04" + bytes(200),
+    "bytes flipped": lambda good: good[:150] + bytes(b ^ 255 for b in good[150:260]) + good[260:],
+    "a pickle": lambda good: _rezipped(good, points=np.array([object()], dtype=object)),
+    "other arrays": lambda good: _rezipped(good, points=np.zeros((3, 3))),
+    "other counts": lambda good: _rezipped(good, counts=np.array([1000])),
+    "negative counts": lambda good: _rezipped(good, counts=np.array([-1, 60, 41])),
+    "no numbers": lambda good: _rezipped(
+        good, points=np.full_like(np.load(io.BytesIO(good))["points"], np.nan)
+    ),
+    "text": lambda good: _rezipped(good, focal=np.array("a lot")),
+    "odd nodes": lambda good: _rezipped(good, nodes=np.zeros(7)),
+}
+
+
+@pytest.mark.parametrize("kind", POISON)
+def test_a_damaged_or_poisoned_cache_is_no_cache(kind, photos, marker, tmp_path):
     cache = tmp_path / "cache"
-    list(detect(photos[:1], marker, cache=cache))
+    [first] = detect(photos[:1], marker, cache=cache)
     [file] = cache.iterdir()
-    file.write_bytes(file.read_bytes()[:100])
-    assert len(next(detect(photos[:1], marker, cache=cache)).lines) == 1
+    file.write_bytes(POISON[kind](file.read_bytes()))
+    [again] = detect(photos[:1], marker, cache=cache)
+    for line, other in zip(again.lines, first.lines, strict=True):
+        np.testing.assert_array_equal(line, other)
     assert looks(marker) == 2
+    list(detect(photos[:1], marker, cache=cache))
+    assert looks(marker) == 2  # it was mended
 
 
 def test_a_cache_that_cannot_be_written_does_no_harm(photos, marker, tmp_path):

@@ -1,14 +1,19 @@
 """From images on disk to a lens: rendered photographs of the paper's board, and a clip that zooms."""
 
+import dataclasses
 import json
+import unicodedata
 import warnings
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from zoomjax import synthetic
+from zoomjax.cli import _show_images
 from zoomjax.io.exif import exif_with_focal
+from zoomjax.report import report
 from zoomjax.vision import demo
 from zoomjax.vision.image_calibration import ImageJob, calibrate_images
 
@@ -68,10 +73,13 @@ def test_bad_images_are_reported_and_do_not_matter(done):
 def test_results_are_written_with_the_lines_over_each_image(done, tmp_path):
     done.write(tmp_path)
     written = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file())
-    overlays = sorted(f"lines/{d.name}" for d in done.used)
-    assert written == sorted(["lens.json", "lines.npz", "summary.json", "model.png", *overlays])
-    for detection in done.used:
-        assert cv2.imread(str(tmp_path / "lines" / detection.name)).shape == (SIZE[1], SIZE[0], 3)
+    numbers = [1 + sorted([*done.unused, *(d.name for d in done.used)]).index(d.name) for d in done.used]
+    overlays = [f"{n:04d}-{d.name}" for n, d in zip(numbers, done.used, strict=True)]
+    assert overlays == done.overlays()
+    files = ["lens.json", "lines.npz", "summary.json", "model.png", *(f"lines/{name}" for name in overlays)]
+    assert written == sorted([*files, ".zoomjax.json"])
+    for name in overlays:
+        assert cv2.imread(str(tmp_path / "lines" / name)).shape == (SIZE[1], SIZE[0], 3)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["focal_source"] == "EXIF data"
     assert [image["name"] for image in summary["images"]] == [d.name for d in done.used]
@@ -136,14 +144,86 @@ def test_a_zooming_video_is_calibrated(tmp_path):
     lens, truth = done.calibration.zoom.lens, clips.lens()
     assert demo.worst_error(lens, truth, [20.0, 35.0, 80.0]) < 1.5  # 320 px wide, few lines
     done.write(tmp_path)
-    assert len(list((tmp_path / "lines").glob("zoom-*.jpg"))) == 8
+    assert len(list((tmp_path / "lines").glob("*-zoom-*.jpg"))) == 8
 
 
-def test_a_second_run_leaves_nothing_of_the_first(done, tmp_path):
+def test_a_second_run_leaves_nothing_of_the_first_and_everything_else(done, tmp_path):
     done.write(tmp_path)
-    (tmp_path / "lines" / "old.jpg").write_bytes(b"of a photo that is no longer used")
+    stale, *others = sorted((tmp_path / "lines").iterdir())
+    (tmp_path / "lines" / "old.jpg").write_bytes(b"not of zoomjax")
+    done.calibration.write(tmp_path)  # of other lines
+    assert [p.name for p in (tmp_path / "lines").iterdir()] == ["old.jpg"]
     done.write(tmp_path)
-    assert sorted(p.name for p in (tmp_path / "lines").iterdir()) == sorted(d.name for d in done.used)
+    names = ["old.jpg", *(p.name for p in (stale, *others))]
+    assert sorted(p.name for p in (tmp_path / "lines").iterdir()) == sorted(names)
+
+
+HOSTILE = [
+    "<script>alert(1)<‚script>.jpg",
+    "[red]x[‚red].jpg",
+    "\x1b[31m\x9b2J.jpg",
+    "=cmd().jpg",
+    "two\nlines\u202e.jpg",
+]
+
+
+@pytest.fixture
+def hostile(done, folder, tmp_path):
+    """The photographs once more under names that mean something to somebody, two folders up."""
+    photos = [tmp_path / name for name in HOSTILE]
+    for detection, photo in zip(done.used, photos, strict=True):
+        photo.write_bytes((folder / detection.name).read_bytes())
+    inputs = tuple(f"{tmp_path}/a/b/../../{photo.name}" for photo in photos)
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    pairs = zip(done.used, inputs, strict=True)
+    used = tuple(dataclasses.replace(d, name=name, file=name) for d, name in pairs)
+    names = {source.path: source.name for source in ImageJob(inputs).sources()[0]}
+    used = tuple(dataclasses.replace(d, name=names[Path(d.file)]) for d in used)
+    focals = dataclasses.replace(
+        done.focals, focal={d.name: f for d, f in zip(used, done.focals.focal.values(), strict=True)}
+    )
+    unused = {f"bad {name}": f"it is bad: {name}" for name in HOSTILE}
+    images = tuple(d.name for d in used)
+    return dataclasses.replace(
+        done, job=ImageJob(inputs), used=used, focals=focals, images=images, unused=unused
+    )
+
+
+def test_results_in_the_photographs_own_folder_touch_none_of_them(hostile, tmp_path):
+    before = {photo: photo.read_bytes() for photo in tmp_path.glob("*.jpg")}
+    assert len(before) == 5
+    (tmp_path / "lines").mkdir()
+    (tmp_path / "lines" / "0001-mine.jpg").write_bytes(b"mine")
+    for _ in range(2):
+        hostile.write(tmp_path)
+    assert {photo: photo.read_bytes() for photo in tmp_path.glob("*.jpg")} == before
+    made = ["0001-script_alert_1_script", "0002-red_x_red", "0003-31m_2J", "0004-cmd", "0005-two_lines"]
+    assert sorted(p.stem for p in (tmp_path / "lines").iterdir()) == sorted(["0001-mine", *made])
+    assert not list((tmp_path / "a").rglob("*.jpg"))
+    (tmp_path / "lines" / f"{made[2]}.jpg").write_bytes(b"edited")
+    with pytest.raises(FileExistsError, match=r"0003-31m_2J\.jpg would be replaced"):
+        hostile.write(tmp_path)
+
+
+def test_hostile_names_give_no_orders(hostile, tmp_path, capsys):
+    _show_images(hostile, tmp_path / "[red]out\x1b[0m")
+    shown = "".join(capsys.readouterr())
+    assert not {c for c in shown if unicodedata.category(c) in ("Cc", "Cf")} - {"\n"}
+    flat = "".join(shown.split())
+    for name in (
+        "[red]x[‚red].jpg",
+        r"\x1b[31m\x9b2J.jpg",
+        r"two\nlines\u202e.jpg",
+        r"[red]out\x1b[0m/lines",
+    ):
+        assert name in flat
+    page = report(hostile.calibration, hostile)
+    assert "<script>" not in page
+    assert "&lt;script&gt;alert(1)&lt;" in page
+    assert "\x1b" not in page
+    assert r"two\nlines\u202e.jpg" in page
+    assert "[red]x[‚red].jpg" in page
+    page.encode()
 
 
 WRONG = {

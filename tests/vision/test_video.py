@@ -12,7 +12,8 @@ import pytest
 
 import zoomjax as zj
 from zoomjax.vision.encoding import display_matrix
-from zoomjax.vision.video import undistort_video
+from zoomjax.vision.planes import sampled_planes
+from zoomjax.vision.video import decode_video, undistort_video
 
 from .clips import FRAMES, SIZE, bend, focal, lens, luma, picture, write_clip
 
@@ -208,6 +209,32 @@ def test_only_sound(tmp_path):
         undistort_video(tmp_path / "sound.mp4", tmp_path / "out.mp4", lens=lens(), focal=30.0)
 
 
+def test_tags_that_are_not_utf_8_go_over_as_they_are(tmp_path):
+    """As older recorders write them."""
+    given = tmp_path / "in.avi"
+    with av.open(str(given), "w", metadata_encoding="latin-1") as out:
+        out.metadata["title"] = "Straße Ä"
+        stream = out.add_stream("mpeg4", rate=30)
+        stream.width, stream.height = SIZE
+        for packet in [
+            *stream.encode(av.VideoFrame.from_ndarray(picture(0), "gray")),
+            *stream.encode(None),
+        ]:
+            out.mux(packet)
+    undistort_video(given, tmp_path / "out.avi", lens=lens(), focal=30.0)
+    with av.open(str(tmp_path / "out.avi"), metadata_encoding="latin-1") as found:
+        assert found.metadata["title"] == "Straße Ä"
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.mp4")
+    (tmp_path / "folder.mp4").mkdir()
+    for name in ("pipe.mp4", "folder.mp4"):
+        with pytest.raises(ValueError, match=rf"Cannot read a video from .*{name}: it is no ordinary file"):
+            undistort_video(tmp_path / name, tmp_path / "out.mp4", lens=lens(), focal=30.0)
+
+
 def test_cut_off_mp4_is_named(clip, tmp_path):
     whole = clip.read_bytes()
     (tmp_path / "cut.mp4").write_bytes(whole[: len(whole) // 2])  # the index at its end is gone
@@ -232,6 +259,56 @@ def test_last_frames_that_do_not_decode_are_counted(tmp_path):
     after, _ = luma(tmp_path / "out.mp4")
     assert len(after) == done.frames
     assert max(bend(frame) for frame in after[:15]) <= 0.4  # MPEG-4 part 2 blurs
+
+
+def test_frames_after_lost_ones_keep_their_numbers(tmp_path):
+    """The data of frames 5 to 7 are overwritten: frame 8 is still frame 8, at its own focal length."""
+    source = write_clip(tmp_path / "in.mkv", encoder="mjpeg", pixels="yuvj420p", sound=False)
+    with av.open(str(source)) as container:
+        packets = [bytes(p) for p in container.demux(video=0) if p.size]
+    content = source.read_bytes()
+    for packet in packets[5:8]:
+        content = content.replace(packet, bytes(len(packet)))
+    source.write_bytes(content)
+    step = zj.FocalTrack(np.array([0, 7.0, 8, 23]), np.array([80.0, 80, 20, 20]), by_time=False)
+    with pytest.warns(UserWarning, match=r"3 of 2\d frames of .*in\.mkv do not decode"):
+        done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=step, encoder="ffv1")
+    assert done.frames == FRAMES - 3
+    after, _ = luma(tmp_path / "out.mkv")
+    for index, number, f in ((4, 4, 80.0), (5, 8, 20.0), (7, 10, 20.0), (20, 23, 20.0)):
+        right, wrong = (
+            np.mean(abs(after[index].astype(int) - zj.undistort_image(picture(number), lens()(at))))
+            for at in (f, 100 - f)
+        )
+        assert right < wrong / 3
+
+
+def test_a_track_in_seconds_needs_frames_with_times(clip, tmp_path):
+    """A bare H.264 stream has none; FFmpeg guesses 25 frames a second for this one of 30."""
+    with av.open(str(clip)) as given, av.open(str(tmp_path / "raw.h264"), "w", format="h264") as out:
+        stream = out.add_stream_from_template(given.streams.video[0])
+        for packet in given.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                out.mux(packet)
+    seconds = zj.FocalTrack(np.array([0.0, 2.0]), np.array([20.0, 80.0]), hold=True)
+    with pytest.raises(ValueError, match="frames of the video have no times"):
+        undistort_video(tmp_path / "raw.h264", tmp_path / "out.mkv", lens=lens(), focal=seconds)
+    assert only(tmp_path, "raw.h264")
+    with decode_video(tmp_path / "raw.h264") as (_, frames):
+        assert all(np.isnan(time) for time, _ in frames)
+
+
+@pytest.mark.parametrize(
+    ("name", "step"), [("yuv420p", (2, 2)), ("yuv411p", (4, 1)), ("yuv410p", (4, 4)), ("yuv444p", (1, 1))]
+)
+@pytest.mark.parametrize("size", [(64, 48), (1, 1), (5, 7), (6, 6), (97, 65)])
+def test_chroma_of_odd_sizes_is_sampled_as_of_even_ones(name, step, size):
+    luminance, *colours = sampled_planes(name, size)
+    assert (luminance.size, luminance.step, luminance.offset) == (size, (1, 1), (0, 0))
+    for plane in colours:
+        assert plane.step == step
+        assert plane.size == tuple(-(-side // each) for side, each in zip(size, step, strict=True))
 
 
 def test_no_frame_decodes(tmp_path):

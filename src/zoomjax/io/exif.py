@@ -5,6 +5,7 @@ import struct
 _FOCAL_LENGTH, _EXIF_FOLDER = 0x920A, 0x8769
 _LONG, _RATIONAL = 4, 5
 _FINENESS = 10_000  # parts of a mm
+_UNKNOWN = 2**32 - 1  # as numerator
 
 
 def exif_focal(block: bytes) -> float | None:
@@ -44,4 +45,4 @@ def _focal(block: bytes) -> float | None:
     if fraction is None:
         return None
     above, below = struct.unpack_from(f"{order}II", block, fraction)
-    return above / below if above and below else None
+    return above / below if above and below and above != _UNKNOWN else None

@@ -1,17 +1,21 @@
 """Focal lengths of images: a CSV file ``image,focal``, perhaps with their deviations, ``sigma``."""
 
-import csv
 import math
 import os
 from collections.abc import Iterable
-from pathlib import Path, PurePath
+from pathlib import PurePath
+
+import numpy as np
+
+from .text_table import read_text_table
 
 
 class FocalTable:
     """Focal lengths by the names of images.
 
     An image is looked up by its name with as many of its folders as the table gives: ``3x/board.png`` or,
-    where that is enough to tell it from others, ``board.png``.
+    where that is enough to tell it from others, ``board.png``. If rows with and without folders fit, the
+    one with more folders counts.
     """
 
     def __init__(
@@ -69,54 +73,38 @@ class FocalTable:
 def read_focal_table(path: str | os.PathLike[str]) -> FocalTable:
     """Read a CSV file whose first line names the columns ``image`` and ``focal``, and perhaps ``sigma``.
 
+    Of a kind that `zoomjax.io.text_table` reads. A name that begins with ``#`` is written in quotes.
+
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: it is something else, a focal length is no positive number, or an image comes twice
-            with different ones; the message names the row.
+            with different numbers; the message names the row.
     """
-    try:
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            rows = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"Cannot read focal lengths from {os.fspath(path)}: it is not text.") from error
-    header = [name.lower() for name in rows[0]] if rows else []
-    if not {"image", "focal"} <= set(header):
-        raise ValueError(
-            f'Cannot read focal lengths from {os.fspath(path)}: its columns must be "image,focal", but '
-            f"they are {','.join(header)!r}."
-        )
-    image, focal = header.index("image"), header.index("focal")
-    column = header.index("sigma") if "sigma" in header else None
-    table: dict[str, float] = {}
-    sigmas: dict[str, float] = {}
-    for number, row in enumerate(rows[1:], start=2):
-        name = "/".join(PurePath(row[image].replace("\\", "/")).parts) if image < len(row) else ""
-        value = _number(row[focal]) if focal < len(row) else None
-        if not name or value is None or value <= 0:
-            raise ValueError(
-                f"Cannot read focal lengths from {os.fspath(path)}: row {number} must hold an image and a "
-                f"positive number, but it is {','.join(row)!r}."
+    table = read_text_table(
+        path, "focal lengths", texts=("image",), numbers=("focal",), optional=("sigma",), gaps=("sigma",)
+    )
+    focal = table.numbers["focal"]
+    sigma = table.numbers.get("sigma", np.full(focal.size, np.nan))
+    table.check("focal", focal > 0, "a positive number")
+    table.check("sigma", ~(sigma < 0), "a number of at least 0")
+    found: dict[str, tuple[float, float | None]] = {}
+    for row, text, value, std in zip(
+        table.rows, table.texts["image"], focal.tolist(), sigma.tolist(), strict=True
+    ):
+        name = "/".join(PurePath(text.replace("\\", "/")).parts)
+        if not name:
+            raise table.error(f"row {row} must name an image, but image is empty")
+        told = (value, None if math.isnan(std) else std)
+        if found.setdefault(name, told) != told:
+            raise table.error(
+                f"{name} comes twice, with {_told(*found[name])} and, in row {row}, {_told(*told)}"
             )
-        if table.setdefault(name, value) != value:
-            raise ValueError(
-                f"Cannot read focal lengths from {os.fspath(path)}: {name} comes twice, with "
-                f"{table[name]:g} and, in row {number}, {value:g}."
-            )
-        if column is None or not (text := row[column] if column < len(row) else ""):
-            continue
-        sigma = _number(text)
-        if sigma is None or sigma < 0:
-            raise ValueError(
-                f"Cannot read focal lengths from {os.fspath(path)}: sigma in row {number} must be a number "
-                f"of at least 0, but it is {text!r}."
-            )
-        sigmas[name] = sigma
-    return FocalTable(table, path, sigmas)
+    return FocalTable(
+        {name: value for name, (value, _) in found.items()},
+        path,
+        {name: std for name, (_, std) in found.items() if std is not None},
+    )
 
 
-def _number(text: str) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
+def _told(value: float, std: float | None) -> str:
+    return f"{value:g}" if std is None else f"{value:g} ± {std:g}"

@@ -3,12 +3,12 @@
 Between two samples 1/f is taken as linear, because that is the variable in which the distortion is smooth.
 """
 
-import csv
 import dataclasses
 import os
-from pathlib import Path
 
 import numpy as np
+
+from .text_table import read_text_table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,9 +54,15 @@ class FocalTrack:
         """The focal length of a frame, given its number from 0 and its time in seconds.
 
         Raises:
-            ValueError: the track begins after it or ends before it, and does not hold.
+            ValueError: the track begins after it or ends before it, and does not hold; or the frame has no
+                time (NaN), and the track is in seconds.
         """
         position = time if self.by_time else float(frame)
+        if not np.isfinite(position):
+            raise ValueError(
+                "The frames of the video have no times, and the focal track is in seconds. Give a track of "
+                "frame numbers, frame,focal."
+            )
         first, last = float(self.position[0]), float(self.position[-1])
         slack = 1e-3 if self.by_time else 0.0  # times are printed with milliseconds
         if not self.hold and not first - slack <= position <= last + slack:
@@ -72,11 +78,12 @@ class FocalTrack:
 def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> FocalTrack:
     """A track from a CSV file with a header, ``time,focal`` (seconds) or ``frame,focal`` (from 0).
 
-    Under the header ``time_or_frame`` positions are frames if all are whole numbers, else seconds.
+    Under the header ``time_or_frame`` positions are frames if all are whole numbers, else seconds. The
+    file is of a kind that `zoomjax.io.text_table` reads.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is something else; the message names it.
+        ValueError: the file is something else, or not in order of time; the message names it.
 
     Example:
         >>> import pathlib, tempfile
@@ -85,23 +92,19 @@ def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> Foc
         >>> read_focal_track(path).at(125, 5.0)
         30.0
     """
-    try:
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"Cannot read a focal track from {os.fspath(path)}: it is not text.") from error
-    header = [cell.strip().lower() for cell in rows[0]] if rows else []
-    kinds = {"time": True, "frame": False, "time_or_frame": None}
-    if len(header) < 2 or header[0] not in kinds or header[1] != "focal":
-        raise ValueError(
-            f'Cannot read a focal track from {os.fspath(path)}: its first line must be "time,focal" or '
-            f'"frame,focal", but it is {",".join(header)!r}.'
-        )
-    try:
-        numbers = np.array([[float(cell) for cell in row[:2]] for row in rows[1:]]).reshape(-1, 2)
-        by_time = kinds[header[0]]
-        if by_time is None:
-            by_time = bool((numbers[:, 0] != np.floor(numbers[:, 0])).any())
-        return FocalTrack(numbers[:, 0], numbers[:, 1], by_time=by_time, hold=hold)
-    except ValueError as error:
-        raise ValueError(f"Cannot read a focal track from {os.fspath(path)}: {error}") from error
+    table = read_text_table(path, "a focal track", numbers=("focal",), one_of=tuple(_BY_TIME))
+    [header] = table.numbers.keys() & _BY_TIME.keys()
+    position, focal = table.numbers[header], table.numbers["focal"]
+    by_time, whole = _BY_TIME[header], position == np.floor(position)
+    if by_time is False:
+        table.check("frame", whole, "a whole number (seconds are in a column time)")
+    if by_time is None:
+        by_time = not whole.all()
+    table.check("focal", focal >= np.finfo(np.float64).tiny, "a positive number")
+    later = np.append(True, np.diff(position) > 0)
+    table.check(header, later, "greater than in the row before: sort the track, and give each moment once")
+    return FocalTrack(position, focal, by_time=by_time, hold=hold)
+
+
+_BY_TIME = {"time": True, "frame": False, "time_or_frame": None}
+"""Columns of positions: whether they are seconds."""

@@ -7,15 +7,17 @@ column ``focal``, the same in all rows of a frame, or from a second file with th
 
 import csv
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from .._arguments import kinds_checked
 from .._files import whole_file
 from ..lines import Lines
+from .text_table import TextTable, read_text_table
 
 
+@kinds_checked
 def read_lines_csv(
     path: str | os.PathLike[str],
     *,
@@ -26,40 +28,46 @@ def read_lines_csv(
     """Read lines from a ``frame,line,x,y[,focal]`` file, in float64.
 
     Args:
-        path: the file; columns in any order, others are ignored.
+        path: the file, of a kind that `zoomjax.io.text_table` reads; columns in any order, others are
+            ignored.
         image_size: (width, height) px.
-        focal: focal length by frame number, where the file has no column ``focal``; a sequence counts
+        focal: focal length by frame number, if the file has no column ``focal``; a sequence counts
             frames from 0.
         focal_unit: "mm" or "px".
 
     Raises:
-        ValueError: a column is missing, a value is no number, or a frame has no focal length, or
-            `Lines.from_ragged` raises one; the message names the file.
+        ValueError: a column is missing, a value is no number, a frame has no focal length, or focal
+            lengths are in the file and in `focal`, or `Lines.from_ragged` raises one; the message names
+            the file.
     """
-    columns = _read(path, required=("frame", "line", "x", "y"), optional=("focal",))
-    frame, line = (_integers(columns[name], name, path) for name in ("frame", "line"))
+    table = read_text_table(path, "lines", numbers=("frame", "line", "x", "y"), optional=("focal",))
+    columns = table.numbers
+    frame, line = (_integers(table, name) for name in ("frame", "line"))
     frames, index = np.unique(frame, return_inverse=True)
     if "focal" in columns:
-        _check_focal(columns["focal"], path)
+        if focal is not None:
+            raise table.error(
+                "it has a column focal, and focal lengths are given beside it. Leave one of them out"
+            )
+        table.check("focal", columns["focal"] > 0, "positive")
         lowest, highest = np.full(frames.size, np.inf), np.full(frames.size, -np.inf)
         np.minimum.at(lowest, index, columns["focal"])
         np.maximum.at(highest, index, columns["focal"])
         if (lowest != highest).any():
             bad = frames[np.argmax(lowest != highest)]
-            raise ValueError(f"Cannot read lines from {path}: frame {bad} has two focal lengths.")
+            raise table.error(f"frame {bad} has two focal lengths")
         focals = lowest
     elif focal is None:
-        raise ValueError(
-            f"Cannot read lines from {path}: no focal lengths. Add a column focal, or give a file with the "
-            "columns frame,focal."
+        raise table.error(
+            "it has no focal lengths. Add a column focal, or give a file with the columns frame,focal"
         )
     else:
         focal = focal if isinstance(focal, Mapping) else dict(enumerate(focal))
         missing = [int(f) for f in frames if int(f) not in focal]
         if missing:
-            raise ValueError(
-                f"Cannot read lines from {path}: no focal length for {len(missing)} of its "
-                f"{frames.size} frames (the first are {', '.join(map(str, missing[:5]))})."
+            raise table.error(
+                f"there is no focal length for {len(missing)} of its {frames.size} frames (the first are "
+                f"{', '.join(map(str, missing[:5]))})"
             )
         focals = np.array([focal[int(f)] for f in frames])
 
@@ -75,9 +83,10 @@ def read_lines_csv(
             focal_unit=focal_unit,
         )
     except ValueError as error:
-        raise ValueError(f"Cannot read lines from {os.fspath(path)}: {error}") from error
+        raise table.error(str(error)) from error
 
 
+@kinds_checked
 def write_lines_csv(lines: Lines, path: str | os.PathLike[str]) -> None:
     """Write lines as ``frame,line,x,y,focal``, with all the digits of their dtype."""
     frame, focal = np.asarray(lines.frame), np.asarray(lines.focal)
@@ -89,73 +98,25 @@ def write_lines_csv(lines: Lines, path: str | os.PathLike[str]) -> None:
             writer.writerows([m, number, x, y, focal[m]] for x, y in points)
 
 
+@kinds_checked
 def read_focal_csv(path: str | os.PathLike[str]) -> dict[int, float]:
     """Read focal lengths by frame number from a file with the columns ``frame,focal``.
 
     Raises:
         ValueError: a column is missing, a value is no number, or not positive, or a frame comes twice.
     """
-    columns = _read(path, required=("frame", "focal"))
-    frame = _integers(columns["frame"], "frame", path)
-    if np.unique(frame).size < frame.size:
-        raise ValueError(f"Cannot read focal lengths from {path}: a frame comes twice.")
-    _check_focal(columns["focal"], path)
-    return dict(zip(frame.tolist(), columns["focal"].tolist(), strict=True))
+    table = read_text_table(path, "focal lengths", numbers=("frame", "focal"))
+    frame, focal = _integers(table, "frame"), table.numbers["focal"]
+    table.check("focal", focal > 0, "positive")
+    first = np.zeros(frame.size, bool)
+    first[np.unique(frame, return_index=True)[1]] = True
+    if not first.all():
+        bad = int(np.argmin(first))
+        raise table.error(f"frame {frame[bad]} comes twice, the second time in row {table.rows[bad]}")
+    return dict(zip(frame.tolist(), focal.tolist(), strict=True))
 
 
-def _check_focal(focal: np.ndarray, path) -> None:
-    good = np.isfinite(focal) & (focal > 0)
-    if not good.all():
-        raise ValueError(
-            f"Cannot read focal lengths from {os.fspath(path)}: they must be finite positive numbers, but "
-            f"one is {focal[np.argmin(good)]}."
-        )
-
-
-def _read(path, *, required, optional=()) -> dict[str, np.ndarray]:
-    """The named columns as float64."""
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            first = file.readline()
-            header = [name.strip() for name in next(csv.reader([first]), [])]
-            missing = [name for name in required if name not in header]
-            if missing:
-                hint = "; separate columns by commas" if ";" in first or "\t" in first else ""
-                raise ValueError(
-                    f"the first line must name the columns {','.join(required)}, but "
-                    f"{' and '.join(missing)} is not among them{hint}"
-                )
-            names = [name for name in (*required, *optional) if name in header]
-            used = [header.index(name) for name in names]
-            start = file.tell()
-            try:
-                with warnings.catch_warnings():
-                    warnings.filterwarnings("ignore", ".*input contained no data")  # told below
-                    table = np.loadtxt(file, delimiter=",", usecols=used, ndmin=2, comments=None)
-            except (ValueError, IndexError):
-                file.seek(start)
-                raise ValueError(_first_bad_row(file, header, names)) from None
-        if not len(table):
-            raise ValueError("there are no rows")
-    except (ValueError, csv.Error) as error:  # UnicodeDecodeError is one too
-        raise ValueError(f"Cannot read {os.fspath(path)}: {error}.") from error
-    return dict(zip(names, table.T, strict=True))
-
-
-def _first_bad_row(file, header, names) -> str:
-    """What is wrong with the first row that holds no numbers; rows are counted from 1, the header's."""
-    for number, row in enumerate(csv.reader(file), start=2):
-        if row and len(row) < len(header):
-            return f"row {number} has {len(row)} columns and the first has {len(header)}"
-        for name in names if row else ():
-            try:
-                float(row[header.index(name)])
-            except ValueError:
-                return f"{name} in row {number} is {row[header.index(name)]!r}, which is no number"
-    return "it holds something else than numbers"
-
-
-def _integers(values: np.ndarray, name: str, path) -> np.ndarray:
-    if not (abs(values) < 2**53).all() or (values != np.floor(values)).any():
-        raise ValueError(f"Cannot read {os.fspath(path)}: column {name} must hold integers.")
+def _integers(table: TextTable, name: str) -> np.ndarray:
+    values = table.numbers[name]
+    table.check(name, (abs(values) < 2**53) & (values == np.floor(values)), "an integer")
     return values.astype(np.int64)

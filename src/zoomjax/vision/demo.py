@@ -35,8 +35,8 @@ def write_photos(
     """
     lens = synthetic.nikkor_18_200(image_size)
     Path(folder).mkdir(parents=True, exist_ok=True)
-    paths = []
-    for index, focal in enumerate(np.round(synthetic.focal_sweep(number), 2)):
+    paths = [Path(folder) / name for name in photo_names(number)]
+    for index, (path, focal) in enumerate(zip(paths, _focal(number), strict=True)):
         photo = synthetic.board_photo(
             lens, float(focal), blur=0.8, noise=2, vignetting=0.3, seed=seed + index
         )
@@ -45,11 +45,19 @@ def write_photos(
             ".jpg", photo, [cv2.IMAGE_METADATA_EXIF], [exif], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
         )
         assert done
-        paths.append(Path(folder) / f"board-{focal:06.2f}mm.jpg")
-        with whole_file(paths[-1]) as part:
+        with whole_file(path) as part:
             part.write_bytes(content.tobytes())
         progress(index + 1, number)
     return paths
+
+
+def photo_names(number: int) -> list[str]:
+    """What `write_photos` calls so many photographs."""
+    return [f"board-{focal:06.2f}mm.jpg" for focal in _focal(number)]
+
+
+def _focal(number: int) -> np.ndarray:
+    return np.round(synthetic.focal_sweep(number), 2)
 
 
 def write_before_after(photo: Path, target: Path, lens: ZoomLens, focal: float) -> None:

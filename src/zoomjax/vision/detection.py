@@ -5,17 +5,14 @@ smooth over some px, so that nearer neighbours share their noise and say little 
 """
 
 import collections
-import concurrent.futures
+import contextlib
 import dataclasses
 import functools
 import hashlib
 import io
 import math
-import multiprocessing
-import signal
-import zipfile
-from collections.abc import Iterable, Iterator
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Generator, Iterable
+from concurrent.futures import Future
 from pathlib import Path
 
 import cv2
@@ -27,6 +24,7 @@ from .edges import EdgeDetector
 from .grid import GridDetector
 from .images import Source
 from .pitch import PitchDetector
+from .workers import LostError, Workers
 
 DETECTORS: dict[str, type[AbstractDetector]] = {
     "edges": EdgeDetector,
@@ -37,6 +35,9 @@ DETECTORS: dict[str, type[AbstractDetector]] = {
 
 _SPACING = 4.0
 _SMALLEST = 32
+
+_SECONDS = 300.0
+"""That an image may take: the largest that is read, on a slow machine, takes less."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,9 +69,9 @@ def detect(
     detector: AbstractDetector,
     *,
     grid: str = "none",
-    workers: int = 1,
+    workers: int = 0,
     cache: Path | None = None,
-) -> Iterator[Detection]:
+) -> Generator[Detection, None, None]:
     """The lines in each image, in order.
 
     Args:
@@ -78,59 +79,29 @@ def detect(
         detector: what finds lines.
         grid: where to look for a grid, too, whose nodes tell the focal length: in "all" images, those
             "without focal length" of their own, or "none".
-        workers: number of processes; 1: no others than this one.
+        workers: number of processes. An image that ends one, or takes longer than five minutes, is one
+            with a problem. 0: this one looks, and has no such protection.
         cache: folder of what was found before in the same images by the same detector; None: no cache.
     """
     task = functools.partial(_detected, detector=detector, grid=grid)
-    with _pool(workers) as submit:
-        pending: collections.deque[tuple[Path | None, concurrent.futures.Future | Detection]]
-        pending = collections.deque()
+    with contextlib.ExitStack() as stack:
+        submit = stack.enter_context(Workers(task, workers, _SECONDS)).submit if workers else task
+        pending: collections.deque[tuple[Path | None, Source, Future | Detection]] = collections.deque()
         for source in sources:
             file = None if cache is None else cache / f"{_key(source, detector, grid)}.npz"
             known = None if file is None else _load(file, source)
-            pending.append((file, submit(task, source) if known is None else known))
-            while len(pending) > 2 * workers or (pending and isinstance(pending[0][1], Detection)):
+            pending.append((file, source, submit(source)) if known is None else (None, source, known))
+            while len(pending) > 2 * workers or (pending and isinstance(pending[0][2], Detection)):
                 yield _finished(*pending.popleft())
         while pending:
             yield _finished(*pending.popleft())
-
-
-class _pool:
-    """A function like `Executor.submit`: of processes, begun with the first task, or of this one."""
-
-    def __init__(self, workers: int):
-        self._workers = workers
-        self._executor: concurrent.futures.ProcessPoolExecutor | None = None
-
-    def __enter__(self):
-        return self._submit
-
-    def _submit(self, task, source: Source) -> concurrent.futures.Future:
-        if self._workers <= 1:
-            future: concurrent.futures.Future = concurrent.futures.Future()
-            future.set_result(task(source))
-            return future
-        if self._executor is None:
-            self._executor = concurrent.futures.ProcessPoolExecutor(
-                self._workers, multiprocessing.get_context("spawn"), _begin_worker
-            )
-        return self._executor.submit(task, source)
-
-    def __exit__(self, *_) -> None:
-        if self._executor is not None:
-            self._executor.shutdown(cancel_futures=True)
-
-
-def _begin_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that shuts the workers down
-    cv2.setNumThreads(1)
 
 
 def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detection:
     found = functools.partial(Detection, source.name, source.file)
     try:
         image, focal = source.read()
-    except (ValueError, OSError) as error:
+    except Exception as error:  # whatever it is, it is one image's
         return found(problem=_sentence(error))
     size = (image.shape[1], image.shape[0])
     if min(size) < _SMALLEST:
@@ -143,7 +114,7 @@ def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detec
         own = isinstance(detector, GridDetector)
         nodes = (detector if own else GridDetector()).find(image) if own or wanted else None
         lines = tuple(_thinned(line) for line in (detector.lines(nodes) if own else detector(image)))
-    except Exception as error:  # whatever it is, it is one image's
+    except Exception as error:
         return found(size, problem=f"the detector failed: {type(error).__name__}: {_sentence(error)}")
     return found(size, lines, focal, nodes, "" if lines else _NO_LINES)
 
@@ -152,7 +123,9 @@ def _sentence(error: Exception) -> str:
     """What an error says, without the numbers of the operating system and a full stop."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    return str(error).strip().rstrip(".")
+    if isinstance(error, MemoryError) or getattr(error, "code", 0) == cv2.Error.StsNoMem:
+        return "it takes more memory than there is"
+    return " ".join(str(error).split()).rstrip(".")
 
 
 _NO_LINES = (
@@ -169,17 +142,12 @@ def _thinned(line: np.ndarray) -> np.ndarray:
     return line[:: math.ceil(_SPACING * (len(line) - 1) / max(length, 1e-9))]
 
 
-def _finished(file: Path | None, result: concurrent.futures.Future | Detection) -> Detection:
-    if isinstance(result, Detection):
-        return result
+def _finished(file: Path | None, source: Source, result: Future | Detection) -> Detection:
     try:
-        detection = result.result()
-    except BrokenProcessPool:
-        raise RuntimeError(
-            "A process that looked at images was ended from outside, probably for want of memory. Try "
-            "again with --jobs 1."
-        ) from None
-    if file is not None and detection.image_size != (0, 0):  # what cannot be read may be mended
+        detection = result if isinstance(result, Detection) else result.result()
+    except LostError as error:
+        return Detection(source.name, source.file, problem=str(error))
+    if file is not None and detection.problem in ("", _NO_LINES):  # other problems may be mended
         _save(detection, file)
     return detection
 
@@ -195,8 +163,8 @@ def _code() -> bytes:
 def _key(source: Source, detector: AbstractDetector, grid: str) -> str:
     digest = hashlib.sha256(_code() + cv2.__version__.encode() + repr((detector, grid)).encode())
     try:
-        digest.update(source.content())
-    except OSError as error:  # told when it is read
+        digest.update(source.digest())
+    except (OSError, ValueError) as error:  # told when it is read
         digest.update(repr(error).encode())
     return digest.hexdigest()
 
@@ -224,18 +192,24 @@ def _save(detection: Detection, file: Path) -> None:
 def _load(file: Path, source: Source) -> Detection | None:
     """What was found before, under the image's present name; None if nothing was."""
     try:
-        with file.open("rb") as opened, np.load(opened) as stored:
-            lines = np.split(stored["points"], np.cumsum(stored["counts"])[:-1])
-            width, height = stored["image_size"].tolist()
-            focal = float(stored["focal"])
-            return Detection(
-                name=source.name,
-                file=source.file,
-                image_size=(width, height),
-                lines=tuple(lines) if len(stored["counts"]) else (),
-                focal=source.focal or (None if np.isnan(focal) else focal),
-                nodes=stored["nodes"] if stored["nodes"].size else None,
-                problem=str(stored["problem"]),
-            )
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as stored:
+            points, nodes = np.asarray(stored["points"], float), np.asarray(stored["nodes"], float)
+            counts, focal = stored["counts"].tolist(), float(stored["focal"])
+            width, height = map(int, stored["image_size"].tolist())
+            problem = str(stored["problem"])
+        sound = (
+            points.shape == (sum(counts), 2) and np.isfinite(points).all() and min(counts, default=1) > 0
+        )
+        if not sound or nodes.ndim != 3 or nodes.shape[2] != 2:
+            return None
+    except Exception:  # whatever is wrong with it, it can be found again
         return None
+    return Detection(
+        name=source.name,
+        file=source.file,
+        image_size=(width, height),
+        lines=tuple(np.split(points, np.cumsum(counts)[:-1])) if counts else (),
+        focal=source.focal or (None if np.isnan(focal) else focal),
+        nodes=nodes if nodes.size else None,
+        problem=problem,
+    )

@@ -5,11 +5,9 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
-from av.codec.codec import find_best_pix_fmt_of_list
-from av.error import FFmpegError
-from av.sidedata.sidedata import Type
+
+from ._av import av
 
 CONTAINER = {
     ".mp4": "mp4",
@@ -72,7 +70,9 @@ class FrameWriter(contextlib.AbstractContextManager):
         options: dict[str, str] | None,
         orientation: list[int] | None,
     ):
-        self._output = av.open(str(path), "w", format=CONTAINER[named.suffix.lower()])
+        self._output = av.open(
+            str(path), "w", format=CONTAINER[named.suffix.lower()], metadata_errors="surrogateescape"
+        )
         try:
             self._output.metadata.update(
                 {key: value for key, value in input_.metadata.items() if key not in _OWN_TAGS}
@@ -144,7 +144,7 @@ class FrameWriter(contextlib.AbstractContextManager):
 
 def display_matrix(frame: Any) -> list[int] | None:
     """How players turn and mirror this frame: FFmpeg's nine fixed-point numbers; None if they do not."""
-    matrix = frame.side_data.get(Type.DISPLAYMATRIX)
+    matrix = frame.side_data.get(av.sidedata.sidedata.Type.DISPLAYMATRIX)
     return None if matrix is None else np.frombuffer(matrix, "<i4").tolist()
 
 
@@ -153,7 +153,8 @@ def _encodable(context: Any, name: str) -> str:
     known = [each.name for each in context.codec.video_formats or ()]
     if name in known or not known:
         return name
-    nearest, _ = find_best_pix_fmt_of_list(known, name, has_alpha=name.startswith(("yuva", "gbra")))
+    has_alpha = name.startswith(("yuva", "gbra"))
+    nearest, _ = av.codec.codec.find_best_pix_fmt_of_list(known, name, has_alpha=has_alpha)
     return nearest.name if nearest else "yuv420p"
 
 
@@ -162,7 +163,7 @@ def _blamed(encoder: str) -> Generator[None, None, None]:
     """Errors of an encoder that cannot be used, in a sentence."""
     try:
         yield
-    except (ValueError, FFmpegError) as error:
+    except (ValueError, av.error.FFmpegError) as error:
         raise ValueError(
             f"Cannot encode with {encoder!r}: {error}. Choose another encoder, container, or even size."
         ) from error

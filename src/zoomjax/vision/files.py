@@ -1,14 +1,23 @@
 """Files in, corrected files out: what ``zoomjax undistort`` does, checked before any work."""
 
 import dataclasses
-from collections.abc import Callable
+import functools
+import mimetypes
+import unicodedata
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ..framing import frame_output
+import cv2
+import numpy as np
+
+from .._files import refuse_existing, refuse_inputs, whole_file
+from ..framing import Framing, check_keep, frame_output
 from ..io.focal_table import read_focal_table
 from ..io.focal_track import read_focal_track
+from ..io.text_table import plain_number
 from ..lens import ZoomLens, load_lens
-from .photos import SUFFIXES, photo_focal, undistort_photo
+from ..sizes import at_focal, lens_for_size
+from .photos import SUFFIXES, corrected_photo, photo_focal
 from .undistort import check_sampling
 
 
@@ -23,6 +32,7 @@ class Job:
         focal: a number, a CSV file, or None for the photos' own.
         keep, interpolation, border: as for `undistort_image`; one framing for all photos.
         hold: whether a track's ends hold.
+        overwrite: whether files that are there may be replaced; never those that are read.
     """
 
     lens: Path
@@ -33,16 +43,32 @@ class Job:
     interpolation: str = "linear"
     border: str = "constant"
     hold: bool = False
+    overwrite: bool = False
 
 
-def undistort_files(job: Job, progress: Callable[[int, int], None] = lambda done, total: None) -> str:
-    """Do it, and say in a sentence what was done.
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What was done.
+
+    Attributes:
+        sentence: what was written.
+        skipped: why photos were not corrected, by their paths.
+    """
+
+    sentence: str
+    skipped: dict[str, str] = dataclasses.field(default_factory=dict)
+
+
+def undistort_files(job: Job, progress: Callable[[int, int], None] = lambda done, total: None) -> Outcome:
+    """Do it. Of several photos, those that cannot be corrected are skipped.
 
     Raises:
-        OSError, ValueError: as `undistort_photo` and `undistort_video` do. Photos before the one with the
-            error have been written, each whole.
+        OSError, ValueError: something is wrong with the options, the lens, the table of focal lengths or
+            the targets, found before any work; or as `undistort_video` does, or `undistort_photo` for a
+            single photo. Where a target cannot be written, those before it have been, each whole.
     """
     check_sampling(job.interpolation, job.border)
+    check_keep(job.keep)
     lens = load_lens(job.lens)
     photos = [path for path in job.inputs if path.suffix.lower() in SUFFIXES]
     if photos and len(photos) < len(job.inputs):
@@ -54,7 +80,7 @@ def undistort_files(job: Job, progress: Callable[[int, int], None] = lambda done
     return _video(job, lens, progress)
 
 
-def _video(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> str:
+def _video(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> Outcome:
     from .video import undistort_video  # PyAV is of the extra "app"
 
     if job.focal is None:
@@ -62,10 +88,11 @@ def _video(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> st
             "A video needs --focal: one focal length, or a CSV file with time,focal or frame,focal."
         )
     number = _number(job.focal)
+    if number is not None and job.hold:
+        raise ValueError("--hold is for a track of focal lengths, and --focal is one number.")
     focal = read_focal_track(job.focal, hold=job.hold) if number is None else number
     target = job.output / job.inputs[0].name if job.output.is_dir() else job.output
-    if target.resolve() == job.inputs[0].resolve():
-        raise ValueError(f"The output {target} is the input. Choose another file.")
+    _check_targets(job, [target])
     done = undistort_video(
         job.inputs[0],
         target,
@@ -76,44 +103,122 @@ def _video(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> st
         border=job.border,
         progress=progress,
     )
-    return f"{done.frames} frames corrected, scale {done.scale:.4f}: {target}"
+    return Outcome(f"{done.frames} frames corrected, scale {done.scale:.4f}: {target}")
 
 
-def _photos(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> str:
-    single = len(job.inputs) == 1 and job.output.suffix.lower() in SUFFIXES
-    folder = job.output.parent if single else job.output
-    targets = [job.output] if single else [folder / path.name for path in job.inputs]
-    for source, target in zip(job.inputs, targets, strict=True):
-        if source.resolve() == target.resolve():
-            raise ValueError(f"The output {target} is the input. Choose another folder.")
-    if len(set(targets)) < len(targets):
-        raise ValueError("Two photos have the same name, and would be written to one file.")
-    focals = [_photo_focal(job, lens, path) for path in job.inputs]
-    folder.mkdir(parents=True, exist_ok=True)
-    keep = job.keep
-    if keep != "same" and len(set(focals)) > 1:
-        low, high = min(focals), max(focals)
-        spread = [1 / (1 / low + (1 / high - 1 / low) * i / 64) for i in range(65)]
-        keep = frame_output([lens(f) for f in spread], lens.image_size, keep=keep)
-    for number, (source, target, focal) in enumerate(
-        zip(job.inputs, targets, focals, strict=True), start=1
-    ):
-        undistort_photo(source, target, lens=lens, focal=focal, keep=keep, interpolation=job.interpolation)
-        progress(number, len(targets))
-    return f"{len(targets)} photo{'s' * (len(targets) > 1)} corrected: {job.output}"
+def _photos(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> Outcome:
+    if job.hold:
+        raise ValueError("--hold is for a video's track of focal lengths, and the inputs are photos.")
+    targets = _photo_targets(job)
+    _check_targets(job, targets)
+    focal_of = _photo_focals(job, lens)
+    skipped: dict[Path, Exception] = {}
+    keep = _common_keep(job, lens, focal_of, skipped)
+    for done, (source, target) in enumerate(zip(job.inputs, targets, strict=True), start=1):
+        if source not in skipped:
+            try:
+                content = corrected_photo(
+                    source,
+                    target.suffix,
+                    lens=lens,
+                    focal=focal_of(source),
+                    keep=keep,
+                    interpolation=job.interpolation,
+                    border=job.border,
+                )
+            except _BAD_PHOTO as error:
+                skipped[source] = error
+            else:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with whole_file(target) as part:
+                    part.write_bytes(content)
+        progress(done, len(targets))
+    if len(job.inputs) == 1 and skipped:
+        raise next(iter(skipped.values()))
+    written, number = len(targets) - len(skipped), len(targets)
+    count = f"{number} photo{'s' * (number > 1)}" if not skipped else f"{written} of {number} photos"
+    return Outcome(f"{count} corrected: {job.output}", {str(p): str(e) for p, e in skipped.items()})
 
 
-def _photo_focal(job: Job, lens: ZoomLens, path: Path) -> float:
+_BAD_PHOTO = (ValueError, OSError, MemoryError, cv2.error)
+"""What one photo may raise that is no reason to leave out the others."""
+
+
+def _photo_targets(job: Job) -> list[Path]:
+    """Where each photo goes."""
+    folder = job.output.is_dir() or job.output.suffix.lower() not in SUFFIXES
+    if not folder and len(job.inputs) > 1:
+        raise ValueError(
+            f"The output of {len(job.inputs)} photos must be a folder, but it is the file {job.output}."
+        )
+    if not folder:
+        return [job.output]
+    kind = mimetypes.guess_type(job.output.name)[0] or ""
+    if not job.output.is_dir() and kind.startswith(("image/", "video/")):
+        raise ValueError(f"The output must end in one of {', '.join(SUFFIXES)}, but it is {job.output}.")
+    names: dict[str, Path] = {}
+    for path in job.inputs:
+        # Many file systems make no difference between cases, or between ways to write an accent.
+        other = names.setdefault(unicodedata.normalize("NFC", path.name).casefold(), path)
+        if other is not path:
+            raise ValueError(
+                f"The photos {other} and {path} have the same name, and would be written to one file."
+            )
+    return [job.output / path.name for path in job.inputs]
+
+
+def _check_targets(job: Job, targets: Sequence[Path]) -> None:
+    tables = [] if job.focal is None else [job.focal]
+    refuse_inputs(targets, [*job.inputs, job.lens, *tables])
+    refuse_existing(targets, overwrite=job.overwrite)
+
+
+def _common_keep(
+    job: Job, lens: ZoomLens, focal_of: Callable[[Path], float], skipped: dict[Path, Exception]
+) -> Callable[[tuple[int, int]], str | Framing]:
+    """What to show of a photo of some size: one framing for all, but for their sizes.
+
+    Photos without a focal length are skipped.
+    """
+    if job.keep == "same":
+        return lambda size: job.keep
+    focals = []
+    for source in job.inputs:
+        try:
+            focals.append(focal_of(source))
+        except _BAD_PHOTO as error:
+            skipped[source] = error
+    if not focals:
+        return lambda size: job.keep
+    low, high = min(focals), max(focals)
+    dtype = np.asarray(lens.centre).dtype
+    spread = (1 / np.linspace(1 / low, 1 / high, 65 if low < high else 1)).astype(dtype)
+
+    @functools.cache
+    def keep(size: tuple[int, int]) -> Framing:
+        scaled = lens_for_size(lens, size)
+        return frame_output([at_focal(scaled, f) for f in spread], size, keep=job.keep)
+
+    return keep
+
+
+def _photo_focals(job: Job, lens: ZoomLens) -> Callable[[Path], float]:
+    """The focal length of a photo, by the table, the number, or its own account."""
     if job.focal is None:
-        return photo_focal(path, lens)
+        return functools.cache(lambda path: photo_focal(path, lens))
     number = _number(job.focal)
     if number is not None:
-        return number
-    return read_focal_table(job.focal).need(path)
+        return lambda path: number
+    return read_focal_table(job.focal).need
 
 
 def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
+    """A focal length; None if it is a file."""
+    number = plain_number(text)
+    if number is None and not Path(text).exists() and not text.lower().endswith(".csv"):
+        raise ValueError(
+            f"--focal must be a positive number, with a decimal point, or a CSV file, but it is {text!r}."
+        )
+    if number is not None and number <= 0:
+        raise ValueError(f"--focal must be a positive number, but it is {text}.")
+    return number

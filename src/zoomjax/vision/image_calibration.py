@@ -1,10 +1,9 @@
 """From photographs or a video to a calibrated lens: what ``zoomjax calibrate`` does with images."""
 
 import concurrent.futures
+import contextlib
 import dataclasses
 import os
-import shutil
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..calibration import Calibration, calibrate, focal_sigmas
+from .._results import results_folder
+from .._text import numbered_name, plain
+from ..calibration import CLEARS, FILES, Calibration, calibrate, focal_sigmas
 from ..io.focal_track import FocalTrack, read_focal_track
 from .detection import DETECTORS, Detection, detect
 from .focals import Board, Focals, check_way, choose_focals, lines_of
@@ -92,6 +93,11 @@ class ImageJob:
             return photos, len(photos)
         return video_frames(self.video, self._track(), self.frames), self.frames
 
+    def results(self) -> list[str]:
+        """Names of the files that `ImageCalibration.write` writes, as far as they are known before."""
+        photos = self.sources()[0] if self.video is None else ()
+        return [*FILES, *(f"lines/{_overlay(n, photo.name)}" for n, photo in enumerate(photos, start=1))]
+
     def _track(self) -> FocalTrack | float:
         """Of a video; 1 where its own frames tell."""
         if self.focal in (None, "plane", "board"):
@@ -111,6 +117,7 @@ class ImageCalibration:
         calibration: the fits; a frame for each used image, in their order.
         used: what was detected in them.
         focals: their focal lengths.
+        images: the names of all images, in order; an overlay has its image's number here, from 1.
         unused: why an image was not used, by its name.
     """
 
@@ -118,6 +125,7 @@ class ImageCalibration:
     calibration: Calibration
     used: tuple[Detection, ...]
     focals: Focals
+    images: tuple[str, ...]
     unused: dict[str, str]
 
     def rejected(self) -> list[np.ndarray]:
@@ -148,71 +156,64 @@ class ImageCalibration:
         """What a user must hear of: images that were not used, and what the calibration warns of."""
         told = []
         if self.unused:
-            listed = [f"{name}: {why}" for name, why in self.unused.items()]
+            listed = [f"{plain(name)}: {plain(why)}" for name, why in self.unused.items()]
             rest = len(listed) - 8
             told.append(
                 f"{len(listed)} of {len(listed) + len(self.used)} images are not used.\n  "
                 + "\n  ".join(listed[:8] + ([f"and {rest} more, in summary.json"] if rest > 0 else []))
             )
-        return told + self.calibration.warnings([detection.name for detection in self.used])
+        return told + self.calibration.warnings([plain(detection.name) for detection in self.used])
 
     def overlays(self) -> list[str]:
-        """For each used image the picture of its lines, relative to ``lines/``, with slashes."""
-        paths = [Path(detection.name) for detection in self.used]
-        stems = Counter(path.with_suffix("") for path in paths)
-        return [  # a.jpg beside a.png are two pictures
-            (
-                path.with_suffix(".jpg") if stems[path.with_suffix("")] == 1 else Path(f"{path}.jpg")
-            ).as_posix()
-            for path in paths
-        ]
+        """For each used image the name of the picture of its lines, in ``lines/``."""
+        numbers = {name: number for number, name in enumerate(self.images, start=1)}
+        return [_overlay(numbers[detection.name], detection.name) for detection in self.used]
 
     def write(
         self,
         folder: str | os.PathLike[str],
         progress: Progress = lambda done, total: None,
         pages: Mapping[str, str] | None = None,
+        *,
+        overwrite: bool = False,
     ) -> None:
-        """Write what `Calibration.write` does, and the lines drawn over each image, in ``lines/``.
+        """Write what `Calibration.write` does, and the lines drawn over each image, in ``lines/``."""
+        names = [*self.job.results(), *(pages or {})]
+        with results_folder(folder, names, clears=CLEARS, overwrite=overwrite) as part:
+            self.make(part, progress, pages)
 
-        What an earlier calibration drew there is removed.
-        """
-        lines = Path(folder) / "lines"
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".zoomjax-") as part:
-            made = self._draw(Path(part), progress)
-            if (Path(folder) / "summary.json").exists():
-                shutil.rmtree(lines, ignore_errors=True)
-            self.calibration.write(folder, about=self.about(), pages=pages)
-            for file in made:
-                target = lines / file.relative_to(part)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                file.replace(target)
+    def make(
+        self,
+        folder: Path,
+        progress: Progress = lambda done, total: None,
+        pages: Mapping[str, str] | None = None,
+    ) -> None:
+        """The same in an empty folder: that of a `results_folder`, say."""
+        (folder / "lines").mkdir()
+        self._draw(folder / "lines", progress)
+        self.calibration.make(folder, about=self.about(), pages=pages)
 
-    def _draw(self, folder: Path, progress: Progress) -> list[Path]:
+    def _draw(self, folder: Path, progress: Progress) -> None:
         used = {
             detection.name: (detection, rejected, folder / target)
             for detection, rejected, target in zip(self.used, self.rejected(), self.overlays(), strict=True)
         }
-        made: list[Path] = []
 
-        def draw(source: Source) -> Path:
+        def draw(source: Source) -> None:
             detection, rejected, target = used[source.name]
             picture = draw_lines(source.read()[0], detection.lines, rejected.tolist())
-            target.parent.mkdir(parents=True, exist_ok=True)
             done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
             assert done
             target.write_bytes(content.tobytes())
-            return target
 
         sources = (source for source in self.job.sources()[0] if source.name in used)
         if self.job.video is not None:
-            made = [draw(source) for source in sources]
+            for source in sources:
+                draw(source)
         else:
             with concurrent.futures.ThreadPoolExecutor(self.job.workers) as pool:
-                for path in pool.map(draw, sources):
-                    made.append(path)
-                    progress(len(made), len(used))
-        return made
+                for done, _ in enumerate(pool.map(draw, sources), start=1):
+                    progress(done, len(used))
 
 
 def calibrate_images(
@@ -242,9 +243,10 @@ def calibrate_images(
         workers=job.workers,
         cache=job.cache,
     )
-    for detection in looked:
-        detections.append(detection)
-        progress(len(detections), total)
+    with contextlib.closing(looked):  # whatever happens, no process is left behind
+        for detection in looked:
+            detections.append(detection)
+            progress(len(detections), total)
     unused = {d.name: d.problem for d in detections if d.problem}
     usable, others = _of_one_size([d for d in detections if not d.problem])
     unused |= others
@@ -272,7 +274,7 @@ def calibrate_images(
             select=job.select,
             stage=stage,
         )
-        done = ImageCalibration(job, calibration, used, focals, unused)
+        done = ImageCalibration(job, calibration, used, focals, tuple(d.name for d in detections), unused)
         hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}
         if not hopeless:
             return done
@@ -283,6 +285,11 @@ def calibrate_images(
 _NONE_AGREES = (
     "none of its lines is straight under the distortion of the others. Is its focal length right?"
 )
+
+
+def _overlay(number: int, name: str) -> str:
+    """What the picture of an image's lines is called: a name of ours, whatever the image is called."""
+    return numbered_name(number, name, ".jpg")
 
 
 def _is_video(path: str | os.PathLike[str]) -> bool:
@@ -314,6 +321,6 @@ def _nothing(detections: Sequence[Detection]) -> str:
     problems = Counter(d.problem.rstrip(".") for d in detections)
     if len(problems) == 1 and len(detections) > 1:
         return f"None of the {len(detections)} images can be used: {next(iter(problems))}."
-    listed = "; ".join(f"{d.name}: {d.problem}" for d in detections[:4])
+    listed = "; ".join(f"{plain(d.name)}: {plain(d.problem)}" for d in detections[:4])
     more = f"; and {len(detections) - 4} more" if len(detections) > 4 else ""
     return f"None of the images can be used. {listed}{more}."

@@ -2,6 +2,7 @@
 
 import dataclasses
 import glob
+import hashlib
 import os
 import warnings
 from collections.abc import Iterable, Iterator
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ..io.focal_track import FocalTrack
-from .photos import SUFFIXES, metadata_focal, read_photo
+from .photos import SUFFIXES, metadata_focal, open_photo, read_photo
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".m2ts", ".mpg", ".mxf", ".ts")
 """Of files that count as videos."""
@@ -42,19 +43,23 @@ class Source:
         """The path, or the name of what has none."""
         return self.name if self.path is None else str(self.path)
 
-    def content(self) -> bytes:
-        """What the image is made from, to tell it from others."""
+    def digest(self) -> bytes:
+        """Of what the image is made from, to tell it from others.
+
+        Raises:
+            OSError, ValueError: it cannot be read, as `open_photo` says.
+        """
         if self.path is not None:
-            return self.path.read_bytes()
+            with open_photo(self.path) as file:
+                return hashlib.file_digest(file, "sha256").digest()
         assert self.image is not None
-        return self.image.tobytes()
+        return hashlib.sha256(np.ascontiguousarray(self.image).data).digest()
 
     def read(self) -> tuple[UInt8[np.ndarray, "height width *channels"], float | None]:
         """The pixels as stored, whatever the orientation tag says, in bytes; the focal length in EXIF data.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: it cannot be decoded.
+            OSError, ValueError: it cannot be read, as `read_photo` says.
         """
         if self.image is not None:
             return self.image, None
@@ -169,6 +174,8 @@ def video_frames(
                 continue
             at = focal.at(last, time) if isinstance(focal, FocalTrack) else float(focal)
             yield Source(f"{stem}-{last:06d}.jpg", None, image(), at)
+        if last < 0:
+            raise ValueError(f"Cannot read {os.fspath(path)}: none of its frames decodes.")
         if last + 1 < 0.98 * announced - 2:  # lengths are rounded
             warnings.warn(
                 f"{os.fspath(path)} ends early, after {last + 1} of {announced} frames: it is cut off or "

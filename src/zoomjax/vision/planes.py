@@ -7,13 +7,13 @@ theirs, and frames at one focal length all), and `cv2.remap` of each plane.
 
 from typing import Any
 
-import av
 import numpy as np
 
 from ..framing import Framing
 from ..lens import ZoomLens
 from ..positions import OUTSIDE, Plane
 from ..sizes import at_focal
+from ._av import av
 from .undistort import position_map, remap
 
 _PACKED = {
@@ -116,11 +116,15 @@ def sampled_planes(name: str, size: tuple[int, int]) -> list[Plane]:
     hundredths of a pixel.
     """
     planes = []
-    for component in av.VideoFormat(name, *size).components:
-        width, height = component.width, component.height
-        step = (float(round(size[0] / width)), float(round(size[1] / height)))
-        planes.append(Plane((width, height), step, (0.0, (step[1] - 1) / 2)))
+    even = av.VideoFormat(name, _EVEN, _EVEN).components  # of odd sizes chroma is rounded up
+    for component, whole in zip(av.VideoFormat(name, *size).components, even, strict=True):
+        step = (_EVEN / whole.width, _EVEN / whole.height)
+        planes.append(Plane((component.width, component.height), step, (0.0, (step[1] - 1) / 2)))
     return planes
+
+
+_EVEN = 64
+"""px, a multiple of every step between samples of chroma."""
 
 
 def _black(frame: Any) -> list[int]:

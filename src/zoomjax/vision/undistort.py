@@ -13,10 +13,12 @@ import cv2
 import numpy as np
 from jaxtyping import Shaped
 
-from ..framing import Framing, frame_output
+from ..framing import Framing, check_framing, frame_output
 from ..inverse import fit_inverse, fold_radius
+from ..lens import ZoomLens
 from ..positions import OUTSIDE, Plane, source_positions
 from ..radial import Distortion
+from ..sizes import check_channels_last, check_image_size, checked_distortion, lens_for_size
 
 _INTERPOLATION = {
     "nearest": cv2.INTER_NEAREST,
@@ -43,8 +45,9 @@ _KNOWN = ("uint8", "uint16", "int16", "float32", "float64")
 
 def undistort_image(
     image: Shaped[np.ndarray, "height width *channels"],
-    distortion: Distortion,
+    distortion: Distortion | ZoomLens,
     *,
+    focal: float | int | None = None,
     keep: str | Framing = "same",
     size: tuple[int, int] | None = None,
     interpolation: str = "linear",
@@ -56,9 +59,11 @@ def undistort_image(
     Args:
         image: grey, or with any number of channels; boolean, integer of up to 32 bits, or floating.
             It may be a strided view.
-        distortion: of this image, in its pixels.
+        distortion: of this image, in its pixels; or a lens, which is scaled to images of another size of
+            the same aspect ratio.
+        focal: with a lens, its focal length.
         keep: what part to show, "same", "all" or "valid", or a `Framing` from `frame_output`, which
-            also tells the scale, and serves many images alike.
+            also tells the scale, and serves many images of one size alike.
         size: (width, height) px of the result; by default the image's. Not with a `Framing`.
         interpolation: "nearest", "linear", "cubic" or "lanczos".
         border: what lies beyond the image: "constant", "replicate" or "reflect".
@@ -69,10 +74,13 @@ def undistort_image(
         The dtype and channels of the image. Positions are those of `Distortion.distort` to 0.01 px.
 
     Raises:
-        ValueError: an argument is none of the above, or a side is longer than 32766 px.
+        ValueError: an argument is none of the above, channels are first, a side is longer than 32766 px,
+            the framing was made for images of another size, or the distortion is plainly that of such,
+            by its centre and scale. With a `Framing` of your own the distortion is taken as it is.
 
     Warns:
-        UserWarning: the lens folds within the image: what lies beyond cannot be corrected.
+        UserWarning: the lens folds within the image: what lies beyond cannot be corrected; or it is for
+            images of another size, and was scaled.
 
     Example:
         >>> import numpy as np
@@ -83,6 +91,11 @@ def undistort_image(
     _check_image(image)
     check_sampling(interpolation, border)
     height, width = image.shape[:2]
+    distortion = _distortion(distortion, focal, (width, height))
+    if isinstance(keep, Framing):
+        check_framing(keep, (width, height), "keep")
+    if not isinstance(keep, Framing) or keep.image_size is not None:
+        check_image_size(distortion, (width, height))
     if not isinstance(keep, Framing):
         keep = frame_output(distortion, (width, height), keep=keep, size=size)
     elif size is not None:
@@ -98,6 +111,22 @@ def undistort_image(
     if folded and border != "constant":
         corrected[x == OUTSIDE] = fill if image.ndim > 2 else fill[0]
     return corrected
+
+
+def _distortion(
+    distortion: Distortion | ZoomLens, focal: float | int | None, size: tuple[int, int]
+) -> Distortion:
+    """That of the image, also from a lens and a focal length."""
+    if isinstance(distortion, ZoomLens):
+        if focal is None:
+            raise ValueError(
+                "Argument focal must be given with a ZoomLens, but it is not: undistort_image(image, lens, "
+                "focal=...), or undistort_image(image, lens(focal))."
+            )
+        return lens_for_size(distortion, size)(focal)
+    if focal is not None:
+        raise ValueError("Argument focal must be left out unless the distortion is a ZoomLens.")
+    return checked_distortion(distortion)
 
 
 def position_map(
@@ -248,6 +277,7 @@ def _check_image(image) -> None:
             "Argument image must be a NumPy array (height, width[, channels]) with pixels, but it is "
             f"{shape}. cv2.imread gives None where it cannot read a file."
         )
+    check_channels_last(image.shape)
     if image.dtype.name not in (*_KNOWN, *_WORKING):
         raise ValueError(
             "Argument image must be boolean, integer of up to 32 bits or floating, but its dtype is "

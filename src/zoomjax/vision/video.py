@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import functools
 import itertools
+import math
 import os
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -17,17 +18,12 @@ from typing import Any
 
 import numpy as np
 
-try:
-    import av
-    from av.error import FFmpegError
-except ModuleNotFoundError as error:  # pragma: no cover
-    raise ModuleNotFoundError('Video needs PyAV: pip install "zoomjax[app]"') from error
-
-from .._files import whole_file
-from ..framing import Framing, frame_output
+from .._files import refuse_inputs, whole_file
+from ..framing import Framing, check_keep, frame_output, framing_for_size
 from ..io.focal_track import FocalTrack
 from ..lens import ZoomLens
 from ..sizes import at_focal, lens_for_size
+from ._av import av
 from .ahead import ahead
 from .encoding import CONTAINER, FrameWriter, display_matrix
 from .planes import FrameWarper
@@ -42,6 +38,8 @@ def decode_video(
     source: str | os.PathLike[str],
 ) -> Iterator[tuple[int, Iterator[tuple[float, Callable[[], np.ndarray]]]]]:
     """The number of frames by the file's own account, and for each its time, s, and what decodes them.
+
+    The time is NaN where the file has none: the rate that FFmpeg then tells is a guess.
 
     Pixels are (height, width, 3) blue, green, red bytes, as stored: before any rotation for display.
     Damaged frames are passed over.
@@ -59,9 +57,9 @@ def decode_video(
             for item in _decoded(input_, video, report):
                 if not isinstance(item, av.VideoFrame):
                     continue
-                time = float(item.time or 0.0)
+                time = math.nan if item.time is None else float(item.time)
                 if first is None:
-                    first = time
+                    first = 0.0 if math.isnan(time) else time
                     _warn_of_fields(item)
                 yield time - first, functools.partial(item.to_ndarray, format="bgr24")
 
@@ -103,7 +101,8 @@ def undistort_video(
         target: the file to write, all of it or none: .mp4, .mov, .m4v, .mkv, .webm, .avi, .ts.
         lens: the lens; for frames of another size of the same aspect ratio it is scaled.
         focal: one focal length for all frames, or a track, in the lens's unit.
-        keep: "same", "all" or "valid", one framing for all focal lengths of the track; or a `Framing`.
+        keep: "same", "all" or "valid", one framing for all focal lengths of the track; or a `Framing`,
+            which for frames of another size is scaled as the lens is.
         interpolation, border: as for `undistort_image`; a constant border is black.
         encoder: FFmpeg's name of it; by default one for the source's own format, or for H.264.
         options: of the encoder; by default ones for a quality that shows no difference.
@@ -113,7 +112,8 @@ def undistort_video(
         FileNotFoundError: there is no such video.
         OSError: the target cannot be written; nothing is left of it.
         ValueError: the source is no video, or none of its frames decodes; the track is shorter; the lens is
-            for another aspect ratio; or the target's suffix or encoder is unknown, or not for these frames.
+            for another aspect ratio; or the target is the source, or its suffix or the encoder is unknown,
+            or not for these frames.
 
     Warns:
         UserWarning: frames do not decode, or are interlaced; focal lengths are outside of the fitted range;
@@ -125,16 +125,24 @@ def undistort_video(
             f"Argument target must end in one of {', '.join(CONTAINER)}, but it is {target.name!r}."
         )
     check_sampling(interpolation, border)
+    if not isinstance(keep, Framing):
+        check_keep(keep)
+    refuse_inputs([target], [source])
     with _opened(source) as input_, whole_file(target) as part:
         video = input_.streams.best("video")
-        lens = lens_for_size(lens, (video.codec_context.width, video.codec_context.height))
+        size = (video.codec_context.width, video.codec_context.height)
+        lens = lens_for_size(lens, size)
         track = focal if isinstance(focal, FocalTrack) else _constant(float(focal))
         _check_length(track, video)
         lens.check_range(track.focal)
-        framing = keep if isinstance(keep, Framing) else _common_framing(lens, track.focal, keep)
+        if isinstance(keep, Framing):
+            framing = framing_for_size(keep, size)
+        else:
+            framing = _common_framing(lens, track.focal, keep)
         warper = FrameWarper(lens, framing, interpolation=interpolation, border=border)
         report = _Report(video.frames)
-        items = ahead(_warped(ahead(_decoded(input_, video, report)), warper, track, report))
+        numbers = functools.cache(lambda: _numbers(source))
+        items = ahead(_warped(ahead(_decoded(input_, video, report)), warper, track, report, numbers))
         try:
             _write(items, part, target, input_, video, encoder, options, report, progress)
         finally:
@@ -156,6 +164,7 @@ class _Report:
     announced: int
     written: int = 0
     corrupt: int = 0
+    failed: int = 0
     error: str = ""
     orientation: list[int] | None = None
 
@@ -164,16 +173,19 @@ def _opened(source: str | os.PathLike[str]) -> Any:
     path = Path(source)
     if not path.exists():
         raise FileNotFoundError(f"There is no video {path}.")
-    if path.is_file() and path.stat().st_size == 0:
+    if not path.is_file():
+        raise ValueError(f"Cannot read a video from {path}: it is no ordinary file.")
+    if path.stat().st_size == 0:
         raise ValueError(f"Cannot read a video from {path}: the file is empty.")
     try:
-        container: Any = av.open(str(path))
-    except FFmpegError as error:
+        container: Any = av.open(str(path), metadata_errors="surrogateescape")  # tags need not be UTF-8
+    except av.error.FFmpegError as error:
         raise ValueError(
             f"Cannot read a video from {path}: {error.strerror}. The file is damaged, cut off, or no video."
         ) from error
     video = container.streams.best("video")
-    if video is None or not (video.codec_context.width and video.codec_context.height):
+    context = video and video.codec_context  # none of a codec that FFmpeg does not know
+    if not (context and context.width and context.height):
         container.close()
         why = "it has no video stream" if video is None else "none of its frames decodes"
         raise ValueError(f"Cannot read a video from {path}: {why}.")
@@ -183,12 +195,22 @@ def _opened(source: str | os.PathLike[str]) -> Any:
 
 def _counted(source: str | os.PathLike[str]) -> int:
     """How many frames there are, where the file does not tell: by reading, without decoding."""
-    with _opened(source) as input_, contextlib.suppress(FFmpegError):
+    with _opened(source) as input_, contextlib.suppress(av.error.FFmpegError):
         number = 0
         for packet in input_.demux(input_.streams.best("video")):
             number += packet.size > 0
         return number
     return 0
+
+
+def _numbers(source: str | os.PathLike[str]) -> dict[int, int]:
+    """The numbers of all frames by their time stamps, also of those that do not decode: by reading."""
+    stamps = set()
+    with _opened(source) as input_, contextlib.suppress(av.error.FFmpegError):
+        for packet in input_.demux(input_.streams.best("video")):
+            if packet.pts is not None and not packet.is_discard:
+                stamps.add(packet.pts)
+    return {stamp: number for number, stamp in enumerate(sorted(stamps))}
 
 
 def _constant(focal: float) -> FocalTrack:
@@ -234,8 +256,9 @@ def _decoded(input_: Any, video: Any, report: _Report) -> Generator[Any, None, N
                     yield packet
                 continue
             frames = packet.decode()
-        except FFmpegError as error:
+        except av.error.FFmpegError as error:
             report.corrupt += 1
+            report.failed += 1
             report.error = error.strerror or str(error)
             continue
         for frame in frames:
@@ -244,9 +267,16 @@ def _decoded(input_: Any, video: Any, report: _Report) -> Generator[Any, None, N
 
 
 def _warped(
-    items: Generator[Any, None, None], warper: FrameWarper, track: FocalTrack, report: _Report
+    items: Generator[Any, None, None],
+    warper: FrameWarper,
+    track: FocalTrack,
+    report: _Report,
+    numbers: Callable[[], dict[int, int]],
 ) -> Generator[Any, None, None]:
-    """Each frame corrected; packets of audio as they are."""
+    """Each frame corrected; packets of audio as they are.
+
+    Frames are counted; once some did not decode, `numbers` tells the number of a frame by its time stamp.
+    """
     number, first = 0, None
     try:
         for item in items:
@@ -257,7 +287,9 @@ def _warped(
                 first = item.time or 0.0
                 _warn_of_fields(item)
                 report.orientation = display_matrix(item)
-            time = item.time - first if item.time is not None else number / 25
+            time = math.nan if item.time is None else item.time - first
+            if report.failed and not track.by_time and item.pts is not None:
+                number = numbers().get(item.pts, number)
             yield warper(item, track.at(number, time))
             number += 1
     finally:

@@ -1,0 +1,114 @@
+"""Arguments of another kind than a function takes, named in a sentence that says what to pass.
+
+`kinds_checked` reads what a function's annotations say of our own classes, of solvers and of paths, and
+looks at what it is given before anything else does: one place for all functions.
+"""
+
+import functools
+import inspect
+import os
+import types
+import typing
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import equinox as eqx
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+_WANTED = {
+    "AbstractLines": "Lines (see Lines.from_ragged) or compress(lines)",
+    "Lines": "Lines (see Lines.from_ragged)",
+    "CompressedLines": "compressed lines, compress(lines)",
+    "AbstractZoom": "a zoom model such as PolynomialZoom(degree=2)",
+    "AbstractLinearZoom": "a zoom model that is linear in its parameters, such as PolynomialZoom(degree=2)",
+    "AbstractFamily": "a family such as Division()",
+    "ZoomLens": "a ZoomLens, such as fit.lens or load_lens(path)",
+    "Distortion": "a Distortion, such as lens(35.0)",
+    "ZoomFit": "a ZoomFit, what fit_zoom returns",
+    "FrameFits": "what fit_frames returns",
+    "AbstractLeastSquaresSolver": "an optimistix solver such as optimistix.LevenbergMarquardt(1e-9, 1e-9)",
+    "str": "a path",
+}
+"""What to ask for, by the first of the classes that an argument may be of."""
+
+_INSTEAD = {
+    ("ZoomLens", "ZoomFit"): "pass its lens, fit.lens",
+    ("ZoomLens", "CentreFit"): "pass its lens, found.fit.lens",
+    ("ZoomLens", "RobustFit"): "pass its lens, robust.fit.lens",
+    ("ZoomLens", "FocalFit"): "pass its lens, found.fit.lens",
+    ("ZoomLens", "Distortion"): "that is one focal length's; pass the lens that it came from",
+    ("ZoomLens", "str"): "load_lens(path) reads a file",
+    ("ZoomLens", "PosixPath"): "load_lens(path) reads a file",
+    ("Distortion", "ZoomLens"): "pass the distortion at one focal length, lens(35.0)",
+    ("Distortion", "ZoomFit"): "pass the distortion at one focal length, fit.lens(35.0)",
+    ("ZoomFit", "ZoomLens"): "a lens alone has no covariance; pass the fit that it came from",
+    ("ZoomFit", "CentreFit"): "pass its fit, found.fit",
+    ("ZoomFit", "RobustFit"): "pass its fit, robust.fit",
+    ("ZoomFit", "FocalFit"): "pass its fit, found.fit",
+    ("ZoomFit", "FrameFits"): "that is each frame by itself; fit_zoom(lines) fits all together",
+    ("FrameFits", "ZoomFit"): "fit_frames(lines) fits each frame by itself",
+    ("FrameFits", "FrameCentres"): "pass its fits, found.each",
+    ("AbstractLines", "str"): "load_lines(path) reads a file",
+    ("AbstractLines", "PosixPath"): "load_lines(path) reads a file",
+    ("AbstractLines", "ndarray"): "Lines.from_ragged(points, frame, focal, image_size=(w, h)) makes them",
+    ("AbstractLines", "list"): "Lines.from_ragged(points, frame, focal, image_size=(w, h)) makes them",
+    ("Lines", "str"): "load_lines(path) reads a file",
+    ("Lines", "PosixPath"): "load_lines(path) reads a file",
+    ("Lines", "CompressedLines"): "these are compressed already; pass the Lines that they came from",
+    ("Lines", "AnyCentreLines"): "these are compressed already; pass the Lines that they came from",
+    ("CompressedLines", "Lines"): "pass compress(lines)",
+    ("AbstractZoom", "ZoomLens"): "pass its zoom model, lens.zoom",
+    ("AbstractZoom", "ZoomFit"): "pass its zoom model, fit.lens.zoom",
+    ("AbstractZoom", "int"): "PolynomialZoom(degree=...) is one of that degree",
+    ("str", "ZoomLens"): "it is loaded already",
+    ("str", "Lines"): "they are loaded already",
+}
+"""What to pass instead of something that is near to what is wanted."""
+
+
+def check_kind(name: str, value: Any, kinds: tuple[type, ...]) -> None:
+    """Raise TypeError where a value is of none of these kinds."""
+    if isinstance(value, kinds):
+        return
+    first = kinds[0].__name__
+    wanted = _WANTED.get(first) or " or ".join(kind.__name__ for kind in kinds)
+    if isinstance(value, type):
+        what = f"it is the class {value.__name__}"
+        instead = f"pass an instance, {value.__name__}(...)" if issubclass(value, kinds) else None
+    else:
+        what = f"its type is {type(value).__name__}"
+        instead = _INSTEAD.get((first, type(value).__name__))
+    raise TypeError(f"Argument {name} must be {wanted}, but {what}{f': {instead}' if instead else ''}.")
+
+
+def kinds_checked(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """The function, which looks at the kinds of its arguments first."""
+    wanted = {
+        name: (place, kinds, parameter.default)
+        for place, (name, parameter) in enumerate(inspect.signature(function).parameters.items())
+        if (kinds := _kinds(parameter.annotation))
+    }
+    assert wanted, f"{function} takes nothing to check"
+
+    @functools.wraps(function)
+    def checked(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        for name, (place, kinds, default) in wanted.items():
+            value = args[place] if place < len(args) else kwargs.get(name, default)
+            if not isinstance(value, kinds) and value is not inspect.Parameter.empty:
+                check_kind(name, value, kinds)
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def _kinds(annotation: Any) -> tuple[type, ...]:
+    """The classes that an annotation names, if all are modules, None, or what paths are; else none."""
+    union = isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is typing.Union
+    members: tuple[Any, ...] = typing.get_args(annotation) if union else (annotation,)
+    kinds = tuple(typing.get_origin(member) or member for member in members)
+    if not all(isinstance(kind, type) for kind in kinds):
+        return ()
+    telling = {kind for kind in kinds if kind is os.PathLike or issubclass(kind, eqx.Module)}
+    return kinds if telling and set(kinds) - telling <= {str, type(None)} else ()

@@ -1,0 +1,49 @@
+"""One formula for NumPy and JAX: the namespace to take operations from, and ranks made equal."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def namespace(*values: Any) -> Any:
+    """``jax.numpy`` if one of the arguments is a JAX array, traced or not; else ``numpy``."""
+    return jnp if any(isinstance(value, jax.Array) for value in values) else np
+
+
+def as_array(value: Any) -> Any:
+    """Numbers as an array of floating dtype; what is one, or stands for one, as it is."""
+    if isinstance(value, (list, tuple, float, int, np.generic)):
+        value = np.asarray(value)
+    if isinstance(value, (np.ndarray, jax.Array)) and not jnp.issubdtype(value.dtype, jnp.inexact):
+        value = value.astype(float)
+    return value
+
+
+def aligned(*parts: tuple[Any, int]) -> list[Any]:
+    """Arrays with as many leading axes of length 1 as make them broadcast without a change of rank.
+
+    Args:
+        parts: each an array, and how many of its last axes are its own and do not take part.
+    """
+    rank = max(array.ndim - own for array, own in parts)
+    return [
+        namespace(array).reshape(array, (*[1] * (rank + own - array.ndim), *array.shape))
+        for array, own in parts
+    ]
+
+
+def finite(values: Any) -> Any:
+    """Whether each of the values is finite, as an array even of one."""
+    xp = namespace(values)
+    return xp.asarray(xp.isfinite(values))
+
+
+def together(x: Any, y: Any) -> Any:
+    """Points (x, y) from their coordinates.
+
+    Formulas take points apart by ``z[..., 0]`` and put them together by this, and do not multiply ``z`` by
+    ``factor[..., None]``: XLA can then make one loop of it all, and of its gradient by the points.
+    """
+    return namespace(x, y).stack([x, y], axis=-1)

@@ -1,0 +1,169 @@
+"""What fields of modules must be: converters that take lists, and checks of shapes and values.
+
+Constructors run under every transformation, and with stand-ins for arrays: tracers, `ShapeDtypeStruct`,
+None, booleans (of filters), bare objects. Shapes are checked wherever there is one, values only where they
+are known and looking costs nothing: those of NumPy arrays, and of JAX arrays that are small. A module that
+`vmap` made has one more axis in front of all of its arrays, and passes.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+_FEW = 2**16
+"""Elements of a JAX array up to which its values are looked at: more would be waited for."""
+
+Axes = tuple[str | int, ...]
+
+_KINDS = {"real numbers": jnp.floating, "integers": jnp.integer, "booleans": jnp.bool_}
+
+
+def numbers(name: str) -> Callable[[Any], Any]:
+    """A converter for a field of real numbers: lists and integers become arrays of floats."""
+    return _converter(name, "real numbers")
+
+
+def integers(name: str) -> Callable[[Any], Any]:
+    """A converter for a field of integers: lists become arrays."""
+    return _converter(name, "integers")
+
+
+def booleans(name: str) -> Callable[[Any], Any]:
+    """A converter for a field of booleans: lists become arrays."""
+    return _converter(name, "booleans")
+
+
+def _converter(name: str, kind: str) -> Callable[[Any], Any]:
+    def convert(value: Any) -> Any:
+        if value is None or isinstance(value, bool) or type(value) is object:
+            return value
+        array = value
+        if not hasattr(value, "dtype"):
+            array = _array(value) if isinstance(value, int | float | list | tuple) else None
+            if array is None:
+                raise ValueError(f"Argument {name} must hold {kind}, but it is {_shown(value)}.")
+        elif isinstance(value, np.generic):
+            array = np.asarray(value)
+        if jnp.issubdtype(array.dtype, _KINDS[kind]):
+            return array
+        if kind == "real numbers" and jnp.issubdtype(array.dtype, jnp.integer) and hasattr(array, "astype"):
+            return array.astype(jnp.result_type(float))
+        raise ValueError(f"Argument {name} must hold {kind}, but its dtype is {array.dtype}.")
+
+    return convert
+
+
+def _array(value: Any) -> jax.Array | None:
+    """An array of numbers and lists of them; None of anything else."""
+    leaves = jax.tree.leaves(value)
+    if not all(isinstance(leaf, int | float | complex) or hasattr(leaf, "dtype") for leaf in leaves):
+        return None
+    try:
+        return jnp.array(value)
+    except (TypeError, ValueError, OverflowError):  # rows of different lengths
+        return None
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:80]}..., of type {type(value).__name__}"
+
+
+def check_shapes(fields: Mapping[str, tuple[Any, Axes]]) -> None:
+    """Raise ValueError where shapes are not those of the axes: numbers, or names that stand for one each.
+
+    What has no shape is passed over.
+    """
+    shapes = {name: value.shape for name, (value, _) in fields.items() if hasattr(value, "shape")}
+    more = {shape[: max(len(shape) - len(fields[name][1]), 0)] for name, shape in shapes.items()}
+    batch = more.pop() if len(shapes) > 1 and len(more) == 1 else ()
+    sizes: dict[str, int] = {}
+    for name, shape in shapes.items():
+        axes = fields[name][1]
+        own = shape[len(batch) :]
+        fits = len(own) == len(axes)
+        if fits:
+            both = zip(axes, own, strict=True)
+            fits = all(
+                have == (axis if isinstance(axis, int) else sizes.setdefault(axis, have))
+                for axis, have in both
+            )
+        if not fits:
+            wanted = [axis if isinstance(axis, int) else sizes.get(axis, axis) for axis in axes]
+            which = f" = {_tuple(wanted)}" if wanted != list(axes) else ""
+            raise ValueError(
+                f"Argument {name} must have shape {_tuple(axes)}{which}, but its shape is {_tuple(shape)}."
+            )
+
+
+def _tuple(entries: Any) -> str:
+    inner = ", ".join(map(str, entries))
+    return f"({inner},)" if len(entries) == 1 else f"({inner})"
+
+
+def known(value: Any) -> np.ndarray | None:
+    """The values of an array, if they are known and few enough to look at."""
+    if isinstance(value, np.ndarray):
+        return value
+    if isinstance(value, Tracer) or not isinstance(value, jax.Array) or value.size > _FEW:
+        return None
+    return None if value.is_deleted() or not value.is_fully_addressable else np.asarray(value)
+
+
+def check_finite(name: str, value: Any) -> None:
+    """Raise ValueError where values are NaN or infinite."""
+    if (values := known(value)) is not None:
+        _check_each(name, values, np.isfinite(values), "finite")
+
+
+def check_positive(name: str, value: Any) -> None:
+    """Raise ValueError where values are not finite and above zero."""
+    if (values := known(value)) is not None:
+        _check_each(name, values, np.isfinite(values) & (values > 0), "finite and positive")
+
+
+def check_not_negative(name: str, value: Any) -> None:
+    """Raise ValueError where values are not finite or below zero."""
+    if (values := known(value)) is not None:
+        _check_each(name, values, np.isfinite(values) & (values >= 0), "finite and at least 0")
+
+
+def check_increasing(name: str, value: Any) -> None:
+    """Raise ValueError where values are not finite, each above the one before."""
+    check_finite(name, value)
+    if (values := known(value)) is not None and not (np.diff(values, axis=-1) > 0).all():
+        raise ValueError(f"Argument {name} must increase from entry to entry, but it does not.")
+
+
+def check_range(name: str, value: Any) -> None:
+    """Raise ValueError where two values are not finite and in order."""
+    check_finite(name, value)
+    if (values := known(value)) is not None and (values[..., 0] > values[..., 1]).any():
+        raise ValueError(
+            f"Argument {name} must be two numbers in order, the least first, but it is {values.tolist()}."
+        )
+
+
+def check_indices(name: str, value: Any, number: int, of: str) -> None:
+    """Raise ValueError where indices are not from 0 to `number` - 1."""
+    values = known(value)
+    if values is None or ((values >= 0) & (values < number)).all():
+        return
+    place = int(np.argmax((values < 0) | (values >= number)))
+    raise ValueError(
+        f"Argument {name} must hold indices from 0 to {number - 1}, {of}, but {name}[{place}] is "
+        f"{values.ravel()[place]}."
+    )
+
+
+def _check_each(name: str, values: np.ndarray, good: Any, wanted: str) -> None:
+    good = np.asarray(good)
+    if good.all():
+        return
+    place = np.unravel_index(int(np.argmin(good)), good.shape)
+    where = f"{name}[{', '.join(map(str, place))}]" if place else "it"
+    raise ValueError(f"Argument {name} must be {wanted}, but {where} is {values[place]}.")

@@ -1,0 +1,37 @@
+"""Names of files as text: what somebody else chose, shown and used without harm."""
+
+import re
+import unicodedata
+
+_LONGEST = 80
+
+
+def plain(text: str) -> str:
+    """Text on one line in which nothing is an order to a terminal or a browser.
+
+    Control characters (escape sequences, line breaks), those that turn the direction of writing, and
+    bytes that are no text are shown as in Python: ``\\x1b``.
+    """
+    return "".join(c if _is_harmless(c) else c.encode("unicode_escape").decode() for c in text)
+
+
+def _is_harmless(character: str) -> bool:
+    # Cc control, Cf direction, joiners and marks, Cs halves of pairs, Zl and Zp breaks of lines
+    return (
+        unicodedata.category(character) not in {"Cc", "Cf", "Cs", "Zl", "Zp"} or character in "\u200c\u200d"
+    )
+
+
+def numbered_name(number: int, name: str, suffix: str) -> str:
+    """A file's name for what is made of the image `name`: with its number, so that no two are the same.
+
+    Of the image's name remain letters, digits and ``._+-``, the last 80 at most; no folder. It is good on
+    every system: the number keeps it from being a device's.
+    """
+    last = re.split(r"[/\\]", name)[-1].rpartition(".")
+    text = unicodedata.normalize("NFC", last[0] or last[2])
+    kept = "".join(c if c in "._+-" or unicodedata.category(c)[0] in "LMN" else "_" for c in text)
+    readable = re.sub("_+", "_", kept).strip("._-")
+    while len(readable.encode()) > _LONGEST:
+        readable = readable[1:]
+    return f"{number:04d}-{readable or 'image'}{suffix}"

@@ -1,0 +1,78 @@
+"""Run in a process of its own by `test_compression`: lines spread over four devices of the CPU."""
+
+import re
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+import zoomjax as zj
+from zoomjax.any_centre import _monomials
+from zoomjax.compression import _columns, _reduce_shards, _sharding_of_lines
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+FRAMES = 4
+K = jnp.asarray(0.1 * np.random.default_rng(1).standard_normal((FRAMES, 2)))
+
+
+def scene() -> zj.Lines:
+    rng = np.random.default_rng(0)
+    x = np.linspace(9, 600, 300)
+    points = [np.stack([x, y + rng.standard_normal(300)], axis=-1) for y in np.linspace(5, 470, 40)]
+    return zj.Lines.from_ragged(
+        points, np.arange(40) % FRAMES, [24.0, 35.0, 50.0, 70.0], image_size=(640, 480)
+    )
+
+
+def exchanged(compiled) -> dict[str, int]:
+    """How many numbers each kind of collective of a compiled program exchanges."""
+    found: dict[str, int] = {}
+    for shape, kind in re.findall(
+        r"= \(?\w+\[([\d,]*)\]\S* (all-\w+|collective-\w+|reduce-scatter)", compiled.compiled.as_text()
+    ):
+        number = int(np.prod([int(side) for side in shape.split(",") if side], initial=1))
+        found[kind] = max(found.get(kind, 0), number)
+    return found
+
+
+def main() -> None:
+    assert len(jax.devices()) == 4
+    lines = scene()
+    over = NamedSharding(Mesh(np.array(jax.devices()), ("line",)), PartitionSpec("line"))
+    every = tuple(jax.device_put(getattr(lines, name), over) for name in ("points", "mask", "frame"))
+    layouts = {
+        "points alone": eqx.tree_at(lambda data: data.points, lines, every[0]),
+        "all": eqx.tree_at(lambda data: (data.points, data.mask, data.frame), lines, every),
+    }
+    plain = zj.compress(lines)
+    any_centre = zj.compress_any_centre(lines)
+    for data in layouts.values():
+        small = zj.compress(data)
+        assert small.triangle.sharding.is_equivalent_to(over, 3)
+        np.testing.assert_array_equal(small.triangle, plain.triangle)
+        of_any = zj.compress_any_centre(data).triangle
+        assert of_any.sharding.is_equivalent_to(over, 3)
+        np.testing.assert_array_equal(of_any, any_centre.triangle)
+
+        sharding = _sharding_of_lines(data)
+        for columns in (_columns, _monomials):
+            program = _reduce_shards.lower(
+                data.points, jax.device_put(data.mask, over), data.centre, data.scale, columns, 2, sharding
+            ).compile()
+            assert exchanged(program) == {}, exchanged(program)
+
+        for measured in (data, small):
+            for function in (zj.frame_energy, zj.global_energy):
+                np.testing.assert_allclose(function(measured, K), function(lines, K), rtol=1e-12)
+                sums = exchanged(eqx.filter_jit(function).lower(measured, K).compile())
+                assert set(sums) == {"all-reduce"}, sums
+                assert sums["all-reduce"] <= FRAMES, sums
+    print("as on one device")
+
+
+if __name__ == "__main__":
+    main()
