@@ -9,7 +9,7 @@ being invertible. Radial families have ``z L(t)``, ``t = z.z``, and state L; all
 
 The radius maps as ``r -> r L(r^2)``, and the *limit* is where that first stops growing; beyond it the image
 folds over and no inverse exists. Inverses are iterated until their residual is one of rounding, or are
-NaN, and are differentiated by the implicit function theorem. A new family is a final class of
+NaN; `radial` differentiates them. A new family is a final class of
 `AbstractRadial` or `AbstractFamily`; fits, certificates, files and images go through these methods alone.
 
 Formulas are written for one point, with coefficients ``k[0], k[1], ...``, in operations that NumPy and JAX
@@ -21,13 +21,12 @@ import abc
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ._arrays import namespace, together
-from ._roots import first_positive_root, increasing_root, until
+from ._roots import first_positive_root, first_quadratic_root, increasing_root, newton_root, until
 from ._types import AnyArray, Elements
 
 _DIRECTIONS = 8
@@ -63,6 +62,11 @@ def _times(factors: np.ndarray, k: Elements) -> Elements:
 def _first_root(rows: np.ndarray, k: Elements) -> Float[AnyArray, "..."]:
     """The first positive root of ``1 + sum_i rows[j, i] k_i x^i``, i from 1, over all rows j."""
     xp = namespace(k)
+    if len(k) <= 2:  # element by element: XLA makes no copies
+        first = first_quadratic_root(*_times(rows[0], k))
+        for row in rows[1:]:
+            first = xp.minimum(first, first_quadratic_root(*_times(row, k)))
+        return first
     polynomials = xp.stack([xp.concatenate([xp.ones_like(k[:1]), _times(row, k)]) for row in rows])
     return first_positive_root(xp.moveaxis(polynomials, (0, 1), (-2, -1)))
 
@@ -95,7 +99,17 @@ class AbstractFamily(eqx.Module):
     def distort(
         self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
     ) -> Float[AnyArray, "... 2"]:
-        """The point within the limit that is corrected to z; NaN where there is none. See `inverse`."""
+        """The point within the limit that is corrected to z; NaN where there is none."""
+
+    def quick_distort(
+        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
+    ) -> tuple[Float[AnyArray, "... 2"], Bool[AnyArray, "..."]] | None:
+        """The same by a few steps that need not arrive, and where they did; None if there is no such way.
+
+        Where all points arrive, which is nearly always, `distort` is not called.
+        """
+        del z, k, limit
+        return None
 
     @abc.abstractmethod
     def conditions(self, size: int) -> np.ndarray:
@@ -170,6 +184,18 @@ class AbstractRadial(AbstractFamily):
 
         It solves ``q L(t q^2) = 1``, which needs no root of the squared radius and is regular at 0.
         """
+        exists, squared, equation, within = self._ratios(squared, k, limit)
+        xp = namespace(squared, k)
+
+        def high():
+            off_centre = squared > 0
+            return xp.where(off_centre, limit / xp.sqrt(xp.where(off_centre, squared, 1)), np.inf)
+
+        q, found = increasing_root(equation, xp.ones_like(squared), high, within)
+        return q, exists & found
+
+    def _ratios(self, squared, k, limit):
+        """Where there is a ratio, the squared radii there, its equation, and whether it is in the limit."""
         xp = namespace(squared, k)
         eps = np.finfo(squared.dtype).eps
         reach = self.reach(k, limit)
@@ -181,22 +207,21 @@ class AbstractRadial(AbstractFamily):
         def equation(q):
             return self.equation(q, squared * q * q, 1, k)
 
-        def high():
-            off_centre = squared > 0
-            return xp.where(off_centre, limit / xp.sqrt(xp.where(off_centre, squared, 1)), np.inf)
-
-        q, found = increasing_root(
-            equation, xp.ones_like(squared), high, lambda q: squared * q * q <= farthest
-        )
-        return q, exists & found
+        return exists, squared, equation, lambda q: squared * q * q <= farthest
 
     def distort(
         self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
     ) -> Float[AnyArray, "... 2"]:
         """By the `ratio` of the radii."""
-        q, found = self.ratio(_square(z), k, limit)
-        q = namespace(z, k).where(found, q, np.nan)
-        return together(z[..., 0] * q, z[..., 1] * q)
+        return _scaled(z, *self.ratio(_square(z), k, limit))
+
+    def quick_distort(
+        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
+    ) -> tuple[Float[AnyArray, "... 2"], Bool[AnyArray, "..."]]:
+        """By Newton's steps alone."""
+        exists, squared, equation, within = self._ratios(_square(z), k, limit)
+        q, arrived = newton_root(equation, namespace(squared, k).ones_like(squared), within)
+        return _scaled(z, q, exists & arrived), arrived
 
 
 class RadialPolynomial(AbstractRadial):
@@ -454,44 +479,7 @@ def _square(z: Float[AnyArray, "... 2"]) -> Float[AnyArray, "..."]:
     return z[..., 0] * z[..., 0] + z[..., 1] * z[..., 1]
 
 
-@jax.custom_jvp
-def inverse(
-    family: AbstractFamily,
-    z: Float[AnyArray, "... 2"],
-    k: Elements,
-    limit: Float[AnyArray, "..."],
-) -> Float[AnyArray, "... 2"]:
-    """`AbstractFamily.distort`, differentiable: by the implicit function theorem, whatever its iterations.
-
-    Where there is no inverse the result is NaN and its derivatives are zero: then
-    ``where(has_inverse, distort, 0)`` has derivatives. At the fold itself they would be infinite, and are
-    1/eps of the dtype at most.
-    """
-    return family.distort(z, k, limit)
-
-
-@inverse.defjvp
-def _inverse_jvp(primals, tangents):
-    family, z, k, limit = primals
-    _, z_dot, k_dot, _ = tangents
-    w = inverse(family, z, k, limit)
-    exists = jnp.isfinite(w[..., 0])
-    at = together(*(jnp.where(exists, w[..., i], 0) for i in (0, 1)))
-    one, zero = jnp.ones_like(w[..., 0]), jnp.zeros_like(w[..., 0])
-
-    def correct(w):
-        return family.correct(w, _square(w), k)
-
-    # F(w, k) = z along the solution: dF/dw dw = dz - dF/dk dk.
-    _, by_k = jax.jvp(lambda k: family.correct(at, _square(at), k), (k,), (k_dot,))
-    (ax, ay), (bx, by), (rx, ry) = (
-        (part[..., 0], part[..., 1])
-        for part in (
-            jax.jvp(correct, (at,), (together(one, zero),))[1],
-            jax.jvp(correct, (at,), (together(zero, one),))[1],
-            z_dot - by_k,
-        )
-    )
-    determinant = ax * by - ay * bx
-    weight = jnp.where(exists, 1 / jnp.maximum(determinant, jnp.finfo(w.dtype).eps), 0)
-    return w, together(weight * (by * rx - bx * ry), weight * (ax * ry - ay * rx))
+def _scaled(z, q, found):
+    """``q z``, NaN where nothing was found."""
+    q = namespace(z, q).where(found, q, np.nan)
+    return together(z[..., 0] * q, z[..., 1] * q)

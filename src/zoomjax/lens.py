@@ -22,7 +22,7 @@ from ._types import AnyArray, FocalLike, Point, Points, traced
 from .families import AbstractFamily, RadialPolynomial
 from .lines import AbstractLines
 from .models import array_of, coefficients_shape, described, family_name, family_named, zoom_from
-from .radial import Distortion, as_points, mapped
+from .radial import Distortion, as_points, compiled, mapped
 from .zoom import AbstractFocusZoom, AbstractLinearZoom, AbstractZoom
 
 _FORMAT, _VERSION = "zoomjax.lens", 2
@@ -122,7 +122,7 @@ class ZoomLens(eqx.Module):
         """
         focal = self._checked(focal, stacklevel=4)
         if traced((self, focal, focus)):
-            return self._distortion(focal, focus)
+            return self._distortion(focal, focus, within=traced((self, focal)))
         with jax.ensure_compile_time_eval():  # what is known stays known inside of ``jit``
             return self._distortion(focal, focus)
 
@@ -167,10 +167,12 @@ class ZoomLens(eqx.Module):
         if isinstance(points, np.ndarray) and not traced((self, focal, focus)):
             d = self._distortion(focal, focus)
             return mapped(method, d.family, points, d.coefficients, d.centre, d.scale)
-        return _compiled(self, method, jnp.asarray(points), focal, focus)
+        points = jnp.asarray(points)
+        operands = (self, jnp.asarray(focal, points.dtype), focus, traced((self, focal)))
+        return compiled(method, _bent, points, operands)
 
     def _checked(self, focal, stacklevel):
-        """Focal lengths as an array: looked at where they are known, NaN outside of the range elsewhere."""
+        """Focal lengths as an array, looked at where they are known."""
         if not isinstance(focal, jax.Array):
             try:
                 focal = np.asarray(focal, float)
@@ -179,17 +181,19 @@ class ZoomLens(eqx.Module):
                     f"Argument focal must be a number or an array, but it is {focal!r}."
                 ) from error
         self.check_range(focal, stacklevel=stacklevel)
-        if not traced((self, focal)):
-            return focal
-        low, high = jnp.moveaxis(jnp.asarray(self.focal_range), -1, 0)
-        within = (focal > 0) & (focal >= low * (1 - _SLACK)) & (focal <= high * (1 + _SLACK))
-        return jnp.where(within, focal, jnp.nan)
+        return focal
 
-    def _distortion(self, focal, focus):
-        """The distortion, whatever the range."""
+    def _distortion(self, focal, focus, within=False):
+        """The distortion; NaN outside of the range, if it is to be `within`, else extrapolated."""
         dtype = jnp.asarray(self.centre).dtype
-        centre = jnp.asarray(self.centre)
+        centre, focal = jnp.asarray(self.centre), jnp.asarray(focal, dtype)
+        low, high = jnp.moveaxis(jnp.asarray(self.focal_range, dtype), -1, 0)
+        inside = (focal > 0) & (focal >= low * (1 - _SLACK)) & (focal <= high * (1 + _SLACK))
+        if within:  # at a focal length that is: a NaN in `focal` would be one in all derivatives
+            focal = jnp.where(inside, focal, high)
         k = _at(self.zoom, focal, focus, dtype)
+        if within:
+            k = jnp.where(inside[..., None], k, jnp.nan)
         if self.shift is not None:
             centre, moved = aligned((centre, 1), (_at(self.shift, focal, None, dtype), 1))
             centre = centre + self.scale * moved
@@ -283,10 +287,10 @@ def _at(zoom, focal, focus, dtype):
     return function(*arguments)
 
 
-@eqx.filter_jit
-def _compiled(lens, method, points, focal, focus):
-    d = lens._distortion(jnp.asarray(focal, points.dtype), focus)
-    return mapped(method, d.family, points, d.coefficients, d.centre, d.scale)
+def _bent(operands):
+    lens, focal, focus, within = operands
+    d = lens._distortion(focal, focus, within)
+    return d.family, d.coefficients, d.centre, d.scale
 
 
 def _coefficients(zoom: AbstractZoom | None) -> int | None:

@@ -7,18 +7,20 @@ With ``z = (x - c)/s`` the corrected point is ``c + s F(z)``: F is the family's 
 Here are lengths in px, arrays of points and dtypes; formulas and inverses are there.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from ._arguments import check_kind
 from ._arrays import aligned, as_array, finite, namespace, together
 from ._types import AnyArray, Points, traced
-from .families import AbstractFamily, RadialPolynomial, inverse
+from .families import AbstractFamily, RadialPolynomial
 
 
 class Distortion(eqx.Module):
@@ -145,27 +147,132 @@ def mapped(method: str, family: AbstractFamily, points: Any, k: Any, centre: Any
         with np.errstate(all="ignore"):  # NaN and inf are answers
             # With one more axis, as NumPy makes plain numbers of arrays without any.
             leaves = ((points, 1), (np.asarray(k), 1), (np.asarray(centre), 1), (np.asarray(scale), 0))
-            return _mapped(method, family, *(leaf[None] for leaf in aligned(*leaves)))[0]
-    return _compiled(method, family, jnp.asarray(points), k, centre, scale)
+            points, k, centre, scale = (leaf[None] for leaf in aligned(*leaves))
+            if method == "undistort":
+                return _undistorted(points, family, k, centre, scale)[0]
+            z, k, centre, scale = _normalised(points, k, centre, scale)
+            return _in_pixels(family.distort(z, k, _limit_of(family, k)), centre, scale)[0]
+    return compiled(method, _given, jnp.asarray(points), (family, k, centre, scale))
 
 
-def _mapped(method, family, points, k, centre, scale):
+@eqx.filter_jit
+def compiled(
+    method: str, distortion_of: Callable[[Any], Any], points: Float[Array, "... 2"], operands: Any
+) -> Float[Array, "... 2"]:
+    """``undistort`` or ``distort`` in JAX, of what a function says that the distortion is.
+
+    Args:
+        method: which of them.
+        distortion_of: the family, coefficients, centre and scale that the operands make. `distort` calls it
+            again where Newton's steps do not arrive: coefficients of each point are then not kept in memory
+            for the branch that is nearly never taken.
+        points: px.
+        operands: a pytree.
+    """
+    if method == "undistort":
+        return _undistorted(points, *distortion_of(operands))
+    arrays, rest = eqx.partition(operands, eqx.is_array)
+    return _distorted(lambda arrays: distortion_of(eqx.combine(arrays, rest)), points, arrays)
+
+
+def _given(operands):
+    family, *numbers = operands
+    return family, *map(jnp.asarray, numbers)
+
+
+def _normalised(points, k, centre, scale):
+    """Normalised points, coefficients (first axis), centre and scale; with axes that broadcast."""
     leaves = ((points, 1), (k, 1), (centre, 1), (scale, 0))
     points, k, centre, scale = aligned(*((leaf.astype(points.dtype), own) for leaf, own in leaves))
     xp = namespace(k)
     # JAX's know of symbolic shapes, for `jax.export`; and NumPy's do not wait for JAX.
     broadcast_shapes = (jnp if xp is jnp else np).broadcast_shapes
-    first = xp.moveaxis(k, -1, 0)
     shape = broadcast_shapes(points.shape[:-1], k.shape[:-1], centre.shape[:-1], scale.shape)
     x, y = (xp.broadcast_to((points[..., i] - centre[..., i]) / scale, shape) for i in (0, 1))
-    function = _undistort if method == "undistort" else _distort
-    x, y = function(family, together(x, y), first, _limit_of(family, first))
-    return together(centre[..., 0] + scale * x, centre[..., 1] + scale * y)
+    return together(x, y), xp.moveaxis(k, -1, 0), centre, scale
 
 
-@eqx.filter_jit
-def _compiled(method, family, points, k, centre, scale):
-    return _mapped(method, family, points, *(jnp.asarray(leaf) for leaf in (k, centre, scale)))
+def _in_pixels(z, centre, scale):
+    return together(centre[..., 0] + scale * z[..., 0], centre[..., 1] + scale * z[..., 1])
+
+
+def _undistorted(points, family, k, centre, scale):
+    """Corrected points; NaN beyond the limit."""
+    z, k, centre, scale = _normalised(points, k, centre, scale)
+    xp, limit = namespace(z), _limit_of(family, k)
+    squared = z[..., 0] * z[..., 0] + z[..., 1] * z[..., 1]
+    # A few last digits beyond it are the same radius: what `distort` puts at the fold rounds to there.
+    within = squared <= (limit * (1 + 4 * np.finfo(z.dtype).eps)) ** 2
+    corrected = family.correct(z, squared, k)
+    x, y = corrected[..., 0], corrected[..., 1]
+    # An invertible correction is monotone, and never goes to the other side; at a pole rounding does.
+    within = within & (z[..., 0] * x + z[..., 1] * y >= 0)
+    return _in_pixels(together(xp.where(within, x, np.nan), xp.where(within, y, np.nan)), centre, scale)
+
+
+def _by_formula(points, family, k, centre, scale):
+    """Corrected points, also beyond the limit."""
+    z, k, centre, scale = _normalised(points, k, centre, scale)
+    squared = z[..., 0] * z[..., 0] + z[..., 1] * z[..., 1]
+    return _in_pixels(family.correct(z, squared, k), centre, scale)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _distorted(distortion_of, points, operands):
+    """Distorted points; NaN, with derivatives of zero, where there is no inverse.
+
+    So ``where(has_inverse, distort, 0)`` has derivatives. At the fold itself they would be infinite, and
+    are 1/eps of the dtype at most.
+    """
+
+    def certain():
+        family, k, centre, scale = distortion_of(operands)
+        z, k, centre, scale = _normalised(points, k, centre, scale)
+        return _in_pixels(family.distort(z, k, _limit_of(family, k)), centre, scale)
+
+    family, k, centre, scale = distortion_of(operands)
+    z, k, centre, scale = _normalised(points, k, centre, scale)
+    quick = family.quick_distort(z, k, _limit_of(family, k))
+    if quick is None:
+        return certain()
+    distorted, arrived = quick
+    distorted = _in_pixels(distorted, centre, scale)
+    # A branch, not a loop that is left at once: the state of a loop would be written to memory. Under vmap
+    # both branches are taken, and the loops in the other one end at once where all have arrived.
+    return jax.lax.cond(jnp.all(arrived), lambda: distorted, certain)
+
+
+@_distorted.defjvp
+def _distorted_jvp(distortion_of, primals, tangents):
+    """By the implicit function theorem, whatever the iterations: G(w, a) = p, for the formula G in px."""
+    (points, operands), (points_dot, operands_dot) = primals, tangents
+    w = _distorted(distortion_of, points, operands)
+    exists = jnp.isfinite(w[..., 0])
+    _, _, centre, _ = distortion_of(operands)
+    centre, _ = aligned((jax.lax.stop_gradient(centre).astype(w.dtype), 1), (w, 1))
+    at = together(*(jnp.where(exists, w[..., i], centre[..., i]) for i in (0, 1)))
+    one, zero = jnp.ones_like(w[..., 0]), jnp.zeros_like(w[..., 0])
+
+    def formula(at, operands):
+        family, k, centre, scale = distortion_of(operands)
+        return _by_formula(at, family, jnp.where(jnp.isfinite(k), k, 0), centre, scale)
+
+    def moved(direction):
+        return jax.jvp(lambda at: formula(at, operands), (at,), (direction,))[1]
+
+    # dG/dw dw = dp - dG/da da.
+    _, by_operands = jax.jvp(lambda operands: formula(at, operands), (operands,), (operands_dot,))
+    (ax, ay), (bx, by), (rx, ry) = (
+        (part[..., 0], part[..., 1])
+        for part in (
+            moved(together(one, zero)),
+            moved(together(zero, one)),
+            jnp.broadcast_to(points_dot, w.shape) - by_operands,
+        )
+    )
+    determinant = ax * by - ay * bx
+    weight = jnp.where(exists, 1 / jnp.maximum(determinant, jnp.finfo(w.dtype).eps), 0)
+    return w, together(weight * (by * rx - bx * ry), weight * (ax * ry - ay * rx))
 
 
 def _limit_of(family, k):
@@ -178,23 +285,6 @@ def _limit(family, k):
         with np.errstate(all="ignore"):
             return _limit_of(family, np.moveaxis(k[None], -1, 0))[0]
     return _limit_of(family, jnp.moveaxis(k, -1, 0))
-
-
-def _undistort(family, z, k, limit):
-    xp = namespace(z, k)
-    squared = z[..., 0] * z[..., 0] + z[..., 1] * z[..., 1]
-    # A few last digits beyond it are the same radius: what `distort` puts at the fold rounds to there.
-    within = squared <= (limit * (1 + 4 * np.finfo(z.dtype).eps)) ** 2
-    corrected = family.correct(z, squared, k)
-    x, y = corrected[..., 0], corrected[..., 1]
-    # An invertible correction is monotone, and never goes to the other side; at a pole rounding does.
-    within = within & (z[..., 0] * x + z[..., 1] * y >= 0)
-    return xp.where(within, x, np.nan), xp.where(within, y, np.nan)
-
-
-def _distort(family, z, k, limit):
-    distorted = inverse(family, z, k, limit) if isinstance(z, jax.Array) else family.distort(z, k, limit)
-    return distorted[..., 0], distorted[..., 1]
 
 
 def _check(coefficients, centre, scale, family):
