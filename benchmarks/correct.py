@@ -30,10 +30,10 @@ import numpy as np
 
 import zoomjax as zj
 from shared import RESULTS, machine, write
-from zoomjax.positions import OUTSIDE
-from zoomjax.vision.ahead import ahead
-from zoomjax.vision.undistort import position_map
-from zoomjax.vision.video import undistort_video
+from zoomjax.correct._prefetch import ahead
+from zoomjax.correct.image import position_map
+from zoomjax.correct.maps import OUTSIDE
+from zoomjax.correct.video import undistort_video
 
 HD, PHOTO = (1920, 1080), (4000, 3000)
 FLAGS = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}

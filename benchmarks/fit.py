@@ -28,7 +28,7 @@ import scipy.optimize
 
 import zoomjax as zj
 from shared import RESULTS, machine, write
-from zoomjax import synthetic
+from zoomjax import scenes
 
 
 def seconds(function: Callable, *arguments, repeats: int = 7) -> float:
@@ -57,7 +57,7 @@ def memory_pass(points):
 
 def corner_error(zoom, truth: zj.ZoomLens) -> float:
     """Largest error of the displacement at a corner over the focal range, px."""
-    focal = jnp.asarray(synthetic.focal_sweep())
+    focal = jnp.asarray(scenes.focal_sweep())
     radius = jnp.hypot(*truth.centre) / truth.scale
     powers = radius ** jnp.asarray([3, 5])
     difference = jax.vmap(zoom)(focal) - jax.vmap(truth.zoom)(focal)
@@ -120,7 +120,7 @@ def growth(truth: zj.ZoomLens, base: zj.Lines) -> list[dict]:
     """Time against the number of points: three scenes, and ten chunks of the base merged one by one."""
     rows = []
     for spacing in (100.0, 10.0):
-        lines = synthetic.board_lines(truth, synthetic.focal_sweep(), spacing=spacing, noise=0.5)
+        lines = scenes.board_lines(truth, scenes.focal_sweep(), spacing=spacing, noise=0.5)
         rows.append(growth_row(lines))
     rows.append(growth_row(base))
 
@@ -163,14 +163,12 @@ def growth_row(lines: zj.Lines) -> dict:
 
 def run(spacing: float) -> dict:
     """All measurements."""
-    truth = synthetic.nikkor_18_200()
+    truth = scenes.nikkor_18_200()
     process = psutil.Process()
-    tiny = synthetic.board_lines(truth, synthetic.focal_sweep(4), spacing=400, noise=0.5)
+    tiny = scenes.board_lines(truth, scenes.focal_sweep(4), spacing=400, noise=0.5)
     jax.block_until_ready(zj.compress(tiny).triangle)  # JAX itself is in the baseline
     before = process.memory_info().rss
-    made, making = once(
-        lambda: synthetic.board_lines(truth, synthetic.focal_sweep(), spacing=spacing, noise=0.5)
-    )
+    made, making = once(lambda: scenes.board_lines(truth, scenes.focal_sweep(), spacing=spacing, noise=0.5))
     points = int(jnp.sum(made.mask))
     tensor = made.points.nbytes
     print(f"{points:,} points on {len(made.frame):,} lines, {tensor / 1e6:.0f} MB, made in {making:.0f} s")

@@ -26,12 +26,12 @@ import numpy as np
 from PIL import Image
 
 import zoomjax as zj
-from zoomjax import synthetic
+from zoomjax import scenes
+from zoomjax.detect._workers import LostError, Workers
+from zoomjax.detect.sources import Source, video_frames
 from zoomjax.io.exif import exif_focal, exif_with_focal
 from zoomjax.io.focal_table import read_focal_table
-from zoomjax.vision.images import Source, video_frames
-from zoomjax.vision.photos import read_photo
-from zoomjax.vision.workers import LostError, Workers
+from zoomjax.io.photo import read_photo
 
 TOKENS = (
     *(b",", b";", b"\n", b"\r", b'"', b"\x00", b"nan", b"inf", b"-1", b"1e400", b"9" * 400, b"[", b"{"),
@@ -208,7 +208,7 @@ def lines_values(lines: zj.Lines) -> bytes:
 
 def every_model() -> list[zj.ZoomLens]:
     """A lens of each zoom model that has a file format."""
-    lens, focal = synthetic.nikkor_18_200((640, 427)), np.linspace(20.0, 120.0, 7)
+    lens, focal = scenes.nikkor_18_200((640, 427)), np.linspace(20.0, 120.0, 7)
     made = []
     for zoom in (
         zj.PolynomialZoom(),

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from shared import RESULTS, machine, machine_line, table, write
-from zoomjax import Distortion, synthetic
-from zoomjax._types import AnyArray
+from zoomjax import Distortion, scenes
+from zoomjax._core.types import AnyArray
 
 _NEWTON_STEPS = 4
 
@@ -63,7 +63,7 @@ def paired(functions: dict, repeats: int) -> dict[str, float]:
 def measure(dtype: type, number: int, repeats: int) -> dict[str, float]:
     """Times, s, and errors, px."""
     rng = np.random.default_rng(0)
-    lens = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), synthetic.nikkor_18_200())
+    lens = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), scenes.nikkor_18_200())
     size = np.array(lens.image_size) - 1
     points = jnp.asarray(rng.uniform(0, 1, (number, 2)) * size, dtype)
     low, high = (float(end) for end in lens.focal_range)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import zoomjax as zj
-from zoomjax.energy import line_rms, residuals
+from zoomjax.fit.energy import line_rms, residuals
 
 Counts = dict[str, int]
 

@@ -30,8 +30,8 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from zoomjax import synthetic
-from zoomjax._results import LIST
+from zoomjax import scenes
+from zoomjax.app.results_folder import LIST
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 PATIENCE = 60.0  # s
@@ -40,7 +40,7 @@ _MAIN = [
     sys.executable,
     "-c",
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # as in a terminal
-    "from zoomjax.cli import main; main()",
+    "from zoomjax.app.cli import main; main()",
 ]
 _ENDS = {".json": b"}\n", ".html": b"</html>\n", ".jpg": b"\xff\xd9", ".png": b"IEND\xaeB`\x82"}
 
@@ -85,13 +85,13 @@ def commands(folder: Path, names: tuple[str, ...]) -> list[Command]:
     made = []
     for name in names:
         (own := folder / name).mkdir()
-        lens = synthetic.nikkor_18_200()
+        lens = scenes.nikkor_18_200()
         if name == "lines":
-            lines = synthetic.board_lines(lens, synthetic.focal_sweep(5), spacing=60, noise=0.3)
+            lines = scenes.board_lines(lens, scenes.focal_sweep(5), spacing=60, noise=0.3)
             lines.save(own / "lines.npz")
             arguments = ["calibrate", "lines.npz", "-o", "out"]
         else:
-            from zoomjax.vision.demo import write_photos
+            from zoomjax.app.demo import write_photos
 
             write_photos(own / "photos", number=3, image_size=(536, 356))
             arguments = ["calibrate", "photos", "-o", "out", "--degree", "1", "--jobs", "2", "--no-cache"]

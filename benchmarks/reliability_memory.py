@@ -21,8 +21,8 @@ import psutil
 
 import zoomjax as zj
 from mutations import READERS, damaged
-from zoomjax.vision.detection import detect
-from zoomjax.vision.images import Source, find_photos, video_frames
+from zoomjax.detect.batch import detect
+from zoomjax.detect.sources import Source, find_photos, video_frames
 
 _SIZE = (192, 128)
 

@@ -23,9 +23,10 @@ import numpy as np
 
 import zoomjax as zj
 from shared import RESULTS, machine, machine_line, table, write
-from zoomjax import synthetic
-from zoomjax.held_out import HoldOut, folds_of, held_out_frames, held_out_zoom
-from zoomjax.selection import compare, default_candidates
+from zoomjax import scenes
+from zoomjax.trust.cross_validation import held_out_frames, held_out_zoom
+from zoomjax.trust.folds import HoldOut, folds_of
+from zoomjax.trust.selection import compare, default_candidates
 
 SIZE = (1072, 712)
 CANDIDATES = default_candidates()[:12]
@@ -43,7 +44,7 @@ def seconds(function) -> dict[str, float]:
 
 def times() -> dict:
     """Of the paper's scene: 50 frames, each left out by itself."""
-    lines = synthetic.board_lines(synthetic.nikkor_18_200(), synthetic.focal_sweep(), spacing=40, noise=0.5)
+    lines = scenes.board_lines(scenes.nikkor_18_200(), scenes.focal_sweep(), spacing=40, noise=0.5)
     small = zj.compress(lines, terms=3)
     parts = folds_of(small, "frame", None, 0)
     runs = [seconds(lambda: compare(small, CANDIDATES, parts)) for _ in range(3)]
@@ -59,7 +60,7 @@ def times() -> dict:
 
 def truth(degree: int) -> zj.ZoomLens:
     """A lens of that degree: the paper's published one for 2."""
-    lens = synthetic.nikkor_18_200(SIZE)
+    lens = scenes.nikkor_18_200(SIZE)
     own = np.zeros((4, 2))
     own[:3] = lens.zoom.parameters
     own = {1: own * [[1], [1], [0], [0]], 2: own, 3: own + CUBIC}[degree]
@@ -71,10 +72,10 @@ def truth(degree: int) -> zj.ZoomLens:
 
 def choices(degree: int, hold_out: HoldOut, draws: int) -> dict:
     """What is chosen, and how straight it makes what was left out, over new noise."""
-    scene = synthetic.board_lines(truth(degree), synthetic.focal_sweep(10), spacing=24)
+    scene = scenes.board_lines(truth(degree), scenes.focal_sweep(10), spacing=24)
     chosen, best, ratio = Counter(), Counter(), []
     for draw in range(draws):
-        noisy = synthetic.with_noise(scene, jax.random.key(draw), std=0.2)
+        noisy = scenes.with_noise(scene, jax.random.key(draw), std=0.2)
         small = zj.compress(noisy, terms=3)
         verdicts, first, choice = compare(small, CANDIDATES, folds_of(small, hold_out, None, 0))
         chosen[choice.name] += 1

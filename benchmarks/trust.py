@@ -27,10 +27,9 @@ import psutil
 from jax.flatten_util import ravel_pytree
 
 import zoomjax as zj
-from zoomjax import synthetic
-from zoomjax.energy import line_weights
-from zoomjax.fit import linearised
-from zoomjax.uncertainty import parameter_covariance
+from zoomjax import scenes
+from zoomjax.fit.covariance import parameter_covariance
+from zoomjax.fit.energy import line_weights, linearised
 
 RESULTS = Path(__file__).parent / "results"
 SIZE = (1072, 712)
@@ -61,7 +60,7 @@ class Noise(NamedTuple):
         for_points, for_std, for_bend = jax.random.split(key, 3)
         number = scene.frame.shape
         own = self.std * jnp.exp(self.spread * jax.random.normal(for_std, number) - self.spread**2)
-        noisy = synthetic.with_noise(scene, for_points, std=own, correlation=self.correlation)
+        noisy = scenes.with_noise(scene, for_points, std=own, correlation=self.correlation)
         t, across = along_and_across(scene)
         bent = (self.bend * jax.random.normal(for_bend, number)[:, None] * t**2)[..., None] * across
         points = noisy.points + jnp.where(scene.mask[..., None], bent, 0)
@@ -93,10 +92,10 @@ METRICS: dict[str, Callable[[zj.AbstractLines], zj.AbstractLines]] = {
 
 def board(stripes: tuple[int, int], frames: int, spacing: float = 12) -> tuple[zj.ZoomLens, zj.Lines]:
     """The paper's lens, and its board with fewer stripes, without noise."""
-    truth = synthetic.nikkor_18_200(SIZE)
-    whole = synthetic.StripedBoard.before(truth)
-    fewer = synthetic.StripedBoard(stripes=stripes, pixel=whole.pixel)
-    return truth, synthetic.board_lines(truth, synthetic.focal_sweep(frames), board=fewer, spacing=spacing)
+    truth = scenes.nikkor_18_200(SIZE)
+    whole = scenes.StripedBoard.before(truth)
+    fewer = scenes.StripedBoard(stripes=stripes, pixel=whole.pixel)
+    return truth, scenes.board_lines(truth, scenes.focal_sweep(frames), board=fewer, spacing=spacing)
 
 
 SCENES = {"5 photos": ((15, 11), 5), "4 photos, few lines": ((4, 3), 4)}
@@ -229,8 +228,8 @@ class Scene(NamedTuple):
 
 def paper_scene(frames: int = 50, spacing: float = 12) -> tuple[zj.ZoomLens, zj.Lines]:
     """The paper's board and camera, as many of its photos, without noise."""
-    truth = synthetic.nikkor_18_200()
-    return truth, synthetic.board_lines(truth, synthetic.focal_sweep(frames), spacing=spacing)
+    truth = scenes.nikkor_18_200()
+    return truth, scenes.board_lines(truth, scenes.focal_sweep(frames), spacing=spacing)
 
 
 def metric_scenes() -> dict[str, Scene]:
@@ -245,7 +244,7 @@ def _metric_errors(truth, scene, std, keys):
     """Errors of the corner's displacement, (draw, 2, metric, 3), and RMS errors of the field, px."""
 
     def one(key, std):
-        small = zj.compress(synthetic.with_noise(scene, key, std=std))
+        small = zj.compress(scenes.with_noise(scene, key, std=std))
         kinds = [metric(small) for metric in METRICS.values()]
         lenses = [zj.fit_zoom(lines, invertible=False, throw=False).lens for lines in kinds]
         errors = [corner_displacement(lens) - corner_displacement(truth) for lens in lenses]
@@ -334,7 +333,7 @@ def _robust_errors(truth, scene, std, arcs, keys):
 
     def one(key):
         for_noise, for_arcs = jax.random.split(key)
-        noisy = synthetic.with_noise(scene, for_noise, std=std)
+        noisy = scenes.with_noise(scene, for_noise, std=std)
         spoiled, bent = with_arcs(noisy, for_arcs, *arcs)
         plain = zj.fit_zoom(zj.compress(noisy), invertible=False, throw=False).lens
         robust = zj.fit_robust(zj.compress(spoiled), invertible=False, throw=False)
@@ -426,8 +425,8 @@ def certificates(draws: int) -> Table:
 def cost(draws: int) -> Table:
     """What covariance and certificate take of a warm compressed fit, and the robust fit beside it."""
     del draws
-    truth = synthetic.nikkor_18_200()
-    small = zj.compress(synthetic.board_lines(truth, synthetic.focal_sweep(), noise=0.5))
+    truth = scenes.nikkor_18_200()
+    small = zj.compress(scenes.board_lines(truth, scenes.focal_sweep(), noise=0.5))
     fit = zj.fit_zoom(small)
     weighted, jacobian = eqx.filter_jit(linearised)(small, fit.lens.zoom)
     alone = eqx.filter_jit(parameter_covariance)

@@ -25,13 +25,13 @@ from scipy.spatial import KDTree
 import zoomjax as zj
 from correct import HD, in_turn, summary
 from shared import RESULTS, machine, write
-from zoomjax import synthetic
-from zoomjax.vision.demo import IMAGE_SIZE, worst_error
+from zoomjax import scenes
+from zoomjax.app.demo import IMAGE_SIZE, worst_error
 
 SHARP, NOISY = "blur 0.7 px, no noise", "blur 1 px, noise 5"
 CONDITIONS = {SHARP: (0.7, 0.0), NOISY: (1.0, 5.0)}
 
-FRAMES_LABELLED = Path(__file__).parents[1] / "tests" / "vision" / "pitch_labels.json"
+FRAMES_LABELLED = Path(__file__).parents[1] / "tests" / "detect" / "pitch_labels.json"
 NEAR = 3.0
 """px: what is so near to a label agrees with it."""
 
@@ -45,7 +45,7 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> Any:
 
 def speed(data: Path | None, rounds: int) -> dict:
     """The detectors beside what OpenCV takes for edges of pixels, with all threads and with one."""
-    photo = synthetic.board_photo(synthetic.nikkor_18_200(), 20.56, blur=1, noise=2)
+    photo = scenes.board_photo(scenes.nikkor_18_200(), 20.56, blur=1, noise=2)
 
     def with_threads(number: int, function: Callable) -> Callable:
         def run():
@@ -74,14 +74,14 @@ def speed(data: Path | None, rounds: int) -> dict:
 
 def rendered() -> dict:
     """Photos of the paper's board at 12 focal lengths: what is found, how exactly, and the lens from it."""
-    lens, focals = synthetic.nikkor_18_200(IMAGE_SIZE), synthetic.focal_sweep(12)
+    lens, focals = scenes.nikkor_18_200(IMAGE_SIZE), scenes.focal_sweep(12)
     results = {}
     for name, (blur, noise) in CONDITIONS.items():
         points: list[np.ndarray] = []
         frame: list[int] = []
         errors, seen = [], []
         for index, focal in enumerate(focals):
-            photo = synthetic.board_photo(lens, focal, blur=blur, noise=noise, seed=index)
+            photo = scenes.board_photo(lens, focal, blur=blur, noise=noise, seed=index)
             found = zj.EdgeDetector()(photo)
             error, counts = against_truth(found, lens, float(focal))
             errors.append(error)
@@ -110,7 +110,7 @@ def against_truth(
     To first order: the distance in the corrected image, where borders are straight, over how much the
     correction stretches the image across the border there.
     """
-    board = synthetic.StripedBoard.before(lens)
+    board = scenes.StripedBoard.before(lens)
     edges = [board.magnification(focal) * board.edges(axis) for axis in (0, 1)]
     correct = lens(focal).undistort
 
@@ -140,7 +140,7 @@ def against_truth(
         counts["again"] += which in longest
         longest[which] = max(longest.get(which, 0), extent(line))
         errors.append(error)
-    for line in synthetic.board_lines(lens, np.array([focal]), spacing=2.0).to_ragged():
+    for line in scenes.board_lines(lens, np.array([focal]), spacing=2.0).to_ragged():
         line = np.asarray(line)
         if extent(line) < min(lens.image_size) / 4:
             continue

@@ -2,12 +2,12 @@
 
 import sys
 
-COMMAND = [sys.executable, "-c", "from zoomjax.cli import main; main()"]
+COMMAND = [sys.executable, "-c", "from zoomjax.app.cli import main; main()"]
 
 # As in a terminal: what runs in the background of a shell inherits that Ctrl-C is ignored.
 INTERRUPTIBLE = [
     sys.executable,
     "-c",
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    "from zoomjax.cli import main; main()",
+    "from zoomjax.app.cli import main; main()",
 ]

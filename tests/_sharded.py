@@ -9,8 +9,8 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import zoomjax as zj
-from zoomjax.any_centre import _monomials
-from zoomjax.compression import _columns, _reduce_shards, _sharding_of_lines
+from zoomjax.lines.compressed import _columns, _reduce_shards, _sharding_of_lines
+from zoomjax.lines.free_centre import _monomials
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
-from zoomjax import synthetic
+from zoomjax import scenes
 
 SEED = 2012
 
@@ -59,7 +59,7 @@ def data() -> Path:
 @pytest.fixture(scope="session")
 def truth():
     """The lens of the paper's first experiment."""
-    return synthetic.nikkor_18_200()
+    return scenes.nikkor_18_200()
 
 
 NOISE = 0.5
@@ -68,13 +68,13 @@ NOISE = 0.5
 @pytest.fixture(scope="session")
 def clean(truth):
     """The paper's scene at four focal lengths, thinly sampled, without noise."""
-    return synthetic.board_lines(truth, synthetic.focal_sweep(4), spacing=60.0)
+    return scenes.board_lines(truth, scenes.focal_sweep(4), spacing=60.0)
 
 
 @pytest.fixture(scope="session")
 def noisy(truth):
     """The same points with edge noise; all shapes are those of `clean`."""
-    return synthetic.board_lines(truth, synthetic.focal_sweep(4), spacing=60.0, noise=NOISE, seed=SEED)
+    return scenes.board_lines(truth, scenes.focal_sweep(4), spacing=60.0, noise=NOISE, seed=SEED)
 
 
 @pytest.fixture(scope="session")

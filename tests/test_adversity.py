@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from _commands import COMMAND
-from zoomjax import synthetic
+from zoomjax import scenes
+
+from ._commands import COMMAND
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -45,8 +46,8 @@ def contents(folder):
 def calibrated(tmp_path_factory):
     """Lines, and their results in ``out``."""
     folder = tmp_path_factory.mktemp("calibrated")
-    lens, focal = synthetic.nikkor_18_200(), synthetic.focal_sweep(5)
-    synthetic.board_lines(lens, focal, spacing=60, noise=0.3).save(folder / "lines.npz")
+    lens, focal = scenes.nikkor_18_200(), scenes.focal_sweep(5)
+    scenes.board_lines(lens, focal, spacing=60, noise=0.3).save(folder / "lines.npz")
     done = zoomjax("calibrate", "lines.npz", "-o", "out", cwd=folder)
     assert done.returncode == 0, done.stderr
     return folder
@@ -179,8 +180,8 @@ def test_a_read_only_folder_is_told_before_the_work(folder, mounted):
 @posix
 @pytest.mark.slow
 def test_two_processes_in_one_folder_leave_the_results_of_one(folder):
-    lens, focal = synthetic.nikkor_18_200(), synthetic.focal_sweep(5)
-    synthetic.board_lines(lens, focal, spacing=60, noise=0.6).save(folder / "noisy.npz")
+    lens, focal = scenes.nikkor_18_200(), scenes.focal_sweep(5)
+    scenes.board_lines(lens, focal, spacing=60, noise=0.6).save(folder / "noisy.npz")
     begun = [
         subprocess.Popen(
             [*COMMAND, "calibrate", name, "-o", "new"], cwd=folder, stderr=subprocess.PIPE, text=True
@@ -215,8 +216,8 @@ def test_a_signal_that_a_library_swallows_ends_the_run_before_the_next_step(numb
     """Deterministic: it arrives in a destructor, which Python lets raise nothing."""
     first = f"""
 import signal; signal.signal(signal.SIGINT, signal.default_int_handler)
-import zoomjax.lines
-load = zoomjax.lines.load_lines
+import zoomjax.lines.npz
+load = zoomjax.lines.npz.load_lines
 class Swallow:
     def __del__(self):
         signal.raise_signal({int(number)})
@@ -224,7 +225,7 @@ def swallowing(path):
     Swallow()
     print("went on", flush=True)
     return load(path)
-zoomjax.lines.load_lines = swallowing
+zoomjax.lines.npz.load_lines = swallowing
 """
     before = contents(folder)
     done = zoomjax("calibrate", "lines.npz", "-o", "out", cwd=folder, first=first)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
-from zoomjax import _fields
+from zoomjax._core import fields as _fields
 
 FOCAL = np.array([18.0, 24.0, 35.0, 50.0, 70.0, 120.0, 200.0])
 FOCUS = np.array([0.0, 1.0, 0.5, 0.0, 1.0, 0.5, 0.2])

@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import _embeddings as table
 import zoomjax as zj
-from _embeddings import ROWS, Cell, at, copies, eager, far, number, stacked, tolerance
+
+from . import _embeddings as table
+from ._embeddings import ROWS, Cell, at, copies, eager, far, number, stacked, tolerance
 
 DTYPES = ("float32", "float64")
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from jax import export
 
-import _embeddings as table
 import zoomjax as zj
+
+from . import _embeddings as table
 
 FAMILIES = {
     "RadialPolynomial": ((0.1, -0.02), zj.RadialPolynomial()),

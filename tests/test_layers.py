@@ -1,4 +1,4 @@
-"""Imports go one way, and only the outer layers know images, plots, terminals and video."""
+"""The package is ten rooms on a private base, and imports go one way: from a room to rooms below it."""
 
 import ast
 from pathlib import Path
@@ -7,55 +7,38 @@ import pytest
 
 import zoomjax
 
-# From the inside out: a module may import from layers before its own. Packages count as one module.
-LAYERS = (
-    {"_types", "_files", "_text", "_checks", "_fields", "_arguments", "_linear", "_bernstein", "_interior"},
-    {"_arrays"},
-    {"_roots"},
-    {"_results", "families", "focal", "_splines"},
-    {"radial"},
-    {"inverse", "pitch"},
-    {"zoom"},
-    {"rivals", "smooth"},
-    {"focus"},
-    {"models"},
-    {"lines"},
-    {"energy"},
-    {"lens"},
-    {"certificate", "bounds", "camera", "sizes", "training"},
-    {"framing"},
-    {"positions", "warp"},
-    {"torch"},
-    {"_solver", "compression"},
-    {"any_centre", "image_metric"},
-    {"family_lines"},
-    {"concatenation"},
-    {"algebraic"},
-    {"uncertainty"},
-    {"fit"},
-    {"bands", "robust", "centre", "focal_error", "held_out"},
-    {"design", "blunders", "selection"},
-    {"synthetic", "broadcast", "metrics", "io"},
-    {"plot"},
-    {"calibration"},
-    {"reproduce"},
-    {"vision"},
-    {"report"},
-    {"cli"},
-    {"__main__"},
+ROOMS = (
+    "app",
+    "trust",
+    "fit",
+    "scenes",
+    "correct",
+    "lines",
+    "detect",
+    "focal",
+    "models",
+    "io",
+    "_core",
 )
-OUTER = {
-    "plot": {"matplotlib"},
-    "vision": {"cv2", "av"},
+"""From the top down: a room imports from rooms after it in this list alone."""
+
+TOP = {"torch": {"correct", "models"}, "__main__": {"app"}}
+"""Modules beside the rooms, and what they import from."""
+
+LIBRARIES = {
+    "app": {"matplotlib", "typer", "rich", "cv2"},
+    "correct": {"cv2"},
+    "detect": {"cv2"},
+    "io": {"cv2", "av"},
     "torch": {"torch"},
-    "report": {"matplotlib"},
-    "reproduce": {"matplotlib"},
-    "cli": {"typer", "rich"},
 }
-HEAVY = set().union(*OUTER.values())
+"""Libraries of images, plots, terminals and video, and where they may be imported."""
+
+ALL_LIBRARIES = set().union(*LIBRARIES.values())
+
+MOST_LINES = 400
 
 ROOT = Path(zoomjax.__file__).parent
-LEVEL = {module: level for level, layer in enumerate(LAYERS) for module in layer}
 FILES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts): path
     for path in sorted(ROOT.rglob("*.py"))
@@ -65,7 +48,7 @@ FILES = {
 every_module = pytest.mark.parametrize("name", FILES)
 
 
-def top(name):
+def room(name):
     return name.split(".")[0]
 
 
@@ -78,29 +61,59 @@ def imports(name):
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else []
             origin = ".".join([*base, *filter(None, [node.module])])
-            if origin == "zoomjax":  # from . import x: the names are modules
-                yield from (f"zoomjax.{alias.name}" for alias in node.names)
-            else:
-                yield origin
+            modules = [f"{origin}.{alias.name}" for alias in node.names]
+            # from . import x: a module
+            yield from modules if is_module(modules[0]) else [origin]
+
+
+def is_module(absolute):
+    return absolute.removeprefix("zoomjax.") in FILES
+
+
+def own(name):
+    """What a module imports of the package: modules, each by its path from the package on."""
+    return [other.removeprefix("zoomjax.") for other in imports(name) if other.startswith("zoomjax.")]
+
+
+def circle(name, arrows, above=()):
+    """The modules of a circle that can be reached from a module, or nothing."""
+    if name in above:
+        return [*above[above.index(name) :], name]
+    return next(filter(None, (circle(other, arrows, (*above, name)) for other in arrows.pop(name, ()))), [])
+
+
+def test_the_rooms_are_these():
+    folders = {path.name for path in ROOT.iterdir() if path.is_dir() and path.name != "__pycache__"}
+    assert folders == set(ROOMS)
+    assert {name for name in FILES if "." not in name} == set(TOP)
 
 
 @every_module
-def test_module_has_its_layer(name):
-    assert top(name) in LEVEL, f"add {top(name)} to LAYERS, as far in as its imports allow"
+def test_module_imports_from_rooms_below_only(name):
+    below = TOP[name] if name in TOP else set(ROOMS[ROOMS.index(room(name)) + 1 :])
+    assert {room(other) for other in own(name)} <= below | {room(name)}
 
 
 @every_module
-def test_module_imports_from_inner_layers_only(name):
-    level = LEVEL[top(name)]
-    own = [other.split(".")[1] for other in imports(name) if other.startswith("zoomjax.")]
-    outward = {other for other in own if other != top(name) and LEVEL.get(other, len(LAYERS)) >= level}
-    assert not outward
+def test_module_imports_modules_and_no_doors(name):
+    assert not [other for other in own(name) if other not in FILES or other in ROOMS]
 
 
 @every_module
-def test_module_imports_no_application_library_but_its_own(name):
-    used = {other.split(".")[0] for other in imports(name)} & HEAVY
-    assert used <= OUTER.get(top(name), set())
+def test_module_leaves_alone_what_is_private_to_another_room(name):
+    others = [other.split(".")[1:] for other in own(name) if room(other) != room(name)]
+    assert not [path for path in others if any(part.startswith("_") for part in path)]
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    arrows = {name: own(name) for name in FILES}
+    assert not [found for name in FILES if (found := circle(name, dict(arrows)))]
+
+
+@every_module
+def test_module_imports_no_application_library_but_its_rooms(name):
+    used = {other.split(".")[0] for other in imports(name)} & ALL_LIBRARIES
+    assert used <= LIBRARIES.get(room(name), set())
 
 
 @every_module
@@ -108,5 +121,6 @@ def test_module_does_not_import_the_package_from_within(name):
     assert "zoomjax" not in set(imports(name))
 
 
-def test_layers_name_each_module_once():
-    assert len(LEVEL) == sum(len(layer) for layer in LAYERS)
+@every_module
+def test_module_is_not_too_long(name):
+    assert len(FILES[name].read_text().splitlines()) <= MOST_LINES

@@ -1,6 +1,7 @@
 """The public names: they exist, say what they do, and are the ones agreed on."""
 
 import ast
+import importlib
 import importlib.metadata
 import inspect
 import subprocess
@@ -12,11 +13,12 @@ import pytest
 
 import zoomjax as zj
 
+ROOMS = ("models", "focal", "io", "detect", "lines", "correct", "scenes", "fit", "trust")
 STUB = Path(zj.__file__).with_suffix(".pyi")
 PUBLIC = [
     alias.asname
     for node in ast.parse(STUB.read_text()).body
-    if isinstance(node, ast.ImportFrom) and node.module  # from . import x: a module
+    if isinstance(node, ast.ImportFrom) and node.module not in (None, "app")  # from . import x: a module
     for alias in node.names
 ]
 HEADINGS = ("Args:", "Attributes:", "Returns:", "Example:")
@@ -95,9 +97,9 @@ import zoomjax
 pydoc.render_doc(zoomjax)
 from zoomjax import *
 assert set(zoomjax.__all__) <= set(globals()), "names are missing"
-assert "synthetic" not in globals(), "modules are no part of it"
+assert not {{"scenes", "fit", "plot"}} & set(globals()), "modules are no part of it"
 try:
-    undistort_video(sys.executable, "out.mp4", lens=zoomjax.synthetic.nikkor_18_200(), focal=35.0)
+    undistort_video(sys.executable, "out.mp4", lens=zoomjax.scenes.nikkor_18_200(), focal=35.0)
 except ModuleNotFoundError as error:
     print(error)
 except ValueError as error:
@@ -110,10 +112,24 @@ except ValueError as error:
 
 
 def test_modules_are_reached_as_attributes():
-    assert zj.synthetic.nikkor_18_200().focal_unit == "mm"
+    assert zj.scenes.nikkor_18_200().focal_unit == "mm"
     assert callable(zj.plot.plot_model)
-    assert {"synthetic", "plot", "__version__"} <= set(dir(zj))
-    assert not {"synthetic", "plot"} & set(zj.__all__)
+    assert {*ROOMS, "plot", "__version__"} <= set(dir(zj))
+    assert not {*ROOMS, "plot", "torch"} & set(zj.__all__)
+
+
+@pytest.mark.parametrize("room", [*ROOMS, "app"])
+def test_every_name_of_a_room_is_there(room):
+    module = importlib.import_module(f"zoomjax.{room}")
+    assert module.__doc__
+    assert module.__all__
+    assert all(hasattr(module, name) for name in module.__all__)
+    assert set(module.__all__) <= set(dir(module))
+
+
+def test_a_room_is_imported_without_what_is_in_it():
+    code = "import sys, zoomjax.app, zoomjax.fit, zoomjax.models; assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_version_is_that_of_the_package():

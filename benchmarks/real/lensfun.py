@@ -13,7 +13,7 @@ is tested. (lensfunpy does not tell the aspect ratio of the images calibrated: a
 
 The prior of `SmoothZoom` is learned here, from half of the lenses for the other half; a lens that is in the
 database under several names, or whose table is, is in one half only. `--prior` learns it from all instead
-and prints the numbers that `zoomjax/smooth.py` has.
+and prints the numbers that `zoomjax/models/smooth.py` has.
 
 Once: lines, their compression, each frame's own optimum, and the second derivatives of its energy. Fits of
 models linear in their parameters then are least squares of the frames' coefficients in that metric, which
@@ -42,7 +42,8 @@ import scipy.interpolate
 import scipy.optimize
 
 import zoomjax as zj
-from zoomjax.energy import line_residuals
+from zoomjax.fit.energy import line_residuals
+from zoomjax.models.zoom import with_parameters
 
 sys.path.append(str(Path(__file__).parents[1]))
 from shared import RESULTS, machine
@@ -332,7 +333,7 @@ def penalty_of(zoom):
     zero = zoom.prepare(jnp.array([1.0]), 2)
     flat = jnp.zeros(zero.parameters.size)
     rows = jax.jacfwd(
-        lambda flat: zj.zoom.with_parameters(zero, flat.reshape(zero.parameters.shape)).standardised()
+        lambda flat: with_parameters(zero, flat.reshape(zero.parameters.shape)).standardised()
     )(flat)
     return (SCALE * zoom.error) ** 2 * rows.T @ rows
 

@@ -33,7 +33,7 @@ from zoomjax import (
     focal_from_planes,
     frame_rms,
 )
-from zoomjax.pitch import PITCH_LINES
+from zoomjax.focal.pitch import PITCH_LINES
 
 SIZE = (1280, 720)
 NOISE = 0.6

@@ -33,7 +33,7 @@ import numpy as np
 from study import DEFAULT, NONE, TERMS, choose, fitting, main, root_mean, table
 
 import zoomjax as zj
-from zoomjax.pitch import PITCH_LINES
+from zoomjax.focal.pitch import PITCH_LINES
 
 SIZE = (1920, 1080)
 SCALE = np.hypot(*SIZE) / 2

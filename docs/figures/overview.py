@@ -13,14 +13,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 import zoomjax as zj
-from zoomjax import synthetic
+from zoomjax import scenes
 
 INK, MODEL = "#1e3a5f", "#c2410c"
 EXAGGERATION = 5
 
 jax.config.update("jax_enable_x64", True)
-truth = synthetic.nikkor_18_200()
-lines = synthetic.board_lines(truth, synthetic.focal_sweep(25), spacing=40, noise=0.5)
+truth = scenes.nikkor_18_200()
+lines = scenes.board_lines(truth, scenes.focal_sweep(25), spacing=40, noise=0.5)
 small = zj.compress(lines)
 fit, each = zj.fit_zoom(small), zj.fit_frames(small)
 corner_radius = float(np.hypot(*truth.centre)) / truth.scale

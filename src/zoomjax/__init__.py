@@ -1,8 +1,8 @@
 """zoomjax: one continuous, differentiable distortion model for a zoom lens.
 
 The public names are listed, once, in ``__init__.pyi``. They are imported when first used, so that
-``zoomjax --help`` does not wait for JAX. So are ``zoomjax.synthetic`` and ``zoomjax.plot``, which are not
-part of ``from zoomjax import *``.
+``zoomjax --help`` does not wait for JAX. So are the rooms of the package, from ``zoomjax.models`` to
+``zoomjax.plot``, which are not part of ``from zoomjax import *``.
 """
 
 import importlib.util
@@ -12,7 +12,9 @@ import lazy_loader
 
 _getattr, _, _names = lazy_loader.attach_stub(__name__, __file__)
 
-_MODULES = {"plot": "matplotlib", "synthetic": "numpy"}
+_ROOMS = ("models", "focal", "io", "detect", "lines", "correct", "scenes", "fit", "trust")
+
+_MODULES = {**dict.fromkeys(_ROOMS, "numpy"), "plot": "matplotlib", "torch": "torch"}
 """Modules that are reached as attributes, and what each of them needs."""
 
 __all__ = [name for name in _names if name not in _MODULES]  # pyright: ignore[reportUnsupportedDunderAll]

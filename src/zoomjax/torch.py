@@ -24,11 +24,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .framing import Framing
-from .lens import ZoomLens
-from .radial import Distortion
-from .warp import warp_image as _warp_image
-from .zoom import with_parameters
+from .correct.framing import Framing
+from .correct.warp import warp_image as _warp_image
+from .models.distortion import Distortion
+from .models.lens import ZoomLens
+from .models.zoom import with_parameters
 
 try:
     import torch  # pyright: ignore[reportMissingImports]

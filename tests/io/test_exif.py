@@ -2,8 +2,9 @@
 
 import pytest
 
-from _exif import exif
 from zoomjax.io.exif import exif_focal, exif_with_focal
+
+from .._exif import exif
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

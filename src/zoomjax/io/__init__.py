@@ -1,1 +1,5 @@
-"""File formats other than zoomjax's own: one module a format, a reader and a writer each."""
+"""File formats other than zoomjax's own: one module a format."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,51 @@
+"""What JAX computes in, and where what it compiles is kept for the next run."""
+
+import contextlib
+import glob
+import logging
+import os
+import re
+import shutil
+from pathlib import Path
+
+from .._core.files import cache_folder
+
+_MOST_COMPILED = 100_000_000  # bytes; a run with new shapes adds about a million
+
+
+def set_up_jax() -> None:
+    """Compute in float64, and keep what is compiled for the next run: most of a short run is compiling.
+
+    What cannot be kept, or read again, is compiled anew: a loss of time, of which nobody need hear.
+    """
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    folder = cache_folder("compiled")
+    if folder and "JAX_COMPILATION_CACHE_DIR" not in os.environ and _can_write(folder):
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_compilation_cache_max_size", _MOST_COMPILED)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    logging.getLogger("matplotlib").setLevel(
+        logging.ERROR
+    )  # else it tells of fonts and of folders of its own
+
+
+def _can_write(folder: Path) -> bool:
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder.is_dir() and os.access(folder, os.W_OK)
+
+
+UNKEPT = re.compile(r"Error (?:reading|writing) persistent compilation cache entry for '([^']*)'")
+
+
+def forget_compiled(name: str) -> None:
+    """Remove what was kept of a program: JAX would never replace what a full disk has cut off."""
+    folder = cache_folder("compiled")
+    for path in folder.glob(f"{glob.escape(name)}-*") if folder else ():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with contextlib.suppress(OSError):
+                path.unlink()

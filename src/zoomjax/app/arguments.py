@@ -1,0 +1,114 @@
+"""What the command line is given, checked and made into what the library takes."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from ..lines.lines import Lines
+    from .focal_sources import Board
+    from .image_calibration import ImageJob
+
+
+Overwrite = Annotated[
+    bool,
+    typer.Option(
+        "--overwrite",
+        help="Replace files of these names, too, that zoomjax did not write or that were changed since.",
+    ),
+]
+Degree = Annotated[int, typer.Option(min=0, help="Degree of the polynomials in 1/f.")]
+Terms = Annotated[int, typer.Option(min=1, help="Number of distortion coefficients, k1 to kN.")]
+
+
+def read_lines(
+    inputs: list[Path], focal: str | None, image_size: str | None, focal_unit: str | None
+) -> "Lines":
+    """The lines of the one file that is given."""
+    if len(inputs) > 1:
+        raise ValueError(f"Give one file of lines; there are {len(inputs)}.")
+    [path] = inputs
+    if path.suffix == ".npz":
+        if (focal, image_size, focal_unit) != (None, None, None):
+            raise ValueError(
+                f"{path} carries its own focal lengths and image size: --focal, --image-size and "
+                "--focal-unit are for CSV files."
+            )
+        from ..lines.npz import load_lines
+
+        return load_lines(path)
+    if path.suffix == ".csv":
+        from ..lines.csv import read_focal_csv, read_lines_csv
+
+        if image_size is None:
+            raise ValueError(f"The image size of {path} is not known: give --image-size, e.g. 1920x1080.")
+        width, _, height = image_size.lower().partition("x")
+        if not (width.isdigit() and height.isdigit()):
+            raise ValueError(f"--image-size must be like 1920x1080, but it is {image_size!r}.")
+        return read_lines_csv(
+            path,
+            image_size=(int(width), int(height)),
+            focal=None if focal is None else read_focal_csv(Path(focal)),
+            focal_unit=focal_unit or "mm",
+        )
+    raise ValueError(f"Cannot calibrate from {path}: give lines.npz, or a CSV file frame,line,x,y[,focal].")
+
+
+def number_of_cores() -> int:
+    """How many cores this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def unit_of(given: str | None) -> str:
+    """The unit of focal lengths."""
+    if given not in (None, "mm", "px"):
+        raise ValueError(f"--focal-unit must be mm or px, but it is {given!r}.")
+    return given or "mm"
+
+
+def board_of(pitch: str | None, distance: float | None, pixel: float | None) -> "Board | None":
+    """The board, if one is given."""
+    from .focal_sources import Board
+
+    if pitch is distance is pixel is None:
+        return None
+    pitches = [_positive(part) for part in (pitch or "").lower().split("x")]
+    given = {"--pitch": all(pitches), "--distance": (distance or 0) > 0, "--pixel": (pixel or 0) > 0}
+    bad = [name for name, good in given.items() if not good]
+    if bad or len(pitches) > 2 or distance is None or pixel is None:
+        raise ValueError(
+            "A board needs its --pitch (MM, or MMxMM across and down), its --distance and the sensor's "
+            f"--pixel, all in mm and positive: {' and '.join(bad or ['--pitch'])} is not."
+        )
+    return Board((pitches[0], pitches[-1]), distance, pixel)
+
+
+def _positive(text: str) -> float:
+    """The number, or 0 if it is none or not positive."""
+    try:
+        return max(float(text), 0.0)
+    except ValueError:
+        return 0.0
+
+
+def refuse_to_replace(job: "ImageJob", output: Path) -> None:
+    """Refuse to write over photographs that are calibrated from."""
+    from ..detect.sources import RESULTS
+
+    results = {(output / name).resolve() for name in RESULTS}
+    for source in job.sources()[0] if job.video is None else ():
+        real = (source.path or Path()).resolve()
+        if results.intersection((real, *real.parents)):
+            raise ValueError(
+                f"The results would replace the photograph {source.path}: give another folder."
+            )
+
+
+def refuse_image_options(options: dict[str, object], inputs: list[str]) -> None:
+    """Refuse options of images where lines are given."""
+    given = [name for name, value in options.items() if value is not None]
+    if given:
+        raise ValueError(f"{' and '.join(given)} are for images, but {inputs[0]} holds lines.")

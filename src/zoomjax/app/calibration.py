@@ -1,0 +1,341 @@
+"""A whole calibration: from lines to the fits, the figures worth reading, and a folder of results.
+
+This is what the command line runs; it prints nothing, and draws with `plot`.
+"""
+
+import dataclasses
+import importlib.metadata
+import json
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from .._core.types import AnyArray
+from ..fit.algebraic import algebraic_zoom
+from ..fit.energy import coefficients_by, line_rms
+from ..fit.focal_lengths import with_focal_sigma
+from ..fit.frames import fit_frames
+from ..fit.result import RESULTS, FrameFits, ZoomFit
+from ..fit.robust import fit_robust
+from ..fit.straightness import frame_rms
+from ..fit.zoom import fit_zoom
+from ..lines.compressed import compress
+from ..lines.lines import Lines
+from ..models.invertibility import Certificate
+from ..models.zoom import PolynomialZoom
+from ..trust.bands import displacement_std
+from ..trust.cross_validation import held_out_frames, held_out_zoom
+from ..trust.next_photo import Suggestion, suggest_next
+from ..trust.selection import Selection, default_candidates, select_model
+from .plot import plot_model
+from .results_folder import results_folder
+
+FILES = ("lens.json", "lines.npz", "summary.json", "model.png")
+"""What `Calibration.write` writes."""
+
+CLEARS = ("lines/*",)
+"""What it removes of what an earlier calibration wrote: pictures of other lines."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """The zoom model of some lines beside what it is compared with.
+
+    Attributes:
+        lines: the lines.
+        zoom: the zoom model's fit.
+        each: every frame by itself.
+        none, algebraic: each frame's RMS, px, without correction and with the algebraic estimate.
+        rejected: which lines count nothing, being not straight in the scene.
+        line_rms: of each line as the zoom model corrects it, px; of rejected ones, too.
+        next: the photo that would help most.
+        focal_sigma: standard deviation of each frame's focal length, which the bands allow for; 0: exact.
+        held_out: each frame's RMS, px, under the zoom model of all others; NaN where these do not make one.
+        each_held_out: each frame's RMS, px, each tenth of its lines under the model of its others.
+        selection: how the model was chosen, if it was.
+    """
+
+    lines: Lines
+    zoom: ZoomFit
+    each: FrameFits
+    none: np.ndarray
+    algebraic: np.ndarray
+    rejected: np.ndarray
+    line_rms: np.ndarray
+    next: Suggestion
+    focal_sigma: np.ndarray
+    held_out: np.ndarray
+    each_held_out: np.ndarray
+    selection: Selection | None = None
+
+    def corner(self) -> list[tuple[float, float, float]]:
+        """Focal lengths at both ends of the range and in its middle, and what becomes of a corner there.
+
+        With each the displacement away from the centre, px, of the corner farthest from it, and its
+        standard deviation.
+        """
+        lens = self.zoom.lens
+        low, high = (float(f) for f in lens.focal_range)
+        centre = np.asarray(lens.centre)
+        last = np.array(lens.image_size) - 1
+        corner = np.where(centre > last / 2, 0.0, last)
+        focal = [low, *([float(np.sqrt(low * high)), high] if high > low else [])]
+        std = np.asarray(displacement_std(self.zoom, corner, focal=np.array(focal)))
+        corrected = [np.asarray(lens(f).undistort(corner)) for f in focal]
+        moved = [np.hypot(*(point - centre)) - np.hypot(*(corner - centre)) for point in corrected]
+        return list(zip(focal, map(float, moved), std.tolist(), strict=True))
+
+    def allowed_for(self) -> str:
+        """What the bands allow for besides noise, in a sentence; nothing if that is nothing."""
+        share = self.focal_sigma / np.asarray(self.lines.focal)
+        if not share.any():
+            return ""
+        return (
+            "Standard deviations allow for those of the focal lengths, "
+            f"{share.min():.2%} to {share.max():.2%}; the next photo is chosen by noise alone."
+        )
+
+    def rows(self) -> list[tuple[str, np.ndarray]]:
+        """The lines of a table like the paper's Table 1: what was done, and each frame's RMS, px."""
+        return [
+            ("no correction", self.none),
+            ("frame by frame", np.asarray(self.each.frame_rms)),
+            ("zoom polynomial (algebraic)", self.algebraic),
+            ("zoom polynomial", np.asarray(self.zoom.frame_rms)),
+        ]
+
+    def held_out_rows(self) -> dict[str, np.ndarray]:
+        """Of some of the `rows`, each frame's RMS, px, of lines that were not fitted."""
+        return {"frame by frame": self.each_held_out, "zoom polynomial": self.held_out}
+
+    def warnings(self, names: Sequence[str] | None = None) -> list[str]:
+        """What a user must hear of: sentences about the zoom model, and about frames that have none.
+
+        `names` are those of the frames; by default their numbers, from 0.
+        """
+        told = [RESULTS[self.zoom.result]] if self.zoom.result != RESULTS.successful else []
+        for message in dict.fromkeys(filter(None, messages := self.each.messages())):
+            frames = [
+                names[frame] if names else str(frame)
+                for frame, other in enumerate(messages)
+                if other == message
+            ]
+            which = ", ".join(frames[:8]) + (", ..." if len(frames) > 8 else "")
+            told.append(
+                f"{len(frames)} of {len(messages)} frames have no good model of their own "
+                f"(frames {which}). {message}"
+            )
+        return told
+
+    def summary(self) -> dict[str, Any]:
+        """The figures, as plain numbers and strings that JSON can hold."""
+        lens = self.zoom.lens
+        low, high = (float(f) for f in lens.focal_range)
+        frame = np.asarray(self.lines.frame)
+        fits = {
+            "frame": range(len(self.none)),
+            "focal": np.asarray(self.lines.focal).tolist(),
+            "focal_sigma": self.focal_sigma.tolist(),
+            "lines": np.bincount(frame, minlength=len(self.none)).tolist(),
+            "rms_none": _finite(self.none),
+            "rms_frames": _finite(np.asarray(self.each.frame_rms)),
+            "rms_zoom": _finite(np.asarray(self.zoom.frame_rms)),
+            "rms_held_out": _finite(self.held_out),
+            "rms_frames_held_out": _finite(self.each_held_out),
+        }
+        return {
+            "rms_none": rms_over_frames(self.none),
+            "rms_algebraic": rms_over_frames(self.algebraic),
+            "rms_frames": float(self.each.rms),
+            "rms_zoom": float(self.zoom.rms),
+            "rms_held_out": _finite([rms_over_frames(self.held_out)])[0],
+            "rms_frames_held_out": _finite([rms_over_frames(self.each_held_out)])[0],
+            "frames": len(self.none),
+            "lines": len(frame),
+            "rejected_lines": int(self.rejected.sum()),
+            "rejected": [
+                {"line": int(line), "frame": int(frame[line]), "rms": float(self.line_rms[line])}
+                for line in np.flatnonzero(self.rejected)[np.argsort(-self.line_rms[self.rejected])]
+            ],
+            "points": int(np.sum(np.asarray(self.lines.mask))),
+            "focal_range": [low, high],
+            "focal_unit": lens.focal_unit,
+            "image_size": list(lens.image_size),
+            "result": RESULTS[self.zoom.result] or "successful",
+            "certificate": _plain(self.zoom.certificate),
+            "rms_unconstrained": float(self.zoom.rms_unconstrained),
+            "frames_without_a_model": sum(map(bool, self.each.messages())),
+            "warnings": self.warnings(),
+            "pixel_polynomials": self.pixel_polynomials().tolist(),
+            "parameters": np.asarray(lens.zoom.parameters).tolist(),
+            "corner_displacement": [
+                {"focal": f, "px": moved, "std": _finite([std])[0]} for f, moved, std in self.corner()
+            ],
+            "next_photo": {
+                "focal": self.next.focal,
+                "direction": self.next.direction,
+                "region": self.next.region,
+                "displacement_std": _finite([self.next.before])[0],
+                "displacement_std_with_it": _finite([self.next.after])[0],
+                "sentence": self.next.sentence,
+            },
+            "parameter_sigma": _finite(np.sqrt(np.diag(np.asarray(self.zoom.covariance)))),
+            "per_frame": [dict(zip(fits, row, strict=True)) for row in zip(*fits.values(), strict=True)],
+            "versions": {
+                name: importlib.metadata.version(name) for name in ("zoomjax", "jax", "optimistix")
+            },
+        } | ({"selection": self.selection.summary()} if self.selection else {})
+
+    def pixel_polynomials(self) -> np.ndarray:
+        """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as the paper prints them."""
+        model = self.zoom.lens.zoom
+        assert isinstance(model, PolynomialZoom)  # `calibrate` fits no other
+        normalised = np.asarray(model.in_inverse_focal())
+        return normalised / self.zoom.lens.scale ** (2 * np.arange(1, normalised.shape[1] + 1))
+
+    def write(
+        self,
+        folder: str | os.PathLike[str],
+        about: dict[str, Any] | None = None,
+        pages: Mapping[str, str] | None = None,
+        *,
+        overwrite: bool = False,
+    ) -> None:
+        """Write lens.json, lines.npz, summary.json and model.png, which appear together.
+
+        Args:
+            folder: where to.
+            about: what summary.json says besides.
+            pages: further files' texts, by their names.
+            overwrite: whether to replace files that zoomjax did not write, or that were changed since.
+
+        Raises:
+            OSError: the folder cannot be written, or such a file is there.
+        """
+        names = [*FILES, *(pages or {})]
+        with results_folder(folder, names, clears=CLEARS, overwrite=overwrite) as part:
+            self.make(part, about, pages)
+
+    def make(
+        self,
+        folder: str | os.PathLike[str],
+        about: dict[str, Any] | None = None,
+        pages: Mapping[str, str] | None = None,
+    ) -> None:
+        """The same in an empty folder: that of a `results_folder`, say."""
+        folder = Path(folder)
+        self.zoom.lens.save(folder / "lens.json")
+        self.lines.save(folder / "lines.npz")
+        (folder / "summary.json").write_text(json.dumps(self.summary() | (about or {}), indent=2) + "\n")
+        plot_model(self.zoom, self.each, self.lines).savefig(folder / "model.png", dpi=150)
+        for name, text in (pages or {}).items():
+            (folder / name).write_text(text, encoding="utf-8")
+
+
+def calibrate(
+    lines: Lines,
+    *,
+    degree: int = 2,
+    terms: int = 2,
+    robust: bool = False,
+    focal_sigma: float | Float[np.ndarray, "frame"] = 0.0,
+    select: bool = False,
+    stage: Callable[[str], None] = lambda _: None,
+) -> Calibration:
+    """Fit the zoom polynomial and what it is compared with.
+
+    Args:
+        lines: the lines; computed in float64 if that is enabled, whatever their dtype.
+        degree: of the polynomials in 1/f.
+        terms: the number of distortion coefficients.
+        robust: whether to reject lines that are not straight in the scene; all figures are then those of
+            the others.
+        focal_sigma: standard deviation of the focal lengths: a number, or one a frame; 0 where exact.
+        select: whether to choose degree and terms by `select_model`, among the polynomials. Lines are then
+            rejected under the quadratic.
+        stage: called with a sentence before each step that takes time.
+    """
+    if select:
+        degree, terms = min(2, np.unique(np.asarray(lines.focal)).size - 1), 2
+    model = PolynomialZoom(degree=degree)
+    model.prepare(lines.focal, terms)  # complain of too few focal lengths before any work
+    stage("Compressing the lines")
+    widest = jnp.result_type(float)
+    data = jax.tree.map(
+        lambda a: jnp.asarray(a, widest) if jnp.issubdtype(a.dtype, jnp.floating) else a, lines
+    )
+    choices = [c for c in default_candidates() if isinstance(c.zoom, PolynomialZoom)] if select else []
+    small = compress(data, max([terms, *(choice.terms for choice in choices)]))
+    rejected = np.zeros(len(lines.frame), bool)
+    if robust:
+        stage("Rejecting lines that are not straight")
+        weight = fit_robust(small, zoom=model, terms=terms, throw=False).weight
+        small, lines = small.weighted(weight), lines.weighted(weight)
+        rejected = np.asarray(weight) == 0
+    selection = None
+    if choices:
+        stage("Choosing the model")
+        selection = select_model(small, choices)
+        model, terms = selection.chosen.zoom, selection.chosen.terms
+        assert isinstance(model, PolynomialZoom)
+    stage("Fitting each frame by itself")
+    each = fit_frames(small, terms=terms, throw=False)
+    stage("Fitting the zoom polynomial")
+    zoom = selection.fit if selection else fit_zoom(small, zoom=model, terms=terms)
+    sigma = np.broadcast_to(focal_sigma, lines.focal.shape)
+    none = np.asarray(frame_rms(small, None))
+    several = len(none) > 1
+    return Calibration(
+        lines=lines,
+        zoom=with_focal_sigma(zoom, small, focal_sigma=sigma) if sigma.any() else zoom,
+        each=each,
+        none=none,
+        algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=model, terms=terms))),
+        rejected=rejected,
+        line_rms=np.asarray(line_rms(small, coefficients_by(zoom.lens.zoom, small))),
+        next=suggest_next(zoom, small),  # a further photo's worth is counted in noise alone
+        focal_sigma=sigma,
+        held_out=held_out_zoom(small, zoom=model, terms=terms) if several else np.full_like(none, np.nan),
+        each_held_out=held_out_frames(small, terms=terms),
+        selection=selection,
+    )
+
+
+def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray, "frame"]:
+    """Standard deviations as a user writes them: a number in the unit of f, or per cent such as "1%".
+
+    Raises:
+        ValueError: it is neither, or negative.
+    """
+    number, percent, rest = text.strip().partition("%")
+    try:
+        value = float(number)
+    except ValueError:
+        value = np.nan
+    if rest or not 0 <= value < np.inf:
+        raise ValueError(f"--focal-sigma must be a number such as 0.3, or 1%, but it is {text!r}.")
+    return value / 100 * np.asarray(focal) if percent else np.full(np.shape(focal), value)
+
+
+def rms_over_frames(frame_rms: Float[AnyArray, "frame"]) -> float:
+    """Root of the mean of the frames' errors: eq. 13 from eq. 3. NaN frames do not count."""
+    known = np.asarray(frame_rms)[~np.isnan(frame_rms)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
+
+
+def _plain(certificate: Certificate) -> dict[str, bool | float]:
+    """For JSON."""
+    return {
+        field.name: getattr(certificate, field.name).item() for field in dataclasses.fields(certificate)
+    }
+
+
+def _finite(values: Iterable[float]) -> list[float | None]:
+    """JSON has no infinity: None says that a value is not determined."""
+    return [float(v) if np.isfinite(v) else None for v in values]

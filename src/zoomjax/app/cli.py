@@ -1,0 +1,61 @@
+"""The command line: ``zoomjax demo``, ``calibrate``, ``undistort`` and ``reproduce``.
+
+Errors go to stderr with exit status 2, and leave no partial result.
+"""
+
+import io
+import os
+import signal
+import sys
+import warnings
+
+try:
+    import typer  # noqa: F401
+except ModuleNotFoundError:
+    sys.exit('The command line needs the extra "app": pip install "zoomjax[app]"')
+
+from .._core.text import plain
+from ._compiled import UNKEPT, forget_compiled
+from ._interrupts import INTERRUPTED, LAST_WORDS, end_run, leave, swallowed
+from .commands import app
+
+
+def main() -> None:
+    """Run the command line; what a user can mend is one sentence on stderr and exit status 2."""
+    warnings.showwarning = _print_warning
+    sys.unraisablehook = swallowed
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal that cannot show a sign ends no run
+    signal.signal(signal.SIGTERM, end_run)  # and leave no half file
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else a shell had it ignored
+        signal.signal(signal.SIGINT, end_run)
+    try:
+        app()
+    except (ValueError, OSError, RuntimeError, MemoryError) as error:
+        print(f"Error: {_sentence(error)}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:  # where Typer does not see it
+        leave(INTERRUPTED)
+    except SystemExit as exit:
+        if isinstance(exit.code, int) and exit.code in LAST_WORDS:
+            leave(exit.code)
+        raise
+
+
+def _sentence(error: BaseException) -> str:
+    """What an error says, without Python's numbers for those of the operating system."""
+    text = str(error)
+    if isinstance(error, MemoryError):
+        text = f"There is not enough memory. {text}".strip()
+    elif isinstance(error, OSError) and error.strerror:
+        text = error.strerror + (f": {os.fspath(error.filename)}" if error.filename is not None else ".")
+    return plain(text).replace("give overwrite.", "give --overwrite.")
+
+
+def _print_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    unkept = UNKEPT.match(str(message))
+    if unkept and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        forget_compiled(unkept[1])
+        return
+    print(f"Warning: {plain(str(message))}", file=sys.stderr)

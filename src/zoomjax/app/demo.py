@@ -1,0 +1,90 @@
+"""The paper's first experiment as photographs, on disk as a user's would be."""
+
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+
+from .._core.files import whole_file
+from ..correct.image import undistort_image
+from ..io.exif import exif_with_focal
+from ..models.lens import ZoomLens
+from ..scenes.board import board_photo, focal_sweep, nikkor_18_200
+
+IMAGE_SIZE = (2144, 1424)
+"""px: half the paper's camera's, the same field of view."""
+
+_QUALITY = 92
+
+
+def write_photos(
+    folder: str | os.PathLike[str],
+    *,
+    number: int = 12,
+    image_size: tuple[int, int] = IMAGE_SIZE,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Path]:
+    """Photograph the striped board at focal lengths spread over the lens's range, into JPEG files.
+
+    The lens is the paper's, from its published polynomials; photographs have blur of 0.8 px, noise of
+    2 grey levels, vignetting, and the focal length in their EXIF data.
+    """
+    lens = nikkor_18_200(image_size)
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    paths = [Path(folder) / name for name in photo_names(number)]
+    for index, (path, focal) in enumerate(zip(paths, _focal(number), strict=True)):
+        photo = board_photo(lens, float(focal), blur=0.8, noise=2, vignetting=0.3, seed=seed + index)
+        exif = np.frombuffer(exif_with_focal(float(focal)), np.uint8)
+        done, content = cv2.imencodeWithMetadata(
+            ".jpg", photo, [cv2.IMAGE_METADATA_EXIF], [exif], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+        )
+        assert done
+        with whole_file(path) as part:
+            part.write_bytes(content.tobytes())
+        progress(index + 1, number)
+    return paths
+
+
+def photo_names(number: int) -> list[str]:
+    """What `write_photos` calls so many photographs."""
+    return [f"board-{focal:06.2f}mm.jpg" for focal in _focal(number)]
+
+
+def _focal(number: int) -> np.ndarray:
+    return np.round(focal_sweep(number), 2)
+
+
+def write_before_after(photo: Path, target: Path, lens: ZoomLens, focal: float) -> None:
+    """One photograph beside its correction, each with a thin straight frame to compare with."""
+    image = cv2.imread(str(photo), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    assert image is not None
+    both = [image, undistort_image(image, lens(focal), keep="valid", interpolation="cubic")]
+    scale = 900 / image.shape[1]
+    halves = []
+    for picture, title in zip(both, (f"{photo.name}", "corrected"), strict=True):
+        size = (900, round(image.shape[0] * scale))
+        small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+        bar = np.full((36, size[0], 3), 255, np.uint8)
+        cv2.putText(bar, title, (10, 25), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (40, 40, 40), 1, cv2.LINE_AA)
+        halves.append(np.vstack([bar, small]))
+    gap = np.full((halves[0].shape[0], 12, 3), 255, np.uint8)
+    done, content = cv2.imencode(".jpg", np.hstack([halves[0], gap, halves[1]]))
+    assert done
+    with whole_file(target) as part:
+        part.write_bytes(content.tobytes())
+
+
+def worst_error(lens: ZoomLens, truth: ZoomLens, focal: Iterable[float]) -> float:
+    """The greatest distance, px, of two lenses' corrections, on 20 x 20 points at each focal length."""
+    width, height = truth.image_size
+    x, y = np.meshgrid(np.linspace(0, width - 1, 20), np.linspace(0, height - 1, 20))
+    grid = jnp.asarray(np.stack([x, y], axis=-1))
+    worst = 0.0
+    for f in focal:
+        apart = lens(float(f)).undistort(grid) - truth(float(f)).undistort(grid)
+        worst = max(worst, float(jnp.max(jnp.hypot(apart[..., 0], apart[..., 1]))))
+    return worst

@@ -1,0 +1,332 @@
+"""The focal length of each image, from the best source that there is.
+
+EXIF data, a table, a number, or the images themselves: a board parallel to the sensor at a known distance
+(eq. 14), or oblique views of a flat grid (Zhang's constraints). The last two need corrected points, and the
+correction is what is sought: so it comes first from each image by itself, which needs no focal length, and
+then once more from the zoom model of the focal lengths found.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..detect.batch import Detection
+from ..fit.frames import fit_frames
+from ..fit.robust import fit_robust
+from ..focal.board import focal_from_board
+from ..focal.estimate import FocalEstimate
+from ..focal.plane import focal_from_planes
+from ..io.focal_table import read_focal_table
+from ..io.focal_track import read_focal_track
+from ..lines.compressed import compress
+from ..lines.lines import Lines
+from ..models.distortion import Distortion
+from ..models.zoom import PolynomialZoom
+
+WAYS = (
+    'a CSV file with the columns "image,focal" (--focal focal.csv); EXIF data in the photos '
+    "(--focal exif); a board parallel to the sensor (--focal board --pitch MM --distance MM --pixel MM); "
+    "or oblique photos of a flat checkerboard or dot grid (--focal plane)"
+)
+
+_VIDEO_WAYS = (
+    "one focal length, a CSV file with time,focal or frame,focal, or plane or board, as photos may have"
+)
+
+_MOST_UNCERTAIN = 0.2
+"""Standard deviation over focal length above which a view says too little of it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Board:
+    """A board parallel to the sensor.
+
+    Attributes:
+        pitch: mm between neighbouring lines on it, across and down: from one edge of a stripe to the next
+            one, or from corner to corner, or from dot to dot.
+        distance: mm from the camera's projection plane to it.
+        pixel: mm, side of a pixel on the sensor.
+    """
+
+    pitch: tuple[float, float]
+    distance: float
+    pixel: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Focals:
+    """Focal lengths of images.
+
+    Attributes:
+        focal: by the images' names; those without one are not in it.
+        unit: "mm" or "px".
+        origin: where they come from, in words.
+        absent: why an image may have none.
+        deviation: standard deviations by name, of those of which they are known: estimated from images, or
+            told.
+    """
+
+    focal: dict[str, float]
+    unit: str
+    origin: str
+    absent: str
+    deviation: dict[str, float] = dataclasses.field(default_factory=dict)
+
+
+def check_way(way: str | None, board: Board | None, *, video: bool) -> None:
+    """Check what can be known of a way to focal lengths before any image is looked at.
+
+    Raises:
+        FileNotFoundError: there is no such CSV file.
+        ValueError: the way is none, or lacks something; the message names the ways.
+    """
+    if way == "board" or (way is None and board):
+        if board is None:
+            raise ValueError(_NO_BOARD)
+    elif video and way in (None, "exif"):
+        raise ValueError(f"A video needs --focal: {_VIDEO_WAYS}.")
+    elif way not in (None, "exif", "plane") and _number(way) is None:
+        if not way.lower().endswith(".csv"):
+            raise ValueError(
+                f"--focal is {way!r}, which is no way to a focal length. Give "
+                f"{_VIDEO_WAYS if video else WAYS}."
+            )
+        read_focal_track(way) if video else read_focal_table(way)
+
+
+_NO_BOARD = "--focal board needs the board's --pitch and --distance, and the sensor's --pixel, in mm."
+
+
+def choose_focals(
+    detections: Sequence[Detection],
+    way: str | None = None,
+    *,
+    unit: str = "mm",
+    board: Board | None = None,
+) -> Focals:
+    """The focal length of each image.
+
+    Args:
+        detections: of the images, all of one size and with lines.
+        way: "exif", "board", "plane", a number, a CSV file; or None for what there is: a `board`'s, if one
+            is given, else EXIF data, else an oblique grid.
+        unit: of a number's or a CSV file's focal lengths.
+        board: for "board".
+
+    Raises:
+        FileNotFoundError: there is no such CSV file.
+        ValueError: no focal length is to be had that way; the message names the others.
+    """
+    if way is None:
+        way = "board" if board else "exif" if any(d.focal for d in detections) else "plane"
+    if way == "exif":
+        found = Focals(_own(detections), "mm", "EXIF data", "its EXIF data hold no focal length")
+    elif way == "track":
+        found = Focals(_own(detections), unit, "the track of the video", "the track has none")
+    elif way == "board":
+        if board is None:
+            raise ValueError(_NO_BOARD)
+        found = _estimated(
+            detections, "mm", "the board's pitch (eq. 14)", _NOT_THE_BOARD, _from_board(board)
+        )
+    elif way == "plane":
+        found = _estimated(detections, "px", "homographies of the grid", _NO_PLANE, _from_plane)
+    elif (number := _number(way)) is not None:
+        found = Focals({d.name: number for d in detections}, unit, "--focal", "")
+    else:
+        table = read_focal_table(way)
+        known = table.of([d.file for d in detections])
+        sigma = {d.name: table.sigma(d.file) for d in detections if d.file in known}
+        found = Focals(
+            {d.name: known[d.file] for d in detections if d.file in known},
+            unit,
+            Path(way).name,
+            f"{Path(way).name} has no row for it",
+            {name: value for name, value in sigma.items() if value is not None},
+        )
+    if not found.focal:
+        raise ValueError(
+            f"No focal length is to be had of any image from {found.origin} ({found.absent}). Give {WAYS}. "
+            "(Straightness alone cannot tell: with focal lengths relabelled, and the model accordingly, "
+            "every line is as straight as before.)"
+        )
+    return found
+
+
+_NO_PLANE = "it shows no flat grid, or one too squarely to tell a focal length"
+
+
+_NOT_THE_BOARD = (
+    "it shows no evenly spaced lines of a board, or their pitch differs between its two directions (then "
+    "give both: --pitch ACROSSxDOWN)"
+)
+_EVEN = 0.1
+"""Steps, RMS, that lines of a board may be from where they are expected."""
+
+_DISAGREE = 3e-3
+"""Share of the focal length by which a board's two directions may disagree, beside three deviations."""
+
+
+def _own(detections: Sequence[Detection]) -> dict[str, float]:
+    return {detection.name: detection.focal for detection in detections if detection.focal}
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    if not (np.isfinite(value) and value > 0):
+        raise ValueError(f"--focal must be a positive number, but it is {text}.")
+    return value
+
+
+Estimator = Callable[[Detection, Distortion], FocalEstimate | None]
+
+
+def _estimated(
+    detections: Sequence[Detection], unit: str, origin: str, absent: str, estimate: Estimator
+) -> Focals:
+    """Focal lengths from corrected images, corrected twice."""
+    each = fit_frames(compress(lines_of(detections, np.ones(len(detections)), unit)), throw=False)
+    corrections = [each.distortion(frame) for frame in range(len(detections))]
+    found = _all(detections, corrections, estimate)
+    usable = [d for d in detections if d.name in found]
+    if len(usable) > 2:
+        focal = np.array([float(found[d.name].focal) for d in usable])
+        lines = compress(lines_of(usable, focal, unit))
+        degree = min(2, np.unique(focal).size - 1)
+        lens = fit_robust(lines, zoom=PolynomialZoom(degree=degree), terms=2, throw=False).fit.lens
+        found = _all(usable, [lens(float(f)) for f in focal], estimate) or found
+    return Focals(
+        {name: float(f.focal) for name, f in found.items()},
+        unit,
+        origin,
+        absent,
+        {name: float(f.std) for name, f in found.items()},
+    )
+
+
+def _all(
+    detections: Sequence[Detection], corrections: Sequence[Distortion], estimate: Estimator
+) -> dict[str, FocalEstimate]:
+    """The estimates that say something, by the names of the images."""
+    found = {}
+    for detection, correction in zip(detections, corrections, strict=True):
+        if not np.isfinite(np.asarray(correction.coefficients)).all():
+            continue
+        value = estimate(detection, correction)
+        if value is not None and float(value.std) < _MOST_UNCERTAIN * float(value.focal):
+            found[detection.name] = value
+    return found
+
+
+def lines_of(detections: Sequence[Detection], focal: np.ndarray, unit: str) -> Lines:
+    """The lines of all images, a frame each."""
+    return Lines.from_ragged(
+        [line for detection in detections for line in detection.lines],
+        np.repeat(np.arange(len(detections)), [len(detection.lines) for detection in detections]),
+        jnp.asarray(focal, float),
+        image_size=detections[0].image_size,
+        focal_unit=unit,
+    )
+
+
+def _nodes(detection: Detection, correction: Distortion) -> tuple[np.ndarray, np.ndarray] | None:
+    """Corrected nodes, px, and their places in the grid, steps; None if there are too few."""
+    if detection.nodes is None:
+        return None
+    seen = np.isfinite(detection.nodes[..., 0])
+    row, column = np.nonzero(seen)
+    if np.unique(row).size < 3 or np.unique(column).size < 3:
+        return None
+    corrected = correction.undistort(jnp.asarray(detection.nodes[seen]))
+    return np.asarray(corrected), np.stack([column, row], axis=-1).astype(float)
+
+
+def _from_plane(detection: Detection, correction: Distortion) -> FocalEstimate | None:
+    known = _nodes(detection, correction)
+    if known is None:
+        return None
+    points, places = known
+    _, each = focal_from_planes(points[None], places, principal=np.asarray(correction.centre))
+    return jax.tree.map(lambda a: a[0], each)
+
+
+def _from_board(board: Board) -> Estimator:
+    def estimate(detection: Detection, correction: Distortion) -> FocalEstimate | None:
+        pitch = np.array(board.pitch)
+        known = _nodes(detection, correction)
+        if known is not None:
+            points, places = known
+            parts = [(points, pitch * places)]
+        else:
+            corrected = [np.asarray(correction.undistort(jnp.asarray(line))) for line in detection.lines]
+            parts = [(points, pitch * places) for points, places in _parallels(corrected)]
+        found = [
+            focal_from_board(points, places, distance=board.distance, pixel=board.pixel)
+            for points, places in parts
+        ]
+        return _combined(found)
+
+    return estimate
+
+
+def _combined(found: Sequence[FocalEstimate]) -> FocalEstimate | None:
+    """The mean of estimates by their weights; None if there is none, or if they disagree."""
+    if not found:
+        return None
+    focal, std, rms = (
+        np.array([float(getattr(f, name)) for f in found]) for name in ("focal", "std", "rms")
+    )
+    weight = 1 / np.maximum(std, 1e-12) ** 2
+    mean = weight @ focal / weight.sum()
+    if np.any(abs(focal - mean) > np.maximum(3 * std, _DISAGREE * mean)):
+        return None
+    return FocalEstimate(jnp.asarray(mean), jnp.asarray(weight.sum() ** -0.5), jnp.asarray(rms.max()))
+
+
+def _parallels(lines: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For each direction of a board, its lines' positions across, px, and which lines of it they are.
+
+    Positions (n, 2) are on the x axis for what runs down, on the y axis for what runs across; so are the
+    places: what `focal_from_board` compares. A direction whose lines are not evenly spaced is left out.
+    """
+    middle = np.array([line.mean(axis=0) for line in lines])
+    along = np.array([line[-1] - line[0] for line in lines])
+    twice = 2 * np.arctan2(along[:, 1], along[:, 0])
+    # Squared once more, both directions of a board are one.
+    main = np.angle(np.sum(np.hypot(*along.T) * np.exp(2j * twice))) / 4
+    result = []
+    for direction in (main, main + np.pi / 2):
+        chosen = np.cos(twice - 2 * direction) > 0.9
+        normal = np.array([-np.sin(direction), np.cos(direction)])
+        counted = _counted(np.sort(middle[chosen] @ normal))
+        if counted is not None:
+            axis = np.eye(2)[int(np.argmax(abs(normal)))]
+            result.append(tuple(values[:, None] * axis for values in counted))
+    return result
+
+
+def _counted(position: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Positions of evenly spaced lines, in order, and which of them each is; None if they are none.
+
+    Some may be missing, and some seen in two pieces.
+    """
+    if len(position) < 3:
+        return None
+    usual = float(np.median(np.diff(position)))
+    position = position[np.append(True, np.diff(position) > 0.2 * usual)]
+    if len(position) < 3 or usual < 1:
+        return None
+    step, index = float(np.median(np.diff(position))), np.zeros(len(position))
+    for number in range(1, len(position)):  # the step is known better and better
+        index[number] = index[number - 1] + np.rint((position[number] - position[number - 1]) / step)
+        if number > 3:
+            step = float(np.polyfit(index[: number + 1], position[: number + 1], 1)[0])
+    rest = position - np.polyval(np.polyfit(index, position, 1), index)
+    return (position, index) if np.sqrt(np.mean(rest**2)) < _EVEN * step else None

@@ -1,0 +1,326 @@
+"""From photographs or a video to a calibrated lens: what ``zoomjax calibrate`` does with images."""
+
+import concurrent.futures
+import contextlib
+import dataclasses
+import os
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from .._core.text import numbered_name, plain
+from ..detect.batch import DETECTORS, Detection, detect
+from ..detect.sources import VIDEO_SUFFIXES, Source, find_photos, video_frames
+from ..io.focal_track import FocalTrack, read_focal_track
+from .calibration import CLEARS, FILES, Calibration, calibrate, focal_sigmas
+from .focal_sources import Board, Focals, check_way, choose_focals, lines_of
+from .overlay import draw_lines
+from .results_folder import results_folder
+
+Progress = Callable[[int, int], None]
+"""Called with how many images are done, and of how many."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageJob:
+    """What to calibrate from images.
+
+    Attributes:
+        inputs: photographs, folders or patterns; or one video.
+        detector: "edges", "grid" or "pitch".
+        focal: where focal lengths come from, as for `choose_focals`; of a video also a track.
+        focal_unit: of a number's, a table's or a track's.
+        focal_sigma: standard deviation of the focal lengths: a number in their unit, or per cent such as
+            "1%"; None for what is known from where they come from.
+        board: for ``focal="board"``.
+        degree: of the polynomials in 1/f.
+        terms: number of distortion coefficients.
+        select: whether to choose degree and terms.
+        frames: of a video, at most.
+        workers: number of processes.
+        cache: folder for what was detected; None: no cache.
+    """
+
+    inputs: tuple[str | os.PathLike[str], ...]
+    detector: str = "edges"
+    focal: str | None = None
+    focal_unit: str = "mm"
+    focal_sigma: str | None = None
+    board: Board | None = None
+    degree: int = 2
+    terms: int = 2
+    select: bool = False
+    frames: int = 60
+    workers: int = 1
+    cache: Path | None = None
+
+    def __post_init__(self):
+        """Check what can be checked before any work.
+
+        Raises:
+            FileNotFoundError: there is no such CSV file.
+            ValueError: a name is unknown, or a file is something else.
+        """
+        if self.detector not in DETECTORS:
+            raise ValueError(
+                f"--detector must be one of {', '.join(DETECTORS)}, but it is {self.detector!r}."
+            )
+        if len(self.inputs) > 1 and any(map(_is_video, self.inputs)):
+            raise ValueError("Give photographs, or one video.")
+        check_way(self.focal, self.board, video=self.video is not None)
+        focal_sigmas(self.focal_sigma or "0", np.ones(1))
+
+    @property
+    def video(self) -> Path | None:
+        """The video, if that is what is calibrated from."""
+        return Path(self.inputs[0]) if _is_video(self.inputs[0]) else None
+
+    @property
+    def grid(self) -> str:
+        """In which images a grid must be looked for, to tell the focal length, in `detect`'s words."""
+        if self.focal == "plane" or (self.focal == "board" and self.detector == "grid"):
+            return "all"
+        return "without focal length" if self.focal is None and self.board is None else "none"
+
+    def sources(self) -> tuple[Iterable[Source], int]:
+        """The images and how many they are."""
+        if self.video is None:
+            photos = find_photos(self.inputs)
+            return photos, len(photos)
+        return video_frames(self.video, self._track(), self.frames), self.frames
+
+    def results(self) -> list[str]:
+        """Names of the files that `ImageCalibration.write` writes, as far as they are known before."""
+        photos = self.sources()[0] if self.video is None else ()
+        return [*FILES, *(f"lines/{_overlay(n, photo.name)}" for n, photo in enumerate(photos, start=1))]
+
+    def _track(self) -> FocalTrack | float:
+        """Of a video; 1 where its own frames tell."""
+        if self.focal in (None, "plane", "board"):
+            return 1.0
+        try:
+            return float(self.focal)
+        except ValueError:
+            return read_focal_track(self.focal)
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageCalibration:
+    """A calibration and the images that it is from.
+
+    Attributes:
+        job: what was asked for.
+        calibration: the fits; a frame for each used image, in their order.
+        used: what was detected in them.
+        focals: their focal lengths.
+        images: the names of all images, in order; an overlay has its image's number here, from 1.
+        unused: why an image was not used, by its name.
+    """
+
+    job: ImageJob
+    calibration: Calibration
+    used: tuple[Detection, ...]
+    focals: Focals
+    images: tuple[str, ...]
+    unused: dict[str, str]
+
+    def rejected(self) -> list[np.ndarray]:
+        """For each used image, which of its lines were found not to be straight in the scene."""
+        counts = [len(detection.lines) for detection in self.used]
+        return np.split(self.calibration.rejected, np.cumsum(counts)[:-1])
+
+    def about(self) -> dict[str, Any]:
+        """What summary.json says of the images."""
+        images = [
+            {
+                "name": detection.name,
+                "focal": self.focals.focal[detection.name],
+                "focal_sigma": self.focals.deviation.get(detection.name),
+                "lines": len(detection.lines),
+                "rejected": int(rejected.sum()),
+            }
+            for detection, rejected in zip(self.used, self.rejected(), strict=True)
+        ]
+        return {
+            "detector": self.job.detector,
+            "focal_source": self.focals.origin,
+            "images": images,
+            "unused": self.unused,
+        }
+
+    def warnings(self) -> list[str]:
+        """What a user must hear of: images that were not used, and what the calibration warns of."""
+        told = []
+        if self.unused:
+            listed = [f"{plain(name)}: {plain(why)}" for name, why in self.unused.items()]
+            rest = len(listed) - 8
+            told.append(
+                f"{len(listed)} of {len(listed) + len(self.used)} images are not used.\n  "
+                + "\n  ".join(listed[:8] + ([f"and {rest} more, in summary.json"] if rest > 0 else []))
+            )
+        return told + self.calibration.warnings([plain(detection.name) for detection in self.used])
+
+    def overlays(self) -> list[str]:
+        """For each used image the name of the picture of its lines, in ``lines/``."""
+        numbers = {name: number for number, name in enumerate(self.images, start=1)}
+        return [_overlay(numbers[detection.name], detection.name) for detection in self.used]
+
+    def write(
+        self,
+        folder: str | os.PathLike[str],
+        progress: Progress = lambda done, total: None,
+        pages: Mapping[str, str] | None = None,
+        *,
+        overwrite: bool = False,
+    ) -> None:
+        """Write what `Calibration.write` does, and the lines drawn over each image, in ``lines/``."""
+        names = [*self.job.results(), *(pages or {})]
+        with results_folder(folder, names, clears=CLEARS, overwrite=overwrite) as part:
+            self.make(part, progress, pages)
+
+    def make(
+        self,
+        folder: Path,
+        progress: Progress = lambda done, total: None,
+        pages: Mapping[str, str] | None = None,
+    ) -> None:
+        """The same in an empty folder: that of a `results_folder`, say."""
+        (folder / "lines").mkdir()
+        self._draw(folder / "lines", progress)
+        self.calibration.make(folder, about=self.about(), pages=pages)
+
+    def _draw(self, folder: Path, progress: Progress) -> None:
+        used = {
+            detection.name: (detection, rejected, folder / target)
+            for detection, rejected, target in zip(self.used, self.rejected(), self.overlays(), strict=True)
+        }
+
+        def draw(source: Source) -> None:
+            detection, rejected, target = used[source.name]
+            picture = draw_lines(source.read()[0], detection.lines, rejected.tolist())
+            done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
+            assert done
+            target.write_bytes(content.tobytes())
+
+        sources = (source for source in self.job.sources()[0] if source.name in used)
+        if self.job.video is not None:
+            for source in sources:
+                draw(source)
+        else:
+            with concurrent.futures.ThreadPoolExecutor(self.job.workers) as pool:
+                for done, _ in enumerate(pool.map(draw, sources), start=1):
+                    progress(done, len(used))
+
+
+def calibrate_images(
+    job: ImageJob,
+    *,
+    progress: Progress = lambda done, total: None,
+    stage: Callable[[str], None] = lambda _: None,
+) -> ImageCalibration:
+    """Detect lines in images, find their focal lengths, fit, and reject lines that are not straight.
+
+    Args:
+        job: what to do.
+        progress: called after each image.
+        stage: called with a sentence before each step after that.
+
+    Raises:
+        FileNotFoundError: an input does not exist.
+        ValueError: no image can be used, or no focal length is to be had, or there are too few.
+        RuntimeError: the lines do not determine the model.
+    """
+    sources, total = job.sources()
+    detections = []
+    looked = detect(
+        sources,
+        DETECTORS[job.detector](),
+        grid=job.grid,
+        workers=job.workers,
+        cache=job.cache,
+    )
+    with contextlib.closing(looked):  # whatever happens, no process is left behind
+        for detection in looked:
+            detections.append(detection)
+            progress(len(detections), total)
+    unused = {d.name: d.problem for d in detections if d.problem}
+    usable, others = _of_one_size([d for d in detections if not d.problem])
+    unused |= others
+    if not usable:
+        raise ValueError(_nothing(detections))
+    stage("Finding the focal lengths")
+    way = "track" if job.video and job.focal not in (None, "plane", "board") else job.focal
+    if job.video and job.focal is None:
+        way = "board"
+    focals = choose_focals(usable, way, unit=job.focal_unit, board=job.board)
+    unused |= {d.name: focals.absent for d in usable if d.name not in focals.focal}
+    if job.focal_sigma is not None:
+        sigma = focal_sigmas(job.focal_sigma, np.array(list(focals.focal.values())))
+        focals = dataclasses.replace(focals, deviation=dict(zip(focals.focal, sigma.tolist(), strict=True)))
+    used = tuple(d for d in usable if d.name in focals.focal)
+    while True:
+        lines = lines_of(used, np.array([focals.focal[d.name] for d in used]), focals.unit)
+        sigma = np.array([focals.deviation.get(d.name, 0.0) for d in used])
+        calibration = calibrate(
+            lines,
+            degree=job.degree,
+            terms=job.terms,
+            robust=True,
+            focal_sigma=sigma,
+            select=job.select,
+            stage=stage,
+        )
+        done = ImageCalibration(job, calibration, used, focals, tuple(d.name for d in detections), unused)
+        hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}
+        if not hopeless:
+            return done
+        unused = unused | dict.fromkeys(sorted(hopeless), _NONE_AGREES)
+        used = tuple(d for d in used if d.name not in hopeless)
+
+
+_NONE_AGREES = (
+    "none of its lines is straight under the distortion of the others. Is its focal length right?"
+)
+
+
+def _overlay(number: int, name: str) -> str:
+    """What the picture of an image's lines is called: a name of ours, whatever the image is called."""
+    return numbered_name(number, name, ".jpg")
+
+
+def _is_video(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix.lower() in VIDEO_SUFFIXES
+
+
+def _of_one_size(detections: Sequence[Detection]) -> tuple[list[Detection], dict[str, str]]:
+    """The images of the most frequent size, and what is wrong with the others."""
+    if not detections:
+        return [], {}
+    (width, height), _ = Counter(d.image_size for d in detections).most_common(1)[0]
+    others = {}
+    for detection in detections:
+        if detection.image_size == (width, height):
+            continue
+        own = "x".join(map(str, detection.image_size))
+        here = f"its size is {own} px, most images' {width}x{height}"
+        turned = detection.image_size == (height, width)
+        others[detection.name] = here + (
+            ": it was turned, so turn it back"
+            if turned
+            else ": use images as the camera stored them, neither resized nor cropped"
+        )
+    return [d for d in detections if d.image_size == (width, height)], others
+
+
+def _nothing(detections: Sequence[Detection]) -> str:
+    """Why no image can be used."""
+    problems = Counter(d.problem.rstrip(".") for d in detections)
+    if len(problems) == 1 and len(detections) > 1:
+        return f"None of the {len(detections)} images can be used: {next(iter(problems))}."
+    listed = "; ".join(f"{plain(d.name)}: {plain(d.problem)}" for d in detections[:4])
+    more = f"; and {len(detections) - 4} more" if len(detections) > 4 else ""
+    return f"None of the images can be used. {listed}{more}."

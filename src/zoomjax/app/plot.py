@@ -1,0 +1,354 @@
+"""Plots, with matplotlib (the extra ``zoomjax[app]``). Figures are returned, not shown or saved."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+from ..fit.centre import FrameCentres
+from ..fit.result import FrameFits, ZoomFit
+from ..lines.base import AbstractLines
+from ..lines.lines import Lines
+from ..models.lens import ZoomLens
+from ..trust.bands import coefficient_std, displacement_std
+
+_MODEL, _FRAMES = "#c2410c", "#1e3a5f"
+_DEPTHS = LinearSegmentedColormap.from_list("zoomjax", ["#ffffff", "#7da3c8"])
+_EXAGGERATIONS = np.outer(10.0 ** np.arange(7), (1, 2, 5)).ravel()
+_VISIBLE = 0.03  # of the image's longer side: how far the drawn grid is bent at least
+_STEP = 7  # from one arrow to the next, in points at which the field is known
+_ROUNDING = 1e-6  # of half the diagonal: smaller displacements are none
+
+
+def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
+    """The distortion coefficients against 1/f: each frame by itself, and the zoom model (Figure 8).
+
+    Below each coefficient stands by how much the frames differ from the model, with bars of one standard
+    deviation of the frame's own fit; frames whose lines do not determine it have no dot. Around the model
+    are shaded one and two of its standard deviations, where the lines determine it.
+
+    Args:
+        zoom: the fitted zoom model.
+        each: the frames fitted by themselves.
+        lines: what both were fitted to; only its focal lengths are used.
+    """
+    lens = zoom.lens
+    terms = each.coefficients.shape[1]
+    orders = lens.family.orders(terms)
+    to_pixel = lens.scale ** (-1.0 * orders)
+    focal = np.asarray(lines.focal)
+    grid = np.linspace(1 / focal.max(), 1 / focal.min(), 200)
+    frames = np.asarray(each.coefficients) * to_pixel
+    sigma = np.sqrt(np.diagonal(np.asarray(each.covariance), axis1=1, axis2=2)) * to_pixel
+
+    def model(focal: np.ndarray) -> np.ndarray:
+        return (
+            np.asarray(jax.vmap(lens.zoom)(jnp.asarray(focal, jnp.asarray(lines.focal).dtype))) * to_pixel
+        )
+
+    curve, expected = model(1 / grid), model(focal)
+    spread = np.asarray(coefficient_std(zoom, 1 / grid)) * to_pixel
+    figure = Figure(figsize=(4.8 * terms, 5.2), layout="constrained")
+    figure.suptitle(
+        f"RMS {float(zoom.rms):.3f} px by the zoom model, {float(each.rms):.3f} px frame by frame",
+        fontsize=10,
+    )
+    axes = figure.subplots(2, terms, sharex=True, squeeze=False, height_ratios=[2.2, 1])
+    for i, (above, below) in enumerate(axes.T):
+        known = np.isfinite(sigma[:, i])
+        x, unit = 1 / focal[known], f"px$^{{-{orders[i]}}}$"
+        above.plot(x, frames[known, i], "o", markersize=3.5, color=_FRAMES, label="each frame by itself")
+        above.plot(grid, curve[:, i], color=_MODEL, linewidth=1.8, label="zoom model")
+        _shade(above, grid, curve[:, i], spread[:, i])
+        name = f"k_{i + 1}" if orders[i] > 1 else f"p_{i + 1 - np.sum(orders > 1)}"
+        _label(above, f"${name}$", unit, curve[:, i])
+        difference = frames[known, i] - expected[known, i]
+        below.errorbar(
+            x, difference, sigma[known, i], fmt="o", markersize=2.5, linewidth=0.9, color=_FRAMES
+        )
+        _shade(below, grid, 0.0, spread[:, i])
+        _label(below, "frame − model", unit, np.append(difference, sigma[known, i]))
+        below.axhline(0, color=_MODEL, linewidth=1.2, zorder=0)
+        below.set_xlabel(f"$1/f$  (1/{lens.focal_unit})")
+        below.locator_params(axis="x", nbins=6)  # labels of focal lengths in px are long
+        _show_focal_lengths(above, focal, lens.focal_unit)
+    figure.axes[0].legend(frameon=False)
+    return figure
+
+
+def plot_residues(
+    lines: AbstractLines,
+    none: Float[np.ndarray, "frame"],
+    each: Float[np.ndarray, "frame"],
+    zoom: Float[np.ndarray, "frame"],
+    *,
+    unit: str = "px",
+) -> Figure:
+    """What is left of each frame against 1/f: uncorrected, frame by frame, zoom model (Figures 9 and 10).
+
+    Args:
+        lines: only their focal lengths are used.
+        none, each, zoom: each frame's RMS.
+        unit: theirs.
+    """
+    focal = np.asarray(lines.focal)
+    order = np.argsort(focal)
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(1 / focal[order], none[order], "--", color="0.45", label="no correction")
+    axes.plot(1 / focal[order], zoom[order], color=_MODEL, linewidth=1.8, label="zoom model")
+    axes.plot(1 / focal[order], each[order], ":", color=_FRAMES, linewidth=2.2, label="frame by frame")
+    axes.set_ylim(0)
+    axes.set_ylabel(f"RMS distance to the lines  ({unit})")
+    axes.set_xlabel(f"$1/f$  (1/{lines.focal_unit})")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+    _show_focal_lengths(axes, focal, lines.focal_unit)
+    return figure
+
+
+def plot_primitives(lines: Lines, lens: ZoomLens, frames: Sequence[int]) -> Figure:
+    """The points of some frames as they were seen, and as a lens corrects them (Figures 5 and 6).
+
+    The frame around them is the border of the image, which the correction bends. A row is a frame.
+    """
+    figure = Figure(figsize=(9, 3.1 * len(frames)), layout="constrained")
+    width, height = lines.image_size
+    border = np.concatenate(
+        [
+            np.linspace(start, end, 100)
+            for start, end in pairwise(
+                np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * [width - 1, height - 1]
+            )
+        ]
+    )
+    mask, index = np.asarray(lines.mask), np.asarray(lines.frame)
+    for row, frame in zip(figure.subplots(len(frames), 2, squeeze=False), frames, strict=True):
+        number = range(len(lines.focal))[frame]
+        focal = float(np.asarray(lines.focal)[number])
+        chosen = index == number
+        points = np.asarray(lines.points)[chosen][mask[chosen]].astype(float)
+        distortion = lens(focal)
+        for axes, mapped in zip(row, (np.asarray, distortion.undistort), strict=True):
+            axes.plot(*np.asarray(mapped(points)).T, ".", markersize=0.5, color=_FRAMES, rasterized=True)
+            axes.plot(*np.asarray(mapped(border)).T, color=_MODEL, linewidth=1)
+            axes.set_aspect("equal")
+            axes.invert_yaxis()
+            axes.set_axis_off()
+        row[0].set_title(f"$f$ = {focal:.2f} {lines.focal_unit}: {chosen.sum()} lines", fontsize=9)
+        row[1].set_title("corrected", fontsize=9)
+    return figure
+
+
+def plot_centres(centres: FrameCentres, lines: AbstractLines) -> Figure:
+    """Each frame's centre of distortion, and how much it lowers the frame's RMS (Figure 7).
+
+    Crosses are standard deviations; frames whose lines do not determine a centre are left out.
+    """
+    known = np.asarray(centres.determined)
+    away = (np.asarray(centres.each.centre) - np.asarray(lines.centre))[known]
+    gain = 100 * (1 - np.asarray(centres.each.frame_rms) / np.asarray(centres.rms_fixed))[known]
+    focal = np.asarray(lines.focal)
+    figure = Figure(figsize=(9.6, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    std = np.asarray(centres.std)[known]
+    left.errorbar(*away.T, xerr=std[:, 0], yerr=std[:, 1], fmt="none", ecolor="0.85", elinewidth=0.8)
+    dots = left.scatter(*away.T, c=1 / focal[known], s=16, cmap="viridis", zorder=2)
+    left.plot(0, 0, "+", color=_MODEL, markersize=12, label="the image's centre")
+    figure.colorbar(dots, label=f"$1/f$  (1/{lines.focal_unit})", shrink=0.85)
+    left.set_aspect("equal", adjustable="datalim")
+    left.set_xlabel("centre of distortion, $x$  (px from the image's)")
+    left.set_ylabel("$y$  (px)")
+    left.invert_yaxis()
+    left.legend(frameon=False)
+    right.plot(1 / focal[known], gain, "o", markersize=3.5, color=_FRAMES)
+    right.axhline(0, color="0.85", linewidth=0.8, zorder=0)
+    right.set_ylabel("RMS lower by  (%)")
+    right.set_xlabel(f"$1/f$  (1/{lines.focal_unit})")
+    for axes in (left, right):
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def plot_distortion(
+    lens: ZoomLens | ZoomFit, *, focal: float | Sequence[float], exaggeration: float | None = None
+) -> Figure:
+    """How a lens bends a straight grid, and how far each pixel is from where it belongs.
+
+    A row is a focal length. On the left is a straight grid, and over it the same grid as the lens shows
+    it. On the right is the distance of each pixel to its corrected point, with arrows towards it, and for
+    a fit contours of its standard deviation. Beyond a fold, where there is no corrected point, lines of
+    the grid end, and the right is hatched.
+
+    Args:
+        lens: a lens, or a fit.
+        focal: one focal length or several, in the lens's unit.
+        exaggeration: how many times farther from the straight grid the bent one is drawn than it is; by
+            default the first of 1, 2, 5, 10, ... that makes it visible.
+    """
+    fit, lens = (lens, lens.lens) if isinstance(lens, ZoomFit) else (None, lens)
+    focals = np.atleast_1d(np.asarray(focal, float)).tolist()
+    width, height = lens.image_size
+    figure = Figure(figsize=(9.6, len(focals) * (1.2 + 4 * height / width)), layout="constrained")
+    for f, (left, right) in zip(focals, figure.subplots(len(focals), 2, squeeze=False), strict=True):
+        _draw_grid(left, lens, f, exaggeration)
+        _draw_field(figure, right, lens, fit, f)
+        for axes in (left, right):
+            axes.set_aspect("equal")
+            axes.invert_yaxis()
+            axes.set_xlabel("$x$  (px)", fontsize=8)
+            axes.set_ylabel("$y$  (px)", fontsize=8)
+            axes.tick_params(labelsize=8)
+            axes.locator_params(nbins=5)
+    return figure
+
+
+def _draw_grid(axes: Axes, lens: ZoomLens, focal: float, exaggeration: float | None) -> None:
+    """A straight grid in grey, and how the lens shows it."""
+    width, height = lens.image_size
+    cells = np.maximum(2, np.round(12 * np.array([width, height]) / max(width, height)).astype(int))
+    x, y = (np.linspace(0, side - 1, 8 * n + 1) for side, n in zip((width, height), cells, strict=True))
+    straight = [np.stack(np.broadcast_arrays(at, y), -1) for at in x[::8]]
+    straight += [np.stack(np.broadcast_arrays(x, at), -1) for at in y[::8]]
+    points = np.concatenate(straight)
+    off = np.asarray(lens(focal).distort(points)) - points
+    farthest = np.max(np.nan_to_num(_lengths(off)))
+    if exaggeration is None:
+        enough = _EXAGGERATIONS[_EXAGGERATIONS * farthest >= _VISIBLE * max(width, height)]
+        exaggeration = float(enough[0]) if len(enough) else 1.0
+    bent = np.split(points + exaggeration * off, np.cumsum([len(line) for line in straight])[:-1])
+    for line, seen in zip(straight, bent, strict=True):
+        axes.plot(*line.T, color="0.75", linewidth=0.8, zorder=1)
+        axes.plot(*seen.T, color=_MODEL, linewidth=1.1, zorder=2)
+    axes.set_title(f"$f$ = {focal:.4g} {lens.focal_unit}: a straight grid as the lens shows it", fontsize=9)
+    more = "" if exaggeration == 1 else f", distortion × {exaggeration:g}"
+    _explain(
+        axes,
+        Line2D([], [], color="0.75", label="straight"),
+        Line2D([], [], color=_MODEL, label=f"as the lens shows it{more}"),
+    )
+    axes.spines[:].set_visible(False)
+
+
+def _draw_field(figure: Figure, axes: Axes, lens: ZoomLens, fit: ZoomFit | None, focal: float) -> None:
+    """How far pixels are from their corrected points, in which direction, and how certain that is."""
+    points = _raster(lens)
+    moved = np.asarray(lens(focal).undistort(points)) - points
+    distance = np.ma.masked_invalid(_lengths(moved))
+    distance[distance < _ROUNDING * lens.scale] = 0
+    levels = MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]).tick_values(0, float(distance.filled(0).max()) or 1)
+    axes.patch.set(hatch="////", edgecolor="0.75")  # what shows beyond a fold
+    filled = axes.contourf(*np.moveaxis(points, -1, 0), distance, levels, cmap=_DEPTHS)
+    bar = figure.colorbar(filled, ax=axes, shrink=0.8)
+    bar.set_label("displacement  (px)", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    some = np.s_[_STEP // 2 :: _STEP, _STEP // 2 :: _STEP]
+    at, arrows = points[some], np.ma.masked_invalid(moved[some])
+    longest = float(distance[some].filled(0).max())
+    if longest > 0:
+        scale = longest / (at[0, 1, 0] - at[0, 0, 0])  # the longest reaches to the next
+        axes.quiver(
+            *np.moveaxis(at, -1, 0),
+            *np.moveaxis(arrows, -1, 0),
+            color=_FRAMES,
+            angles="xy",
+            scale_units="xy",
+            scale=scale,
+            width=0.004,
+        )
+    fold = " (hatched: folded over)" if distance.mask.any() else ""
+    axes.set_title(
+        f"$f$ = {focal:.4g} {lens.focal_unit}: from pixels to where they belong{fold}", fontsize=9
+    )
+    if fit is not None:
+        std = np.asarray(displacement_std(fit, points, focal=focal))
+        _draw_std(axes, points, np.ma.masked_where(distance.mask | ~np.isfinite(std), std))
+    axes.set(xlim=(0, lens.image_size[0] - 1), ylim=(0, lens.image_size[1] - 1))
+
+
+def _draw_std(axes: Axes, points: np.ndarray, std: np.ma.MaskedArray) -> None:
+    """Contours of the standard deviation, each with its px."""
+    largest = float(std.filled(0).max())
+    if largest == 0:
+        _explain(axes, Line2D([], [], linestyle="", label="The lines do not determine its uncertainty."))
+        return
+    levels = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(0, largest)[1:-1]
+    drawn = axes.contour(
+        *np.moveaxis(points, -1, 0), std, levels, colors=_MODEL, linestyles="--", linewidths=1.1
+    )
+    axes.clabel(drawn, fmt="%g", fontsize=7)
+    _explain(axes, Line2D([], [], color=_MODEL, linestyle="--", label="standard deviation  (px)"))
+
+
+def _explain(axes: Axes, *handles: Line2D) -> None:
+    """A legend below the axes."""
+    axes.legend(
+        handles=handles,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.17),
+        ncols=len(handles),
+        frameon=False,
+        fontsize=8,
+    )
+
+
+def _raster(lens: ZoomLens) -> np.ndarray:
+    """Evenly spaced points over the image: (row, column, 2) px."""
+    number = [max(2, round(14 * side / max(lens.image_size))) * _STEP for side in lens.image_size]
+    sides = (np.linspace(0, side - 1, n) for side, n in zip(lens.image_size, number, strict=True))
+    return np.stack(np.meshgrid(*sides), axis=-1)
+
+
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    return np.hypot(vectors[..., 0], vectors[..., 1])
+
+
+def _shade(axes: Axes, x: np.ndarray, middle: np.ndarray | float, std: np.ndarray) -> None:
+    """The bands of one and of two standard deviations, the inner one darker."""
+    if not np.isfinite(std).all():
+        return
+    for times, label in ((2, "±1 and ±2 standard deviations"), (1, None)):
+        axes.fill_between(
+            x,
+            middle - times * std,
+            middle + times * std,
+            color=_MODEL,
+            alpha=0.16,
+            linewidth=0,
+            label=label,
+        )
+
+
+def _label(axes: Axes, quantity: str, unit: str, values: np.ndarray) -> None:
+    """Name the y axis, with the power of ten in its unit rather than in a corner."""
+    largest = np.max(np.abs(values), initial=0)
+    power = int(np.floor(np.log10(largest))) if largest > 0 else 0
+    axes.set_ylabel(f"{quantity}\n($10^{{{power}}}$ {unit})")
+    axes.yaxis.set_major_formatter(lambda y, _: f"{y / 10.0**power:.4g}")
+    axes.axhline(0, color="0.85", linewidth=0.8, zorder=0)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.margins(x=0.03)
+
+
+def _show_focal_lengths(axes: Axes, focal: np.ndarray, unit: str) -> None:
+    """A second scale above, with round focal lengths."""
+    steps = np.array([1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 7])
+    decade = 10.0 ** np.arange(np.floor(np.log10(focal.min())), np.ceil(np.log10(focal.max())) + 1)
+    candidates = np.sort(np.outer(decade, steps).ravel())
+    candidates = candidates[(candidates >= focal.min() * 0.99) & (candidates <= focal.max() * 1.01)]
+    span, shown = 1 / focal.min() - 1 / focal.max(), []
+    for f in candidates:  # from the widest gaps in 1/f on, never closer than a tenth of the axis
+        if not shown or 1 / shown[-1] - 1 / f >= 0.1 * span:
+            shown.append(float(f))
+    above = axes.secondary_xaxis("top")
+    above.set_ticks([1 / f for f in shown], [f"{f:g}" for f in shown], fontsize=8)
+    above.set_xlabel(f"$f$  ({unit})", fontsize=8)
+    above.spines["top"].set_visible(False)

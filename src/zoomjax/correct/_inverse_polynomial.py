@@ -1,0 +1,144 @@
+"""The inverse of the radial function as a polynomial: where corrected pixels come from, fast.
+
+Correcting an image asks, for each of millions of pixels at a corrected radius ρ, for the distorted
+radius r with ``r L(r²) = ρ``. Their ratio depends on ``τ = ρ²`` alone and is smooth up to the fold. So
+once per focal length a polynomial p is fitted to exact pairs (r L(r²), r), which cost no iteration, and
+each pixel costs one evaluation: ``distorted = centre + (corrected - centre) p(τ)``. Where the polynomial is
+not accurate enough it still starts two steps of Newton's method, and where those are not either there is
+the exact inverse.
+
+All of this happens once per distortion, in NumPy and float64, whatever JAX's precision: 0.4 ms, the
+measurement of the error included.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+from numpy.polynomial import chebyshev, polynomial
+
+from ..models.distortion import Distortion
+from ..models.family import AbstractRadial
+
+TOLERANCE = 0.01
+"""px: the error up to which the polynomial stands in for the exact inverse: less than a third of the
+1/32 px to which OpenCV's fixed-point maps round."""
+
+_TRIALS = ((8, 0), (16, 2))
+"""Degree, and steps of Newton's method after it, tried in this order. Degree 8 alone is enough for
+photographic lenses (2e-4 px on the Nikkor 18-200). Near a fold the inverse has a square-root singularity
+that no polynomial follows: there the steps help (5 % before it they reach 8e-4 px)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RadialInverse:
+    """A polynomial for the ratio of distorted to corrected radius, with its measured error.
+
+    Attributes:
+        powers: coefficients of the powers of ``v = 2 τ/reach² - 1``, lowest first, float32.
+        steps: steps of Newton's method that follow.
+        family, coefficients: of the distortion, float32.
+        reach: the corrected radius, normalised, up to which it holds; beyond it nothing is seen.
+        error: the largest distance, px, between its distorted positions and the exact ones.
+    """
+
+    powers: np.ndarray
+    steps: int
+    family: AbstractRadial
+    coefficients: np.ndarray
+    reach: float
+    error: float
+
+
+def fit_inverse(
+    distortion: Distortion, radius: float, *, seen: float = math.inf, tolerance: float = TOLERANCE
+) -> RadialInverse | None:
+    """The polynomial for corrected points up to `radius` px from the centre; None if none is accurate.
+
+    None, too, where the family is not radial.
+
+    Args:
+        distortion: with concrete values (this is NumPy, in float64).
+        radius: px; beyond the fold's image nothing exists, and nothing is fitted.
+        seen: the distorted radius, px, beyond which positions are of no interest: all off the image.
+        tolerance: the largest error allowed, px.
+    """
+    family = distortion.family
+    if not isinstance(family, AbstractRadial):
+        return None
+    k = np.asarray(distortion.coefficients, float)
+    scale = float(distortion.scale)
+    top = min(_first_radius(family, k, radius / scale), seen / scale)
+    # Exact pairs, denser towards the end, where polynomials go wrong first.
+    r = top * np.sin(np.linspace(0, np.pi / 2, 64)[1:])
+    rho = _corrected(family, r, k)
+    between = top * np.sin((np.arange(512) + 0.5) * np.pi / 1024)
+    rho_between = _corrected(family, between, k)
+    reach = float(rho[-1])
+    squared = (rho_between**2).astype(np.float32)
+    single = k.astype(np.float32)
+    for degree, steps in _TRIALS:
+        design = chebyshev.chebvander(2 * (rho / reach) ** 2 - 1, degree) * rho[:, None]
+        fitted = np.linalg.lstsq(design, r, rcond=None)[0]
+        powers = np.zeros(degree + 1, np.float32)
+        trimmed = chebyshev.cheb2poly(fitted)
+        powers[: len(trimmed)] = trimmed
+        ratio = radius_ratio(squared, np.float32(reach), powers, steps, family, single)
+        error = float(scale * np.max(np.abs(rho_between * ratio - between)))
+        if error <= tolerance:
+            return RadialInverse(powers, steps, family, single, reach, error)
+    return None
+
+
+def radius_ratio(squared, reach, powers, steps, family, k):
+    """Distorted over corrected radius at squared corrected radii: the same code for NumPy and JAX."""
+    ratio = _horner(powers, squared * (2 / (reach * reach)) - 1)
+    for _ in range(steps):  # on q L(τ q²) - 1 = 0, in the ratio q
+        error, slope = family.equation(ratio, squared * ratio * ratio, 1, k)
+        ratio = ratio - error / slope
+    return ratio
+
+
+def fold_radius(distortion: Distortion) -> float:
+    """The monotone radius, px, of a concrete distortion, in float64; inf if it never folds.
+
+    `Distortion.monotone_radius` is for tracing, in JAX's precision and on its device. Here eigenvalues from
+    NumPy do: in float64 whatever JAX's setting, with nothing to compile, once for each frame of a video.
+    (Not for families that are not radial.)
+    """
+    family = distortion.family
+    if not isinstance(family, AbstractRadial):
+        return float(distortion.monotone_radius)
+    return float(distortion.scale) * _fold(family, np.asarray(distortion.coefficients, float))
+
+
+def _horner(powers, x):
+    """The polynomial with these coefficients, lowest first, in their own precision."""
+    value = powers[-1] + 0 * x
+    for power in powers[-2::-1]:
+        value = value * x + power
+    return value
+
+
+def _corrected(family, r, k):
+    """``r L(r²)``."""
+    return r * family.factor(r * r, k)
+
+
+def _fold(family: AbstractRadial, k: np.ndarray) -> float:
+    """The first positive root of what must stay positive, as a radius."""
+    first = math.inf
+    for row in family.conditions(len(k)):
+        roots = polynomial.polyroots(np.trim_zeros(np.append(1.0, row * k), "b"))
+        folds = roots.real[(abs(roots.imag) < 1e-9 * (1 + abs(roots.real))) & (roots.real > 0)]
+        first = min(first, folds.min(initial=math.inf))
+    return math.sqrt(first)
+
+
+def _first_radius(family: AbstractRadial, k: np.ndarray, rho: float) -> float:
+    """A distorted radius just large enough to be corrected to `rho`, or that of the fold before it."""
+    limit, end = _fold(family, k), rho
+    while end < limit and _corrected(family, np.array([end]), k)[0] < rho:
+        end *= 2
+    r = np.linspace(0, min(end, limit), 1025)
+    return float(r[min(np.searchsorted(_corrected(family, r, k), rho), 1024)])

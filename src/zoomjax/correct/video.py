@@ -1,0 +1,213 @@
+"""Zooming video, corrected frame by frame at each frame's own focal length, with PyAV.
+
+Decoding, warping (`_planes`) and encoding overlap in three threads with a few frames between them, so that
+memory stays flat. Frame times, frame rate, colour description, orientation and tags go over unchanged, and
+audio packets as they are.
+"""
+
+import dataclasses
+import functools
+import itertools
+import math
+import os
+import warnings
+from collections.abc import Callable, Generator, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._core.files import refuse_inputs, whole_file
+from ..io.focal_track import FocalTrack
+from ..io.pyav import av
+from ..io.video_reader import Report, decoded_items, frame_numbers, opened_video, warn_of_fields
+from ..io.video_writer import CONTAINER, FrameWriter, display_matrix
+from ..models.lens import ZoomLens
+from ..models.sizes import at_focal, lens_for_size
+from ._planes import FrameWarper
+from ._prefetch import ahead
+from .framing import Framing, check_keep, frame_output, framing_for_size
+from .image import check_sampling, warn_of_fold
+
+
+@dataclasses.dataclass(frozen=True)
+class CorrectedVideo:
+    """What `undistort_video` did.
+
+    Attributes:
+        frames: frames written.
+        lost: frames that the file announces but that do not decode, or only with errors.
+        scale: output pixels per corrected pixel, of all frames.
+    """
+
+    frames: int
+    lost: int
+    scale: float
+
+
+def undistort_video(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    lens: ZoomLens,
+    focal: float | int | FocalTrack,
+    keep: str | Framing = "same",
+    interpolation: str = "linear",
+    border: str = "constant",
+    encoder: str | None = None,
+    options: dict[str, str] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> CorrectedVideo:
+    """Correct a video, each frame at its own focal length, into a new file.
+
+    Args:
+        source: the video. Its frames are taken as they are stored, before any rotation for display.
+        target: the file to write, all of it or none: .mp4, .mov, .m4v, .mkv, .webm, .avi, .ts.
+        lens: the lens; for frames of another size of the same aspect ratio it is scaled.
+        focal: one focal length for all frames, or a track, in the lens's unit.
+        keep: "same", "all" or "valid", one framing for all focal lengths of the track; or a `Framing`,
+            which for frames of another size is scaled as the lens is.
+        interpolation, border: as for `undistort_image`; a constant border is black.
+        encoder: FFmpeg's name of it; by default one for the source's own format, or for H.264.
+        options: of the encoder; by default ones for a quality that shows no difference.
+        progress: called after each frame with the number of frames done, and announced (0 if unknown).
+
+    Raises:
+        FileNotFoundError: there is no such video.
+        OSError: the target cannot be written; nothing is left of it.
+        ValueError: the source is no video, or none of its frames decodes; the track is shorter; the lens is
+            for another aspect ratio; or the target is the source, or its suffix or the encoder is unknown,
+            or not for these frames.
+
+    Warns:
+        UserWarning: frames do not decode, or are interlaced; focal lengths are outside of the fitted range;
+            the lens was made for another size, or folds within the frames.
+    """
+    target = Path(target)
+    if target.suffix.lower() not in CONTAINER:
+        raise ValueError(
+            f"Argument target must end in one of {', '.join(CONTAINER)}, but it is {target.name!r}."
+        )
+    check_sampling(interpolation, border)
+    if not isinstance(keep, Framing):
+        check_keep(keep)
+    refuse_inputs([target], [source])
+    with opened_video(source) as input_, whole_file(target) as part:
+        video = input_.streams.best("video")
+        size = (video.codec_context.width, video.codec_context.height)
+        lens = lens_for_size(lens, size)
+        track = focal if isinstance(focal, FocalTrack) else _constant(float(focal))
+        _check_length(track, video)
+        lens.check_range(track.focal)
+        if isinstance(keep, Framing):
+            framing = framing_for_size(keep, size)
+        else:
+            framing = _common_framing(lens, track.focal, keep)
+        warper = FrameWarper(lens, framing, interpolation=interpolation, border=border)
+        report = Report(video.frames)
+        numbers = functools.cache(lambda: frame_numbers(source))
+        items = ahead(_warped(ahead(decoded_items(input_, video, report)), warper, track, report, numbers))
+        try:
+            _write(items, part, target, input_, video, encoder, options, report, progress)
+        finally:
+            items.close()
+    lost = max(report.corrupt, report.announced - report.written if report.announced else 0)
+    if lost:
+        warnings.warn(
+            f"{lost} of {max(report.announced, report.written)} frames of {os.fspath(source)} do not "
+            f"decode ({report.error or 'the file ends early'}): {report.written} were written.",
+            stacklevel=2,
+        )
+    return CorrectedVideo(report.written, lost, float(framing.scale))
+
+
+def _constant(focal: float) -> FocalTrack:
+    return FocalTrack(np.zeros(1), np.array([focal]), hold=True)
+
+
+def _check_length(track: FocalTrack, video: Any) -> None:
+    """Refuse a track that ends well before the video's announced end: now, not after all the work."""
+    rate = float(video.average_rate or 25)
+    if track.by_time:
+        length, slack = float((video.duration or 0) * video.time_base), 2 / rate  # durations are rounded
+    else:
+        length, slack = float(video.frames), 1.0
+    end = float(track.position[-1])
+    if not track.hold and end < length - slack:
+        unit = "s" if track.by_time else "frames"
+        raise ValueError(
+            f"The focal track ends at {end:g} {unit}, and the video has {length:.6g} {unit}. "
+            "Give a track as long as the video, or hold its ends (--hold)."
+        )
+
+
+def _common_framing(lens: ZoomLens, focal: np.ndarray, keep: str) -> Framing:
+    """One framing for all focal lengths from the shortest to the longest."""
+    inverse = np.linspace(1 / focal.min(), 1 / focal.max(), 65 if focal.min() < focal.max() else 1)
+    distortions = [at_focal(lens, np.asarray(1 / u, np.asarray(lens.centre).dtype)) for u in inverse]
+    for distortion in (distortions[0], distortions[-1]):
+        if warn_of_fold(distortion, lens.image_size, stacklevel=4):
+            break
+    return frame_output(distortions, lens.image_size, keep=keep)
+
+
+def _warped(
+    items: Generator[Any, None, None],
+    warper: FrameWarper,
+    track: FocalTrack,
+    report: Report,
+    numbers: Callable[[], dict[int, int]],
+) -> Generator[Any, None, None]:
+    """Each frame corrected; packets of audio as they are.
+
+    Frames are counted; once some did not decode, `numbers` tells the number of a frame by its time stamp.
+    """
+    number, first = 0, None
+    try:
+        for item in items:
+            if not isinstance(item, av.VideoFrame):
+                yield item
+                continue
+            if first is None:
+                first = item.time or 0.0
+                warn_of_fields(item)
+                report.orientation = display_matrix(item)
+            time = math.nan if item.time is None else item.time - first
+            if report.failed and not track.by_time and item.pts is not None:
+                number = numbers().get(item.pts, number)
+            yield warper(item, track.at(number, time))
+            number += 1
+    finally:
+        items.close()
+
+
+def _write(
+    items: Iterable[Any],
+    part: Path,
+    target: Path,
+    input_: Any,
+    video: Any,
+    encoder: str | None,
+    options: dict[str, str] | None,
+    report: Report,
+    progress: Callable[[int, int], None],
+) -> None:
+    """Encode the frames and copy the packets as they come."""
+    items = iter(items)
+    early = []  # audio before the first frame, of which the encoder must know the size and orientation
+    for item in items:
+        early.append(item)
+        if isinstance(item, av.VideoFrame):
+            break
+    else:
+        raise ValueError(f"Cannot read a video from {input_.name}: none of its frames decodes.")
+    with FrameWriter(
+        part, target, input_, video, early[-1], encoder, options, report.orientation
+    ) as writer:
+        for item in itertools.chain(early, items):
+            if not isinstance(item, av.VideoFrame):
+                writer.copy(item)
+                continue
+            writer.encode(item)
+            report.written += 1
+            progress(report.written, report.announced)

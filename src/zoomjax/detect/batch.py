@@ -1,0 +1,215 @@
+"""Lines in many images: over processes, with a cache, one bad image at a time reported and passed over.
+
+Only points are kept of an image, and of these no more than one every `_SPACING` px of a line: detectors
+smooth over some px, so that nearer neighbours share their noise and say little more.
+"""
+
+import collections
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import io
+import math
+from collections.abc import Generator, Iterable
+from concurrent.futures import Future
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from .._core.files import whole_file
+from ._workers import LostError, Workers
+from .base import AbstractDetector
+from .edges import EdgeDetector
+from .grid import GridDetector
+from .pitch import PitchDetector
+from .sources import Source
+
+DETECTORS: dict[str, type[AbstractDetector]] = {
+    "edges": EdgeDetector,
+    "grid": GridDetector,
+    "pitch": PitchDetector,
+}
+"""By name, as the command line calls them."""
+
+_SPACING = 4.0
+_SMALLEST = 32
+
+_SECONDS = 300.0
+"""That an image may take: the largest that is read, on a slow machine, takes less."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Detection:
+    """What one image showed.
+
+    Attributes:
+        name: of the image.
+        file: the image's path, or its name if it has none.
+        image_size: (width, height) px; (0, 0) if it could not be read.
+        lines: for each line an (n, 2) array of points, px.
+        focal: the focal length that the image itself or the video's track tells, or None.
+        nodes: (row, column, 2) px, of the checkerboard or grid of dots in it, if that was looked for and
+            is there: NaN where a dot is not seen.
+        problem: why the image cannot be used; empty if it can.
+    """
+
+    name: str
+    file: str = ""
+    image_size: tuple[int, int] = (0, 0)
+    lines: tuple[np.ndarray, ...] = ()
+    focal: float | None = None
+    nodes: np.ndarray | None = None
+    problem: str = ""
+
+
+def detect(
+    sources: Iterable[Source],
+    detector: AbstractDetector,
+    *,
+    grid: str = "none",
+    workers: int = 0,
+    cache: Path | None = None,
+) -> Generator[Detection, None, None]:
+    """The lines in each image, in order.
+
+    Args:
+        sources: the images.
+        detector: what finds lines.
+        grid: where to look for a grid, too, whose nodes tell the focal length: in "all" images, those
+            "without focal length" of their own, or "none".
+        workers: number of processes. An image that ends one, or takes longer than five minutes, is one
+            with a problem. 0: this one looks, and has no such protection.
+        cache: folder of what was found before in the same images by the same detector; None: no cache.
+    """
+    task = functools.partial(_detected, detector=detector, grid=grid)
+    with contextlib.ExitStack() as stack:
+        submit = stack.enter_context(Workers(task, workers, _SECONDS)).submit if workers else task
+        pending: collections.deque[tuple[Path | None, Source, Future | Detection]] = collections.deque()
+        for source in sources:
+            file = None if cache is None else cache / f"{_key(source, detector, grid)}.npz"
+            known = None if file is None else _load(file, source)
+            pending.append((file, source, submit(source)) if known is None else (None, source, known))
+            while len(pending) > 2 * workers or (pending and isinstance(pending[0][2], Detection)):
+                yield _finished(*pending.popleft())
+        while pending:
+            yield _finished(*pending.popleft())
+
+
+def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detection:
+    found = functools.partial(Detection, source.name, source.file)
+    try:
+        image, focal = source.read()
+    except Exception as error:  # whatever it is, it is one image's
+        return found(problem=_sentence(error))
+    size = (image.shape[1], image.shape[0])
+    if min(size) < _SMALLEST:
+        return found(problem=f"it is {size[0]}x{size[1]} px: at least {_SMALLEST} px a side are needed")
+    if isinstance(detector, PitchDetector) and image.ndim == 2:
+        return found(size, problem="it is grey, and grass is told by its colour. Try --detector edges")
+    try:
+        focal = source.focal if focal is None else focal
+        wanted = grid == "all" or (grid == "without focal length" and focal is None)
+        own = isinstance(detector, GridDetector)
+        nodes = (detector if own else GridDetector()).find(image) if own or wanted else None
+        lines = tuple(_thinned(line) for line in (detector.lines(nodes) if own else detector(image)))
+    except Exception as error:
+        return found(size, problem=f"the detector failed: {type(error).__name__}: {_sentence(error)}")
+    return found(size, lines, focal, nodes, "" if lines else _NO_LINES)
+
+
+def _sentence(error: Exception) -> str:
+    """What an error says, without the numbers of the operating system and a full stop."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    if isinstance(error, MemoryError) or getattr(error, "code", 0) == cv2.Error.StsNoMem:
+        return "it takes more memory than there is"
+    return " ".join(str(error).split()).rstrip(".")
+
+
+_NO_LINES = (
+    "no lines were found. Is what should be straight in focus, well lit and large in the image? Or try "
+    "another --detector"
+)
+
+
+def _thinned(line: np.ndarray) -> np.ndarray:
+    """Points of a line, in order, `_SPACING` px apart or more."""
+    if len(line) < 3:
+        return line
+    length = float(np.hypot(*(line[-1] - line[0])))
+    return line[:: math.ceil(_SPACING * (len(line) - 1) / max(length, 1e-9))]
+
+
+def _finished(file: Path | None, source: Source, result: Future | Detection) -> Detection:
+    try:
+        detection = result if isinstance(result, Detection) else result.result()
+    except LostError as error:
+        return Detection(source.name, source.file, problem=str(error))
+    if file is not None and detection.problem in ("", _NO_LINES):  # other problems may be mended
+        _save(detection, file)
+    return detection
+
+
+@functools.cache
+def _code() -> bytes:
+    """The source of everything that detects: what it found before is of no use once it has changed."""
+    folder = Path(__file__).parent
+    files = [*sorted(folder.glob("*.py")), *sorted(folder.with_name("io").glob("*.py"))]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).digest()
+
+
+def _key(source: Source, detector: AbstractDetector, grid: str) -> str:
+    digest = hashlib.sha256(_code() + cv2.__version__.encode() + repr((detector, grid)).encode())
+    try:
+        digest.update(source.digest())
+    except (OSError, ValueError) as error:  # told when it is read
+        digest.update(repr(error).encode())
+    return digest.hexdigest()
+
+
+def _save(detection: Detection, file: Path) -> None:
+    lines = detection.lines
+    content = io.BytesIO()
+    np.savez(
+        content,
+        points=np.concatenate(lines) if lines else np.zeros((0, 2)),
+        counts=np.array([len(line) for line in lines], int),
+        image_size=np.array(detection.image_size),
+        focal=np.array(np.nan if detection.focal is None else detection.focal),
+        nodes=np.zeros((0, 0, 2)) if detection.nodes is None else detection.nodes,
+        problem=np.array(detection.problem),
+    )
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(file) as part:
+            part.write_bytes(content.getvalue())
+    except OSError:  # a cache that cannot be written saves no time, and does no harm
+        pass
+
+
+def _load(file: Path, source: Source) -> Detection | None:
+    """What was found before, under the image's present name; None if nothing was."""
+    try:
+        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as stored:
+            points, nodes = np.asarray(stored["points"], float), np.asarray(stored["nodes"], float)
+            counts, focal = stored["counts"].tolist(), float(stored["focal"])
+            width, height = map(int, stored["image_size"].tolist())
+            problem = str(stored["problem"])
+        sound = (
+            points.shape == (sum(counts), 2) and np.isfinite(points).all() and min(counts, default=1) > 0
+        )
+        if not sound or nodes.ndim != 3 or nodes.shape[2] != 2:
+            return None
+    except Exception:  # whatever is wrong with it, it can be found again
+        return None
+    return Detection(
+        name=source.name,
+        file=source.file,
+        image_size=(width, height),
+        lines=tuple(np.split(points, np.cumsum(counts)[:-1])) if counts else (),
+        focal=source.focal or (None if np.isnan(focal) else focal),
+        nodes=nodes if nodes.size else None,
+        problem=problem,
+    )

@@ -1,0 +1,192 @@
+"""Where images come from: photographs, folders and patterns of names, and the frames of a video."""
+
+import dataclasses
+import glob
+import hashlib
+import os
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from ..io.focal_track import FocalTrack
+from ..io.photo import SUFFIXES, metadata_focal, open_photo, read_photo
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".m2ts", ".mpg", ".mxf", ".ts")
+"""Of files that count as videos."""
+
+RESULTS = ("lines", "model.png", "before-after.jpg")
+"""What a calibration puts beside its ``lens.json`` that might be taken for photographs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """One image, not yet read if it is a file.
+
+    Attributes:
+        name: what it is called in reports: a file name, with folders where two files share one.
+        path: the file, or None for a frame of a video.
+        image: the frame's pixels, or None.
+        focal: the focal length that a video's track gives.
+    """
+
+    name: str
+    path: Path | None = None
+    image: UInt8[np.ndarray, "height width *channels"] | None = None
+    focal: float | None = None
+
+    @property
+    def file(self) -> str:
+        """The path, or the name of what has none."""
+        return self.name if self.path is None else str(self.path)
+
+    def digest(self) -> bytes:
+        """Of what the image is made from, to tell it from others.
+
+        Raises:
+            OSError, ValueError: it cannot be read, as `open_photo` says.
+        """
+        if self.path is not None:
+            with open_photo(self.path) as file:
+                return hashlib.file_digest(file, "sha256").digest()
+        assert self.image is not None
+        return hashlib.sha256(np.ascontiguousarray(self.image).data).digest()
+
+    def read(self) -> tuple[UInt8[np.ndarray, "height width *channels"], float | None]:
+        """The pixels as stored, whatever the orientation tag says, in bytes; the focal length in EXIF data.
+
+        Raises:
+            OSError, ValueError: it cannot be read, as `read_photo` says.
+        """
+        if self.image is not None:
+            return self.image, None
+        assert self.path is not None
+        image, metadata = read_photo(self.path)
+        return as_bytes(image), metadata_focal(self.path, metadata)
+
+
+def as_bytes(image: np.ndarray) -> UInt8[np.ndarray, "height width *channels"]:
+    """An image of any depth and number of channels as grey or blue, green, red bytes.
+
+    Other depths are scaled so that all but the brightest thousandth of the values fit in: 16-bit files
+    often hold 12 bits, and a hot pixel. Alpha is dropped.
+    """
+    if image.ndim == 3:
+        image = image[..., 0] if image.shape[2] < 3 else image[..., :3]
+    if image.dtype != np.uint8:
+        known = np.nan_to_num(image.astype(np.float32), posinf=0, neginf=0)
+        brightest = float(np.quantile(known, 0.999, method="higher")) if known.size else 0.0
+        image = np.clip(known * (255 / max(brightest, 1e-30)), 0, 255).astype(np.uint8)
+    return np.ascontiguousarray(image)
+
+
+def find_photos(inputs: Iterable[str | os.PathLike[str]]) -> list[Source]:
+    """The photographs among files, folders (and the folders in them) and patterns like ``shots/*.jpg``.
+
+    In a folder, what else is in it does not matter, and the results of a calibration are passed over; of
+    a pattern, only photographs and folders count.
+
+    Raises:
+        FileNotFoundError: an input does not exist, or no file fits a pattern.
+        ValueError: an input is no photograph, a folder holds none, or one comes twice.
+    """
+    paths: list[Path] = []
+    for given in inputs:
+        paths += _expanded(os.fspath(given))
+    seen: set[Path] = set()
+    for path in paths:
+        real = path.resolve()
+        if real in seen:
+            raise ValueError(f"The photograph {path} is given twice. Give each once.")
+        seen.add(real)
+    return [Source(name, path) for name, path in zip(_names(paths), paths, strict=True)]
+
+
+def _expanded(given: str) -> list[Path]:
+    path = Path(given)
+    if path.is_dir():
+        return _within(path)
+    if path.exists():
+        if path.suffix.lower() not in SUFFIXES:
+            raise ValueError(f"{path} is no photograph: the file name must end in {', '.join(SUFFIXES)}.")
+        return [path]
+    found = [Path(name) for name in sorted(glob.glob(given, recursive=True))]
+    photos = [p for p in found if p.suffix.lower() in SUFFIXES and p.is_file()]
+    photos = photos or [inner for p in found if p.is_dir() for inner in _within(p)]
+    if not photos:
+        what = "no photograph fits the pattern" if glob.has_magic(given) else "there is no file or folder"
+        raise FileNotFoundError(f"Cannot find photographs: {what} {given}.")
+    return photos
+
+
+def _within(folder: Path) -> list[Path]:
+    results = {lens.with_name(name) for lens in folder.rglob("lens.json") for name in RESULTS}
+    found = sorted(
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in SUFFIXES
+        and path.is_file()
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        and not results.intersection((path, *path.parents))
+    )
+    if not found:
+        raise ValueError(f"There are no photographs in the folder {folder} ({', '.join(SUFFIXES)}).")
+    return found
+
+
+def _names(paths: list[Path]) -> list[str]:
+    """File names, with as many folders as tell them all apart."""
+    parts, depth = [path.absolute().parts for path in paths], 1
+    while len({part[-depth:] for part in parts}) < len(parts):
+        depth += 1
+    return ["/".join(part[-depth:]) for part in parts]
+
+
+def video_frames(
+    path: str | os.PathLike[str], focal: FocalTrack | float | int, number: int
+) -> Iterator[Source]:
+    """Frames of a video, evenly spread over it, each with its focal length.
+
+    Args:
+        path: the video.
+        focal: a track, or one focal length for all.
+        number: how many frames, at most.
+
+    Raises:
+        FileNotFoundError: there is no such video.
+        ValueError: it cannot be read, or the track does not reach over it.
+
+    Warns:
+        UserWarning: the video ends early, being cut off or damaged; the frames before that count.
+    """
+    from ..io.video_reader import decode_video
+
+    stem = Path(path).stem
+    with decode_video(path) as (announced, frames):
+        # From the first to the last; where not even the length is known, the first ones.
+        wanted = set(np.linspace(0, (announced or number) - 1, number).round().astype(int).tolist())
+        last = -1
+        for last, (time, image) in enumerate(frames):
+            if last not in wanted:
+                continue
+            at = focal.at(last, time) if isinstance(focal, FocalTrack) else float(focal)
+            yield Source(f"{stem}-{last:06d}.jpg", None, image(), at)
+        if last < 0:
+            raise ValueError(f"Cannot read {os.fspath(path)}: none of its frames decodes.")
+        if last + 1 < 0.98 * announced - 2:  # lengths are rounded
+            warnings.warn(
+                f"{os.fspath(path)} ends early, after {last + 1} of {announced} frames: it is cut off or "
+                "damaged. The frames before that are used.",
+                stacklevel=2,
+            )
+
+
+def shrunk(image: np.ndarray, longest: int) -> tuple[np.ndarray, float]:
+    """The image, made smaller if a side is longer than so many px, and the scale."""
+    scale = min(1.0, longest / max(image.shape[:2]))
+    if scale == 1:
+        return image, scale
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), scale

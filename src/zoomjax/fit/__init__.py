@@ -1,0 +1,5 @@
+"""Fits: energies of lines under a model, their minimisers, and how straight lines then are."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,31 @@
+# The public names of this room: read by type checkers, and by lazy_loader at run time.
+
+from .algebraic import algebraic_frames as algebraic_frames
+from .algebraic import algebraic_zoom as algebraic_zoom
+from .centre import CentreFit as CentreFit
+from .centre import FrameCentres as FrameCentres
+from .centre import fit_centre as fit_centre
+from .centre import fit_frame_centres as fit_frame_centres
+from .concatenation import concatenate as concatenate
+from .energy import frame_energy as frame_energy
+from .energy import global_energy as global_energy
+from .energy import residuals as residuals
+from .family_lines import FamilyLines as FamilyLines
+from .family_lines import compress_family as compress_family
+from .family_lines import with_family as with_family
+from .focal_lengths import FocalFit as FocalFit
+from .focal_lengths import fit_focal as fit_focal
+from .focal_lengths import with_focal_sigma as with_focal_sigma
+from .frames import fit_frames as fit_frames
+from .image_metric import ImageLines as ImageLines
+from .image_metric import in_image as in_image
+from .outlier_points import PointRejection as PointRejection
+from .outlier_points import reject_points as reject_points
+from .result import RESULTS as RESULTS
+from .result import FrameFits as FrameFits
+from .result import ZoomFit as ZoomFit
+from .result import lens_of as lens_of
+from .robust import RobustFit as RobustFit
+from .robust import fit_robust as fit_robust
+from .straightness import frame_rms as frame_rms
+from .zoom import fit_zoom as fit_zoom

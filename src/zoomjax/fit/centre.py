@@ -1,0 +1,234 @@
+"""Fits that look for the centre of distortion as well: of all frames, along the zoom, or of each frame.
+
+The centre's offset is a function of the focal length like the coefficients are, and any zoom model serves
+for it: `PolynomialZoom` of degree 0 is one centre for all frames, of degree 1 one that moves along a line,
+`TableZoom` one of each focal length. The unknowns of both are found together, from the fit about the
+image's centre, on lines compressed for any centre (`free_centre`). The paper does so frame by frame
+(section 5.1, Figure 7), and finds that it gains next to nothing.
+
+Where there is no distortion there is no centre of it, and lines may say little of it elsewhere. A centre
+that is too uncertain to be believed is left where it was, and the result says so.
+"""
+
+import dataclasses
+from typing import Any, NoReturn
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PyTree, ScalarLike
+
+from .._core.arguments import kinds_checked
+from .._core.types import Coefficients, Focal
+from ..lines.free_centre import AnyCentreLines, compress_any_centre
+from ..lines.lines import Lines
+from ..models.invertibility import certify
+from ..models.lens import ZoomLens
+from ..models.zoom import AbstractZoom, PolynomialZoom, with_parameters
+from ._least_squares import Solver, default_solver
+from .covariance import parameter_covariance
+from .energy import linearised
+from .result import RESULTS, FrameFits, ZoomFit, collected
+from .zoom import fit_zoom, minimise
+
+_MOST_UNCERTAIN = 0.05
+"""Standard deviation of a centre, in half diagonals, above which it is not believed."""
+
+_FARTHEST = 0.5
+"""Half diagonals from the middle of the image beyond which no centre is believed."""
+
+
+class CentreFit(eqx.Module):
+    """A zoom lens fitted together with its centre of distortion.
+
+    Attributes:
+        fit: the fit, whose lens has the centre. Its covariance allows for the centre's.
+        centre: of each frame, px.
+        std: standard deviations of the frames' centres, px; infinite where the lines say nothing of it.
+        determined: whether the centre is what the lines say. If not, they say too little of it, and it is
+            the one that they came with: the image's.
+        rms_fixed: what `fit.rms` would be about that one, px.
+        covariance: of all parameters, normalised: those of the zoom model, then those of the centre's.
+    """
+
+    fit: ZoomFit
+    centre: Float[Array, "frame 2"]
+    std: Float[Array, "frame 2"]
+    determined: Bool[Array, ""]
+    rms_fixed: Float[Array, ""]
+    covariance: Float[Array, "parameter parameter"]
+
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: the lens of its fit is asked."""
+        raise TypeError("A CentreFit is not a lens: use found.fit.lens, as in found.fit.lens(35.0).")
+
+
+class FrameCentres(eqx.Module):
+    """Each frame fitted by itself, its centre of distortion included.
+
+    Attributes:
+        each: the fits, about the centres found.
+        std: standard deviations of the centres, px.
+        determined: whether a frame's centre is what its lines say. If not it is that of the image.
+        rms_fixed: what `each.frame_rms` would be about that one, px.
+    """
+
+    each: FrameFits
+    std: Float[Array, "frame 2"]
+    determined: Bool[Array, "frame"]
+    rms_fixed: Float[Array, "frame"]
+
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: there is a distortion of each frame, and none between them."""
+        raise TypeError("FrameCentres are not a lens: use found.each.distortion(frame).")
+
+
+class _CentredZoom(AbstractZoom):
+    """From a focal length to the coefficients and, after them, the offset of the centre, normalised."""
+
+    zoom: AbstractZoom
+    centre: AbstractZoom
+    parameters: PyTree
+
+    def prepare(self, focal: Focal, terms: int) -> "_CentredZoom":
+        zoom, centre = self.zoom.prepare(focal, terms), self.centre.prepare(focal, 2)
+        return _both(zoom, centre)
+
+    def __call__(self, focal: ScalarLike) -> Coefficients:
+        zoom, centre = self.parts()
+        return jnp.concatenate([zoom(focal), centre(focal)])
+
+    def parts(self) -> tuple[AbstractZoom, AbstractZoom]:
+        """Both models, with the parameters of this one."""
+        zoom, centre = self.parameters
+        return with_parameters(self.zoom, zoom), with_parameters(self.centre, centre)
+
+
+def _both(zoom: AbstractZoom, centre: AbstractZoom) -> _CentredZoom:
+    return _CentredZoom(zoom=zoom, centre=centre, parameters=(zoom.parameters, centre.parameters))
+
+
+@kinds_checked
+def fit_centre(
+    lines: Lines | AnyCentreLines,
+    *,
+    zoom: AbstractZoom | None = None,
+    centre: AbstractZoom | None = None,
+    terms: int | None = None,
+    solver: Solver | None = None,
+    max_steps: int = 256,
+    throw: bool = True,
+) -> CentreFit:
+    """The zoom model and the centre of distortion that together minimise the global energy (eq. 13).
+
+    Args:
+        lines: the lines, or ``compress_any_centre(lines)``: the same answer, and what to keep for several
+            fits. Their `centre` is where the search starts, and what is returned to.
+        zoom, terms, solver, max_steps, throw: as for `fit_zoom`, whose errors also apply.
+        centre: how the centre depends on the focal length, as any zoom model: by default
+            ``PolynomialZoom(degree=0)``, one centre for all frames.
+
+    Example:
+        >>> import numpy as np
+        >>> from zoomjax import Distortion, Lines, PolynomialZoom
+        >>> t = np.linspace(0.0, 479.0, 50)
+        >>> straight = [np.stack([np.full(50, x), t], -1) for x in (9.0, 320.0, 599.0)]
+        >>> straight += [np.stack([t, np.full(50, y)], -1) for y in (9.0, 240.0, 470.0)]
+        >>> bent = Distortion(np.array([0.1]), np.array([310.0, 250.0]), np.array(400.0)).distort(
+        ...     np.stack(straight)
+        ... )
+        >>> lines = Lines.from_ragged(list(bent), [0] * 6, [50], image_size=(640, 480))
+        >>> found = fit_centre(lines, zoom=PolynomialZoom(degree=0), terms=1)
+        >>> found.fit.lens.centre.round(1).tolist()
+        [310.0, 250.0]
+    """
+    if not isinstance(lines, AnyCentreLines):
+        lines = compress_any_centre(lines, 2 if terms is None else terms)
+    options = {"max_steps": max_steps, "throw": throw}
+    fixed = fit_zoom(lines.about(lines.centre), zoom=zoom, terms=terms, solver=solver, **options)
+    model = (PolynomialZoom(degree=0) if centre is None else centre).prepare(lines.focal, 2)
+    start = _both(fixed.lens.zoom, model)
+    found, covariance, std, determined = _search(lines, start, solver or default_solver(lines), max_steps)
+    _, moved = found.parts()
+    each = lines.centre[None] + lines.scale * jax.vmap(moved)(lines.focal)
+    # Once more about these centres, for all else that is to know of a fit: the same compiled program.
+    fit = fit_zoom(lines.about(each), zoom=zoom, terms=terms, solver=solver, **options)
+    own = fit.covariance.shape[0]
+    lens = _lens(lines, fit.lens, moved, each)
+    certificate = fit.certificate if lens.shift is None else certify(lens)
+    good: Any = RESULTS.successful  # an inherited member, which pyright takes for another class's
+    folded = certificate.folded & (fit.result == good)
+    fit = eqx.tree_at(
+        lambda fit: (fit.lens, fit.covariance, fit.certificate, fit.result),
+        fit,
+        (
+            lens,
+            jnp.where(determined & jnp.isfinite(fit.covariance), covariance[:own, :own], fit.covariance),
+            certificate,
+            RESULTS.where(folded, RESULTS.folded, fit.result),
+        ),
+    )
+    return CentreFit(fit, each, std, determined, fixed.rms, covariance)
+
+
+@kinds_checked
+def fit_frame_centres(
+    lines: Lines | AnyCentreLines, *, terms: int = 2, solver: Solver | None = None, max_steps: int = 256
+) -> FrameCentres:
+    """Each frame's distortion and centre of distortion by itself, as the paper's Figure 7 has them.
+
+    Args:
+        lines, terms, solver, max_steps: as for `fit_centre`.
+    """
+    if not isinstance(lines, AnyCentreLines):
+        lines = compress_any_centre(lines, terms)
+    return _fit_frame_centres(lines, *lines.by_frame(), terms, solver, max_steps)
+
+
+@eqx.filter_jit
+def _fit_frame_centres(lines, chosen, present, terms, solver, max_steps):
+    def one(frame):
+        return fit_centre(
+            lines.take(*frame),
+            zoom=PolynomialZoom(degree=0),
+            terms=terms,
+            solver=solver,
+            max_steps=max_steps,
+            throw=False,
+        )
+
+    found = jax.lax.map(one, (chosen, present), batch_size=chosen.shape[0])
+    each = eqx.tree_at(lambda fits: fits.centre, collected(lines, found.fit), found.centre[:, 0])
+    return FrameCentres(each, found.std[:, 0], found.determined, found.rms_fixed)
+
+
+@eqx.filter_jit
+def _search(lines, start, solver, max_steps):
+    """The joint minimum, or the start where the centre found is not to be believed."""
+    found, _, _ = minimise(lines, start, solver, max_steps)
+    covariance, _ = parameter_covariance(lines, found, *linearised(lines, found), extra=2)
+
+    def offsets(parameters):
+        centre = with_parameters(found, parameters).parts()[1]
+        return jax.vmap(centre)(lines.focal)
+
+    flat, unravel = ravel_pytree(found.parameters)
+    by_parameter = jax.jacfwd(lambda flat: offsets(unravel(flat)))(flat)
+    variance = jnp.einsum("mcp,pq,mcq->mc", by_parameter, covariance, by_parameter)
+    std = jnp.sqrt(jnp.where(variance >= 0, variance, jnp.inf))
+    distance = jnp.linalg.norm(offsets(found.parameters), axis=1)
+    determined = jnp.all(std <= _MOST_UNCERTAIN) & jnp.all(distance <= _FARTHEST)
+    parameters = jax.tree.map(
+        lambda new, old: jnp.where(determined, new, old), found.parameters, start.parameters
+    )
+    return with_parameters(found, parameters), covariance, lines.scale * std, determined
+
+
+def _lens(
+    lines: AnyCentreLines, lens: ZoomLens, centre: AbstractZoom, each: Float[Array, "frame 2"]
+) -> ZoomLens:
+    """The lens with its centre: a point if it is one for all focal lengths."""
+    if isinstance(centre, PolynomialZoom) and centre.degree == 0:
+        return eqx.tree_at(lambda lens: lens.centre, lens, each[0])
+    return dataclasses.replace(lens, centre=jnp.asarray(lines.centre), shift=centre)

@@ -1,0 +1,141 @@
+"""How well the lines determine the parameters of a zoom model.
+
+Covariance of the parameters from the residuals and their Jacobian, and which of them the lines do not
+determine at all; work of one or two iterations of the fit, once after it.
+
+Neighbouring points of an edge err together, and lines that are not quite straight bend as a whole: points
+are not independent, lines are taken to be. A line pulls at the parameters with its score ``J_l^T r_l``, the
+same from its compressed rows, and the squares of the scores make the line-by-line sandwich ``H^-1 (sum_l
+g_l g_l^T) H^-1``. By itself that is too uncertain, for a few lines decide a parameter; so it is shrunk to
+the shape that independent points would give, as far as its own scatter demands (Ledoit and Wolf 2004).
+docs/trust.md has the measured coverage, and that of what was tried instead.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
+
+from ..lines.base import AbstractLines
+from ..models.zoom import AbstractPriorZoom, AbstractZoom, with_parameters
+from .energy import coefficients_by, line_weights, prior_error, prior_jacobian
+
+
+def parameter_covariance(
+    lines: AbstractLines,
+    zoom: AbstractZoom,
+    weighted: Float[Array, "line rows"],
+    jacobian: Float[Array, "line rows parameter"],
+    extra: int = 0,
+) -> tuple[Float[Array, "parameter parameter"], Bool[Array, ""]]:
+    """Covariance of the flattened parameters, and whether the lines determine them all.
+
+    Were points independent, with errors of one size, it would be the sandwich of the weights w of eq. 13,
+    ``sigma^2 (J^T W J)^-1 (J^T W^2 J) (J^T W J)^-1``, with sigma from the residuals and their degrees of
+    freedom; `_of_whole_lines` puts lines for points. Both are made by way of the triangle of J: the
+    normal equations would square the condition number, which float32 has no room for.
+
+    A parameter is *undetermined* where moving it changes the residuals by less than twice what noise in
+    the points alone would feign: each point's error appears in the derivative by k_j, times r^(2j). (Lines
+    through the centre have nothing else there, and would otherwise seem to determine k from their noise.)
+
+    Args:
+        lines: what was fitted.
+        zoom: the fitted model.
+        weighted, jacobian: the residuals, times the root of their weights, and their derivatives.
+        extra: how many numbers the model gives after the coefficients.
+    """
+    energy = jnp.sum(weighted**2)
+    weights = line_weights(lines)
+    prior = prior_jacobian(lines, zoom)
+    rows = jnp.concatenate([jacobian.reshape(-1, jacobian.shape[-1]), prior])
+    triangle = jnp.linalg.qr(rows, mode="r")
+    # Columns of unit length, so that one threshold serves parameters of any size.
+    size = jnp.linalg.norm(triangle, axis=0)
+    size = jnp.where(size > 0, size, 1)
+    left, values, right = jnp.linalg.svd(triangle / size[None])
+    good = values > 64 * jnp.finfo(values.dtype).eps
+    reciprocal = jnp.where(good, 1 / jnp.where(good, values, 1), 0)
+    back = right.T * reciprocal[None]  # to the parameters that change the residuals by one unit
+    # Of the directions that change them so, those in which noise would feign more than half of it.
+    feigned = _feigned(lines, zoom, weights, energy, extra) / size[:, None] / size[None]
+    shares, directions = jnp.linalg.eigh(back.T @ feigned @ back)
+    doubtful = jnp.concatenate([back @ directions, right.T], axis=1)
+    doubtful = doubtful / jnp.maximum(jnp.linalg.norm(doubtful, axis=0), jnp.finfo(size.dtype).tiny)[None]
+    unknown = jnp.concatenate([shares >= 0.25, ~good])
+    undetermined = jnp.any(unknown[None] & (jnp.abs(doubtful) > 0.05), axis=1)
+
+    inverse = back @ left.T / size[:, None]
+    jacobian = jacobian @ inverse  # by parameters in which J^T W J, with the prior, is the identity
+    leverage = jnp.einsum("lri,lrj->lij", jacobian, jacobian)
+    share = weights[:, None, None] * leverage
+    freedom = jnp.sum(weights * (lines.counts - 2)) - jnp.trace(jnp.sum(share, axis=0))
+    undetermined = undetermined | (freedom <= 0)  # nothing is left over to tell the noise by
+    share = energy / _positive(freedom) * share
+    terms = jax.eval_shape(coefficients_by, zoom, lines).shape[1]
+    scores = terms * jnp.sum(weights > 0) - jnp.sum(good)
+    score = jnp.einsum("lri,lr->li", jacobian, weighted)
+    covariance = inverse @ _of_whole_lines(score, leverage, share, scores) @ inverse.T
+    if isinstance(zoom, AbstractPriorZoom):
+        # The prior draws the parameters to its mean: by how much, in the mean over what it expects.
+        half = prior_error(lines, zoom) * inverse @ (prior @ inverse).T
+        covariance = covariance + half @ half.T
+    either = undetermined[:, None] | undetermined[None]
+    infinite = jnp.where(jnp.eye(size.shape[0], dtype=bool), jnp.inf, 0)
+    return jnp.where(either, infinite, covariance), ~jnp.any(undetermined)
+
+
+def _of_whole_lines(score, leverage, share, scores):
+    """The covariance of parameters in which the fit's Gauss-Newton matrix is the identity.
+
+    `share` is what each line would contribute were its points independent. Their sum, A, is compared with
+    the sum S of the squares of the scores. A line draws the fit to itself: its score is first divided by
+    ``sqrt(1 - h)``, h its leverage along the score (Bell and McCaffrey 2002 have a matrix there). The size
+    of S is kept, ``c = tr S / tr A``: n points of a line count as n/c independent ones. Its shape is shrunk
+    to that of A by the part of their difference that the scatter of the scores explains.
+
+    c has nu degrees of freedom, few where a few long lines at the border decide all, and at most `scores`,
+    the number of independent scores less the parameters. Its own uncertainty is added, ``2 max(c, 1)/nu``,
+    so that two standard deviations keep their meaning. With none left, A is all that is known.
+    """
+    length = jnp.sum(score**2, axis=1)
+    along = jnp.einsum("li,lij,lj->l", score, leverage, score) / _positive(length)
+    kept = jnp.maximum(1 - along, 0.01)  # a line that alone decides a parameter says nothing of its noise
+    score, length = score / jnp.sqrt(kept)[:, None], length / kept
+    total, independent = score.T @ score, jnp.sum(share, axis=0)
+    c = jnp.sum(length) / _positive(jnp.trace(independent))
+    apart = jnp.sum((total - c * independent) ** 2)
+    by_chance = jnp.sum(length**2) - jnp.sum(total**2) / _positive(jnp.sum(length > 0))
+    shrink = jnp.clip(by_chance / _positive(apart), 0, 1)
+    shape = shrink * independent + (1 - shrink) * total / _positive(c)
+    nu = jnp.minimum(jnp.trace(independent) ** 2 / _positive(jnp.sum(share**2)), scores)
+    size = c + 2 * jnp.maximum(c, 1) / _positive(nu)
+    return jnp.where((nu > 0) & (c > 0), size * shape, independent)
+
+
+def _positive(value):
+    """A divisor: the value, or 1 where it is not positive."""
+    return jnp.where(value > 0, value, 1)
+
+
+def _feigned(lines, zoom, weights, energy, extra):
+    """What the points' own noise contributes to ``J^T J`` in the mean, by parameter and parameter."""
+    flat, unravel = ravel_pytree(zoom.parameters)
+
+    def coefficients_at(flat):
+        k = coefficients_by(with_parameters(zoom, unravel(flat)), lines)
+        return lines.expansion(k[:, : k.shape[1] - extra])
+
+    k, _ = coefficients_at(flat)
+    terms = k.shape[1]
+    order = jnp.arange(terms + 1)
+    moments = lines.radial_moments(2 * terms)[:, order[:, None] + order[None]] * weights[:, None, None]
+    # The residuals have the noise of the corrected image, shrunk by L: divide by its mean square.
+    kappa = jnp.concatenate([jnp.ones_like(k[:, :1]), k], axis=1)[lines.frame]
+    variance_in_image = energy / jnp.einsum("li,lij,lj->", kappa, moments, kappa)
+    by_parameter, tangential = (rows[lines.frame] for rows in jax.jacfwd(coefficients_at)(flat))
+    # (line, terms, parameter). Decentering moves points by squares of x and y: noise enters its derivative
+    # by matrices whose mean square over all directions is 12 r^2.
+    decentred = 12 * jnp.einsum("lip,l,liq->pq", tangential, moments[:, 0, 1], tangential)
+    radial = jnp.einsum("lip,lij,ljq->pq", by_parameter, moments[:, 1:, 1:], by_parameter)
+    return variance_in_image * (radial + decentred)

@@ -1,0 +1,189 @@
+"""The energies of the paper: how far corrected points are from straight lines (eq. 3 and 13).
+
+A line's own parameters drop out (variable projection): given the coefficients, the best line passes
+through the mean of the corrected points, with the normal of least variance, and the residual of a
+point is its signed distance ``n . (x - mean)``. Residuals are differentiated through ``n``.
+
+Weights are the paper's: a point counts ``1 / (M Nl(m) Np(l, m))``, so that every frame weighs the same,
+and within it every line. The M frames are those that have a line of a weight above 0.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core.arguments import kinds_checked
+from .._core.types import AnyArray
+from ..lines.base import AbstractLines
+from ..models.zoom import (
+    AbstractFocusZoom,
+    AbstractPriorZoom,
+    AbstractZoom,
+    with_parameters,
+)
+
+# The angle of a line, ½ atan2, jumps by half a turn at one direction: harmless to derivatives, but the
+# residuals change sign there and finite differences across it are wrong. Left alone the jump sits at
+# exactly vertical lines, the commonest there are; this turns it to 110.9° from the x axis.
+_CUT = 0.73
+
+
+def line_normal(centred: Float[Array, "rows 2"]) -> Float[Array, "2"]:
+    """The unit normal of the total-least-squares line of points about their mean.
+
+    Points without a direction (none, one, or an isotropic cloud) get a fixed normal, with zero gradient.
+    """
+    x, y = centred[:, 0], centred[:, 1]
+    difference, product = x @ x - y @ y, 2 * (x @ y)
+    cos, sin = math.cos(_CUT), math.sin(_CUT)
+    along, across = cos * difference + sin * product, cos * product - sin * difference
+    # Guard the input of atan2: at (0, 0) its gradient is NaN, and stays so through a where().
+    directed = (along != 0) | (across != 0)
+    twice = jnp.arctan2(jnp.where(directed, across, 0), jnp.where(directed, along, 1)) + _CUT
+    return jnp.stack([-jnp.sin(twice / 2), jnp.cos(twice / 2)])
+
+
+def line_residuals(centred: Float[Array, "rows 2"]) -> Float[Array, "rows"]:
+    """Signed distances of points about their mean to their own best line, in their unit."""
+    return centred @ line_normal(centred)
+
+
+def line_weights(lines: AbstractLines) -> Float[Array, "line"]:
+    """``1 / (M Nl(m) Np(l, m))`` of eq. 13 for the points of each line, of the M frames that count.
+
+    With weights v of the lines themselves ``v_l / (M Np(l, m) sum_l v_l)``, summed over the frame's lines.
+    0 for lines that are not there. One or two points count as none: they are straight whatever the lens,
+    and would only dilute their frame's mean. (`Lines` drops them; merged chunks may come with them.) A
+    frame of which no line counts would dilute the mean over frames likewise: see `counted_frames`.
+    """
+    share, per_frame = _shares(lines)
+    number = number_counted(per_frame > 0).astype(share.dtype)
+    per_frame = jnp.where(per_frame > 0, per_frame, 1)
+    return share / (number * per_frame[lines.frame] * jnp.maximum(lines.counts, 1))
+
+
+def counted_frames(lines: AbstractLines) -> Bool[Array, "frame"]:
+    """Which frames have a line that counts: one of three points or more and a weight above 0."""
+    return _shares(lines)[1] > 0
+
+
+def number_counted(counted: Bool[Array, "frame"]) -> Int[Array, ""]:
+    """M of eq. 13: the number of frames that count, but 1 if none does."""
+    return jnp.maximum(jnp.sum(counted), 1)
+
+
+def _shares(lines: AbstractLines) -> tuple[Float[Array, "line"], Float[Array, "frame"]]:
+    """What each line counts beside the others of its frame, and the frames' sums."""
+    counts = lines.counts
+    share = (counts > 2).astype(counts.dtype)
+    if lines.weight is not None:
+        share = share * lines.weight
+        largest = jnp.max(share)  # so that sums of large weights do not overflow
+        share = share / jnp.where(largest > 0, largest, 1)
+    return share, jax.ops.segment_sum(share, lines.frame, lines.focal.shape[0])
+
+
+@kinds_checked
+def residuals(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "line rows"]:
+    """Weighted residuals, px, whose sum of squares is the global energy of eq. 13.
+
+    Args:
+        lines: the lines, or their compressed form.
+        coefficients: normalised (k1, ..., kN) of each frame.
+    """
+    if coefficients.shape[0] != lines.focal.shape[0]:
+        raise ValueError(
+            f"Argument coefficients must have a row for each of the {lines.focal.shape[0]} frames, but its "
+            f"shape is {coefficients.shape}."
+        )
+    distances = jax.vmap(line_residuals)(lines.corrected(coefficients[lines.frame]))
+    return jnp.sqrt(line_weights(lines))[:, None] * distances
+
+
+def settings(zoom: AbstractZoom, lines: AbstractLines) -> tuple[Float[AnyArray, "frame"], ...]:
+    """What a zoom model's coefficients depend on, frame by frame: the focal length, and perhaps the focus.
+
+    Raises:
+        ValueError: the model needs the focus, and the lines do not have it.
+    """
+    if not isinstance(zoom, AbstractFocusZoom):
+        return (lines.focal,)
+    if lines.focus is None:
+        raise ValueError(
+            f"A {type(zoom).__name__} needs the focus of each frame: Lines.from_ragged(..., focus=...), or "
+            "choose a model of the focal length alone."
+        )
+    return lines.focal, lines.focus
+
+
+def coefficients_by(zoom: AbstractZoom, lines: AbstractLines) -> Float[Array, "frame terms"]:
+    """The coefficients of each frame, by a zoom model."""
+    return jnp.asarray(jax.vmap(zoom)(*settings(zoom, lines)))
+
+
+def prior_residuals(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "row"] | None:
+    """What the prior of a zoom model adds to the residuals, px; None for a model without a prior."""
+    if not isinstance(zoom, AbstractPriorZoom):
+        return None
+    return prior_error(lines, zoom) * zoom.standardised()
+
+
+def prior_error(lines: AbstractLines, zoom: AbstractPriorZoom) -> Float[Array, ""]:
+    """The size, px, that a standardised parameter has among the residuals of eq. 13."""
+    error = jnp.asarray(zoom.error)
+    return lines.scale * error / jnp.sqrt(number_counted(counted_frames(lines)).astype(error.dtype))
+
+
+def prior_jacobian(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "row parameter"]:
+    """Derivatives of `prior_residuals` by the flattened parameters; no rows for a model without a prior."""
+    flat, unravel = ravel_pytree(zoom.parameters)
+    if not isinstance(zoom, AbstractPriorZoom):
+        return jnp.zeros((0, flat.size), flat.dtype)
+    return jax.jacfwd(lambda flat: prior_residuals(lines, with_parameters(zoom, unravel(flat))))(flat)
+
+
+@kinds_checked
+@eqx.filter_jit
+def frame_energy(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "frame"]:
+    """The error of each frame, px^2: mean over its lines of the mean squared distance (eq. 3).
+
+    NaN for a frame of which no line counts: its error is not known.
+    """
+    return energy_by_frame(lines, residuals(lines, coefficients))
+
+
+def energy_by_frame(lines: AbstractLines, weighted: Float[Array, "line rows"]) -> Float[Array, "frame"]:
+    """The error of each frame, px^2, from the weighted residuals; NaN for frames that do not count."""
+    counted = counted_frames(lines)
+    squares = jax.ops.segment_sum(jnp.sum(weighted**2, axis=1), lines.frame, counted.shape[0])
+    return jnp.where(counted, number_counted(counted).astype(squares.dtype) * squares, jnp.nan)
+
+
+@eqx.filter_jit
+def line_rms(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "line"]:
+    """Root of the mean squared distance of each line's corrected points to it, px, whatever its weight."""
+    distances = jax.vmap(line_residuals)(lines.corrected(coefficients[lines.frame]))
+    return jnp.sqrt(jnp.sum(distances**2, axis=1) / jnp.maximum(lines.counts, 1))
+
+
+@kinds_checked
+@eqx.filter_jit
+def global_energy(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, ""]:
+    """The global energy, px^2: the mean of the frames' errors (eq. 13)."""
+    return jnp.sum(residuals(lines, coefficients) ** 2)
+
+
+def linearised(lines, zoom):
+    """The residuals and their derivatives by the flattened parameters, a row a residual."""
+    flat, unravel = ravel_pytree(zoom.parameters)
+
+    def function(flat):
+        k = coefficients_by(with_parameters(zoom, unravel(flat)), lines)
+        return (weighted := residuals(lines, k)), weighted
+
+    jacobian, weighted = jax.jacfwd(function, has_aux=True)(flat)
+    return weighted, jacobian

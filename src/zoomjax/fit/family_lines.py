@@ -1,0 +1,188 @@
+"""Lines whose coefficients are those of another family than the radial polynomial.
+
+The fits know lines only by what coefficients make of them (`AbstractLines.corrected`). Points are
+corrected by the family's own formula. Compressed lines stand for powers, in which corrected points are
+linear: so are they in the coefficients of `BrownConrady`, by the triangles for any centre, which hold all
+monomials; those of `Division` become the 8 of a polynomial, as good as exact (`Division.expansion`).
+"""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core.arguments import kinds_checked
+from .._core.checks import checked_terms
+from .._core.types import Centres, Focal, Focus, FrameIndex, LineWeight, Point, traced
+from ..lines.base import AbstractLines, with_fields_of
+from ..lines.compressed import CompressedLines, compress
+from ..lines.free_centre import AnyCentreLines, compress_any_centre
+from ..lines.lines import Lines, corrected_points
+from ..models.family import AbstractFamily, AbstractRadial
+from ..models.polynomial import RadialPolynomial
+from .image_metric import ImageLines, in_image
+
+
+class FamilyLines(AbstractLines):
+    """Lines that are corrected by a family: `with_family` and `compress_family` make them.
+
+    Attributes:
+        lines: the lines.
+        corrected_by: the family.
+        frame, focal, focus, centre, image_size, focal_unit, weight: those of the lines.
+    """
+
+    lines: AbstractLines
+    corrected_by: AbstractFamily
+    frame: FrameIndex
+    focal: Focal
+    focus: Focus | None
+    centre: Point
+    image_size: tuple[int, int] = eqx.field(static=True)
+    focal_unit: str = eqx.field(static=True)
+    weight: LineWeight | None
+
+    @property
+    def family(self) -> AbstractFamily:
+        """What the coefficients mean."""
+        return self.corrected_by
+
+    @property
+    def counts(self) -> Float[Array, "line"]:
+        """Number of points of each line."""
+        return self.lines.counts
+
+    def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
+        """Corrected points of each line about their mean, px, or rows with the same scatter.
+
+        Raises:
+            ValueError: the lines were compressed for another family, or for fewer terms.
+        """
+        if isinstance(self.lines, Lines):
+            return corrected_points(self.lines, self.family, coefficients)
+        self._check(coefficients.shape[1])
+        powers, tangential = self.expansion(coefficients)
+        if isinstance(self.lines, AnyCentreLines):
+            return self.lines.decentred(powers, tangential)
+        return self.lines.corrected(powers)
+
+    def _check(self, size):
+        name = type(self.family).__name__
+        needed = self.family.expansion_terms(size)
+        enough = needed <= getattr(self.lines, "terms", 0)
+        if isinstance(self.family, AbstractRadial):
+            if not (isinstance(self.lines, CompressedLines) and enough):
+                raise ValueError(
+                    f"{name} needs lines compressed for {needed} terms about a fixed centre, but they are "
+                    f"not: compress(lines, terms={needed}), or pass the lines themselves."
+                )
+        elif not (isinstance(self.lines, AnyCentreLines) and enough):
+            raise ValueError(
+                f"{name} is not radial, and needs lines compressed with all monomials for {needed} terms, "
+                f"but are not: compress_any_centre(lines, terms={needed}), or pass the lines themselves."
+            )
+
+    def compressed(self, terms: int) -> "FamilyLines":
+        """The same lines compressed, unless they are."""
+        if not isinstance(self.lines, Lines):
+            return self
+        size = self.family.size(terms)
+        reduce = compress if isinstance(self.family, AbstractRadial) else compress_any_centre
+        small = reduce(self.lines, self.family.expansion_terms(size))
+        return eqx.tree_at(lambda lines: lines.lines, self, small)
+
+    def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
+        """``sum_p r_p^(2i) z_p z_p^T`` of the points as they were seen."""
+        return self.lines.second_moments(order)
+
+    def about(self, centre: Centres) -> "FamilyLines":
+        """The same lines about another centre of distortion; see `AbstractLines.about`."""
+        if isinstance(self.lines, AnyCentreLines):
+            if traced((self.centre, centre)) or np.allclose(self.centre, centre, rtol=0, atol=1e-3):
+                return self
+            raise ValueError(
+                "Lines compressed with all monomials serve one centre if their family is not radial, and "
+                "another is asked for. Compress the lines about that, or pass the lines themselves."
+            )
+        return _wrapped(self.as_weighted().about(centre), self.family)
+
+    def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "FamilyLines":
+        """The chosen lines as a data set of one frame."""
+        return _wrapped(self.as_weighted().take(lines, present), self.family)
+
+    def as_weighted(self) -> AbstractLines:
+        """The lines with the weights and focal lengths that these have been given."""
+        return with_fields_of(self.lines, self)
+
+
+@kinds_checked
+def with_family(lines: AbstractLines, family: AbstractFamily) -> AbstractLines:
+    """The same lines, coefficients for them to be those of a family.
+
+    Args:
+        lines: the lines, their compressed form, or either measured in the image.
+        family: the family.
+
+    Raises:
+        ValueError: lines measured in the image have a family that is not radial.
+
+    Example:
+        >>> import jax.numpy as jnp, numpy as np
+        >>> from zoomjax import Division, frame_rms
+        >>> row = np.stack([np.arange(500.0), np.full(500, 20.0)], axis=-1)
+        >>> lines = Lines.from_ragged([row], [0], [24], image_size=(640, 480))
+        >>> frame_rms(with_family(lines, Division()), jnp.array([[-0.1]])).shape
+        (1,)
+    """
+    if isinstance(lines, ImageLines):
+        return in_image(with_family(lines.as_weighted(), family))
+    if isinstance(lines, FamilyLines):
+        lines = lines.as_weighted()
+    return lines if isinstance(family, RadialPolynomial) else _wrapped(lines, family)
+
+
+@kinds_checked
+def compress_family(lines: Lines, family: AbstractFamily, *, terms: int = 2) -> AbstractLines:
+    """What `compress` is for the radial polynomial, for any family; the result remembers it.
+
+    Args:
+        lines: the lines; their `centre` is the centre the result is for.
+        family: the family that will be fitted.
+        terms: the largest number N of its radial coefficients that will be.
+
+    Example:
+        >>> import numpy as np
+        >>> from zoomjax import Division, PolynomialZoom, fit_zoom
+        >>> t = np.linspace(0.0, 479.0, 50)
+        >>> bent = [np.stack([x + (t / 240 - 1) ** 2, t], axis=-1) for x in (9, 30, 599)]
+        >>> lines = Lines.from_ragged(bent, [0] * 3, [50], image_size=(640, 480))
+        >>> small = compress_family(lines, Division())
+        >>> fit_zoom(small, zoom=PolynomialZoom(degree=0), terms=1).lens.family
+        Division()
+    """
+    wrapped = with_family(lines, family)
+    return (
+        wrapped.compressed(checked_terms(terms))
+        if isinstance(wrapped, FamilyLines)
+        else compress(lines, terms)
+    )
+
+
+def points_of(lines: AbstractLines) -> AbstractLines:
+    """The lines themselves, under whatever they are wrapped in."""
+    while isinstance(lines, ImageLines | FamilyLines):
+        lines = lines.lines
+    return lines
+
+
+def _wrapped(lines, family):
+    return FamilyLines(
+        lines=lines,
+        corrected_by=family,
+        frame=lines.frame,
+        focal=lines.focal,
+        focus=lines.focus,
+        centre=lines.centre,
+        image_size=lines.image_size,
+        focal_unit=lines.focal_unit,
+        weight=lines.weight,
+    )

@@ -1,0 +1,397 @@
+"""Focal lengths that are known with errors: what those do to a lens, and what the lines know of them.
+
+A fit takes the focal lengths of the frames as exact. Where they are wrong by t_m, in log f, its parameters
+a are wrong by what keeps the gradient g of the energy at zero (the implicit function theorem):
+
+    da = R t,    R = -(dg/da)^-1 dg/dt,    and their covariance is larger by R diag(sigma^2 / f^2) R^T.
+
+Frames meet in the energy only through their coefficients k_m = k(f_m): near the minimum it is a sum over
+frames of quadratics in k_m, found by N + 1 gradients whatever the number of frames, and all derivatives
+by a and t are those of that sum.
+
+The lines also know where on its curve k(f) a frame lies. `fit_focal` minimises, over a and t together,
+
+    E(a, t) + sum_m tau_m (t_m f_m / sigma_m)^2 .
+
+That is the mode of the posterior if E_m / (2 tau_m), of each frame, is minus the logarithm of a likelihood:
+tau_m is s^2 times the mean weight w_l of the frame's lines in eq. 13, s being the noise of a point that
+is independent of the others. The fit's own covariance C tells s: with G = J^T J and h_l the leverages of
+the lines, ``tr(G C) = s^2 sum_l w_l h_l``. So noise that goes together along a line counts as what it is.
+"""
+
+from typing import Any, NamedTuple, NoReturn
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int, Num, ScalarLike
+
+from .._core.arguments import kinds_checked
+from .._core.types import AnyArray, Focal, traced
+from ..lines.base import AbstractLines
+from ..models.zoom import AbstractPriorZoom, AbstractZoom, with_parameters
+from .covariance import parameter_covariance
+from .energy import coefficients_by, line_weights, linearised, prior_error, prior_residuals, residuals
+from .family_lines import with_family
+from .result import ZoomFit
+from .zoom import fit_zoom
+
+Sigma = ScalarLike | Num[AnyArray, "frame"]
+
+_MOST_STEPS = 100
+"""Of the joint minimisation, which takes 5 to 15."""
+
+_LEAST_NOISE = 1e-3
+"""px: points are not taken for better than that, or a scene without noise would leave the prior no say."""
+
+
+class FocalFit(eqx.Module):
+    """A zoom lens fitted together with the focal lengths of its frames.
+
+    Attributes:
+        fit: the fit at the focal lengths found; its covariance allows for what is still unknown of them.
+        focal: of each frame, as found.
+        std: their standard deviations, same unit; at most about those given, and 0 where 0 was given.
+        given: the focal lengths that the lines came with.
+        steps: number of steps the joint solver took.
+    """
+
+    fit: ZoomFit
+    focal: Float[Array, "frame"]
+    std: Float[Array, "frame"]
+    given: Float[Array, "frame"]
+    steps: Int[Array, ""]
+
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: the lens of its fit is asked."""
+        raise TypeError("A FocalFit is not a lens: use found.fit.lens, as in found.fit.lens(35.0).")
+
+
+@kinds_checked
+def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma) -> ZoomFit:
+    """The same fit, its covariance, and so all bands, enlarged by what is unknown of the focal lengths.
+
+    Args:
+        fit: the fit.
+        lines: the lines that it was fitted to, with their weights; measured in the image, if they were.
+        focal_sigma: standard deviation of the focal lengths, in the lines' unit: a number, or one a frame;
+            0 where they are exact. A focal length rounded to whole mm has 0.29, 1/sqrt(12). Errors of
+            frames count as independent.
+
+    Returns:
+        The fit with `covariance` larger, to first order in the errors.
+
+    Raises:
+        ValueError: `focal_sigma` does not hold finite numbers of at least 0, one or one a frame; or the
+            lens has a centre that moves along the zoom.
+
+    Example:
+        >>> from zoomjax import compress, displacement_std, fit_zoom, scenes
+        >>> focal = scenes.focal_sweep(4)
+        >>> lines = compress(scenes.board_lines(scenes.nikkor_18_200(), focal, spacing=99, noise=1))
+        >>> exact = fit_zoom(lines)
+        >>> rounded = with_focal_sigma(exact, lines, focal_sigma=0.29)
+        >>> wide = [displacement_std(fit, focal[:2], focal=21.0) for fit in (exact, rounded)]
+        >>> bool(wide[0] < wide[1])
+        True
+    """
+    sigma = _checked_sigma(focal_sigma, lines.focal)
+    if not traced(sigma) and not np.isfinite(sigma).all():
+        raise ValueError(
+            f"Argument focal_sigma must hold finite numbers, but it is {focal_sigma}. {_UNKNOWN}"
+        )
+    if fit.lens.shift is not None:
+        raise ValueError(
+            "The lens has a centre that moves along the zoom, for which this is not worked out."
+        )
+    lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
+    return _widened(fit, lines, jnp.diag(sigma / jnp.asarray(lines.focal)) ** 2)
+
+
+@kinds_checked
+def fit_focal(
+    lines: AbstractLines,
+    focal_sigma: Sigma,
+    *,
+    zoom: AbstractZoom | None = None,
+    terms: int | None = None,
+    invertible: bool = True,
+    throw: bool = True,
+) -> FocalFit:
+    """The zoom model and the focal lengths that make the lines straightest, these drawn to the given ones.
+
+    Straightness alone cannot tell focal lengths. Relabel them by any increasing function, change the zoom
+    model accordingly, and every line is as straight as before; for a polynomial in 1/f, which stays one if
+    1/f is scaled and shifted, nothing at all tells those two apart. So the scale of the result is that of
+    the focal lengths given, and what the lines can mend is where single ones stand out from a smooth k(f).
+    What the zoom model cannot follow is taken for an error of focal lengths, too.
+
+    Args:
+        lines: the lines, or, much faster and with the same answer, ``compress(lines)``.
+        focal_sigma: standard deviation of the given focal lengths, in their unit: a number, or one a frame.
+            0 keeps a focal length as it is; infinity says that nothing is known of it, and the given one
+            is where the search starts.
+        zoom, terms, invertible, throw: as for `fit_zoom`, whose errors also apply.
+
+    Raises:
+        ValueError: `focal_sigma` is not such, or is infinite for all frames but those at one focal length;
+            or the lines are in float32, whose rounding outweighs the prior where lines say nothing.
+        RuntimeError: the solver failed (see `throw`).
+
+    Example:
+        >>> import jax
+        >>> from zoomjax import compress, scenes
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> truth, focal = scenes.nikkor_18_200(), scenes.focal_sweep(8)
+        >>> lines = scenes.board_lines(truth, focal, spacing=99, noise=0.1)
+        >>> given = eqx.tree_at(lambda lines: lines.focal, lines, jax.numpy.asarray(focal.round()))
+        >>> found = fit_focal(compress(given), 0.29)
+        >>> bool(abs(found.focal - focal).mean() < abs(found.given - focal).mean())
+        True
+        >>> jax.config.update("jax_enable_x64", False)
+    """
+    sigma = _checked_sigma(focal_sigma, lines.focal)
+    given = jnp.asarray(lines.focal)
+    if given.dtype != jnp.float64:
+        raise ValueError(
+            "Focal lengths are refined in float64 only: "
+            f'jax.config.update("jax_enable_x64", True), and not lines in {given.dtype}.'
+        )
+    if not traced((sigma, given)) and np.unique(given[np.isfinite(sigma)]).size < 2:
+        raise ValueError(
+            "Argument focal_sigma must be finite for frames at two different focal lengths or more, but it "
+            f"is {focal_sigma}. {_UNKNOWN}"
+        )
+    start = fit_zoom(lines, zoom=zoom, terms=terms, invertible=False, throw=throw)
+    t, model, steps, reached = _refined(lines, start.lens.zoom, sigma / given)
+    if throw and not traced(reached) and not reached:
+        raise RuntimeError(
+            f"The focal lengths did not settle in {_MOST_STEPS} steps: the lines say too little of those "
+            "with a large focal_sigma. Leave these frames out, or measure their focal lengths."
+        )
+    focal = given * jnp.exp(t)
+    refined = _at(lines, focal)
+    fit = fit_zoom(refined, zoom=model, invertible=invertible, throw=throw)
+    covariance = _posterior(refined, fit.lens.zoom, sigma / given)
+    return FocalFit(
+        fit=_widened(fit, refined, covariance),
+        focal=focal,
+        std=focal * jnp.sqrt(jnp.diagonal(covariance)),
+        given=given,
+        steps=steps,
+    )
+
+
+_UNKNOWN = (
+    "Straightness alone cannot tell focal lengths: relabel them by any increasing function, change the "
+    "zoom model accordingly, and every line is as straight as before. Take them from EXIF data or a table, "
+    "or measure them from a board (focal_from_board) or a plane (focal_from_planes, focal_from_lines)."
+)
+
+
+def _checked_sigma(focal_sigma: Any, focal: Focal) -> Float[Array, "frame"]:
+    """The standard deviation of each frame's focal length."""
+    focal = jnp.asarray(focal)
+    if focal_sigma is None:
+        raise ValueError(
+            f"Argument focal_sigma must be a number or one a frame, but it is None. {_UNKNOWN}"
+        )
+    sigma = jnp.asarray(focal_sigma, focal.dtype)
+    if sigma.shape not in ((), focal.shape):
+        raise ValueError(
+            f"Argument focal_sigma must hold one number, or one for each of the {focal.shape[0]} frames, "
+            f"but its shape is {sigma.shape}."
+        )
+    if not traced(sigma):
+        if np.isnan(sigma).any():
+            raise ValueError(f"Argument focal_sigma must hold numbers, but it is {focal_sigma}. {_UNKNOWN}")
+        if (np.asarray(sigma) < 0).any():
+            raise ValueError(f"Argument focal_sigma must be at least 0, but it is {focal_sigma}.")
+    return jnp.broadcast_to(sigma, focal.shape)
+
+
+class _NearEnergy(NamedTuple):
+    """Half the energy, but for a constant, near some coefficients of the frames."""
+
+    coefficients: Float[Array, "frame terms"]
+    gradient: Float[Array, "frame terms"]
+    hessian: Float[Array, "frame terms terms"]
+
+    def __call__(self, coefficients):
+        d = coefficients - self.coefficients
+        return jnp.sum(self.gradient * d) + jnp.einsum("mi,mij,mj->", d, self.hessian, d) / 2
+
+
+def _near_energy(lines, coefficients) -> _NearEnergy:
+    """A frame's energy depends on its own coefficients alone: a direction serves all frames at once."""
+    gradient = jax.grad(lambda k: jnp.sum(residuals(lines, k) ** 2) / 2)
+
+    def along(direction):
+        return jax.jvp(gradient, (coefficients,), (jnp.broadcast_to(direction[None], coefficients.shape),))
+
+    values, columns = jax.vmap(along)(jnp.eye(coefficients.shape[1], dtype=coefficients.dtype))
+    return _NearEnergy(coefficients, values[0], jnp.moveaxis(columns, 0, 1))
+
+
+def _response(lines, zoom) -> Float[Array, "parameter frame"]:
+    """By how much the fitted parameters move with the logarithm of each frame's focal length."""
+    flat, unravel = ravel_pytree(zoom.parameters)
+    focal = jnp.asarray(lines.focal)
+    near = _near_energy(lines, coefficients_by(zoom, lines))
+
+    def half(flat, t):
+        model = with_parameters(zoom, unravel(flat))
+        prior = prior_residuals(lines, model)
+        return near(coefficients_by(model, _at(lines, focal * jnp.exp(t)))) + (
+            0 if prior is None else jnp.sum(prior**2) / 2
+        )
+
+    by_both = jax.jacfwd(jax.grad(half), argnums=(0, 1))
+    hessian, mixed = by_both(flat, jnp.zeros_like(focal))
+    return -_inverse(hessian) @ mixed
+
+
+def _inverse(matrix):
+    """Of a symmetric matrix, in units of its diagonal; what it does not determine stays as it is."""
+    size = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0))
+    size = jnp.where(size > 0, size, 1)
+    return jnp.linalg.pinv(matrix / size[:, None] / size[None], hermitian=True) / size[:, None] / size[None]
+
+
+@eqx.filter_jit
+def _widened(fit, lines, covariance):
+    """The fit with its covariance enlarged by that of the logarithms of the focal lengths."""
+    response = _response(lines, fit.lens.zoom)
+    own = fit.covariance
+    infinite = jnp.isinf(jnp.diagonal(own))
+    more = jnp.where(infinite[:, None] | infinite[None], 0, response @ covariance @ response.T)
+    return eqx.tree_at(lambda fit: fit.covariance, fit, own + more)
+
+
+def _prior_weights(lines, zoom) -> Float[Array, "frame"]:
+    """tau of each frame, px^2: see the module."""
+    weighted, jacobian = linearised(lines, zoom)
+    covariance, _ = parameter_covariance(lines, zoom, weighted, jacobian)
+    known = jnp.isfinite(jnp.diagonal(covariance))
+    covariance = jnp.where(known[:, None] & known[None], covariance, 0)
+    weights, frames = line_weights(lines), lines.focal.shape[0]
+    squares = jnp.einsum("lrp,lrq->lpq", jacobian, jacobian)
+    gauss_newton = jnp.sum(squares, axis=0)
+    leverage = jnp.einsum("lpq,qp->l", squares, _inverse(gauss_newton))
+    noise = jnp.trace(gauss_newton @ covariance) / jnp.sum(weights * leverage)
+    total, share = (jax.ops.segment_sum(v, lines.frame, frames) for v in (leverage, weights * leverage))
+    mean_weight = share / jnp.where(total > 0, total, 1)
+    return jnp.maximum(noise, _LEAST_NOISE**2) * mean_weight
+
+
+class _Joint(NamedTuple):
+    """Half the joint energy's derivatives by the parameters and the frames' standardised t."""
+
+    gradient: Float[Array, "unknown"]
+    gauss_newton: Float[Array, "unknown unknown"]
+    middle: Float[Array, "unknown unknown"]
+
+
+def _at(lines, focal):
+    """The lines with other focal lengths of their frames."""
+    return eqx.tree_at(lambda lines: lines.focal, lines, focal)
+
+
+def _focal_of(lines, relative, t):
+    return jnp.asarray(lines.focal) * jnp.exp(relative * t)
+
+
+def _joint(lines, zoom, relative, known, tau, t) -> _Joint:
+    """At focal lengths moved by t standard deviations, of which `known` ones have a prior."""
+    flat, unravel = ravel_pytree(zoom.parameters)
+    number = flat.shape[0]
+
+    def coefficients(both):
+        model = with_parameters(zoom, unravel(both[:number]))
+        return coefficients_by(model, _at(lines, _focal_of(lines, relative, both[number:])))
+
+    def priors(both):
+        own = prior_residuals(lines, with_parameters(zoom, unravel(both[:number])))
+        on_focal = jnp.where(known, jnp.sqrt(tau) * both[number:], 0)
+        return on_focal if own is None else jnp.concatenate([on_focal, own])
+
+    both = jnp.concatenate([flat, t])
+    near = _near_energy(lines, coefficients(both))
+    rows, prior_rows = jax.jacfwd(coefficients)(both), jax.jacfwd(priors)(both)
+    of_prior = jnp.concatenate(
+        [tau, jnp.full(prior_rows.shape[0] - tau.shape[0], _prior_noise(lines, zoom))]
+    )
+    return _Joint(
+        gradient=jnp.einsum("mi,mip->p", near.gradient, rows) + priors(both) @ prior_rows,
+        gauss_newton=jnp.einsum("mip,mij,mjq->pq", rows, near.hessian, rows) + prior_rows.T @ prior_rows,
+        middle=jnp.einsum("m,mip,mij,mjq->pq", tau, rows, near.hessian, rows)
+        + prior_rows.T @ (of_prior[:, None] * prior_rows),
+    )
+
+
+def _prior_noise(lines, zoom):
+    """The variance that the residuals of a zoom model's own prior have."""
+    return prior_error(lines, zoom) ** 2 if isinstance(zoom, AbstractPriorZoom) else 0.0
+
+
+@eqx.filter_jit
+def _refined(lines, zoom, relative):
+    """log f relative to the given ones, and the zoom model with them, by damped Gauss-Newton steps."""
+    known = jnp.isfinite(relative)
+    relative = jnp.where(known, relative, 1)
+    flat, unravel = ravel_pytree(zoom.parameters)
+    tolerance = jnp.sqrt(jnp.finfo(flat.dtype).eps)
+
+    def model(flat):
+        return with_parameters(zoom, unravel(flat))
+
+    def energy(flat, t, tau):
+        total = jnp.sum(
+            residuals(lines, coefficients_by(model(flat), _at(lines, _focal_of(lines, relative, t)))) ** 2
+        )
+        prior = prior_residuals(lines, model(flat))
+        return (
+            total + jnp.sum(jnp.where(known, tau * t**2, 0)) + (0 if prior is None else jnp.sum(prior**2))
+        )
+
+    def turn(state):
+        flat, t, damping, _, steps = state
+        moved = _at(lines, _focal_of(lines, relative, t))
+        tau = _prior_weights(moved, model(flat))
+        joint = _joint(lines, model(flat), relative, known, tau, t)
+        matrix = joint.gauss_newton
+        step = -_inverse(matrix + damping * jnp.diag(jnp.diagonal(matrix))) @ joint.gradient
+        new_flat, new_t = flat + step[: flat.shape[0]], t + step[flat.shape[0] :]
+        rounding = 128 * jnp.finfo(flat.dtype).eps
+        better = energy(new_flat, new_t, tau) <= (1 + rounding) * energy(flat, t, tau)
+        return (
+            jnp.where(better, new_flat, flat),
+            jnp.where(better, new_t, t),
+            jnp.where(better, damping / 10, 10 * jnp.maximum(damping, 1e-4)).astype(damping.dtype),
+            jnp.where(better, jnp.max(jnp.abs(step[flat.shape[0] :])), jnp.inf),
+            steps + 1,
+        )
+
+    def goes_on(state):
+        *_, change, steps = state
+        return (change > tolerance) & (steps < _MOST_STEPS)
+
+    zero, inf = jnp.zeros_like(relative), jnp.asarray(jnp.inf, relative.dtype)
+    start = (flat, zero, jnp.zeros_like(inf), inf, jnp.asarray(0))
+    flat, t, _, change, steps = jax.lax.while_loop(goes_on, turn, start)
+    reached: Bool[Array, ""] = change <= tolerance
+    return relative * t, model(flat), steps, reached
+
+
+@eqx.filter_jit
+def _posterior(lines, zoom, relative):
+    """Covariance of the logarithms of the focal lengths, given the lines and the prior, at the minimum."""
+    known = jnp.isfinite(relative)
+    relative = jnp.where(known, relative, 1)
+    tau = _prior_weights(lines, zoom)
+    joint = _joint(lines, zoom, relative, known, tau, jnp.zeros_like(relative))
+    inverse = _inverse(joint.gauss_newton)
+    both = (inverse @ joint.middle @ inverse)[-relative.shape[0] :, -relative.shape[0] :]
+    return relative[:, None] * both * relative[None]

@@ -1,0 +1,85 @@
+"""Each frame fitted by itself (eq. 3 and 6).
+
+A frame by itself is a zoom polynomial of degree 0 on the lines of that frame, so that the solver of `zoom`
+serves here, `vmap`\\ ped over the frames.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .._core.arguments import kinds_checked
+from .._core.checks import checked_terms
+from ..lines.base import AbstractLines
+from ..lines.lines import Lines
+from ..models.family import AbstractFamily
+from ..models.zoom import PolynomialZoom, with_parameters
+from ._least_squares import Solver, default_solver
+from .constrained import or_else, refit_zoom
+from .family_lines import points_of, with_family
+from .prepare import algebraic_start, compressed_as_measured
+from .result import FrameFits, collected, described_fit, is_invertible, outcome_of, thrown
+from .zoom import fit_prepared
+
+
+@kinds_checked
+def fit_frames(
+    lines: AbstractLines,
+    *,
+    family: AbstractFamily | None = None,
+    terms: int = 2,
+    solver: Solver | None = None,
+    max_steps: int = 256,
+    invertible: bool = True,
+    throw: bool = True,
+) -> FrameFits:
+    """The distortion of each frame by itself (eq. 3 and 6): what a zoom model is compared with.
+
+    Args:
+        lines, family, terms, solver, max_steps, invertible, throw: as for `fit_zoom`, frame by frame.
+
+    Raises:
+        RuntimeError: the solver failed on some frame, and `throw` is set.
+    """
+    terms = checked_terms(terms)
+    lines = lines if family is None else with_family(lines, family)
+    chosen, present = lines.by_frame()
+    solver = default_solver(lines) if solver is None else solver
+    start = algebraic_start(lines, terms)
+    fits, outcome = _fit_frames(lines, start, chosen, present, terms, solver, max_steps)
+    if invertible:
+        small = compressed_as_measured(lines, terms)
+        fits, outcome = or_else(fits, outcome, lambda: _refit_frames(small, chosen, present, terms, fits))
+    return thrown(fits, outcome, throw)
+
+
+@eqx.filter_jit
+def _fit_frames(lines, start, chosen, present, terms, solver, max_steps):
+    def fit(chosen, present):
+        frame = lines.take(chosen, present)
+        constant = PolynomialZoom(degree=0).prepare(frame.focal, lines.family.size(terms))
+        own = None if start is None else start.take(chosen, present)
+        return fit_prepared(frame, own, constant, terms, solver, max_steps)[0]
+
+    # Small compressed frames are solved side by side; the points themselves one frame at a time, for
+    # side by side they would all be in memory at once, padded to the fullest frame.
+    batch = 1 if isinstance(points_of(lines), Lines) else len(chosen)
+    fits = jax.lax.map(lambda frame: fit(*frame), (chosen, present), batch_size=batch)
+    each = collected(lines, fits)
+    return each, outcome_of(each)
+
+
+@eqx.filter_jit
+def _refit_frames(lines, chosen, present, terms, free):
+    """All frames as they are, if they are invertible, and otherwise the best that is."""
+
+    def fit(chosen, present, result, coefficients):
+        frame = lines.take(chosen, present)
+        constant = PolynomialZoom(degree=0).prepare(frame.focal, lines.family.size(terms))
+        own = described_fit(frame, with_parameters(constant, coefficients[None]), result, jnp.asarray(0))
+        other, _ = refit_zoom(frame, own)
+        keep = is_invertible(own)
+        return jax.tree.map(lambda own, other: jnp.where(keep, own, other), own, other)
+
+    each = collected(lines, jax.vmap(fit)(chosen, present, free.result, free.coefficients))
+    return each, outcome_of(each)

@@ -1,0 +1,236 @@
+"""What fits return, and how they ended."""
+
+from typing import Any, NoReturn
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+
+from .._core.types import Centres, traced
+from ..lines.base import AbstractLines
+from ..models.distortion import Distortion
+from ..models.family import AbstractFamily
+from ..models.invertibility import Certificate, certificate_of
+from ..models.lens import ZoomLens
+from ..models.polynomial import RadialPolynomial
+from ..models.zoom import AbstractFocusZoom, AbstractZoom
+from .covariance import parameter_covariance
+from .energy import energy_by_frame, linearised
+
+
+def lens_of(lines: AbstractLines, zoom: AbstractZoom) -> ZoomLens:
+    """The lens that a zoom model fitted to these lines makes."""
+    focal = jnp.asarray(lines.focal)
+    return ZoomLens(
+        zoom=zoom,
+        centre=jnp.asarray(lines.centre),
+        focal_range=jnp.stack([jnp.min(focal), jnp.max(focal)]),
+        image_size=lines.image_size,
+        focal_unit=lines.focal_unit,
+        focus_range=_focus_range(lines) if isinstance(zoom, AbstractFocusZoom) else None,
+        family=lines.family,
+    )
+
+
+def _focus_range(lines):
+    focus = jnp.asarray(lines.focus)
+    return jnp.stack([jnp.min(focus), jnp.max(focus)])
+
+
+class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """How a fit ended: optimistix' results, and three about the model that came out."""
+
+    undetermined = (
+        "The lines do not determine all coefficients: some can change without bending any line by more "
+        "than the noise does, and their variance is reported as infinite. Add lines that pass far from the "
+        "centre of distortion, at more focal lengths, or lower the degree or the number of terms."
+    )
+    folded = (
+        "The fitted distortion is not invertible over the whole image and the range of focal lengths: its "
+        "`certificate` says where the corrected image folds over. Add lines near the corners, remove lines "
+        "that are not straight in the scene, or lower the degree or the number of terms."
+    )
+    constrained = (
+        "The lines fit best with a distortion that is not invertible over the whole image and the range of "
+        "focal lengths; this is the best one that is, and `rms_unconstrained` tells what that cost. Add "
+        "lines near the corners, remove lines that are not straight in the scene, or lower the degree or "
+        "the number of terms."
+    )
+
+
+class ZoomFit(eqx.Module):
+    """A fitted zoom lens.
+
+    Attributes:
+        lens: from a focal length to the distortion there.
+        rms: root of the global energy (eq. 13), px of the corrected image.
+        frame_rms: root of each frame's error (eq. 3), px; NaN for a frame whose lines all weigh nothing.
+        covariance: of the zoom model's parameters in normalised units, flattened row by row (for a
+            polynomial: all terms of power 0, then of power 1, ...). Lines are taken to have independent
+            errors, points of a line are not: it is the line-by-line sandwich of the residuals, its shape
+            shrunk to what independent points would give by as much as its own scatter demands. Where
+            there are too few lines for that, points are taken to be independent. An undetermined
+            parameter has infinite variance and zero covariances. With a prior (`AbstractPriorZoom`), the
+            mean square of both what noise and what the prior does to the parameters. What invertibility
+            forbids is not taken into account.
+        result: how the fit ended; ``RESULTS[fit.result]`` is a sentence.
+        steps: number of steps the solver took.
+        certificate: whether the lens is invertible over its image and focal range.
+        rms_unconstrained: what `rms` is without the demand that the lens be invertible: the same, unless
+            the lens had to be made so. The result is then `constrained`, if there is nothing worse to say.
+    """
+
+    lens: ZoomLens
+    rms: Float[Array, ""]
+    frame_rms: Float[Array, "frame"]
+    covariance: Float[Array, "parameter parameter"]
+    result: RESULTS
+    steps: Int[Array, ""]
+    certificate: Certificate
+    rms_unconstrained: Float[Array, ""]
+
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: the lens of a fit is asked, not the fit."""
+        raise TypeError("A ZoomFit is not a lens: use fit.lens, as in fit.lens(35.0).")
+
+
+class FrameFits(eqx.Module):
+    """Each frame fitted by itself (eq. 6).
+
+    Attributes:
+        coefficients: normalised (k1, ..., kN) of each frame.
+        rms: root of the mean of the frames' errors, px: what a zoom model's `rms` is compared with.
+        frame_rms: root of each frame's error (eq. 3), px; NaN for a frame whose lines all weigh nothing.
+        covariance: of each frame's coefficients; see `ZoomFit`.
+        result: how each frame's fit ended.
+        certificate: of each frame, whether it is invertible over the image.
+        rms_unconstrained: what `rms` is without the demand that every frame be invertible.
+        centre: centre of distortion, px: of all frames, or of each.
+        scale: the length in px that is radius 1.
+        family: what the coefficients mean.
+    """
+
+    coefficients: Float[Array, "frame terms"]
+    rms: Float[Array, ""]
+    frame_rms: Float[Array, "frame"]
+    covariance: Float[Array, "frame terms terms"]
+    result: RESULTS
+    certificate: Certificate
+    rms_unconstrained: Float[Array, ""]
+    centre: Centres
+    scale: float = eqx.field(static=True)
+    family: AbstractFamily = RadialPolynomial()
+
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: there is a distortion of each frame, and none between them."""
+        raise TypeError(
+            "FrameFits are not a lens: use each.distortion(frame) for one frame's distortion, or fit_zoom "
+            "for a lens at any focal length."
+        )
+
+    def messages(self) -> list[str]:
+        """For each frame a sentence about how its fit ended, empty where nothing is wrong."""
+        return [
+            RESULTS[jax.tree.map(lambda value, frame=frame: value[frame], self.result)]
+            for frame in range(self.coefficients.shape[0])
+        ]
+
+    def distortion(self, frame: int) -> Distortion:
+        """The distortion of one frame.
+
+        Raises:
+            IndexError: there is no such frame.
+        """
+        frames = self.coefficients.shape[0]
+        if not -frames <= frame < frames:
+            raise IndexError(f"There is no frame {frame}: the frames fitted are 0 to {frames - 1}.")
+        dtype = self.coefficients.dtype
+        return Distortion(
+            self.coefficients[frame],
+            jnp.broadcast_to(jnp.asarray(self.centre, dtype), (frames, 2))[frame],
+            jnp.asarray(self.scale, dtype),
+            self.family,
+        )
+
+
+def described_fit(lines, zoom, result, steps):
+    """A fitted zoom model with all that is to be said of it."""
+    weighted, jacobian = linearised(lines, zoom)
+    errors = energy_by_frame(lines, weighted)
+    covariance, determined = parameter_covariance(lines, zoom, weighted, jacobian)
+    lens, rms = lens_of(lines, zoom), jnp.sqrt(jnp.nanmean(errors))
+    certificate = certificate_of(zoom, lens.centre, lens.focal_range, lens.image_size, family=lens.family)
+    return ZoomFit(
+        lens=lens,
+        rms=rms,
+        frame_rms=jnp.sqrt(errors),
+        covariance=covariance,
+        result=_judge(zoom, result, determined, certificate),
+        steps=steps,
+        certificate=certificate,
+        rms_unconstrained=rms,
+    )
+
+
+def collected(lines, fits):
+    """Fits of one frame each, stacked, as one; about the centre of the lines."""
+    return FrameFits(
+        coefficients=fits.lens.zoom.parameters[:, 0],
+        rms=jnp.sqrt(jnp.nanmean(fits.rms**2)),
+        frame_rms=fits.rms,
+        covariance=fits.covariance,
+        result=fits.result,
+        certificate=fits.certificate,
+        rms_unconstrained=jnp.sqrt(jnp.nanmean(fits.rms_unconstrained**2)),
+        centre=jnp.asarray(lines.centre),
+        scale=lines.scale,
+        family=lines.family,
+    )
+
+
+def _judge(zoom, result, determined, certificate):
+    """The worst of what the solver says and of what the model looks like."""
+    finite = jnp.all(jnp.isfinite(ravel_pytree(zoom.parameters)[0]))
+    good: Any = RESULTS.successful  # inherited members, which pyright takes for another class's
+    nonfinite: Any = RESULTS.nonfinite
+    about_model = RESULTS.where(certificate.folded, RESULTS.folded, good)
+    about_model = RESULTS.where(determined, about_model, RESULTS.undetermined)
+    about_model = RESULTS.where(finite, about_model, nonfinite)
+    solved = result if isinstance(result, RESULTS) else RESULTS.promote(result)
+    return RESULTS.where(solved == good, about_model, solved)
+
+
+def is_invertible(fit):
+    """Whether there is nothing to be made invertible: it is, or there is no model, or none that can be."""
+    stated = ~jnp.isneginf(fit.certificate.least)
+    return fit.certificate.certified | ~stated | _failed(fit.result)
+
+
+def _failed(result):
+    """Whether a solver failed; what is said of a model is no failure."""
+    told = (result == RESULTS.undetermined) | (result == RESULTS.folded) | (result == RESULTS.constrained)
+    return (result != RESULTS.successful) & ~told
+
+
+def outcome_of(fit):
+    """Whether it is invertible, and whether a solver failed, in which frame first, and how."""
+    failed = jnp.atleast_1d(_failed(fit.result))
+    frame = jnp.argmax(failed)
+    result = jax.tree.map(lambda value: jnp.atleast_1d(value)[frame], fit.result)
+    return jnp.all(is_invertible(fit)), (jnp.any(failed), frame, result)
+
+
+def thrown(fit, outcome, throw):
+    """The fit, raising where its solver failed."""
+    _, (failed, frame, result) = outcome
+    if not throw:
+        return fit
+    if traced(failed):
+        return result.error_if(fit, failed)
+    if failed:
+        where = f"Frame {int(frame)}: " if isinstance(fit, FrameFits) else ""
+        raise RuntimeError(f"The fit failed. {where}{RESULTS[result]}")
+    return fit

@@ -1,0 +1,155 @@
+"""Fits that some crooked lines do not spoil: an M-estimator over whole lines.
+
+A curved marking, a bent edge or two borders joined by mistake are wrong as a whole, so that what is weighed
+is a line, not a point, and compression stays exact. With the RMS distance r of a line's corrected points
+to their line, m its median over the lines, and s its spread, the weight of a line is Tukey's
+
+    v = (1 - t^2)^2,  t = (r - m) / (c s),    but 1 for r < m, and 0 for t > 1.
+
+The spread is that of the better half, 1.48 times the median of m - r there, for the bad lines are all in
+the other; to it is added m / sqrt(2 (n - 2)), by which a line of n points may be rough by chance.
+
+Weights and fit are found in turns (iteratively reweighted least squares, a Gauss-Newton step a turn), from
+a wide c that narrows to `_CUT`, so that lines spoiled by the first, unweighted fit get the chance to come
+back; then `fit_zoom` converges with the weights as they are.
+"""
+
+from typing import Any, NoReturn
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+
+from .._core.arguments import kinds_checked
+from ..lines.base import AbstractLines
+from ..models.family import AbstractFamily
+from ..models.polynomial import RadialPolynomial
+from ..models.zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
+from ._least_squares import Solver
+from ._linear import least_squares
+from .algebraic import algebraic_zoom
+from .energy import coefficients_by, line_residuals, linearised, prior_jacobian
+from .family_lines import with_family
+from .prepare import ready_model
+from .result import ZoomFit
+from .zoom import fit_zoom
+
+_CUT = 6.0  # standard deviations of r among good lines, were they normal
+_NARROWING = (np.inf, 24.0, 16.0, 10.0, *(_CUT,) * 4)  # c of each turn
+_LEAST_SPREAD = 0.02  # of m: lines of thousands of points, or without noise, are all alike
+
+
+class RobustFit(eqx.Module):
+    """A fit, and how much of each line it believes.
+
+    Attributes:
+        fit: the zoom model fitted to the weighted lines; its RMS and covariance are theirs.
+        weight: of each line, from 0 (rejected) to 1, or to the weight it had before.
+        line_rms: RMS distance of each line's n corrected points to their line, px, over n - 2, so that
+            short lines are not flattered; of rejected ones too.
+        scale: the typical `line_rms`, px: the median.
+    """
+
+    fit: ZoomFit
+    weight: Float[Array, "line"]
+    line_rms: Float[Array, "line"]
+    scale: Float[Array, ""]
+
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: the lens of its fit is asked."""
+        raise TypeError("A RobustFit is not a lens: use robust.fit.lens, as in robust.fit.lens(35.0).")
+
+    @property
+    def rejected(self) -> Int[np.ndarray, "rejected"]:
+        """Indices of the lines that count nothing, the roughest first."""
+        lines = np.flatnonzero(np.asarray(self.weight) == 0)
+        return lines[np.argsort(-np.asarray(self.line_rms)[lines], kind="stable")]
+
+
+@kinds_checked
+def fit_robust(
+    lines: AbstractLines,
+    *,
+    zoom: AbstractZoom | None = None,
+    family: AbstractFamily | None = None,
+    terms: int | None = None,
+    solver: Solver | None = None,
+    max_steps: int = 256,
+    invertible: bool = True,
+    throw: bool = True,
+) -> RobustFit:
+    """The zoom model of the lines that agree on one; those not straight in the scene are rejected.
+
+    Args:
+        lines: the lines, or, much faster and with the same answer, ``compress(lines)``. Weights that they
+            have already are kept as factors.
+        zoom, family, terms, invertible, throw: as for `fit_zoom`, whose errors also apply.
+        solver, max_steps: of the last fit, with the weights as they then are; as for `fit_zoom`. The turns
+            before it are single Gauss-Newton steps.
+
+    Returns:
+        The fit of the lines that are left, with the weight of each line.
+
+    Example:
+        >>> import numpy as np
+        >>> from zoomjax import Lines, PolynomialZoom, compress
+        >>> rng, t = np.random.default_rng(0), np.linspace(10.0, 470.0, 60)
+        >>> straight = [np.stack([x + 0.1 * rng.standard_normal(60), t], -1) for x in range(20, 620, 60)]
+        >>> arc = np.stack([300 + 30 * np.sin(t / 150), t], axis=-1)
+        >>> lines = Lines.from_ragged([*straight, arc], [0] * 11, [50], image_size=(640, 480))
+        >>> fit_robust(compress(lines), zoom=PolynomialZoom(degree=0), terms=1).rejected.tolist()
+        [10]
+    """
+    lines = lines if family is None else with_family(lines, family)
+    start, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
+    new = zoom is None or zoom.parameters is None
+    if new and isinstance(start, AbstractLinearZoom) and isinstance(lines.family, RadialPolynomial):
+        start = algebraic_zoom(lines, zoom=start, terms=terms).zoom
+    weighted, model = _reweighted(lines, start)
+    fit = fit_zoom(
+        weighted, zoom=model, solver=solver, max_steps=max_steps, invertible=invertible, throw=throw
+    )
+    line_rms, median = _line_rms(lines, fit.lens.zoom)
+    return RobustFit(fit=fit, weight=weighted.weight, line_rms=line_rms, scale=median)
+
+
+@eqx.filter_jit
+def _reweighted(lines, start):
+    """The lines with their weights, and the model that goes with them: a Gauss-Newton step a turn."""
+    own = jnp.ones_like(lines.counts) if lines.weight is None else lines.weight
+
+    def turn(model, cut):
+        weighted = lines.weighted(own * _weights(lines, model, cut))
+        residuals, jacobian = linearised(weighted, model)
+        flat, unravel = ravel_pytree(model.parameters)
+        prior = prior_jacobian(weighted, model)  # a prior's residuals are linear in the parameters
+        matrix = jnp.concatenate([jacobian.reshape(-1, flat.size), prior])
+        right = jnp.concatenate([residuals.reshape(-1), prior @ flat])
+        step = least_squares(matrix, -right, floor=0.0)
+        return with_parameters(model, unravel(flat + step)), None
+
+    model, _ = jax.lax.scan(turn, start, jnp.asarray(_NARROWING, lines.focal.dtype))
+    return lines.weighted(own * _weights(lines, model, _CUT)), model
+
+
+def _weights(lines, model, cut):
+    """Tukey's weight of each line under a model; 0 for lines that are not there."""
+    line_rms, median = _line_rms(lines, model)
+    better = (line_rms <= median) & (lines.counts > 2)
+    spread = 1.4826 * jnp.nanmedian(jnp.where(better, median - line_rms, jnp.nan))
+    chance = median / jnp.sqrt(2 * jnp.maximum(lines.counts - 2, 1))
+    spread = jnp.sqrt(jnp.maximum(spread, _LEAST_SPREAD * median) ** 2 + chance**2)
+    excess = jnp.maximum(line_rms - median, 0) / jnp.where(spread > 0, cut * spread, 1)
+    return jnp.where((excess < 1) & (lines.counts > 2), (1 - excess**2) ** 2, 0)
+
+
+@eqx.filter_jit
+def _line_rms(lines, model):
+    """RMS distance of each line, px, over its degrees of freedom, and the median over lines."""
+    corrected = lines.corrected(coefficients_by(model, lines)[lines.frame])
+    squares = jnp.sum(jax.vmap(line_residuals)(corrected) ** 2, axis=1)
+    line_rms = jnp.sqrt(squares / jnp.maximum(lines.counts - 2, 1))
+    return line_rms, jnp.nanmedian(jnp.where(lines.counts > 2, line_rms, jnp.nan))

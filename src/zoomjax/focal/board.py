@@ -1,0 +1,73 @@
+"""The focal length from a board of known geometry, parallel to the sensor.
+
+At a known distance d the image is the board times a magnification, and eq. 14 of the paper,
+``f = d r_c / (R + r_c)``, gives the focal length of the thin lens, which is focused at the board. Here
+r_c / R is the scale of the similarity that best maps the board's points to the image.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from .._core.types import AnyArray, Scalar
+from .estimate import FocalEstimate, check_pairs
+
+
+def focal_from_board(
+    points: Float[AnyArray, "point 2"],
+    board: Float[AnyArray, "point 2"],
+    *,
+    distance: float | int | Scalar,
+    pixel: float | int | Scalar,
+) -> FocalEstimate:
+    """The focal length from one picture of a board parallel to the sensor: eq. 14.
+
+    Args:
+        points: corrected positions in the image, px, at least 3.
+        board: the same points on the board, mm, x to the right and y downwards as seen by the camera;
+            it may be turned in its plane and moved.
+        distance: from the projection plane to the board, mm, > 0: eq. 14's d.
+        pixel: side of a pixel on the sensor, mm, > 0. 1 is for points measured in mm.
+
+    Returns:
+        The focal length in mm. Residuals count as independent errors of the points' coordinates; those of
+        distance, pixel and board are not included: f changes by as many per cent as the distance.
+
+    Raises:
+        ValueError: shapes differ, or there are fewer than 3 points.
+        RuntimeError: a length is not positive, or all points of the board are one.
+
+    References:
+        Eq. 14 of the paper.
+
+    Example:
+        >>> import numpy as np
+        >>> board = 10 * np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), axis=-1).reshape(-1, 2)
+        >>> image = board * 50 / (1000 - 50) / 0.005 + 100
+        >>> print(round(float(focal_from_board(image, board, distance=1000, pixel=0.005).focal), 3))
+        50.0
+    """
+    check_pairs(points, board, fewest=3)
+    # A similarity is one complex factor: its absolute value is px in the image per mm on the board.
+    seen, known = _complex(points), _complex(board)
+    seen, known = seen - jnp.mean(seen), known - jnp.mean(known)
+    spread = jnp.sum(abs(known) ** 2)
+    positive = (jnp.asarray(distance) > 0) & (jnp.asarray(pixel) > 0) & (spread > 0)
+    spread = eqx.error_if(
+        spread,
+        ~positive,
+        "Arguments distance and pixel must be positive, and the points of board must differ.",
+    )
+    factor = jnp.sum(jnp.conj(known) * seen) / spread
+    squares = jnp.sum(abs(seen - factor * known) ** 2)
+    ratio = abs(factor) * pixel  # r_c / R
+    error = jnp.sqrt(squares / (2 * len(points) - 4) / spread) * pixel
+    return FocalEstimate(
+        focal=distance * ratio / (1 + ratio),
+        std=distance * error / (1 + ratio) ** 2,
+        rms=jnp.sqrt(squares / len(points)),
+    )
+
+
+def _complex(points):
+    return points[:, 0] + 1j * points[:, 1]

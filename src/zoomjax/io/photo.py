@@ -1,0 +1,113 @@
+"""Photographs read with their metadata.
+
+Pixels are taken as they are stored, before the orientation tag turns them: that is how the lens saw them.
+"""
+
+import contextlib
+import io
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from .exif import exif_focal
+from .headers import announced_size, jpeg_segments
+
+FORMATS = {  # suffix: bits a sample, and numbers of channels, that the format holds
+    **dict.fromkeys([".jpg", ".jpeg"], ((8,), (1, 3))),
+    ".png": ((8, 16), (1, 3, 4)),
+    ".webp": ((8,), (3, 4)),
+    **dict.fromkeys([".tif", ".tiff"], ((8, 16, 32, 64), (1, 3, 4))),
+    ".bmp": ((8,), (1, 3, 4)),
+}
+SUFFIXES = tuple(FORMATS)
+"""Of files that count as photographs."""
+
+
+def metadata_focal(source: str | os.PathLike[str], metadata: list[tuple[int, np.ndarray]]) -> float | None:
+    """The focal length, mm, that a photograph's EXIF data tell, given what `read_photo` found in it."""
+    blocks = [data.tobytes() for kind, data in metadata if kind == cv2.IMAGE_METADATA_EXIF]
+    path = Path(source)
+    if path.suffix.lower() in (".tif", ".tiff"):
+        with open_photo(path) as file:
+            blocks = [file.read(_MOST_BYTES)]
+    return next((exif_focal(block) for block in blocks), None)
+
+
+def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
+    """The pixels as stored, and metadata (EXIF, XMP, colour profile) as pairs of kind and bytes.
+
+    The header is looked at before anything is decoded, and what is no ordinary file is not opened.
+
+    Raises:
+        FileNotFoundError: there is no such photograph.
+        OSError: it cannot be read.
+        ValueError: it cannot be decoded, or has more than 500 million pixels or 4 GB.
+    """
+    path = Path(source)
+    try:
+        with open_photo(path) as file:
+            content = file.read(_MOST_BYTES)
+        if not content:
+            raise ValueError("the file is empty")
+        kind, width, height = announced_size(content)
+        if width * height > _MOST_PIXELS:
+            raise ValueError(f"its header announces {width}x{height} px, more than {_MOST_PIXELS:,} in all")
+        if kind == "JPEG" and all(mark != _END for mark, _ in jpeg_segments(content)):
+            raise ValueError("the file is damaged or cut off")  # OpenCV fills up what is missing with grey
+        return _decoded(np.frombuffer(content, np.uint8), metadata=kind in ("JPEG", "PNG", "WebP"))
+    except (ValueError, MemoryError) as error:
+        reason = error if isinstance(error, ValueError) else "it takes more memory than there is"
+        raise ValueError(f"Cannot read a photograph from {path}: {reason}.") from error
+
+
+_MOST_BYTES = 4_000_000_000
+_MOST_PIXELS = 500_000_000
+"""Cameras that shift their sensor give 400 million; three bytes each, and five times that to find lines."""
+
+_END = 0xD9
+"""The marker at the end of a JPEG's picture; phones append films and other pictures."""
+
+
+@contextlib.contextmanager
+def open_photo(path: Path) -> Iterator[io.BufferedReader]:
+    """The file for reading: one that has an end, and not a pipe, which would be waited for.
+
+    Raises:
+        FileNotFoundError: there is no such photograph.
+        OSError: it cannot be read.
+        ValueError: it is no ordinary file, or too large.
+    """
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    try:
+        descriptor = os.open(path, flags)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"There is no photograph {path}.") from error
+    with open(descriptor, "rb") as file:
+        about = os.fstat(descriptor)
+        if not stat.S_ISREG(about.st_mode):
+            raise ValueError("it is no ordinary file")
+        if about.st_size > _MOST_BYTES:
+            raise ValueError(f"it has {about.st_size / 1e9:.1f} GB, more than {_MOST_BYTES / 1e9:.0f}")
+        yield file
+
+
+def _decoded(content: np.ndarray, *, metadata: bool) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
+    kinds, blocks = [], []
+    try:
+        if metadata:
+            image, kinds, blocks = cv2.imdecodeWithMetadata(content, flags=cv2.IMREAD_UNCHANGED)
+        else:
+            image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        if error.code == cv2.Error.StsNoMem:
+            raise MemoryError from error
+        raise ValueError(f"OpenCV cannot decode it ({error.err})") from error
+    if image is None:
+        raise ValueError("it is damaged, or of an unknown format")
+    return image, [
+        (int(kind), np.asarray(data, np.uint8)) for kind, data in zip(kinds, blocks, strict=True)
+    ]

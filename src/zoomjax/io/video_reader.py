@@ -1,0 +1,141 @@
+"""Video decoded frame by frame, with PyAV."""
+
+import contextlib
+import dataclasses
+import functools
+import math
+import os
+import warnings
+from collections.abc import Callable, Generator, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .pyav import av
+
+_MOST_ERRORS = 1000
+"""Of one file: a demuxer may fail for ever."""
+
+
+@contextlib.contextmanager
+def decode_video(
+    source: str | os.PathLike[str],
+) -> Iterator[tuple[int, Iterator[tuple[float, Callable[[], np.ndarray]]]]]:
+    """The number of frames by the file's own account, and for each its time, s, and what decodes them.
+
+    The time is NaN where the file has none: the rate that FFmpeg then tells is a guess.
+
+    Pixels are (height, width, 3) blue, green, red bytes, as stored: before any rotation for display.
+    Damaged frames are passed over.
+
+    Raises:
+        FileNotFoundError: there is no such video.
+        ValueError: the source is no video, or none of its frames decodes.
+    """
+    with opened_video(source) as input_:
+        video = input_.streams.best("video")
+        report = Report(video.frames)
+
+        def frames() -> Iterator[tuple[float, Callable[[], np.ndarray]]]:
+            first: float | None = None
+            for item in decoded_items(input_, video, report):
+                if not isinstance(item, av.VideoFrame):
+                    continue
+                time = math.nan if item.time is None else float(item.time)
+                if first is None:
+                    first = 0.0 if math.isnan(time) else time
+                    warn_of_fields(item)
+                yield time - first, functools.partial(item.to_ndarray, format="bgr24")
+
+        yield video.frames or _counted(source), frames()
+
+
+@dataclasses.dataclass
+class Report:
+    """What happened on the way, in threads."""
+
+    announced: int
+    written: int = 0
+    corrupt: int = 0
+    failed: int = 0
+    error: str = ""
+    orientation: list[int] | None = None
+
+
+def opened_video(source: str | os.PathLike[str]) -> Any:
+    """The file as a container of PyAV's; raises as `decode_video`."""
+    path = Path(source)
+    if not path.exists():
+        raise FileNotFoundError(f"There is no video {path}.")
+    if not path.is_file():
+        raise ValueError(f"Cannot read a video from {path}: it is no ordinary file.")
+    if path.stat().st_size == 0:
+        raise ValueError(f"Cannot read a video from {path}: the file is empty.")
+    try:
+        container: Any = av.open(str(path), metadata_errors="surrogateescape")  # tags need not be UTF-8
+    except av.error.FFmpegError as error:
+        raise ValueError(
+            f"Cannot read a video from {path}: {error.strerror}. The file is damaged, cut off, or no video."
+        ) from error
+    video = container.streams.best("video")
+    context = video and video.codec_context  # none of a codec that FFmpeg does not know
+    if not (context and context.width and context.height):
+        container.close()
+        why = "it has no video stream" if video is None else "none of its frames decodes"
+        raise ValueError(f"Cannot read a video from {path}: {why}.")
+    video.thread_type = "AUTO"
+    return container
+
+
+def _counted(source: str | os.PathLike[str]) -> int:
+    """How many frames there are, where the file does not tell: by reading, without decoding."""
+    with opened_video(source) as input_, contextlib.suppress(av.error.FFmpegError):
+        number = 0
+        for packet in input_.demux(input_.streams.best("video")):
+            number += packet.size > 0
+        return number
+    return 0
+
+
+def frame_numbers(source: str | os.PathLike[str]) -> dict[int, int]:
+    """The numbers of all frames by their time stamps, also of those that do not decode: by reading."""
+    stamps = set()
+    with opened_video(source) as input_, contextlib.suppress(av.error.FFmpegError):
+        for packet in input_.demux(input_.streams.best("video")):
+            if packet.pts is not None and not packet.is_discard:
+                stamps.add(packet.pts)
+    return {stamp: number for number, stamp in enumerate(sorted(stamps))}
+
+
+def decoded_items(input_: Any, video: Any, report: Report) -> Generator[Any, None, None]:
+    """Frames and audio packets, in the file's order; what is damaged is counted and passed over."""
+    packets = input_.demux([video, *input_.streams.audio])
+    while report.corrupt < _MOST_ERRORS:
+        try:
+            packet = next(packets, None)
+            if packet is None:
+                return
+            if packet.stream is not video:
+                if packet.dts is not None:
+                    yield packet
+                continue
+            frames = packet.decode()
+        except av.error.FFmpegError as error:
+            report.corrupt += 1
+            report.failed += 1
+            report.error = error.strerror or str(error)
+            continue
+        for frame in frames:
+            report.corrupt += bool(frame.is_corrupt)
+            yield frame
+
+
+def warn_of_fields(frame: Any) -> None:
+    """Warn of a frame that is interlaced."""
+    if frame.interlaced_frame:
+        warnings.warn(
+            "The video is interlaced: each frame holds two moments in alternate rows, which are taken for "
+            "one. Deinterlace it first.",
+            stacklevel=2,
+        )

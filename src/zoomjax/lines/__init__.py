@@ -1,0 +1,5 @@
+"""Line primitives: points on straight lines of the scene, compressed or not, and their files."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

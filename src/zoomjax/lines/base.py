@@ -1,0 +1,179 @@
+"""What the energies and the fits see of lines.
+
+`AbstractLines` gives, for any distortion coefficients, line by line, the corrected points about their mean,
+or rows that stand for them exactly.
+"""
+
+import abc
+import math
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from .._core.checks import (
+    checked_size,
+    checked_unit,
+)
+from .._core.fields import (
+    check_finite,
+    check_indices,
+    check_not_negative,
+    check_positive,
+    check_shapes,
+)
+from .._core.types import (
+    AnyArray,
+    Centres,
+    Focal,
+    Focus,
+    FrameIndex,
+    LineWeight,
+    Point,
+    traced,
+)
+from ..models.family import AbstractFamily
+from ..models.polynomial import RadialPolynomial
+
+SomeLines = TypeVar("SomeLines", bound="AbstractLines")
+
+
+class AbstractLines(eqx.Module):
+    """Lines seen in frames of known focal length, as the energies of eq. 3 and 13 need them."""
+
+    frame: eqx.AbstractVar[FrameIndex]
+    focal: eqx.AbstractVar[Focal]
+    focus: eqx.AbstractVar[Focus | None]
+    centre: eqx.AbstractVar[Point]
+    image_size: eqx.AbstractVar[tuple[int, int]]
+    focal_unit: eqx.AbstractVar[str]
+    weight: eqx.AbstractVar[LineWeight | None]
+
+    def __check_init__(self):
+        """Check what all kinds of lines have."""
+        checked_size(self.image_size)
+        checked_unit(self.focal_unit)
+        check_shapes(
+            {
+                "frame": (self.frame, ("line",)),
+                "weight": (self.weight, ("line",)),
+                "focal": (self.focal, ("frame",)),
+                "focus": (self.focus, ("frame",)),
+                "centre": (self.centre, (2,)),
+            }
+        )
+        check_positive("focal", self.focal)
+        check_finite("focus", self.focus)
+        check_finite("centre", self.centre)
+        check_not_negative("weight", self.weight)
+        if hasattr(self.focal, "shape"):
+            check_indices("frame", self.frame, self.focal.shape[-1], "one focal length each")
+
+    @property
+    def scale(self) -> float:
+        """The length in px that is radius 1: half the image diagonal."""
+        return math.hypot(*self.image_size) / 2
+
+    @property
+    def family(self) -> AbstractFamily:
+        """What the coefficients mean: the radial polynomial, except for `FamilyLines`."""
+        return RadialPolynomial()
+
+    def expansion(
+        self, coefficients: Float[Array, "some size"]
+    ) -> tuple[Float[Array, "some power"], Float[Array, "some tangential"]]:
+        """The family's coefficients as what corrected points are linear in, up to the image's corners."""
+        far = jnp.maximum(self.centre, jnp.asarray(self.image_size) - 1 - self.centre) / self.scale
+        expand = jax.vmap(lambda k: self.family.expansion(k, far @ far))
+        powers, tangential = expand(coefficients)
+        return jnp.asarray(powers), jnp.asarray(tangential)
+
+    @property
+    @abc.abstractmethod
+    def counts(self) -> Float[Array, "line"]:
+        """Number of points of each line, Np(l, m); 0 marks a line that is not there."""
+
+    @abc.abstractmethod
+    def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
+        """Corrected points of each line about their mean, px, or rows with the same scatter.
+
+        `coefficients` are those of each line's own frame. Rows beyond a line's end are zero.
+        """
+
+    @abc.abstractmethod
+    def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
+        """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1, over each line's points, normalised."""
+
+    def radial_moments(self, order: int) -> Float[Array, "line moment"]:
+        """``sum_p r_p^(2i)`` for i = 0 ... order, over the points of each line, normalised."""
+        traces = jnp.trace(self.second_moments(order), axis1=2, axis2=3)
+        return jnp.concatenate([self.counts[:, None].astype(traces.dtype), traces], axis=1)
+
+    @abc.abstractmethod
+    def about(self, centre: Centres) -> "AbstractLines":
+        """The same lines about another centre of distortion, px: that of all frames, or of each frame.
+
+        Raises:
+            ValueError: they were compressed for one centre, and this is another.
+        """
+
+    @abc.abstractmethod
+    def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "AbstractLines":
+        """The chosen lines as a data set of one frame; those not `present` count as empty."""
+
+    def weighted(self: SomeLines, weight: ArrayLike) -> SomeLines:
+        """The same lines, each counting `weight` beside the others of its frame.
+
+        Raises:
+            ValueError: there is not one finite weight of at least 0 for each line.
+        """
+        weight = jnp.asarray(weight, jnp.asarray(self.focal).dtype)
+        if weight.shape != self.frame.shape:
+            raise ValueError(
+                f"Argument weight must hold one number for each of the {self.frame.shape[0]} lines, but "
+                f"its shape is {weight.shape}."
+            )
+        if not traced(weight) and not (np.isfinite(weight) & (np.asarray(weight) >= 0)).all():
+            raise ValueError("Argument weight must hold finite numbers of at least 0, but it does not.")
+        return eqx.tree_at(lambda lines: lines.weight, self, weight, is_leaf=lambda leaf: leaf is None)
+
+    def by_frame(self) -> tuple[Int[AnyArray, "frame some"], Bool[AnyArray, "frame some"]]:
+        """For each frame the indices of its lines, padded to the fullest frame, and which are real.
+
+        Computed in NumPy: the padding is a shape. Under ``jit``, where `frame` is not known, every
+        frame is given all lines and chooses by the mask.
+        """
+        frames, number = self.focal.shape[0], self.frame.shape[0]
+        if traced(self.frame):
+            chosen = jnp.broadcast_to(jnp.arange(number), (frames, number))
+            return chosen, self.frame[None] == jnp.arange(frames)[:, None]
+        frame = np.asarray(self.frame)
+        order = np.argsort(frame, kind="stable")
+        size = np.bincount(frame, minlength=frames)
+        start = np.cumsum(size) - size
+        slot = np.arange(size.max())
+        chosen = order[np.minimum(start[:, None] + slot, number - 1)]
+        return chosen, slot < size[:, None]
+
+
+def with_fields_of(lines: SomeLines, other: AbstractLines) -> SomeLines:
+    """The lines with the focal lengths, focus and weights of a wrapper of them."""
+    return eqx.tree_at(
+        lambda lines: (lines.focal, lines.focus, lines.weight),
+        lines,
+        (other.focal, other.focus, other.weight),
+        is_leaf=lambda leaf: leaf is None,
+    )
+
+
+def focus_of(
+    lines: AbstractLines, chosen: Int[Array, "some"], present: Bool[Array, "some"]
+) -> Float[Array, "1"] | None:
+    """The focus of the one frame that the chosen lines are seen in."""
+    if lines.focus is None:
+        return None
+    return jnp.asarray(lines.focus)[lines.frame[chosen[jnp.argmax(present)]]][None]

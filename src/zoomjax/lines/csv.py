@@ -1,0 +1,122 @@
+"""Line primitives as text: a row a point, with the columns ``frame,line,x,y`` and perhaps ``focal``.
+
+``frame`` and ``line`` are integers of the writer's choice; a line is one pair of both, its points in the
+order of their rows. ``x,y`` are px, (0, 0) the centre of the top-left pixel. Focal lengths come from the
+column ``focal``, the same in all rows of a frame, or from a second file with the columns ``frame,focal``.
+"""
+
+import csv
+import os
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from .._core.arguments import kinds_checked
+from .._core.files import whole_file
+from ..io.text_table import TextTable, read_text_table
+from .lines import Lines
+
+
+@kinds_checked
+def read_lines_csv(
+    path: str | os.PathLike[str],
+    *,
+    image_size: Sequence[int],
+    focal: Mapping[int, float] | Sequence[float] | None = None,
+    focal_unit: str = "mm",
+) -> Lines:
+    """Read lines from a ``frame,line,x,y[,focal]`` file, in float64.
+
+    Args:
+        path: the file, of a kind that `zoomjax.io.text_table` reads; columns in any order, others are
+            ignored.
+        image_size: (width, height) px.
+        focal: focal length by frame number, if the file has no column ``focal``; a sequence counts
+            frames from 0.
+        focal_unit: "mm" or "px".
+
+    Raises:
+        ValueError: a column is missing, a value is no number, a frame has no focal length, or focal
+            lengths are in the file and in `focal`, or `Lines.from_ragged` raises one; the message names
+            the file.
+    """
+    table = read_text_table(path, "lines", numbers=("frame", "line", "x", "y"), optional=("focal",))
+    columns = table.numbers
+    frame, line = (_integers(table, name) for name in ("frame", "line"))
+    frames, index = np.unique(frame, return_inverse=True)
+    if "focal" in columns:
+        if focal is not None:
+            raise table.error(
+                "it has a column focal, and focal lengths are given beside it. Leave one of them out"
+            )
+        table.check("focal", columns["focal"] > 0, "positive")
+        lowest, highest = np.full(frames.size, np.inf), np.full(frames.size, -np.inf)
+        np.minimum.at(lowest, index, columns["focal"])
+        np.maximum.at(highest, index, columns["focal"])
+        if (lowest != highest).any():
+            bad = frames[np.argmax(lowest != highest)]
+            raise table.error(f"frame {bad} has two focal lengths")
+        focals = lowest
+    elif focal is None:
+        raise table.error(
+            "it has no focal lengths. Add a column focal, or give a file with the columns frame,focal"
+        )
+    else:
+        focal = focal if isinstance(focal, Mapping) else dict(enumerate(focal))
+        missing = [int(f) for f in frames if int(f) not in focal]
+        if missing:
+            raise table.error(
+                f"there is no focal length for {len(missing)} of its {frames.size} frames (the first are "
+                f"{', '.join(map(str, missing[:5]))})"
+            )
+        focals = np.array([focal[int(f)] for f in frames])
+
+    order = np.lexsort((line, index))  # stable: points keep the order of their rows
+    starts = np.flatnonzero(np.diff(index[order]) | np.diff(line[order])) + 1
+    points = np.stack([columns["x"], columns["y"]], axis=1)[order]
+    try:
+        return Lines.from_ragged(
+            np.split(points, starts),
+            index[order][np.concatenate([[0], starts])],
+            focals,
+            image_size=image_size,
+            focal_unit=focal_unit,
+        )
+    except ValueError as error:
+        raise table.error(str(error)) from error
+
+
+@kinds_checked
+def write_lines_csv(lines: Lines, path: str | os.PathLike[str]) -> None:
+    """Write lines as ``frame,line,x,y,focal``, with all the digits of their dtype."""
+    frame, focal = np.asarray(lines.frame), np.asarray(lines.focal)
+    with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["frame", "line", "x", "y", "focal"])
+        for number, points in enumerate(lines.to_ragged()):
+            m = int(frame[number])
+            writer.writerows([m, number, x, y, focal[m]] for x, y in points)
+
+
+@kinds_checked
+def read_focal_csv(path: str | os.PathLike[str]) -> dict[int, float]:
+    """Read focal lengths by frame number from a file with the columns ``frame,focal``.
+
+    Raises:
+        ValueError: a column is missing, a value is no number, or not positive, or a frame comes twice.
+    """
+    table = read_text_table(path, "focal lengths", numbers=("frame", "focal"))
+    frame, focal = _integers(table, "frame"), table.numbers["focal"]
+    table.check("focal", focal > 0, "positive")
+    first = np.zeros(frame.size, bool)
+    first[np.unique(frame, return_index=True)[1]] = True
+    if not first.all():
+        bad = int(np.argmin(first))
+        raise table.error(f"frame {frame[bad]} comes twice, the second time in row {table.rows[bad]}")
+    return dict(zip(frame.tolist(), focal.tolist(), strict=True))
+
+
+def _integers(table: TextTable, name: str) -> np.ndarray:
+    values = table.numbers[name]
+    table.check(name, (abs(values) < 2**53) & (values == np.floor(values)), "an integer")
+    return values.astype(np.int64)

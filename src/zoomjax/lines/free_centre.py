@@ -1,0 +1,210 @@
+"""Exact compression for any centre of distortion, for fits that look for the centre as well.
+
+About a centre o (normalised, from a reference) a corrected point is a polynomial in the point z,
+
+    o + w L(w.w),  w = z - o,
+
+of degree 2N + 1 whatever o and k are: linear in the (2N + 2)(2N + 3)/2 monomials ``x^a y^b``, 21 for N = 2.
+So the triangle R of those monomials, made once as in `compressed`, stands for all of a line's points at
+every centre. It takes about ten times the work of the seven columns of a fixed centre, once; a step of a
+fit then costs 20 rows a line. `AnyCentreLines.about` makes the small triangles of a fixed centre from it,
+without the points.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core.arguments import kinds_checked
+from .._core.checks import checked_size, checked_terms
+from .._core.fields import check_shapes, integers, numbers
+from .._core.types import Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Point
+from .base import AbstractLines, focus_of
+from .compressed import EXACT, CompressedLines, triangle, triangles_of
+from .lines import Lines
+
+
+class AnyCentreLines(AbstractLines):
+    """Lines reduced to triangles that serve every centre of distortion, and up to `terms` coefficients.
+
+    Attributes:
+        triangle: R of each line's monomials, about `centre`, in normalised lengths.
+        frame, focal, centre, image_size, focal_unit, number, weight, focus: as in `Lines`.
+    """
+
+    triangle: Float[Array, "line rows rows"] = eqx.field(converter=numbers("triangle"))
+    frame: FrameIndex = eqx.field(converter=integers("frame"))
+    focal: Focal = eqx.field(converter=numbers("focal"))
+    centre: Point = eqx.field(converter=numbers("centre"))
+    image_size: tuple[int, int] = eqx.field(static=True, converter=checked_size)
+    focal_unit: str = eqx.field(static=True)
+    number: LineNumber | None = eqx.field(default=None, converter=integers("number"))
+    weight: LineWeight | None = eqx.field(default=None, converter=numbers("weight"))
+    focus: Focus | None = eqx.field(default=None, converter=numbers("focus"))
+
+    def __check_init__(self):
+        """Check that the shapes agree."""
+        check_shapes(
+            {
+                "triangle": (self.triangle, ("line", "rows", "rows")),
+                "frame": (self.frame, ("line",)),
+                "number": (self.number, ("line",)),
+            }
+        )
+        if hasattr(self.triangle, "shape"):
+            terms = self.terms
+            if terms < 1 or self.triangle.shape[-1] != (2 * terms + 2) * (2 * terms + 3) // 2:
+                raise ValueError(
+                    "Argument triangle must have (2 N + 2)(2 N + 3) / 2 rows for N terms, N >= 1, but its "
+                    f"shape is {self.triangle.shape}."
+                )
+
+    @property
+    def terms(self) -> int:
+        """The largest number of coefficients N that these triangles serve."""
+        return (round((8 * self.triangle.shape[-1] + 1) ** 0.5) - 5) // 4
+
+    @property
+    def counts(self) -> Float[Array, "line"]:
+        """Number of points of each line."""
+        return jnp.round(self.triangle[:, 0, 0] ** 2)
+
+    def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
+        """Rows, px, with the scatter of the corrected points about their mean.
+
+        The last two of the `coefficients`, after (k1, ..., kN), are the centre's offset from `centre`,
+        normalised.
+        """
+        combine = jax.vmap(lambda r, k: r[1:] @ _corrected_point(self.terms, k[:-2], k[-2:]).T)
+        return self.scale * combine(self.triangle, coefficients)
+
+    def decentred(
+        self, k: Float[Array, "line terms"], tangential: Float[Array, "line 2"]
+    ) -> Float[Array, "line rows 2"]:
+        """Such rows about `centre`, of the radial polynomial and the coefficients (p1, p2) of each line."""
+
+        def combine(r, k, p):
+            none = jnp.zeros_like(p)
+            # The rows of R after the first hold the points about their mean; columns 3-5 are x^2, xy, y^2.
+            squares = jnp.stack(
+                [jnp.stack([3 * p[1], 2 * p[0], p[1]]), jnp.stack([p[0], 2 * p[1], 3 * p[0]])]
+            )
+            radial = _corrected_point(self.terms, k, none)
+            return r[1:] @ radial.at[:, 3:6].add(squares).T
+
+        return self.scale * jax.vmap(combine)(self.triangle, k, tangential)
+
+    def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
+        """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1, at most 2 N + 1, z from `centre`."""
+        return self.about(self.centre).second_moments(order)
+
+    def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "AnyCentreLines":
+        """The chosen lines as a data set of one frame."""
+        return AnyCentreLines(
+            triangle=jnp.where(present[:, None, None], self.triangle[lines], 0),
+            frame=jnp.zeros_like(lines, jnp.int32),
+            focal=jnp.asarray(self.focal)[self.frame[lines[jnp.argmax(present)]]][None],
+            centre=self.centre,
+            image_size=self.image_size,
+            focal_unit=self.focal_unit,
+            number=None if self.number is None else self.number[lines],
+            weight=None if self.weight is None else self.weight[lines],
+            focus=focus_of(self, lines, present),
+        )
+
+    def about(self, centre: Centres) -> CompressedLines:
+        """The lines compressed about a fixed centre, px: that of all frames, or of each frame.
+
+        In the latter case the result's `centre` is the mean.
+        """
+        centre = jnp.asarray(centre, self.triangle.dtype)
+        each = jnp.broadcast_to(centre, (self.focal.shape[0], 2))
+        return CompressedLines(
+            triangle=_about(
+                self.terms, self.triangle, ((each - self.centre[None]) / self.scale)[self.frame]
+            ),
+            frame=self.frame,
+            focal=self.focal,
+            centre=jnp.mean(each, axis=0),
+            image_size=self.image_size,
+            focal_unit=self.focal_unit,
+            number=self.number,
+            weight=self.weight,
+            focus=self.focus,
+        )
+
+
+@kinds_checked
+def compress_any_centre(lines: Lines, terms: int = 2) -> AnyCentreLines:
+    """Reduce each line to a triangle that serves every centre of distortion: for `fit_centre`.
+
+    Args:
+        lines: the lines.
+        terms: the largest number N of coefficients that will be fitted. Fewer can be.
+
+    Example:
+        >>> import numpy as np
+        >>> row = np.stack([np.arange(500.0), np.full(500, 20.0)], axis=-1)
+        >>> lines = Lines.from_ragged([row, row + 1], [0, 1], [24, 70], image_size=(640, 480))
+        >>> small = compress_any_centre(lines)
+        >>> small.triangle.shape, small.about(np.array([320.0, 250.0])).triangle.shape
+        ((2, 21, 21), (2, 7, 7))
+    """
+    return AnyCentreLines(
+        triangle=triangles_of(lines, _monomials, checked_terms(terms)),
+        frame=lines.frame,
+        focal=lines.focal,
+        centre=lines.centre,
+        image_size=lines.image_size,
+        focal_unit=lines.focal_unit,
+        number=lines.number,
+        weight=lines.weight,
+        focus=lines.focus,
+    )
+
+
+def _monomials(z, valid, terms):
+    """The rows ``x^a y^b`` of one line, by degree ``a + b``, then by b; zero where it has no point."""
+    degree = [valid[None]]
+    for _ in range(2 * terms + 1):
+        degree.append(jnp.concatenate([z[:1] * degree[-1], z[1:] * degree[-1][-1:]]))
+    return jnp.concatenate(degree)
+
+
+def _powers(terms):
+    """The powers (a, b) of the monomials, in the order of `_monomials`."""
+    pairs = [(d - b, b) for d in range(2 * terms + 2) for b in range(d + 1)]
+    return tuple(np.array(pairs).T)
+
+
+def _radial_columns(terms, offset):
+    """1, w, (w.w) w, ..., (w.w)^N w with ``w = z - offset``, as polynomials ``c[a, b] x^a y^b``."""
+
+    def times(polynomial, axis):
+        up = jnp.roll(polynomial, 1, axis)  # the highest power is never reached
+        return up - offset[axis] * polynomial
+
+    one = jnp.zeros((2 * terms + 2,) * 2, offset.dtype).at[0, 0].set(1)
+    columns, power = [one], one
+    for term in range(terms + 1):
+        columns += [times(power, 0), times(power, 1)]
+        if term < terms:
+            power = times(columns[-2], 0) + times(columns[-1], 1)
+    return jnp.stack(columns)[(slice(None), *_powers(terms))]
+
+
+def _corrected_point(terms, k, offset):
+    """The corrected point of a line's points, x and y, by monomials."""
+    columns = _radial_columns(terms, offset)[1:].reshape(terms + 1, 2, -1)
+    kappa = jnp.concatenate([jnp.ones(1, k.dtype), k, jnp.zeros(terms - k.shape[0], k.dtype)])
+    return jnp.einsum("j,jcm->cm", kappa, columns, precision=EXACT)
+
+
+@eqx.filter_jit
+def _about(terms, triangles, offset):
+    def one(r, offset):
+        return triangle(jnp.matmul(_radial_columns(terms, offset), r.T, precision=EXACT))
+
+    return jax.vmap(one)(triangles, offset)

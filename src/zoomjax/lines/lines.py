@@ -1,0 +1,293 @@
+"""Line primitives: sequences of image points that lie on straight lines of the scene.
+
+`Lines` holds the points themselves, flat over lines (not nested in frames, which hold from 5 to 108 lines:
+nesting would waste 27 times the memory on the paper's data). Compressed lines are in `compressed`.
+"""
+
+import os
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from .._core.arguments import check_kind
+from .._core.checks import (
+    checked_centre,
+    checked_focal,
+    checked_focus,
+    checked_frames,
+    checked_points,
+    checked_size,
+    checked_unit,
+    usable_lines,
+    warn_of_points_outside,
+)
+from .._core.fields import booleans, check_shapes, integers, known, numbers
+from .._core.files import whole_file
+from .._core.types import AnyArray, Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Mask, Point
+from ..models.family import AbstractFamily
+from .base import AbstractLines, focus_of
+
+FORMAT, VERSION = "zoomjax.lines", 1
+
+
+class Lines(AbstractLines):
+    """Line primitives as padded tensors; `Lines.from_ragged` makes them from sequences and checks them.
+
+    Arrays are JAX arrays in the dtype given. Where JAX cannot hold it (float64 while x64 is off) they
+    stay NumPy arrays, so that nothing is lost on saving, and computations run in float32.
+
+    Attributes:
+        points: ``(x, y)`` px; (0, 0) is the centre of the top-left pixel.
+        mask: which entries of `points` are points rather than padding.
+        frame: index of the image that each line was seen in, into `focal`.
+        focal: focal length of each image, positive, in `focal_unit`.
+        centre: centre of distortion, px; the image's centre ``((w-1)/2, (h-1)/2)`` by default.
+        image_size: (width, height) px.
+        focal_unit: "mm" or "px".
+        number: position of each line among those that `from_ragged` was given; None if unknown.
+        weight: how much each line counts beside the others of its frame, at least 0; None for all alike.
+        focus: where the lens is focused in each image, for models that depend on it (`AbstractFocusZoom`):
+            any number that grows or falls with it, such as the reciprocal of the distance; None if unknown.
+    """
+
+    points: Float[AnyArray, "line point 2"] = eqx.field(converter=numbers("points"))
+    mask: Mask = eqx.field(converter=booleans("mask"))
+    frame: FrameIndex = eqx.field(converter=integers("frame"))
+    focal: Focal = eqx.field(converter=numbers("focal"))
+    centre: Point = eqx.field(converter=numbers("centre"))
+    image_size: tuple[int, int] = eqx.field(static=True, converter=checked_size)
+    focal_unit: str = eqx.field(static=True, default="mm")
+    number: LineNumber | None = eqx.field(default=None, converter=integers("number"))
+    weight: LineWeight | None = eqx.field(default=None, converter=numbers("weight"))
+    focus: Focus | None = eqx.field(default=None, converter=numbers("focus"))
+
+    def __check_init__(self):
+        """Check that the shapes agree, and that points are numbers where they are few."""
+        check_shapes(
+            {
+                "points": (self.points, ("line", "point", 2)),
+                "mask": (self.mask, ("line", "point")),
+                "frame": (self.frame, ("line",)),
+                "number": (self.number, ("line",)),
+            }
+        )
+        points, mask = known(self.points), known(self.mask)
+        if points is not None and mask is not None and not np.isfinite(points).all():
+            bad = np.argwhere(mask & ~np.isfinite(points).all(axis=-1))
+            if bad.size:
+                where = ", ".join(map(str, bad[0]))
+                raise ValueError(
+                    f"Argument points must be finite where mask is set, but points[{where}] is "
+                    f"{points[tuple(bad[0])]}: remove such points, or clear their mask."
+                )
+
+    @classmethod
+    def from_ragged(
+        cls,
+        points: Iterable[ArrayLike],
+        frame: ArrayLike,
+        focal: ArrayLike,
+        *,
+        image_size: Sequence[int],
+        focal_unit: str = "mm",
+        centre: ArrayLike | None = None,
+        focus: ArrayLike | None = None,
+        chunk: bool = False,
+    ) -> "Lines":
+        """Lines from one array of points a line.
+
+        Args:
+            points: for each line an (n, 2) array of ``(x, y)`` px, n >= 3.
+            frame: for each line the index of its image, into `focal`.
+            focal: for each image its focal length, > 0.
+            image_size: (width, height) px.
+            focal_unit: "mm" or "px", the unit of `focal`.
+            centre: centre of distortion, px; default the centre of the image.
+            focus: for each image where the lens is focused, a finite number, 1/distance say, or None.
+            chunk: whether these are only some of the lines' points, to be compressed and merged with
+                others: then every line is kept, whatever its number of points, even none.
+
+        Raises:
+            ValueError: a point or focal length is not finite, a focal length is not positive, a frame
+                index is out of range, a frame has no line, or no usable line is left.
+
+        Warns:
+            UserWarning: lines with fewer than 3 distinct points are dropped; the message counts them. Or
+                points lie outside of the image.
+
+        Example:
+            >>> import numpy as np
+            >>> row = np.stack([np.arange(5.0), np.full(5, 2.0)], axis=-1)
+            >>> lines = Lines.from_ragged([row, row + 1], [0, 1], [24, 70], image_size=(6, 4))
+            >>> lines.points.shape, lines.centre.tolist()
+            ((2, 5, 2), [2.5, 1.5])
+        """
+        size, unit = checked_size(image_size), checked_unit(focal_unit)
+        arrays = [checked_points(line, index) for index, line in enumerate(points)]
+        focals = checked_focal(focal)
+        frames = checked_frames(frame, len(arrays), focals.size)
+        number = np.arange(len(arrays))
+        if not chunk:
+            number = usable_lines(arrays, frames, focals.size)
+            arrays, frames = [arrays[index] for index in number], frames[number]
+
+        dtype = np.result_type(*arrays)
+        counts = np.array([len(line) for line in arrays])
+        padded = np.zeros((len(arrays), max(counts), 2), dtype)
+        for row, line in zip(padded, arrays, strict=True):
+            row[: len(line)] = line
+        mask = np.arange(max(counts)) < counts[:, None]
+        warn_of_points_outside(padded, mask, size)
+        return cls(
+            points=_held_as_given(padded),
+            mask=jnp.asarray(mask),
+            frame=jnp.asarray(frames, jnp.int32),
+            focal=_held_as_given(focals.astype(dtype)),
+            centre=_held_as_given(checked_centre(centre, size).astype(dtype)),
+            image_size=size,
+            focal_unit=unit,
+            number=jnp.asarray(number, jnp.int32),
+            focus=None
+            if focus is None
+            else _held_as_given(checked_focus(focus, focals.size).astype(dtype)),
+        )
+
+    @classmethod
+    def from_grids(
+        cls,
+        corners: Float[np.ndarray, "grid row column 2"],
+        frame: ArrayLike,
+        focal: ArrayLike,
+        *,
+        image_size: Sequence[int],
+        focal_unit: str = "mm",
+    ) -> "Lines":
+        """Every row and every column of flat grids (checkerboard corners, dots) as a line.
+
+        Args:
+            corners: positions of the grids' nodes, px.
+            frame: for each grid the index of the frame that it counts in. Grids at the same focal
+                length may share a frame: eq. 3 then averages over all their lines.
+            focal, image_size, focal_unit: as for `from_ragged`, whose errors also apply.
+        """
+        corners = np.asarray(corners)
+        if corners.ndim != 4 or corners.shape[-1] != 2:
+            raise ValueError(
+                "Argument corners must have shape (grid, row, column, 2), but its shape is "
+                f"{corners.shape}."
+            )
+        index = np.asarray(frame)
+        if index.shape != corners.shape[:1]:
+            raise ValueError(
+                f"Argument frame must hold one index for each of the {len(corners)} grids, but its "
+                f"shape is {index.shape}."
+            )
+        lines: list[ArrayLike] = []
+        for grid in corners:
+            lines += [*grid, *grid.swapaxes(0, 1)]
+        return cls.from_ragged(
+            lines,
+            np.repeat(index, corners.shape[1] + corners.shape[2]),
+            focal,
+            image_size=image_size,
+            focal_unit=focal_unit,
+        )
+
+    def to_ragged(self) -> list[np.ndarray]:
+        """The points of each line as an (n, 2) array: what `from_ragged` took."""
+        mask = np.asarray(self.mask)
+        return [line[keep] for line, keep in zip(np.asarray(self.points), mask, strict=True)]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all fields, in their dtypes, to a ``.npz`` file that `load_lines` reads."""
+        check_kind("path", path, (str, os.PathLike))
+        optional: dict[str, Any] = {"weight": self.weight, "focus": self.focus}
+        fields: dict[str, Any] = {
+            name: np.asarray(value) for name, value in optional.items() if value is not None
+        }
+        with whole_file(path) as part, part.open("wb") as file:
+            np.savez(
+                file,
+                **fields,
+                format=FORMAT,
+                version=VERSION,
+                points=np.asarray(self.points)[np.asarray(self.mask)],
+                counts=np.asarray(self.mask).sum(1),
+                frame=np.asarray(self.frame),
+                focal=np.asarray(self.focal),
+                centre=np.asarray(self.centre),
+                image_size=np.array(self.image_size),
+                focal_unit=self.focal_unit,
+            )
+
+    @property
+    def counts(self) -> Float[Array, "line"]:
+        """Number of points of each line."""
+        return jnp.sum(self.mask, axis=1).astype(jnp.asarray(self.points).dtype)
+
+    def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
+        """Corrected points of each line about their mean, px."""
+        return corrected_points(self, self.family, coefficients)
+
+    def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
+        """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1."""
+        z = jnp.where(self.mask[..., None], (self.points - self.centre[None, None]) / self.scale, 0)
+        squared = jnp.sum(z * z, axis=-1, keepdims=True)
+        return jnp.stack([jnp.einsum("lpc,lpd->lcd", squared**i * z, z) for i in range(order)], axis=1)
+
+    def about(self, centre: Centres) -> "Lines":
+        """The same lines about another centre of distortion, px: that of all frames, or of each frame.
+
+        In the latter case points are moved, frame by frame, so that one centre, the mean, serves all.
+        """
+        centre = jnp.asarray(centre, jnp.asarray(self.centre).dtype)
+        if centre.ndim == 1:
+            return eqx.tree_at(lambda lines: lines.centre, self, centre)
+        mean = jnp.mean(centre, axis=0)
+        points = jnp.asarray(self.points) - (centre - mean[None])[self.frame][:, None]
+        return eqx.tree_at(lambda lines: (lines.points, lines.centre), self, (points, mean))
+
+    def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "Lines":
+        """The chosen lines as a data set of one frame."""
+        return Lines(
+            points=jnp.asarray(self.points)[lines],
+            mask=jnp.asarray(self.mask)[lines] & present[:, None],
+            frame=jnp.zeros_like(lines, jnp.int32),
+            focal=jnp.asarray(self.focal)[self.frame[lines[jnp.argmax(present)]]][None],
+            centre=self.centre,
+            image_size=self.image_size,
+            focal_unit=self.focal_unit,
+            number=None if self.number is None else self.number[lines],
+            weight=None if self.weight is None else self.weight[lines],
+            focus=focus_of(self, lines, present),
+        )
+
+
+def corrected_points(
+    lines: Lines, family: AbstractFamily, coefficients: Float[Array, "line size"]
+) -> Float[Array, "line point 2"]:
+    """Points of each line, corrected by a family's `coefficients` of each, about their mean, px."""
+    return jax.vmap(_correct_line, in_axes=(0, 0, 0, None, None, None))(
+        jnp.asarray(lines.points), jnp.asarray(lines.mask), coefficients, lines.centre, lines.scale, family
+    )
+
+
+def _correct_line(points, mask, k, centre, scale, family):
+    """Corrected points of one line about their mean, px; zero where masked."""
+    z = jnp.where(mask[:, None], (points - centre[None]) / scale, 0)
+    corrected = jax.vmap(family.correct, (0, 0, None))(z, jnp.sum(z * z, axis=1), k)
+    mean = jnp.sum(corrected, axis=0) / jnp.maximum(jnp.sum(mask), 1)
+    return jnp.where(mask[:, None], scale * (corrected - mean[None]), 0)
+
+
+def _held_as_given(array: np.ndarray) -> AnyArray:
+    """A JAX array, unless that would change the values' dtype."""
+    if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
+        return jnp.asarray(array)
+    return array

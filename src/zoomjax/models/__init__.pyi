@@ -1,0 +1,29 @@
+# The public names of this room: read by type checkers, and by lazy_loader at run time.
+
+from ._bernstein import Pieces as Pieces
+from .brown_conrady import BrownConrady as BrownConrady
+from .camera import Camera as Camera
+from .distortion import Distortion as Distortion
+from .division import Division as Division
+from .family import AbstractFamily as AbstractFamily
+from .family import AbstractRadial as AbstractRadial
+from .focus import FocusSplineZoom as FocusSplineZoom
+from .invertibility import Certificate as Certificate
+from .invertibility import certify as certify
+from .lens import ZoomLens as ZoomLens
+from .lens import load_lens as load_lens
+from .polynomial import RadialPolynomial as RadialPolynomial
+from .power import PowerZoom as PowerZoom
+from .registry import register_model as register_model
+from .sizes import lens_for_size as lens_for_size
+from .smooth import SmoothZoom as SmoothZoom
+from .spline import SplineZoom as SplineZoom
+from .tables import TableZoom as TableZoom
+from .training import trainable as trainable
+from .two_region import TwoRegionZoom as TwoRegionZoom
+from .two_region import barrel_crossover as barrel_crossover
+from .zoom import AbstractFocusZoom as AbstractFocusZoom
+from .zoom import AbstractLinearZoom as AbstractLinearZoom
+from .zoom import AbstractPriorZoom as AbstractPriorZoom
+from .zoom import AbstractZoom as AbstractZoom
+from .zoom import PolynomialZoom as PolynomialZoom

@@ -1,0 +1,74 @@
+"""Interpolation between knots, as weights of the values there: hats, and natural cubic splines."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core.types import AnyArray, traced
+
+
+def spread(values: Float[AnyArray, "value"], number: int | None) -> Float[AnyArray, "knot"]:
+    """`number` of the distinct values, or all, increasing and spread evenly over their ranks."""
+    ordered = jnp.sort(values) if traced(values) else np.unique(np.asarray(values))
+    if number is None:
+        return ordered
+    return ordered[np.round(np.linspace(0, ordered.shape[0] - 1, number)).astype(int)]
+
+
+def place(
+    knots: Float[AnyArray, "basis"], x: Float[Array, ""]
+) -> tuple[Int[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Index of the interval that x lies in, how far along it, from 0 to 1, and its width."""
+    knots = jnp.asarray(knots)
+    if knots.shape[0] == 1:
+        return jnp.asarray(0), jnp.zeros_like(x), jnp.ones_like(x)
+    index = jnp.clip(jnp.searchsorted(knots, x) - 1, 0, knots.shape[0] - 2)
+    width = knots[index + 1] - knots[index]
+    known: Bool[Array, ""] = width > 0  # knots that coincide, as they may under a trace
+    return index, jnp.where(known, x - knots[index], 0) / jnp.where(known, width, 1), width
+
+
+def at_ends(
+    knots: Float[AnyArray, "basis"], index: Int[Array, ""], first: Array, second: Array
+) -> Float[Array, "basis"]:
+    """A vector with two values, at the ends of an interval."""
+    vector = jnp.zeros(knots.shape[0], jnp.result_type(first)).at[index].add(first)
+    return vector.at[index + 1].add(second)  # beyond the only knot of a table of one: dropped
+
+
+def natural_basis(
+    knots: Float[AnyArray, "basis"], curvature: Float[AnyArray, "basis basis"], x: Float[Array, ""]
+) -> Float[Array, "basis"]:
+    """The cardinal natural splines at x, between the first and the last knot."""
+    index, share, width = place(knots, x)
+    bent = at_ends(knots, index, (1 - share) ** 3 - (1 - share), share**3 - share)
+    return at_ends(knots, index, 1 - share, share) + width**2 / 6 * (bent @ curvature)
+
+
+def natural_controls(
+    knots: Float[Array, "basis"], curvature: Float[Array, "basis basis"]
+) -> Float[Array, "interval control basis"]:
+    """The Bernstein coefficients of the cardinal natural splines in each interval between knots."""
+    one = jnp.eye(knots.shape[0], dtype=knots.dtype)
+    share = jnp.asarray([0, 1 / 3, 2 / 3, 1], knots.dtype)[None, :, None]
+    bent = jnp.asarray([[0, 0], [2, 1], [1, 2], [0, 0]], knots.dtype)
+    width = jnp.diff(knots)[:, None, None]
+    straight = (1 - share) * one[:-1, None] + share * one[1:, None]
+    neighbours = jnp.stack([curvature[:-1], curvature[1:]], axis=1)
+    return straight - width**2 / 18 * jnp.einsum("cn,pnb->pcb", bent, neighbours, precision="highest")
+
+
+def natural_curvature(knots: Float[AnyArray, "basis"]) -> Float[Array, "basis basis"]:
+    """The matrix from values at the knots to the natural spline's second derivatives there."""
+    knots = jnp.asarray(knots)
+    size = knots.shape[0]
+    if size < 3:
+        return jnp.zeros((size, size), knots.dtype)
+    width = jnp.diff(knots)
+    inner = jnp.arange(size - 2)
+    bands = jnp.zeros((size - 2, size), knots.dtype)
+    system = bands.at[inner, inner].set(width[:-1] / 6).at[inner, inner + 2].set(width[1:] / 6)
+    system = system.at[inner, inner + 1].set((width[:-1] + width[1:]) / 3)
+    second = bands.at[inner, inner].set(1 / width[:-1]).at[inner, inner + 2].set(1 / width[1:])
+    second = second.at[inner, inner + 1].set(-1 / width[:-1] - 1 / width[1:])
+    return jnp.pad(jnp.linalg.solve(system[:, 1:-1], second), ((1, 1), (0, 0)))

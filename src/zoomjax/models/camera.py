@@ -1,0 +1,140 @@
+"""A pinhole camera behind a zoom lens: from pixels to rays, and from points in space to pixels.
+
+    ray of a pixel      ((x̂ - c) / f, 1),  x̂ the corrected pixel (eq. 1), c the principal point, f in px
+    pixel of (X, Y, Z)  the distorted position of  c + f (X, Y) / Z
+
+Axes are OpenCV's: x to the right, y down, z forward. There is no pose: transform points before, rays after.
+All is elementwise, a focal length for each pixel if wanted, and differentiable in pixels, points, focal
+lengths and the lens.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Bool, Float, Num
+
+from .._core.arrays import aligned, as_array, finite, namespace
+from .._core.types import AnyArray, FocalLike, Points
+from .lens import ZoomLens
+
+
+class Camera(eqx.Module):
+    """A zoom lens, a principal point, and the size of a pixel.
+
+    Attributes:
+        lens: from `fit_zoom` or `load_lens`.
+        principal: the principal point, px: where the optical axis meets the image. By default the centre of
+            distortion.
+        pixel_pitch: mm from one pixel to the next, for lenses whose focal lengths are in mm; None for
+            lenses in px.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from zoomjax import PolynomialZoom, ZoomLens
+        >>> zoom = PolynomialZoom(1, jnp.array([[0.0], [0.1]]), jnp.array(20.0))
+        >>> lens = ZoomLens(zoom, jnp.array([319.5, 239.5]), jnp.array([20.0, 80.0]), (640, 480))
+        >>> camera = Camera(lens, pixel_pitch=0.02)
+        >>> rays, known = camera.rays(jnp.array([[319.5, 239.5], [0.0, 0.0]]), 40.0)
+        >>> pixels, seen = camera.project(5 * rays, 40.0)
+        >>> pixels.round(1).tolist(), seen.tolist()
+        ([[319.5, 239.5], [-0.0, 0.0]], [True, True])
+    """
+
+    lens: ZoomLens
+    principal: Float[AnyArray, "2"] | None = eqx.field(
+        default=None, converter=lambda value: None if value is None else as_array(value)
+    )
+    pixel_pitch: Float[AnyArray, ""] | None = eqx.field(
+        default=None, converter=lambda value: None if value is None else as_array(value)
+    )
+
+    def __check_init__(self):
+        """Check that the focal length in px is known, and shapes."""
+        if not isinstance(self.lens, ZoomLens):
+            raise TypeError(
+                f"Argument lens must be a ZoomLens, but its type is {type(self.lens).__name__}."
+            )
+        if (self.lens.focal_unit == "mm") == (self.pixel_pitch is None):
+            raise ValueError(
+                "Argument pixel_pitch, mm from one pixel to the next (the sensor's width over that of the "
+                "image in px), must be given for a lens whose focal lengths are in mm."
+                if self.pixel_pitch is None
+                else "Argument pixel_pitch must be left out: the lens's focal lengths are in px already."
+            )
+        pitch = self.pixel_pitch
+        if isinstance(pitch, np.ndarray) and not (np.isfinite(pitch).all() and (pitch > 0).all()):
+            raise ValueError(f"Argument pixel_pitch must be positive, but it is {pitch}.")
+        shape = getattr(self.principal, "shape", (2,))
+        if shape[-1:] != (2,):
+            raise ValueError(f"Argument principal must be (x, y) px, but its shape is {shape}.")
+
+    def rays(
+        self,
+        pixels: Points,
+        focal: FocalLike,
+        focus: FocalLike | None = None,
+    ) -> tuple[Float[AnyArray, "*pixels 3"], Bool[AnyArray, "*pixels"]]:
+        """The direction that each pixel looks in.
+
+        Args:
+            pixels: (..., 2) px of the distorted image.
+            focal: focal lengths in the lens's unit, which broadcast with the pixels, as for
+                `ZoomLens.undistort`.
+            focus: as for a call of the lens.
+
+        Returns:
+            Directions ``(x, y, 1)``, not of length 1, and whether there is one: beyond the fold of a lens
+            that folds they are NaN, with derivatives of zero.
+        """
+        corrected = self.lens.undistort(pixels, focal, focus)
+        xp = namespace(corrected)
+        corrected, principal, length = self._aligned(corrected, focal)
+        flat = (corrected - principal) / length[..., None]
+        return xp.concatenate([flat, xp.ones_like(flat[..., :1])], axis=-1), finite(flat[..., 0])
+
+    def project(
+        self,
+        points: Num[AnyArray, "*points 3"] | list | tuple,
+        focal: FocalLike,
+        focus: FocalLike | None = None,
+    ) -> tuple[Float[AnyArray, "*pixels 2"], Bool[AnyArray, "*pixels"]]:
+        """The pixel that each point in space is seen at.
+
+        Args:
+            points: (..., 3) in the camera's axes, in any unit.
+            focal, focus: as for `rays`.
+
+        Returns:
+            Positions in the distorted image, px, within it or not, and whether there is one. Points that
+            are not in front of the camera, or have no inverse, are NaN, with derivatives of zero.
+        """
+        space: Any = points if isinstance(points, jax.Array) else as_array(np.asarray(points))
+        xp = namespace(space)
+        if space.shape[-1:] != (3,):
+            raise ValueError(f"Argument points must have shape (..., 3), but its shape is {space.shape}.")
+        before = space[..., 2] > 0
+        depth = xp.where(before, space[..., 2], 1)
+        flat, principal, length = self._aligned(space[..., :2] / depth[..., None], focal)
+        flat = principal + length[..., None] * flat
+        before = xp.broadcast_to(before, flat.shape[:-1])
+        # NaN goes in where nothing is to be seen: the inverse has no derivative there.
+        pixels = self.lens.distort(xp.where(before[..., None], flat, np.nan), focal, focus)
+        return pixels, finite(pixels[..., 0])
+
+    def _aligned(self, points: Any, focal: Any) -> list[Any]:
+        """Points, the principal point and focal lengths in px, ready to broadcast."""
+        principal = _as(self.lens.centre if self.principal is None else self.principal, points)
+        length = _as(focal, points)
+        if self.pixel_pitch is not None:
+            length = length / _as(self.pixel_pitch, points)
+        return aligned((points, 1), (principal, 1), (length, 0))
+
+
+def _as(values: Any, like: Any) -> Any:
+    """An array of the dtype of another, and NumPy's if both are."""
+    known = isinstance(like, np.ndarray) and not isinstance(values, Tracer)
+    return (np if known else jnp).asarray(values, like.dtype)

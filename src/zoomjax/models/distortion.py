@@ -1,0 +1,320 @@
+"""Distortion of one frame: the paper's L (eq. 1-2), its inverse, and where that exists.
+
+With ``z = (x - c)/s`` the corrected point is ``c + s F(z)``: F is the family's (`family`), by default
+
+    F(z) = z L(t),  L(t) = 1 + k1 t + k2 t^2 + ... + kN t^N,  t = z.z.
+
+Here are lengths in px, arrays of points and dtypes; formulas and inverses are there.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._core.arguments import check_kind
+from .._core.arrays import aligned, as_array, finite, namespace, together
+from .._core.types import AnyArray, Points, traced
+from .family import AbstractFamily
+from .polynomial import RadialPolynomial
+
+
+class Distortion(eqx.Module):
+    """Distortion of one frame (eq. 1-2), radial unless its family says otherwise, or of several frames.
+
+    ``undistort`` maps distorted to corrected points, the paper's L; ``distort`` is its inverse. Points
+    are ``(x, y)`` px with (0, 0) at the centre of the top-left pixel, in arrays of any leading shape.
+
+    NumPy arrays, and lists, give NumPy arrays, computed at once, without compilation; JAX arrays give JAX
+    arrays. Results have the points' dtype; integers give float64, half precision (which has steps of
+    0.5 px at 1,000) float32.
+
+    Several distortions in one, as ``lens([24, 35, 50])`` makes them, have leading axes. Points then begin
+    with the same axes: ``points[0]`` are those of the first. A single point is one for all.
+
+    Attributes:
+        coefficients: (k1, ..., kN), or those of another family, for radii in units of `scale`.
+        centre: centre of distortion, px.
+        scale: length in px that is radius 1: half the image diagonal, unless stated otherwise.
+        family: what the coefficients mean.
+
+    Example:
+        >>> d = Distortion([0.1, -0.02], [319.5, 239.5], 400.0)
+        >>> d.undistort([639.0, 479.0]).round(2).tolist()
+        [664.49, 498.11]
+    """
+
+    coefficients: Float[AnyArray, "*batch terms"] = eqx.field(converter=as_array)
+    centre: Float[AnyArray, "... 2"] = eqx.field(converter=as_array)
+    scale: Float[AnyArray, "..."] = eqx.field(converter=as_array)
+    family: AbstractFamily = RadialPolynomial()
+
+    def __check_init__(self):
+        """Check shapes, and values where they are known."""
+        _check(self.coefficients, self.centre, self.scale, self.family)
+
+    @property
+    def pixel_coefficients(self) -> Float[AnyArray, "*batch terms"]:
+        """The coefficients in the paper's units, ``k_i / scale^(2i)``, px^(-2i); p1 and p2 in px^-1."""
+        order = self.family.orders(self.coefficients.shape[-1])
+        scale = namespace(self.scale).asarray(self.scale)[..., None]
+        lengths, order, k = aligned((scale, 0), (order, 0), (self.coefficients, 0))
+        return k / lengths**order
+
+    @property
+    def monotone_radius(self) -> Float[AnyArray, "*batch"]:
+        """Distance in px from the centre at which the distorted image begins to fold; inf if never.
+
+        For `BrownConrady` a bound of it: up to there it is certain not to.
+        """
+        radius = self.scale * _limit(self.family, self.coefficients)
+        return namespace(radius).asarray(radius)
+
+    def undistort(self, points: Points) -> Float[AnyArray, "*points 2"]:
+        """Corrected positions of distorted `points` (eq. 1).
+
+        Beyond `monotone_radius` the result is NaN: there the formula folds the plane over, and two points
+        would share one corrected position. `certify` proves that a lens has no such points in its images.
+        """
+        return self._mapped("undistort", points)
+
+    def distort(self, points: Points) -> Float[AnyArray, "*points 2"]:
+        """Distorted positions of corrected `points`: the exact inverse of `undistort`.
+
+        Iterated until the residual is one of rounding. Where there is no inverse within the monotone radius
+        the result is NaN, its derivatives are zero, and `has_inverse` is False. Derivatives elsewhere are
+        those of the implicit function theorem.
+        """
+        return self._mapped("distort", points)
+
+    def has_inverse(self, points: Points) -> Bool[AnyArray, "*points"]:
+        """Whether corrected `points` are the image of a distorted point inside the monotone radius."""
+        return finite(self.distort(points)[..., 0])
+
+    def _mapped(self, method, points):
+        points = as_points(points)
+        batch = self.coefficients.ndim - 1
+        if batch and points.ndim > 1:
+            leading = self.coefficients.shape[:batch]
+            if points.shape[:batch] != leading or points.ndim == batch:
+                raise ValueError(
+                    f"Argument points must begin with the axes {leading} of the distortions, a set of "
+                    f"points for each, but its shape is {points.shape}. ZoomLens.undistort(points, focal) "
+                    "broadcasts both."
+                )
+        between = max(points.ndim - 1 - batch, 0)
+
+        def spread(leaf, own):
+            return leaf.reshape(*leaf.shape[:batch], *[1] * between, *leaf.shape[batch:]) if own else leaf
+
+        k, centre, scale = (
+            spread(leaf, leaf.ndim > own)
+            for leaf, own in ((self.coefficients, 1), (self.centre, 1), (self.scale, 0))
+        )
+        return mapped(method, self.family, points, k, centre, scale)
+
+
+def as_points(points: Any) -> Any:
+    """Points as an array (..., 2) of float32 or float64.
+
+    Raises:
+        ValueError: they are not real numbers, or of another shape.
+    """
+    if not isinstance(points, jax.Array):
+        try:
+            points = np.asarray(points)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"Argument points must be an array of shape (..., 2): {error}.") from error
+    if points.shape[-1:] != (2,):
+        raise ValueError(f"Argument points must have shape (..., 2), but its shape is {points.shape}.")
+    if not jnp.issubdtype(points.dtype, jnp.integer) and not jnp.issubdtype(points.dtype, jnp.floating):
+        raise ValueError(f"Argument points must hold real numbers, but its dtype is {points.dtype}.")
+    if jnp.issubdtype(points.dtype, jnp.integer):
+        return points.astype(float)
+    return points.astype(np.float32) if points.dtype.itemsize < 4 else points
+
+
+def mapped(method: str, family: AbstractFamily, points: Any, k: Any, centre: Any, scale: Any) -> Any:
+    """``undistort`` or ``distort`` for points and distortions that broadcast.
+
+    In NumPy where everything is known and the points are NumPy's, else compiled.
+    """
+    if isinstance(points, np.ndarray) and not traced((k, centre, scale)):
+        with np.errstate(all="ignore"):  # NaN and inf are answers
+            # With one more axis, as NumPy makes plain numbers of arrays without any.
+            leaves = ((points, 1), (np.asarray(k), 1), (np.asarray(centre), 1), (np.asarray(scale), 0))
+            points, k, centre, scale = (leaf[None] for leaf in aligned(*leaves))
+            if method == "undistort":
+                return _undistorted(points, family, k, centre, scale)[0]
+            z, k, centre, scale = _normalised(points, k, centre, scale)
+            return _in_pixels(family.distort(z, k, _limit_of(family, k)), centre, scale)[0]
+    return compiled(method, _given, jnp.asarray(points), (family, k, centre, scale))
+
+
+@eqx.filter_jit
+def compiled(
+    method: str, distortion_of: Callable[[Any], Any], points: Float[Array, "... 2"], operands: Any
+) -> Float[Array, "... 2"]:
+    """``undistort`` or ``distort`` in JAX, of what a function says that the distortion is.
+
+    Args:
+        method: which of them.
+        distortion_of: the family, coefficients, centre and scale that the operands make. `distort` calls it
+            again where Newton's steps do not arrive: coefficients of each point are then not kept in memory
+            for the branch that is nearly never taken.
+        points: px.
+        operands: a pytree.
+    """
+    if method == "undistort":
+        return _undistorted(points, *distortion_of(operands))
+    arrays, rest = eqx.partition(operands, eqx.is_array)
+    return _distorted(lambda arrays: distortion_of(eqx.combine(arrays, rest)), points, arrays)
+
+
+def _given(operands):
+    family, *numbers = operands
+    return family, *map(jnp.asarray, numbers)
+
+
+def _normalised(points, k, centre, scale):
+    """Normalised points, coefficients (first axis), centre and scale; with axes that broadcast."""
+    leaves = ((points, 1), (k, 1), (centre, 1), (scale, 0))
+    points, k, centre, scale = aligned(*((leaf.astype(points.dtype), own) for leaf, own in leaves))
+    xp = namespace(k)
+    # JAX's know of symbolic shapes, for `jax.export`; and NumPy's do not wait for JAX.
+    broadcast_shapes = (jnp if xp is jnp else np).broadcast_shapes
+    shape = broadcast_shapes(points.shape[:-1], k.shape[:-1], centre.shape[:-1], scale.shape)
+    x, y = (xp.broadcast_to((points[..., i] - centre[..., i]) / scale, shape) for i in (0, 1))
+    return together(x, y), xp.moveaxis(k, -1, 0), centre, scale
+
+
+def _in_pixels(z, centre, scale):
+    return together(centre[..., 0] + scale * z[..., 0], centre[..., 1] + scale * z[..., 1])
+
+
+def _undistorted(points, family, k, centre, scale):
+    """Corrected points; NaN beyond the limit."""
+    z, k, centre, scale = _normalised(points, k, centre, scale)
+    xp, limit = namespace(z), _limit_of(family, k)
+    squared = z[..., 0] * z[..., 0] + z[..., 1] * z[..., 1]
+    # A few last digits beyond it are the same radius: what `distort` puts at the fold rounds to there.
+    within = squared <= (limit * (1 + 4 * np.finfo(z.dtype).eps)) ** 2
+    corrected = family.correct(z, squared, k)
+    x, y = corrected[..., 0], corrected[..., 1]
+    # An invertible correction is monotone, and never goes to the other side; at a pole rounding does.
+    within = within & (z[..., 0] * x + z[..., 1] * y >= 0)
+    return _in_pixels(together(xp.where(within, x, np.nan), xp.where(within, y, np.nan)), centre, scale)
+
+
+def _by_formula(points, family, k, centre, scale):
+    """Corrected points, also beyond the limit."""
+    z, k, centre, scale = _normalised(points, k, centre, scale)
+    squared = z[..., 0] * z[..., 0] + z[..., 1] * z[..., 1]
+    return _in_pixels(family.correct(z, squared, k), centre, scale)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _distorted(distortion_of, points, operands):
+    """Distorted points; NaN, with derivatives of zero, where there is no inverse.
+
+    So ``where(has_inverse, distort, 0)`` has derivatives. At the fold itself they would be infinite, and
+    are 1/eps of the dtype at most.
+    """
+
+    def certain():
+        family, k, centre, scale = distortion_of(operands)
+        z, k, centre, scale = _normalised(points, k, centre, scale)
+        return _in_pixels(family.distort(z, k, _limit_of(family, k)), centre, scale)
+
+    family, k, centre, scale = distortion_of(operands)
+    z, k, centre, scale = _normalised(points, k, centre, scale)
+    quick = family.quick_distort(z, k, _limit_of(family, k))
+    if quick is None:
+        return certain()
+    distorted, arrived = quick
+    distorted = _in_pixels(distorted, centre, scale)
+    # A branch, not a loop that is left at once: the state of a loop would be written to memory. Under vmap
+    # both branches are taken, and the loops in the other one end at once where all have arrived.
+    return jax.lax.cond(jnp.all(arrived), lambda: distorted, certain)
+
+
+@_distorted.defjvp
+def _distorted_jvp(distortion_of, primals, tangents):
+    """By the implicit function theorem, whatever the iterations: G(w, a) = p, for the formula G in px."""
+    (points, operands), (points_dot, operands_dot) = primals, tangents
+    w = _distorted(distortion_of, points, operands)
+    exists = jnp.isfinite(w[..., 0])
+    _, _, centre, _ = distortion_of(operands)
+    centre, _ = aligned((jax.lax.stop_gradient(centre).astype(w.dtype), 1), (w, 1))
+    at = together(*(jnp.where(exists, w[..., i], centre[..., i]) for i in (0, 1)))
+    one, zero = jnp.ones_like(w[..., 0]), jnp.zeros_like(w[..., 0])
+
+    def formula(at, operands):
+        family, k, centre, scale = distortion_of(operands)
+        return _by_formula(at, family, jnp.where(jnp.isfinite(k), k, 0), centre, scale)
+
+    def moved(direction):
+        return jax.jvp(lambda at: formula(at, operands), (at,), (direction,))[1]
+
+    # dG/dw dw = dp - dG/da da.
+    _, by_operands = jax.jvp(lambda operands: formula(at, operands), (operands,), (operands_dot,))
+    (ax, ay), (bx, by), (rx, ry) = (
+        (part[..., 0], part[..., 1])
+        for part in (
+            moved(together(one, zero)),
+            moved(together(zero, one)),
+            jnp.broadcast_to(points_dot, w.shape) - by_operands,
+        )
+    )
+    determinant = ax * by - ay * bx
+    weight = jnp.where(exists, 1 / jnp.maximum(determinant, jnp.finfo(w.dtype).eps), 0)
+    return w, together(weight * (by * rx - bx * ry), weight * (ax * ry - ay * rx))
+
+
+def _limit_of(family, k):
+    """The family's limit, a constant for derivatives."""
+    return family.limit(jax.lax.stop_gradient(k) if isinstance(k, jax.Array) else k)
+
+
+def _limit(family, k):
+    if isinstance(k, np.ndarray):
+        with np.errstate(all="ignore"):
+            return _limit_of(family, np.moveaxis(k[None], -1, 0))[0]
+    return _limit_of(family, jnp.moveaxis(k, -1, 0))
+
+
+def _check(coefficients, centre, scale, family):
+    """What a `Distortion` is made of: shapes, and values where they are known."""
+    if isinstance(family, bool) or type(family) is object:
+        return  # stands for one in filters and trees
+    check_kind("family", family, (AbstractFamily,))
+    parts = {"coefficients": coefficients, "centre": centre, "scale": scale}
+    if not all(hasattr(part, "shape") and hasattr(part, "dtype") for part in parts.values()):
+        return  # a stand-in, of a pytree's structure
+    for name, part in parts.items():
+        if not jnp.issubdtype(part.dtype, jnp.floating):
+            raise ValueError(f"Argument {name} must hold real numbers, but its dtype is {part.dtype}.")
+    size = coefficients.shape[-1] if coefficients.ndim else 0
+    sizes = [family.size(terms) for terms in range(1, family.most_terms + 1)]
+    if size not in sizes:
+        opencv = ": OpenCV's (k1, k2, p1, p2, k3, ...) are of another model" * (size in (5, 8, 12, 14))
+        raise ValueError(
+            f"Argument coefficients must hold from {min(sizes)} to {max(sizes)} numbers for a "
+            f"{type(family).__name__}, but its shape is {coefficients.shape}{opencv}."
+        )
+    if centre.shape[-1:] != (2,):
+        raise ValueError(f"Argument centre must be (x, y), but its shape is {centre.shape}.")
+    batch = coefficients.shape[:-1]
+    for name, shape in (("centre", centre.shape[:-1]), ("scale", scale.shape)):
+        if shape not in ((), batch):
+            raise ValueError(
+                f"Argument {name} must be one for all distortions or one for each of {batch}, but its "
+                f"shape is {parts[name].shape}."
+            )
+    if isinstance(scale, np.ndarray) and not (np.isfinite(scale) & (scale > 0)).all():
+        raise ValueError(f"Argument scale must be positive and finite, but it is {scale}.")

@@ -1,0 +1,87 @@
+"""The division model: a family of distortions where a strong barrel needs few terms."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._core.types import AnyArray, Elements
+from .family import AbstractRadial, radial_factor, radial_orders, radial_slope, times
+
+
+class Division(AbstractRadial):
+    """``L = 1 / (1 + k1 t + ... + kN t^N)``: Fitzgibbon's, where a strong barrel needs few terms.
+
+    One or two terms are usual. To first order its k1 is minus that of the polynomial. It is invertible up
+    to the first pole, or the first zero of the numerator ``1 - k1 t - 3 k2 t^2 - ...`` of its slope.
+
+    References:
+        A. Fitzgibbon, "Simultaneous linear estimation of multiple view geometry and lens distortion",
+        CVPR 2001.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from zoomjax import Distortion
+        >>> d = Distortion(jnp.array([-0.2]), jnp.zeros(2), jnp.array(100.0), Division())
+        >>> d.undistort(jnp.array([100.0, 0.0])).tolist(), d.distort(jnp.array([125.0, 0.0])).tolist()
+        ([125.0, 0.0], [100.0, 0.0])
+    """
+
+    formula: ClassVar[str] = (
+        "corrected = centre + z * scale / (1 + k1 r^2 + ... + kN r^2N), "
+        "z = (distorted - centre) / scale, r^2 = z.z"
+    )
+
+    def factor(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
+        """L."""
+        return 1 / radial_factor(squared, k)
+
+    def slope(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
+        """``(1 - k1 t - 3 k2 t^2 - ...) / (1 + k1 t + ...)^2``."""
+        numerator = radial_factor(squared, times(1 - 2 * radial_orders(len(k)), k))
+        return numerator / radial_factor(squared, k) ** 2
+
+    def equation(self, r: Any, squared: Any, rho: Any, k: Elements) -> tuple[Any, Any]:
+        """``r - rho (1 + k1 t + ...)``, which has no pole."""
+        divisor = radial_factor(squared, k)
+        growth = radial_slope(squared, k) - divisor  # by r, times r
+        return r - rho * divisor, 1 - rho / (r + (r == 0)) * growth
+
+    def conditions(self, size: int) -> np.ndarray:
+        """The numerator of the slope, and the divisor."""
+        return np.stack([1 - 2 * radial_orders(size), np.ones(size, int)])
+
+    def expansion_terms(self, size: int) -> int:
+        """8, or its own number if that is more.
+
+        The error of L up to the corner, measured: for |k1| up to 0.1 5e-14, to 0.3 3e-9, to 0.5 1.5e-6
+        (of half the diagonal: 6e-4 px at 640 x 480); for (-0.3, -0.2), half way to the pole, 2e-5.
+        """
+        return max(8, size)
+
+    def expansion(
+        self, k: Elements, reach: Float[Array, ""]
+    ) -> tuple[Float[AnyArray, "power"], Float[AnyArray, "tangential"]]:
+        """L's Taylor polynomial T, and the interpolation of the rest in Chebyshev's nodes.
+
+        The rest is ``(1 - D T)/D`` for the divisor D, and its first powers are known to vanish. It is small
+        and so are its rounding errors, which powers through nodes multiply by 1e5: not those of L itself.
+        """
+        size, terms = k.shape[0], self.expansion_terms(k.shape[0])
+        powers = jnp.asarray(reach, k.dtype) ** np.arange(1, terms + 1)
+        scaled = k * powers[:size]  # now t is from 0 to 1
+        series: list[Any] = [jnp.ones((), k.dtype)]
+        for _ in range(terms):
+            series.append(-sum(c * s for c, s in zip(scaled, series[::-1], strict=False)))
+        # What 1 - D T is made of: its powers terms + 1, ..., terms + size.
+        beyond = [
+            -sum(scaled[j - 1] * series[terms + m - j] for j in range(m, size + 1))
+            for m in range(1, size + 1)
+        ]
+        nodes = (1 - np.cos(np.pi * (np.arange(terms) + 0.5) / terms)) / 2
+        t = nodes.astype(k.dtype)
+        tail = sum(b * t**m for m, b in enumerate(beyond)) * t**terms / radial_factor(t, scaled)
+        interpolation = np.linalg.inv(np.vander(nodes, increasing=True)).astype(k.dtype)
+        rest = jnp.matmul(interpolation, tail, precision="highest")
+        return (jnp.stack(series[1:]) + rest) / powers, k[:0]

@@ -1,0 +1,231 @@
+"""Families of distortions: what the coefficients k of one frame make of a point, and back.
+
+A family maps a normalised point ``z = (x - c)/s`` to its corrected one, up to the radius where that stops
+being invertible. Radial families have ``z L(t)``, ``t = z.z``, and state L; all else follows:
+
+    RadialPolynomial    L = 1 + k1 t + k2 t^2 + ... + kN t^N                (eq. 1-2, the default)
+    Division            L = 1 / (1 + k1 t + ... + kN t^N)
+    BrownConrady        the polynomial, and p1, p2 for a decentred lens, which is not radial
+
+The radius maps as ``r -> r L(r^2)``, and the *limit* is where that first stops growing; beyond it the image
+folds over and no inverse exists. Inverses are iterated until their residual is one of rounding, or are
+NaN; `distortion` differentiates them. A new family is a final class of
+`AbstractRadial` or `AbstractFamily`; fits, certificates, files and images go through these methods alone.
+
+Formulas are written for one point, with coefficients ``k[0], k[1], ...``, in operations that NumPy and JAX
+share. They are also called for many points at once: ``k`` then has further axes, which broadcast against
+those of the points.
+"""
+
+import abc
+from typing import Any, ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._core.arrays import namespace, together
+from .._core.types import AnyArray, Elements
+from ._roots import first_positive_root, first_quadratic_root, increasing_root, newton_root
+
+
+def radial_factor(squared_radius: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
+    """L(t) of eq. 2 for normalised squared radii `t` and coefficients `k = (k1, ..., kN)`.
+
+    The same code for NumPy and JAX, as all of a radial family's formulas.
+    """
+    factor = 0 * squared_radius if len(k) == 0 else k[-1] * squared_radius
+    for coefficient in k[-2::-1]:
+        factor = (factor + coefficient) * squared_radius
+    return 1 + factor
+
+
+def radial_slope(squared_radius: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
+    """The derivative of ``r L(r^2)`` with respect to r, at ``t = r^2``."""
+    return radial_factor(squared_radius, times(2 * radial_orders(len(k)) + 1, k))
+
+
+def radial_orders(terms: int) -> np.ndarray:
+    """1, 2, ..., N."""
+    return np.arange(1, terms + 1)
+
+
+def times(factors: np.ndarray, k: Elements) -> Elements:
+    """Each coefficient times a number of its own."""
+    return factors.astype(k.dtype).reshape(-1, *[1] * (k.ndim - 1)) * k
+
+
+def first_root(rows: np.ndarray, k: Elements) -> Float[AnyArray, "..."]:
+    """The first positive root of ``1 + sum_i rows[j, i] k_i x^i``, i from 1, over all rows j."""
+    xp = namespace(k)
+    if len(k) <= 2:  # element by element: XLA makes no copies
+        first = first_quadratic_root(*times(rows[0], k))
+        for row in rows[1:]:
+            first = xp.minimum(first, first_quadratic_root(*times(row, k)))
+        return first
+    polynomials = xp.stack([xp.concatenate([xp.ones_like(k[:1]), times(row, k)]) for row in rows])
+    return first_positive_root(xp.moveaxis(polynomials, (0, 1), (-2, -1)))
+
+
+class AbstractFamily(eqx.Module):
+    """What coefficients k make of a normalised point z. It has no fields: the coefficients are k alone."""
+
+    formula: ClassVar[str]
+    most_terms: ClassVar[int] = 4
+
+    @abc.abstractmethod
+    def size(self, terms: int) -> int:
+        """How many coefficients there are with `terms` radial ones."""
+
+    @abc.abstractmethod
+    def orders(self, size: int) -> np.ndarray:
+        """The power of the radius that each coefficient goes with: a length in px has it as its unit."""
+
+    @abc.abstractmethod
+    def correct(
+        self, z: Float[AnyArray, "... 2"], squared: Float[AnyArray, "..."], k: Elements
+    ) -> Float[AnyArray, "... 2"]:
+        """The corrected point, by formula, also beyond the limit; `squared` is z.z."""
+
+    @abc.abstractmethod
+    def limit(self, k: Elements) -> Float[AnyArray, "..."]:
+        """The radius up to which `correct` is invertible; inf if everywhere. Constant for derivatives."""
+
+    @abc.abstractmethod
+    def distort(
+        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
+    ) -> Float[AnyArray, "... 2"]:
+        """The point within the limit that is corrected to z; NaN where there is none."""
+
+    def quick_distort(
+        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
+    ) -> tuple[Float[AnyArray, "... 2"], Bool[AnyArray, "..."]] | None:
+        """The same by a few steps that need not arrive, and where they did; None if there is no such way.
+
+        Where all points arrive, which is nearly always, `distort` is not called.
+        """
+        del z, k, limit
+        return None
+
+    @abc.abstractmethod
+    def conditions(self, size: int) -> np.ndarray:
+        """Rows m such that it is invertible up to R where ``1 + sum_i m_i k_i r^o_i > 0`` for r up to R.
+
+        o are the `orders`; where those are 1, r is to be R itself. Linear in k, for proofs and fits.
+        """
+
+    @abc.abstractmethod
+    def expansion_terms(self, size: int) -> int:
+        """How many powers of t `expansion` needs."""
+
+    @abc.abstractmethod
+    def expansion(
+        self, k: Elements, reach: Float[Array, ""]
+    ) -> tuple[Float[AnyArray, "power"], Float[AnyArray, "tangential"]]:
+        """The distortion, up to ``t = reach``, as coefficients of powers of t, and (p1, p2) or none.
+
+        Corrected points are linear in these: what compressed lines, and sums over points, can be used for.
+        """
+
+
+class AbstractRadial(AbstractFamily):
+    """A family with ``z L(t)``."""
+
+    @abc.abstractmethod
+    def factor(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
+        """L at squared radii t."""
+
+    @abc.abstractmethod
+    def slope(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
+        """The derivative of ``r L(r^2)`` with respect to r."""
+
+    @abc.abstractmethod
+    def equation(self, r: Any, squared: Any, rho: Any, k: Elements) -> tuple[Any, Any]:
+        """A number with the sign of ``r L(t) - rho``, smooth up to the limit, and its derivative by r.
+
+        ``t = r^2`` is given; with ``t = (r rho)^2`` and 1 for rho, it is about the ratio of both radii.
+        """
+
+    def size(self, terms: int) -> int:
+        """`terms`."""
+        return terms
+
+    def orders(self, size: int) -> np.ndarray:
+        """2, 4, ..., 2N."""
+        return 2 * radial_orders(size)
+
+    def correct(
+        self, z: Float[AnyArray, "... 2"], squared: Float[AnyArray, "..."], k: Elements
+    ) -> Float[AnyArray, "... 2"]:
+        """``z L(t)``."""
+        factor = self.factor(squared, k)
+        return together(z[..., 0] * factor, z[..., 1] * factor)
+
+    def limit(self, k: Elements) -> Float[AnyArray, "..."]:
+        """The monotone radius: the first root of a condition in t."""
+        return namespace(k).sqrt(first_root(self.conditions(len(k)), k))
+
+    def reach(self, k: Elements, limit: Float[AnyArray, "..."]) -> Float[AnyArray, "..."]:
+        """The corrected radius that the limit goes to; inf if there is none, or at a pole."""
+        xp = namespace(k, limit)
+        finite = xp.where(xp.isinf(limit), 0, limit)
+        factor = self.factor(finite * finite, k)
+        end = xp.isinf(limit) | ~((factor > 0) & (factor < np.finfo(factor.dtype).eps ** -0.5))
+        return xp.where(end, np.inf, finite * factor)
+
+    def ratio(
+        self, squared: Float[AnyArray, "..."], k: Elements, limit: Float[AnyArray, "..."]
+    ) -> tuple[Float[AnyArray, "..."], Bool[AnyArray, "..."]]:
+        """The distorted radius over the corrected one, whose square is given, and whether there is one.
+
+        It solves ``q L(t q^2) = 1``, which needs no root of the squared radius and is regular at 0.
+        """
+        exists, squared, equation, within = self._ratios(squared, k, limit)
+        xp = namespace(squared, k)
+
+        def high():
+            off_centre = squared > 0
+            return xp.where(off_centre, limit / xp.sqrt(xp.where(off_centre, squared, 1)), np.inf)
+
+        q, found = increasing_root(equation, xp.ones_like(squared), high, within)
+        return q, exists & found
+
+    def _ratios(self, squared, k, limit):
+        """Where there is a ratio, the squared radii there, its equation, and whether it is in the limit."""
+        xp = namespace(squared, k)
+        eps = np.finfo(squared.dtype).eps
+        reach = self.reach(k, limit)
+        # A few last digits beyond it are the same radius: what is corrected at the fold rounds to there.
+        exists = xp.isfinite(squared) & (squared <= (reach * (1 + 8 * eps)) ** 2)
+        squared = xp.where(exists, squared, 0)
+        farthest = (limit * (1 + 8 * eps)) ** 2
+
+        def equation(q):
+            return self.equation(q, squared * q * q, 1, k)
+
+        return exists, squared, equation, lambda q: squared * q * q <= farthest
+
+    def distort(
+        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
+    ) -> Float[AnyArray, "... 2"]:
+        """By the `ratio` of the radii."""
+        return _scaled(z, *self.ratio(_square(z), k, limit))
+
+    def quick_distort(
+        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
+    ) -> tuple[Float[AnyArray, "... 2"], Bool[AnyArray, "..."]]:
+        """By Newton's steps alone."""
+        exists, squared, equation, within = self._ratios(_square(z), k, limit)
+        q, arrived = newton_root(equation, namespace(squared, k).ones_like(squared), within)
+        return _scaled(z, q, exists & arrived), arrived
+
+
+def _square(z: Float[AnyArray, "... 2"]) -> Float[AnyArray, "..."]:
+    """z.z."""
+    return z[..., 0] * z[..., 0] + z[..., 1] * z[..., 1]
+
+
+def _scaled(z, q, found):
+    """``q z``, NaN where nothing was found."""
+    q = namespace(z, q).where(found, q, np.nan)
+    return together(z[..., 0] * q, z[..., 1] * q)

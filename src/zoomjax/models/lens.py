@@ -1,0 +1,372 @@
+"""ZoomLens: the fitted model, from a focal length to the distortion there, and its file format."""
+
+import dataclasses
+import functools
+import json
+import math
+import os
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Num, ScalarLike
+
+from .._core.arguments import check_kind, kinds_checked
+from .._core.arrays import aligned
+from .._core.checks import checked_size, checked_unit
+from .._core.fields import check_finite, check_positive, check_range, check_shapes, numbers
+from .._core.files import whole_file
+from .._core.types import AnyArray, FocalLike, Point, Points, traced
+from .distortion import Distortion, as_points, compiled, mapped
+from .family import AbstractFamily
+from .polynomial import RadialPolynomial
+from .registry import array_of, coefficients_shape, described, family_name, family_named, zoom_from
+from .zoom import AbstractFocusZoom, AbstractLinearZoom, AbstractZoom
+
+_FORMAT, _VERSION = "zoomjax.lens", 2
+
+_SLACK = 1e-6
+"""Share of a focal length by which it may be beyond the range: the end itself, through a float32."""
+
+
+class ZoomLens(eqx.Module):
+    """The distortion of a zoom lens at any focal length: ``lens(f)`` is a `Distortion` (eq. 11-12).
+
+    Attributes:
+        zoom: from a focal length to the normalised coefficients.
+        centre: centre of distortion, px.
+        shift: from a focal length to the offset of its own centre of distortion from `centre`, in units of
+            `scale`; None where the centre stays.
+        focal_range: the shortest and longest focal length fitted.
+        image_size: (width, height) px of the images it is for.
+        focal_unit: "mm" or "px".
+        focus_range: the least and greatest focus fitted, where the zoom model depends on it.
+        family: what the coefficients mean: by default the radial polynomial.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from zoomjax import PolynomialZoom
+        >>> zoom = PolynomialZoom(1, jnp.array([[0.0], [0.1]]), jnp.array(20.0))
+        >>> lens = ZoomLens(zoom, jnp.array([319.5, 239.5]), jnp.array([20.0, 80.0]), (640, 480))
+        >>> lens(40.0).coefficients.round(3).tolist()
+        [0.05000000074505806]
+    """
+
+    zoom: AbstractZoom
+    centre: Point = eqx.field(converter=numbers("centre"))
+    focal_range: Float[AnyArray, "2"] = eqx.field(converter=numbers("focal_range"))
+    image_size: tuple[int, int] = eqx.field(static=True, converter=checked_size)
+    focal_unit: str = eqx.field(static=True, default="mm", converter=checked_unit)
+    shift: AbstractZoom | None = None
+    focus_range: Float[AnyArray, "2"] | None = eqx.field(default=None, converter=numbers("focus_range"))
+    family: AbstractFamily = RadialPolynomial()
+
+    def __check_init__(self):
+        """Check the geometry, and that the zoom model gives the family's coefficients."""
+        for name, kinds in (
+            ("zoom", (AbstractZoom,)),
+            ("family", (AbstractFamily,)),
+            ("shift", (AbstractZoom, type(None))),
+        ):
+            value = getattr(self, name)
+            # Booleans stand for modules in filters, bare objects in JAX's own handling of trees.
+            if not (isinstance(value, bool) or type(value) is object):
+                check_kind(name, value, kinds)
+        check_shapes(
+            {
+                "centre": (self.centre, (2,)),
+                "focal_range": (self.focal_range, (2,)),
+                "focus_range": (self.focus_range, (2,)),
+            }
+        )
+        check_finite("centre", self.centre)
+        check_positive("focal_range", self.focal_range)
+        check_range("focal_range", self.focal_range)
+        check_range("focus_range", self.focus_range)
+        one = getattr(self.centre, "ndim", 0) == 1  # or it is a batch of lenses, or stands in for one
+        size, shift = (_coefficients(model) if one else None for model in (self.zoom, self.shift))
+        if shift not in (None, 2):
+            raise ValueError(
+                f"Argument shift must give two numbers, the offset of the centre, but it gives {shift}."
+            )
+        if size is not None and isinstance(self.family, AbstractFamily) and size < self.family.size(1):
+            raise ValueError(
+                f"Argument zoom must give {self.family.size(1)} or more coefficients for the family "
+                f"{type(self.family).__name__}, but it gives {size}."
+            )
+
+    @property
+    def scale(self) -> float:
+        """The length in px that is radius 1: half the image diagonal."""
+        return math.hypot(*self.image_size) / 2
+
+    def __call__(self, focal: FocalLike, focus: FocalLike | None = None) -> Distortion:
+        """The distortion at a focal length, in `focal_unit`; or those at several, in one.
+
+        Args:
+            focal: the focal length, or an array or list of them: the distortion then has its axes in front.
+            focus: where the lens is focused, for models that depend on it (`AbstractFocusZoom`), which hold
+                it within the fitted range.
+
+        Under ``jit``, ``vmap`` and ``grad``, where values are not known and nobody can be warned, focal
+        lengths outside of the fitted range give NaN; see `extended`.
+
+        Warns:
+            UserWarning: `focal` is outside of the fitted range, and the distortion extrapolated.
+
+        Raises:
+            ValueError: `focal` is not positive and finite, or the zoom model depends on the focus and there
+                is none.
+        """
+        focal = self._checked(focal, stacklevel=4)
+        if traced((self, focal, focus)):
+            return self._distortion(focal, focus, within=traced((self, focal)))
+        with jax.ensure_compile_time_eval():  # what is known stays known inside of ``jit``
+            return self._distortion(focal, focus)
+
+    def undistort(
+        self,
+        points: Points,
+        focal: FocalLike,
+        focus: FocalLike | None = None,
+    ) -> Float[AnyArray, "*points 2"]:
+        """Corrected positions of distorted `points`, each at its own focal length.
+
+        Args:
+            points: (..., 2) px.
+            focal: focal lengths, which broadcast with the points: one for all, or one for each, as rays of
+                a radiance field need them.
+            focus: as for a call of the lens.
+
+        Returns:
+            Points of the shape that both have together; see `Distortion.undistort`.
+        """
+        return self._mapped("undistort", points, focal, focus)
+
+    def distort(
+        self,
+        points: Points,
+        focal: FocalLike,
+        focus: FocalLike | None = None,
+    ) -> Float[AnyArray, "*points 2"]:
+        """Distorted positions of corrected `points`, each at its own focal length; see `undistort`."""
+        return self._mapped("distort", points, focal, focus)
+
+    def extended(self, low: float, high: float) -> "ZoomLens":
+        """The same lens with another focal range: to extrapolate on purpose.
+
+        Nothing vouches for the distortion beyond the range fitted; `certify` it.
+        """
+        return dataclasses.replace(self, focal_range=np.array([low, high], float))
+
+    def _mapped(self, method, points, focal, focus):
+        points = as_points(points)
+        focal = self._checked(focal, stacklevel=5)
+        if isinstance(points, np.ndarray) and not traced((self, focal, focus)):
+            d = self._distortion(focal, focus)
+            return mapped(method, d.family, points, d.coefficients, d.centre, d.scale)
+        points = jnp.asarray(points)
+        operands = (self, jnp.asarray(focal, points.dtype), focus, traced((self, focal)))
+        return compiled(method, _bent, points, operands)
+
+    def _checked(self, focal, stacklevel):
+        """Focal lengths as an array, looked at where they are known."""
+        if not isinstance(focal, jax.Array):
+            try:
+                focal = np.asarray(focal, float)
+            except (TypeError, ValueError) as error:
+                raise ValueError(
+                    f"Argument focal must be a number or an array, but it is {focal!r}."
+                ) from error
+        self.check_range(focal, stacklevel=stacklevel)
+        return focal
+
+    def _distortion(self, focal, focus, within=False):
+        """The distortion; NaN outside of the range, if it is to be `within`, else extrapolated."""
+        dtype = jnp.asarray(self.centre).dtype
+        centre, focal = jnp.asarray(self.centre), jnp.asarray(focal, dtype)
+        low, high = jnp.moveaxis(jnp.asarray(self.focal_range, dtype), -1, 0)
+        inside = (focal > 0) & (focal >= low * (1 - _SLACK)) & (focal <= high * (1 + _SLACK))
+        if within:  # at a focal length that is: a NaN in `focal` would be one in all derivatives
+            focal = jnp.where(inside, focal, high)
+        k = _at(self.zoom, focal, focus, dtype)
+        if within:
+            k = jnp.where(inside[..., None], k, jnp.nan)
+        if self.shift is not None:
+            centre, moved = aligned((centre, 1), (_at(self.shift, focal, None, dtype), 1))
+            centre = centre + self.scale * moved
+        return Distortion(k, centre, jnp.asarray(self.scale, dtype), self.family)
+
+    def at_focus(self, focus: ScalarLike) -> "ZoomLens":
+        """The lens focused at one place, a lens of the focal length alone: to correct images and video by.
+
+        Raises:
+            TypeError: the zoom model does not depend on the focus.
+        """
+        if not isinstance(self.zoom, AbstractFocusZoom):
+            raise TypeError(
+                f"A {type(self.zoom).__name__} does not depend on the focus: use the lens as it is."
+            )
+        return dataclasses.replace(self, zoom=self.zoom.at_focus(focus), focus_range=None)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the lens to a JSON file that `load_lens` reads, all digits kept.
+
+        Raises:
+            TypeError: the class of the zoom model or of the family is not registered (`register_model`), or
+                has fields that a file cannot hold.
+        """
+        check_kind("path", path, (str, os.PathLike))
+        polynomial = isinstance(self.family, RadialPolynomial)
+        content = {
+            "format": _FORMAT,
+            # Older readers know no families, and must not take this one's coefficients for a polynomial's.
+            "version": 1 if polynomial else _VERSION,
+            "image_size": list(self.image_size),
+            "centre": _numbers(self.centre),
+            "scale": self.scale,
+            "focal_unit": self.focal_unit,
+            "focal_range": _numbers(self.focal_range),
+            **({} if polynomial else {"family": family_name(self.family)}),
+            "radial": self.family.formula,
+            "zoom": described(self.zoom),
+        }
+        if self.focus_range is not None:
+            content["focus_range"] = _numbers(self.focus_range)
+        if self.shift is not None:
+            content["shift"] = described(self.shift)
+            content["shift_meaning"] = "centre at f = centre + scale (k_1(f), k_2(f)) of the model in shift"
+        with whole_file(path) as part:
+            part.write_text(json.dumps(content, indent=2) + "\n")
+
+    def check_range(self, focal: Num[AnyArray | ScalarLike, "..."], *, stacklevel: int = 2) -> None:
+        """Look at focal lengths, if their values are known (not under ``jit`` or ``vmap``).
+
+        Warns:
+            UserWarning: some are outside of the fitted range.
+
+        Raises:
+            ValueError: some are not positive and finite.
+        """
+        if traced((self, focal)):
+            return
+        # By NumPy alone: under ``jit`` even an operation of JAX on known arrays is traced.
+        low, high = np.asarray(self.focal_range, np.float64).tolist()
+        values = np.ravel(np.asarray(focal, np.float64))
+        if not values.size:
+            return
+        bad = ~(np.isfinite(values) & (values > 0))
+        if bad.any():
+            raise ValueError(f"Argument focal must be a positive number, but it is {values[bad][0]}.")
+        slack = _SLACK * values
+        if np.any((values < low - slack) | (values > high + slack)):
+            asked = f"The focal length {values[0]:g} {self.focal_unit} is"
+            if values.size > 1:
+                asked = f"Focal lengths from {values.min():g} to {values.max():g} {self.focal_unit} are"
+            warnings.warn(
+                f"{asked} asked for, and the lens was fitted on {low:g} to {high:g} {self.focal_unit}: "
+                "beyond that its distortion is extrapolated.",
+                stacklevel=stacklevel + 1,
+            )
+
+
+def _at(zoom, focal, focus, dtype):
+    """The coefficients of a zoom model at focal lengths of any shape, which come first."""
+    focal = jnp.asarray(focal, dtype)
+    if isinstance(zoom, AbstractFocusZoom):
+        if focus is None:
+            return zoom(focal.reshape(-1)[0], None)  # says what is missing
+        focal, focus = jnp.broadcast_arrays(focal, jnp.asarray(focus, dtype))
+        function, arguments = zoom, (focal, focus)
+    else:
+        function, arguments = zoom, (focal,)
+    for _ in range(focal.ndim):
+        function = jax.vmap(function)
+    return function(*arguments)
+
+
+def _bent(operands):
+    lens, focal, focus, within = operands
+    d = lens._distortion(focal, focus, within)
+    return d.family, d.coefficients, d.centre, d.scale
+
+
+def _coefficients(zoom: AbstractZoom | None) -> int | None:
+    """How many coefficients a zoom model gives; None where its arrays are not there, or a batch."""
+    leaves = jax.tree.leaves(zoom)
+    if not isinstance(zoom, AbstractZoom) or not all(eqx.is_array(leaf) for leaf in leaves):
+        return None
+    if isinstance(zoom, AbstractLinearZoom) and zoom.parameters is not None:
+        return zoom.parameters.shape[1] if zoom.parameters.ndim == 2 else None
+    kinds = tuple((leaf.shape, np.dtype(leaf.dtype)) for leaf in leaves)
+    return _number_of(jax.tree.structure(zoom), kinds, jnp.result_type(float))
+
+
+@functools.lru_cache(maxsize=1024)
+def _number_of(structure, kinds, _):
+    """How many coefficients there are, of a model known by its shapes: to trace it takes milliseconds."""
+    zoom = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*kind) for kind in kinds])
+    try:
+        shape = coefficients_shape(zoom)
+    except (jax.errors.JAXTypeError, IndexError, TypeError):  # that cannot be traced, or is a batch
+        return None
+    return shape[0] if len(shape) == 1 else None
+
+
+def _pair(content, name):
+    return array_of(name, np.asarray(content[name], np.float64), (2,))
+
+
+@kinds_checked
+def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
+    """Read a lens that `ZoomLens.save` wrote.
+
+    Models of users' own have to be registered before, by the module that defines them (`register_model`).
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is not such a file, or of a later version; the message names it.
+    """
+    try:
+        with open(path, encoding="utf-8") as file:
+            content = json.load(file)
+        if not isinstance(content, dict) or content.get("format") != _FORMAT:
+            raise ValueError("it describes no zoom lens; ZoomLens.save writes such a file")
+        if content["version"] not in range(1, _VERSION + 1):
+            raise ValueError(
+                f"its format version is {content['version']!r} and this zoomjax reads up to {_VERSION}; "
+                "update zoomjax"
+            )
+        lens = ZoomLens(
+            zoom=zoom_from(content["zoom"]),
+            centre=_pair(content, "centre"),
+            focal_range=_pair(content, "focal_range"),
+            image_size=content["image_size"],
+            focal_unit=content["focal_unit"],
+            shift=zoom_from(content["shift"], 2) if "shift" in content else None,
+            focus_range=_pair(content, "focus_range") if "focus_range" in content else None,
+            family=family_named(content.get("family", "RadialPolynomial")),
+        )
+        if not math.isclose(content["scale"], lens.scale, rel_tol=1e-6):
+            raise ValueError("its scale is not half the diagonal of its image_size")
+        return lens
+    except FileNotFoundError:
+        raise
+    except (
+        ValueError,
+        TypeError,
+        KeyError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+        OSError,
+    ) as error:
+        reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
+        raise ValueError(f"Cannot read a lens from {os.fspath(path)}: {reason}.") from error
+
+
+def _numbers(array):
+    """Nested lists of floats; JSON keeps every digit of them."""
+    return np.asarray(array, np.float64).tolist()

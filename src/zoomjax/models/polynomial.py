@@ -1,0 +1,45 @@
+"""The radial polynomial (eq. 1-2), the default family of distortions."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._core.types import AnyArray, Elements
+from .family import AbstractRadial, radial_factor, radial_orders, radial_slope
+
+
+class RadialPolynomial(AbstractRadial):
+    """``L = 1 + k1 t + ... + kN t^N``: the paper's (eq. 1-2)."""
+
+    formula: ClassVar[str] = (
+        "corrected = centre + z * scale * (1 + k1 r^2 + ... + kN r^2N), "
+        "z = (distorted - centre) / scale, r^2 = z.z"
+    )
+
+    def factor(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
+        """L."""
+        return radial_factor(squared, k)
+
+    def slope(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
+        """``1 + 3 k1 t + ... + (2N+1) kN t^N``."""
+        return radial_slope(squared, k)
+
+    def equation(self, r: Any, squared: Any, rho: Any, k: Elements) -> tuple[Any, Any]:
+        """``r L(t) - rho``."""
+        return r * radial_factor(squared, k) - rho, radial_slope(squared, k)
+
+    def conditions(self, size: int) -> np.ndarray:
+        """One: the slope."""
+        return (2 * radial_orders(size) + 1)[None]
+
+    def expansion_terms(self, size: int) -> int:
+        """Its own."""
+        return size
+
+    def expansion(
+        self, k: Elements, reach: Float[Array, ""]
+    ) -> tuple[Float[AnyArray, "power"], Float[AnyArray, "tangential"]]:
+        """Itself."""
+        del reach
+        return k, k[:0]

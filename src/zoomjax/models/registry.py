@@ -1,0 +1,226 @@
+"""The zoom models and families of distortions that ``lens.json`` can hold, by name.
+
+A file names the class of its models, and holds their fields as plain numbers. It is never asked what to
+import or to run: only classes that have been registered in this process are made from it. Users' own join
+ours by `register_model`.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar, cast, overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .brown_conrady import BrownConrady
+from .division import Division
+from .family import AbstractFamily
+from .focus import FocusSplineZoom
+from .polynomial import RadialPolynomial
+from .power import PowerZoom
+from .smooth import SmoothZoom
+from .spline import SplineZoom
+from .tables import TableZoom
+from .two_region import TwoRegionZoom
+from .zoom import AbstractFocusZoom, AbstractZoom, PolynomialZoom
+
+Model = TypeVar("Model", bound=AbstractZoom | AbstractFamily)
+
+_ZOOMS: dict[str, type[AbstractZoom]] = {}
+_FAMILIES: dict[str, type[AbstractFamily]] = {}
+
+_RESERVED = {"model", "formula"}
+"""Keys of a model in the file beside its fields."""
+
+
+@overload
+def register_model(cls: type[Model], *, name: str | None = None) -> type[Model]: ...
+
+
+@overload
+def register_model(
+    cls: None = None, *, name: str | None = None
+) -> Callable[[type[Model]], type[Model]]: ...
+
+
+def register_model(cls: Any = None, *, name: str | None = None) -> Any:
+    """Let lenses with a zoom model, or a family of distortions, of one's own be saved and loaded.
+
+    The process that loads has to register the class, too: import the module that does so first. The file
+    holds the model's name, its formula and its fields: arrays and numbers, and in static fields also
+    booleans, words, None and tuples of these. Families have no fields.
+
+    Args:
+        cls: a final class of `AbstractZoom` or `AbstractFamily`, with a class attribute ``formula``: a
+            sentence, for readers of the file, on what its numbers mean.
+        name: what files call it, the name of the class by default.
+
+    Returns:
+        The class itself, so that this serves as a decorator.
+
+    Raises:
+        TypeError: it is no such class, has no formula, or its fields cannot be told from the file's own.
+        ValueError: another class has that name.
+
+    Example:
+        >>> from typing import ClassVar
+        >>> import jax.numpy as jnp
+        >>> from zoomjax import AbstractLinearZoom
+        >>> @register_model
+        ... class ConstantZoom(AbstractLinearZoom):
+        ...     formula: ClassVar[str] = "k_i(f) = parameters[0][i-1]"
+        ...     parameters: jnp.ndarray | None = None
+        ...
+        ...     def prepare(self, focal, terms):
+        ...         return ConstantZoom(jnp.zeros((1, terms)))
+        ...
+        ...     def basis(self, focal):
+        ...         return jnp.ones(1)
+    """
+    if cls is None:
+        return functools.partial(register_model, name=name)
+    kinds: dict[type, dict[str, Any]] = {AbstractZoom: _ZOOMS, AbstractFamily: _FAMILIES}
+    table = next((kinds[k] for k in kinds if isinstance(cls, type) and issubclass(cls, k)), None)
+    if table is None:
+        raise TypeError(
+            f"Argument cls must be a class of AbstractZoom or AbstractFamily, but it is {cls!r}."
+        )
+    if not isinstance(getattr(cls, "formula", None), str):
+        raise TypeError(
+            f'{cls.__name__} needs a class attribute formula: ClassVar[str] = "...", which says in '
+            "the file what its numbers mean."
+        )
+    fields = {field.name for field in dataclasses.fields(cls)}
+    if table is _FAMILIES and fields:
+        raise TypeError(f"A family has no fields, but {cls.__name__} has {', '.join(sorted(fields))}.")
+    if clash := fields & _RESERVED:
+        raise TypeError(f"{cls.__name__} must not have a field {clash.pop()}, a key of the file's own.")
+    name = cast(str, cls.__name__) if name is None else name
+    other = table.get(name)
+    # The cell of a notebook, run again, makes the same class anew.
+    if other is not None and (other.__module__, other.__qualname__) != (cls.__module__, cls.__qualname__):
+        raise ValueError(
+            f"Another class is registered as {name!r}, {other.__module__}.{other.__qualname__}: give this "
+            'one another name by register_model(name="...").'
+        )
+    table[name] = cls
+    return cls
+
+
+for _model in (
+    *(PolynomialZoom, TableZoom, SplineZoom, PowerZoom, TwoRegionZoom, SmoothZoom, FocusSplineZoom),
+    *(RadialPolynomial, Division, BrownConrady),
+):
+    register_model(_model)
+
+
+def family_name(family: AbstractFamily) -> str:
+    """What files call a family; TypeError if it is not registered."""
+    return _name_of(family, _FAMILIES)
+
+
+def family_named(name: Any) -> AbstractFamily:
+    """The family that files call so; ValueError if none is registered."""
+    return _class_named(name, _FAMILIES, "family of distortions")()
+
+
+def described(model: AbstractZoom) -> dict[str, Any]:
+    """A zoom model as JSON knows it; TypeError if it is not registered or JSON cannot hold its fields."""
+    content: dict[str, Any] = {"model": _name_of(model, _ZOOMS), "formula": type(model).formula}
+    for field in dataclasses.fields(model):
+        value = getattr(model, field.name)
+        try:
+            content[field.name] = _plain(value) if field.metadata.get("static") else _listed(value)
+        except TypeError as error:
+            raise TypeError(
+                f"A lens with a {type(model).__name__} cannot be saved: its field {field.name} {error}."
+            ) from error
+    return content
+
+
+def zoom_from(content: Any, numbers: int | None = None) -> AbstractZoom:
+    """The zoom model that is described so, of so many coefficients; ValueError where it is none."""
+    model = _class_named(content["model"], _ZOOMS, "zoom model")
+    fields = {}
+    for field in dataclasses.fields(model):
+        value = content[field.name]
+        if field.metadata.get("static"):
+            fields[field.name] = _fixed(value)
+        elif value is not None or field.default is not None:
+            fields[field.name] = array_of(field.name, value)
+    zoom = model(**fields)
+    shape = coefficients_shape(zoom)
+    if len(shape) != 1 or numbers not in (None, *shape):
+        raise ValueError("its parameters are not those of its model")
+    return zoom
+
+
+def coefficients_shape(zoom: AbstractZoom) -> tuple[int, ...]:
+    """The shape of a zoom model's coefficients, (N,) unless it is a batch of them."""
+    settings = [jax.ShapeDtypeStruct((), jnp.result_type(float))] * (
+        2 if isinstance(zoom, AbstractFocusZoom) else 1
+    )
+    return eqx.filter_eval_shape(zoom, *settings).shape
+
+
+def _class_named(name: Any, table: dict[str, Any], kind: str) -> Any:
+    if not isinstance(name, str) or name not in table:
+        raise ValueError(
+            f"its {kind}, {name!r}, is unknown: import the module that registers it by "
+            "zoomjax.register_model, or update zoomjax"
+        )
+    return table[name]
+
+
+def _name_of(model: AbstractZoom | AbstractFamily, table: dict[str, Any]) -> str:
+    for name, cls in table.items():
+        if cls is type(model):
+            return name
+    raise TypeError(
+        f"A lens with a {type(model).__name__} cannot be saved: register the class by "
+        "zoomjax.register_model, before it is saved and before it is loaded."
+    )
+
+
+def _listed(value: Any) -> Any:
+    """An array as nested lists; JSON keeps every digit of them."""
+    if value is None or isinstance(value, bool | int | float):
+        return value
+    if not eqx.is_array(value) or np.asarray(value).dtype.kind not in "biuf":
+        raise TypeError(f"is no array of real numbers, but a {type(value).__name__}")
+    array = np.asarray(value)
+    return (array.astype(np.float64) if array.dtype.kind == "f" else array).tolist()
+
+
+def _plain(value: Any) -> Any:
+    """A static field as JSON knows it."""
+    if isinstance(value, tuple):
+        return [_plain(entry) for entry in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"is static and no None, boolean, number, text or tuple of these, but {value!r}")
+
+
+def _fixed(value: Any) -> Any:
+    """A static field from what JSON makes of it."""
+    if isinstance(value, list):
+        return tuple(_fixed(entry) for entry in value)
+    if isinstance(value, dict):
+        raise ValueError("a static field of its model is a table")
+    return value
+
+
+def array_of(name: str, value: Any, shape: tuple[int, ...] | None = None) -> jax.Array:
+    """The array of a file's entry, floats in JAX's own dtype for them; ValueError where it is none."""
+    array = np.asarray(value)
+    if array.dtype.kind in "iuf" and (shape is None or array.shape == shape) and array.size:
+        dtype = jnp.result_type(float if array.dtype.kind == "f" else int)
+        largest = jnp.finfo(dtype).max if array.dtype.kind == "f" else jnp.iinfo(dtype).max
+        if (abs(array) <= largest).all():
+            return jnp.asarray(array, dtype)
+    if array.dtype.kind == "b" and shape is None:
+        return jnp.asarray(array)
+    raise ValueError(f"the numbers of its {name!r} are incomplete or not finite")

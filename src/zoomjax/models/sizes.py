@@ -1,0 +1,159 @@
+"""Which images a lens, and a distortion, are for; a lens for images of another size.
+
+A `ZoomLens` knows the size of its images. A `Distortion` knows its centre and scale alone; but of a lens
+those are the middle of the image, or near it, and half the diagonal, from which another size shows.
+"""
+
+import dataclasses
+import math
+import warnings
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .._core.arguments import kinds_checked
+from .._core.checks import checked_size
+from .._core.types import traced
+from .distortion import Distortion
+from .lens import ZoomLens
+
+_SAME_SCALE = 0.01
+"""By which a scale may differ from half the image's diagonal and count as that."""
+
+
+@kinds_checked
+def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
+    """The same lens for images that show the same view with more or fewer pixels.
+
+    The normalised coefficients stay; the centre scales with the half pixel: ``(c + 1/2) w'/w - 1/2``.
+    Focal lengths stay those of the lens, also in px: they are of images of its own size.
+
+    Args:
+        lens: the lens.
+        image_size: (width, height) px of the images.
+
+    Raises:
+        ValueError: the images have another aspect ratio, so that they cannot show the same view.
+
+    Warns:
+        UserWarning: the size is another, and the lens was scaled.
+
+    Example:
+        >>> from zoomjax.scenes.board import nikkor_18_200
+        >>> lens_for_size(nikkor_18_200(), (4288, 2848)).image_size
+        (4288, 2848)
+    """
+    size = checked_size(image_size)
+    if size == lens.image_size:
+        return lens
+    check_aspect(size, lens.image_size)
+    (width, height), (old_width, old_height) = size, lens.image_size
+    warnings.warn(
+        f"The lens is for images of {old_width} x {old_height} px, and this one has {width} x {height}: "
+        "its distortion is scaled to them.",
+        stacklevel=2,
+    )
+    centre = jnp.asarray(lens.centre)
+    ratio = jnp.asarray([width / old_width, height / old_height], centre.dtype)
+    return dataclasses.replace(lens, centre=(centre + 0.5) * ratio - 0.5, image_size=size)
+
+
+def check_aspect(image_size: tuple[int, int], lens_size: tuple[int, int]) -> None:
+    """Refuse images that cannot show the same view as those of a lens.
+
+    Raises:
+        ValueError: the aspect ratio is another, by more than rounding.
+    """
+    (width, height), (old_width, old_height) = image_size, lens_size
+    if abs(width * old_height - height * old_width) > max(old_width, old_height, width, height):
+        raise ValueError(
+            f"The lens is for images of {old_width} x {old_height} px, and this one has {width} x "
+            f"{height}, another aspect ratio: it was cropped, turned, or taken in another mode. Give "
+            "images as they were when the lens was calibrated."
+        )
+
+
+def checked_distortion(distortion: Any, name: str = "distortion") -> Distortion:
+    """One `Distortion`.
+
+    Raises:
+        ValueError: it is something else, such as a lens, which becomes one by a focal length.
+    """
+    if isinstance(distortion, Distortion) and np.ndim(distortion.coefficients) == 1:
+        return distortion
+    if isinstance(distortion, Distortion):
+        kind = "several at once: give one"
+    elif isinstance(distortion, ZoomLens):
+        kind = "a ZoomLens: give lens(focal)"
+    else:
+        kind = f"a {type(distortion).__name__}: give lens(focal), of the lens of a fit fit.lens(focal)"
+    raise ValueError(f"Argument {name} must be a Distortion, but it is {kind}.")
+
+
+def check_image_size(distortion: Distortion, image_size: tuple[int, int]) -> None:
+    """Refuse a distortion that is plainly one of images of another size.
+
+    So it is if another image explains centre and scale and this one does not: the other's middle is the
+    centre, and half its diagonal the scale; or it shows the same view in another size, or turned, and the
+    centre is nearer, by far, to its middle than to that of this image. Nothing is checked under ``jit`` or
+    ``vmap``.
+
+    Raises:
+        ValueError: so it is; the message tells the size.
+    """
+    known = all(isinstance(side, int | np.integer) for side in image_size)  # or symbolic, for `jax.export`
+    if not known or traced((distortion.centre, distortion.scale)):
+        return
+    centre, scale = np.asarray(distortion.centre, float), float(distortion.scale)
+    width, height = image_size
+    half = math.hypot(width, height) / 2
+    ratio = scale / half
+
+    here = _off_middle(centre, width, height)
+    if abs(ratio - 1) > _SAME_SCALE:
+        other = tuple(2 * centre + 1)  # in the middle of which the centre is
+        explained = min(other) > 0 and abs(math.hypot(*other) / 2 - scale) < _SAME_SCALE * scale
+        if not explained:
+            other = (ratio * width, ratio * height)
+            explained = 2 * _off_middle(centre, *other) < here
+    else:
+        other = (height, width)
+        explained = 4 * _off_middle(centre, *other) < here
+    if explained:
+        middle = f"({(width - 1) / 2:.5g}, {(height - 1) / 2:.5g})"
+        raise ValueError(
+            f"The distortion is that of images of another size: its centre is ({centre[0]:.5g}, "
+            f"{centre[1]:.5g}) and its scale {scale:.5g} px, and this one, of {width} x {height} px, has "
+            f"its middle at {middle} and half a diagonal of {half:.5g}. "
+            f"Give images of the lens's size, or lens_for_size(lens, ({width}, {height}))(focal). If the "
+            "image is a crop and the distortion is meant so, give a Framing of your own: "
+            f"Framing(np.array(1.0), np.zeros(2), ({width}, {height}))."
+        )
+
+
+def _off_middle(centre: np.ndarray, width: float | int, height: float | int) -> float:
+    """How far the centre is from the middle of an image, in halves of its diagonal."""
+    return (
+        2
+        * math.hypot(centre[0] - (width - 1) / 2, centre[1] - (height - 1) / 2)
+        / math.hypot(width, height)
+    )
+
+
+def check_channels_last(shape: tuple[int, ...]) -> None:
+    """Refuse images with channels first, which would be taken for images of 3 rows.
+
+    Raises:
+        ValueError: the shape is (1, 3 or 4, rows, columns).
+    """
+    if len(shape) == 3 and shape[0] in (1, 3, 4) and shape[-1] > 4:
+        raise ValueError(
+            "Argument image must have its channels last, (height, width, channels), but its shape is "
+            f"{shape}. Move the axis: jnp.moveaxis(image, 0, -1)."
+        )
+
+
+at_focal = eqx.filter_jit(lambda lens, focal: lens._distortion(focal, None))
+"""``lens(focal)`` compiled: 0.05 ms instead of 2, for videos; without the check of the range."""

@@ -1,0 +1,254 @@
+"""Zoom models: how the distortion coefficients depend on the focal length.
+
+The paper's is a polynomial in 1/f for each coefficient (eq. 9-10), ``k(f) = phi(f) . a`` with the
+basis ``phi = (1, u, ..., u^n)`` of ``u = f_ref/f`` in (0, 1]. A new model is a final class of
+`AbstractZoom`, or of `AbstractLinearZoom` where it is linear in its parameters: then only its basis
+has to be written, and the algebraic estimate applies to it too.
+"""
+
+import abc
+from typing import ClassVar, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree, ScalarLike
+
+from .._core.checks import checked_integer
+from .._core.fields import check_positive, check_shapes, numbers
+from .._core.types import AnyArray, Coefficients, Focal, Focus, Scalar, traced
+from ._bernstein import Pieces, power_controls
+
+SomeZoom = TypeVar("SomeZoom", bound="AbstractZoom")
+
+
+class AbstractZoom(eqx.Module):
+    """A map from a focal length to the coefficients (k1, ..., kN) of the normalised radius.
+
+    `parameters` holds what a fit adjusts, and is None in a model that has only been specified, as in
+    ``fit_zoom(lines, zoom=PolynomialZoom(degree=2))``. Other array fields stay as `prepare` set them.
+    Lenses with a model of one's own are saved once its class is registered (`register_model`), with a class
+    attribute ``formula`` that says what its numbers mean.
+    """
+
+    formula: ClassVar[str]
+    parameters: eqx.AbstractVar[PyTree]
+
+    @abc.abstractmethod
+    def prepare(self, focal: Focal, terms: int) -> "AbstractZoom":
+        """This model made ready for these focal lengths: knots and references set, parameters zero.
+
+        Raises:
+            ValueError: the focal lengths cannot determine the parameters.
+        """
+
+    @abc.abstractmethod
+    def __call__(self, focal: ScalarLike) -> Coefficients:
+        """The coefficients at one focal length."""
+
+    def pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces | None:
+        """The coefficients from the shortest to the longest of these focal lengths, as polynomials.
+
+        What `certify` proves invertibility from. None in a model that does not state them.
+        """
+        del focal_range
+        return None
+
+
+class AbstractLinearZoom(AbstractZoom):
+    """A zoom model that is linear in its parameters: ``k(f) = basis(f) @ parameters``."""
+
+    parameters: eqx.AbstractVar[Float[AnyArray, "basis terms"] | None]
+
+    @abc.abstractmethod
+    def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:
+        """The values of the basis functions at one focal length."""
+
+    def basis_pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces | None:
+        """The basis functions over a range of focal lengths, as polynomials; see `AbstractZoom.pieces`."""
+        del focal_range
+        return None
+
+    def __call__(self, focal: ScalarLike) -> Coefficients:
+        """The coefficients at one focal length."""
+        return _combined(self.basis(focal), _fitted(self))
+
+    def pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces | None:
+        """The coefficients over a range of focal lengths, as polynomials."""
+        basis = self.basis_pieces(focal_range)
+        if basis is None:
+            return None
+        parameters = jnp.asarray(_fitted(self))
+        controls = jnp.einsum("pcb,bt->pct", basis.controls, parameters, precision="highest")
+        return Pieces(controls, basis.ends, basis.focal_of, (1 + basis.size) @ jnp.abs(parameters))
+
+
+def _combined(basis, parameters):
+    """``basis @ parameters``; few functions are written out, which XLA fuses with what uses them."""
+    if basis.shape[0] > _WRITTEN_OUT:
+        return basis @ parameters
+    coefficients = basis[0] * parameters[0]
+    for value, row in zip(basis[1:], parameters[1:], strict=True):
+        coefficients = coefficients + value * row
+    return coefficients
+
+
+_WRITTEN_OUT = 8
+"""Basis functions up to which their sum is written out."""
+
+
+class AbstractPriorZoom(AbstractLinearZoom):
+    """A linear zoom model that knows, before any line is seen, what its parameters are likely to be.
+
+    A fit minimises the energy (eq. 13) and ``error^2 / M`` times the sum of squares of the `standardised`
+    parameters, for M frames: the mode of their posterior, if each frame by itself is wrong by an RMS of
+    `error`. So frames outweigh the prior as they become more, and with an error of 0 it has no weight.
+
+    Attributes:
+        error: RMS distance to straightness, in half image diagonals, that a frame is wrong by.
+    """
+
+    error: eqx.AbstractVar[Scalar]
+
+    @abc.abstractmethod
+    def standardised(self) -> Float[Array, "row"]:
+        """The parameters as numbers that are independent a priori, of mean 0 and variance 1."""
+
+
+class AbstractFocusZoom(AbstractLinearZoom):
+    """A linear zoom model whose coefficients depend on the focus, too: ``k(f, d)``.
+
+    The focus d is any number that grows or falls with it, such as the reciprocal of the distance focused
+    on; lines carry one a frame (``Lines.from_ragged(..., focus=...)``). `at_focus` gives the model at one.
+    """
+
+    @abc.abstractmethod
+    def prepare(self, focal: Focal, terms: int, focus: Focus | None = None) -> "AbstractFocusZoom":
+        """This model made ready for these focal lengths and focuses, a pair a frame."""
+
+    @abc.abstractmethod
+    def basis(self, focal: ScalarLike, focus: ScalarLike | None = None) -> Float[Array, "basis"]:
+        """The values of the basis functions at one focal length and focus."""
+
+    @abc.abstractmethod
+    def at_focus(self, focus: ScalarLike) -> AbstractLinearZoom:
+        """The model of the focal length alone that this one is at one focus."""
+
+    def __call__(self, focal: ScalarLike, focus: ScalarLike | None = None) -> Coefficients:
+        """The coefficients at one focal length and focus.
+
+        Raises:
+            ValueError: the focus is missing.
+        """
+        return _combined(self.basis(focal, focus), _fitted(self))
+
+
+class PolynomialZoom(AbstractLinearZoom):
+    """The paper's model: each coefficient a polynomial of `degree` n in 1/f (eq. 9-10).
+
+    Attributes:
+        degree: n; 0 is one distortion for all focal lengths, 2 the paper's choice.
+        parameters: a, where ``k_i(f) = sum_j a[j, i] (focal_ref/f)^j``; None until fitted.
+        focal_ref: the shortest focal length fitted.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> zoom = PolynomialZoom(1, jnp.array([[0.0], [0.1]]), jnp.array(20.0))
+        >>> zoom(jnp.array(40.0)).tolist()
+        [0.05000000074505806]
+    """
+
+    formula: ClassVar[str] = "k_i(f) = sum_j parameters[j][i-1] * (focal_ref / f)^j"
+    degree: int = eqx.field(
+        static=True, default=2, converter=lambda degree: checked_integer("degree", degree, 0)
+    )
+    parameters: Float[AnyArray, "basis terms"] | None = eqx.field(
+        default=None, converter=numbers("parameters")
+    )
+    focal_ref: Scalar | None = eqx.field(default=None, converter=numbers("focal_ref"))
+
+    def __check_init__(self):
+        """Check the parameters' shape: a row for each power, 0 to the degree."""
+        check_shapes(
+            {"parameters": (self.parameters, (self.degree + 1, "terms")), "focal_ref": (self.focal_ref, ())}
+        )
+        check_positive("focal_ref", self.focal_ref)
+
+    @classmethod
+    def from_inverse_focal(
+        cls, coefficients: Float[AnyArray, "basis terms"], focal_ref: ScalarLike
+    ) -> "PolynomialZoom":
+        """The model ``k_i(f) = sum_j coefficients[j, i] f^(-j)``, stated about `focal_ref`."""
+        coefficients = jnp.asarray(coefficients)
+        focal_ref = jnp.asarray(focal_ref, coefficients.dtype)
+        power = jnp.arange(coefficients.shape[0])
+        return cls(
+            degree=coefficients.shape[0] - 1,
+            parameters=coefficients * focal_ref ** -power[:, None].astype(coefficients.dtype),
+            focal_ref=focal_ref,
+        )
+
+    def in_inverse_focal(self) -> Float[Array, "basis terms"]:
+        """The polynomials' coefficients of ``f^(-j)``, as the paper prints them (but normalised)."""
+        parameters = _fitted(self)
+        power = jnp.arange(self.degree + 1, dtype=parameters.dtype)
+        return parameters * jnp.asarray(self.focal_ref) ** power[:, None]
+
+    def prepare(self, focal: Focal, terms: int) -> "PolynomialZoom":
+        """Zero polynomials about the shortest focal length."""
+        if not traced(focal):
+            check_distinct(f"A polynomial of degree {self.degree} in 1/f", focal, self.degree + 1)
+            focal = np.asarray(focal)  # its minimum then compiles nothing
+        return PolynomialZoom(
+            degree=self.degree,
+            parameters=jnp.asarray(np.zeros((self.degree + 1, terms), focal.dtype)),
+            focal_ref=jnp.asarray(focal.min()),
+        )
+
+    def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:
+        """``(1, u, ..., u^n)`` with ``u = focal_ref/f``."""
+        if self.focal_ref is None:
+            raise ValueError(UNFITTED)
+        u = self.focal_ref / focal
+        return jnp.stack([u**j for j in range(self.degree + 1)])
+
+    def basis_pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces:
+        """One piece, in 1/f."""
+        if self.focal_ref is None:
+            raise ValueError(UNFITTED)
+        return inverse_powers(self.focal_ref, focal_range, self.degree)
+
+
+def inverse_powers(focal_ref: ScalarLike, focal_range: Float[AnyArray, "2"], degree: int) -> Pieces:
+    """The powers of ``focal_ref / f`` over a range of focal lengths: one piece."""
+    ends = 1 / jnp.asarray(focal_range)[::-1]
+    controls = power_controls(focal_ref * ends[0], focal_ref * ends[1], degree)
+    return Pieces(controls[None], ends[None], jnp.reciprocal, controls[-1])
+
+
+def with_parameters(zoom: SomeZoom, parameters: PyTree) -> SomeZoom:
+    """The same model with other parameters."""
+    return eqx.tree_at(lambda model: model.parameters, zoom, parameters, is_leaf=lambda leaf: leaf is None)
+
+
+def check_distinct(what: str, focal: Focal, least: int) -> None:
+    """Raise ValueError where there are fewer distinct focal lengths than a model needs."""
+    distinct = np.unique(np.asarray(focal)).size
+    if distinct < least:
+        raise ValueError(
+            f"{what} needs lines at {least} or more distinct focal lengths, but there are {distinct}. "
+            "Choose a model with fewer parameters (a lower degree, say), or add images at other focal "
+            "lengths."
+        )
+
+
+UNFITTED = (
+    "This zoom model has been specified but not fitted: pass it to fit_zoom(lines, zoom=...), and "
+    "use the model in the result, fit.lens.zoom."
+)
+
+
+def _fitted(zoom: AbstractZoom) -> PyTree:
+    if zoom.parameters is None:
+        raise ValueError(UNFITTED)
+    return zoom.parameters

@@ -1,0 +1,18 @@
+# The public names of this room: read by type checkers, and by lazy_loader at run time.
+
+from .bands import coefficient_std as coefficient_std
+from .bands import displacement_band as displacement_band
+from .bands import displacement_covariance as displacement_covariance
+from .bands import displacement_std as displacement_std
+from .bands import std_of as std_of
+from .cramer_rao_bounds import cramer_rao as cramer_rao
+from .cramer_rao_bounds import displacement_bound as displacement_bound
+from .cramer_rao_bounds import displacement_rms as displacement_rms
+from .cross_validation import held_out_frames as held_out_frames
+from .cross_validation import held_out_zoom as held_out_zoom
+from .next_photo import Suggestion as Suggestion
+from .next_photo import suggest_next as suggest_next
+from .selection import Candidate as Candidate
+from .selection import Selection as Selection
+from .selection import Verdict as Verdict
+from .selection import select_model as select_model

@@ -1,0 +1,236 @@
+"""How far a fitted lens may be off: standard deviations and bands of whatever is computed from it.
+
+The delta method: a quantity q(a) of the parameters a, whose covariance is C, has the covariance
+``(dq/da) C (dq/da)^T``. For the coefficients at a focal length, and for where the lens puts a point, of any
+zoom model that is linear in its parameters, that is exact, for those points' q is linear too.
+
+Once per call one derivative by each parameter; nothing is fitted or sampled.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jax.scipy.stats import norm
+from jaxtyping import Array, Float, Num, PyTree, ScalarLike
+
+from .._core.arguments import kinds_checked
+from .._core.types import AnyArray, Points
+from ..fit.result import ZoomFit
+from ..models.lens import ZoomLens
+from ..models.zoom import with_parameters
+
+Focals = Num[AnyArray | ScalarLike, "*focal"]
+
+
+@kinds_checked
+def std_of(fit: ZoomFit, function: Callable[[ZoomLens], PyTree]) -> PyTree:
+    """Standard deviations of anything computed from a fitted lens.
+
+    Args:
+        fit: the fit.
+        function: from a lens to arrays, differentiable by JAX.
+
+    Returns:
+        What `function` returns, each number replaced by its standard deviation: infinite where it depends
+        on a parameter that the lines do not determine.
+
+    Example:
+        >>> import jax.numpy as jnp, numpy as np
+        >>> from zoomjax import Lines, PolynomialZoom, compress, fit_zoom
+        >>> rng, t = np.random.default_rng(0), np.linspace(10.0, 470.0, 60)
+        >>> points = [np.stack([x + 0.1 * rng.standard_normal(60), t], -1) for x in range(20, 620, 60)]
+        >>> lines = Lines.from_ragged(points, [0] * 10, [50], image_size=(640, 480))
+        >>> fit = fit_zoom(compress(lines), zoom=PolynomialZoom(degree=0), terms=1)
+        >>> pixel = jnp.array([600.0, 440.0])
+        >>> std_of(fit, lambda lens: lens(50.0).distort(pixel)).shape
+        (2,)
+    """
+    lens = fit.lens
+    flat, unravel = ravel_pytree(lens.zoom.parameters)
+
+    def at(flat):
+        return function(
+            eqx.tree_at(lambda lens: lens.zoom, lens, with_parameters(lens.zoom, unravel(flat)))
+        )
+
+    derivatives = jax.jacfwd(at)(flat)
+    return jax.tree.map(lambda rows: _root(_variance(fit.covariance, rows)), derivatives)
+
+
+@kinds_checked
+@eqx.filter_jit
+def coefficient_std(fit: ZoomFit, focal: Focals) -> Float[Array, "*focal terms"]:
+    """Standard deviations of the normalised coefficients k1(f), ..., kN(f).
+
+    Args:
+        fit: the fit.
+        focal: one focal length or an array of them, in the lens's unit. Beyond the fitted range the bands
+            widen as the model's parameters let them: they know nothing of the model being wrong there.
+
+    Returns:
+        For each focal length N numbers, infinite where the lines do not determine them.
+
+    Example:
+        >>> import numpy as np
+        >>> from zoomjax import compress, fit_zoom, scenes
+        >>> focal = scenes.focal_sweep(3)
+        >>> lines = scenes.board_lines(scenes.nikkor_18_200(), focal, spacing=99.0, noise=0.5)
+        >>> coefficient_std(fit_zoom(compress(lines)), focal).shape
+        (3, 2)
+    """
+    return _each_focal(lambda f: std_of(fit, lambda lens: lens.zoom(f)), fit, focal)
+
+
+@kinds_checked
+@eqx.filter_jit
+def displacement_covariance(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Array, "*both 2 2"]:
+    """Covariance, px^2, of where the lens puts points: of corrected positions, and so of displacements.
+
+    Args:
+        fit: the fit.
+        points: distorted image points, px, of any leading shape.
+        focal: focal length of each point, of a shape that broadcasts with the points' leading shape.
+
+    Returns:
+        A matrix for each point, for x and y; infinite on its diagonal where the lines do not determine it.
+        Radial lenses are uncertain along the radius alone: their matrices have rank 1.
+
+    Example:
+        >>> import numpy as np
+        >>> from zoomjax import compress, fit_zoom, scenes
+        >>> focal = scenes.focal_sweep(3)
+        >>> lines = scenes.board_lines(scenes.nikkor_18_200(), focal, spacing=99.0, noise=0.5)
+        >>> displacement_covariance(fit_zoom(compress(lines)), np.zeros((5, 1, 2)), focal=focal).shape
+        (5, 3, 2, 2)
+    """
+    return _each_point(_point_covariance, "(c,d)", fit, points, focal)
+
+
+@kinds_checked
+@eqx.filter_jit
+def displacement_std(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Array, "*both"]:
+    """Standard deviation, px, of where the lens puts points: the root of the mean squared distance.
+
+    For radial lenses it is the standard deviation along the radius.
+
+    Args:
+        fit, points, focal: as for `displacement_covariance`.
+
+    Returns:
+        A number for each point; infinite where the lines do not determine it.
+
+    Example:
+        >>> import numpy as np
+        >>> from zoomjax import compress, fit_zoom, scenes
+        >>> focal = scenes.focal_sweep(3)
+        >>> lines = scenes.board_lines(scenes.nikkor_18_200(), focal, spacing=99.0, noise=0.5)
+        >>> bool(displacement_std(fit_zoom(compress(lines)), np.zeros(2), focal=50.0) < 0.5)
+        True
+    """
+    return _each_point(lambda *one: _root(jnp.trace(_point_covariance(*one))), "()", fit, points, focal)
+
+
+@kinds_checked
+@eqx.filter_jit
+def displacement_band(
+    fit: ZoomFit, points: Points, *, focal: Focals, level: ScalarLike = 0.95
+) -> tuple[Float[Array, "*both"], Float[Array, "*both"]]:
+    """Between what outward displacements, px, the true one lies, with a probability of `level`.
+
+    The displacement is how much farther from the centre of distortion the corrected point is than the
+    point itself; negative where correcting moves it inwards.
+
+    Args:
+        fit, points, focal: as for `displacement_covariance`.
+        level: between 0 and 1.
+
+    Returns:
+        The lower and the upper end for each point.
+
+    Example:
+        >>> import numpy as np
+        >>> from zoomjax import compress, fit_zoom, scenes
+        >>> lens, focal = scenes.nikkor_18_200(), scenes.focal_sweep(3)
+        >>> lines = scenes.board_lines(lens, focal, spacing=99.0, noise=0.5)
+        >>> low, high = displacement_band(fit_zoom(compress(lines)), np.zeros(2), focal=50.0)
+        >>> bool(low < high)
+        True
+    """
+    quantile = norm.ppf((1 + jnp.asarray(level)) / 2)
+
+    def band(fit, point, f):
+        offset = point - jnp.asarray(fit.lens.centre, point.dtype)
+        squared = offset @ offset
+        outward = offset / jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 1)
+        variance = _variance(fit.covariance, outward @ _point_rows(fit, point, f))
+        middle = (fit.lens(f).undistort(point) - point) @ outward
+        half = quantile.astype(point.dtype) * _root(variance)
+        return jnp.stack([middle - half, middle + half])
+
+    ends = _each_point(band, "(e)", fit, points, focal)
+    return ends[..., 0], ends[..., 1]
+
+
+def _each_focal(function, fit, focal):
+    focal = jnp.asarray(focal, fit.covariance.dtype)
+    return jnp.vectorize(function, signature="()->(k)")(focal)
+
+
+def _each_point(function, result, fit, points, focal):
+    """Apply a function of the fit, one point and one focal length to all of them."""
+    dtype = fit.covariance.dtype
+    points, focal = jnp.asarray(points, dtype), jnp.asarray(focal, dtype)
+    if points.shape[-1:] != (2,):
+        raise ValueError(f"Argument points must have shape (..., 2), but its shape is {points.shape}.")
+    both = jnp.broadcast_shapes(points.shape[:-1], focal.shape)
+    over = jnp.vectorize(lambda *one: function(fit, *one), signature=f"(c),()->{result}")
+    return over(jnp.broadcast_to(points, (*both, 2)), jnp.broadcast_to(focal, both))
+
+
+def _point_rows(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 parameter"]:
+    """Derivatives of one corrected point by the parameters."""
+    flat, unravel = ravel_pytree(fit.lens.zoom.parameters)
+
+    def corrected(flat):
+        zoom = with_parameters(fit.lens.zoom, unravel(flat))
+        return eqx.tree_at(lambda lens: lens.zoom, fit.lens, zoom)(f).undistort(point)
+
+    return jax.jacfwd(corrected)(flat)
+
+
+def _point_covariance(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 2"]:
+    """Of one corrected point."""
+    rows = _point_rows(fit, point, f)
+    variance = _variance(fit.covariance, rows)
+    covariance = rows @ _finite(fit.covariance) @ rows.T
+    unknown = jnp.any(jnp.isinf(variance))
+    off_diagonal = jnp.where(unknown, 0, covariance)
+    return jnp.where(jnp.eye(2, dtype=bool), variance[:, None], off_diagonal)
+
+
+def _variance(covariance, rows):
+    """The diagonal of ``rows C rows^T``, infinite where a row uses a parameter of infinite variance.
+
+    Never below what rounding may make of it. Focal lengths that are nearly the same give parameters with
+    variances of 1e18, say, whose sum cancels: its last digits, or a negative number, say nothing.
+    """
+    finite = jnp.einsum("...p,pq,...q->...", rows, _finite(covariance), rows)
+    size = jnp.einsum("...p,pq,...q->...", *map(jnp.abs, (rows, _finite(covariance), rows)))
+    rounding = jax.lax.stop_gradient(rows.shape[-1] * jnp.finfo(rows.dtype).eps * size)
+    unknown = jnp.isinf(jnp.diagonal(covariance)).astype(rows.dtype)
+    return jnp.where((rows != 0).astype(rows.dtype) @ unknown > 0, jnp.inf, jnp.maximum(finite, rounding))
+
+
+def _finite(covariance):
+    return jnp.where(jnp.isinf(covariance), 0, covariance)
+
+
+def _root(variance):
+    """The square root, with a gradient of zero at zero, and infinity left as it is."""
+    regular = (variance > 0) & jnp.isfinite(variance)
+    root = jnp.sqrt(jnp.where(regular, variance, 1))
+    return jnp.where(regular, root, jnp.where(jnp.isinf(variance), jnp.inf, 0))

@@ -1,0 +1,171 @@
+"""Straightness of lines that a fit has not seen: cross-validation over focal lengths, frames or lines.
+
+The lines are parted into folds. Each fold is left out in turn, its lines counting nothing, and measured by
+the model of the others. For models that are linear in their parameters see `_linear_folds`; others are
+fitted anew for each fold.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
+
+from .._core.arguments import kinds_checked
+from .._core.checks import checked_terms
+from .._core.types import of_known_values
+from ..fit.energy import coefficients_by, line_residuals, settings
+from ..fit.family_lines import FamilyLines
+from ..fit.result import RESULTS
+from ..fit.zoom import fit_zoom
+from ..lines.base import AbstractLines
+from ..lines.compressed import CompressedLines
+from ..models.zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom
+from ._linear_folds import Design, Lanes, as_given, cross_validated, judge_linear, lanes_of
+from .folds import Folds, HoldOut, Judged, folds_of, own_weights, shares, small_lines
+
+
+@kinds_checked
+@of_known_values
+def held_out_zoom(
+    lines: AbstractLines,
+    *,
+    zoom: AbstractZoom | None = None,
+    terms: int = 2,
+    hold_out: HoldOut = "frame",
+    folds: int | None = None,
+    seed: int = 0,
+) -> Float[np.ndarray, "frame"]:
+    """RMS, px, of each frame under zoom models fitted without it.
+
+    By default one frame is left out at a time, and corrected as its focal length says by the model of all
+    others. A frame at the shortest or longest focal length is extrapolated to, if no other has it.
+
+    Args:
+        lines: the lines, or, much faster, ``compress(lines)``.
+        zoom, terms: as for `fit_zoom`.
+        hold_out, folds, seed: as for `select_model`.
+
+    Returns:
+        The root of eq. 3 of each frame, of the lines left out. NaN where the model cannot be fitted to what
+        is left, and for frames that are never left out.
+
+    Example:
+        >>> from zoomjax import compress, fit_zoom, scenes
+        >>> lines = compress(
+        ...     scenes.board_lines(
+        ...         scenes.nikkor_18_200(), scenes.focal_sweep(5), spacing=200, noise=0.5
+        ...     )
+        ... )
+        >>> bool((held_out_zoom(lines) ** 2).mean() > fit_zoom(lines).rms ** 2)
+        True
+    """
+    terms = checked_terms(terms)
+    zoom = PolynomialZoom() if zoom is None else zoom
+    focal, *focus = settings(zoom, lines)
+    zoom.prepare(focal, terms, *focus)  # complains of too few focal lengths
+    small = small_lines(lines, terms)
+    parts = folds_of(small, hold_out, folds, seed)
+    judged = judge(small, zoom, terms, parts)
+    return _by_frame(small, np.where(parts.fold >= 0, judged.unseen, np.nan))
+
+
+@kinds_checked
+@of_known_values
+def held_out_frames(
+    lines: AbstractLines, *, terms: int = 2, folds: int | None = None, seed: int = 0
+) -> Float[np.ndarray, "frame"]:
+    """RMS, px, of each frame's lines under fits of the other lines of that frame.
+
+    What a frame by itself knows of lines that it has not seen: the noise, and what too few lines cost.
+
+    Args:
+        lines, terms: as for `fit_frames`.
+        folds: into how many parts a frame's lines are parted; 10 by default.
+        seed: of the parting.
+
+    Returns:
+        The root of eq. 3 of each frame, of all its lines, each as it was left out. NaN for a frame with
+        fewer than two lines.
+    """
+    terms = checked_terms(terms)
+    small = small_lines(lines, terms)
+    parts = folds_of(small, "line", folds, seed)
+    lanes = lanes_of(small, parts.fold, terms)
+    unseen = np.full(lanes.fold.shape, np.nan)
+    one = Design(np.ones((1, 1)), np.ones((1, 1)), np.zeros((terms, terms)))
+    for frame in np.unique(lanes.frame):
+        own = lanes.frame == frame
+        alone = Lanes(
+            lanes.columns[..., own],
+            lanes.gram[..., own],
+            np.zeros(own.sum(), int),
+            lanes.counts[own],
+            lanes.weight[own],
+            lanes.fold[own],
+            starts=np.zeros(1, int),
+            frames=1,
+        )
+        unseen[own] = cross_validated(alone, [one] * (parts.number + 1))[1]
+    return _by_frame(small, as_given(small, unseen))
+
+
+def judge(lines: CompressedLines | FamilyLines, zoom: AbstractZoom, terms: int, parts: Folds) -> Judged:
+    """A model's errors on lines that it has seen and has not.
+
+    Args:
+        lines: from `small_lines`, or those lines with another family.
+        zoom: a model without parameters.
+        terms: its number of coefficients.
+        parts: the folds.
+    """
+    if isinstance(zoom, AbstractLinearZoom) and isinstance(lines, CompressedLines):
+        return judge_linear(lines, zoom, terms, parts)
+    return _judge_by_fits(lines, zoom, terms, parts)
+
+
+def _by_frame(lines, of_line):
+    """Root of the mean over each frame's lines, by their weights; NaN if one that counts is not known."""
+    share, frame = shares(lines), np.asarray(lines.frame)
+    kept = share > 0
+    total, squares = (
+        np.bincount(frame[kept], values[kept], minlength=len(lines.focal))
+        for values in (share, share * of_line)
+    )
+    return np.sqrt(squares / np.where(total > 0, total, np.nan))
+
+
+def _judge_by_fits(lines, zoom, terms, parts):
+    """By a fit of its own for each fold, starting from that of all lines."""
+    own = own_weights(lines)
+    everything = fit_zoom(lines, zoom=zoom, terms=terms, invertible=False, throw=False)
+    seen = np.asarray(_squares(lines, everything.lens.zoom))
+    unseen, failed = np.full(seen.shape, np.nan), 0
+    problem = ""
+    for fold in range(parts.number):
+        kept = own * (parts.fold != fold)
+        left = np.unique(np.asarray(lines.frame)[kept > 0])
+        try:
+            focal, *focus = (np.asarray(values)[left] for values in settings(zoom, lines))
+            zoom.prepare(focal, terms, *focus)
+        except ValueError as error:
+            problem = problem or str(error)
+            continue
+        start = everything.lens.zoom
+        fit = fit_zoom(lines.weighted(kept), zoom=start, invertible=False, throw=False)
+        if fit.result in (RESULTS.successful, RESULTS.undetermined, RESULTS.folded):
+            out = parts.fold == fold
+            unseen[out] = np.asarray(_squares(lines, fit.lens.zoom))[out]
+        else:
+            failed += 1
+    if failed:
+        problem = problem or f"{failed} of {parts.number} folds do not converge"
+    return Judged(seen, unseen, float(ravel_pytree(everything.lens.zoom.parameters)[0].size), problem)
+
+
+@eqx.filter_jit
+def _squares(lines, zoom):
+    """Mean squared distance of each line, px^2."""
+    corrected = lines.corrected(coefficients_by(zoom, lines)[lines.frame])
+    return jnp.sum(jax.vmap(line_residuals)(corrected) ** 2, axis=1) / jnp.maximum(lines.counts, 1)

@@ -1,0 +1,131 @@
+"""Folds: which lines are left out together, and what each line weighs."""
+
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Float
+
+from .._core.checks import checked_integer
+from ..fit.algebraic import compressed
+from ..fit.family_lines import FamilyLines
+from ..fit.image_metric import ImageLines
+from ..lines.base import AbstractLines
+from ..lines.compressed import CompressedLines
+
+HoldOut = Literal["focal", "frame", "line"]
+
+_MOST_FOLDS = 50  # of focal lengths or frames, one each as long as there are no more
+_LINE_FOLDS = 10
+
+
+class Folds(NamedTuple):
+    """What is left out together.
+
+    Attributes:
+        fold: of each line, from 0; -1 for lines that are never left out.
+        unit: of each line, the focal length, frame or line it stands for; -1 as before.
+        number: of folds.
+    """
+
+    fold: np.ndarray
+    unit: np.ndarray
+    number: int
+
+
+class Judged(NamedTuple):
+    """A model on the lines of `Folds`.
+
+    Attributes:
+        seen: mean squared distance of each line, px^2, under the fit of all lines.
+        unseen: the same under the fit that has not seen it. NaN where there is none.
+        parameters: how many numbers the model has to follow the lines; those that a prior holds count
+            as parts, ``tr (H + P)^-1 H``.
+        problem: why there are NaNs, or nothing.
+    """
+
+    seen: np.ndarray
+    unseen: np.ndarray
+    parameters: float
+    problem: str
+
+
+def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
+    """The lines compressed, for so many terms.
+
+    Raises:
+        TypeError: they are no lines, or measured in another way than eq. 3.
+        ValueError: they are compressed already, for fewer terms; a point is not finite; or no line counts.
+    """
+    if isinstance(lines, ImageLines | FamilyLines):
+        raise TypeError(
+            "Lines held out are measured in the corrected image, and by the radial polynomial: pass the "
+            "lines without in_image or with_family. (select_model compares families, given "
+            "Candidate(zoom, terms, family).)"
+        )
+    if not isinstance(lines, AbstractLines):
+        raise TypeError(
+            "Argument lines must be Lines (see Lines.from_ragged) or compress(lines), but its type is "
+            f"{type(lines).__name__}."
+        )
+    small = compressed(lines, terms)
+    if not np.isfinite(small.triangle).all():
+        raise ValueError("Argument lines must hold finite points, but it holds NaN or infinite ones.")
+    if not own_weights(small).any():
+        raise ValueError(
+            "Argument lines must have a line that counts, but all have a weight of 0 or too few points."
+        )
+    return small
+
+
+def folds_of(lines: CompressedLines, hold_out: HoldOut, folds: int | None, seed: int) -> Folds:
+    """The parts of the lines that are left out in turn; see `select_model`.
+
+    Raises:
+        ValueError: the way of holding out is none, or there are too few focal lengths, frames or lines.
+    """
+    if hold_out not in get_args(HoldOut):
+        raise ValueError(f'Argument hold_out must be "focal", "frame" or "line", but it is {hold_out!r}.')
+    frame, focal = np.asarray(lines.frame), np.asarray(lines.focal)
+    rng = np.random.default_rng(seed)
+    most = _LINE_FOLDS if hold_out == "line" else _MOST_FOLDS
+    most = most if folds is None else checked_integer("folds", folds, 2)
+    if hold_out == "line":
+        # Every frame's lines over all folds, as evenly as can be.
+        order = np.lexsort([rng.random(len(frame)), frame])
+        fold = np.empty(len(frame), int)
+        fold[order] = np.arange(len(frame)) % most
+        return Folds(fold, np.arange(len(frame)), most)
+    if hold_out == "frame":
+        group, number, needed = frame, len(focal), "two or more frames"
+    else:
+        distinct, place = np.unique(focal, return_inverse=True)
+        number, needed = len(distinct) - 2, "4 distinct focal lengths or more, for both ends stay"
+        group = np.where((place > 0) & (place <= number), place - 1, -1)[frame]
+    if number < 2:
+        raise ValueError(
+            f'Argument hold_out is "{hold_out}", which takes {needed}; there are fewer. Ask for '
+            'hold_out="line", or add images at other focal lengths.'
+        )
+    parts = min(most, number)
+    fold = np.arange(number) if parts == number else rng.permutation(number) % parts
+    return Folds(np.where(group >= 0, fold[group], -1), group, parts)
+
+
+def shares(lines: CompressedLines) -> Float[np.ndarray, "line"]:
+    """The part of each line in the energy of eq. 13: every frame that counts weighs the same."""
+    frame, own = np.asarray(lines.frame), own_weights(lines)
+    total = np.bincount(frame, own, minlength=len(lines.focal))
+    return own / (np.where(total > 0, total, 1) * max(np.sum(total > 0), 1))[frame]
+
+
+def own_weights(lines):
+    """The weight of each line; 0 for those of too few points to count."""
+    own = np.ones(lines.frame.shape) if lines.weight is None else np.asarray(lines.weight, float)
+    return np.where(counts_of(lines) > 2, own, 0)
+
+
+def counts_of(lines):
+    """Numbers of points; of `CompressedLines` in NumPy: of what JAX does once, most is compiling."""
+    if not isinstance(lines, CompressedLines):
+        return np.asarray(lines.counts)
+    return np.round(np.asarray(lines.triangle)[:, 0, 0].astype(float) ** 2)

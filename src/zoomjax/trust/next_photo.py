@@ -1,0 +1,282 @@
+"""Where to photograph next: the focal length and part of the image that would narrow the bands most.
+
+A further photo changes the covariance ``H^-1 D H^-1`` of the fit (`covariance`) by what its lines add to
+H and D, which depends on where they are and not on what will be measured there. So every candidate's band
+is known beforehand: focal lengths over the range, nine parts of the image, lines level or upright,
+as many and as long as in the photos there are. The noise, whatever its size, is taken to stay as it is.
+
+Directions that no line determines get a prior, normalised coefficients of about 1, so that candidates can
+be compared there too. One small Jacobian a candidate; nothing is fitted.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
+
+from .._core.arguments import kinds_checked
+from .._core.types import of_known_values
+from ..fit.energy import counted_frames, line_residuals, line_weights, linearised, number_counted
+from ..fit.family_lines import with_family
+from ..fit.result import ZoomFit
+from ..lines.base import AbstractLines
+from ..models.zoom import AbstractFocusZoom, with_parameters
+from .bands import displacement_std
+
+_FOCALS = 5  # over the range, evenly in 1/f
+_DIRECTIONS = ("horizontal", "vertical")
+_REGIONS = (
+    *("the top left corner", "the top edge", "the top right corner"),
+    *("the left edge", "the middle", "the right edge"),
+    *("the bottom left corner", "the bottom edge", "the bottom right corner"),
+)
+_MIRRORED = {
+    "the corners": (0, 2, 6, 8),
+    "the top or bottom edge": (1, 7),
+    "the left or right edge": (3, 5),
+}
+_SIMPLEST_FIRST = (4, 1, 7, 3, 5, 0, 2, 6, 8)
+_ALIKE = 1.02  # bands that differ by less are as good as each other
+
+
+@dataclasses.dataclass(frozen=True)
+class Suggestion:
+    """The photo that would help most, and what each candidate would leave.
+
+    Attributes:
+        focal: the focal length to photograph at.
+        direction: "horizontal" or "vertical": of the lines.
+        region: the part of the image that they should run through, in words.
+        before, after: the standard deviation of the displacement, px, as it is and as it would be: the
+            geometric mean over image and focal range. Infinite where the lines do not determine the lens.
+        focals: the candidates' focal lengths.
+        regions: their parts of the image, in words.
+        table: `after` of each candidate: of each focal length, region and direction.
+        focal_unit: "mm" or "px".
+    """
+
+    focal: float
+    direction: str
+    region: str
+    before: float
+    after: float
+    focals: np.ndarray
+    regions: tuple[str, ...]
+    table: np.ndarray
+    focal_unit: str
+
+    @property
+    def sentence(self) -> str:
+        """What to do next, in words."""
+        photo = (
+            f"Next, photograph {self.direction} lines through {self.region} of the image at f = "
+            f"{self.focal:.4g} {self.focal_unit}"
+        )
+        if not np.isfinite(self.before):
+            return f"{photo}: of all there is to add, that would determine the lens best."
+        return (
+            f"{photo}: the standard deviation of the displacement, in the mean over image and range, would "
+            f"fall from {self.before:.2g} to {self.after:.2g} px."
+        )
+
+
+@kinds_checked
+@of_known_values
+def suggest_next(
+    fit: ZoomFit, lines: AbstractLines, *, focal_range: tuple[float, float] | None = None
+) -> Suggestion:
+    """The further photo that would shrink the displacement's band most.
+
+    Args:
+        fit: the fit.
+        lines: what it was fitted to, compressed or not.
+        focal_range: from the shortest to the longest focal length that matters, in the lens's unit; by
+            default those fitted.
+
+    Returns:
+        The best of the candidates, and all of them.
+
+    Raises:
+        ValueError: `focal_range` is not two positive numbers in order, or no line counts.
+
+    Example:
+        >>> from zoomjax import compress, fit_zoom, scenes
+        >>> focal = scenes.focal_sweep(4)
+        >>> lines = compress(scenes.board_lines(scenes.nikkor_18_200(), focal, spacing=99, noise=1))
+        >>> suggest_next(fit_zoom(lines), lines).sentence
+        'Next, photograph ...
+    """
+    low, high = (float(f) for f in (fit.lens.focal_range if focal_range is None else focal_range))
+    if not 0 < low <= high < np.inf:
+        raise ValueError(
+            "Argument focal_range must be two positive numbers, the shorter first, but it is "
+            f"{focal_range!r}."
+        )
+    if isinstance(fit.lens.zoom, AbstractFocusZoom) or fit.lens.shift is not None:
+        raise ValueError(
+            "Photos are suggested for lenses that depend on the focal length alone, about one centre of "
+            "distortion: this one depends on the focus, or its centre moves along the zoom."
+        )
+    lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
+    if not np.any(counted_frames(lines)):
+        raise ValueError(
+            "Argument lines must have a line that counts, but all have a weight of 0 or too few points."
+        )
+    focals = np.unique(1 / np.linspace(1 / low, 1 / high, _FOCALS))
+    number, length, counts = _typical(lines)
+    dtype = fit.covariance.dtype
+    candidates = jnp.asarray(candidate_lines(fit.lens.image_size, length), dtype)
+    grid = jnp.asarray(focals, dtype)
+    now, table = _bands(fit, lines, candidates, grid, jnp.asarray(number), jnp.asarray(counts))
+    before = float(_average(displacement_std(fit, _image_grid(fit.lens.image_size)[:, None], focal=grid)))
+    # What was measured of the noise is in `before`; how a photo changes it is the ratio.
+    table = np.nan_to_num(np.asarray(table, np.float64), nan=np.inf)  # what rounding alone is left of
+    if np.isfinite(before) and float(now) > 0:
+        table = before * (table / float(now))
+    at_focal, _, in_direction = np.unravel_index(np.argmin(table), table.shape)
+    region = _simplest(table[at_focal, :, in_direction])
+    return Suggestion(
+        focal=float(focals[at_focal]),
+        direction=_DIRECTIONS[in_direction],
+        region=_named(table[at_focal, :, in_direction], region),
+        before=before,
+        after=float(table[at_focal, region, in_direction]) if np.isfinite(before) else np.inf,
+        focals=focals,
+        regions=_REGIONS,
+        table=table,
+        focal_unit=fit.lens.focal_unit,
+    )
+
+
+def _simplest(stds):
+    """Of the regions as good as the best: long lines along an edge run through its corners too."""
+    return next(region for region in _SIMPLEST_FIRST if stds[region] <= _ALIKE * min(stds))
+
+
+def _named(stds, region):
+    """The region in words, with those that mirror it if they are as good."""
+    for name, group in _MIRRORED.items():
+        if region in group and max(stds[list(group)]) <= _ALIKE * stds[region]:
+            return name
+    return _REGIONS[region]
+
+
+def _typical(lines):
+    """Of the lines there are: how many a frame, how long (px) and of how many points, the medians."""
+    weights, counts, squares = (np.asarray(array) for array in _sizes(lines))
+    there = weights > 0
+    per_frame = np.bincount(np.asarray(lines.frame)[there])
+    length = np.sqrt(12 * squares[there] / counts[there])  # of points spread evenly
+    return tuple(float(np.median(values)) for values in (per_frame[per_frame > 0], length, counts[there]))
+
+
+@eqx.filter_jit
+def _sizes(lines):
+    unchanged = lines.corrected(jnp.zeros((lines.frame.shape[0], lines.family.size(1)), lines.focal.dtype))
+    return line_weights(lines), lines.counts, jnp.sum(unchanged**2, axis=(1, 2))
+
+
+def candidate_lines(
+    image_size: tuple[int, int], length: float
+) -> Float[np.ndarray, "region direction line point 2"]:
+    """Lines through each part of the image, level and upright: three across each, 25 points on each.
+
+    They are `length` px long, or as long as the image; moved along themselves to lie within it.
+    """
+    size = np.array(image_size, float)
+    steps = np.linspace(-0.5, 0.5, 25)
+    lines = np.empty((len(_REGIONS), len(_DIRECTIONS), 3, 25, 2))
+    for region, direction, line in np.ndindex(lines.shape[:3]):
+        along, across = direction, 1 - direction  # 0 is x
+        parts = np.array([region % 3, region // 3]) + 0.5
+        parts[across] += (line - 1) / 3
+        middle = size * parts / 3 - 0.5
+        reach = min(length, size[along] - 1) / 2
+        middle[along] = np.clip(middle[along], reach, size[along] - 1 - reach)
+        lines[region, direction, line] = middle
+        lines[region, direction, line, :, along] += 2 * reach * steps
+    return lines
+
+
+@eqx.filter_jit
+def _bands(fit, lines, candidates, focals, number, counts):
+    """The mean standard deviation of the displacement now, and with each candidate.
+
+    For independent points, and candidates with so many lines of so many points.
+    """
+    zoom = fit.lens.zoom
+    flat, unravel = ravel_pytree(zoom.parameters)
+    weights, frames = line_weights(lines), number_counted(counted_frames(lines)).astype(flat.dtype)
+    weighted, jacobian = linearised(lines, zoom)
+    information = jnp.einsum("lri,lrj->ij", jacobian, jacobian)
+    noise = jnp.einsum("l,lri,lrj->ij", weights, jacobian, jacobian)
+    variance = jnp.sum(weighted**2) / _positive(jnp.sum(weights * (lines.counts - 2)))
+    rows = _displacement_rows(fit, flat, unravel, focals)
+
+    def typical(information, noise):
+        """Of the estimate with the prior: a variance of 1 for each parameter, weighed as a point is."""
+        ridge = variance / jnp.sum(jnp.where(weights > 0, lines.counts, 0))
+        eps = jnp.finfo(flat.dtype).eps
+        rounding = 64 * eps * jnp.trace(information)
+        ridge = jnp.maximum(ridge, rounding)  # lines without noise would leave nothing
+        eye = jnp.eye(flat.size, dtype=flat.dtype)
+        inverse = jnp.linalg.inv(information + ridge * eye)
+        covariance = inverse @ (variance * noise + ridge**2 * eye) @ inverse.T
+        squares = jnp.einsum("ndp,pq,ndq->n", rows, covariance, rows)
+        return _average(jnp.sqrt(jnp.maximum(squares, eps * jnp.max(squares))))  # or rounding is negative
+
+    def of_line(points, focal):
+        """Mean over a line's points of the squared derivatives of their residuals."""
+
+        def residuals(flat):
+            lens = eqx.tree_at(lambda lens: lens.zoom, fit.lens, with_parameters(zoom, unravel(flat)))
+            corrected = lens(focal).undistort(points)
+            return line_residuals(corrected - jnp.mean(corrected, axis=0)[None])
+
+        derivative = jax.jacfwd(residuals)(flat)
+        return derivative.T @ derivative / points.shape[0]
+
+    def with_photo(points, focal):
+        """A frame more: eq. 13 gives it the weight of one, and its lines and points equal shares."""
+        squared = jnp.mean(jax.vmap(of_line, (0, None))(points, focal), axis=0)
+        old, new = frames / (frames + 1), 1 / (frames + 1)
+        more_noise = new**2 / (number * counts) * squared
+        return typical(old * information + new * squared, old**2 * noise + more_noise)
+
+    over = jax.vmap(jax.vmap(jax.vmap(with_photo, (0, None)), (0, None)), (None, 0))
+    return typical(information, noise), over(candidates, focals)
+
+
+def _displacement_rows(fit, flat, unravel, focals):
+    """Derivatives by the parameters of where points all over the image go, at all focal lengths."""
+    points = _image_grid(fit.lens.image_size).astype(flat.dtype)
+
+    def corrected(flat, focal):
+        zoom = with_parameters(fit.lens.zoom, unravel(flat))
+        return eqx.tree_at(lambda lens: lens.zoom, fit.lens, zoom)(focal).undistort(points)
+
+    rows = jax.vmap(jax.jacfwd(corrected), (None, 0))(flat, focals)
+    return rows.reshape(-1, 2, flat.size)
+
+
+def _average(stds):
+    """The geometric mean.
+
+    The largest, or the plain mean, is that of the worst focal length; a photo elsewhere then gains nothing,
+    and one there as much wherever its lines are, for the next worst is left.
+    """
+    return jnp.exp(jnp.mean(jnp.log(stds)))
+
+
+def _image_grid(image_size):
+    """Points all over the image, its corners among them, and not its centre, which is always certain."""
+    x, y = (jnp.linspace(0, side - 1, 6) for side in image_size)
+    return jnp.stack(jnp.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def _positive(value):
+    return jnp.where(value > 0, value, 1)

@@ -1,0 +1,352 @@
+"""Choosing the model: which zoom model, degree, number of coefficients and family the lines ask for.
+
+More parameters always bring the lines that were fitted closer to straightness; what tells is how straight a
+model makes lines that it has not seen (`cross_validation`). Their mean squared distance E is known to a
+standard error only, from the scatter over the focal lengths, frames or lines that were left out; but two
+models are judged on the same ones, and most of what scatters is common to both. So differences are
+compared, paired:
+
+    s^2 = n/(n-1) sum_u a_u^2 (d_u - d)^2,   d_u = E_u(model)/2R(model) - E_u(best)/2R(best),
+
+a_u being the weight in eq. 13 of what was left out, d the mean, and R the root of E, so that s is of the
+difference of two R, px. The one-standard-error rule (Breiman, Friedman, Olshen and Stone 1984) takes the
+simplest of the models whose R is above the best one's by no more than s.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from .._core.arguments import kinds_checked
+from .._core.checks import checked_terms
+from .._core.types import of_known_values
+from ..fit.energy import settings
+from ..fit.family_lines import compress_family, with_family
+from ..fit.result import ZoomFit
+from ..fit.zoom import fit_zoom
+from ..lines.base import AbstractLines
+from ..lines.compressed import CompressedLines
+from ..lines.lines import Lines
+from ..models.family import AbstractFamily
+from ..models.polynomial import RadialPolynomial
+from ..models.smooth import SmoothZoom
+from ..models.zoom import AbstractZoom, PolynomialZoom, with_parameters
+from .cross_validation import judge
+from .folds import Folds, HoldOut, Judged, folds_of, shares, small_lines
+
+_TERMS = 3  # of the default candidates, at most
+_DEGREES = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A model to compare: a zoom model, specified but not fitted, and its number of coefficients.
+
+    Attributes:
+        zoom: such as ``PolynomialZoom(degree=2)``.
+        terms: N, of eq. 2.
+        family: what the coefficients mean, such as ``Division()``.
+    """
+
+    zoom: AbstractZoom
+    terms: int = 2
+    family: AbstractFamily = RadialPolynomial()  # noqa: RUF009, it has no state
+
+    def __post_init__(self):
+        """Check what it is made of."""
+        if not isinstance(self.zoom, AbstractZoom):
+            raise TypeError(
+                f"A candidate must be a zoom model, as PolynomialZoom(degree=2) is, not {self.zoom!r}."
+            )
+        checked_terms(self.terms)
+
+    @property
+    def name(self) -> str:
+        """What it is called: "degree 2, 2 terms" if it is a polynomial in 1/f; others with their kind."""
+        settings = [
+            f"{field.name} {value}"
+            for field in dataclasses.fields(self.zoom)
+            if field.metadata.get("static") and (value := getattr(self.zoom, field.name)) is not None
+        ]
+        other = [self.zoom] * (not isinstance(self.zoom, PolynomialZoom))
+        other += [self.family] * (not isinstance(self.family, RadialPolynomial))
+        kind = [type(model).__name__ for model in other]
+        return ", ".join([*kind, *settings, f"{self.terms} term{'s' * (self.terms > 1)}"])
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What became of a candidate. All RMS are of the same lines, px; NaN where there is none.
+
+    Attributes:
+        candidate: the candidate.
+        parameters: how many numbers it has to follow the lines; a prior makes it fewer than it has.
+        rms: of the lines as fitted.
+        held_out: of the lines, each left out of the fit that it is measured by.
+        held_out_std: its standard error.
+        difference: of `held_out` to that of the best candidate.
+        difference_std: its standard error, paired.
+        problem: why it was not compared, in a sentence; empty if it was.
+    """
+
+    candidate: Candidate
+    parameters: float = np.nan
+    rms: float = np.nan
+    held_out: float = np.nan
+    held_out_std: float = np.nan
+    difference: float = np.nan
+    difference_std: float = np.nan
+    problem: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Selection:
+    """The model chosen, its fit, and how all candidates compared. ``print(selection)`` shows a table.
+
+    Attributes:
+        chosen: the simplest candidate within one standard error of the best.
+        best: the candidate of least held-out error.
+        fit: of the chosen model, to all lines.
+        verdicts: of all candidates, in their order.
+        hold_out: what was left out: "focal", "frame" or "line".
+        folds: in how many parts.
+    """
+
+    chosen: Candidate
+    best: Candidate
+    fit: ZoomFit
+    verdicts: tuple[Verdict, ...]
+    hold_out: HoldOut
+    folds: int
+
+    def rows(self) -> list[tuple[str, str, str, str, str, str]]:
+        """The table: candidate, parameters, RMS as fitted and held out, difference to the best, mark."""
+        return [self._row(verdict) for verdict in self.verdicts]
+
+    def _row(self, v: Verdict) -> tuple[str, str, str, str, str, str]:
+        if v.problem:
+            return v.candidate.name, "", "", "", "", f"not compared: {v.problem.partition('. ')[0]}"
+        return (
+            v.candidate.name,
+            f"{v.parameters:.1f}".removesuffix(".0"),
+            f"{v.rms:.4f}",
+            f"{v.held_out:.4f} ± {v.held_out_std:.4f}",
+            "best" if v.candidate is self.best else f"{v.difference:+.5f} ± {v.difference_std:.5f}",
+            "chosen" if v.candidate is self.chosen else "",
+        )
+
+    def __str__(self) -> str:
+        """The table as text."""
+        rows = [COLUMNS, *self.rows()]
+        width = [max(len(row[i]) for row in rows) for i in range(5)]
+        lines = [
+            "  ".join([row[0].ljust(width[0]), *map(str.rjust, row[1:5], width[1:]), row[5]]).rstrip()
+            for row in rows
+        ]
+        return "\n".join([self.title, *lines])
+
+    @property
+    def title(self) -> str:
+        """What the table shows."""
+        what = {"focal": "inner focal lengths", "frame": "frames", "line": "lines"}[self.hold_out]
+        return f"RMS distance to straight lines, px; {what} left out in {self.folds} parts"
+
+    def summary(self) -> dict:
+        """The figures, as plain numbers and strings that JSON can hold."""
+        return {
+            "chosen": self.chosen.name,
+            "best": self.best.name,
+            "hold_out": self.hold_out,
+            "folds": self.folds,
+            "candidates": [
+                {"candidate": v.candidate.name}
+                | {
+                    field.name: None if isinstance(x, float) and not np.isfinite(x) else x
+                    for field in dataclasses.fields(v)[1:]
+                    for x in [getattr(v, field.name)]
+                }
+                for v in self.verdicts
+            ],
+        }
+
+
+COLUMNS = ("candidate", "parameters", "fitted", "held out", "to the best", "")
+"""Heads of `Selection.rows`."""
+
+
+@kinds_checked
+@of_known_values
+def select_model(
+    lines: AbstractLines,
+    candidates: Sequence[AbstractZoom | Candidate] | None = None,
+    *,
+    hold_out: HoldOut | None = None,
+    folds: int | None = None,
+    seed: int = 0,
+) -> Selection:
+    """Choose the zoom model that makes lines straight that it has not seen, and none more complicated.
+
+    Parts of the lines are left out in turn, and measured by the fit of the others. Of the candidates that
+    do so as well as the best, within one standard error of the difference, the one with the fewest
+    parameters is chosen, and fitted to all lines.
+
+    Args:
+        lines: the lines, or ``compress(lines, terms=3)``.
+        candidates: zoom models, or `Candidate` where `terms` is not 2 or the family another. By default
+            polynomials in 1/f of degree 0 to 3 with 1 to 3 coefficients (or as many as the lines are
+            compressed for), and `SmoothZoom`.
+        hold_out: what is left out. "focal": focal lengths, with all of their frames, but never the shortest
+            and the longest, so that nothing is extrapolated; it tells how well a model does between the
+            focal lengths photographed, which is what it is for. "frame": frames, those at both ends too,
+            where the model is then extrapolated unless another frame has that focal length. "line": lines,
+            of each frame a part; it tells whether coefficients are determined, and little of the focal
+            lengths in between. By default "focal" with four or more distinct focal lengths, and "line"
+            with fewer.
+        folds: into how many parts; by default each focal length or frame by itself, but no more than 50
+            parts, and 10 parts of the lines.
+        seed: of the random parting, where parts hold more than one. What is in a part does not depend on
+            anything else.
+
+    Returns:
+        The choice. Candidates that cannot be fitted, or not to what is left, are in its table with the
+        reason, and so are those of which a fold does not converge.
+
+    Raises:
+        ValueError: no candidate can be compared, there is nothing that can be left out, or an argument is
+            none of those above.
+        TypeError: `lines` or a candidate is something else.
+
+    The fits of folds are not made invertible, the chosen one is, by `fit_zoom`. Candidates that are linear
+    in their parameters are cross-validated at hundreds of fits a second; others, and those of another
+    family, fit by fit.
+
+    References:
+        L. Breiman, J. Friedman, R. Olshen, C. Stone, "Classification and regression trees" (1984), 3.4.3.
+
+    Example:
+        >>> from zoomjax import compress, scenes
+        >>> scene = scenes.board_lines(
+        ...     scenes.nikkor_18_200(), scenes.focal_sweep(8), spacing=100, noise=0.2
+        ... )
+        >>> select_model(compress(scene, terms=2)).chosen.name
+        'degree 2, 2 terms'
+    """
+    if candidates is None:
+        most = min(_TERMS, lines.terms) if isinstance(lines, CompressedLines) else _TERMS
+        compared = default_candidates(most)
+    else:
+        compared = tuple(c if isinstance(c, Candidate) else Candidate(c) for c in candidates)
+    if not compared:
+        raise ValueError("Argument candidates must hold one or more zoom models, but it is empty.")
+    own = lines.terms if isinstance(lines, CompressedLines) else max(c.terms for c in compared)
+    small = small_lines(lines, own)
+    forms = {c.family: _in_family(lines, small, c.family, own) for c in compared}
+    if hold_out is None:
+        hold_out = "focal" if np.unique(np.asarray(small.focal)).size > 3 else "line"
+    parts = folds_of(small, hold_out, folds, seed)
+    verdicts, best, chosen = compare(small, compared, parts, forms)
+    fit = fit_zoom(forms[chosen.family], zoom=chosen.zoom, terms=chosen.terms)
+    return Selection(chosen, best, fit, verdicts, hold_out, parts.number)
+
+
+def default_candidates(terms: int = _TERMS) -> tuple[Candidate, ...]:
+    """Polynomials of degree 0 to 3 with up to so many coefficients, and `SmoothZoom`."""
+    polynomials = [
+        Candidate(PolynomialZoom(degree=degree), number)
+        for number in range(1, terms + 1)
+        for degree in range(_DEGREES)
+    ]
+    return (*polynomials, *([Candidate(SmoothZoom(), 2)] if terms > 1 else []))
+
+
+def _in_family(lines, small, family, terms):
+    """The lines as fits of a family need them."""
+    if isinstance(family, RadialPolynomial):
+        return small
+    return (
+        compress_family(lines, family, terms=terms)
+        if isinstance(lines, Lines)
+        else with_family(small, family)
+    )
+
+
+def _judged(lines, candidate, parts):
+    """The errors, or why there are none."""
+    zoom = with_parameters(candidate.zoom, None)
+    try:
+        if isinstance(lines, CompressedLines):
+            lines.check_terms(candidate.terms)
+        focal, *focus = settings(zoom, lines)
+        zoom.prepare(np.asarray(focal), candidate.terms, *focus)
+        return judge(lines, zoom, candidate.terms, parts)
+    except ValueError as error:
+        return str(error)
+
+
+def compare(
+    lines: CompressedLines,
+    candidates: Sequence[Candidate],
+    parts: Folds,
+    forms: Mapping[AbstractFamily, AbstractLines] | None = None,
+) -> tuple[tuple[Verdict, ...], Candidate, Candidate]:
+    """The verdicts, the best candidate and the chosen one; see `select_model`.
+
+    `forms` are the same lines for other families than the radial polynomial.
+    """
+    errors = [_judged((forms or {}).get(c.family, lines), c, parts) for c in candidates]
+    share = shares(lines)
+    counted = (parts.unit >= 0) & (share > 0)
+    unit, share = parts.unit[counted], share[counted] / share[counted].sum()
+    weight = np.bincount(unit, share)
+
+    def by_unit(of_line):
+        return np.bincount(unit, share * of_line[counted]) / np.where(weight > 0, weight, 1)
+
+    unseen = {}
+    for i, judged in enumerate(errors):
+        if isinstance(judged, Judged) and not judged.problem:
+            unseen[i] = by_unit(judged.unseen)
+    if not unseen:
+        reasons = {e if isinstance(e, str) else e.problem for e in errors}
+        raise ValueError(f"No candidate can be compared. {' '.join(sorted(reasons))}")
+    best = min(unseen, key=lambda i: weight @ unseen[i])
+    verdicts = [
+        _verdict(candidate, judged, unseen.get(i), unseen[best], weight, by_unit)
+        for i, (candidate, judged) in enumerate(zip(candidates, errors, strict=True))
+    ]
+    within = [v for v in verdicts if not v.problem and v.difference <= v.difference_std]
+    chosen = min(within, key=lambda v: (round(v.parameters, 6), v.held_out)).candidate
+    return tuple(verdicts), candidates[best], chosen
+
+
+def _verdict(candidate, judged, unseen, best, weight, by_unit):
+    if isinstance(judged, str):
+        return Verdict(candidate, problem=judged)
+    rms = float(np.sqrt(weight @ by_unit(judged.seen)))
+    if unseen is None:
+        return Verdict(candidate, judged.parameters, rms, problem=judged.problem)
+    own, own_part = _root(weight, unseen)
+    least, least_part = _root(weight, best)
+    return Verdict(
+        candidate,
+        judged.parameters,
+        rms,
+        own,
+        _standard_error(weight, own_part),
+        own - least,
+        _standard_error(weight, own_part - least_part),
+    )
+
+
+def _root(weight, squares):
+    """The root of the mean, and what each of the squares does to it."""
+    mean = weight @ squares
+    root = float(np.sqrt(mean))
+    return root, (squares - mean) / (2 * root if root > 0 else 1)
+
+
+def _standard_error(weight, deviation):
+    """Of a weighted mean, from the deviations of what it is the mean of."""
+    number = np.sum(weight > 0)
+    return float(np.sqrt(np.sum((weight * deviation) ** 2) * number / max(number - 1, 1)))

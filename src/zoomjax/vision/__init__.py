@@ -1,1 +1,0 @@
-"""Images in, images out: the only part of zoomjax that imports OpenCV."""

@@ -1,0 +1,77 @@
+"""Writing whole files, and only where nothing is lost."""
+
+import os
+
+import pytest
+
+from zoomjax._core.files import refuse_existing, remove_left, whole_file
+
+
+def test_what_is_there_is_not_replaced_unless_that_is_given(tmp_path):
+    targets = [tmp_path / name for name in ("a.jpg", "b.jpg", "c.jpg")]
+    refuse_existing(targets, overwrite=False)
+    targets[1].write_text("mine")
+    with pytest.raises(FileExistsError, match=r"b\.jpg is there already and .* give overwrite\.$"):
+        refuse_existing(targets, overwrite=False)
+    targets[2].symlink_to(tmp_path / "nowhere")
+    with pytest.raises(FileExistsError, match=r"b\.jpg and 1 more file are there already"):
+        refuse_existing(iter([*targets, targets[1]]), overwrite=False)
+    refuse_existing(targets, overwrite=True)
+
+
+@pytest.mark.parametrize("name", ["a.json", "a" * 250 + ".json", "ü" * 125 + ".json", "new\nline"])
+def test_a_file_appears_whole_or_stays_as_it_was(name, tmp_path):
+    def fail(part):
+        part.write_text("half")
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError), whole_file(tmp_path / name) as part:
+        fail(part)
+    assert not list(tmp_path.iterdir())
+    with whole_file(tmp_path / name) as part:
+        assert part.parent == tmp_path
+        part.write_text("first")
+    with pytest.raises(ZeroDivisionError), whole_file(tmp_path / name) as part:
+        fail(part)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["first"]
+
+
+@pytest.mark.parametrize("to", ["kept", "nowhere"])
+def test_a_link_is_replaced_and_not_followed(to, tmp_path):
+    (tmp_path / "kept").write_text("kept")
+    (tmp_path / "link").symlink_to(to)
+    with whole_file(tmp_path / "link") as part:
+        part.write_text("new")
+    assert not (tmp_path / "link").is_symlink()
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"kept": "kept", "link": "new"}
+
+
+def test_what_is_no_ordinary_file_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    (tmp_path / "null").symlink_to("/dev/null")
+    for name in ("pipe", "link", "null"):
+        before = (tmp_path / name).lstat()
+        with pytest.raises(FileExistsError, match="in place of a device"), whole_file(tmp_path / name):
+            pytest.fail("the work began")
+        assert (tmp_path / name).lstat() == before
+
+
+def test_parts_that_no_process_uses_are_removed(tmp_path):
+    left, theirs = tmp_path / ".zoomjax-0left__0.part", tmp_path / ".mine.12345678.part"
+    folder, link = tmp_path / ".zoomjax-0folder0.part", tmp_path / ".zoomjax-0link__0.part"
+    left.write_text("half")
+    theirs.write_text("half")
+    folder.mkdir()
+    link.symlink_to(theirs)
+    os.mkfifo(tmp_path / ".zoomjax-0pipe__0.part")
+    with whole_file(tmp_path / "video.mp4") as used:
+        used.write_text("half")
+        for path in (left, theirs, used, folder):
+            os.utime(path, (1e9, 1e9))
+        remove_left(tmp_path)
+        assert not left.exists()
+        assert used.exists()
+    names = {theirs.name, folder.name, link.name, ".zoomjax-0pipe__0.part", "video.mp4"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    remove_left(tmp_path / "nowhere")

@@ -1,0 +1,59 @@
+"""Names that somebody else chose."""
+
+import unicodedata
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zoomjax._core.text import numbered_name, plain
+
+names = st.text(max_size=300) | st.text(
+    st.sampled_from("./\\:*?<>|\"' -=~a\x1b\n\udcff\u202e"), max_size=300
+)
+
+
+@given(names)
+def test_plain_text_gives_no_orders(text):
+    shown = plain(text)
+    assert not {unicodedata.category(c) for c in shown} & {"Cc", "Cs", "Zl", "Zp"}
+    assert not set(shown) & set("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069\ufeff")
+    shown.encode()
+    assert plain(shown) == shown
+    if text.isprintable() and text.isascii():
+        assert shown == text
+
+
+def test_orders_are_shown():
+    assert plain("a\x1b[31m\n\x9b\u202eé\udcff") == r"a\x1b[31m\n\x9b\u202eé\udcff"
+
+
+@given(st.integers(1, 10**6), names)
+def test_made_names_are_files_names_everywhere(number, name):
+    made = numbered_name(number, name, ".jpg")
+    assert made.startswith(f"{number:04d}-")
+    assert made.endswith(".jpg")
+    assert len(made.encode()) <= 100
+    assert not set(made) & set("/\\:*?<>|\"'= ~\0")
+    assert all(unicodedata.category(c)[0] in "LMN" or c in "._+-" for c in made)
+
+
+@pytest.mark.parametrize(
+    ("name", "made"),
+    [
+        ("board-050mm.jpg", "0003-board-050mm.jpg"),
+        ("../../board.jpg", "0003-board.jpg"),
+        ("/etc/passwd", "0003-passwd.jpg"),
+        ("C:\\photos\\CON.png", "0003-CON.jpg"),
+        ("C:x.png", "0003-C_x.jpg"),
+        ("..", "0003-image.jpg"),
+        (".jpg", "0003-jpg.jpg"),
+        ("", "0003-image.jpg"),
+        ("Stadion Süd (2).JPG", "0003-Stadion_Süd_2.jpg"),
+        ("गेंद.png", "0003-गेंद.jpg"),
+        ("=cmd().jpg", "0003-cmd.jpg"),
+        ("a" * 300 + "-end.jpg", "0003-" + "a" * 76 + "-end.jpg"),
+    ],
+)
+def test_made_names_can_be_read(name, made):
+    assert numbered_name(3, name, ".jpg") == made

@@ -1,0 +1,138 @@
+"""Calibrations as a whole: their figures, their folder, and the real zoom camera."""
+
+import json
+import sys
+import warnings
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax import scenes
+from zoomjax.app.calibration import calibrate, focal_sigmas, rms_over_frames
+from zoomjax.app.report import report
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks" / "real"))
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    lines = scenes.board_lines(scenes.nikkor_18_200(), scenes.focal_sweep(5), spacing=60, noise=0.4)
+    return calibrate(lines)
+
+
+def test_stages_are_told(calibration):
+    told = []
+    calibrate(calibration.lines, stage=told.append)
+    assert len(told) == 3
+
+
+def test_pixel_polynomials_give_the_coefficients_of_the_lens(calibration):
+    polynomials = calibration.pixel_polynomials()
+    for f in (20.56, 50.0, 127.0):
+        expected = calibration.zoom.lens(f).pixel_coefficients
+        np.testing.assert_allclose(f ** -np.arange(3.0) @ polynomials, expected, rtol=1e-9)
+
+
+def test_summary_is_json_and_agrees_with_the_fits(calibration):
+    summary = json.loads(json.dumps(calibration.summary(), allow_nan=False))
+    assert summary["rms_zoom"] == float(calibration.zoom.rms)
+    assert summary["certificate"]["certified"] is True
+    assert summary["rms_none"] == pytest.approx(rms_over_frames(zj.frame_rms(calibration.lines, None)))
+    assert [row["frame"] for row in summary["per_frame"]] == list(range(5))
+    assert summary["rms_zoom"] < summary["rms_held_out"] < 1.1 * summary["rms_zoom"]
+    assert summary["rms_frames"] < summary["rms_frames_held_out"]
+    held_out = [row["rms_held_out"] for row in summary["per_frame"]]
+    assert rms_over_frames(np.array(held_out)) == summary["rms_held_out"]
+    assert "selection" not in summary
+
+
+def test_the_model_can_be_chosen(calibration):
+    chosen = calibrate(calibration.lines, select=True)
+    summary = json.loads(json.dumps(chosen.summary(), allow_nan=False))
+    assert summary["selection"]["chosen"] == "degree 2, 2 terms"
+    assert len(summary["selection"]["candidates"]) == 12
+    assert summary["rms_zoom"] == pytest.approx(float(calibration.zoom.rms), rel=1e-9)
+
+
+def test_lines_that_determine_nothing_are_reported(calibration):
+    t = np.linspace(-200, 200, 50)
+    radial = [np.stack([319.5 + t * c, 239.5 + t * s], -1) for c, s in ((1, 0), (0, 1), (0.6, 0.8))]
+    lines = zj.Lines.from_ragged(radial * 3, np.repeat([0, 1, 2], 3), [20, 40, 80], image_size=(640, 480))
+    summary = json.loads(json.dumps(calibrate(lines).summary(), allow_nan=False))
+    assert "do not determine" in summary["result"]
+    assert summary["frames_without_a_model"] == 3
+    assert summary["rms_held_out"] is None  # two focal lengths do not make a quadratic
+    assert None in summary["parameter_sigma"]
+    assert summary["warnings"][0] == summary["result"]
+    assert summary["warnings"][1].startswith(
+        "3 of 3 frames have no good model of their own (frames 0, 1, 2)"
+    )
+
+
+def test_results_are_written_together_or_not_at_all(calibration, tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("zoomjax.app.calibration.plot_model", fail)  # the last of the four files
+    with pytest.raises(OSError, match="disk full"):
+        calibration.write(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_zoomcam_gives_the_reference_figures(data):
+    from zoomcam import read_zoomcam
+
+    lines = read_zoomcam(data / "zoomcam")
+    assert len(lines.focal) == 5
+    assert len(lines.frame) == 116 * (15 + 22)
+    by_degree = {d: calibrate(lines, degree=d) for d in (0, 1, 2)}
+    assert float(by_degree[2].each.rms) == pytest.approx(0.8796, abs=5e-4)
+    for degree, rms in {0: 0.9969, 1: 0.8855, 2: 0.8809}.items():
+        assert float(by_degree[degree].zoom.rms) == pytest.approx(rms, abs=5e-4)
+    first, last = by_degree[2].each.coefficients[0], by_degree[2].each.coefficients[-1]
+    np.testing.assert_allclose(first, [0.0815, -0.0303], atol=1e-4)
+    np.testing.assert_allclose(last, [-0.0491, -0.0057], atol=1e-4)
+
+
+def test_bands_allow_for_uncertain_focal_lengths(calibration):
+    sigma = 0.01 * np.asarray(calibration.lines.focal)
+    allowed = calibrate(calibration.lines, focal_sigma=focal_sigmas("1%", calibration.lines.focal))
+    expected = zj.with_focal_sigma(calibration.zoom, zj.compress(calibration.lines), focal_sigma=sigma)
+    np.testing.assert_allclose(allowed.zoom.covariance, expected.covariance, rtol=1e-6)
+    assert all(a[2] > b[2] for a, b in zip(allowed.corner(), calibration.corner(), strict=True))
+    told = [row["focal_sigma"] for row in allowed.summary()["per_frame"]]
+    np.testing.assert_allclose(told, sigma)
+    assert allowed.next.sentence == calibration.next.sentence
+
+
+def test_deviations_are_numbers_or_per_cent():
+    np.testing.assert_allclose(focal_sigmas("0.3", np.array([20.0, 50.0])), [0.3, 0.3])
+    np.testing.assert_allclose(focal_sigmas(" 2 %", np.array([20.0, 50.0])), [0.4, 1.0])
+    for text in ("", "%", "-1", "nan", "1%%", "inf", "a bit"):
+        with pytest.raises(ValueError, match=r"--focal-sigma must be a number such as 0.3, or 1%"):
+            focal_sigmas(text, np.ones(2))
+
+
+def test_a_frame_whose_lines_are_all_rejected_has_no_figures():
+    """In `summary.json`, which is JSON without NaN, and in the tables."""
+    lines = scenes.board_lines(scenes.nikkor_18_200(), scenes.focal_sweep(5), spacing=60, noise=0.4)
+    wave = 80 * np.sin(np.linspace(0, 9, lines.points.shape[1]))[None, :, None]
+    bad = np.asarray(lines.frame) == 1
+    lines = eqx.tree_at(
+        lambda data: data.points, lines, lines.points + np.where(bad[:, None, None], wave, 0)
+    )
+    spoiled = calibrate(lines, robust=True)
+    assert spoiled.rejected[bad].all()
+    summary = json.loads(json.dumps(spoiled.summary(), allow_nan=False))
+    for key in ("rms_none", "rms_frames", "rms_zoom"):
+        per_frame = [row[key] for row in summary["per_frame"]]
+        assert per_frame[1] is None
+        known = np.array([value for value in per_frame if value is not None])
+        assert len(known) == 4
+        assert summary[key] == pytest.approx(rms_over_frames(known), rel=1e-9)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert ">nan<" not in report(spoiled)

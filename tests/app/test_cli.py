@@ -1,0 +1,280 @@
+"""The command line, run as a user runs it: in a process of its own, on files."""
+
+import contextlib
+import importlib.metadata
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax import scenes
+from zoomjax.app.demo import write_photos
+from zoomjax.lines.csv import write_lines_csv
+
+from .._commands import COMMAND, INTERRUPTIBLE
+
+
+def zoomjax(*arguments, cwd=None):
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, cwd=cwd, timeout=300
+    )
+
+
+@pytest.fixture(scope="module")
+def few_lines():
+    """The paper's board at five focal lengths, 40 px between points."""
+    return scenes.board_lines(scenes.nikkor_18_200(), scenes.focal_sweep(5), spacing=40, noise=0.3)
+
+
+@pytest.fixture(scope="module")
+def calibrated(few_lines, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("calibrated")
+    few_lines.save(folder / "lines.npz")
+    done = zoomjax("calibrate", folder / "lines.npz", "-o", folder / "out")
+    assert done.returncode == 0, done.stderr
+    return folder / "out", done
+
+
+def test_help_does_not_wait_for_jax():
+    probe = "import sys; sys.argv = ['zoomjax', '--help']\nfrom zoomjax.app.cli import main\n"
+    probe += "try:\n    main()\nexcept SystemExit:\n    pass\nassert 'jax' not in sys.modules"
+    start = time.perf_counter()
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "calibrate" in done.stdout
+    assert time.perf_counter() - start < 30  # the figure itself is measured, not tested
+
+
+def test_calibrate_writes_all_results(calibrated, few_lines):
+    out, done = calibrated
+    expected = [".zoomjax.json", "lens.json", "lines.npz", "model.png", "report.html", "summary.json"]
+    assert sorted(p.name for p in out.iterdir()) == expected
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["frames"] == 5
+    assert summary["lines"] == len(few_lines.frame)
+    assert summary["points"] == int(few_lines.mask.sum())
+    assert summary["focal_range"] == pytest.approx([20.56, 127.36])
+    assert summary["result"] == "successful"
+    assert summary["rms_frames"] <= summary["rms_zoom"] < 0.35 < summary["rms_none"]
+    assert f"{summary['rms_zoom']:.4f}" in done.stdout
+
+
+STAGE = re.compile(r"  \S.* +\d+\.\d\d s")
+
+
+@pytest.mark.slow
+def test_on_a_fresh_machine_a_terminal_shows_nothing_but_stages(few_lines, tmp_path):
+    """All of stderr: with nothing kept, with what was compiled damaged, and with no home at all."""
+    few_lines.save(tmp_path / "lines.npz")
+    (tmp_path / "home").mkdir()
+    kept = tmp_path / "home" / ".cache" / "zoomjax" / "compiled"
+    own = {"HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR", "ZOOMJAX_CACHE"}
+    bare = {name: value for name, value in os.environ.items() if name not in own}
+    for home in (tmp_path / "lines.npz" / "none", tmp_path / "home", tmp_path / "home"):
+        done = subprocess.run(
+            [*COMMAND, "calibrate", "lines.npz", "-o", "out"],
+            capture_output=True, text=True, cwd=tmp_path, timeout=600, env=bare | {"HOME": str(home)},
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert [line for line in done.stderr.splitlines() if not STAGE.fullmatch(line)] == []
+        programs = list(kept.glob("*-cache"))
+        assert (len(programs) > 3) == kept.exists() == (home.name == "home")
+        assert all(file.stat().st_size > 100 for file in programs)  # those cut off were made again
+        for file in programs:
+            file.write_bytes(b"cut off")
+
+
+def test_every_package_that_a_command_needs_is_declared():
+    """JAX keeps nothing compiled, and complains at each program, where filelock is missing."""
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    assert any(line.startswith("filelock") for line in project["optional-dependencies"]["app"])
+
+
+def test_calibrate_gives_the_lens_that_the_library_gives(calibrated, few_lines):
+    out, _ = calibrated
+    lens = zj.load_lens(out / "lens.json")
+    fit = zj.fit_zoom(zj.compress(few_lines))
+    np.testing.assert_allclose(lens.zoom.parameters, fit.lens.zoom.parameters, atol=1e-9)
+    np.testing.assert_array_equal(zj.load_lines(out / "lines.npz").points, few_lines.points)
+
+
+def test_calibrate_allows_for_uncertain_focal_lengths(calibrated, tmp_path):
+    exact = json.loads((calibrated[0] / "summary.json").read_text())
+    done = zoomjax("calibrate", calibrated[0] / "lines.npz", "-o", tmp_path, "--focal-sigma", "1%")
+    assert done.returncode == 0, done.stderr
+    assert "allow for those of the focal lengths, 1.00% to 1.00%" in done.stdout
+    told = json.loads((tmp_path / "summary.json").read_text())
+    assert [row["focal_sigma"] / row["focal"] for row in told["per_frame"]] == pytest.approx([0.01] * 5)
+    assert told["corner_displacement"][0]["std"] > 2 * exact["corner_displacement"][0]["std"]
+    np.testing.assert_allclose(told["parameters"], exact["parameters"])
+    refused = zoomjax(
+        "calibrate", calibrated[0] / "lines.npz", "-o", tmp_path / "no", "--focal-sigma", "a bit"
+    )
+    assert refused.returncode == 2
+    assert "--focal-sigma must be a number such as 0.3, or 1%" in refused.stderr
+
+
+def test_calibrate_reads_csv(calibrated, few_lines, tmp_path):
+    write_lines_csv(few_lines, tmp_path / "lines.csv")
+    done = zoomjax("calibrate", tmp_path / "lines.csv", "--image-size", "4288x2848", "-o", tmp_path)
+    assert done.returncode == 0, done.stderr
+    of_csv = json.loads((tmp_path / "summary.json").read_text())
+    of_npz = json.loads((calibrated[0] / "summary.json").read_text())
+    assert of_csv["rms_zoom"] == pytest.approx(of_npz["rms_zoom"], rel=1e-9)
+
+
+@pytest.mark.slow
+def test_demo_photographs_the_board_and_finds_the_papers_lens(tmp_path):
+    """And calibrating its photographs again takes what was found in them from the cache."""
+    done = zoomjax("demo", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    out = tmp_path / "zoomjax-demo"
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["frames"], summary["image_size"]) == (12, [2144, 1424])
+    assert summary["rms_zoom"] / summary["rms_frames"] - 1 < 0.015
+    assert (out / "model.png").stat().st_size > 10_000
+    assert (out / "before-after.jpg").stat().st_size > 10_000
+    photos = sorted((out / "photos").iterdir())
+    assert [p.name for p in photos] == [p.name[5:] for p in sorted((out / "lines").iterdir())]
+    lens, truth = zj.load_lens(out / "lens.json"), scenes.nikkor_18_200((2144, 1424))
+    for f in (20.56, 35.0, 127.36):
+        error = lens(f).undistort(np.zeros(2)) - truth(f).undistort(np.zeros(2))
+        assert np.abs(error).max() < 0.1
+    assert "of the true one" in done.stdout
+
+
+def test_calibrate_takes_photographs(tmp_path, monkeypatch):
+    """Two processes, one bad file, the default source of focal lengths; then once more, from the cache."""
+    monkeypatch.setenv("ZOOMJAX_CACHE", str(tmp_path / "cache"))
+    write_photos(tmp_path / "shots", number=4, image_size=(1072, 712))
+    (tmp_path / "shots" / "broken.jpg").write_bytes(b"")
+    done = zoomjax("calibrate", "shots", "-o", "out", "--jobs", "2", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Focal lengths: EXIF data." in done.stdout
+    assert "1 of 5 images are not used" in done.stderr
+    assert "broken.jpg" in done.stderr
+    first = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert first["focal_range"] == pytest.approx([20.56, 127.36])
+    assert len(list((tmp_path / "out" / "lines").iterdir())) == first["frames"] == 4
+    pictures = re.findall(r'href="(lines/[^"]+)"', (tmp_path / "out" / "report.html").read_text())
+    assert len(pictures) == 4
+    assert all((tmp_path / "out" / picture).is_file() for picture in pictures)
+    cached = {p: p.stat().st_mtime_ns for p in (tmp_path / "cache" / "detections").iterdir()}
+    assert len(cached) == 4
+    again = zoomjax("calibrate", "shots/*.jpg", "-o", "again", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "cache" / "detections").iterdir()} == cached
+    assert json.loads((tmp_path / "again" / "summary.json").read_text())["rms_zoom"] == first["rms_zoom"]
+
+
+WRONG = {
+    "no such file": (["missing.npz"], "missing.npz"),
+    "not a lines file": (["foreign.npz"], "foreign.npz"),
+    "truncated": (["truncated.npz"], "truncated.npz"),
+    "unknown kind": (["notes.txt"], "notes.txt is no photograph"),
+    "a folder without photos": (["."], "no photographs in the folder"),
+    "options of images for lines": (["lines.npz", "--pitch", "3"], "--pitch are for images"),
+    "an option of lines for images": (["a.jpg", "--image-size", "640x480"], "images have their own"),
+    "half a board": (["a.jpg", "--pitch", "20"], "--distance and --pixel is not"),
+    "a pitch that is none": (
+        ["a.jpg", "--pitch", "20x", "--distance", "9", "--pixel", "1"],
+        "--pitch is not",
+    ),
+    "no way to a focal length": (["a.jpg", "--focal", "zoom"], "no way to a focal length"),
+    "a unit that is none": (["a.jpg", "--focal-unit", "km"], "mm or px"),
+    "no such detector": (["a.jpg", "--detector", "circles"], "edges, grid, pitch"),
+    "two files": (["lines.npz", "lines.npz"], "one file"),
+    "options for another kind": (["lines.npz", "--image-size", "640x480"], "for CSV files"),
+    "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),
+    "a model chosen and given": (["lines.npz", "--select", "--degree", "1"], "leave --degree"),
+    "csv without image size": (["lines.csv"], "--image-size"),
+    "csv with a bad image size": (["lines.csv", "--image-size", "big"], "1920x1080"),
+    "csv without focal lengths": (["bare.csv", "--image-size", "640x480"], "frame,focal"),
+}
+
+
+@pytest.fixture(scope="module")
+def wrong_files(few_lines, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wrong")
+    few_lines.save(folder / "lines.npz")
+    (folder / "truncated.npz").write_bytes((folder / "lines.npz").read_bytes()[:5000])
+    np.savez(folder / "foreign.npz", corners=np.zeros(3))
+    (folder / "notes.txt").write_text("straight lines")
+    write_lines_csv(few_lines, folder / "lines.csv")
+    (folder / "bare.csv").write_text("frame,line,x,y\n0,0,1,1\n0,0,2,2\n0,0,3,4\n")
+    return folder
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_mistake_is_one_sentence_and_status_2(case, wrong_files):
+    arguments, hint = WRONG[case]
+    done = zoomjax("calibrate", *arguments, "-o", "out", cwd=wrong_files)
+    assert done.returncode == 2
+    assert hint in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (wrong_files / "out").exists()
+
+
+def test_calibrate_does_not_replace_its_input(wrong_files):
+    before = (wrong_files / "lines.npz").read_bytes()
+    done = zoomjax("calibrate", "lines.npz", "-o", ".", cwd=wrong_files)
+    assert done.returncode == 2
+    assert "would replace the input" in done.stderr
+    assert (wrong_files / "lines.npz").read_bytes() == before
+
+
+def test_calibrate_does_not_replace_photographs(tmp_path):
+    write_photos(tmp_path / "lines", number=3, image_size=(536, 356))
+    before = {p: p.read_bytes() for p in (tmp_path / "lines").iterdir()}
+    done = zoomjax("calibrate", "lines", "-o", ".", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "would replace the photograph" in done.stderr
+    assert {p: p.read_bytes() for p in (tmp_path / "lines").iterdir()} == before
+
+
+def test_an_interrupted_run_leaves_nothing(wrong_files):
+    """Interrupted as by Ctrl-C, at the first sign of life."""
+    command = [*INTERRUPTIBLE, "demo", "-o", "new"]
+    process = subprocess.Popen(command, cwd=wrong_files, stderr=subprocess.PIPE)
+    while not (wrong_files / "new").exists():
+        time.sleep(0.05)
+        assert process.poll() is None
+    stderr = b""
+    for _ in range(30):  # libraries now and then swallow an interrupt: users press again
+        process.send_signal(signal.SIGINT)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            _, stderr = process.communicate(timeout=2)
+            break
+    assert process.returncode == 130
+    assert stderr.decode().rstrip().endswith("Interrupted.")
+    assert not (wrong_files / "new").exists()
+
+
+def test_version():
+    assert zoomjax("--version").stdout == f"zoomjax {importlib.metadata.version('zoomjax')}\n"
+
+
+def test_what_is_wrong_with_a_model_is_told_on_stderr(tmp_path):
+    t = np.linspace(-200, 200, 50)
+    radial = [np.stack([319.5 + t * c, 239.5 + t * s], -1) for c, s in ((1, 0), (0, 1), (0.6, 0.8))]
+    lines = zj.Lines.from_ragged(radial * 3, np.repeat([0, 1, 2], 3), [20, 40, 80], image_size=(640, 480))
+    lines.save(tmp_path / "lines.npz")
+    done = zoomjax("calibrate", "lines.npz", "-o", "out", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "Beware: The lines do not determine" in " ".join(done.stderr.split())
+
+
+def test_an_output_folder_that_cannot_be_written_is_told_before_the_work(wrong_files):
+    done = zoomjax("calibrate", "lines.npz", "-o", Path("lines.npz") / "out", cwd=wrong_files)
+    assert done.returncode == 2
+    assert f"lines.npz{os.sep}out" in done.stderr
+    assert "Fitting" not in done.stderr

@@ -1,0 +1,174 @@
+"""Focal lengths from every source, on rendered boards with exact truth."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax import scenes
+from zoomjax.app.focal_sources import Board, check_way, choose_focals
+from zoomjax.detect.batch import Detection, detect
+from zoomjax.detect.sources import Source
+
+SIZE = (1072, 712)
+PRINCIPAL = (np.array(SIZE) - 1) / 2
+
+
+def of(name, focal=None):
+    line = np.stack([np.full(9, 30.0), np.arange(10.0, 100, 10)], axis=-1)
+    return Detection(name, name, SIZE, (line,), focal)
+
+
+def test_exif_data_come_first():
+    found = choose_focals([of("a.jpg", 24.0), of("b.jpg", 70.0), of("c.jpg")])
+    assert found.focal == {"a.jpg": 24.0, "b.jpg": 70.0}
+    assert (found.unit, found.origin, found.deviation) == ("mm", "EXIF data", {})
+    assert "EXIF" in found.absent
+
+
+def test_deviations_of_a_table_are_read(tmp_path):
+    (tmp_path / "f.csv").write_text("image,focal,sigma\na.jpg,1200,9\nb.jpg,4000,\n")
+    found = choose_focals([of("a.jpg"), of("b.jpg")], str(tmp_path / "f.csv"), unit="px")
+    assert found.deviation == {"a.jpg": 9.0}
+
+
+def test_a_table_is_read(tmp_path):
+    (tmp_path / "f.csv").write_text("image,focal\na.jpg,1200\nb.jpg,4000\n")
+    found = choose_focals([of("a.jpg", 24.0), of("b.jpg"), of("c.jpg")], str(tmp_path / "f.csv"), unit="px")
+    assert (found.focal, found.unit) == ({"a.jpg": 1200.0, "b.jpg": 4000.0}, "px")
+    assert found.absent == "f.csv has no row for it"
+
+
+def test_one_number_is_that_of_all():
+    assert choose_focals([of("a.jpg", 24.0), of("b.jpg")], "35").focal == {"a.jpg": 35.0, "b.jpg": 35.0}
+
+
+@pytest.mark.parametrize(
+    ("way", "message"),
+    [
+        (None, "no flat grid.*image,focal.*EXIF.*parallel.*oblique"),
+        ("exif", "EXIF data.*image,focal.*EXIF.*parallel.*oblique"),
+        ("plane", "homographies"),
+        ("board", "--pitch and --distance"),
+    ],
+)
+def test_without_a_focal_length_the_ways_are_named(way, message):
+    with pytest.raises(ValueError, match=message):
+        choose_focals([of("a.jpg"), of("b.jpg")], way)
+
+
+@pytest.mark.parametrize("video", [False, True])
+@pytest.mark.parametrize(
+    ("way", "error", "message"),
+    [
+        ("board", ValueError, "--pitch and --distance"),
+        ("zoom", ValueError, "'zoom', which is no way"),
+        ("focal.txt", ValueError, "which is no way"),
+        ("-3", ValueError, "positive number"),
+        ("0", ValueError, "positive number"),
+        ("nan", ValueError, "positive number"),
+        ("nothing.csv", FileNotFoundError, r"nothing\.csv"),
+    ],
+)
+def test_what_is_no_way_is_told_before_any_work(way, video, error, message):
+    with pytest.raises(error, match=message):
+        check_way(way, None, video=video)
+
+
+def test_the_ways_that_there_are(tmp_path):
+    (tmp_path / "f.csv").write_text("image,focal\na.jpg,1200\n")
+    (tmp_path / "t.csv").write_text("frame,focal\n0,1200\n")
+    board = Board((20.0, 20.0), 1000.0, 0.005)
+    for way in (None, "exif", "plane", "35", str(tmp_path / "f.csv")):
+        check_way(way, None, video=False)
+    for way in ("plane", "35", str(tmp_path / "t.csv")):
+        check_way(way, None, video=True)
+    for way in (None, "board"):
+        check_way(way, board, video=True)
+    for way in (None, "exif"):
+        with pytest.raises(ValueError, match=r"A video needs --focal.*time,focal"):
+            check_way(way, None, video=True)
+
+
+@pytest.fixture(scope="module")
+def striped():
+    """What the detector finds on the paper's board at four focal lengths."""
+    lens = scenes.nikkor_18_200(SIZE)
+    focal = np.array([24.0, 35.0, 60.0, 100.0])
+    photos = [
+        Source(f"{f:g}.jpg", image=scenes.board_photo(lens, float(f), blur=0.8, noise=2)) for f in focal
+    ]
+    return focal, list(detect(photos, zj.EdgeDetector()))
+
+
+BOARD = scenes.StripedBoard.before(scenes.nikkor_18_200(SIZE))
+PITCHES = tuple(BOARD.size[axis] / BOARD.stripes[axis] / 2 for axis in (0, 1))  # 21.45 and 21.96 mm
+
+
+def test_the_pitch_of_a_board_gives_the_focal_length_within_a_thousandth(striped):
+    focal, detections = striped
+    found = choose_focals(detections, board=Board(PITCHES, BOARD.distance, BOARD.pixel))
+    assert (found.unit, found.origin) == ("mm", "the board's pitch (eq. 14)")
+    for d, f in zip(detections, focal, strict=True):
+        assert found.focal[d.name] == pytest.approx(f, rel=1e-3)
+        assert 0 < found.deviation[d.name] < 1e-3 * f
+
+
+def test_a_board_whose_directions_disagree_is_refused(striped):
+    """As the paper's board does, taken for one of square fields."""
+    _, detections = striped  # of the first, only borders across are found evenly spaced
+    with pytest.raises(ValueError, match=r"differs between its two directions.*ACROSSxDOWN"):
+        choose_focals(detections[1:], board=Board((PITCHES[0],) * 2, BOARD.distance, BOARD.pixel))
+
+
+def upright(*positions):
+    y = np.arange(10.0, 700, 10)
+    lines = tuple(np.stack([np.full_like(y, x), y], axis=-1) for x in positions)
+    return Detection("a.png", "a.png", SIZE, lines)
+
+
+def test_lines_that_are_no_boards_tell_nothing():
+    board = Board((20.0, 20.0), 1000.0, 0.01)
+    with pytest.raises(ValueError, match="no evenly spaced lines of a board"):
+        choose_focals([upright(30, 77, 190, 260, 500, 900)], board=board)
+    with pytest.raises(ValueError, match="no evenly spaced lines of a board"):
+        choose_focals([upright(30, 30, 30)], board=board)
+
+
+def test_missing_lines_and_lines_in_pieces_do_not_matter():
+    board = Board((20.0, 20.0), 1000.0, 0.01)
+    [even] = choose_focals([upright(100, 200, 300, 400, 500, 600, 700)], board=board).focal.values()
+    [gaps] = choose_focals([upright(100, 200, 200.01, 400, 500, 600, 700)], board=board).focal.values()
+    assert even == pytest.approx(1000 * 1 / 21)  # a step of 100 px, 1 mm, is 20 mm on the board
+    assert gaps == pytest.approx(even, rel=1e-3)
+
+
+def oblique(focal, tilts, k=(0.05, -0.02)):
+    """A grid of 12 x 8 nodes seen obliquely through a lens, a detection each view."""
+    lens = zj.Distortion(jnp.array(k), jnp.array(PRINCIPAL), jnp.array(np.hypot(*SIZE) / 2))
+    row, column = np.mgrid[:8, :12].astype(float)
+    for index, (a, b) in enumerate(tilts):
+        x, y = (column - 5.5) / 12, (row - 3.5) / 12
+        depth = 1.3 * focal / 1000 + np.sin(a) * x + np.sin(b) * y
+        corrected = PRINCIPAL + focal * np.stack([np.cos(a) * x, np.cos(b) * y], -1) / depth[..., None]
+        seen = np.asarray(lens.distort(jnp.asarray(corrected)))
+        name = f"{focal:g}-{index}.png"
+        yield Detection(name, name, SIZE, tuple(zj.GridDetector.lines(seen)), None, seen)
+
+
+def test_oblique_views_of_a_grid_give_focal_lengths():
+    """Their distortion is not known: it is found first. Tilts about one axis are plane rotations."""
+    tilts = ((0.5, 0.0), (0.0, 0.6), (-0.6, 0.0))
+    detections = [d for focal in (1000.0, 1500.0, 2200.0) for d in oblique(focal, tilts)]
+    found = choose_focals(detections)
+    assert (found.unit, found.origin) == ("px", "homographies of the grid")
+    for name, focal in found.focal.items():
+        assert focal == pytest.approx(float(name.split("-")[0]), rel=2e-3)
+    assert len(found.focal) == len(detections)
+
+
+def test_a_square_view_tells_nothing():
+    detections = [*oblique(1000.0, [(0.5, 0.0), (0.0, 0.5), (0.0, 0.0)])]
+    found = choose_focals(detections, "plane")
+    assert set(found.focal) == {"1000-0.png", "1000-1.png"}
+    assert "too squarely" in found.absent

@@ -1,0 +1,260 @@
+"""From images on disk to a lens: rendered photographs of the paper's board, and a clip that zooms."""
+
+import dataclasses
+import json
+import unicodedata
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from zoomjax import scenes
+from zoomjax.app import demo
+from zoomjax.app.console import show_images
+from zoomjax.app.image_calibration import ImageJob, calibrate_images
+from zoomjax.app.report import report
+from zoomjax.io.exif import exif_with_focal
+
+from .. import _clips as clips
+
+SIZE = (1072, 712)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Five good photographs, and one of everything that can be wrong with one."""
+    folder = tmp_path_factory.mktemp("photos")
+    good = demo.write_photos(folder, number=5, image_size=SIZE)
+    image = cv2.imread(str(good[0]), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(folder / "no-exif.png"), image)
+    cv2.imwrite(str(folder / "small.png"), cv2.resize(image, None, fx=0.5, fy=0.5))
+    cv2.imwrite(str(folder / "turned.png"), np.rot90(image))
+    cv2.imwrite(str(folder / "blank.png"), np.full_like(image, 90))
+    (folder / "empty.jpg").write_bytes(b"")
+    (folder / "cut.jpg").write_bytes(good[1].read_bytes()[:20000])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(folder):
+    steps = []
+    calibrated = calibrate_images(ImageJob((folder,)), progress=lambda *step: steps.append(step))
+    assert steps == [(number, 11) for number in range(1, 12)]
+    return calibrated
+
+
+def test_the_lens_is_that_of_the_photographs(done):
+    lens, truth = done.calibration.zoom.lens, scenes.nikkor_18_200(SIZE)
+    assert demo.worst_error(lens, truth, done.focals.focal.values()) < 0.1
+    assert (lens.image_size, lens.focal_unit) == (SIZE, "mm")
+    np.testing.assert_allclose(lens.focal_range, [20.56, 127.36])
+
+
+def test_bad_images_are_reported_and_do_not_matter(done):
+    assert [d.name[:5] for d in done.used] == ["board"] * 5
+    expected = {
+        "no-exif.png": "EXIF data hold no focal length",
+        "small.png": "its size is 536x356 px, most images' 1072x712: use images as the camera stored them",
+        "turned.png": "its size is 712x1072 px, most images' 1072x712: it was turned, so turn it back",
+        "blank.png": "no lines were found",
+        "empty.jpg": "the file is empty",
+        "cut.jpg": "the file is damaged or cut off",
+    }
+    assert set(done.unused) == set(expected)
+    for name, reason in expected.items():
+        assert reason in done.unused[name]
+    [told, *_] = done.warnings()
+    assert told.startswith("6 of 11 images are not used.")
+    assert all(name in told for name in expected)
+
+
+def test_results_are_written_with_the_lines_over_each_image(done, tmp_path):
+    done.write(tmp_path)
+    written = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file())
+    numbers = [1 + sorted([*done.unused, *(d.name for d in done.used)]).index(d.name) for d in done.used]
+    overlays = [f"{n:04d}-{d.name}" for n, d in zip(numbers, done.used, strict=True)]
+    assert overlays == done.overlays()
+    files = ["lens.json", "lines.npz", "summary.json", "model.png", *(f"lines/{name}" for name in overlays)]
+    assert written == sorted([*files, ".zoomjax.json"])
+    for name in overlays:
+        assert cv2.imread(str(tmp_path / "lines" / name)).shape == (SIZE[1], SIZE[0], 3)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["focal_source"] == "EXIF data"
+    assert [image["name"] for image in summary["images"]] == [d.name for d in done.used]
+    assert sum(image["lines"] for image in summary["images"]) == summary["lines"]
+    assert summary["unused"] == done.unused
+    assert summary["rms_frames"] <= summary["rms_zoom"] < 0.1 < summary["rms_none"]
+
+
+def test_lines_that_are_not_straight_are_rejected(folder, tmp_path):
+    """A stripe bent by 2.5 px in one of the photographs: too little for the detector."""
+    for path in sorted(folder.glob("board*")):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    target = tmp_path / sorted(folder.glob("board*"))[-1].name
+    image, metadata = cv2.imread(str(target)), cv2.imreadWithMetadata(str(target), flags=1)
+    t = np.linspace(0, 1, 200)
+    for side, level in ((0, 255), (14, 0)):
+        arc = np.stack([330 + side + 2.5 * (2 * t - 1) ** 2, 20 + 670 * t], axis=-1)
+        cv2.polylines(image, [np.rint(arc * 16).astype(np.int32)], False, (level,) * 3, 14, cv2.LINE_AA, 4)
+    _, content = cv2.imencodeWithMetadata(".jpg", image, list(metadata[1]), list(metadata[2]))
+    target.write_bytes(content.tobytes())
+    spoiled = calibrate_images(ImageJob((tmp_path,)))
+    rejected = spoiled.rejected()
+    assert [int(r.sum()) for r in rejected[:-1]] == [0] * 4
+    assert 1 <= rejected[-1].sum() <= 4
+    truth = scenes.nikkor_18_200(SIZE)
+    assert demo.worst_error(spoiled.calibration.zoom.lens, truth, [20.56, 50.0, 127.36]) < 0.1
+
+
+def test_an_image_none_of_whose_lines_agrees_is_not_used(folder, tmp_path):
+    """One line, drawn by hand."""
+    for path in sorted(folder.glob("board*")):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    t = np.linspace(0, 1, 200)
+    arc = np.stack([500 + 12 * (2 * t - 1) ** 2, 20 + 670 * t], axis=-1)
+    image = np.full((SIZE[1], SIZE[0]), 60, np.uint8)
+    cv2.fillPoly(
+        image,
+        [np.rint(np.vstack([arc, [[1100, 690], [1100, 20]]]) * 16).astype(np.int32)],
+        200,
+        cv2.LINE_AA,
+        4,
+    )
+    exif = np.frombuffer(exif_with_focal(60.0), np.uint8)
+    _, content = cv2.imencodeWithMetadata(".png", image, [cv2.IMAGE_METADATA_EXIF], [exif])
+    (tmp_path / "bent.png").write_bytes(content.tobytes())
+    done = calibrate_images(ImageJob((tmp_path,)))
+    assert list(done.unused) == ["bent.png"]
+    assert "none of its lines is straight" in done.unused["bent.png"]
+    assert len(done.used) == 5
+
+
+def test_a_zooming_video_is_calibrated(tmp_path):
+    clips.write_clip(tmp_path / "zoom.mp4", sound=False)
+    track = [f"{n},{clips.focal(n)}" for n in range(clips.FRAMES)]
+    (tmp_path / "track.csv").write_text("\n".join(["frame,focal", *track]))
+    job = ImageJob((tmp_path / "zoom.mp4",), focal=str(tmp_path / "track.csv"), degree=1, frames=8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        done = calibrate_images(job)
+    assert done.focals.origin == "the track of the video"
+    assert len(done.used) == 8
+    lens, truth = done.calibration.zoom.lens, clips.lens()
+    assert demo.worst_error(lens, truth, [20.0, 35.0, 80.0]) < 1.5  # 320 px wide, few lines
+    done.write(tmp_path)
+    assert len(list((tmp_path / "lines").glob("*-zoom-*.jpg"))) == 8
+
+
+def test_a_second_run_leaves_nothing_of_the_first_and_everything_else(done, tmp_path):
+    done.write(tmp_path)
+    stale, *others = sorted((tmp_path / "lines").iterdir())
+    (tmp_path / "lines" / "old.jpg").write_bytes(b"not of zoomjax")
+    done.calibration.write(tmp_path)  # of other lines
+    assert [p.name for p in (tmp_path / "lines").iterdir()] == ["old.jpg"]
+    done.write(tmp_path)
+    names = ["old.jpg", *(p.name for p in (stale, *others))]
+    assert sorted(p.name for p in (tmp_path / "lines").iterdir()) == sorted(names)
+
+
+HOSTILE = [
+    "<script>alert(1)<‚script>.jpg",
+    "[red]x[‚red].jpg",
+    "\x1b[31m\x9b2J.jpg",
+    "=cmd().jpg",
+    "two\nlines\u202e.jpg",
+]
+
+
+@pytest.fixture
+def hostile(done, folder, tmp_path):
+    """The photographs once more under names that mean something to somebody, two folders up."""
+    photos = [tmp_path / name for name in HOSTILE]
+    for detection, photo in zip(done.used, photos, strict=True):
+        photo.write_bytes((folder / detection.name).read_bytes())
+    inputs = tuple(f"{tmp_path}/a/b/../../{photo.name}" for photo in photos)
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    pairs = zip(done.used, inputs, strict=True)
+    used = tuple(dataclasses.replace(d, name=name, file=name) for d, name in pairs)
+    names = {source.path: source.name for source in ImageJob(inputs).sources()[0]}
+    used = tuple(dataclasses.replace(d, name=names[Path(d.file)]) for d in used)
+    focals = dataclasses.replace(
+        done.focals, focal={d.name: f for d, f in zip(used, done.focals.focal.values(), strict=True)}
+    )
+    unused = {f"bad {name}": f"it is bad: {name}" for name in HOSTILE}
+    images = tuple(d.name for d in used)
+    return dataclasses.replace(
+        done, job=ImageJob(inputs), used=used, focals=focals, images=images, unused=unused
+    )
+
+
+def test_results_in_the_photographs_own_folder_touch_none_of_them(hostile, tmp_path):
+    before = {photo: photo.read_bytes() for photo in tmp_path.glob("*.jpg")}
+    assert len(before) == 5
+    (tmp_path / "lines").mkdir()
+    (tmp_path / "lines" / "0001-mine.jpg").write_bytes(b"mine")
+    for _ in range(2):
+        hostile.write(tmp_path)
+    assert {photo: photo.read_bytes() for photo in tmp_path.glob("*.jpg")} == before
+    made = ["0001-script_alert_1_script", "0002-red_x_red", "0003-31m_2J", "0004-cmd", "0005-two_lines"]
+    assert sorted(p.stem for p in (tmp_path / "lines").iterdir()) == sorted(["0001-mine", *made])
+    assert not list((tmp_path / "a").rglob("*.jpg"))
+    (tmp_path / "lines" / f"{made[2]}.jpg").write_bytes(b"edited")
+    with pytest.raises(FileExistsError, match=r"0003-31m_2J\.jpg would be replaced"):
+        hostile.write(tmp_path)
+
+
+def test_hostile_names_give_no_orders(hostile, tmp_path, capsys):
+    show_images(hostile, tmp_path / "[red]out\x1b[0m")
+    shown = "".join(capsys.readouterr())
+    assert not {c for c in shown if unicodedata.category(c) in ("Cc", "Cf")} - {"\n"}
+    flat = "".join(shown.split())
+    for name in (
+        "[red]x[‚red].jpg",
+        r"\x1b[31m\x9b2J.jpg",
+        r"two\nlines\u202e.jpg",
+        r"[red]out\x1b[0m/lines",
+    ):
+        assert name in flat
+    page = report(hostile.calibration, hostile)
+    assert "<script>" not in page
+    assert "&lt;script&gt;alert(1)&lt;" in page
+    assert "\x1b" not in page
+    assert r"two\nlines\u202e.jpg" in page
+    assert "[red]x[‚red].jpg" in page
+    page.encode()
+
+
+WRONG = {
+    "unknown detector": (
+        {"detector": "circles"},
+        ValueError,
+        "--detector must be one of edges, grid, pitch",
+    ),
+    "photos and a video": ({"inputs": ("a.jpg", "b.mp4")}, ValueError, "photographs, or one video"),
+    "two videos": ({"inputs": ("a.mp4", "b.mp4")}, ValueError, "one video"),
+    "no such photo": ({"inputs": ("nothing.jpg",)}, FileNotFoundError, "nothing.jpg"),
+    "no such table": ({"focal": "nothing.csv"}, FileNotFoundError, "nothing.csv"),
+    "video without focal": ({"inputs": ("a.mp4",)}, ValueError, "A video needs --focal"),
+    "a number that is none": ({"focal": "-3"}, ValueError, "positive number"),
+    "video with exif": ({"inputs": ("a.mp4",), "focal": "exif"}, ValueError, "A video needs --focal"),
+    "no such video": ({"inputs": ("a.mp4",), "focal": "3"}, FileNotFoundError, "no video a.mp4"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_mistakes_are_told_before_any_work(case, folder):
+    settings, error, message = WRONG[case]
+    with pytest.raises(error, match=message):
+        calibrate_images(ImageJob(**{"inputs": (folder,)} | settings))
+
+
+def test_when_no_image_can_be_used_the_reason_is_told(tmp_path):
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), np.full((100, 100), 90, np.uint8))
+    with pytest.raises(ValueError, match="None of the 2 images can be used: no lines were found"):
+        calibrate_images(ImageJob((tmp_path,)))
+    (tmp_path / "c.png").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"a\.png: no lines.*c\.png: .*empty"):
+        calibrate_images(ImageJob((tmp_path,)))

@@ -1,0 +1,46 @@
+"""Lines drawn over images."""
+
+import numpy as np
+import pytest
+
+from zoomjax.app.overlay import draw_lines
+
+LINE = np.stack([np.full(80, 30.0), np.arange(10.0, 90.0)], axis=-1)
+
+
+def test_a_line_is_drawn_where_it_is_in_a_colour():
+    image = np.full((100, 100), 200, np.uint8)
+    picture = draw_lines(image, [LINE], [False])
+    coloured = np.ptp(picture.astype(int), axis=2) > 60
+    assert coloured[15:85, 30].all()
+    assert not coloured[:, :28].any()
+    assert not coloured[:, 33:].any()
+    assert image.min() == 200
+
+
+def test_rejected_lines_are_dashed_and_red():
+    picture = draw_lines(np.zeros((100, 100, 3), np.uint8), [LINE], [True]).astype(int)
+    red = (picture[..., 2] > 150) & (picture[..., 0] < 100)
+    assert 0.3 < red[15:85, 30].mean() < 0.8
+
+
+def test_neighbours_have_different_colours():
+    lines = [LINE + np.array([10.0 * i, 0]) for i in (0, 2, 1, 3)]
+    picture = draw_lines(np.zeros((100, 100), np.uint8), lines, [False] * 4)
+    colours = [tuple(picture[50, 30 + 10 * i]) for i in range(4)]
+    assert len(set(colours)) == 4
+
+
+@pytest.mark.parametrize("shape", [(3000, 4000), (4000, 3000, 3)])
+def test_large_images_are_made_smaller_with_their_lines(shape):
+    image = np.zeros(shape, np.uint8)
+    line = np.stack([np.full(2500, 999.5), np.arange(2500.0)], axis=-1)
+    picture = draw_lines(image, [line], [False])
+    assert max(picture.shape) == 2000
+    found = np.flatnonzero(picture[100].max(axis=1) > 60)
+    assert found.mean() == pytest.approx(499.5, abs=0.5)
+
+
+def test_an_image_without_lines_is_only_dimmed():
+    picture = draw_lines(np.full((20, 30), 100, np.uint8), [], [])
+    assert (picture == 55).all()

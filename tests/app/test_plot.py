@@ -1,0 +1,102 @@
+"""Plots: what is drawn is what was fitted."""
+
+import io
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax import scenes
+from zoomjax.app.plot import plot_distortion, plot_model
+
+
+def test_model_plot_shows_every_frame_and_the_polynomial():
+    lens = scenes.nikkor_18_200()
+    lines = scenes.board_lines(lens, scenes.focal_sweep(6), spacing=80)
+    small = zj.compress(lines)
+    figure = plot_model(zj.fit_zoom(small), zj.fit_frames(small), lines)
+    above, below = figure.axes[:2], figure.axes[2:]
+    assert len(below) == 2
+    for i, axes in enumerate(above):
+        curve = max(axes.lines, key=lambda line: len(line.get_xdata()))
+        for inverse, value in zip(*curve.get_data(), strict=True):
+            expected = lens.zoom(np.clip(1 / inverse, 20.56, 127.36))[i] / lens.scale ** (2 * i + 2)
+            np.testing.assert_allclose(value, expected, rtol=1e-6, atol=1e-22)
+        [dots] = [line for line in axes.lines if line.get_marker() == "o"]
+        np.testing.assert_allclose(dots.get_xdata(), 1 / np.asarray(lines.focal))
+    for axes in below:
+        [dots] = axes.containers
+        assert len(dots.lines[0].get_xdata()) == 6
+    [scale] = above[0].child_axes
+    assert [label.get_text() for label in scale.get_xticklabels()] == ["25", "30", "40", "50", "70", "100"]
+
+
+@pytest.fixture(scope="module")
+def folding():
+    """A lens that folds at 0.86 of its half diagonal at 20 mm, and does nothing at 80 mm."""
+    zoom = zj.PolynomialZoom(1, jnp.array([[0.15], [-0.6]]), jnp.array(20.0))
+    return zj.ZoomLens(zoom, jnp.array([319.5, 239.5]), jnp.array([20.0, 80.0]), (640, 480))
+
+
+def bent_lines(axes):
+    """The grid as the lens shows it: the lines in the colour of models."""
+    return [line for line in axes.lines if line.get_color() == "#c2410c"]
+
+
+def test_distortion_plot_shows_the_grid_as_the_lens_does(fit):
+    figure = plot_distortion(fit.lens, focal=35.0, exaggeration=1.0)
+    grid = figure.axes[0]
+    straight = [line for line in grid.lines if line.get_color() == "0.75"]
+    assert len(straight) == 22  # 13 upright, 9 level
+    for line, bent in zip(straight, bent_lines(grid), strict=True):
+        seen = fit.lens(35.0).distort(np.asarray(line.get_xydata()))
+        np.testing.assert_allclose(bent.get_xydata(), seen, atol=1e-9)
+
+
+@pytest.mark.parametrize(("focal", "times"), [(20.56, 1), (127.36, 5)])
+def test_a_small_distortion_is_exaggerated_and_the_plot_says_so(fit, focal, times):
+    """Corners are off by 180 and 40 px of 4288 at the ends of the range."""
+    grid = plot_distortion(fit.lens, focal=focal).axes[0]
+    corner = bent_lines(grid)[0].get_xydata()[0]
+    seen = np.asarray(fit.lens(focal).distort(np.zeros(2)))
+    np.testing.assert_allclose(corner, times * seen, atol=1e-9)
+    labels = [text.get_text() for text in grid.get_legend().get_texts()]
+    assert ("distortion × 5" in labels[1]) == (times == 5)
+
+
+def test_distortion_plot_shows_displacement_and_standard_deviation_of_a_fit(fit):
+    figure = plot_distortion(fit, focal=[20.56, 127.36])
+    assert len(figure.axes) == 6  # two grids, two fields, two colour bars
+    field = figure.axes[1]
+    filled, arrows, contours = field.collections
+    corner = float(np.hypot(*fit.lens(20.56).undistort(np.zeros(2))))
+    assert filled.levels[-2] < corner <= filled.levels[-1]
+    points = np.asarray(arrows.get_offsets())
+    moved = np.asarray(fit.lens(20.56).undistort(points)) - points
+    np.testing.assert_allclose(np.stack([arrows.U, arrows.V], -1), moved, atol=1e-9)
+    largest = float(zj.displacement_std(fit, np.zeros(2), focal=20.56))
+    assert 0 < contours.levels[0] < contours.levels[-1] < largest
+    figure.savefig(io.BytesIO(), format="svg")
+
+
+def test_a_fold_leaves_a_gap_in_the_distortion_plot(folding):
+    figure = plot_distortion(folding, focal=20.0)
+    grid, field, _ = figure.axes
+    bent = np.concatenate([line.get_xydata() for line in bent_lines(grid)])
+    assert 0 < np.isnan(bent).any(axis=-1).sum() < len(bent)
+    filled, arrows = field.collections
+    beyond = np.hypot(*(arrows.get_offsets() - [319.5, 239.5]).T) > float(folding(20.0).monotone_radius)
+    assert beyond.any()
+    np.testing.assert_array_equal(arrows.Umask, beyond)
+    assert "folded over" in field.get_title()
+    assert not any(path.contains_point((0, 0)) for path in filled.get_paths())
+    figure.savefig(io.BytesIO(), format="png")
+
+
+def test_a_lens_without_distortion_can_be_drawn(folding):
+    figure = plot_distortion(folding, focal=80.0)
+    for line in bent_lines(figure.axes[0]):
+        assert np.ptp(line.get_xydata(), axis=0).min() < 1e-9
+    assert len(figure.axes[1].collections) == 1  # no arrows of rounding errors
+    figure.savefig(io.BytesIO(), format="png")

@@ -1,0 +1,230 @@
+"""The report: complete, escaped, by itself, and in a browser without errors, on a phone too."""
+
+import base64
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from types import SimpleNamespace
+from urllib.parse import unquote
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import zoomjax.app.report
+from zoomjax import RESULTS
+from zoomjax.app.calibration import calibrate
+from zoomjax.app.report import report
+
+VOID = {"meta", "img", "br", "hr", "link", "input"}
+INLINE = {"a", "b", "i", "span", "strong", "sub", "sup"}
+
+
+class Page(HTMLParser):
+    """What is on a page; raises where an element is not closed in order."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.elements, self.words = [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+        if tag not in INLINE:
+            self.words.append(" ")
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.words.append(data)
+
+    @property
+    def text(self):
+        return " ".join("".join(self.words).split())
+
+    def all(self, tag, attribute):
+        return [attributes[attribute] for name, attributes in self.elements if name == tag]
+
+
+REJECTED = 7
+
+
+@pytest.fixture(scope="module")
+def calibration(noisy):
+    """Four frames of the board, and one of the lines rejected."""
+    done = calibrate(noisy)
+    return dataclasses.replace(done, rejected=np.arange(len(done.rejected)) == REJECTED)
+
+
+@pytest.fixture(scope="module")
+def text(calibration):
+    return report(calibration)
+
+
+@pytest.fixture(scope="module")
+def page(text):
+    return Page(text)
+
+
+def test_page_is_well_formed_and_by_itself(page, text):
+    ids = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
+    assert len(ids) == len(set(ids)) == 5
+    assert "script" not in {tag for tag, _ in page.elements}
+    for source in page.all("img", "src"):
+        assert source.startswith(("data:image/svg+xml;base64,", "data:image/png;base64,"))
+        assert len(base64.b64decode(source.split(",")[1], validate=True)) > 1000
+    assert len(page.all("img", "src")) == 4
+    assert all(page.all("img", "alt"))
+    assert page.all("a", "href") == ["lens.json", "summary.json", "lines.npz", "model.png"]
+    outside = [attributes for tag, attributes in page.elements if tag in ("link", "iframe", "object")]
+    assert not outside
+    assert not re.search(r"url\(|@import", text)
+    assert len(text) < 2_000_000
+
+
+def test_page_says_what_the_summary_says(page, calibration):
+    summary = json.loads(json.dumps(calibration.summary()))
+    for key in ("rms_none", "rms_frames", "rms_algebraic", "rms_zoom"):
+        assert f"{summary[key]:.4f}" in page.text
+    for row in summary["per_frame"]:
+        assert f"{row['rms_zoom']:.3f}" in page.text
+    assert "It is proved to be invertible" in page.text
+    assert summary["next_photo"]["sentence"] in page.text
+    assert f"zoomjax {summary['versions']['zoomjax']}" in page.text
+    for row in summary["corner_displacement"]:
+        assert f"{row['px']:+.2f}".replace("-", "−") in page.text
+
+
+def test_worst_lines_are_those_of_the_lens(page, calibration):
+    """The distance of a line's corrected points to it, from their own singular values."""
+    lines, lens = calibration.lines, calibration.zoom.lens
+    rms = []
+    for line, frame in enumerate(np.asarray(lines.frame)):
+        seen = np.asarray(lines.points[line])[np.asarray(lines.mask[line])]
+        corrected = np.asarray(lens(float(lines.focal[frame])).undistort(seen))
+        spread = np.linalg.svd(corrected - corrected.mean(axis=0), compute_uv=False)[1]
+        rms.append(spread / np.sqrt(len(seen)))
+    np.testing.assert_allclose(calibration.line_rms, rms, rtol=1e-6)
+    assert re.search(rf"{REJECTED} at \(\d+, \d+\): {rms[REJECTED]:.2f} px, rejected", page.text)
+    own = np.flatnonzero((np.asarray(lines.frame) == 0) & ~calibration.rejected)
+    worst = own[np.argmax(np.array(rms)[own])]
+    assert re.search(rf"{worst} at \(\d+, \d+\): {rms[worst]:.2f} px", page.text)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    monkeypatch.setattr(zoomjax.app.report, "_plot", lambda *_, **__: zoomjax.app.report.Html())
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_names_are_escaped_and_lead_to_their_pictures(calibration):
+    names = ['<script>alert("1")</script>.jpg', "a b/ü & #1?.png", "c", "d"]
+    images = SimpleNamespace(
+        used=[SimpleNamespace(name=name) for name in names],
+        overlays=lambda: [f"{name}.jpg" for name in names],
+        warnings=lambda: ["<b>two</b>\n  lines & more"],
+        focals=SimpleNamespace(origin='"here" <there>'),
+    )
+    page = Page(report(calibration, images))
+    assert "script" not in {tag for tag, _ in page.elements}
+    for name in names:
+        assert name in page.text
+    links = page.all("a", "href")[: len(names)]
+    assert [unquote(link) for link in links] == [f"lines/{name}.jpg" for name in names]
+    assert all(re.fullmatch(r"[\w/.%-]+", link) for link in links)
+    assert "Beware: <b>two</b> lines & more" in page.text
+    assert 'Focal lengths: "here" <there>.' in page.text
+
+
+def test_what_is_not_determined_is_said(calibration):
+    zoom = eqx.tree_at(
+        lambda fit: (fit.covariance, fit.result),
+        calibration.zoom,
+        (jnp.full_like(calibration.zoom.covariance, jnp.inf), RESULTS.undetermined),
+    )
+    page = Page(report(dataclasses.replace(calibration, zoom=zoom)))
+    assert "Beware: The lines do not determine" in page.text
+    assert "not determined" in page.text
+    assert "at the corner, where it is least certain unknown" in page.text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_lens_that_folds_is_called_so(calibration):
+    zoom = eqx.tree_at(
+        lambda fit: (fit.certificate.certified, fit.certificate.slope),
+        calibration.zoom,
+        (jnp.array(False), jnp.array(-0.2)),
+    )
+    page = Page(report(dataclasses.replace(calibration, zoom=zoom)))
+    assert "It is not invertible" in page.text
+    assert "goes down to -0.2, at f = " in page.text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_long_lists_are_cut_to_the_worst_frames(calibration, monkeypatch):
+    monkeypatch.setattr(zoomjax.app.report, "_MOST_FRAMES", 2)
+    page = Page(report(calibration))
+    assert "Of 4 frames, these are the 2 that the polynomial fits worst." in page.text
+    rms = np.asarray(calibration.zoom.frame_rms)
+    frames = page.text[page.text.index("Frame by frame") :]
+    for frame in range(4):
+        assert (f"{rms[frame]:.3f}" in frames) == (frame in np.argsort(-rms)[:2])
+
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+PROBE = """<!DOCTYPE html><meta charset="utf-8"><title>probe</title>
+<iframe id="page" src="report.html" style="width:{width}px;height:800px;border:0"></iframe>
+<pre id="found"></pre>
+<script>
+onload = () => {{
+  const page = document.getElementById("page").contentDocument;
+  const images = [...page.images];
+  document.getElementById("found").textContent = JSON.stringify({{
+    width: page.documentElement.clientWidth,
+    needed: page.documentElement.scrollWidth,
+    images: images.length,
+    shown: images.filter((image) => image.complete && image.naturalWidth > 0).length,
+    boxes: [...page.querySelectorAll(".box")].filter((box) => box.scrollWidth > box.clientWidth).length,
+  }});
+}};
+</script>"""
+
+
+@pytest.mark.parametrize("width", [360, 1200])
+def test_in_a_browser(text, tmp_path, width):
+    """Nothing on the console, all images there, and only boxes scroll sideways."""
+    if CHROMIUM is None:
+        pytest.skip("Needs a browser: chromium, chromium-browser or google-chrome.")
+    (tmp_path / "report.html").write_text(text, encoding="utf-8")
+    (tmp_path / "probe.html").write_text(PROBE.format(width=width), encoding="utf-8")
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"]
+    command += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
+    command += [
+        "--allow-file-access-from-files",
+        "--hide-scrollbars",
+        "--window-size=1300,900",
+        "--virtual-time-budget=10000",
+    ]
+    command += [f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--dump-dom"]
+    done = subprocess.run(
+        [*command, (tmp_path / "probe.html").as_uri()], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert "CONSOLE" not in done.stderr
+    found = json.loads(re.search(r'<pre id="found">(.*?)</pre>', done.stdout)[1])
+    assert found["width"] == width
+    assert found["needed"] == width
+    assert found["images"] == found["shown"] == 4
+    if width == 360:
+        assert found["boxes"] > 0

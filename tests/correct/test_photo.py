@@ -1,0 +1,152 @@
+"""Photographs from file to file: pixels, depths, metadata, orientation, focal lengths, and mistakes."""
+
+import warnings
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax.correct.photo import photo_focal
+
+from .._exif import exif
+
+SIZE = (192, 128)
+
+
+def lens(size=SIZE, unit="mm"):
+    zoom = zj.PolynomialZoom(1, jnp.array([[-0.17, 0.02], [0.43, -0.02]]), jnp.array(20.0))
+    return zj.ZoomLens(zoom, (jnp.array(size) - 1) / 2, jnp.array([20.0, 80.0]), size, unit)
+
+
+def picture(rng, channels=3, dtype=np.uint8):
+    noise = cv2.GaussianBlur(rng.uniform(size=(SIZE[1], SIZE[0], max(channels, 1))), (0, 0), 3)
+    noise = (noise - noise.min()) / np.ptp(noise)
+    top = 1 if np.dtype(dtype).kind == "f" else np.iinfo(dtype).max
+    return np.squeeze((noise * top).astype(dtype))
+
+
+def write(path, image, block=None, profile=None):
+    kinds, blocks = [], []
+    if block is not None:
+        kinds, blocks = [cv2.IMAGE_METADATA_EXIF], [np.frombuffer(block, np.uint8)]
+    if profile is not None:
+        kinds.append(cv2.IMAGE_METADATA_ICCP)
+        blocks.append(np.frombuffer(profile, np.uint8))
+    if kinds:
+        done, content = cv2.imencodeWithMetadata(path.suffix, image, kinds, blocks)
+    else:
+        done, content = cv2.imencode(path.suffix, image)
+    assert done
+    path.write_bytes(content.tobytes())
+    return path
+
+
+def metadata(path):
+    image, kinds, blocks = cv2.imreadWithMetadata(str(path), flags=cv2.IMREAD_UNCHANGED)
+    return image, {kind: bytes(np.asarray(b, np.uint8)) for kind, b in zip(kinds, blocks, strict=True)}
+
+
+@pytest.mark.parametrize(
+    ("suffix", "channels", "dtype"),
+    [
+        (".png", 1, np.uint8),
+        (".png", 3, np.uint16),
+        (".png", 4, np.uint8),
+        (".png", 4, np.uint16),
+        (".tif", 3, np.uint16),
+        (".tif", 3, np.float32),
+        (".bmp", 3, np.uint8),
+        (".webp", 4, np.uint8),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Metadata of")
+def test_depth_and_channels_are_kept(tmp_path, rng, suffix, channels, dtype):
+    source = write(tmp_path / f"in{suffix}", picture(rng, channels, dtype))
+    zj.undistort_photo(source, tmp_path / f"out{suffix}", lens=lens(), focal=20.0)
+    before, after = (
+        cv2.imread(str(tmp_path / f"{n}{suffix}"), cv2.IMREAD_UNCHANGED) for n in ("in", "out")
+    )
+    expected = zj.undistort_image(before, lens()(20.0))
+    assert after.dtype == dtype
+    seen = expected[..., 3] > 0 if channels == 4 else ...  # lossless WebP drops colours nobody sees
+    np.testing.assert_array_equal(after[seen], expected[seen])
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+def test_metadata_are_kept_and_orientation_does_not_turn_pixels(tmp_path, rng, suffix):
+    block = exif((3500, 100), orientation=6)
+    source = write(tmp_path / f"in{suffix}", picture(rng), block)
+    zj.undistort_photo(source, tmp_path / f"out{suffix}", lens=lens())  # 35 mm, from the EXIF data
+    before, _ = metadata(source)
+    after, kept = metadata(tmp_path / f"out{suffix}")
+    assert kept[cv2.IMAGE_METADATA_EXIF].endswith(block)
+    assert after.shape == (SIZE[1], SIZE[0], 3)
+    difference = cv2.absdiff(after, zj.undistort_image(before, lens()(35.0)))
+    assert difference.mean() < 1  # JPEG in quality 97
+    turned = cv2.imread(str(tmp_path / f"out{suffix}"))  # as viewers do
+    if suffix == ".jpg":
+        assert turned.shape == (SIZE[0], SIZE[1], 3)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".webp"])
+def test_colour_profile_is_kept(tmp_path, rng, suffix):
+    profile = bytes(range(256)) * 2  # OpenCV checks those of PNG files, and passes these on
+    source = write(tmp_path / f"in{suffix}", picture(rng), exif(), profile)
+    zj.undistort_photo(source, tmp_path / f"out{suffix}", lens=lens())
+    assert metadata(tmp_path / f"out{suffix}")[1][cv2.IMAGE_METADATA_ICCP] == profile
+
+
+def test_tiff_tells_its_focal_length_and_that_metadata_are_lost(tmp_path, rng):
+    source = write(tmp_path / "in.tif", picture(rng))
+    with pytest.raises(ValueError, match=r"focal length of .*in\.tif is not known"):
+        photo_focal(source, lens())
+    with pytest.warns(UserWarning, match=r"Metadata of .*in\.tif are not kept"):
+        zj.undistort_photo(source, tmp_path / "out.tif", lens=lens(), focal=20.0)
+
+
+def wrong(case, tmp_path, rng):
+    """Arguments of a call that must fail, and what it must say."""
+    good = write(tmp_path / "in.jpg", picture(rng), exif())
+    deep = write(tmp_path / "deep.png", picture(rng, 3, np.uint16))
+    clear = write(tmp_path / "clear.png", picture(rng, 4))
+    bare = write(tmp_path / "bare.jpg", picture(rng))
+    (tmp_path / "damaged.jpg").write_bytes(good.read_bytes()[:300])
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    out = tmp_path / "out.jpg"
+    return {
+        "missing": (tmp_path / "none.jpg", out, {}, FileNotFoundError, "no photograph"),
+        "empty": (tmp_path / "empty.jpg", out, {}, ValueError, r"Cannot read a photograph from .*empty"),
+        "damaged": (tmp_path / "damaged.jpg", out, {}, ValueError, "damaged"),
+        "suffix": (good, tmp_path / "out.gif", {}, ValueError, r"must end in one of \.jpg"),
+        "16 bits": (deep, out, {"focal": 30.0}, ValueError, r"3 channels of 16 bits.*choose \.png"),
+        "alpha": (clear, out, {"focal": 30.0}, ValueError, r"4 channels of 8 bits"),
+        "no EXIF": (bare, out, {}, ValueError, "its EXIF data have none in mm"),
+        "px": (good, out, {"lens": lens(unit="px")}, ValueError, "its EXIF data have none in px"),
+        "aspect": (good, out, {"lens": lens((128, 192))}, ValueError, "another aspect ratio"),
+        "folder": (good, tmp_path / "no" / "out.jpg", {}, OSError, "cannot write in the folder"),
+    }[case]
+
+
+CASES = ("missing", "empty", "damaged", "suffix", "16 bits", "alpha", "no EXIF", "px", "aspect", "folder")
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_mistakes_are_named_and_leave_nothing(case, tmp_path, rng):
+    source, target, arguments, error, message = wrong(case, tmp_path, rng)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(error, match=message):
+        zj.undistort_photo(source, target, **{"lens": lens(), **arguments})
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_another_size_of_the_same_aspect_is_scaled_and_said(tmp_path, rng):
+    source = write(tmp_path / "in.png", picture(rng))
+    with pytest.warns(UserWarning, match="its distortion is scaled"):
+        zj.undistort_photo(source, tmp_path / "out.png", lens=lens((384, 256)), focal=20.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scaled = zj.lens_for_size(lens((384, 256)), SIZE)
+    expected = zj.undistort_image(cv2.imread(str(source)), scaled(20.0))
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "out.png")), expected)

@@ -1,0 +1,224 @@
+"""Lines of many images: the same over processes and from the cache, and bad images in between."""
+
+import io
+import multiprocessing
+
+import cv2
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax.detect import batch as module
+from zoomjax.detect.batch import Detection, detect
+from zoomjax.detect.sources import Source, find_photos
+
+
+class Marker(zj.AbstractDetector):
+    """Finds a line in each row of bright pixels, and writes down that it has looked."""
+
+    log: str
+
+    def __call__(self, image):
+        with open(self.log, "a") as file:
+            file.write("looked\n")
+        rows = np.flatnonzero(image.reshape(*image.shape[:2], -1)[..., 0].min(axis=1) > 200)
+        return [
+            np.stack([np.arange(image.shape[1]), np.full(image.shape[1], row)], -1) * 1.0 for row in rows
+        ]
+
+
+@pytest.fixture
+def marker(tmp_path):
+    return Marker(str(tmp_path / "log.txt"))
+
+
+def looks(marker):
+    try:
+        with open(marker.log) as file:
+            return len(file.readlines())
+    except FileNotFoundError:
+        return 0
+
+
+@pytest.fixture
+def photos(tmp_path):
+    """Five images 120 px wide, with 1, 2, 3 lines, none, and one that cannot be read."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number, rows in enumerate(([7], [3, 30], [1, 2, 3], [])):
+        image = np.zeros((40, 120), np.uint8)
+        image[rows] = 255
+        cv2.imwrite(str(folder / f"{number}.png"), image)
+    (folder / "4.png").write_bytes(b"no image")
+    return find_photos([folder])
+
+
+def same(first: Detection, second: Detection):
+    assert (first.name, first.image_size, first.problem) == (second.name, second.image_size, second.problem)
+    for line, other in zip(first.lines, second.lines, strict=True):
+        np.testing.assert_array_equal(line, other)
+
+
+def test_each_image_is_looked_at_and_bad_ones_are_reported(photos, marker):
+    found = list(detect(photos, marker))
+    assert [d.name for d in found] == ["0.png", "1.png", "2.png", "3.png", "4.png"]
+    assert [len(d.lines) for d in found] == [1, 2, 3, 0, 0]
+    assert [d.image_size for d in found] == [(120, 40)] * 4 + [(0, 0)]
+    assert [bool(d.problem) for d in found] == [False] * 3 + [True] * 2
+    assert "no lines were found" in found[3].problem
+    assert "4.png: it is damaged, or of an unknown format" in found[4].problem
+
+
+def test_points_are_four_px_apart(photos, marker):
+    [line] = next(detect(photos, marker)).lines
+    np.testing.assert_array_equal(line[:, 0], np.arange(0, 120, 4))
+
+
+def test_what_was_found_before_is_not_looked_for_again(photos, marker, tmp_path):
+    first = list(detect(photos, marker, cache=tmp_path / "cache"))
+    assert looks(marker) == 4
+    for one, other in zip(first, detect(photos, marker, cache=tmp_path / "cache"), strict=True):
+        same(one, other)
+    assert looks(marker) == 4
+
+
+def test_the_cache_knows_images_by_what_they_show(photos, marker, tmp_path):
+    cache = tmp_path / "cache"
+    list(detect(photos, marker, cache=cache))
+    photos[0].path.rename(photos[0].path.with_name("renamed.png"))
+    photos[1].path.write_bytes(photos[2].path.read_bytes())
+    [renamed, changed] = detect(
+        [Source("renamed.png", photos[0].path.with_name("renamed.png")), photos[1]], marker, cache=cache
+    )
+    assert (renamed.name, len(renamed.lines), len(changed.lines)) == ("renamed.png", 1, 3)
+    assert looks(marker) == 4
+
+
+def test_another_detector_or_program_looks_again(photos, marker, tmp_path, monkeypatch):
+    cache = tmp_path / "cache"
+    list(detect(photos[:1], marker, cache=cache))
+    list(detect(photos[:1], Marker(str(tmp_path / "other.txt")), cache=cache))
+    assert len(list(cache.iterdir())) == 2
+    monkeypatch.setattr(module, "_code", lambda: b"changed")
+    list(detect(photos[:1], marker, cache=cache))
+    assert looks(marker) == 2
+
+
+def _rezipped(content, **changed):
+    stored = dict(np.load(io.BytesIO(content))) | changed
+    np.savez(file := io.BytesIO(), **stored)
+    return file.getvalue()
+
+
+POISON = {
+    "cut": lambda good: good[:100],
+    "empty": lambda good: b"",
+    "no archive": lambda good: b"PK\x03\x04" + bytes(200),
+    "bytes flipped": lambda good: good[:150] + bytes(b ^ 255 for b in good[150:260]) + good[260:],
+    "a pickle": lambda good: _rezipped(good, points=np.array([object()], dtype=object)),
+    "other arrays": lambda good: _rezipped(good, points=np.zeros((3, 3))),
+    "other counts": lambda good: _rezipped(good, counts=np.array([1000])),
+    "negative counts": lambda good: _rezipped(good, counts=np.array([-1, 60, 41])),
+    "no numbers": lambda good: _rezipped(
+        good, points=np.full_like(np.load(io.BytesIO(good))["points"], np.nan)
+    ),
+    "text": lambda good: _rezipped(good, focal=np.array("a lot")),
+    "odd nodes": lambda good: _rezipped(good, nodes=np.zeros(7)),
+}
+
+
+@pytest.mark.parametrize("kind", POISON)
+def test_a_damaged_or_poisoned_cache_is_no_cache(kind, photos, marker, tmp_path):
+    cache = tmp_path / "cache"
+    [first] = detect(photos[:1], marker, cache=cache)
+    [file] = cache.iterdir()
+    file.write_bytes(POISON[kind](file.read_bytes()))
+    [again] = detect(photos[:1], marker, cache=cache)
+    for line, other in zip(again.lines, first.lines, strict=True):
+        np.testing.assert_array_equal(line, other)
+    assert looks(marker) == 2
+    list(detect(photos[:1], marker, cache=cache))
+    assert looks(marker) == 2  # it was mended
+
+
+def test_a_cache_that_cannot_be_written_does_no_harm(photos, marker, tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    assert len(next(detect(photos[:1], marker, cache=tmp_path / "file" / "cache")).lines) == 1
+
+
+def test_the_cache_does_not_keep_a_videos_track(marker, tmp_path):
+    image = np.zeros((40, 120), np.uint8)
+    image[7] = 255
+    for focal in (20.0, 200.0):
+        [found] = detect([Source("a", image=image, focal=focal)], marker, cache=tmp_path / "cache")
+        assert found.focal == focal
+    assert looks(marker) == 1
+
+
+def test_what_no_detector_can_do_with_an_image_is_told(tmp_path):
+    grey, small = np.zeros((100, 100), np.uint8), np.zeros((20, 100, 3), np.uint8)
+    [found] = detect([Source("a", image=grey)], zj.PitchDetector())
+    assert "grey" in found.problem
+    assert "--detector edges" in found.problem
+    [found] = detect([Source("a", image=small)], zj.EdgeDetector())
+    assert found.problem == "it is 100x20 px: at least 32 px a side are needed"
+
+
+class Broken(zj.AbstractDetector):
+    def __call__(self, image):
+        raise IndexError("out of bounds.")
+
+
+def test_a_detector_that_fails_is_one_images_problem(photos):
+    found = list(detect(photos, Broken()))
+    assert [d.problem for d in found[:4]] == ["the detector failed: IndexError: out of bounds"] * 4
+
+
+def test_a_file_that_may_not_be_read_is_told_in_words(photos, marker, monkeypatch):
+    def denied(self):
+        raise PermissionError(13, "Permission denied", str(self.path))
+
+    monkeypatch.setattr(Source, "read", denied)
+    assert next(detect(photos, marker)).problem == "Permission denied"
+
+
+@pytest.mark.slow
+def test_processes_find_what_one_does(tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number in range(5):
+        image = np.full((200, 300), 40, np.uint8)
+        image[:, 40 + 10 * number : 90] = 200
+        image[:, 150 : 170 + 10 * number] = 200
+        cv2.imwrite(str(folder / f"{number}.png"), cv2.GaussianBlur(image, (0, 0), 0.8))
+    (folder / "broken.png").write_bytes(b"no image")
+    photos = find_photos([folder])
+    alone = list(detect(photos, zj.EdgeDetector()))
+    assert [len(d.lines) for d in alone] == [4] * 5 + [0]
+    for one, other in zip(alone, detect(photos, zj.EdgeDetector(), workers=2), strict=True):
+        same(one, other)
+    assert multiprocessing.active_children() == []
+
+
+def test_processes_end_when_the_rest_is_not_wanted(photos):
+    found = detect(photos, zj.EdgeDetector(), workers=2)
+    next(found)
+    found.close()
+    assert multiprocessing.active_children() == []
+
+
+def test_a_grid_is_looked_for_where_it_tells_the_focal_length(tmp_path):
+    squares = np.kron(np.indices((8, 10)).sum(0) % 2, np.ones((20, 20)))
+    board = np.pad((255 * squares).astype(np.uint8), 20, constant_values=255)
+    sources = [Source("plain", image=board), Source("known", image=board, focal=35.0)]
+    nodes = {grid: [d.nodes is not None for d in detect(sources, zj.EdgeDetector(), grid=grid)]
+             for grid in ("all", "none", "without focal length")}  # fmt: skip
+    assert nodes == {
+        "all": [True, True],
+        "none": [False, False],
+        "without focal length": [True, False],
+    }
+    [of_grid] = detect(sources[:1], zj.GridDetector(), cache=tmp_path)
+    [again] = detect(sources[:1], zj.GridDetector(), cache=tmp_path)
+    np.testing.assert_array_equal(of_grid.nodes, again.nodes)
+    assert of_grid.nodes.shape == (7, 9, 2)

@@ -1,0 +1,209 @@
+"""Photographs of every kind, folders, patterns, and the frames of a video."""
+
+import warnings
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from zoomjax.detect.sources import as_bytes, find_photos, video_frames
+from zoomjax.io.focal_track import FocalTrack
+
+from .._clips import FRAMES, cut_off, focal, picture, write_clip
+from .._exif import exif
+
+
+@pytest.fixture
+def image(rng):
+    soft = cv2.GaussianBlur(rng.integers(0, 256, (40, 60, 3)).astype(np.float32), (0, 0), 2)
+    return np.rint(255 * (soft - soft.min()) / np.ptp(soft)).astype(np.uint8)
+
+
+def names(sources):
+    return [source.name for source in sources]
+
+
+def test_a_folder_holds_its_photographs_in_order(tmp_path, image):
+    for name in ("b.png", "a.JPG", "sub/c.tif", ".hidden/d.png", "._e.jpg", "notes.txt"):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"") if name == "notes.txt" else cv2.imwrite(str(path), image)
+    assert names(find_photos([tmp_path])) == ["a.JPG", "b.png", "c.tif"]
+
+
+def test_patterns_are_expanded(tmp_path, image):
+    for name in ("a.png", "b.png", "c.jpg"):
+        cv2.imwrite(str(tmp_path / name), image)
+    assert names(find_photos([str(tmp_path / "*.png")])) == ["a.png", "b.png"]
+    assert names(find_photos([str(tmp_path / "*.png"), tmp_path / "c.jpg"])) == ["a.png", "b.png", "c.jpg"]
+
+
+def test_of_a_pattern_only_photographs_count(tmp_path, image):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "notes.txt").write_text("straight")
+    (tmp_path / "gone.png").symlink_to(tmp_path / "nowhere.png")
+    for name in ("a.png", "sub/b.png"):
+        cv2.imwrite(str(tmp_path / name), image)
+    assert names(find_photos([str(tmp_path / "*")])) == ["a.png"]
+    assert names(find_photos([str(tmp_path / "**")])) == ["a.png", "b.png"]
+    assert names(find_photos([str(tmp_path / "s*")])) == ["b.png"]
+
+
+def test_results_of_a_calibration_are_no_photographs(tmp_path, image):
+    for folder in (tmp_path, tmp_path / "out"):
+        (folder / "lines").mkdir(parents=True)
+        (folder / "lens.json").write_text("{}")
+        for name in ("a.png", "model.png", "lines/a.png"):
+            cv2.imwrite(str(folder / name), image)
+    assert names(find_photos([tmp_path])) == [f"{tmp_path.name}/a.png", "out/a.png"]
+
+
+def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path, image):
+    for folder in ("1x", "3x"):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "board.png"), image)
+    assert names(find_photos([tmp_path])) == ["1x/board.png", "3x/board.png"]
+
+
+def test_the_same_file_twice_is_refused(tmp_path, image):
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    with pytest.raises(ValueError, match=r"a\.png is given twice"):
+        find_photos([tmp_path, tmp_path / "a.png"])
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "message"),
+    [
+        ("nothing.jpg", FileNotFoundError, r"no file or folder .*nothing\.jpg"),
+        ("*.jpg", FileNotFoundError, "no photograph fits the pattern"),
+        ("notes.txt", ValueError, r"notes\.txt is no photograph"),
+        ("empty", ValueError, "no photographs in the folder"),
+    ],
+)
+def test_what_is_not_there_is_named(tmp_path, given, error, message):
+    (tmp_path / "notes.txt").write_text("straight")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(error, match=message):
+        find_photos([str(tmp_path / given)])
+
+
+@pytest.mark.parametrize("kind", ["grey", "colour", "alpha", "16 bit", "16 bit grey", "float"])
+def test_images_of_any_depth_and_channels_become_bytes(tmp_path, image, kind):
+    of = {
+        "grey": image[..., 0],
+        "colour": image,
+        "alpha": np.dstack([image, np.full(image.shape[:2], 9, np.uint8)]),
+        "16 bit": image.astype(np.uint16) * 16,  # 12 bits in 16
+        "16 bit grey": image[..., 0].astype(np.uint16) * 16,
+        "float": image.astype(np.float32) / 255,
+    }[kind]
+    path = tmp_path / ("a.tif" if kind == "float" else "a.png")
+    assert cv2.imwrite(str(path), of)
+    read, own = find_photos([path])[0].read()
+    expected = image[..., 0] if kind.endswith("grey") else image
+    assert read.dtype == np.uint8
+    assert read.shape == expected.shape
+    assert own is None
+    np.testing.assert_allclose(read.astype(float), expected, atol=12)
+
+
+def test_a_hot_pixel_does_not_darken_the_rest(image):
+    deep = image.astype(np.uint16) * 16
+    deep[3, 4] = 65535
+    found, expected = as_bytes(deep).astype(float), image.astype(float)
+    found[3, 4] = expected[3, 4] = 0
+    np.testing.assert_allclose(found, expected, atol=12)
+
+
+def test_values_that_are_no_numbers_are_dark():
+    image = np.array([[np.nan, 1.0], [np.inf, 2.0]], np.float32)
+    np.testing.assert_array_equal(as_bytes(image), [[0, 127], [0, 255]])
+
+
+def test_the_orientation_tag_does_not_turn_the_pixels(tmp_path, image):
+    """The lens saw them as they are stored."""
+    block = np.frombuffer(exif((3500, 100), orientation=6), np.uint8)
+    _, content = cv2.imencodeWithMetadata(".png", image, [cv2.IMAGE_METADATA_EXIF], [block])
+    (tmp_path / "a.png").write_bytes(content.tobytes())
+    read, own = find_photos([tmp_path / "a.png"])[0].read()
+    np.testing.assert_array_equal(read, image)
+    assert own == 35.0
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_a_file_that_is_cut_off_or_empty_or_something_else_is_refused(tmp_path, image, suffix):
+    whole = cv2.imencode(suffix, image)[1].tobytes()
+    for content in (whole[: len(whole) // 2], b"", b"straight lines" * 100):
+        (tmp_path / f"a{suffix}").write_bytes(content)
+        with pytest.raises(ValueError, match=r"Cannot read a photograph from .*a\."):
+            find_photos([tmp_path / f"a{suffix}"])[0].read()
+
+
+def test_what_follows_a_photograph_in_its_file_does_not_matter(tmp_path, image, rng):
+    """As films do in phones' files; and a thumbnail within it is not its end."""
+    whole = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    path = tmp_path / "a.jpg"
+    for _ in range(5):
+        path.write_bytes(whole + rng.bytes(20000))
+        find_photos([path])[0].read()
+    thumbnail = cv2.imencode(".jpg", image[:8, :8])[1].tobytes()
+    segment = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
+    path.write_bytes(whole[:2] + segment + whole[2:])
+    find_photos([path])[0].read()
+    path.write_bytes(whole[:2] + segment + whole[2 : len(whole) // 2])
+    with pytest.raises(ValueError, match="cut off"):
+        find_photos([path])[0].read()
+
+
+# Video.
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    return write_clip(tmp_path_factory.mktemp("clip") / "zoom.mp4")
+
+
+def test_frames_of_a_video_are_spread_over_it_with_their_focal_lengths(clip):
+    track = FocalTrack(
+        np.arange(FRAMES, dtype=float), np.array([focal(n) for n in range(FRAMES)]), by_time=False
+    )
+    found = list(video_frames(clip, track, 6))
+    numbers = [0, 5, 9, 14, 18, 23]
+    assert names(found) == [f"zoom-{n:06d}.jpg" for n in numbers]
+    for number, source in zip(numbers, found, strict=True):
+        assert source.focal == pytest.approx(focal(number))
+        image, own = source.read()
+        assert own is None
+        assert abs(image.astype(float) - picture(number)[..., None]).mean() < 3
+
+
+def test_frames_are_spread_where_their_number_is_not_announced(clip, tmp_path):
+    """As in Matroska files, which have a length."""
+    with av.open(str(clip)) as given, av.open(str(tmp_path / "a.mkv"), "w") as out:
+        stream = out.add_stream_from_template(given.streams.video[0])
+        for packet in given.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                out.mux(packet)
+    numbers = [int(source.name[-10:-4]) for source in video_frames(tmp_path / "a.mkv", 30.0, 6)]
+    assert len(numbers) >= 5
+    assert (numbers[0], numbers[-1] >= FRAMES - 3) == (0, True)
+
+
+def test_more_frames_than_there_are_are_all_frames(clip):
+    assert len(list(video_frames(clip, 30.0, 1000))) == FRAMES
+
+
+def test_a_video_that_ends_early_gives_the_frames_before_that(clip, tmp_path):
+    """Its index announces them all, and the last third is not there."""
+    cut = cut_off(clip, tmp_path / "cut.mp4")
+    with pytest.warns(UserWarning, match=rf"ends early, after \d+ of {FRAMES} frames"):
+        found = list(video_frames(cut, 30.0, FRAMES))
+    assert 3 < len(found) < FRAMES
+
+
+def test_a_whole_video_gives_no_warning(clip):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        list(video_frames(clip, 30.0, 3))

@@ -1,0 +1,203 @@
+"""Focal lengths known with errors: bands that allow for them, and focal lengths that the lines mend."""
+
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax import scenes
+from zoomjax.fit.focal_lengths import _response
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+ROUNDED = 1 / np.sqrt(12)
+
+
+def at_focal(lines, focal):
+    return eqx.tree_at(lambda lines: lines.focal, lines, jnp.asarray(focal))
+
+
+@pytest.fixture(scope="module")
+def sweep(truth):
+    """Ten focal lengths, few points."""
+    return zj.compress(scenes.board_lines(truth, scenes.focal_sweep(10), spacing=150.0, noise=0.3, seed=1))
+
+
+@pytest.fixture(scope="module")
+def rounded(sweep):
+    return at_focal(sweep, np.round(sweep.focal))
+
+
+@pytest.fixture(scope="module")
+def refined(rounded):
+    return zj.fit_focal(rounded, ROUNDED)
+
+
+# What errors do to the parameters
+
+
+@pytest.mark.parametrize("zoom", [None, pytest.param(zj.SmoothZoom(), marks=pytest.mark.slow)])
+def test_response_is_that_of_fits_at_other_focal_lengths(sweep, zoom):
+    model = zj.fit_zoom(sweep, zoom=zoom).lens.zoom
+    response = eqx.filter_jit(_response)(sweep, model)
+    for frame in (0, 7):
+
+        def refit(t, frame=frame):
+            moved = at_focal(sweep, sweep.focal.at[frame].multiply(np.exp(t)))
+            return zj.fit_zoom(moved, zoom=model).lens.zoom.parameters.ravel()
+
+        expected = (refit(1e-4) - refit(-1e-4)) / 2e-4
+        np.testing.assert_allclose(response[:, frame], expected, atol=1e-4 * np.max(np.abs(expected)))
+
+
+def test_covariance_grows_by_the_response(sweep):
+    fit = zj.fit_zoom(sweep)
+    sigma = np.linspace(0.0, 0.9, 10)
+    wide = zj.with_focal_sigma(fit, sweep, focal_sigma=sigma)
+    response = np.asarray(_response(sweep, fit.lens.zoom)) * (sigma / np.asarray(sweep.focal))
+    np.testing.assert_allclose(wide.covariance, fit.covariance + response @ response.T, rtol=1e-9)
+    same = zj.with_focal_sigma(fit, sweep, focal_sigma=0)
+    np.testing.assert_array_equal(same.covariance, fit.covariance)
+
+
+def test_undetermined_stays_infinite(sweep):
+    fit = zj.fit_zoom(sweep)
+    unknown = eqx.tree_at(lambda fit: fit.covariance, fit, jnp.diag(jnp.full(6, jnp.inf).at[0].set(1.0)))
+    wide = zj.with_focal_sigma(unknown, sweep, focal_sigma=0.3).covariance
+    assert np.isposinf(np.diag(wide)[1:]).all()
+    assert wide[0, 0] > 1
+    assert (np.asarray(wide)[~np.eye(6, dtype=bool)] == 0).all()
+
+
+# Focal lengths that are refined
+
+
+def test_refined_focal_lengths_are_nearer_to_the_truth(truth, sweep, rounded, refined):
+    given, found = (np.asarray(f - sweep.focal) for f in (rounded.focal, refined.focal))
+    assert np.sqrt(np.mean(found**2)) < 0.8 * np.sqrt(np.mean(given**2))
+    assert (abs(found) < 3 * np.asarray(refined.std)).all()
+    assert (refined.std < 1.01 * ROUNDED).all()
+    assert refined.std.min() < 0.5 * ROUNDED
+    corner = np.zeros(2)
+    plain = zj.fit_zoom(rounded)
+    for f in (30.0, 60.0, 110.0):
+        errors = [
+            np.linalg.norm(fit.lens(f).undistort(corner) - truth(f).undistort(corner))
+            for fit in (refined.fit, plain)
+        ]
+        assert errors[0] < 0.7 * errors[1]
+    assert refined.fit.rms < plain.rms
+
+
+def test_the_joint_minimum_is_one(rounded, refined):
+    """No single focal length, moved either way, lowers the joint energy, with the model fitted again."""
+    from zoomjax.fit.focal_lengths import _prior_weights
+
+    at = at_focal(rounded, refined.focal)
+    tau = np.asarray(_prior_weights(at, refined.fit.lens.zoom))
+
+    def energy(focal):
+        rms = zj.fit_zoom(at_focal(rounded, focal), zoom=refined.fit.lens.zoom).rms
+        t = np.log(np.asarray(focal) / np.asarray(rounded.focal)) * np.asarray(rounded.focal) / ROUNDED
+        return float(rms**2) + tau @ t**2
+
+    least = energy(refined.focal)
+    for frame in range(10):
+        for moved in (-0.2, 0.2):
+            assert energy(refined.focal.at[frame].add(moved * refined.std[frame])) > least
+
+
+def test_known_focal_lengths_stay(rounded):
+    sigma = np.where(np.arange(10) % 3 == 0, 0.0, 0.3)
+    found = zj.fit_focal(rounded, sigma)
+    np.testing.assert_array_equal(found.focal[::3], rounded.focal[::3])
+    assert (found.std[::3] == 0).all()
+    assert (found.focal != rounded.focal)[1::3].all()
+    exact = zj.fit_focal(rounded, 0.0)
+    np.testing.assert_allclose(
+        exact.fit.lens.zoom.parameters, zj.fit_zoom(rounded).lens.zoom.parameters, atol=1e-8
+    )
+
+
+def test_a_focal_length_that_nobody_knows_is_found(sweep):
+    """Given 30 % too long, with the others known."""
+    spoiled = at_focal(sweep, sweep.focal.at[2].multiply(1.3))
+    found = zj.fit_focal(spoiled, np.where(np.arange(10) == 2, np.inf, 0.0))
+    assert abs(found.focal[2] - sweep.focal[2]) < 3 * found.std[2] < 1.0
+
+
+def test_without_noise_rounding_is_undone_but_for_scale_and_shift(truth):
+    """Of 1/f, which no line can tell apart; what is left of the errors is a straight line in 1/f."""
+    clean = zj.compress(scenes.board_lines(truth, scenes.focal_sweep(10), spacing=150.0))
+    found = zj.fit_focal(at_focal(clean, np.round(clean.focal)), ROUNDED)
+    u, off = 1 / np.asarray(clean.focal), np.asarray(1 / found.focal - 1 / clean.focal)
+    left = off - np.polyval(np.polyfit(u, off, 1), u)
+    given = 1 / np.round(np.asarray(clean.focal)) - u
+    assert np.abs(left[:5]).max() < 0.02 * np.abs(given[:5]).max()
+
+
+def test_float32_bands_agree_and_refining_wants_float64(sweep):
+    single = jax.tree.map(
+        lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a, sweep
+    )
+    wide = zj.with_focal_sigma(zj.fit_zoom(single), single, focal_sigma=0.3)
+    assert wide.covariance.dtype == jnp.float32
+    focal, corner = np.array([25.0, 60.0]), np.zeros(2)
+    double = zj.with_focal_sigma(zj.fit_zoom(sweep), sweep, focal_sigma=0.3)
+    std = [zj.displacement_std(fit, corner, focal=focal) for fit in (wide, double)]
+    np.testing.assert_allclose(std[0], std[1], rtol=0.02)
+    with pytest.raises(ValueError, match=r"float64 only.*jax_enable_x64"):
+        zj.fit_focal(single, ROUNDED)
+
+
+# Coverage
+
+
+@pytest.mark.slow
+def test_bands_with_rounded_focal_lengths_hold_the_truth_as_often_as_they_say():
+    """Taken as exact the 95 % are 30 %; the refined lens is better and its bands as true."""
+    from trust import rounded_focal
+
+    table = rounded_focal(100).data
+    covered = {
+        name: [float(cell.split(" ± ")[0]) for cell in row["covered"]] for name, row in table.items()
+    }
+    assert covered["rounded, taken as exact"][1] < 50
+    for name in ("rounded, `with_focal_sigma`", "rounded, `fit_focal`"):
+        assert covered[name][0] == pytest.approx(68.3, abs=10)
+        assert covered[name][1] == pytest.approx(95, abs=5)
+    plain, refined = (np.array(table[name]["rms"]) for name in list(table)[1:4:2])
+    assert (refined < 0.7 * plain).all()
+    assert table["rounded, `fit_focal`"]["focal_rms"] < 0.8 * table["rounded, taken as exact"]["focal_rms"]
+
+
+# Errors
+
+
+@pytest.mark.parametrize("sigma", [None, np.inf, np.nan, np.where(np.arange(10) == 3, 0.1, np.inf)])
+def test_focal_lengths_that_nobody_knows_raise_and_say_why(rounded, sigma, unchecked):
+    with pytest.raises(ValueError, match=r"(?s)focal_sigma.*Straightness alone cannot tell.*EXIF.*board"):
+        zj.fit_focal(rounded, sigma)
+    with pytest.raises(ValueError, match=r"focal_sigma.*Straightness alone cannot tell"):
+        zj.with_focal_sigma(zj.fit_zoom(rounded), rounded, focal_sigma=sigma)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "message"), [(-0.1, "at least 0"), (np.ones(3), "each of the 10 frames")]
+)
+def test_sigma_that_is_none_raises(rounded, sigma, message, unchecked):
+    with pytest.raises(ValueError, match=message):
+        zj.fit_focal(rounded, sigma)
+
+
+def test_a_centre_that_moves_raises(sweep):
+    fit = zj.fit_zoom(sweep)
+    lens = zj.ZoomLens(**vars(fit.lens) | {"shift": fit.lens.zoom})
+    moving = eqx.tree_at(lambda fit: fit.lens, fit, lens)
+    with pytest.raises(ValueError, match="centre that moves"):
+        zj.with_focal_sigma(moving, sweep, focal_sigma=0.1)

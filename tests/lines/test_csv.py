@@ -1,0 +1,109 @@
+"""Line primitives as CSV: what is read back, and what is refused with which words."""
+
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax.lines.csv import read_focal_csv, read_lines_csv, write_lines_csv
+
+SIZE = (640, 480)
+
+
+def lines_of(dtype):
+    rng = np.random.default_rng(3)
+    points = [rng.uniform(0, 480, (n, 2)).astype(dtype) for n in (3, 7, 4)]
+    return zj.Lines.from_ragged(points, [1, 0, 1], np.array([24.5, 1 / 0.03]), image_size=SIZE)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_what_is_written_is_read_back_to_the_last_digit(dtype, tmp_path):
+    lines = lines_of(dtype)
+    write_lines_csv(lines, tmp_path / "lines.csv")
+    read = read_lines_csv(tmp_path / "lines.csv", image_size=SIZE)
+    np.testing.assert_array_equal(np.asarray(read.focal, dtype), lines.focal)
+    order = np.argsort(np.asarray(lines.frame), kind="stable")
+    for got, index in zip(read.to_ragged(), order, strict=True):
+        np.testing.assert_array_equal(got.astype(dtype), lines.to_ragged()[index])
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+def test_columns_in_any_order_rows_interleaved_frames_numbered_freely(tmp_path):
+    text = (
+        "x, y, note, line, frame\n1,1,a,5,30\n9,9,a,5,10\n2,2,b,5,30\n8,8,b,5,10\n3,4,c,5,30\n7,6,c,5,10\n"
+    )
+    path = write(tmp_path / "lines.csv", text)
+    focal = read_focal_csv(write(tmp_path / "focal.csv", "frame,focal\n30,50\n10,24\n20,1\n"))
+    lines = read_lines_csv(path, image_size=SIZE, focal=focal)
+    np.testing.assert_array_equal(lines.focal, [24, 50])
+    np.testing.assert_array_equal(lines.to_ragged()[0], [[9, 9], [8, 8], [7, 6]])
+    np.testing.assert_array_equal(lines.to_ragged()[1], [[1, 1], [2, 2], [3, 4]])
+
+
+def test_focal_lengths_as_a_sequence_count_frames_from_zero(tmp_path):
+    rows = [f"{m},0,{i},{i * i}" for m in (0, 1) for i in range(4)]
+    path = write(tmp_path / "lines.csv", "\n".join(["frame,line,x,y", *rows]))
+    lines = read_lines_csv(path, image_size=SIZE, focal=[24.0, 50.0])
+    np.testing.assert_array_equal(lines.focal, [24, 50])
+
+
+REFUSED = {
+    "empty": ("", "frame,line,x,y"),
+    "column missing": (
+        "frame,line,x\n0,0,1\n",
+        r'must name the columns "frame,line,x,y", .* but it is .frame,line,x.',
+    ),
+    "no rows": ("frame,line,x,y,focal\n", "no rows"),
+    "not a number": ("frame,line,x,y,focal\n0,0,1,2,20\n0,0,1,two,20\n", "y in row 3 is 'two'"),
+    "short row": ("frame,line,x,y,focal\n0,0,1\n", "row 2 has 3 fields, and the first line has 5 columns"),
+    "other separators": ("frame line x y focal\n0 0 1 1 20\n", "separated by commas, semicolons or tabs"),
+    "decimal commas": (
+        "frame,line,x,y,focal\n0,0,1,1,20,5\n",
+        "row 2 has 6 .* decimal commas, write decimal",
+    ),
+    "negative focal": (
+        "frame,line,x,y,focal\n0,0,1,1,20\n\n0,0,1,1,-2\n",
+        "focal in row 4 must be positive",
+    ),
+    "frame not an integer": (
+        "frame,line,x,y,focal\n0.5,0,1,1,20\n",
+        "frame in row 2 must be an integer, but it is 0.5",
+    ),
+    "focal changes": ("frame,line,x,y,focal\n0,0,1,1,20\n0,0,1,2,30\n", "two focal lengths"),
+    "no focal": ("frame,line,x,y\n0,0,1,1\n", "no focal lengths"),
+    "not finite": (
+        "frame,line,x,y,focal\n0,0,1,nan,20\n0,0,2,2,20\n0,0,3,3,20\n",
+        "y in row 2 is 'nan', which is no number",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_read_is_refused(case, tmp_path):
+    text, reason = REFUSED[case]
+    with pytest.raises(ValueError, match=reason):
+        read_lines_csv(write(tmp_path / "lines.csv", text), image_size=SIZE)
+
+
+def test_frames_without_focal_length_are_named(tmp_path):
+    path = write(tmp_path / "lines.csv", "frame,line,x,y\n0,0,1,1\n7,0,2,2\n")
+    with pytest.raises(ValueError, match=r"no focal length for 1 of its 2 frames .*7"):
+        read_lines_csv(path, image_size=SIZE, focal={0: 20.0})
+
+
+def test_a_frame_given_twice_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="frame 1 comes twice, the second time in row 3"):
+        read_focal_csv(write(tmp_path / "focal.csv", "frame,focal\n1,50\n1,24\n"))
+
+
+def test_focal_lengths_in_the_file_and_beside_it_are_refused(tmp_path):
+    rows = "".join(f"0,0,{i},{i * i},24\n" for i in range(4))
+    path = write(tmp_path / "lines.csv", "frame,line,x,y,focal\n" + rows)
+    with pytest.raises(
+        ValueError, match=r"lines\.csv: it has a column focal, and .* Leave one of them out"
+    ):
+        read_lines_csv(path, image_size=SIZE, focal={0: 50.0})
+    assert read_lines_csv(path, image_size=SIZE).focal.tolist() == [24]

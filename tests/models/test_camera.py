@@ -1,0 +1,107 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import zoomjax as zj
+
+from .._reference import assert_derivatives_agree, image_grid
+
+FOCAL = 50.0
+
+
+@pytest.fixture(scope="module")
+def camera(truth):
+    return zj.Camera(truth, principal=truth.centre + np.array([3.0, -2.0]), pixel_pitch=0.006)
+
+
+@pytest.fixture(scope="module")
+def pixels(truth):
+    return image_grid(truth.image_size, 7)
+
+
+def test_rays_are_the_formula(camera, pixels, truth):
+    rays, known = camera.rays(pixels, FOCAL)
+    corrected = truth(FOCAL).undistort(pixels)
+    expected = (corrected - np.asarray(camera.principal)) / (FOCAL / 0.006)
+    assert isinstance(rays, np.ndarray)
+    assert known.all()
+    np.testing.assert_allclose(rays[:, :2], expected, rtol=1e-12)
+    np.testing.assert_array_equal(rays[:, 2], 1)
+
+
+@pytest.mark.parametrize("kind", [np.asarray, jnp.asarray], ids=["NumPy", "JAX"])
+def test_projection_inverts_rays_at_any_depth_and_focal_length(camera, pixels, kind, rng):
+    focal = rng.uniform(*np.asarray(camera.lens.focal_range), len(pixels))
+    rays, _ = camera.rays(kind(pixels), kind(focal))
+    depth = kind(rng.uniform(0.1, 100, (len(pixels), 1)))
+    back, seen = camera.project(depth * rays, kind(focal))
+    assert isinstance(back, type(kind(pixels)))
+    assert seen.all()
+    np.testing.assert_allclose(back, pixels, rtol=0, atol=1e-9)
+
+
+def test_what_is_behind_is_masked_and_has_no_derivative(camera):
+    points = jnp.array([[0.1, 0.0, 1.0], [0.1, 0.0, -1.0], [0.1, 0.0, 0.0]])
+    pixels, seen = camera.project(points, FOCAL)
+    assert seen.tolist() == [True, False, False]
+    assert jnp.isnan(pixels[1:]).all()
+
+    def total(points, focal):
+        pixels, seen = camera.project(points, focal)
+        return jnp.sum(jnp.where(seen[:, None], pixels, 0))
+
+    by_points, by_focal = jax.grad(total, (0, 1))(points, FOCAL)
+    assert jnp.isfinite(by_focal)
+    np.testing.assert_array_equal(by_points[1:], 0)
+    assert (by_points[0] != 0).any()
+
+
+def test_derivatives(camera, pixels):
+    rays = jnp.asarray(camera.rays(pixels[::9], FOCAL)[0])
+    assert_derivatives_agree(lambda p: camera.project(p, FOCAL)[0], rays, step=1e-5)
+    assert_derivatives_agree(lambda p: camera.rays(p, FOCAL)[0], pixels[::9], step=1e-2)
+    focal = jnp.full(len(rays), FOCAL)
+    assert_derivatives_agree(lambda f: camera.project(rays, f)[0], focal, step=1e-3)
+
+
+def test_the_principal_point_is_by_default_the_centre(truth):
+    camera = zj.Camera(truth, pixel_pitch=0.006)
+    rays, _ = camera.rays(np.asarray(truth.centre), FOCAL)
+    np.testing.assert_array_equal(rays, [0, 0, 1])
+
+
+def test_a_lens_in_pixels_needs_no_pitch(truth):
+    import dataclasses
+
+    camera = zj.Camera(dataclasses.replace(truth, focal_unit="px"))
+    rays, _ = camera.rays([0.0, 0.0], FOCAL)
+    assert rays[0] < -1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({}, "pixel_pitch"),
+        ({"pixel_pitch": -0.006}, "positive"),
+        ({"pixel_pitch": 0.006, "principal": [1.0, 2.0, 3.0]}, r"principal must be \(x, y\)"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_what_is_missing_is_said(truth, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        zj.Camera(truth, **arguments)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_points_of_two_numbers_are_refused(camera):
+    with pytest.raises(ValueError, match="shape"):
+        camera.project(np.zeros((4, 2)), FOCAL)
+
+
+def test_float32_stays(camera, pixels):
+    rays, _ = camera.rays(jnp.asarray(pixels, jnp.float32), FOCAL)
+    assert rays.dtype == jnp.float32
+    back, _ = camera.project(rays, FOCAL)
+    assert back.dtype == jnp.float32
+    np.testing.assert_allclose(back, pixels, rtol=0, atol=2e-3)

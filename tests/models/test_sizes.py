@@ -1,0 +1,213 @@
+"""Lenses for images of another size."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import zoomjax as zj
+from zoomjax.correct.framing import framing_for_size
+from zoomjax.models.sizes import at_focal, check_image_size
+
+
+def test_same_size_is_the_same_lens(truth):
+    assert zj.lens_for_size(truth, (4288, 2848)) is truth
+
+
+def test_scaled_lens_corrects_the_scaled_image_alike(truth):
+    with pytest.warns(
+        UserWarning, match="4288 x 2848 px, and this one has 1072 x 712: its distortion is scaled"
+    ):
+        quarter = zj.lens_for_size(truth, (1072, 712))
+    points = np.array([[0.0, 0.0], [3000.0, 500.0], [4287.0, 2847.0]])
+    expected = (np.asarray(truth(30.0).undistort(points)) + 0.5) / 4 - 0.5
+    np.testing.assert_allclose(quarter(30.0).undistort((points + 0.5) / 4 - 0.5), expected, atol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:The lens is for images")
+def test_rounded_sizes_count_as_the_same_aspect(truth):
+    assert zj.lens_for_size(truth, (1000, 664)).image_size == (1000, 664)
+
+
+@pytest.mark.parametrize("size", [(1920, 1080), (2848, 4288), (4288, 2412)])
+def test_other_aspect_explains(truth, size):
+    with pytest.raises(ValueError, match="another aspect ratio: it was cropped, turned"):
+        zj.lens_for_size(truth, size)
+
+
+def test_distortion_compiled_is_the_lens_s(truth):
+    np.testing.assert_allclose(
+        at_focal(truth, np.asarray(30.0)).coefficients, truth(30.0).coefficients, rtol=1e-12
+    )
+
+
+@pytest.mark.filterwarnings("ignore:The lens is for images")
+def test_a_centre_that_moves_does_so_in_the_scaled_image(truth):
+    shift = zj.PolynomialZoom(0, np.array([[0.01, -0.005]]), np.array(20.0))
+    moving = zj.ZoomLens(truth.zoom, truth.centre, truth.focal_range, truth.image_size, shift=shift)
+    quarter = zj.lens_for_size(moving, (1072, 712))
+    expected = (np.asarray(moving(30.0).centre) + 0.5) / 4 - 0.5
+    np.testing.assert_allclose(quarter(30.0).centre, expected, atol=1e-9)
+
+
+def of_size(*size, scale=None, off=(0.0, 0.0)):
+    """A distortion like that of a lens for a size, perhaps with another centre or scale."""
+    middle = (np.array(size) - 1) / 2 + np.array(off)
+    return zj.Distortion(np.array([0.1]), middle, np.array(scale or np.hypot(*size) / 2))
+
+
+MADE_FOR_OTHERS = {
+    "twice as large": of_size(1280, 960),
+    "half as large": of_size(320, 240),
+    "a little larger": of_size(670, 502),
+    "turned": of_size(480, 640),
+    "cut above and below": of_size(640, 800),
+    "another aspect": of_size(1920, 1080),
+    "twice as large, centre fitted": of_size(1280, 960, off=(21, -35)),
+    "half as large, centre fitted": of_size(320, 240, off=(-12, 9)),
+    "turned, centre fitted": of_size(480, 640, off=(8, 6)),
+}
+
+
+@pytest.mark.parametrize("case", MADE_FOR_OTHERS)
+def test_a_distortion_of_images_of_another_size_is_refused(case):
+    """Wherever an image or its size meets a distortion; and nothing is computed."""
+    d = MADE_FOR_OTHERS[case]
+    calls = [
+        lambda: zj.frame_output(d, (640, 480)),
+        lambda: zj.frame_output([of_size(640, 480), d], (640, 480), keep="all"),
+        lambda: zj.undistort_image(np.zeros((480, 640, 3), np.uint8), d),
+        lambda: zj.warp_image(jnp.zeros((480, 640)), d),
+    ]
+    for call in calls:
+        with pytest.raises(
+            ValueError, match=r"images of another size: its centre .* this one, of 640 x 480 px"
+        ):
+            call()
+
+
+OWN = {
+    "in the middle": of_size(640, 480),
+    "rounded": of_size(640, 480, scale=401.0),
+    "centre fitted": of_size(640, 480, off=(40, -30)),
+    "centre far off": of_size(640, 480, off=(150, 0)),
+    "scale of a focal length": of_size(640, 480, scale=1500.0, off=(9, -14)),
+    "scale of one pixel": of_size(640, 480, scale=1.0, off=(9, -14)),
+    "middle of a larger image": of_size(640, 480, scale=800.0),
+}
+
+
+@pytest.mark.parametrize("case", OWN)
+def test_a_distortion_that_may_be_of_the_image_is_taken(case):
+    check_image_size(OWN[case], (640, 480))
+
+
+@given(
+    width=st.integers(16, 8000),
+    aspect=st.floats(0.4, 2.5),
+    ratio=st.floats(0.05, 20).filter(lambda r: abs(r - 1) > 0.1),
+    off=st.tuples(st.floats(-0.02, 0.02), st.floats(-0.02, 0.02)),
+)
+def test_photographic_lenses_are_told_apart_by_size(width, aspect, ratio, off):
+    """The centre within 2 % of the half diagonal of the middle: its own size is taken, others are not."""
+    size = (width, max(8, round(width * aspect)))
+    half = np.hypot(*size) / 2
+    d = of_size(*size, off=np.array(off) * half)
+    check_image_size(d, size)
+    with pytest.raises(ValueError, match="is that of images of another size"):
+        check_image_size(d, (max(1, round(ratio * size[0])), max(1, round(ratio * size[1]))))
+
+
+def test_a_crop_is_taken_with_a_framing_of_your_own():
+    """The upper left quarter of an image, with the whole's distortion: it looks like another size's."""
+    d, image = of_size(64, 48), np.arange(48 * 64, dtype=np.float32).reshape(48, 64)
+    quarter = zj.Framing(np.array(1.0), np.zeros(2), (32, 24))
+    whole = zj.undistort_image(image, d)
+    np.testing.assert_allclose(
+        zj.undistort_image(image[:24, :32], d, keep=quarter)[4:20, 4:20], whole[4:20, 4:20], rtol=1e-5
+    )
+    warped = zj.warp_image(jnp.asarray(image[:24, :32]), d, framing=quarter)
+    np.testing.assert_allclose(warped[4:20, 4:20], whole[4:20, 4:20], rtol=1e-2)
+
+
+def test_a_framing_for_another_size_is_refused_and_scaled_for_photos():
+    d, image = of_size(64, 48), np.zeros((48, 64), np.float32)
+    other = zj.frame_output(of_size(128, 96), (128, 96), keep="all")
+    for call in (
+        lambda: zj.undistort_image(image, d, keep=other),
+        lambda: zj.warp_image(jnp.asarray(image), d, framing=other),
+    ):
+        with pytest.raises(ValueError, match=r"a framing for images of 64 x 48 px, .* made for 128 x 96"):
+            call()
+    scaled = framing_for_size(other, (64, 48))
+    assert (scaled.size, scaled.image_size, float(scaled.scale)) == ((64, 48), (64, 48), float(other.scale))
+    shown = np.asarray(other.corrected(np.array([[-0.5, -0.5], [127.5, 95.5]])))
+    corners = np.asarray(scaled.corrected(np.array([[-0.5, -0.5], [63.5, 47.5]])))
+    np.testing.assert_allclose((corners + 0.5) * 2 - 0.5, shown, atol=1e-9)
+    with pytest.raises(ValueError, match="another aspect ratio"):
+        framing_for_size(other, (64, 64))
+
+
+def small_lens():
+    zoom = zj.PolynomialZoom(1, jnp.array([[0.02], [0.1]]), jnp.array(20.0))
+    return zj.ZoomLens(zoom, jnp.array([63.5, 47.5]), jnp.array([20.0, 80.0]), (128, 96))
+
+
+def test_a_lens_takes_its_size_along():
+    truth, size = small_lens(), (64, 48)
+    image = np.zeros((48, 64), np.float32)
+    with pytest.warns(UserWarning, match="its distortion is scaled"):
+        quarter = zj.lens_for_size(truth, size)
+    with pytest.warns(UserWarning, match="its distortion is scaled"):
+        framing = zj.frame_output(truth, size, keep="valid")
+    assert float(framing.scale) == float(zj.frame_output(quarter, size, keep="valid").scale)
+    image[::8] = 1
+    with pytest.warns(UserWarning, match="its distortion is scaled"):
+        corrected = zj.undistort_image(image, truth, focal=30.0)
+    np.testing.assert_array_equal(corrected, zj.undistort_image(image, quarter(30.0)))
+    for call in (
+        lambda: zj.undistort_image(np.zeros((64, 64)), truth, focal=30.0),
+        lambda: zj.frame_output(truth, (64, 64)),
+    ):
+        with pytest.raises(ValueError, match="another aspect ratio"):
+            call()
+
+
+@pytest.mark.parametrize("shape", [(3, 48, 64), (1, 48, 64), (4, 48, 64)])
+def test_channels_first_are_refused(shape):
+    d = of_size(64, 48)
+    for call in (
+        lambda: zj.undistort_image(np.zeros(shape, np.uint8), d),
+        lambda: zj.warp_image(jnp.zeros(shape), d),
+        lambda: jax.jit(zj.warp_image)(jnp.zeros(shape), d),
+        lambda: jax.vmap(lambda image: zj.warp_image(image, d))(jnp.zeros((2, *shape))),
+    ):
+        with pytest.raises(ValueError, match=r"channels last, .* Move the axis: jnp\.moveaxis"):
+            call()
+    assert zj.undistort_image(np.zeros((4, 64, 3), np.uint8), of_size(64, 4)).shape == (4, 64, 3)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_something_else_for_a_distortion_says_what_to_call():
+    truth, image = small_lens(), np.zeros((96, 128), np.uint8)
+    with pytest.raises(ValueError, match="focal must be given with a ZoomLens"):
+        zj.undistort_image(image, truth)
+    with pytest.raises(ValueError, match="focal must be left out unless"):
+        zj.undistort_image(image, truth(30.0), focal=30.0)
+    with pytest.raises(ValueError, match=r"must be a Distortion, but it is a ZoomLens: give lens\(focal\)"):
+        zj.warp_image(jnp.asarray(image), truth)
+    several = jax.vmap(truth)(jnp.array([30.0, 40.0]))
+    for call, name in (
+        (lambda d: zj.undistort_image(image, d), "distortion"),
+        (lambda d: zj.warp_image(jnp.asarray(image), d), "distortion"),
+        (lambda d: zj.frame_output(d, (128, 96)), "distortions"),
+        (lambda d: zj.frame_output([d], (128, 96)), "distortions"),
+    ):
+        with pytest.raises(
+            ValueError, match=rf"{name} must be .* it is a PolynomialZoom: .* fit\.lens\(focal\)"
+        ):
+            call(truth.zoom)
+        with pytest.raises(ValueError, match=f"{name} must be a Distortion, but it is several at once"):
+            call(several)

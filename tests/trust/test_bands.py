@@ -1,0 +1,171 @@
+"""Bands: what they say is what repeated noise does, and the delta method's own derivatives."""
+
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax import scenes
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+FOCAL = np.array([20.56, 51.0, 127.36])
+POINTS = np.array([[0.0, 0.0], [4287.0, 2847.0], [3000.0, 400.0]])
+
+
+# Against repeated noise
+
+
+@pytest.mark.parametrize(
+    ("draws", "slack"), [(150, (9, 5)), pytest.param(1000, (3, 3), marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_bands_hold_the_truth_as_often_as_they_say(correlation, draws, slack):
+    """Also where points err together along an edge; within 3 in a hundred, or what few draws can tell."""
+    from trust import Noise, board, corner_errors
+
+    truth, scene = board((15, 11), 5, 12)
+    errors, stds = corner_errors(truth, scene, Noise(correlation=correlation), draws)
+    ratio = np.abs(errors) / stds["`fit.covariance`"]
+    assert 100 * np.mean(ratio < 1) == pytest.approx(68.3, abs=slack[0])
+    assert 100 * np.mean(ratio < 1.96) == pytest.approx(95, abs=slack[1])
+
+
+# The delta method
+
+
+def test_std_of_coefficients_is_that_of_the_polynomial(fit):
+    """``phi C phi^T``, written out for the polynomial's parameters, row by row."""
+    covariance = np.asarray(fit.covariance).reshape(3, 2, 3, 2)
+    for f, std in zip(FOCAL, zj.coefficient_std(fit, FOCAL), strict=True):
+        phi = (float(fit.lens.zoom.focal_ref) / f) ** np.arange(3)
+        expected = np.sqrt(np.einsum("a,aibi,b->i", phi, covariance, phi))
+        np.testing.assert_allclose(std, expected, rtol=1e-9)
+
+
+def test_displacement_is_uncertain_along_the_radius(fit):
+    covariance = np.asarray(zj.displacement_covariance(fit, POINTS, focal=FOCAL))
+    std = np.asarray(zj.displacement_std(fit, POINTS, focal=FOCAL))
+    assert covariance.shape == (3, 2, 2)
+    for point, matrix, sigma in zip(POINTS, covariance, std, strict=True):
+        outward = (point - fit.lens.centre) / np.linalg.norm(point - fit.lens.centre)
+        np.testing.assert_allclose(matrix, sigma**2 * np.outer(outward, outward), atol=1e-12 * sigma**2)
+
+
+def test_displacement_std_is_that_of_lenses_drawn_from_the_covariance(fit, rng):
+    flat = np.asarray(fit.lens.zoom.parameters).ravel()
+    drawn = rng.multivariate_normal(flat, np.asarray(fit.covariance), 4000, method="eigh")
+
+    def corrected(parameters, f):
+        lens = eqx.tree_at(lambda lens: lens.zoom.parameters, fit.lens, parameters.reshape(3, 2))
+        return lens(f).undistort(jnp.asarray(POINTS))
+
+    for f in FOCAL:
+        seen = np.asarray(jax.vmap(corrected, (0, None))(jnp.asarray(drawn), jnp.asarray(f)))
+        spread = np.linalg.norm(seen.std(axis=0), axis=-1)
+        np.testing.assert_allclose(zj.displacement_std(fit, POINTS, focal=f), spread, rtol=0.04)
+
+
+def test_shapes_broadcast(fit):
+    assert zj.coefficient_std(fit, 50.0).shape == (2,)
+    assert zj.coefficient_std(fit, np.full((4, 5), 50.0)).shape == (4, 5, 2)
+    assert zj.displacement_std(fit, POINTS[0], focal=50.0).shape == ()
+    assert zj.displacement_std(fit, POINTS[:, None], focal=FOCAL[:2]).shape == (3, 2)
+    assert zj.displacement_covariance(fit, POINTS[:, None], focal=FOCAL[:2]).shape == (3, 2, 2, 2)
+
+
+def test_band_is_about_the_outward_displacement(fit):
+    low, high = zj.displacement_band(fit, POINTS, focal=FOCAL, level=0.95)
+    std = zj.displacement_std(fit, POINTS, focal=FOCAL)
+    np.testing.assert_allclose(high - low, 2 * 1.959964 * std, rtol=1e-6)
+    for point, f, a, b in zip(POINTS, FOCAL, low, high, strict=True):
+        radius, corrected = (
+            np.linalg.norm(p - fit.lens.centre) for p in (point, fit.lens(f).undistort(point))
+        )
+        assert (a + b) / 2 == pytest.approx(corrected - radius, abs=1e-9)
+
+
+def test_std_of_anything_covers_the_inverse(fit):
+    """To first order an error of the inverse is minus that of the lens over its stretch."""
+    distortion = fit.lens(30.0)
+    point = jnp.array([1000.0, 800.0])
+    seen = distortion.distort(point)
+    std = zj.std_of(fit, lambda lens: lens(30.0).distort(point))
+    covariance = zj.displacement_covariance(fit, seen, focal=30.0)
+    back = jnp.linalg.inv(jax.jacfwd(distortion.undistort)(seen))
+    np.testing.assert_allclose(std, jnp.sqrt(jnp.diag(back @ covariance @ back.T)), rtol=1e-9)
+
+
+@pytest.mark.parametrize("zoom", [zj.TableZoom(number=3), zj.SplineZoom(number=3), zj.PowerZoom()])
+def test_bands_of_every_zoom_model(zoom, small):
+    fit = zj.fit_zoom(small, zoom=zoom)
+    std = zj.displacement_std(fit, np.zeros(2), focal=FOCAL)
+    assert std.shape == (3,)
+    assert (np.isfinite(std) & (std > 0)).all()
+
+
+def test_centre_is_certain_and_has_a_gradient(fit):
+    centre = jnp.asarray(fit.lens.centre)
+    assert zj.displacement_std(fit, centre, focal=50.0) == 0
+    gradient = jax.grad(lambda point: zj.displacement_std(fit, point, focal=50.0))(centre)
+    np.testing.assert_array_equal(gradient, 0)
+    gradient = jax.grad(lambda point: zj.displacement_std(fit, point, focal=50.0))(centre + 100)
+    assert np.isfinite(gradient).all()
+    assert (gradient > 0).all()
+
+
+def test_what_is_not_determined_is_infinite(fit):
+    unknown = eqx.tree_at(lambda fit: fit.covariance, fit, jnp.where(jnp.eye(6, dtype=bool), jnp.inf, 0.0))
+    assert np.isposinf(zj.coefficient_std(unknown, FOCAL)).all()
+    assert np.isposinf(zj.displacement_std(unknown, POINTS, focal=FOCAL)).all()
+    low, high = zj.displacement_band(unknown, POINTS, focal=FOCAL)
+    assert np.isneginf(low).all()
+    assert np.isposinf(high).all()
+    assert zj.displacement_std(unknown, unknown.lens.centre, focal=50.0) == 0
+    covariance = zj.displacement_covariance(unknown, POINTS[0], focal=50.0)
+    np.testing.assert_array_equal(covariance, [[np.inf, 0], [0, np.inf]])
+
+
+def test_points_that_are_none_raise(fit, unchecked):
+    with pytest.raises(ValueError, match=r"must have shape \(\.\.\., 2\)"):
+        zj.displacement_std(fit, np.zeros((4, 3)), focal=50.0)
+
+
+# Rounding
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_bands_are_never_narrower_than_rounding_allows(dtype, truth):
+    """Focal lengths that are nearly the same: parameters with huge variances, of which a small one is left.
+
+    The band of a lens of one focal length, from the same lines, is what the band should be, at least.
+    """
+    scene = scenes.board_lines(truth, FOCAL[:1].repeat(4), spacing=400.0, noise=2.0, seed=5)
+    corner = np.array([0.0, 0.0])
+    outcomes = []
+    for step in (1e-1, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4):
+        focal = (20.56 + step * np.arange(4)).astype(dtype)
+        lines = zj.Lines.from_ragged(
+            [line.astype(dtype) for line in scene.to_ragged()],
+            scene.frame,
+            focal,
+            image_size=scene.image_size,
+        )
+        fit = zj.fit_zoom(zj.compress(lines), invertible=False)
+        one = zj.fit_zoom(zj.compress(lines), zoom=zj.PolynomialZoom(degree=0))
+        least = 0.5 * float(zj.displacement_std(one, corner, focal=focal[0]))
+        std = zj.displacement_std(fit, corner, focal=focal)
+        low, high = zj.displacement_band(fit, corner, focal=focal, level=0.6827)
+        assert (std > least).all()
+        assert ((high - low) / 2 > least).all()
+        assert (
+            jnp.diagonal(zj.displacement_covariance(fit, corner, focal=focal), axis1=-2, axis2=-1) > 0
+        ).all()
+        assert (zj.coefficient_std(fit, focal) > 0.5 * zj.coefficient_std(one, focal[:1])).all()
+        outcomes.append(float(std[0]))
+    assert outcomes[0] < 10 * least  # and of use where there are digits left
