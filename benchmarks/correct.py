@@ -89,7 +89,7 @@ def stills(size: tuple[int, int], rounds: int) -> dict:
     """`undistort_image` against `cv2.remap` alone, and OpenCV's own map with remap."""
     lens, image = zoom_lens(size), picture(size)
     distortions = itertools.cycle([lens(f) for f in 1 / np.linspace(1 / 20, 1 / 80, 50)])
-    x, y = position_map(lens(20.0), zj.frame_output(lens, size), size)
+    x, y = position_map(lens(20.0), zj.correct.frame_output(lens, size), size)
     scale = float(lens.scale)
     camera = np.array([[scale, 0, (size[0] - 1) / 2], [0, scale, (size[1] - 1) / 2], [0, 0, 1]])
 
@@ -116,7 +116,7 @@ def stills(size: tuple[int, int], rounds: int) -> dict:
 
 def map_error(lens: zj.ZoomLens, size: tuple[int, int]) -> float:
     """The largest distance of the map to the exact inverse, px, at nine focal lengths."""
-    framing = zj.frame_output(lens, size)
+    framing = zj.correct.frame_output(lens, size)
     pixels = np.stack(np.meshgrid(*map(np.arange, size)), axis=-1).astype(float)
     worst = 0.0
     for focal in 1 / np.linspace(1 / 20, 1 / 80, 9):
@@ -134,7 +134,7 @@ def differentiable(size: tuple[int, int], rounds: int) -> dict:
     single = image.astype(np.float32)
     array, brightness = jnp.asarray(image), jnp.asarray(single)
     distortions = itertools.cycle([lens(f) for f in 1 / np.linspace(1 / 20, 1 / 80, 50)])
-    x, y = position_map(lens(20.0), zj.frame_output(lens, size), size)
+    x, y = position_map(lens(20.0), zj.correct.frame_output(lens, size), size)
 
     def loss(distortion, image):
         return jnp.sum(zj.warp_image(image, distortion) ** 2)
@@ -189,7 +189,7 @@ def pass_through(source: Path, target: Path, options: dict[str, str]) -> None:
 def video(frames: int, rounds: int) -> dict:
     """Frames/s of correcting a clip, against no correction, and FFmpeg without and with its filter."""
     lens, results = zoom_lens(HD), {}
-    track = zj.FocalTrack(np.array([0.0, frames - 1]), np.array([20.0, 80.0]), by_time=False)
+    track = zj.io.FocalTrack(np.array([0.0, frames - 1]), np.array([20.0, 80.0]), by_time=False)
     ffmpeg = shutil.which("ffmpeg")
     with tempfile.TemporaryDirectory() as name:
         source, target = Path(name) / "in.mp4", Path(name) / "out.mp4"

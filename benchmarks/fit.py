@@ -125,7 +125,7 @@ def growth(truth: zj.ZoomLens, base: zj.Lines) -> list[dict]:
     rows.append(growth_row(base))
 
     rng = np.random.default_rng(1)
-    zj.merge(*[zj.compress(base)] * 2)
+    zj.lines.merge(*[zj.compress(base)] * 2)
     spent = 0.0
 
     def chunks():
@@ -141,7 +141,7 @@ def growth(truth: zj.ZoomLens, base: zj.Lines) -> list[dict]:
             yield small
 
     with PeakMemory(psutil.Process().memory_info().rss) as memory:
-        merged, total = once(lambda: reduce(zj.merge, chunks()))
+        merged, total = once(lambda: reduce(zj.lines.merge, chunks()))
     points = float(jnp.sum(merged.counts))
     rows.append(
         {"points": points, "compress": spent, "fit": seconds(zj.fit_zoom, merged), "extra": memory.peak}
@@ -194,16 +194,16 @@ def run(spacing: float) -> dict:
     )
     results["fit"] = seconds(zj.fit_zoom, small, repeats=21)
     results["frames"] = seconds(zj.fit_frames, small, repeats=21)
-    results["algebraic"] = seconds(zj.algebraic_zoom, small, repeats=21)
-    results["certificate"] = seconds(zj.certify, fit.lens, repeats=21)
+    results["algebraic"] = seconds(zj.fit.algebraic_zoom, small, repeats=21)
+    results["certificate"] = seconds(zj.models.certify, fit.lens, repeats=21)
     results["rms"] = {"zoom": float(fit.rms), "frames": float(each.rms)}
     results["corner_error"] = corner_error(fit.lens.zoom, truth)
     print(json.dumps(results, indent=1))
 
-    results["any_centre_first"] = once(zj.compress_any_centre, made)[1]
-    results["any_centre"] = seconds(zj.compress_any_centre, made, repeats=3)
-    any_centre = zj.compress_any_centre(made)
-    results["centre_fit"] = seconds(zj.fit_centre, any_centre, repeats=5)
+    results["any_centre_first"] = once(zj.lines.compress_any_centre, made)[1]
+    results["any_centre"] = seconds(zj.lines.compress_any_centre, made, repeats=3)
+    any_centre = zj.lines.compress_any_centre(made)
+    results["centre_fit"] = seconds(zj.fit.fit_centre, any_centre, repeats=5)
     results["robust_fit"] = seconds(zj.fit_robust, small, repeats=5)
 
     full = zj.fit_zoom(made)

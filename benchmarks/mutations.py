@@ -212,10 +212,10 @@ def every_model() -> list[zj.ZoomLens]:
     made = []
     for zoom in (
         zj.PolynomialZoom(),
-        zj.TableZoom(number=3),
-        zj.SplineZoom(number=4),
-        zj.PowerZoom(),
-        zj.TwoRegionZoom(crossover=60.0),
+        zj.models.TableZoom(number=3),
+        zj.models.SplineZoom(number=4),
+        zj.models.PowerZoom(),
+        zj.models.TwoRegionZoom(crossover=60.0),
         zj.SmoothZoom(),
     ):
         made.append(dataclasses.replace(lens, zoom=zoom.prepare(focal, 2)))
@@ -258,7 +258,7 @@ def sound_mapping(focal: dict[int, float]) -> None:
 
 def read_lines_csv(path: Path) -> zj.Lines:
     """With the image size that the command line would be given."""
-    return zj.read_lines_csv(path, image_size=(64, 64))
+    return zj.lines.read_lines_csv(path, image_size=(64, 64))
 
 
 CSV_LINES = b"frame,line,x,y,focal\n" + b"".join(
@@ -364,7 +364,7 @@ READERS = {
     "lens.json": Reader(".json", _lens_files, zj.load_lens, sound_lens),
     "lines CSV": Reader(".csv", _constant(CSV_LINES), read_lines_csv, sound_lines),
     "focal CSV": Reader(
-        ".csv", _constant(b"frame,focal\n0,20\n1,35.5\n7,5e1\n"), zj.read_focal_csv, sound_mapping
+        ".csv", _constant(b"frame,focal\n0,20\n1,35.5\n7,5e1\n"), zj.lines.read_focal_csv, sound_mapping
     ),
     "focal table": Reader(
         ".csv",
@@ -375,7 +375,7 @@ READERS = {
     "focal track": Reader(
         ".csv",
         _constant(b"time,focal\n0,20\n0.5,30\n2,5e1\n", b"frame,focal\n0,20\n5,30\n"),
-        zj.read_focal_track,
+        zj.io.read_focal_track,
         sound_track,
     ),
     "EXIF": Reader(".exif", _exif_files, _read_exif, sound_focal),

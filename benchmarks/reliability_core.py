@@ -148,7 +148,7 @@ def _wrong_lines(rng, lines, points, k, dtype):
             )
         )
 
-    merged = zj.merge(chunk(first), chunk(np.asarray(lines.mask) & ~first))
+    merged = zj.lines.merge(chunk(first), chunk(np.asarray(lines.mask) & ~first))
     again = np.empty(LINES)
     again[order] = np.asarray(line_rms(merged, jnp.asarray(k)), float)
     bad |= ~(np.abs(again - exact) <= 2 * allowed)
@@ -215,7 +215,7 @@ def _certified(parameters, focal):
     def one(parameters):
         zoom = zj.PolynomialZoom(parameters.shape[0] - 1, parameters, focal[0])
         centre = jnp.asarray([319.5, 239.5], focal.dtype)
-        found = zj.certify(zj.ZoomLens(zoom, centre, focal, (640, 480)))
+        found = zj.models.certify(zj.ZoomLens(zoom, centre, focal, (640, 480)))
         return found.certified, found.least
 
     return jax.vmap(one)(parameters)

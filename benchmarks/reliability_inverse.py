@@ -10,7 +10,8 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
-from zoomjax import AbstractRadial, BrownConrady, Distortion, Division, RadialPolynomial
+from zoomjax import Distortion
+from zoomjax.models import AbstractRadial, BrownConrady, Division, RadialPolynomial
 
 _LENGTH = 4096  # points of a lens
 _ROUNDING = 64

@@ -83,10 +83,10 @@ NOISES = {
     "each line is bent, 0.2 px": Noise(bend=0.2),
     "independent, 0.5 px": Noise(std=0.5),
 }
-METRICS: dict[str, Callable[[zj.AbstractLines], zj.AbstractLines]] = {
+METRICS: dict[str, Callable[[zj.lines.AbstractLines], zj.lines.AbstractLines]] = {
     "paper's metric": lambda lines: lines,
-    "`in_image`": zj.in_image,
-    "`in_image`, points alike": lambda lines: zj.in_image(lines.weighted(lines.counts)),
+    "`in_image`": zj.fit.in_image,
+    "`in_image`, points alike": lambda lines: zj.fit.in_image(lines.weighted(lines.counts)),
 }
 
 
@@ -101,7 +101,7 @@ def board(stripes: tuple[int, int], frames: int, spacing: float = 12) -> tuple[z
 SCENES = {"5 photos": ((15, 11), 5), "4 photos, few lines": ((4, 3), 4)}
 
 
-def independent_covariance(small: zj.CompressedLines, fit: zj.ZoomFit):
+def independent_covariance(small: zj.lines.CompressedLines, fit: zj.ZoomFit):
     """What the covariance would be were points independent."""
     weighted, jacobian = linearised(small, fit.lens.zoom)
     weights = line_weights(small)
@@ -111,7 +111,7 @@ def independent_covariance(small: zj.CompressedLines, fit: zj.ZoomFit):
     return jnp.sum(weighted**2) / freedom * inverse @ noise @ inverse
 
 
-def plain_sandwich(small: zj.CompressedLines, fit: zj.ZoomFit):
+def plain_sandwich(small: zj.lines.CompressedLines, fit: zj.ZoomFit):
     """The textbook's line-by-line sandwich, with its correction L / (L - p)."""
     weighted, jacobian = linearised(small, fit.lens.zoom)
     inverse = jnp.linalg.inv(jnp.einsum("lri,lrj->ij", jacobian, jacobian))
@@ -248,7 +248,7 @@ def _metric_errors(truth, scene, std, keys):
         kinds = [metric(small) for metric in METRICS.values()]
         lenses = [zj.fit_zoom(lines, invertible=False, throw=False).lens for lines in kinds]
         errors = [corner_displacement(lens) - corner_displacement(truth) for lens in lenses]
-        return jnp.stack(errors), jnp.stack([zj.displacement_rms(truth, lens) for lens in lenses])
+        return jnp.stack(errors), jnp.stack([zj.trust.displacement_rms(truth, lens) for lens in lenses])
 
     signs = jnp.array([1.0, -1.0])
     return jax.lax.map(lambda key: jax.lax.map(lambda sign: one(key, sign * std), signs), keys)
@@ -262,7 +262,7 @@ def metrics(draws: int) -> Table:
         keys = jax.random.split(jax.random.key(1), pairs)
         for std in stds:
             errors, fields = map(np.asarray, _metric_errors(truth, scene, jnp.asarray(std), keys))
-            bound = float(zj.displacement_bound(truth, scene, std=std))
+            bound = float(zj.trust.displacement_bound(truth, scene, std=std))
             spread = errors.reshape(-1, *errors.shape[2:]).std(axis=0)
             means, squares = errors.mean(axis=1), np.mean(fields**2, axis=1)
             bias, bias_error = means.mean(0) / spread, means.std(0) / pairs**0.5 / spread
@@ -338,7 +338,7 @@ def _robust_errors(truth, scene, std, arcs, keys):
         plain = zj.fit_zoom(zj.compress(noisy), invertible=False, throw=False).lens
         robust = zj.fit_robust(zj.compress(spoiled), invertible=False, throw=False)
         ours = robust.fit.lens
-        apart = [zj.displacement_rms(a, b) for a, b in ((truth, ours), (truth, plain), (plain, ours))]
+        apart = [zj.trust.displacement_rms(a, b) for a, b in ((truth, ours), (truth, plain), (plain, ours))]
         believed = jnp.sum(bent & (robust.weight > 0)), jnp.sum(~bent & (robust.weight == 0))
         return jnp.stack(apart), jnp.stack(believed)
 
@@ -396,7 +396,7 @@ def certificates(draws: int) -> Table:
     def one(parameters):
         zoom = zj.PolynomialZoom(degree=2, parameters=parameters, focal_ref=jnp.asarray(low))
         lens = zj.ZoomLens(zoom, jnp.array([319.5, 239.5]), jnp.array([low, high]), (640, 480))
-        return zj.certify(lens)
+        return zj.models.certify(lens)
 
     ours = jax.jit(lambda every: jax.lax.map(one, every, batch_size=500))(jnp.asarray(parameters))
     u, t = np.linspace(low / high, 1, side), np.linspace(0, 1, side)
@@ -434,9 +434,9 @@ def cost(draws: int) -> Table:
     parts: dict[str, tuple] = {
         "`fit_zoom`": (zj.fit_zoom, small),
         "covariance": (alone, small, fit.lens.zoom, weighted, jacobian),
-        "certificate": (zj.certify, fit.lens),
+        "certificate": (zj.models.certify, fit.lens),
         "`fit_robust`": (zj.fit_robust, small),
-        "`fit_zoom(in_image(...))`": (zj.fit_zoom, zj.in_image(small)),
+        "`fit_zoom(in_image(...))`": (zj.fit_zoom, zj.fit.in_image(small)),
     }
     times: dict[str, list[float]] = {name: [] for name in parts}
     for _ in range(15):  # in turns, so that whatever else the machine does falls on all
@@ -513,8 +513,8 @@ def _rounded(truth, scene, keys):
         off = jax.random.uniform(for_focal, scene.focal.shape, minval=-0.5, maxval=0.5)
         given = eqx.tree_at(lambda lines: lines.focal, small, scene.focal + off)
         plain = zj.fit_zoom(given, throw=False)
-        found = zj.fit_focal(given, sigma, throw=False)
-        widened = zj.with_focal_sigma(plain, given, focal_sigma=sigma)
+        found = zj.fit.fit_focal(given, sigma, throw=False)
+        widened = zj.fit.with_focal_sigma(plain, given, focal_sigma=sigma)
         all_fits = (zj.fit_zoom(small, throw=False), plain, widened, found.fit)
         fits = dict(zip(_ROUNDED, all_fits, strict=True))
         offs = dict(zip(_ROUNDED, (0 * off, off, off, found.focal - scene.focal), strict=True))

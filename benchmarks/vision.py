@@ -65,8 +65,12 @@ def speed(data: Path | None, rounds: int) -> dict:
     if data:
         frame = cv2.resize(read_image(data / "broadcast_frames" / "frame_000.jpg"), HD)
         board = read_image(data / "zoomcam" / "zoom_1x" / "1x_zoom_1.png")
-        functions["1080p: PitchDetector, one thread"] = with_threads(1, lambda: zj.PitchDetector()(frame))
-        functions["720p: GridDetector, all threads"] = with_threads(-1, lambda: zj.GridDetector()(board))
+        functions["1080p: PitchDetector, one thread"] = with_threads(
+            1, lambda: zj.detect.PitchDetector()(frame)
+        )
+        functions["720p: GridDetector, all threads"] = with_threads(
+            -1, lambda: zj.detect.GridDetector()(board)
+        )
     times = in_turn(functions, rounds)
     cv2.setNumThreads(-1)
     return summary(times, ratios)
@@ -169,7 +173,7 @@ def real_boards(folder: Path) -> dict:
     for index, zoom in enumerate(zooms):
         for number, path in enumerate(sorted((folder / f"zoom_{zoom:g}x").glob("*.png"))):
             image = read_image(path)
-            found = {"grid": zj.GridDetector()(image), "edges": zj.EdgeDetector()(image)}
+            found = {"grid": zj.detect.GridDetector()(image), "edges": zj.EdgeDetector()(image)}
             boards.append(len(found["grid"]))
             half += [number % 2] * len(found["grid"])
             covered += [in_one_piece(line, found["edges"]) for line in found["grid"]]
@@ -177,7 +181,7 @@ def real_boards(folder: Path) -> dict:
                 points[name] += lines
                 frame[name] += [index] * len(lines)
 
-    def compressed(name: str, chosen: Sequence[bool] | None = None) -> zj.CompressedLines:
+    def compressed(name: str, chosen: Sequence[bool] | None = None) -> zj.lines.CompressedLines:
         keep = range(len(points[name])) if chosen is None else np.flatnonzero(chosen)
         lines = zj.Lines.from_ragged(
             [points[name][i] for i in keep],
@@ -290,7 +294,7 @@ def broadcast(folder: Path) -> dict:
     labels = json.loads(FRAMES_LABELLED.read_text())
     recall, precision, on_arcs = [], [], 0
     for name, label in labels.items():
-        found = zj.PitchDetector()(read_image(folder / f"{name}.jpg"))
+        found = zj.detect.PitchDetector()(read_image(folder / f"{name}.jpg"))
         lines, arcs = sampled(label["lines"]), sampled(label["arcs"])
         recall.append(np.mean(is_near(lines, np.concatenate(found))))
         steps = [np.hypot(*np.diff(line, axis=0, append=line[-1:]).T) for line in found]

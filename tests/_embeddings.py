@@ -51,7 +51,7 @@ def lens(terms=2):
 
 
 def distortion(family=None, k=(0.1, -0.02)):
-    family = zj.RadialPolynomial() if family is None else family
+    family = zj.models.RadialPolynomial() if family is None else family
     return zj.Distortion(jnp.array(k), jnp.array([29.0, 20.0]), jnp.array(36.0), family)
 
 
@@ -118,7 +118,7 @@ def robust(data):
 
 
 def apart(own, x):
-    return zj.displacement_rms(own, zoomed(own, 1.1 * x))
+    return zj.trust.displacement_rms(own, zoomed(own, 1.1 * x))
 
 
 def zoomed(own, x):
@@ -128,7 +128,7 @@ def zoomed(own, x):
 def sized(own, x):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return zj.lens_for_size(own, (120, 80))(30.0).undistort(2 * x)
+        return zj.models.lens_for_size(own, (120, 80))(30.0).undistort(2 * x)
 
 
 def image():
@@ -144,14 +144,14 @@ EACH = np.array([21.0, 33.0, 70.0])
 
 PRINCIPAL = np.array([320.0, 240.0])
 
-MODELS = (zj.TableZoom(), zj.SplineZoom(3))
+MODELS = (zj.models.TableZoom(), zj.models.SplineZoom(3))
 
 
 def by_model(zoom):
     """A row of the algebraic estimate: every model made ready, and evaluated."""
     return Row(
         f"algebraic_zoom ({type(zoom).__name__})",
-        with_points(lambda data: zj.algebraic_zoom(data, zoom=zoom, terms=1)(33.0).coefficients),
+        with_points(lambda data: zj.fit.algebraic_zoom(data, zoom=zoom, terms=1)(33.0).coefficients),
         lines,
         line_points,
     )
@@ -191,13 +191,13 @@ def focal_numbers(estimate):
 
 
 def wider(own, x):
-    return zj.with_focal_sigma(
+    return zj.fit.with_focal_sigma(
         own, zj.compress(lines().about(own.lens.centre), 1), focal_sigma=x
     ).covariance
 
 
 def with_focals(data, x):
-    found = zj.fit_focal(seen_by(data, x), 0.5, zoom=zj.PolynomialZoom(1), terms=1, throw=False)
+    found = zj.fit.fit_focal(seen_by(data, x), 0.5, zoom=zj.PolynomialZoom(1), terms=1, throw=False)
     return found.focal, found.fit.rms
 
 
@@ -206,7 +206,7 @@ def seen_by(data, x):
 
 
 def centred(data):
-    fitted = zj.fit_centre(data, zoom=zj.PolynomialZoom(1), terms=1, throw=False).fit
+    fitted = zj.fit.fit_centre(data, zoom=zj.PolynomialZoom(1), terms=1, throw=False).fit
     return fitted.lens.centre, fitted.rms
 
 
@@ -216,13 +216,13 @@ ROWS = [
     Row(
         "Distortion.distort (Division)",
         lambda d, x: d.distort(x),
-        lambda: distortion(zj.Division(), (-0.1,)),
+        lambda: distortion(zj.models.Division(), (-0.1,)),
         points,
     ),
     Row(
         "Distortion.distort (BrownConrady)",
         lambda d, x: d.distort(x),
-        lambda: distortion(zj.BrownConrady(), (0.1, 0.01, -0.02)),
+        lambda: distortion(zj.models.BrownConrady(), (0.1, 0.01, -0.02)),
         points,
     ),
     Row("Distortion.has_inverse", lambda d, x: d.has_inverse(x), distortion, points, constant=True),
@@ -251,7 +251,7 @@ ROWS = [
     Row("lens_for_size", sized, lens, points),
     Row(
         "certify",
-        lambda own, x: zj.certify(zoomed(own, x)).least,
+        lambda own, x: zj.models.certify(zoomed(own, x)).least,
         lens,
         lambda: lens().zoom.parameters,
         constant=True,
@@ -260,20 +260,22 @@ ROWS = [
     Row("compress", with_points(lambda data: squared(zj.compress(data, 1))), lines, line_points),
     Row(
         "merge",
-        with_points(lambda data: squared(zj.merge(zj.compress(data, 1), zj.compress(data, 1)))),
+        with_points(lambda data: squared(zj.lines.merge(zj.compress(data, 1), zj.compress(data, 1)))),
         lines,
         line_points,
     ),
     Row(
         "compress_any_centre",
-        with_points(lambda data: squared(zj.compress_any_centre(data, 1))),
+        with_points(lambda data: squared(zj.lines.compress_any_centre(data, 1))),
         lines,
         line_points,
     ),
     Row(
         "compress_family",
         with_points(
-            lambda data: zj.frame_rms(zj.compress_family(data, zj.Division(), terms=1), coefficients())
+            lambda data: zj.frame_rms(
+                zj.fit.compress_family(data, zj.models.Division(), terms=1), coefficients()
+            )
         ),
         lines,
         line_points,
@@ -281,25 +283,27 @@ ROWS = [
     ),
     Row(
         "with_family",
-        with_points(lambda data: zj.frame_rms(zj.with_family(data, zj.Division()), coefficients())),
+        with_points(
+            lambda data: zj.frame_rms(zj.fit.with_family(data, zj.models.Division()), coefficients())
+        ),
         lines,
         line_points,
     ),
     Row(
         "in_image",
-        with_points(lambda data: zj.frame_rms(zj.in_image(data), coefficients())),
+        with_points(lambda data: zj.frame_rms(zj.fit.in_image(data), coefficients())),
         lines,
         line_points,
     ),
-    Row("residuals", zj.residuals, lines, coefficients),
-    Row("frame_energy", zj.frame_energy, lines, coefficients),
-    Row("global_energy", zj.global_energy, lines, coefficients),
+    Row("residuals", zj.fit.residuals, lines, coefficients),
+    Row("frame_energy", zj.fit.frame_energy, lines, coefficients),
+    Row("global_energy", zj.fit.global_energy, lines, coefficients),
     Row("frame_rms", zj.frame_rms, lines, coefficients),
     Row("frame_rms of a lens", lambda own, x: zj.frame_rms(seen(x), own), lens, line_points),
     Row(
         "algebraic_zoom",
         with_points(
-            lambda data: zj.algebraic_zoom(data, zoom=zj.PolynomialZoom(1), terms=1).zoom.parameters
+            lambda data: zj.fit.algebraic_zoom(data, zoom=zj.PolynomialZoom(1), terms=1).zoom.parameters
         ),
         lines,
         line_points,
@@ -307,21 +311,23 @@ ROWS = [
     *map(by_model, MODELS),
     Row(
         "algebraic_zoom (SmoothZoom)",
-        with_points(lambda data: zj.algebraic_zoom(data, zoom=zj.SmoothZoom())(33.0).coefficients),
+        with_points(lambda data: zj.fit.algebraic_zoom(data, zoom=zj.SmoothZoom())(33.0).coefficients),
         lines,
         line_points,
     ),
     Row(
         "algebraic_zoom (TwoRegionZoom)",
         with_points(
-            lambda data: zj.algebraic_zoom(data, zoom=zj.TwoRegionZoom(40.0), terms=1)(33.0).coefficients
+            lambda data: (
+                zj.fit.algebraic_zoom(data, zoom=zj.models.TwoRegionZoom(40.0), terms=1)(33.0).coefficients
+            )
         ),
         two_regions,
         line_points,
     ),
     Row(
         "algebraic_frames",
-        with_points(lambda data: zj.algebraic_frames(data, terms=1)),
+        with_points(lambda data: zj.fit.algebraic_frames(data, terms=1)),
         lines,
         line_points,
     ),
@@ -338,11 +344,11 @@ ROWS = [
     Row("fit_centre", with_points(centred), lines, line_points, slow=True, solves=True, sharded=False),
     Row("fit_focal", with_focals, lines, line_points, slow=True, solves=True),
     Row("with_focal_sigma", wider, fit, lambda: jnp.array([0.3, 0.2, 0.1])),
-    Row("std_of", lambda own, x: zj.std_of(own, lambda lens: lens(35.0).undistort(x)), fit, points),
-    Row("coefficient_std", lambda own, x: zj.coefficient_std(own, x), fit, lambda: jnp.asarray(EACH)),
+    Row("std_of", lambda own, x: zj.trust.std_of(own, lambda lens: lens(35.0).undistort(x)), fit, points),
+    Row("coefficient_std", lambda own, x: zj.trust.coefficient_std(own, x), fit, lambda: jnp.asarray(EACH)),
     Row(
         "displacement_covariance",
-        lambda own, x: zj.displacement_covariance(own, x, focal=35.0),
+        lambda own, x: zj.trust.displacement_covariance(own, x, focal=35.0),
         fit,
         points,
     ),
@@ -350,28 +356,28 @@ ROWS = [
     Row("displacement_band", lambda own, x: zj.displacement_band(own, x, focal=35.0), fit, points),
     Row(
         "cramer_rao",
-        lambda own, x: zj.cramer_rao(own, seen(x), std=0.1),
+        lambda own, x: zj.trust.cramer_rao(own, seen(x), std=0.1),
         lambda: lens(1),
         line_points,
         slow=True,
     ),
     Row(
         "displacement_bound",
-        lambda own, x: zj.displacement_bound(own, seen(x), std=0.1),
+        lambda own, x: zj.trust.displacement_bound(own, seen(x), std=0.1),
         lambda: lens(1),
         line_points,
         slow=True,
     ),
     Row(
         "focal_from_board",
-        lambda known, x: focal_numbers(zj.focal_from_board(x, known, distance=1500.0, pixel=0.005)),
+        lambda known, x: focal_numbers(zj.focal.focal_from_board(x, known, distance=1500.0, pixel=0.005)),
         board,
         oblique,
     ),
     Row(
         "focal_from_planes",
         lambda known, x: focal_numbers(
-            zj.focal_from_planes(x, known, principal=np.array([320.0, 240.0]))[0]
+            zj.focal.focal_from_planes(x, known, principal=np.array([320.0, 240.0]))[0]
         ),
         board,
         lambda: oblique()[None],
@@ -379,7 +385,7 @@ ROWS = [
     ),
     Row(
         "focal_from_lines",
-        lambda known, x: focal_numbers(zj.focal_from_lines(x, known, principal=PRINCIPAL)),
+        lambda known, x: focal_numbers(zj.focal.focal_from_lines(x, known, principal=PRINCIPAL)),
         edges,
         on_edges,
         slow=True,

@@ -10,8 +10,8 @@ import numpy as np
 import zoomjax as zj
 
 
-@zj.register_model
-class LogZoom(zj.AbstractLinearZoom):
+@zj.models.register_model
+class LogZoom(zj.models.AbstractLinearZoom):
     """Each coefficient a polynomial in log(f / start), times fixed factors."""
 
     formula: ClassVar[str] = "k_i(f) = sum_j parameters[j][i-1] (log(f / start))^powers[j]"
@@ -32,26 +32,26 @@ class LogZoom(zj.AbstractLinearZoom):
         low, high = jnp.log(jnp.asarray(focal_range) / self.start)
         controls = jnp.stack([jnp.ones(2), jnp.stack([low, high])], axis=1)
         ends = jnp.stack([low, high]) + jnp.log(self.start)
-        return zj.Pieces(controls[None], ends[None], jnp.exp, jnp.max(jnp.abs(controls), axis=0))
+        return zj.models.Pieces(controls[None], ends[None], jnp.exp, jnp.max(jnp.abs(controls), axis=0))
 
 
-@zj.register_model(name="half-polynomial")
-class Halved(zj.AbstractRadial):
+@zj.models.register_model(name="half-polynomial")
+class Halved(zj.models.AbstractRadial):
     """The radial polynomial of half of the coefficients."""
 
     formula: ClassVar[str] = "corrected = centre + z * scale * (1 + (k1 r^2 + ... + kN r^2N) / 2)"
 
     def factor(self, squared, k):
-        return zj.RadialPolynomial().factor(squared, k / 2)
+        return zj.models.RadialPolynomial().factor(squared, k / 2)
 
     def slope(self, squared, k):
-        return zj.RadialPolynomial().slope(squared, k / 2)
+        return zj.models.RadialPolynomial().slope(squared, k / 2)
 
     def equation(self, r, squared, rho, k):
-        return zj.RadialPolynomial().equation(r, squared, rho, k / 2)
+        return zj.models.RadialPolynomial().equation(r, squared, rho, k / 2)
 
     def conditions(self, size):
-        return zj.RadialPolynomial().conditions(size) / 2
+        return zj.models.RadialPolynomial().conditions(size) / 2
 
     def expansion_terms(self, size):
         return size

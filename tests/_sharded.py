@@ -49,12 +49,12 @@ def main() -> None:
         "all": eqx.tree_at(lambda data: (data.points, data.mask, data.frame), lines, every),
     }
     plain = zj.compress(lines)
-    any_centre = zj.compress_any_centre(lines)
+    any_centre = zj.lines.compress_any_centre(lines)
     for data in layouts.values():
         small = zj.compress(data)
         assert small.triangle.sharding.is_equivalent_to(over, 3)
         np.testing.assert_array_equal(small.triangle, plain.triangle)
-        of_any = zj.compress_any_centre(data).triangle
+        of_any = zj.lines.compress_any_centre(data).triangle
         assert of_any.sharding.is_equivalent_to(over, 3)
         np.testing.assert_array_equal(of_any, any_centre.triangle)
 
@@ -66,7 +66,7 @@ def main() -> None:
             assert exchanged(program) == {}, exchanged(program)
 
         for measured in (data, small):
-            for function in (zj.frame_energy, zj.global_energy):
+            for function in (zj.fit.frame_energy, zj.fit.global_energy):
                 np.testing.assert_allclose(function(measured, K), function(lines, K), rtol=1e-12)
                 sums = exchanged(eqx.filter_jit(function).lower(measured, K).compile())
                 assert set(sums) == {"all-reduce"}, sums

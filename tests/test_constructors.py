@@ -17,19 +17,19 @@ SIZE = (640, 480)
 
 ZOOMS = {
     "polynomial": zj.PolynomialZoom(),
-    "table": zj.TableZoom(),
-    "table of three": zj.TableZoom(3, inverse=False),
-    "spline": zj.SplineZoom(4),
-    "power": zj.PowerZoom(),
-    "two regions": zj.TwoRegionZoom(40.0),
+    "table": zj.models.TableZoom(),
+    "table of three": zj.models.TableZoom(3, inverse=False),
+    "spline": zj.models.SplineZoom(4),
+    "power": zj.models.PowerZoom(),
+    "two regions": zj.models.TwoRegionZoom(40.0),
     "smooth": zj.SmoothZoom(),
-    "focus": zj.FocusSplineZoom(3, 2),
+    "focus": zj.models.FocusSplineZoom(3, 2),
 }
 every_zoom = pytest.mark.parametrize("model", ZOOMS.values(), ids=ZOOMS)
 
 
 def prepared(model, terms=2):
-    more = (FOCUS,) if isinstance(model, zj.AbstractFocusZoom) else ()
+    more = (FOCUS,) if isinstance(model, zj.models.AbstractFocusZoom) else ()
     return model.prepare(FOCAL, terms, *more)
 
 
@@ -122,9 +122,9 @@ LENS = {
     "no model": ({"zoom": 2}, r"zoom must be a zoom model .* its type is int: PolynomialZoom\(degree"),
     "class of a model": ({"zoom": zj.PolynomialZoom}, r"it is the class PolynomialZoom: pass an instance"),
     "model not fitted": ({"zoom": zj.PolynomialZoom()}, "specified but not fitted"),
-    "class of a family": ({"family": zj.Division}, "it is the class Division: pass an instance"),
+    "class of a family": ({"family": zj.models.Division}, "it is the class Division: pass an instance"),
     "two for Brown and Conrady": (
-        {"family": zj.BrownConrady()},
+        {"family": zj.models.BrownConrady()},
         "zoom must give 3 or more coefficients for the family BrownConrady, but it gives 2",
     ),
     "a shift of three": (
@@ -146,15 +146,15 @@ def test_lines(change, message, unchecked):
 
 @pytest.mark.parametrize(("change", "message"), COMPRESSED.values(), ids=COMPRESSED)
 def test_compressed_lines(change, message, unchecked):
-    refused(zj.CompressedLines, compressed_fields(), change, message)
+    refused(zj.lines.CompressedLines, compressed_fields(), change, message)
 
 
 @pytest.mark.parametrize("rows", [7, 20, 22, 3])
 def test_lines_for_any_centre(rows, unchecked):
     fields = compressed_fields() | {"triangle": np.tile(np.eye(rows), (2, 1, 1))}
     with pytest.raises(ValueError, match=r"\(2 N \+ 2\)\(2 N \+ 3\) / 2 rows"):
-        zj.AnyCentreLines(**fields)
-    zj.AnyCentreLines(**fields | {"triangle": np.tile(np.eye(21), (2, 1, 1))})
+        zj.lines.AnyCentreLines(**fields)
+    zj.lines.AnyCentreLines(**fields | {"triangle": np.tile(np.eye(21), (2, 1, 1))})
 
 
 @pytest.mark.parametrize(("change", "message"), LENS.values(), ids=LENS)
@@ -165,7 +165,7 @@ def test_lens(change, message, unchecked):
 def test_what_is_in_order_passes(unchecked):
     """The fields that the cases above spoil are sound."""
     assert zj.Lines(**lines_fields()).points.shape == (2, 5, 2)
-    assert zj.CompressedLines(**compressed_fields()).terms == 2
+    assert zj.lines.CompressedLines(**compressed_fields()).terms == 2
     lens = zj.ZoomLens(**lens_fields())
     assert lens.image_size == (640, 480)
     assert hash(lens.image_size) == hash((640, 480))
@@ -226,14 +226,14 @@ def test_a_prior_that_is_none(unchecked):
     with pytest.raises(ValueError, match=r"beyond must be finite, but beyond\[0, 0\] is nan"):
         zj.SmoothZoom(beyond=np.full((2, 2), np.nan))
     with pytest.raises(ValueError, match="inverse must be True or False"):
-        zj.TableZoom(inverse="f")
+        zj.models.TableZoom(inverse="f")
 
 
 def test_lists_and_integers_are_taken(unchecked):
     zoom = zj.PolynomialZoom(1, [[0, 0], [1, 2]], 20)
     assert zoom.parameters.dtype == jnp.result_type(float)
     np.testing.assert_array_equal(zoom(40.0), [0.5, 1.0])
-    assert zj.TableZoom(parameters=[[0.1], [0.2]], knots=[0.02, 0.04])(40.0).shape == (1,)
+    assert zj.models.TableZoom(parameters=[[0.1], [0.2]], knots=[0.02, 0.04])(40.0).shape == (1,)
     assert jnp.issubdtype(zj.Lines(**lines_fields()).frame.dtype, jnp.integer)
 
 
@@ -283,7 +283,9 @@ def test_stand_ins_pass(clean, unchecked):
 
 def test_a_batch_of_lenses_passes(unchecked):
     def one(f):
-        return zj.ZoomLens(zj.PowerZoom(jnp.ones((3, 2)) * f, f), jnp.zeros(2), jnp.stack([f, 2 * f]), SIZE)
+        return zj.ZoomLens(
+            zj.models.PowerZoom(jnp.ones((3, 2)) * f, f), jnp.zeros(2), jnp.stack([f, 2 * f]), SIZE
+        )
 
     lenses = jax.vmap(one)(jnp.array([20.0, 30.0]))
     assert lenses.focal_range.shape == (2, 2)
@@ -292,7 +294,7 @@ def test_a_batch_of_lenses_passes(unchecked):
 
 
 def test_a_model_that_cannot_be_traced_passes(unchecked):
-    class Stepped(zj.AbstractZoom):
+    class Stepped(zj.models.AbstractZoom):
         parameters: jax.Array
 
         def prepare(self, focal, terms):

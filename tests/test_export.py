@@ -15,10 +15,10 @@ import zoomjax as zj
 from . import _embeddings as table
 
 FAMILIES = {
-    "RadialPolynomial": ((0.1, -0.02), zj.RadialPolynomial()),
-    "three terms": ((0.1, -0.02, 0.01), zj.RadialPolynomial()),
-    "Division": ((-0.1,), zj.Division()),
-    "BrownConrady": ((0.1, 0.01, -0.02), zj.BrownConrady()),
+    "RadialPolynomial": ((0.1, -0.02), zj.models.RadialPolynomial()),
+    "three terms": ((0.1, -0.02, 0.01), zj.models.RadialPolynomial()),
+    "Division": ((-0.1,), zj.models.Division()),
+    "BrownConrady": ((0.1, 0.01, -0.02), zj.models.BrownConrady()),
 }
 
 READ_BACK = """

@@ -385,10 +385,10 @@ def test_deep_nesting_is_an_error(opening, folder):
 
 CSV = {
     "lines": (CSV_LINES, read_lines_csv, sound_lines),
-    "focal": (b"frame,focal\n0,20\n1,35.5\n7,5e1\n", zj.read_focal_csv, sound_mapping),
+    "focal": (b"frame,focal\n0,20\n1,35.5\n7,5e1\n", zj.lines.read_focal_csv, sound_mapping),
     "table": (b"image,focal,sigma\na.jpg,20,0.3\nb/c.jpg,35.5,\n", read_focal_table, sound_table),
-    "track": (b"time,focal\n0,20\n0.5,30\n2,5e1\n", zj.read_focal_track, sound_track),
-    "frames": (b"time_or_frame,focal\n0,20\n5,30\n", zj.read_focal_track, sound_track),
+    "track": (b"time,focal\n0,20\n0.5,30\n2,5e1\n", zj.io.read_focal_track, sound_track),
+    "frames": (b"time_or_frame,focal\n0,20\n5,30\n", zj.io.read_focal_track, sound_track),
 }
 
 

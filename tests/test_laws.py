@@ -144,8 +144,9 @@ def test_finite_input_never_gives_nan(scene):
     each = zj.fit_frames(small, throw=False)
     robust = zj.fit_robust(small, throw=False)
     tree = (
-        fitted(lines), each, robust, zj.algebraic_zoom(small), zj.frame_rms(small, None),
-        zj.coefficient_std(robust.fit, focal), zj.displacement_std(robust.fit, np.ones(2), focal=focal[0]),
+        fitted(lines), each, robust, zj.fit.algebraic_zoom(small), zj.frame_rms(small, None),
+        zj.trust.coefficient_std(robust.fit, focal),
+        zj.displacement_std(robust.fit, np.ones(2), focal=focal[0]),
     )  # fmt: skip
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         assert not np.isnan(np.asarray(leaf, float)).any(), jax.tree_util.keystr(path)
@@ -158,7 +159,7 @@ def test_finite_input_never_gives_nan(scene):
 def test_round_trip_inside_the_certificate(k, x, y, focal):
     zoom = zj.PolynomialZoom(1, jnp.asarray([[k[0], k[1]], [-k[1], k[0]]]), jnp.asarray(20.0))
     lens = zj.ZoomLens(zoom, jnp.asarray(CENTRE), jnp.asarray([20.0, 80.0]), SIZE)
-    certificate = zj.certify(lens)
+    certificate = zj.models.certify(lens)
     distortion, point = lens(focal), np.array([x, y])
     corrected = distortion.undistort(point)
     back = distortion.distort(corrected)

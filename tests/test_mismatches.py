@@ -12,7 +12,7 @@ import zoomjax as zj
 def test_triangles_of_other_scenes_do_not_merge(small, field):
     other = eqx.tree_at(lambda lines: getattr(lines, field), small, getattr(small, field) + 1)
     with pytest.raises(ValueError, match="same lines"):
-        zj.merge(small, other)
+        zj.lines.merge(small, other)
 
 
 def test_coefficients_must_be_those_of_all_frames(small):

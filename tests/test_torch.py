@@ -35,7 +35,7 @@ both = pytest.mark.parametrize("dtype", DTYPES)
 
 
 def distortion(family=None, k=(0.1, -0.02)):
-    family = zj.RadialPolynomial() if family is None else family
+    family = zj.models.RadialPolynomial() if family is None else family
     return zj.Distortion(jnp.array(k), jnp.array([29.0, 20.0]), jnp.array(36.0), family)
 
 
@@ -47,8 +47,8 @@ def lens():
 
 FAMILIES = [
     distortion(),
-    distortion(zj.Division(), (-0.1,)),
-    distortion(zj.BrownConrady(), (0.1, 0.01, -0.02)),
+    distortion(zj.models.Division(), (-0.1,)),
+    distortion(zj.models.BrownConrady(), (0.1, 0.01, -0.02)),
 ]
 families = pytest.mark.parametrize("d", FAMILIES, ids=lambda d: type(d.family).__name__)
 methods = pytest.mark.parametrize("method", ["undistort", "distort"])

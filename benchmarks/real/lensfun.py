@@ -454,7 +454,7 @@ def two_regions(frames: Frames, asked: np.ndarray) -> np.ndarray | None:
     """TwoRegionZoom, where k1 changes its sign with three focal lengths or more on either side."""
     if not (np.diff(np.sign(frames.k[:, 0])) != 0).any():
         return None
-    crossover = zj.barrel_crossover(frames.focal, frames.k[:, 0])
+    crossover = zj.models.barrel_crossover(frames.focal, frames.k[:, 0])
     result = np.zeros((len(asked), 2))
     for train, test in (
         (frames.focal < crossover, asked < crossover),
@@ -600,7 +600,7 @@ def check_against_package(lines, lenses, data, zooms, fits, every=16):
                 continue
             m = number // 2
             triangle, focal = frames_of(lines, start[i] + np.delete(np.arange(number), m))
-            small = zj.CompressedLines(
+            small = zj.lines.CompressedLines(
                 triangle=triangle.reshape(-1, 7, 7),
                 frame=jnp.repeat(jnp.arange(number - 1), UPRIGHT + LEVEL),
                 focal=focal,
@@ -755,7 +755,7 @@ def study() -> dict:
     }
 
 
-def read() -> tuple[list[Lens], zj.CompressedLines, list[Frames]]:
+def read() -> tuple[list[Lens], zj.lines.CompressedLines, list[Frames]]:
     """The lenses, their lines compressed, and each frame by itself."""
     lenses = read_lenses()
     lines = zj.compress(make_lines(lenses))

@@ -23,16 +23,8 @@ import jax
 import numpy as np
 from zoomcam import read_zoomcam
 
-from zoomjax import (
-    Distortion,
-    FocalEstimate,
-    Lines,
-    PolynomialZoom,
-    fit_zoom,
-    focal_from_pitch,
-    focal_from_planes,
-    frame_rms,
-)
+from zoomjax import Distortion, Lines, PolynomialZoom, fit_zoom, frame_rms
+from zoomjax.focal import FocalEstimate, focal_from_pitch, focal_from_planes
 from zoomjax.focal.pitch import PITCH_LINES
 
 SIZE = (1280, 720)

@@ -31,10 +31,10 @@ class Candidate:
     """A zoom model to compare: how it is specified for some lines, and the number of its coefficients."""
 
     name: str
-    zoom: Callable[[zj.AbstractLines], zj.AbstractZoom]
+    zoom: Callable[[zj.lines.AbstractLines], zj.models.AbstractZoom]
     terms: int = TERMS
 
-    def coefficients(self, lines: zj.AbstractLines, focal: np.ndarray) -> np.ndarray:
+    def coefficients(self, lines: zj.lines.AbstractLines, focal: np.ndarray) -> np.ndarray:
         """Of the model fitted to the lines, at some focal lengths: (focal, TERMS), absent ones zero.
 
         NaN where the solver fails.
@@ -54,7 +54,7 @@ def candidates(entries: int | None = None) -> list[Candidate]:
         entries: of tables, and knots of splines; None for one at every focal length.
     """
 
-    def always(zoom: zj.AbstractZoom) -> Callable[[zj.AbstractLines], zj.AbstractZoom]:
+    def always(zoom: zj.models.AbstractZoom) -> Callable[[zj.lines.AbstractLines], zj.models.AbstractZoom]:
         return lambda lines: zoom
 
     note = "" if entries is None else f", {entries} entries"
@@ -66,20 +66,20 @@ def candidates(entries: int | None = None) -> list[Candidate]:
     return [
         *polynomials,
         Candidate("degree 2, k1 alone", always(zj.PolynomialZoom(degree=2)), 1),
-        Candidate(f"table in f{note} [25]", always(zj.TableZoom(number=entries, inverse=False))),
-        Candidate(f"table in 1/f{note} [25]", always(zj.TableZoom(number=entries))),
-        Candidate(f"spline in 1/f{knots}", always(zj.SplineZoom(number=entries))),
-        Candidate("power law, k1 and k2", always(zj.PowerZoom())),
-        Candidate("power law, k1 alone [14]", always(zj.PowerZoom()), 1),
+        Candidate(f"table in f{note} [25]", always(zj.models.TableZoom(number=entries, inverse=False))),
+        Candidate(f"table in 1/f{note} [25]", always(zj.models.TableZoom(number=entries))),
+        Candidate(f"spline in 1/f{knots}", always(zj.models.SplineZoom(number=entries))),
+        Candidate("power law, k1 and k2", always(zj.models.PowerZoom())),
+        Candidate("power law, k1 alone [14]", always(zj.models.PowerZoom()), 1),
         Candidate("two regions, k1 alone [30]", _two_regions, 1),
     ]
 
 
-def _two_regions(lines: zj.AbstractLines) -> zj.AbstractZoom:
+def _two_regions(lines: zj.lines.AbstractLines) -> zj.models.AbstractZoom:
     """Parted where a single quadratic changes its sign: single frames may tell it from their noise."""
     whole = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=2), terms=1).lens.zoom
-    crossover = zj.barrel_crossover(lines.focal, _at(whole, lines.focal)[:, 0])
-    return zj.TwoRegionZoom(crossover=jnp.asarray(crossover))
+    crossover = zj.models.barrel_crossover(lines.focal, _at(whole, lines.focal)[:, 0])
+    return zj.models.TwoRegionZoom(crossover=jnp.asarray(crossover))
 
 
 @eqx.filter_jit
@@ -87,7 +87,7 @@ def _at(zoom, focal):
     return jax.vmap(zoom)(focal)
 
 
-def choose(lines: zj.CompressedLines, frames: np.ndarray, room: int) -> zj.CompressedLines:
+def choose(lines: zj.lines.CompressedLines, frames: np.ndarray, room: int) -> zj.lines.CompressedLines:
     """The lines of some frames, which are numbered anew.
 
     Args:
@@ -99,7 +99,7 @@ def choose(lines: zj.CompressedLines, frames: np.ndarray, room: int) -> zj.Compr
     index, present = (np.asarray(array)[frames] for array in lines.by_frame())
     padding = ((0, 0), (0, room - index.shape[1]))
     index, present = np.pad(index, padding).ravel(), np.pad(present, padding).ravel()
-    return zj.CompressedLines(
+    return zj.lines.CompressedLines(
         triangle=jnp.where(present[:, None, None], lines.triangle[index], 0),
         frame=jnp.asarray(np.repeat(np.arange(len(frames)), room), jnp.int32),
         focal=lines.focal[frames],
@@ -109,7 +109,9 @@ def choose(lines: zj.CompressedLines, frames: np.ndarray, room: int) -> zj.Compr
     )
 
 
-def fitting(lines: zj.AbstractLines, entries: int | None = None) -> tuple[list[Candidate], dict[str, str]]:
+def fitting(
+    lines: zj.lines.AbstractLines, entries: int | None = None
+) -> tuple[list[Candidate], dict[str, str]]:
     """The candidates that can be fitted to lines such as these, and why the others cannot."""
     able, unable = [], {}
     for model in candidates(entries):

@@ -170,7 +170,7 @@ def truly_straight(clip: Clip, lines: zj.Lines) -> np.ndarray:
     return np.asarray(zj.frame_rms(straight, None))
 
 
-def frame_by_frame(lines: zj.CompressedLines, batch: int = 100) -> np.ndarray:
+def frame_by_frame(lines: zj.lines.CompressedLines, batch: int = 100) -> np.ndarray:
     """Coefficients of each frame from its own lines, some frames at a time."""
     frames = np.arange(len(lines.focal))
     found = [

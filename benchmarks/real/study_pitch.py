@@ -32,7 +32,7 @@ EACH = "each frame by itself"
 
 
 def held_out(
-    lines: zj.CompressedLines, models: list[Candidate]
+    lines: zj.lines.CompressedLines, models: list[Candidate]
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Squared error of each frame under models that have not seen it, px^2: (partings, frames).
 
@@ -61,7 +61,7 @@ def held_out(
     return found, unable
 
 
-def in_sample(lines: zj.CompressedLines, models: list[Candidate]) -> dict[str, float]:
+def in_sample(lines: zj.lines.CompressedLines, models: list[Candidate]) -> dict[str, float]:
     """RMS of every model on the frames that it is fitted to, px."""
     focal = np.asarray(lines.focal)
     k = {NONE: np.zeros((len(focal), TERMS)), EACH: np.asarray(zj.fit_frames(lines).coefficients)}
@@ -72,7 +72,7 @@ def in_sample(lines: zj.CompressedLines, models: list[Candidate]) -> dict[str, f
     }
 
 
-def line_left_out(lines: zj.CompressedLines, terms: int) -> np.ndarray:
+def line_left_out(lines: zj.lines.CompressedLines, terms: int) -> np.ndarray:
     """Squared error of each frame's lines, px^2, each corrected as the frame's other lines ask for."""
     index, present = (np.asarray(array) for array in lines.by_frame())
     frame, line = np.nonzero(present)

@@ -31,7 +31,7 @@ ROWS_AND_COLUMNS = 15 + 22
 ZOOMS = (1, 3, 5, 7, 9)
 
 
-def random_halves(lines: zj.CompressedLines, number: int) -> list[np.ndarray]:
+def random_halves(lines: zj.lines.CompressedLines, number: int) -> list[np.ndarray]:
     """Weights of the lines, 1 for those of the photos in a random half of each zoom's, 0 for the others."""
     assert lines.number is not None
     photo = np.asarray(lines.number) // ROWS_AND_COLUMNS
@@ -49,7 +49,7 @@ def random_halves(lines: zj.CompressedLines, number: int) -> list[np.ndarray]:
 
 
 def frame_rms(
-    train: zj.CompressedLines, test: zj.CompressedLines, models: Sequence[Candidate]
+    train: zj.lines.CompressedLines, test: zj.lines.CompressedLines, models: Sequence[Candidate]
 ) -> dict[str, np.ndarray]:
     """RMS of each zoom of `test`, px, under each model fitted to `train`."""
     focal = np.asarray(test.focal)
@@ -59,7 +59,7 @@ def frame_rms(
 
 
 def with_each_zoom(
-    train: zj.CompressedLines, test: zj.CompressedLines, models: Sequence[Candidate]
+    train: zj.lines.CompressedLines, test: zj.lines.CompressedLines, models: Sequence[Candidate]
 ) -> dict[str, np.ndarray]:
     """The same, and under the model that each zoom of `train` has by itself."""
     each = np.asarray(zj.frame_rms(test, zj.fit_frames(train).coefficients))
@@ -67,7 +67,7 @@ def with_each_zoom(
 
 
 def zoom_left_out(
-    lines: zj.CompressedLines, halves: list[np.ndarray], models: Sequence[Candidate]
+    lines: zj.lines.CompressedLines, halves: list[np.ndarray], models: Sequence[Candidate]
 ) -> dict[str, np.ndarray]:
     """RMS, px, at zooms of which the models have seen no photo: (halves, zooms)."""
     zooms = np.arange(len(lines.focal))

@@ -100,7 +100,7 @@ def test_zoomcam_gives_the_reference_figures(data):
 def test_bands_allow_for_uncertain_focal_lengths(calibration):
     sigma = 0.01 * np.asarray(calibration.lines.focal)
     allowed = calibrate(calibration.lines, focal_sigma=focal_sigmas("1%", calibration.lines.focal))
-    expected = zj.with_focal_sigma(calibration.zoom, zj.compress(calibration.lines), focal_sigma=sigma)
+    expected = zj.fit.with_focal_sigma(calibration.zoom, zj.compress(calibration.lines), focal_sigma=sigma)
     np.testing.assert_allclose(allowed.zoom.covariance, expected.covariance, rtol=1e-6)
     assert all(a[2] > b[2] for a, b in zip(allowed.corner(), calibration.corner(), strict=True))
     told = [row["focal_sigma"] for row in allowed.summary()["per_frame"]]

@@ -153,7 +153,7 @@ def oblique(focal, tilts, k=(0.05, -0.02)):
         corrected = PRINCIPAL + focal * np.stack([np.cos(a) * x, np.cos(b) * y], -1) / depth[..., None]
         seen = np.asarray(lens.distort(jnp.asarray(corrected)))
         name = f"{focal:g}-{index}.png"
-        yield Detection(name, name, SIZE, tuple(zj.GridDetector.lines(seen)), None, seen)
+        yield Detection(name, name, SIZE, tuple(zj.detect.GridDetector.lines(seen)), None, seen)
 
 
 def test_oblique_views_of_a_grid_give_focal_lengths():

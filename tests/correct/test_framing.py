@@ -32,7 +32,7 @@ def border():
 @pytest.mark.parametrize("d", LENSES)
 @pytest.mark.parametrize("size", [None, (100, 100)])
 def test_all_shows_all_and_no_more(d, size):
-    framing = zj.frame_output(d, SIZE, keep="all", size=size)
+    framing = zj.correct.frame_output(d, SIZE, keep="all", size=size)
     shown = (np.asarray(d.undistort(border())) - framing.origin) * framing.scale
     last = np.array(framing.size) - 1
     assert (shown >= -1e-3).all()
@@ -44,7 +44,7 @@ def test_all_shows_all_and_no_more(d, size):
 @pytest.mark.parametrize("d", LENSES)
 @pytest.mark.parametrize("size", [None, (60, 100)])
 def test_valid_shows_the_image_only_and_as_much_as_it_can(d, size):
-    framing = zj.frame_output(d, SIZE, keep="valid", size=size)
+    framing = zj.correct.frame_output(d, SIZE, keep="valid", size=size)
     image = np.full(SIZE[::-1], 250, np.uint8)
     assert (zj.undistort_image(image, d, keep=framing) == 250).all()
     middle = np.asarray(framing.corrected((np.array(framing.size) - 1) / 2))
@@ -55,31 +55,32 @@ def test_valid_shows_the_image_only_and_as_much_as_it_can(d, size):
 
 
 def test_same_is_the_input_and_crops_about_the_middle():
-    framing = zj.frame_output(LENSES[0], SIZE)
+    framing = zj.correct.frame_output(LENSES[0], SIZE)
     assert framing.scale == 1
     assert framing.size == SIZE
     np.testing.assert_array_equal(framing.origin, [0, 0])
-    cropped = zj.frame_output(LENSES[0], SIZE, size=(92, 58))
+    cropped = zj.correct.frame_output(LENSES[0], SIZE, size=(92, 58))
     np.testing.assert_array_equal(cropped.origin, [50, 25])
 
 
 @pytest.mark.parametrize("keep", ["all", "valid"])
 def test_one_framing_for_a_zoom_range_is_the_tightest_of_each(truth, keep):
-    common = zj.frame_output(truth, truth.image_size, keep=keep)
+    common = zj.correct.frame_output(truth, truth.image_size, keep=keep)
     focal = 1 / np.linspace(1 / 20.56, 1 / 127.36, 65)
     each = [
-        zj.frame_output(truth(f), truth.image_size, keep=keep).scale for f in np.clip(focal, 20.56, 127.36)
+        zj.correct.frame_output(truth(f), truth.image_size, keep=keep).scale
+        for f in np.clip(focal, 20.56, 127.36)
     ]
     worst = min(each) if keep == "all" else max(each)
     np.testing.assert_allclose(common.scale, worst, rtol=1e-9)
     assert max(each) - min(each) > 0.05
-    listed = zj.frame_output([truth(25.0), truth(100.0)], truth.image_size, keep=keep)
+    listed = zj.correct.frame_output([truth(25.0), truth(100.0)], truth.image_size, keep=keep)
     assert common.scale <= listed.scale if keep == "all" else common.scale >= listed.scale
 
 
 def test_fold_bounds_what_counts():
     d = bent(-0.6)
-    framing = zj.frame_output(d, SIZE, keep="valid")
+    framing = zj.correct.frame_output(d, SIZE, keep="valid")
     shown = np.stack(np.meshgrid(*map(np.arange, SIZE)), axis=-1)
     assert np.isfinite(np.asarray(d.distort(framing.corrected(shown)))).all()
     np.testing.assert_allclose(fold_radius(d), d.monotone_radius, rtol=1e-12)
@@ -97,4 +98,4 @@ def test_fold_bounds_what_counts():
 def test_bad_arguments(arguments, message):
     distortions, size, keep = arguments
     with pytest.raises(ValueError, match=message):
-        zj.frame_output(distortions, size, keep=keep)
+        zj.correct.frame_output(distortions, size, keep=keep)

@@ -52,7 +52,7 @@ def bilinear(image, where):
 @pytest.mark.parametrize("size", [None, (7, 3)])
 def test_half_pixel_convention_on_asymmetric_image(rng, keep, size):
     image = rng.integers(0, 255, (4, 6)).astype(np.float32)
-    framing = zj.frame_output(TINY, (6, 4), keep=keep, size=size)
+    framing = zj.correct.frame_output(TINY, (6, 4), keep=keep, size=size)
     expected = cv2.remap(
         image, exact_map(TINY, framing).astype(np.float32), None, cv2.INTER_LINEAR, borderValue=9
     )
@@ -83,7 +83,7 @@ def test_depths_and_channels(rng, dtype, channels):
     shape = (108, 192, *channels)
     image = np.stack([smooth(rng, shape[:2], dtype) for _ in range(int(np.prod(channels)))], axis=-1)
     image = image.reshape(shape)
-    framing = zj.frame_output(BARREL, SIZE)
+    framing = zj.correct.frame_output(BARREL, SIZE)
     where = exact_map(BARREL, framing)
     expected = bilinear(image.reshape(108, 192, -1).astype(np.float64), where).reshape(shape)
     result = zj.undistort_image(image, BARREL)
@@ -119,7 +119,7 @@ def test_against_an_opencv_camera(rng):
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-14)
     camera_and_lens = (pixels, camera, np.array([k1, k2, 0, 0]))
     where = cv2.undistortPoints(*camera_and_lens, P=camera, criteria=criteria).reshape(540, 960, 2)
-    x, y = position_map(d, zj.frame_output(d, (960, 540)), (960, 540))
+    x, y = position_map(d, zj.correct.frame_output(d, (960, 540)), (960, 540))
     seen = (where >= 0).all(-1) & (where[..., 0] <= 959) & (where[..., 1] <= 539)
     assert seen.mean() > 0.8
     assert np.hypot(x - where[..., 0], y - where[..., 1])[seen].max() <= TOLERANCE
@@ -168,7 +168,7 @@ def test_lines_come_out_straight(d):
 @pytest.mark.parametrize("d", [BARREL, PINCUSHION, bent(0.3, 0.1, centre=(70, 60)), bent(-0.3, size=SIZE)])
 @pytest.mark.parametrize("plane", [None, Plane((96, 54), (2.0, 2.0), (0.0, 0.5))])
 def test_map_within_a_hundredth_of_a_pixel(d, plane):
-    framing = zj.frame_output(d, SIZE, size=(200, 120))
+    framing = zj.correct.frame_output(d, SIZE, size=(200, 120))
     size, step, offset = (
         ((200, 120), (1, 1), (0, 0)) if plane is None else (plane.size, plane.step, plane.offset)
     )
@@ -187,7 +187,7 @@ def test_exact_inverse_where_no_polynomial_will_do():
     """k1 = -1/3: the fold lies on the farthest corner."""
     d = bent(-1 / 3 - 1e-3)
     assert fit_inverse(d, 400.0) is None
-    framing = zj.frame_output(d, SIZE)
+    framing = zj.correct.frame_output(d, SIZE)
     x, y = position_map(d, framing, SIZE, extend=True)
     exact = exact_map(d, framing)
     gone = np.isnan(exact[..., 0])
@@ -200,7 +200,7 @@ def test_error_of_the_fit_is_what_it_says():
     d = bent(0.3, 0.1, size=(1920, 1080))
     inverse = fit_inverse(d, 1100.0)
     assert inverse is not None
-    framing = zj.frame_output(d, (1920, 1080))
+    framing = zj.correct.frame_output(d, (1920, 1080))
     x, y = position_map(d, framing, (1920, 1080), extend=True)
     exact = exact_map(d, framing)
     error = np.hypot(x - exact[..., 0], y - exact[..., 1]).max()
@@ -214,7 +214,7 @@ def test_fold_gives_border_value_and_says_so(rng, border):
     image = np.full((108, 192), 200, np.uint8)
     with pytest.warns(UserWarning, match="not invertible on this image.* folds 8. px from the centre"):
         result = zj.undistort_image(image, d, border=border, border_value=7)
-    exact = exact_map(d, zj.frame_output(d, SIZE))
+    exact = exact_map(d, zj.correct.frame_output(d, SIZE))
     gone = np.isnan(exact[..., 0])
     assert 0.2 < gone.mean() < 0.9
     assert (result[gone] == 7).all()
@@ -242,7 +242,7 @@ def test_borders(rng):
 @pytest.mark.parametrize(("name", "flag"), [("nearest", 0), ("cubic", 2), ("lanczos", 4)])
 def test_interpolations(rng, name, flag):
     image = smooth(rng, (108, 192, 3))
-    where = exact_map(BARREL, zj.frame_output(BARREL, SIZE)).astype(np.float32)
+    where = exact_map(BARREL, zj.correct.frame_output(BARREL, SIZE)).astype(np.float32)
     expected = cv2.remap(image, where, None, flag)
     difference = cv2.absdiff(zj.undistort_image(image, BARREL, interpolation=name), expected)
     assert (difference > 1).mean() < 2e-3
@@ -258,7 +258,7 @@ def test_interpolations(rng, name, flag):
         ({"keep": "most"}, 'keep must be "same", "all" or "valid"'),
         ({"size": (0, 3)}, "size must be two positive integers"),
         ({"size": (40000, 3)}, "at most 32766 px a side"),
-        ({"keep": zj.frame_output(BARREL, SIZE), "size": (3, 3)}, "size must be left out"),
+        ({"keep": zj.correct.frame_output(BARREL, SIZE), "size": (3, 3)}, "size must be left out"),
     ],
 )
 def test_bad_arguments(arguments, message):

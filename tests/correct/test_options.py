@@ -93,11 +93,11 @@ def expected(kind, focal, **options):
     """What `undistort_image` makes of them; one framing, "all" or "valid", for all focal lengths."""
     result = []
     for size, f in zip(KINDS[kind], focal, strict=True):
-        scaled = zj.lens_for_size(lens(), size)
+        scaled = zj.models.lens_for_size(lens(), size)
         keep = options.get("keep", "same")
         if keep != "same":
             spread = 1 / np.linspace(1 / min(focal), 1 / max(focal), 65 if len(set(focal)) > 1 else 1)
-            keep = zj.frame_output([scaled(float(each)) for each in spread], size, keep=keep)
+            keep = zj.correct.frame_output([scaled(float(each)) for each in spread], size, keep=keep)
         result.append(zj.undistort_image(scene(size), scaled(float(f)), **{**options, "keep": keep}))
     return result
 
@@ -187,7 +187,7 @@ def test_focal_lengths_are_plain_numbers(made, tmp_path, kind, focal):
 
 def test_a_framing_is_scaled_with_the_lens(made, tmp_path):
     """One made for the lens's size, for a photo and a video of another."""
-    framing = zj.frame_output(lens()(80.0), SIZE, keep="valid", size=(60, 40))
+    framing = zj.correct.frame_output(lens()(80.0), SIZE, keep="valid", size=(60, 40))
     with pytest.warns(UserWarning, match="its distortion is scaled"):
         zj.undistort_photo(made / "48.png", tmp_path / "a.png", lens=lens(), focal=80.0, keep=framing)
     zj.undistort_photo(made / "96.png", tmp_path / "b.png", lens=lens(), focal=80.0, keep=framing)
@@ -196,12 +196,12 @@ def test_a_framing_is_scaled_with_the_lens(made, tmp_path):
     assert (
         np.median(abs(cv2.resize(large, (30, 20), interpolation=cv2.INTER_AREA).astype(int) - small)) <= 4
     )
-    double = zj.lens_for_size(lens(), (192, 128))
+    double = zj.models.lens_for_size(lens(), (192, 128))
     undistort_video(
         made / "zoom.mkv",
         tmp_path / "c.mkv",
         lens=double,
         focal=80.0,
-        keep=zj.frame_output(double(80.0), (192, 128), keep="valid", size=(120, 80)),
+        keep=zj.correct.frame_output(double(80.0), (192, 128), keep="valid", size=(120, 80)),
     )
     np.testing.assert_allclose(frames(tmp_path / "c.mkv")[0].astype(int), large, atol=2)

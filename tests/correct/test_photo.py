@@ -147,6 +147,6 @@ def test_another_size_of_the_same_aspect_is_scaled_and_said(tmp_path, rng):
         zj.undistort_photo(source, tmp_path / "out.png", lens=lens((384, 256)), focal=20.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        scaled = zj.lens_for_size(lens((384, 256)), SIZE)
+        scaled = zj.models.lens_for_size(lens((384, 256)), SIZE)
     expected = zj.undistort_image(cv2.imread(str(source)), scaled(20.0))
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "out.png")), expected)

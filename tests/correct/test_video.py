@@ -18,7 +18,7 @@ from zoomjax.io.video_writer import display_matrix
 
 from .._clips import FRAMES, SIZE, bend, focal, lens, luma, picture, write_clip
 
-TRACK = zj.FocalTrack(np.array([0.0, FRAMES - 1]), np.array([20.0, 80.0]), by_time=False)
+TRACK = zj.io.FocalTrack(np.array([0.0, FRAMES - 1]), np.array([20.0, 80.0]), by_time=False)
 
 
 @pytest.fixture(scope="module")
@@ -55,10 +55,12 @@ def test_times_colours_and_sound_are_kept(clip, tmp_path):
 
 def test_track_in_seconds_and_one_framing_for_all(clip, tmp_path):
     times = luma(clip)[1]
-    track = zj.FocalTrack(times[[0, -1]], np.array([20.0, 80.0]))
+    track = zj.io.FocalTrack(times[[0, -1]], np.array([20.0, 80.0]))
     done = undistort_video(clip, tmp_path / "out.mkv", lens=lens(), focal=track, keep="valid")
     after, _ = luma(tmp_path / "out.mkv")
-    assert done.scale == pytest.approx(float(zj.frame_output(lens(), SIZE, keep="valid").scale), rel=1e-6)
+    assert done.scale == pytest.approx(
+        float(zj.correct.frame_output(lens(), SIZE, keep="valid").scale), rel=1e-6
+    )
     assert done.scale > 1.04
     corners = after[:, [0, 0, -1, -1], [0, -1, 0, -1]]
     assert (corners > 15).all()  # no black, at any focal length
@@ -130,7 +132,7 @@ def test_sound_that_the_container_does_not_take(clip, tmp_path):
 
 def test_a_framing_of_one_s_own_and_odd_sizes(tmp_path):
     source = write_clip(tmp_path / "in.mkv", 3, encoder="ffv1", sound=False)
-    framing = zj.frame_output(lens(), SIZE, keep="all", size=(201, 99))
+    framing = zj.correct.frame_output(lens(), SIZE, keep="all", size=(201, 99))
     done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=20.0, keep=framing)
     after, _ = luma(tmp_path / "out.mkv")
     assert after.shape == (3, 99, 201)
@@ -158,13 +160,13 @@ def only(folder, *names):
 
 
 def test_short_track_leaves_nothing(clip, tmp_path):
-    short = zj.FocalTrack(np.array([0.0, 9.0]), np.array([20.0, 80.0]), by_time=False)
+    short = zj.io.FocalTrack(np.array([0.0, 9.0]), np.array([20.0, 80.0]), by_time=False)
     with pytest.raises(
         ValueError, match=r"ends at 9 frames, and the video has 24 frames\. Give a track as long"
     ):
         undistort_video(clip, tmp_path / "out.mp4", lens=lens(), focal=short)
     assert only(tmp_path)
-    held = zj.FocalTrack(short.position, short.focal, by_time=False, hold=True)
+    held = zj.io.FocalTrack(short.position, short.focal, by_time=False, hold=True)
     assert undistort_video(clip, tmp_path / "out.mp4", lens=lens(), focal=held).frames == FRAMES
 
 
@@ -271,7 +273,7 @@ def test_frames_after_lost_ones_keep_their_numbers(tmp_path):
     for packet in packets[5:8]:
         content = content.replace(packet, bytes(len(packet)))
     source.write_bytes(content)
-    step = zj.FocalTrack(np.array([0, 7.0, 8, 23]), np.array([80.0, 80, 20, 20]), by_time=False)
+    step = zj.io.FocalTrack(np.array([0, 7.0, 8, 23]), np.array([80.0, 80, 20, 20]), by_time=False)
     with pytest.warns(UserWarning, match=r"3 of 2\d frames of .*in\.mkv do not decode"):
         done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=step, encoder="ffv1")
     assert done.frames == FRAMES - 3
@@ -292,7 +294,7 @@ def test_a_track_in_seconds_needs_frames_with_times(clip, tmp_path):
             if packet.dts is not None:
                 packet.stream = stream
                 out.mux(packet)
-    seconds = zj.FocalTrack(np.array([0.0, 2.0]), np.array([20.0, 80.0]), hold=True)
+    seconds = zj.io.FocalTrack(np.array([0.0, 2.0]), np.array([20.0, 80.0]), hold=True)
     with pytest.raises(ValueError, match="frames of the video have no times"):
         undistort_video(tmp_path / "raw.h264", tmp_path / "out.mkv", lens=lens(), focal=seconds)
     assert only(tmp_path, "raw.h264")

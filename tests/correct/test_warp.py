@@ -31,7 +31,7 @@ def image(rng):
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("d", LENSES)
 def test_positions_are_those_of_distort(d, dtype):
-    framing = zj.frame_output(d, SIZE, size=(60, 40))
+    framing = zj.correct.frame_output(d, SIZE, size=(60, 40))
     pixels = np.stack(np.meshgrid(np.arange(60), np.arange(40)), axis=-1).astype(float)
     exact = np.asarray(d.distort(framing.corrected(pixels)))
     found = np.stack(jax.jit(sample_positions, static_argnums=2)(d, framing, dtype), axis=-1)
@@ -55,7 +55,7 @@ def test_half_pixel_convention_on_asymmetric_image(rng):
     d = bent(0.3, -0.1, size=(6, 4), centre=(3, 1))
     small = rng.uniform(size=(4, 6)).astype(np.float32)
     for keep in ("same", "all", "valid"):
-        framing = zj.frame_output(d, (6, 4), keep=keep, size=(7, 5))
+        framing = zj.correct.frame_output(d, (6, 4), keep=keep, size=(7, 5))
         where = exact_map(d, framing).astype(np.float32)
         expected = cv2.remap(small, where, None, cv2.INTER_LINEAR, borderValue=0.4)
         result = zj.warp_image(jnp.asarray(small), d, framing=framing, border_value=0.4)
@@ -64,7 +64,7 @@ def test_half_pixel_convention_on_asymmetric_image(rng):
 
 @pytest.mark.parametrize("d", LENSES)
 def test_bilinear_is_opencv_s(image, d):
-    where = exact_map(d, zj.frame_output(d, SIZE))
+    where = exact_map(d, zj.correct.frame_output(d, SIZE))
     where = np.where(np.isnan(where), -100, where).astype(np.float32)
     expected = cv2.remap(np.asarray(image, np.float32), where, None, cv2.INTER_LINEAR)
     result = np.asarray(zj.warp_image(image, d))
@@ -89,7 +89,7 @@ def catmull_rom(image, x, y):
 
 def test_bicubic_is_catmull_rom(image):
     d = LENSES[0]
-    where = exact_map(d, zj.frame_output(d, SIZE))
+    where = exact_map(d, zj.correct.frame_output(d, SIZE))
     expected = np.array([[catmull_rom(np.asarray(image), *point) for point in row] for row in where])
     result = zj.warp_image(image, d, interpolation="cubic")
     np.testing.assert_allclose(result, expected, atol=1e-6)
@@ -100,7 +100,7 @@ def test_bicubic_reproduces_parabolas():
     d = bent(0.1, -0.02)
     y, x = np.mgrid[:30, :48]
     image = jnp.asarray((x - 20.0) ** 2 + 0.5 * (y - 10.0) ** 2 + x * y)
-    where = exact_map(d, zj.frame_output(d, SIZE))
+    where = exact_map(d, zj.correct.frame_output(d, SIZE))
     u, v = where[..., 0], where[..., 1]
     expected = (u - 20) ** 2 + 0.5 * (v - 10) ** 2 + u * v
     inner = (u > 2) & (u < 45) & (v > 2) & (v < 27)
@@ -139,7 +139,7 @@ def test_gradients_are_finite_differences(rng, image, d, interpolation):
 def test_gradient_with_respect_to_the_image_is_the_adjoint(rng, image, interpolation):
     """Also where positions lie on the border, off the image, and where there is no inverse."""
     d = bent(-0.6)
-    framing = zj.frame_output(d, SIZE, size=(60, 40))
+    framing = zj.correct.frame_output(d, SIZE, size=(60, 40))
 
     def warp(image):
         return zj.warp_image(image, d, framing=framing, interpolation=interpolation)
@@ -183,7 +183,7 @@ def test_compiles_once_for_all_focal_lengths(image, compilations):
 def test_fold_is_border_and_has_finite_gradients(image):
     d = bent(-0.6)
     result = zj.warp_image(image, d, border_value=9.0)
-    gone = np.isnan(exact_map(d, zj.frame_output(d, SIZE))[..., 0])
+    gone = np.isnan(exact_map(d, zj.correct.frame_output(d, SIZE))[..., 0])
     assert gone.mean() > 0.2
     assert (np.asarray(result)[gone] == 9).all()
     gradient = jax.grad(lambda d: zj.warp_image(image, d).sum())(d)

@@ -21,7 +21,7 @@ from .._bad_files import png, whole_png, write_bad_files
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
 
 
-class Rows(zj.AbstractDetector):
+class Rows(zj.detect.AbstractDetector):
     """Finds bright rows, and does what the first pixel tells: ends its process, hangs, takes memory."""
 
     def __call__(self, image):

@@ -13,7 +13,7 @@ from zoomjax.detect.batch import Detection, detect
 from zoomjax.detect.sources import Source, find_photos
 
 
-class Marker(zj.AbstractDetector):
+class Marker(zj.detect.AbstractDetector):
     """Finds a line in each row of bright pixels, and writes down that it has looked."""
 
     log: str
@@ -157,14 +157,14 @@ def test_the_cache_does_not_keep_a_videos_track(marker, tmp_path):
 
 def test_what_no_detector_can_do_with_an_image_is_told(tmp_path):
     grey, small = np.zeros((100, 100), np.uint8), np.zeros((20, 100, 3), np.uint8)
-    [found] = detect([Source("a", image=grey)], zj.PitchDetector())
+    [found] = detect([Source("a", image=grey)], zj.detect.PitchDetector())
     assert "grey" in found.problem
     assert "--detector edges" in found.problem
     [found] = detect([Source("a", image=small)], zj.EdgeDetector())
     assert found.problem == "it is 100x20 px: at least 32 px a side are needed"
 
 
-class Broken(zj.AbstractDetector):
+class Broken(zj.detect.AbstractDetector):
     def __call__(self, image):
         raise IndexError("out of bounds.")
 
@@ -218,7 +218,7 @@ def test_a_grid_is_looked_for_where_it_tells_the_focal_length(tmp_path):
         "none": [False, False],
         "without focal length": [True, False],
     }
-    [of_grid] = detect(sources[:1], zj.GridDetector(), cache=tmp_path)
-    [again] = detect(sources[:1], zj.GridDetector(), cache=tmp_path)
+    [of_grid] = detect(sources[:1], zj.detect.GridDetector(), cache=tmp_path)
+    [again] = detect(sources[:1], zj.detect.GridDetector(), cache=tmp_path)
     np.testing.assert_array_equal(of_grid.nodes, again.nodes)
     assert of_grid.nodes.shape == (7, 9, 2)

@@ -106,7 +106,7 @@ def test_noise_and_uneven_light_move_nodes_little(pattern, find, rng):
 @pytest.mark.parametrize("pattern", [squares, dots])
 def test_rows_run_to_the_right_and_columns_down_however_the_image_is_turned(pattern, turns):
     image = np.ascontiguousarray(np.rot90(rendered(pattern, OBLIQUE), turns))
-    grid = zj.GridDetector().find(image)
+    grid = zj.detect.GridDetector().find(image)
     assert grid.shape[:2] == ((ROWS, COLUMNS) if turns % 2 == 0 else (COLUMNS, ROWS))
     assert (np.diff(grid[..., 0], axis=1) > 0).all()
     assert (np.diff(grid[..., 1], axis=0) > 0).all()
@@ -114,7 +114,7 @@ def test_rows_run_to_the_right_and_columns_down_however_the_image_is_turned(patt
 
 @pytest.mark.parametrize("pattern", [squares, dots])
 def test_every_row_and_column_is_a_line_in_order(pattern):
-    lines = zj.GridDetector()(rendered(pattern, OBLIQUE))
+    lines = zj.detect.GridDetector()(rendered(pattern, OBLIQUE))
     assert [len(line) for line in lines] == [COLUMNS] * ROWS + [ROWS] * COLUMNS
     truth = mapped(OBLIQUE, nodes())
     for line, expected in zip(lines, [*truth, *truth.swapaxes(0, 1)], strict=True):
@@ -125,7 +125,7 @@ def test_every_row_and_column_is_a_line_in_order(pattern):
 def test_the_lines_of_several_images_give_back_their_lens():
     """The whole way: images, lines, fit."""
     k = LENSES["barrel"]
-    found = [zj.GridDetector()(rendered(dots, pose, k)) for pose in (SQUARE, OBLIQUE)]
+    found = [zj.detect.GridDetector()(rendered(dots, pose, k)) for pose in (SQUARE, OBLIQUE)]
     lines = zj.Lines.from_ragged(
         [line for image in found for line in image],
         np.repeat([0, 0], [len(image) for image in found]),
@@ -140,10 +140,10 @@ def test_the_lines_of_several_images_give_back_their_lens():
 def test_absent_dots_are_nan_and_left_out_of_their_lines():
     absent = [(2, 3), (5, 10), (0, 6)]
     image = rendered(lambda places: dots(places, absent=absent), OBLIQUE)
-    grid = zj.GridDetector().find(image)
+    grid = zj.detect.GridDetector().find(image)
     np.testing.assert_array_equal(np.argwhere(np.isnan(grid[..., 0])), sorted(absent))
     assert rms(grid - mapped(OBLIQUE, nodes())) < 0.05
-    lengths = [len(line) for line in zj.GridDetector()(image)]
+    lengths = [len(line) for line in zj.detect.GridDetector()(image)]
     assert lengths[:ROWS] == [10, 11, 10, 11, 11, 10, 11, 11]
     assert sum(lengths) == 2 * (ROWS * COLUMNS - 3)
 
@@ -180,8 +180,8 @@ def test_corners_found_in_a_smaller_image_are_sharpened_in_the_full_one(monkeypa
 @pytest.mark.parametrize("pattern", [squares, dots])
 def test_colour_is_grey_in_three_channels(pattern):
     image = rendered(pattern, OBLIQUE)
-    colour = zj.GridDetector()(np.repeat(image[..., None], 3, axis=2))
-    for line, same in zip(zj.GridDetector()(image), colour, strict=True):
+    colour = zj.detect.GridDetector()(np.repeat(image[..., None], 3, axis=2))
+    for line, same in zip(zj.detect.GridDetector()(image), colour, strict=True):
         np.testing.assert_array_equal(line, same)
 
 
@@ -215,27 +215,27 @@ def test_images_without_a_grid_give_no_lines(rng):
     for image in nothing(rng):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            assert zj.GridDetector()(image) == []
+            assert zj.detect.GridDetector()(image) == []
 
 
 def test_scattered_spots_are_no_grid(rng):
     image = np.full((300, 400), 220, np.uint8)
     for x, y in rng.uniform((10, 10), (390, 290), (150, 2)).astype(int):
         cv2.circle(image, (int(x), int(y)), 4, 30, -1)
-    assert zj.GridDetector()(image) == []
+    assert zj.detect.GridDetector()(image) == []
 
 
 def test_grids_smaller_than_asked_do_not_count():
     image = rendered(squares, OBLIQUE)
-    assert len(zj.GridDetector(fewest=ROWS)(image)) == ROWS + COLUMNS
+    assert len(zj.detect.GridDetector(fewest=ROWS)(image)) == ROWS + COLUMNS
     assert find_checkerboard(image) is not None
-    assert zj.GridDetector(fewest=ROWS + 1)(image) == []
+    assert zj.detect.GridDetector(fewest=ROWS + 1)(image) == []
 
 
 @pytest.mark.parametrize("fewest", [2, 3.5, "four", True])
 def test_wrong_setting_raises(fewest, unchecked):
     with pytest.raises(ValueError, match="fewest must be an integer of at least 3"):
-        zj.GridDetector(fewest=fewest)
+        zj.detect.GridDetector(fewest=fewest)
 
 
 @pytest.mark.parametrize(
@@ -250,14 +250,14 @@ def test_wrong_setting_raises(fewest, unchecked):
 )
 def test_other_images_raise(image, unchecked):
     with pytest.raises(ValueError, match="image must be uint8 of shape"):
-        zj.GridDetector()(image)
+        zj.detect.GridDetector()(image)
 
 
 def test_a_detector_is_abstract_or_final():
-    assert issubclass(zj.GridDetector, zj.AbstractDetector)
+    assert issubclass(zj.detect.GridDetector, zj.detect.AbstractDetector)
     with pytest.raises(TypeError, match="abstract"):
-        zj.AbstractDetector()
-    assert issubclass(zj.AbstractDetector, eqx.Module)
+        zj.detect.AbstractDetector()
+    assert issubclass(zj.detect.AbstractDetector, eqx.Module)
 
 
 @pytest.mark.slow
@@ -269,7 +269,7 @@ def test_the_boards_of_a_real_zoom_camera_are_found(data):
     assert len(photos) == 30
     squared = []
     for path in photos:
-        found = zj.GridDetector().find(cv2.imread(str(path)))
+        found = zj.detect.GridDetector().find(cv2.imread(str(path)))
         if found is not None and found.shape == (15, 22, 2):
             known = reference[path.name].reshape(-1, 2)
             offset = found.reshape(-1, 1, 2) - known[None]
@@ -283,11 +283,11 @@ def test_the_boards_of_a_real_zoom_camera_are_found(data):
 
 def test_a_real_grid_of_dots_is_found(data):
     image = cv2.imread(str(data / "line_patterns" / "dot_pattern_05.jpg"))
-    grid = zj.GridDetector().find(image)
+    grid = zj.detect.GridDetector().find(image)
     # 52 rows and 85 columns have whole dots; one corner of the image is covered.
     assert grid.shape[:2] == (52, 85)
     assert np.isfinite(grid[..., 0]).sum() > 4380
-    for line in zj.GridDetector()(image):
+    for line in zj.detect.GridDetector()(image):
         if len(line) > 40:  # a parabola is what the lens leaves of a line
             middle = line - line.mean(axis=0)
             along, across = (middle @ np.linalg.svd(middle, full_matrices=False)[2].T).T
@@ -298,4 +298,4 @@ def test_a_real_grid_of_dots_is_found(data):
 def test_football_shows_no_grid(data):
     frames = sorted((data / "broadcast_frames").glob("*.jpg"))[::5]
     assert len(frames) > 3
-    assert all(zj.GridDetector()(cv2.imread(str(path))) == [] for path in frames)
+    assert all(zj.detect.GridDetector()(cv2.imread(str(path))) == [] for path in frames)

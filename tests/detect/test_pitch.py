@@ -77,7 +77,7 @@ def test_points_are_in_the_middle_of_a_marking(rng, width, angle):
     start, end = np.array([640.3, 360.2]) - 300 * way, np.array([640.3, 360.2]) + 300 * way
     scene = Scene()
     scene.line(start, end, width)
-    (line,) = zj.PitchDetector()(scene.shot(rng))
+    (line,) = zj.detect.PitchDetector()(scene.shot(rng))
     error = across(line, start, end)
     assert abs(error.mean()) < 0.05
     assert np.sqrt(np.mean(error**2)) < 0.2
@@ -89,7 +89,7 @@ def test_grass_of_two_brightnesses_does_not_move_a_marking(rng):
     half = FINER * 360
     scene.large[:half] = np.array(GRASS) * 0.7
     scene.line(np.array([200, 359.5]), np.array([1100, 359.5]), 5)
-    (line,) = zj.PitchDetector()(scene.shot(rng))
+    (line,) = zj.detect.PitchDetector()(scene.shot(rng))
     assert abs(np.mean(line[:, 1] - 359.5)) < 0.1
 
 
@@ -98,7 +98,7 @@ def test_a_marking_behind_a_player_is_one_line(rng):
     scene = Scene()
     scene.line(start, end, 5)
     scene.blob((650, 350), (18, 45), (30, 30, 200))
-    (line,) = zj.PitchDetector()(scene.shot(rng))
+    (line,) = zj.detect.PitchDetector()(scene.shot(rng))
     assert extent(line) > 1100
     assert abs(across(line, start, end)).max() < 1
     assert not np.any(abs(line[:, 0] - 650) < 10)
@@ -108,7 +108,7 @@ def test_a_marking_behind_a_player_is_one_line(rng):
 def test_circles_on_the_pitch_are_no_lines(rng, axes):
     scene = Scene()
     scene.curve(ellipse((640, 360), axes), 5)
-    assert zj.PitchDetector()(scene.shot(rng)) == []
+    assert zj.detect.PitchDetector()(scene.shot(rng)) == []
 
 
 def test_a_line_through_a_circle_is_found_whole(rng):
@@ -116,7 +116,7 @@ def test_a_line_through_a_circle_is_found_whole(rng):
     scene = Scene()
     scene.curve(ellipse((645, 360), (300, 110)), 5)
     scene.line(start, end, 5)
-    (line,) = zj.PitchDetector()(scene.shot(rng))
+    (line,) = zj.detect.PitchDetector()(scene.shot(rng))
     assert extent(line) > 620
     assert abs(across(line, start, end)).max() < 1
 
@@ -126,7 +126,7 @@ def test_lines_bent_by_a_lens_are_found(rng):
     y = 150 - 20 * (1 - ((x - 640) / 540) ** 2)
     scene = Scene()
     scene.curve(np.stack([x, y], axis=-1), 5)
-    (line,) = zj.PitchDetector()(scene.shot(rng))
+    (line,) = zj.detect.PitchDetector()(scene.shot(rng))
     error = line[:, 1] - (150 - 20 * (1 - ((line[:, 0] - 640) / 540) ** 2))
     assert np.sqrt(np.mean(error**2)) < 0.2
 
@@ -137,7 +137,7 @@ def test_what_is_not_on_grass_is_no_marking(rng):
     scene.line(np.array([100, 100]), np.array([1100, 120]), 5)  # on a board
     scene.line(np.array([100, 200]), np.array([1100, 200]), 6)  # the board's lower border
     scene.line(np.array([100.0, 400.0]), np.array([1100.0, 420.0]), 5)
-    (line,) = zj.PitchDetector()(scene.shot(rng))
+    (line,) = zj.detect.PitchDetector()(scene.shot(rng))
     assert abs(across(line, (100, 400), (1100, 420))).max() < 1
 
 
@@ -146,56 +146,56 @@ def test_coloured_lines_and_wide_ones_are_no_markings(rng):
     scene.line(np.array([100, 500]), np.array([1100, 600]), 40)
     shot = scene.shot(rng, noise=0)
     cv2.line(shot, (100, 200), (1100, 260), (60, 220, 230), 5, cv2.LINE_AA)
-    assert zj.PitchDetector()(shot) == []
+    assert zj.detect.PitchDetector()(shot) == []
 
 
 def test_least_length_is_a_share_of_the_diagonal(rng):
     scene = Scene()
     scene.line(np.array([300, 300]), np.array([500, 320]), 5)  # 0.137 of the diagonal
     shot = scene.shot(rng)
-    assert len(zj.PitchDetector(least_length=0.12)(shot)) == 1
-    assert zj.PitchDetector(least_length=0.15)(shot) == []
+    assert len(zj.detect.PitchDetector(least_length=0.12)(shot)) == 1
+    assert zj.detect.PitchDetector(least_length=0.15)(shot) == []
 
 
 def test_the_longest_line_comes_first(rng):
     scene = Scene()
     scene.line(np.array([100, 600]), np.array([500, 640]), 5)
     scene.line(np.array([100, 100]), np.array([1100, 300]), 5)
-    lines = zj.PitchDetector()(scene.shot(rng))
+    lines = zj.detect.PitchDetector()(scene.shot(rng))
     assert [line.dtype for line in lines] == [np.float64, np.float64]
     assert extent(lines[0]) > extent(lines[1])
 
 
 def test_an_image_without_grass_has_no_markings(rng):
-    assert zj.PitchDetector()(rng.integers(0, 256, (360, 640, 3), np.uint8)) == []
-    assert zj.PitchDetector()(np.zeros((360, 640, 3), np.uint8)) == []
-    assert zj.PitchDetector()(np.full((360, 640, 3), 255, np.uint8)) == []
+    assert zj.detect.PitchDetector()(rng.integers(0, 256, (360, 640, 3), np.uint8)) == []
+    assert zj.detect.PitchDetector()(np.zeros((360, 640, 3), np.uint8)) == []
+    assert zj.detect.PitchDetector()(np.full((360, 640, 3), 255, np.uint8)) == []
 
 
 def test_bare_grass_has_no_markings(rng):
-    assert zj.PitchDetector()(Scene().shot(rng, noise=12)) == []
+    assert zj.detect.PitchDetector()(Scene().shot(rng, noise=12)) == []
 
 
 @pytest.mark.parametrize("size", [(32, 32), (33, 500), (500, 33)])
 def test_small_images_are_taken(size):
-    assert zj.PitchDetector()(np.full((*size[::-1], 3), GRASS, np.uint8)) == []
+    assert zj.detect.PitchDetector()(np.full((*size[::-1], 3), GRASS, np.uint8)) == []
 
 
 def test_a_grey_image_is_refused(unchecked):
     with pytest.raises(ValueError, match="colour image"):
-        zj.PitchDetector()(np.zeros((360, 640), np.uint8))
+        zj.detect.PitchDetector()(np.zeros((360, 640), np.uint8))
 
 
 @pytest.mark.parametrize("image", [None, np.zeros((360, 640, 3)), np.zeros((360, 640, 4), np.uint8)])
 def test_what_is_no_image_is_refused(unchecked, image):
     with pytest.raises(ValueError, match="Argument image"):
-        zj.PitchDetector()(image)
+        zj.detect.PitchDetector()(image)
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1])
 def test_a_length_that_is_no_share_is_refused(share):
     with pytest.raises(ValueError, match="least_length"):
-        zj.PitchDetector(least_length=share)
+        zj.detect.PitchDetector(least_length=share)
 
 
 def sampled(lines):
@@ -216,7 +216,7 @@ def is_near(points, others):
 @pytest.fixture(scope="module")
 def found(data):
     """For each labelled frame the lines found."""
-    detector = zj.PitchDetector()
+    detector = zj.detect.PitchDetector()
     folder = data / "broadcast_frames"
     return {name: detector(cv2.imread(str(folder / f"{name}.jpg"))) for name in LABELS}
 

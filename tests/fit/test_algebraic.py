@@ -35,11 +35,11 @@ def reference(lines, frame, terms):
 @pytest.mark.parametrize("terms", [1, 2, 3])
 def test_estimate_is_the_one_from_all_pairs_of_points(terms, ragged):
     expected = [reference(ragged, frame, terms) for frame in range(3)]
-    np.testing.assert_allclose(zj.algebraic_frames(ragged, terms=terms), expected, rtol=1e-6)
+    np.testing.assert_allclose(zj.fit.algebraic_frames(ragged, terms=terms), expected, rtol=1e-6)
 
 
 def test_estimate_is_close_to_the_truth(clean, truth):
-    lens = zj.algebraic_zoom(clean)
+    lens = zj.fit.algebraic_zoom(clean)
     nothing = eqx.tree_at(lambda lens: lens.zoom.parameters, truth, jnp.zeros((3, 2)))
     distortion = largest_difference(nothing, truth, clean.focal)
     assert largest_difference(lens, truth, clean.focal) < 0.05 * distortion
@@ -47,21 +47,23 @@ def test_estimate_is_close_to_the_truth(clean, truth):
 
 def test_points_and_compressed_lines_give_the_same(noisy, small):
     np.testing.assert_allclose(
-        zj.algebraic_zoom(noisy).zoom.parameters, zj.algebraic_zoom(small).zoom.parameters, rtol=1e-9
+        zj.fit.algebraic_zoom(noisy).zoom.parameters,
+        zj.fit.algebraic_zoom(small).zoom.parameters,
+        rtol=1e-9,
     )
 
 
 def test_frames_are_zoom_estimates_of_degree_0(ragged):
-    frames = zj.algebraic_frames(ragged)
+    frames = zj.fit.algebraic_frames(ragged)
     lines = ragged.to_ragged()
     own = [line for line, frame in zip(lines, RAGGED_FRAMES, strict=True) if frame == 2]
     alone = zj.Lines.from_ragged(own, [0] * len(own), [50.0], image_size=ragged.image_size)
-    lens = zj.algebraic_zoom(alone, zoom=zj.PolynomialZoom(0))
+    lens = zj.fit.algebraic_zoom(alone, zoom=zj.PolynomialZoom(0))
     np.testing.assert_allclose(lens.zoom.parameters[0], frames[2], rtol=1e-8)
 
 
 def test_lens_carries_the_geometry_of_the_lines(noisy):
-    lens = zj.algebraic_zoom(noisy)
+    lens = zj.fit.algebraic_zoom(noisy)
     assert lens.image_size == noisy.image_size
     np.testing.assert_array_equal(lens.focal_range, [noisy.focal.min(), noisy.focal.max()])
 
@@ -70,9 +72,9 @@ def test_lines_through_the_centre_give_no_distortion():
     t = np.linspace(-200, 200, 20)[:, None]
     points = [np.array([319.5, 239.5]) + t * [np.cos(a), np.sin(a)] for a in np.linspace(0, 3, 8)]
     lines = zj.Lines.from_ragged(points, [0] * 8, [50.0], image_size=(640, 480))
-    np.testing.assert_allclose(zj.algebraic_frames(lines), 0, atol=1e-9)
+    np.testing.assert_allclose(zj.fit.algebraic_frames(lines), 0, atol=1e-9)
 
 
 def test_too_few_focal_lengths_raise(ragged):
     with pytest.raises(ValueError, match="distinct focal lengths"):
-        zj.algebraic_zoom(ragged, zoom=zj.PolynomialZoom(3))
+        zj.fit.algebraic_zoom(ragged, zoom=zj.PolynomialZoom(3))

@@ -30,16 +30,16 @@ def aside(truth):
 
 @pytest.fixture(scope="module")
 def lines(aside):
-    return zj.compress_any_centre(seen(aside, NOISE))
+    return zj.lines.compress_any_centre(seen(aside, NOISE))
 
 
 @pytest.fixture(scope="module")
 def found(lines):
-    return zj.fit_centre(lines)
+    return zj.fit.fit_centre(lines)
 
 
 def test_without_noise_the_centre_is_the_true_one(aside):
-    found = zj.fit_centre(zj.compress_any_centre(seen(aside)))
+    found = zj.fit.fit_centre(zj.lines.compress_any_centre(seen(aside)))
     np.testing.assert_allclose(found.fit.lens.centre, aside.centre, atol=1e-6)
     np.testing.assert_allclose(found.centre, np.broadcast_to(aside.centre, (4, 2)), atol=1e-6)
     assert found.determined
@@ -63,7 +63,7 @@ def test_it_is_the_minimum_of_the_energy(lines, found):
 
 
 def test_lines_and_compressed_lines_give_one_answer(aside, found):
-    again = zj.fit_centre(seen(aside, NOISE))
+    again = zj.fit.fit_centre(seen(aside, NOISE))
     np.testing.assert_allclose(again.centre, found.centre, atol=1e-6)
 
 
@@ -75,7 +75,7 @@ def test_deviations_are_those_of_many_draws(aside, lines):
     for _ in range(40):
         noise = np.asarray(clean.mask)[..., None] * rng.normal(0, NOISE, clean.points.shape)
         draw = eqx.tree_at(lambda data: data.points, clean, clean.points + noise)
-        fit = zj.fit_centre(zj.compress_any_centre(draw))
+        fit = zj.fit.fit_centre(zj.lines.compress_any_centre(draw))
         centres.append(fit.centre[0])
         deviations.append(fit.std[0])
     ratio = np.std(centres, axis=0, ddof=1) / np.sqrt(np.mean(np.square(deviations), axis=0))
@@ -86,7 +86,7 @@ def test_a_centre_that_moves_is_followed(truth):
     shift = zj.PolynomialZoom(1, jnp.array([[0.0, 0.002], [0.01, -0.006]]), jnp.asarray(FOCAL.min()))
     moving = zj.ZoomLens(truth.zoom, truth.centre, truth.focal_range, truth.image_size, shift=shift)
     lines = seen(moving)
-    found = zj.fit_centre(lines, centre=zj.PolynomialZoom(degree=1))
+    found = zj.fit.fit_centre(lines, centre=zj.PolynomialZoom(degree=1))
     np.testing.assert_allclose(found.fit.lens.shift.parameters, shift.parameters, atol=1e-8)
     np.testing.assert_allclose(found.centre, jax.vmap(moving)(jnp.asarray(FOCAL)).centre, atol=1e-4)
     np.testing.assert_allclose(zj.frame_rms(lines, found.fit.lens), 0, atol=1e-6)
@@ -97,14 +97,14 @@ def test_a_centre_that_moves_is_followed(truth):
 
 
 def test_each_frame_by_itself(aside, lines):
-    found = zj.fit_frame_centres(lines)
+    found = zj.fit.fit_frame_centres(lines)
     assert found.determined.all()
     away = np.asarray(found.each.centre) - np.asarray(aside.centre)
     assert (abs(away) < 5 * np.asarray(found.std)).all()
     assert (found.each.frame_rms <= found.rms_fixed * (1 + 1e-9)).all()
     chosen, present = lines.by_frame()
     third = lines.take(jnp.asarray(chosen[2]), jnp.asarray(present[2]))
-    alone = zj.fit_centre(third, zoom=zj.PolynomialZoom(degree=0))
+    alone = zj.fit.fit_centre(third, zoom=zj.PolynomialZoom(degree=0))
     np.testing.assert_allclose(found.each.centre[2], alone.centre[0], atol=1e-5)
     np.testing.assert_allclose(found.each.distortion(2).centre, found.each.centre[2])
 
@@ -117,7 +117,7 @@ def test_where_the_lines_do_not_tell_it_stays():
     straight += [np.stack([1.3 * t, np.full(40, y)], axis=-1) for y in (9.0, 200.0, 470.0)]
     bent = [line + 0.3 * rng.standard_normal(line.shape) for line in straight]
     lines = zj.Lines.from_ragged(bent, [0] * 7, [50.0], image_size=(640, 480))
-    found = zj.fit_centre(lines, zoom=zj.PolynomialZoom(degree=0), terms=1)
+    found = zj.fit.fit_centre(lines, zoom=zj.PolynomialZoom(degree=0), terms=1)
     assert not found.determined
     np.testing.assert_array_equal(found.fit.lens.centre, lines.centre)
     np.testing.assert_allclose(found.fit.rms, found.rms_fixed, rtol=1e-9)
@@ -125,6 +125,6 @@ def test_where_the_lines_do_not_tell_it_stays():
 
 
 def test_other_zoom_models_have_centres_too(lines):
-    found = zj.fit_centre(lines, zoom=zj.PowerZoom(), terms=1)
+    found = zj.fit.fit_centre(lines, zoom=zj.models.PowerZoom(), terms=1)
     assert found.determined
     assert found.fit.rms < found.rms_fixed

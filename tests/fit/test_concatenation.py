@@ -28,11 +28,15 @@ def split(lines, at):
 WAYS = {
     "points": lambda lines: lines,
     "compressed": zj.compress,
-    "for any centre": zj.compress_any_centre,
-    "of a family": lambda lines: zj.compress_family(lines, zj.Division()),
-    "in the image": lambda lines: zj.in_image(zj.compress(lines)),
+    "for any centre": zj.lines.compress_any_centre,
+    "of a family": lambda lines: zj.fit.compress_family(lines, zj.models.Division()),
+    "in the image": lambda lines: zj.fit.in_image(zj.compress(lines)),
 }
-SLOW = {"in the image, of a family": lambda lines: zj.in_image(zj.compress_family(lines, zj.Division()))}
+SLOW = {
+    "in the image, of a family": lambda lines: zj.fit.in_image(
+        zj.fit.compress_family(lines, zj.models.Division())
+    )
+}
 every_way = pytest.mark.parametrize(
     "way",
     [
@@ -46,20 +50,20 @@ every_way = pytest.mark.parametrize(
 def test_it_is_all_lines_at_once(way, noisy):
     lines = noisy.weighted(0.5 + np.arange(noisy.frame.shape[0]) % 3)
     whole, parts = way(lines), [way(part) for part in split(lines, 1)]
-    both = zj.concatenate(parts)
+    both = zj.fit.concatenate(parts)
     assert type(both) is type(whole)
     np.testing.assert_array_equal(both.frame, whole.frame)
     np.testing.assert_array_equal(both.focal, whole.focal)
-    k = np.zeros((4, 4 if isinstance(whole, zj.AnyCentreLines) else 2))
+    k = np.zeros((4, 4 if isinstance(whole, zj.lines.AnyCentreLines) else 2))
     k[:, 0] = 0.05
     np.testing.assert_allclose(
-        zj.frame_energy(both, jnp.asarray(k)), zj.frame_energy(whole, jnp.asarray(k)), rtol=1e-12
+        zj.fit.frame_energy(both, jnp.asarray(k)), zj.fit.frame_energy(whole, jnp.asarray(k)), rtol=1e-12
     )
 
 
 @pytest.mark.parametrize("at", [1, 3])
 def test_the_fit_is_that_of_all_at_once(at, noisy, fit):
-    both = zj.concatenate([zj.compress(part) for part in split(noisy, at)])
+    both = zj.fit.concatenate([zj.compress(part) for part in split(noisy, at)])
     again = zj.fit_zoom(both)
     np.testing.assert_allclose(again.lens.zoom.parameters, fit.lens.zoom.parameters, rtol=0, atol=1e-12)
     np.testing.assert_allclose(again.rms, fit.rms, rtol=1e-12)
@@ -72,7 +76,7 @@ def test_points_of_different_numbers_and_some_weights(noisy, ragged):
         ragged.focal,
         image_size=ragged.image_size,
     ).weighted(np.full(9, 2.0))
-    both = zj.concatenate([ragged, more, ragged])
+    both = zj.fit.concatenate([ragged, more, ragged])
     assert both.points.shape == (27, *ragged.points.shape[1:])
     assert [len(line) for line in both.to_ragged()[9:18]] == [3] + [4] * 8
     np.testing.assert_array_equal(both.weight, np.repeat([1.0, 2.0, 1.0], 9))
@@ -85,21 +89,21 @@ def test_focus_goes_with_the_frames(ragged):
         focus = jnp.full(3, value)
         return eqx.tree_at(lambda lines: lines.focus, ragged, focus, is_leaf=lambda leaf: leaf is None)
 
-    both = zj.concatenate([focused(0.5), focused(1.0)])
+    both = zj.fit.concatenate([focused(0.5), focused(1.0)])
     np.testing.assert_array_equal(both.focus, [0.5] * 3 + [1.0] * 3)
     with pytest.raises(ValueError, match=r"focus of parts\[0\] is given, and that of parts\[1\] is None"):
-        zj.concatenate([focused(0.5), ragged])
+        zj.fit.concatenate([focused(0.5), ragged])
 
 
 def test_under_jit(noisy, small):
     parts = [zj.compress(part) for part in split(noisy, 2)]
-    both = eqx.filter_jit(zj.concatenate)(parts)
-    assert eqx.tree_equal(both, zj.concatenate(parts))
+    both = eqx.filter_jit(zj.fit.concatenate)(parts)
+    assert eqx.tree_equal(both, zj.fit.concatenate(parts))
     np.testing.assert_array_equal(both.frame, small.frame)
 
 
 def test_one_is_itself(small):
-    assert eqx.tree_equal(zj.concatenate([small]).triangle, small.triangle)
+    assert eqx.tree_equal(zj.fit.concatenate([small]).triangle, small.triangle)
 
 
 OTHERS = {
@@ -121,16 +125,18 @@ OTHERS = {
 @pytest.mark.parametrize("what", OTHERS)
 def test_other_cameras_are_refused(what, noisy, small):
     with pytest.raises(ValueError, match=f"the {what} of parts"):
-        zj.concatenate([small, OTHERS[what](noisy)])
+        zj.fit.concatenate([small, OTHERS[what](noisy)])
 
 
 def test_other_kinds_are_refused(noisy, small, unchecked):
     with pytest.raises(TypeError, match=r"parts\[0\] are CompressedLines and parts\[1\] Lines"):
-        zj.concatenate([small, noisy])
-    division, decentred = (zj.with_family(noisy, family) for family in (zj.Division(), zj.BrownConrady()))
+        zj.fit.concatenate([small, noisy])
+    division, decentred = (
+        zj.fit.with_family(noisy, family) for family in (zj.models.Division(), zj.models.BrownConrady())
+    )
     with pytest.raises(ValueError, match=r"the family of parts\[0\] is Division, and"):
-        zj.concatenate([division, decentred])
+        zj.fit.concatenate([division, decentred])
     with pytest.raises(TypeError, match=r"parts\[1\] must be Lines"):
-        zj.concatenate([small, "lines.npz"])
+        zj.fit.concatenate([small, "lines.npz"])
     with pytest.raises(ValueError, match="it is empty"):
-        zj.concatenate([])
+        zj.fit.concatenate([])

@@ -78,7 +78,7 @@ def test_there_is_no_better_one(terms, folding):
         return slope_controls(model(flat), lines.centre, best.lens.focal_range, SIZE) - LEAST_SLOPE
 
     energy = jax.jit(
-        jax.value_and_grad(lambda flat: zj.global_energy(lines, jax.vmap(model(flat))(lines.focal)))
+        jax.value_and_grad(lambda flat: zj.fit.global_energy(lines, jax.vmap(model(flat))(lines.focal)))
     )
     slopes = np.asarray(jax.jacfwd(slack)(jnp.zeros(3 * terms)))
     solution = scipy.optimize.minimize(
@@ -125,10 +125,10 @@ def test_frames_that_fold_become_invertible_and_others_stay(lines):
 
 
 RIVALS = {
-    "table": zj.TableZoom(),
-    "spline": zj.SplineZoom(4),
-    "two regions": zj.TwoRegionZoom(35.0),
-    "power law": zj.PowerZoom(),
+    "table": zj.models.TableZoom(),
+    "spline": zj.models.SplineZoom(4),
+    "two regions": zj.models.TwoRegionZoom(35.0),
+    "power law": zj.models.PowerZoom(),
 }
 
 

@@ -24,11 +24,11 @@ def line_at(angle, number=7):
 
 
 def test_frame_energy_is_equation_3(ragged):
-    close(zj.frame_energy(ragged, COEFFICIENTS), frame_energies(ragged, COEFFICIENTS))
+    close(zj.fit.frame_energy(ragged, COEFFICIENTS), frame_energies(ragged, COEFFICIENTS))
 
 
 def test_global_energy_is_equation_13(ragged):
-    close(zj.global_energy(ragged, COEFFICIENTS), frame_energies(ragged, COEFFICIENTS).mean())
+    close(zj.fit.global_energy(ragged, COEFFICIENTS), frame_energies(ragged, COEFFICIENTS).mean())
 
 
 def test_weights_are_one_over_frames_lines_and_points(ragged):
@@ -38,7 +38,7 @@ def test_weights_are_one_over_frames_lines_and_points(ragged):
 
 
 def test_residuals_are_weighted_distances(ragged):
-    residuals = eqx.filter_jit(zj.residuals)(ragged, jnp.zeros((3, 1)))
+    residuals = eqx.filter_jit(zj.fit.residuals)(ragged, jnp.zeros((3, 1)))
     weights = line_weights(ragged)
     for row, weight, line in zip(residuals, weights, ragged.to_ragged(), strict=True):
         close(row[: len(line)] ** 2, weight * squared_distances(line), rtol=1e-9)
@@ -47,7 +47,10 @@ def test_residuals_are_weighted_distances(ragged):
 
 def test_no_distortion_needs_no_particular_number_of_terms(ragged):
     for terms in (1, 2, 5):
-        close(zj.frame_energy(ragged, jnp.zeros((3, terms))), zj.frame_energy(ragged, jnp.zeros((3, 1))))
+        close(
+            zj.fit.frame_energy(ragged, jnp.zeros((3, terms))),
+            zj.fit.frame_energy(ragged, jnp.zeros((3, 1))),
+        )
 
 
 def with_garbage(lines, garbage):
@@ -64,7 +67,7 @@ def with_garbage(lines, garbage):
 def test_padding_changes_neither_energies_nor_gradients(compressed, ragged):
     def energy(points, k, lines):
         lines = moved(lines, points)
-        return zj.global_energy(zj.compress(lines) if compressed else lines, k)
+        return zj.fit.global_energy(zj.compress(lines) if compressed else lines, k)
 
     gradients = eqx.filter_jit(jax.value_and_grad(energy, (0, 1)))
     clean_value, (clean_by_point, clean_by_coefficient) = gradients(ragged.points, COEFFICIENTS, ragged)
@@ -86,7 +89,7 @@ def test_order_of_lines_does_not_matter(ragged, rng):
         ragged,
         (ragged.points[order], ragged.mask[order], ragged.frame[order]),
     )
-    close(zj.frame_energy(shuffled, COEFFICIENTS), zj.frame_energy(ragged, COEFFICIENTS))
+    close(zj.fit.frame_energy(shuffled, COEFFICIENTS), zj.fit.frame_energy(ragged, COEFFICIENTS))
 
 
 def test_order_of_points_does_not_matter(ragged, rng):
@@ -94,7 +97,7 @@ def test_order_of_points_does_not_matter(ragged, rng):
     shuffled = eqx.tree_at(
         lambda data: (data.points, data.mask), ragged, (ragged.points[:, order], ragged.mask[:, order])
     )
-    close(zj.frame_energy(shuffled, COEFFICIENTS), zj.frame_energy(ragged, COEFFICIENTS))
+    close(zj.fit.frame_energy(shuffled, COEFFICIENTS), zj.fit.frame_energy(ragged, COEFFICIENTS))
 
 
 def test_order_of_frames_does_not_matter(ragged):
@@ -104,8 +107,8 @@ def test_order_of_frames_does_not_matter(ragged):
         ragged,
         (jnp.asarray(np.argsort(order))[ragged.frame], ragged.focal[order]),
     )
-    energies = zj.frame_energy(shuffled, COEFFICIENTS[order])
-    close(energies, zj.frame_energy(ragged, COEFFICIENTS)[order])
+    energies = zj.fit.frame_energy(shuffled, COEFFICIENTS[order])
+    close(energies, zj.fit.frame_energy(ragged, COEFFICIENTS)[order])
 
 
 def test_energy_scales_with_the_square_of_the_pixels(ragged):
@@ -118,17 +121,17 @@ def test_energy_scales_with_the_square_of_the_pixels(ragged):
         centre=2 * ragged.centre,
         image_size=(2 * width, 2 * height),
     )
-    close(zj.frame_energy(doubled, COEFFICIENTS), 4 * zj.frame_energy(ragged, COEFFICIENTS))
+    close(zj.fit.frame_energy(doubled, COEFFICIENTS), 4 * zj.fit.frame_energy(ragged, COEFFICIENTS))
 
 
 def test_energies_under_vmap(ragged):
     many = jnp.stack([COEFFICIENTS, 2 * COEFFICIENTS])
-    batched = jax.vmap(lambda k: zj.global_energy(ragged, k))(many)
-    close(batched, [zj.global_energy(ragged, k) for k in many])
+    batched = jax.vmap(lambda k: zj.fit.global_energy(ragged, k))(many)
+    close(batched, [zj.fit.global_energy(ragged, k) for k in many])
 
 
 def test_energy_gradient_with_respect_to_coefficients(ragged):
-    assert_derivatives_agree(lambda k: zj.frame_energy(ragged, k), COEFFICIENTS, step=1e-5, rtol=1e-7)
+    assert_derivatives_agree(lambda k: zj.fit.frame_energy(ragged, k), COEFFICIENTS, step=1e-5, rtol=1e-7)
 
 
 def test_normal_is_perpendicular_in_all_directions():
@@ -172,7 +175,7 @@ def test_lines_that_hold_next_to_nothing_have_finite_gradients(count, ragged):
     """Such lines are not made by `from_ragged`, but masks may empty a line later on."""
     mask = ragged.mask.at[0].set(jnp.arange(ragged.mask.shape[1]) < count)
     thinned = eqx.tree_at(lambda data: data.mask, ragged, mask)
-    gradient = jax.grad(lambda points: zj.global_energy(moved(thinned, points), COEFFICIENTS))(
+    gradient = jax.grad(lambda points: zj.fit.global_energy(moved(thinned, points), COEFFICIENTS))(
         ragged.points
     )
     assert jnp.isfinite(gradient).all()
@@ -184,7 +187,7 @@ def test_one_or_two_points_are_no_line(ragged):
     short = eqx.tree_at(lambda lines: lines.mask, ragged, ragged.mask.at[0, 2:].set(False))
     absent = eqx.tree_at(lambda lines: lines.mask, ragged, ragged.mask.at[0].set(False))
     k = jnp.full((3, 2), 0.1)
-    np.testing.assert_array_equal(zj.frame_energy(short, k), zj.frame_energy(absent, k))
+    np.testing.assert_array_equal(zj.fit.frame_energy(short, k), zj.fit.frame_energy(absent, k))
 
 
 def test_lines_of_weight_zero_are_not_there(ragged):
@@ -192,13 +195,15 @@ def test_lines_of_weight_zero_are_not_there(ragged):
     k = jnp.full((3, 2), 0.1)
     for lines in (ragged, zj.compress(ragged)):
         weighted = lines.weighted(np.arange(9) > 0)
-        np.testing.assert_allclose(zj.frame_energy(weighted, k), zj.frame_energy(absent, k), rtol=1e-12)
+        np.testing.assert_allclose(
+            zj.fit.frame_energy(weighted, k), zj.fit.frame_energy(absent, k), rtol=1e-12
+        )
 
 
 def test_equal_weights_change_nothing_and_whole_ones_repeat_lines(ragged):
     k = jnp.full((3, 2), 0.1)
-    plain = zj.frame_energy(ragged, k)
-    np.testing.assert_allclose(zj.frame_energy(ragged.weighted(np.full(9, 0.3)), k), plain, rtol=1e-12)
+    plain = zj.fit.frame_energy(ragged, k)
+    np.testing.assert_allclose(zj.fit.frame_energy(ragged.weighted(np.full(9, 0.3)), k), plain, rtol=1e-12)
     points = ragged.to_ragged()
     repeated = zj.Lines.from_ragged(
         [*points, points[0]],
@@ -207,7 +212,7 @@ def test_equal_weights_change_nothing_and_whole_ones_repeat_lines(ragged):
         image_size=ragged.image_size,
     )
     twice = ragged.weighted(np.where(np.arange(9) == 0, 2, 1))
-    np.testing.assert_allclose(zj.frame_energy(twice, k), zj.frame_energy(repeated, k), rtol=1e-12)
+    np.testing.assert_allclose(zj.fit.frame_energy(twice, k), zj.fit.frame_energy(repeated, k), rtol=1e-12)
 
 
 @pytest.mark.parametrize("weight", [np.ones(8), -np.ones(9), np.full(9, np.nan)])
@@ -236,9 +241,9 @@ def test_frames_without_weight_do_not_dilute_the_energy(weight, left, compressed
     lines = (zj.compress(ragged) if compressed else ragged).weighted(weight)
     frames = frame_energies(ragged, COEFFICIENTS)
     expected = np.where(np.isin(np.arange(3), left), frames, np.nan)
-    close(zj.frame_energy(lines, COEFFICIENTS), expected, rtol=1e-9)
+    close(zj.fit.frame_energy(lines, COEFFICIENTS), expected, rtol=1e-9)
     close(zj.frame_rms(lines, COEFFICIENTS) ** 2, expected, rtol=1e-9)
-    close(zj.global_energy(lines, COEFFICIENTS), frames[left].mean() if left else 0, rtol=1e-9)
+    close(zj.fit.global_energy(lines, COEFFICIENTS), frames[left].mean() if left else 0, rtol=1e-9)
 
 
 @WITHOUT_A_FRAME
@@ -246,7 +251,7 @@ def test_gradients_past_frames_without_weight_are_finite(weight, left, ragged):
     lines = ragged.weighted(weight)
 
     def known(points):
-        return jnp.nansum(jnp.sqrt(zj.frame_energy(moved(lines, points), COEFFICIENTS)))
+        return jnp.nansum(jnp.sqrt(zj.fit.frame_energy(moved(lines, points), COEFFICIENTS)))
 
     gradient = np.asarray(jax.grad(known)(lines.points))
     assert np.isfinite(gradient).all()
@@ -262,9 +267,9 @@ def test_energies_of_float32_lines_are_float32(weighted, ragged):
     for measured in (lines, zj.compress(lines)):
         for values in (
             line_weights(measured),
-            zj.residuals(measured, k),
-            zj.frame_energy(measured, k),
-            zj.global_energy(measured, k),
+            zj.fit.residuals(measured, k),
+            zj.fit.frame_energy(measured, k),
+            zj.fit.global_energy(measured, k),
             zj.frame_rms(measured, None),
         ):
             assert values.dtype == jnp.float32

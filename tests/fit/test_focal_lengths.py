@@ -35,7 +35,7 @@ def rounded(sweep):
 
 @pytest.fixture(scope="module")
 def refined(rounded):
-    return zj.fit_focal(rounded, ROUNDED)
+    return zj.fit.fit_focal(rounded, ROUNDED)
 
 
 # What errors do to the parameters
@@ -58,17 +58,17 @@ def test_response_is_that_of_fits_at_other_focal_lengths(sweep, zoom):
 def test_covariance_grows_by_the_response(sweep):
     fit = zj.fit_zoom(sweep)
     sigma = np.linspace(0.0, 0.9, 10)
-    wide = zj.with_focal_sigma(fit, sweep, focal_sigma=sigma)
+    wide = zj.fit.with_focal_sigma(fit, sweep, focal_sigma=sigma)
     response = np.asarray(_response(sweep, fit.lens.zoom)) * (sigma / np.asarray(sweep.focal))
     np.testing.assert_allclose(wide.covariance, fit.covariance + response @ response.T, rtol=1e-9)
-    same = zj.with_focal_sigma(fit, sweep, focal_sigma=0)
+    same = zj.fit.with_focal_sigma(fit, sweep, focal_sigma=0)
     np.testing.assert_array_equal(same.covariance, fit.covariance)
 
 
 def test_undetermined_stays_infinite(sweep):
     fit = zj.fit_zoom(sweep)
     unknown = eqx.tree_at(lambda fit: fit.covariance, fit, jnp.diag(jnp.full(6, jnp.inf).at[0].set(1.0)))
-    wide = zj.with_focal_sigma(unknown, sweep, focal_sigma=0.3).covariance
+    wide = zj.fit.with_focal_sigma(unknown, sweep, focal_sigma=0.3).covariance
     assert np.isposinf(np.diag(wide)[1:]).all()
     assert wide[0, 0] > 1
     assert (np.asarray(wide)[~np.eye(6, dtype=bool)] == 0).all()
@@ -114,11 +114,11 @@ def test_the_joint_minimum_is_one(rounded, refined):
 
 def test_known_focal_lengths_stay(rounded):
     sigma = np.where(np.arange(10) % 3 == 0, 0.0, 0.3)
-    found = zj.fit_focal(rounded, sigma)
+    found = zj.fit.fit_focal(rounded, sigma)
     np.testing.assert_array_equal(found.focal[::3], rounded.focal[::3])
     assert (found.std[::3] == 0).all()
     assert (found.focal != rounded.focal)[1::3].all()
-    exact = zj.fit_focal(rounded, 0.0)
+    exact = zj.fit.fit_focal(rounded, 0.0)
     np.testing.assert_allclose(
         exact.fit.lens.zoom.parameters, zj.fit_zoom(rounded).lens.zoom.parameters, atol=1e-8
     )
@@ -127,14 +127,14 @@ def test_known_focal_lengths_stay(rounded):
 def test_a_focal_length_that_nobody_knows_is_found(sweep):
     """Given 30 % too long, with the others known."""
     spoiled = at_focal(sweep, sweep.focal.at[2].multiply(1.3))
-    found = zj.fit_focal(spoiled, np.where(np.arange(10) == 2, np.inf, 0.0))
+    found = zj.fit.fit_focal(spoiled, np.where(np.arange(10) == 2, np.inf, 0.0))
     assert abs(found.focal[2] - sweep.focal[2]) < 3 * found.std[2] < 1.0
 
 
 def test_without_noise_rounding_is_undone_but_for_scale_and_shift(truth):
     """Of 1/f, which no line can tell apart; what is left of the errors is a straight line in 1/f."""
     clean = zj.compress(scenes.board_lines(truth, scenes.focal_sweep(10), spacing=150.0))
-    found = zj.fit_focal(at_focal(clean, np.round(clean.focal)), ROUNDED)
+    found = zj.fit.fit_focal(at_focal(clean, np.round(clean.focal)), ROUNDED)
     u, off = 1 / np.asarray(clean.focal), np.asarray(1 / found.focal - 1 / clean.focal)
     left = off - np.polyval(np.polyfit(u, off, 1), u)
     given = 1 / np.round(np.asarray(clean.focal)) - u
@@ -145,14 +145,14 @@ def test_float32_bands_agree_and_refining_wants_float64(sweep):
     single = jax.tree.map(
         lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a, sweep
     )
-    wide = zj.with_focal_sigma(zj.fit_zoom(single), single, focal_sigma=0.3)
+    wide = zj.fit.with_focal_sigma(zj.fit_zoom(single), single, focal_sigma=0.3)
     assert wide.covariance.dtype == jnp.float32
     focal, corner = np.array([25.0, 60.0]), np.zeros(2)
-    double = zj.with_focal_sigma(zj.fit_zoom(sweep), sweep, focal_sigma=0.3)
+    double = zj.fit.with_focal_sigma(zj.fit_zoom(sweep), sweep, focal_sigma=0.3)
     std = [zj.displacement_std(fit, corner, focal=focal) for fit in (wide, double)]
     np.testing.assert_allclose(std[0], std[1], rtol=0.02)
     with pytest.raises(ValueError, match=r"float64 only.*jax_enable_x64"):
-        zj.fit_focal(single, ROUNDED)
+        zj.fit.fit_focal(single, ROUNDED)
 
 
 # Coverage
@@ -182,9 +182,9 @@ def test_bands_with_rounded_focal_lengths_hold_the_truth_as_often_as_they_say():
 @pytest.mark.parametrize("sigma", [None, np.inf, np.nan, np.where(np.arange(10) == 3, 0.1, np.inf)])
 def test_focal_lengths_that_nobody_knows_raise_and_say_why(rounded, sigma, unchecked):
     with pytest.raises(ValueError, match=r"(?s)focal_sigma.*Straightness alone cannot tell.*EXIF.*board"):
-        zj.fit_focal(rounded, sigma)
+        zj.fit.fit_focal(rounded, sigma)
     with pytest.raises(ValueError, match=r"focal_sigma.*Straightness alone cannot tell"):
-        zj.with_focal_sigma(zj.fit_zoom(rounded), rounded, focal_sigma=sigma)
+        zj.fit.with_focal_sigma(zj.fit_zoom(rounded), rounded, focal_sigma=sigma)
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ def test_focal_lengths_that_nobody_knows_raise_and_say_why(rounded, sigma, unche
 )
 def test_sigma_that_is_none_raises(rounded, sigma, message, unchecked):
     with pytest.raises(ValueError, match=message):
-        zj.fit_focal(rounded, sigma)
+        zj.fit.fit_focal(rounded, sigma)
 
 
 def test_a_centre_that_moves_raises(sweep):
@@ -200,4 +200,4 @@ def test_a_centre_that_moves_raises(sweep):
     lens = zj.ZoomLens(**vars(fit.lens) | {"shift": fit.lens.zoom})
     moving = eqx.tree_at(lambda fit: fit.lens, fit, lens)
     with pytest.raises(ValueError, match="centre that moves"):
-        zj.with_focal_sigma(moving, sweep, focal_sigma=0.1)
+        zj.fit.with_focal_sigma(moving, sweep, focal_sigma=0.1)

@@ -24,7 +24,7 @@ def stretch(lines, k, index):
 
 
 def test_stretch_is_that_of_the_jacobian(ragged):
-    paper, image = (np.asarray(zj.residuals(lines, K)) for lines in (ragged, zj.in_image(ragged)))
+    paper, image = (np.asarray(zj.fit.residuals(lines, K)) for lines in (ragged, zj.fit.in_image(ragged)))
     ratio = np.linalg.norm(paper, axis=1) / np.linalg.norm(image, axis=1)
     expected = [stretch(ragged, K, index) for index in range(len(ragged.frame))]
     np.testing.assert_allclose(ratio, expected, rtol=1e-9)
@@ -32,52 +32,52 @@ def test_stretch_is_that_of_the_jacobian(ragged):
 
 
 def test_compressed_lines_are_measured_alike(ragged):
-    full, small = (zj.in_image(lines) for lines in (ragged, zj.compress(ragged)))
+    full, small = (zj.fit.in_image(lines) for lines in (ragged, zj.compress(ragged)))
     for k in (K, 0 * K, K[:, :1]):
-        np.testing.assert_allclose(zj.frame_energy(small, k), zj.frame_energy(full, k), rtol=1e-10)
+        np.testing.assert_allclose(zj.fit.frame_energy(small, k), zj.fit.frame_energy(full, k), rtol=1e-10)
 
 
 def test_without_distortion_both_metrics_are_one(ragged):
     none = jnp.zeros((3, 2))
     np.testing.assert_allclose(
-        zj.frame_energy(zj.in_image(ragged), none), zj.frame_energy(ragged, none), rtol=1e-12
+        zj.fit.frame_energy(zj.fit.in_image(ragged), none), zj.fit.frame_energy(ragged, none), rtol=1e-12
     )
 
 
 def test_gradients_are_finite_differences(ragged):
-    lines = zj.in_image(zj.compress(ragged))
-    gradient = jax.grad(lambda k: zj.global_energy(lines, k))(K)
+    lines = zj.fit.in_image(zj.compress(ragged))
+    gradient = jax.grad(lambda k: zj.fit.global_energy(lines, k))(K)
     for index in np.ndindex(K.shape):
         step = jnp.zeros_like(K).at[index].set(1e-5)
-        difference = (zj.global_energy(lines, K + step) - zj.global_energy(lines, K - step)) / 2e-5
+        difference = (zj.fit.global_energy(lines, K + step) - zj.fit.global_energy(lines, K - step)) / 2e-5
         np.testing.assert_allclose(gradient[index], difference, rtol=1e-5)
 
 
 def test_wrapped_twice_is_wrapped_once(small):
-    once = zj.in_image(small)
-    assert zj.in_image(once) is once
+    once = zj.fit.in_image(small)
+    assert zj.fit.in_image(once) is once
 
 
 def test_weights_and_centres_are_kept(noisy):
     weight = np.linspace(0, 1, len(noisy.frame))
     k = jnp.asarray(jax.vmap(scenes.nikkor_18_200().zoom)(noisy.focal))
-    expected = zj.frame_energy(zj.in_image(noisy.weighted(weight)), k)
-    weighted = zj.in_image(noisy).weighted(weight)
-    np.testing.assert_allclose(zj.frame_energy(weighted, k), expected, rtol=1e-12)
+    expected = zj.fit.frame_energy(zj.fit.in_image(noisy.weighted(weight)), k)
+    weighted = zj.fit.in_image(noisy).weighted(weight)
+    np.testing.assert_allclose(zj.fit.frame_energy(weighted, k), expected, rtol=1e-12)
     moved = weighted.about(noisy.centre + 5)
     aside = eqx.tree_at(lambda lines: lines.centre, noisy.weighted(weight), noisy.centre + 5)
     np.testing.assert_allclose(
-        zj.frame_energy(moved, k), zj.frame_energy(zj.in_image(aside), k), rtol=1e-12
+        zj.fit.frame_energy(moved, k), zj.fit.frame_energy(zj.fit.in_image(aside), k), rtol=1e-12
     )
 
 
 def test_all_fits_take_them(noisy, small, fit):
-    lines = zj.in_image(small)
+    lines = zj.fit.in_image(small)
     zoom = zj.fit_zoom(lines)
     assert zj.RESULTS[zoom.result] == ""
     assert zoom.certificate.certified
     np.testing.assert_allclose(zj.frame_rms(lines, zoom.lens), zoom.frame_rms, rtol=1e-9)
-    full = zj.fit_zoom(zj.in_image(noisy))
+    full = zj.fit_zoom(zj.fit.in_image(noisy))
     np.testing.assert_allclose(full.lens.zoom.parameters, zoom.lens.zoom.parameters, atol=1e-7)
     each = zj.fit_frames(lines)
     assert (each.frame_rms <= zoom.frame_rms * (1 + 1e-9)).all()
@@ -104,7 +104,7 @@ def test_noise_does_not_bias_the_lens(std):
         def one(key):
             # The same noise with both signs: in the mean all but the bias nearly cancels.
             draws = [zj.compress(scenes.with_noise(clean, key, std=sign * std)) for sign in (1, -1)]
-            pairs = [[draw, zj.in_image(draw)] for draw in draws]
+            pairs = [[draw, zj.fit.in_image(draw)] for draw in draws]
             fits = [[zj.fit_zoom(lines, throw=False, invertible=False) for lines in pair] for pair in pairs]
             return jnp.array([[displacement(fit.lens) for fit in pair] for pair in fits])
 

@@ -57,7 +57,7 @@ def spoiled(good):
 
 @pytest.fixture(scope="module")
 def found(spoiled):
-    return zj.reject_points(spoiled[0])
+    return zj.fit.reject_points(spoiled[0])
 
 
 def test_the_lens_is_that_without_blunders(good, spoiled, found):
@@ -83,7 +83,7 @@ def test_what_is_rejected_are_the_blunders(spoiled, found):
 def test_runs_of_blunders_to_one_side_are_rejected(good):
     """What a detector does that follows something else for a while."""
     lines, which = with_blunders(good, 0.08, run=4)
-    found = zj.reject_points(lines)
+    found = zj.fit.reject_points(lines)
     focal, plain = np.asarray(good.focal), zj.fit_zoom(zj.compress(good)).lens
     assert displacement_rms(found.fit.fit.lens, plain, focal) < 0.05
     assert (which & ~found.rejected).sum() <= 0.05 * which.sum()
@@ -92,7 +92,7 @@ def test_runs_of_blunders_to_one_side_are_rejected(good):
 def test_crooked_lines_keep_their_points_and_are_rejected_whole(good):
     """Also where blunders are on the other lines."""
     bent, arcs = with_arcs(with_blunders(good, 0.05)[0], 0.1, sagitta=(15, 60), outward=False)
-    found = zj.reject_points(bent)
+    found = zj.fit.reject_points(bent)
     assert set(arcs) <= set(found.fit.rejected)
     assert displacement_rms(found.fit.fit.lens, zj.fit_zoom(zj.compress(good)).lens, good.focal) < 0.1
 
@@ -103,7 +103,7 @@ def test_without_blunders_next_to_nothing_is_lost(truth, clean):
     errors = []
     for _ in range(6):
         noisy = moved(clean, clean.points + NOISE * rng.standard_normal(clean.points.shape))
-        found = zj.reject_points(noisy)
+        found = zj.fit.reject_points(noisy)
         assert found.rejected.sum() <= 1e-3 * noisy.mask.sum()
         fits = (zj.fit_zoom(zj.compress(found.lines)), zj.fit_zoom(zj.compress(noisy)))
         errors.append([displacement_rms(fit.lens, truth, focal) ** 2 for fit in fits])
@@ -112,7 +112,7 @@ def test_without_blunders_next_to_nothing_is_lost(truth, clean):
 
 
 def test_points_without_noise_all_stay(clean):
-    assert not zj.reject_points(clean).rejected.any()
+    assert not zj.fit.reject_points(clean).rejected.any()
 
 
 def test_lines_of_few_points_keep_them():
@@ -121,11 +121,11 @@ def test_lines_of_few_points_keep_them():
     points = [np.stack([x + 0.1 * rng.standard_normal(4), t], -1) for x in range(20, 620, 20)]
     points[3][1, 0] += 5
     lines = zj.Lines.from_ragged(points, [0] * 30, [50], image_size=(640, 480))
-    found = zj.reject_points(lines, zoom=zj.PolynomialZoom(degree=0), terms=1)
+    found = zj.fit.reject_points(lines, zoom=zj.PolynomialZoom(degree=0), terms=1)
     assert not found.rejected.any()
     assert found.fit.rejected.tolist() == [3]
 
 
 def test_compressed_lines_raise_and_say_what_to_do(small, unchecked):
     with pytest.raises(TypeError, match="reject points first, then compress"):
-        zj.reject_points(small)
+        zj.fit.reject_points(small)

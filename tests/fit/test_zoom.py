@@ -138,7 +138,7 @@ def test_scipy_finds_the_same_minimum(noisy, fit):
     @jax.jit
     def residuals(flat):
         zoom = eqx.tree_at(lambda zoom: zoom.parameters, fit.lens.zoom, flat.reshape(3, 2))
-        return zj.residuals(noisy, jax.vmap(zoom)(noisy.focal)).ravel()
+        return zj.fit.residuals(noisy, jax.vmap(zoom)(noisy.focal)).ravel()
 
     found = scipy.optimize.least_squares(
         residuals, np.zeros(6), jac=jax.jit(jax.jacfwd(residuals)), xtol=1e-12, ftol=1e-14, gtol=1e-14
@@ -157,7 +157,7 @@ def test_frames_are_fitted_as_zoom_lenses_of_degree_0(small, frame_fits):
         np.testing.assert_allclose(frame_fits.covariance[index], single.covariance, rtol=1e-6)
 
 
-class LogarithmicZoom(zj.AbstractLinearZoom):
+class LogarithmicZoom(zj.models.AbstractLinearZoom):
     """``k(f) = a + b log(f)``: a model made outside of the package."""
 
     parameters: jax.Array | None = None
@@ -430,16 +430,16 @@ def test_too_few_steps_raise_unless_asked_not_to(small):
 
 
 def test_a_table_at_every_focal_length_is_frame_by_frame(small, frame_fits):
-    fit = zj.fit_zoom(small, zoom=zj.TableZoom())
+    fit = zj.fit_zoom(small, zoom=zj.models.TableZoom())
     np.testing.assert_allclose(parameters(fit)[::-1], frame_fits.coefficients, atol=1e-7)
     np.testing.assert_allclose(fit.frame_rms, frame_fits.frame_rms, rtol=1e-9)
 
 
 RIVALS = {
-    "table": (zj.TableZoom(number=2, inverse=False), [[0.05], [-0.1]]),
-    "spline": (zj.SplineZoom(number=3), [[0.05], [0.02], [-0.1]]),
-    "power law": (zj.PowerZoom(), [[0.02], [-0.1], [-1.3]]),
-    "two regions": (zj.TwoRegionZoom(35.0), [[-0.3], [0.5], [-0.3], [0.08], [-0.1], [0.05]]),
+    "table": (zj.models.TableZoom(number=2, inverse=False), [[0.05], [-0.1]]),
+    "spline": (zj.models.SplineZoom(number=3), [[0.05], [0.02], [-0.1]]),
+    "power law": (zj.models.PowerZoom(), [[0.02], [-0.1], [-1.3]]),
+    "two regions": (zj.models.TwoRegionZoom(35.0), [[-0.3], [0.5], [-0.3], [0.08], [-0.1], [0.05]]),
 }
 
 

@@ -31,7 +31,7 @@ def photographed(lens, f, board=BOARD):
 
 
 def from_board(points, board, **settings):
-    return zj.focal_from_board(
+    return zj.focal.focal_from_board(
         points, board, **{"distance": BOARD.distance, "pixel": BOARD.pixel} | settings
     )
 
@@ -135,7 +135,7 @@ def test_boards_of_other_shapes_raise(board, unchecked):
 
 @pytest.mark.parametrize("focal", [300.0, 1200.0, 7000.0])
 def test_exact_views_give_their_focal_length(focal):
-    together, each = zj.focal_from_planes(views(focal), PLANE, principal=PRINCIPAL)
+    together, each = zj.focal.focal_from_planes(views(focal), PLANE, principal=PRINCIPAL)
     np.testing.assert_allclose(together.focal, focal, rtol=1e-9)
     np.testing.assert_allclose(each.focal, focal, rtol=1e-9)
     assert each.focal.shape == each.std.shape == each.rms.shape == (3,)
@@ -148,7 +148,7 @@ def test_standard_deviation_from_planes_is_that_of_sampled_noise(tilts, rng):
     exact, number = views(1200.0, tilts), 2000
     noise = jnp.array(0.3 * rng.standard_normal((number, *exact.shape)))
     together, each = jax.vmap(
-        lambda error: zj.focal_from_planes(exact + error, PLANE, principal=PRINCIPAL)
+        lambda error: zj.focal.focal_from_planes(exact + error, PLANE, principal=PRINCIPAL)
     )(noise)
     assert together.focal.mean() == pytest.approx(1200, abs=float(0.2 * together.focal.std()))
     assert np.sqrt((together.std**2).mean()) == pytest.approx(float(together.focal.std()), rel=0.07)
@@ -160,16 +160,16 @@ def test_standard_deviation_from_planes_is_that_of_sampled_noise(tilts, rng):
 
 def test_together_views_know_more_than_each(rng):
     noisy = views(1200.0) + 0.3 * rng.standard_normal((3, len(PLANE), 2))
-    together, each = zj.focal_from_planes(noisy, PLANE, principal=PRINCIPAL)
+    together, each = zj.focal.focal_from_planes(noisy, PLANE, principal=PRINCIPAL)
     assert together.std < 1.05 * each.std.min()
     assert abs(together.focal - 1200) < 4 * together.std
 
 
 def test_unit_place_and_turn_of_the_plane_do_not_matter(rng):
     noisy = views(1200.0) + 0.3 * rng.standard_normal((3, len(PLANE), 2))
-    known = zj.focal_from_planes(noisy, PLANE, principal=PRINCIPAL)
+    known = zj.focal.focal_from_planes(noisy, PLANE, principal=PRINCIPAL)
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
-    other = zj.focal_from_planes(noisy, 25 * PLANE @ turn.T + 1000, principal=PRINCIPAL)
+    other = zj.focal.focal_from_planes(noisy, 25 * PLANE @ turn.T + 1000, principal=PRINCIPAL)
     for one, same in zip(jax.tree.leaves(known), jax.tree.leaves(other), strict=True):
         np.testing.assert_allclose(one, same, rtol=1e-6)
 
@@ -177,7 +177,7 @@ def test_unit_place_and_turn_of_the_plane_do_not_matter(rng):
 def test_a_view_closer_to_squarely_says_less(rng):
     tilts = [(angle, 0.0, 0.2) for angle in (0.6, 0.3, 0.15)]
     noisy = views(1200.0, tilts) + 0.1 * rng.standard_normal((3, len(PLANE), 2))
-    _, each = zj.focal_from_planes(noisy, PLANE, principal=PRINCIPAL)
+    _, each = zj.focal.focal_from_planes(noisy, PLANE, principal=PRINCIPAL)
     relative = each.std / each.focal
     assert relative[0] < relative[1] < relative[2]
 
@@ -186,7 +186,7 @@ def test_a_view_that_says_nothing_is_nan_and_infinitely_uncertain():
     """A bulge that no plane seen by a camera could have: both equations ask for a negative 1/f²."""
     turned = (PLANE - PLANE.mean(axis=0)) @ np.diag([1.5, 1.0])
     stretched = 100 * turned / (1 + 0.02 * turned[:, :1]) + PRINCIPAL
-    together, each = zj.focal_from_planes(stretched[None], PLANE, principal=PRINCIPAL)
+    together, each = zj.focal.focal_from_planes(stretched[None], PLANE, principal=PRINCIPAL)
     assert np.isnan(together.focal)
     assert np.isnan(each.focal).all()
     assert np.isposinf(each.std).all()
@@ -194,7 +194,7 @@ def test_a_view_that_says_nothing_is_nan_and_infinitely_uncertain():
 
 def test_a_square_view_weighs_nothing_beside_an_oblique_one(rng):
     noisy = views(1200.0, [TILTS[0], (0.0, 0.0, 0.1)]) + 0.1 * rng.standard_normal((2, len(PLANE), 2))
-    together, each = zj.focal_from_planes(noisy, PLANE, principal=PRINCIPAL)
+    together, each = zj.focal.focal_from_planes(noisy, PLANE, principal=PRINCIPAL)
     assert not each.std[1] < 20 * each.std[0]
     assert together.focal == pytest.approx(float(each.focal[0]), abs=float(2 * each.std[0]))
 
@@ -202,7 +202,7 @@ def test_a_square_view_weighs_nothing_beside_an_oblique_one(rng):
 def test_float32_is_kept_and_close():
     points = jnp.asarray(views(1200.0), jnp.float32)
     plane, principal = jnp.asarray(PLANE, jnp.float32), jnp.asarray(PRINCIPAL, jnp.float32)
-    together, _ = zj.focal_from_planes(points, plane, principal=principal)
+    together, _ = zj.focal.focal_from_planes(points, plane, principal=principal)
     assert together.focal.dtype == together.std.dtype == jnp.float32
     assert together.focal == pytest.approx(1200, rel=1e-3)
 
@@ -212,14 +212,14 @@ def test_float32_is_kept_and_close():
 )
 def test_views_of_other_shapes_raise(points, unchecked):
     with pytest.raises(ValueError, match="shape"):
-        zj.focal_from_planes(points, PLANE, principal=PRINCIPAL)
+        zj.focal.focal_from_planes(points, PLANE, principal=PRINCIPAL)
 
 
 def test_no_views_and_few_points_raise(unchecked):
     with pytest.raises(ValueError, match="view"):
-        zj.focal_from_planes(np.zeros((0, 54, 2)), PLANE, principal=PRINCIPAL)
+        zj.focal.focal_from_planes(np.zeros((0, 54, 2)), PLANE, principal=PRINCIPAL)
     with pytest.raises(ValueError, match="n >= 5"):
-        zj.focal_from_planes(views(1200.0)[:, :4], PLANE[:4], principal=PRINCIPAL)
+        zj.focal.focal_from_planes(views(1200.0)[:, :4], PLANE[:4], principal=PRINCIPAL)
 
 
 def test_the_two_focal_lengths_differ_by_the_focus():
@@ -230,7 +230,7 @@ def test_the_two_focal_lengths_differ_by_the_focus():
     square = plane * image_distance / distance / pixel
     assert from_board(square, plane, distance=distance, pixel=pixel).focal == pytest.approx(f)
     oblique = views(image_distance / pixel, plane=plane, depth=distance)
-    together, _ = zj.focal_from_planes(oblique, plane, principal=PRINCIPAL)
+    together, _ = zj.focal.focal_from_planes(oblique, plane, principal=PRINCIPAL)
     assert together.focal * pixel == pytest.approx(image_distance)
 
 
@@ -256,7 +256,7 @@ def seen_on(lines, focal=1200.0, tilt=TILTS[0], number=5):
 
 
 def from_lines(points, lines=FIELD, **settings):
-    return zj.focal_from_lines(points, lines, principal=PRINCIPAL, **settings)
+    return zj.focal.focal_from_lines(points, lines, principal=PRINCIPAL, **settings)
 
 
 @pytest.mark.parametrize("tilt", TILTS)
@@ -313,7 +313,9 @@ def test_standard_deviation_from_lines_is_that_of_sampled_noise(number, rng):
 def test_points_at_the_same_places_say_more_if_the_places_are_known(rng):
     places = FIELD[:, :1] + np.linspace(0.1, 0.8, 5)[:, None] * (FIELD[:, 1:] - FIELD[:, :1])
     noisy = seen_on(FIELD) + 0.3 * rng.standard_normal((5, 5, 2))
-    together, _ = zj.focal_from_planes(noisy.reshape(1, -1, 2), places.reshape(-1, 2), principal=PRINCIPAL)
+    together, _ = zj.focal.focal_from_planes(
+        noisy.reshape(1, -1, 2), places.reshape(-1, 2), principal=PRINCIPAL
+    )
     lines = from_lines(noisy)
     assert together.std < lines.std
     assert abs(together.focal - lines.focal) < 3 * lines.std
@@ -325,7 +327,7 @@ def test_gradients_are_finite_differences(rng):
     flat = views(1200.0, TILTS[:1]) + 5 * rng.standard_normal((1, len(PLANE), 2))
     for solve, points in (
         (from_lines, noisy),
-        (lambda points: zj.focal_from_planes(points, PLANE, principal=PRINCIPAL)[0], flat),
+        (lambda points: zj.focal.focal_from_planes(points, PLANE, principal=PRINCIPAL)[0], flat),
     ):
         direction = rng.standard_normal(points.shape)
         for of in (lambda points, solve=solve: solve(points).focal, lambda p, s=solve: s(p).std):
@@ -341,7 +343,7 @@ def test_under_jit_and_in_float32(rng):
     noisy = seen_on(FIELD) + 0.3 * rng.standard_normal((5, 5, 2))
     known = from_lines(noisy).focal
     np.testing.assert_allclose(jax.jit(from_lines)(noisy).focal, known, rtol=1e-9)
-    single = zj.focal_from_lines(
+    single = zj.focal.focal_from_lines(
         *(jnp.asarray(array, jnp.float32) for array in (noisy, FIELD)),
         principal=jnp.asarray(PRINCIPAL, jnp.float32),
     )
@@ -425,7 +427,7 @@ REAL_PLANE = np.stack(np.meshgrid(np.arange(22.0), np.arange(15.0)), axis=-1).re
 )
 def test_focal_lengths_of_a_real_zoom_camera(zoomcam, zoom, within):
     lens, focal, corrected = zoomcam
-    _, each = zj.focal_from_planes(corrected[zoom], REAL_PLANE, principal=np.asarray(lens.centre))
+    _, each = zj.focal.focal_from_planes(corrected[zoom], REAL_PLANE, principal=np.asarray(lens.centre))
     assert np.nanmedian(each.focal) == pytest.approx(focal[zoom], rel=within)
 
 
@@ -434,7 +436,7 @@ def test_focal_lengths_of_a_real_zoom_camera(zoomcam, zoom, within):
 def test_focal_lengths_of_a_real_zoom_camera_are_those_of_opencv(zoomcam, zoom):
     """cv2.calibrateCamera on the same corrected corners, with the same principal point."""
     lens, focal, corrected = zoomcam
-    together, _ = zj.focal_from_planes(corrected[zoom], REAL_PLANE, principal=np.asarray(lens.centre))
+    together, _ = zj.focal.focal_from_planes(corrected[zoom], REAL_PLANE, principal=np.asarray(lens.centre))
     board = np.c_[REAL_PLANE, np.zeros(330)].astype(np.float32)
     x, y = np.asarray(lens.centre)
     guess = np.array([[focal[zoom], 0, x], [0, focal[zoom], y], [0, 0, 1]])

@@ -27,7 +27,7 @@ def seen(focal=3000.0, names=LEFT, pan=-0.3, tilt=1.4, number=5):
 
 
 def from_pitch(annotations):
-    return zj.focal_from_pitch(annotations, principal=PRINCIPAL)
+    return zj.focal.focal_from_pitch(annotations, principal=PRINCIPAL)
 
 
 def test_the_markings_are_those_of_the_laws_of_the_game():

@@ -12,7 +12,7 @@ def written(path, text):
 
 
 def test_interpolates_in_the_inverse(tmp_path):
-    track = zj.read_focal_track(written(tmp_path / "t.csv", "time,focal\n0,20\n2.5,40\n5,100\n"))
+    track = zj.io.read_focal_track(written(tmp_path / "t.csv", "time,focal\n0,20\n2.5,40\n5,100\n"))
     assert track.at(999, 0.0) == 20
     assert track.at(0, 1.25) == pytest.approx(2 / (1 / 20 + 1 / 40))
     assert track.at(0, 5.0) == 100
@@ -28,7 +28,7 @@ def test_interpolates_in_the_inverse(tmp_path):
     ],
 )
 def test_positions_are_frames_or_seconds(tmp_path, header, rows, by_time):
-    track = zj.read_focal_track(written(tmp_path / "t.csv", f"{header}\n{rows}"))
+    track = zj.io.read_focal_track(written(tmp_path / "t.csv", f"{header}\n{rows}"))
     assert track.by_time is by_time
     assert track.at(5, 5.0) == pytest.approx(1 / np.interp(5, track.position, 1 / track.focal))
     assert track.at(2, 4.0) != track.at(4, 2.0)
@@ -38,9 +38,9 @@ def test_ends_are_errors_unless_held():
     samples = (np.array([1.0, 2.0]), np.array([20.0, 40.0]))
     for time in (0.5, 2.5):
         with pytest.raises(ValueError, match=r"goes from 1 to 2 s, and frame 7, at .* s, is outside"):
-            zj.FocalTrack(*samples).at(7, time)
-    assert zj.FocalTrack(*samples, hold=True).at(7, 0.5) == 20
-    assert zj.FocalTrack(*samples, hold=True).at(7, 2.5) == 40
+            zj.io.FocalTrack(*samples).at(7, time)
+    assert zj.io.FocalTrack(*samples, hold=True).at(7, 0.5) == 20
+    assert zj.io.FocalTrack(*samples, hold=True).at(7, 2.5) == 40
 
 
 @pytest.mark.parametrize(
@@ -61,20 +61,20 @@ def test_ends_are_errors_unless_held():
 def test_bad_files_are_named(tmp_path, text, message):
     path = written(tmp_path / "bad.csv", text)
     with pytest.raises(ValueError, match=f"bad.csv.*{message}"):
-        zj.read_focal_track(path)
+        zj.io.read_focal_track(path)
 
 
 def test_no_file_and_no_text(tmp_path):
     with pytest.raises(FileNotFoundError):
-        zj.read_focal_track(tmp_path / "none.csv")
+        zj.io.read_focal_track(tmp_path / "none.csv")
     (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ValueError, match="not text"):
-        zj.read_focal_track(tmp_path / "bytes.csv")
+        zj.io.read_focal_track(tmp_path / "bytes.csv")
 
 
 @pytest.mark.parametrize("hold", [False, True])
 def test_frames_without_times_have_no_place_in_seconds(hold):
     samples = (np.array([0.0, 2.0]), np.array([20.0, 40.0]))
     with pytest.raises(ValueError, match="frames of the video have no times"):
-        zj.FocalTrack(*samples, hold=hold).at(1, np.nan)
-    assert zj.FocalTrack(*samples, by_time=False, hold=hold).at(2, np.nan) == 40
+        zj.io.FocalTrack(*samples, hold=hold).at(1, np.nan)
+    assert zj.io.FocalTrack(*samples, by_time=False, hold=hold).at(2, np.nan) == 40

@@ -22,8 +22,8 @@ def coefficients(rng, frames, terms=2):
 @eqx.filter_jit
 def normal_equations(lines, k):
     """The residual sum of squares, its gradient, and the Gauss-Newton matrix."""
-    residuals = zj.residuals(lines, k).ravel()
-    jacobian = jax.jacfwd(lambda k: zj.residuals(lines, k))(k).reshape(residuals.size, -1)
+    residuals = zj.fit.residuals(lines, k).ravel()
+    jacobian = jax.jacfwd(lambda k: zj.fit.residuals(lines, k))(k).reshape(residuals.size, -1)
     return residuals @ residuals, jacobian.T @ residuals, jacobian.T @ jacobian
 
 
@@ -102,7 +102,7 @@ def test_more_terms_serve_fewer(ragged, rng):
 
 def test_fewer_terms_do_not_serve_more(ragged, rng):
     with pytest.raises(ValueError, match="compressed for 1 terms, but 2 are asked for"):
-        zj.residuals(zj.compress(ragged, 1), coefficients(rng, 3, 2))
+        zj.fit.residuals(zj.compress(ragged, 1), coefficients(rng, 3, 2))
 
 
 def test_no_terms_raise(ragged):
@@ -122,7 +122,7 @@ def chunks(lines, rng):
 def test_chunks_merge_to_the_whole_in_either_order(ragged, rng):
     first, second = (zj.compress(chunk) for chunk in chunks(ragged, rng))
     whole = zj.compress(ragged)
-    for merged in (zj.merge(first, second), zj.merge(second, first)):
+    for merged in (zj.lines.merge(first, second), zj.lines.merge(second, first)):
         assert_same_triangles(merged, whole)
         assert_same_for_fits(merged, ragged, coefficients(rng, 3))
         np.testing.assert_array_equal(merged.counts, ragged.counts)
@@ -138,7 +138,7 @@ def test_chunks_of_few_points_a_line_merge_to_the_whole(ragged):
         zj.compress(zj.Lines.from_ragged(half, frame, focal, image_size=size, chunk=True))
         for half in halves
     ]
-    assert_same_triangles(zj.merge(*parts), zj.compress(ragged))
+    assert_same_triangles(zj.lines.merge(*parts), zj.compress(ragged))
 
 
 def test_chunks_that_lost_different_lines_do_not_merge(ragged):
@@ -151,7 +151,7 @@ def test_chunks_that_lost_different_lines_do_not_merge(ragged):
         with pytest.warns(UserWarning, match="Dropped 1"):
             parts.append(zj.compress(zj.Lines.from_ragged(given, np.sort(frame), focal, image_size=size)))
     with pytest.raises(ValueError, match="chunk=True"):
-        zj.merge(*parts)
+        zj.lines.merge(*parts)
 
 
 def test_compressing_twice_is_refused(small, unchecked):
@@ -164,11 +164,13 @@ def test_merge_is_differentiable(ragged, rng):
     parts = chunks(ragged, rng)
 
     def energy(points):
-        return zj.global_energy(zj.merge(*(zj.compress(moved(part, points)) for part in parts)), k)
+        return zj.fit.global_energy(
+            zj.lines.merge(*(zj.compress(moved(part, points)) for part in parts)), k
+        )
 
     np.testing.assert_allclose(
         jax.jit(jax.grad(energy))(ragged.points),
-        jax.jit(jax.grad(lambda points: zj.global_energy(moved(ragged, points), k)))(ragged.points),
+        jax.jit(jax.grad(lambda points: zj.fit.global_energy(moved(ragged, points), k)))(ragged.points),
         rtol=1e-9,
         atol=1e-12,
     )
@@ -176,7 +178,7 @@ def test_merge_is_differentiable(ragged, rng):
 
 def test_other_lines_do_not_merge(ragged, small):
     with pytest.raises(ValueError, match="Only triangles of the same lines"):
-        zj.merge(zj.compress(ragged), small)
+        zj.lines.merge(zj.compress(ragged), small)
 
 
 @pytest.mark.parametrize("cores", [1, 2, 6, 64])
@@ -205,7 +207,7 @@ def test_under_vmap(ragged):
 def energy(lines, points, centre, k, *, compressed):
     """The global energy as a function of points, centre and coefficients."""
     there = eqx.tree_at(lambda data: (data.points, data.centre), lines, (points, centre))
-    return zj.global_energy(zj.compress(there, k.shape[1]) if compressed else there, k)
+    return zj.fit.global_energy(zj.compress(there, k.shape[1]) if compressed else there, k)
 
 
 SCENES = pytest.mark.parametrize("scene", ["bent", "straight"])

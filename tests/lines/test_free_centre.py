@@ -16,7 +16,7 @@ K = jnp.array([[0.1, -0.05], [0.02, 0.03], [-0.1, 0.01]])
 
 @pytest.fixture(scope="module")
 def small(ragged):
-    return zj.compress_any_centre(ragged)
+    return zj.lines.compress_any_centre(ragged)
 
 
 def about(lines, centre):
@@ -25,7 +25,7 @@ def about(lines, centre):
 
 @pytest.mark.parametrize("terms", [1, 2, 3])
 def test_terms_are_those_asked_for(ragged, terms):
-    small = zj.compress_any_centre(ragged, terms)
+    small = zj.lines.compress_any_centre(ragged, terms)
     assert small.terms == terms
     np.testing.assert_array_equal(small.counts, ragged.counts)
 
@@ -35,28 +35,30 @@ def test_about_a_centre_it_is_the_compression_there(ragged, small, centre):
     there, expected = small.about(centre), zj.compress(about(ragged, centre))
     np.testing.assert_array_equal(there.centre, centre)
     for k in (K, 0 * K, K[:, :1]):
-        np.testing.assert_allclose(zj.frame_energy(there, k), zj.frame_energy(expected, k), rtol=1e-12)
+        np.testing.assert_allclose(
+            zj.fit.frame_energy(there, k), zj.fit.frame_energy(expected, k), rtol=1e-12
+        )
 
 
 @pytest.mark.parametrize("kind", ["points", "compressed"])
 def test_each_frame_may_have_its_own_centre(ragged, small, kind):
     lines = (ragged if kind == "points" else small).about(CENTRES)
-    expected = [zj.frame_energy(about(ragged, CENTRES[m]), K)[m] for m in range(3)]
-    np.testing.assert_allclose(zj.frame_energy(lines, K), expected, rtol=1e-12)
+    expected = [zj.fit.frame_energy(about(ragged, CENTRES[m]), K)[m] for m in range(3)]
+    np.testing.assert_allclose(zj.fit.frame_energy(lines, K), expected, rtol=1e-12)
 
 
 def test_the_offset_of_the_centre_comes_after_the_coefficients(ragged, small):
     offset = (CENTRES - np.asarray(small.centre)) / small.scale
-    with_offset = zj.frame_energy(small, jnp.concatenate([K, offset], axis=1))
-    np.testing.assert_allclose(with_offset, zj.frame_energy(ragged.about(CENTRES), K), rtol=1e-12)
+    with_offset = zj.fit.frame_energy(small, jnp.concatenate([K, offset], axis=1))
+    np.testing.assert_allclose(with_offset, zj.fit.frame_energy(ragged.about(CENTRES), K), rtol=1e-12)
 
 
 def test_derivatives_by_the_centre_are_those_of_the_points(ragged, small):
     def energy(offset, lines):
         offsets = jnp.broadcast_to(offset, (3, 2))
         if lines is small:
-            return jnp.sum(zj.frame_energy(lines, jnp.concatenate([K, offsets], axis=1)))
-        return jnp.sum(zj.frame_energy(lines.about(lines.centre + lines.scale * offset), K))
+            return jnp.sum(zj.fit.frame_energy(lines, jnp.concatenate([K, offsets], axis=1)))
+        return jnp.sum(zj.fit.frame_energy(lines.about(lines.centre + lines.scale * offset), K))
 
     offset = jnp.array([0.02, -0.03])
     expected = jax.grad(energy)(offset, ragged)
@@ -74,8 +76,8 @@ def test_a_frame_of_them_is_that_frame(ragged, small):
     chosen, present = small.by_frame()
     frame = small.take(jnp.asarray(chosen[1]), jnp.asarray(present[1]))
     np.testing.assert_allclose(
-        zj.frame_energy(frame, jnp.concatenate([K[1:2], jnp.zeros((1, 2))], axis=1)),
-        zj.frame_energy(ragged, K)[1:2],
+        zj.fit.frame_energy(frame, jnp.concatenate([K[1:2], jnp.zeros((1, 2))], axis=1)),
+        zj.fit.frame_energy(ragged, K)[1:2],
         rtol=1e-12,
     )
 
@@ -88,15 +90,15 @@ def test_float32_keeps_its_floor():
     lines = zj.Lines.from_ragged(
         [a + t * (b - a) for a, b in ends], np.arange(6) % 2, np.float32([20, 50]), image_size=(4000, 3000)
     )
-    small = zj.compress_any_centre(lines)
+    small = zj.lines.compress_any_centre(lines)
     assert small.triangle.dtype == np.float32
-    rms = np.sqrt(zj.frame_energy(small, jnp.zeros((2, 4), jnp.float32)))
+    rms = np.sqrt(zj.fit.frame_energy(small, jnp.zeros((2, 4), jnp.float32)))
     assert (rms < 2e-3).all()
 
 
 def test_what_is_compressed_cannot_be_compressed_again(small, unchecked):
     with pytest.raises(TypeError, match="must be Lines"):
-        zj.compress_any_centre(small)
+        zj.lines.compress_any_centre(small)
 
 
 def test_lines_of_one_centre_have_no_other(ragged):

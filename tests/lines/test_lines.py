@@ -121,7 +121,7 @@ def test_taken_lines_are_a_data_set_of_one_frame(compressed, ragged):
     for frame in range(3):
         one = lines.take(jnp.asarray(chosen[frame]), jnp.asarray(present[frame]))
         np.testing.assert_array_equal(one.focal, ragged.focal[frame : frame + 1])
-        np.testing.assert_allclose(zj.frame_energy(one, jnp.asarray(k)), energies[frame], rtol=1e-9)
+        np.testing.assert_allclose(zj.fit.frame_energy(one, jnp.asarray(k)), energies[frame], rtol=1e-9)
 
 
 def test_by_frame_under_jit_chooses_the_same_lines(ragged):

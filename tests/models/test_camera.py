@@ -12,7 +12,7 @@ FOCAL = 50.0
 
 @pytest.fixture(scope="module")
 def camera(truth):
-    return zj.Camera(truth, principal=truth.centre + np.array([3.0, -2.0]), pixel_pitch=0.006)
+    return zj.models.Camera(truth, principal=truth.centre + np.array([3.0, -2.0]), pixel_pitch=0.006)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_derivatives(camera, pixels):
 
 
 def test_the_principal_point_is_by_default_the_centre(truth):
-    camera = zj.Camera(truth, pixel_pitch=0.006)
+    camera = zj.models.Camera(truth, pixel_pitch=0.006)
     rays, _ = camera.rays(np.asarray(truth.centre), FOCAL)
     np.testing.assert_array_equal(rays, [0, 0, 1])
 
@@ -74,7 +74,7 @@ def test_the_principal_point_is_by_default_the_centre(truth):
 def test_a_lens_in_pixels_needs_no_pitch(truth):
     import dataclasses
 
-    camera = zj.Camera(dataclasses.replace(truth, focal_unit="px"))
+    camera = zj.models.Camera(dataclasses.replace(truth, focal_unit="px"))
     rays, _ = camera.rays([0.0, 0.0], FOCAL)
     assert rays[0] < -1
 
@@ -90,7 +90,7 @@ def test_a_lens_in_pixels_needs_no_pitch(truth):
 @pytest.mark.usefixtures("unchecked")
 def test_what_is_missing_is_said(truth, arguments, message):
     with pytest.raises(ValueError, match=message):
-        zj.Camera(truth, **arguments)
+        zj.models.Camera(truth, **arguments)
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -18,11 +18,11 @@ from .._reference import finite_jacobian, image_grid
 SIZE = (320, 240)
 CENTRE, SCALE = np.array([159.5, 119.5]), 200.0
 TABLE = {  # coefficients well within the domain, and some whose domain ends inside the image
-    "polynomial": (zj.RadialPolynomial(), [-0.12, 0.03], [-0.5, 0.02]),
-    "division 1": (zj.Division(), [-0.2], [1.4]),
-    "division 2": (zj.Division(), [-0.15, -0.03], [0.5, 0.4]),
-    "division at a pole": (zj.Division(), [-0.3, 0.02], [-1.5]),
-    "decentred": (zj.BrownConrady(), [-0.1, 0.02, 0.004, -0.003], [-0.4, 0.02, 0.01, 0.02]),
+    "polynomial": (zj.models.RadialPolynomial(), [-0.12, 0.03], [-0.5, 0.02]),
+    "division 1": (zj.models.Division(), [-0.2], [1.4]),
+    "division 2": (zj.models.Division(), [-0.15, -0.03], [0.5, 0.4]),
+    "division at a pole": (zj.models.Division(), [-0.3, 0.02], [-1.5]),
+    "decentred": (zj.models.BrownConrady(), [-0.1, 0.02, 0.004, -0.003], [-0.4, 0.02, 0.01, 0.02]),
 }
 FAMILIES = {name: TABLE[name] for name in ("polynomial", "division 1", "decentred")}
 RANGE = np.array([20.0, 80.0])
@@ -63,7 +63,7 @@ def test_where_there_is_no_inverse_is_nan(family, k, tight):
     beyond = jnp.asarray(CENTRE + 1.3 * (np.asarray(d.undistort(border)) - CENTRE))
     pole = (
         family.factor(jnp.asarray((radius / SCALE) ** 2), jnp.asarray(tight)) > 1e6
-        if (isinstance(family, zj.Division))
+        if (isinstance(family, zj.models.Division))
         else False
     )
     assert d.has_inverse(beyond).all() == pole
@@ -119,7 +119,7 @@ def least_slope(family, zoom):
         k = zoom(f)
         jacobian = jax.vmap(jax.jacfwd(lambda z: family.correct(z, z @ z, k)))(z)
         values = jnp.linalg.eigvalsh((jacobian + jacobian.mT) / 2)
-        if isinstance(family, zj.Division):  # its slope's numerator, and the divisor
+        if isinstance(family, zj.models.Division):  # its slope's numerator, and the divisor
             factor = family.factor(jnp.sum(z**2, axis=1), k)
             return jnp.minimum(jnp.min(values[:, 0] / factor**2), jnp.min(1 / factor))
         return jnp.min(values)
@@ -129,7 +129,7 @@ def least_slope(family, zoom):
 
 @every
 def test_certificate_against_sampling(family, k, tight):
-    certify = eqx.filter_jit(zj.certify)
+    certify = eqx.filter_jit(zj.models.certify)
     outcomes = []
     for factor, base in ((0.5, k), (1.0, k), (0.2, tight), (0.6, tight), (1.0, tight)):
         lens = lens_of(family, factor * np.array(base))
@@ -160,7 +160,7 @@ def test_file(family, k, tight, tmp_path):
 
 
 def test_files_of_unknown_families_and_too_few_coefficients_are_refused(tmp_path):
-    lens_of(zj.Division(), [-0.1]).save(tmp_path / "lens.json")
+    lens_of(zj.models.Division(), [-0.1]).save(tmp_path / "lens.json")
     text = (tmp_path / "lens.json").read_text()
     for family, message in (("Fisheye", "unknown"), ("BrownConrady", "it gives 1")):
         (tmp_path / "other.json").write_text(text.replace('"Division"', f'"{family}"'))
@@ -197,7 +197,7 @@ def fitted(request):
     lens = lens_of(family, k)
     lines = lines_of(lens, noise=0.05)
     terms = len(k) - family.size(0)
-    small = zj.compress_family(lines, family, terms=terms)
+    small = zj.fit.compress_family(lines, family, terms=terms)
     return lens, lines, small, terms, zj.fit_zoom(small, zoom=zj.PolynomialZoom(degree=1), terms=terms)
 
 
@@ -214,7 +214,7 @@ def test_fit_recovers_the_lens(fitted):
     assert float(jnp.max(std)) < 1
     zoom = zj.PolynomialZoom(degree=1)
     exact = zj.fit_zoom(
-        zj.compress_family(lines_of(lens), lens.family, terms=terms), zoom=zoom, terms=terms
+        zj.fit.compress_family(lines_of(lens), lens.family, terms=terms), zoom=zoom, terms=terms
     )
     np.testing.assert_allclose(exact.lens.zoom.parameters, lens.zoom.parameters, rtol=0, atol=2e-7)
 
@@ -222,8 +222,8 @@ def test_fit_recovers_the_lens(fitted):
 def test_points_and_their_compression_give_one_fit(fitted):
     lens, lines, small, terms, fit = fitted
     k = jax.vmap(lens.zoom)(jnp.asarray(lines.focal))
-    full = zj.with_family(lines, lens.family)
-    np.testing.assert_allclose(zj.frame_energy(small, k), zj.frame_energy(full, k), rtol=1e-6)
+    full = zj.fit.with_family(lines, lens.family)
+    np.testing.assert_allclose(zj.fit.frame_energy(small, k), zj.fit.frame_energy(full, k), rtol=1e-6)
     ours = zj.fit_zoom(lines, family=lens.family, zoom=zj.PolynomialZoom(degree=1), terms=terms)
     np.testing.assert_allclose(ours.lens.zoom.parameters, fit.lens.zoom.parameters, rtol=0, atol=1e-6)
     np.testing.assert_allclose(ours.covariance, fit.covariance, rtol=1e-3, atol=1e-12)
@@ -247,7 +247,7 @@ def test_crooked_lines_are_rejected(fitted):
     crooked = zj.Lines.from_ragged(
         points, np.asarray(lines.frame), np.asarray(lines.focal), image_size=SIZE
     )
-    small = zj.compress_family(crooked, lens.family, terms=terms)
+    small = zj.fit.compress_family(crooked, lens.family, terms=terms)
     robust = zj.fit_robust(small, zoom=zj.PolynomialZoom(degree=1), terms=terms)
     assert 7 in robust.rejected
     assert robust.fit.lens.family == lens.family
@@ -256,8 +256,8 @@ def test_crooked_lines_are_rejected(fitted):
 @pytest.mark.parametrize(
     ("family", "terms", "message"),
     [
-        (zj.Division(), 1, r"compress\(lines, terms=8\)"),
-        (zj.BrownConrady(), 2, r"compress_any_centre\(lines, terms=2\)"),
+        (zj.models.Division(), 1, r"compress\(lines, terms=8\)"),
+        (zj.models.BrownConrady(), 2, r"compress_any_centre\(lines, terms=2\)"),
     ],
 )
 def test_lines_compressed_for_another_family_are_refused(family, terms, message, ragged):
@@ -270,8 +270,8 @@ def test_a_fit_is_made_invertible(family, k, tight):
     """Lines of a lens that does not fold, corrected by one that would."""
     del k
     terms = len(tight) - family.size(0)
-    bent = lines_of(lens_of(zj.RadialPolynomial(), [0.0]), bend=-90.0 if tight[0] < 0 else 90.0)
-    small = zj.compress_family(bent, family, terms=terms)
+    bent = lines_of(lens_of(zj.models.RadialPolynomial(), [0.0]), bend=-90.0 if tight[0] < 0 else 90.0)
+    small = zj.fit.compress_family(bent, family, terms=terms)
     zoom = zj.PolynomialZoom(degree=0)
     free = zj.fit_zoom(small, zoom=zoom, terms=terms, invertible=False, throw=False)
     ours = zj.fit_zoom(small, zoom=zoom, terms=terms)
@@ -283,7 +283,7 @@ def test_a_fit_is_made_invertible(family, k, tight):
 def test_images_are_corrected_by_the_exact_inverse(family, k, tight):
     del tight
     d = distortion(family, k)
-    framing = zj.frame_output(d, SIZE, keep="valid")
+    framing = zj.correct.frame_output(d, SIZE, keep="valid")
     pixels = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), axis=-1)
     exact = np.asarray(d.distort(framing.corrected(pixels)))
     assert ((exact >= 0) & (exact <= np.array(SIZE) - 1)).all()
@@ -293,7 +293,7 @@ def test_images_are_corrected_by_the_exact_inverse(family, k, tight):
     np.testing.assert_allclose(shown, exact, rtol=0, atol=0.01)
     warped = zj.warp_image(jnp.asarray(image), d, framing=framing)
     np.testing.assert_allclose(warped, exact, rtol=0, atol=0.01)
-    assert (fit_inverse(d, 250.0) is None) == isinstance(family, zj.BrownConrady)
+    assert (fit_inverse(d, 250.0) is None) == isinstance(family, zj.models.BrownConrady)
 
 
 @pytest.mark.parametrize(("family", "k", "tight"), FAMILIES.values(), ids=FAMILIES)
@@ -313,21 +313,21 @@ def test_distances_in_the_image(name):
     family, k, _ = TABLE[name]
     lens = lens_of(family, k)
     lines = lines_of(lens, noise=0.05)
-    small = zj.compress_family(lines, family, terms=len(k))
+    small = zj.fit.compress_family(lines, family, terms=len(k))
     coefficients = jax.vmap(lens.zoom)(jnp.asarray(lines.focal))
-    energy = zj.global_energy(zj.in_image(small), coefficients)
-    full = zj.in_image(zj.with_family(lines, family))
-    np.testing.assert_allclose(energy, zj.global_energy(full, coefficients), rtol=1e-6)
+    energy = zj.fit.global_energy(zj.fit.in_image(small), coefficients)
+    full = zj.fit.in_image(zj.fit.with_family(lines, family))
+    np.testing.assert_allclose(energy, zj.fit.global_energy(full, coefficients), rtol=1e-6)
     assert math.sqrt(energy) == pytest.approx(0.05, rel=0.15)
 
 
 def test_distances_in_the_image_need_a_radial_family(ragged):
     with pytest.raises(ValueError, match="leave in_image out"):
-        zj.fit_zoom(zj.in_image(ragged), family=zj.BrownConrady())
+        zj.fit_zoom(zj.fit.in_image(ragged), family=zj.models.BrownConrady())
 
 
 def test_division_is_its_formula():
-    d = distortion(zj.Division(), [-0.2, 0.03])
+    d = distortion(zj.models.Division(), [-0.2, 0.03])
     z = np.array([0.6, -0.3])
     expected = CENTRE + SCALE * z / (1 - 0.2 * 0.45 + 0.03 * 0.45**2)
     np.testing.assert_allclose(d.undistort(CENTRE + SCALE * z), expected, rtol=1e-14)
@@ -340,14 +340,14 @@ def test_decentering_is_opencvs():
     z = np.concatenate([(grid - CENTRE) / SCALE, np.ones((49, 1))], axis=1)
     none = np.zeros(3)
     theirs, _ = cv2.projectPoints(z, none, none, np.eye(3), np.array(k))
-    ours = distortion(zj.BrownConrady(), k)
+    ours = distortion(zj.models.BrownConrady(), k)
     np.testing.assert_allclose(ours.undistort(grid), CENTRE + SCALE * theirs[:, 0], rtol=0, atol=1e-9)
 
 
 def test_without_decentering_it_is_the_polynomial():
     grid = jnp.asarray(image_grid(SIZE, 7))
-    ours = distortion(zj.BrownConrady(), [-0.1, 0.02, 0.0, 0.0])
-    plain = distortion(zj.RadialPolynomial(), [-0.1, 0.02])
+    ours = distortion(zj.models.BrownConrady(), [-0.1, 0.02, 0.0, 0.0])
+    plain = distortion(zj.models.RadialPolynomial(), [-0.1, 0.02])
     np.testing.assert_allclose(ours.undistort(grid), plain.undistort(grid), rtol=1e-14)
     np.testing.assert_allclose(ours.monotone_radius, plain.monotone_radius, rtol=1e-9)
 
@@ -357,9 +357,11 @@ def test_decentering_and_a_shift_of_the_centre_are_nearly_the_same():
     k1, shift = -0.1, np.array([2.0, -1.0])
     d = shift / SCALE
     moved = zj.Distortion(jnp.array([k1]), jnp.asarray(CENTRE + shift), jnp.asarray(SCALE))
-    ours = distortion(zj.BrownConrady(), [k1, -k1 * d[1], -k1 * d[0]])
+    ours = distortion(zj.models.BrownConrady(), [k1, -k1 * d[1], -k1 * d[0]])
     grid = jnp.asarray(image_grid(SIZE, 9))
     apart = np.asarray(moved.undistort(grid) - ours.undistort(grid))
-    both = np.asarray(moved.undistort(grid) - distortion(zj.RadialPolynomial(), [k1]).undistort(grid))
+    both = np.asarray(
+        moved.undistort(grid) - distortion(zj.models.RadialPolynomial(), [k1]).undistort(grid)
+    )
     assert np.abs(both).max() > 0.4
     assert np.abs(apart).max() < 0.01

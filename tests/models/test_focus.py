@@ -18,7 +18,7 @@ FOCUS = np.array([0.0, 0.4, 1.0, 2.5])  # 1/m
 @pytest.fixture(scope="module")
 def model():
     focal, focus = (jnp.asarray(a.ravel()) for a in np.meshgrid(FOCAL, FOCUS))
-    prepared = zj.FocusSplineZoom(4, 3).prepare(focal, 2, focus)
+    prepared = zj.models.FocusSplineZoom(4, 3).prepare(focal, 2, focus)
     random = np.random.default_rng(0).standard_normal(prepared.parameters.shape)
     return eqx.tree_at(lambda zoom: zoom.parameters, prepared, jnp.asarray(0.05 * random))
 
@@ -56,7 +56,7 @@ def seen():
 def test_at_a_knot_of_the_focus_it_is_the_spline_of_its_row(model):
     for row, focus in enumerate(np.asarray(model.focus_knots)):
         table = model.parameters.reshape(4, 3, 2)[:, row]
-        spline = zj.SplineZoom(4, table, model.knots, model.curvature)
+        spline = zj.models.SplineZoom(4, table, model.knots, model.curvature)
         for f in (18.0, 30.0, 120.0):
             np.testing.assert_allclose(model(f, focus), spline(jnp.asarray(f)), rtol=1e-12)
 
@@ -94,7 +94,7 @@ def test_pieces_bound_the_coefficients(model):
 
 def test_a_lens_that_breathes_is_recovered(seen):
     small = zj.compress(seen)
-    fit = zj.fit_zoom(small, zoom=zj.FocusSplineZoom(5, 3))
+    fit = zj.fit_zoom(small, zoom=zj.models.FocusSplineZoom(5, 3))
     blind = zj.fit_zoom(small)
     assert fit.rms < 0.002
     assert fit.rms < 0.05 * blind.rms
@@ -109,7 +109,9 @@ def test_a_lens_that_breathes_is_recovered(seen):
 
 
 def test_points_and_triangles_give_one_answer(seen):
-    full, small = (zj.fit_zoom(lines, zoom=zj.FocusSplineZoom(2, 2)) for lines in (seen, zj.compress(seen)))
+    full, small = (
+        zj.fit_zoom(lines, zoom=zj.models.FocusSplineZoom(2, 2)) for lines in (seen, zj.compress(seen))
+    )
     np.testing.assert_allclose(full.lens.zoom.parameters, small.lens.zoom.parameters, atol=1e-8)
 
 
@@ -122,17 +124,17 @@ def test_models_of_the_focal_length_alone_ignore_the_focus(seen):
 def test_robust_fits_and_frames_and_centres_keep_the_focus(seen):
     small = zj.compress(seen)
     noisy = zj.compress(scenes.with_noise(seen, jax.random.key(0), std=0.1))
-    robust = zj.fit_robust(noisy, zoom=zj.FocusSplineZoom(5, 3))
+    robust = zj.fit_robust(noisy, zoom=zj.models.FocusSplineZoom(5, 3))
     assert robust.rejected.size < 0.01 * len(seen.frame)
     assert zj.fit_frames(small).rms < 1e-6
-    assert zj.compress_any_centre(seen).about(seen.centre).focus is seen.focus
-    assert zj.in_image(small).focus is small.focus
+    assert zj.lines.compress_any_centre(seen).about(seen.centre).focus is seen.focus
+    assert zj.fit.in_image(small).focus is small.focus
 
 
 def test_files_keep_the_focus(seen, tmp_path):
     seen.save(tmp_path / "lines.npz")
     np.testing.assert_array_equal(zj.load_lines(tmp_path / "lines.npz").focus, seen.focus)
-    lens = zj.fit_zoom(zj.compress(seen), zoom=zj.FocusSplineZoom(2, 2)).lens
+    lens = zj.fit_zoom(zj.compress(seen), zoom=zj.models.FocusSplineZoom(2, 2)).lens
     lens.save(tmp_path / "lens.json")
     loaded = zj.load_lens(tmp_path / "lens.json")
     for one, other in zip(jax.tree.leaves(loaded), jax.tree.leaves(lens), strict=True):
@@ -142,11 +144,11 @@ def test_files_keep_the_focus(seen, tmp_path):
 
 def test_a_missing_focus_says_what_to_do(small, seen, model, truth):
     with pytest.raises(ValueError, match="needs the focus of each frame"):
-        zj.fit_zoom(small, zoom=zj.FocusSplineZoom())
+        zj.fit_zoom(small, zoom=zj.models.FocusSplineZoom())
     with pytest.raises(ValueError, match=r"lens\.at_focus"):
-        zj.fit_zoom(zj.compress(seen), zoom=zj.FocusSplineZoom(2, 2)).lens(30.0)
+        zj.fit_zoom(zj.compress(seen), zoom=zj.models.FocusSplineZoom(2, 2)).lens(30.0)
     with pytest.raises(ValueError, match="smaller focus_number"):
-        zj.fit_zoom(seen, zoom=zj.FocusSplineZoom(3, 4))
+        zj.fit_zoom(seen, zoom=zj.models.FocusSplineZoom(3, 4))
     with pytest.raises(TypeError, match="does not depend on the focus"):
         truth.at_focus(1.0)
     row = np.stack([np.arange(9.0), np.full(9, 2.0)], axis=-1)

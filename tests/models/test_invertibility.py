@@ -15,13 +15,13 @@ from zoomjax.models.invertibility import Certificate, slope_controls
 SIZE, CENTRE, RANGE = (640, 480), np.array([319.5, 239.5]), np.array([20.0, 120.0])
 MODELS = {
     "polynomial": zj.PolynomialZoom(),
-    "table": zj.TableZoom(),
-    "table in f": zj.TableZoom(inverse=False),
-    "table of one": zj.TableZoom(number=1),
-    "spline": zj.SplineZoom(),
-    "spline of two knots": zj.SplineZoom(number=2),
-    "power law": zj.PowerZoom(),
-    "two regions": zj.TwoRegionZoom(40.0),
+    "table": zj.models.TableZoom(),
+    "table in f": zj.models.TableZoom(inverse=False),
+    "table of one": zj.models.TableZoom(number=1),
+    "spline": zj.models.SplineZoom(),
+    "spline of two knots": zj.models.SplineZoom(number=2),
+    "power law": zj.models.PowerZoom(),
+    "two regions": zj.models.TwoRegionZoom(40.0),
 }
 
 
@@ -39,7 +39,7 @@ def certified(parameters, dtype=np.float64) -> Certificate:
 
     def one(parameters):
         zoom = zj.PolynomialZoom(parameters.shape[0] - 1, parameters, jnp.asarray(RANGE[0], dtype))
-        return zj.certify(lens_of(zoom, dtype=dtype))
+        return zj.models.certify(lens_of(zoom, dtype=dtype))
 
     return eqx.filter_jit(lambda every: jax.lax.map(one, every, batch_size=500))(
         jnp.asarray(parameters, dtype)
@@ -130,7 +130,7 @@ def fitted_model(model, seed=0, terms=2, spread=0.1):
 @pytest.mark.parametrize("terms", [2, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_every_zoom_model_is_certified_as_it_is(model, terms):
-    certify = eqx.filter_jit(zj.certify)
+    certify = eqx.filter_jit(zj.models.certify)
     focal = jnp.asarray(np.geomspace(*RANGE, 1001))
     t = jnp.linspace(0, 1, 101)
     outcomes = []
@@ -143,7 +143,7 @@ def test_every_zoom_model_is_certified_as_it_is(model, terms):
         assert ours.slope <= least + 0.011
         assert bool(ours.certified) == (ours.least > 0)
         there = radial_slope((ours.radius / 400) ** 2, zoom(ours.focal))
-        jump = isinstance(model, zj.TwoRegionZoom) and abs(ours.focal - 40.0) < 1e-9
+        jump = isinstance(model, zj.models.TwoRegionZoom) and abs(ours.focal - 40.0) < 1e-9
         assert jump or ours.slope == pytest.approx(float(there), abs=1e-3)
         outcomes.append(bool(ours.certified))
     assert 0 < sum(outcomes) < 6
@@ -162,13 +162,16 @@ def test_pieces_are_the_coefficients(model):
                     math.comb(degree, i) * share**i * (1 - share) ** (degree - i) for i in range(degree + 1)
                 ]
                 above = zoom(pieces.focal_of(low + share * (high - low))) - np.array(weights) @ controls
-                allowed = 1e-3 if isinstance(model, zj.PowerZoom) else 1e-13
+                allowed = 1e-3 if isinstance(model, zj.models.PowerZoom) else 1e-13
                 assert ((above > -1e-13) & (above < allowed)).all()
 
 
 def test_off_centre_the_farthest_corner_counts():
     zoom = zj.PolynomialZoom(0, jnp.array([[-0.25]]), jnp.asarray(20.0))
-    centred, aside = zj.certify(lens_of(zoom)), zj.certify(lens_of(zoom, CENTRE + np.array([-120, 90.0])))
+    centred, aside = (
+        zj.models.certify(lens_of(zoom)),
+        zj.models.certify(lens_of(zoom, CENTRE + np.array([-120, 90.0]))),
+    )
     assert centred.certified
     assert centred.radius == pytest.approx(400)
     assert not aside.certified
@@ -178,17 +181,17 @@ def test_off_centre_the_farthest_corner_counts():
 
 def test_coefficients_that_are_not_finite_are_not_certified():
     zoom = zj.PolynomialZoom(1, jnp.array([[0.1, jnp.nan], [0.0, 0.0]]), jnp.asarray(20.0))
-    assert not zj.certify(lens_of(zoom)).certified
+    assert not zj.models.certify(lens_of(zoom)).certified
 
 
 def test_is_a_constant_for_differentiation():
     def least(parameters):
-        return zj.certify(lens_of(zj.PolynomialZoom(1, parameters, jnp.asarray(20.0)))).least
+        return zj.models.certify(lens_of(zj.PolynomialZoom(1, parameters, jnp.asarray(20.0)))).least
 
     np.testing.assert_array_equal(jax.grad(least)(jnp.array([[-0.1], [-0.1]])), np.zeros((2, 1)))
 
 
-class SomeZoom(zj.AbstractLinearZoom):
+class SomeZoom(zj.models.AbstractLinearZoom):
     """A model that does not state its pieces: linear in log f."""
 
     parameters: jax.Array | None = None
@@ -202,7 +205,7 @@ class SomeZoom(zj.AbstractLinearZoom):
 
 @pytest.mark.parametrize(("k1", "folds"), [(-0.2, False), (-0.4, True)])
 def test_of_models_without_pieces_nothing_is_proved(k1, folds):
-    ours = zj.certify(lens_of(SomeZoom(jnp.array([[k1], [0.05]]))))
+    ours = zj.models.certify(lens_of(SomeZoom(jnp.array([[k1], [0.05]]))))
     assert not ours.certified
     assert ours.least == -jnp.inf
     assert (ours.slope <= 0) == folds
@@ -229,7 +232,7 @@ numbers = st.floats(-0.4, 0.4, allow_subnormal=False)
 def test_there_and_back_inside_the_certificate(parameters, share, x, y):
     parameters = jnp.array(parameters).reshape(3, 2)
     lens = lens_of(zj.PolynomialZoom(2, parameters, jnp.asarray(20.0)))
-    ours = zj.certify(lens)
+    ours = zj.models.certify(lens)
     hypothesis.assume(ours.certified & (ours.least > 1e-6))
     focal = np.clip(1 / ((1 - share) / RANGE[0] + share / RANGE[1]), *RANGE)
     point = np.array([x * 640 - 0.5, y * 480 - 0.5])
@@ -245,8 +248,8 @@ def test_a_centre_that_moves_is_allowed_for(truth):
     k = jnp.array([[-0.31]])  # slope 1 - 0.93 t, 0.07 at the corner
     zoom = zj.PolynomialZoom(0, k, jnp.array(20.0))
     still = zj.ZoomLens(zoom, truth.centre, truth.focal_range, truth.image_size)
-    assert zj.certify(still).certified
+    assert zj.models.certify(still).certified
     for offset, certified in ((0.01, True), (0.1, False)):
         shift = zj.PolynomialZoom(1, jnp.array([[0.0, 0.0], [offset, 0.0]]), jnp.array(20.56))
         moving = eqx.tree_at(lambda lens: lens.shift, still, shift, is_leaf=lambda leaf: leaf is None)
-        assert zj.certify(moving).certified == certified
+        assert zj.models.certify(moving).certified == certified

@@ -250,7 +250,7 @@ def test_missing_file_raises(tmp_path):
         zj.load_lens(tmp_path / "lens.json")
 
 
-class Nameless(zj.AbstractZoom):
+class Nameless(zj.models.AbstractZoom):
     """A zoom model with no file format."""
 
     parameters: None = None

@@ -60,7 +60,10 @@ def test_without_their_module_a_sentence_says_what_is_missing(saved):
     done = read_elsewhere(saved)
     assert done.returncode == 1
     last = done.stderr.strip().splitlines()[-1]
-    assert "'LogZoom', is unknown: import the module that registers it by zoomjax.register_model" in last
+    assert (
+        "'LogZoom', is unknown: import the module that registers it by zoomjax.models.register_model"
+        in last
+    )
     content = json.loads(saved.read_text())
     content["zoom"]["model"] = "PolynomialZoom"
     content["zoom"] |= {"degree": 1, "focal_ref": 20.0}
@@ -104,7 +107,9 @@ def model(**body):
     body["__annotations__"] = {"formula": ClassVar[str], "parameters": jax.Array | None} | body.pop(
         "more", {}
     )
-    return type(zj.AbstractZoom)(body.pop("name", "Still"), (zj.AbstractZoom,), {"parameters": None} | body)
+    return type(zj.models.AbstractZoom)(
+        body.pop("name", "Still"), (zj.models.AbstractZoom,), {"parameters": None} | body
+    )
 
 
 @pytest.fixture
@@ -119,19 +124,19 @@ def registry(monkeypatch):
 def test_what_cannot_be_registered(registry):
     for thing in (3, zj.ZoomLens, zj.PolynomialZoom()):
         with pytest.raises(TypeError, match="class of AbstractZoom or AbstractFamily"):
-            zj.register_model(thing)
+            zj.models.register_model(thing)
     with pytest.raises(TypeError, match="Still needs a class attribute formula"):
-        zj.register_model(model(formula=None))
+        zj.models.register_model(model(formula=None))
     with pytest.raises(TypeError, match="must not have a field model"):
-        zj.register_model(model(more={"model": int}, model=3))
+        zj.models.register_model(model(more={"model": int}, model=3))
     with pytest.raises(ValueError, match="Another class is registered as 'PolynomialZoom'"):
-        zj.register_model(model(name="PolynomialZoom"))
-    zj.register_model(name="Other")(model(name="PolynomialZoom"))
+        zj.models.register_model(model(name="PolynomialZoom"))
+    zj.models.register_model(name="Other")(model(name="PolynomialZoom"))
 
 
 def test_a_class_that_is_defined_again_takes_its_place(registry, tmp_path):
-    zj.register_model(model())
-    again = zj.register_model(model())
+    zj.models.register_model(model())
+    again = zj.models.register_model(model())
     lens = zj.ZoomLens(again(), jnp.zeros(2), jnp.array([20.0, 80.0]), (640, 480))
     lens.save(tmp_path / "lens.json")
     assert type(zj.load_lens(tmp_path / "lens.json").zoom) is again
@@ -146,7 +151,7 @@ def test_a_class_that_is_defined_again_takes_its_place(registry, tmp_path):
     ],
 )
 def test_fields_that_json_cannot_hold_are_named_and_leave_no_file(value, message, registry, tmp_path):
-    cls = zj.register_model(model(more={"extra": object}, extra=None))
+    cls = zj.models.register_model(model(more={"extra": object}, extra=None))
     zoom = cls(None, value)
     lens = zj.ZoomLens(zoom, jnp.zeros(2), jnp.array([20.0, 80.0]), (640, 480))
     with pytest.raises(TypeError, match=message):
@@ -155,7 +160,7 @@ def test_fields_that_json_cannot_hold_are_named_and_leave_no_file(value, message
 
 
 def test_fields_keep_their_kind(registry, tmp_path):
-    cls = zj.register_model(model(more={"extra": object}, extra=None))
+    cls = zj.models.register_model(model(more={"extra": object}, extra=None))
     for value in (jnp.arange(3), jnp.array([True, False]), jnp.array([0.5]), None):
         lens = zj.ZoomLens(cls(None, value), jnp.zeros(2), jnp.array([20.0, 80.0]), (640, 480))
         lens.save(tmp_path / "lens.json")

@@ -15,7 +15,7 @@ CYCLES = [(1.290903, -0.486014), (0.41440674, -0.16653695), (0.55, -0.28)]
 def unit(k, dtype=np.float64, family=None):
     """A distortion whose lengths are normalised."""
     return zj.Distortion(
-        np.asarray(k, dtype), np.zeros(2, dtype), np.ones((), dtype), family or zj.RadialPolynomial()
+        np.asarray(k, dtype), np.zeros(2, dtype), np.ones((), dtype), family or zj.models.RadialPolynomial()
     )
 
 
@@ -128,7 +128,7 @@ def test_without_a_root_nothing_is_found():
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_nothing_is_corrected_to_the_other_side_of_a_pole(dtype):
     """Where the divisor is zero but for rounding its sign is anyone's guess."""
-    d = unit([-0.02111666, -0.02492284], dtype, zj.Division())
+    d = unit([-0.02111666, -0.02492284], dtype, zj.models.Division())
     pole = d.monotone_radius * (1 + np.arange(-40, 40, dtype=dtype) * np.finfo(dtype).eps)
     angle = np.linspace(0, 1, len(pole), dtype=dtype)
     points = pole[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -145,7 +145,9 @@ def test_nan_ends_the_search():
 
 
 @pytest.mark.parametrize(
-    "family", [zj.RadialPolynomial(), zj.Division(), zj.BrownConrady()], ids=lambda f: type(f).__name__
+    "family",
+    [zj.models.RadialPolynomial(), zj.models.Division(), zj.models.BrownConrady()],
+    ids=lambda f: type(f).__name__,
 )
 def test_numpy_and_jax_agree(family, rng):
     k = np.array([-0.1, 0.03, 0.004, -0.003][: family.size(2)])

@@ -13,14 +13,14 @@ from zoomjax.models.sizes import at_focal, check_image_size
 
 
 def test_same_size_is_the_same_lens(truth):
-    assert zj.lens_for_size(truth, (4288, 2848)) is truth
+    assert zj.models.lens_for_size(truth, (4288, 2848)) is truth
 
 
 def test_scaled_lens_corrects_the_scaled_image_alike(truth):
     with pytest.warns(
         UserWarning, match="4288 x 2848 px, and this one has 1072 x 712: its distortion is scaled"
     ):
-        quarter = zj.lens_for_size(truth, (1072, 712))
+        quarter = zj.models.lens_for_size(truth, (1072, 712))
     points = np.array([[0.0, 0.0], [3000.0, 500.0], [4287.0, 2847.0]])
     expected = (np.asarray(truth(30.0).undistort(points)) + 0.5) / 4 - 0.5
     np.testing.assert_allclose(quarter(30.0).undistort((points + 0.5) / 4 - 0.5), expected, atol=1e-9)
@@ -28,13 +28,13 @@ def test_scaled_lens_corrects_the_scaled_image_alike(truth):
 
 @pytest.mark.filterwarnings("ignore:The lens is for images")
 def test_rounded_sizes_count_as_the_same_aspect(truth):
-    assert zj.lens_for_size(truth, (1000, 664)).image_size == (1000, 664)
+    assert zj.models.lens_for_size(truth, (1000, 664)).image_size == (1000, 664)
 
 
 @pytest.mark.parametrize("size", [(1920, 1080), (2848, 4288), (4288, 2412)])
 def test_other_aspect_explains(truth, size):
     with pytest.raises(ValueError, match="another aspect ratio: it was cropped, turned"):
-        zj.lens_for_size(truth, size)
+        zj.models.lens_for_size(truth, size)
 
 
 def test_distortion_compiled_is_the_lens_s(truth):
@@ -47,7 +47,7 @@ def test_distortion_compiled_is_the_lens_s(truth):
 def test_a_centre_that_moves_does_so_in_the_scaled_image(truth):
     shift = zj.PolynomialZoom(0, np.array([[0.01, -0.005]]), np.array(20.0))
     moving = zj.ZoomLens(truth.zoom, truth.centre, truth.focal_range, truth.image_size, shift=shift)
-    quarter = zj.lens_for_size(moving, (1072, 712))
+    quarter = zj.models.lens_for_size(moving, (1072, 712))
     expected = (np.asarray(moving(30.0).centre) + 0.5) / 4 - 0.5
     np.testing.assert_allclose(quarter(30.0).centre, expected, atol=1e-9)
 
@@ -76,8 +76,8 @@ def test_a_distortion_of_images_of_another_size_is_refused(case):
     """Wherever an image or its size meets a distortion; and nothing is computed."""
     d = MADE_FOR_OTHERS[case]
     calls = [
-        lambda: zj.frame_output(d, (640, 480)),
-        lambda: zj.frame_output([of_size(640, 480), d], (640, 480), keep="all"),
+        lambda: zj.correct.frame_output(d, (640, 480)),
+        lambda: zj.correct.frame_output([of_size(640, 480), d], (640, 480), keep="all"),
         lambda: zj.undistort_image(np.zeros((480, 640, 3), np.uint8), d),
         lambda: zj.warp_image(jnp.zeros((480, 640)), d),
     ]
@@ -134,7 +134,7 @@ def test_a_crop_is_taken_with_a_framing_of_your_own():
 
 def test_a_framing_for_another_size_is_refused_and_scaled_for_photos():
     d, image = of_size(64, 48), np.zeros((48, 64), np.float32)
-    other = zj.frame_output(of_size(128, 96), (128, 96), keep="all")
+    other = zj.correct.frame_output(of_size(128, 96), (128, 96), keep="all")
     for call in (
         lambda: zj.undistort_image(image, d, keep=other),
         lambda: zj.warp_image(jnp.asarray(image), d, framing=other),
@@ -159,17 +159,17 @@ def test_a_lens_takes_its_size_along():
     truth, size = small_lens(), (64, 48)
     image = np.zeros((48, 64), np.float32)
     with pytest.warns(UserWarning, match="its distortion is scaled"):
-        quarter = zj.lens_for_size(truth, size)
+        quarter = zj.models.lens_for_size(truth, size)
     with pytest.warns(UserWarning, match="its distortion is scaled"):
-        framing = zj.frame_output(truth, size, keep="valid")
-    assert float(framing.scale) == float(zj.frame_output(quarter, size, keep="valid").scale)
+        framing = zj.correct.frame_output(truth, size, keep="valid")
+    assert float(framing.scale) == float(zj.correct.frame_output(quarter, size, keep="valid").scale)
     image[::8] = 1
     with pytest.warns(UserWarning, match="its distortion is scaled"):
         corrected = zj.undistort_image(image, truth, focal=30.0)
     np.testing.assert_array_equal(corrected, zj.undistort_image(image, quarter(30.0)))
     for call in (
         lambda: zj.undistort_image(np.zeros((64, 64)), truth, focal=30.0),
-        lambda: zj.frame_output(truth, (64, 64)),
+        lambda: zj.correct.frame_output(truth, (64, 64)),
     ):
         with pytest.raises(ValueError, match="another aspect ratio"):
             call()
@@ -202,8 +202,8 @@ def test_something_else_for_a_distortion_says_what_to_call():
     for call, name in (
         (lambda d: zj.undistort_image(image, d), "distortion"),
         (lambda d: zj.warp_image(jnp.asarray(image), d), "distortion"),
-        (lambda d: zj.frame_output(d, (128, 96)), "distortions"),
-        (lambda d: zj.frame_output([d], (128, 96)), "distortions"),
+        (lambda d: zj.correct.frame_output(d, (128, 96)), "distortions"),
+        (lambda d: zj.correct.frame_output([d], (128, 96)), "distortions"),
     ):
         with pytest.raises(
             ValueError, match=rf"{name} must be .* it is a PolynomialZoom: .* fit\.lens\(focal\)"

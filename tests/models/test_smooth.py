@@ -126,7 +126,7 @@ def test_with_much_weight_the_fit_is_the_prior_mean(small):
 def test_the_fit_is_the_mode_of_the_posterior(small, smooth):
     def objective(flat):
         zoom = with_parameters(smooth.lens.zoom, flat.reshape(7, 2))
-        return zj.global_energy(small, jax.vmap(zoom)(small.focal)) + jnp.sum(
+        return zj.fit.global_energy(small, jax.vmap(zoom)(small.focal)) + jnp.sum(
             prior_residuals(small, zoom) ** 2
         )
 
@@ -140,7 +140,7 @@ def repeated(lines, times):
     """The same frames many times over, as more photos at the same focal lengths are."""
     frames = lines.focal.shape[0]
     number = lines.frame.shape[0]
-    return zj.CompressedLines(
+    return zj.lines.CompressedLines(
         triangle=jnp.tile(lines.triangle, (times, 1, 1)),
         frame=jnp.tile(lines.frame, times) + frames * jnp.repeat(jnp.arange(times), number),
         focal=jnp.tile(lines.focal, times),
@@ -190,7 +190,7 @@ def test_compressed_lines_have_the_same_fit(noisy, small, smooth):
 def test_algebraic_estimate_has_the_prior_too(small, smooth):
     """Between the focal lengths, where nothing else tells."""
     middles = jnp.array([23.0, 35.0, 70.0])
-    algebraic = jax.vmap(zj.algebraic_zoom(small, zoom=zj.SmoothZoom()).zoom)(middles)
+    algebraic = jax.vmap(zj.fit.algebraic_zoom(small, zoom=zj.SmoothZoom()).zoom)(middles)
     np.testing.assert_allclose(algebraic, coefficients(smooth, middles), atol=3e-3)
 
 

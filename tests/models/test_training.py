@@ -14,7 +14,7 @@ POINTS = jnp.array([[100.0, 80.0], [600.0, 40.0], [320.0, 470.0]])
 
 
 def lens_with(zoom, **more):
-    focus = jnp.array([0.0, 1.0]) if isinstance(zoom, zj.AbstractFocusZoom) else None
+    focus = jnp.array([0.0, 1.0]) if isinstance(zoom, zj.models.AbstractFocusZoom) else None
     return zj.ZoomLens(
         zoom, jnp.array([310.0, 236.0]), jnp.array([18.0, 200.0]), SIZE, focus_range=focus, **more
     )
@@ -22,7 +22,7 @@ def lens_with(zoom, **more):
 
 def trained(thing, corrected, **options):
     """After ten steps of gradient descent towards points 1 % farther out."""
-    parameters, rest = eqx.partition(thing, zj.trainable(thing, **options))
+    parameters, rest = eqx.partition(thing, zj.models.trainable(thing, **options))
 
     def loss(parameters):
         return jnp.mean((corrected(eqx.combine(parameters, rest)) - 1.01 * POINTS) ** 2)
@@ -45,7 +45,7 @@ def moved(before, after):
 @every_zoom
 def test_of_a_lens_only_the_parameters_move(model):
     lens = lens_with(prepared(model))
-    f = (50.0, 0.5) if isinstance(model, zj.AbstractFocusZoom) else (50.0,)
+    f = (50.0, 0.5) if isinstance(model, zj.models.AbstractFocusZoom) else (50.0,)
     after = trained(lens, lambda lens: lens(*f).undistort(POINTS))
     assert moved(lens, after) == {".zoom.parameters"}
 
@@ -73,7 +73,7 @@ def test_of_a_distortion_only_the_coefficients_move():
 def test_of_a_model_of_users_own_that_holds_one(fit):
     """Other arrays are not marked; the lens of a fit is one like any other."""
     tree = {"lens": fit.lens, "pose": jnp.zeros(6), "zooms": [fit.lens.zoom, ZOOMS["power"]]}
-    marks = zj.trainable(tree)
+    marks = zj.models.trainable(tree)
     assert jax.tree.structure(marks) == jax.tree.structure(tree)
     marked = [path for path, mark in jax.tree_util.tree_leaves_with_path(marks) if mark]
     assert {jax.tree_util.keystr(path) for path in marked} == {
@@ -84,4 +84,4 @@ def test_of_a_model_of_users_own_that_holds_one(fit):
 
 @pytest.mark.parametrize("centre", [False, True])
 def test_nothing_but_booleans(centre, truth):
-    assert {type(mark) for mark in jax.tree.leaves(zj.trainable(truth, centre=centre))} == {bool}
+    assert {type(mark) for mark in jax.tree.leaves(zj.models.trainable(truth, centre=centre))} == {bool}

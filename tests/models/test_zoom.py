@@ -12,15 +12,15 @@ MODELS = {
     "linear": zj.PolynomialZoom(degree=1),
     "quadratic": zj.PolynomialZoom(),
     "cubic": zj.PolynomialZoom(degree=3),
-    "table": zj.TableZoom(),
-    "short table in f": zj.TableZoom(number=3, inverse=False),
-    "table of one": zj.TableZoom(number=1),
-    "spline": zj.SplineZoom(),
-    "spline of four knots": zj.SplineZoom(number=4),
-    "power law": zj.PowerZoom(),
-    "two regions": zj.TwoRegionZoom(jnp.asarray(30.0)),
+    "table": zj.models.TableZoom(),
+    "short table in f": zj.models.TableZoom(number=3, inverse=False),
+    "table of one": zj.models.TableZoom(number=1),
+    "spline": zj.models.SplineZoom(),
+    "spline of four knots": zj.models.SplineZoom(number=4),
+    "power law": zj.models.PowerZoom(),
+    "two regions": zj.models.TwoRegionZoom(jnp.asarray(30.0)),
 }
-LINEAR = {name: model for name, model in MODELS.items() if isinstance(model, zj.AbstractLinearZoom)}
+LINEAR = {name: model for name, model in MODELS.items() if isinstance(model, zj.models.AbstractLinearZoom)}
 FOCAL = np.array([18.0, 21.0, 24.0, 35.0, 70.0, 200.0])
 TERMS = (1, 2, 3)
 
@@ -109,7 +109,7 @@ def test_focal_lengths_that_do_not_determine_a_model_raise(model):
         except ValueError as error:
             assert "distinct focal lengths, but there are" in str(error)  # noqa: PT017
             continue
-        if isinstance(model, zj.AbstractLinearZoom):
+        if isinstance(model, zj.models.AbstractLinearZoom):
             basis = jax.vmap(prepared.basis)(jnp.asarray(FOCAL[:least]))
             assert np.linalg.matrix_rank(basis) == basis.shape[1]
     assert prepared is not None
@@ -148,33 +148,35 @@ def test_parameters_of_another_degree_raise():
 
 
 def test_a_table_is_linear_interpolation():
-    zoom = with_random_parameters(zj.TableZoom())
+    zoom = with_random_parameters(zj.models.TableZoom())
     for f in (10.0, 18.0, 20.0, 30.0, 100.0, 300.0):
         expected = [np.interp(1 / f, zoom.knots, column) for column in zoom.parameters.T]
         close(zoom(jnp.asarray(f)), expected)
 
 
 def test_a_table_in_f_has_its_entries_spread_over_the_focal_lengths():
-    zoom = with_random_parameters(zj.TableZoom(number=3, inverse=False))
+    zoom = with_random_parameters(zj.models.TableZoom(number=3, inverse=False))
     np.testing.assert_array_equal(zoom.knots, FOCAL[[0, 2, 5]])
     close(zoom(jnp.asarray(100.0)), [np.interp(100, zoom.knots, column) for column in zoom.parameters.T])
 
 
 @pytest.mark.parametrize("number", [None, 2, 3])
 def test_a_spline_is_the_natural_one_of_scipy(number):
-    zoom = with_random_parameters(zj.SplineZoom(number))
+    zoom = with_random_parameters(zj.models.SplineZoom(number))
     spline = scipy.interpolate.CubicSpline(zoom.knots, zoom.parameters, bc_type="natural")
     for f in (18.0, 19.0, 28.0, 60.0, 200.0):
         np.testing.assert_allclose(zoom(jnp.asarray(f)), spline(1 / f), rtol=1e-12, atol=1e-13)
 
 
 def test_a_spline_goes_on_straight_beyond_its_ends():
-    zoom = with_random_parameters(zj.SplineZoom())
+    zoom = with_random_parameters(zj.models.SplineZoom())
     inside, end, outside = (np.asarray(zoom(jnp.asarray(1 / (1 / 18 + d)))) for d in (-1e-7, 0.0, 0.01))
     np.testing.assert_allclose((outside - end) / 0.01, (end - inside) / 1e-7, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("model", [zj.TableZoom(), zj.SplineZoom(), zj.PowerZoom()], ids=str)
+@pytest.mark.parametrize(
+    "model", [zj.models.TableZoom(), zj.models.SplineZoom(), zj.models.PowerZoom()], ids=str
+)
 def test_models_are_differentiable_in_the_focal_length(model):
     zoom = with_random_parameters(model)
     slope = jax.jacfwd(zoom)(jnp.asarray(28.0))
@@ -186,7 +188,7 @@ def test_models_are_differentiable_in_the_focal_length(model):
 
 
 def test_two_regions_are_two_quadratics():
-    zoom = with_random_parameters(zj.TwoRegionZoom(30.0))
+    zoom = with_random_parameters(zj.models.TwoRegionZoom(30.0))
     for f, rows in ((24.0, slice(0, 3)), (70.0, slice(3, 6))):
         u = 18.0 / f
         close(zoom(jnp.asarray(f)), np.array([1, u, u * u]) @ np.asarray(zoom.parameters)[rows])
@@ -194,12 +196,12 @@ def test_two_regions_are_two_quadratics():
 
 def test_the_crossover_is_where_k1_is_zero():
     inverse = 1 / FOCAL
-    crossover = zj.barrel_crossover(FOCAL[::-1], (3 * (inverse - 1 / 30.0))[::-1])
+    crossover = zj.models.barrel_crossover(FOCAL[::-1], (3 * (inverse - 1 / 30.0))[::-1])
     assert crossover == pytest.approx(30.0)
     with pytest.raises(ValueError, match="one sign throughout"):
-        zj.barrel_crossover(FOCAL, inverse)
+        zj.models.barrel_crossover(FOCAL, inverse)
 
 
 def test_two_regions_without_a_crossover_say_where_to_get_it():
     with pytest.raises(ValueError, match="barrel_crossover"):
-        zj.TwoRegionZoom().prepare(FOCAL, 1)
+        zj.models.TwoRegionZoom().prepare(FOCAL, 1)

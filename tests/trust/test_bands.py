@@ -42,14 +42,14 @@ def test_bands_hold_the_truth_as_often_as_they_say(correlation, draws, slack):
 def test_std_of_coefficients_is_that_of_the_polynomial(fit):
     """``phi C phi^T``, written out for the polynomial's parameters, row by row."""
     covariance = np.asarray(fit.covariance).reshape(3, 2, 3, 2)
-    for f, std in zip(FOCAL, zj.coefficient_std(fit, FOCAL), strict=True):
+    for f, std in zip(FOCAL, zj.trust.coefficient_std(fit, FOCAL), strict=True):
         phi = (float(fit.lens.zoom.focal_ref) / f) ** np.arange(3)
         expected = np.sqrt(np.einsum("a,aibi,b->i", phi, covariance, phi))
         np.testing.assert_allclose(std, expected, rtol=1e-9)
 
 
 def test_displacement_is_uncertain_along_the_radius(fit):
-    covariance = np.asarray(zj.displacement_covariance(fit, POINTS, focal=FOCAL))
+    covariance = np.asarray(zj.trust.displacement_covariance(fit, POINTS, focal=FOCAL))
     std = np.asarray(zj.displacement_std(fit, POINTS, focal=FOCAL))
     assert covariance.shape == (3, 2, 2)
     for point, matrix, sigma in zip(POINTS, covariance, std, strict=True):
@@ -72,11 +72,11 @@ def test_displacement_std_is_that_of_lenses_drawn_from_the_covariance(fit, rng):
 
 
 def test_shapes_broadcast(fit):
-    assert zj.coefficient_std(fit, 50.0).shape == (2,)
-    assert zj.coefficient_std(fit, np.full((4, 5), 50.0)).shape == (4, 5, 2)
+    assert zj.trust.coefficient_std(fit, 50.0).shape == (2,)
+    assert zj.trust.coefficient_std(fit, np.full((4, 5), 50.0)).shape == (4, 5, 2)
     assert zj.displacement_std(fit, POINTS[0], focal=50.0).shape == ()
     assert zj.displacement_std(fit, POINTS[:, None], focal=FOCAL[:2]).shape == (3, 2)
-    assert zj.displacement_covariance(fit, POINTS[:, None], focal=FOCAL[:2]).shape == (3, 2, 2, 2)
+    assert zj.trust.displacement_covariance(fit, POINTS[:, None], focal=FOCAL[:2]).shape == (3, 2, 2, 2)
 
 
 def test_band_is_about_the_outward_displacement(fit):
@@ -95,13 +95,15 @@ def test_std_of_anything_covers_the_inverse(fit):
     distortion = fit.lens(30.0)
     point = jnp.array([1000.0, 800.0])
     seen = distortion.distort(point)
-    std = zj.std_of(fit, lambda lens: lens(30.0).distort(point))
-    covariance = zj.displacement_covariance(fit, seen, focal=30.0)
+    std = zj.trust.std_of(fit, lambda lens: lens(30.0).distort(point))
+    covariance = zj.trust.displacement_covariance(fit, seen, focal=30.0)
     back = jnp.linalg.inv(jax.jacfwd(distortion.undistort)(seen))
     np.testing.assert_allclose(std, jnp.sqrt(jnp.diag(back @ covariance @ back.T)), rtol=1e-9)
 
 
-@pytest.mark.parametrize("zoom", [zj.TableZoom(number=3), zj.SplineZoom(number=3), zj.PowerZoom()])
+@pytest.mark.parametrize(
+    "zoom", [zj.models.TableZoom(number=3), zj.models.SplineZoom(number=3), zj.models.PowerZoom()]
+)
 def test_bands_of_every_zoom_model(zoom, small):
     fit = zj.fit_zoom(small, zoom=zoom)
     std = zj.displacement_std(fit, np.zeros(2), focal=FOCAL)
@@ -121,13 +123,13 @@ def test_centre_is_certain_and_has_a_gradient(fit):
 
 def test_what_is_not_determined_is_infinite(fit):
     unknown = eqx.tree_at(lambda fit: fit.covariance, fit, jnp.where(jnp.eye(6, dtype=bool), jnp.inf, 0.0))
-    assert np.isposinf(zj.coefficient_std(unknown, FOCAL)).all()
+    assert np.isposinf(zj.trust.coefficient_std(unknown, FOCAL)).all()
     assert np.isposinf(zj.displacement_std(unknown, POINTS, focal=FOCAL)).all()
     low, high = zj.displacement_band(unknown, POINTS, focal=FOCAL)
     assert np.isneginf(low).all()
     assert np.isposinf(high).all()
     assert zj.displacement_std(unknown, unknown.lens.centre, focal=50.0) == 0
-    covariance = zj.displacement_covariance(unknown, POINTS[0], focal=50.0)
+    covariance = zj.trust.displacement_covariance(unknown, POINTS[0], focal=50.0)
     np.testing.assert_array_equal(covariance, [[np.inf, 0], [0, np.inf]])
 
 
@@ -164,8 +166,8 @@ def test_bands_are_never_narrower_than_rounding_allows(dtype, truth):
         assert (std > least).all()
         assert ((high - low) / 2 > least).all()
         assert (
-            jnp.diagonal(zj.displacement_covariance(fit, corner, focal=focal), axis1=-2, axis2=-1) > 0
+            jnp.diagonal(zj.trust.displacement_covariance(fit, corner, focal=focal), axis1=-2, axis2=-1) > 0
         ).all()
-        assert (zj.coefficient_std(fit, focal) > 0.5 * zj.coefficient_std(one, focal[:1])).all()
+        assert (zj.trust.coefficient_std(fit, focal) > 0.5 * zj.trust.coefficient_std(one, focal[:1])).all()
         outcomes.append(float(std[0]))
     assert outcomes[0] < 10 * least  # and of use where there are digits left

@@ -74,13 +74,13 @@ def test_bound_is_that_of_the_whole_information(lens, scene, rng):
     inverse = np.linalg.inv(np.linalg.qr(design / np.linalg.norm(design, axis=0), mode="r"))
     inverse = inverse / np.linalg.norm(design, axis=0)[:, None]
     expected = (inverse @ inverse.T)[:6, :6]
-    np.testing.assert_allclose(zj.cramer_rao(lens, scene, std=std), expected, rtol=1e-6)
+    np.testing.assert_allclose(zj.trust.cramer_rao(lens, scene, std=std), expected, rtol=1e-6)
 
 
 def test_bound_grows_with_the_noise(lens, scene):
-    one, three = (float(zj.displacement_bound(lens, scene, std=std)) for std in (1, 3.0))
+    one, three = (float(zj.trust.displacement_bound(lens, scene, std=std)) for std in (1, 3.0))
     assert three == pytest.approx(3 * one, rel=1e-8)
-    alike = zj.displacement_bound(lens, scene, std=np.full(len(scene.frame), 3.0))
+    alike = zj.trust.displacement_bound(lens, scene, std=np.full(len(scene.frame), 3.0))
     assert float(alike) == pytest.approx(three, rel=1e-8)
 
 
@@ -88,18 +88,20 @@ def test_padding_and_weights_change_nothing(lens, scene):
     padded = moved(scene, jnp.where(scene.mask[..., None], scene.points, jnp.nan))
     weighted = padded.weighted(np.linspace(0, 1, len(scene.frame)))
     np.testing.assert_array_equal(
-        zj.cramer_rao(lens, weighted, std=1.0), zj.cramer_rao(lens, scene, std=1.0)
+        zj.trust.cramer_rao(lens, weighted, std=1.0), zj.trust.cramer_rao(lens, scene, std=1.0)
     )
 
 
 def test_bound_of_displacements_is_that_of_the_parameters(lens, scene):
     """In the mean over draws from the covariance, the error of the field is the bound."""
     flat, unravel = ravel_pytree(lens.zoom.parameters)
-    covariance = zj.cramer_rao(lens, scene, std=0.1)
+    covariance = zj.trust.cramer_rao(lens, scene, std=0.1)
     root = jnp.linalg.cholesky(covariance)
     # Directions instead of draws: the six columns of the root have the covariance's sum of squares.
-    squares = [zj.displacement_rms(lens, with_zoom(lens, unravel(flat + step))) ** 2 for step in root.T]
-    bound = zj.displacement_bound(lens, scene, std=0.1)
+    squares = [
+        zj.trust.displacement_rms(lens, with_zoom(lens, unravel(flat + step))) ** 2 for step in root.T
+    ]
+    bound = zj.trust.displacement_bound(lens, scene, std=0.1)
     assert float(jnp.sqrt(sum(squares))) == pytest.approx(float(bound), rel=1e-9)
 
 
@@ -111,26 +113,26 @@ def test_displacement_rms_is_that_of_a_dense_grid(lens):
     focal = 1 / (low + (high - low) * (np.arange(40) + 0.5) / 40)
     apart = [np.asarray(lens(f).undistort(grid) - other(f).undistort(grid)) for f in focal]
     expected = np.sqrt(np.mean(np.sum(np.square(apart), axis=-1)))
-    assert float(zj.displacement_rms(lens, other)) == pytest.approx(expected, rel=1e-3)
+    assert float(zj.trust.displacement_rms(lens, other)) == pytest.approx(expected, rel=1e-3)
 
 
 def test_lines_through_the_centre_bound_nothing(lens):
     t = np.linspace(0, 200, 20)[:, None]
     points = [np.asarray(lens.centre) + t * np.array([np.cos(a), np.sin(a)]) for a in (0.3, 1.1, 2.0)]
     lines = zj.Lines.from_ragged(points, [0, 1, 2], [25, 50, 100], image_size=lens.image_size)
-    covariance = np.asarray(zj.cramer_rao(lens, lines, std=1.0))
+    covariance = np.asarray(zj.trust.cramer_rao(lens, lines, std=1.0))
     assert np.isinf(covariance.diagonal()).all()
-    assert np.isinf(zj.displacement_bound(lens, lines, std=1.0))
+    assert np.isinf(zj.trust.displacement_bound(lens, lines, std=1.0))
 
 
 def test_fits_come_near_the_bound(lens, scene):
     """By their own sandwich: no weights beat the bound, and eq. 13's cost less than a tenth."""
     small = zj.compress(scene)
-    bound = zj.cramer_rao(lens, scene, std=1.0)
-    least = zj.displacement_bound(lens, scene, std=1.0)
+    bound = zj.trust.cramer_rao(lens, scene, std=1.0)
+    least = zj.trust.displacement_bound(lens, scene, std=1.0)
     flat, unravel = ravel_pytree(lens.zoom.parameters)
     for alike in (jnp.ones_like(small.counts), small.counts):  # lines, or points, of a frame
-        lines = zj.in_image(small.weighted(alike))
+        lines = zj.fit.in_image(small.weighted(alike))
         weights = line_weights(lines)
         _, jacobian = eqx.filter_jit(linearised)(lines, lens.zoom)
         inverse = jnp.linalg.inv(jnp.einsum("lri,lrj->ij", jacobian, jacobian))
@@ -138,19 +140,21 @@ def test_fits_come_near_the_bound(lens, scene):
         ratio = jnp.linalg.eigvals(jnp.linalg.solve(bound, covariance)).real
         assert (ratio > 0.99).all()  # the sandwich takes the stretch to be the same along a line
         root = jnp.linalg.cholesky(covariance)
-        squares = [zj.displacement_rms(lens, with_zoom(lens, unravel(flat + step))) ** 2 for step in root.T]
+        squares = [
+            zj.trust.displacement_rms(lens, with_zoom(lens, unravel(flat + step))) ** 2 for step in root.T
+        ]
         assert jnp.sqrt(sum(squares)) < 1.1 * least
 
 
 def test_float32_stays_float32(lens, scene):
     single = jax.tree.map(lambda a: a.astype(jnp.float32) if eqx.is_inexact_array(a) else a, (lens, scene))
-    bound = zj.displacement_bound(*single, std=0.5)
+    bound = zj.trust.displacement_bound(*single, std=0.5)
     assert bound.dtype == jnp.float32
-    assert float(bound) == pytest.approx(float(zj.displacement_bound(lens, scene, std=0.5)), rel=1e-2)
+    assert float(bound) == pytest.approx(float(zj.trust.displacement_bound(lens, scene, std=0.5)), rel=1e-2)
 
 
 @pytest.mark.parametrize("std", [0.0, -0.5, np.nan, np.inf, "one is 0", "one is negative", "too few"])
-@pytest.mark.parametrize("bound", [zj.cramer_rao, zj.displacement_bound])
+@pytest.mark.parametrize("bound", [zj.trust.cramer_rao, zj.trust.displacement_bound])
 def test_errors_of_points_that_are_none_are_refused(bound, std, clean, truth, unchecked):
     """A negative one was taken for a positive, and 0 said that the lines determine nothing."""
     each = np.full(len(clean.frame), 0.5)

@@ -16,14 +16,16 @@ from zoomjax.trust.folds import HoldOut, folds_of
 from zoomjax.trust.selection import compare, default_candidates
 
 FOCALS = 7
-POLYNOMIALS = [zj.Candidate(zj.PolynomialZoom(degree=d), terms) for terms in (1, 2) for d in (0, 1, 2, 3)]
+POLYNOMIALS = [
+    zj.trust.Candidate(zj.PolynomialZoom(degree=d), terms) for terms in (1, 2) for d in (0, 1, 2, 3)
+]
 MODELS = {
     "polynomial": (zj.PolynomialZoom(degree=2), 2),
     "one term": (zj.PolynomialZoom(degree=1), 1),
     "prior": (zj.SmoothZoom(), 2),
-    "table": (zj.TableZoom(), 2),
-    "spline": (zj.SplineZoom(number=4), 2),
-    "not linear": (zj.PowerZoom(), 1),
+    "table": (zj.models.TableZoom(), 2),
+    "spline": (zj.models.SplineZoom(number=4), 2),
+    "not linear": (zj.models.PowerZoom(), 1),
 }
 every_model = pytest.mark.parametrize(("zoom", "terms"), MODELS.values(), ids=MODELS)
 
@@ -232,7 +234,7 @@ def test_the_summary_is_json(selection):
 
 
 def test_a_prior_makes_parameters_fewer(lines):
-    verdict, *_ = compared(lines, [zj.Candidate(zj.SmoothZoom())])[0]
+    verdict, *_ = compared(lines, [zj.trust.Candidate(zj.SmoothZoom())])[0]
     assert 4 < verdict.parameters < 14
 
 
@@ -240,7 +242,7 @@ def test_what_cannot_be_fitted_is_in_the_table_with_the_reason(lines):
     many, left, terms = (
         zj.PolynomialZoom(degree=7),
         zj.PolynomialZoom(degree=6),
-        zj.Candidate(zj.PolynomialZoom(degree=1), 4),
+        zj.trust.Candidate(zj.PolynomialZoom(degree=1), 4),
     )
     selection = zj.select_model(lines, [many, left, terms, zj.PolynomialZoom(degree=2)])
     problems = [v.problem for v in selection.verdicts]
@@ -300,7 +302,7 @@ def test_other_types_are_told(lines):
     with pytest.raises(TypeError, match="must be Lines"):
         zj.select_model(np.zeros(3))  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="without in_image"):
-        zj.select_model(zj.in_image(lines))
+        zj.select_model(zj.fit.in_image(lines))
     with pytest.raises(TypeError, match="zoom model"):
         zj.select_model(lines, ["quadratic"])  # pyright: ignore[reportArgumentType]
 
@@ -320,22 +322,24 @@ def test_frames_that_cannot_be_left_out_are_nan(lines):
 def test_families_are_compared(scene):
     """A lens that the division model describes, and the polynomial not so well, with one term each."""
     zoom = zj.PolynomialZoom(1, jnp.array([[0.0], [-0.25]]), jnp.asarray(20.0))
-    lens = zj.ZoomLens(zoom, scene.centre, jnp.array([20.0, 80.0]), scene.image_size, family=zj.Division())
+    lens = zj.ZoomLens(
+        zoom, scene.centre, jnp.array([20.0, 80.0]), scene.image_size, family=zj.models.Division()
+    )
     focal = np.array([20.0, 28.0, 45.0, 80.0])
     bent = scenes.board_lines(lens, focal, spacing=150, noise=0.05)
     candidates = [
-        zj.Candidate(zj.PolynomialZoom(degree=1), 1, family)
-        for family in (zj.RadialPolynomial(), zj.Division())
+        zj.trust.Candidate(zj.PolynomialZoom(degree=1), 1, family)
+        for family in (zj.models.RadialPolynomial(), zj.models.Division())
     ]
     selection = zj.select_model(bent, candidates, hold_out="line", folds=3)
     assert selection.chosen.name == "Division, degree 1, 1 term"
-    assert isinstance(selection.fit.lens.family, zj.Division)
+    assert isinstance(selection.fit.lens.family, zj.models.Division)
     assert selection.verdicts[0].held_out > 1.5 * selection.verdicts[1].held_out
     np.testing.assert_allclose(selection.fit.lens.zoom.parameters, zoom.parameters, atol=0.01)
 
 
 def test_a_family_that_the_triangles_do_not_serve_says_so(lines):
-    candidates = [zj.PolynomialZoom(), zj.Candidate(zj.PolynomialZoom(), 1, zj.Division())]
+    candidates = [zj.PolynomialZoom(), zj.trust.Candidate(zj.PolynomialZoom(), 1, zj.models.Division())]
     _, verdict = zj.select_model(lines, candidates, hold_out="line", folds=2).verdicts
     assert "compress(lines, terms=8)" in verdict.problem
 

@@ -24,7 +24,6 @@ from .outlier_points import reject_points as reject_points
 from .result import RESULTS as RESULTS
 from .result import FrameFits as FrameFits
 from .result import ZoomFit as ZoomFit
-from .result import lens_of as lens_of
 from .robust import RobustFit as RobustFit
 from .robust import fit_robust as fit_robust
 from .straightness import frame_rms as frame_rms

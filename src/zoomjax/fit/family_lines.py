@@ -127,7 +127,8 @@ def with_family(lines: AbstractLines, family: AbstractFamily) -> AbstractLines:
 
     Example:
         >>> import jax.numpy as jnp, numpy as np
-        >>> from zoomjax import Division, frame_rms
+        >>> from zoomjax.models import Division
+        >>> from zoomjax import frame_rms
         >>> row = np.stack([np.arange(500.0), np.full(500, 20.0)], axis=-1)
         >>> lines = Lines.from_ragged([row], [0], [24], image_size=(640, 480))
         >>> frame_rms(with_family(lines, Division()), jnp.array([[-0.1]])).shape
@@ -151,7 +152,8 @@ def compress_family(lines: Lines, family: AbstractFamily, *, terms: int = 2) -> 
 
     Example:
         >>> import numpy as np
-        >>> from zoomjax import Division, PolynomialZoom, fit_zoom
+        >>> from zoomjax.models import Division
+        >>> from zoomjax import PolynomialZoom, fit_zoom
         >>> t = np.linspace(0.0, 479.0, 50)
         >>> bent = [np.stack([x + (t / 240 - 1) ** 2, t], axis=-1) for x in (9, 30, 599)]
         >>> lines = Lines.from_ragged(bent, [0] * 3, [50], image_size=(640, 480))

@@ -68,7 +68,7 @@ def register_model(cls: Any = None, *, name: str | None = None) -> Any:
     Example:
         >>> from typing import ClassVar
         >>> import jax.numpy as jnp
-        >>> from zoomjax import AbstractLinearZoom
+        >>> from zoomjax.models import AbstractLinearZoom
         >>> @register_model
         ... class ConstantZoom(AbstractLinearZoom):
         ...     formula: ClassVar[str] = "k_i(f) = parameters[0][i-1]"
@@ -170,7 +170,7 @@ def _class_named(name: Any, table: dict[str, Any], kind: str) -> Any:
     if not isinstance(name, str) or name not in table:
         raise ValueError(
             f"its {kind}, {name!r}, is unknown: import the module that registers it by "
-            "zoomjax.register_model, or update zoomjax"
+            "zoomjax.models.register_model, or update zoomjax"
         )
     return table[name]
 
@@ -181,7 +181,7 @@ def _name_of(model: AbstractZoom | AbstractFamily, table: dict[str, Any]) -> str
             return name
     raise TypeError(
         f"A lens with a {type(model).__name__} cannot be saved: register the class by "
-        "zoomjax.register_model, before it is saved and before it is loaded."
+        "zoomjax.models.register_model, before it is saved and before it is loaded."
     )
 
 
