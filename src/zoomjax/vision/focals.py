@@ -19,6 +19,7 @@ from ..fit import fit_frames
 from ..focal import FocalEstimate, focal_from_board, focal_from_planes
 from ..io.focal_table import read_focal_table
 from ..io.focal_track import read_focal_track
+from ..io.text_table import plain_number
 from ..lines import Lines
 from ..radial import Distortion
 from ..robust import fit_robust
@@ -174,11 +175,8 @@ def _own(detections: Sequence[Detection]) -> dict[str, float]:
 
 
 def _number(text: str) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    if not (np.isfinite(value) and value > 0):
+    value = plain_number(text)
+    if value is not None and value <= 0:
         raise ValueError(f"--focal must be a positive number, but it is {text}.")
     return value
 

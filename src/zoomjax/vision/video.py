@@ -36,10 +36,11 @@ _MOST_ERRORS = 1000
 @contextlib.contextmanager
 def decode_video(
     source: str | os.PathLike[str],
-) -> Iterator[tuple[int, Iterator[tuple[float, Callable[[], np.ndarray]]]]]:
-    """The number of frames by the file's own account, and for each its time, s, and what decodes them.
+) -> Iterator[tuple[int, Iterator[tuple[int, float, Callable[[], np.ndarray]]]]]:
+    """The number of frames by the file's own account, and for each number, time, s, and what decodes it.
 
-    The time is NaN where the file has none: the rate that FFmpeg then tells is a guess.
+    Numbers count damaged frames, too. The time is NaN where the file has none: the rate that FFmpeg then
+    tells is a guess.
 
     Pixels are (height, width, 3) blue, green, red bytes, as stored: before any rotation for display.
     Damaged frames are passed over.
@@ -52,16 +53,10 @@ def decode_video(
         video = input_.streams.best("video")
         report = _Report(video.frames)
 
-        def frames() -> Iterator[tuple[float, Callable[[], np.ndarray]]]:
-            first: float | None = None
-            for item in _decoded(input_, video, report):
-                if not isinstance(item, av.VideoFrame):
-                    continue
-                time = math.nan if item.time is None else float(item.time)
-                if first is None:
-                    first = 0.0 if math.isnan(time) else time
-                    _warn_of_fields(item)
-                yield time - first, functools.partial(item.to_ndarray, format="bgr24")
+        def frames() -> Iterator[tuple[int, float, Callable[[], np.ndarray]]]:
+            for item, number, time in _numbered(_decoded(input_, video, report), report, source):
+                if isinstance(item, av.VideoFrame):
+                    yield number, time, functools.partial(item.to_ndarray, format="bgr24")
 
         yield video.frames or _counted(source), frames()
 
@@ -141,8 +136,7 @@ def undistort_video(
             framing = _common_framing(lens, track.focal, keep)
         warper = FrameWarper(lens, framing, interpolation=interpolation, border=border)
         report = _Report(video.frames)
-        numbers = functools.cache(lambda: _numbers(source))
-        items = ahead(_warped(ahead(_decoded(input_, video, report)), warper, track, report, numbers))
+        items = ahead(_warped(ahead(_decoded(input_, video, report)), warper, track, report, source))
         try:
             _write(items, part, target, input_, video, encoder, options, report, progress)
         finally:
@@ -271,29 +265,41 @@ def _warped(
     warper: FrameWarper,
     track: FocalTrack,
     report: _Report,
-    numbers: Callable[[], dict[int, int]],
+    source: str | os.PathLike[str],
 ) -> Generator[Any, None, None]:
-    """Each frame corrected; packets of audio as they are.
-
-    Frames are counted; once some did not decode, `numbers` tells the number of a frame by its time stamp.
-    """
-    number, first = 0, None
+    """Each frame corrected; packets of audio as they are."""
     try:
-        for item in items:
-            if not isinstance(item, av.VideoFrame):
+        for item, number, time in _numbered(items, report, source):
+            if isinstance(item, av.VideoFrame):
+                if report.orientation is None:
+                    report.orientation = display_matrix(item)
+                yield warper(item, track.at(number, time))
+            else:
                 yield item
-                continue
-            if first is None:
-                first = item.time or 0.0
-                _warn_of_fields(item)
-                report.orientation = display_matrix(item)
-            time = math.nan if item.time is None else item.time - first
-            if report.failed and not track.by_time and item.pts is not None:
-                number = numbers().get(item.pts, number)
-            yield warper(item, track.at(number, time))
-            number += 1
     finally:
         items.close()
+
+
+def _numbered(
+    items: Iterable[Any], report: _Report, source: str | os.PathLike[str]
+) -> Iterator[tuple[Any, int, float]]:
+    """Each frame with its number and time since the first, s, NaN if unknown; other packets as they are.
+
+    Frames are counted. Once some did not decode, time stamps tell the numbers of the others.
+    """
+    number, first, stamps = 0, None, None
+    for item in items:
+        if not isinstance(item, av.VideoFrame):
+            yield item, -1, math.nan
+            continue
+        if first is None:
+            first = item.time or 0.0
+            _warn_of_fields(item)
+        if report.failed and item.pts is not None:
+            stamps = _numbers(source) if stamps is None else stamps
+            number = stamps.get(item.pts, number)
+        yield item, number, math.nan if item.time is None else item.time - first
+        number += 1
 
 
 def _warn_of_fields(frame: Any) -> None:
