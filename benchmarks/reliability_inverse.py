@@ -107,9 +107,8 @@ def check(distortion: Distortion, radius: np.ndarray, angle: np.ndarray, compile
     reachable = np.isfinite(np.asarray(corrected)).all(axis=1)
     # What is found must be corrected to the same place, in extended precision, and lie within the fold.
     wide = back.astype(np.longdouble)
-    again = distortion.family.correct(
-        wide, (wide**2).sum(axis=1), np.asarray(distortion.coefficients).astype(np.longdouble)
-    )
+    k = np.asarray(distortion.coefficients).astype(np.longdouble)
+    again = np.stack(distortion.family.correct((wide[:, 0], wide[:, 1]), (wide**2).sum(axis=1), k), axis=1)
     rho = np.hypot(*np.asarray(corrected).astype(np.longdouble).T)
     r = np.hypot(*wide.T)
     slope = _steepness(distortion, np.asarray(r, float))

@@ -66,7 +66,9 @@ def test_without_a_focal_length_the_ways_are_named(way, message):
         ("focal.txt", ValueError, "which is no way"),
         ("-3", ValueError, "positive number"),
         ("0", ValueError, "positive number"),
-        ("nan", ValueError, "positive number"),
+        ("nan", ValueError, "which is no way"),
+        ("1_000", ValueError, "which is no way"),
+        ("20,5", ValueError, "which is no way"),
         ("nothing.csv", FileNotFoundError, r"nothing\.csv"),
     ],
 )

@@ -463,6 +463,7 @@ def test_a_lens_of_a_rivals_kind_comes_back(model, truth, lens):
 
 MISTAKES = {
     "terms of zero": ({"terms": 0}, ValueError, "terms must be an integer of at least 1, but it is 0"),
+    "terms beyond those of a lens": ({"terms": 5}, ValueError, "terms must be at most 4, but it is 5"),
     "terms with a fraction": ({"terms": 2.0}, ValueError, "but it is 2.0"),
     "terms in words": ({"terms": "2"}, ValueError, "but it is '2'"),
     "a degree for a model": (

@@ -117,7 +117,7 @@ def least_slope(family, zoom):
 
     def least(f):
         k = zoom(f)
-        jacobian = jax.vmap(jax.jacfwd(lambda z: family.correct(z, z @ z, k)))(z)
+        jacobian = jax.vmap(jax.jacfwd(lambda z: jnp.stack(family.correct((z[0], z[1]), z @ z, k))))(z)
         values = jnp.linalg.eigvalsh((jacobian + jacobian.mT) / 2)
         if isinstance(family, zj.models.Division):  # its slope's numerator, and the divisor
             factor = family.factor(jnp.sum(z**2, axis=1), k)

@@ -88,10 +88,9 @@ def board_of(pitch: str | None, distance: float | None, pixel: float | None) -> 
 
 def _positive(text: str) -> float:
     """The number, or 0 if it is none or not positive."""
-    try:
-        return max(float(text), 0.0)
-    except ValueError:
-        return 0.0
+    from ..io.text_table import plain_number
+
+    return max(plain_number(text) or 0.0, 0.0)
 
 
 def refuse_to_replace(job: "ImageJob", output: Path) -> None:

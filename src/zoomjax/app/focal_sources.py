@@ -22,6 +22,7 @@ from ..focal.estimate import FocalEstimate
 from ..focal.plane import focal_from_planes
 from ..io.focal_table import read_focal_table
 from ..io.focal_track import read_focal_track
+from ..io.text_table import plain_number
 from ..lines.compressed import compress
 from ..lines.lines import Lines
 from ..models.distortion import Distortion
@@ -176,11 +177,8 @@ def _own(detections: Sequence[Detection]) -> dict[str, float]:
 
 
 def _number(text: str) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    if not (np.isfinite(value) and value > 0):
+    value = plain_number(text)
+    if value is not None and value <= 0:
         raise ValueError(f"--focal must be a positive number, but it is {text}.")
     return value
 

@@ -16,6 +16,7 @@ from .._core.text import numbered_name, plain
 from ..detect.batch import DETECTORS, Detection, detect
 from ..detect.sources import VIDEO_SUFFIXES, Source, find_photos, video_frames
 from ..io.focal_track import FocalTrack, read_focal_track
+from ..io.text_table import plain_number
 from .calibration import CLEARS, FILES, Calibration, calibrate, focal_sigmas
 from .focal_sources import Board, Focals, check_way, choose_focals, lines_of
 from .overlay import draw_lines
@@ -102,10 +103,8 @@ class ImageJob:
         """Of a video; 1 where its own frames tell."""
         if self.focal in (None, "plane", "board"):
             return 1.0
-        try:
-            return float(self.focal)
-        except ValueError:
-            return read_focal_track(self.focal)
+        number = plain_number(self.focal)
+        return read_focal_track(self.focal) if number is None else number
 
 
 @dataclasses.dataclass(frozen=True)

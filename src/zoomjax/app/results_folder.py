@@ -62,7 +62,8 @@ def results_folder(
             part = _begun(folder)
             try:
                 with locked(part):
-                    _check(folder, names, overwrite)
+                    with locked(folder, wait=True):  # or another process's list would be of other files
+                        _check(folder, names, overwrite)
                     (part / "new").mkdir()
                     yield part / "new"
                     _publish(part, folder, clears, overwrite)

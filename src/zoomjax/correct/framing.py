@@ -203,7 +203,8 @@ def _outline(distortion: Distortion, image_size: tuple[int, int], inset: float) 
     scale = float(distortion.scale)
     squared = np.sum((away / scale) ** 2, axis=1)
     k = np.asarray(distortion.coefficients, float)
-    return centre + scale * distortion.family.correct(away / scale, squared, k)
+    x, y = (away / scale).T
+    return centre + scale * np.stack(distortion.family.correct((x, y), squared, k), axis=1)
 
 
 def _clearance(apart: np.ndarray) -> float:

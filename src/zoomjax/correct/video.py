@@ -6,9 +6,7 @@ audio packets as they are.
 """
 
 import dataclasses
-import functools
 import itertools
-import math
 import os
 import warnings
 from collections.abc import Callable, Generator, Iterable
@@ -20,7 +18,7 @@ import numpy as np
 from .._core.files import refuse_inputs, whole_file
 from ..io.focal_track import FocalTrack
 from ..io.pyav import av
-from ..io.video_reader import Report, decoded_items, frame_numbers, opened_video, warn_of_fields
+from ..io.video_reader import Report, decoded_items, numbered, opened_video
 from ..io.video_writer import CONTAINER, FrameWriter, display_matrix
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal, lens_for_size
@@ -105,8 +103,7 @@ def undistort_video(
             framing = _common_framing(lens, track.focal, keep)
         warper = FrameWarper(lens, framing, interpolation=interpolation, border=border)
         report = Report(video.frames)
-        numbers = functools.cache(lambda: frame_numbers(source))
-        items = ahead(_warped(ahead(decoded_items(input_, video, report)), warper, track, report, numbers))
+        items = ahead(_warped(ahead(decoded_items(input_, video, report)), warper, track, report, source))
         try:
             _write(items, part, target, input_, video, encoder, options, report, progress)
         finally:
@@ -156,27 +153,17 @@ def _warped(
     warper: FrameWarper,
     track: FocalTrack,
     report: Report,
-    numbers: Callable[[], dict[int, int]],
+    source: str | os.PathLike[str],
 ) -> Generator[Any, None, None]:
-    """Each frame corrected; packets of audio as they are.
-
-    Frames are counted; once some did not decode, `numbers` tells the number of a frame by its time stamp.
-    """
-    number, first = 0, None
+    """Each frame corrected; packets of audio as they are."""
     try:
-        for item in items:
-            if not isinstance(item, av.VideoFrame):
+        for item, number, time in numbered(items, report, source):
+            if isinstance(item, av.VideoFrame):
+                if report.orientation is None:
+                    report.orientation = display_matrix(item)
+                yield warper(item, track.at(number, time))
+            else:
                 yield item
-                continue
-            if first is None:
-                first = item.time or 0.0
-                warn_of_fields(item)
-                report.orientation = display_matrix(item)
-            time = math.nan if item.time is None else item.time - first
-            if report.failed and not track.by_time and item.pts is not None:
-                number = numbers().get(item.pts, number)
-            yield warper(item, track.at(number, time))
-            number += 1
     finally:
         items.close()
 

@@ -169,7 +169,7 @@ def video_frames(
         # From the first to the last; where not even the length is known, the first ones.
         wanted = set(np.linspace(0, (announced or number) - 1, number).round().astype(int).tolist())
         last = -1
-        for last, (time, image) in enumerate(frames):
+        for last, time, image in frames:
             if last not in wanted:
                 continue
             at = focal.at(last, time) if isinstance(focal, FocalTrack) else float(focal)

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.arguments import kinds_checked
+from .._core.checks import checked_terms
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines, compress
 from ..lines.lines import Lines
@@ -93,6 +94,7 @@ def algebraic_zoom(
         rectification", J. Math. Imaging Vis. 35 (2009): [9] of the paper.
     """
     model = PolynomialZoom() if zoom is None else zoom
+    terms = checked_terms(terms, lines.family.most_terms)
     focal, *focus = settings(model, lines)
     prepared = model.prepare(focal, terms, *focus)
     return _solve_zoom(compressed(lines, terms), prepared, terms)
@@ -101,6 +103,7 @@ def algebraic_zoom(
 @kinds_checked
 def algebraic_frames(lines: AbstractLines, *, terms: int = 2) -> Float[Array, "frame terms"]:
     """The normalised coefficients of each frame by itself, by the algebraic estimate."""
+    terms = checked_terms(terms, lines.family.most_terms)
     return _solve_frames(compressed(lines, terms), *lines.by_frame(), terms)
 
 

@@ -101,7 +101,9 @@ def residuals(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -
             f"shape is {coefficients.shape}."
         )
     distances = jax.vmap(line_residuals)(lines.corrected(coefficients[lines.frame]))
-    return jnp.sqrt(line_weights(lines))[:, None] * distances
+    weights = line_weights(lines)
+    counted = weights > 0  # the root has no derivative at 0
+    return jnp.where(counted, jnp.sqrt(jnp.where(counted, weights, 1)), 0)[:, None] * distances
 
 
 def settings(zoom: AbstractZoom, lines: AbstractLines) -> tuple[Float[AnyArray, "frame"], ...]:

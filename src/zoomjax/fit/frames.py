@@ -41,8 +41,8 @@ def fit_frames(
     Raises:
         RuntimeError: the solver failed on some frame, and `throw` is set.
     """
-    terms = checked_terms(terms)
     lines = lines if family is None else with_family(lines, family)
+    terms = checked_terms(terms, lines.family.most_terms)
     chosen, present = lines.by_frame()
     solver = default_solver(lines) if solver is None else solver
     start = algebraic_start(lines, terms)

@@ -18,7 +18,8 @@ def ready_model(lines, zoom, terms):
     """The model ready to be fitted to these lines, in their dtype, and its number of radial terms."""
     own = None if zoom.parameters is None else jax.eval_shape(coefficients_by, zoom, lines).shape[1]
     besides = lines.family.size(0)
-    terms = checked_terms((2 if own is None else own - besides) if terms is None else terms)
+    terms = (2 if own is None else own - besides) if terms is None else terms
+    terms = checked_terms(terms, lines.family.most_terms)
     if own not in (None, terms + besides):
         raise ValueError(
             f"Argument terms is {terms}, but the parameters of zoom are for {own - besides}: leave terms "

@@ -139,10 +139,11 @@ def _weights(lines, model, cut):
     """Tukey's weight of each line under a model; 0 for lines that are not there."""
     line_rms, median = _line_rms(lines, model)
     better = (line_rms <= median) & (lines.counts > 2)
-    spread = 1.4826 * jnp.nanmedian(jnp.where(better, median - line_rms, jnp.nan))
+    spread = 1.4826 * _median(median - line_rms, better)
     chance = median / jnp.sqrt(2 * jnp.maximum(lines.counts - 2, 1))
     spread = jnp.sqrt(jnp.maximum(spread, _LEAST_SPREAD * median) ** 2 + chance**2)
-    excess = jnp.maximum(line_rms - median, 0) / jnp.where(spread > 0, cut * spread, 1)
+    # 1/cut is 0 in the first turn: by an infinite cut the derivative would be 0 times infinity.
+    excess = (1 / cut) * jnp.maximum(line_rms - median, 0) / jnp.where(spread > 0, spread, 1)
     return jnp.where((excess < 1) & (lines.counts > 2), (1 - excess**2) ** 2, 0)
 
 
@@ -152,4 +153,12 @@ def _line_rms(lines, model):
     corrected = lines.corrected(coefficients_by(model, lines)[lines.frame])
     squares = jnp.sum(jax.vmap(line_residuals)(corrected) ** 2, axis=1)
     line_rms = jnp.sqrt(squares / jnp.maximum(lines.counts - 2, 1))
-    return line_rms, jnp.nanmedian(jnp.where(lines.counts > 2, line_rms, jnp.nan))
+    return line_rms, _median(line_rms, lines.counts > 2)
+
+
+def _median(values, counted):
+    """The median of those that are counted; NaN of none. Unlike `jnp.nanmedian` it has a derivative."""
+    ordered = jnp.sort(jnp.where(counted, values, jnp.inf))
+    number = jnp.sum(counted)
+    middle = (ordered[(number - 1) // 2] + ordered[number // 2]) / 2
+    return jnp.where(number > 0, middle, jnp.nan)

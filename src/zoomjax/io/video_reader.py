@@ -6,7 +6,7 @@ import functools
 import math
 import os
 import warnings
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,11 @@ _MOST_ERRORS = 1000
 @contextlib.contextmanager
 def decode_video(
     source: str | os.PathLike[str],
-) -> Iterator[tuple[int, Iterator[tuple[float, Callable[[], np.ndarray]]]]]:
-    """The number of frames by the file's own account, and for each its time, s, and what decodes them.
+) -> Iterator[tuple[int, Iterator[tuple[int, float, Callable[[], np.ndarray]]]]]:
+    """The number of frames by the file's own account, and for each number, time, s, and what decodes it.
 
-    The time is NaN where the file has none: the rate that FFmpeg then tells is a guess.
+    Numbers count damaged frames, too. The time is NaN where the file has none: the rate that FFmpeg then
+    tells is a guess.
 
     Pixels are (height, width, 3) blue, green, red bytes, as stored: before any rotation for display.
     Damaged frames are passed over.
@@ -37,16 +38,10 @@ def decode_video(
         video = input_.streams.best("video")
         report = Report(video.frames)
 
-        def frames() -> Iterator[tuple[float, Callable[[], np.ndarray]]]:
-            first: float | None = None
-            for item in decoded_items(input_, video, report):
-                if not isinstance(item, av.VideoFrame):
-                    continue
-                time = math.nan if item.time is None else float(item.time)
-                if first is None:
-                    first = 0.0 if math.isnan(time) else time
-                    warn_of_fields(item)
-                yield time - first, functools.partial(item.to_ndarray, format="bgr24")
+        def frames() -> Iterator[tuple[int, float, Callable[[], np.ndarray]]]:
+            for item, number, time in numbered(decoded_items(input_, video, report), report, source):
+                if isinstance(item, av.VideoFrame):
+                    yield number, time, functools.partial(item.to_ndarray, format="bgr24")
 
         yield video.frames or _counted(source), frames()
 
@@ -98,7 +93,7 @@ def _counted(source: str | os.PathLike[str]) -> int:
     return 0
 
 
-def frame_numbers(source: str | os.PathLike[str]) -> dict[int, int]:
+def _frame_numbers(source: str | os.PathLike[str]) -> dict[int, int]:
     """The numbers of all frames by their time stamps, also of those that do not decode: by reading."""
     stamps = set()
     with opened_video(source) as input_, contextlib.suppress(av.error.FFmpegError):
@@ -129,6 +124,28 @@ def decoded_items(input_: Any, video: Any, report: Report) -> Generator[Any, Non
         for frame in frames:
             report.corrupt += bool(frame.is_corrupt)
             yield frame
+
+
+def numbered(
+    items: Iterable[Any], report: Report, source: str | os.PathLike[str]
+) -> Iterator[tuple[Any, int, float]]:
+    """Each frame with its number and time since the first, s, NaN if unknown; other packets as they are.
+
+    Frames are counted. Once some did not decode, time stamps tell the numbers of the others.
+    """
+    number, first, stamps = 0, None, None
+    for item in items:
+        if not isinstance(item, av.VideoFrame):
+            yield item, -1, math.nan
+            continue
+        if first is None:
+            first = item.time or 0.0
+            warn_of_fields(item)
+        if report.failed and item.pts is not None:
+            stamps = _frame_numbers(source) if stamps is None else stamps
+            number = stamps.get(item.pts, number)
+        yield item, number, math.nan if item.time is None else item.time - first
+        number += 1
 
 
 def warn_of_fields(frame: Any) -> None:

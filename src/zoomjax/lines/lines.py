@@ -281,7 +281,7 @@ def corrected_points(
 def _correct_line(points, mask, k, centre, scale, family):
     """Corrected points of one line about their mean, px; zero where masked."""
     z = jnp.where(mask[:, None], (points - centre[None]) / scale, 0)
-    corrected = jax.vmap(family.correct, (0, 0, None))(z, jnp.sum(z * z, axis=1), k)
+    corrected = jnp.stack(family.correct((z[:, 0], z[:, 1]), jnp.sum(z * z, axis=1), k), axis=1)
     mean = jnp.sum(corrected, axis=0) / jnp.maximum(jnp.sum(mask), 1)
     return jnp.where(mask[:, None], scale * (corrected - mean[None]), 0)
 

@@ -5,10 +5,10 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.arrays import namespace, together
+from .._core.arrays import namespace
 from .._core.types import AnyArray, Elements
 from ._roots import until
-from .family import AbstractFamily, first_root, radial_factor, radial_orders, times
+from .family import AbstractFamily, Pair, first_root, radial_factor, radial_orders, times
 from .polynomial import RadialPolynomial
 
 _DIRECTIONS = 8
@@ -46,14 +46,12 @@ class BrownConrady(AbstractFamily):
         """2, 4, ..., 2N, 1, 1."""
         return np.append(2 * radial_orders(size - 2), [1, 1])
 
-    def correct(
-        self, z: Float[AnyArray, "... 2"], squared: Float[AnyArray, "..."], k: Elements
-    ) -> Float[AnyArray, "... 2"]:
+    def correct(self, z: Pair, squared: Float[AnyArray, "..."], k: Elements) -> Pair:
         """``z L(t) + t q + 2 (q.z) z``."""
         qx, qy = k[-1], k[-2]
-        x, y = z[..., 0], z[..., 1]
+        x, y = z
         factor = radial_factor(squared, k[:-2]) + 2 * (qx * x + qy * y)
-        return together(x * factor + squared * qx, y * factor + squared * qy)
+        return x * factor + squared * qx, y * factor + squared * qy
 
     def limit(self, k: Elements) -> Float[AnyArray, "..."]:
         """The first root of ``min(L, (r L)') - 6 |q| r``."""
@@ -66,16 +64,13 @@ class BrownConrady(AbstractFamily):
         rows[1, 1::2] = 2 * radial_orders(terms) + 1
         return first_root(rows, xp.concatenate(powers))
 
-    def distort(
-        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
-    ) -> Float[AnyArray, "... 2"]:
+    def distort(self, z: Pair, k: Elements, limit: Float[AnyArray, "..."]) -> Pair:
         """By Newton's method from the inverse without decentering; see `_solve`."""
-        xp = namespace(z, k)
-        finite = xp.all(xp.isfinite(z), axis=-1)
-        zx, zy = xp.where(finite, z[..., 0], 0), xp.where(finite, z[..., 1], 0)
-        x, y, found = self._solve(zx, zy, k, limit)
+        xp = namespace(*z, k)
+        finite = xp.isfinite(z[0]) & xp.isfinite(z[1])
+        x, y, found = self._solve(xp.where(finite, z[0], 0), xp.where(finite, z[1], 0), k, limit)
         found = finite & found
-        return together(xp.where(found, x, np.nan), xp.where(found, y, np.nan))
+        return xp.where(found, x, np.nan), xp.where(found, y, np.nan)
 
     def _solve(self, zx, zy, k, limit):
         """The point of the disc that is corrected to (zx, zy), and whether it was found.

@@ -9,7 +9,7 @@ Here are lengths in px, arrays of points and dtypes; formulas and inverses are t
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float
 
 from .._core.arguments import check_kind
 from .._core.arrays import aligned, as_array, finite, namespace, together
-from .._core.types import AnyArray, Points, traced
-from .family import AbstractFamily
+from .._core.types import AnyArray, Elements, Points, traced
+from .family import AbstractFamily, Pair
 from .polynomial import RadialPolynomial
 
 
@@ -148,11 +148,11 @@ def mapped(method: str, family: AbstractFamily, points: Any, k: Any, centre: Any
         with np.errstate(all="ignore"):  # NaN and inf are answers
             # With one more axis, as NumPy makes plain numbers of arrays without any.
             leaves = ((points, 1), (np.asarray(k), 1), (np.asarray(centre), 1), (np.asarray(scale), 0))
-            points, k, centre, scale = (leaf[None] for leaf in aligned(*leaves))
+            points, *distortion = (leaf[None] for leaf in aligned(*leaves))
             if method == "undistort":
-                return _undistorted(points, family, k, centre, scale)[0]
-            z, k, centre, scale = _normalised(points, k, centre, scale)
-            return _in_pixels(family.distort(z, k, _limit_of(family, k)), centre, scale)[0]
+                return _undistorted(points, family, *distortion)[0]
+            at = _normal(_apart(points), family, *distortion)
+            return together(*at.in_pixels(family.distort(at.z, at.k, at.limit)))[0]
     return compiled(method, _given, jnp.asarray(points), (family, k, centre, scale))
 
 
@@ -181,41 +181,60 @@ def _given(operands):
     return family, *map(jnp.asarray, numbers)
 
 
-def _normalised(points, k, centre, scale):
-    """Normalised points, coefficients (first axis), centre and scale; with axes that broadcast."""
-    leaves = ((points, 1), (k, 1), (centre, 1), (scale, 0))
-    points, k, centre, scale = aligned(*((leaf.astype(points.dtype), own) for leaf, own in leaves))
+class _Normal(NamedTuple):
+    """Points and a distortion, aligned: each array broadcasts with the others.
+
+    Coefficients, centre and scale have the shape of the points: each has then one sum over all points in a
+    gradient, and not one for each place where it is used. `limit` has that of the distortion.
+    """
+
+    z: Pair
+    k: Elements
+    limit: Any
+    centre: Pair
+    scale: Any
+
+    def in_pixels(self, z: Pair) -> Pair:
+        """Normalised points in px."""
+        return self.centre[0] + self.scale * z[0], self.centre[1] + self.scale * z[1]
+
+
+def _normal(points, family, k, centre, scale) -> _Normal:
+    """Of points (x, y) in px."""
+    leaves = ((points[0], 0), (points[1], 0), (k, 1), (centre, 1), (scale, 0))
+    x, y, k, centre, scale = aligned(*((leaf.astype(points[0].dtype), own) for leaf, own in leaves))
     xp = namespace(k)
     # JAX's know of symbolic shapes, for `jax.export`; and NumPy's do not wait for JAX.
     broadcast_shapes = (jnp if xp is jnp else np).broadcast_shapes
-    shape = broadcast_shapes(points.shape[:-1], k.shape[:-1], centre.shape[:-1], scale.shape)
-    x, y = (xp.broadcast_to((points[..., i] - centre[..., i]) / scale, shape) for i in (0, 1))
-    return together(x, y), xp.moveaxis(k, -1, 0), centre, scale
+    shape = broadcast_shapes(x.shape, k.shape[:-1], centre.shape[:-1], scale.shape)
+    first = xp.moveaxis(k, -1, 0)
+    limit = _limit_of(family, first)
+    cx, cy, scale = (xp.broadcast_to(a, shape) for a in (centre[..., 0], centre[..., 1], scale))
+    z = (x - cx) / scale, (y - cy) / scale
+    return _Normal(z, xp.broadcast_to(first, (len(first), *shape)), limit, (cx, cy), scale)
 
 
-def _in_pixels(z, centre, scale):
-    return together(centre[..., 0] + scale * z[..., 0], centre[..., 1] + scale * z[..., 1])
+def _apart(points):
+    return points[..., 0], points[..., 1]
 
 
 def _undistorted(points, family, k, centre, scale):
     """Corrected points; NaN beyond the limit."""
-    z, k, centre, scale = _normalised(points, k, centre, scale)
-    xp, limit = namespace(z), _limit_of(family, k)
-    squared = z[..., 0] * z[..., 0] + z[..., 1] * z[..., 1]
+    at = _normal(_apart(points), family, k, centre, scale)
+    xp, (x, y) = namespace(at.k), at.z
+    squared = x * x + y * y
     # A few last digits beyond it are the same radius: what `distort` puts at the fold rounds to there.
-    within = squared <= (limit * (1 + 4 * np.finfo(z.dtype).eps)) ** 2
-    corrected = family.correct(z, squared, k)
-    x, y = corrected[..., 0], corrected[..., 1]
+    within = squared <= (at.limit * (1 + 4 * np.finfo(squared.dtype).eps)) ** 2
+    new_x, new_y = family.correct(at.z, squared, at.k)
     # An invertible correction is monotone, and never goes to the other side; at a pole rounding does.
-    within = within & (z[..., 0] * x + z[..., 1] * y >= 0)
-    return _in_pixels(together(xp.where(within, x, np.nan), xp.where(within, y, np.nan)), centre, scale)
+    within = within & (x * new_x + y * new_y >= 0)
+    return together(*at.in_pixels((xp.where(within, new_x, np.nan), xp.where(within, new_y, np.nan))))
 
 
 def _by_formula(points, family, k, centre, scale):
     """Corrected points, also beyond the limit."""
-    z, k, centre, scale = _normalised(points, k, centre, scale)
-    squared = z[..., 0] * z[..., 0] + z[..., 1] * z[..., 1]
-    return _in_pixels(family.correct(z, squared, k), centre, scale)
+    at = _normal(points, family, k, centre, scale)
+    return at.in_pixels(family.correct(at.z, at.z[0] * at.z[0] + at.z[1] * at.z[1], at.k))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -227,17 +246,16 @@ def _distorted(distortion_of, points, operands):
     """
 
     def certain():
-        family, k, centre, scale = distortion_of(operands)
-        z, k, centre, scale = _normalised(points, k, centre, scale)
-        return _in_pixels(family.distort(z, k, _limit_of(family, k)), centre, scale)
+        family, *distortion = distortion_of(operands)
+        at = _normal(_apart(points), family, *distortion)
+        return together(*at.in_pixels(family.distort(at.z, at.k, at.limit)))
 
-    family, k, centre, scale = distortion_of(operands)
-    z, k, centre, scale = _normalised(points, k, centre, scale)
-    quick = family.quick_distort(z, k, _limit_of(family, k))
+    family, *distortion = distortion_of(operands)
+    at = _normal(_apart(points), family, *distortion)
+    quick = family.quick_distort(at.z, at.k, at.limit)
     if quick is None:
         return certain()
-    distorted, arrived = quick
-    distorted = _in_pixels(distorted, centre, scale)
+    distorted, arrived = together(*at.in_pixels(quick[0])), quick[1]
     # A branch, not a loop that is left at once: the state of a loop would be written to memory. Under vmap
     # both branches are taken, and the loops in the other one end at once where all have arrived.
     return jax.lax.cond(jnp.all(arrived), lambda: distorted, certain)
@@ -251,28 +269,22 @@ def _distorted_jvp(distortion_of, primals, tangents):
     exists = jnp.isfinite(w[..., 0])
     _, _, centre, _ = distortion_of(operands)
     centre, _ = aligned((jax.lax.stop_gradient(centre).astype(w.dtype), 1), (w, 1))
-    at = together(*(jnp.where(exists, w[..., i], centre[..., i]) for i in (0, 1)))
-    one, zero = jnp.ones_like(w[..., 0]), jnp.zeros_like(w[..., 0])
+    at = tuple(jnp.where(exists, w[..., i], centre[..., i]) for i in (0, 1))
+    one, zero = jnp.ones_like(at[0]), jnp.zeros_like(at[0])
 
     def formula(at, operands):
         family, k, centre, scale = distortion_of(operands)
         return _by_formula(at, family, jnp.where(jnp.isfinite(k), k, 0), centre, scale)
 
-    def moved(direction):
-        return jax.jvp(lambda at: formula(at, operands), (at,), (direction,))[1]
+    def moved(*direction):
+        return jax.jvp(lambda *at: formula(at, operands), at, direction)[1]
 
     # dG/dw dw = dp - dG/da da.
-    _, by_operands = jax.jvp(lambda operands: formula(at, operands), (operands,), (operands_dot,))
-    (ax, ay), (bx, by), (rx, ry) = (
-        (part[..., 0], part[..., 1])
-        for part in (
-            moved(together(one, zero)),
-            moved(together(zero, one)),
-            jnp.broadcast_to(points_dot, w.shape) - by_operands,
-        )
-    )
+    by_operands = jax.jvp(lambda operands: formula(at, operands), (operands,), (operands_dot,))[1]
+    rx, ry = (jnp.broadcast_to(points_dot[..., i], one.shape) - by_operands[i] for i in (0, 1))
+    (ax, ay), (bx, by) = moved(one, zero), moved(zero, one)
     determinant = ax * by - ay * bx
-    weight = jnp.where(exists, 1 / jnp.maximum(determinant, jnp.finfo(w.dtype).eps), 0)
+    weight = jnp.where(exists, 1 / jnp.maximum(determinant, jnp.finfo(one.dtype).eps), 0)
     return w, together(weight * (by * rx - bx * ry), weight * (ax * ry - ay * rx))
 
 

@@ -24,9 +24,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._core.arrays import namespace, together
+from .._core.arrays import namespace
 from .._core.types import AnyArray, Elements
 from ._roots import first_positive_root, first_quadratic_root, increasing_root, newton_root
+
+Pair = tuple[Float[AnyArray, "..."], Float[AnyArray, "..."]]
+"""A point (x, y). Coordinates are taken apart once: gradients by slices of a stack are padded arrays."""
 
 
 def radial_factor(squared_radius: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
@@ -82,9 +85,7 @@ class AbstractFamily(eqx.Module):
         """The power of the radius that each coefficient goes with: a length in px has it as its unit."""
 
     @abc.abstractmethod
-    def correct(
-        self, z: Float[AnyArray, "... 2"], squared: Float[AnyArray, "..."], k: Elements
-    ) -> Float[AnyArray, "... 2"]:
+    def correct(self, z: Pair, squared: Float[AnyArray, "..."], k: Elements) -> Pair:
         """The corrected point, by formula, also beyond the limit; `squared` is z.z."""
 
     @abc.abstractmethod
@@ -92,14 +93,12 @@ class AbstractFamily(eqx.Module):
         """The radius up to which `correct` is invertible; inf if everywhere. Constant for derivatives."""
 
     @abc.abstractmethod
-    def distort(
-        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
-    ) -> Float[AnyArray, "... 2"]:
+    def distort(self, z: Pair, k: Elements, limit: Float[AnyArray, "..."]) -> Pair:
         """The point within the limit that is corrected to z; NaN where there is none."""
 
     def quick_distort(
-        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
-    ) -> tuple[Float[AnyArray, "... 2"], Bool[AnyArray, "..."]] | None:
+        self, z: Pair, k: Elements, limit: Float[AnyArray, "..."]
+    ) -> tuple[Pair, Bool[AnyArray, "..."]] | None:
         """The same by a few steps that need not arrive, and where they did; None if there is no such way.
 
         Where all points arrive, which is nearly always, `distort` is not called.
@@ -154,12 +153,10 @@ class AbstractRadial(AbstractFamily):
         """2, 4, ..., 2N."""
         return 2 * radial_orders(size)
 
-    def correct(
-        self, z: Float[AnyArray, "... 2"], squared: Float[AnyArray, "..."], k: Elements
-    ) -> Float[AnyArray, "... 2"]:
+    def correct(self, z: Pair, squared: Float[AnyArray, "..."], k: Elements) -> Pair:
         """``z L(t)``."""
         factor = self.factor(squared, k)
-        return together(z[..., 0] * factor, z[..., 1] * factor)
+        return z[0] * factor, z[1] * factor
 
     def limit(self, k: Elements) -> Float[AnyArray, "..."]:
         """The monotone radius: the first root of a condition in t."""
@@ -180,8 +177,10 @@ class AbstractRadial(AbstractFamily):
 
         It solves ``q L(t q^2) = 1``, which needs no root of the squared radius and is regular at 0.
         """
-        exists, squared, equation, within = self._ratios(squared, k, limit)
         xp = namespace(squared, k)
+        exists = self._exists(squared, k, limit)
+        squared = xp.where(exists, squared, 0)
+        equation, within = self._of_ratio(squared, k, limit)
 
         def high():
             off_centre = squared > 0
@@ -190,42 +189,45 @@ class AbstractRadial(AbstractFamily):
         q, found = increasing_root(equation, xp.ones_like(squared), high, within)
         return q, exists & found
 
-    def _ratios(self, squared, k, limit):
-        """Where there is a ratio, the squared radii there, its equation, and whether it is in the limit."""
-        xp = namespace(squared, k)
+    def _exists(self, squared, k, limit):
+        """Where there is a ratio."""
         eps = np.finfo(squared.dtype).eps
-        reach = self.reach(k, limit)
         # A few last digits beyond it are the same radius: what is corrected at the fold rounds to there.
-        exists = xp.isfinite(squared) & (squared <= (reach * (1 + 8 * eps)) ** 2)
-        squared = xp.where(exists, squared, 0)
-        farthest = (limit * (1 + 8 * eps)) ** 2
+        return namespace(squared, k).isfinite(squared) & (
+            squared <= (self.reach(k, limit) * (1 + 8 * eps)) ** 2
+        )
+
+    def _of_ratio(self, squared, k, limit):
+        """The ratio's equation, and whether it is within the limit."""
+        farthest = (limit * (1 + 8 * np.finfo(squared.dtype).eps)) ** 2
 
         def equation(q):
             return self.equation(q, squared * q * q, 1, k)
 
-        return exists, squared, equation, lambda q: squared * q * q <= farthest
+        return equation, lambda q: squared * q * q <= farthest
 
-    def distort(
-        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
-    ) -> Float[AnyArray, "... 2"]:
+    def distort(self, z: Pair, k: Elements, limit: Float[AnyArray, "..."]) -> Pair:
         """By the `ratio` of the radii."""
         return _scaled(z, *self.ratio(_square(z), k, limit))
 
     def quick_distort(
-        self, z: Float[AnyArray, "... 2"], k: Elements, limit: Float[AnyArray, "..."]
-    ) -> tuple[Float[AnyArray, "... 2"], Bool[AnyArray, "..."]]:
+        self, z: Pair, k: Elements, limit: Float[AnyArray, "..."]
+    ) -> tuple[Pair, Bool[AnyArray, "..."]]:
         """By Newton's steps alone."""
-        exists, squared, equation, within = self._ratios(_square(z), k, limit)
+        squared = _square(z)
+        exists = self._exists(squared, k, limit)
+        squared = namespace(squared, k).where(exists, squared, 0)  # arrived at once
+        equation, within = self._of_ratio(squared, k, limit)
         q, arrived = newton_root(equation, namespace(squared, k).ones_like(squared), within)
         return _scaled(z, q, exists & arrived), arrived
 
 
-def _square(z: Float[AnyArray, "... 2"]) -> Float[AnyArray, "..."]:
+def _square(z: Pair) -> Float[AnyArray, "..."]:
     """z.z."""
-    return z[..., 0] * z[..., 0] + z[..., 1] * z[..., 1]
+    return z[0] * z[0] + z[1] * z[1]
 
 
-def _scaled(z, q, found):
+def _scaled(z: Pair, q: Float[AnyArray, "..."], found: Bool[AnyArray, "..."]) -> Pair:
     """``q z``, NaN where nothing was found."""
-    q = namespace(z, q).where(found, q, np.nan)
-    return together(z[..., 0] * q, z[..., 1] * q)
+    q = namespace(*z, q).where(found, q, np.nan)
+    return z[0] * q, z[1] * q

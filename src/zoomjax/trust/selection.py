@@ -59,7 +59,7 @@ class Candidate:
             raise TypeError(
                 f"A candidate must be a zoom model, as PolynomialZoom(degree=2) is, not {self.zoom!r}."
             )
-        checked_terms(self.terms)
+        checked_terms(self.terms, AbstractFamily.most_terms)
 
     @property
     def name(self) -> str:
