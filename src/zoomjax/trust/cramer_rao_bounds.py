@@ -29,6 +29,7 @@ from .._core.types import AnyArray, traced
 from ..fit.energy import line_normal
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
+from ..models.sizes import at_focal
 from ..models.zoom import with_parameters
 
 _NODES = 8  # of Gauss and Legendre, along x, y and 1/f: exact where the square has a degree of at most 15
@@ -137,7 +138,9 @@ def displacement_rms(lens: ZoomLens, other: ZoomLens) -> Float[Array, ""]:
         0.0
     """
     points, focal, weight = _field(lens)
-    apart = jax.vmap(lambda f: lens(f).undistort(points) - other(f).undistort(points))(focal)
+    apart = jax.vmap(lambda f: at_focal(lens, f).undistort(points) - at_focal(other, f).undistort(points))(
+        focal
+    )
     return jnp.sqrt(jnp.sum(weight * jnp.sum(apart**2, axis=-1)))
 
 

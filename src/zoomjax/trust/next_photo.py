@@ -24,6 +24,7 @@ from ..fit.energy import counted_frames, line_residuals, line_weights, linearise
 from ..fit.family_lines import with_family
 from ..fit.result import ZoomFit
 from ..lines.base import AbstractLines
+from ..models.sizes import at_focal
 from ..models.zoom import AbstractFocusZoom, with_parameters
 from .bands import displacement_std
 
@@ -234,7 +235,7 @@ def _bands(fit, lines, candidates, focals, number, counts):
 
         def residuals(flat):
             lens = eqx.tree_at(lambda lens: lens.zoom, fit.lens, with_parameters(zoom, unravel(flat)))
-            corrected = lens(focal).undistort(points)
+            corrected = at_focal(lens, focal).undistort(points)
             return line_residuals(corrected - jnp.mean(corrected, axis=0)[None])
 
         derivative = jax.jacfwd(residuals)(flat)
@@ -257,7 +258,7 @@ def _displacement_rows(fit, flat, unravel, focals):
 
     def corrected(flat, focal):
         zoom = with_parameters(fit.lens.zoom, unravel(flat))
-        return eqx.tree_at(lambda lens: lens.zoom, fit.lens, zoom)(focal).undistort(points)
+        return at_focal(eqx.tree_at(lambda lens: lens.zoom, fit.lens, zoom), focal).undistort(points)
 
     rows = jax.vmap(jax.jacfwd(corrected), (None, 0))(flat, focals)
     return rows.reshape(-1, 2, flat.size)
