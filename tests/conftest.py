@@ -20,14 +20,10 @@ SEED = 2012
 _CACHE = tempfile.TemporaryDirectory(prefix="zoomjax-tests-")
 os.environ["ZOOMJAX_CACHE"] = _CACHE.name
 
-# Tests compile far more than they compute: so without costly optimisation, once for all files and workers.
-_PROGRAMS = os.environ.setdefault("ZOOMJAX_TEST_PROGRAMS", f"{_CACHE.name}/programs")
+# Tests compile far more than they compute: so without costly optimisation.
 os.environ.setdefault(
     "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 )
-jax.config.update("jax_compilation_cache_dir", _PROGRAMS)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
