@@ -89,7 +89,7 @@ def test_there_is_no_better_one(terms, folding):
         constraints=[
             {"type": "ineq", "fun": lambda flat: np.asarray(slack(flat)), "jac": lambda _: slopes}
         ],
-        options={"ftol": 1e-14, "maxiter": 500},
+        options={"ftol": 1e-12, "maxiter": 500},
     )
     assert solution.success
     assert float(best.rms) ** 2 == pytest.approx(solution.fun, rel=1e-8)
