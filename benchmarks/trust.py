@@ -30,6 +30,7 @@ import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.fit.covariance import parameter_covariance
 from zoomjax.fit.energy import line_weights, linearised
+from zoomjax.models.sizes import at_focal
 
 RESULTS = Path(__file__).parent / "results"
 SIZE = (1072, 712)
@@ -504,7 +505,7 @@ def _rounded(truth, scene, keys):
 
     def displacement(lens):
         return jnp.linalg.norm(
-            jax.vmap(lambda f: lens(f).undistort(corner))(focal) - lens.centre[None], axis=1
+            jax.vmap(lambda f: at_focal(lens, f).undistort(corner))(focal) - lens.centre[None], axis=1
         )
 
     def one(key):

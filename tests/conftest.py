@@ -35,16 +35,29 @@ def pytest_report_header(config):
     return f"zoomjax: seed {SEED}, float64 {jax.config.jax_enable_x64}, {jax.default_backend()}"
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _programs_are_dropped():
-    """Let go of what one file's tests compiled.
+MOST_MAPS = 15_000
+"""Memory maps of a process. Each compiled program holds several; Linux allows 65530, and XLA crashes then."""
 
-    A compiled program holds several memory maps, and Linux allows a process 65530 of them: XLA crashes
-    at the next.
-    """
-    yield
+
+def _drop_programs():
     eqx.clear_caches()
     jax.clear_caches()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _programs_of_a_file_are_dropped():
+    """Let go of what one file's tests compiled."""
+    yield
+    _drop_programs()
+
+
+@pytest.fixture(autouse=True)
+def _programs_of_a_test_are_dropped():
+    """Let go of it earlier, where a file compiles very many."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
+        _drop_programs()
 
 
 @pytest.fixture

@@ -79,7 +79,7 @@ def jitted_gradient(row, dtype):
 def checkpointed(row, dtype):
     subject, x = at(row, dtype)
     function = jax.checkpoint(lambda x: number(row)((subject, x)))
-    return Cell(jax.grad(function)(x), gradient(row, dtype)[1])
+    return Cell(jax.jit(jax.grad(function))(x), gradient(row, dtype)[1])
 
 
 HERE = dict(
@@ -90,8 +90,8 @@ HERE = dict(
     )
 )
 LOOSE = {"grad": {"float32": 5e-2, "float64": 1e-4}}
-QUICK = ("jit, closed over", "grad")
-"""What of float32 is not left to the slow tests."""
+FEW = ("jit, closed over", "grad")
+"""What is tested always, of float32, and of rows that compile for long; all with ``-m exhaustive``."""
 
 
 def cells():
@@ -100,8 +100,9 @@ def cells():
             for dtype in DTYPES[row.doubles :]:
                 if row.constant and way in table.DERIVATIVES:
                     continue
-                slow = row.slow or (dtype == "float32" and way not in QUICK)
-                marks = pytest.mark.slow if slow else ()
+                always = dtype == "float64" and not row.slow
+                few = way in FEW and (dtype == "float64" or not row.slow)
+                marks = () if always else pytest.mark.slow if few else pytest.mark.exhaustive
                 yield pytest.param(row, way, dtype, id=f"{row.name}-{way}-{dtype}", marks=marks)
 
 
@@ -113,7 +114,7 @@ def test_cell(row, way, dtype):
     assert wrong is None, wrong
 
 
-@pytest.mark.parametrize("slow", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("slow", [False, pytest.param(True, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_over_four_devices(dtype, slow):
     result = subprocess.run(

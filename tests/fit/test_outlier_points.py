@@ -127,5 +127,5 @@ def test_lines_of_few_points_keep_them():
 
 
 def test_compressed_lines_raise_and_say_what_to_do(small, unchecked):
-    with pytest.raises(TypeError, match="reject points first, then compress"):
+    with pytest.raises(TypeError, match="compressed already; pass the Lines"):
         zj.fit.reject_points(small)
