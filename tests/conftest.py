@@ -36,7 +36,7 @@ def pytest_report_header(config):
 
 
 MOST_MAPS = 15_000
-"""Memory maps of a process. Each compiled program holds several; Linux allows 65530, and XLA crashes then."""
+"""Memory maps of a process. A compiled program holds several; Linux allows 65530, and XLA crashes then."""
 
 
 def _drop_programs():
