@@ -93,7 +93,7 @@ def test_commands_refuse_what_is_not_theirs_before_the_work(command, tmp_path):
 
 
 @posix
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_cache_that_a_killed_run_left_half_written_is_mended_unnoticed(folder, tmp_path):
     """JAX writes its entries in place, complains of half ones in each run, and never replaces them."""
     cache = tmp_path / "cache"
@@ -117,7 +117,15 @@ def test_a_cache_that_a_killed_run_left_half_written_is_mended_unnoticed(folder,
 @posix
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "home", [{"HOME": "/nowhere"}, {"HOME": None}, {"HOME": ""}, {"ZOOMJAX_CACHE": "lines.npz"}], ids=str
+    "home",
+    [
+        {"HOME": None},
+        *(
+            pytest.param(variables, marks=pytest.mark.exhaustive)
+            for variables in ({"HOME": "/nowhere"}, {"HOME": ""}, {"ZOOMJAX_CACHE": "lines.npz"})
+        ),
+    ],
+    ids=str,
 )
 def test_no_home_and_no_cache_do_no_harm(home, folder):
     without = {"ZOOMJAX_CACHE": None, "XDG_CACHE_HOME": "/dev/null/cache"} if "HOME" in home else {}
