@@ -31,6 +31,11 @@ hypothesis.settings.register_profile("fixed", derandomize=True, deadline=None, m
 hypothesis.settings.load_profile("fixed")
 
 
+def pytest_itemcollected(item):
+    if item.get_closest_marker("exhaustive"):
+        item.add_marker(pytest.mark.slow)  # also of those that are left out by -m "not slow"
+
+
 def pytest_report_header(config):
     return f"zoomjax: seed {SEED}, float64 {jax.config.jax_enable_x64}, {jax.default_backend()}"
 
