@@ -88,11 +88,6 @@ def reject_points(
         >>> np.argwhere(reject_points(lines, zoom=PolynomialZoom(degree=0), terms=1).rejected).tolist()
         [[3, 7]]
     """
-    if not isinstance(lines, Lines):
-        raise TypeError(
-            "Argument lines must be Lines, for single points are looked at, but its type is "
-            f"{type(lines).__name__}: reject points first, then compress what is left."
-        )
     _, number = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
     everything, kept, seen = np.asarray(lines.mask), lines, set[bytes]()
     few = everything.sum(axis=1, keepdims=True) < _FEWEST
