@@ -187,7 +187,7 @@ def edges():
 def on_edges():
     seen = oblique()[:4]
     share = jnp.array([0.1, 0.4, 0.9])[:, None]
-    return jax.vmap(lambda a, b: a + share * (b - a)[None])(seen, jnp.roll(seen, -1, axis=0))
+    return jax.vmap(lambda a, b: a[None] + share * (b - a)[None])(seen, jnp.roll(seen, -1, axis=0))
 
 
 def focal_numbers(estimate):
