@@ -79,9 +79,6 @@ def same(first, second, focal):
             np.testing.assert_allclose(corner(first.lens, f), corner(second.lens, f), atol=1e-3)
 
 
-@pytest.mark.xfail(
-    reason="of some scenes a fit's parameters become NaN, and its RMS with them", strict=False
-)
 @few
 @hypothesis.given(scenes(), st.randoms(use_true_random=False))
 def test_the_order_of_lines_and_frames_does_not_matter(scene, random):
@@ -140,9 +137,6 @@ def _good(fit):
     return zj.RESULTS[fit.result] == "" or fit.result in (zj.RESULTS.undetermined, zj.RESULTS.constrained)
 
 
-@pytest.mark.xfail(
-    reason="of some scenes a fit's parameters become NaN, and its RMS with them", strict=False
-)
 @hypothesis.given(scenes(KINDS))
 def test_finite_input_never_gives_nan(scene):
     points, focal = scene

@@ -113,18 +113,43 @@ def implicit(
 
     They are those of the minimum with the barrier at its last strength: of inequalities that are active the
     slack stays what it is, others have no part. Where one begins or ceases to be active there is a kink.
+    Directions that the energy does not determine stay where they are.
     """
     minimum, strength = jax.lax.stop_gradient((minimum, strength))
+    multiplier = strength / jax.lax.stop_gradient(slack(minimum))
 
-    def gradient(x):
-        def barred(x):
-            return energy(x) - jnp.sum(strength * jnp.log(slack(x)))
+    def conditions(point):
+        x, z = point
+        gaps, transposed = jax.vjp(slack, x)
+        return jax.grad(energy)(x) - transposed(z)[0], z * gaps - strength
 
-        return jax.grad(barred)(x)
+    def change(_, right):
+        gaps, slopes = _linearised(slack, minimum)
+        curvature = jax.jacfwd(jax.grad(lambda x: energy(x) - multiplier @ slack(x)))(minimum)
+        x = _stationary(curvature, slopes, multiplier / gaps, right[0], right[1] / multiplier)
+        return x, (right[1] - multiplier * (slopes @ x)) / gaps
 
-    curvature = jax.lax.stop_gradient(jax.jacfwd(gradient)(minimum))
-    newton = -jnp.linalg.solve(curvature, gradient(minimum))
-    return minimum + newton - jax.lax.stop_gradient(newton)
+    return jax.lax.custom_root(conditions, (minimum, multiplier), lambda _, start: start, change)[0]
+
+
+def _stationary(curvature, slopes, weight, right, gaps):
+    """The x of ``(curvature + slopes' W slopes) x = right + slopes' W gaps``, W the diagonal of weights.
+
+    Weights of active inequalities are up to 1e15 times the curvature, whose part in the sum would be lost.
+    So it is solved along the singular vectors of ``sqrt(W) slopes``, where the large part is diagonal.
+    """
+    root = jnp.sqrt(weight)
+    rows = jnp.concatenate([root[:, None] * slopes, jnp.zeros_like(curvature)])  # never fewer than unknowns
+    left, size, directions = jnp.linalg.svd(rows, full_matrices=False)
+    left = left[: root.shape[0]]
+    matrix = directions @ curvature @ directions.T + jnp.diag(size**2)
+    scale = jnp.sqrt(jnp.abs(jnp.diagonal(matrix)))
+    scale = jnp.where(scale > 0, scale, 1)
+    values, vectors = jnp.linalg.eigh(matrix / (scale[:, None] * scale[None]))
+    known = jnp.abs(values) > 64 * jnp.finfo(values.dtype).eps
+    inverse = jnp.where(known, 1 / jnp.where(known, values, 1), 0)
+    turned = (directions @ right + size * (left.T @ (root * gaps))) / scale
+    return directions.T @ (vectors @ (inverse * (vectors.T @ turned)) / scale)
 
 
 def _solved(rows):
