@@ -47,3 +47,11 @@ def together(x: Any, y: Any) -> Any:
     ``factor[..., None]``: XLA can then make one loop of it all, and of its gradient by the points.
     """
     return namespace(x, y).stack([x, y], axis=-1)
+
+
+def once(values: Any) -> Any:
+    """Arrays as they are, computed once: XLA would compute them anew wherever they are used.
+
+    For what is expensive and used for both coordinates of a point.
+    """
+    return jax.lax.optimization_barrier(values) if namespace(*jax.tree.leaves(values)) is jnp else values

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._core.arrays import namespace
+from .._core.arrays import namespace, once
 from .._core.types import AnyArray
 
 _NEWTON_STEPS = 4
@@ -179,7 +179,7 @@ def newton_root(
     for _ in range(_NEWTON_STEPS):
         q = q - error / xp.where(slope > 0, slope, 1)
         error, slope = equation(q)
-    return q, (abs(error) <= rounding(q, slope)) & (q >= 0) & (slope >= 0) & within(q)
+    return once((q, (abs(error) <= rounding(q, slope)) & (q >= 0) & (slope >= 0) & within(q)))
 
 
 def increasing_root(

@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._core.arguments import check_kind
-from .._core.arrays import aligned, as_array, finite, namespace, together
+from .._core.arrays import aligned, as_array, finite, namespace, once, together
 from .._core.types import AnyArray, Elements, Points, traced
-from .family import AbstractFamily, Pair
+from .family import AbstractFamily, AbstractRadial, Pair
 from .polynomial import RadialPolynomial
 
 
@@ -150,9 +150,9 @@ def mapped(method: str, family: AbstractFamily, points: Any, k: Any, centre: Any
             leaves = ((points, 1), (np.asarray(k), 1), (np.asarray(centre), 1), (np.asarray(scale), 0))
             points, *distortion = (leaf[None] for leaf in aligned(*leaves))
             if method == "undistort":
-                return _undistorted(points, family, *distortion)[0]
-            at = _normal(_apart(points), family, *distortion)
-            return together(*at.in_pixels(family.distort(at.z, at.k, at.limit)))[0]
+                return _undistorted(points, family, *distortion, spread=False)[0]
+            at = _normal(_apart(points), *distortion, spread=False)
+            return together(*at.in_pixels(family.distort(at.z, at.k, family.limit(at.k))))[0]
     return compiled(method, _given, jnp.asarray(points), (family, k, centre, scale))
 
 
@@ -170,10 +170,9 @@ def compiled(
         points: px.
         operands: a pytree.
     """
-    if method == "undistort":
-        return _undistorted(points, *distortion_of(operands))
     arrays, rest = eqx.partition(operands, eqx.is_array)
-    return _distorted(lambda arrays: distortion_of(eqx.combine(arrays, rest)), points, arrays)
+    function = _corrected if method == "undistort" else _distorted
+    return function(lambda arrays: distortion_of(eqx.combine(arrays, rest)), points, arrays)
 
 
 def _given(operands):
@@ -184,13 +183,12 @@ def _given(operands):
 class _Normal(NamedTuple):
     """Points and a distortion, aligned: each array broadcasts with the others.
 
-    Coefficients, centre and scale have the shape of the points: each has then one sum over all points in a
-    gradient, and not one for each place where it is used. `limit` has that of the distortion.
+    `own` are the coefficients in the shape of the distortion, `k` possibly in that of the points.
     """
 
     z: Pair
     k: Elements
-    limit: Any
+    own: Elements
     centre: Pair
     scale: Any
 
@@ -199,32 +197,55 @@ class _Normal(NamedTuple):
         return self.centre[0] + self.scale * z[0], self.centre[1] + self.scale * z[1]
 
 
-def _normal(points, family, k, centre, scale) -> _Normal:
-    """Of points (x, y) in px."""
+def _normal(points, k, centre, scale, *, spread=True) -> _Normal:
+    """Of points (x, y) in px.
+
+    If spread, coefficients, centre and scale get the shape of the points: each has then one sum over all
+    points in a gradient, and not one for each place where it is used. Without gradients it is better left:
+    what depends on the distortion alone would be computed for each point.
+    """
     leaves = ((points[0], 0), (points[1], 0), (k, 1), (centre, 1), (scale, 0))
     x, y, k, centre, scale = aligned(*((leaf.astype(points[0].dtype), own) for leaf, own in leaves))
     xp = namespace(k)
+    own = xp.moveaxis(k, -1, 0)
+    cx, cy = centre[..., 0], centre[..., 1]
+    if not spread:
+        return _Normal(((x - cx) / scale, (y - cy) / scale), own, own, (cx, cy), scale)
     # JAX's know of symbolic shapes, for `jax.export`; and NumPy's do not wait for JAX.
     broadcast_shapes = (jnp if xp is jnp else np).broadcast_shapes
     shape = broadcast_shapes(x.shape, k.shape[:-1], centre.shape[:-1], scale.shape)
-    first = xp.moveaxis(k, -1, 0)
-    limit = _limit_of(family, first)
-    cx, cy, scale = (xp.broadcast_to(a, shape) for a in (centre[..., 0], centre[..., 1], scale))
+    cx, cy, scale = (xp.broadcast_to(a, shape) for a in (cx, cy, scale))
     z = (x - cx) / scale, (y - cy) / scale
-    return _Normal(z, xp.broadcast_to(first, (len(first), *shape)), limit, (cx, cy), scale)
+    return _Normal(z, xp.broadcast_to(own, (len(own), *shape)), own, (cx, cy), scale)
 
 
 def _apart(points):
     return points[..., 0], points[..., 1]
 
 
-def _undistorted(points, family, k, centre, scale):
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _corrected(distortion_of, points, operands):
+    """Corrected points, with the same derivatives as what is written: they are computed another way."""
+    return _undistorted(points, *distortion_of(operands), spread=False)
+
+
+@_corrected.defjvp
+def _corrected_jvp(distortion_of, primals, tangents):
+    return jax.jvp(
+        lambda points, operands: _undistorted(points, *distortion_of(operands)), primals, tangents
+    )
+
+
+def _undistorted(points, family, k, centre, scale, *, spread=True):
     """Corrected points; NaN beyond the limit."""
-    at = _normal(_apart(points), family, k, centre, scale)
+    at = _normal(_apart(points), k, centre, scale, spread=spread)
     xp, (x, y) = namespace(at.k), at.z
     squared = x * x + y * y
-    # A few last digits beyond it are the same radius: what `distort` puts at the fold rounds to there.
-    within = squared <= (at.limit * (1 + 4 * np.finfo(squared.dtype).eps)) ** 2
+    within = family.within(_constant(squared), _constant(at.own), digits=4)
+    if isinstance(family, AbstractRadial):
+        factor = family.factor(squared, at.k)
+        factor = once(xp.where(within & (factor >= 0), factor, np.nan))
+        return together(*at.in_pixels((x * factor, y * factor)))
     new_x, new_y = family.correct(at.z, squared, at.k)
     # An invertible correction is monotone, and never goes to the other side; at a pole rounding does.
     within = within & (x * new_x + y * new_y >= 0)
@@ -233,7 +254,7 @@ def _undistorted(points, family, k, centre, scale):
 
 def _by_formula(points, family, k, centre, scale):
     """Corrected points, also beyond the limit."""
-    at = _normal(points, family, k, centre, scale)
+    at = _normal(points, k, centre, scale)
     return at.in_pixels(family.correct(at.z, at.z[0] * at.z[0] + at.z[1] * at.z[1], at.k))
 
 
@@ -245,20 +266,41 @@ def _distorted(distortion_of, points, operands):
     are 1/eps of the dtype at most.
     """
 
-    def certain():
-        family, *distortion = distortion_of(operands)
-        at = _normal(_apart(points), family, *distortion)
-        return together(*at.in_pixels(family.distort(at.z, at.k, at.limit)))
-
     family, *distortion = distortion_of(operands)
-    at = _normal(_apart(points), family, *distortion)
-    quick = family.quick_distort(at.z, at.k, at.limit)
-    if quick is None:
-        return certain()
-    distorted, arrived = together(*at.in_pixels(quick[0])), quick[1]
-    # A branch, not a loop that is left at once: the state of a loop would be written to memory. Under vmap
-    # both branches are taken, and the loops in the other one end at once where all have arrived.
-    return jax.lax.cond(jnp.all(arrived), lambda: distorted, certain)
+    at = _normal(_apart(points), *distortion, spread=False)
+    if isinstance(family, AbstractRadial):
+        q = _ratio(distortion_of, points, operands)
+        return together(*at.in_pixels((at.z[0] * q, at.z[1] * q)))
+    return together(*at.in_pixels(family.distort(at.z, at.k, family.limit(at.k))))
+
+
+def _ratio(distortion_of, points, operands):
+    """The distorted radii over the corrected ones; NaN where there is no inverse.
+
+    Newton's steps alone nearly always arrive. The rest is in branches, and not in loops that are left at
+    once, as the state of a loop would be written to memory. Under vmap all branches are taken, and the
+    loops in the last one end at once where all have arrived.
+    """
+
+    def normal():
+        family, *distortion = distortion_of(operands)
+        at = _normal(_apart(points), *distortion, spread=False)
+        return family, at.z[0] * at.z[0] + at.z[1] * at.z[1], at.k
+
+    def certain():
+        family, squared, k = normal()
+        q, found = family.ratio(squared, k, family.limit(k))
+        return jnp.where(found, q, jnp.nan)
+
+    def doubtful():
+        family, squared, k = normal()
+        settled = arrived | ~family.reaches(squared, k, family.limit(k))
+        return jax.lax.cond(jnp.all(settled), lambda: quick, certain)
+
+    family, squared, k = normal()
+    quick, arrived = family.quick_ratio(squared, k)
+    quick = jnp.where(arrived, quick, jnp.nan)
+    return jax.lax.cond(jnp.all(arrived), lambda: quick, doubtful)
 
 
 @_distorted.defjvp
@@ -288,16 +330,16 @@ def _distorted_jvp(distortion_of, primals, tangents):
     return w, together(weight * (by * rx - bx * ry), weight * (ax * ry - ay * rx))
 
 
-def _limit_of(family, k):
-    """The family's limit, a constant for derivatives."""
-    return family.limit(jax.lax.stop_gradient(k) if isinstance(k, jax.Array) else k)
+def _constant(array):
+    """For derivatives."""
+    return jax.lax.stop_gradient(array) if isinstance(array, jax.Array) else array
 
 
 def _limit(family, k):
     if isinstance(k, np.ndarray):
         with np.errstate(all="ignore"):
-            return _limit_of(family, np.moveaxis(k[None], -1, 0))[0]
-    return _limit_of(family, jnp.moveaxis(k, -1, 0))
+            return family.limit(np.moveaxis(k[None], -1, 0))[0]
+    return family.limit(_constant(jnp.moveaxis(k, -1, 0)))
 
 
 def _check(coefficients, centre, scale, family):

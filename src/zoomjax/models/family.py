@@ -58,6 +58,21 @@ def times(factors: np.ndarray, k: Elements) -> Elements:
     return factors.astype(k.dtype).reshape(-1, *[1] * (k.ndim - 1)) * k
 
 
+def positive_up_to(
+    x: Float[AnyArray, "..."], b: Float[AnyArray, "..."], c: Any = 0.0, *, digits: int
+) -> Bool[AnyArray, "..."]:
+    """Whether ``1 + b x + c x²`` is positive from 0 to x, up to some last digits; without a root.
+
+    With ``B = b x`` and ``C = c x²`` it is positive at x if ``1 + B + C`` is. If there were roots before x
+    nevertheless, then two: x is beyond the least value, so that ``2 C > -B``, and ``B² >= 4 C``; together
+    with ``1 + B + C > 0`` this is ``B < -2``.
+    """
+    rounding = digits * np.finfo(x.dtype).eps
+    linear, square = b * x, c * x * x
+    positive = (1 + 2 * rounding) + linear + (1 - rounding) * square >= 0
+    return positive & ((linear >= -2 - 2 * rounding) | (4 * square > linear * linear))
+
+
 def first_root(rows: np.ndarray, k: Elements) -> Float[AnyArray, "..."]:
     """The first positive root of ``1 + sum_i rows[j, i] k_i x^i``, i from 1, over all rows j."""
     xp = namespace(k)
@@ -96,15 +111,12 @@ class AbstractFamily(eqx.Module):
     def distort(self, z: Pair, k: Elements, limit: Float[AnyArray, "..."]) -> Pair:
         """The point within the limit that is corrected to z; NaN where there is none."""
 
-    def quick_distort(
-        self, z: Pair, k: Elements, limit: Float[AnyArray, "..."]
-    ) -> tuple[Pair, Bool[AnyArray, "..."]] | None:
-        """The same by a few steps that need not arrive, and where they did; None if there is no such way.
+    def within(self, squared: Float[AnyArray, "..."], k: Elements, *, digits: int) -> Bool[AnyArray, "..."]:
+        """Whether a squared radius is within the limit, or beyond it by some last digits.
 
-        Where all points arrive, which is nearly always, `distort` is not called.
+        Rounded, those are the same radius: what `distort` puts at the fold lies there.
         """
-        del z, k, limit
-        return None
+        return squared <= (self.limit(k) * (1 + digits * np.finfo(squared.dtype).eps)) ** 2
 
     @abc.abstractmethod
     def conditions(self, size: int) -> np.ndarray:
@@ -170,6 +182,16 @@ class AbstractRadial(AbstractFamily):
         end = xp.isinf(limit) | ~((factor > 0) & (factor < np.finfo(factor.dtype).eps ** -0.5))
         return xp.where(end, np.inf, finite * factor)
 
+    def within(self, squared: Float[AnyArray, "..."], k: Elements, *, digits: int) -> Bool[AnyArray, "..."]:
+        """Of one or two coefficients of each point by their conditions, without a root for each."""
+        one_for_all = k.ndim == 1 or k.shape[-1] == 1
+        if one_for_all or len(k) > 2:
+            return AbstractFamily.within(self, squared, k, digits=digits)
+        inside = squared >= 0  # not NaN
+        for row in self.conditions(len(k)):
+            inside = inside & positive_up_to(squared, *times(row, k), digits=2 * digits)
+        return inside
+
     def ratio(
         self, squared: Float[AnyArray, "..."], k: Elements, limit: Float[AnyArray, "..."]
     ) -> tuple[Float[AnyArray, "..."], Bool[AnyArray, "..."]]:
@@ -178,56 +200,45 @@ class AbstractRadial(AbstractFamily):
         It solves ``q L(t q^2) = 1``, which needs no root of the squared radius and is regular at 0.
         """
         xp = namespace(squared, k)
-        exists = self._exists(squared, k, limit)
+        exists = self.reaches(squared, k, limit)
         squared = xp.where(exists, squared, 0)
-        equation, within = self._of_ratio(squared, k, limit)
+        farthest = (limit * (1 + 8 * np.finfo(squared.dtype).eps)) ** 2
 
         def high():
             off_centre = squared > 0
             return xp.where(off_centre, limit / xp.sqrt(xp.where(off_centre, squared, 1)), np.inf)
 
-        q, found = increasing_root(equation, xp.ones_like(squared), high, within)
+        q, found = increasing_root(
+            self._of_ratio(squared, k), xp.ones_like(squared), high, lambda q: squared * q * q <= farthest
+        )
         return q, exists & found
 
-    def _exists(self, squared, k, limit):
-        """Where there is a ratio."""
+    def reaches(
+        self, squared: Float[AnyArray, "..."], k: Elements, limit: Float[AnyArray, "..."]
+    ) -> Bool[AnyArray, "..."]:
+        """Whether a corrected point, of which the squared radius is given, can be reached."""
         eps = np.finfo(squared.dtype).eps
         # A few last digits beyond it are the same radius: what is corrected at the fold rounds to there.
         return namespace(squared, k).isfinite(squared) & (
             squared <= (self.reach(k, limit) * (1 + 8 * eps)) ** 2
         )
 
-    def _of_ratio(self, squared, k, limit):
-        """The ratio's equation, and whether it is within the limit."""
-        farthest = (limit * (1 + 8 * np.finfo(squared.dtype).eps)) ** 2
+    def _of_ratio(self, squared, k):
+        """The ratio's equation."""
+        return lambda q: self.equation(q, squared * q * q, 1, k)
 
-        def equation(q):
-            return self.equation(q, squared * q * q, 1, k)
-
-        return equation, lambda q: squared * q * q <= farthest
+    def quick_ratio(
+        self, squared: Float[AnyArray, "..."], k: Elements
+    ) -> tuple[Float[AnyArray, "..."], Bool[AnyArray, "..."]]:
+        """The `ratio` by Newton's steps alone, which need not arrive, and where they did."""
+        return newton_root(
+            self._of_ratio(squared, k),
+            namespace(squared, k).ones_like(squared),
+            lambda q: self.within(squared * q * q, k, digits=8),
+        )
 
     def distort(self, z: Pair, k: Elements, limit: Float[AnyArray, "..."]) -> Pair:
         """By the `ratio` of the radii."""
-        return _scaled(z, *self.ratio(_square(z), k, limit))
-
-    def quick_distort(
-        self, z: Pair, k: Elements, limit: Float[AnyArray, "..."]
-    ) -> tuple[Pair, Bool[AnyArray, "..."]]:
-        """By Newton's steps alone."""
-        squared = _square(z)
-        exists = self._exists(squared, k, limit)
-        squared = namespace(squared, k).where(exists, squared, 0)  # arrived at once
-        equation, within = self._of_ratio(squared, k, limit)
-        q, arrived = newton_root(equation, namespace(squared, k).ones_like(squared), within)
-        return _scaled(z, q, exists & arrived), arrived
-
-
-def _square(z: Pair) -> Float[AnyArray, "..."]:
-    """z.z."""
-    return z[0] * z[0] + z[1] * z[1]
-
-
-def _scaled(z: Pair, q: Float[AnyArray, "..."], found: Bool[AnyArray, "..."]) -> Pair:
-    """``q z``, NaN where nothing was found."""
-    q = namespace(*z, q).where(found, q, np.nan)
-    return z[0] * q, z[1] * q
+        q, found = self.ratio(z[0] * z[0] + z[1] * z[1], k, limit)
+        q = namespace(q).where(found, q, np.nan)
+        return z[0] * q, z[1] * q

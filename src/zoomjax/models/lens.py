@@ -188,7 +188,7 @@ class ZoomLens(eqx.Module):
         dtype = jnp.asarray(self.centre).dtype
         centre, focal = jnp.asarray(self.centre), jnp.asarray(focal, dtype)
         low, high = jnp.moveaxis(jnp.asarray(self.focal_range, dtype), -1, 0)
-        inside = (focal > 0) & (focal >= low * (1 - _SLACK)) & (focal <= high * (1 + _SLACK))
+        inside = (focal >= low * (1 - _SLACK)) & (focal <= high * (1 + _SLACK))
         if within:  # at a focal length that is: a NaN in `focal` would be one in all derivatives
             focal = jnp.where(inside, focal, high)
         k = _at(self.zoom, focal, focus, dtype)
@@ -254,17 +254,17 @@ class ZoomLens(eqx.Module):
             return
         # By NumPy alone: under ``jit`` even an operation of JAX on known arrays is traced.
         low, high = np.asarray(self.focal_range, np.float64).tolist()
-        values = np.ravel(np.asarray(focal, np.float64))
+        values = np.ravel(np.asarray(focal))
         if not values.size:
             return
-        bad = ~(np.isfinite(values) & (values > 0))
-        if bad.any():
+        least, most = float(values.min()), float(values.max())  # NaN if one is: two passes are quick
+        if not (least > 0 and np.isfinite(most)):
+            bad = ~(np.isfinite(values) & (values > 0))
             raise ValueError(f"Argument focal must be a positive number, but it is {values[bad][0]}.")
-        slack = _SLACK * values
-        if np.any((values < low - slack) | (values > high + slack)):
-            asked = f"The focal length {values[0]:g} {self.focal_unit} is"
+        if least < low - _SLACK * least or most > high + _SLACK * most:
+            asked = f"The focal length {least:g} {self.focal_unit} is"
             if values.size > 1:
-                asked = f"Focal lengths from {values.min():g} to {values.max():g} {self.focal_unit} are"
+                asked = f"Focal lengths from {least:g} to {most:g} {self.focal_unit} are"
             warnings.warn(
                 f"{asked} asked for, and the lens was fitted on {low:g} to {high:g} {self.focal_unit}: "
                 "beyond that its distortion is extrapolated.",
