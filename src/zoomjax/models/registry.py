@@ -152,7 +152,10 @@ def zoom_from(content: Any, numbers: int | None = None) -> AbstractZoom:
         elif value is not None or field.default is not None:
             fields[field.name] = array_of(field.name, value)
     zoom = model(**fields)
-    shape = coefficients_shape(zoom)
+    try:
+        shape = coefficients_shape(zoom)
+    except Exception as error:  # whatever a model of a user's own says of parameters of another shape
+        raise ValueError("its parameters are not those of its model") from error
     if len(shape) != 1 or numbers not in (None, *shape):
         raise ValueError("its parameters are not those of its model")
     return zoom
