@@ -112,7 +112,7 @@ def test_deviations_are_numbers_or_per_cent():
     np.testing.assert_allclose(focal_sigmas("0.3", np.array([20.0, 50.0])), [0.3, 0.3])
     np.testing.assert_allclose(focal_sigmas(" 2 %", np.array([20.0, 50.0])), [0.4, 1.0])
     for text in ("", "%", "-1", "nan", "1%%", "inf", "a bit"):
-        with pytest.raises(ValueError, match=r"--focal-sigma must be a number such as 0.3, or 1%"):
+        with pytest.raises(ValueError, match=r"Argument focal_sigma must be a number such as 0.3, or 1%"):
             focal_sigmas(text, np.ones(2))
 
 

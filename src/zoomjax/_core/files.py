@@ -112,7 +112,7 @@ def refuse_existing(targets: Iterable[Path], *, overwrite: bool) -> None:
     if there:
         raise FileExistsError(
             f"{_several(there)} there already and would be replaced: choose another place, or give "
-            "overwrite."
+            "argument overwrite."
         )
 
 

@@ -319,7 +319,7 @@ def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray
     except ValueError:
         value = np.nan
     if rest or not 0 <= value < np.inf:
-        raise ValueError(f"--focal-sigma must be a number such as 0.3, or 1%, but it is {text!r}.")
+        raise ValueError(f"Argument focal_sigma must be a number such as 0.3, or 1%, but it is {text!r}.")
     return value / 100 * np.asarray(focal) if percent else np.full(np.shape(focal), value)
 
 

@@ -137,7 +137,7 @@ def photo_focal(source: str | os.PathLike[str], lens: ZoomLens) -> float:
     if focal is None:
         raise ValueError(
             f"The focal length of {os.fspath(source)} is not known: its EXIF data have none in "
-            f"{lens.focal_unit}. Give it: --focal, a number or a CSV file image,focal."
+            f"{lens.focal_unit}. Give it (argument focal)."
         )
     return focal
 
