@@ -34,7 +34,7 @@ def exif_with_focal(focal: float) -> bytes:
     """EXIF data that hold a focal length, mm, and nothing else."""
     exif = Image.Exif()
     fraction = IFDRational(round(focal * _FINENESS), _FINENESS)
-    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = fraction
+    exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLength: fraction}
     return exif.tobytes().removeprefix(_PREFIX)
 
 
