@@ -53,7 +53,7 @@ def decode_heic(content: bytes) -> tuple[np.ndarray, Metadata]:
     """
     picture, metadata = _opened(content), heic_metadata(content)
     try:
-        image = np.asarray(picture)
+        image = np.array(picture)  # a copy: the memory goes with the picture
     except Exception as error:  # of whatever kind libheif's are
         raise ValueError("the file is damaged or cut off") from error
     exif = next((block.tobytes() for kind, block in metadata if kind == cv2.IMAGE_METADATA_EXIF), b"")
