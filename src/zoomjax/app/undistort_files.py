@@ -16,7 +16,7 @@ from ..correct.image import check_sampling
 from ..correct.photo import corrected_photo, photo_focal
 from ..io.focal_table import read_focal_table
 from ..io.focal_track import read_focal_track
-from ..io.photo import SUFFIXES
+from ..io.photo import FORMATS, SUFFIXES
 from ..io.text_table import plain_number
 from ..models.lens import ZoomLens, load_lens
 from ..models.sizes import at_focal, lens_for_size
@@ -86,11 +86,11 @@ def _video(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> Ou
 
     if job.focal is None:
         raise ValueError(
-            "A video needs --focal: one focal length, or a CSV file with time,focal or frame,focal."
+            "A video needs argument focal: one focal length, or a CSV file with time,focal or frame,focal."
         )
     number = _number(job.focal)
     if number is not None and job.hold:
-        raise ValueError("--hold is for a track of focal lengths, and --focal is one number.")
+        raise ValueError("Argument hold is for a track of focal lengths, and argument focal is one number.")
     focal = read_focal_track(job.focal, hold=job.hold) if number is None else number
     target = job.output / job.inputs[0].name if job.output.is_dir() else job.output
     _check_targets(job, [target])
@@ -109,7 +109,9 @@ def _video(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> Ou
 
 def _photos(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> Outcome:
     if job.hold:
-        raise ValueError("--hold is for a video's track of focal lengths, and the inputs are photos.")
+        raise ValueError(
+            "Argument hold is for a video's track of focal lengths, and the inputs are photos."
+        )
     targets = _photo_targets(job)
     _check_targets(job, targets)
     focal_of = _photo_focals(job, lens)
@@ -147,7 +149,7 @@ _BAD_PHOTO = (ValueError, OSError, MemoryError, cv2.error)
 
 def _photo_targets(job: Job) -> list[Path]:
     """Where each photo goes."""
-    folder = job.output.is_dir() or job.output.suffix.lower() not in SUFFIXES
+    folder = job.output.is_dir() or job.output.suffix.lower() not in FORMATS
     if not folder and len(job.inputs) > 1:
         raise ValueError(
             f"The output of {len(job.inputs)} photos must be a folder, but it is the file {job.output}."
@@ -156,16 +158,21 @@ def _photo_targets(job: Job) -> list[Path]:
         return [job.output]
     kind = mimetypes.guess_type(job.output.name)[0] or ""
     if not job.output.is_dir() and kind.startswith(("image/", "video/")):
-        raise ValueError(f"The output must end in one of {', '.join(SUFFIXES)}, but it is {job.output}.")
+        raise ValueError(f"The output must end in one of {', '.join(FORMATS)}, but it is {job.output}.")
     names: dict[str, Path] = {}
     for path in job.inputs:
         # Many file systems make no difference between cases, or between ways to write an accent.
-        other = names.setdefault(unicodedata.normalize("NFC", path.name).casefold(), path)
+        other = names.setdefault(unicodedata.normalize("NFC", _target_name(path)).casefold(), path)
         if other is not path:
             raise ValueError(
                 f"The photos {other} and {path} have the same name, and would be written to one file."
             )
-    return [job.output / path.name for path in job.inputs]
+    return [job.output / _target_name(path) for path in job.inputs]
+
+
+def _target_name(photo: Path) -> str:
+    """The photograph's own name; PNG, which holds what HEIC does, for what can be read only."""
+    return photo.name if photo.suffix.lower() in FORMATS else f"{photo.stem}.png"
 
 
 def _check_targets(job: Job, targets: Sequence[Path]) -> None:
@@ -218,8 +225,9 @@ def _number(text: str) -> float | None:
     number = plain_number(text)
     if number is None and not Path(text).exists() and not text.lower().endswith(".csv"):
         raise ValueError(
-            f"--focal must be a positive number, with a decimal point, or a CSV file, but it is {text!r}."
+            "Argument focal must be a positive number, with a decimal point, or a CSV file, "
+            f"but it is {text!r}."
         )
     if number is not None and number <= 0:
-        raise ValueError(f"--focal must be a positive number, but it is {text}.")
+        raise ValueError(f"Argument focal must be a positive number, but it is {text}.")
     return number

@@ -8,9 +8,25 @@ import re
 import struct
 from collections.abc import Iterator
 
+from .heic import heic_size
+
+
+def announced_format(content: bytes) -> str:
+    """Format ("JPEG", "PNG", "WebP", "TIFF", "BMP" or "HEIC") of a file that begins like this.
+
+    Raises:
+        ValueError: the content has another format.
+    """
+    if not content:
+        raise ValueError("the file is empty")
+    for begins, name, _ in _FORMATS:
+        if begins.match(content):
+            return name
+    raise ValueError("it is damaged, or of an unknown format")
+
 
 def announced_size(content: bytes) -> tuple[str, int, int]:
-    """Format ("JPEG", "PNG", "WebP", "TIFF" or "BMP"), width and height that a file's header announces.
+    """Format, as `announced_format` has it, width and height that a file's header announces.
 
     Raises:
         ValueError: the content has another format, or ends before its size.
@@ -98,4 +114,5 @@ _FORMATS = (
     (re.compile(rb"RIFF....WEBPVP8[ LX]", re.DOTALL), "WebP", _webp),
     (re.compile(rb"II[*+]\0|MM\0[*+]"), "TIFF", _tiff),
     (re.compile(rb"BM"), "BMP", _bmp),
+    (re.compile(rb"....ftyp(hei[cmsx]|hev[cx]|mif1)", re.DOTALL), "HEIC", heic_size),
 )
