@@ -151,7 +151,7 @@ def names():
     small = zj.compress(lines, terms=3)
     fit = zj.fit_zoom(small, terms=2)
     lens = fit.lens
-    common = {"np": np, "zj": zj, "lines": lines, "small": small, "fit": fit, "lens": lens}
+    common = {"np": np, "jnp": jnp, "zj": zj, "lines": lines, "small": small, "fit": fit, "lens": lens}
     common |= {"exact_lines": lines, "point": np.array([10.0, 20.0]), "points": np.array([[10.0, 20.0]])}
     common |= {"focals": np.array([24.0, 35.0]), "image": np.zeros(SIZE[::-1], np.uint8)}
     common |= {"w": 400, "h": 300, "x": 200, "y": 150, "d": lens(35.0)}
@@ -187,7 +187,11 @@ def focused():
     }
 
 
-WITH_PYTHON = [name for name, page in PAGES.items() if list(PYTHON.parse(page).examples())]
+WITH_PYTHON = [
+    pytest.param(name, marks=[] if name == "README.md" else pytest.mark.slow)
+    for name, page in PAGES.items()
+    if list(PYTHON.parse(page).examples())
+]
 
 
 @pytest.mark.parametrize("name", WITH_PYTHON)

@@ -63,7 +63,7 @@ def gather(work: Path) -> None:
     for page in pages.rglob("*.md"):
         page.write_text(linked(page.read_text()))
     shutil.copy(ROOT / "zensical.toml", work / "zensical.toml")
-    shutil.copy(Path(__file__).parent / "griffe_examples.py", work / "griffe_examples.py")
+    shutil.copy(Path(__file__).parent / "griffe_docstrings.py", work / "griffe_docstrings.py")
     (work / "src").symlink_to(ROOT / "src")
 
 
