@@ -70,6 +70,10 @@ def test_all_links_lead_somewhere(pages):
                 assert unquote(parts.fragment) in pages[target].places, f"{path}: {address}"
 
 
+def test_every_room_has_a_page():
+    assert set(site.ROOMS) == set(DOORS)
+
+
 @pytest.mark.parametrize("room", site.ROOMS)
 def test_every_public_name_has_its_entry(pages, folder, room):
     places = pages[(folder / "api" / f"{room}.html").resolve()].places

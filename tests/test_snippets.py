@@ -44,7 +44,7 @@ SHELL = Sybil([CodeBlockParser("sh", nothing)])
 def shell_lines(page):
     for example in SHELL.parse(page).examples():
         lines = example.parsed.splitlines()
-        yield from (line.partition("  #")[0].strip() for line in lines if line.strip())
+        yield from (line.partition("  #")[0].strip() for line in lines if line and line[0] != "#")
 
 
 COMMANDS = sorted({line for page in PAGES.values() for line in shell_lines(page)})
