@@ -1,10 +1,12 @@
 """The Python and shell blocks of README and docs, run as they stand on one small data set."""
 
 import importlib.util
+import json
 import os
 import shlex
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import av
@@ -21,7 +23,7 @@ from zoomjax import scenes
 from zoomjax.app.calibration import calibrate
 from zoomjax.app.demo import write_photos
 
-from ._commands import COMMAND
+from ._commands import SEVERAL
 
 SIZE = (1072, 712)
 FOCAL = (20.56, 30.94, 41.38, 62.46, 127.36)
@@ -202,16 +204,36 @@ def test_python_blocks_run(name, names, here):
         example.evaluate()
 
 
+@pytest.fixture(scope="module")
+def ran(given, tmp_path_factory):
+    """The status, the words and the folder of each command; the shell takes the commands apart."""
+    jobs = {}
+    for line in OURS:
+        folder = tmp_path_factory.mktemp("command") / "work"
+        shutil.copytree(given, folder, copy_function=os.link)
+        apart = subprocess.run(
+            ["sh", "-c", f"printf '%s\\n' {line}"], cwd=folder, capture_output=True, text=True, check=True
+        )
+        words = apart.stdout.splitlines()
+        shutil.rmtree(folder / words[words.index("-o") + 1], ignore_errors=True)
+        jobs[line] = str(folder), words
+    done = subprocess.run(
+        [sys.executable, "-c", SEVERAL],
+        input=json.dumps(list(jobs.values())),
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout.splitlines()[-1])
+    return {line: (*one, *jobs[line]) for line, one in zip(jobs, told, strict=True)}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("line", OURS)
-def test_shell_commands_run(line, here):
-    words = shlex.split(line)
-    out = Path(words[words.index("-o") + 1])
-    shutil.rmtree(out, ignore_errors=True)
-    command = line.replace("zoomjax ", shlex.join(COMMAND) + " ", 1)
-    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
-    assert out.exists()
+def test_shell_commands_run(line, ran):
+    status, said, folder, words = ran[line]
+    assert status == 0, said
+    assert (Path(folder) / words[words.index("-o") + 1]).exists()
 
 
 def test_other_commands_are_those_that_set_up_and_check():
