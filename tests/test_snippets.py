@@ -49,8 +49,10 @@ def shell_lines(page):
         yield from (line.partition("  #")[0].strip() for line in lines if line and line[0] != "#")
 
 
-COMMANDS = sorted({line for page in PAGES.values() for line in shell_lines(page)})
-OURS = [line for line in COMMANDS if line.startswith("zoomjax ")]
+COMMANDS = {name: list(shell_lines(page)) for name, page in PAGES.items()}
+OURS = {line for lines in COMMANDS.values() for line in lines if line.startswith("zoomjax ")}
+README = sorted(OURS & set(COMMANDS["README.md"]))
+OTHERS = sorted(OURS - set(README))
 
 
 @pytest.fixture(scope="module")
@@ -204,12 +206,14 @@ def test_python_blocks_run(name, names, here):
         example.evaluate()
 
 
-@pytest.fixture(scope="module")
-def ran(given, tmp_path_factory):
-    """The status, the words and the folder of each command; the shell takes the commands apart."""
+def ran(lines, given, folders):
+    """The status and the words of each command, and what it should have made.
+
+    The shell takes the commands apart; one process runs them all.
+    """
     jobs = {}
-    for line in OURS:
-        folder = tmp_path_factory.mktemp("command") / "work"
+    for line in lines:
+        folder = folders.mktemp("command") / "work"
         shutil.copytree(given, folder, copy_function=os.link)
         apart = subprocess.run(
             ["sh", "-c", f"printf '%s\\n' {line}"], cwd=folder, capture_output=True, text=True, check=True
@@ -225,22 +229,41 @@ def ran(given, tmp_path_factory):
     )
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout.splitlines()[-1])
-    return {line: (*one, *jobs[line]) for line, one in zip(jobs, told, strict=True)}
+    made = [Path(folder) / words[words.index("-o") + 1] for folder, words in jobs.values()]
+    return {line: (*one, path) for line, one, path in zip(jobs, told, made, strict=True)}
+
+
+@pytest.fixture(scope="module")
+def readme(given, tmp_path_factory):
+    return ran(README, given, tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def others(given, tmp_path_factory):
+    return ran(OTHERS, given, tmp_path_factory)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("line", OURS)
-def test_shell_commands_run(line, ran):
-    status, said, folder, words = ran[line]
+@pytest.mark.parametrize("line", README)
+def test_shell_commands_of_the_readme_run(line, readme):
+    status, said, made = readme[line]
     assert status == 0, said
-    assert (Path(folder) / words[words.index("-o") + 1]).exists()
+    assert made.exists()
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("line", OTHERS)
+def test_shell_commands_of_the_docs_run(line, others):
+    status, said, made = others[line]
+    assert status == 0, said
+    assert made.exists()
 
 
 def test_other_commands_are_those_that_set_up_and_check():
     """They install packages and run all tests: .ci/run runs them itself."""
     first = ("python3 -m venv .venv", ".venv/bin/pip install", ".venv/bin/pre-commit install")
     first += (".venv/bin/python -m pytest", ".venv/bin/python -m docs.make")
-    others = [line for line in COMMANDS if line not in OURS]
+    others = {line for lines in COMMANDS.values() for line in lines} - OURS
     assert all(line.startswith(first) for line in others), others
     for line in others:
         for word in shlex.split(line):
