@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import zoomjax as zj
+
 from .shared import RESULTS, machine, machine_line, table, write
 
 POINTS = 3427

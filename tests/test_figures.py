@@ -4,6 +4,7 @@ import re
 import tomllib
 
 import pytest
+
 from docs.make import figures, tables
 
 PAGES = {str(page.relative_to(tables.ROOT)): page for page in tables.pages()}

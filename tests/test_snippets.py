@@ -14,11 +14,11 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from docs.make.tables import ROOT, pages
 from sybil import Sybil
 from sybil.parsers.markdown import CodeBlockParser, PythonCodeBlockParser
 
 import zoomjax as zj
+from docs.make.tables import ROOT, pages
 from zoomjax import scenes
 from zoomjax.app.calibration import calibrate
 from zoomjax.app.demo import write_photos
