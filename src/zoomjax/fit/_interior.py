@@ -135,8 +135,8 @@ def implicit(
 def _stationary(curvature, slopes, weight, right, gaps):
     """The x of ``(curvature + slopes' W slopes) x = right + slopes' W gaps``, W the diagonal of weights.
 
-    Weights of active inequalities are up to 1e15 times the curvature, whose part in the sum would be lost.
-    So it is solved along the singular vectors of ``sqrt(W) slopes``, where the large part is diagonal.
+    Weights of active inequalities may exceed the curvature by all digits of a number: in the sum it would be
+    lost. So it is solved along the singular vectors of ``sqrt(W) slopes``, where the large part is diagonal.
     """
     root = jnp.sqrt(weight)
     rows = jnp.concatenate([root[:, None] * slopes, jnp.zeros_like(curvature)])  # never fewer than unknowns
