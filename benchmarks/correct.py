@@ -1,6 +1,6 @@
 """How fast images, photos and video are corrected, beside OpenCV and FFmpeg.
 
-    python benchmarks/correct.py [--frames N] [--output FILE]
+    python -m benchmarks.correct [--frames N] [--output FILE]
 
 A lens from barrel to pincushion over 20-80 mm, another focal length at every call or frame. Everything in
 one process, taking turns, so that all see the same disturbances; medians of times (lower is better), and
@@ -29,11 +29,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import zoomjax as zj
-from shared import RESULTS, machine, write
 from zoomjax.correct._prefetch import ahead
 from zoomjax.correct.image import position_map
 from zoomjax.correct.maps import OUTSIDE
 from zoomjax.correct.video import undistort_video
+
+from .shared import RESULTS, machine, write
 
 HD, PHOTO = (1920, 1080), (4000, 3000)
 FLAGS = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}
@@ -284,7 +285,7 @@ def markdown(r: dict) -> str:
         [
             "# Correcting",
             "",
-            "`python benchmarks/correct.py`: another focal length at every call or frame. Medians; ratios "
+            "`python -m benchmarks.correct`: another focal length at every call or frame. Medians; ratios "
             "are medians of the ratios within a round of turns.",
             "",
             f"{m['cpu']}, {m['cores']} cores, {m['memory_GB']} GB; Python {m['python']}, "

@@ -1,6 +1,6 @@
 """How fast lines become a lens: compression, both fits, and what they are measured against.
 
-    python benchmarks/fit.py [--spacing PX] [--output FILE]
+    python -m benchmarks.fit [--spacing PX] [--output FILE]
 
 Scene: the paper's board through its published lens, 50 focal lengths, edge points every `spacing` px (1
 gives about 10 million points), noise 0.5 px, float64. Everything in one process, alternating where two
@@ -27,8 +27,9 @@ import psutil
 import scipy.optimize
 
 import zoomjax as zj
-from shared import RESULTS, machine, write
 from zoomjax import scenes
+
+from .shared import RESULTS, machine, write
 
 
 def seconds(function: Callable, *arguments, repeats: int = 7) -> float:
@@ -285,7 +286,7 @@ def markdown(results: dict) -> str:
     lines = [
         "# Fitting",
         "",
-        f"`python benchmarks/fit.py`: {r['points']:,} points on {r['lines']:,} lines in 50 frames (the "
+        f"`python -m benchmarks.fit`: {r['points']:,} points on {r['lines']:,} lines in 50 frames (the "
         "paper's board through its published lens, noise 0.5 px), float64 unless stated.",
         "",
         f"{m['cpu']}, {m['cores']} cores, {m['memory_GB']} GB; Python {m['python']}, jax {m['jax']}, "

@@ -1,6 +1,6 @@
 """Points in a differentiable pipeline: what the exact correction and its inverse cost.
 
-    python benchmarks/pipeline.py [--points N] [--repeats N]
+    python -m benchmarks.pipeline [--points N] [--repeats N]
 
 Each figure is a ratio of times in one run on one machine, calls of both taken in turn and medians compared.
 The bare formula is eq. 1-2 written out, compiled; plain Newton is four steps of it, without any check.
@@ -18,9 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from shared import RESULTS, machine, machine_line, table, write
 from zoomjax import Distortion, scenes
 from zoomjax._core.types import AnyArray
+
+from .shared import RESULTS, machine, machine_line, table, write
 
 _NEWTON_STEPS = 4
 

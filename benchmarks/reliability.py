@@ -1,6 +1,6 @@
 """Never silently wrong, nothing lost: inputs tried, and how many were wrong, lost, crashed or hung.
 
-    python benchmarks/reliability.py [--sections NAME ...] [--count SECTION=N ...] [--seed N] [--output F]
+    python -m benchmarks.reliability [--sections NAME ...] [--count SECTION=N ...] [--seed N] [--output F]
 
 One table a section, a row a search. "Wrong" is an answer that is not right and says nothing of it; "lost"
 what a user had and has no more; "crashed" an error from inside instead of a sentence, or a process that
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import jax
 
-from shared import RESULTS, machine, machine_line, table, write
+from .shared import RESULTS, machine, machine_line, table, write
 
 COLUMNS = ("tried", "wrong", "lost", "crashed", "hung")
 
@@ -28,43 +28,43 @@ Rows = dict[str, dict]
 
 
 def inverse(count: int, seed: int) -> Rows:
-    from reliability_inverse import inverse_round_trips
+    from .reliability_inverse import inverse_round_trips
 
     return _rows("round trips", inverse_round_trips(count, seed))
 
 
 def certificates(count: int, seed: int) -> Rows:
-    import reliability_core
+    from . import reliability_core
 
     return {"zoom polynomials next to a fold": reliability_core.certificates(count, seed)}
 
 
 def compression(count: int, seed: int) -> Rows:
-    import reliability_core
+    from . import reliability_core
 
     return {"lines of all kinds": reliability_core.compression(count, seed)}
 
 
 def fits(count: int, seed: int) -> Rows:
-    import reliability_core
+    from . import reliability_core
 
     return {"scenes of all kinds": reliability_core.fits(count, seed)}
 
 
 def fuzz(count: int, seed: int) -> Rows:
-    import reliability_fuzz
+    from . import reliability_fuzz
 
     return _rows("files", reliability_fuzz.run(count, seed))
 
 
 def interruption(count: int, seed: int) -> Rows:
-    import reliability_interrupt
+    from . import reliability_interrupt
 
     return _rows("interrupted commands", reliability_interrupt.run(count, seed))
 
 
 def memory(count: int, seed: int) -> Rows:
-    import reliability_memory
+    from . import reliability_memory
 
     del count, seed
     return _rows("long runs", reliability_memory.run())

@@ -1,6 +1,6 @@
 """Damaged files of every kind that zoomjax reads: how many are read wrongly, lost, crash it or hang it.
 
-    python benchmarks/reliability_fuzz.py --count 100000
+    python -m benchmarks.reliability_fuzz --count 100000
 
 Files are made from sound ones by a seeded generator (`mutations`), and each is given to the
 reader of its kind, in another process: decoders are C code. "wrong" is an object that is not sound (a lens
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mutations import READERS, Outcomes, damaged
+from .mutations import READERS, Outcomes, damaged
 
 
 def run(count: int = 1000, seed: int = 0, readers: list[str] | None = None) -> dict[str, dict]:

@@ -11,7 +11,7 @@ runs after which
   has begun;
 - hung: it, or a process that it began, is still there a minute later.
 
-    python benchmarks/reliability_interrupt.py 200
+    python -m benchmarks.reliability_interrupt 200
 """
 
 import argparse

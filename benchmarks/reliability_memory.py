@@ -1,6 +1,6 @@
 """Memory and open files while many images are looked at: they do not grow.
 
-    python benchmarks/reliability_memory.py
+    python -m benchmarks.reliability_memory
 
 Of this process and of those that it begins, after the first quarter of the images (all libraries are there
 by then) and at the end. Images are small, so that what is kept of each would show, not hide in their size.
@@ -20,9 +20,10 @@ import numpy as np
 import psutil
 
 import zoomjax as zj
-from mutations import READERS, damaged
 from zoomjax.detect.batch import detect
 from zoomjax.detect.sources import Source, find_photos, video_frames
+
+from .mutations import READERS, damaged
 
 _SIZE = (192, 128)
 

@@ -1,6 +1,6 @@
 """Choosing the model: how long cross-validation takes, and how often it finds the truth.
 
-    python benchmarks/selection.py [--draws N] [--output FILE]
+    python -m benchmarks.selection [--draws N] [--output FILE]
 
 Twelve polynomials in 1/f (degree 0 to 3, 1 to 3 coefficients) are compared by `select_model`'s rule: on the
 paper's scene for its time, in a process whose JAX has compiled nothing of it (cold) and again (warm); on
@@ -12,7 +12,6 @@ Results go to benchmarks/results/selection.md and selection.json.
 import argparse
 import dataclasses
 import os
-import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -22,11 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import zoomjax as zj
-from shared import RESULTS, machine, machine_line, table, write
 from zoomjax import scenes
 from zoomjax.trust.cross_validation import held_out_frames, held_out_zoom
 from zoomjax.trust.folds import HoldOut, folds_of
 from zoomjax.trust.selection import compare, default_candidates
+
+from .shared import RESULTS, machine, machine_line, table, write
 
 SIZE = (1072, 712)
 CANDIDATES = default_candidates()[:12]
@@ -91,8 +91,7 @@ def choices(degree: int, hold_out: HoldOut, draws: int) -> dict:
 
 def real(folder: Path) -> dict:
     """What is chosen for the real zoom camera, by what is left out."""
-    sys.path.insert(0, str(Path(__file__).parent / "real"))
-    from zoomcam import read_zoomcam
+    from .real.zoomcam import read_zoomcam
 
     small = zj.compress(read_zoomcam(folder / "zoomcam"), terms=3)
     found = {}
@@ -136,7 +135,7 @@ def markdown(results: dict) -> str:
     lines = [
         "# Choosing the model",
         "",
-        f"`python benchmarks/selection.py --draws {draws}`. {machine_line(results['machine'])} "
+        f"`python -m benchmarks.selection --draws {draws}`. {machine_line(results['machine'])} "
         f"Load average {results['load']:.0f}, mostly of other work, which the clock counts and the "
         "processor time does not.",
         "",

@@ -1,6 +1,6 @@
 """How far a fitted lens can be trusted: what its error bands say beside what repeated noise does.
 
-    python benchmarks/trust.py [--draws N] [--tables NAME ...] [--output FILE]
+    python -m benchmarks.trust [--draws N] [--tables NAME ...] [--output FILE]
 
 Scenes have exact truth; each is drawn with new noise N times, compressed, fitted, and compared with the
 truth. Figures that are counted over draws have their Monte-Carlo error (one standard deviation) beside
@@ -573,7 +573,7 @@ def kept(output: Path) -> dict[str, dict]:
 
 def markdown(tables: dict[str, dict]) -> str:
     """The results as a page."""
-    page = ["# Trust", "", "`python benchmarks/trust.py`, float64."]
+    page = ["# Trust", "", "`python -m benchmarks.trust`, float64."]
     for table in tables.values():
         m = table["machine"]
         page += ["", f"## {table['title']}", "", table["about"], "", f"| {' | '.join(table['heads'])} |"]

@@ -1,6 +1,6 @@
 """How fast, exactly and completely lines are found in images, and what lens they give.
 
-    python benchmarks/vision.py [--rounds N] [--output FILE]
+    python -m benchmarks.vision [--rounds N] [--output FILE]
 
 Rendered photos of the paper's board have exact truth. Real photos are read from the folder that the
 environment variable ZOOMJAX_DATA names; without it what needs them is left out, and the page says so.
@@ -23,10 +23,11 @@ import numpy as np
 from scipy.spatial import KDTree
 
 import zoomjax as zj
-from correct import HD, in_turn, summary
-from shared import RESULTS, machine, write
 from zoomjax import scenes
 from zoomjax.app.demo import IMAGE_SIZE, worst_error
+
+from .correct import HD, in_turn, summary
+from .shared import RESULTS, machine, write
 
 SHARP, NOISY = "blur 0.7 px, no noise", "blur 1 px, noise 5"
 CONDITIONS = {SHARP: (0.7, 0.0), NOISY: (1.0, 5.0)}
@@ -388,7 +389,7 @@ def markdown(r: dict) -> str:
     lines = [
         "# Finding lines",
         "",
-        "`python benchmarks/vision.py`. Times are medians; ratios are medians of the ratios within a round "
+        "`python -m benchmarks.vision`. Times are medians; ratios are medians of the ratios within a round "
         "of turns.",
         "",
         f"{m['cpu']}, {m['cores']} cores, {m['memory_GB']} GB; Python {m['python']}, "

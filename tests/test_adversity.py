@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,8 +14,6 @@ import pytest
 from zoomjax import scenes
 
 from ._commands import COMMAND
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 posix = pytest.mark.skipif(os.name != "posix", reason="needs POSIX")
 
@@ -210,7 +207,7 @@ def test_two_processes_in_one_folder_leave_the_results_of_one(folder):
 @posix
 @pytest.mark.slow
 def test_signals_at_random_moments_lose_nothing():
-    from reliability_interrupt import run
+    from benchmarks.reliability_interrupt import run
 
     found = run(6, seed=3, names=("lines", "lines", "undistort"))
     assert found.pop("tried") == 6

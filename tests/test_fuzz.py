@@ -8,11 +8,9 @@ import copy
 import io
 import json
 import math
-import sys
 import tracemalloc
 import warnings
 import zipfile
-from pathlib import Path
 
 import jaxtyping
 import numpy as np
@@ -21,10 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import zoomjax as zj
-from zoomjax.io.focal_table import read_focal_table
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from mutations import (
+from benchmarks.mutations import (
     CSV_LINES,
     READERS,
     Outcomes,
@@ -36,6 +31,7 @@ from mutations import (
     sound_table,
     sound_track,
 )
+from zoomjax.io.focal_table import read_focal_table
 
 MANY = settings(max_examples=200)
 

@@ -26,10 +26,10 @@ TOP = {"torch": {"correct", "models"}, "__main__": {"app"}}
 """Modules beside the rooms, and what they import from."""
 
 LIBRARIES = {
-    "app": {"matplotlib", "typer", "rich", "cv2"},
+    "app": {"matplotlib", "typer", "rich", "cv2", "jinja2"},
     "correct": {"cv2"},
     "detect": {"cv2"},
-    "io": {"cv2", "av"},
+    "io": {"cv2", "av", "PIL", "tifffile"},
     "torch": {"torch"},
 }
 """Libraries of images, plots, terminals and video, and where they may be imported."""

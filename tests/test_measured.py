@@ -1,21 +1,30 @@
 """What docs/measured.md says of real cameras: the studies of benchmarks/real, and their geometry."""
 
-import sys
+import json
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+import benchmarks
 import zoomjax as zj
+from benchmarks.real.lensfun.page import markdown
+from benchmarks.real.study import DEFAULT, candidates, choose, root_mean
+from benchmarks.real.study_broadcast import (
+    Clip,
+    corrected,
+    distorted,
+    looking_at,
+    pitch_lines,
+    seen,
+    truly_straight,
+)
+from benchmarks.real.study_pitch import line_left_out
+from benchmarks.real.study_zoomcam import in_double, random_halves
+from benchmarks.real.zoomcam import read_zoomcam
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "real"))
-
-from study import DEFAULT, candidates, choose, root_mean
-from study_broadcast import Clip, corrected, distorted, looking_at, pitch_lines, seen, truly_straight
-from study_pitch import line_left_out
-from study_zoomcam import in_double, random_halves
-from zoomcam import read_zoomcam
+RESULTS = Path(benchmarks.__file__).parent / "results"
 
 MODELS = {model.name: model for model in candidates()}
 
@@ -126,3 +135,8 @@ def test_a_line_left_out_is_corrected_as_the_others_of_its_frame_ask_for(ragged)
         squares[line] = zj.frame_rms(lines.weighted(only), k)[frame[line]] ** 2
     expected = np.bincount(frame, squares) / np.bincount(frame)
     np.testing.assert_allclose(line_left_out(lines, 1), expected, rtol=1e-6)
+
+
+def test_the_page_of_six_hundred_lenses_is_made_of_its_results():
+    page = RESULTS / "lensfun.md"
+    assert markdown(json.loads(page.with_suffix(".json").read_text())) == page.read_text(encoding="utf-8")

@@ -1,13 +1,8 @@
 """The searches of `benchmarks/reliability.py`, with small counts: none finds a silent wrong answer."""
 
-import sys
-from pathlib import Path
-
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-
-import reliability_core
+from benchmarks import reliability_core
 
 COUNTS = {"compression": 96, "certificates": 300, "fits": len(reliability_core.SCENES)}
 

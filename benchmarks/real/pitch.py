@@ -1,6 +1,6 @@
 """Focal lengths from the pitch lines of real broadcasts, and from a real zoom camera's checkerboards.
 
-    python benchmarks/real/pitch.py
+    python -m benchmarks.real.pitch
 
 reads the data folder that the environment variable ZOOMJAX_DATA names, and prints four tables.
 
@@ -21,11 +21,12 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from zoomcam import read_zoomcam
 
 from zoomjax import Distortion, Lines, PolynomialZoom, fit_zoom, frame_rms
 from zoomjax.focal import FocalEstimate, focal_from_pitch, focal_from_planes
 from zoomjax.focal.pitch import PITCH_LINES
+
+from .zoomcam import read_zoomcam
 
 SIZE = (1280, 720)
 NOISE = 0.6

@@ -5,7 +5,6 @@ tables, and writes it to benchmarks/results with the figures beside it as JSON.
 """
 
 import argparse
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,9 +17,8 @@ import numpy as np
 
 import zoomjax as zj
 
-sys.path.append(str(Path(__file__).parents[1]))  # scripts see the modules of their own folder alone
-from shared import RESULTS, machine, machine_line, real_data, write
-from shared import table as table
+from ..shared import RESULTS, machine, machine_line, real_data, write
+from ..shared import table as table
 
 TERMS = 2
 NONE, EACH, DEFAULT = "no correction", "each zoom by itself", "zoom polynomial, degree 2"
@@ -151,5 +149,5 @@ def main(
 
 def whole_page(results: dict, name: str, lines: list[str]) -> list[str]:
     """The page of a study with the command that makes it, and where it ran."""
-    command = f"`python benchmarks/real/study_{name}.py`: {results['cpu_seconds']:.0f} s of CPU time."
+    command = f"`python -m benchmarks.real.study_{name}`: {results['cpu_seconds']:.0f} s of CPU time."
     return [*lines[:2], command, "", *lines[2:], "", machine_line(results["machine"]), ""]

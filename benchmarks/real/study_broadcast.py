@@ -1,6 +1,6 @@
 """Zoom models on the frames between: the true lenses of real broadcast cameras, 55 frames to learn from.
 
-    python benchmarks/real/study_broadcast.py [--output FILE]
+    python -m benchmarks.real.study_broadcast [--output FILE]
 
 Five clips of the World Cup 2022, with focal length, principal point and OpenCV's k1 and k2 of every frame,
 1920 x 1080 px. OpenCV's coefficients bend a straight image, ``x_d = x (1 + k1 r^2 + k2 r^4)`` with x in
@@ -30,10 +30,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from study import DEFAULT, NONE, TERMS, choose, fitting, main, root_mean, table
 
 import zoomjax as zj
 from zoomjax.focal.pitch import PITCH_LINES
+
+from .study import DEFAULT, NONE, TERMS, choose, fitting, main, root_mean, table
 
 SIZE = (1920, 1080)
 SCALE = np.hypot(*SIZE) / 2

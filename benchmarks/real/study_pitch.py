@@ -1,6 +1,6 @@
 """Zoom models on frames they have not seen: lines of a football pitch, marked by hand.
 
-    python benchmarks/real/study_pitch.py [--output FILE]
+    python -m benchmarks.real.study_pitch [--output FILE]
 
 93 frames of broadcasts of the World Cup 2014, 1280 x 720 px (see pitch.py). Straight lines of the pitch
 with 3 marks or more, most have 3, and the focal length of a camera that another program predicts, which is
@@ -20,10 +20,11 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from pitch import annotated_lines, read_pitch
-from study import DEFAULT, NONE, TERMS, Candidate, choose, fitting, interval, main, root_mean, table
 
 import zoomjax as zj
+
+from .pitch import annotated_lines, read_pitch
+from .study import DEFAULT, NONE, TERMS, Candidate, choose, fitting, interval, main, root_mean, table
 
 PARTS, PARTINGS = 5, 10
 DRAWS = 4000

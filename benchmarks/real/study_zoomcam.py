@@ -1,6 +1,6 @@
 """Zoom models on photos they have not seen: a real zoom camera in front of a checkerboard.
 
-    python benchmarks/real/study_zoomcam.py [--output FILE]
+    python -m benchmarks.real.study_zoomcam [--output FILE]
 
 116 photos at five zooms (see zoomcam.py), whose rows and columns of corners are straight lines. Every model
 is fitted to a random half of the photos of each zoom and tested on the others, in many random halves; then
@@ -20,10 +20,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from study import DEFAULT, EACH, NONE, TERMS, Candidate, fitting, main, root_mean, table
-from zoomcam import read_zoomcam
 
 import zoomjax as zj
+
+from .study import DEFAULT, EACH, NONE, TERMS, Candidate, fitting, main, root_mean, table
+from .zoomcam import read_zoomcam
 
 HALVES = 30
 LEFT_OUT_HALVES = 10

@@ -1,6 +1,6 @@
 """The corners of a real zoom camera as lines, for `zoomjax calibrate` and for measurements.
 
-    python benchmarks/real/zoomcam.py [-o zoomcam.npz]
+    python -m benchmarks.real.zoomcam [-o zoomcam.npz]
 
 reads the folder ``zoomcam`` of the data folder that the environment variable ZOOMJAX_DATA names: 116 photos
 of a checkerboard (22 x 15 inner corners) at five zooms of a surveillance camera, 1280 x 720 px. Every row

@@ -1,5 +1,6 @@
 """Where what can be made again is kept."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -26,13 +27,9 @@ def test_else_it_is_the_users_cache(monkeypatch, tmp_path, base):
 @pytest.mark.parametrize("base", [None, "", "relative"])
 def test_without_a_home_there_is_none(base, monkeypatch):
     """Neither in the working folder nor where others could fill it."""
-
-    def nowhere():
-        raise RuntimeError("Could not determine home directory.")
-
-    for variable in ("ZOOMJAX_CACHE", "XDG_CACHE_HOME", "LOCALAPPDATA"):
+    for variable in ("ZOOMJAX_CACHE", "HOME", "XDG_CACHE_HOME", "LOCALAPPDATA"):
         monkeypatch.delenv(variable, raising=False)
-        if base is not None and variable != "ZOOMJAX_CACHE":
+        if base is not None and variable == "XDG_CACHE_HOME":
             monkeypatch.setenv(variable, base)
-    monkeypatch.setattr(Path, "home", nowhere)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as where the system knows none
     assert cache_folder("compiled") is None

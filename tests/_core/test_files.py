@@ -11,7 +11,7 @@ def test_what_is_there_is_not_replaced_unless_that_is_given(tmp_path):
     targets = [tmp_path / name for name in ("a.jpg", "b.jpg", "c.jpg")]
     refuse_existing(targets, overwrite=False)
     targets[1].write_text("mine")
-    with pytest.raises(FileExistsError, match=r"b\.jpg is there already and .* give overwrite\.$"):
+    with pytest.raises(FileExistsError, match=r"b\.jpg is there already and .* give argument overwrite\.$"):
         refuse_existing(targets, overwrite=False)
     targets[2].symlink_to(tmp_path / "nowhere")
     with pytest.raises(FileExistsError, match=r"b\.jpg and 1 more file are there already"):

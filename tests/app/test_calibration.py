@@ -1,9 +1,7 @@
 """Calibrations as a whole: their figures, their folder, and the real zoom camera."""
 
 import json
-import sys
 import warnings
-from pathlib import Path
 
 import equinox as eqx
 import numpy as np
@@ -13,8 +11,6 @@ import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app.calibration import calibrate, focal_sigmas, rms_over_frames
 from zoomjax.app.report import report
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks" / "real"))
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +79,7 @@ def test_results_are_written_together_or_not_at_all(calibration, tmp_path, monke
 
 
 def test_zoomcam_gives_the_reference_figures(data):
-    from zoomcam import read_zoomcam
+    from benchmarks.real.zoomcam import read_zoomcam
 
     lines = read_zoomcam(data / "zoomcam")
     assert len(lines.focal) == 5
@@ -112,7 +108,7 @@ def test_deviations_are_numbers_or_per_cent():
     np.testing.assert_allclose(focal_sigmas("0.3", np.array([20.0, 50.0])), [0.3, 0.3])
     np.testing.assert_allclose(focal_sigmas(" 2 %", np.array([20.0, 50.0])), [0.4, 1.0])
     for text in ("", "%", "-1", "nan", "1%%", "inf", "a bit"):
-        with pytest.raises(ValueError, match=r"--focal-sigma must be a number such as 0.3, or 1%"):
+        with pytest.raises(ValueError, match=r"Argument focal_sigma must be a number such as 0.3, or 1%"):
             focal_sigmas(text, np.ones(2))
 
 

@@ -230,7 +230,7 @@ WRONG = {
     "unknown detector": (
         {"detector": "circles"},
         ValueError,
-        "--detector must be one of edges, grid, pitch",
+        "Argument detector must be one of edges, grid, pitch",
     ),
     "photos and a video": ({"inputs": ("a.jpg", "b.mp4")}, ValueError, "photographs, or one video"),
     "two videos": ({"inputs": ("a.mp4", "b.mp4")}, ValueError, "one video"),

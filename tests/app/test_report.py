@@ -123,7 +123,8 @@ def test_worst_lines_are_those_of_the_lens(page, calibration):
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    monkeypatch.setattr(zoomjax.app.report, "_plot", lambda *_, **__: zoomjax.app.report.Html())
+    nothing = dict.fromkeys(("source", "label", "class", "width", "height"), "")
+    monkeypatch.setattr(zoomjax.app.report, "_plot", lambda *_, **__: nothing)
 
 
 @pytest.mark.usefixtures("undrawn")

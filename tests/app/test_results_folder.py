@@ -100,7 +100,7 @@ def test_what_zoomjax_did_not_write_is_refused_before_the_work(kind, tmp_path, o
     write(folder, OLD)
     FOREIGN[kind](folder)
     before = tree(folder)
-    asks = pytest.raises(FileExistsError, match=r"would be replaced.*another folder, or give overwrite")
+    asks = pytest.raises(FileExistsError, match=r"would be replaced.*folder, or give argument overwrite")
     with asks, results_folder(folder, NEW):
         pytest.fail("the work began")
     assert tree(folder) == before

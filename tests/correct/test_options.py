@@ -157,7 +157,7 @@ def test_hold_is_for_tracks(made, tmp_path):
     held = run(made, "video", tmp_path, focal=str(made / "short.csv"), hold=True)
     np.testing.assert_allclose(held[2].astype(int), expected("video", [20, 40, 40])[2], atol=1)
     for kind in ("photo", "video"):
-        with pytest.raises(ValueError, match="--hold is for"):
+        with pytest.raises(ValueError, match="Argument hold is for"):
             run(made, kind, tmp_path / "no", hold=True)
 
 
@@ -180,7 +180,7 @@ def test_the_output_is_a_file_or_a_folder(made, tmp_path):
 @pytest.mark.parametrize("focal", ["1_000", "20,5", "nan", "0x20", "٣٥", "-3", "0", "wide"])
 @pytest.mark.parametrize("kind", ["photo", "video"])
 def test_focal_lengths_are_plain_numbers(made, tmp_path, kind, focal):
-    with pytest.raises(ValueError, match="--focal must be a positive number"):
+    with pytest.raises(ValueError, match="Argument focal must be a positive number"):
         run(made, kind, tmp_path, focal=focal)
     assert not list(tmp_path.iterdir())
 

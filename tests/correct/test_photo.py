@@ -9,6 +9,8 @@ import pytest
 
 import zoomjax as zj
 from zoomjax.correct.photo import photo_focal
+from zoomjax.io.photo import read_focal, read_photo
+from zoomjax.io.tiff import encode_tiff
 
 from .._exif import exif
 
@@ -61,7 +63,6 @@ def metadata(path):
         (".webp", 4, np.uint8),
     ],
 )
-@pytest.mark.filterwarnings("ignore:Metadata of")
 def test_depth_and_channels_are_kept(tmp_path, rng, suffix, channels, dtype):
     source = write(tmp_path / f"in{suffix}", picture(rng, channels, dtype))
     zj.undistort_photo(source, tmp_path / f"out{suffix}", lens=lens(), focal=20.0)
@@ -98,12 +99,36 @@ def test_colour_profile_is_kept(tmp_path, rng, suffix):
     assert metadata(tmp_path / f"out{suffix}")[1][cv2.IMAGE_METADATA_ICCP] == profile
 
 
-def test_tiff_tells_its_focal_length_and_that_metadata_are_lost(tmp_path, rng):
+def test_tiff_tells_its_focal_length_if_it_knows(tmp_path, rng):
     source = write(tmp_path / "in.tif", picture(rng))
-    with pytest.raises(ValueError, match=r"focal length of .*in\.tif is not known"):
+    with pytest.raises(ValueError, match=r"focal length of .*in\.tif is not known.*argument focal"):
         photo_focal(source, lens())
-    with pytest.warns(UserWarning, match=r"Metadata of .*in\.tif are not kept"):
-        zj.undistort_photo(source, tmp_path / "out.tif", lens=lens(), focal=20.0)
+
+
+TIFF_AND_OTHERS = [(".tif", ".jpg"), (".jpg", ".tif"), (".tif", ".tiff"), (".png", ".tif")]
+
+
+@pytest.mark.parametrize("suffixes", TIFF_AND_OTHERS)
+def test_tiff_files_take_and_give_metadata(tmp_path, rng, suffixes):
+    block, image = exif((3500, 100), orientation=6), picture(rng)
+    source, target = (tmp_path / f"{name}{suffix}" for name, suffix in zip("ab", suffixes, strict=True))
+    if suffixes[0] == ".tif":
+        source.write_bytes(encode_tiff(image, [(cv2.IMAGE_METADATA_EXIF, np.frombuffer(block, np.uint8))]))
+    else:
+        write(source, image, block)
+    zj.undistort_photo(source, target, lens=lens())  # 35 mm, from the EXIF data
+    assert read_focal(target) == 35.0
+    stored, _ = read_photo(target)
+    expected = zj.undistort_image(read_photo(source)[0], lens()(35.0))
+    assert cv2.absdiff(stored, expected).mean() < 1  # JPEG in quality 97
+    upright = cv2.imdecode(np.fromfile(target, np.uint8), cv2.IMREAD_COLOR)  # as viewers show it
+    assert upright.shape == (SIZE[0], SIZE[1], 3)
+
+
+def test_what_has_no_room_for_metadata_says_so(tmp_path, rng):
+    source = write(tmp_path / "in.png", picture(rng), exif())
+    with pytest.warns(UserWarning, match=r"Metadata of .*in\.png are not kept"):
+        zj.undistort_photo(source, tmp_path / "out.bmp", lens=lens())
 
 
 def wrong(case, tmp_path, rng):

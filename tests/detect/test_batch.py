@@ -159,7 +159,7 @@ def test_what_no_detector_can_do_with_an_image_is_told(tmp_path):
     grey, small = np.zeros((100, 100), np.uint8), np.zeros((20, 100, 3), np.uint8)
     [found] = detect([Source("a", image=grey)], zj.detect.PitchDetector())
     assert "grey" in found.problem
-    assert "--detector edges" in found.problem
+    assert "Try another detector, such as edges (argument detector)" in found.problem
     [found] = detect([Source("a", image=small)], zj.EdgeDetector())
     assert found.problem == "it is 100x20 px: at least 32 px a side are needed"
 

@@ -1,13 +1,9 @@
 """Memory and open files do not grow with the number of images: scaled down from `reliability_memory`."""
 
-import sys
-from pathlib import Path
-
 import pytest
 
 pytest.importorskip("av")
 pytest.importorskip("psutil")
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 LEAST_SHOWN = 4.0
 """MB: of 120 small pictures, 9 MB would be held if each were kept."""
@@ -15,7 +11,7 @@ LEAST_SHOWN = 4.0
 
 @pytest.mark.slow
 def test_photographs_frames_and_bad_files_leave_nothing_behind():
-    import reliability_memory
+    from benchmarks import reliability_memory
 
     for name, row in reliability_memory.run(photos=160, frames=160, bad=160, workers=1).items():
         assert row["images"] == 160, name

@@ -1,8 +1,5 @@
 """Focal lengths known with errors: bands that allow for them, and focal lengths that the lines mend."""
 
-import sys
-from pathlib import Path
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,8 +9,6 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.fit.focal_lengths import _response
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 ROUNDED = 1 / np.sqrt(12)
 
@@ -161,7 +156,7 @@ def test_float32_bands_agree_and_refining_wants_float64(sweep):
 @pytest.mark.slow
 def test_bands_with_rounded_focal_lengths_hold_the_truth_as_often_as_they_say():
     """Taken as exact the 95 % are 30 %; the refined lens is better and its bands as true."""
-    from trust import rounded_focal
+    from benchmarks.trust import rounded_focal
 
     table = rounded_focal(100).data
     covered = {

@@ -1,8 +1,5 @@
 """Bands: what they say is what repeated noise does, and the delta method's own derivatives."""
 
-import sys
-from pathlib import Path
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,8 +8,6 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 FOCAL = np.array([20.56, 51.0, 127.36])
 POINTS = np.array([[0.0, 0.0], [4287.0, 2847.0], [3000.0, 400.0]])
@@ -27,7 +22,7 @@ POINTS = np.array([[0.0, 0.0], [4287.0, 2847.0], [3000.0, 400.0]])
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
 def test_bands_hold_the_truth_as_often_as_they_say(correlation, draws, slack):
     """Also where points err together along an edge; within 3 in a hundred, or what few draws can tell."""
-    from trust import Noise, board, corner_errors
+    from benchmarks.trust import Noise, board, corner_errors
 
     truth, scene = board((15, 11), 5, 12)
     errors, stds = corner_errors(truth, scene, Noise(correlation=correlation), draws)

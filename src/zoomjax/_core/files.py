@@ -17,6 +17,8 @@ import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import platformdirs
+
 try:
     import fcntl
 except ModuleNotFoundError:  # Windows
@@ -37,13 +39,11 @@ def cache_folder(kind: str) -> Path | None:
     """
     if named := os.environ.get("ZOOMJAX_CACHE"):
         return Path(named) / kind
-    base = Path(os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME") or "")
-    if not base.is_absolute():  # to be passed over, says the standard
-        try:
-            base = Path.home() / ".cache"
-        except RuntimeError:
-            return None
-    return base / "zoomjax" / kind if base.is_absolute() else None
+    try:
+        folder = platformdirs.user_cache_path("zoomjax", appauthor=False)
+    except RuntimeError:
+        return None
+    return folder / kind if folder.is_absolute() else None
 
 
 _unfinished: list[Path] = []
@@ -112,7 +112,7 @@ def refuse_existing(targets: Iterable[Path], *, overwrite: bool) -> None:
     if there:
         raise FileExistsError(
             f"{_several(there)} there already and would be replaced: choose another place, or give "
-            "overwrite."
+            "argument overwrite."
         )
 
 

@@ -33,7 +33,6 @@ from ..trust.bands import displacement_std
 from ..trust.cross_validation import held_out_frames, held_out_zoom
 from ..trust.next_photo import Suggestion, suggest_next
 from ..trust.selection import Selection, default_candidates, select_model
-from .plot import plot_model
 from .results_folder import results_folder
 
 FILES = ("lens.json", "lines.npz", "summary.json", "model.png")
@@ -229,6 +228,8 @@ class Calibration:
         pages: Mapping[str, str] | None = None,
     ) -> None:
         """The same in an empty folder: that of a `results_folder`, say."""
+        from .plot import plot_model  # so that `calibrate` does not need Matplotlib
+
         folder = Path(folder)
         self.zoom.lens.save(folder / "lens.json")
         self.lines.save(folder / "lines.npz")
@@ -319,7 +320,7 @@ def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray
     except ValueError:
         value = np.nan
     if rest or not 0 <= value < np.inf:
-        raise ValueError(f"--focal-sigma must be a number such as 0.3, or 1%, but it is {text!r}.")
+        raise ValueError(f"Argument focal_sigma must be a number such as 0.3, or 1%, but it is {text!r}.")
     return value / 100 * np.asarray(focal) if percent else np.full(np.shape(focal), value)
 
 

@@ -16,6 +16,7 @@ except ModuleNotFoundError:
 
 from .._core.text import plain
 from ._compiled import UNKEPT, forget_compiled
+from ._flags import with_flags
 from ._interrupts import INTERRUPTED, LAST_WORDS, end_run, leave, swallowed
 from .commands import app
 
@@ -50,7 +51,7 @@ def _sentence(error: BaseException) -> str:
         text = f"There is not enough memory. {text}".strip()
     elif isinstance(error, OSError) and error.strerror:
         text = error.strerror + (f": {os.fspath(error.filename)}" if error.filename is not None else ".")
-    return plain(text).replace("give overwrite.", "give --overwrite.")
+    return plain(with_flags(text))
 
 
 def _print_warning(message, category, filename, lineno, file=None, line=None) -> None:
@@ -58,4 +59,4 @@ def _print_warning(message, category, filename, lineno, file=None, line=None) ->
     if unkept and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         forget_compiled(unkept[1])
         return
-    print(f"Warning: {plain(str(message))}", file=sys.stderr)
+    print(f"Warning: {plain(with_flags(str(message)))}", file=sys.stderr)

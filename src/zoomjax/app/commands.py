@@ -16,6 +16,7 @@ import typer
 from .._core.files import cache_folder
 from .._core.text import plain
 from ._compiled import set_up_jax
+from ._flags import with_flags
 from .arguments import (
     Degree,
     Overwrite,
@@ -257,7 +258,7 @@ def undistort(
         )
     print(plain(done.sentence))
     for path, reason in done.skipped.items():
-        print(plain(f"Skipped {path}: {reason}"), file=sys.stderr)
+        print(plain(f"Skipped {path}: {with_flags(reason)}"), file=sys.stderr)
     if done.skipped:
         raise typer.Exit(2 if len(done.skipped) == len(inputs) else 1)
 

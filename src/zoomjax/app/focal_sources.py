@@ -179,7 +179,7 @@ def _own(detections: Sequence[Detection]) -> dict[str, float]:
 def _number(text: str) -> float | None:
     value = plain_number(text)
     if value is not None and value <= 0:
-        raise ValueError(f"--focal must be a positive number, but it is {text}.")
+        raise ValueError(f"Argument focal must be a positive number, but it is {text}.")
     return value
 
 

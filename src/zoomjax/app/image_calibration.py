@@ -17,6 +17,7 @@ from ..detect.batch import DETECTORS, Detection, detect
 from ..detect.sources import VIDEO_SUFFIXES, Source, find_photos, video_frames
 from ..io.focal_track import FocalTrack, read_focal_track
 from ..io.text_table import plain_number
+from ._flags import with_flags
 from .calibration import CLEARS, FILES, Calibration, calibrate, focal_sigmas
 from .focal_sources import Board, Focals, check_way, choose_focals, lines_of
 from .overlay import draw_lines
@@ -68,7 +69,7 @@ class ImageJob:
         """
         if self.detector not in DETECTORS:
             raise ValueError(
-                f"--detector must be one of {', '.join(DETECTORS)}, but it is {self.detector!r}."
+                f"Argument detector must be one of {', '.join(DETECTORS)}, but it is {self.detector!r}."
             )
         if len(self.inputs) > 1 and any(map(_is_video, self.inputs)):
             raise ValueError("Give photographs, or one video.")
@@ -246,7 +247,7 @@ def calibrate_images(
         for detection in looked:
             detections.append(detection)
             progress(len(detections), total)
-    unused = {d.name: d.problem for d in detections if d.problem}
+    unused = {d.name: with_flags(d.problem) for d in detections if d.problem}
     usable, others = _of_one_size([d for d in detections if not d.problem])
     unused |= others
     if not usable:

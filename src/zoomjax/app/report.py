@@ -1,24 +1,24 @@
 """report.html: a calibration on one page, to read and to hand on.
 
-The page needs nothing but itself: its style and its plots are in it, and it has no script. Every text goes
-through `element`, which escapes it. Plots are drawn for a light background; browsers in dark mode invert
-them.
+The page needs nothing but itself: its style and its plots are in it, and it has no script. Its text is in
+``templates/report.html``, its colours in ``templates/report.css``; here is what they are filled with. Plots
+are drawn for a light background; browsers in dark mode invert them.
 
 Once per calibration; most of the time is drawing.
 """
 
 import base64
+import functools
 import io
-from html import escape
-from typing import TYPE_CHECKING
-from urllib.parse import quote
+from typing import TYPE_CHECKING, Any
 
+import jinja2
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from .._core.text import plain
 from ..trust.selection import COLUMNS
-from ._html import STYLE, Html, box, element, joined, section, table
 from .calibration import Calibration, rms_over_frames
 from .plot import plot_distortion, plot_model, plot_primitives, plot_residues
 
@@ -42,35 +42,52 @@ def report(calibration: Calibration, images: "ImageCalibration | None" = None) -
     """
     lens = calibration.zoom.lens
     low, high = (float(f) for f in lens.focal_range)
-    about = [
-        f"f = {low:.4g} to {high:.4g} {lens.focal_unit}",
-        f"{lens.image_size[0]} × {lens.image_size[1]} px",
-        _number(len(calibration.none), "frame"),
-        _number(len(calibration.rejected), "line"),
-        _number(int(np.sum(np.asarray(calibration.lines.mask))), "point"),
-    ]
-    warnings = images.warnings() if images else calibration.warnings()
-    body = [
-        element("header", [element("h1", "Zoom lens calibration"), element("p", " · ".join(about))]),
-        _headline(calibration),
-        *(element("aside", [element("strong", "Beware: "), warning]) for warning in warnings),
-        section("straightness", "How straight lines are", _straightness(calibration)),
-        section("lens", "The lens", _lens(calibration)),
-        section("distortion", "What it does to images", _distortion(calibration)),
-        section("next", "The next photo", [element("p", calibration.next.sentence)]),
-        section("frames", "Frame by frame", _frames(calibration, images)),
-        element("footer", _footer(calibration, images)),
-    ]
+    versions = calibration.summary()["versions"]
     return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="color-scheme" content="light dark">\n'
-        f"<title>Zoom lens calibration, {escape(about[0])}</title>\n<style>{STYLE}</style>\n</head>\n"
-        "<body>\n<main>\n" + "\n".join(body) + "\n</main>\n</body>\n</html>\n"
+        _templates()
+        .get_template("report.html")
+        .render(
+            about=[
+                f"f = {low:.4g} to {high:.4g} {lens.focal_unit}",
+                f"{lens.image_size[0]} × {lens.image_size[1]} px",
+                _number(len(calibration.none), "frame"),
+                _number(len(calibration.rejected), "line"),
+                _number(int(np.sum(np.asarray(calibration.lines.mask))), "point"),
+            ],
+            cards=_cards(calibration),
+            warnings=images.warnings() if images else calibration.warnings(),
+            straightness=_straightness(calibration),
+            lens=_lens(calibration),
+            distortion=_distortion(calibration),
+            next=calibration.next.sentence,
+            frames=_frames(calibration, images),
+            images=images,
+            files=["lens.json", "summary.json", "lines.npz", "model.png"],
+            versions=", ".join(f"{name} {of}" for name, of in versions.items()),
+        )
     )
 
 
-def _headline(calibration: Calibration) -> "Html":
+@functools.cache
+def _templates() -> jinja2.Environment:
+    """Templates in which every text is escaped, and has no orders to whoever reads it."""
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("zoomjax.app"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=lambda value: _shown(value) if type(value) is str else value,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+
+
+def _shown(text: str) -> str:
+    """Without orders to a browser; warnings have lines."""
+    return "\n".join(map(plain, text.split("\n")))
+
+
+def _cards(calibration: Calibration) -> list[tuple[str, str]]:
     """The figures that decide whether to look any further."""
     none, zoom, each = (
         rms_over_frames(values)
@@ -78,80 +95,56 @@ def _headline(calibration: Calibration) -> "Html":
     )
     std = max(std for _, _, std in calibration.corner())
     certified = bool(calibration.zoom.certificate.certified)
-    cards = [
+    return [
         (f"{zoom:.3g} px", "from straight, RMS, with the zoom polynomial"),
         (f"{none / zoom:.3g} times" if zoom > 0 else "∞", "straighter than without correction"),
         (_excess(zoom, each), "over every frame by itself"),
         (f"± {std:.2g} px" if np.isfinite(std) else "unknown", "at the corner, where it is least certain"),
         ("proved" if certified else "not proved", "to be invertible at every focal length"),
     ]
-    figures = [element("div", [element("dt", name), element("dd", value)]) for value, name in cards]
-    return element("dl", figures, class_="cards")
 
 
-def _straightness(calibration: Calibration) -> list["Html"]:
+def _straightness(calibration: Calibration) -> dict[str, Any]:
     each = rms_over_frames(calibration.each.frame_rms)
     held_out = {name: rms_over_frames(frames) for name, frames in calibration.held_out_rows().items()}
-    rows = [
-        (
-            name,
-            f"{value:.4f}",
-            f"{held_out[name]:.4f}" if held_out.get(name, np.nan) > 0 else "",
-            "" if name == "frame by frame" else _excess(value, each),
-        )
-        for name, value in ((name, rms_over_frames(frames)) for name, frames in calibration.rows())
-    ]
     figure = plot_residues(
         calibration.lines,
         calibration.none,
         np.asarray(calibration.each.frame_rms),
         np.asarray(calibration.zoom.frame_rms),
     )
-    return [
-        element(
-            "p",
-            "Distance of corrected points to the straight lines through them, over all frames. Held out: "
-            "of lines that were not fitted, each frame under the polynomial of all others, and a tenth of "
-            "its lines at a time under its own model.",
-        ),
-        table("Straightness", ["", "RMS, px", "held out, px", "over frame by frame"], rows),
-        *_choice(calibration),
-        _plot(figure, "What is left of each frame against 1/f", class_="box plot"),
-    ]
+    chosen = calibration.selection
+    return {
+        "rows": [
+            (
+                name,
+                f"{value:.4f}",
+                f"{held_out[name]:.4f}" if held_out.get(name, np.nan) > 0 else "",
+                "" if name == "frame by frame" else _excess(value, each),
+            )
+            for name, value in ((name, rms_over_frames(frames)) for name, frames in calibration.rows())
+        ],
+        "choice": chosen and {"title": chosen.title, "columns": COLUMNS, "rows": chosen.rows()},
+        "plot": _plot(figure, "What is left of each frame against 1/f", class_="box plot"),
+    }
 
 
-def _choice(calibration: Calibration) -> list["Html"]:
-    """How the model was chosen, if it was."""
-    if calibration.selection is None:
-        return []
-    rows = calibration.selection.rows()
-    return [element("p", f"{calibration.selection.title}:"), table("The choice", [*COLUMNS], rows)]
-
-
-def _lens(calibration: Calibration) -> list["Html"]:
-    lens = calibration.zoom.lens
-    polynomials = [
-        element(
-            "p",
-            [
-                Html(f"<i>k</i><sub>{i}</sub>(<i>f</i>) = "),
-                *(_term(value, power) for power, value in enumerate(column)),
-                Html(f" &ensp;px<sup>−{2 * i}</sup>"),
-            ],
-        )
-        for i, column in enumerate(calibration.pixel_polynomials().T, start=1)
-    ]
-    x, y = (float(value) for value in np.asarray(lens.centre))
-    return [
-        element("p", f"With f in {lens.focal_unit}, and radii in px from the point ({x:.6g}, {y:.6g}):"),
-        box("Polynomials", polynomials, "box formulas"),
-        element("p", _certificate(calibration)),
-        _plot(
+def _lens(calibration: Calibration) -> dict[str, Any]:
+    x, y = (float(value) for value in np.asarray(calibration.zoom.lens.centre))
+    return {
+        "unit": calibration.zoom.lens.focal_unit,
+        "centre": f"{x:.6g}, {y:.6g}",
+        "polynomials": [
+            [_term(value, power) for power, value in enumerate(column)]
+            for column in calibration.pixel_polynomials().T
+        ],
+        "certificate": _certificate(calibration),
+        "plot": _plot(
             plot_model(calibration.zoom, calibration.each, calibration.lines),
             "The distortion coefficients against 1/f: each frame by itself, and the zoom model",
             kind="svg" if len(calibration.none) <= _MOST_FRAMES else "png",
         ),
-    ]
+    }
 
 
 def _certificate(calibration: Calibration) -> str:
@@ -176,33 +169,29 @@ def _certificate(calibration: Calibration) -> str:
     return f"No fold was found, but none is ruled out: the least slope of the corrected radius is {found}."
 
 
-def _distortion(calibration: Calibration) -> list["Html"]:
+def _distortion(calibration: Calibration) -> dict[str, Any]:
     lens, focal = calibration.zoom.lens, np.asarray(calibration.lines.focal)
-    unit = lens.focal_unit
     ends = sorted({float(focal.min()), float(focal.max())})
     frames = sorted({int(np.argmin(focal)), int(np.argmax(focal))}, key=lambda frame: focal[frame])
-    rows = [
-        (f"{f:.4g} {unit}", f"{moved:+.2f}".replace("-", "−"), _uncertainty(std))
-        for f, moved, std in calibration.corner()
-    ]
-    return [
-        element("p", "Corrected, the corner farthest from the centre moves outwards (−: inwards) by"),
-        table("The corner", ["f", "px", "± px"], rows),
-        *([element("p", calibration.allowed_for())] if calibration.allowed_for() else []),
-        _plot(
+    return {
+        "rows": [
+            (f"{f:.4g} {lens.focal_unit}", f"{moved:+.2f}".replace("-", "−"), _uncertainty(std))
+            for f, moved, std in calibration.corner()
+        ],
+        "allowed_for": calibration.allowed_for(),
+        "grid": _plot(
             plot_distortion(calibration.zoom, focal=ends),
             "A straight grid as the lens shows it, and where pixels belong, at both ends of the zoom",
         ),
-        element("p", "The points of the widest and of the longest frame, as seen and as corrected:"),
-        _plot(
+        "points": _plot(
             plot_primitives(calibration.lines, lens, frames),
             "Points before and after correction",
             kind="png",
         ),
-    ]
+    }
 
 
-def _frames(calibration: Calibration, images: "ImageCalibration | None") -> list["Html"]:
+def _frames(calibration: Calibration, images: "ImageCalibration | None") -> dict[str, Any]:
     """The list of frames, each with the lines that are least straight."""
     summary = calibration.summary()["per_frame"]
     shown = np.sort(np.argsort(-np.asarray(calibration.zoom.frame_rms), kind="stable")[:_MOST_FRAMES])
@@ -211,37 +200,33 @@ def _frames(calibration: Calibration, images: "ImageCalibration | None") -> list
         np.argsort(lines.frame, kind="stable"),
         np.cumsum(np.bincount(lines.frame, minlength=len(summary)))[:-1],
     )
-    rows = []
-    for number in shown.tolist():
-        frame, rejected = summary[number], calibration.rejected[members[number]]
-        counted = f"{frame['lines']:,}" + (f" ({rejected.sum()} rejected)" if rejected.any() else "")
-        values = (
-            "" if frame[key] is None else f"{frame[key]:.3f}"  # of a frame whose lines are all rejected
-            for key in ("rms_zoom", "rms_frames", "rms_none")
-        )
-        name = _frame_name(number, images)
-        rows.append(
-            (name, f"{frame['focal']:.4g}", *values, counted, _worst_lines(calibration, members[number]))
-        )
-    head = ["frame", f"f, {lines.focal_unit}", "polynomial", "by itself", "uncorrected", "lines"]
-    told = (
-        "RMS distances, px, as corrected by the zoom polynomial, by the frame's own model, and not at all. "
-        "The worst lines are given with their row in lines.npz and a place, px."
+    unit = f"f, {lines.focal_unit}"
+    return {
+        "number": len(summary),
+        "head": ["frame", unit, "polynomial", "by itself", "uncorrected", "lines", "worst lines"],
+        "rows": [
+            {
+                "name": images.used[number].name if images else str(number),
+                "picture": f"lines/{images.overlays()[number]}" if images else None,
+                "cells": _frame_cells(summary[number], calibration.rejected[members[number]]),
+                "worst": _worst_lines(calibration, members[number]),
+            }
+            for number in shown.tolist()
+        ],
+    }
+
+
+def _frame_cells(frame: dict[str, Any], rejected: np.ndarray) -> list[str]:
+    """Its focal length, RMS values and number of lines."""
+    values = (
+        "" if frame[key] is None else f"{frame[key]:.3f}"  # of a frame whose lines are all rejected
+        for key in ("rms_zoom", "rms_frames", "rms_none")
     )
-    if len(shown) < len(summary):
-        told += f" Of {len(summary):,} frames, these are the {len(shown)} that the polynomial fits worst."
-    if images:
-        told += " Names lead to the lines found in the images."
-    return [element("p", told), table("Frames", [*head, "worst lines"], rows)]
+    counted = f"{frame['lines']:,}" + (f" ({rejected.sum()} rejected)" if rejected.any() else "")
+    return [f"{frame['focal']:.4g}", *values, counted]
 
 
-def _frame_name(number: int, images: "ImageCalibration | None") -> "str | Html":
-    if images is None:
-        return str(number)
-    return element("a", images.used[number].name, href=quote(f"lines/{images.overlays()[number]}"))
-
-
-def _worst_lines(calibration: Calibration, members: np.ndarray) -> list["Html"]:
+def _worst_lines(calibration: Calibration, members: np.ndarray) -> list[dict[str, Any]]:
     """The worst lines of a frame that count, and of those that were rejected."""
     worst = members[np.argsort(-calibration.line_rms[members], kind="stable")]
     rejected = calibration.rejected[worst]
@@ -249,29 +234,20 @@ def _worst_lines(calibration: Calibration, members: np.ndarray) -> list["Html"]:
     told = []
     for line in [*worst[~rejected][:_WORST], *worst[rejected][:_WORST_REJECTED]]:
         x, y = np.asarray(points[line])[mask[line]].mean(axis=0)
-        what = f"{line} at ({x:.0f}, {y:.0f}): {calibration.line_rms[line]:.2f} px"
-        if calibration.rejected[line]:
-            told.append(element("span", [what, ", ", element("b", "rejected")], class_="rejected"))
-        else:
-            told.append(element("span", what))
+        text = f"{line} at ({x:.0f}, {y:.0f}): {calibration.line_rms[line]:.2f} px"
+        told.append({"text": text, "rejected": bool(calibration.rejected[line])})
     return told
 
 
-def _footer(calibration: Calibration, images: "ImageCalibration | None") -> list["Html"]:
-    files = ["lens.json", "summary.json", "lines.npz", "model.png"]
-    links = [element("a", name, href=name) for name in files]
-    more = [element("p", f"Focal lengths: {images.focals.origin}.")] if images else []
-    versions = ", ".join(f"{name} {of}" for name, of in calibration.summary()["versions"].items())
-    return [*more, element("p", ["Beside this page: ", joined(links), "."]), element("p", versions)]
-
-
-def _term(value: float, power: int) -> "Html":
+def _term(value: float, power: int) -> dict[str, Any]:
     """A term of a polynomial in 1/f, with its sign."""
     mantissa, exponent = f"{abs(value):.4e}".split("e")
-    sign = "−" if value < 0 else "+" if power else ""
-    over = ("", "/<i>f</i>")[power > 0] + (f"<sup>{power}</sup>" if power > 1 else "")
-    times = f" × 10<sup>{int(exponent)}</sup>".replace("-", "−") if int(exponent) else ""
-    return Html(f'<span class="term">{sign} {mantissa}{times}{over}</span> ')
+    return {
+        "sign": "−" if value < 0 else "+" if power else "",
+        "mantissa": mantissa,
+        "exponent": str(int(exponent)).replace("-", "−") if int(exponent) else "",
+        "power": power,
+    }
 
 
 def _excess(value: float, reference: float) -> str:
@@ -290,15 +266,14 @@ def _number(count: int, noun: str) -> str:
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
-def _plot(figure: Figure, label: str, *, class_: str = "box wide plot", kind: str = "svg") -> Html:
+def _plot(
+    figure: Figure, label: str, *, class_: str = "box wide plot", kind: str = "svg"
+) -> dict[str, str | int]:
     """A plot; a wide one is not made smaller than can be read."""
     file = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "zoomjax"}):
         figure.savefig(file, format=kind, dpi=150, metadata={"Date": None} if kind == "svg" else {})
     content = base64.b64encode(file.getvalue()).decode()
     width, height = (f"{96 * side:.0f}" for side in figure.get_size_inches())
-    image = Html(
-        f'<img src="data:image/{kind.replace("svg", "svg+xml")};base64,{content}" alt="{escape(label)}" '
-        f'width="{width}" height="{height}">'
-    )
-    return element("figure", box(label, image, class_))
+    source = f"data:image/{kind.replace('svg', 'svg+xml')};base64,{content}"
+    return {"source": source, "label": label, "class": class_, "width": width, "height": height}

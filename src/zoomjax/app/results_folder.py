@@ -122,7 +122,7 @@ def _check(folder: Path, names: Iterable[str], overwrite: bool) -> None:
         more = f" (and {len(foreign) - 1} more)" if len(foreign) > 1 else ""
         raise FileExistsError(
             f"{foreign[0]}{more} would be replaced, but zoomjax did not write it, or it was changed since: "
-            "choose another folder, or give overwrite."
+            "choose another folder, or give argument overwrite."
         )
 
 

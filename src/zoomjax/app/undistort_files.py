@@ -86,11 +86,11 @@ def _video(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> Ou
 
     if job.focal is None:
         raise ValueError(
-            "A video needs --focal: one focal length, or a CSV file with time,focal or frame,focal."
+            "A video needs argument focal: one focal length, or a CSV file with time,focal or frame,focal."
         )
     number = _number(job.focal)
     if number is not None and job.hold:
-        raise ValueError("--hold is for a track of focal lengths, and --focal is one number.")
+        raise ValueError("Argument hold is for a track of focal lengths, and argument focal is one number.")
     focal = read_focal_track(job.focal, hold=job.hold) if number is None else number
     target = job.output / job.inputs[0].name if job.output.is_dir() else job.output
     _check_targets(job, [target])
@@ -109,7 +109,9 @@ def _video(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> Ou
 
 def _photos(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> Outcome:
     if job.hold:
-        raise ValueError("--hold is for a video's track of focal lengths, and the inputs are photos.")
+        raise ValueError(
+            "Argument hold is for a video's track of focal lengths, and the inputs are photos."
+        )
     targets = _photo_targets(job)
     _check_targets(job, targets)
     focal_of = _photo_focals(job, lens)
@@ -218,8 +220,9 @@ def _number(text: str) -> float | None:
     number = plain_number(text)
     if number is None and not Path(text).exists() and not text.lower().endswith(".csv"):
         raise ValueError(
-            f"--focal must be a positive number, with a decimal point, or a CSV file, but it is {text!r}."
+            "Argument focal must be a positive number, with a decimal point, or a CSV file, "
+            f"but it is {text!r}."
         )
     if number is not None and number <= 0:
-        raise ValueError(f"--focal must be a positive number, but it is {text}.")
+        raise ValueError(f"Argument focal must be a positive number, but it is {text}.")
     return number

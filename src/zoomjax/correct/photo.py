@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 
 from .._core.files import refuse_inputs, whole_file
-from ..io.photo import FORMATS, SUFFIXES, metadata_focal, read_photo
+from ..io.photo import FORMATS, SUFFIXES, metadata_focal, read_focal, read_photo
+from ..io.tiff import Metadata, encode_tiff
 from ..models.lens import ZoomLens
 from .framing import Framing, framing_for_size
 from .image import undistort_image
@@ -27,8 +28,8 @@ _OPTIONS = {
 }
 _OPTIONS[".jpeg"] = _OPTIONS[".jpg"]
 
-_NO_METADATA = (".tif", ".tiff", ".bmp")
-"""Formats whose metadata OpenCV neither reads nor writes."""
+_NO_METADATA = (".bmp",)
+"""Formats that hold no metadata."""
 
 
 def undistort_photo(
@@ -59,7 +60,7 @@ def undistort_photo(
             not hold such pixels.
 
     Warns:
-        UserWarning: as `undistort_image` and `ZoomLens` do; or metadata are lost, as TIFF's are.
+        UserWarning: as `undistort_image` and `ZoomLens` do; or metadata are lost, as in BMP files.
     """
     target = Path(target)
     check_target(target)
@@ -112,37 +113,41 @@ def corrected_photo(
             "file: choose .png or .tif."
         )
     if focal is None:
-        focal = photo_focal(source, lens)
+        focal = _known(metadata_focal(metadata) if lens.focal_unit == "mm" else None, source, lens)
     size = (image.shape[1], image.shape[0])
     corrected = undistort_image(
         image, lens, focal=focal, keep=keep(size), interpolation=interpolation, border=border
     )
-    lost = Path(source).suffix.lower() in (".tif", ".tiff") or (metadata and suffix in _NO_METADATA)
-    if lost:
+    if metadata and suffix in _NO_METADATA:
         warnings.warn(
-            f"Metadata of {os.fspath(source)} are not kept: OpenCV has none of TIFF and BMP files.",
+            f"Metadata of {os.fspath(source)} are not kept: BMP files hold none.",
             stacklevel=3,
         )
     return _encoded(corrected, suffix, metadata)
 
 
 def photo_focal(source: str | os.PathLike[str], lens: ZoomLens) -> float:
-    """The focal length in a photograph's EXIF data, for a lens in mm.
+    """The focal length in a photograph's EXIF data, for a lens in mm. No pixel is decoded.
 
     Raises:
         FileNotFoundError: there is no such photograph.
-        ValueError: it cannot be decoded or tells none, or the lens is in px.
+        ValueError: it cannot be read or tells none, or the lens is in px.
     """
-    focal = metadata_focal(source, read_photo(source)[1]) if lens.focal_unit == "mm" else None
+    return _known(read_focal(source) if lens.focal_unit == "mm" else None, source, lens)
+
+
+def _known(focal: float | None, source: str | os.PathLike[str], lens: ZoomLens) -> float:
     if focal is None:
         raise ValueError(
             f"The focal length of {os.fspath(source)} is not known: its EXIF data have none in "
-            f"{lens.focal_unit}. Give it: --focal, a number or a CSV file image,focal."
+            f"{lens.focal_unit}. Give it (argument focal)."
         )
     return focal
 
 
-def _encoded(image: np.ndarray, suffix: str, metadata: list[tuple[int, np.ndarray]]) -> bytes:
+def _encoded(image: np.ndarray, suffix: str, metadata: Metadata) -> bytes:
+    if suffix in (".tif", ".tiff"):
+        return encode_tiff(image, metadata)
     options = _OPTIONS.get(suffix, [])
     try:
         if metadata and suffix not in _NO_METADATA:

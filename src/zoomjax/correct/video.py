@@ -134,7 +134,7 @@ def _check_length(track: FocalTrack, video: Any) -> None:
         unit = "s" if track.by_time else "frames"
         raise ValueError(
             f"The focal track ends at {end:g} {unit}, and the video has {length:.6g} {unit}. "
-            "Give a track as long as the video, or hold its ends (--hold)."
+            "Give a track as long as the video, or hold its ends (argument hold)."
         )
 
 

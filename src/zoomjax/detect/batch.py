@@ -107,7 +107,7 @@ def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detec
     if min(size) < _SMALLEST:
         return found(problem=f"it is {size[0]}x{size[1]} px: at least {_SMALLEST} px a side are needed")
     if isinstance(detector, PitchDetector) and image.ndim == 2:
-        return found(size, problem="it is grey, and grass is told by its colour. Try --detector edges")
+        return found(size, problem=f"it is grey, and grass is told by its colour. {_ANOTHER}")
     try:
         focal = source.focal if focal is None else focal
         wanted = grid == "all" or (grid == "without focal length" and focal is None)
@@ -128,9 +128,11 @@ def _sentence(error: Exception) -> str:
     return " ".join(str(error).split()).rstrip(".")
 
 
+_ANOTHER = "Try another detector, such as edges (argument detector)"
+
 _NO_LINES = (
-    "no lines were found. Is what should be straight in focus, well lit and large in the image? Or try "
-    "another --detector"
+    "no lines were found. Is what should be straight in focus, well lit and large in the image? Or: "
+    + _ANOTHER
 )
 
 

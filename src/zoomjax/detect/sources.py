@@ -65,7 +65,7 @@ class Source:
             return self.image, None
         assert self.path is not None
         image, metadata = read_photo(self.path)
-        return as_bytes(image), metadata_focal(self.path, metadata)
+        return as_bytes(image), metadata_focal(metadata)
 
 
 def as_bytes(image: np.ndarray) -> UInt8[np.ndarray, "height width *channels"]:

@@ -1,48 +1,82 @@
-"""The focal length in EXIF data, read from and written to the bytes of their TIFF structure."""
+"""EXIF data, read and written by Pillow: where they are in a file, and the focal length in them.
 
+No pixel is decoded. That is why `find_exif` looks through the chunks of PNG and WebP files by itself:
+Pillow decodes a PNG to find what is behind its pixels, and takes the memory of two pictures for a WebP.
+"""
+
+import io
 import struct
+import warnings
+from collections.abc import Callable
 
-_FOCAL_LENGTH, _EXIF_FOLDER = 0x920A, 0x8769
-_LONG, _RATIONAL = 4, 5
+from PIL import ExifTags, Image
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.TiffImagePlugin import IFDRational
+
+File = io.BytesIO | io.BufferedReader
+"""What is read, at its beginning."""
+
+_PREFIX = b"Exif\0\0"
 _FINENESS = 10_000  # parts of a mm
 _UNKNOWN = 2**32 - 1  # as numerator
 
 
 def exif_focal(block: bytes) -> float | None:
     """The focal length, mm, in EXIF data or at the start of a TIFF file; None if they hold none."""
-    try:
-        return _focal(block.removeprefix(b"Exif\0\0"))
-    except struct.error:  # cut off, or offsets that lead nowhere
+    exif = parse_exif(io.BytesIO(block.removeprefix(_PREFIX)))
+    focal = None if exif is None else exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
+    if not isinstance(focal, IFDRational) or not focal.denominator or focal.numerator == _UNKNOWN:
         return None
+    return float(focal) if focal > 0 else None
 
 
 def exif_with_focal(focal: float) -> bytes:
     """EXIF data that hold a focal length, mm, and nothing else."""
-    folder, fraction = 26, 44  # where the EXIF folder and the fraction begin
-    return (
-        b"II"
-        + struct.pack("<HI", 42, 8)
-        + struct.pack("<HHHIII", 1, _EXIF_FOLDER, _LONG, 1, folder, 0)
-        + struct.pack("<HHHIII", 1, _FOCAL_LENGTH, _RATIONAL, 1, fraction, 0)
-        + struct.pack("<II", round(focal * _FINENESS), _FINENESS)
-    )
+    exif = Image.Exif()
+    fraction = IFDRational(round(focal * _FINENESS), _FINENESS)
+    exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLength: fraction}
+    return exif.tobytes().removeprefix(_PREFIX)
 
 
-def _focal(block: bytes) -> float | None:
-    """First folder, EXIF folder, one fraction."""
-    order = {b"II": "<", b"MM": ">"}.get(block[:2])
-    if order is None:
+def parse_exif(file: File) -> Image.Exif | None:
+    """The EXIF data of a TIFF file, which EXIF data are by themselves; None if they are damaged."""
+    exif = Image.Exif()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of damage, which does not matter unless the focal length is gone
+        try:
+            exif.load_from_fp(file)
+            for folder in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):
+                exif.get_ifd(folder)  # read while warnings are caught
+        except Exception:  # Pillow raises errors of many kinds where offsets lead nowhere
+            return None
+    return exif
+
+
+def find_exif(file: File, kind: str) -> bytes | None:
+    """The EXIF data of a file of a kind such as "JPEG", PNG, WebP or TIFF; None if it holds none."""
+    try:
+        if kind == "JPEG":
+            return JpegImageFile(file).info.get("exif")
+        if kind == "PNG":
+            return _find_chunk(file, 8, ">I4s", b"eXIf", lambda size: size + 4)  # and a checksum
+        if kind == "TIFF":
+            return None if (exif := parse_exif(file)) is None else exif.tobytes()
+        if kind == "WebP":
+            return _find_chunk(file, 12, "<4sI", b"EXIF", lambda size: size + size % 2)
+    except Exception:  # as above
         return None
+    return None
 
-    def entries(offset: int) -> dict[tuple[int, int], int]:
-        (count,) = struct.unpack_from(f"{order}H", block, offset)
-        each = (struct.unpack_from(f"{order}HHII", block, offset + 2 + 12 * i) for i in range(count))
-        return {(tag, kind): value for tag, kind, _, value in each}
 
-    (first,) = struct.unpack_from(f"{order}I", block, 4)
-    folder = entries(first).get((_EXIF_FOLDER, _LONG))
-    fraction = entries(folder).get((_FOCAL_LENGTH, _RATIONAL)) if folder else None
-    if fraction is None:
-        return None
-    above, below = struct.unpack_from(f"{order}II", block, fraction)
-    return above / below if above and below and above != _UNKNOWN else None
+def _find_chunk(
+    file: File, start: int, layout: str, wanted: bytes, length: Callable[[int], int]
+) -> bytes | None:
+    """The content of the first chunk of a name."""
+    file.seek(start)
+    while len(head := file.read(8)) == 8:
+        fields = struct.unpack(layout, head)
+        size, name = sorted(fields, key=lambda field: isinstance(field, bytes))
+        if name == wanted:
+            return file.read(size)
+        file.seek(length(size), io.SEEK_CUR)
+    return None

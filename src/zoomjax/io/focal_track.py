@@ -70,7 +70,7 @@ class FocalTrack:
             raise ValueError(
                 f"The focal track goes from {first:g} to {last:g} {unit}, and frame {frame}, at "
                 f"{time:.3f} s, is outside of it. Give a track as long as the video, or hold its ends "
-                "(--hold)."
+                "(argument hold)."
             )
         return 1 / float(np.interp(position, self.position, 1 / self.focal))
 

@@ -9,6 +9,20 @@ import struct
 from collections.abc import Iterator
 
 
+def announced_format(content: bytes) -> str:
+    """Format ("JPEG", "PNG", "WebP", "TIFF" or "BMP") of a file that begins like this.
+
+    Raises:
+        ValueError: the content has another format.
+    """
+    if not content:
+        raise ValueError("the file is empty")
+    for begins, name, _ in _FORMATS:
+        if begins.match(content):
+            return name
+    raise ValueError("it is damaged, or of an unknown format")
+
+
 def announced_size(content: bytes) -> tuple[str, int, int]:
     """Format ("JPEG", "PNG", "WebP", "TIFF" or "BMP"), width and height that a file's header announces.
 

@@ -13,8 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from .exif import exif_focal
-from .headers import announced_size, jpeg_segments
+from .exif import exif_focal, find_exif
+from .headers import announced_format, announced_size, jpeg_segments
+from .tiff import Metadata, as_stored, tiff_metadata
 
 FORMATS = {  # suffix: bits a sample, and numbers of channels, that the format holds
     **dict.fromkeys([".jpg", ".jpeg"], ((8,), (1, 3))),
@@ -27,17 +28,32 @@ SUFFIXES = tuple(FORMATS)
 """Of files that count as photographs."""
 
 
-def metadata_focal(source: str | os.PathLike[str], metadata: list[tuple[int, np.ndarray]]) -> float | None:
-    """The focal length, mm, that a photograph's EXIF data tell, given what `read_photo` found in it."""
-    blocks = [data.tobytes() for kind, data in metadata if kind == cv2.IMAGE_METADATA_EXIF]
+def read_focal(source: str | os.PathLike[str]) -> float | None:
+    """The focal length, mm, in a photograph's EXIF data; None if they tell none. No pixel is decoded.
+
+    Raises:
+        FileNotFoundError: there is no such photograph.
+        OSError: it cannot be read.
+        ValueError: it is no photograph, no ordinary file, or has more than 4 GB.
+    """
     path = Path(source)
-    if path.suffix.lower() in (".tif", ".tiff"):
+    try:
         with open_photo(path) as file:
-            blocks = [file.read(_MOST_BYTES)]
+            kind = announced_format(file.read(16))
+            file.seek(0)
+            block = find_exif(file, kind)
+    except ValueError as error:
+        raise ValueError(f"Cannot read a photograph from {path}: {error}.") from error
+    return None if block is None else exif_focal(block)
+
+
+def metadata_focal(metadata: Metadata) -> float | None:
+    """The focal length, mm, in what `read_photo` found beside the pixels."""
+    blocks = (data.tobytes() for kind, data in metadata if kind == cv2.IMAGE_METADATA_EXIF)
     return next((exif_focal(block) for block in blocks), None)
 
 
-def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
+def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, Metadata]:
     """The pixels as stored, and metadata (EXIF, XMP, colour profile) as pairs of kind and bytes.
 
     The header is looked at before anything is decoded, and what is no ordinary file is not opened.
@@ -58,11 +74,18 @@ def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, list[tuple[i
             raise ValueError(f"its header announces {width}x{height} px, more than {_MOST_PIXELS:,} in all")
         if kind == "JPEG" and all(mark != _END for mark, _ in jpeg_segments(content)):
             raise ValueError("the file is damaged or cut off")  # OpenCV fills up what is missing with grey
-        return _decoded(np.frombuffer(content, np.uint8), metadata=kind in ("JPEG", "PNG", "WebP"))
+        image, metadata = _decoded(np.frombuffer(content, np.uint8), metadata=kind in _WITH_METADATA)
+        if kind == "TIFF":
+            metadata, orientation = tiff_metadata(io.BytesIO(content))
+            image = as_stored(image, orientation)  # OpenCV turns TIFF files, whatever it is asked
+        return image, metadata
     except (ValueError, MemoryError) as error:
         reason = error if isinstance(error, ValueError) else "it takes more memory than there is"
         raise ValueError(f"Cannot read a photograph from {path}: {reason}.") from error
 
+
+_WITH_METADATA = ("JPEG", "PNG", "WebP")
+"""Formats whose metadata OpenCV knows."""
 
 _MOST_BYTES = 4_000_000_000
 _MOST_PIXELS = 500_000_000
@@ -95,7 +118,7 @@ def open_photo(path: Path) -> Iterator[io.BufferedReader]:
         yield file
 
 
-def _decoded(content: np.ndarray, *, metadata: bool) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
+def _decoded(content: np.ndarray, *, metadata: bool) -> tuple[np.ndarray, Metadata]:
     kinds, blocks = [], []
     try:
         if metadata:

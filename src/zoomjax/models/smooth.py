@@ -5,7 +5,7 @@ lengths. `SmoothZoom` has degree 6 and a Gaussian prior instead: a Gaussian proc
 and k2, in the finite basis of the Legendre polynomials of ``u = f_ref/f``. Few focal lengths give a curve
 that lenses have; many determine it by themselves.
 
-The prior's numbers come from `benchmarks/real/lensfun.py`, which learns them from zoom lenses of the
+The prior's numbers come from `benchmarks/real/lensfun`, which learns them from zoom lenses of the
 lensfun database as those that predict best the focal lengths that are left out.
 """
 
@@ -34,7 +34,7 @@ _QUADRATIC = (
     (-0.0093, 0.0134, -0.0049, 0.0011, -0.0029, 0.0118),
 )
 _BEYOND = ((0.0079, 0), (-0.0051, 0.0050))
-"""What `python benchmarks/real/lensfun.py --prior` prints, learned from all 618 lenses."""
+"""What `python -m benchmarks.real.lensfun --prior` prints, learned from all 618 lenses."""
 
 
 class SmoothZoom(AbstractPriorZoom):
