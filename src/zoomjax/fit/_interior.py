@@ -170,7 +170,7 @@ def _linearised(function, x):
 
 
 def _triangle(rows):
-    """R of the QR of many rows, by modified Gram-Schmidt: 4096 x 13 in 1 ms, LAPACK here 100 ms."""
+    """R of the QR of many rows, by modified Gram-Schmidt: much faster than LAPACK for few columns."""
 
     def reduce(rows, column):
         products = jnp.matmul(rows[:, column], rows, precision="highest")

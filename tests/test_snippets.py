@@ -1,0 +1,226 @@
+"""The Python and shell blocks of README and docs, run as they stand on one small data set."""
+
+import importlib.util
+import os
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import av
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from docs.make.tables import ROOT, pages
+from sybil import Sybil
+from sybil.parsers.markdown import CodeBlockParser, PythonCodeBlockParser
+
+import zoomjax as zj
+from zoomjax import scenes
+from zoomjax.app.calibration import calibrate
+from zoomjax.app.demo import write_photos
+
+from ._commands import COMMAND
+
+SIZE = (1072, 712)
+FOCAL = (20.56, 30.94, 41.38, 62.46, 127.36)
+PAGES = {str(page.relative_to(ROOT)): page for page in pages()}
+
+
+def without_torch(example):
+    if importlib.util.find_spec("torch"):
+        exec(compile(example.parsed, example.path, "exec"), example.namespace)
+
+
+def nothing(example):
+    """Shell commands are run one by one, below."""
+
+
+PYTHON = Sybil([PythonCodeBlockParser(), CodeBlockParser("python torch", without_torch)])
+SHELL = Sybil([CodeBlockParser("sh", nothing)])
+
+
+def shell_lines(page):
+    for example in SHELL.parse(page).examples():
+        lines = example.parsed.splitlines()
+        yield from (line.partition("  #")[0].strip() for line in lines if line and line[0] != "#")
+
+
+COMMANDS = sorted({line for page in PAGES.values() for line in shell_lines(page)})
+OURS = [line for line in COMMANDS if line.startswith("zoomjax ")]
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory):
+    """What a user has: photos, views of a grid, clips and their tracks, lines, and a lens."""
+    folder = tmp_path_factory.mktemp("given")
+    photos = write_photos(folder / "photos", number=5, image_size=SIZE)
+    names = [photo.name for photo in photos]
+    table(folder / "focal.csv", "image,focal", zip(names, FOCAL, strict=True))
+    write_clip(folder / "clip.mp4", [cv2.imread(str(photo))[..., ::-1] for photo in photos])
+    table(folder / "track.csv", "frame,focal", enumerate(FOCAL))
+    write_clip(folder / "match.mp4", pitch_frames())
+    (folder / "views").mkdir()
+    for number, view in enumerate(grid_views()):
+        cv2.imwrite(str(folder / "views" / f"{number}.png"), view)
+    table(folder / "views.csv", "image,focal", ((f"{n}.png", f) for n, f in enumerate(FOCAL)))
+    straight_lines_bent(folder / "lines.csv")
+    table(folder / "frames.csv", "frame,focal", enumerate((24, 50, 80, 105)))
+    calibrate(board()).write(folder / "mylens")
+    return folder
+
+
+def table(path, head, rows):
+    path.write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]) + "\n")
+
+
+def write_clip(path, frames):
+    with av.open(str(path), "w") as out:
+        video = out.add_stream("libx264", rate=25, options={"crf": "6", "preset": "veryfast"})
+        video.height, video.width = frames[0].shape[:2]
+        video.pix_fmt = "yuv420p"
+        for frame in frames:
+            out.mux(video.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), "rgb24")))
+        out.mux(video.encode(None))
+
+
+def board():
+    lens = scenes.nikkor_18_200(SIZE)
+    return scenes.board_lines(lens, np.array(FOCAL), spacing=20.0, noise=0.2)
+
+
+def straight_lines_bent(path):
+    t = np.linspace(0, 479, 60)
+    rows = [
+        (frame, line, x + 200 / f * (x / 320 - 1) * (y / 240 - 1) ** 2, y)
+        for frame, f in enumerate((24, 50, 80, 105))
+        for line, x in enumerate(range(20, 640, 54))
+        for y in t
+    ]
+    table(path, "frame,line,x,y", rows)
+
+
+def pitch_frames():
+    lens = scenes.broadcast_zoom()
+    focal = np.linspace(*np.asarray(lens.focal_range), len(FOCAL))
+    lines = scenes.broadcast_lines(lens, focal)
+    grass = np.full((*lens.image_size[::-1], 3), (60, 130, 50), np.uint8)
+    frames = [grass.copy() for _ in focal]
+    for points, frame in zip(lines.to_ragged(), np.asarray(lines.frame), strict=True):
+        fixed = np.rint(points * 16).astype(np.int32)
+        cv2.polylines(frames[frame], [fixed], False, (250,) * 3, 6, cv2.LINE_AA, 4)
+    return frames
+
+
+def grid_views():
+    """A checkerboard seen obliquely, at five focal lengths."""
+    squares = np.kron(np.indices((9, 12)).sum(0) % 2, np.ones((40, 40))).astype(np.uint8) * 200 + 30
+    corners = np.array([[0, 0], [480, 0], [480, 360], [0, 360]], np.float32)
+    for number, f in enumerate(FOCAL):
+        angle = 0.35 + 0.05 * number
+        x, y = ((corners - [240, 180]) / 100).T
+        depth = 8 + np.sin(angle) * (x + 0.6 * y)
+        seen = 150 * f**0.5 * np.stack([np.cos(angle) * x, np.cos(0.6 * angle) * y]).T / depth[:, None]
+        place = cv2.getPerspectiveTransform(corners, (seen + np.array([536, 356])).astype(np.float32))
+        yield cv2.warpPerspective(squares, place, SIZE, flags=cv2.INTER_AREA, borderValue=255)
+
+
+@pytest.fixture
+def here(given, tmp_path, monkeypatch):
+    """A copy of it to work in."""
+    shutil.copytree(given, tmp_path / "work", copy_function=os.link)
+    monkeypatch.chdir(tmp_path / "work")
+    return Path.cwd()
+
+
+def beams():
+    """A bright beam in each image, bent a little."""
+    images = np.zeros((len(FOCAL), 480, 640), np.uint8)
+    for image, f in zip(images, FOCAL, strict=True):
+        for y in range(480):
+            x = 500 + 40 / f * (y / 240 - 1) ** 2
+            image[y, int(x) : int(x) + 2] = [255 * (1 - x % 1), 255 * (x % 1)]
+    return list(images)
+
+
+@pytest.fixture(scope="module")
+def names():
+    """What the blocks take as given: a small data set, its fit, and what a reader would call the rest."""
+    lines = board()
+    small = zj.compress(lines, terms=3)
+    fit = zj.fit_zoom(small, terms=2)
+    lens = fit.lens
+    common = {"np": np, "jnp": jnp, "zj": zj, "lines": lines, "small": small, "fit": fit, "lens": lens}
+    common |= {"exact_lines": lines, "point": np.array([10.0, 20.0]), "points": np.array([[10.0, 20.0]])}
+    common |= {"focals": np.array([24.0, 35.0]), "image": np.zeros(SIZE[::-1], np.uint8)}
+    common |= {"w": 400, "h": 300, "x": 200, "y": 150, "d": lens(35.0)}
+    return {
+        None: common,
+        "docs/embedding.md": {},
+        "README.md": {},
+        "docs/detection.md": {"zj": zj, "image": cv2.GaussianBlur(next(grid_views()), None, 0.7)}
+        | {"images": beams(), "focal": np.array(FOCAL)},
+        "docs/zoom-models.md": common | focused(),
+    }
+
+
+def focused():
+    """Lines at several focuses, in the variables of Lines.from_ragged."""
+    ragged, frame = [], []
+    distance = np.repeat([1.0, 2.0, 5.0], 3)
+    focal = np.tile([24.0, 50.0, 100.0], 3)
+    t = np.linspace(0, 479, 40)
+    for number, (f, d) in enumerate(zip(focal, distance, strict=True)):
+        for x in range(20, 640, 54):
+            bend = (200 / f + 2 / d) * (x / 320 - 1) * (t / 240 - 1) ** 2
+            ragged.append(np.stack([x + bend, t], axis=-1))
+            frame.append(number)
+    return {
+        "points": ragged,
+        "frame": frame,
+        "focal": focal,
+        "distance": distance,
+        "w": 640,
+        "h": 480,
+        "point": jnp.zeros(2),
+    }
+
+
+WITH_PYTHON = [
+    pytest.param(name, marks=[] if name == "README.md" else pytest.mark.slow)
+    for name, page in PAGES.items()
+    if list(PYTHON.parse(page).examples())
+]
+
+
+@pytest.mark.parametrize("name", WITH_PYTHON)
+def test_python_blocks_run(name, names, here):
+    document = PYTHON.parse(PAGES[name])
+    document.namespace.update(names.get(name, names[None]))
+    for example in document.examples():
+        example.evaluate()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", OURS)
+def test_shell_commands_run(line, here):
+    words = shlex.split(line)
+    out = Path(words[words.index("-o") + 1])
+    shutil.rmtree(out, ignore_errors=True)
+    command = line.replace("zoomjax ", shlex.join(COMMAND) + " ", 1)
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert out.exists()
+
+
+def test_other_commands_are_those_that_set_up_and_check():
+    """They install packages and run all tests: .ci/run runs them itself."""
+    first = ("python3 -m venv .venv", ".venv/bin/pip install", ".venv/bin/pre-commit install")
+    first += (".venv/bin/python -m pytest", ".venv/bin/python -m docs.make")
+    others = [line for line in COMMANDS if line not in OURS]
+    assert all(line.startswith(first) for line in others), others
+    for line in others:
+        for word in shlex.split(line):
+            if word.startswith("tests/"):
+                assert (ROOT / word).exists()
