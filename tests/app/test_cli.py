@@ -180,7 +180,7 @@ WRONG = {
     "no such file": (["missing.npz"], "missing.npz"),
     "not a lines file": (["foreign.npz"], "foreign.npz"),
     "truncated": (["truncated.npz"], "truncated.npz"),
-    "unknown kind": (["notes.txt"], "notes.txt is no photograph"),
+    "unknown kind": (["notes.txt"], "notes.txt is not a photo"),
     "a folder without photos": (["."], "no photographs in the folder"),
     "options of images for lines": (["lines.npz", "--pitch", "3"], "--pitch are for images"),
     "an option of lines for images": (["a.jpg", "--image-size", "640x480"], "images have their own"),
@@ -189,7 +189,7 @@ WRONG = {
         ["a.jpg", "--pitch", "20x", "--distance", "9", "--pixel", "1"],
         "--pitch is not",
     ),
-    "no way to a focal length": (["a.jpg", "--focal", "zoom"], "no way to a focal length"),
+    "not a source of focal lengths": (["a.jpg", "--focal", "zoom"], "is not a source of focal lengths"),
     "a unit that is none": (["a.jpg", "--focal-unit", "km"], "mm or px"),
     "no such detector": (["a.jpg", "--detector", "circles"], "edges, grid, pitch"),
     "two files": (["lines.npz", "lines.npz"], "one file"),
@@ -270,7 +270,7 @@ def test_what_is_wrong_with_a_model_is_told_on_stderr(tmp_path):
     lines.save(tmp_path / "lines.npz")
     done = zoomjax("calibrate", "lines.npz", "-o", "out", cwd=tmp_path)
     assert done.returncode == 0
-    assert "Beware: The lines do not determine" in " ".join(done.stderr.split())
+    assert "Warning: The lines do not determine" in " ".join(done.stderr.split())
 
 
 def test_an_output_folder_that_cannot_be_written_is_told_before_the_work(wrong_files):

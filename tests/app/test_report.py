@@ -98,7 +98,7 @@ def test_page_says_what_the_summary_says(page, calibration):
         assert f"{summary[key]:.4f}" in page.text
     for row in summary["per_frame"]:
         assert f"{row['rms_zoom']:.3f}" in page.text
-    assert "It is proved to be invertible" in page.text
+    assert "The lens is proved to be invertible" in page.text
     assert summary["next_photo"]["sentence"] in page.text
     assert f"zoomjax {summary['versions']['zoomjax']}" in page.text
     for row in summary["corner_displacement"]:
@@ -143,7 +143,7 @@ def test_names_are_escaped_and_lead_to_their_pictures(calibration):
     links = page.all("a", "href")[: len(names)]
     assert [unquote(link) for link in links] == [f"lines/{name}.jpg" for name in names]
     assert all(re.fullmatch(r"[\w/.%-]+", link) for link in links)
-    assert "Beware: <b>two</b> lines & more" in page.text
+    assert "Warning: <b>two</b> lines & more" in page.text
     assert 'Focal lengths: "here" <there>.' in page.text
 
 
@@ -154,7 +154,7 @@ def test_what_is_not_determined_is_said(calibration):
         (jnp.full_like(calibration.zoom.covariance, jnp.inf), RESULTS.undetermined),
     )
     page = Page(report(dataclasses.replace(calibration, zoom=zoom)))
-    assert "Beware: The lines do not determine" in page.text
+    assert "Warning: The lines do not determine" in page.text
     assert "not determined" in page.text
     assert "at the corner, where it is least certain unknown" in page.text
 
@@ -167,7 +167,7 @@ def test_a_lens_that_folds_is_called_so(calibration):
         (jnp.array(False), jnp.array(-0.2)),
     )
     page = Page(report(dataclasses.replace(calibration, zoom=zoom)))
-    assert "It is not invertible" in page.text
+    assert "The lens is not invertible" in page.text
     assert "goes down to -0.2, at f = " in page.text
 
 

@@ -7,7 +7,9 @@ import pytest
 
 from zoomjax.fit._interior import implicit, least_squares_within
 
-NORMALS = jnp.array([[3.0, 4.0, 0.0]] * 4) / 5  # one plane, said four times: curvature is singular beside it
+NORMALS = (
+    jnp.array([[3.0, 4.0, 0.0]] * 4) / 5
+)  # one plane, said four times: curvature is singular beside it
 
 
 def slack(x):

@@ -111,8 +111,7 @@ def refuse_existing(targets: Iterable[Path], *, overwrite: bool) -> None:
     there = [] if overwrite else [path for path in dict.fromkeys(targets) if os.path.lexists(path)]
     if there:
         raise FileExistsError(
-            f"{_several(there)} there already and would be replaced: choose another place, or give "
-            "argument overwrite."
+            f"{_several(there)} and would be replaced: choose another place, or give argument overwrite."
         )
 
 
@@ -136,11 +135,11 @@ def refuse_inputs(targets: Iterable[Path], inputs: Iterable[str | os.PathLike[st
 
 
 def _several(paths: list[Path]) -> str:
-    """The first and how many more, with their verb."""
+    """That these paths exist: the first, and the number of others."""
     more = len(paths) - 1
-    return (
-        f"{paths[0]} and {more} more {'file' if more == 1 else 'files'} are" if more else f"{paths[0]} is"
-    )
+    if not more:
+        return f"{paths[0]} already exists"
+    return f"{paths[0]} and {more} more {'file' if more == 1 else 'files'} already exist"
 
 
 @contextlib.contextmanager

@@ -51,8 +51,8 @@ class FrameWarper:
         size = (frame.width, frame.height)
         if size != self._lens.image_size:
             raise ValueError(
-                f"The frame at {frame.time or 0:.3f} s has {size[0]} x {size[1]} px, and those before "
-                f"{self._lens.image_size[0]} x {self._lens.image_size[1]}. Cut the video there."
+                f"The frame at {frame.time or 0:.3f} s has {size[0]} x {size[1]} px, but earlier ones have "
+                f"{self._lens.image_size[0]} x {self._lens.image_size[1]} px. Split the video there."
             )
         name = planar_format(frame.format.name)
         given = frame if frame.format.name == name else frame.reformat(format=name)

@@ -243,7 +243,7 @@ def warn_of_fold(distortion: Distortion, image_size: tuple[int, int], stacklevel
         return False
     warnings.warn(
         f"The lens is not invertible on this image: its distortion folds {limit:.0f} px from the "
-        f"centre, and the farthest corner is {corner:.0f} px from it. What lies beyond the fold is left "
+        f"centre, and the farthest corner is {corner:.0f} px from it. The part beyond the fold is left "
         "out, and pixels without a counterpart get the border value. Fit the lens to lines that reach the "
         "corners, or with fewer terms.",
         stacklevel=stacklevel,

@@ -120,7 +120,7 @@ def corrected_photo(
     )
     if metadata and suffix in _NO_METADATA:
         warnings.warn(
-            f"Metadata of {os.fspath(source)} are not kept: BMP files hold none.",
+            f"Metadata of {os.fspath(source)} are not kept: BMP files cannot store metadata.",
             stacklevel=3,
         )
     return _encoded(corrected, suffix, metadata)

@@ -111,8 +111,8 @@ def undistort_video(
     lost = max(report.corrupt, report.announced - report.written if report.announced else 0)
     if lost:
         warnings.warn(
-            f"{lost} of {max(report.announced, report.written)} frames of {os.fspath(source)} do not "
-            f"decode ({report.error or 'the file ends early'}): {report.written} were written.",
+            f"{lost} of {max(report.announced, report.written)} frames of {os.fspath(source)} cannot "
+            f"be decoded ({report.error or 'the file ends early'}): {report.written} were written.",
             stacklevel=2,
         )
     return CorrectedVideo(report.written, lost, float(framing.scale))
@@ -187,7 +187,7 @@ def _write(
         if isinstance(item, av.VideoFrame):
             break
     else:
-        raise ValueError(f"Cannot read a video from {input_.name}: none of its frames decodes.")
+        raise ValueError(f"Cannot read a video from {input_.name}: none of its frames can be decoded.")
     with FrameWriter(
         part, target, input_, video, early[-1], encoder, options, report.orientation
     ) as writer:

@@ -73,12 +73,12 @@ class Workers:
             try:
                 connection.send(item)
                 if not connection.poll(self._seconds):
-                    raise LostError(f"looking at it took more than {self._seconds:.0f} s")
+                    raise LostError(f"detection took more than {self._seconds:.0f} s")
                 return connection.recv()
             except (EOFError, OSError) as error:
                 code = self._discard()
                 if last:
-                    raise LostError(f"the process that looked at it was ended {_how(code)}") from error
+                    raise LostError(f"the detection process ended {_how(code)}") from error
             except BaseException:
                 self._discard()
                 raise
@@ -95,8 +95,8 @@ class Workers:
                     return connection
             self._discard()
         raise RuntimeError(
-            "A process that looks at images cannot be started, perhaps for want of memory. Try again with "
-            "fewer of them."
+            "A detection process cannot be started, perhaps because memory is short. Try again with fewer "
+            "processes."
         )
 
     def _begun(self) -> Connection:
@@ -105,7 +105,7 @@ class Workers:
         process = context.Process(target=_serve, args=(theirs, self._task, self._seconds), daemon=True)
         with self._lock:
             if self._closed:
-                raise LostError("it is not wanted any more")
+                raise LostError("detection was cancelled")
             process.start()
             self._processes.add(process)
         theirs.close()  # so that its end is seen here when the process ends
@@ -141,7 +141,7 @@ def _how(code: int | None) -> str:
         name = signal.Signals(-code).name
     except ValueError:
         name = f"signal {-code}"
-    return f"by {name}: it is damaged, or takes too much memory"
+    return f"by {name}: the image is damaged, or takes too much memory"
 
 
 def _serve(connection: Connection, task: Callable[[Any], Any], seconds: float) -> None:

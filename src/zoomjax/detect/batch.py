@@ -107,7 +107,9 @@ def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detec
     if min(size) < _SMALLEST:
         return found(problem=f"it is {size[0]}x{size[1]} px: at least {_SMALLEST} px a side are needed")
     if isinstance(detector, PitchDetector) and image.ndim == 2:
-        return found(size, problem=f"it is grey, and grass is told by its colour. {_ANOTHER}")
+        return found(
+            size, problem=f"it is grey, but the pitch detector finds grass by its colour. {_ANOTHER}"
+        )
     try:
         focal = source.focal if focal is None else focal
         wanted = grid == "all" or (grid == "without focal length" and focal is None)
@@ -124,14 +126,14 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     if isinstance(error, MemoryError) or getattr(error, "code", 0) == cv2.Error.StsNoMem:
-        return "it takes more memory than there is"
+        return "there is not enough memory for it"
     return " ".join(str(error).split()).rstrip(".")
 
 
 _ANOTHER = "Try another detector, such as edges (argument detector)"
 
 _NO_LINES = (
-    "no lines were found. Is what should be straight in focus, well lit and large in the image? Or: "
+    "no lines were found. Check that straight edges are in focus, well lit and large in the image. "
     + _ANOTHER
 )
 

@@ -91,7 +91,7 @@ def _check(image) -> None:
     as_grey(image)
     if image.ndim != 3:
         raise ValueError(
-            "Argument image must be a colour image (height, width, 3), blue, green, red, as grass is told "
+            "Argument image must be a colour image (height, width, 3), blue, green, red, as grass is found "
             f"by its colour, but its shape is {image.shape}."
         )
 

@@ -111,7 +111,7 @@ def _expanded(given: str) -> list[Path]:
         return _within(path)
     if path.exists():
         if path.suffix.lower() not in SUFFIXES:
-            raise ValueError(f"{path} is no photograph: the file name must end in {', '.join(SUFFIXES)}.")
+            raise ValueError(f"{path} is not a photo: the file name must end in {', '.join(SUFFIXES)}.")
         return [path]
     found = [Path(name) for name in sorted(glob.glob(given, recursive=True))]
     photos = [p for p in found if p.suffix.lower() in SUFFIXES and p.is_file()]
@@ -175,7 +175,7 @@ def video_frames(
             at = focal.at(last, time) if isinstance(focal, FocalTrack) else float(focal)
             yield Source(f"{stem}-{last:06d}.jpg", None, image(), at)
         if last < 0:
-            raise ValueError(f"Cannot read {os.fspath(path)}: none of its frames decodes.")
+            raise ValueError(f"Cannot read {os.fspath(path)}: none of its frames can be decoded.")
         if last + 1 < 0.98 * announced - 2:  # lengths are rounded
             warnings.warn(
                 f"{os.fspath(path)} ends early, after {last + 1} of {announced} frames: it is cut off or "

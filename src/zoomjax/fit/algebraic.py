@@ -41,8 +41,8 @@ def compressed(lines: AbstractLines, terms: int) -> CompressedLines:
     if isinstance(lines, Lines):
         return compress(lines, terms)
     raise TypeError(
-        f"Lines of type {type(lines).__name__} do not serve here: pass Lines or compress(lines); of "
-        "compress_any_centre(lines), those about one centre, .about(centre)."
+        f"Lines of type {type(lines).__name__} cannot be used here: pass Lines or compress(lines); after "
+        "compress_any_centre(lines), pass .about(centre)."
     )
 
 

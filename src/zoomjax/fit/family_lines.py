@@ -100,8 +100,8 @@ class FamilyLines(AbstractLines):
             if traced((self.centre, centre)) or np.allclose(self.centre, centre, rtol=0, atol=1e-3):
                 return self
             raise ValueError(
-                "Lines compressed with all monomials serve one centre if their family is not radial, and "
-                "another is asked for. Compress the lines about that, or pass the lines themselves."
+                "Lines compressed with all monomials for a family that is not radial have one centre, but "
+                "another is requested. Compress the lines about that centre, or pass the lines themselves."
             )
         return _wrapped(self.as_weighted().about(centre), self.family)
 

@@ -104,7 +104,7 @@ def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma) 
         )
     if fit.lens.shift is not None:
         raise ValueError(
-            "The lens has a centre that moves along the zoom, for which this is not worked out."
+            "Argument fit must have a lens with a fixed centre, but its centre moves along the zoom."
         )
     lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
     return _widened(fit, lines, jnp.diag(sigma / jnp.asarray(lines.focal)) ** 2)
@@ -168,7 +168,7 @@ def fit_focal(
     t, model, steps, reached = _refined(lines, start.lens.zoom, sigma / given)
     if throw and not traced(reached) and not reached:
         raise RuntimeError(
-            f"The focal lengths did not settle in {_MOST_STEPS} steps: the lines say too little of those "
+            f"The focal lengths did not converge in {_MOST_STEPS} steps: the lines hardly determine those "
             "with a large focal_sigma. Leave these frames out, or measure their focal lengths."
         )
     focal = given * jnp.exp(t)
@@ -185,9 +185,10 @@ def fit_focal(
 
 
 _UNKNOWN = (
-    "Straightness alone cannot tell focal lengths: relabel them by any increasing function, change the "
-    "zoom model accordingly, and every line is as straight as before. Take them from EXIF data or a table, "
-    "or measure them from a board (focal_from_board) or a plane (focal_from_planes, focal_from_lines)."
+    "Straight lines alone do not determine focal lengths: after a change of all focal lengths by an "
+    "increasing function, another zoom model makes every line as straight. Take them from EXIF data or a "
+    "table, or measure them from a board (focal_from_board) or a plane (focal_from_planes, "
+    "focal_from_lines)."
 )
 
 

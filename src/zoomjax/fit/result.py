@@ -45,19 +45,19 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 
     undetermined = (
         "The lines do not determine all coefficients: some can change without bending any line by more "
-        "than the noise does, and their variance is reported as infinite. Add lines that pass far from the "
-        "centre of distortion, at more focal lengths, or lower the degree or the number of terms."
+        "than the noise. Their variance is reported as infinite. Add lines far from the centre of "
+        "distortion or at more focal lengths, or lower the degree or the number of terms."
     )
     folded = (
-        "The fitted distortion is not invertible over the whole image and the range of focal lengths: its "
-        "`certificate` says where the corrected image folds over. Add lines near the corners, remove lines "
+        "The fitted distortion is not invertible over the whole image and the range of focal lengths: see "
+        "`certificate` for where the corrected image folds over. Add lines near the corners, remove lines "
         "that are not straight in the scene, or lower the degree or the number of terms."
     )
     constrained = (
-        "The lines fit best with a distortion that is not invertible over the whole image and the range of "
-        "focal lengths; this is the best one that is, and `rms_unconstrained` tells what that cost. Add "
-        "lines near the corners, remove lines that are not straight in the scene, or lower the degree or "
-        "the number of terms."
+        "The best-fitting distortion is not invertible over the whole image and the range of focal "
+        "lengths. The model was refitted to be invertible; `rms_unconstrained` is the RMS without this "
+        "constraint. Add lines near the corners, remove lines that are not straight in the scene, or lower "
+        "the degree or the number of terms."
     )
 
 

@@ -42,7 +42,8 @@ class FocalTable:
         row = self.row(image)
         if row is None:
             raise ValueError(
-                f"Cannot read focal lengths from {self._path}: it has no number for {PurePath(image).name}."
+                f"Cannot read focal lengths from {self._path}: it has no focal length for "
+                f"{PurePath(image).name}."
             )
         return self._focals[row]
 
@@ -97,7 +98,7 @@ def read_focal_table(path: str | os.PathLike[str]) -> FocalTable:
         told = (value, None if math.isnan(std) else std)
         if found.setdefault(name, told) != told:
             raise table.error(
-                f"{name} comes twice, with {_told(*found[name])} and, in row {row}, {_told(*told)}"
+                f"{name} is listed twice, with {_told(*found[name])} and, in row {row}, {_told(*told)}"
             )
     return FocalTable(
         {name: value for name, (value, _) in found.items()},

@@ -80,7 +80,7 @@ def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, Metadata]:
             image = as_stored(image, orientation)  # OpenCV turns TIFF files, whatever it is asked
         return image, metadata
     except (ValueError, MemoryError) as error:
-        reason = error if isinstance(error, ValueError) else "it takes more memory than there is"
+        reason = error if isinstance(error, ValueError) else "there is not enough memory for it"
         raise ValueError(f"Cannot read a photograph from {path}: {reason}.") from error
 
 
@@ -112,7 +112,7 @@ def open_photo(path: Path) -> Iterator[io.BufferedReader]:
     with open(descriptor, "rb") as file:
         about = os.fstat(descriptor)
         if not stat.S_ISREG(about.st_mode):
-            raise ValueError("it is no ordinary file")
+            raise ValueError("it is not a regular file")
         if about.st_size > _MOST_BYTES:
             raise ValueError(f"it has {about.st_size / 1e9:.1f} GB, more than {_MOST_BYTES / 1e9:.0f}")
         yield file

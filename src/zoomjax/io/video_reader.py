@@ -64,7 +64,7 @@ def opened_video(source: str | os.PathLike[str]) -> Any:
     if not path.exists():
         raise FileNotFoundError(f"There is no video {path}.")
     if not path.is_file():
-        raise ValueError(f"Cannot read a video from {path}: it is no ordinary file.")
+        raise ValueError(f"Cannot read a video from {path}: it is not a regular file.")
     if path.stat().st_size == 0:
         raise ValueError(f"Cannot read a video from {path}: the file is empty.")
     try:
@@ -77,7 +77,7 @@ def opened_video(source: str | os.PathLike[str]) -> Any:
     context = video and video.codec_context  # none of a codec that FFmpeg does not know
     if not (context and context.width and context.height):
         container.close()
-        why = "it has no video stream" if video is None else "none of its frames decodes"
+        why = "it has no video stream" if video is None else "none of its frames can be decoded"
         raise ValueError(f"Cannot read a video from {path}: {why}.")
     video.thread_type = "AUTO"
     return container

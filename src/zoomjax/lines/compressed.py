@@ -91,7 +91,7 @@ class CompressedLines(AbstractLines):
         """Raise ValueError where these triangles do not serve so many coefficients."""
         if terms > self.terms:
             raise ValueError(
-                f"These lines were compressed for {self.terms} terms, but {terms} are asked for: "
+                f"These lines were compressed for {self.terms} terms, but {terms} are requested: "
                 f"compress(lines, terms={terms})."
             )
 
@@ -119,8 +119,8 @@ class CompressedLines(AbstractLines):
         """
         if not traced((self.centre, centre)) and not np.allclose(self.centre, centre, rtol=0, atol=1e-3):
             raise ValueError(
-                "The compressed lines have another centre of distortion than is asked for. Compress the "
-                "lines about that centre, or by compress_any_centre, or pass the lines themselves."
+                "The compressed lines have another centre of distortion than the one requested. Compress "
+                "the lines about that centre, or by compress_any_centre, or pass the lines themselves."
             )
         return self
 

@@ -47,7 +47,7 @@ def read_lines_csv(
     if "focal" in columns:
         if focal is not None:
             raise table.error(
-                "it has a column focal, and focal lengths are given beside it. Leave one of them out"
+                "it has a column focal, but focal lengths are also given separately. Leave one of them out"
             )
         table.check("focal", columns["focal"] > 0, "positive")
         lowest, highest = np.full(frames.size, np.inf), np.full(frames.size, -np.inf)

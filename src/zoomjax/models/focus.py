@@ -164,8 +164,8 @@ class FocusSplineZoom(AbstractFocusZoom):
 
 
 _NO_FOCUS = (
-    "This zoom model depends on the focus, which is missing here: ask lens(f, focus) or "
-    "lens.at_focus(focus)(f); for standard deviations, std_of(fit, lambda lens: ...) of these."
+    "This zoom model depends on the focus, which is missing here: call lens(f, focus) or "
+    "lens.at_focus(focus)(f); for standard deviations, use std_of(fit, lambda lens: ...) with these."
 )
 
 

@@ -262,12 +262,14 @@ class ZoomLens(eqx.Module):
             raise ValueError(f"Argument focal must be a positive number, but it is {values[bad][0]}.")
         slack = _SLACK * values
         if np.any((values < low - slack) | (values > high + slack)):
-            asked = f"The focal length {values[0]:g} {self.focal_unit} is"
+            outside = f"The focal length {values[0]:g} {self.focal_unit} is not"
             if values.size > 1:
-                asked = f"Focal lengths from {values.min():g} to {values.max():g} {self.focal_unit} are"
+                outside = (
+                    f"Focal lengths from {values.min():g} to {values.max():g} {self.focal_unit} are not all"
+                )
             warnings.warn(
-                f"{asked} asked for, and the lens was fitted on {low:g} to {high:g} {self.focal_unit}: "
-                "beyond that its distortion is extrapolated.",
+                f"{outside} within the range on which the lens was fitted, {low:g} to {high:g} "
+                f"{self.focal_unit}: beyond it the distortion is extrapolated.",
                 stacklevel=stacklevel + 1,
             )
 

@@ -124,11 +124,11 @@ def check_image_size(distortion: Distortion, image_size: tuple[int, int]) -> Non
     if explained:
         middle = f"({(width - 1) / 2:.5g}, {(height - 1) / 2:.5g})"
         raise ValueError(
-            f"The distortion is that of images of another size: its centre is ({centre[0]:.5g}, "
-            f"{centre[1]:.5g}) and its scale {scale:.5g} px, and this one, of {width} x {height} px, has "
-            f"its middle at {middle} and half a diagonal of {half:.5g}. "
-            f"Give images of the lens's size, or lens_for_size(lens, ({width}, {height}))(focal). If the "
-            "image is a crop and the distortion is meant so, give a Framing of your own: "
+            f"The distortion is for images of another size: its centre is ({centre[0]:.5g}, "
+            f"{centre[1]:.5g}) and its scale {scale:.5g} px, but this image of {width} x {height} px has "
+            f"its middle at {middle} and half a diagonal of {half:.5g} px. "
+            f"Give images of the lens's size, or use lens_for_size(lens, ({width}, {height}))(focal). If "
+            "the image is a crop for which this distortion is right, give a Framing: "
             f"Framing(np.array(1.0), np.zeros(2), ({width}, {height}))."
         )
 

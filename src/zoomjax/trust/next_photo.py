@@ -78,10 +78,10 @@ class Suggestion:
             f"{self.focal:.4g} {self.focal_unit}"
         )
         if not np.isfinite(self.before):
-            return f"{photo}: of all there is to add, that would determine the lens best."
+            return f"{photo}: of all candidates, this one would determine the lens best."
         return (
-            f"{photo}: the standard deviation of the displacement, in the mean over image and range, would "
-            f"fall from {self.before:.2g} to {self.after:.2g} px."
+            f"{photo}: the standard deviation of the displacement, averaged over image and focal range, "
+            f"would fall from {self.before:.2g} to {self.after:.2g} px."
         )
 
 
@@ -119,13 +119,13 @@ def suggest_next(
         )
     if isinstance(fit.lens.zoom, AbstractFocusZoom) or fit.lens.shift is not None:
         raise ValueError(
-            "Photos are suggested for lenses that depend on the focal length alone, about one centre of "
-            "distortion: this one depends on the focus, or its centre moves along the zoom."
+            "Argument fit must have a lens that depends on the focal length alone and has one centre of "
+            "distortion, but it depends on the focus, or its centre moves along the zoom."
         )
     lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
     if not np.any(counted_frames(lines)):
         raise ValueError(
-            "Argument lines must have a line that counts, but all have a weight of 0 or too few points."
+            "Argument lines must have a usable line, but all have a weight of 0 or too few points."
         )
     focals = np.unique(1 / np.linspace(1 / low, 1 / high, _FOCALS))
     number, length, counts = _typical(lines)
