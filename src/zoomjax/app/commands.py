@@ -71,9 +71,10 @@ def demo(
 ) -> None:
     """Run a complete example: render photos of a board with a known lens, then calibrate from them.
 
-    The scene is the first experiment of Alvarez, Gómez and Henríquez (2012): a board of 31 x 23 stripes at
-    1185 mm, focal lengths from 20.56 to 127.36 mm, and the lens measured there, a Nikkor 18-200. The
-    rendered photos are calibrated as by zoomjax calibrate, and the result is compared with the true lens.
+    The scene is the first experiment of Alvarez et al. (2012): a board of
+    31 x 23 stripes at 1185 mm, focal lengths from 20.56 to 127.36 mm, and the
+    lens measured there, a Nikkor 18-200. The photos are calibrated as by
+    zoomjax calibrate, and the result is compared with the true lens.
     """
     set_up_jax()
     from ..scenes.board import StripedBoard, nikkor_18_200
@@ -180,8 +181,9 @@ def calibrate(
 ) -> None:
     """Calibrate a zoom lens from photos, a video or a file of lines.
 
-    Writes lens.json, summary.json, report.html, model.png and lines.npz; from images also lines/, each
-    image with its detected lines. Results of an earlier run in the same folder are replaced.
+    Writes lens.json, summary.json, report.html, model.png and lines.npz. From
+    images it also writes lines/: each image with its detected lines. Results
+    of an earlier run in the same folder are replaced.
     """
     set_up_jax()
     from .calibration import CLEARS, FILES
@@ -276,8 +278,8 @@ def undistort(
 ) -> None:
     """Correct photos or a video, each image at its own focal length.
 
-    Photos that cannot be corrected are reported and skipped. The exit status is then 1, or 2 if all were
-    skipped.
+    Photos that cannot be corrected are reported and skipped. The exit status
+    is then 1, or 2 if all were skipped.
     """
     set_up_jax()
     from .undistort_files import Job, undistort_files
@@ -300,11 +302,11 @@ def reproduce(
     ],
     overwrite: Overwrite = False,
 ) -> None:
-    """Repeat the two experiments of Alvarez, Gómez and Henríquez (2012) on synthetic scenes.
+    """Repeat the two experiments of Alvarez et al. (2012) on synthetic scenes.
 
-    The paper's images are not public, so the scenes are made from its published numbers. Writes
-    reproduce.md, with the tables next to those of the paper, Figures 5 to 10 as PNG and PDF, and
-    reproduce.json.
+    The paper's images are not public, so the scenes are made from its
+    published numbers. Writes reproduce.md, with the tables next to those of
+    the paper, Figures 5 to 10 as PNG and PDF, and reproduce.json.
     """
     set_up_jax()
     from rich.console import Console

@@ -1,4 +1,4 @@
-"""Plots with matplotlib (extra ``zoomjax[app]``). Functions return figures; they do not show or save them."""
+"""Plots with matplotlib (extra ``zoomjax[app]``). Functions return figures; nothing is shown or saved."""
 
 from collections.abc import Sequence
 from itertools import pairwise
