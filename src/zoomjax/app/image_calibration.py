@@ -37,8 +37,7 @@ class ImageJob:
         focal: source of the focal lengths, as for `choose_focals`; for a video also a track.
         focal_unit: unit of the focal lengths in a number, a table or a track.
         focal_sigma: standard deviation of the focal lengths: a number in their unit, or a percentage such
-            as
-            "1%"; None for the standard deviation given by their source.
+            as "1%"; None for the standard deviation given by their source.
         board: the board, for ``focal="board"``.
         degree: degree of the polynomials in 1/f.
         terms: number of distortion coefficients.

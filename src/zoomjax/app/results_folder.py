@@ -1,8 +1,7 @@
 """Folders of results: files are published together, and replace only files that zoomjax wrote.
 
 The files written are listed in ``.zoomjax.json`` in the same folder, with size and SHA-256. An existing
-file
-that does not match the list belongs to the user: it is replaced only on request, and never removed.
+file that does not match the list belongs to the user: it is replaced only on request, and never removed.
 
 Results are made in a temporary folder inside, then renamed one by one. Before that, the list gets the old
 and the new files, so that the next run recognises all files even if this one is killed in between.
