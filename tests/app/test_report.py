@@ -156,7 +156,7 @@ def test_what_is_not_determined_is_said(calibration):
     page = Page(report(dataclasses.replace(calibration, zoom=zoom)))
     assert "Warning: The lines do not determine" in page.text
     assert "not determined" in page.text
-    assert "at the corner, where it is least certain unknown" in page.text
+    assert "largest standard deviation at the corner unknown" in page.text
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -168,14 +168,14 @@ def test_a_lens_that_folds_is_called_so(calibration):
     )
     page = Page(report(dataclasses.replace(calibration, zoom=zoom)))
     assert "The lens is not invertible" in page.text
-    assert "goes down to -0.2, at f = " in page.text
+    assert "falls to -0.2, at f = " in page.text
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_long_lists_are_cut_to_the_worst_frames(calibration, monkeypatch):
     monkeypatch.setattr(zoomjax.app.report, "_MOST_FRAMES", 2)
     page = Page(report(calibration))
-    assert "Of 4 frames, these are the 2 that the polynomial fits worst." in page.text
+    assert "Of 4 frames, the 2 that the polynomial fits worst are shown." in page.text
     rms = np.asarray(calibration.zoom.frame_rms)
     frames = page.text[page.text.index("Frame by frame") :]
     for frame in range(4):

@@ -83,7 +83,7 @@ def test_a_distortion_of_images_of_another_size_is_refused(case):
     ]
     for call in calls:
         with pytest.raises(
-            ValueError, match=r"images of another size: its centre .* this one, of 640 x 480 px"
+            ValueError, match=r"images of another size: its centre .* but this image of 640 x 480 px"
         ):
             call()
 
