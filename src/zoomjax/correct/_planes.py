@@ -1,4 +1,4 @@
-"""Frames of video corrected plane by plane, in the pixel format they come in.
+"""Correction of video frames plane by plane, in their own pixel format.
 
 YUV is not converted to RGB and back, and chroma of 4:2:0 is warped at its own size: half the samples of
 RGB, and no rounding in between. Per frame: the focal length's distortion, one map a sampling (U and V share

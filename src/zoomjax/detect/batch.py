@@ -1,7 +1,7 @@
-"""Lines in many images: over processes, with a cache, one bad image at a time reported and passed over.
+"""Detection in many images: in several processes, with a cache. Bad images are reported and skipped.
 
-Only points are kept of an image, and of these no more than one every `_SPACING` px of a line: detectors
-smooth over some px, so that nearer neighbours share their noise and say little more.
+Only points are kept, at most one every `_SPACING` px of a line: detectors smooth over some px, so that
+closer neighbours share their noise and add little information.
 """
 
 import collections
@@ -42,16 +42,16 @@ _SECONDS = 300.0
 
 @dataclasses.dataclass(frozen=True)
 class Detection:
-    """What one image showed.
+    """The result of detection in one image.
 
     Attributes:
-        name: of the image.
+        name: name of the image.
         file: the image's path, or its name if it has none.
         image_size: (width, height) px; (0, 0) if it could not be read.
         lines: for each line an (n, 2) array of points, px.
-        focal: the focal length that the image itself or the video's track tells, or None.
-        nodes: (row, column, 2) px, of the checkerboard or grid of dots in it, if that was looked for and
-            is there: NaN where a dot is not seen.
+        focal: the focal length from the image's EXIF data or the video's track, or None.
+        nodes: (row, column, 2) px, the nodes of a checkerboard or grid of dots, if one was searched for and
+            found: NaN where a dot is not seen.
         problem: why the image cannot be used; empty if it can.
     """
 
@@ -72,16 +72,16 @@ def detect(
     workers: int = 0,
     cache: Path | None = None,
 ) -> Generator[Detection, None, None]:
-    """The lines in each image, in order.
+    """Detect lines in each image, in order.
 
     Args:
         sources: the images.
-        detector: what finds lines.
-        grid: where to look for a grid, too, whose nodes tell the focal length: in "all" images, those
-            "without focal length" of their own, or "none".
-        workers: number of processes. An image that ends one, or takes longer than five minutes, is one
-            with a problem. 0: this one looks, and has no such protection.
-        cache: folder of what was found before in the same images by the same detector; None: no cache.
+        detector: the detector of lines.
+        grid: where to search also for a grid, from whose nodes the focal length can be estimated: in "all"
+            images, those "without focal length", or "none".
+        workers: number of processes. An image that crashes a process, or takes longer than five minutes, is
+            reported as a problem. 0: detect in this process, without this protection.
+        cache: folder of cached detections by the same detector; None: no cache.
     """
     task = functools.partial(_detected, detector=detector, grid=grid)
     with contextlib.ExitStack() as stack:

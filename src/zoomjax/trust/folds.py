@@ -1,4 +1,4 @@
-"""Folds: which lines are left out together, and what each line weighs."""
+"""Folds: which lines are left out together, and the weight of each line."""
 
 from typing import Literal, NamedTuple, get_args
 
