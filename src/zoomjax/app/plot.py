@@ -29,7 +29,8 @@ _ROUNDING = 1e-6  # of half the diagonal: smaller displacements are none
 
 
 def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
-    """The distortion coefficients against 1/f: each frame by itself, and the zoom model (Figure 8).
+    """Plot the distortion coefficients against 1/f: separate fits of the frames, and the zoom model (Figure
+    8).
 
     Below each coefficient stands by how much the frames differ from the model, with bars of one standard
     deviation of the frame's own fit; frames whose lines do not determine it have no dot. Around the model

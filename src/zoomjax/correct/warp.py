@@ -139,7 +139,7 @@ def sample_positions(
 
 
 def _exact_positions(distortion, framing, dtype):
-    """The same by the inverse of each pixel by itself, for families that are not radial."""
+    """The same by a separate inverse for each pixel, for distortion models that are not radial."""
     width, height = framing.size
     pixels = jnp.stack(jnp.meshgrid(jnp.arange(width), jnp.arange(height)), axis=-1).astype(dtype)
     positions = distortion.distort(

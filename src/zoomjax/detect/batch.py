@@ -37,7 +37,7 @@ _SPACING = 4.0
 _SMALLEST = 32
 
 _SECONDS = 300.0
-"""That an image may take: the largest that is read, on a slow machine, takes less."""
+"""Time limit for an image: the largest that is accepted takes less, on a slow machine."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +101,7 @@ def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detec
     found = functools.partial(Detection, source.name, source.file)
     try:
         image, focal = source.read()
-    except Exception as error:  # whatever it is, it is one image's
+    except Exception as error:  # any error concerns this image only
         return found(problem=_sentence(error))
     size = (image.shape[1], image.shape[0])
     if min(size) < _SMALLEST:
@@ -122,7 +122,7 @@ def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detec
 
 
 def _sentence(error: Exception) -> str:
-    """What an error says, without the numbers of the operating system and a full stop."""
+    """The message of an error, without the error numbers of the operating system and a full stop."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     if isinstance(error, MemoryError) or getattr(error, "code", 0) == cv2.Error.StsNoMem:
@@ -158,7 +158,7 @@ def _finished(file: Path | None, source: Source, result: Future | Detection) -> 
 
 @functools.cache
 def _code() -> bytes:
-    """The source of everything that detects: what it found before is of no use once it has changed."""
+    """Digest of the detection code: cached detections are invalid once it has changed."""
     folder = Path(__file__).parent
     files = [*sorted(folder.glob("*.py")), *sorted(folder.with_name("io").glob("*.py"))]
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).digest()
@@ -168,7 +168,7 @@ def _key(source: Source, detector: AbstractDetector, grid: str) -> str:
     digest = hashlib.sha256(_code() + cv2.__version__.encode() + repr((detector, grid)).encode())
     try:
         digest.update(source.digest())
-    except (OSError, ValueError) as error:  # told when it is read
+    except (OSError, ValueError) as error:  # reported when it is read
         digest.update(repr(error).encode())
     return digest.hexdigest()
 
@@ -194,7 +194,7 @@ def _save(detection: Detection, file: Path) -> None:
 
 
 def _load(file: Path, source: Source) -> Detection | None:
-    """What was found before, under the image's present name; None if nothing was."""
+    """The cached detection, with the image's present name; None if there is none."""
     try:
         with file.open("rb") as opened, np.load(opened, allow_pickle=False) as stored:
             points, nodes = np.asarray(stored["points"], float), np.asarray(stored["nodes"], float)
@@ -206,7 +206,7 @@ def _load(file: Path, source: Source) -> Detection | None:
         )
         if not sound or nodes.ndim != 3 or nodes.shape[2] != 2:
             return None
-    except Exception:  # whatever is wrong with it, it can be found again
+    except Exception:  # a damaged entry: detect again
         return None
     return Detection(
         name=source.name,

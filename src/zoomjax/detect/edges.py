@@ -19,10 +19,10 @@ _LONG = 0.2
 """Share of the image's shorter side that a border must extend over to inform the frame's distortion."""
 
 _LEAST_LINES = 3
-"""With fewer long borders a frame says too little of its distortion."""
+"""Number of long borders needed to estimate the distortion of a frame."""
 
 _ENOUGH = 100
-"""Points that tell how a line runs."""
+"""Number of points that represent a line."""
 
 _LEAST_TOLERANCE = 0.5
 _GREATEST_TOLERANCE = 2.0

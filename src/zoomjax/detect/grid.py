@@ -244,7 +244,7 @@ def _centroids(grey: np.ndarray, label: np.ndarray, number: int, across: float) 
     own = np.where(label > 0, label, wider).ravel()
     depth = np.bincount(own, np.where(label > 0, contrast, 0).ravel(), number + 1)
     depth /= np.maximum(np.bincount(label.ravel(), minlength=number + 1), 1)
-    # Below a tenth of its depth a spot is not told from noise.
+    # Below a tenth of its depth a spot cannot be distinguished from noise.
     weight = np.maximum(contrast.ravel() - 0.1 * depth[own], 0)
     y, x = (axis.ravel() for axis in np.indices(grey.shape))
     total = np.maximum(np.bincount(own, weight, number + 1), 1e-9)

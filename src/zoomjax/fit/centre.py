@@ -33,10 +33,10 @@ from .result import RESULTS, FrameFits, ZoomFit, collected
 from .zoom import fit_zoom, minimise
 
 _MOST_UNCERTAIN = 0.05
-"""Standard deviation of a centre, in half diagonals, above which it is not believed."""
+"""Largest standard deviation of a centre, in half diagonals, with which it is accepted."""
 
 _FARTHEST = 0.5
-"""Half diagonals from the middle of the image beyond which no centre is believed."""
+"""Largest distance of a centre from the middle of the image, in half diagonals, that is accepted."""
 
 
 class CentreFit(eqx.Module):

@@ -214,7 +214,7 @@ def _checked_sigma(focal_sigma: Any, focal: Focal) -> Float[Array, "frame"]:
 
 
 class _NearEnergy(NamedTuple):
-    """Half the energy, but for a constant, near some coefficients of the frames."""
+    """Half the energy, up to a constant, near some coefficients of the frames."""
 
     coefficients: Float[Array, "frame terms"]
     gradient: Float[Array, "frame terms"]

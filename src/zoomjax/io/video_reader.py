@@ -22,13 +22,14 @@ _MOST_ERRORS = 1000
 def decode_video(
     source: str | os.PathLike[str],
 ) -> Iterator[tuple[int, Iterator[tuple[int, float, Callable[[], np.ndarray]]]]]:
-    """The number of frames by the file's own account, and for each number, time, s, and what decodes it.
+    """The announced number of frames, and for each frame its number, time, s, and a function that decodes
+    it.
 
-    Numbers count damaged frames, too. The time is NaN where the file has none: the rate that FFmpeg then
-    tells is a guess.
+    Numbers count damaged frames, too. The time is NaN where the file has none: the frame rate from FFmpeg
+    is then a guess.
 
     Pixels are (height, width, 3) blue, green, red bytes, as stored: before any rotation for display.
-    Damaged frames are passed over.
+    Damaged frames are skipped.
 
     Raises:
         FileNotFoundError: there is no such video.

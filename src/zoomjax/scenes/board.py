@@ -240,7 +240,7 @@ def board_photo(
         focal: the focal length.
         board: the board and the camera's pixels; by default the paper's, whatever the image size.
         blur: standard deviation, px, of the Gaussian blur of the optics; at most an eighth of a stripe, for
-            each border is blurred by itself.
+            each border is blurred separately.
         noise: standard deviation, grey levels, of the noise of each pixel.
         vignetting: the fraction of light lost in the corners.
         levels: grey levels of dark and white in the middle, of 255.

@@ -75,7 +75,7 @@ def _cramer_rao(lens, lines, std):
     triangle = jnp.linalg.qr(rows.reshape(-1, rows.shape[-1]), mode="r")
     size = jnp.linalg.norm(triangle, axis=0)
     eps = 64 * jnp.finfo(size.dtype).eps
-    told = size > eps * jnp.sqrt(jnp.sum(most, axis=0))  # or rounding is all that the lines say
+    told = size > eps * jnp.sqrt(jnp.sum(most, axis=0))  # else rounding errors dominate
     size = jnp.where(told, size, 1)
     _, values, right = jnp.linalg.svd(triangle / size[None])
     determined = jnp.all(told) & (values[-1] > eps)
