@@ -234,7 +234,7 @@ WRONG = {
         ValueError,
         "Argument detector must be one of edges, grid, pitch",
     ),
-    "photos and a video": ({"inputs": ("a.jpg", "b.mp4")}, ValueError, "photographs, or one video"),
+    "photos and a video": ({"inputs": ("a.jpg", "b.mp4")}, ValueError, "photos, or one video"),
     "two videos": ({"inputs": ("a.mp4", "b.mp4")}, ValueError, "one video"),
     "no such photo": ({"inputs": ("nothing.jpg",)}, FileNotFoundError, "nothing.jpg"),
     "no such table": ({"focal": "nothing.csv"}, FileNotFoundError, "nothing.csv"),
