@@ -173,4 +173,4 @@ def test_a_square_view_tells_nothing():
     detections = [*oblique(1000.0, [(0.5, 0.0), (0.0, 0.5), (0.0, 0.0)])]
     found = choose_focals(detections, "plane")
     assert set(found.focal) == {"1000-0.png", "1000-1.png"}
-    assert "too squarely" in found.absent
+    assert "too frontal" in found.absent

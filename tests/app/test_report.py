@@ -177,7 +177,7 @@ def test_long_lists_are_cut_to_the_worst_frames(calibration, monkeypatch):
     page = Page(report(calibration))
     assert "Of 4 frames, the 2 that the polynomial fits worst are shown." in page.text
     rms = np.asarray(calibration.zoom.frame_rms)
-    frames = page.text[page.text.index("Frame by frame") :]
+    frames = page.text[page.text.index("RMS distance in px") :]
     for frame in range(4):
         assert (f"{rms[frame]:.3f}" in frames) == (frame in np.argsort(-rms)[:2])
 
