@@ -16,7 +16,7 @@ from ..correct.image import check_sampling
 from ..correct.photo import corrected_photo, photo_focal
 from ..io.focal_table import read_focal_table
 from ..io.focal_track import read_focal_track
-from ..io.photo import SUFFIXES
+from ..io.photo import FORMATS, SUFFIXES
 from ..io.text_table import plain_number
 from ..models.lens import ZoomLens, load_lens
 from ..models.sizes import at_focal, lens_for_size
@@ -149,7 +149,7 @@ _BAD_PHOTO = (ValueError, OSError, MemoryError, cv2.error)
 
 def _photo_targets(job: Job) -> list[Path]:
     """The target of each photo."""
-    folder = job.output.is_dir() or job.output.suffix.lower() not in SUFFIXES
+    folder = job.output.is_dir() or job.output.suffix.lower() not in FORMATS
     if not folder and len(job.inputs) > 1:
         raise ValueError(
             f"The output of {len(job.inputs)} photos must be a folder, but it is the file {job.output}."
@@ -158,16 +158,21 @@ def _photo_targets(job: Job) -> list[Path]:
         return [job.output]
     kind = mimetypes.guess_type(job.output.name)[0] or ""
     if not job.output.is_dir() and kind.startswith(("image/", "video/")):
-        raise ValueError(f"The output must end in one of {', '.join(SUFFIXES)}, but it is {job.output}.")
+        raise ValueError(f"The output must end in one of {', '.join(FORMATS)}, but it is {job.output}.")
     names: dict[str, Path] = {}
     for path in job.inputs:
         # Many file systems ignore case, and treat different encodings of an accent alike.
-        other = names.setdefault(unicodedata.normalize("NFC", path.name).casefold(), path)
+        other = names.setdefault(unicodedata.normalize("NFC", _target_name(path)).casefold(), path)
         if other is not path:
             raise ValueError(
                 f"The photos {other} and {path} have the same name and would be written to the same file."
             )
-    return [job.output / path.name for path in job.inputs]
+    return [job.output / _target_name(path) for path in job.inputs]
+
+
+def _target_name(photo: Path) -> str:
+    """The photo's name, with the suffix .png for formats that can only be read (HEIC)."""
+    return photo.name if photo.suffix.lower() in FORMATS else f"{photo.stem}.png"
 
 
 def _check_targets(job: Job, targets: Sequence[Path]) -> None:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from .._core.files import refuse_inputs, whole_file
-from ..io.photo import FORMATS, SUFFIXES, metadata_focal, read_focal, read_photo
+from ..io.photo import FORMATS, metadata_focal, read_focal, read_photo
 from ..io.tiff import Metadata, encode_tiff
 from ..models.lens import ZoomLens
 from .framing import Framing, framing_for_size
@@ -45,7 +45,8 @@ def undistort_photo(
     """Correct a photo and write it to a new file, with its metadata.
 
     Args:
-        source: the photo: JPEG, PNG, WebP, TIFF or BMP. All its bits and channels are kept.
+        source: the photo: JPEG, PNG, WebP, TIFF, BMP, or HEIC with the extra ``heic``. All its bits and
+            channels are kept.
         target: the file to write, completely or not at all. Its suffix sets the format; JPEG in quality 97.
         lens: the lens; for another size of the same aspect ratio it is scaled.
         focal: focal length in the lens's unit; by default that in the EXIF data.
@@ -86,7 +87,7 @@ def check_target(target: Path) -> None:
     """
     if target.suffix.lower() not in FORMATS:
         raise ValueError(
-            f"Argument target must end in one of {', '.join(SUFFIXES)}, but it is {target.name!r}."
+            f"Argument target must end in one of {', '.join(FORMATS)}, but it is {target.name!r}."
         )
 
 

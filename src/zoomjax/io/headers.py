@@ -8,9 +8,11 @@ import re
 import struct
 from collections.abc import Iterator
 
+from .heic import heic_size
+
 
 def announced_format(content: bytes) -> str:
-    """Format ("JPEG", "PNG", "WebP", "TIFF" or "BMP") of a file that begins like this.
+    """Format ("JPEG", "PNG", "WebP", "TIFF", "BMP" or "HEIC") of a file that begins like this.
 
     Raises:
         ValueError: the content has another format.
@@ -24,7 +26,7 @@ def announced_format(content: bytes) -> str:
 
 
 def announced_size(content: bytes) -> tuple[str, int, int]:
-    """Format ("JPEG", "PNG", "WebP", "TIFF" or "BMP"), width and height that a file's header announces.
+    """Format, as `announced_format` has it, width and height that a file's header announces.
 
     Raises:
         ValueError: the content has another format, or ends before its size.
@@ -112,4 +114,5 @@ _FORMATS = (
     (re.compile(rb"RIFF....WEBPVP8[ LX]", re.DOTALL), "WebP", _webp),
     (re.compile(rb"II[*+]\0|MM\0[*+]"), "TIFF", _tiff),
     (re.compile(rb"BM"), "BMP", _bmp),
+    (re.compile(rb"....ftyp(hei[cmsx]|hev[cx]|mif1)", re.DOTALL), "HEIC", heic_size),
 )

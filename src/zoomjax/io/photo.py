@@ -15,6 +15,7 @@ import numpy as np
 
 from .exif import exif_focal, find_exif
 from .headers import announced_format, announced_size, jpeg_segments
+from .heic import HEIC_SUFFIXES, decode_heic, heic_metadata
 from .tiff import Metadata, as_stored, tiff_metadata
 
 FORMATS = {  # suffix: bits a sample, and numbers of channels, that the format holds
@@ -24,7 +25,7 @@ FORMATS = {  # suffix: bits a sample, and numbers of channels, that the format h
     **dict.fromkeys([".tif", ".tiff"], ((8, 16, 32, 64), (1, 3, 4))),
     ".bmp": ((8,), (1, 3, 4)),
 }
-SUFFIXES = tuple(FORMATS)
+SUFFIXES = (*FORMATS, *HEIC_SUFFIXES)
 """Of files that count as photographs."""
 
 
@@ -41,6 +42,8 @@ def read_focal(source: str | os.PathLike[str]) -> float | None:
         with open_photo(path) as file:
             kind = announced_format(file.read(16))
             file.seek(0)
+            if kind == "HEIC":
+                return metadata_focal(heic_metadata(file.read(_MOST_BYTES)))
             block = find_exif(file, kind)
     except ValueError as error:
         raise ValueError(f"Cannot read a photograph from {path}: {error}.") from error
@@ -74,6 +77,8 @@ def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, Metadata]:
             raise ValueError(f"its header announces {width}x{height} px, more than {_MOST_PIXELS:,} in all")
         if kind == "JPEG" and all(mark != _END for mark, _ in jpeg_segments(content)):
             raise ValueError("the file is damaged or cut off")  # OpenCV fills up what is missing with grey
+        if kind == "HEIC":
+            return decode_heic(content)
         image, metadata = _decoded(np.frombuffer(content, np.uint8), metadata=kind in _WITH_METADATA)
         if kind == "TIFF":
             metadata, orientation = tiff_metadata(io.BytesIO(content))

@@ -44,14 +44,20 @@ def tiff_metadata(file: File) -> tuple[Metadata, int]:
         del exif[tag]
     for tag in set(_TEXTS) & set(exif):
         exif[tag] = _bytes(exif[tag])  # else Pillow writes ASCII alone
-    orientation: Any = exif.get(_BASE.Orientation)
+    orientation = orientation_of(exif)
     blocks = [(kind, block) for kind, block in others if isinstance(block, bytes)]
     if len(exif):
         blocks.insert(0, (cv2.IMAGE_METADATA_EXIF, exif.tobytes().removeprefix(b"Exif\0\0")))
     metadata = [
         (kind, np.frombuffer(block, np.uint8)) for kind, block in blocks if len(block) < _MOST_BYTES
     ]
-    return metadata, orientation if orientation in range(1, 9) else 1
+    return metadata, orientation
+
+
+def orientation_of(exif: Image.Exif) -> int:
+    """1 to 8; 1, upright, if it is not known."""
+    orientation: Any = exif.get(_BASE.Orientation)
+    return orientation if orientation in range(1, 9) else 1
 
 
 def _bytes(text: Any) -> bytes:

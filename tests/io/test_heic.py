@@ -1,0 +1,102 @@
+"""HEIC photographs: pixels as the camera stored them, metadata, and sentences about what is wrong."""
+
+import contextlib
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
+
+import zoomjax as zj
+from zoomjax.detect.sources import find_photos
+from zoomjax.io.headers import announced_size
+from zoomjax.io.photo import read_focal, read_photo
+
+pillow_heif = pytest.importorskip("pillow_heif")
+
+SIZE = (192, 128)
+
+
+def gradient(depth=8):
+    """Smooth, and different at each corner: compression changes little, turning much."""
+    x, y = np.meshgrid(np.linspace(0, 1, SIZE[0]), np.linspace(0, 1, SIZE[1]))
+    return (np.stack([x, y, 0.5 * (x + y)], axis=-1) * (2**depth - 1)).astype(f"u{depth // 8}")
+
+
+def write(path, image, orientation=1, focal=35.0, profile=None):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    if focal:
+        exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLength: IFDRational(round(focal * 10), 10)}
+    mode = "BGR;16" if image.dtype == np.uint16 else "BGR"
+    file = pillow_heif.from_bytes(mode, image.shape[1::-1], image.tobytes())
+    more = {"icc_profile": profile} if profile else {}
+    file.save(path, quality=-1, exif=exif.tobytes(), **more)
+    return path
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pixels_are_those_that_were_stored(tmp_path, orientation):
+    path = write(tmp_path / "a.heic", gradient(), orientation)
+    image, metadata = read_photo(path)
+    assert image.dtype == np.uint8
+    assert np.abs(image.astype(int) - gradient()).max() <= 4
+    assert read_focal(path) == 35.0
+    assert [kind for kind, _ in metadata] == [cv2.IMAGE_METADATA_EXIF]
+
+
+def test_more_than_eight_bits_are_kept(tmp_path):
+    image, _ = read_photo(write(tmp_path / "a.heif", gradient(16)))
+    assert image.dtype == np.uint16
+    assert np.abs(image.astype(int) - gradient(16)).max() < 65535 / 100  # lossy
+    assert len(np.unique(image)) > 500
+
+
+def test_the_size_is_known_before_pixels_are_decoded(tmp_path):
+    content = write(tmp_path / "a.heic", gradient()).read_bytes()
+    assert announced_size(content) == ("HEIC", *SIZE)
+
+
+def test_corrected_with_its_metadata(tmp_path):
+    profile = bytes(range(256))
+    source = write(tmp_path / "a.heic", gradient(), orientation=6, profile=profile)
+    lens = zj.scenes.nikkor_18_200(SIZE)
+    zj.undistort_photo(source, tmp_path / "b.tif", lens=lens)  # 35 mm, from the EXIF data
+    stored, metadata = read_photo(tmp_path / "b.tif")
+    np.testing.assert_array_equal(stored, zj.undistort_image(read_photo(source)[0], lens(35.0)))
+    assert read_focal(tmp_path / "b.tif") == 35.0
+    assert dict(metadata)[cv2.IMAGE_METADATA_ICCP].tobytes() == profile
+    with pytest.raises(ValueError, match=r"must end in one of \.jpg"):
+        zj.undistort_photo(source, tmp_path / "b.heic", lens=lens)
+
+
+def test_folders_of_photographs_include_them(tmp_path):
+    write(tmp_path / "a.HEIC", gradient())
+    [source] = find_photos([tmp_path])
+    assert source.read()[1] == 35.0
+
+
+def test_without_a_focal_length_there_is_none(tmp_path):
+    assert read_focal(write(tmp_path / "a.heic", gradient(), focal=None)) is None
+
+
+def test_without_the_extra_a_sentence_names_it(tmp_path, monkeypatch):
+    path = write(tmp_path / "a.heic", gradient())
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    for read in (read_photo, read_focal):
+        with pytest.raises(ValueError, match=r'need the extra "heic": pip install "zoomjax\[heic\]"'):
+            read(path)
+
+
+def test_damaged_files_are_refused(tmp_path, rng):
+    content = write(tmp_path / "a.heic", gradient()).read_bytes()
+    for _ in range(60):
+        damaged = bytearray(content[: rng.integers(20, len(content))])
+        for place in rng.integers(12, len(damaged), 5):
+            damaged[place] = rng.integers(256)
+        (path := tmp_path / "damaged.heic").write_bytes(damaged)
+        for read in (read_photo, read_focal):
+            with contextlib.suppress(ValueError):  # which names the file: anything else is a crash
+                read(path)
