@@ -54,15 +54,15 @@ def undistort(
         points: (..., 2) px, float32 or float64.
         lens: a distortion, or a lens.
         focal: of a lens, the focal length, or a tensor of them that broadcasts with the points.
-        coefficients: in place of the lens's own (see `coefficients_of`).
+        coefficients: used instead of the lens's own (see `coefficients_of`).
 
     Returns:
         A tensor of the points' dtype and device; NaN beyond the lens's focal range (see
-        `ZoomLens.extended`). First derivatives exist, second ones are for JAX.
+        `ZoomLens.extended`). First derivatives exist; for second ones use JAX.
 
-    Raises:
-        TypeError: the points are no tensor of float32 or float64, or the lens is something else.
-        ValueError: a lens comes without a focal length, or a distortion with one.
+        Raises:
+        TypeError: the points are not a tensor of float32 or float64, or the lens has the wrong type.
+        ValueError: a lens is given without a focal length, or a distortion with one.
     """
     return _mapped("undistort", points, lens, focal, coefficients)
 
@@ -74,9 +74,9 @@ def distort(
     *,
     coefficients: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Distorted positions of corrected points, the inverse of `undistort`, whose arguments it has.
+    """Distorted positions of corrected points: the inverse of `undistort`, with the same arguments.
 
-    NaN, and derivatives of zero, where there is none.
+    Where there is no inverse the result is NaN, with derivatives of zero.
     """
     return _mapped("distort", points, lens, focal, coefficients)
 

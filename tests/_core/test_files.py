@@ -11,10 +11,10 @@ def test_what_is_there_is_not_replaced_unless_that_is_given(tmp_path):
     targets = [tmp_path / name for name in ("a.jpg", "b.jpg", "c.jpg")]
     refuse_existing(targets, overwrite=False)
     targets[1].write_text("mine")
-    with pytest.raises(FileExistsError, match=r"b\.jpg is there already and .* give argument overwrite\.$"):
+    with pytest.raises(FileExistsError, match=r"b\.jpg already exists and .* give argument overwrite\.$"):
         refuse_existing(targets, overwrite=False)
     targets[2].symlink_to(tmp_path / "nowhere")
-    with pytest.raises(FileExistsError, match=r"b\.jpg and 1 more file are there already"):
+    with pytest.raises(FileExistsError, match=r"b\.jpg and 1 more file already exist"):
         refuse_existing(iter([*targets, targets[1]]), overwrite=False)
     refuse_existing(targets, overwrite=True)
 

@@ -62,13 +62,13 @@ def test_without_a_focal_length_the_ways_are_named(way, message):
     ("way", "error", "message"),
     [
         ("board", ValueError, "--pitch and --distance"),
-        ("zoom", ValueError, "'zoom', which is no way"),
-        ("focal.txt", ValueError, "which is no way"),
+        ("zoom", ValueError, "'zoom', which is not a source"),
+        ("focal.txt", ValueError, "which is not a source"),
         ("-3", ValueError, "positive number"),
         ("0", ValueError, "positive number"),
-        ("nan", ValueError, "which is no way"),
-        ("1_000", ValueError, "which is no way"),
-        ("20,5", ValueError, "which is no way"),
+        ("nan", ValueError, "which is not a source"),
+        ("1_000", ValueError, "which is not a source"),
+        ("20,5", ValueError, "which is not a source"),
         ("nothing.csv", FileNotFoundError, r"nothing\.csv"),
     ],
 )
@@ -119,7 +119,7 @@ def test_the_pitch_of_a_board_gives_the_focal_length_within_a_thousandth(striped
 def test_a_board_whose_directions_disagree_is_refused(striped):
     """As the paper's board does, taken for one of square fields."""
     _, detections = striped  # of the first, only borders across are found evenly spaced
-    with pytest.raises(ValueError, match=r"differs between its two directions.*ACROSSxDOWN"):
+    with pytest.raises(ValueError, match=r"differs between the two directions.*ACROSSxDOWN"):
         choose_focals(detections[1:], board=Board((PITCHES[0],) * 2, BOARD.distance, BOARD.pixel))
 
 
@@ -173,4 +173,4 @@ def test_a_square_view_tells_nothing():
     detections = [*oblique(1000.0, [(0.5, 0.0), (0.0, 0.5), (0.0, 0.0)])]
     found = choose_focals(detections, "plane")
     assert set(found.focal) == {"1000-0.png", "1000-1.png"}
-    assert "too squarely" in found.absent
+    assert "too frontal" in found.absent

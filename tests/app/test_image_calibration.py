@@ -55,9 +55,11 @@ def test_the_lens_is_that_of_the_photographs(done):
 def test_bad_images_are_reported_and_do_not_matter(done):
     assert [d.name[:5] for d in done.used] == ["board"] * 5
     expected = {
-        "no-exif.png": "EXIF data hold no focal length",
-        "small.png": "its size is 536x356 px, most images' 1072x712: use images as the camera stored them",
-        "turned.png": "its size is 712x1072 px, most images' 1072x712: it was turned, so turn it back",
+        "no-exif.png": "EXIF data have no focal length",
+        "small.png": "its size is 536x356 px, but most images have 1072x712: use images as stored by the "
+        "camera",
+        "turned.png": "its size is 712x1072 px, but most images have 1072x712: it was rotated, so rotate "
+        "it back",
         "blank.png": "no lines were found",
         "empty.jpg": "the file is empty",
         "cut.jpg": "the file is damaged or cut off",
@@ -232,7 +234,7 @@ WRONG = {
         ValueError,
         "Argument detector must be one of edges, grid, pitch",
     ),
-    "photos and a video": ({"inputs": ("a.jpg", "b.mp4")}, ValueError, "photographs, or one video"),
+    "photos and a video": ({"inputs": ("a.jpg", "b.mp4")}, ValueError, "photos, or one video"),
     "two videos": ({"inputs": ("a.mp4", "b.mp4")}, ValueError, "one video"),
     "no such photo": ({"inputs": ("nothing.jpg",)}, FileNotFoundError, "nothing.jpg"),
     "no such table": ({"focal": "nothing.csv"}, FileNotFoundError, "nothing.csv"),

@@ -98,7 +98,7 @@ def test_page_says_what_the_summary_says(page, calibration):
         assert f"{summary[key]:.4f}" in page.text
     for row in summary["per_frame"]:
         assert f"{row['rms_zoom']:.3f}" in page.text
-    assert "It is proved to be invertible" in page.text
+    assert "The lens is proved to be invertible" in page.text
     assert summary["next_photo"]["sentence"] in page.text
     assert f"zoomjax {summary['versions']['zoomjax']}" in page.text
     for row in summary["corner_displacement"]:
@@ -143,7 +143,7 @@ def test_names_are_escaped_and_lead_to_their_pictures(calibration):
     links = page.all("a", "href")[: len(names)]
     assert [unquote(link) for link in links] == [f"lines/{name}.jpg" for name in names]
     assert all(re.fullmatch(r"[\w/.%-]+", link) for link in links)
-    assert "Beware: <b>two</b> lines & more" in page.text
+    assert "Warning: <b>two</b> lines & more" in page.text
     assert 'Focal lengths: "here" <there>.' in page.text
 
 
@@ -154,9 +154,9 @@ def test_what_is_not_determined_is_said(calibration):
         (jnp.full_like(calibration.zoom.covariance, jnp.inf), RESULTS.undetermined),
     )
     page = Page(report(dataclasses.replace(calibration, zoom=zoom)))
-    assert "Beware: The lines do not determine" in page.text
+    assert "Warning: The lines do not determine" in page.text
     assert "not determined" in page.text
-    assert "at the corner, where it is least certain unknown" in page.text
+    assert "largest standard deviation at the corner unknown" in page.text
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -167,17 +167,17 @@ def test_a_lens_that_folds_is_called_so(calibration):
         (jnp.array(False), jnp.array(-0.2)),
     )
     page = Page(report(dataclasses.replace(calibration, zoom=zoom)))
-    assert "It is not invertible" in page.text
-    assert "goes down to -0.2, at f = " in page.text
+    assert "The lens is not invertible" in page.text
+    assert "falls to -0.2, at f = " in page.text
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_long_lists_are_cut_to_the_worst_frames(calibration, monkeypatch):
     monkeypatch.setattr(zoomjax.app.report, "_MOST_FRAMES", 2)
     page = Page(report(calibration))
-    assert "Of 4 frames, these are the 2 that the polynomial fits worst." in page.text
+    assert "Of 4 frames, the 2 that the polynomial fits worst are shown." in page.text
     rms = np.asarray(calibration.zoom.frame_rms)
-    frames = page.text[page.text.index("Frame by frame") :]
+    frames = page.text[page.text.index("RMS distance in px") :]
     for frame in range(4):
         assert (f"{rms[frame]:.3f}" in frames) == (frame in np.argsort(-rms)[:2])
 

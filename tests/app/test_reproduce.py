@@ -82,7 +82,7 @@ def test_page_says_what_is_synthetic_and_shows_all_figures(done):
         assert (folder / f"figure-{number:02d}.pdf").read_bytes().startswith(b"%PDF")
     for row in board.rows:
         assert " | ".join((row.name, *row.cells())) in page
-    assert stages[0] == "Seeing the board"
+    assert stages[0] == "Generating the lines of the board"
     assert not list(folder.glob(".zoomjax-*"))
 
 

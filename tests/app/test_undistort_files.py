@@ -85,7 +85,7 @@ WRONG = {
     "negative": (["zoom.mp4", "--focal", "-3"], "--focal must be a positive"),
     "two videos": (["zoom.mp4", "zoom.mp4", "--focal", "30"], "one video at a time"),
     "both kinds": (["zoom.mp4", "a.jpg"], "not both"),
-    "table too short": (["a.jpg", "--focal", "table.csv"], "no number for a.jpg"),
+    "table too short": (["a.jpg", "--focal", "table.csv"], "no focal length for a.jpg"),
     "table of something else": (["a.jpg", "--focal", "track.csv"], 'must name the columns "image,focal"'),
     "no such table": (["a.jpg", "--focal", "none.csv"], "none.csv"),
     "no such photo": (["none.jpg", "--focal", "30"], "There is no photograph none.jpg"),
@@ -169,7 +169,7 @@ def test_what_is_there_is_replaced_only_if_that_is_said(folder, tmp_path, name):
     for make in (lambda: target.write_text("mine"), lambda: target.symlink_to(mine)):
         make()
         job = Job(folder / "lens.json", (folder / name,), target, "30")
-        with pytest.raises(FileExistsError, match="is there already"):
+        with pytest.raises(FileExistsError, match="already exists"):
             undistort_files(job)
         assert target.read_text() == "mine"
         undistort_files(dataclasses.replace(job, overwrite=True))
@@ -184,7 +184,7 @@ def test_one_file_that_is_there_is_found_before_any_work(folder, tmp_path):
     (tmp_path / "b.jpg").write_text("mine")
     done = run(folder, "a.jpg", "b.jpg", "c.jpg", "-o", tmp_path)
     assert done.returncode == 2
-    assert "b.jpg is there already" in done.stderr
+    assert "b.jpg already exists" in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["b.jpg"]
     done = run(folder, "a.jpg", "b.jpg", "c.jpg", "-o", tmp_path, "--overwrite")
     assert (done.returncode, done.stderr) == (0, "")

@@ -235,7 +235,9 @@ def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe.mp4")
     (tmp_path / "folder.mp4").mkdir()
     for name in ("pipe.mp4", "folder.mp4"):
-        with pytest.raises(ValueError, match=rf"Cannot read a video from .*{name}: it is no ordinary file"):
+        with pytest.raises(
+            ValueError, match=rf"Cannot read a video from .*{name}: it is not a regular file"
+        ):
             undistort_video(tmp_path / name, tmp_path / "out.mp4", lens=lens(), focal=30.0)
 
 
@@ -256,7 +258,7 @@ def test_last_frames_that_do_not_decode_are_counted(tmp_path):
     for position, size in packets[16:]:
         content[position : position + size] = bytes(size)
     source.write_bytes(bytes(content))
-    with pytest.warns(UserWarning, match=r"\d+ of 24 frames of .*in\.mp4 do not decode"):
+    with pytest.warns(UserWarning, match=r"\d+ of 24 frames of .*in\.mp4 cannot be decoded"):
         done = undistort_video(source, tmp_path / "out.mp4", lens=lens(), focal=TRACK)
     assert done.frames >= 15
     assert done.lost >= 1
@@ -275,7 +277,7 @@ def test_frames_after_lost_ones_keep_their_numbers(tmp_path):
         content = content.replace(packet, bytes(len(packet)))
     source.write_bytes(content)
     step = zj.io.FocalTrack(np.array([0, 7.0, 8, 23]), np.array([80.0, 80, 20, 20]), by_time=False)
-    with pytest.warns(UserWarning, match=r"3 of 2\d frames of .*in\.mkv do not decode"):
+    with pytest.warns(UserWarning, match=r"3 of 2\d frames of .*in\.mkv cannot be decoded"):
         done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=step, encoder="ffv1")
     assert done.frames == FRAMES - 3
     after, _ = luma(tmp_path / "out.mkv")
@@ -326,7 +328,7 @@ def test_no_frame_decodes(tmp_path):
     for position, size in packets:
         content[position : position + size] = bytes(size)
     source.write_bytes(bytes(content))
-    with pytest.raises(ValueError, match=r"in\.mp4: none of its frames decodes"):
+    with pytest.raises(ValueError, match=r"in\.mp4: none of its frames can be decoded"):
         undistort_video(source, tmp_path / "out.mp4", lens=lens(), focal=30.0)
     assert only(tmp_path, "in.mp4")
 

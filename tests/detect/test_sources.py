@@ -77,7 +77,7 @@ def test_the_same_file_twice_is_refused(tmp_path, image):
     [
         ("nothing.jpg", FileNotFoundError, r"no file or folder .*nothing\.jpg"),
         ("*.jpg", FileNotFoundError, "no photograph fits the pattern"),
-        ("notes.txt", ValueError, r"notes\.txt is no photograph"),
+        ("notes.txt", ValueError, r"notes\.txt is not a photo"),
         ("empty", ValueError, "no photographs in the folder"),
     ],
 )

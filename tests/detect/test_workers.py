@@ -164,4 +164,4 @@ def test_a_program_that_cannot_be_begun_again_is_told_so(tmp_path):
         [sys.executable, tmp_path / "script.py"], capture_output=True, text=True, timeout=300, check=False
     )
     assert (done.returncode, done.stdout) == (1, "")
-    assert "RuntimeError: A process that looks at images cannot be started" in done.stderr
+    assert "RuntimeError: A detection process cannot be started" in done.stderr

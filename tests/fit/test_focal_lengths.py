@@ -176,9 +176,14 @@ def test_bands_with_rounded_focal_lengths_hold_the_truth_as_often_as_they_say():
 
 @pytest.mark.parametrize("sigma", [None, np.inf, np.nan, np.where(np.arange(10) == 3, 0.1, np.inf)])
 def test_focal_lengths_that_nobody_knows_raise_and_say_why(rounded, sigma, unchecked):
-    with pytest.raises(ValueError, match=r"(?s)focal_sigma.*Straightness alone cannot tell.*EXIF.*board"):
+    with pytest.raises(
+        ValueError,
+        match=r"(?s)focal_sigma.*Straight lines alone do not determine focal lengths.*EXIF.*board",
+    ):
         zj.fit.fit_focal(rounded, sigma)
-    with pytest.raises(ValueError, match=r"focal_sigma.*Straightness alone cannot tell"):
+    with pytest.raises(
+        ValueError, match=r"focal_sigma.*Straight lines alone do not determine focal lengths"
+    ):
         zj.fit.with_focal_sigma(zj.fit_zoom(rounded), rounded, focal_sigma=sigma)
 
 

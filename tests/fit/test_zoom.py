@@ -415,7 +415,7 @@ def test_too_few_focal_lengths_raise(tiny):
 
 def test_lines_compressed_for_fewer_terms_raise(small):
     for fit in (zj.fit_zoom, zj.fit_frames):
-        with pytest.raises(ValueError, match="compressed for 2 terms, but 3 are asked for"):
+        with pytest.raises(ValueError, match="compressed for 2 terms, but 3 are requested"):
             fit(small, terms=3)
 
 
@@ -526,5 +526,5 @@ def test_messages_of_good_frames_are_empty(frame_fits):
 
 def test_frame_rms_tells_of_frames_outside_of_the_range(noisy, fit):
     narrow = eqx.tree_at(lambda lens: lens.focal_range, fit.lens, fit.lens.focal_range[:1].repeat(2))
-    with pytest.warns(UserWarning, match="Focal lengths from 20.56 to 127.36 mm are asked for"):
+    with pytest.warns(UserWarning, match="Focal lengths from 20.56 to 127.36 mm are not all within"):
         zj.frame_rms(noisy, narrow)

@@ -33,7 +33,7 @@ def test_one_row_for_two_images_is_refused(tmp_path):
 
 
 def test_a_needed_image_that_is_absent_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"focal.csv: it has no number for c\.jpg"):
+    with pytest.raises(ValueError, match=r"focal.csv: it has no focal length for c\.jpg"):
         table(tmp_path, "image,focal\na.jpg,24\n").need("c.jpg")
 
 
@@ -48,9 +48,12 @@ def test_a_needed_image_that_is_absent_is_named(tmp_path):
         ("image,focal\na.jpg,nan\n", "focal in row 2 is .nan., which is no number"),
         ("image,focal\n,24\n", "row 2 must name an image"),
         ("image,focal\na.jpg,20,5\n", "row 2 has 3 fields, .* decimal commas"),
-        ("image,focal,sigma\na.jpg,24,1\na.jpg,24,2\n", r"comes twice, with 24 ± 1 and, in row 3, 24 ± 2"),
-        ("image,focal\na.jpg,24\n./a.jpg,25\n", r"a\.jpg comes twice"),
-        ("image,focal\na.jpg,24\na.jpg,25\n", r"a\.jpg comes twice, with 24 and, in row 3, 25"),
+        (
+            "image,focal,sigma\na.jpg,24,1\na.jpg,24,2\n",
+            r"is listed twice, with 24 ± 1 and, in row 3, 24 ± 2",
+        ),
+        ("image,focal\na.jpg,24\n./a.jpg,25\n", r"a\.jpg is listed twice"),
+        ("image,focal\na.jpg,24\na.jpg,25\n", r"a\.jpg is listed twice, with 24 and, in row 3, 25"),
     ],
 )
 def test_other_files_are_refused(tmp_path, text, message):

@@ -101,7 +101,7 @@ def test_more_terms_serve_fewer(ragged, rng):
 
 
 def test_fewer_terms_do_not_serve_more(ragged, rng):
-    with pytest.raises(ValueError, match="compressed for 1 terms, but 2 are asked for"):
+    with pytest.raises(ValueError, match="compressed for 1 terms, but 2 are requested"):
         zj.fit.residuals(zj.compress(ragged, 1), coefficients(rng, 3, 2))
 
 

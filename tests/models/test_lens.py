@@ -232,7 +232,7 @@ def test_numpy_points_at_another_focal_length_compile_nothing(truth, compilation
 def test_range_is_checked_of_many_focal_lengths(lens):
     low, high = lens.focal_range
     lens.check_range(np.array([low, high]))
-    with pytest.warns(UserWarning, match=r"Focal lengths from 10 to 160 px are asked for"):
+    with pytest.warns(UserWarning, match=r"Focal lengths from 10 to 160 px are not all within"):
         lens.check_range(np.array([low / 2, low, high * 2]))
     with pytest.raises(ValueError, match="positive number, but it is -1"):
         lens.check_range(np.array([low, -1.0]))

@@ -83,7 +83,7 @@ def test_a_distortion_of_images_of_another_size_is_refused(case):
     ]
     for call in calls:
         with pytest.raises(
-            ValueError, match=r"images of another size: its centre .* this one, of 640 x 480 px"
+            ValueError, match=r"images of another size: its centre .* but this image of 640 x 480 px"
         ):
             call()
 
@@ -116,7 +116,7 @@ def test_photographic_lenses_are_told_apart_by_size(width, aspect, ratio, off):
     half = np.hypot(*size) / 2
     d = of_size(*size, off=np.array(off) * half)
     check_image_size(d, size)
-    with pytest.raises(ValueError, match="is that of images of another size"):
+    with pytest.raises(ValueError, match="is for images of another size"):
         check_image_size(d, (max(1, round(ratio * size[0])), max(1, round(ratio * size[1]))))
 
 

@@ -157,5 +157,5 @@ def test_candidates_are_in_their_part_of_the_image():
 
 
 def test_without_lines_that_count_nothing_is_suggested(fit, small):
-    with pytest.raises(ValueError, match="must have a line that counts"):
+    with pytest.raises(ValueError, match="must have a usable line"):
         zj.suggest_next(fit, small.weighted(np.zeros(len(small.frame))))

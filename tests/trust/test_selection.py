@@ -309,7 +309,7 @@ def test_other_types_are_told(lines):
 
 def test_too_few_focal_lengths_to_leave_one_out_are_told(lines):
     few = without(lines, [1, 3, 4, 5])
-    with pytest.raises(ValueError, match="4 distinct focal lengths"):
+    with pytest.raises(ValueError, match="4 or more distinct focal lengths"):
         zj.select_model(few, POLYNOMIALS[:1], hold_out="focal")
 
 

@@ -1,7 +1,7 @@
-"""Arguments of another kind than a function takes, named in a sentence that says what to pass.
+"""Type checks of arguments, with error messages that say what to pass.
 
-`kinds_checked` reads what a function's annotations say of our own classes, of solvers and of paths, and
-looks at what it is given before anything else does: one place for all functions.
+`kinds_checked` reads a function's annotations of our own classes, of solvers and of paths, and checks its
+arguments before anything else: one place for all functions.
 """
 
 import functools
@@ -47,8 +47,8 @@ _INSTEAD = {
     ("ZoomFit", "CentreFit"): "pass its fit, found.fit",
     ("ZoomFit", "RobustFit"): "pass its fit, robust.fit",
     ("ZoomFit", "FocalFit"): "pass its fit, found.fit",
-    ("ZoomFit", "FrameFits"): "that is each frame by itself; fit_zoom(lines) fits all together",
-    ("FrameFits", "ZoomFit"): "fit_frames(lines) fits each frame by itself",
+    ("ZoomFit", "FrameFits"): "that is a separate fit of each frame; fit_zoom(lines) fits all together",
+    ("FrameFits", "ZoomFit"): "fit_frames(lines) fits each frame separately",
     ("FrameFits", "FrameCentres"): "pass its fits, found.each",
     ("AbstractLines", "str"): "load_lines(path) reads a file",
     ("AbstractLines", "PosixPath"): "load_lines(path) reads a file",

@@ -1,4 +1,4 @@
-"""What input must be, in one place: each check returns the value in its plain form, or says what to do."""
+"""Checks of input, in one place: each returns the value in its plain form, or raises an error."""
 
 import math
 import operator

@@ -1,8 +1,8 @@
-"""Writing files whole or not at all, where nothing is lost; where what can be made again is kept.
+"""Writing of files completely or not at all, and the folder of caches.
 
-Until it is whole, a file has a temporary name, ``.zoomjax-*``, in the folder that it is for. A run that is
-killed leaves it there; the next one removes it. That no process uses it any more is told by a lock, which
-the operating system lets go of with the process.
+Until it is complete, a file has a temporary name, ``.zoomjax-*``, in its folder. A run that is killed
+leaves it there, and the next one removes it. A lock shows whether a process still uses it; the operating
+system releases the lock when the process ends.
 """
 
 import contextlib
@@ -33,9 +33,9 @@ _OLD = 7 * 86400.0  # s, after which what cannot be locked counts as left
 
 
 def cache_folder(kind: str) -> Path | None:
-    """A folder for what can be made again: in ``ZOOMJAX_CACHE``, else in the user's cache.
+    """A folder for caches: in ``ZOOMJAX_CACHE``, else in the user's cache.
 
-    None if there is no home to have one in: never a folder that others could fill.
+    None if there is no home folder: never a folder that others can write to.
     """
     if named := os.environ.get("ZOOMJAX_CACHE"):
         return Path(named) / kind
@@ -66,12 +66,13 @@ def is_unfinished() -> bool:
 
 @contextlib.contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary path beside `path`, which takes its place only if the block succeeds.
+    """Yield a temporary path next to `path`, which replaces it only if the block succeeds.
 
     A link to a file is replaced, and not followed.
 
     Raises:
-        OSError: the folder does not exist or cannot be written, or `path` is no ordinary file; the message
+        OSError: the folder does not exist or cannot be written, or `path` is not a regular file; the
+        message
             names it.
     """
     path = Path(path)
@@ -101,18 +102,17 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def refuse_existing(targets: Iterable[Path], *, overwrite: bool) -> None:
-    """Refuse to replace what is there: to be called before any work.
+    """Refuse to replace existing files: to be called before any work.
 
-    A link counts as what is there, wherever it leads.
+    A link counts as an existing file, even if broken.
 
     Raises:
-        FileExistsError: one of `targets` is there, and `overwrite` is not given.
+        FileExistsError: one of `targets` exists, and `overwrite` is False.
     """
     there = [] if overwrite else [path for path in dict.fromkeys(targets) if os.path.lexists(path)]
     if there:
         raise FileExistsError(
-            f"{_several(there)} there already and would be replaced: choose another place, or give "
-            "argument overwrite."
+            f"{_several(there)} and would be replaced: choose another place, or give argument overwrite."
         )
 
 
@@ -136,11 +136,11 @@ def refuse_inputs(targets: Iterable[Path], inputs: Iterable[str | os.PathLike[st
 
 
 def _several(paths: list[Path]) -> str:
-    """The first and how many more, with their verb."""
+    """That these paths exist: the first, and the number of others."""
     more = len(paths) - 1
-    return (
-        f"{paths[0]} and {more} more {'file' if more == 1 else 'files'} are" if more else f"{paths[0]} is"
-    )
+    if not more:
+        return f"{paths[0]} already exists"
+    return f"{paths[0]} and {more} more {'file' if more == 1 else 'files'} already exist"
 
 
 @contextlib.contextmanager

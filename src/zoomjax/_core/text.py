@@ -1,4 +1,4 @@
-"""Names of files as text: what somebody else chose, shown and used without harm."""
+"""Safe display and use of file names that others chose."""
 
 import re
 import unicodedata
@@ -7,7 +7,7 @@ _LONGEST = 80
 
 
 def plain(text: str) -> str:
-    """Text on one line in which nothing is an order to a terminal or a browser.
+    """Text on one line without control characters for a terminal or a browser.
 
     Control characters (escape sequences, line breaks), those that turn the direction of writing, and
     bytes that are no text are shown as in Python: ``\\x1b``.

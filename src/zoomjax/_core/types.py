@@ -56,8 +56,8 @@ def of_known_values(function: Callable[_Given, _Result]) -> Callable[_Given, _Re
     def at_once(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
         if traced((args, kwargs)):
             raise ValueError(
-                f"Arguments of {function.__name__} must have known values, as it decides by them, but some "
-                "are traced: call it outside of jit, vmap and grad."
+                f"Arguments of {function.__name__} must have known values, because its control flow "
+                "depends on them, but some are traced: call it outside of jit, vmap and grad."
             )
         with jax.ensure_compile_time_eval():
             return function(*args, **kwargs)

@@ -1,4 +1,4 @@
-"""What JAX computes in, and where what it compiles is kept for the next run."""
+"""Settings of JAX: float64, and a cache on disk for compiled programs."""
 
 import contextlib
 import glob
@@ -14,9 +14,9 @@ _MOST_COMPILED = 100_000_000  # bytes; a run with new shapes adds about a millio
 
 
 def set_up_jax() -> None:
-    """Compute in float64, and keep what is compiled for the next run: most of a short run is compiling.
+    """Compute in float64, and cache compiled programs on disk: compiling takes most of a short run.
 
-    What cannot be kept, or read again, is compiled anew: a loss of time, of which nobody need hear.
+    A program that cannot be cached or read is compiled again, without a warning.
     """
     import jax
 
@@ -26,9 +26,7 @@ def set_up_jax() -> None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_compilation_cache_max_size", _MOST_COMPILED)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-    logging.getLogger("matplotlib").setLevel(
-        logging.ERROR
-    )  # else it tells of fonts and of folders of its own
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # no messages about fonts and its own folders
 
 
 def _can_write(folder: Path) -> bool:
@@ -41,7 +39,7 @@ UNKEPT = re.compile(r"Error (?:reading|writing) persistent compilation cache ent
 
 
 def forget_compiled(name: str) -> None:
-    """Remove what was kept of a program: JAX would never replace what a full disk has cut off."""
+    """Remove the cached files of a program: JAX does not replace a file cut off by a full disk."""
     folder = cache_folder("compiled")
     for path in folder.glob(f"{glob.escape(name)}-*") if folder else ():
         if path.is_dir() and not path.is_symlink():

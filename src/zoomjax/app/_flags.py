@@ -1,4 +1,4 @@
-"""How the command line calls what messages of the library name: ``argument hold`` is ``--hold`` there."""
+"""Translation of the library's messages for the command line: ``argument hold`` becomes ``--hold``."""
 
 import re
 
@@ -9,12 +9,12 @@ FLAGS = {
         *("keep", "overwrite", "terms"),
     )
 }
-"""Options by the arguments of the library that they become."""
+"""Options of the command line by the names of the library's arguments."""
 
-# A capital within a message is about what is in a file: "Cannot read a.npz: Argument focal ..."
+# Within a message, a capital letter marks the content of a file: "Cannot read a.npz: Argument focal ..."
 _ARGUMENT = re.compile(rf"(?:\AA|\ba)rgument ({'|'.join(FLAGS)})\b")
 
 
 def with_flags(message: str) -> str:
-    """A message of the library in which arguments have the names that they have on the command line."""
+    """A message of the library with the command line's names for arguments."""
     return _ARGUMENT.sub(lambda found: FLAGS[found[1]], message)

@@ -1,4 +1,4 @@
-"""Signals that end a run, and how it ends."""
+"""Signals that end a run."""
 
 import contextlib
 import os
@@ -19,9 +19,9 @@ _signals: list[int] = []
 
 
 def end_run(number: int, _: object) -> NoReturn:
-    """End a run by a signal: a handler."""
+    """Signal handler that ends the run."""
     _signals.append(number)
-    if not is_unfinished():  # an exception in the midst of importing JAX can abort the process
+    if not is_unfinished():  # an exception during the import of JAX can abort the process
         leave(128 + number)
     if number == signal.SIGINT:
         raise KeyboardInterrupt
@@ -29,19 +29,19 @@ def end_run(number: int, _: object) -> NoReturn:
 
 
 def swallowed(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Tell of exceptions that cannot be raised, unless it is a run's end."""
+    """Report exceptions that cannot be raised, except those that end the run."""
     if not isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):  # those are for `go_on`
         sys.__unraisablehook__(unraisable)
 
 
 def go_on() -> None:
-    """Between two steps: end after all if what `end_run` raised was swallowed, as in callbacks of JAX."""
+    """End the run between two steps if the exception of `end_run` was lost, as in callbacks of JAX."""
     if _signals:
         end_run(_signals[0], None)
 
 
 def leave(status: int) -> NoReturn:
-    """At once: the usual way out waits for a compiler thread, and can crash in it."""
+    """Exit at once: a normal exit waits for a compiler thread, and can crash in it."""
     with contextlib.suppress(OSError):
-        os.write(2, f"{LAST_WORDS[status]}\n".encode())  # a handler may be within print
+        os.write(2, f"{LAST_WORDS[status]}\n".encode())  # not print: the signal may have interrupted one
     os._exit(status)

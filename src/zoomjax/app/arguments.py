@@ -1,4 +1,4 @@
-"""What the command line is given, checked and made into what the library takes."""
+"""Arguments of the command line: checks, and conversion to arguments of the library."""
 
 import os
 from pathlib import Path
@@ -16,7 +16,7 @@ Overwrite = Annotated[
     bool,
     typer.Option(
         "--overwrite",
-        help="Replace files of these names, too, that zoomjax did not write or that were changed since.",
+        help="Also replace files that zoomjax did not write, or that were changed since.",
     ),
 ]
 Degree = Annotated[int, typer.Option(min=0, help="Degree of the polynomials in 1/f.")]
@@ -26,15 +26,15 @@ Terms = Annotated[int, typer.Option(min=1, help="Number of distortion coefficien
 def read_lines(
     inputs: list[Path], focal: str | None, image_size: str | None, focal_unit: str | None
 ) -> "Lines":
-    """The lines of the one file that is given."""
+    """Read the one file of lines that is given."""
     if len(inputs) > 1:
         raise ValueError(f"Give one file of lines; there are {len(inputs)}.")
     [path] = inputs
     if path.suffix == ".npz":
         if (focal, image_size, focal_unit) != (None, None, None):
             raise ValueError(
-                f"{path} carries its own focal lengths and image size: --focal, --image-size and "
-                "--focal-unit are for CSV files."
+                f"{path} contains focal lengths and image size: leave out --focal, --image-size and "
+                "--focal-unit, which are for CSV files."
             )
         from ..lines.npz import load_lines
 
@@ -57,13 +57,13 @@ def read_lines(
 
 
 def number_of_cores() -> int:
-    """How many cores this process may use."""
+    """The number of cores that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def unit_of(given: str | None) -> str:
-    """The unit of focal lengths."""
+    """Check the unit of focal lengths; by default mm."""
     if given not in (None, "mm", "px"):
         raise ValueError(f"--focal-unit must be mm or px, but it is {given!r}.")
     return given or "mm"
@@ -80,34 +80,32 @@ def board_of(pitch: str | None, distance: float | None, pixel: float | None) -> 
     bad = [name for name, good in given.items() if not good]
     if bad or len(pitches) > 2 or distance is None or pixel is None:
         raise ValueError(
-            "A board needs its --pitch (MM, or MMxMM across and down), its --distance and the sensor's "
-            f"--pixel, all in mm and positive: {' and '.join(bad or ['--pitch'])} is not."
+            "A board needs --pitch (MM, or MMxMM across and down), --distance and --pixel (of the sensor), "
+            f"all positive and in mm. Missing or wrong: {', '.join(bad or ['--pitch'])}."
         )
     return Board((pitches[0], pitches[-1]), distance, pixel)
 
 
 def _positive(text: str) -> float:
-    """The number, or 0 if it is none or not positive."""
+    """The number, or 0 if the text is not a positive number."""
     from ..io.text_table import plain_number
 
     return max(plain_number(text) or 0.0, 0.0)
 
 
 def refuse_to_replace(job: "ImageJob", output: Path) -> None:
-    """Refuse to write over photographs that are calibrated from."""
+    """Refuse to overwrite the input photos."""
     from ..detect.sources import RESULTS
 
     results = {(output / name).resolve() for name in RESULTS}
     for source in job.sources()[0] if job.video is None else ():
         real = (source.path or Path()).resolve()
         if results.intersection((real, *real.parents)):
-            raise ValueError(
-                f"The results would replace the photograph {source.path}: give another folder."
-            )
+            raise ValueError(f"The results would replace the photo {source.path}: give another folder.")
 
 
 def refuse_image_options(options: dict[str, object], inputs: list[str]) -> None:
-    """Refuse options of images where lines are given."""
+    """Refuse options for images if the input is a file of lines."""
     given = [name for name, value in options.items() if value is not None]
     if given:
-        raise ValueError(f"{' and '.join(given)} are for images, but {inputs[0]} holds lines.")
+        raise ValueError(f"{' and '.join(given)} are for images, but {inputs[0]} contains lines.")

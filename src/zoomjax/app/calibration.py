@@ -1,6 +1,6 @@
-"""A whole calibration: from lines to the fits, the figures worth reading, and a folder of results.
+"""A whole calibration: from lines to the fits, the key figures and a folder of results.
 
-This is what the command line runs; it prints nothing, and draws with `plot`.
+The command line runs this. It prints nothing; plots are made by `plot`.
 """
 
 import dataclasses
@@ -39,25 +39,25 @@ FILES = ("lens.json", "lines.npz", "summary.json", "model.png")
 """What `Calibration.write` writes."""
 
 CLEARS = ("lines/*",)
-"""What it removes of what an earlier calibration wrote: pictures of other lines."""
+"""Files of an earlier calibration that `Calibration.write` removes: pictures of its lines."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """The zoom model of some lines beside what it is compared with.
+    """The zoom model fitted to lines, and the fits it is compared with.
 
     Attributes:
         lines: the lines.
         zoom: the zoom model's fit.
-        each: every frame by itself.
+        each: separate fits of the frames.
         none, algebraic: each frame's RMS, px, without correction and with the algebraic estimate.
-        rejected: which lines count nothing, being not straight in the scene.
-        line_rms: of each line as the zoom model corrects it, px; of rejected ones, too.
-        next: the photo that would help most.
-        focal_sigma: standard deviation of each frame's focal length, which the bands allow for; 0: exact.
-        held_out: each frame's RMS, px, under the zoom model of all others; NaN where these do not make one.
-        each_held_out: each frame's RMS, px, each tenth of its lines under the model of its others.
-        selection: how the model was chosen, if it was.
+        rejected: which lines have weight 0 because they are not straight in the scene.
+        line_rms: RMS of each line under the zoom model, px, rejected lines included.
+        next: the photo that would reduce the uncertainty most.
+        focal_sigma: standard deviation of each frame's focal length, included in the bands; 0: exact.
+        held_out: each frame's RMS, px, under the zoom model fitted to all others; NaN if that fit fails.
+        each_held_out: each frame's RMS, px, each tenth of its lines under the model of its other lines.
+        selection: how the model was selected; None if it was given.
     """
 
     lines: Lines
@@ -74,10 +74,11 @@ class Calibration:
     selection: Selection | None = None
 
     def corner(self) -> list[tuple[float, float, float]]:
-        """Focal lengths at both ends of the range and in its middle, and what becomes of a corner there.
+        """Displacement of the farthest corner at both ends of the focal range and in its middle.
 
-        With each the displacement away from the centre, px, of the corner farthest from it, and its
-        standard deviation.
+        Returns:
+            For each focal length: the focal length, the displacement away from the centre, px, of the
+            corner farthest from it, and the standard deviation of the displacement, px.
         """
         lens = self.zoom.lens
         low, high = (float(f) for f in lens.focal_range)
@@ -91,17 +92,17 @@ class Calibration:
         return list(zip(focal, map(float, moved), std.tolist(), strict=True))
 
     def allowed_for(self) -> str:
-        """What the bands allow for besides noise, in a sentence; nothing if that is nothing."""
+        """A sentence on the uncertainty of focal lengths in the bands; empty if they are exact."""
         share = self.focal_sigma / np.asarray(self.lines.focal)
         if not share.any():
             return ""
         return (
-            "Standard deviations allow for those of the focal lengths, "
-            f"{share.min():.2%} to {share.max():.2%}; the next photo is chosen by noise alone."
+            "Standard deviations include those of the focal lengths, "
+            f"{share.min():.2%} to {share.max():.2%}. The next photo is chosen without them."
         )
 
     def rows(self) -> list[tuple[str, np.ndarray]]:
-        """The lines of a table like the paper's Table 1: what was done, and each frame's RMS, px."""
+        """Rows of a table like the paper's Table 1: the correction and each frame's RMS, px."""
         return [
             ("no correction", self.none),
             ("frame by frame", np.asarray(self.each.frame_rms)),
@@ -110,15 +111,15 @@ class Calibration:
         ]
 
     def held_out_rows(self) -> dict[str, np.ndarray]:
-        """Of some of the `rows`, each frame's RMS, px, of lines that were not fitted."""
+        """For some of the `rows`, each frame's RMS on lines that were not used in the fit, px."""
         return {"frame by frame": self.each_held_out, "zoom polynomial": self.held_out}
 
     def warnings(self, names: Sequence[str] | None = None) -> list[str]:
-        """What a user must hear of: sentences about the zoom model, and about frames that have none.
+        """User-facing warnings about the zoom model, and about frames without a good fit.
 
-        `names` are those of the frames; by default their numbers, from 0.
+        `names` are the names of the frames; by default their numbers, from 0.
         """
-        told = [RESULTS[self.zoom.result]] if self.zoom.result != RESULTS.successful else []
+        warnings = [RESULTS[self.zoom.result]] if self.zoom.result != RESULTS.successful else []
         for message in dict.fromkeys(filter(None, messages := self.each.messages())):
             frames = [
                 names[frame] if names else str(frame)
@@ -126,14 +127,14 @@ class Calibration:
                 if other == message
             ]
             which = ", ".join(frames[:8]) + (", ..." if len(frames) > 8 else "")
-            told.append(
-                f"{len(frames)} of {len(messages)} frames have no good model of their own "
+            warnings.append(
+                f"{len(frames)} of {len(messages)} frames have no good separate fit "
                 f"(frames {which}). {message}"
             )
-        return told
+        return warnings
 
     def summary(self) -> dict[str, Any]:
-        """The figures, as plain numbers and strings that JSON can hold."""
+        """All figures as plain numbers and strings, for JSON."""
         lens = self.zoom.lens
         low, high = (float(f) for f in lens.focal_range)
         frame = np.asarray(self.lines.frame)
@@ -192,7 +193,7 @@ class Calibration:
         } | ({"selection": self.selection.summary()} if self.selection else {})
 
     def pixel_polynomials(self) -> np.ndarray:
-        """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as the paper prints them."""
+        """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as printed in the paper."""
         model = self.zoom.lens.zoom
         assert isinstance(model, PolynomialZoom)  # `calibrate` fits no other
         normalised = np.asarray(model.in_inverse_focal())
@@ -206,16 +207,16 @@ class Calibration:
         *,
         overwrite: bool = False,
     ) -> None:
-        """Write lens.json, lines.npz, summary.json and model.png, which appear together.
+        """Write lens.json, lines.npz, summary.json and model.png: all of them, or after an error none.
 
         Args:
-            folder: where to.
-            about: what summary.json says besides.
-            pages: further files' texts, by their names.
+            folder: the folder to write to.
+            about: additional entries of summary.json.
+            pages: additional text files: their contents by name.
             overwrite: whether to replace files that zoomjax did not write, or that were changed since.
 
         Raises:
-            OSError: the folder cannot be written, or such a file is there.
+            OSError: the folder cannot be written, or it has such a file and `overwrite` is False.
         """
         names = [*FILES, *(pages or {})]
         with results_folder(folder, names, clears=CLEARS, overwrite=overwrite) as part:
@@ -227,7 +228,7 @@ class Calibration:
         about: dict[str, Any] | None = None,
         pages: Mapping[str, str] | None = None,
     ) -> None:
-        """The same in an empty folder: that of a `results_folder`, say."""
+        """Write the files of `write` into an empty folder, such as that of a `results_folder`."""
         from .plot import plot_model  # so that `calibrate` does not need Matplotlib
 
         folder = Path(folder)
@@ -249,23 +250,23 @@ def calibrate(
     select: bool = False,
     stage: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
-    """Fit the zoom polynomial and what it is compared with.
+    """Fit the zoom polynomial, and the models it is compared with.
 
     Args:
         lines: the lines; computed in float64 if that is enabled, whatever their dtype.
-        degree: of the polynomials in 1/f.
-        terms: the number of distortion coefficients.
-        robust: whether to reject lines that are not straight in the scene; all figures are then those of
-            the others.
-        focal_sigma: standard deviation of the focal lengths: a number, or one a frame; 0 where exact.
+        degree: degree of the polynomials in 1/f.
+        terms: number of distortion coefficients.
+        robust: whether to reject lines that are not straight in the scene. All figures are then computed
+            from the remaining lines.
+        focal_sigma: standard deviation of the focal lengths: a number, or one per frame; 0 where exact.
         select: whether to choose degree and terms by `select_model`, among the polynomials. Lines are then
             rejected under the quadratic.
-        stage: called with a sentence before each step that takes time.
+        stage: called with a description before each step that takes time.
     """
     if select:
         degree, terms = min(2, np.unique(np.asarray(lines.focal)).size - 1), 2
     model = PolynomialZoom(degree=degree)
-    model.prepare(lines.focal, terms)  # complain of too few focal lengths before any work
+    model.prepare(lines.focal, terms)  # raises if there are too few focal lengths, before any work
     stage("Compressing the lines")
     widest = jnp.result_type(float)
     data = jax.tree.map(
@@ -281,11 +282,11 @@ def calibrate(
         rejected = np.asarray(weight) == 0
     selection = None
     if choices:
-        stage("Choosing the model")
+        stage("Selecting the model")
         selection = select_model(small, choices)
         model, terms = selection.chosen.zoom, selection.chosen.terms
         assert isinstance(model, PolynomialZoom)
-    stage("Fitting each frame by itself")
+    stage("Fitting each frame separately")
     each = fit_frames(small, terms=terms, throw=False)
     stage("Fitting the zoom polynomial")
     zoom = selection.fit if selection else fit_zoom(small, zoom=model, terms=terms)
@@ -300,7 +301,7 @@ def calibrate(
         algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=model, terms=terms))),
         rejected=rejected,
         line_rms=np.asarray(line_rms(small, coefficients_by(zoom.lens.zoom, small))),
-        next=suggest_next(zoom, small),  # a further photo's worth is counted in noise alone
+        next=suggest_next(zoom, small),  # from the noise alone, without focal_sigma
         focal_sigma=sigma,
         held_out=held_out_zoom(small, zoom=model, terms=terms) if several else np.full_like(none, np.nan),
         each_held_out=held_out_frames(small, terms=terms),
@@ -309,10 +310,10 @@ def calibrate(
 
 
 def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray, "frame"]:
-    """Standard deviations as a user writes them: a number in the unit of f, or per cent such as "1%".
+    """Parse standard deviations: a number in the unit of f, or a percentage of f such as "1%".
 
     Raises:
-        ValueError: it is neither, or negative.
+        ValueError: the text is neither, or negative.
     """
     number, percent, rest = text.strip().partition("%")
     try:
@@ -325,18 +326,18 @@ def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray
 
 
 def rms_over_frames(frame_rms: Float[AnyArray, "frame"]) -> float:
-    """Root of the mean of the frames' errors: eq. 13 from eq. 3. NaN frames do not count."""
+    """Root of the mean of the frames' squared RMS: eq. 13 from eq. 3. NaN frames are ignored."""
     known = np.asarray(frame_rms)[~np.isnan(frame_rms)]
     return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
 
 
 def _plain(certificate: Certificate) -> dict[str, bool | float]:
-    """For JSON."""
+    """The fields of a certificate as plain values, for JSON."""
     return {
         field.name: getattr(certificate, field.name).item() for field in dataclasses.fields(certificate)
     }
 
 
 def _finite(values: Iterable[float]) -> list[float | None]:
-    """JSON has no infinity: None says that a value is not determined."""
+    """Values for JSON, which has no infinity: None means that a value is not determined."""
     return [float(v) if np.isfinite(v) else None for v in values]

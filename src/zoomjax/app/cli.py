@@ -22,21 +22,21 @@ from .commands import app
 
 
 def main() -> None:
-    """Run the command line; what a user can mend is one sentence on stderr and exit status 2."""
+    """Run the command line. An error that the user can fix is one message on stderr, with exit status 2."""
     warnings.showwarning = _print_warning
     sys.unraisablehook = swallowed
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a terminal that cannot show a sign ends no run
-    signal.signal(signal.SIGTERM, end_run)  # and leave no half file
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else a shell had it ignored
+            stream.reconfigure(errors="backslashreplace")  # characters that the terminal cannot show
+    signal.signal(signal.SIGTERM, end_run)  # removes unfinished files
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # unless the shell ignores it
         signal.signal(signal.SIGINT, end_run)
     try:
         app()
     except (ValueError, OSError, RuntimeError, MemoryError) as error:
         print(f"Error: {_sentence(error)}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:  # where Typer does not see it
+    except KeyboardInterrupt:  # outside of Typer
         leave(INTERRUPTED)
     except SystemExit as exit:
         if isinstance(exit.code, int) and exit.code in LAST_WORDS:
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def _sentence(error: BaseException) -> str:
-    """What an error says, without Python's numbers for those of the operating system."""
+    """The message of an error, without the error numbers of the operating system."""
     text = str(error)
     if isinstance(error, MemoryError):
         text = f"There is not enough memory. {text}".strip()

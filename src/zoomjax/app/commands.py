@@ -1,7 +1,7 @@
-"""The commands: what each takes, and what it does with it.
+"""The commands and their options.
 
-Commands import what they need when they run, so that ``--help`` answers without waiting for JAX. They
-compute in float64.
+Commands import what they need when they run, so that ``--help`` does not wait for JAX. They compute in
+float64.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="One continuous distortion model for a zoom lens, from images of straight things.",
+    help="Calibrate the distortion of zoom lenses from images of straight lines, and correct images.",
 )
 
 
@@ -55,7 +55,7 @@ def options(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
-    """One continuous distortion model for a zoom lens, from images of straight things."""
+    """Calibrate the distortion of zoom lenses from images of straight lines, and correct images."""
 
 
 @app.command()
@@ -63,15 +63,18 @@ def demo(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder for the results.", file_okay=False)
     ] = Path("zoomjax-demo"),
-    photos: Annotated[int, typer.Option(min=3, help="Number of photographs, one a focal length.")] = 12,
-    seed: Annotated[int, typer.Option(help="Seed of the photographs' noise.")] = 0,
+    photos: Annotated[
+        int, typer.Option(min=3, help="Number of photos, each at its own focal length.")
+    ] = 12,
+    seed: Annotated[int, typer.Option(help="Random seed of the image noise.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """The paper's first experiment: photograph its board through a known lens, then calibrate the photos.
+    """Run a complete example: render photos of a board with a known lens, then calibrate from them.
 
-    A board of 31 x 23 stripes at 1185 mm, at focal lengths from 20.56 to 127.36 mm, through the lens that
-    the paper measured, a Nikkor 18-200. The photographs are rendered; what then runs on them is
-    zoomjax calibrate.
+    The scene is the first experiment of Alvarez et al. (2012): a board of
+    31 x 23 stripes at 1185 mm, focal lengths from 20.56 to 127.36 mm, and the
+    lens measured there, a Nikkor 18-200. The photos are calibrated as by
+    zoomjax calibrate, and the result is compared with the true lens.
     """
     set_up_jax()
     from ..scenes.board import StripedBoard, nikkor_18_200
@@ -83,7 +86,7 @@ def demo(
     board = StripedBoard.before(truth := nikkor_18_200(demo.IMAGE_SIZE))
     names = [*FILES, REPORT, "before-after.jpg", *(f"photos/{name}" for name in demo.photo_names(photos))]
     with results_folder(output, names, clears=[*CLEARS, "photos/*"], overwrite=overwrite) as folder:
-        with progress_bar("Photographing the board") as progress:
+        with progress_bar("Rendering photos of the board") as progress:
             made = demo.write_photos(folder / "photos", number=photos, seed=seed, progress=progress)
         done = _calibrate_images(ImageJob(tuple(made), workers=number_of_cores()), folder)
         focal = sorted(done.focals.focal.values())
@@ -92,7 +95,10 @@ def demo(
     show_calibration(done.calibration, board.magnification)
     show_images(done, output, also=["before-after.jpg", "photos/"])
     worst = demo.worst_error(lens, truth, focal)
-    print(f"The lens is within {worst:.3f} px of the true one, everywhere in all {len(focal)} images.")
+    print(
+        f"Largest error of the calibrated lens: {worst:.3f} px, over the whole image at all {len(focal)} "
+        "focal lengths."
+    )
 
 
 @app.command()
@@ -101,8 +107,8 @@ def calibrate(
         list[str],
         typer.Argument(
             metavar="INPUT...",
-            help="Photos, folders of them or patterns; or a video; or lines: lines.npz, or a CSV "
-            "frame,line,x,y[,focal].",
+            help="Photos, folders or patterns such as shots/*.jpg; or one video; or a file of lines: "
+            "lines.npz, or a CSV file with the columns frame,line,x,y[,focal].",
         ),
     ],
     output: Annotated[
@@ -111,60 +117,73 @@ def calibrate(
     degree: Degree = 2,
     terms: Terms = 2,
     select: Annotated[
-        bool, typer.Option("--select", help="Choose degree and terms: see what lines left out prefer.")
+        bool, typer.Option("--select", help="Select degree and terms by cross-validation.")
     ] = False,
     robust: Annotated[
         bool,
         typer.Option(
-            "--robust", help="Reject lines that are not straight in the scene, as is done in photos."
+            "--robust",
+            help="For a file of lines: reject lines that are not straight in the scene. For images this is "
+            "always done.",
         ),
     ] = False,
     detector: Annotated[
-        str, typer.Option(help="What to look for in images: edges, grid or pitch.")
+        str,
+        typer.Option(
+            help="What to detect in images: edges (any straight edges), grid (checkerboards and dot grids) "
+            "or pitch (markings of a sports pitch)."
+        ),
     ] = "edges",
     focal: Annotated[
         str | None,
         typer.Option(
-            help="Where focal lengths come from: a CSV (image,focal; of a video time,focal or frame,focal; "
-            "of CSV lines frame,focal), a number, exif, board or plane. Without it: the best there is."
+            help="Source of the focal lengths: a CSV file (columns image,focal; for a video time,focal or "
+            "frame,focal; for CSV lines frame,focal), a number, exif, board (parallel to the sensor) or "
+            "plane (oblique views of a flat grid). Default for photos: board if --pitch is given, else "
+            "exif, else plane."
         ),
     ] = None,
     focal_unit: Annotated[
-        str | None, typer.Option(help="Unit of the focal lengths of a CSV or a number: mm (default) or px.")
+        str | None, typer.Option(help="Unit of focal lengths in a CSV file or number: mm (default) or px.")
     ] = None,
     focal_sigma: Annotated[
         str | None,
         typer.Option(
-            help="Standard deviation of the focal lengths, in their unit or per cent, e.g. 0.3 or 1%: what "
-            "the bands allow for. Without it: what plane, board or a CSV column sigma tell, or none."
+            help="Standard deviation of the focal lengths, in their unit or per cent, e.g. 0.3 or 1%. "
+            "Standard deviations of the results include it. Default: the estimate of plane or board, the "
+            "CSV column sigma, or else 0."
         ),
     ] = None,
     pitch: Annotated[
         str | None,
         typer.Option(
-            metavar="MM[xMM]", help="--focal board: from one line on it to the next, across and down."
+            metavar="MM[xMM]",
+            help="For --focal board: distance between neighbouring lines of the board, across and down.",
         ),
     ] = None,
     distance: Annotated[
-        float | None, typer.Option(metavar="MM", help="--focal board: from the camera to the board.")
+        float | None,
+        typer.Option(metavar="MM", help="For --focal board: distance from the camera to the board."),
     ] = None,
     pixel: Annotated[
-        float | None, typer.Option(metavar="MM", help="--focal board: side of a pixel on the sensor.")
+        float | None, typer.Option(metavar="MM", help="For --focal board: pixel size on the sensor.")
     ] = None,
-    frames: Annotated[int, typer.Option(min=1, help="Of a video: how many frames, at most.")] = 60,
+    frames: Annotated[int, typer.Option(min=1, help="For a video: maximum number of frames used.")] = 60,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes that look at images; by default one a core.")
+        int | None,
+        typer.Option(min=1, help="Number of processes that detect lines; default: one per core."),
     ] = None,
-    cache: Annotated[bool, typer.Option(help="Remember what was found in images.")] = True,
+    cache: Annotated[bool, typer.Option(help="Cache detections, and use cached ones.")] = True,
     image_size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Image size of a CSV of lines, px, e.g. 1920x1080.")
+        str | None, typer.Option(metavar="WxH", help="For CSV lines: image size in px, e.g. 1920x1080.")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Calibrate a zoom lens from images of straight things, or from lines.
+    """Calibrate a zoom lens from photos, a video or a file of lines.
 
-    Writes lens.json, summary.json, report.html, model.png and lines.npz; and lines/, what was found in
-    each image. Its own results of an earlier run in the same folder are replaced.
+    Writes lens.json, summary.json, report.html, model.png and lines.npz. From
+    images it also writes lines/: each image with its detected lines. Results
+    of an earlier run in the same folder are replaced.
     """
     set_up_jax()
     from .calibration import CLEARS, FILES
@@ -219,35 +238,48 @@ def calibrate(
 
 @app.command()
 def undistort(
-    lens: Annotated[Path, typer.Argument(metavar="lens.json", help="The lens, from zoomjax calibrate.")],
+    lens: Annotated[
+        Path, typer.Argument(metavar="lens.json", help="The lens written by zoomjax calibrate.")
+    ],
     inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help="Photos, or one video.")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="OUT", help="A file for one input, else a folder.")
+        Path,
+        typer.Option(
+            "-o", "--output", metavar="OUT", help="Output file for a single input, else a folder."
+        ),
     ],
     focal: Annotated[
         str | None,
         typer.Option(
-            help="A focal length, or a CSV: time,focal or frame,focal of a video, image,focal of photos. "
-            "Without it, photos' EXIF data tell."
+            help="A focal length, or a CSV file: columns time,focal or frame,focal for a video, "
+            "image,focal for photos. Default for photos: their EXIF data."
         ),
     ] = None,
     keep: Annotated[
-        str, typer.Option(help="What to show: same, all or valid; one framing for all of a zoom.")
+        str,
+        typer.Option(
+            help="Framing of the corrected image: same (as the input), all (every input pixel) or valid "
+            "(no empty borders). The framing stays constant while zooming."
+        ),
     ] = "same",
-    interpolation: Annotated[str, typer.Option(help="nearest, linear, cubic or lanczos.")] = "linear",
+    interpolation: Annotated[
+        str, typer.Option(help="Interpolation: nearest, linear, cubic or lanczos.")
+    ] = "linear",
     border: Annotated[
-        str, typer.Option(help="What lies beyond the image: constant (black), replicate or reflect.")
+        str, typer.Option(help="Fill outside of the input image: constant (black), replicate or reflect.")
     ] = "constant",
     hold: Annotated[
-        bool, typer.Option("--hold", help="Hold the first and last focal length beyond a track's ends.")
+        bool,
+        typer.Option("--hold", help="Use the first and last focal length of a track beyond its ends."),
     ] = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace files that are there, but never an input.")
+        bool, typer.Option("--overwrite", help="Replace existing files, but never an input.")
     ] = False,
 ) -> None:
-    """Correct photos, or a video, each at its own focal length.
+    """Correct photos or a video, each image at its own focal length.
 
-    Photos that cannot be corrected are named and skipped; the exit status is then 1, or 2 if none is left.
+    Photos that cannot be corrected are reported and skipped. The exit status
+    is then 1, or 2 if all were skipped.
     """
     set_up_jax()
     from .undistort_files import Job, undistort_files
@@ -270,10 +302,11 @@ def reproduce(
     ],
     overwrite: Overwrite = False,
 ) -> None:
-    """The paper's two experiments done again, its tables and figures beside ours.
+    """Repeat the two experiments of Alvarez et al. (2012) on synthetic scenes.
 
-    The scenes are made from what the paper published, as its images are not public. Writes reproduce.md
-    with the tables, Figures 5 to 10 as PNG and PDF, and reproduce.json.
+    The paper's images are not public, so the scenes are made from its
+    published numbers. Writes reproduce.md, with the tables next to those of
+    the paper, Figures 5 to 10 as PNG and PDF, and reproduce.json.
     """
     set_up_jax()
     from rich.console import Console
@@ -286,15 +319,15 @@ def reproduce(
         experiments = again.reproduce(folder, stage)
     console = Console()
     for title, experiment in zip(("Table 1, striped board", "Table 2, football"), experiments, strict=True):
-        table = Table("", title=f"\n{title}: RMS residues", title_justify="left", box=None)
+        table = Table("", title=f"\n{title}: RMS residuals", title_justify="left", box=None)
         for column in ("the paper", "here", "difference"):
             table.add_column(column, justify="right", no_wrap=True)
         for row in experiment.rows:
             table.add_row(row.name, *row.cells())
         console.print(table, highlight=False)
     print(
-        f"\nAll scenes are synthetic: what is whose is in {plain(str(output / 'reproduce.md'))}, "
-        "with the figures."
+        "\nAll scenes are synthetic. Tables, figures and the origin of each number are in "
+        f"{plain(str(output / 'reproduce.md'))}."
     )
 
 
@@ -325,11 +358,11 @@ def _calibrate_images(job: "ImageJob", folder: Path) -> "ImageCalibration":
     from .report import report
 
     with contextlib.ExitStack() as shown:
-        progress = shown.enter_context(progress_bar("Looking for lines"))
+        progress = shown.enter_context(progress_bar("Detecting lines"))
 
         def stage(name: str) -> None:
             nonlocal current
-            if current is None:  # the bar makes way for the stages
+            if current is None:  # replace the bar by the stages
                 shown.close()
                 current = shown.enter_context(stages())
             current(name)

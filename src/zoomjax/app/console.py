@@ -1,4 +1,4 @@
-"""What the commands show while they run, and tell when they are done."""
+"""Terminal output of the commands: progress while they run, results when they are done."""
 
 import contextlib
 import math
@@ -21,9 +21,9 @@ REPORT = "report.html"
 
 @contextlib.contextmanager
 def progress_bar(what: str, timed: bool = True) -> Iterator[Callable[[int, int], None]]:
-    """A function of what is done and of how much (0: unknown), shown as a bar on stderr.
+    """Yield a function of the number done and the total (0: unknown) that updates a bar on stderr.
 
-    If `timed`, the bar leaves behind how long it took, as a stage does.
+    If `timed`, the elapsed time is printed at the end, as for a stage.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -57,7 +57,7 @@ def _stage_done(console: "Console", name: str, start: float) -> None:
 
 @contextlib.contextmanager
 def stages() -> Iterator[Callable[[str], None]]:
-    """A function that shows what is being done, and how long what was done before took."""
+    """Yield a function that starts a stage: it shows its name, and prints the previous stage's time."""
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -83,7 +83,7 @@ def stages() -> Iterator[Callable[[str], None]]:
 def show_calibration(
     calibration: "Calibration", magnification: Callable[[float], float] | None = None
 ) -> None:
-    """Print the table and the polynomials."""
+    """Print the table of RMS values, the polynomials and the displacement of a corner."""
     from rich.console import Console
     from rich.table import Table
 
@@ -98,12 +98,14 @@ def show_calibration(
         f"f = {low:g} to {high:g} {unit}\n",
         highlight=False,
     )
-    table = Table(title="Distance of corrected points to their lines, RMS", title_justify="left", box=None)
+    table = Table(
+        title="RMS distance of corrected points to straight lines", title_justify="left", box=None
+    )
     table.add_column("", no_wrap=True)
     table.add_column("px", justify="right")
     if magnification:
         table.add_column("mm on the board", justify="right")
-    table.add_column("over frame by frame", justify="right", no_wrap=True)
+    table.add_column("vs. frame by frame", justify="right", no_wrap=True)
     table.add_column("px, held out", justify="right", no_wrap=True)
     held_out = {name: rms_over_frames(frames) for name, frames in calibration.held_out_rows().items()}
     for name, frames in calibration.rows():
@@ -124,28 +126,25 @@ def show_calibration(
         terms = " ".join(f"{value:+.4e}{power}" for value, power in zip(column, powers, strict=True))
         console.print(f"k{i}(f) = {terms}   px^-{2 * i}", highlight=False)
     corner = [f"{moved:+.2f} ± {std:.2g} px at {f:.4g} {unit}" for f, moved, std in calibration.corner()]
-    console.print(f"\nCorrected, a corner moves by {', '.join(corner)}.", highlight=False)
+    console.print(f"\nThe correction moves a corner by {', '.join(corner)}.", highlight=False)
     if allowed_for := calibration.allowed_for():
         console.print(allowed_for, highlight=False)
     console.print(calibration.next.sentence, highlight=False)
 
 
 def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()) -> None:
-    """Print what became of the images and their lines, and where the results are."""
+    """Print how many lines were found and rejected, warnings, and where the results are."""
     found = sum(len(detection.lines) for detection in done.used)
     rejected = int(done.calibration.rejected.sum())
     print(
-        f"\nLines found in {len(done.used)} images: {found}, of which {rejected} are not straight in the "
+        f"\n{found} lines found in {len(done.used)} images; {rejected} of them are not straight in the "
         f"scene and were rejected.\nFocal lengths: {plain(done.focals.origin)}."
     )
     deviation = sorted(s / done.focals.focal[name] for name, s in done.focals.deviation.items())
     if deviation:
         print(f"Their standard deviations: {deviation[0]:.2%} to {deviation[-1]:.2%}.")
     tell(done.warnings())
-    print(
-        f"\nLook at {plain(str(folder / 'lines'))} before you believe: the lines found, drawn over each "
-        "image."
-    )
+    print(f"\nCheck the detected lines, drawn over each image, in {plain(str(folder / 'lines'))}.")
     tell_written(folder, ["lines/", *also])
 
 
@@ -155,7 +154,7 @@ def tell(warnings: Sequence[str]) -> None:
     from rich.text import Text
 
     for warning in warnings:  # names in it may look like markup
-        Console(stderr=True).print(Text.assemble("\n", ("Beware:", "bold"), " ", warning))
+        Console(stderr=True).print(Text.assemble("\n", ("Warning:", "bold"), " ", warning))
 
 
 def tell_written(folder: Path, also: Sequence[str] = ()) -> None:

@@ -1,4 +1,4 @@
-"""The paper's first experiment as photographs, on disk as a user's would be."""
+"""Rendered photos of the paper's first experiment, as files like those of a camera."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -15,7 +15,7 @@ from ..models.lens import ZoomLens
 from ..scenes.board import board_photo, focal_sweep, nikkor_18_200
 
 IMAGE_SIZE = (2144, 1424)
-"""px: half the paper's camera's, the same field of view."""
+"""px: half the size of the paper's images, with the same field of view."""
 
 _QUALITY = 92
 
@@ -28,10 +28,10 @@ def write_photos(
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
-    """Photograph the striped board at focal lengths spread over the lens's range, into JPEG files.
+    """Render photos of the striped board at focal lengths over the range of the lens, as JPEG files.
 
-    The lens is the paper's, from its published polynomials; photographs have blur of 0.8 px, noise of
-    2 grey levels, vignetting, and the focal length in their EXIF data.
+    The lens is the paper's, from its published polynomials. Photos have a blur of 0.8 px, noise of 2 grey
+    levels, vignetting, and the focal length in their EXIF data.
     """
     lens = nikkor_18_200(image_size)
     Path(folder).mkdir(parents=True, exist_ok=True)
@@ -50,7 +50,7 @@ def write_photos(
 
 
 def photo_names(number: int) -> list[str]:
-    """What `write_photos` calls so many photographs."""
+    """The file names that `write_photos` gives to this number of photos."""
     return [f"board-{focal:06.2f}mm.jpg" for focal in _focal(number)]
 
 
@@ -59,7 +59,7 @@ def _focal(number: int) -> np.ndarray:
 
 
 def write_before_after(photo: Path, target: Path, lens: ZoomLens, focal: float) -> None:
-    """One photograph beside its correction, each with a thin straight frame to compare with."""
+    """Write a picture of one photo next to its correction."""
     image = cv2.imread(str(photo), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     assert image is not None
     both = [image, undistort_image(image, lens(focal), keep="valid", interpolation="cubic")]
@@ -79,7 +79,7 @@ def write_before_after(photo: Path, target: Path, lens: ZoomLens, focal: float) 
 
 
 def worst_error(lens: ZoomLens, truth: ZoomLens, focal: Iterable[float]) -> float:
-    """The greatest distance, px, of two lenses' corrections, on 20 x 20 points at each focal length."""
+    """The largest distance between two lenses' corrections, px, on 20 x 20 points per focal length."""
     width, height = truth.image_size
     x, y = np.meshgrid(np.linspace(0, width - 1, 20), np.linspace(0, height - 1, 20))
     grid = jnp.asarray(np.stack([x, y], axis=-1))

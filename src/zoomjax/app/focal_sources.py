@@ -1,9 +1,9 @@
-"""The focal length of each image, from the best source that there is.
+"""The focal length of each image, from the best available source.
 
-EXIF data, a table, a number, or the images themselves: a board parallel to the sensor at a known distance
-(eq. 14), or oblique views of a flat grid (Zhang's constraints). The last two need corrected points, and the
-correction is what is sought: so it comes first from each image by itself, which needs no focal length, and
-then once more from the zoom model of the focal lengths found.
+Sources are EXIF data, a table, a number, or the images themselves: a board parallel to the sensor at a
+known distance (eq. 14), or oblique views of a flat grid (Zhang's constraints). The last two need corrected
+points, and the correction is not known yet. So points are corrected twice: first by a separate fit of each
+image, which needs no focal length, then by the zoom model fitted with the focal lengths found.
 """
 
 import dataclasses
@@ -34,12 +34,10 @@ WAYS = (
     "or oblique photos of a flat checkerboard or dot grid (--focal plane)"
 )
 
-_VIDEO_WAYS = (
-    "one focal length, a CSV file with time,focal or frame,focal, or plane or board, as photos may have"
-)
+_VIDEO_WAYS = "one focal length, a CSV file with time,focal or frame,focal, or plane or board as for photos"
 
 _MOST_UNCERTAIN = 0.2
-"""Standard deviation over focal length above which a view says too little of it."""
+"""Largest standard deviation, relative to the focal length, of an estimate that is used."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,12 +61,11 @@ class Focals:
     """Focal lengths of images.
 
     Attributes:
-        focal: by the images' names; those without one are not in it.
+        focal: focal lengths by the images' names; images without one are missing.
         unit: "mm" or "px".
-        origin: where they come from, in words.
-        absent: why an image may have none.
-        deviation: standard deviations by name, of those of which they are known: estimated from images, or
-            told.
+        origin: the source of the focal lengths, in words.
+        absent: why an image may have no focal length.
+        deviation: standard deviations by name, where known: estimated from images, or given.
     """
 
     focal: dict[str, float]
@@ -79,11 +76,11 @@ class Focals:
 
 
 def check_way(way: str | None, board: Board | None, *, video: bool) -> None:
-    """Check what can be known of a way to focal lengths before any image is looked at.
+    """Check a focal source before any image is read.
 
     Raises:
         FileNotFoundError: there is no such CSV file.
-        ValueError: the way is none, or lacks something; the message names the ways.
+        ValueError: the source is unknown or incomplete; the message lists the sources.
     """
     if way == "board" or (way is None and board):
         if board is None:
@@ -93,7 +90,7 @@ def check_way(way: str | None, board: Board | None, *, video: bool) -> None:
     elif way not in (None, "exif", "plane") and _number(way) is None:
         if not way.lower().endswith(".csv"):
             raise ValueError(
-                f"--focal is {way!r}, which is no way to a focal length. Give "
+                f"--focal is {way!r}, which is not a source of focal lengths. Give "
                 f"{_VIDEO_WAYS if video else WAYS}."
             )
         read_focal_track(way) if video else read_focal_table(way)
@@ -109,25 +106,25 @@ def choose_focals(
     unit: str = "mm",
     board: Board | None = None,
 ) -> Focals:
-    """The focal length of each image.
+    """Find the focal length of each image.
 
     Args:
-        detections: of the images, all of one size and with lines.
-        way: "exif", "board", "plane", a number, a CSV file; or None for what there is: a `board`'s, if one
-            is given, else EXIF data, else an oblique grid.
-        unit: of a number's or a CSV file's focal lengths.
-        board: for "board".
+        detections: detections of images of one size, all with lines.
+        way: the source: "exif", "board", "plane", a number or a CSV file. None for the best available one:
+            the `board` if it is given, else EXIF data, else an oblique grid.
+        unit: unit of a number or of the focal lengths in a CSV file.
+        board: the board, for "board".
 
     Raises:
         FileNotFoundError: there is no such CSV file.
-        ValueError: no focal length is to be had that way; the message names the others.
+        ValueError: no focal length was found; the message lists the other sources.
     """
     if way is None:
         way = "board" if board else "exif" if any(d.focal for d in detections) else "plane"
     if way == "exif":
-        found = Focals(_own(detections), "mm", "EXIF data", "its EXIF data hold no focal length")
+        found = Focals(_own(detections), "mm", "EXIF data", "its EXIF data have no focal length")
     elif way == "track":
-        found = Focals(_own(detections), unit, "the track of the video", "the track has none")
+        found = Focals(_own(detections), unit, "the track of the video", "the track has none for it")
     elif way == "board":
         if board is None:
             raise ValueError(_NO_BOARD)
@@ -151,25 +148,25 @@ def choose_focals(
         )
     if not found.focal:
         raise ValueError(
-            f"No focal length is to be had of any image from {found.origin} ({found.absent}). Give {WAYS}. "
-            "(Straightness alone cannot tell: with focal lengths relabelled, and the model accordingly, "
-            "every line is as straight as before.)"
+            f"No focal length found for any image. Source: {found.origin}; problem: {found.absent}. Give "
+            f"{WAYS}. (Straight lines alone do not determine focal lengths: other focal lengths with "
+            "another zoom model give the same correction.)"
         )
     return found
 
 
-_NO_PLANE = "it shows no flat grid, or one too squarely to tell a focal length"
+_NO_PLANE = "no flat grid was found in it, or the view is too frontal to determine a focal length"
 
 
 _NOT_THE_BOARD = (
-    "it shows no evenly spaced lines of a board, or their pitch differs between its two directions (then "
-    "give both: --pitch ACROSSxDOWN)"
+    "no evenly spaced lines of a board were found in it, or their pitch differs between the two directions "
+    "(then give both: --pitch ACROSSxDOWN)"
 )
 _EVEN = 0.1
-"""Steps, RMS, that lines of a board may be from where they are expected."""
+"""Largest RMS distance of lines of a board from even spacing, in steps."""
 
 _DISAGREE = 3e-3
-"""Share of the focal length by which a board's two directions may disagree, beside three deviations."""
+"""Relative difference allowed between a board's two directions, if more than three deviations."""
 
 
 def _own(detections: Sequence[Detection]) -> dict[str, float]:
@@ -189,7 +186,7 @@ Estimator = Callable[[Detection, Distortion], FocalEstimate | None]
 def _estimated(
     detections: Sequence[Detection], unit: str, origin: str, absent: str, estimate: Estimator
 ) -> Focals:
-    """Focal lengths from corrected images, corrected twice."""
+    """Focal lengths from corrected points. The correction is done twice, see the module."""
     each = fit_frames(compress(lines_of(detections, np.ones(len(detections)), unit)), throw=False)
     corrections = [each.distortion(frame) for frame in range(len(detections))]
     found = _all(detections, corrections, estimate)
@@ -212,7 +209,7 @@ def _estimated(
 def _all(
     detections: Sequence[Detection], corrections: Sequence[Distortion], estimate: Estimator
 ) -> dict[str, FocalEstimate]:
-    """The estimates that say something, by the names of the images."""
+    """The estimates that are precise enough, by the names of the images."""
     found = {}
     for detection, correction in zip(detections, corrections, strict=True):
         if not np.isfinite(np.asarray(correction.coefficients)).all():
@@ -224,7 +221,7 @@ def _all(
 
 
 def lines_of(detections: Sequence[Detection], focal: np.ndarray, unit: str) -> Lines:
-    """The lines of all images, a frame each."""
+    """The lines of all images, one frame per image."""
     return Lines.from_ragged(
         [line for detection in detections for line in detection.lines],
         np.repeat(np.arange(len(detections)), [len(detection.lines) for detection in detections]),
@@ -235,7 +232,7 @@ def lines_of(detections: Sequence[Detection], focal: np.ndarray, unit: str) -> L
 
 
 def _nodes(detection: Detection, correction: Distortion) -> tuple[np.ndarray, np.ndarray] | None:
-    """Corrected nodes, px, and their places in the grid, steps; None if there are too few."""
+    """Corrected nodes, px, and their positions in the grid, steps; None if there are too few."""
     if detection.nodes is None:
         return None
     seen = np.isfinite(detection.nodes[..., 0])
@@ -275,7 +272,7 @@ def _from_board(board: Board) -> Estimator:
 
 
 def _combined(found: Sequence[FocalEstimate]) -> FocalEstimate | None:
-    """The mean of estimates by their weights; None if there is none, or if they disagree."""
+    """The weighted mean of estimates; None if there are none, or if they disagree."""
     if not found:
         return None
     focal, std, rms = (
@@ -289,15 +286,15 @@ def _combined(found: Sequence[FocalEstimate]) -> FocalEstimate | None:
 
 
 def _parallels(lines: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For each direction of a board, its lines' positions across, px, and which lines of it they are.
+    """For each direction of a board, the positions of its lines, px, and their numbers on the board.
 
-    Positions (n, 2) are on the x axis for what runs down, on the y axis for what runs across; so are the
-    places: what `focal_from_board` compares. A direction whose lines are not evenly spaced is left out.
+    Both are (n, 2), on the x axis for vertical and on the y axis for horizontal lines, as
+    `focal_from_board` takes them. A direction whose lines are not evenly spaced is left out.
     """
     middle = np.array([line.mean(axis=0) for line in lines])
     along = np.array([line[-1] - line[0] for line in lines])
     twice = 2 * np.arctan2(along[:, 1], along[:, 0])
-    # Squared once more, both directions of a board are one.
+    # Multiplying the angle by 4 in all makes both directions of a board one.
     main = np.angle(np.sum(np.hypot(*along.T) * np.exp(2j * twice))) / 4
     result = []
     for direction in (main, main + np.pi / 2):
@@ -311,9 +308,9 @@ def _parallels(lines: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray
 
 
 def _counted(position: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Positions of evenly spaced lines, in order, and which of them each is; None if they are none.
+    """Positions of evenly spaced lines, in order, and their numbers; None if they are not evenly spaced.
 
-    Some may be missing, and some seen in two pieces.
+    Some lines may be missing, and some may be in two pieces.
     """
     if len(position) < 3:
         return None
@@ -322,7 +319,7 @@ def _counted(position: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     if len(position) < 3 or usual < 1:
         return None
     step, index = float(np.median(np.diff(position))), np.zeros(len(position))
-    for number in range(1, len(position)):  # the step is known better and better
+    for number in range(1, len(position)):  # the estimate of the step improves with each line
         index[number] = index[number - 1] + np.rint((position[number] - position[number - 1]) / step)
         if number > 3:
             step = float(np.polyfit(index[: number + 1], position[: number + 1], 1)[0])

@@ -1,4 +1,4 @@
-"""From photographs or a video to a calibrated lens: what ``zoomjax calibrate`` does with images."""
+"""Calibration from photos or a video: what ``zoomjax calibrate`` does with images."""
 
 import concurrent.futures
 import contextlib
@@ -24,27 +24,27 @@ from .overlay import draw_lines
 from .results_folder import results_folder
 
 Progress = Callable[[int, int], None]
-"""Called with how many images are done, and of how many."""
+"""Called with the number of images done and their total."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ImageJob:
-    """What to calibrate from images.
+    """Settings of a calibration from images.
 
     Attributes:
-        inputs: photographs, folders or patterns; or one video.
+        inputs: photos, folders or patterns; or one video.
         detector: "edges", "grid" or "pitch".
-        focal: where focal lengths come from, as for `choose_focals`; of a video also a track.
-        focal_unit: of a number's, a table's or a track's.
-        focal_sigma: standard deviation of the focal lengths: a number in their unit, or per cent such as
-            "1%"; None for what is known from where they come from.
-        board: for ``focal="board"``.
-        degree: of the polynomials in 1/f.
+        focal: source of the focal lengths, as for `choose_focals`; for a video also a track.
+        focal_unit: unit of the focal lengths in a number, a table or a track.
+        focal_sigma: standard deviation of the focal lengths: a number in their unit, or a percentage such
+            as "1%"; None for the standard deviation given by their source.
+        board: the board, for ``focal="board"``.
+        degree: degree of the polynomials in 1/f.
         terms: number of distortion coefficients.
-        select: whether to choose degree and terms.
-        frames: of a video, at most.
+        select: whether to select degree and terms by cross-validation.
+        frames: maximum number of frames used from a video.
         workers: number of processes.
-        cache: folder for what was detected; None: no cache.
+        cache: folder for cached detections; None: no cache.
     """
 
     inputs: tuple[str | os.PathLike[str], ...]
@@ -61,47 +61,47 @@ class ImageJob:
     cache: Path | None = None
 
     def __post_init__(self):
-        """Check what can be checked before any work.
+        """Check the settings before any work.
 
         Raises:
             FileNotFoundError: there is no such CSV file.
-            ValueError: a name is unknown, or a file is something else.
+            ValueError: a name is unknown, or a file has the wrong type.
         """
         if self.detector not in DETECTORS:
             raise ValueError(
                 f"Argument detector must be one of {', '.join(DETECTORS)}, but it is {self.detector!r}."
             )
         if len(self.inputs) > 1 and any(map(_is_video, self.inputs)):
-            raise ValueError("Give photographs, or one video.")
+            raise ValueError("Give photos, or one video.")
         check_way(self.focal, self.board, video=self.video is not None)
         focal_sigmas(self.focal_sigma or "0", np.ones(1))
 
     @property
     def video(self) -> Path | None:
-        """The video, if that is what is calibrated from."""
+        """The video, if the input is one."""
         return Path(self.inputs[0]) if _is_video(self.inputs[0]) else None
 
     @property
     def grid(self) -> str:
-        """In which images a grid must be looked for, to tell the focal length, in `detect`'s words."""
+        """In which images to search for a grid for the focal length: `detect`'s argument ``grid``."""
         if self.focal == "plane" or (self.focal == "board" and self.detector == "grid"):
             return "all"
         return "without focal length" if self.focal is None and self.board is None else "none"
 
     def sources(self) -> tuple[Iterable[Source], int]:
-        """The images and how many they are."""
+        """The images and their number."""
         if self.video is None:
             photos = find_photos(self.inputs)
             return photos, len(photos)
         return video_frames(self.video, self._track(), self.frames), self.frames
 
     def results(self) -> list[str]:
-        """Names of the files that `ImageCalibration.write` writes, as far as they are known before."""
+        """Names of the files that `ImageCalibration.write` writes, as far as known in advance."""
         photos = self.sources()[0] if self.video is None else ()
         return [*FILES, *(f"lines/{_overlay(n, photo.name)}" for n, photo in enumerate(photos, start=1))]
 
     def _track(self) -> FocalTrack | float:
-        """Of a video; 1 where its own frames tell."""
+        """The focal track of a video; 1 where focal lengths are estimated from its frames."""
         if self.focal in (None, "plane", "board"):
             return 1.0
         number = plain_number(self.focal)
@@ -110,15 +110,15 @@ class ImageJob:
 
 @dataclasses.dataclass(frozen=True)
 class ImageCalibration:
-    """A calibration and the images that it is from.
+    """A calibration with its images.
 
     Attributes:
-        job: what was asked for.
-        calibration: the fits; a frame for each used image, in their order.
-        used: what was detected in them.
-        focals: their focal lengths.
-        images: the names of all images, in order; an overlay has its image's number here, from 1.
-        unused: why an image was not used, by its name.
+        job: the settings.
+        calibration: the fits; one frame for each used image, in their order.
+        used: the detections in the used images.
+        focals: the focal lengths of the used images.
+        images: the names of all images, in order; overlays are numbered by their place in it, from 1.
+        unused: for each image that was not used, the reason.
     """
 
     job: ImageJob
@@ -129,12 +129,12 @@ class ImageCalibration:
     unused: dict[str, str]
 
     def rejected(self) -> list[np.ndarray]:
-        """For each used image, which of its lines were found not to be straight in the scene."""
+        """For each used image, which of its lines were rejected as not straight in the scene."""
         counts = [len(detection.lines) for detection in self.used]
         return np.split(self.calibration.rejected, np.cumsum(counts)[:-1])
 
     def about(self) -> dict[str, Any]:
-        """What summary.json says of the images."""
+        """The entries of summary.json about the images."""
         images = [
             {
                 "name": detection.name,
@@ -153,19 +153,19 @@ class ImageCalibration:
         }
 
     def warnings(self) -> list[str]:
-        """What a user must hear of: images that were not used, and what the calibration warns of."""
-        told = []
+        """User-facing warnings: images that were not used, and those of the calibration."""
+        warnings = []
         if self.unused:
             listed = [f"{plain(name)}: {plain(why)}" for name, why in self.unused.items()]
             rest = len(listed) - 8
-            told.append(
+            warnings.append(
                 f"{len(listed)} of {len(listed) + len(self.used)} images are not used.\n  "
                 + "\n  ".join(listed[:8] + ([f"and {rest} more, in summary.json"] if rest > 0 else []))
             )
-        return told + self.calibration.warnings([plain(detection.name) for detection in self.used])
+        return warnings + self.calibration.warnings([plain(detection.name) for detection in self.used])
 
     def overlays(self) -> list[str]:
-        """For each used image the name of the picture of its lines, in ``lines/``."""
+        """For each used image, the name of its picture with detected lines in ``lines/``."""
         numbers = {name: number for number, name in enumerate(self.images, start=1)}
         return [_overlay(numbers[detection.name], detection.name) for detection in self.used]
 
@@ -177,7 +177,7 @@ class ImageCalibration:
         *,
         overwrite: bool = False,
     ) -> None:
-        """Write what `Calibration.write` does, and the lines drawn over each image, in ``lines/``."""
+        """Write the files of `Calibration.write`, and each image with its detected lines in ``lines/``."""
         names = [*self.job.results(), *(pages or {})]
         with results_folder(folder, names, clears=CLEARS, overwrite=overwrite) as part:
             self.make(part, progress, pages)
@@ -188,7 +188,7 @@ class ImageCalibration:
         progress: Progress = lambda done, total: None,
         pages: Mapping[str, str] | None = None,
     ) -> None:
-        """The same in an empty folder: that of a `results_folder`, say."""
+        """Write the files of `write` into an empty folder, such as that of a `results_folder`."""
         (folder / "lines").mkdir()
         self._draw(folder / "lines", progress)
         self.calibration.make(folder, about=self.about(), pages=pages)
@@ -222,16 +222,16 @@ def calibrate_images(
     progress: Progress = lambda done, total: None,
     stage: Callable[[str], None] = lambda _: None,
 ) -> ImageCalibration:
-    """Detect lines in images, find their focal lengths, fit, and reject lines that are not straight.
+    """Detect lines in images, find focal lengths, reject lines that are not straight, and fit the model.
 
     Args:
-        job: what to do.
+        job: the settings.
         progress: called after each image.
-        stage: called with a sentence before each step after that.
+        stage: called with a description before each later step.
 
     Raises:
         FileNotFoundError: an input does not exist.
-        ValueError: no image can be used, or no focal length is to be had, or there are too few.
+        ValueError: no image can be used, no focal length was found, or there are too few of them.
         RuntimeError: the lines do not determine the model.
     """
     sources, total = job.sources()
@@ -243,7 +243,7 @@ def calibrate_images(
         workers=job.workers,
         cache=job.cache,
     )
-    with contextlib.closing(looked):  # whatever happens, no process is left behind
+    with contextlib.closing(looked):  # ends the processes after an error, too
         for detection in looked:
             detections.append(detection)
             progress(len(detections), total)
@@ -283,12 +283,12 @@ def calibrate_images(
 
 
 _NONE_AGREES = (
-    "none of its lines is straight under the distortion of the others. Is its focal length right?"
+    "none of its lines is straight under the model fitted to the other images. Check its focal length"
 )
 
 
 def _overlay(number: int, name: str) -> str:
-    """What the picture of an image's lines is called: a name of ours, whatever the image is called."""
+    """File name of the picture with an image's detected lines, safe for any image name."""
     return numbered_name(number, name, ".jpg")
 
 
@@ -297,7 +297,7 @@ def _is_video(path: str | os.PathLike[str]) -> bool:
 
 
 def _of_one_size(detections: Sequence[Detection]) -> tuple[list[Detection], dict[str, str]]:
-    """The images of the most frequent size, and what is wrong with the others."""
+    """The images of the most frequent size, and why the others are not used."""
     if not detections:
         return [], {}
     (width, height), _ = Counter(d.image_size for d in detections).most_common(1)[0]
@@ -306,18 +306,18 @@ def _of_one_size(detections: Sequence[Detection]) -> tuple[list[Detection], dict
         if detection.image_size == (width, height):
             continue
         own = "x".join(map(str, detection.image_size))
-        here = f"its size is {own} px, most images' {width}x{height}"
+        here = f"its size is {own} px, but most images have {width}x{height}"
         turned = detection.image_size == (height, width)
         others[detection.name] = here + (
-            ": it was turned, so turn it back"
+            ": it was rotated, so rotate it back"
             if turned
-            else ": use images as the camera stored them, neither resized nor cropped"
+            else ": use images as stored by the camera, neither resized nor cropped"
         )
     return [d for d in detections if d.image_size == (width, height)], others
 
 
 def _nothing(detections: Sequence[Detection]) -> str:
-    """Why no image can be used."""
+    """The error message when no image can be used."""
     problems = Counter(d.problem.rstrip(".") for d in detections)
     if len(problems) == 1 and len(detections) > 1:
         return f"None of the {len(detections)} images can be used: {next(iter(problems))}."

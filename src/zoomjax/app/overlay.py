@@ -1,4 +1,4 @@
-"""Detected lines drawn over their image: to look at before believing."""
+"""Detected lines drawn over their image, for checking."""
 
 from collections.abc import Sequence
 
@@ -20,12 +20,12 @@ def draw_lines(
     lines: Sequence[np.ndarray],
     rejected: Sequence[bool],
 ) -> UInt8[np.ndarray, "tall wide 3"]:
-    """The image, dimmed, with neighbouring lines in different colours, and rejected ones dashed in red.
+    """Draw lines over the dimmed image: neighbours in different colours, rejected lines dashed in red.
 
     Args:
-        image: grey or blue, green, red.
-        lines: (n, 2) px each, in order.
-        rejected: whether each is.
+        image: grey, or colour in the order blue, green, red.
+        lines: points of each line, (n, 2) px, in order along the line.
+        rejected: whether each line was rejected.
 
     Returns:
         At most 2000 px a side.
@@ -59,6 +59,6 @@ def _is_steep(line: np.ndarray) -> bool:
 
 
 def _place(line: np.ndarray) -> tuple[float, ...]:
-    """Where a line is among those of about its direction."""
+    """Sort key of a line among those of about its direction."""
     x, y = line.mean(axis=0)
     return (float(x),) if _is_steep(line) else (float(y),)

@@ -1,4 +1,4 @@
-"""Plots, with matplotlib (the extra ``zoomjax[app]``). Figures are returned, not shown or saved."""
+"""Plots with matplotlib (extra ``zoomjax[app]``). Functions return figures; nothing is shown or saved."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -29,7 +29,8 @@ _ROUNDING = 1e-6  # of half the diagonal: smaller displacements are none
 
 
 def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
-    """The distortion coefficients against 1/f: each frame by itself, and the zoom model (Figure 8).
+    """Plot the distortion coefficients against 1/f: separate fits of the frames, and the zoom model (Figure
+    8).
 
     Below each coefficient stands by how much the frames differ from the model, with bars of one standard
     deviation of the frame's own fit; frames whose lines do not determine it have no dot. Around the model
@@ -65,7 +66,9 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
     for i, (above, below) in enumerate(axes.T):
         known = np.isfinite(sigma[:, i])
         x, unit = 1 / focal[known], f"px$^{{-{orders[i]}}}$"
-        above.plot(x, frames[known, i], "o", markersize=3.5, color=_FRAMES, label="each frame by itself")
+        above.plot(
+            x, frames[known, i], "o", markersize=3.5, color=_FRAMES, label="separate fit of each frame"
+        )
         above.plot(grid, curve[:, i], color=_MODEL, linewidth=1.8, label="zoom model")
         _shade(above, grid, curve[:, i], spread[:, i])
         name = f"k_{i + 1}" if orders[i] > 1 else f"p_{i + 1 - np.sum(orders > 1)}"
@@ -92,12 +95,12 @@ def plot_residues(
     *,
     unit: str = "px",
 ) -> Figure:
-    """What is left of each frame against 1/f: uncorrected, frame by frame, zoom model (Figures 9 and 10).
+    """Plot each frame's RMS against 1/f: uncorrected, frame by frame, zoom model (Figures 9 and 10).
 
     Args:
         lines: only their focal lengths are used.
-        none, each, zoom: each frame's RMS.
-        unit: theirs.
+        none, each, zoom: each frame's RMS without correction, frame by frame, and with the zoom model.
+        unit: unit of the RMS values.
     """
     focal = np.asarray(lines.focal)
     order = np.argsort(focal)
@@ -116,9 +119,9 @@ def plot_residues(
 
 
 def plot_primitives(lines: Lines, lens: ZoomLens, frames: Sequence[int]) -> Figure:
-    """The points of some frames as they were seen, and as a lens corrects them (Figures 5 and 6).
+    """Plot the points of some frames, distorted and corrected (Figures 5 and 6). One row per frame.
 
-    The frame around them is the border of the image, which the correction bends. A row is a frame.
+    The outline is the border of the image, which the correction bends.
     """
     figure = Figure(figsize=(9, 3.1 * len(frames)), layout="constrained")
     width, height = lines.image_size
@@ -149,9 +152,9 @@ def plot_primitives(lines: Lines, lens: ZoomLens, frames: Sequence[int]) -> Figu
 
 
 def plot_centres(centres: FrameCentres, lines: AbstractLines) -> Figure:
-    """Each frame's centre of distortion, and how much it lowers the frame's RMS (Figure 7).
+    """Plot each frame's centre of distortion, and by how much it lowers the frame's RMS (Figure 7).
 
-    Crosses are standard deviations; frames whose lines do not determine a centre are left out.
+    Crosses show standard deviations. Frames whose lines do not determine a centre are left out.
     """
     known = np.asarray(centres.determined)
     away = (np.asarray(centres.each.centre) - np.asarray(lines.centre))[known]
@@ -181,18 +184,18 @@ def plot_centres(centres: FrameCentres, lines: AbstractLines) -> Figure:
 def plot_distortion(
     lens: ZoomLens | ZoomFit, *, focal: float | Sequence[float], exaggeration: float | None = None
 ) -> Figure:
-    """How a lens bends a straight grid, and how far each pixel is from where it belongs.
+    """Plot how a lens distorts a straight grid, and the displacement of each pixel by the correction.
 
-    A row is a focal length. On the left is a straight grid, and over it the same grid as the lens shows
-    it. On the right is the distance of each pixel to its corrected point, with arrows towards it, and for
-    a fit contours of its standard deviation. Beyond a fold, where there is no corrected point, lines of
-    the grid end, and the right is hatched.
+    One row per focal length. Left: a straight grid, and the same grid distorted by the lens. Right: the
+    distance of each pixel from its corrected point, with arrows towards it, and for a fit contours of its
+    standard deviation. Beyond a fold there is no corrected point: grid lines end there, and the right plot
+    is hatched.
 
     Args:
         lens: a lens, or a fit.
         focal: one focal length or several, in the lens's unit.
-        exaggeration: how many times farther from the straight grid the bent one is drawn than it is; by
-            default the first of 1, 2, 5, 10, ... that makes it visible.
+        exaggeration: factor by which the distortion of the grid is drawn larger than it is; by default the
+            smallest of 1, 2, 5, 10, ... that makes it visible.
     """
     fit, lens = (lens, lens.lens) if isinstance(lens, ZoomFit) else (None, lens)
     focals = np.atleast_1d(np.asarray(focal, float)).tolist()
@@ -212,7 +215,7 @@ def plot_distortion(
 
 
 def _draw_grid(axes: Axes, lens: ZoomLens, focal: float, exaggeration: float | None) -> None:
-    """A straight grid in grey, and how the lens shows it."""
+    """A straight grid in grey, and the same grid distorted by the lens."""
     width, height = lens.image_size
     cells = np.maximum(2, np.round(12 * np.array([width, height]) / max(width, height)).astype(int))
     x, y = (np.linspace(0, side - 1, 8 * n + 1) for side, n in zip((width, height), cells, strict=True))
@@ -228,18 +231,18 @@ def _draw_grid(axes: Axes, lens: ZoomLens, focal: float, exaggeration: float | N
     for line, seen in zip(straight, bent, strict=True):
         axes.plot(*line.T, color="0.75", linewidth=0.8, zorder=1)
         axes.plot(*seen.T, color=_MODEL, linewidth=1.1, zorder=2)
-    axes.set_title(f"$f$ = {focal:.4g} {lens.focal_unit}: a straight grid as the lens shows it", fontsize=9)
+    axes.set_title(f"$f$ = {focal:.4g} {lens.focal_unit}: a straight grid, distorted", fontsize=9)
     more = "" if exaggeration == 1 else f", distortion × {exaggeration:g}"
     _explain(
         axes,
         Line2D([], [], color="0.75", label="straight"),
-        Line2D([], [], color=_MODEL, label=f"as the lens shows it{more}"),
+        Line2D([], [], color=_MODEL, label=f"distorted by the lens{more}"),
     )
     axes.spines[:].set_visible(False)
 
 
 def _draw_field(figure: Figure, axes: Axes, lens: ZoomLens, fit: ZoomFit | None, focal: float) -> None:
-    """How far pixels are from their corrected points, in which direction, and how certain that is."""
+    """Distance and direction of pixels to their corrected points, with standard deviations."""
     points = _raster(lens)
     moved = np.asarray(lens(focal).undistort(points)) - points
     distance = np.ma.masked_invalid(_lengths(moved))
@@ -265,9 +268,7 @@ def _draw_field(figure: Figure, axes: Axes, lens: ZoomLens, fit: ZoomFit | None,
             width=0.004,
         )
     fold = " (hatched: folded over)" if distance.mask.any() else ""
-    axes.set_title(
-        f"$f$ = {focal:.4g} {lens.focal_unit}: from pixels to where they belong{fold}", fontsize=9
-    )
+    axes.set_title(f"$f$ = {focal:.4g} {lens.focal_unit}: displacement by the correction{fold}", fontsize=9)
     if fit is not None:
         std = np.asarray(displacement_std(fit, points, focal=focal))
         _draw_std(axes, points, np.ma.masked_where(distance.mask | ~np.isfinite(std), std))
@@ -275,10 +276,10 @@ def _draw_field(figure: Figure, axes: Axes, lens: ZoomLens, fit: ZoomFit | None,
 
 
 def _draw_std(axes: Axes, points: np.ndarray, std: np.ma.MaskedArray) -> None:
-    """Contours of the standard deviation, each with its px."""
+    """Contours of the standard deviation, labelled in px."""
     largest = float(std.filled(0).max())
     if largest == 0:
-        _explain(axes, Line2D([], [], linestyle="", label="The lines do not determine its uncertainty."))
+        _explain(axes, Line2D([], [], linestyle="", label="standard deviation not determined by the lines"))
         return
     levels = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(0, largest)[1:-1]
     drawn = axes.contour(
@@ -312,7 +313,7 @@ def _lengths(vectors: np.ndarray) -> np.ndarray:
 
 
 def _shade(axes: Axes, x: np.ndarray, middle: np.ndarray | float, std: np.ndarray) -> None:
-    """The bands of one and of two standard deviations, the inner one darker."""
+    """Bands of one and two standard deviations, the inner one darker."""
     if not np.isfinite(std).all():
         return
     for times, label in ((2, "±1 and ±2 standard deviations"), (1, None)):
@@ -328,7 +329,7 @@ def _shade(axes: Axes, x: np.ndarray, middle: np.ndarray | float, std: np.ndarra
 
 
 def _label(axes: Axes, quantity: str, unit: str, values: np.ndarray) -> None:
-    """Name the y axis, with the power of ten in its unit rather than in a corner."""
+    """Label the y axis, with the power of ten in its unit rather than in a corner."""
     largest = np.max(np.abs(values), initial=0)
     power = int(np.floor(np.log10(largest))) if largest > 0 else 0
     axes.set_ylabel(f"{quantity}\n($10^{{{power}}}$ {unit})")
@@ -339,7 +340,7 @@ def _label(axes: Axes, quantity: str, unit: str, values: np.ndarray) -> None:
 
 
 def _show_focal_lengths(axes: Axes, focal: np.ndarray, unit: str) -> None:
-    """A second scale above, with round focal lengths."""
+    """A second axis on top, with round focal lengths."""
     steps = np.array([1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 7])
     decade = 10.0 ** np.arange(np.floor(np.log10(focal.min())), np.ceil(np.log10(focal.max())) + 1)
     candidates = np.sort(np.outer(decade, steps).ravel())

@@ -1,10 +1,10 @@
-"""report.html: a calibration on one page, to read and to hand on.
+"""report.html: a calibration on one page.
 
-The page needs nothing but itself: its style and its plots are in it, and it has no script. Its text is in
-``templates/report.html``, its colours in ``templates/report.css``; here is what they are filled with. Plots
-are drawn for a light background; browsers in dark mode invert them.
+The page is self-contained: style and plots are embedded, and there is no script. Its text is in
+``templates/report.html``, its colours are in ``templates/report.css``; this module computes the values.
+Plots are drawn for a light background; browsers in dark mode invert them.
 
-Once per calibration; most of the time is drawing.
+Runs once per calibration; most of the time is plotting.
 """
 
 import base64
@@ -26,19 +26,19 @@ if TYPE_CHECKING:
     from .image_calibration import ImageCalibration
 
 _MOST_FRAMES = 300
-"""In the list of frames, and as vectors in plots: the page stays readable, and far below 2 MB."""
+"""Limit for the list of frames and for vector plots. It keeps the page readable and far below 2 MB."""
 
 _WORST, _WORST_REJECTED = 3, 2
-"""How many lines of a frame are named."""
+"""How many lines of a frame are listed: of those that count, and of the rejected ones."""
 
 
 def report(calibration: Calibration, images: "ImageCalibration | None" = None) -> str:
-    """The page, as HTML.
+    """Render the report as HTML.
 
     Args:
-        calibration: what it is about.
-        images: what the lines were found in. The page then names them, and links to their pictures in
-            ``lines/`` beside it.
+        calibration: the calibration to report.
+        images: the images in which the lines were found. The page then lists them by name, with links to
+            their pictures in the folder ``lines/`` next to it.
     """
     lens = calibration.zoom.lens
     low, high = (float(f) for f in lens.focal_range)
@@ -70,7 +70,7 @@ def report(calibration: Calibration, images: "ImageCalibration | None" = None) -
 
 @functools.cache
 def _templates() -> jinja2.Environment:
-    """Templates in which every text is escaped, and has no orders to whoever reads it."""
+    """The Jinja templates. All text is escaped and free of control characters."""
     return jinja2.Environment(
         loader=jinja2.PackageLoader("zoomjax.app"),
         autoescape=True,
@@ -83,12 +83,12 @@ def _templates() -> jinja2.Environment:
 
 
 def _shown(text: str) -> str:
-    """Without orders to a browser; warnings have lines."""
+    """Text without control characters, except line breaks."""
     return "\n".join(map(plain, text.split("\n")))
 
 
 def _cards(calibration: Calibration) -> list[tuple[str, str]]:
-    """The figures that decide whether to look any further."""
+    """The key figures at the top of the page."""
     none, zoom, each = (
         rms_over_frames(values)
         for values in (calibration.none, calibration.zoom.frame_rms, calibration.each.frame_rms)
@@ -96,11 +96,11 @@ def _cards(calibration: Calibration) -> list[tuple[str, str]]:
     std = max(std for _, _, std in calibration.corner())
     certified = bool(calibration.zoom.certificate.certified)
     return [
-        (f"{zoom:.3g} px", "from straight, RMS, with the zoom polynomial"),
+        (f"{zoom:.3g} px", "RMS distance to straight lines, zoom polynomial"),
         (f"{none / zoom:.3g} times" if zoom > 0 else "∞", "straighter than without correction"),
-        (_excess(zoom, each), "over every frame by itself"),
-        (f"± {std:.2g} px" if np.isfinite(std) else "unknown", "at the corner, where it is least certain"),
-        ("proved" if certified else "not proved", "to be invertible at every focal length"),
+        (_excess(zoom, each), "RMS, compared with a separate fit of each frame"),
+        (f"± {std:.2g} px" if np.isfinite(std) else "unknown", "largest standard deviation at the corner"),
+        ("proved" if certified else "not proved", "invertible at every focal length"),
     ]
 
 
@@ -125,7 +125,7 @@ def _straightness(calibration: Calibration) -> dict[str, Any]:
             for name, value in ((name, rms_over_frames(frames)) for name, frames in calibration.rows())
         ],
         "choice": chosen and {"title": chosen.title, "columns": COLUMNS, "rows": chosen.rows()},
-        "plot": _plot(figure, "What is left of each frame against 1/f", class_="box plot"),
+        "plot": _plot(figure, "Residual RMS of each frame against 1/f", class_="box plot"),
     }
 
 
@@ -141,7 +141,7 @@ def _lens(calibration: Calibration) -> dict[str, Any]:
         "certificate": _certificate(calibration),
         "plot": _plot(
             plot_model(calibration.zoom, calibration.each, calibration.lines),
-            "The distortion coefficients against 1/f: each frame by itself, and the zoom model",
+            "Distortion coefficients against 1/f: separate fits of the frames, and the zoom model",
             kind="svg" if len(calibration.none) <= _MOST_FRAMES else "png",
         ),
     }
@@ -156,17 +156,20 @@ def _certificate(calibration: Calibration) -> str:
     )
     if proof.certified:
         return (
-            f"It is proved to be invertible: at no focal length from {low:.4g} to {high:.4g} "
-            f"{lens.focal_unit} is the corrected image folded over. The slope of the corrected radius, 1 "
-            f"where there is no distortion and 0 at a fold, is nowhere below {float(proof.least):.3g}; the "
-            f"least one found is {found}."
+            "The lens is proved to be invertible: the corrected image does not fold over at any focal "
+            f"length from {low:.4g} to {high:.4g} {lens.focal_unit}. The slope of the corrected radius (1 "
+            f"without distortion, 0 at a fold) is at least {float(proof.least):.3g}; the smallest slope "
+            f"found is {found}."
         )
     if proof.folded:
         return (
-            "It is not invertible: the corrected image is folded over. The slope of the corrected radius, "
-            f"which must be positive, goes down to {found}."
+            "The lens is not invertible: the corrected image folds over. The slope of the corrected radius "
+            f"must be positive, but falls to {found}."
         )
-    return f"No fold was found, but none is ruled out: the least slope of the corrected radius is {found}."
+    return (
+        "Invertibility is not proved: no fold was found, but a fold cannot be excluded. The smallest slope "
+        f"of the corrected radius is {found}."
+    )
 
 
 def _distortion(calibration: Calibration) -> dict[str, Any]:
@@ -181,7 +184,7 @@ def _distortion(calibration: Calibration) -> dict[str, Any]:
         "allowed_for": calibration.allowed_for(),
         "grid": _plot(
             plot_distortion(calibration.zoom, focal=ends),
-            "A straight grid as the lens shows it, and where pixels belong, at both ends of the zoom",
+            "A straight grid, distorted, and the displacement of pixels, at both ends of the zoom",
         ),
         "points": _plot(
             plot_primitives(calibration.lines, lens, frames),
@@ -192,7 +195,7 @@ def _distortion(calibration: Calibration) -> dict[str, Any]:
 
 
 def _frames(calibration: Calibration, images: "ImageCalibration | None") -> dict[str, Any]:
-    """The list of frames, each with the lines that are least straight."""
+    """The list of frames, each with its least straight lines."""
     summary = calibration.summary()["per_frame"]
     shown = np.sort(np.argsort(-np.asarray(calibration.zoom.frame_rms), kind="stable")[:_MOST_FRAMES])
     lines = calibration.lines
@@ -203,7 +206,7 @@ def _frames(calibration: Calibration, images: "ImageCalibration | None") -> dict
     unit = f"f, {lines.focal_unit}"
     return {
         "number": len(summary),
-        "head": ["frame", unit, "polynomial", "by itself", "uncorrected", "lines", "worst lines"],
+        "head": ["frame", unit, "polynomial", "separate", "uncorrected", "lines", "worst lines"],
         "rows": [
             {
                 "name": images.used[number].name if images else str(number),
@@ -227,20 +230,20 @@ def _frame_cells(frame: dict[str, Any], rejected: np.ndarray) -> list[str]:
 
 
 def _worst_lines(calibration: Calibration, members: np.ndarray) -> list[dict[str, Any]]:
-    """The worst lines of a frame that count, and of those that were rejected."""
+    """The worst lines of a frame: of those that count, and of the rejected ones."""
     worst = members[np.argsort(-calibration.line_rms[members], kind="stable")]
     rejected = calibration.rejected[worst]
     points, mask = calibration.lines.points, np.asarray(calibration.lines.mask)
-    told = []
+    listed = []
     for line in [*worst[~rejected][:_WORST], *worst[rejected][:_WORST_REJECTED]]:
         x, y = np.asarray(points[line])[mask[line]].mean(axis=0)
         text = f"{line} at ({x:.0f}, {y:.0f}): {calibration.line_rms[line]:.2f} px"
-        told.append({"text": text, "rejected": bool(calibration.rejected[line])})
-    return told
+        listed.append({"text": text, "rejected": bool(calibration.rejected[line])})
+    return listed
 
 
 def _term(value: float, power: int) -> dict[str, Any]:
-    """A term of a polynomial in 1/f, with its sign."""
+    """One term of a polynomial in 1/f, with its sign."""
     mantissa, exponent = f"{abs(value):.4e}".split("e")
     return {
         "sign": "−" if value < 0 else "+" if power else "",
@@ -251,7 +254,7 @@ def _term(value: float, power: int) -> dict[str, Any]:
 
 
 def _excess(value: float, reference: float) -> str:
-    """How much more than the reference it is."""
+    """By how much a value exceeds the reference: per cent, or a factor from 2 on."""
     if reference <= 0:
         return "–"
     ratio = value / reference
@@ -269,7 +272,7 @@ def _number(count: int, noun: str) -> str:
 def _plot(
     figure: Figure, label: str, *, class_: str = "box wide plot", kind: str = "svg"
 ) -> dict[str, str | int]:
-    """A plot; a wide one is not made smaller than can be read."""
+    """A plot, embedded as a data URL, with its natural size so that text stays readable."""
     file = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "zoomjax"}):
         figure.savefig(file, format=kind, dpi=150, metadata={"Date": None} if kind == "svg" else {})

@@ -1,9 +1,9 @@
-"""The paper's two experiments once more: Tables 1 and 2, Figures 5 to 10, beside what the paper printed.
+"""The paper's two experiments repeated: Tables 1 and 2, Figures 5 to 10, next to the printed values.
 
-Its photographs and its video are not public. The scenes here are made from what it published: the fitted
+The paper's photos and video are not public. The scenes here are made from what it published: the fitted
 polynomials, which serve as the truth, focal ranges, resolutions, the board and its distance, the numbers
-of images. How noisy its edges were, and how far from straight on the board, follows from the residues that
-were left frame by frame. `NOTES` says where the paper's own figures do not agree with each other.
+of images. The noise of its edges and the bends of its board are chosen to give its residuals frame by
+frame. `NOTES` lists where the paper's own figures contradict each other.
 """
 
 import dataclasses
@@ -29,21 +29,21 @@ from .calibration import Calibration, calibrate, rms_over_frames
 NOTES = (
     "Table 1 in mm does not follow from Table 1 in pixels: by eq. 7 a pixel is at most 0.31 mm on the "
     "board, at 20.56 mm, and 0.47 mm would be needed. Our mm are those of eq. 7. The paper's are about "
-    "twice as many, as they would be if r_c counted from edge to edge and R from stripe to stripe.",
-    "Lines that are 1.8 px from straight cannot tell the centre of a single frame to the 4 px of Figure 7: "
-    "its standard deviation here is tens of px. The paper's descent may have stopped on its way.",
-    "Table 1 has 2.04 mm without correction, the axis of Figure 9 ends at 0.8 mm.",
+    "twice as large, as they would be if r_c were measured from edge to edge and R from stripe to stripe.",
+    "Lines with residuals of 1.8 px do not determine the centre of a single frame to the 4 px of Figure 7: "
+    "its standard deviation here is tens of px. The paper's descent may have stopped early.",
+    "Table 1 has 2.04 mm without correction, but the axis of Figure 9 ends at 0.8 mm.",
     "The paper counts 816,660 points in its 50 images, but also 52,433 in the one with the fewest lines, "
-    "which makes 2.6 million at the least. We take the former.",
-    "With the published polynomials the broadcast is less distorted than Table 2 says, whichever way a "
-    "camera looks at the pitch: without noise, 0.91 px RMS would be needed before correction. So that row "
-    "comes out lower; the two that the paper compares do not.",
+    "which makes at least 2.6 million. We use the former.",
+    "With the published polynomials the broadcast is less distorted than Table 2 says, from any view of "
+    "the pitch: without noise, 0.91 px RMS would be needed before correction. So that row is lower here; "
+    "the two rows that the paper compares are not.",
 )
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One figure: what it is, the paper's, and ours."""
+    """One figure: its name, the paper's value, and ours."""
 
     name: str
     paper: float
@@ -67,11 +67,11 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """One experiment done again.
+    """One repeated experiment.
 
     Attributes:
-        lines: what was fitted.
-        truth: the lens through which the scene was seen.
+        lines: the lines fitted.
+        truth: the lens of the scene.
         calibration: the fits.
         rows: its table.
     """
@@ -85,14 +85,14 @@ class Experiment:
 def board_experiment(
     stage: Callable[[str], None] = lambda _: None, *, spacing: float | int = 12
 ) -> Experiment:
-    """Section 5.1: 50 photographs of the striped board.
+    """Repeat Section 5.1: 50 photos of the striped board.
 
     Args:
-        stage: called with a sentence before each step that takes time.
+        stage: called with a description before each step that takes time.
         spacing: px between points of an edge; 12 gives about the paper's number of points.
     """
     truth, focal = nikkor_18_200(), focal_sweep(50)
-    stage("Seeing the board")
+    stage("Generating the lines of the board")
     lines = board_lines(truth, focal, spacing=spacing, noise=_BOARD_NOISE, imperfection=_BENDS, seed=1)
     calibration = calibrate(lines, stage=stage)
     per_mm = np.array([StripedBoard.before(truth).magnification(float(f)) for f in focal])
@@ -108,7 +108,7 @@ def board_experiment(
 
 
 def board_centres(board: Experiment) -> tuple[FrameCentres, tuple[Row, ...]]:
-    """Section 5.1, Figure 7: each photograph's own centre of distortion, and what the paper says of it."""
+    """Repeat Section 5.1, Figure 7: a separate centre of distortion for each photo."""
     centres = fit_frame_centres(compress_any_centre(board.lines))
     gain = 100 * (1 - centres.each.rms / np.sqrt(np.mean(np.asarray(centres.rms_fixed) ** 2)))
     away = np.linalg.norm(np.asarray(centres.each.centre - jnp.asarray(board.lines.centre)[None]), axis=1)
@@ -120,10 +120,10 @@ def board_centres(board: Experiment) -> tuple[FrameCentres, tuple[Row, ...]]:
 
 
 def broadcast_experiment(stage: Callable[[str], None] = lambda _: None) -> Experiment:
-    """Section 5.2: a lens from 55 frames of a broadcast, which then corrects all 841."""
+    """Repeat Section 5.2: a lens fitted to 55 frames of a broadcast, applied to all 841."""
     truth = broadcast_zoom()
     low, high = (float(f) for f in truth.focal_range)
-    stage("Watching the football")
+    stage("Generating the lines of the broadcast")
     lines = broadcast_lines(truth, focal_sweep(55, low, high), noise=_BROADCAST_NOISE, seed=2)
     calibration = calibrate(lines, stage=stage)
     stage("Correcting all 841 frames")
@@ -138,13 +138,13 @@ def broadcast_experiment(stage: Callable[[str], None] = lambda _: None) -> Exper
     return Experiment(lines, truth, calibration, rows)
 
 
-# These leave the paper's residues frame by frame.
+# These give the paper's residuals frame by frame.
 _BOARD_NOISE, _BENDS = 1.46, 0.5  # px, mm
 _BROADCAST_NOISE = 0.557  # px
 
 
 def _residues(calibration: Calibration) -> list[np.ndarray]:
-    """Of each frame, px: without correction, frame by frame, by the zoom polynomial."""
+    """RMS of each frame, px: without correction, frame by frame, with the zoom polynomial."""
     return [
         calibration.none,
         np.asarray(calibration.each.frame_rms),
@@ -169,20 +169,20 @@ def _largest_gain(centres: FrameCentres) -> float:
 def reproduce(
     folder: str | os.PathLike[str], stage: Callable[[str], None] = lambda _: None
 ) -> tuple[Experiment, Experiment]:
-    """Do both experiments, and write reproduce.md, reproduce.json and Figures 5 to 10, as PNG and PDF.
+    """Repeat both experiments, and write reproduce.md, reproduce.json and Figures 5 to 10, as PNG and PDF.
 
     Args:
-        folder: where to; it exists, and is best one of `results_folder`, as files are replaced.
-        stage: called with a sentence before each step that takes time.
+        folder: an existing folder. Files are replaced, so use that of a `results_folder`.
+        stage: called with a description before each step that takes time.
 
     Returns:
-        The experiments.
+        The two experiments.
 
     Raises:
         OSError: the folder cannot be written.
     """
     board = board_experiment(stage)
-    stage("Looking for each frame's centre")
+    stage("Fitting the centre of each frame")
     centres, more = board_centres(board)
     board = dataclasses.replace(board, rows=board.rows + more)
     football = broadcast_experiment(stage)
@@ -218,32 +218,32 @@ FILES = (
     "reproduce.json",
     *(f"figure-{number:02d}.{kind}" for number in range(5, 11) for kind in ("png", "pdf")),
 )
-"""What `reproduce` writes."""
+"""The files that `reproduce` writes."""
 
 _ABOUT = f"""Made by `zoomjax reproduce`. All scenes are synthetic: the paper's images are not public.
-From the paper are the lenses (its fitted polynomials are the truth here), the focal ranges, the sizes of
-images and board, the distance, and the numbers of images. Ours are, in the first experiment, the noise of
-the edges ({_BOARD_NOISE} px) and the bends of the board ({_BENDS} mm RMS, the same in all photographs),
-and in the second the noise ({_BROADCAST_NOISE} px), the camera's place and its sensor, 36 mm wide. They
-leave frame by frame what the paper's did. No edge detector is wrong by that much: most of the paper's
-residue must have been its board, with short waves, which count as noise here, and long ones, which let a
-frame's own model do better than the zoom's."""
+Taken from the paper: the lenses (its fitted polynomials are the truth here), the focal ranges, the sizes of
+images and board, the distance, and the numbers of images. Chosen by us: in the first experiment, the noise
+of the edges ({_BOARD_NOISE} px) and the bends of the board ({_BENDS} mm RMS, the same in all photos); in
+the second, the noise ({_BROADCAST_NOISE} px), the position of the camera and its sensor, 36 mm wide. With
+these the residuals frame by frame are those of the paper. No edge detector has errors that large: most of
+the paper's residual must come from bends of its board. Short bends count as noise here; long bends let the
+separate fit of a frame do better than the zoom model."""
 
 _CAPTIONS = {
-    "figure-05": "Points of the board's edges, and as corrected by the zoom polynomial, at both ends of "
-    "the zoom; the frame around them is the border of the image.",
-    "figure-06": "The same of the broadcast's markings.",
-    "figure-07": "Each frame's own centre of distortion, and by how much it lowers the residue.",
+    "figure-05": "Points of the board's edges, distorted and corrected by the zoom polynomial, at both "
+    "ends of the zoom. The outline is the border of the image.",
+    "figure-06": "The same for the markings of the broadcast.",
+    "figure-07": "The centre of distortion fitted to each frame, and by how much it lowers the residual.",
     "figure-08": "The coefficients frame by frame, and the fitted polynomials.",
-    "figure-09": "Residues of the board: without correction, frame by frame, by the zoom polynomial.",
-    "figure-10": "Residues of the broadcast.",
+    "figure-09": "Residuals of the board: without correction, frame by frame, with the zoom polynomial.",
+    "figure-10": "Residuals of the broadcast.",
 }
 
 
 def _page(board: Experiment, football: Experiment) -> str:
-    """The tables beside the paper's, the polynomials, the figures, and what is synthetic."""
+    """reproduce.md: the tables next to the paper's, the polynomials, the figures, and their origin."""
     parts = [
-        "# The paper's experiments, done again",
+        "# The paper's experiments, repeated",
         _ABOUT,
     ]
     for title, experiment in (("Table 1: the striped board", board), ("Table 2: football", football)):
@@ -253,7 +253,7 @@ def _page(board: Experiment, football: Experiment) -> str:
             f"{len(np.asarray(lines.focal))} images, {len(np.asarray(lines.frame)):,} lines, "
             f"{int(np.asarray(lines.mask).sum()):,} points.",
             "\n".join(
-                ["| residue, RMS | the paper | ours | difference |", "|---|---:|---:|---:|"]
+                ["| residual, RMS | the paper | ours | difference |", "|---|---:|---:|---:|"]
                 + [f"| {' | '.join((row.name, *row.cells()))} |" for row in experiment.rows]
             ),
             "The polynomials, px, of 1/f in 1/mm:",
@@ -265,7 +265,10 @@ def _page(board: Experiment, football: Experiment) -> str:
                 ]
             ),
         ]
-    parts += ["## Where the paper's figures do not agree", "\n".join(f"- {note}" for note in NOTES)]
+    parts += [
+        "## Where the paper's figures contradict each other",
+        "\n".join(f"- {note}" for note in NOTES),
+    ]
     parts += ["## Figures"]
     parts += [
         f"![Figure {int(name[-2:])}]({name}.png)\n\n*Figure {int(name[-2:])}.* {caption}"
@@ -275,7 +278,7 @@ def _page(board: Experiment, football: Experiment) -> str:
 
 
 def _polynomials(experiment: Experiment) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For each coefficient those of ``f^-j``, px, true and fitted."""
+    """For each distortion coefficient the polynomial's coefficients of ``f^-j``, px: true and fitted."""
     truth = experiment.truth
     true = np.asarray(truth.zoom.in_inverse_focal())  # pyright: ignore[reportAttributeAccessIssue]
     order = np.arange(1, true.shape[1] + 1)

@@ -1,10 +1,10 @@
-"""Folders of results: files that appear together, and replace nothing but what zoomjax wrote.
+"""Folders of results: files are published together, and replace only files that zoomjax wrote.
 
-What was written is listed in ``.zoomjax.json`` beside it, with its size and SHA-256. A file that is there
-and is not as listed is somebody's own: it is not replaced unless that is asked for, and never removed.
+The files written are listed in ``.zoomjax.json`` in the same folder, with size and SHA-256. An existing
+file that does not match the list belongs to the user: it is replaced only on request, and never removed.
 
-Results are made in a temporary folder within, then renamed one by one. Before that the list names old and
-new files alike, so that a run that is killed in between leaves nothing that the next would not know.
+Results are made in a temporary folder inside, then renamed one by one. Before that, the list gets the old
+and the new files, so that the next run recognises all files even if this one is killed in between.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ LIST = ".zoomjax.json"
 _LARGEST_LIST = 100_000_000  # bytes
 
 _Prints = list[tuple[int, str]]
-"""Sizes and SHA-256 of what a file may hold: two while results are being replaced."""
+"""Sizes and SHA-256 that a file may have: two while results are being replaced."""
 
 
 @contextlib.contextmanager
@@ -40,20 +40,20 @@ def results_folder(
     clears: Sequence[str] = (),
     overwrite: bool = False,
 ) -> Iterator[Path]:
-    """An empty folder; what the block puts in it appears in `folder`, together, if the block succeeds.
+    """Yield an empty folder, whose files are moved to `folder` together if the block succeeds.
 
-    `folder` is made if it is not there, and tried: better now than after the work. If the block fails, all
-    is as it was before.
+    `folder` is created if it does not exist, and checked for writing before any work. If the block fails,
+    everything is as before.
 
     Args:
-        folder: for the results.
-        names: files that will be written, as far as they are known: relative to `folder`, with slashes.
-        clears: patterns of files that are removed if zoomjax wrote them before and the block does not.
+        folder: the folder for the results.
+        names: files that will be written, as far as known: relative to `folder`, with slashes.
+        clears: patterns of files of an earlier run that are removed unless the block writes them again.
         overwrite: whether to replace files that zoomjax did not write, or that were changed since.
 
     Raises:
-        FileExistsError: there is such a file, and `overwrite` is False; or a folder where a file belongs.
-        OSError: the folder cannot be made or written; the message names it.
+        FileExistsError: such a file exists and `overwrite` is False; or a folder has the name of a file.
+        OSError: the folder cannot be created or written; the message names it.
     """
     folder = Path(folder)
     made = [path for path in (folder, *folder.parents) if not path.exists()]
@@ -62,7 +62,7 @@ def results_folder(
             part = _begun(folder)
             try:
                 with locked(part):
-                    with locked(folder, wait=True):  # or another process's list would be of other files
+                    with locked(folder, wait=True):  # else another process may be changing the list
                         _check(folder, names, overwrite)
                     (part / "new").mkdir()
                     yield part / "new"
@@ -70,14 +70,14 @@ def results_folder(
             finally:
                 shutil.rmtree(part, ignore_errors=True)
         except BaseException:
-            with contextlib.suppress(OSError):  # what is not there or not empty stays as it is
+            with contextlib.suppress(OSError):  # missing or not empty
                 for path in made:
                     path.rmdir()
             raise
 
 
 def _begun(folder: Path) -> Path:
-    """A temporary folder within; both are made."""
+    """Create the folder, and a temporary one inside."""
     last: OSError | None = None
     for _ in range(5):
         try:
@@ -95,7 +95,7 @@ def _begun(folder: Path) -> Path:
 
 
 def _check(folder: Path, names: Iterable[str], overwrite: bool) -> None:
-    """Refuse to go on if something that is not ours is in the way.
+    """Check that no file of the user would be replaced.
 
     Raises:
         FileExistsError: as `results_folder`.
@@ -127,7 +127,7 @@ def _check(folder: Path, names: Iterable[str], overwrite: bool) -> None:
 
 
 def _publish(part: Path, folder: Path, clears: Sequence[str], overwrite: bool) -> None:
-    """Move the new files to their places, and old ones away; all, or after an error none."""
+    """Move the new files into place and remove old ones: all, or after an error none."""
     new = {path.relative_to(part / "new").as_posix(): path for path in sorted(_files(part / "new"))}
     prints = {name: [_print(path)] for name, path in new.items()}
     with locked(folder, wait=True):
@@ -161,7 +161,7 @@ def _publish(part: Path, folder: Path, clears: Sequence[str], overwrite: bool) -
 
 
 class _Moves:
-    """Renaming that is undone if the block fails. What is replaced is kept in `part` until then."""
+    """Renames that are undone if the block fails. Replaced files are kept in `part` until then."""
 
     def __init__(self, part: Path):
         self._old = part / "old"
@@ -177,12 +177,12 @@ class _Moves:
                 self._undo.pop()()
 
     def put(self, path: Path, target: Path) -> None:
-        """Move a file to its place; at no time is none there if one was."""
+        """Move a file into place. An existing file is replaced without a gap."""
         if os.path.lexists(target):
             kept = self._old / str(len(self._undo))
             try:
                 os.link(target, kept, follow_symlinks=False)
-            except (OSError, NotImplementedError):  # a file system without
+            except (OSError, NotImplementedError):  # no hard links
                 os.rename(target, kept)
             self._undo.append(lambda: os.replace(kept, target))
             os.replace(path, target)
@@ -197,7 +197,7 @@ class _Moves:
         self._undo.append(lambda: os.replace(kept, target))
 
     def make_folder(self, target: Path) -> None:
-        """Make a folder, in place of what is none."""
+        """Create a folder, in place of a file if there is one."""
         if _is_folder(target):
             return
         if os.path.lexists(target):
@@ -211,12 +211,12 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _is_folder(path: Path) -> bool:
-    """Whether it is a folder itself, and no link to one."""
+    """Whether the path is a folder, and not a link to one."""
     return path.is_dir() and not path.is_symlink()
 
 
 def _is_one(path: Path, prints: _Prints | None) -> bool:
-    """Whether a file, and no link to one, holds what was written."""
+    """Whether the path is a regular file with the listed content."""
     try:
         state = path.lstat()
         if not prints or not stat.S_ISREG(state.st_mode) or state.st_size not in dict(prints):
@@ -233,7 +233,7 @@ def _print(path: Path) -> tuple[int, str]:
 
 
 def _listed(folder: Path) -> dict[str, _Prints] | None:
-    """What zoomjax wrote, as listed; None if there is something else in the list's place."""
+    """The files in the list; None if the list's file is something else."""
     path = folder / LIST
     if not os.path.lexists(path):
         return {}
@@ -254,7 +254,7 @@ def _listed(folder: Path) -> dict[str, _Prints] | None:
 
 
 def _is_within(name: str) -> bool:
-    """Whether a name of a list stays in its folder, at most one folder down."""
+    """Whether a listed name stays in its folder, at most one level down."""
     path = PurePosixPath(name)
     plain = not path.is_absolute() and ".." not in path.parts and "\\" not in name and ":" not in name
     return plain and "\0" not in name and 1 <= len(path.parts) <= 2
@@ -266,8 +266,8 @@ def _written(files: dict[str, _Prints]) -> str:
 
 @contextlib.contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Interrupts wait until the block is done: it is short."""
-    if threading.current_thread() is not threading.main_thread():  # only that one has to do with signals
+    """Delay interrupts until the (short) block is done."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread handles signals
         yield
         return
     came: list[tuple[signal.Signals, FrameType | None]] = []

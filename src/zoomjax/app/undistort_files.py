@@ -1,4 +1,4 @@
-"""Files in, corrected files out: what ``zoomjax undistort`` does, checked before any work."""
+"""Correction of files: what ``zoomjax undistort`` does. Arguments are checked before any work."""
 
 import dataclasses
 import functools
@@ -24,16 +24,16 @@ from ..models.sizes import at_focal, lens_for_size
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """What to correct.
+    """Settings of a correction.
 
     Attributes:
         lens: file of the lens.
         inputs: photos, or one video.
-        output: file for one input, else a folder.
-        focal: a number, a CSV file, or None for the photos' own.
+        output: file for a single input, else a folder.
+        focal: a number, a CSV file, or None for the photos' EXIF data.
         keep, interpolation, border: as for `undistort_image`; one framing for all photos.
-        hold: whether a track's ends hold.
-        overwrite: whether files that are there may be replaced; never those that are read.
+        hold: whether a track's first and last focal lengths are used beyond its ends.
+        overwrite: whether existing files may be replaced; inputs never are.
     """
 
     lens: Path
@@ -49,11 +49,11 @@ class Job:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What was done.
+    """The result of a correction.
 
     Attributes:
-        sentence: what was written.
-        skipped: why photos were not corrected, by their paths.
+        sentence: a sentence on what was written.
+        skipped: for each photo that was not corrected, by path, the reason.
     """
 
     sentence: str
@@ -61,12 +61,12 @@ class Outcome:
 
 
 def undistort_files(job: Job, progress: Callable[[int, int], None] = lambda done, total: None) -> Outcome:
-    """Do it. Of several photos, those that cannot be corrected are skipped.
+    """Correct photos or a video. Of several photos, those that cannot be corrected are skipped.
 
     Raises:
-        OSError, ValueError: something is wrong with the options, the lens, the table of focal lengths or
-            the targets, found before any work; or as `undistort_video` does, or `undistort_photo` for a
-            single photo. Where a target cannot be written, those before it have been, each whole.
+        OSError, ValueError: the options, the lens, the table of focal lengths or the targets are wrong,
+            checked before any work; or the errors of `undistort_video`, or of `undistort_photo` for a
+            single photo. If a target cannot be written, the files before it are complete.
     """
     check_sampling(job.interpolation, job.border)
     check_keep(job.keep)
@@ -144,11 +144,11 @@ def _photos(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> O
 
 
 _BAD_PHOTO = (ValueError, OSError, MemoryError, cv2.error)
-"""What one photo may raise that is no reason to leave out the others."""
+"""Errors of one photo that do not stop the others."""
 
 
 def _photo_targets(job: Job) -> list[Path]:
-    """Where each photo goes."""
+    """The target of each photo."""
     folder = job.output.is_dir() or job.output.suffix.lower() not in FORMATS
     if not folder and len(job.inputs) > 1:
         raise ValueError(
@@ -161,17 +161,17 @@ def _photo_targets(job: Job) -> list[Path]:
         raise ValueError(f"The output must end in one of {', '.join(FORMATS)}, but it is {job.output}.")
     names: dict[str, Path] = {}
     for path in job.inputs:
-        # Many file systems make no difference between cases, or between ways to write an accent.
+        # Many file systems ignore case, and treat different encodings of an accent alike.
         other = names.setdefault(unicodedata.normalize("NFC", _target_name(path)).casefold(), path)
         if other is not path:
             raise ValueError(
-                f"The photos {other} and {path} have the same name, and would be written to one file."
+                f"The photos {other} and {path} have the same name and would be written to the same file."
             )
     return [job.output / _target_name(path) for path in job.inputs]
 
 
 def _target_name(photo: Path) -> str:
-    """The photograph's own name; PNG, which holds what HEIC does, for what can be read only."""
+    """The photo's name, with the suffix .png for formats that can only be read (HEIC)."""
     return photo.name if photo.suffix.lower() in FORMATS else f"{photo.stem}.png"
 
 
@@ -184,9 +184,9 @@ def _check_targets(job: Job, targets: Sequence[Path]) -> None:
 def _common_keep(
     job: Job, lens: ZoomLens, focal_of: Callable[[Path], float], skipped: dict[Path, Exception]
 ) -> Callable[[tuple[int, int]], str | Framing]:
-    """What to show of a photo of some size: one framing for all, but for their sizes.
+    """The framing for each image size, common to all focal lengths of the photos.
 
-    Photos without a focal length are skipped.
+    Photos without a focal length are added to `skipped`.
     """
     if job.keep == "same":
         return lambda size: job.keep
@@ -211,7 +211,7 @@ def _common_keep(
 
 
 def _photo_focals(job: Job, lens: ZoomLens) -> Callable[[Path], float]:
-    """The focal length of a photo, by the table, the number, or its own account."""
+    """A function giving a photo's focal length: from the table, the number or its EXIF data."""
     if job.focal is None:
         return functools.cache(lambda path: photo_focal(path, lens))
     number = _number(job.focal)
@@ -221,7 +221,7 @@ def _photo_focals(job: Job, lens: ZoomLens) -> Callable[[Path], float]:
 
 
 def _number(text: str) -> float | None:
-    """A focal length; None if it is a file."""
+    """The focal length, or None if the text names a file."""
     number = plain_number(text)
     if number is None and not Path(text).exists() and not text.lower().endswith(".csv"):
         raise ValueError(

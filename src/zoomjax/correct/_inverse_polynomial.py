@@ -1,7 +1,7 @@
-"""The inverse of the radial function as a polynomial: where corrected pixels come from, fast.
+"""The inverse of the radial function as a polynomial, for fast maps of source positions.
 
-Correcting an image asks, for each of millions of pixels at a corrected radius ρ, for the distorted
-radius r with ``r L(r²) = ρ``. Their ratio depends on ``τ = ρ²`` alone and is smooth up to the fold. So
+Correcting an image needs, for each of millions of pixels at a corrected radius ρ, the distorted radius r
+with ``r L(r²) = ρ``. Their ratio depends on ``τ = ρ²`` alone and is smooth up to the fold. So
 once per focal length a polynomial p is fitted to exact pairs (r L(r²), r), which cost no iteration, and
 each pixel costs one evaluation: ``distorted = centre + (corrected - centre) p(τ)``. Where the polynomial is
 not accurate enough it still starts two steps of Newton's method, and where those are not either there is

@@ -1,4 +1,4 @@
-"""Frames of video corrected plane by plane, in the pixel format they come in.
+"""Correction of video frames plane by plane, in their own pixel format.
 
 YUV is not converted to RGB and back, and chroma of 4:2:0 is warped at its own size: half the samples of
 RGB, and no rounding in between. Per frame: the focal length's distortion, one map a sampling (U and V share
@@ -51,8 +51,8 @@ class FrameWarper:
         size = (frame.width, frame.height)
         if size != self._lens.image_size:
             raise ValueError(
-                f"The frame at {frame.time or 0:.3f} s has {size[0]} x {size[1]} px, and those before "
-                f"{self._lens.image_size[0]} x {self._lens.image_size[1]}. Cut the video there."
+                f"The frame at {frame.time or 0:.3f} s has {size[0]} x {size[1]} px, but earlier ones have "
+                f"{self._lens.image_size[0]} x {self._lens.image_size[1]} px. Split the video there."
             )
         name = planar_format(frame.format.name)
         given = frame if frame.format.name == name else frame.reformat(format=name)

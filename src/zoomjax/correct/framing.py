@@ -1,10 +1,10 @@
-"""Which part of the corrected plane an output image shows, and at what scale.
+"""Framing: the part of the corrected plane that an output image shows, and its scale.
 
-Correcting bends the border of an image, so that the result is no rectangle. A framing is an affine map
-from pixels p of the output to corrected points, ``x = origin + p / scale``: with ``keep="same"`` it is the
+Correction bends the border of an image, so the result is not a rectangle. A framing is an affine map from
+pixels p of the output to corrected points, ``x = origin + p / scale``: with ``keep="same"`` it is the
 identity, ``"all"`` shrinks until every pixel of the input is shown, ``"valid"`` enlarges until no pixel
-of the output lies outside of the input. One framing over all focal lengths of a zoom, instead of
-one a frame, keeps a corrected video from breathing.
+of the output lies outside of the input. One framing for all focal lengths of a zoom, instead of one per
+frame, keeps the framing of a corrected video constant while zooming.
 """
 
 from collections.abc import Iterable
@@ -35,8 +35,8 @@ class Framing(eqx.Module):
         scale: output pixels per corrected pixel; above 1 enlarges.
         origin: the corrected point, px, shown at the centre of the output's top-left pixel.
         size: (width, height) of the output, px.
-        image_size: (width, height) px of the distorted images that it was made for; None for a framing of
-            your own, which is taken as it is meant.
+        image_size: (width, height) px of the distorted images that it was made for; None for a user-defined
+            framing, which is used without checks.
 
     Example:
         >>> import numpy as np
@@ -63,23 +63,23 @@ def frame_output(
     keep: str = "same",
     size: tuple[int, int] | None = None,
 ) -> Framing:
-    """One framing for the corrected images of one distortion, of several, or of a whole zoom range.
+    """Choose one framing for the corrected images of one distortion, of several, or of a whole zoom range.
 
     Args:
-        distortions: those of the images; of a `ZoomLens`, 65 focal lengths spread evenly in 1/f over
-            the fitted range.
-        image_size: (width, height) px of the distorted images. A `ZoomLens` for others is scaled.
+        distortions: the distortions of the images, or a `ZoomLens` for 65 focal lengths spread evenly in
+            1/f over the fitted range.
+        image_size: (width, height) px of the distorted images. A `ZoomLens` for another size is scaled.
         keep: "same" for the geometry of the input, "all" to show every pixel of every input, "valid" to
-            show nothing beyond any input's border. Where a lens folds (see `Distortion.monotone_radius`)
-            only what lies within the fold counts.
+            show nothing beyond any input's border. Where a lens folds (see `Distortion.monotone_radius`),
+            only the part within the fold is used.
         size: (width, height) px of the output; by default `image_size`.
 
     Raises:
-        ValueError: a size or `keep` is not one of those, there is no distortion, one is that of images of
-            another size or aspect ratio, or ("valid") nothing is seen in all the images.
+        ValueError: a size or `keep` is not valid, there is no distortion, one is for images of another size
+            or aspect ratio, or ("valid") the images have no common part.
 
-    Warns:
-        UserWarning: the lens is for images of another size, and was scaled.
+        Warns:
+        UserWarning: the lens is for images of another size, so it was scaled.
 
     Example:
         >>> d = Distortion(np.array([0.1]), np.array([319.5, 239.5]), np.array(400.0))
@@ -143,9 +143,9 @@ def check_framing(framing: Framing, image_size: tuple[int, int], name: str) -> N
 
 
 def framing_for_size(framing: Framing, image_size: tuple[int, int]) -> Framing:
-    """The same framing for images that show the same view with more or fewer pixels.
+    """The same framing for images of the same view with more or fewer pixels.
 
-    A framing of your own, which does not tell the size of its images, is left as it is.
+    A user-defined framing without an image size is returned unchanged.
 
     Raises:
         ValueError: the images have another aspect ratio.

@@ -1,4 +1,4 @@
-"""Corrected images, with OpenCV: a map of source positions, made cheaply, and `cv2.remap`.
+"""Correction of images with OpenCV: a map of source positions, made cheaply, and `cv2.remap`.
 
 Per image: the polynomial for the inverse radial function (`_inverse_polynomial.fit_inverse`), or the exact
 inverse where that is not accurate to 0.01 px; one pass over the output's pixels for the map; one
@@ -55,33 +55,34 @@ def undistort_image(
     border: str = "constant",
     border_value: float | int | Sequence[float | int] = 0,
 ) -> np.ndarray:
-    """The image that a lens without distortion would have taken.
+    """Correct an image: the image that a lens without distortion would have taken.
 
     Args:
         image: grey, or with any number of channels; boolean, integer of up to 32 bits, or floating.
             It may be a strided view.
-        distortion: of this image, in its pixels; or a lens, which is scaled to images of another size of
-            the same aspect ratio.
-        focal: with a lens, its focal length.
-        keep: what part to show, "same", "all" or "valid", or a `Framing` from `frame_output`, which
-            also tells the scale, and serves many images of one size alike.
+        distortion: the distortion of this image, in its pixels; or a lens, which is scaled to images of
+            another size with the same aspect ratio.
+        focal: the focal length, if a lens is given.
+        keep: the part to show, "same", "all" or "valid"; or a `Framing` from `frame_output`, which also
+            gives the scale and can be used for many images of one size.
         size: (width, height) px of the result; by default the image's. Not with a `Framing`.
         interpolation: "nearest", "linear", "cubic" or "lanczos".
-        border: what lies beyond the image: "constant", "replicate" or "reflect".
-        border_value: for "constant": one number, or one a channel. It also fills, whatever `border`, pixels
+        border: fill outside of the image: "constant", "replicate" or "reflect".
+        border_value: for "constant": one number, or one per channel. With any `border` it also fills pixels
             without a counterpart because the lens folds.
 
     Returns:
         The dtype and channels of the image. Positions are those of `Distortion.distort` to 0.01 px.
 
     Raises:
-        ValueError: an argument is none of the above, channels are first, a side is longer than 32766 px,
-            the framing was made for images of another size, or the distortion is plainly that of such,
-            by its centre and scale. With a `Framing` of your own the distortion is taken as it is.
+        ValueError: an argument is not one of the above, channels are first, a side is longer than 32766 px,
+            or the framing, or by its centre and scale the distortion, is for images of another size. With a
+            user-defined `Framing` the distortion is not checked.
 
-    Warns:
-        UserWarning: the lens folds within the image: what lies beyond cannot be corrected; or it is for
-            images of another size, and was scaled.
+        Warns:
+        UserWarning: the lens folds within the image, and the part beyond the fold cannot be corrected; or
+        the
+            lens is for images of another size, so it was scaled.
 
     Example:
         >>> import numpy as np
@@ -243,7 +244,7 @@ def warn_of_fold(distortion: Distortion, image_size: tuple[int, int], stacklevel
         return False
     warnings.warn(
         f"The lens is not invertible on this image: its distortion folds {limit:.0f} px from the "
-        f"centre, and the farthest corner is {corner:.0f} px from it. What lies beyond the fold is left "
+        f"centre, and the farthest corner is {corner:.0f} px from it. The part beyond the fold is left "
         "out, and pixels without a counterpart get the border value. Fit the lens to lines that reach the "
         "corners, or with fewer terms.",
         stacklevel=stacklevel,

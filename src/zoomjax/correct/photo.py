@@ -1,7 +1,7 @@
-"""Photographs from file to file, corrected at the focal length in their EXIF data, metadata kept.
+"""Correction of photo files at the focal length in their EXIF data, with their metadata.
 
-Pixels are taken as they are stored, before the orientation tag turns them: that is how the lens saw them.
-The tag goes over with the other metadata, so that the result is shown the same way up.
+Pixels are used as stored, before rotation by the orientation tag, because the lens model refers to these.
+The tag is copied with the other metadata, so that the result is shown the same way up.
 """
 
 import os
@@ -42,25 +42,25 @@ def undistort_photo(
     interpolation: str = "linear",
     border: str = "constant",
 ) -> None:
-    """Correct a photograph into a new file, with its metadata.
+    """Correct a photo and write it to a new file, with its metadata.
 
     Args:
-        source: the photograph: JPEG, PNG, WebP, TIFF, BMP, or HEIC with the extra ``heic``. All its bits
-            and channels are kept.
-        target: the file to write, all of it or none. Its suffix tells the format; JPEG in quality 97.
+        source: the photo: JPEG, PNG, WebP, TIFF, BMP, or HEIC with the extra ``heic``. All its bits and
+            channels are kept.
+        target: the file to write, completely or not at all. Its suffix sets the format; JPEG in quality 97.
         lens: the lens; for another size of the same aspect ratio it is scaled.
-        focal: in the lens's unit; by default what the EXIF data say.
+        focal: focal length in the lens's unit; by default that in the EXIF data.
         keep: as for `undistort_image`; a `Framing` for images of another size is scaled as the lens is.
         interpolation, border: as for `undistort_image`.
 
     Raises:
-        FileNotFoundError: there is no such photograph.
+        FileNotFoundError: there is no such photo.
         OSError: the target cannot be written; nothing is left of it.
-        ValueError: the photograph cannot be decoded, tells no focal length, or has another aspect ratio
-            than the lens; or the target is the photograph itself, its suffix is unknown, or its format does
-            not hold such pixels.
+        ValueError: the photo cannot be decoded, has no focal length, or has another aspect ratio than the
+            lens; or the target is the photo itself, its suffix is unknown, or its format cannot store such
+            pixels.
 
-    Warns:
+        Warns:
         UserWarning: as `undistort_image` and `ZoomLens` do; or metadata are lost, as in BMP files.
     """
     target = Path(target)
@@ -121,7 +121,7 @@ def corrected_photo(
     )
     if metadata and suffix in _NO_METADATA:
         warnings.warn(
-            f"Metadata of {os.fspath(source)} are not kept: BMP files hold none.",
+            f"Metadata of {os.fspath(source)} are not kept: BMP files cannot store metadata.",
             stacklevel=3,
         )
     return _encoded(corrected, suffix, metadata)

@@ -1,8 +1,8 @@
-"""Zooming video, corrected frame by frame at each frame's own focal length, with PyAV.
+"""Correction of zooming video with PyAV, each frame at its own focal length.
 
 Decoding, warping (`_planes`) and encoding overlap in three threads with a few frames between them, so that
-memory stays flat. Frame times, frame rate, colour description, orientation and tags go over unchanged, and
-audio packets as they are.
+memory use stays constant. Frame times, frame rate, colour description, orientation, tags and audio packets
+are copied unchanged.
 """
 
 import dataclasses
@@ -30,12 +30,12 @@ from .image import check_sampling, warn_of_fold
 
 @dataclasses.dataclass(frozen=True)
 class CorrectedVideo:
-    """What `undistort_video` did.
+    """Result of `undistort_video`.
 
     Attributes:
-        frames: frames written.
-        lost: frames that the file announces but that do not decode, or only with errors.
-        scale: output pixels per corrected pixel, of all frames.
+        frames: number of frames written.
+        lost: number of announced frames that cannot be decoded, or only with errors.
+        scale: output pixels per corrected pixel, the same for all frames.
     """
 
     frames: int
@@ -56,30 +56,31 @@ def undistort_video(
     options: dict[str, str] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> CorrectedVideo:
-    """Correct a video, each frame at its own focal length, into a new file.
+    """Correct a video, each frame at its own focal length, and write it to a new file.
 
     Args:
-        source: the video. Its frames are taken as they are stored, before any rotation for display.
-        target: the file to write, all of it or none: .mp4, .mov, .m4v, .mkv, .webm, .avi, .ts.
+        source: the video. Its frames are used as stored, before any rotation for display.
+        target: the file to write, completely or not at all: .mp4, .mov, .m4v, .mkv, .webm, .avi, .ts.
         lens: the lens; for frames of another size of the same aspect ratio it is scaled.
         focal: one focal length for all frames, or a track, in the lens's unit.
         keep: "same", "all" or "valid", one framing for all focal lengths of the track; or a `Framing`,
             which for frames of another size is scaled as the lens is.
         interpolation, border: as for `undistort_image`; a constant border is black.
-        encoder: FFmpeg's name of it; by default one for the source's own format, or for H.264.
-        options: of the encoder; by default ones for a quality that shows no difference.
-        progress: called after each frame with the number of frames done, and announced (0 if unknown).
+        encoder: FFmpeg's name of the encoder; by default one for the source's own format, or for H.264.
+        options: options of the encoder; by default for visually lossless quality.
+        progress: called after each frame with the number of frames done and announced (0 if unknown).
 
     Raises:
         FileNotFoundError: there is no such video.
         OSError: the target cannot be written; nothing is left of it.
-        ValueError: the source is no video, or none of its frames decodes; the track is shorter; the lens is
-            for another aspect ratio; or the target is the source, or its suffix or the encoder is unknown,
-            or not for these frames.
+        ValueError: the source is not a video, or none of its frames can be decoded; the track is shorter;
+        the
+            lens is for another aspect ratio; or the target is the source, or its suffix or the encoder is
+            unknown, or not suitable for these frames.
 
-    Warns:
-        UserWarning: frames do not decode, or are interlaced; focal lengths are outside of the fitted range;
-            the lens was made for another size, or folds within the frames.
+        Warns:
+        UserWarning: frames cannot be decoded, or are interlaced; focal lengths are outside of the fitted
+            range; the lens is for another size, or folds within the frames.
     """
     target = Path(target)
     if target.suffix.lower() not in CONTAINER:
@@ -111,8 +112,8 @@ def undistort_video(
     lost = max(report.corrupt, report.announced - report.written if report.announced else 0)
     if lost:
         warnings.warn(
-            f"{lost} of {max(report.announced, report.written)} frames of {os.fspath(source)} do not "
-            f"decode ({report.error or 'the file ends early'}): {report.written} were written.",
+            f"{lost} of {max(report.announced, report.written)} frames of {os.fspath(source)} cannot "
+            f"be decoded ({report.error or 'the file ends early'}): {report.written} were written.",
             stacklevel=2,
         )
     return CorrectedVideo(report.written, lost, float(framing.scale))
@@ -187,7 +188,7 @@ def _write(
         if isinstance(item, av.VideoFrame):
             break
     else:
-        raise ValueError(f"Cannot read a video from {input_.name}: none of its frames decodes.")
+        raise ValueError(f"Cannot read a video from {input_.name}: none of its frames can be decoded.")
     with FrameWriter(
         part, target, input_, video, early[-1], encoder, options, report.orientation
     ) as writer:

@@ -1,4 +1,4 @@
-"""Corrected images in JAX: differentiable with respect to the image and to the lens.
+"""Correction of images in JAX, differentiable with respect to the image and the lens.
 
 Each output pixel shows the distorted position of a corrected point, and mixes the 2 x 2 (bilinear) or 4 x 4
 (bicubic) pixels around it. Positions are those of `Distortion.distort`, from Newton's method on all pixels
@@ -43,25 +43,25 @@ def warp_image(
     interpolation: str = "linear",
     border_value: float | int = 0,
 ) -> Num[Array, "out_height out_width *channels"]:
-    """The corrected image, as a differentiable function of the image and the distortion.
+    """Correct an image, differentiably with respect to the image and the distortion.
 
     ``jax.vmap`` it over images, distortions or both.
 
     Args:
         image: grey, or with channels last. Integers are computed in float32, rounded and clipped.
-        distortion: of this image, in its pixels. May be traced.
-        framing: what part to show (`frame_output`); by default the geometry of the input.
+        distortion: the distortion of this image, in its pixels. May be traced.
+        framing: the part to show (`frame_output`); by default the geometry of the input.
         interpolation: "linear", or "cubic" (Catmull-Rom's kernel, a = -0.5; OpenCV's has a = -0.75).
-        border_value: beyond the image, and where the distortion has no inverse: a lens that folds shows
-            nothing beyond its fold (see `Distortion.has_inverse`).
+        border_value: value outside of the image, and where the distortion has no inverse, which is beyond
+            the fold of a lens (see `Distortion.has_inverse`).
 
     Returns:
         An image of the same dtype and channels.
 
     Raises:
         ValueError: the image has no pixels, or its channels first; `interpolation` is unknown; the
-            distortion is plainly that of images of another size (not under ``jit`` or ``vmap``), or is
-            none; or the framing was made for images of another size.
+            distortion is not a `Distortion`, or is for images of another size (not checked under ``jit`` or
+            ``vmap``); or the framing was made for images of another size.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -139,7 +139,7 @@ def sample_positions(
 
 
 def _exact_positions(distortion, framing, dtype):
-    """The same by the inverse of each pixel by itself, for families that are not radial."""
+    """The same by a separate inverse for each pixel, for distortion models that are not radial."""
     width, height = framing.size
     pixels = jnp.stack(jnp.meshgrid(jnp.arange(width), jnp.arange(height)), axis=-1).astype(dtype)
     positions = distortion.distort(

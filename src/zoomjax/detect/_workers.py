@@ -1,8 +1,8 @@
-"""Processes that do one task at a time: one that dies, hangs or eats memory costs its task, and no other.
+"""Processes for one task at a time: a crash, a hang or a lack of memory costs one task only.
 
-Decoders are C code and files are anybody's. `concurrent.futures` gives up at the first process that dies
-and has no limit of time; pools whose processes share a pipe and its locks (pebble's) can wait for ever for
-a lock that died with its holder. Here each process has a pipe of its own, and a thread that waits at it.
+Decoders are C code, and files are not trusted. `concurrent.futures` gives up at the first process that dies
+and has no time limit. Pools whose processes share a pipe and its locks (pebble's) can wait for ever for a
+lock whose holder died. Here each process has its own pipe, and a thread that waits for it.
 """
 
 import concurrent.futures
@@ -33,9 +33,9 @@ class Workers:
     """Processes, begun with their first items, and ended with the block that they serve."""
 
     def __init__(self, task: Callable[[Any], Any], number: int, seconds: float):
-        """What they do with an item; how many they are, at most; and the time that they may take for it.
+        """Set the task, the largest number of processes, and the time limit per item.
 
-        Of the task, items and results, pickles are sent.
+        Task, items and results are sent as pickles.
         """
         self._task, self._seconds = task, seconds
         self._threads = concurrent.futures.ThreadPoolExecutor(number, "worker", _leave_interrupts)
@@ -46,7 +46,7 @@ class Workers:
     def submit(self, item: Any) -> concurrent.futures.Future:
         """A future of ``task(item)``, computed in a process.
 
-        It raises `LostError` if the process dies, or takes too long; `RuntimeError` if none can be begun.
+        It raises `LostError` if the process dies or takes too long, `RuntimeError` if none can be started.
         """
         return self._threads.submit(self._do, item)
 
@@ -64,28 +64,28 @@ class Workers:
             process.close()
 
     def _do(self, item: Any) -> Any:
-        """In a thread: the result from this thread's process, or from a new one should it die.
+        """In a thread: the result from this thread's process, or from a new one if it dies.
 
-        A process may be ended for the memory that another took: so a task is tried once more.
+        A process may be killed because another took the memory, so a task is tried twice.
         """
         for last in (False, True):
             connection = self._connection()
             try:
                 connection.send(item)
                 if not connection.poll(self._seconds):
-                    raise LostError(f"looking at it took more than {self._seconds:.0f} s")
+                    raise LostError(f"detection took more than {self._seconds:.0f} s")
                 return connection.recv()
             except (EOFError, OSError) as error:
                 code = self._discard()
                 if last:
-                    raise LostError(f"the process that looked at it was ended {_how(code)}") from error
+                    raise LostError(f"the detection process ended {_how(code)}") from error
             except BaseException:
                 self._discard()
                 raise
         raise AssertionError
 
     def _connection(self) -> Connection:
-        """To this thread's process, which is begun and ready."""
+        """The connection to this thread's process, started and ready."""
         if getattr(self._own, "process", None) is not None:
             return self._own.connection
         for _ in range(_STARTS):
@@ -95,8 +95,8 @@ class Workers:
                     return connection
             self._discard()
         raise RuntimeError(
-            "A process that looks at images cannot be started, perhaps for want of memory. Try again with "
-            "fewer of them."
+            "A detection process cannot be started, perhaps because memory is short. Try again with fewer "
+            "processes."
         )
 
     def _begun(self) -> Connection:
@@ -105,7 +105,7 @@ class Workers:
         process = context.Process(target=_serve, args=(theirs, self._task, self._seconds), daemon=True)
         with self._lock:
             if self._closed:
-                raise LostError("it is not wanted any more")
+                raise LostError("detection was cancelled")
             process.start()
             self._processes.add(process)
         theirs.close()  # so that its end is seen here when the process ends
@@ -113,7 +113,7 @@ class Workers:
         return connection
 
     def _discard(self) -> int | None:
-        """End this thread's process, and tell its exit code."""
+        """End this thread's process, and return its exit code."""
         process, self._own.process = self._own.process, None
         self._own.connection.close()
         process.join(1.0)  # it may be dying: its own exit code tells more than that of the kill
@@ -141,11 +141,11 @@ def _how(code: int | None) -> str:
         name = signal.Signals(-code).name
     except ValueError:
         name = f"signal {-code}"
-    return f"by {name}: it is damaged, or takes too much memory"
+    return f"by {name}: the image is damaged, or takes too much memory"
 
 
 def _serve(connection: Connection, task: Callable[[Any], Any], seconds: float) -> None:
-    """What a process does: a task, until there are no more items or the other end is gone."""
+    """The loop of a process: do tasks until there are no more items or the other end is closed."""
     _confine()
     connection.send(True)
     while True:
@@ -161,10 +161,10 @@ def _serve(connection: Connection, task: Callable[[Any], Any], seconds: float) -
 
 
 def _confine() -> None:
-    """Let this process harm nobody: one core, half of the memory, no core dumps, nothing on the terminal.
+    """Restrict this process: one core, half of the memory, no core dumps, no terminal output.
 
-    What decoders print names no file, and is of no use. On Linux this process is the first to be ended
-    when memory runs out.
+    Messages of decoders do not name the file, so they are dropped. On Linux this process is the first to be
+    killed when memory runs out.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)

@@ -1,7 +1,7 @@
-"""Lines in many images: over processes, with a cache, one bad image at a time reported and passed over.
+"""Detection in many images: in several processes, with a cache. Bad images are reported and skipped.
 
-Only points are kept of an image, and of these no more than one every `_SPACING` px of a line: detectors
-smooth over some px, so that nearer neighbours share their noise and say little more.
+Only points are kept, at most one every `_SPACING` px of a line: detectors smooth over some px, so that
+closer neighbours share their noise and add little information.
 """
 
 import collections
@@ -37,21 +37,21 @@ _SPACING = 4.0
 _SMALLEST = 32
 
 _SECONDS = 300.0
-"""That an image may take: the largest that is read, on a slow machine, takes less."""
+"""Time limit for an image: the largest that is accepted takes less, on a slow machine."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Detection:
-    """What one image showed.
+    """The result of detection in one image.
 
     Attributes:
-        name: of the image.
+        name: name of the image.
         file: the image's path, or its name if it has none.
         image_size: (width, height) px; (0, 0) if it could not be read.
         lines: for each line an (n, 2) array of points, px.
-        focal: the focal length that the image itself or the video's track tells, or None.
-        nodes: (row, column, 2) px, of the checkerboard or grid of dots in it, if that was looked for and
-            is there: NaN where a dot is not seen.
+        focal: the focal length from the image's EXIF data or the video's track, or None.
+        nodes: (row, column, 2) px, the nodes of a checkerboard or grid of dots, if one was searched for and
+            found: NaN where a dot is not seen.
         problem: why the image cannot be used; empty if it can.
     """
 
@@ -72,16 +72,16 @@ def detect(
     workers: int = 0,
     cache: Path | None = None,
 ) -> Generator[Detection, None, None]:
-    """The lines in each image, in order.
+    """Detect lines in each image, in order.
 
     Args:
         sources: the images.
-        detector: what finds lines.
-        grid: where to look for a grid, too, whose nodes tell the focal length: in "all" images, those
-            "without focal length" of their own, or "none".
-        workers: number of processes. An image that ends one, or takes longer than five minutes, is one
-            with a problem. 0: this one looks, and has no such protection.
-        cache: folder of what was found before in the same images by the same detector; None: no cache.
+        detector: the detector of lines.
+        grid: where to search also for a grid, from whose nodes the focal length can be estimated: in "all"
+            images, those "without focal length", or "none".
+        workers: number of processes. An image that crashes a process, or takes longer than five minutes, is
+            reported as a problem. 0: detect in this process, without this protection.
+        cache: folder of cached detections by the same detector; None: no cache.
     """
     task = functools.partial(_detected, detector=detector, grid=grid)
     with contextlib.ExitStack() as stack:
@@ -101,13 +101,15 @@ def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detec
     found = functools.partial(Detection, source.name, source.file)
     try:
         image, focal = source.read()
-    except Exception as error:  # whatever it is, it is one image's
+    except Exception as error:  # any error concerns this image only
         return found(problem=_sentence(error))
     size = (image.shape[1], image.shape[0])
     if min(size) < _SMALLEST:
         return found(problem=f"it is {size[0]}x{size[1]} px: at least {_SMALLEST} px a side are needed")
     if isinstance(detector, PitchDetector) and image.ndim == 2:
-        return found(size, problem=f"it is grey, and grass is told by its colour. {_ANOTHER}")
+        return found(
+            size, problem=f"it is grey, but the pitch detector finds grass by its colour. {_ANOTHER}"
+        )
     try:
         focal = source.focal if focal is None else focal
         wanted = grid == "all" or (grid == "without focal length" and focal is None)
@@ -120,18 +122,18 @@ def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detec
 
 
 def _sentence(error: Exception) -> str:
-    """What an error says, without the numbers of the operating system and a full stop."""
+    """The message of an error, without the error numbers of the operating system and a full stop."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     if isinstance(error, MemoryError) or getattr(error, "code", 0) == cv2.Error.StsNoMem:
-        return "it takes more memory than there is"
+        return "there is not enough memory for it"
     return " ".join(str(error).split()).rstrip(".")
 
 
 _ANOTHER = "Try another detector, such as edges (argument detector)"
 
 _NO_LINES = (
-    "no lines were found. Is what should be straight in focus, well lit and large in the image? Or: "
+    "no lines were found. Check that straight edges are in focus, well lit and large in the image. "
     + _ANOTHER
 )
 
@@ -156,7 +158,7 @@ def _finished(file: Path | None, source: Source, result: Future | Detection) -> 
 
 @functools.cache
 def _code() -> bytes:
-    """The source of everything that detects: what it found before is of no use once it has changed."""
+    """Digest of the detection code: cached detections are invalid once it has changed."""
     folder = Path(__file__).parent
     files = [*sorted(folder.glob("*.py")), *sorted(folder.with_name("io").glob("*.py"))]
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).digest()
@@ -166,7 +168,7 @@ def _key(source: Source, detector: AbstractDetector, grid: str) -> str:
     digest = hashlib.sha256(_code() + cv2.__version__.encode() + repr((detector, grid)).encode())
     try:
         digest.update(source.digest())
-    except (OSError, ValueError) as error:  # told when it is read
+    except (OSError, ValueError) as error:  # reported when it is read
         digest.update(repr(error).encode())
     return digest.hexdigest()
 
@@ -192,7 +194,7 @@ def _save(detection: Detection, file: Path) -> None:
 
 
 def _load(file: Path, source: Source) -> Detection | None:
-    """What was found before, under the image's present name; None if nothing was."""
+    """The cached detection, with the image's present name; None if there is none."""
     try:
         with file.open("rb") as opened, np.load(opened, allow_pickle=False) as stored:
             points, nodes = np.asarray(stored["points"], float), np.asarray(stored["nodes"], float)
@@ -204,7 +206,7 @@ def _load(file: Path, source: Source) -> Detection | None:
         )
         if not sound or nodes.ndim != 3 or nodes.shape[2] != 2:
             return None
-    except Exception:  # whatever is wrong with it, it can be found again
+    except Exception:  # a damaged entry: detect again
         return None
     return Detection(
         name=source.name,

@@ -1,10 +1,9 @@
-"""The borders of stripes, squares and whatever else has straight edges.
+"""Detection of straight edges, such as the borders of stripes and squares.
 
-As in the paper's first experiment: sub-pixel edges (`_edge_points`), linked into smooth pieces
-(`_segments`), pieces of one border joined by arcs (`_joining`), and then what arcs cannot tell: the
-distortion of the frame is estimated from the longest borders (`_frame_model`), in the corrected image every
-border is a straight line, and each takes all pieces that lie on it. That is done twice. Both edges of a
-stripe are lines of their own.
+As in the paper's first experiment, sub-pixel edges (`_edge_points`) are linked into smooth pieces
+(`_segments`), and pieces of one border are joined by arcs (`_joining`). Then the distortion of the frame is
+estimated from the longest borders (`_frame_model`). In the corrected image every border is a straight line,
+and all pieces that lie on it are added. This is done twice. The two edges of a stripe are separate lines.
 """
 
 import cv2
@@ -20,10 +19,10 @@ _LONG = 0.2
 """Share of the image's shorter side that a border must extend over to inform the frame's distortion."""
 
 _LEAST_LINES = 3
-"""With fewer long borders a frame says too little of its distortion."""
+"""Number of long borders needed to estimate the distortion of a frame."""
 
 _ENOUGH = 100
-"""Points that tell how a line runs."""
+"""Number of points that represent a line."""
 
 _LEAST_TOLERANCE = 0.5
 _GREATEST_TOLERANCE = 2.0
@@ -31,10 +30,10 @@ _GREATEST_TOLERANCE = 2.0
 
 
 class EdgeDetector(AbstractDetector):
-    """Finds the straight borders in an image: of stripes, of the squares of a board, of anything.
+    """Detects straight edges in an image: borders of stripes, squares of a board, or anything straight.
 
-    Thresholds follow the image's own noise and contrast. Pieces of one border are one line, whatever
-    crosses it, and whichever of its sides is the brighter.
+    Thresholds adapt to the noise and contrast of the image. Pieces of one border become one line, also
+    across occlusions and changes of which side is brighter.
 
     Attributes:
         least_length: share of the image's shorter side that a line must extend over, 0 to 1.
@@ -58,7 +57,7 @@ class EdgeDetector(AbstractDetector):
                 raise ValueError(f"Argument {name} must be 0 to 1, but it is {getattr(self, name)}.")
 
     def __call__(self, image: np.ndarray) -> list[np.ndarray]:
-        """Sub-pixel points on the borders in an image, the longest line first.
+        """Detect edges with sub-pixel points, the longest line first.
 
         Args:
             image: (height, width[, 3]), uint8, grey or BGR, at least 32 px a side.
@@ -67,7 +66,7 @@ class EdgeDetector(AbstractDetector):
             For each line an (n, 2) array of ``(x, y)``, px, in order along the line.
 
         Raises:
-            ValueError: the image is none.
+            ValueError: the image is not such an array.
         """
         grey = as_grey(image)
         size = (grey.shape[1], grey.shape[0])

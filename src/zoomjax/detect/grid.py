@@ -1,4 +1,4 @@
-"""Lines from flat grids, checkerboards and dots, whose numbers of rows and columns need not be known.
+"""Detection of flat grids, checkerboards and dots, of unknown numbers of rows and columns.
 
 Checkerboards: OpenCV's sector-based search lets a board grow from a small start while corners are found.
 How far it gets depends on the scale of the image, so it runs at several and the largest board counts; its
@@ -52,13 +52,13 @@ _SEEDS = 9
 
 
 class GridDetector(AbstractDetector):
-    """Every row and every column of a checkerboard's inner corners, or of a grid of dots, as a line.
+    """Detects rows and columns of a checkerboard's inner corners, or of a grid of dots, as lines.
 
-    Checkerboards, dark dots and bright dots are searched for, and the grid of most nodes counts: one an
+    Checkerboards, dark dots and bright dots are searched for, and the grid with most nodes is used: one per
     image, of any size.
 
     Attributes:
-        fewest: rows and columns that a grid must have to count, at least 3.
+        fewest: smallest number of rows and of columns of a grid, at least 3.
 
     Example:
         >>> import numpy as np
@@ -244,7 +244,7 @@ def _centroids(grey: np.ndarray, label: np.ndarray, number: int, across: float) 
     own = np.where(label > 0, label, wider).ravel()
     depth = np.bincount(own, np.where(label > 0, contrast, 0).ravel(), number + 1)
     depth /= np.maximum(np.bincount(label.ravel(), minlength=number + 1), 1)
-    # Below a tenth of its depth a spot is not told from noise.
+    # Below a tenth of its depth a spot cannot be distinguished from noise.
     weight = np.maximum(contrast.ravel() - 0.1 * depth[own], 0)
     y, x = (axis.ravel() for axis in np.indices(grey.shape))
     total = np.maximum(np.bincount(own, weight, number + 1), 1e-9)

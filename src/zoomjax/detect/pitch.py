@@ -1,9 +1,9 @@
-"""The white markings of a pitch: the straight lines in broadcast football.
+"""Detection of the white markings of a pitch: the straight lines in broadcast football.
 
-Grass first (`_grass`), then the middles of white ridges on it (`_ridge_points`), linked into smooth pieces
-(`_segments`), and the pieces of one marking joined where players stand on it (`_joining`). Circles on a
-pitch are ellipses in the image, and their flattest parts are almost straight: what bends more than a lens
-bends a line is none.
+First the grass is found (`_grass`), then the middles of white ridges on it (`_ridge_points`). These are
+linked into smooth pieces (`_segments`), and the pieces of one marking are joined across players
+(`_joining`). Circles on a pitch are ellipses in the image, and their flattest parts are almost straight. So
+curves that bend more than lens distortion can explain are rejected.
 """
 
 import numpy as np
@@ -33,11 +33,11 @@ _LEAST_COVER = 0.4
 
 
 class PitchDetector(AbstractDetector):
-    """Finds the straight white markings on the grass of a pitch, in colour images of broadcast football.
+    """Detects the straight white markings on the grass of a pitch, in colour images of broadcast football.
 
     Points are in the middle of the markings, which may be up to 2 % of the image's shorter side
-    wide. Circles and arcs, players, goals, boards and captions are left out; a marking that a player
-    interrupts is one line. Thresholds follow the grass of each image.
+    wide. Circles and arcs, players, goals, boards and captions are left out; a marking interrupted by a
+    player is one line. Thresholds adapt to the grass of each image.
 
     Attributes:
         least_length: share of the image's diagonal that a line must extend over, 0 to 1.
@@ -61,7 +61,7 @@ class PitchDetector(AbstractDetector):
             raise ValueError(f"Argument least_length must be 0 to 1, but it is {self.least_length}.")
 
     def __call__(self, image: UInt8[np.ndarray, "height width *channels"]) -> list[np.ndarray]:
-        """Sub-pixel points in the middle of the markings in an image, the longest line first.
+        """Detect markings with sub-pixel points in their middle, the longest line first.
 
         Args:
             image: (height, width, 3), uint8 BGR, at least 32 px a side.
@@ -70,7 +70,7 @@ class PitchDetector(AbstractDetector):
             For each line an (n, 2) array of ``(x, y)``, px, in order along the line; none without grass.
 
         Raises:
-            ValueError: the image is none, or not in colour.
+            ValueError: the image is not such an array, or not in colour.
         """
         _check(image)
         grass = find_grass(image)
@@ -91,7 +91,7 @@ def _check(image) -> None:
     as_grey(image)
     if image.ndim != 3:
         raise ValueError(
-            "Argument image must be a colour image (height, width, 3), blue, green, red, as grass is told "
+            "Argument image must be a colour image (height, width, 3), blue, green, red, as grass is found "
             f"by its colour, but its shape is {image.shape}."
         )
 

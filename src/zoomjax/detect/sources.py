@@ -1,4 +1,4 @@
-"""Where images come from: photographs, folders and patterns of names, and the frames of a video."""
+"""Sources of images: photos, folders and patterns of names, and the frames of a video."""
 
 import dataclasses
 import glob
@@ -84,14 +84,14 @@ def as_bytes(image: np.ndarray) -> UInt8[np.ndarray, "height width *channels"]:
 
 
 def find_photos(inputs: Iterable[str | os.PathLike[str]]) -> list[Source]:
-    """The photographs among files, folders (and the folders in them) and patterns like ``shots/*.jpg``.
+    """Find photos in files, folders (also nested ones) and patterns like ``shots/*.jpg``.
 
-    In a folder, what else is in it does not matter, and the results of a calibration are passed over; of
-    a pattern, only photographs and folders count.
+    Other files in a folder, and the results of a calibration, are ignored; of a pattern, only photos and
+    folders are used.
 
     Raises:
         FileNotFoundError: an input does not exist, or no file fits a pattern.
-        ValueError: an input is no photograph, a folder holds none, or one comes twice.
+        ValueError: an input is not a photo, a folder has none, or a photo is given twice.
     """
     paths: list[Path] = []
     for given in inputs:
@@ -111,7 +111,7 @@ def _expanded(given: str) -> list[Path]:
         return _within(path)
     if path.exists():
         if path.suffix.lower() not in SUFFIXES:
-            raise ValueError(f"{path} is no photograph: the file name must end in {', '.join(SUFFIXES)}.")
+            raise ValueError(f"{path} is not a photo: the file name must end in {', '.join(SUFFIXES)}.")
         return [path]
     found = [Path(name) for name in sorted(glob.glob(given, recursive=True))]
     photos = [p for p in found if p.suffix.lower() in SUFFIXES and p.is_file()]
@@ -160,7 +160,7 @@ def video_frames(
         ValueError: it cannot be read, or the track does not reach over it.
 
     Warns:
-        UserWarning: the video ends early, being cut off or damaged; the frames before that count.
+        UserWarning: the video ends early, being cut off or damaged; the frames before that are used.
     """
     from ..io.video_reader import decode_video
 
@@ -175,7 +175,7 @@ def video_frames(
             at = focal.at(last, time) if isinstance(focal, FocalTrack) else float(focal)
             yield Source(f"{stem}-{last:06d}.jpg", None, image(), at)
         if last < 0:
-            raise ValueError(f"Cannot read {os.fspath(path)}: none of its frames decodes.")
+            raise ValueError(f"Cannot read {os.fspath(path)}: none of its frames can be decoded.")
         if last + 1 < 0.98 * announced - 2:  # lengths are rounded
             warnings.warn(
                 f"{os.fspath(path)} ends early, after {last + 1} of {announced} frames: it is cut off or "

@@ -1,4 +1,4 @@
-"""Fits: energies of lines under a model, their minimisers, and how straight lines then are."""
+"""Fits: energies of lines under a model, their minimisation, and the straightness of corrected lines."""
 
 import lazy_loader
 

@@ -42,7 +42,7 @@ def least_squares_within(
 ) -> tuple[Float[Array, "unknown"], Float[Array, "inequality"], Bool[Array, ""], Int[Array, ""]]:
     """The minimum, the barrier's strength ``z slack`` at each inequality, whether it is reached, and steps.
 
-    Reached means that neither the inequalities nor the last step hold back more than 1e-8 of the energy
+    Reached means that neither the inequalities nor the last step account for more than 1e-8 of the energy
     (1e-5 in float32).
 
     Args:
@@ -109,11 +109,11 @@ def implicit(
     minimum: Float[Array, "unknown"],
     strength: Float[Array, "inequality"],
 ) -> Float[Array, "unknown"]:
-    """The same minimum, with derivatives by what `energy` and `slack` are made of (implicit functions).
+    """The same minimum, differentiable in the arguments of `energy` and `slack` (implicit differentiation).
 
-    They are those of the minimum with the barrier at its last strength: of inequalities that are active the
-    slack stays what it is, others have no part. Where one begins or ceases to be active there is a kink.
-    Directions that the energy does not determine stay where they are.
+    Derivatives are those of the minimum with the barrier at its last strength: active inequalities keep
+    their slack, inactive ones have no influence. There is a kink where an inequality becomes active or
+    inactive. Directions that the energy does not determine do not move.
     """
     minimum, strength = jax.lax.stop_gradient((minimum, strength))
     multiplier = strength / jax.lax.stop_gradient(slack(minimum))
@@ -135,8 +135,9 @@ def implicit(
 def _stationary(curvature, slopes, weight, right, gaps):
     """The x of ``(curvature + slopes' W slopes) x = right + slopes' W gaps``, W the diagonal of weights.
 
-    Weights of active inequalities may exceed the curvature by all digits of a number: in the sum it would be
-    lost. So it is solved along the singular vectors of ``sqrt(W) slopes``, where the large part is diagonal.
+    Weights of active inequalities may exceed the curvature by all digits of a number: the sum would lose
+    it. So the system is solved along the singular vectors of ``sqrt(W) slopes``, where the large part is
+    diagonal.
     """
     root = jnp.sqrt(weight)
     rows = jnp.concatenate([root[:, None] * slopes, jnp.zeros_like(curvature)])  # never fewer than unknowns

@@ -1,4 +1,4 @@
-"""The algebraic estimate: coefficients without iterations, as a start and as a method of its own.
+"""The algebraic estimate: coefficients without iterations, as a start for fits or for use on its own.
 
 For a straight line the 2 x 2 scatter of the corrected points has a zero eigenvalue, so its determinant
 vanishes (Alvarez, Gómez and Sendra 2009, [9] of the paper). By Lagrange's identity the determinant is a
@@ -29,9 +29,9 @@ from .result import lens_of
 
 
 def compressed(lines: AbstractLines, terms: int) -> CompressedLines:
-    """The lines themselves if they are compressed already, or else their exact compression.
+    """The lines, compressed unless they are already.
 
-    Of lines measured in the image, those that they are.
+    For lines measured in the image (`in_image`), the lines underneath.
     """
     if isinstance(lines, ImageLines):
         lines = lines.as_weighted()
@@ -41,8 +41,8 @@ def compressed(lines: AbstractLines, terms: int) -> CompressedLines:
     if isinstance(lines, Lines):
         return compress(lines, terms)
     raise TypeError(
-        f"Lines of type {type(lines).__name__} do not serve here: pass Lines or compress(lines); of "
-        "compress_any_centre(lines), those about one centre, .about(centre)."
+        f"Lines of type {type(lines).__name__} cannot be used here: pass Lines or compress(lines); after "
+        "compress_any_centre(lines), pass .about(centre)."
     )
 
 
@@ -82,7 +82,7 @@ def _areas(triangle, terms):
 def algebraic_zoom(
     lines: AbstractLines, *, zoom: AbstractLinearZoom | None = None, terms: int = 2
 ) -> ZoomLens:
-    """The lens that the algebraic estimate alone gives, with no iterations.
+    """Estimate a zoom lens algebraically, without iterations.
 
     Args:
         lines: the lines, or their compressed form.
@@ -102,7 +102,7 @@ def algebraic_zoom(
 
 @kinds_checked
 def algebraic_frames(lines: AbstractLines, *, terms: int = 2) -> Float[Array, "frame terms"]:
-    """The normalised coefficients of each frame by itself, by the algebraic estimate."""
+    """Estimate the normalised coefficients of each frame separately, without iterations."""
     terms = checked_terms(terms, lines.family.most_terms)
     return _solve_frames(compressed(lines, terms), *lines.by_frame(), terms)
 

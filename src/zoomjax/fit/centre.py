@@ -1,13 +1,13 @@
-"""Fits that look for the centre of distortion as well: of all frames, along the zoom, or of each frame.
+"""Fits of the centre of distortion: one for all frames, one along the zoom, or one per frame.
 
-The centre's offset is a function of the focal length like the coefficients are, and any zoom model serves
-for it: `PolynomialZoom` of degree 0 is one centre for all frames, of degree 1 one that moves along a line,
-`TableZoom` one of each focal length. The unknowns of both are found together, from the fit about the
-image's centre, on lines compressed for any centre (`free_centre`). The paper does so frame by frame
-(section 5.1, Figure 7), and finds that it gains next to nothing.
+The offset of the centre is a function of the focal length, as the coefficients are, and is described by any
+zoom model: `PolynomialZoom` of degree 0 is one centre for all frames, of degree 1 one that moves along a
+line, `TableZoom` one for each focal length. Coefficients and centre are fitted together, starting from the
+fit about the image's centre, on lines compressed for any centre (`free_centre`). The paper does so frame by
+frame (section 5.1, Figure 7), and finds almost no gain.
 
-Where there is no distortion there is no centre of it, and lines may say little of it elsewhere. A centre
-that is too uncertain to be believed is left where it was, and the result says so.
+Without distortion there is no centre of distortion, and lines may determine it poorly in other cases too. A
+centre that is too uncertain is kept fixed, and the result says so.
 """
 
 import dataclasses
@@ -33,22 +33,22 @@ from .result import RESULTS, FrameFits, ZoomFit, collected
 from .zoom import fit_zoom, minimise
 
 _MOST_UNCERTAIN = 0.05
-"""Standard deviation of a centre, in half diagonals, above which it is not believed."""
+"""Largest standard deviation of a centre, in half diagonals, with which it is accepted."""
 
 _FARTHEST = 0.5
-"""Half diagonals from the middle of the image beyond which no centre is believed."""
+"""Largest distance of a centre from the middle of the image, in half diagonals, that is accepted."""
 
 
 class CentreFit(eqx.Module):
     """A zoom lens fitted together with its centre of distortion.
 
     Attributes:
-        fit: the fit, whose lens has the centre. Its covariance allows for the centre's.
-        centre: of each frame, px.
-        std: standard deviations of the frames' centres, px; infinite where the lines say nothing of it.
-        determined: whether the centre is what the lines say. If not, they say too little of it, and it is
-            the one that they came with: the image's.
-        rms_fixed: what `fit.rms` would be about that one, px.
+        fit: the fit, whose lens has the centre. Its covariance includes the uncertainty of the centre.
+        centre: centre of distortion of each frame, px.
+        std: standard deviations of the frames' centres, px; infinite where the lines do not determine it.
+        determined: whether the lines determine the centre. If not, it is kept at the centre of the lines,
+            by default that of the image.
+        rms_fixed: what `fit.rms` would be with the centre kept fixed, px.
         covariance: of all parameters, normalised: those of the zoom model, then those of the centre's.
     """
 
@@ -60,18 +60,18 @@ class CentreFit(eqx.Module):
     covariance: Float[Array, "parameter parameter"]
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
-        """Raise TypeError: the lens of its fit is asked."""
+        """Raise TypeError: call the lens of the fit instead."""
         raise TypeError("A CentreFit is not a lens: use found.fit.lens, as in found.fit.lens(35.0).")
 
 
 class FrameCentres(eqx.Module):
-    """Each frame fitted by itself, its centre of distortion included.
+    """Separate fits of each frame with its own centre of distortion.
 
     Attributes:
         each: the fits, about the centres found.
         std: standard deviations of the centres, px.
-        determined: whether a frame's centre is what its lines say. If not it is that of the image.
-        rms_fixed: what `each.frame_rms` would be about that one, px.
+        determined: whether a frame's lines determine its centre. If not, it is that of the image.
+        rms_fixed: what `each.frame_rms` would be with the centres kept fixed, px.
     """
 
     each: FrameFits
@@ -80,7 +80,7 @@ class FrameCentres(eqx.Module):
     rms_fixed: Float[Array, "frame"]
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
-        """Raise TypeError: there is a distortion of each frame, and none between them."""
+        """Raise TypeError: each frame has its own distortion, and there is no lens."""
         raise TypeError("FrameCentres are not a lens: use found.each.distortion(frame).")
 
 
@@ -120,11 +120,11 @@ def fit_centre(
     max_steps: int = 256,
     throw: bool = True,
 ) -> CentreFit:
-    """The zoom model and the centre of distortion that together minimise the global energy (eq. 13).
+    """Fit the zoom model and the centre of distortion together: minimise the global energy (eq. 13).
 
     Args:
-        lines: the lines, or ``compress_any_centre(lines)``: the same answer, and what to keep for several
-            fits. Their `centre` is where the search starts, and what is returned to.
+        lines: the lines, or, with the same result, ``compress_any_centre(lines)``, which can be reused for
+            several fits. Their `centre` is the start, and is kept if the lines do not determine another.
         zoom, terms, solver, max_steps, throw: as for `fit_zoom`, whose errors also apply.
         centre: how the centre depends on the focal length, as any zoom model: by default
             ``PolynomialZoom(degree=0)``, one centre for all frames.
@@ -176,7 +176,7 @@ def fit_centre(
 def fit_frame_centres(
     lines: Lines | AnyCentreLines, *, terms: int = 2, solver: Solver | None = None, max_steps: int = 256
 ) -> FrameCentres:
-    """Each frame's distortion and centre of distortion by itself, as the paper's Figure 7 has them.
+    """Fit distortion and centre of distortion of each frame separately (the paper's Figure 7).
 
     Args:
         lines, terms, solver, max_steps: as for `fit_centre`.
@@ -205,7 +205,7 @@ def _fit_frame_centres(lines, chosen, present, terms, solver, max_steps):
 
 @eqx.filter_jit
 def _search(lines, start, solver, max_steps):
-    """The joint minimum, or the start where the centre found is not to be believed."""
+    """The joint minimum, or the start if the centre found is too uncertain."""
     found, _, _ = minimise(lines, start, solver, max_steps)
     covariance, _ = parameter_covariance(lines, found, *linearised(lines, found), extra=2)
 

@@ -1,4 +1,4 @@
-"""Data sets put one after the other: more frames, of one camera, as one set of lines."""
+"""Concatenation of data sets: frames of one camera as one set of lines."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ SomeLines = TypeVar("SomeLines", bound=AbstractLines)
 
 
 def concatenate(parts: Sequence[SomeLines]) -> SomeLines:
-    """Lines of different frames as one data set: frames of each part are numbered after those before.
+    """Concatenate lines of different frames. Frames of each part are numbered after those before.
 
-    So frames can be compressed one by one, as they come or on several machines, and fitted together: the
-    fit is that of all lines at once. Not to be confused with `merge`, which adds *points* to the same lines
-    of the same frames.
+    So frames can be compressed one by one, as they arrive or on several machines, and then fitted together:
+    the fit is that of all lines at once. In contrast, `merge` adds *points* to the same lines of the same
+    frames.
 
     Args:
         parts: one or more, all `Lines` or all compressed in the same way, of one camera: with the same
@@ -34,9 +34,9 @@ def concatenate(parts: Sequence[SomeLines]) -> SomeLines:
         One set of the same kind. The lines' `number`, their position in one list, is no longer known.
 
     Raises:
-        TypeError: they are of different kinds.
-        ValueError: there are none, or they disagree in one of these, or in the number of terms that they
-            were compressed for, or only some of them have a focus.
+        TypeError: the parts are of different kinds.
+        ValueError: there are no parts, or they differ in one of these properties or in the number of terms
+            they were compressed for, or only some of them have a focus.
 
     Example:
         >>> import numpy as np

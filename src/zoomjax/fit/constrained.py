@@ -1,4 +1,4 @@
-"""The best model that is invertible, where the best one is not.
+"""Refit under the constraint of invertibility, if the best model is not invertible.
 
 A model that is not certified to be invertible is replaced by the best one that is: the same energy is
 minimised again, the slope of the radius kept above `LEAST_SLOPE` all over the image and focal range, by an
@@ -30,7 +30,7 @@ _MOST_STEPS = 200
 
 @eqx.filter_jit
 def refit_zoom(lines, free):
-    """The best invertible model in the place of one that is not."""
+    """The best invertible model."""
     zoom = free.lens.zoom
     if stated_pieces(zoom, free.lens.focal_range, lines.family) is None:  # there is nothing to demand
         return free, outcome_of(free)

@@ -3,12 +3,12 @@
 Covariance of the parameters from the residuals and their Jacobian, and which of them the lines do not
 determine at all; work of one or two iterations of the fit, once after it.
 
-Neighbouring points of an edge err together, and lines that are not quite straight bend as a whole: points
-are not independent, lines are taken to be. A line pulls at the parameters with its score ``J_l^T r_l``, the
-same from its compressed rows, and the squares of the scores make the line-by-line sandwich ``H^-1 (sum_l
-g_l g_l^T) H^-1``. By itself that is too uncertain, for a few lines decide a parameter; so it is shrunk to
-the shape that independent points would give, as far as its own scatter demands (Ledoit and Wolf 2004).
-docs/trust.md has the measured coverage, and that of what was tried instead.
+Errors of neighbouring points on an edge are correlated, and lines that are not quite straight bend as a
+whole: points are not independent, but lines are assumed to be. A line pulls at the parameters with its
+score ``J_l^T r_l``, the same from its compressed rows, and the squares of the scores make the line-by-line
+sandwich ``H^-1 (sum_l g_l g_l^T) H^-1``. That estimate alone is too uncertain, since a few lines decide a
+parameter. So it is shrunk towards the shape for independent points, by an amount given by its own scatter
+(Ledoit and Wolf 2004). docs/trust.md has the measured coverage, and that of alternatives.
 """
 
 import jax

@@ -1,7 +1,7 @@
 """The energies of the paper: how far corrected points are from straight lines (eq. 3 and 13).
 
-A line's own parameters drop out (variable projection): given the coefficients, the best line passes
-through the mean of the corrected points, with the normal of least variance, and the residual of a
+The parameters of the lines are eliminated (variable projection): given the coefficients, the best line
+passes through the mean of the corrected points, with the normal of least variance, and the residual of a
 point is its signed distance ``n . (x - mean)``. Residuals are differentiated through ``n``.
 
 Weights are the paper's: a point counts ``1 / (M Nl(m) Np(l, m))``, so that every frame weighs the same,
@@ -67,7 +67,7 @@ def line_weights(lines: AbstractLines) -> Float[Array, "line"]:
 
 
 def counted_frames(lines: AbstractLines) -> Bool[Array, "frame"]:
-    """Which frames have a line that counts: one of three points or more and a weight above 0."""
+    """Which frames have a usable line: three points or more and a weight above 0."""
     return _shares(lines)[1] > 0
 
 
@@ -107,7 +107,8 @@ def residuals(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -
 
 
 def settings(zoom: AbstractZoom, lines: AbstractLines) -> tuple[Float[AnyArray, "frame"], ...]:
-    """What a zoom model's coefficients depend on, frame by frame: the focal length, and perhaps the focus.
+    """The inputs of a zoom model for each frame: the focal length, and the focus if the model depends on
+    it.
 
     Raises:
         ValueError: the model needs the focus, and the lines do not have it.
@@ -128,7 +129,7 @@ def coefficients_by(zoom: AbstractZoom, lines: AbstractLines) -> Float[Array, "f
 
 
 def prior_residuals(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "row"] | None:
-    """What the prior of a zoom model adds to the residuals, px; None for a model without a prior."""
+    """Residuals of the prior of a zoom model, px; None for a model without a prior."""
     if not isinstance(zoom, AbstractPriorZoom):
         return None
     return prior_error(lines, zoom) * zoom.standardised()

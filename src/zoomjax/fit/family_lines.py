@@ -1,9 +1,9 @@
-"""Lines whose coefficients are those of another family than the radial polynomial.
+"""Lines for a distortion model other than the radial polynomial.
 
-The fits know lines only by what coefficients make of them (`AbstractLines.corrected`). Points are
-corrected by the family's own formula. Compressed lines stand for powers, in which corrected points are
-linear: so are they in the coefficients of `BrownConrady`, by the triangles for any centre, which hold all
-monomials; those of `Division` become the 8 of a polynomial, as good as exact (`Division.expansion`).
+Fits use lines only through their corrected points (`AbstractLines.corrected`). Points are corrected by the
+model's own formula. Compressed lines stand for powers, in which corrected points are linear: so are they in
+the coefficients of `BrownConrady`, by the triangles for any centre, which hold all monomials; those of
+`Division` become the 8 of a polynomial, as good as exact (`Division.expansion`).
 """
 
 import equinox as eqx
@@ -23,11 +23,11 @@ from .image_metric import ImageLines, in_image
 
 
 class FamilyLines(AbstractLines):
-    """Lines that are corrected by a family: `with_family` and `compress_family` make them.
+    """Lines that are corrected by a distortion model: made by `with_family` and `compress_family`.
 
     Attributes:
         lines: the lines.
-        corrected_by: the family.
+        corrected_by: the distortion model.
         frame, focal, focus, centre, image_size, focal_unit, weight: those of the lines.
     """
 
@@ -100,8 +100,8 @@ class FamilyLines(AbstractLines):
             if traced((self.centre, centre)) or np.allclose(self.centre, centre, rtol=0, atol=1e-3):
                 return self
             raise ValueError(
-                "Lines compressed with all monomials serve one centre if their family is not radial, and "
-                "another is asked for. Compress the lines about that, or pass the lines themselves."
+                "Lines compressed with all monomials for a family that is not radial have one centre, but "
+                "another is requested. Compress the lines about that centre, or pass the lines themselves."
             )
         return _wrapped(self.as_weighted().about(centre), self.family)
 
@@ -116,14 +116,14 @@ class FamilyLines(AbstractLines):
 
 @kinds_checked
 def with_family(lines: AbstractLines, family: AbstractFamily) -> AbstractLines:
-    """The same lines, coefficients for them to be those of a family.
+    """The same lines, to be corrected by another distortion model.
 
     Args:
         lines: the lines, their compressed form, or either measured in the image.
-        family: the family.
+        family: the distortion model.
 
     Raises:
-        ValueError: lines measured in the image have a family that is not radial.
+        ValueError: the lines are measured in the image, and the model is not radial.
 
     Example:
         >>> import jax.numpy as jnp, numpy as np
@@ -143,12 +143,12 @@ def with_family(lines: AbstractLines, family: AbstractFamily) -> AbstractLines:
 
 @kinds_checked
 def compress_family(lines: Lines, family: AbstractFamily, *, terms: int = 2) -> AbstractLines:
-    """What `compress` is for the radial polynomial, for any family; the result remembers it.
+    """Compress lines exactly for any distortion model, as `compress` does for the radial polynomial.
 
     Args:
         lines: the lines; their `centre` is the centre the result is for.
-        family: the family that will be fitted.
-        terms: the largest number N of its radial coefficients that will be.
+        family: the distortion model to be fitted, which the result stores.
+        terms: the largest number N of radial coefficients to be fitted.
 
     Example:
         >>> import numpy as np
@@ -170,7 +170,7 @@ def compress_family(lines: Lines, family: AbstractFamily, *, terms: int = 2) -> 
 
 
 def points_of(lines: AbstractLines) -> AbstractLines:
-    """The lines themselves, under whatever they are wrapped in."""
+    """The lines without their wrappers."""
     while isinstance(lines, ImageLines | FamilyLines):
         lines = lines.lines
     return lines

@@ -1,7 +1,7 @@
-"""Focal lengths that are known with errors: what those do to a lens, and what the lines know of them.
+"""Focal lengths with errors: their effect on a lens, and their estimation from the lines.
 
-A fit takes the focal lengths of the frames as exact. Where they are wrong by t_m, in log f, its parameters
-a are wrong by what keeps the gradient g of the energy at zero (the implicit function theorem):
+A fit treats the focal lengths of the frames as exact. If they are wrong by t_m, in log f, its parameters
+a change so that the gradient g of the energy stays zero (the implicit function theorem):
 
     da = R t,    R = -(dg/da)^-1 dg/dt,    and their covariance is larger by R diag(sigma^2 / f^2) R^T.
 
@@ -9,14 +9,14 @@ Frames meet in the energy only through their coefficients k_m = k(f_m): near the
 frames of quadratics in k_m, found by N + 1 gradients whatever the number of frames, and all derivatives
 by a and t are those of that sum.
 
-The lines also know where on its curve k(f) a frame lies. `fit_focal` minimises, over a and t together,
+The lines also determine where on its curve k(f) a frame lies. `fit_focal` minimises, over a and t together,
 
     E(a, t) + sum_m tau_m (t_m f_m / sigma_m)^2 .
 
 That is the mode of the posterior if E_m / (2 tau_m), of each frame, is minus the logarithm of a likelihood:
 tau_m is s^2 times the mean weight w_l of the frame's lines in eq. 13, s being the noise of a point that
 is independent of the others. The fit's own covariance C tells s: with G = J^T J and h_l the leverages of
-the lines, ``tr(G C) = s^2 sum_l w_l h_l``. So noise that goes together along a line counts as what it is.
+the lines, ``tr(G C) = s^2 sum_l w_l h_l``. So noise that is correlated along a line is taken into account.
 """
 
 from typing import Any, NamedTuple, NoReturn
@@ -51,10 +51,10 @@ class FocalFit(eqx.Module):
     """A zoom lens fitted together with the focal lengths of its frames.
 
     Attributes:
-        fit: the fit at the focal lengths found; its covariance allows for what is still unknown of them.
-        focal: of each frame, as found.
+        fit: the fit at the estimated focal lengths; its covariance includes their remaining uncertainty.
+        focal: the estimated focal length of each frame.
         std: their standard deviations, same unit; at most about those given, and 0 where 0 was given.
-        given: the focal lengths that the lines came with.
+        given: the focal lengths of the lines.
         steps: number of steps the joint solver took.
     """
 
@@ -71,14 +71,14 @@ class FocalFit(eqx.Module):
 
 @kinds_checked
 def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma) -> ZoomFit:
-    """The same fit, its covariance, and so all bands, enlarged by what is unknown of the focal lengths.
+    """Add the uncertainty of the focal lengths to a fit's covariance, and so to all bands.
 
     Args:
         fit: the fit.
         lines: the lines that it was fitted to, with their weights; measured in the image, if they were.
-        focal_sigma: standard deviation of the focal lengths, in the lines' unit: a number, or one a frame;
-            0 where they are exact. A focal length rounded to whole mm has 0.29, 1/sqrt(12). Errors of
-            frames count as independent.
+        focal_sigma: standard deviation of the focal lengths, in the lines' unit: a number, or one per
+            frame; 0 where they are exact. For focal lengths rounded to whole mm it is 0.29, 1/sqrt(12).
+            Errors of frames are assumed to be independent.
 
     Returns:
         The fit with `covariance` larger, to first order in the errors.
@@ -104,7 +104,7 @@ def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma) 
         )
     if fit.lens.shift is not None:
         raise ValueError(
-            "The lens has a centre that moves along the zoom, for which this is not worked out."
+            "Argument fit must have a lens with a fixed centre, but its centre moves along the zoom."
         )
     lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
     return _widened(fit, lines, jnp.diag(sigma / jnp.asarray(lines.focal)) ** 2)
@@ -120,24 +120,24 @@ def fit_focal(
     invertible: bool = True,
     throw: bool = True,
 ) -> FocalFit:
-    """The zoom model and the focal lengths that make the lines straightest, these drawn to the given ones.
+    """Fit the zoom model and the focal lengths together, with the given focal lengths as a prior.
 
-    Straightness alone cannot tell focal lengths. Relabel them by any increasing function, change the zoom
-    model accordingly, and every line is as straight as before; for a polynomial in 1/f, which stays one if
-    1/f is scaled and shifted, nothing at all tells those two apart. So the scale of the result is that of
-    the focal lengths given, and what the lines can mend is where single ones stand out from a smooth k(f).
-    What the zoom model cannot follow is taken for an error of focal lengths, too.
+    Straight lines alone do not determine focal lengths: after a change of all focal lengths by an
+    increasing function, another zoom model makes every line as straight. A polynomial in 1/f stays one if
+    1/f is scaled and shifted, so the lines cannot correct scale and offset at all. The scale of the result
+    is therefore that of the given focal lengths; the lines correct single ones that deviate from a smooth
+    k(f). Deviations that the zoom model cannot follow are attributed to focal lengths, too.
 
     Args:
         lines: the lines, or, much faster and with the same answer, ``compress(lines)``.
-        focal_sigma: standard deviation of the given focal lengths, in their unit: a number, or one a frame.
-            0 keeps a focal length as it is; infinity says that nothing is known of it, and the given one
-            is where the search starts.
+        focal_sigma: standard deviation of the given focal lengths, in their unit: a number, or one per
+            frame. 0 keeps a focal length fixed; infinity means that it is unknown, and the given one is
+            only the start.
         zoom, terms, invertible, throw: as for `fit_zoom`, whose errors also apply.
 
     Raises:
-        ValueError: `focal_sigma` is not such, or is infinite for all frames but those at one focal length;
-            or the lines are in float32, whose rounding outweighs the prior where lines say nothing.
+        ValueError: `focal_sigma` is not valid, or is infinite for all frames but those at one focal length;
+            or the lines are in float32, whose rounding errors can outweigh the prior.
         RuntimeError: the solver failed (see `throw`).
 
     Example:
@@ -168,7 +168,7 @@ def fit_focal(
     t, model, steps, reached = _refined(lines, start.lens.zoom, sigma / given)
     if throw and not traced(reached) and not reached:
         raise RuntimeError(
-            f"The focal lengths did not settle in {_MOST_STEPS} steps: the lines say too little of those "
+            f"The focal lengths did not converge in {_MOST_STEPS} steps: the lines hardly determine those "
             "with a large focal_sigma. Leave these frames out, or measure their focal lengths."
         )
     focal = given * jnp.exp(t)
@@ -185,9 +185,10 @@ def fit_focal(
 
 
 _UNKNOWN = (
-    "Straightness alone cannot tell focal lengths: relabel them by any increasing function, change the "
-    "zoom model accordingly, and every line is as straight as before. Take them from EXIF data or a table, "
-    "or measure them from a board (focal_from_board) or a plane (focal_from_planes, focal_from_lines)."
+    "Straight lines alone do not determine focal lengths: after a change of all focal lengths by an "
+    "increasing function, another zoom model makes every line as straight. Take them from EXIF data or a "
+    "table, or measure them from a board (focal_from_board) or a plane (focal_from_planes, "
+    "focal_from_lines)."
 )
 
 
@@ -213,7 +214,7 @@ def _checked_sigma(focal_sigma: Any, focal: Focal) -> Float[Array, "frame"]:
 
 
 class _NearEnergy(NamedTuple):
-    """Half the energy, but for a constant, near some coefficients of the frames."""
+    """Half the energy, up to a constant, near some coefficients of the frames."""
 
     coefficients: Float[Array, "frame terms"]
     gradient: Float[Array, "frame terms"]

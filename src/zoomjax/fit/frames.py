@@ -1,7 +1,7 @@
-"""Each frame fitted by itself (eq. 3 and 6).
+"""Separate fits of each frame (eq. 3 and 6).
 
-A frame by itself is a zoom polynomial of degree 0 on the lines of that frame, so that the solver of `zoom`
-serves here, `vmap`\\ ped over the frames.
+The fit of one frame is a zoom polynomial of degree 0 on the lines of that frame, so that the solver of
+`zoom` is used, under `vmap` over the frames.
 """
 
 import equinox as eqx
@@ -33,7 +33,7 @@ def fit_frames(
     invertible: bool = True,
     throw: bool = True,
 ) -> FrameFits:
-    """The distortion of each frame by itself (eq. 3 and 6): what a zoom model is compared with.
+    """Fit the distortion of each frame separately (eq. 3 and 6), for comparison with a zoom model.
 
     Args:
         lines, family, terms, solver, max_steps, invertible, throw: as for `fit_zoom`, frame by frame.
@@ -71,7 +71,7 @@ def _fit_frames(lines, start, chosen, present, terms, solver, max_steps):
 
 @eqx.filter_jit
 def _refit_frames(lines, chosen, present, terms, free):
-    """All frames as they are, if they are invertible, and otherwise the best that is."""
+    """Each frame's fit, refitted to be invertible where it is not."""
 
     def fit(chosen, present, result, coefficients):
         frame = lines.take(chosen, present)

@@ -1,10 +1,10 @@
-"""Distances measured in the image, where the noise is, and no longer in the corrected one.
+"""Distances measured in the distorted image, where the noise is, instead of the corrected image.
 
 The paper's energy is that of corrected points. Correction stretches some parts of the image and shrinks
-others, and noise with them, so that the energy is lowered by shrinking what is noisy: an error of the lens
-that grows with the square of the noise. To first order an error d of a point moves its corrected point
-by ``n . J d`` across the line, J being the derivative of the correction and n the line's normal. A line's
-distances are therefore divided by the stretch across it, the root of the mean over its points of
+others, and the noise with them. So shrinking noisy parts lowers the energy: a bias of the lens that grows
+with the square of the noise. To first order an error d of a point moves its corrected point by ``n . J d``
+across the line, J being the derivative of the correction and n the line's normal. A line's distances are
+therefore divided by the stretch across it, the root of the mean over its points of
 
     |J^T n|^2 = sum_ij kappa_i kappa_j (r^2(i+j) + (2i + 2j + 4ij) r^(2(i+j)-2) (z.n)^2),
 
@@ -27,11 +27,11 @@ from .energy import line_normal
 
 
 class ImageLines(AbstractLines):
-    """Lines whose distances are measured in the image: `in_image` makes them.
+    """Lines whose distances are measured in the distorted image: made by `in_image`.
 
     Attributes:
         lines: the lines.
-        frame, focal, focus, centre, image_size, focal_unit, weight: theirs.
+        frame, focal, focus, centre, image_size, focal_unit, weight: those of the lines.
     """
 
     lines: AbstractLines
@@ -83,16 +83,16 @@ class ImageLines(AbstractLines):
 
 @kinds_checked
 def in_image(lines: AbstractLines) -> ImageLines:
-    """The same lines, their distances to be measured in the image, px: without the paper's bias.
+    """The same lines with distances measured in the distorted image, px, which removes the paper's bias.
 
-    `fit_zoom`, `fit_frames`, `fit_robust` and `frame_rms` take them like any others; every RMS is then that
-    of the image. Worth it where points are off by half a pixel or more.
+    `fit_zoom`, `fit_frames`, `fit_robust` and `frame_rms` accept them like other lines; every RMS is then
+    in px of the distorted image. Use this where points have errors of half a pixel or more.
 
     Args:
         lines: the lines, or their compressed form, about a fixed centre.
 
     Raises:
-        ValueError: their family is not radial: the stretch of the others is not made of these moments.
+        ValueError: their distortion model is not radial: the stretch then does not follow from the moments.
 
     Example:
         >>> import numpy as np

@@ -1,16 +1,16 @@
-"""Single points that are off a good line: found, and left out.
+"""Rejection of single outlier points on otherwise good lines.
 
-A detector that runs onto something else for a few pixels leaves blunders on a line that is otherwise good.
-`fit_robust` weighs whole lines and cannot know. Here a point is dropped if, in the corrected image, it is
+A detector that follows something else for a few pixels leaves outlier points on a good line. `fit_robust`
+weights whole lines and does not remove them. Here a point is dropped if, in the corrected image, it is
 farther than `_CUT` standard deviations from its line. The line is the one that most points agree on (IRLS,
 from least absolute distances to Tukey's weights), the standard deviation is 1.48 times the median distance
 of the line's points, drawn, as much as `_BORROWED` points weigh, to that of the typical line. Lens and
-decisions are found in turns, each anew from all points, so that those first misjudged can come back.
+decisions are found in turns, each from all points, so that wrong rejections are undone.
 
-Points are dropped rather than weighed. Weights of points would end the exact compression, and would have
-to be known to counts, covariance and figures; a line with fewer points is a line. And as nothing within the
-cut is touched, it costs next to nothing: fewer than one in a thousand good points go, those of lines whose
-spread comes out small. Tukey's weights at their usual width lose 5 % of what the points tell.
+Points are dropped, not weighted. Weights of points would rule out exact compression, and counts, covariance
+and figures would need them; a line with fewer points is an ordinary line. As points within the cut keep
+full weight, the loss is small: fewer than one in a thousand good points are dropped, on lines whose spread
+is underestimated. Tukey's weights at their usual width lose 5 % of the information.
 """
 
 from typing import NamedTuple
@@ -47,13 +47,13 @@ _LINE_STEPS = 12
 
 
 class PointRejection(NamedTuple):
-    """Lines without the points that are off them.
+    """Lines without their outlier points.
 
     Attributes:
-        lines: the lines with a mask that leaves those points out; as many lines as were given.
-        rejected: which points were dropped, of the points of the lines given.
-        fit: the robust fit of what is left; lines that it rejects have kept most of their points.
-        spread: of the points of each line about it, px, in the corrected image: what the cut is 4 times of.
+        lines: the lines with a mask that excludes outlier points; as many lines as were given.
+        rejected: which points of the given lines were dropped.
+        fit: the robust fit of the remaining points; lines that it rejects have kept most of their points.
+        spread: spread of the points of each line, px, in the corrected image; the cut is 4 times this.
     """
 
     lines: Lines
@@ -67,12 +67,12 @@ class PointRejection(NamedTuple):
 def reject_points(
     lines: Lines, *, zoom: AbstractZoom | None = None, terms: int | None = None, throw: bool = True
 ) -> PointRejection:
-    """The lines without single points that lie off them, found together with the zoom model.
+    """Remove single outlier points from lines, together with a robust fit of the zoom model.
 
-    At most half of a line's points go; of a line of three or four, none does. Weights of the lines stay.
+    At most half of a line's points are dropped, and none of a line of three or four. Line weights are kept.
 
     Args:
-        lines: the lines themselves: compressed ones have no points any more.
+        lines: the lines, not compressed.
         zoom, terms, throw: as for `fit_robust`, which is used in every turn.
 
     Raises:

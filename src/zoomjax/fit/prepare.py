@@ -1,4 +1,4 @@
-"""What a fit starts from: the model made ready, the lines compressed, the algebraic start."""
+"""Preparation of a fit: the model, the compressed lines and the algebraic start."""
 
 import equinox as eqx
 import jax

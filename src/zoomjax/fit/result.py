@@ -1,4 +1,4 @@
-"""What fits return, and how they ended."""
+"""Results of fits, and their status."""
 
 from typing import Any, NoReturn
 
@@ -41,23 +41,23 @@ def _focus_range(lines):
 
 
 class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a fit ended: optimistix' results, and three about the model that came out."""
+    """Status of a fit: the results of optimistix, and three about the fitted model."""
 
     undetermined = (
         "The lines do not determine all coefficients: some can change without bending any line by more "
-        "than the noise does, and their variance is reported as infinite. Add lines that pass far from the "
-        "centre of distortion, at more focal lengths, or lower the degree or the number of terms."
+        "than the noise. Their variance is reported as infinite. Add lines far from the centre of "
+        "distortion or at more focal lengths, or lower the degree or the number of terms."
     )
     folded = (
-        "The fitted distortion is not invertible over the whole image and the range of focal lengths: its "
-        "`certificate` says where the corrected image folds over. Add lines near the corners, remove lines "
+        "The fitted distortion is not invertible over the whole image and the range of focal lengths: see "
+        "`certificate` for where the corrected image folds over. Add lines near the corners, remove lines "
         "that are not straight in the scene, or lower the degree or the number of terms."
     )
     constrained = (
-        "The lines fit best with a distortion that is not invertible over the whole image and the range of "
-        "focal lengths; this is the best one that is, and `rms_unconstrained` tells what that cost. Add "
-        "lines near the corners, remove lines that are not straight in the scene, or lower the degree or "
-        "the number of terms."
+        "The best-fitting distortion is not invertible over the whole image and the range of focal "
+        "lengths. The model was refitted to be invertible; `rms_unconstrained` is the RMS without this "
+        "constraint. Add lines near the corners, remove lines that are not straight in the scene, or lower "
+        "the degree or the number of terms."
     )
 
 
@@ -69,18 +69,18 @@ class ZoomFit(eqx.Module):
         rms: root of the global energy (eq. 13), px of the corrected image.
         frame_rms: root of each frame's error (eq. 3), px; NaN for a frame whose lines all weigh nothing.
         covariance: of the zoom model's parameters in normalised units, flattened row by row (for a
-            polynomial: all terms of power 0, then of power 1, ...). Lines are taken to have independent
-            errors, points of a line are not: it is the line-by-line sandwich of the residuals, its shape
-            shrunk to what independent points would give by as much as its own scatter demands. Where
-            there are too few lines for that, points are taken to be independent. An undetermined
-            parameter has infinite variance and zero covariances. With a prior (`AbstractPriorZoom`), the
-            mean square of both what noise and what the prior does to the parameters. What invertibility
-            forbids is not taken into account.
+            polynomial: all terms of power 0, then of power 1, ...). Errors are assumed independent between
+            lines, not between points of a line: this is the cluster-robust (sandwich) estimate with a line
+            as a cluster, shrunk towards the one for independent points by an amount given by its own
+            scatter. With too few lines for that, points are assumed independent. An undetermined parameter
+            has infinite variance and zero covariances. With a prior (`AbstractPriorZoom`), it is the mean
+            squared error from both the noise and the prior. The constraint of invertibility is not taken
+            into account.
         result: how the fit ended; ``RESULTS[fit.result]`` is a sentence.
         steps: number of steps the solver took.
         certificate: whether the lens is invertible over its image and focal range.
-        rms_unconstrained: what `rms` is without the demand that the lens be invertible: the same, unless
-            the lens had to be made so. The result is then `constrained`, if there is nothing worse to say.
+        rms_unconstrained: `rms` of the fit without the constraint of invertibility: the same, unless the
+            model was refitted. The result is then `constrained`, unless there is a worse one.
     """
 
     lens: ZoomLens
@@ -93,24 +93,24 @@ class ZoomFit(eqx.Module):
     rms_unconstrained: Float[Array, ""]
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
-        """Raise TypeError: the lens of a fit is asked, not the fit."""
+        """Raise TypeError: call the lens of the fit instead."""
         raise TypeError("A ZoomFit is not a lens: use fit.lens, as in fit.lens(35.0).")
 
 
 class FrameFits(eqx.Module):
-    """Each frame fitted by itself (eq. 6).
+    """Separate fits of each frame (eq. 6).
 
     Attributes:
         coefficients: normalised (k1, ..., kN) of each frame.
-        rms: root of the mean of the frames' errors, px: what a zoom model's `rms` is compared with.
+        rms: root of the mean of the frames' errors, px, comparable with the `rms` of a zoom model.
         frame_rms: root of each frame's error (eq. 3), px; NaN for a frame whose lines all weigh nothing.
         covariance: of each frame's coefficients; see `ZoomFit`.
         result: how each frame's fit ended.
         certificate: of each frame, whether it is invertible over the image.
-        rms_unconstrained: what `rms` is without the demand that every frame be invertible.
+        rms_unconstrained: `rms` of the fits without the constraint of invertibility.
         centre: centre of distortion, px: of all frames, or of each.
         scale: the length in px that is radius 1.
-        family: what the coefficients mean.
+        family: the distortion model of the coefficients.
     """
 
     coefficients: Float[Array, "frame terms"]
@@ -125,14 +125,14 @@ class FrameFits(eqx.Module):
     family: AbstractFamily = RadialPolynomial()
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
-        """Raise TypeError: there is a distortion of each frame, and none between them."""
+        """Raise TypeError: each frame has its own distortion, and there is no lens."""
         raise TypeError(
             "FrameFits are not a lens: use each.distortion(frame) for one frame's distortion, or fit_zoom "
             "for a lens at any focal length."
         )
 
     def messages(self) -> list[str]:
-        """For each frame a sentence about how its fit ended, empty where nothing is wrong."""
+        """For each frame a sentence on its fit's problem; empty if there is none."""
         return [
             RESULTS[jax.tree.map(lambda value, frame=frame: value[frame], self.result)]
             for frame in range(self.coefficients.shape[0])
@@ -157,7 +157,7 @@ class FrameFits(eqx.Module):
 
 
 def described_fit(lines, zoom, result, steps):
-    """A fitted zoom model with all that is to be said of it."""
+    """A fitted zoom model with its errors, covariance, certificate and status."""
     weighted, jacobian = linearised(lines, zoom)
     errors = energy_by_frame(lines, weighted)
     covariance, determined = parameter_covariance(lines, zoom, weighted, jacobian)
@@ -192,7 +192,7 @@ def collected(lines, fits):
 
 
 def _judge(zoom, result, determined, certificate):
-    """The worst of what the solver says and of what the model looks like."""
+    """The worst status, of the solver and of the model."""
     finite = jnp.all(jnp.isfinite(ravel_pytree(zoom.parameters)[0]))
     good: Any = RESULTS.successful  # inherited members, which pyright takes for another class's
     nonfinite: Any = RESULTS.nonfinite
@@ -204,19 +204,19 @@ def _judge(zoom, result, determined, certificate):
 
 
 def is_invertible(fit):
-    """Whether there is nothing to be made invertible: it is, or there is no model, or none that can be."""
+    """Whether no refit is needed: the model is invertible, or the fit failed, or it has no certificate."""
     stated = ~jnp.isneginf(fit.certificate.least)
     return fit.certificate.certified | ~stated | _failed(fit.result)
 
 
 def _failed(result):
-    """Whether a solver failed; what is said of a model is no failure."""
+    """Whether a solver failed. A status about the model is not a failure."""
     told = (result == RESULTS.undetermined) | (result == RESULTS.folded) | (result == RESULTS.constrained)
     return (result != RESULTS.successful) & ~told
 
 
 def outcome_of(fit):
-    """Whether it is invertible, and whether a solver failed, in which frame first, and how."""
+    """Whether the fit is invertible; whether a solver failed, in which frame first, and its status."""
     failed = jnp.atleast_1d(_failed(fit.result))
     frame = jnp.argmax(failed)
     result = jax.tree.map(lambda value: jnp.atleast_1d(value)[frame], fit.result)

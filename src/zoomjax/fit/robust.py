@@ -1,7 +1,7 @@
-"""Fits that some crooked lines do not spoil: an M-estimator over whole lines.
+"""Robust fits: an M-estimator over whole lines, against lines that are not straight in the scene.
 
-A curved marking, a bent edge or two borders joined by mistake are wrong as a whole, so that what is weighed
-is a line, not a point, and compression stays exact. With the RMS distance r of a line's corrected points
+A curved marking, a bent edge or two borders joined by mistake are wrong as a whole. So whole lines are
+weighted, not points, and compression stays exact. With the RMS distance r of a line's corrected points
 to their line, m its median over the lines, and s its spread, the weight of a line is Tukey's
 
     v = (1 - t^2)^2,  t = (r - m) / (c s),    but 1 for r < m, and 0 for t > 1.
@@ -10,8 +10,8 @@ The spread is that of the better half, 1.48 times the median of m - r there, for
 the other; to it is added m / sqrt(2 (n - 2)), by which a line of n points may be rough by chance.
 
 Weights and fit are found in turns (iteratively reweighted least squares, a Gauss-Newton step a turn), from
-a wide c that narrows to `_CUT`, so that lines spoiled by the first, unweighted fit get the chance to come
-back; then `fit_zoom` converges with the weights as they are.
+a wide c that narrows to `_CUT`, so that good lines that the first, unweighted fit misjudges are not lost;
+then `fit_zoom` converges with these weights.
 """
 
 from typing import Any, NoReturn
@@ -43,13 +43,13 @@ _LEAST_SPREAD = 0.02  # of m: lines of thousands of points, or without noise, ar
 
 
 class RobustFit(eqx.Module):
-    """A fit, and how much of each line it believes.
+    """A robust fit and the weights of its lines.
 
     Attributes:
         fit: the zoom model fitted to the weighted lines; its RMS and covariance are theirs.
         weight: of each line, from 0 (rejected) to 1, or to the weight it had before.
-        line_rms: RMS distance of each line's n corrected points to their line, px, over n - 2, so that
-            short lines are not flattered; of rejected ones too.
+        line_rms: RMS distance of each line's n corrected points to their line, px, with a divisor of n - 2
+            so that short lines do not look better than they are; of rejected ones too.
         scale: the typical `line_rms`, px: the median.
     """
 
@@ -59,12 +59,12 @@ class RobustFit(eqx.Module):
     scale: Float[Array, ""]
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
-        """Raise TypeError: the lens of its fit is asked."""
+        """Raise TypeError: call the lens of the fit instead."""
         raise TypeError("A RobustFit is not a lens: use robust.fit.lens, as in robust.fit.lens(35.0).")
 
     @property
     def rejected(self) -> Int[np.ndarray, "rejected"]:
-        """Indices of the lines that count nothing, the roughest first."""
+        """Indices of the rejected lines, the least straight first."""
         lines = np.flatnonzero(np.asarray(self.weight) == 0)
         return lines[np.argsort(-np.asarray(self.line_rms)[lines], kind="stable")]
 
@@ -81,17 +81,17 @@ def fit_robust(
     invertible: bool = True,
     throw: bool = True,
 ) -> RobustFit:
-    """The zoom model of the lines that agree on one; those not straight in the scene are rejected.
+    """Fit a zoom model robustly, rejecting lines that are not straight in the scene.
 
     Args:
-        lines: the lines, or, much faster and with the same answer, ``compress(lines)``. Weights that they
-            have already are kept as factors.
+        lines: the lines, or, much faster and with the same result, ``compress(lines)``. Existing weights
+            are kept as factors.
         zoom, family, terms, invertible, throw: as for `fit_zoom`, whose errors also apply.
-        solver, max_steps: of the last fit, with the weights as they then are; as for `fit_zoom`. The turns
-            before it are single Gauss-Newton steps.
+        solver, max_steps: of the final fit with fixed weights; as for `fit_zoom`. The turns before it are
+            single Gauss-Newton steps.
 
     Returns:
-        The fit of the lines that are left, with the weight of each line.
+        The fit of the remaining lines, and the weight of each line.
 
     Example:
         >>> import numpy as np

@@ -1,4 +1,4 @@
-"""How straight a lens makes lines: the error of eq. 3, px."""
+"""Straightness of lines corrected by a lens: the error of eq. 3, px."""
 
 import equinox as eqx
 import jax
@@ -18,7 +18,8 @@ from .family_lines import with_family
 def frame_rms(
     lines: AbstractLines, lens: ZoomLens | Float[AnyArray, "frame terms"] | None
 ) -> Float[Array, "frame"]:
-    """Root of the error (eq. 3) of each frame, px, as corrected by a lens; NaN where no line counts.
+    """RMS distance to straight lines (root of eq. 3) of each frame, px; NaN for a frame without usable
+    lines.
 
     Args:
         lines: the lines, or their compressed form.
@@ -33,7 +34,7 @@ def frame_rms(
     Warns:
         UserWarning: frames at focal lengths outside of the range that the lens was fitted on.
 
-    Points beyond the fold of a lens that has one are corrected by formula.
+    If the lens folds, points beyond the fold are corrected by the formula.
     """
     if isinstance(lens, ZoomLens):
         if lens.image_size != lines.image_size:

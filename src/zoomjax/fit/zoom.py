@@ -1,9 +1,9 @@
-"""The zoom model that minimises the global energy (eq. 13).
+"""Fits of zoom models: minimisation of the global energy (eq. 13).
 
-The unknowns are the zoom model's parameters alone, the lines having dropped out (`energy`). Solvers are
-optimistix', with Jacobians by automatic differentiation; a fitted model is differentiable with respect to
-the points through the implicit function theorem. One that is not certified to be invertible is replaced by
-the best one that is (`constrained`).
+The unknowns are the parameters of the zoom model alone, as the lines are eliminated (`energy`). Solvers are
+those of optimistix, with Jacobians by automatic differentiation. A fitted model is differentiable with
+respect to the points by the implicit function theorem. A model that is not certified to be invertible is
+refitted under that constraint (`constrained`).
 
 Compiled once for a shape of the lines; once per fit an algebraic start and, after it, the covariance and
 the certificate; per iteration one Jacobian of the residuals.
@@ -38,34 +38,34 @@ def fit_zoom(
     invertible: bool = True,
     throw: bool = True,
 ) -> ZoomFit:
-    """The zoom model that minimises the global energy (eq. 13), among those that are invertible.
+    """Fit a zoom lens: the zoom model of least global energy (eq. 13), by default among invertible ones.
 
     Args:
-        lines: the lines, or, much faster and with the same answer, ``compress(lines)``.
-        zoom: the model; `PolynomialZoom` of degree 2 by default. One that has parameters already is where
-            the solver starts; one without starts from the algebraic estimate, if it is linear and the
-            family the radial polynomial, and otherwise from no distortion.
-        family: what the coefficients mean, `RadialPolynomial` (eq. 2) unless lines have another already
-            (`compress_family`): `Division` or `BrownConrady`, which has two coefficients besides.
+        lines: the lines, or, much faster and with the same result, ``compress(lines)``.
+        zoom: the zoom model; `PolynomialZoom` of degree 2 by default. If it has parameters, the solver
+            starts there. Otherwise it starts from the algebraic estimate if the model is linear and the
+            distortion model is the radial polynomial, else from no distortion.
+        family: the distortion model: `RadialPolynomial` (eq. 2) unless the lines have another one
+            (`compress_family`); or `Division`, or `BrownConrady`, which has two additional coefficients.
         terms: the number N of radial distortion coefficients (eq. 2): by default 2, or as many as a `zoom`
             with parameters has.
         solver: any optimistix least-squares solver or minimiser; Levenberg-Marquardt by default, with
             tolerances for the dtype of the lines.
-        max_steps: the most steps the solver may take.
-        invertible: whether a model that is not certified to be invertible, over the whole image and the
-            range of focal lengths, gives way to the best one that is, with a slope of the radius (see
-            `Certificate`) of at least 0.02. A model that is certified stays as it is, to the last bit. For
-            zoom models that do not state their `pieces` this does nothing; for a `PowerZoom`, which is not
-            linear, it gives an invertible model that need not be the very best, and of another family than
-            the polynomial nothing is proved of it. Under ``vmap`` the search for the best one that is runs
-            for the whole batch if one fit of it needs it, and not at all if none does.
-        throw: raise where the solver fails. Otherwise `ZoomFit.result` says so. Results about the model
+        max_steps: the maximum number of solver steps.
+        invertible: whether a model that is not certified to be invertible over the whole image and the
+            range of focal lengths is refitted under that constraint, with a slope of the radius (see
+            `Certificate`) of at least 0.02. A certified model is returned unchanged, bit for bit. This has
+            no effect on zoom models that do not state their `pieces`. For a `PowerZoom`, which is not
+            linear, the refitted model is invertible but not necessarily the best, and with a distortion
+            model other than the polynomial it has no proof. Under ``vmap`` the refit runs for the whole
+            batch if one fit needs it, and not at all if none does.
+        throw: whether to raise if the solver fails. Otherwise see `ZoomFit.result`. Results about the model
             (undetermined, folded, constrained) never raise.
 
     Raises:
-        ValueError: fewer distinct focal lengths than the zoom model needs, lines compressed for fewer
-            terms, or a `zoom` whose parameters are for another number of terms.
-        TypeError: an argument is of another kind, such as the class PolynomialZoom for an instance.
+        ValueError: there are fewer distinct focal lengths than the zoom model needs, the lines were
+            compressed for fewer terms, or the parameters of `zoom` are for another number of terms.
+        TypeError: an argument has the wrong type, such as the class PolynomialZoom instead of an instance.
         RuntimeError: the solver failed (see `throw`).
 
     Example:
@@ -92,7 +92,7 @@ def fit_zoom(
 
 @eqx.filter_jit
 def fit_prepared(lines, start, zoom, terms, solver, max_steps):
-    """A fit of a model made ready, and its outcome."""
+    """The fit of a prepared model, and its outcome."""
     if start is not None:
         zoom = with_parameters(zoom, algebraic_parameters(start, zoom, terms))
     zoom, result, steps = minimise(lines, zoom, solver, max_steps)

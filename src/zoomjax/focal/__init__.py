@@ -1,4 +1,4 @@
-"""Focal lengths from a plane of known geometry."""
+"""Estimation of focal lengths from a plane of known geometry."""
 
 import lazy_loader
 

@@ -20,22 +20,22 @@ def focal_from_board(
     distance: float | int | Scalar,
     pixel: float | int | Scalar,
 ) -> FocalEstimate:
-    """The focal length from one picture of a board parallel to the sensor: eq. 14.
+    """Estimate the focal length from one picture of a board parallel to the sensor: eq. 14.
 
     Args:
         points: corrected positions in the image, px, at least 3.
-        board: the same points on the board, mm, x to the right and y downwards as seen by the camera;
-            it may be turned in its plane and moved.
+        board: the same points on the board, mm, x to the right and y downwards as seen by the camera; its
+            position and rotation in its plane do not matter.
         distance: from the projection plane to the board, mm, > 0: eq. 14's d.
         pixel: side of a pixel on the sensor, mm, > 0. 1 is for points measured in mm.
 
     Returns:
-        The focal length in mm. Residuals count as independent errors of the points' coordinates; those of
-        distance, pixel and board are not included: f changes by as many per cent as the distance.
+        The focal length in mm. Residuals are treated as independent errors of the points' coordinates.
+        Errors of distance, pixel and board are not included: f changes by as many per cent as the distance.
 
-    Raises:
+        Raises:
         ValueError: shapes differ, or there are fewer than 3 points.
-        RuntimeError: a length is not positive, or all points of the board are one.
+        RuntimeError: a length is not positive, or all points of the board coincide.
 
     References:
         Eq. 14 of the paper.

@@ -1,4 +1,4 @@
-"""A focal length and how well it is known; of a plane, from its homographies."""
+"""Estimates of focal lengths with standard deviations; for a plane, from its homographies."""
 
 import equinox as eqx
 import jax
@@ -12,15 +12,16 @@ _WEIGHINGS = 5
 
 
 class FocalEstimate(eqx.Module):
-    """A focal length and how well it is known.
+    """An estimate of a focal length with its standard deviation.
 
     Attributes:
-        focal: the focal length, in the unit that the function says; NaN if it is not determined.
-        std: its standard deviation, same unit, propagated from the residuals, and of a homography also from
-            how far it is from a camera's; infinite if it is not determined. It knows nothing of errors that
-            points share: a board that is not flat, distortion that is left in, another principal point.
-        rms: root mean square distance, px, of the points from where the fitted plane puts them, or from
-            where it puts their lines.
+        focal: the focal length, in the unit stated by the function; NaN if it is not determined.
+        std: its standard deviation, same unit, propagated from the residuals, and for a homography also
+            from its deviation from that of a camera; infinite if it is not determined. It does not include
+            errors common to all points: a board that is not flat, remaining distortion, a wrong principal
+            point.
+        rms: root mean square distance, px, of the points from their positions, or from their lines, under
+            the fitted plane.
     """
 
     focal: Float[Array, "*view"]

@@ -1,4 +1,4 @@
-"""The focal length from named lines of a football pitch of 105 m by 68 m, that of international matches.
+"""Focal length from named lines of a football pitch of 105 m by 68 m, the size for international matches.
 
 The names are those of the SoccerNet annotations. "Left" and "right" are the halves as the main camera sees
 them, "top" is far from it and "bottom" near; "Big rect." is the penalty area, "Small rect." the goal area,
@@ -52,16 +52,16 @@ right and y towards the camera. Markings are up to 0.12 m wide; areas are measur
 def focal_from_pitch(
     annotations: Mapping[str, ArrayLike], *, principal: Float[AnyArray, "2"]
 ) -> FocalEstimate:
-    """The focal length from one picture of a football pitch, of which lines are known by name.
+    """Estimate the focal length from one picture of a football pitch with named lines.
 
     Args:
         annotations: for each name corrected positions in the image, px, (n, 2), anywhere on that line.
-            Names that `PITCH_LINES` does not have are left out: curves, posts, crossbars.
+            Names that are not in `PITCH_LINES` are ignored: curves, posts, crossbars.
         principal: the principal point, px; the centre of distortion is the usual choice.
 
     Returns:
-        The focal length in px, as of `focal_from_lines`: NaN from too few lines. The standard deviation
-        includes neither a pitch of another size nor the error of the principal point.
+        The focal length in px, as from `focal_from_lines`: NaN from too few lines. The standard deviation
+        includes neither errors of the size of the pitch nor of the principal point.
 
     Raises:
         ValueError: none of the names is known, or positions are not finite (n, 2) arrays.

@@ -1,8 +1,8 @@
-"""The focal length from oblique views of a plane of known geometry.
+"""Focal length from oblique views of a plane of known geometry.
 
-For corrected points (`Distortion.undistort`): pictures of a lens without distortion.
+Points must be corrected (`Distortion.undistort`), as from a lens without distortion.
 
-A plane seen obliquely, at no known distance: with the principal point known, the homography
+The plane is seen obliquely, at an unknown distance. With the principal point known, the homography
 ``H = (h1 h2 h3)`` from the plane to the image relative to that point gives two equations for w = 1/f²
 (Zhang 2000): with ω = diag(w, w, 1),
 
@@ -10,12 +10,12 @@ A plane seen obliquely, at no known distance: with the principal point known, th
 
 Each homography is fitted to its points' distances in the image, by iterations that start from the linear
 solution. The covariance of its entries becomes that of the two equations, by whose inverse they are
-weighted; w is the generalised least-squares solution. The closer a view is to squarely, the less it says
-about f, and the larger is its standard deviation. This f is the distance from the centre of projection to
-the image, in px: for a lens that is focused at a distance d, it is ``d / (d - f)`` times eq. 14's.
+weighted; w is the generalised least-squares solution. The closer a view is to frontal, the less it
+determines f, and the larger is its standard deviation. This f is the distance from the centre of projection
+to the image, in px: for a lens that is focused at a distance d, it is ``d / (d - f)`` times eq. 14's.
 
-Known lines of a plane, of which points are seen that nobody can tell where on the line they are: markings
-of a sports pitch. Their homography is fitted to the points' distances from the images of their lines.
+Lines of a plane, such as markings of a sports pitch, can be used without known positions of points along
+them. The homography is fitted to the points' distances from the images of their lines.
 """
 
 import equinox as eqx
@@ -34,7 +34,7 @@ def focal_from_planes(
     *,
     principal: Float[AnyArray, "2"],
 ) -> tuple[FocalEstimate, FocalEstimate]:
-    """The focal length from oblique views of a known plane, by Zhang's two constraints.
+    """Estimate the focal length from oblique views of a known plane, by Zhang's two constraints.
 
     Args:
         points: corrected positions in the images, px, one or more views, all at the same zoom, of at
@@ -78,16 +78,17 @@ def focal_from_lines(
     principal: Float[AnyArray, "2"],
     mask: Bool[AnyArray, "line point"] | None = None,
 ) -> FocalEstimate:
-    """The focal length from one oblique view of known lines of a plane, by Zhang's two constraints.
+    """Estimate the focal length from one oblique view of known lines of a plane, by Zhang's two
+    constraints.
 
-    Where on its line each point is, need not be known. For many pictures alike use `jax.vmap`.
+    Positions of points along their lines need not be known. Use `jax.vmap` for many similar pictures.
 
     Args:
         points: corrected positions in the image, px: for each line those that are seen on it.
         lines: for each line two points of it, on the plane, in any unit: its size and place do not matter,
             nor whether the two are seen.
         principal: the principal point, px; the centre of distortion is the usual choice.
-        mask: which of the points there are; all, if it is not given. A line may have none.
+        mask: which points are valid; by default all. A line may have none.
 
     Returns:
         The focal length in px. It is NaN, and its standard deviation infinite, if the view does not

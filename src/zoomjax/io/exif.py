@@ -1,6 +1,6 @@
 """EXIF data, read and written by Pillow: where they are in a file, and the focal length in them.
 
-No pixel is decoded. That is why `find_exif` looks through the chunks of PNG and WebP files by itself:
+No pixel is decoded. That is why `find_exif` searches the chunks of PNG and WebP files itself:
 Pillow decodes a PNG to find what is behind its pixels, and takes the memory of two pictures for a WebP.
 """
 

@@ -1,4 +1,4 @@
-"""Focal lengths of images: a CSV file ``image,focal``, perhaps with their deviations, ``sigma``."""
+"""Tables of focal lengths: CSV files ``image,focal``, optionally with standard deviations, ``sigma``."""
 
 import math
 import os
@@ -14,8 +14,7 @@ class FocalTable:
     """Focal lengths by the names of images.
 
     An image is looked up by its name with as many of its folders as the table gives: ``3x/board.png`` or,
-    where that is enough to tell it from others, ``board.png``. If rows with and without folders fit, the
-    one with more folders counts.
+    where that is unique, ``board.png``. If several rows fit, the one with most folders is used.
     """
 
     def __init__(
@@ -28,7 +27,7 @@ class FocalTable:
         self._path = os.fspath(path)
 
     def row(self, image: str | os.PathLike[str]) -> str | None:
-        """The name by which the table knows an image, or None if it does not."""
+        """The name of an image in the table, or None if it is not there."""
         parts = PurePath(image).parts
         names = ("/".join(parts[start:]) for start in range(len(parts)))
         return next((name for name in names if name in self._focals), None)
@@ -42,19 +41,20 @@ class FocalTable:
         row = self.row(image)
         if row is None:
             raise ValueError(
-                f"Cannot read focal lengths from {self._path}: it has no number for {PurePath(image).name}."
+                f"Cannot read focal lengths from {self._path}: it has no focal length for "
+                f"{PurePath(image).name}."
             )
         return self._focals[row]
 
     def sigma(self, image: str | os.PathLike[str]) -> float | None:
-        """The standard deviation of an image's focal length, or None if the table tells none."""
+        """The standard deviation of an image's focal length, or None if the table has none."""
         return self._sigmas.get(self.row(image) or "")
 
     def of(self, images: Iterable[str]) -> dict[str, float]:
-        """The focal lengths of those images that the table knows.
+        """The focal lengths of those images that are in the table.
 
         Raises:
-            ValueError: one row is the only one for two images.
+            ValueError: two images have the same row.
         """
         found: dict[str, str] = {}
         for image in images:
@@ -71,14 +71,14 @@ class FocalTable:
 
 
 def read_focal_table(path: str | os.PathLike[str]) -> FocalTable:
-    """Read a CSV file whose first line names the columns ``image`` and ``focal``, and perhaps ``sigma``.
+    """Read a CSV file with the columns ``image``, ``focal`` and optionally ``sigma``.
 
-    Of a kind that `zoomjax.io.text_table` reads. A name that begins with ``#`` is written in quotes.
+    For the format see `zoomjax.io.text_table`. A name that begins with ``#`` must be quoted.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is something else, a focal length is no positive number, or an image comes twice
-            with different numbers; the message names the row.
+        ValueError: the file is not such a table, a focal length is not a positive number, or an image is
+            listed twice with different numbers; the message names the row.
     """
     table = read_text_table(
         path, "focal lengths", texts=("image",), numbers=("focal",), optional=("sigma",), gaps=("sigma",)
@@ -97,7 +97,7 @@ def read_focal_table(path: str | os.PathLike[str]) -> FocalTable:
         told = (value, None if math.isnan(std) else std)
         if found.setdefault(name, told) != told:
             raise table.error(
-                f"{name} comes twice, with {_told(*found[name])} and, in row {row}, {_told(*told)}"
+                f"{name} is listed twice, with {_told(*found[name])} and, in row {row}, {_told(*told)}"
             )
     return FocalTable(
         {name: value for name, (value, _) in found.items()},

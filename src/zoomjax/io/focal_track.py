@@ -13,13 +13,13 @@ from .text_table import read_text_table
 
 @dataclasses.dataclass(frozen=True)
 class FocalTrack:
-    """A focal length for every moment from its first sample to its last.
+    """A focal length for every time from the first sample to the last.
 
     Attributes:
-        position: increasing; seconds from the start, or frame numbers from 0.
-        focal: positive, one a position.
+        position: positions of the samples, increasing: seconds from the start, or frame numbers from 0.
+        focal: focal length at each position, positive.
         by_time: whether positions are seconds.
-        hold: whether the first and last focal length go on beyond the ends.
+        hold: whether the first and last focal lengths are used beyond the ends.
 
     Example:
         >>> FocalTrack(np.array([0.0, 10.0]), np.array([20.0, 60.0]), by_time=False).at(5, 0.2)
@@ -54,8 +54,9 @@ class FocalTrack:
         """The focal length of a frame, given its number from 0 and its time in seconds.
 
         Raises:
-            ValueError: the track begins after it or ends before it, and does not hold; or the frame has no
-                time (NaN), and the track is in seconds.
+            ValueError: the frame is outside of the track and `hold` is False; or the frame has no time
+            (NaN)
+                and the track is in seconds.
         """
         position = time if self.by_time else float(frame)
         if not np.isfinite(position):
@@ -76,14 +77,14 @@ class FocalTrack:
 
 
 def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> FocalTrack:
-    """A track from a CSV file with a header, ``time,focal`` (seconds) or ``frame,focal`` (from 0).
+    """Read a track from a CSV file with a header, ``time,focal`` (seconds) or ``frame,focal`` (from 0).
 
-    Under the header ``time_or_frame`` positions are frames if all are whole numbers, else seconds. The
-    file is of a kind that `zoomjax.io.text_table` reads.
+    With the header ``time_or_frame`` positions are frames if all are whole numbers, else seconds. For the
+    format see `zoomjax.io.text_table`.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is something else, or not in order of time; the message names it.
+        ValueError: the file is not such a track, or not in order of time; the message names it.
 
     Example:
         >>> import pathlib, tempfile

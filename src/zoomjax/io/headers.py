@@ -1,7 +1,7 @@
-"""What an image file announces before anything is decoded: its format and its size.
+"""Format and size of an image file from its header, before anything is decoded.
 
-A decoder takes memory for as many pixels as the header names, whatever the file holds. So the header is
-read first, by a few lines that take no memory at all.
+A decoder allocates memory for the number of pixels in the header, whatever the file holds. So the header is
+read first, by a few lines that need almost no memory.
 """
 
 import re
@@ -72,7 +72,7 @@ def _png(content: bytes) -> tuple[int, int]:
 def _bmp(content: bytes) -> tuple[int, int]:
     old = struct.unpack_from("<I", content, 14) == (12,)
     width, height = struct.unpack_from("<HH" if old else "<ii", content, 18)
-    return abs(width), abs(height)  # rows may be stored from the top, told by a negative height
+    return abs(width), abs(height)  # a negative height means rows from the top
 
 
 def _webp(content: bytes) -> tuple[int, int]:

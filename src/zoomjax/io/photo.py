@@ -1,6 +1,6 @@
-"""Photographs read with their metadata.
+"""Reading of photos with their metadata.
 
-Pixels are taken as they are stored, before the orientation tag turns them: that is how the lens saw them.
+Pixels are used as stored, before rotation by the orientation tag, because the lens model refers to these.
 """
 
 import contextlib
@@ -30,12 +30,12 @@ SUFFIXES = (*FORMATS, *HEIC_SUFFIXES)
 
 
 def read_focal(source: str | os.PathLike[str]) -> float | None:
-    """The focal length, mm, in a photograph's EXIF data; None if they tell none. No pixel is decoded.
+    """Read the focal length, mm, from a photo's EXIF data; None if they have none. No pixel is decoded.
 
     Raises:
         FileNotFoundError: there is no such photograph.
         OSError: it cannot be read.
-        ValueError: it is no photograph, no ordinary file, or has more than 4 GB.
+        ValueError: it is not a photo or not a regular file, or has more than 4 GB.
     """
     path = Path(source)
     try:
@@ -51,15 +51,15 @@ def read_focal(source: str | os.PathLike[str]) -> float | None:
 
 
 def metadata_focal(metadata: Metadata) -> float | None:
-    """The focal length, mm, in what `read_photo` found beside the pixels."""
+    """The focal length, mm, in the metadata from `read_photo`."""
     blocks = (data.tobytes() for kind, data in metadata if kind == cv2.IMAGE_METADATA_EXIF)
     return next((exif_focal(block) for block in blocks), None)
 
 
 def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, Metadata]:
-    """The pixels as stored, and metadata (EXIF, XMP, colour profile) as pairs of kind and bytes.
+    """Read the pixels as stored, and metadata (EXIF, XMP, colour profile) as pairs of kind and bytes.
 
-    The header is looked at before anything is decoded, and what is no ordinary file is not opened.
+    The header is checked before anything is decoded, and only regular files are opened.
 
     Raises:
         FileNotFoundError: there is no such photograph.
@@ -85,7 +85,7 @@ def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, Metadata]:
             image = as_stored(image, orientation)  # OpenCV turns TIFF files, whatever it is asked
         return image, metadata
     except (ValueError, MemoryError) as error:
-        reason = error if isinstance(error, ValueError) else "it takes more memory than there is"
+        reason = error if isinstance(error, ValueError) else "there is not enough memory for it"
         raise ValueError(f"Cannot read a photograph from {path}: {reason}.") from error
 
 
@@ -107,7 +107,7 @@ def open_photo(path: Path) -> Iterator[io.BufferedReader]:
     Raises:
         FileNotFoundError: there is no such photograph.
         OSError: it cannot be read.
-        ValueError: it is no ordinary file, or too large.
+        ValueError: it is not a regular file, or too large.
     """
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     try:
@@ -117,7 +117,7 @@ def open_photo(path: Path) -> Iterator[io.BufferedReader]:
     with open(descriptor, "rb") as file:
         about = os.fstat(descriptor)
         if not stat.S_ISREG(about.st_mode):
-            raise ValueError("it is no ordinary file")
+            raise ValueError("it is not a regular file")
         if about.st_size > _MOST_BYTES:
             raise ValueError(f"it has {about.st_size / 1e9:.1f} GB, more than {_MOST_BYTES / 1e9:.0f}")
         yield file

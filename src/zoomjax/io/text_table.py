@@ -1,13 +1,13 @@
-"""Tables of numbers in text files, whatever program wrote them: one reader for all CSV files.
+"""The reader of all CSV files: tables of numbers in text files from any program.
 
-The first line names the columns. As the names that it must hold are known, the separator (comma, semicolon
-or tab) is the one that yields them: nothing is guessed from the numbers. A row must have as many fields as
-the first line has names, so that a decimal comma between commas is an error, and a number must be one in
-plain decimal notation: no ``nan``, ``0x10``, ``1_000`` or digits of other scripts.
+The first line names the columns. The expected names are known, so the separator (comma, semicolon or tab)
+is the one that yields them: nothing is guessed from the numbers. A row must have as many fields as the
+first line, so that a decimal comma in comma-separated files is an error. Numbers must be in plain decimal
+notation: no ``nan``, ``0x10``, ``1_000`` or digits of other scripts.
 
 Files of numbers alone, without quotes and comments, are read by `numpy.loadtxt` after a count of the
-separators in each line, which is some five times faster. All others, and those where that fails, go
-through `csv.reader` row by row, which is what defines the result and words the errors.
+separators in each line, which is some five times faster. All others, and those where that fails, are read
+row by row by `csv.reader`, which defines the result and the error messages.
 """
 
 import codecs
@@ -38,9 +38,9 @@ _GROUPED = re.compile(r"[+-]?[1-9][0-9]{0,2},[0-9]{3}")
 
 
 def plain_number(text: str) -> float | None:
-    """The finite number that a text in plain decimal notation says, or None.
+    """The finite number in a text in plain decimal notation, or None.
 
-    Unlike `float`, it knows no ``nan``, ``inf``, ``1_000`` and digits of other scripts.
+    Unlike `float`, it does not accept ``nan``, ``inf``, ``1_000`` and digits of other scripts.
 
     Example:
         >>> plain_number(" 2.5e1 "), plain_number("1_000"), plain_number("20,5")
@@ -105,14 +105,14 @@ def read_text_table(
     Args:
         path: the file.
         what: what it holds, for errors.
-        numbers, texts: columns that there must be.
-        one_of: columns of numbers of which there must be exactly one.
-        optional: columns of numbers that there may be.
+        numbers, texts: required columns.
+        one_of: columns of numbers of which exactly one is required.
+        optional: optional columns of numbers.
         gaps: columns of numbers whose cells may be empty.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is something else, or what it says is not certain; the message names file and row.
+        ValueError: the file is not such a table, or is ambiguous; the message names file and row.
     """
     source = os.fspath(path)
     try:

@@ -22,13 +22,14 @@ _MOST_ERRORS = 1000
 def decode_video(
     source: str | os.PathLike[str],
 ) -> Iterator[tuple[int, Iterator[tuple[int, float, Callable[[], np.ndarray]]]]]:
-    """The number of frames by the file's own account, and for each number, time, s, and what decodes it.
+    """The announced number of frames, and for each frame its number, time, s, and a function that decodes
+    it.
 
-    Numbers count damaged frames, too. The time is NaN where the file has none: the rate that FFmpeg then
-    tells is a guess.
+    Numbers count damaged frames, too. The time is NaN where the file has none: the frame rate from FFmpeg
+    is then a guess.
 
     Pixels are (height, width, 3) blue, green, red bytes, as stored: before any rotation for display.
-    Damaged frames are passed over.
+    Damaged frames are skipped.
 
     Raises:
         FileNotFoundError: there is no such video.
@@ -64,7 +65,7 @@ def opened_video(source: str | os.PathLike[str]) -> Any:
     if not path.exists():
         raise FileNotFoundError(f"There is no video {path}.")
     if not path.is_file():
-        raise ValueError(f"Cannot read a video from {path}: it is no ordinary file.")
+        raise ValueError(f"Cannot read a video from {path}: it is not a regular file.")
     if path.stat().st_size == 0:
         raise ValueError(f"Cannot read a video from {path}: the file is empty.")
     try:
@@ -77,7 +78,7 @@ def opened_video(source: str | os.PathLike[str]) -> Any:
     context = video and video.codec_context  # none of a codec that FFmpeg does not know
     if not (context and context.width and context.height):
         container.close()
-        why = "it has no video stream" if video is None else "none of its frames decodes"
+        why = "it has no video stream" if video is None else "none of its frames can be decoded"
         raise ValueError(f"Cannot read a video from {path}: {why}.")
     video.thread_type = "AUTO"
     return container

@@ -1,7 +1,7 @@
-"""What the energies and the fits see of lines.
+"""The interface of line sets for energies and fits.
 
-`AbstractLines` gives, for any distortion coefficients, line by line, the corrected points about their mean,
-or rows that stand for them exactly.
+For any distortion coefficients, `AbstractLines` gives the corrected points of each line about their mean,
+or rows that are exactly equivalent.
 """
 
 import abc
@@ -80,7 +80,7 @@ class AbstractLines(eqx.Module):
 
     @property
     def family(self) -> AbstractFamily:
-        """What the coefficients mean: the radial polynomial, except for `FamilyLines`."""
+        """The distortion model of the coefficients: the radial polynomial, except for `FamilyLines`."""
         return RadialPolynomial()
 
     def expansion(
@@ -118,7 +118,7 @@ class AbstractLines(eqx.Module):
         """The same lines about another centre of distortion, px: that of all frames, or of each frame.
 
         Raises:
-            ValueError: they were compressed for one centre, and this is another.
+            ValueError: the lines were compressed for another centre.
         """
 
     @abc.abstractmethod
@@ -126,10 +126,10 @@ class AbstractLines(eqx.Module):
         """The chosen lines as a data set of one frame; those not `present` count as empty."""
 
     def weighted(self: SomeLines, weight: ArrayLike) -> SomeLines:
-        """The same lines, each counting `weight` beside the others of its frame.
+        """The same lines with a weight each, relative to the other lines of the frame.
 
         Raises:
-            ValueError: there is not one finite weight of at least 0 for each line.
+            ValueError: `weight` does not hold one finite number of at least 0 for each line.
         """
         weight = jnp.asarray(weight, jnp.asarray(self.focal).dtype)
         if weight.shape != self.frame.shape:
@@ -142,10 +142,10 @@ class AbstractLines(eqx.Module):
         return eqx.tree_at(lambda lines: lines.weight, self, weight, is_leaf=lambda leaf: leaf is None)
 
     def by_frame(self) -> tuple[Int[AnyArray, "frame some"], Bool[AnyArray, "frame some"]]:
-        """For each frame the indices of its lines, padded to the fullest frame, and which are real.
+        """For each frame the indices of its lines, padded to the largest frame, and a mask of real entries.
 
-        Computed in NumPy: the padding is a shape. Under ``jit``, where `frame` is not known, every
-        frame is given all lines and chooses by the mask.
+        Computed in NumPy, because the padding is a shape. Under ``jit``, where `frame` is not known, every
+        frame gets all lines and selects by the mask.
         """
         frames, number = self.focal.shape[0], self.frame.shape[0]
         if traced(self.frame):

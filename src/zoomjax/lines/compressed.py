@@ -79,7 +79,7 @@ class CompressedLines(AbstractLines):
 
     @property
     def terms(self) -> int:
-        """The largest number of coefficients N that these triangles serve."""
+        """The largest number of coefficients N for which these triangles are valid."""
         return (self.triangle.shape[-1] - 3) // 2
 
     @property
@@ -88,10 +88,10 @@ class CompressedLines(AbstractLines):
         return jnp.round(self.triangle[:, 0, 0] ** 2)
 
     def check_terms(self, terms: int) -> None:
-        """Raise ValueError where these triangles do not serve so many coefficients."""
+        """Raise ValueError if the lines were compressed for fewer coefficients."""
         if terms > self.terms:
             raise ValueError(
-                f"These lines were compressed for {self.terms} terms, but {terms} are asked for: "
+                f"These lines were compressed for {self.terms} terms, but {terms} are requested: "
                 f"compress(lines, terms={terms})."
             )
 
@@ -112,15 +112,15 @@ class CompressedLines(AbstractLines):
         return jnp.stack(products, axis=1)
 
     def about(self, centre: Centres) -> "CompressedLines":
-        """These lines, if `centre` is theirs, px.
+        """These lines, if `centre` is their centre, px.
 
         Raises:
-            ValueError: it is another, which these triangles do not serve.
+            ValueError: it is another centre, for which these triangles are not valid.
         """
         if not traced((self.centre, centre)) and not np.allclose(self.centre, centre, rtol=0, atol=1e-3):
             raise ValueError(
-                "The compressed lines have another centre of distortion than is asked for. Compress the "
-                "lines about that centre, or by compress_any_centre, or pass the lines themselves."
+                "The compressed lines have another centre of distortion than the one requested. Compress "
+                "the lines about that centre, or by compress_any_centre, or pass the lines themselves."
             )
         return self
 
@@ -148,11 +148,11 @@ def _combine(triangle, k):
 
 @kinds_checked
 def compress(lines: Lines, terms: int = 2) -> CompressedLines:
-    """Reduce each line to its triangle; fits then take milliseconds and give the same answer.
+    """Compress each line exactly to a triangle; fits then take milliseconds and give the same result.
 
     Args:
         lines: the lines; their `centre` is the centre the result is for.
-        terms: the largest number N of coefficients that will be fitted. Fewer can be.
+        terms: the largest number N of coefficients to be fitted. Fewer can be fitted, too.
 
     Returns:
         The compressed lines, differentiable with respect to points and centre. If `lines.points` is sharded
@@ -181,14 +181,14 @@ def compress(lines: Lines, terms: int = 2) -> CompressedLines:
 
 @kinds_checked
 def merge(first: CompressedLines, second: CompressedLines) -> CompressedLines:
-    """The same lines with the points of both: for chunks of points that do not fit in memory together.
+    """Merge two chunks of points of the same lines, for data larger than memory.
 
-    Make the chunks by ``Lines.from_ragged(..., chunk=True)``, which keeps a line of which a chunk has few
-    points or none, so that every chunk holds all lines in the same order. Lines of other frames are put
-    beside these by `concatenate`.
+    Make the chunks by ``Lines.from_ragged(..., chunk=True)``, which keeps lines with few or no points in a
+    chunk, so that every chunk holds all lines in the same order. Use `concatenate` to add lines of other
+    frames.
 
     Raises:
-        ValueError: the two do not hold the same lines, or not for the same terms, centre and image size.
+        ValueError: the two differ in their lines, terms, centre or image size.
     """
     if first.triangle.shape != second.triangle.shape:
         raise ValueError(

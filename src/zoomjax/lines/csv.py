@@ -1,7 +1,7 @@
-"""Line primitives as text: a row a point, with the columns ``frame,line,x,y`` and perhaps ``focal``.
+"""Line primitives as CSV: one row per point, with the columns ``frame,line,x,y`` and optionally ``focal``.
 
-``frame`` and ``line`` are integers of the writer's choice; a line is one pair of both, its points in the
-order of their rows. ``x,y`` are px, (0, 0) the centre of the top-left pixel. Focal lengths come from the
+``frame`` and ``line`` are arbitrary integers. Each pair of them is a line, with its points in the order of
+the rows. ``x,y`` are px, (0, 0) the centre of the top-left pixel. Focal lengths come from the
 column ``focal``, the same in all rows of a frame, or from a second file with the columns ``frame,focal``.
 """
 
@@ -28,16 +28,15 @@ def read_lines_csv(
     """Read lines from a ``frame,line,x,y[,focal]`` file, in float64.
 
     Args:
-        path: the file, of a kind that `zoomjax.io.text_table` reads; columns in any order, others are
-            ignored.
+        path: a file that `zoomjax.io.text_table` can read; columns in any order, others are ignored.
         image_size: (width, height) px.
         focal: focal length by frame number, if the file has no column ``focal``; a sequence counts
             frames from 0.
         focal_unit: "mm" or "px".
 
     Raises:
-        ValueError: a column is missing, a value is no number, a frame has no focal length, or focal
-            lengths are in the file and in `focal`, or `Lines.from_ragged` raises one; the message names
+        ValueError: a column is missing, a value is not a number, a frame has no focal length, focal lengths
+            are both in the file and in `focal`, or `Lines.from_ragged` refuses the lines. The message names
             the file.
     """
     table = read_text_table(path, "lines", numbers=("frame", "line", "x", "y"), optional=("focal",))
@@ -47,7 +46,7 @@ def read_lines_csv(
     if "focal" in columns:
         if focal is not None:
             raise table.error(
-                "it has a column focal, and focal lengths are given beside it. Leave one of them out"
+                "it has a column focal, but focal lengths are also given separately. Leave one of them out"
             )
         table.check("focal", columns["focal"] > 0, "positive")
         lowest, highest = np.full(frames.size, np.inf), np.full(frames.size, -np.inf)
@@ -103,7 +102,7 @@ def read_focal_csv(path: str | os.PathLike[str]) -> dict[int, float]:
     """Read focal lengths by frame number from a file with the columns ``frame,focal``.
 
     Raises:
-        ValueError: a column is missing, a value is no number, or not positive, or a frame comes twice.
+        ValueError: a column is missing, a value is not a positive number, or a frame is listed twice.
     """
     table = read_text_table(path, "focal lengths", numbers=("frame", "focal"))
     frame, focal = _integers(table, "frame"), table.numbers["focal"]

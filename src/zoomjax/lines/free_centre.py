@@ -1,4 +1,4 @@
-"""Exact compression for any centre of distortion, for fits that look for the centre as well.
+"""Exact compression for any centre of distortion, for fits of the centre.
 
 About a centre o (normalised, from a reference) a corrected point is a polynomial in the point z,
 
@@ -27,7 +27,8 @@ from .lines import Lines
 
 
 class AnyCentreLines(AbstractLines):
-    """Lines reduced to triangles that serve every centre of distortion, and up to `terms` coefficients.
+    """Lines reduced to triangles that are valid for every centre of distortion and up to `terms`
+    coefficients.
 
     Attributes:
         triangle: R of each line's monomials, about `centre`, in normalised lengths.
@@ -63,7 +64,7 @@ class AnyCentreLines(AbstractLines):
 
     @property
     def terms(self) -> int:
-        """The largest number of coefficients N that these triangles serve."""
+        """The largest number of coefficients N for which these triangles are valid."""
         return (round((8 * self.triangle.shape[-1] + 1) ** 0.5) - 5) // 4
 
     @property
@@ -138,11 +139,11 @@ class AnyCentreLines(AbstractLines):
 
 @kinds_checked
 def compress_any_centre(lines: Lines, terms: int = 2) -> AnyCentreLines:
-    """Reduce each line to a triangle that serves every centre of distortion: for `fit_centre`.
+    """Compress each line exactly for every centre of distortion, for `fit_centre`.
 
     Args:
         lines: the lines.
-        terms: the largest number N of coefficients that will be fitted. Fewer can be.
+        terms: the largest number N of coefficients to be fitted. Fewer can be fitted, too.
 
     Example:
         >>> import numpy as np

@@ -51,9 +51,9 @@ class Lines(AbstractLines):
         image_size: (width, height) px.
         focal_unit: "mm" or "px".
         number: position of each line among those that `from_ragged` was given; None if unknown.
-        weight: how much each line counts beside the others of its frame, at least 0; None for all alike.
-        focus: where the lens is focused in each image, for models that depend on it (`AbstractFocusZoom`):
-            any number that grows or falls with it, such as the reciprocal of the distance; None if unknown.
+        weight: weight of each line relative to the others of its frame, at least 0; None for equal weights.
+        focus: focus of the lens in each image, for models that depend on it (`AbstractFocusZoom`): any
+            monotonic function of the focus distance, such as its reciprocal; None if unknown.
     """
 
     points: Float[AnyArray, "line point 2"] = eqx.field(converter=numbers("points"))
@@ -100,7 +100,7 @@ class Lines(AbstractLines):
         focus: ArrayLike | None = None,
         chunk: bool = False,
     ) -> "Lines":
-        """Lines from one array of points a line.
+        """Make lines from one array of points per line.
 
         Args:
             points: for each line an (n, 2) array of ``(x, y)`` px, n >= 3.
@@ -109,9 +109,9 @@ class Lines(AbstractLines):
             image_size: (width, height) px.
             focal_unit: "mm" or "px", the unit of `focal`.
             centre: centre of distortion, px; default the centre of the image.
-            focus: for each image where the lens is focused, a finite number, 1/distance say, or None.
+            focus: for each image the focus of the lens, a finite number such as 1/distance, or None.
             chunk: whether these are only some of the lines' points, to be compressed and merged with
-                others: then every line is kept, whatever its number of points, even none.
+                others. Then every line is kept, even without points.
 
         Raises:
             ValueError: a point or focal length is not finite, a focal length is not positive, a frame
@@ -168,7 +168,7 @@ class Lines(AbstractLines):
         image_size: Sequence[int],
         focal_unit: str = "mm",
     ) -> "Lines":
-        """Every row and every column of flat grids (checkerboard corners, dots) as a line.
+        """Make a line of every row and every column of flat grids (checkerboard corners, dots).
 
         Args:
             corners: positions of the grids' nodes, px.
@@ -200,7 +200,7 @@ class Lines(AbstractLines):
         )
 
     def to_ragged(self) -> list[np.ndarray]:
-        """The points of each line as an (n, 2) array: what `from_ragged` took."""
+        """The points of each line as an (n, 2) array, as for `from_ragged`."""
         mask = np.asarray(self.mask)
         return [line[keep] for line, keep in zip(np.asarray(self.points), mask, strict=True)]
 

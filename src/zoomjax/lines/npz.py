@@ -21,8 +21,7 @@ def load_lines(path: str | os.PathLike[str]) -> Lines:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is truncated, or something else, or of a later version; the message
-            names it.
+        ValueError: the file is truncated, of another kind, or of a later version; the message names it.
     """
     stored = _read_archive(path)
     try:
@@ -79,7 +78,7 @@ def _read_archive(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 
 def _check_unpacked(size: int, file_size: int) -> None:
-    """Refuse what a small file would fill the memory with."""
+    """Refuse a small file that would unpack to fill the memory."""
     if size > max(_MOST_UNPACKED, _MOST_TIMES * file_size):
         raise ValueError(f"it would take {size / 1e9:.1f} GB of memory, far more than its own size")
 

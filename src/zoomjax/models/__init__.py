@@ -1,4 +1,4 @@
-"""Distortion and zoom models: from a focal length to the distortion there, and back to a file."""
+"""Distortion and zoom models, lenses, their files and their certificates of invertibility."""
 
 import lazy_loader
 

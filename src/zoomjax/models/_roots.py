@@ -5,7 +5,7 @@ The same code for NumPy and JAX: operations are taken from the namespace of the 
 
 The root of an increasing function costs four steps of Newton's method, which is all that photographic
 lenses need. Points that have not arrived then go on in a bracket, where each step either halves the
-residual or halves the bracket. Newton's method inside a bracket does not do that by itself: it can jump
+residual or halves the bracket. Newton's method inside a bracket alone does not do that: it can jump
 between two points for ever.
 """
 

@@ -1,4 +1,4 @@
-"""The radial polynomial and decentering: a family of distortions that is not radial."""
+"""The Brown-Conrady model: the radial polynomial with decentering, which is not radial."""
 
 from typing import ClassVar
 
@@ -16,7 +16,7 @@ _DIRECTIONS = 8
 
 
 class BrownConrady(AbstractFamily):
-    """The radial polynomial of N terms and decentering: coefficients ``(k1, ..., kN, p1, p2)``.
+    """Brown-Conrady: radial polynomial of N terms with decentering, coefficients ``(k1, ..., kN, p1, p2)``.
 
     With ``z = (x, y)`` and ``q = (p2, p1)`` the corrected point is ``z L(t) + t q + 2 (q.z) z``, that is
 

@@ -4,8 +4,8 @@
     pixel of (X, Y, Z)  the distorted position of  c + f (X, Y) / Z
 
 Axes are OpenCV's: x to the right, y down, z forward. There is no pose: transform points before, rays after.
-All is elementwise, a focal length for each pixel if wanted, and differentiable in pixels, points, focal
-lengths and the lens.
+All functions are elementwise, with a focal length for each pixel if wanted, and differentiable in pixels,
+points, focal lengths and the lens.
 """
 
 from typing import Any
@@ -78,7 +78,7 @@ class Camera(eqx.Module):
         focal: FocalLike,
         focus: FocalLike | None = None,
     ) -> tuple[Float[AnyArray, "*pixels 3"], Bool[AnyArray, "*pixels"]]:
-        """The direction that each pixel looks in.
+        """Compute the viewing ray of each pixel.
 
         Args:
             pixels: (..., 2) px of the distorted image.
@@ -87,8 +87,8 @@ class Camera(eqx.Module):
             focus: as for a call of the lens.
 
         Returns:
-            Directions ``(x, y, 1)``, not of length 1, and whether there is one: beyond the fold of a lens
-            that folds they are NaN, with derivatives of zero.
+            Directions ``(x, y, 1)``, not of length 1, and a mask of the pixels that have one. Beyond the
+            fold of a lens, directions are NaN with derivatives of zero.
         """
         corrected = self.lens.undistort(pixels, focal, focus)
         xp = namespace(corrected)
@@ -102,15 +102,15 @@ class Camera(eqx.Module):
         focal: FocalLike,
         focus: FocalLike | None = None,
     ) -> tuple[Float[AnyArray, "*pixels 2"], Bool[AnyArray, "*pixels"]]:
-        """The pixel that each point in space is seen at.
+        """Project points in space to pixels.
 
         Args:
             points: (..., 3) in the camera's axes, in any unit.
             focal, focus: as for `rays`.
 
         Returns:
-            Positions in the distorted image, px, within it or not, and whether there is one. Points that
-            are not in front of the camera, or have no inverse, are NaN, with derivatives of zero.
+            Positions in the distorted image, px, inside of it or not, and a mask of the points that have
+            one. Points not in front of the camera, or without an inverse, are NaN with derivatives of zero.
         """
         space: Any = points if isinstance(points, jax.Array) else as_array(np.asarray(points))
         xp = namespace(space)

@@ -1,10 +1,11 @@
-"""Distortion of one frame: the paper's L (eq. 1-2), its inverse, and where that exists.
+"""Distortion of one frame: the paper's L (eq. 1-2), its inverse, and where the inverse exists.
 
-With ``z = (x - c)/s`` the corrected point is ``c + s F(z)``: F is the family's (`family`), by default
+With ``z = (x - c)/s`` the corrected point is ``c + s F(z)``. F is given by the distortion model (`family`),
+by default
 
     F(z) = z L(t),  L(t) = 1 + k1 t + k2 t^2 + ... + kN t^N,  t = z.z.
 
-Here are lengths in px, arrays of points and dtypes; formulas and inverses are there.
+This module handles px, arrays of points and dtypes; formulas and inverses are in `family`.
 """
 
 from collections.abc import Callable
@@ -25,23 +26,23 @@ from .polynomial import RadialPolynomial
 
 
 class Distortion(eqx.Module):
-    """Distortion of one frame (eq. 1-2), radial unless its family says otherwise, or of several frames.
+    """Distortion of one frame (eq. 1-2) or of several frames, by default radial.
 
     ``undistort`` maps distorted to corrected points, the paper's L; ``distort`` is its inverse. Points
     are ``(x, y)`` px with (0, 0) at the centre of the top-left pixel, in arrays of any leading shape.
 
-    NumPy arrays, and lists, give NumPy arrays, computed at once, without compilation; JAX arrays give JAX
-    arrays. Results have the points' dtype; integers give float64, half precision (which has steps of
-    0.5 px at 1,000) float32.
+    NumPy arrays and lists give NumPy arrays, computed without compilation; JAX arrays give JAX arrays.
+    Results have the points' dtype; integers give float64, half precision (which has steps of 0.5 px at
+    1,000) gives float32.
 
-    Several distortions in one, as ``lens([24, 35, 50])`` makes them, have leading axes. Points then begin
-    with the same axes: ``points[0]`` are those of the first. A single point is one for all.
+    Several distortions in one, as from ``lens([24, 35, 50])``, have leading axes. Points then begin with
+    the same axes: ``points[0]`` belong to the first. A single point is used for all.
 
     Attributes:
-        coefficients: (k1, ..., kN), or those of another family, for radii in units of `scale`.
+        coefficients: (k1, ..., kN), or those of another distortion model, for radii in units of `scale`.
         centre: centre of distortion, px.
         scale: length in px that is radius 1: half the image diagonal, unless stated otherwise.
-        family: what the coefficients mean.
+        family: the distortion model of the coefficients.
 
     Example:
         >>> d = Distortion([0.1, -0.02], [319.5, 239.5], 400.0)
@@ -68,32 +69,33 @@ class Distortion(eqx.Module):
 
     @property
     def monotone_radius(self) -> Float[AnyArray, "*batch"]:
-        """Distance in px from the centre at which the distorted image begins to fold; inf if never.
+        """Distance in px from the centre at which the distortion begins to fold; inf if it never does.
 
-        For `BrownConrady` a bound of it: up to there it is certain not to.
+        For `BrownConrady` a lower bound: the distortion is certain not to fold up to there.
         """
         radius = self.scale * _limit(self.family, self.coefficients)
         return namespace(radius).asarray(radius)
 
     def undistort(self, points: Points) -> Float[AnyArray, "*points 2"]:
-        """Corrected positions of distorted `points` (eq. 1).
+        """Correct distorted `points` (eq. 1).
 
-        Beyond `monotone_radius` the result is NaN: there the formula folds the plane over, and two points
-        would share one corrected position. `certify` proves that a lens has no such points in its images.
+        Beyond `monotone_radius` the result is NaN: the formula folds the plane over there, and two points
+        would have the same corrected position. `certify` proves that a lens has no such points in its
+        images.
         """
         return self._mapped("undistort", points)
 
     def distort(self, points: Points) -> Float[AnyArray, "*points 2"]:
-        """Distorted positions of corrected `points`: the exact inverse of `undistort`.
+        """Distort corrected `points`: the exact inverse of `undistort`.
 
-        Iterated until the residual is one of rounding. Where there is no inverse within the monotone radius
-        the result is NaN, its derivatives are zero, and `has_inverse` is False. Derivatives elsewhere are
-        those of the implicit function theorem.
+        Iterated until the residual is at the level of rounding errors. Where there is no inverse within the
+        monotone radius the result is NaN, its derivatives are zero, and `has_inverse` is False. Elsewhere
+        derivatives are given by the implicit function theorem.
         """
         return self._mapped("distort", points)
 
     def has_inverse(self, points: Points) -> Bool[AnyArray, "*points"]:
-        """Whether corrected `points` are the image of a distorted point inside the monotone radius."""
+        """Whether corrected `points` have a distorted point within the monotone radius."""
         return finite(self.distort(points)[..., 0])
 
     def _mapped(self, method, points):

@@ -1,4 +1,4 @@
-"""The division model: a family of distortions where a strong barrel needs few terms."""
+"""The division model, which describes strong barrel distortion with few terms."""
 
 from typing import Any, ClassVar
 
@@ -11,7 +11,8 @@ from .family import AbstractRadial, radial_factor, radial_orders, radial_slope, 
 
 
 class Division(AbstractRadial):
-    """``L = 1 / (1 + k1 t + ... + kN t^N)``: Fitzgibbon's, where a strong barrel needs few terms.
+    """Fitzgibbon's division model ``L = 1 / (1 + k1 t + ... + kN t^N)``: few terms for strong barrel
+    distortion.
 
     One or two terms are usual. To first order its k1 is minus that of the polynomial. It is invertible up
     to the first pole, or the first zero of the numerator ``1 - k1 t - 3 k2 t^2 - ...`` of its slope.

@@ -1,16 +1,17 @@
-"""Families of distortions: what the coefficients k of one frame make of a point, and back.
+"""Distortion models ("families"): formulas for the coefficients k of one frame, and their inverses.
 
-A family maps a normalised point ``z = (x - c)/s`` to its corrected one, up to the radius where that stops
-being invertible. Radial families have ``z L(t)``, ``t = z.z``, and state L; all else follows:
+A distortion model maps a normalised point ``z = (x - c)/s`` to the corrected point, up to the radius where
+the map stops being invertible. Radial models have the form ``z L(t)``, ``t = z.z``, and define L; the rest
+follows:
 
     RadialPolynomial    L = 1 + k1 t + k2 t^2 + ... + kN t^N                (eq. 1-2, the default)
     Division            L = 1 / (1 + k1 t + ... + kN t^N)
     BrownConrady        the polynomial, and p1, p2 for a decentred lens, which is not radial
 
 The radius maps as ``r -> r L(r^2)``, and the *limit* is where that first stops growing; beyond it the image
-folds over and no inverse exists. Inverses are iterated until their residual is one of rounding, or are
-NaN; `distortion` differentiates them. A new family is a final class of
-`AbstractRadial` or `AbstractFamily`; fits, certificates, files and images go through these methods alone.
+folds over and no inverse exists. Inverses are iterated until their residual is at the level of rounding
+errors, or are NaN; `distortion` differentiates them. A new distortion model is a final class of
+`AbstractRadial` or `AbstractFamily`; fits, certificates, files and images use these methods alone.
 
 Formulas are written for one point, with coefficients ``k[0], k[1], ...``, in operations that NumPy and JAX
 share. They are also called for many points at once: ``k`` then has further axes, which broadcast against
@@ -86,14 +87,14 @@ def first_root(rows: np.ndarray, k: Elements) -> Float[AnyArray, "..."]:
 
 
 class AbstractFamily(eqx.Module):
-    """What coefficients k make of a normalised point z. It has no fields: the coefficients are k alone."""
+    """A distortion model: maps normalised points z, given coefficients k. It has no fields."""
 
     formula: ClassVar[str]
     most_terms: ClassVar[int] = 4
 
     @abc.abstractmethod
     def size(self, terms: int) -> int:
-        """How many coefficients there are with `terms` radial ones."""
+        """The number of coefficients of a model with `terms` radial ones."""
 
     @abc.abstractmethod
     def orders(self, size: int) -> np.ndarray:
@@ -140,7 +141,7 @@ class AbstractFamily(eqx.Module):
 
 
 class AbstractRadial(AbstractFamily):
-    """A family with ``z L(t)``."""
+    """A radial distortion model, ``z L(t)``."""
 
     @abc.abstractmethod
     def factor(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:

@@ -1,8 +1,8 @@
-"""Zoom and focus together: splines in 1/f times splines in the focus, fitted in one go.
+"""Zoom and focus together: tensor-product splines in 1/f and the focus.
 
-A lens that is focused nearer shows another distortion at the same focal length. The paper's [31] fits a
-tensor-product spline to the coefficients of images that have been calibrated one by one; here its values
-are the unknowns of the global energy, like the parameters of any other linear zoom model.
+At the same focal length, distortion changes with the focus distance. The paper's [31] fits a tensor-product
+spline to the coefficients of images that were calibrated one by one; here its values are the unknowns of
+the global energy, like the parameters of any other linear zoom model.
 """
 
 from typing import ClassVar
@@ -31,8 +31,8 @@ class FocusSplineZoom(AbstractFocusZoom):
     the focus. Beyond the ends of the focus it is constant.
 
     Attributes:
-        number: of knots in 1/f, spread over the focal lengths fitted.
-        focus_number: of knots in the focus, likewise; with 1 the focus has no effect.
+        number: number of knots in 1/f, spread over the fitted focal lengths.
+        focus_number: number of knots in the focus, likewise; with 1 the focus has no effect.
         parameters: the values at the knots, those of all focuses at the first knot in 1/f before the next;
             None until fitted.
         knots, curvature: of the spline in 1/f, as in `SplineZoom`.
@@ -164,8 +164,8 @@ class FocusSplineZoom(AbstractFocusZoom):
 
 
 _NO_FOCUS = (
-    "This zoom model depends on the focus, which is missing here: ask lens(f, focus) or "
-    "lens.at_focus(focus)(f); for standard deviations, std_of(fit, lambda lens: ...) of these."
+    "This zoom model depends on the focus, which is missing here: call lens(f, focus) or "
+    "lens.at_focus(focus)(f); for standard deviations, use std_of(fit, lambda lens: ...) with these."
 )
 
 

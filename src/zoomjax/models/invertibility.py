@@ -52,17 +52,18 @@ _CELLS = 16
 
 
 class Certificate(eqx.Module):
-    """Whether a zoom lens is invertible over its image and focal range, and where it is nearest to not.
+    """Whether a zoom lens is proved invertible over its image and focal range, and where it is closest to a
+    fold.
 
-    The slope is the derivative of the corrected by the distorted radius: 1 where there is no distortion,
-    and negative where the corrected image is folded over. Of `Division` it is its numerator, or the divisor
-    where that is smaller; of `BrownConrady` the slope less what decentering may take off it.
+    The slope is the derivative of the corrected with respect to the distorted radius: 1 without distortion,
+    negative where the corrected image folds over. For `Division` it is the numerator of the slope, or the
+    divisor where that is smaller; for `BrownConrady` the slope minus the largest effect of decentering.
 
     Attributes:
-        certified: whether it is proved to be positive everywhere. If not, the lens folds, or comes within
-            rounding of it, or its zoom model is one that does not state its `pieces`.
-        least: below this the slope is nowhere, proved; -inf where nothing is.
-        slope: the smallest slope found. Not above `least` by more than 0.01, where that is finite.
+        certified: whether the slope is proved to be positive everywhere. If not, the lens folds, or is
+            within rounding errors of a fold, or its zoom model does not state its `pieces`.
+        least: a proved lower bound of the slope; -inf if there is no proof.
+        slope: the smallest slope found. At most 0.01 above `least`, if that is finite.
         focal, radius: the focal length, and the distance from the centre in px, of that slope.
     """
 
@@ -82,8 +83,9 @@ class Certificate(eqx.Module):
 def certify(lens: ZoomLens) -> Certificate:
     """Prove that a lens is invertible over its image, to the pixels' outer corners, and its focal range.
 
-    The proof is rigorous, rounding included. It fails for no lens that is invertible with a slope of 1e-6
-    or more in float64, 5e-3 in float32. (For a `PowerZoom` the slope must be above about 1e-3 in both.)
+    The proof is rigorous and includes rounding errors. It succeeds for every lens that is invertible with a
+    slope of at least 1e-6 in float64, 5e-3 in float32. (For a `PowerZoom` the slope must be above about
+    1e-3 in both.)
 
     Example:
         >>> from zoomjax.scenes.board import nikkor_18_200

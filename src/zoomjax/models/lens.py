@@ -1,4 +1,4 @@
-"""ZoomLens: the fitted model, from a focal length to the distortion there, and its file format."""
+"""ZoomLens: a fitted zoom model, which gives the distortion at any focal length, and its file format."""
 
 import dataclasses
 import functools
@@ -35,15 +35,15 @@ class ZoomLens(eqx.Module):
     """The distortion of a zoom lens at any focal length: ``lens(f)`` is a `Distortion` (eq. 11-12).
 
     Attributes:
-        zoom: from a focal length to the normalised coefficients.
+        zoom: zoom model of the normalised coefficients.
         centre: centre of distortion, px.
-        shift: from a focal length to the offset of its own centre of distortion from `centre`, in units of
-            `scale`; None where the centre stays.
+        shift: zoom model of the offset of the centre of distortion from `centre`, in units of `scale`; None
+            if the centre is fixed.
         focal_range: the shortest and longest focal length fitted.
         image_size: (width, height) px of the images it is for.
         focal_unit: "mm" or "px".
-        focus_range: the least and greatest focus fitted, where the zoom model depends on it.
-        family: what the coefficients mean: by default the radial polynomial.
+        focus_range: the least and greatest focus fitted, if the zoom model depends on it.
+        family: the distortion model of the coefficients, by default the radial polynomial.
 
     Example:
         >>> import jax.numpy as jnp
@@ -103,22 +103,23 @@ class ZoomLens(eqx.Module):
         return math.hypot(*self.image_size) / 2
 
     def __call__(self, focal: FocalLike, focus: FocalLike | None = None) -> Distortion:
-        """The distortion at a focal length, in `focal_unit`; or those at several, in one.
+        """The distortion at a focal length in `focal_unit`, or at several.
 
         Args:
-            focal: the focal length, or an array or list of them: the distortion then has its axes in front.
-            focus: where the lens is focused, for models that depend on it (`AbstractFocusZoom`), which hold
-                it within the fitted range.
+            focal: the focal length, or an array or list of them, whose axes come first in the distortion.
+            focus: focus of the lens, for models that depend on it (`AbstractFocusZoom`); it is clipped to
+                the fitted range.
 
-        Under ``jit``, ``vmap`` and ``grad``, where values are not known and nobody can be warned, focal
+        Under ``jit``, ``vmap`` and ``grad``, where values are not known and a warning is impossible, focal
         lengths outside of the fitted range give NaN; see `extended`.
 
         Warns:
-            UserWarning: `focal` is outside of the fitted range, and the distortion extrapolated.
+            UserWarning: `focal` is outside of the fitted range, so the distortion is extrapolated.
 
         Raises:
-            ValueError: `focal` is not positive and finite, or the zoom model depends on the focus and there
-                is none.
+            ValueError: `focal` is not positive and finite, or the zoom model depends on the focus and
+            `focus` is
+                missing.
         """
         focal = self._checked(focal, stacklevel=4)
         if traced((self, focal, focus)):
@@ -132,16 +133,16 @@ class ZoomLens(eqx.Module):
         focal: FocalLike,
         focus: FocalLike | None = None,
     ) -> Float[AnyArray, "*points 2"]:
-        """Corrected positions of distorted `points`, each at its own focal length.
+        """Correct distorted `points`, each at its own focal length.
 
         Args:
             points: (..., 2) px.
-            focal: focal lengths, which broadcast with the points: one for all, or one for each, as rays of
-                a radiance field need them.
+            focal: focal lengths, which broadcast with the points: one for all, or one for each, as for the
+                rays of a radiance field.
             focus: as for a call of the lens.
 
         Returns:
-            Points of the shape that both have together; see `Distortion.undistort`.
+            Points of the broadcast shape; see `Distortion.undistort`.
         """
         return self._mapped("undistort", points, focal, focus)
 
@@ -151,13 +152,13 @@ class ZoomLens(eqx.Module):
         focal: FocalLike,
         focus: FocalLike | None = None,
     ) -> Float[AnyArray, "*points 2"]:
-        """Distorted positions of corrected `points`, each at its own focal length; see `undistort`."""
+        """Distort corrected `points`, each at its own focal length; see `undistort`."""
         return self._mapped("distort", points, focal, focus)
 
     def extended(self, low: float, high: float) -> "ZoomLens":
-        """The same lens with another focal range: to extrapolate on purpose.
+        """The same lens with another focal range, for deliberate extrapolation.
 
-        Nothing vouches for the distortion beyond the range fitted; `certify` it.
+        The distortion is not validated beyond the fitted range; check it with `certify`.
         """
         return dataclasses.replace(self, focal_range=np.array([low, high], float))
 
@@ -200,7 +201,7 @@ class ZoomLens(eqx.Module):
         return Distortion(k, centre, jnp.asarray(self.scale, dtype), self.family)
 
     def at_focus(self, focus: ScalarLike) -> "ZoomLens":
-        """The lens focused at one place, a lens of the focal length alone: to correct images and video by.
+        """The lens at one focus: a lens that depends on the focal length alone, for images and video.
 
         Raises:
             TypeError: the zoom model does not depend on the focus.
@@ -212,11 +213,12 @@ class ZoomLens(eqx.Module):
         return dataclasses.replace(self, zoom=self.zoom.at_focus(focus), focus_range=None)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the lens to a JSON file that `load_lens` reads, all digits kept.
+        """Write the lens to a JSON file for `load_lens`, with all digits.
 
         Raises:
-            TypeError: the class of the zoom model or of the family is not registered (`register_model`), or
-                has fields that a file cannot hold.
+            TypeError: the class of the zoom model or the distortion model is not registered
+            (`register_model`),
+                or has fields that a file cannot hold.
         """
         check_kind("path", path, (str, os.PathLike))
         polynomial = isinstance(self.family, RadialPolynomial)
@@ -242,7 +244,7 @@ class ZoomLens(eqx.Module):
             part.write_text(json.dumps(content, indent=2) + "\n")
 
     def check_range(self, focal: Num[AnyArray | ScalarLike, "..."], *, stacklevel: int = 2) -> None:
-        """Look at focal lengths, if their values are known (not under ``jit`` or ``vmap``).
+        """Check focal lengths, if their values are known (not under ``jit`` or ``vmap``).
 
         Warns:
             UserWarning: some are outside of the fitted range.
@@ -262,12 +264,12 @@ class ZoomLens(eqx.Module):
             bad = ~(np.isfinite(values) & (values > 0))
             raise ValueError(f"Argument focal must be a positive number, but it is {values[bad][0]}.")
         if least < low - _SLACK * least or most > high + _SLACK * most:
-            asked = f"The focal length {least:g} {self.focal_unit} is"
+            outside = f"The focal length {least:g} {self.focal_unit} is not"
             if values.size > 1:
-                asked = f"Focal lengths from {least:g} to {most:g} {self.focal_unit} are"
+                outside = f"Focal lengths from {least:g} to {most:g} {self.focal_unit} are not all"
             warnings.warn(
-                f"{asked} asked for, and the lens was fitted on {low:g} to {high:g} {self.focal_unit}: "
-                "beyond that its distortion is extrapolated.",
+                f"{outside} within the range on which the lens was fitted, {low:g} to {high:g} "
+                f"{self.focal_unit}: beyond it the distortion is extrapolated.",
                 stacklevel=stacklevel + 1,
             )
 
@@ -323,11 +325,11 @@ def _pair(content, name):
 def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
     """Read a lens that `ZoomLens.save` wrote.
 
-    Models of users' own have to be registered before, by the module that defines them (`register_model`).
+    User-defined models must be registered first, by the module that defines them (`register_model`).
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is not such a file, or of a later version; the message names it.
+        ValueError: the file does not describe a lens, or is of a later version; the message names it.
     """
     try:
         with open(path, encoding="utf-8") as file:

@@ -1,4 +1,4 @@
-"""The radial polynomial (eq. 1-2), the default family of distortions."""
+"""The radial polynomial (eq. 1-2), the default distortion model."""
 
 from typing import Any, ClassVar
 
@@ -10,7 +10,7 @@ from .family import AbstractRadial, radial_factor, radial_orders, radial_slope
 
 
 class RadialPolynomial(AbstractRadial):
-    """``L = 1 + k1 t + ... + kN t^N``: the paper's (eq. 1-2)."""
+    """The paper's radial polynomial ``L = 1 + k1 t + ... + kN t^N`` (eq. 1-2)."""
 
     formula: ClassVar[str] = (
         "corrected = centre + z * scale * (1 + k1 r^2 + ... + kN r^2N), "

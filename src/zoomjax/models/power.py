@@ -1,4 +1,4 @@
-"""A power law for k1 (eq. 4, [14]): the one model here that is not linear in its parameters."""
+"""A power law for k1 (eq. 4, [14]): the only zoom model here that is not linear in its parameters."""
 
 from typing import ClassVar
 

@@ -1,8 +1,8 @@
-"""The zoom models and families of distortions that ``lens.json`` can hold, by name.
+"""The zoom models and distortion models that ``lens.json`` can hold, by name.
 
-A file names the class of its models, and holds their fields as plain numbers. It is never asked what to
-import or to run: only classes that have been registered in this process are made from it. Users' own join
-ours by `register_model`.
+A file names the classes of its models, and holds their fields as plain numbers. It cannot import or run
+code: only classes that are registered in this process are created from it. `register_model` adds
+user-defined classes.
 """
 
 import dataclasses
@@ -47,22 +47,22 @@ def register_model(
 
 
 def register_model(cls: Any = None, *, name: str | None = None) -> Any:
-    """Let lenses with a zoom model, or a family of distortions, of one's own be saved and loaded.
+    """Register a zoom model or distortion model, so that lenses with it can be saved and loaded.
 
-    The process that loads has to register the class, too: import the module that does so first. The file
-    holds the model's name, its formula and its fields: arrays and numbers, and in static fields also
-    booleans, words, None and tuples of these. Families have no fields.
+    The process that loads a lens must register the class, too: import the module that does so first. The
+    file holds the model's name, its formula and its fields: arrays and numbers, and in static fields also
+    booleans, words, None and tuples of these. Distortion models have no fields.
 
     Args:
         cls: a final class of `AbstractZoom` or `AbstractFamily`, with a class attribute ``formula``: a
-            sentence, for readers of the file, on what its numbers mean.
-        name: what files call it, the name of the class by default.
+            description of its numbers for readers of the file.
+        name: the model's name in files, by default the name of the class.
 
     Returns:
-        The class itself, so that this serves as a decorator.
+        The class itself, so that this can be used as a decorator.
 
     Raises:
-        TypeError: it is no such class, has no formula, or its fields cannot be told from the file's own.
+        TypeError: it is not such a class, has no formula, or has a field with a name that the file uses.
         ValueError: another class has that name.
 
     Example:

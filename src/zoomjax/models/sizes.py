@@ -1,7 +1,7 @@
-"""Which images a lens, and a distortion, are for; a lens for images of another size.
+"""Image sizes: checks that a lens or distortion fits an image, and lenses for images of another size.
 
-A `ZoomLens` knows the size of its images. A `Distortion` knows its centre and scale alone; but of a lens
-those are the middle of the image, or near it, and half the diagonal, from which another size shows.
+A `ZoomLens` stores the size of its images. A `Distortion` stores only its centre and scale. For a lens
+these are near the middle of the image, and half its diagonal, which reveals an image of another size.
 """
 
 import dataclasses
@@ -25,20 +25,20 @@ _SAME_SCALE = 0.01
 
 @kinds_checked
 def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
-    """The same lens for images that show the same view with more or fewer pixels.
+    """The same lens for images of the same view with more or fewer pixels.
 
-    The normalised coefficients stay; the centre scales with the half pixel: ``(c + 1/2) w'/w - 1/2``.
-    Focal lengths stay those of the lens, also in px: they are of images of its own size.
+    The normalised coefficients are unchanged; the centre becomes ``(c + 1/2) w'/w - 1/2``. Focal lengths
+    are unchanged, also those in px: they refer to images of the lens's original size.
 
     Args:
         lens: the lens.
         image_size: (width, height) px of the images.
 
     Raises:
-        ValueError: the images have another aspect ratio, so that they cannot show the same view.
+        ValueError: the images have another aspect ratio, so they cannot show the same view.
 
-    Warns:
-        UserWarning: the size is another, and the lens was scaled.
+        Warns:
+        UserWarning: the size differs, so the lens was scaled.
 
     Example:
         >>> from zoomjax.scenes.board import nikkor_18_200
@@ -64,7 +64,7 @@ def check_aspect(image_size: tuple[int, int], lens_size: tuple[int, int]) -> Non
     """Refuse images that cannot show the same view as those of a lens.
 
     Raises:
-        ValueError: the aspect ratio is another, by more than rounding.
+        ValueError: the aspect ratios differ by more than rounding.
     """
     (width, height), (old_width, old_height) = image_size, lens_size
     if abs(width * old_height - height * old_width) > max(old_width, old_height, width, height):
@@ -93,15 +93,15 @@ def checked_distortion(distortion: Any, name: str = "distortion") -> Distortion:
 
 
 def check_image_size(distortion: Distortion, image_size: tuple[int, int]) -> None:
-    """Refuse a distortion that is plainly one of images of another size.
+    """Refuse a distortion that is clearly for images of another size.
 
-    So it is if another image explains centre and scale and this one does not: the other's middle is the
-    centre, and half its diagonal the scale; or it shows the same view in another size, or turned, and the
-    centre is nearer, by far, to its middle than to that of this image. Nothing is checked under ``jit`` or
-    ``vmap``.
+    This is so if another image size explains centre and scale and this one does not: the centre is the
+    middle of that size, and the scale half its diagonal; or that size is the same view scaled or turned,
+    and its middle is much nearer to the centre than the middle of this image. Nothing is checked under
+    ``jit`` or ``vmap``.
 
     Raises:
-        ValueError: so it is; the message tells the size.
+        ValueError: the distortion is for another size; the message gives the sizes.
     """
     known = all(isinstance(side, int | np.integer) for side in image_size)  # or symbolic, for `jax.export`
     if not known or traced((distortion.centre, distortion.scale)):
@@ -124,11 +124,11 @@ def check_image_size(distortion: Distortion, image_size: tuple[int, int]) -> Non
     if explained:
         middle = f"({(width - 1) / 2:.5g}, {(height - 1) / 2:.5g})"
         raise ValueError(
-            f"The distortion is that of images of another size: its centre is ({centre[0]:.5g}, "
-            f"{centre[1]:.5g}) and its scale {scale:.5g} px, and this one, of {width} x {height} px, has "
-            f"its middle at {middle} and half a diagonal of {half:.5g}. "
-            f"Give images of the lens's size, or lens_for_size(lens, ({width}, {height}))(focal). If the "
-            "image is a crop and the distortion is meant so, give a Framing of your own: "
+            f"The distortion is for images of another size: its centre is ({centre[0]:.5g}, "
+            f"{centre[1]:.5g}) and its scale {scale:.5g} px, but this image of {width} x {height} px has "
+            f"its middle at {middle} and half a diagonal of {half:.5g} px. "
+            f"Give images of the lens's size, or use lens_for_size(lens, ({width}, {height}))(focal). If "
+            "the image is a crop for which this distortion is right, give a Framing: "
             f"Framing(np.array(1.0), np.zeros(2), ({width}, {height}))."
         )
 

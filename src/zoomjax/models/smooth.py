@@ -1,12 +1,12 @@
-"""A polynomial of high degree, held back by what six hundred real zoom lenses look like.
+"""A polynomial of high degree with a prior learned from six hundred real zoom lenses.
 
-Degree 2 is too stiff for many lenses, and the degree that is not has as many numbers as there are focal
+Degree 2 is too stiff for many lenses, and a sufficient degree has as many parameters as there are focal
 lengths. `SmoothZoom` has degree 6 and a Gaussian prior instead: a Gaussian process in 1/f, joint over k1
-and k2, in the finite basis of the Legendre polynomials of ``u = f_ref/f``. Few focal lengths give a curve
-that lenses have; many determine it by themselves.
+and k2, in the finite basis of the Legendre polynomials of ``u = f_ref/f``. With few focal lengths the prior
+gives a typical curve; many focal lengths outweigh it.
 
-The prior's numbers come from `benchmarks/real/lensfun`, which learns them from zoom lenses of the
-lensfun database as those that predict best the focal lengths that are left out.
+The numbers of the prior are learned by `benchmarks/real/lensfun` from zoom lenses of the lensfun database,
+as those that best predict focal lengths that are left out.
 """
 
 import math
@@ -38,12 +38,12 @@ _BEYOND = ((0.0079, 0), (-0.0051, 0.0050))
 
 
 class SmoothZoom(AbstractPriorZoom):
-    """Each coefficient a polynomial of high degree in 1/f, with a prior on all of them together.
+    """Polynomials of high degree in 1/f for the coefficients, with a joint prior.
 
     ``k_i(f) = sum_j parameters[j, i] P_j(2u - 1)`` with Legendre's P_j and ``u = focal_ref/f`` in (0, 1]. A
     priori the parameters have mean 0 and the covariance ``quadratic quadratic^T`` for j = 0, 1, 2
     (flattened row by row), and ``(3/j)^4 beyond beyond^T``, independently, for each j from 3 to the degree.
-    `error` is what that is weighed against: see `AbstractPriorZoom`.
+    `error` sets the weight of the prior: see `AbstractPriorZoom`.
 
     The defaults are learned from the 618 rectilinear zooms that the lensfun database (of lensfunpy 1.18)
     has at five or more focal lengths. Learned from half of the lenses and tested on the other half, and the
@@ -56,7 +56,7 @@ class SmoothZoom(AbstractPriorZoom):
         degree: of the polynomials, at least 3.
         parameters: Legendre coefficients; None until fitted.
         focal_ref: the shortest focal length fitted.
-        error: RMS distance to straightness, in half diagonals, that a frame is wrong by; 0 for no prior.
+        error: RMS model error of a frame, in half diagonals; 0 for no prior.
         quadratic: lower triangular factor of the covariance of the first three rows of the parameters.
         beyond: the same for the fourth row.
 

@@ -22,7 +22,7 @@ class SplineZoom(AbstractLinearZoom):
     Beyond its ends it continues along a straight line in 1/f.
 
     Attributes:
-        number: of knots, spread over the focal lengths fitted; None for one at each of them.
+        number: number of knots, spread over the fitted focal lengths; None for one at each of them.
         parameters: the values at the knots; None until fitted.
         knots: 1/f of the knots, increasing.
         curvature: from the values at the knots to the spline's second derivatives there.

@@ -20,8 +20,8 @@ class TableZoom(AbstractLinearZoom):
     Beyond its ends a table is constant.
 
     Attributes:
-        number: of entries, spread over the focal lengths fitted; None for one at each of them, which then
-            is frame by frame, interpolated.
+        number: number of entries, spread over the fitted focal lengths; None for one at each of them, which
+            interpolates between the separate fits of the frames.
         inverse: whether to interpolate in 1/f, or in f.
         parameters: the entries; None until fitted.
         knots: 1/f, or f, of the entries, increasing.

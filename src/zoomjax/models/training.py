@@ -1,7 +1,7 @@
-"""What of a lens to train, where it is part of a larger model that gradient descent fits.
+"""Selection of the trainable arrays of a lens, for gradient descent on a larger model.
 
-A lens holds more arrays than its model's parameters: the reference of the focal lengths, the fitted range,
-the image's centre, knots, priors. Their gradients are not zero, and an optimiser would move them.
+A lens holds more arrays than its model's parameters: the reference focal length, the fitted range, the
+image's centre, knots, priors. Their gradients are not zero, so an optimiser would change them.
 """
 
 from typing import Any
@@ -16,15 +16,15 @@ from .zoom import AbstractZoom, with_parameters
 
 
 def trainable(tree: PyTree, *, centre: bool = False) -> PyTree:
-    """Which arrays of a lens are parameters: a filter for `equinox.partition`.
+    """Mark the trainable arrays of a lens: a filter for `equinox.partition`.
 
-    Of a zoom model, and of a lens with one, its `parameters`; of a `Distortion` its coefficients; and, if
-    asked, the centre of distortion and the parameters of how it moves. Nothing else of them: not the
-    reference or the range of focal lengths, knots, scale or prior.
+    Trainable are the `parameters` of a zoom model or of the zoom model of a lens, and the coefficients of a
+    `Distortion`; with `centre` also the centre of distortion and the parameters of its movement. Not
+    trainable are the reference and range of focal lengths, knots, scale and prior.
 
     Args:
-        tree: a `ZoomLens`, a `Distortion`, a zoom model, or any pytree that holds some. Whatever else it
-            holds is not marked.
+        tree: a `ZoomLens`, a `Distortion`, a zoom model, or any pytree that holds some. Other arrays in it
+            are not marked.
         centre: whether the centre of distortion is a parameter, too.
 
     Returns:

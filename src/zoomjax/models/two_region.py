@@ -15,7 +15,7 @@ from .zoom import AbstractLinearZoom, check_distinct, inverse_powers
 
 
 class TwoRegionZoom(AbstractLinearZoom):
-    """Quadratics in 1/f, one where the lens is barrel and one where it is pincushion (eq. 5, [30]).
+    """Two quadratics in 1/f, for barrel and for pincushion distortion (eq. 5, [30]).
 
     The transcript's exponent -2 in eq. 5 is evidently a misprint for 2. [30] has k1 alone: ``terms=1``.
     The two need not meet: as published, the coefficients jump where the regions do.
@@ -95,17 +95,17 @@ class TwoRegionZoom(AbstractLinearZoom):
 
 @of_known_values
 def barrel_crossover(focal: Focal, k1: Float[AnyArray, "frame"]) -> float:
-    """The focal length at which k1 changes its sign: where barrel distortion turns into pincushion.
+    """Find the focal length at which barrel distortion turns into pincushion, where k1 changes its sign.
 
     Args:
         focal: focal length of each frame.
-        k1: first coefficient of each frame by itself, ``fit_frames(lines).coefficients[:, 0]``.
+        k1: first coefficient of the separate fit of each frame, ``fit_frames(lines).coefficients[:, 0]``.
 
-    Returns:
-        The zero of k1, interpolated linearly in 1/f; that of the shortest focal length if there are more.
+        Returns:
+        The zero of k1, interpolated linearly in 1/f; the one of shortest focal length if there are several.
 
-    Raises:
-        ValueError: k1 has one sign throughout.
+        Raises:
+        ValueError: k1 does not change its sign.
     """
     order = np.argsort(1 / np.asarray(focal))[::-1]
     inverse, value = 1 / np.asarray(focal)[order], np.asarray(k1)[order]

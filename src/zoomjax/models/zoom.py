@@ -1,9 +1,9 @@
 """Zoom models: how the distortion coefficients depend on the focal length.
 
-The paper's is a polynomial in 1/f for each coefficient (eq. 9-10), ``k(f) = phi(f) . a`` with the
+The paper's model is a polynomial in 1/f for each coefficient (eq. 9-10), ``k(f) = phi(f) . a`` with the
 basis ``phi = (1, u, ..., u^n)`` of ``u = f_ref/f`` in (0, 1]. A new model is a final class of
-`AbstractZoom`, or of `AbstractLinearZoom` where it is linear in its parameters: then only its basis
-has to be written, and the algebraic estimate applies to it too.
+`AbstractZoom`, or of `AbstractLinearZoom` if it is linear in its parameters. A linear model only defines
+its basis, and the algebraic estimate applies to it.
 """
 
 import abc
@@ -25,10 +25,10 @@ SomeZoom = TypeVar("SomeZoom", bound="AbstractZoom")
 class AbstractZoom(eqx.Module):
     """A map from a focal length to the coefficients (k1, ..., kN) of the normalised radius.
 
-    `parameters` holds what a fit adjusts, and is None in a model that has only been specified, as in
-    ``fit_zoom(lines, zoom=PolynomialZoom(degree=2))``. Other array fields stay as `prepare` set them.
-    Lenses with a model of one's own are saved once its class is registered (`register_model`), with a class
-    attribute ``formula`` that says what its numbers mean.
+    `parameters` are adjusted by a fit, and None in a model that is only specified, as in
+    ``fit_zoom(lines, zoom=PolynomialZoom(degree=2))``. Other array fields are set by `prepare`. Lenses with
+    a user-defined model can be saved once its class is registered (`register_model`), with a class
+    attribute ``formula`` that describes its numbers.
     """
 
     formula: ClassVar[str]
@@ -36,7 +36,7 @@ class AbstractZoom(eqx.Module):
 
     @abc.abstractmethod
     def prepare(self, focal: Focal, terms: int) -> "AbstractZoom":
-        """This model made ready for these focal lengths: knots and references set, parameters zero.
+        """Prepare the model for these focal lengths: set knots and references, and parameters to zero.
 
         Raises:
             ValueError: the focal lengths cannot determine the parameters.
@@ -49,7 +49,7 @@ class AbstractZoom(eqx.Module):
     def pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces | None:
         """The coefficients from the shortest to the longest of these focal lengths, as polynomials.
 
-        What `certify` proves invertibility from. None in a model that does not state them.
+        `certify` uses them to prove invertibility. None in a model that does not state them.
         """
         del focal_range
         return None
@@ -98,14 +98,14 @@ _WRITTEN_OUT = 8
 
 
 class AbstractPriorZoom(AbstractLinearZoom):
-    """A linear zoom model that knows, before any line is seen, what its parameters are likely to be.
+    """A linear zoom model with a Gaussian prior on its parameters.
 
-    A fit minimises the energy (eq. 13) and ``error^2 / M`` times the sum of squares of the `standardised`
-    parameters, for M frames: the mode of their posterior, if each frame by itself is wrong by an RMS of
-    `error`. So frames outweigh the prior as they become more, and with an error of 0 it has no weight.
+    A fit minimises the energy (eq. 13) plus ``error^2 / M`` times the sum of squares of the `standardised`
+    parameters, for M frames: the mode of their posterior, if each frame has an RMS model error of `error`.
+    So the prior loses weight as the number of frames grows, and with an error of 0 it has none.
 
     Attributes:
-        error: RMS distance to straightness, in half image diagonals, that a frame is wrong by.
+        error: RMS model error of a frame, in half image diagonals.
     """
 
     error: eqx.AbstractVar[Scalar]
@@ -116,10 +116,10 @@ class AbstractPriorZoom(AbstractLinearZoom):
 
 
 class AbstractFocusZoom(AbstractLinearZoom):
-    """A linear zoom model whose coefficients depend on the focus, too: ``k(f, d)``.
+    """A linear zoom model whose coefficients also depend on the focus: ``k(f, d)``.
 
-    The focus d is any number that grows or falls with it, such as the reciprocal of the distance focused
-    on; lines carry one a frame (``Lines.from_ragged(..., focus=...)``). `at_focus` gives the model at one.
+    The focus d is any monotonic function of the focus distance, such as its reciprocal; lines have one per
+    frame (``Lines.from_ragged(..., focus=...)``). `at_focus` gives the zoom model at one focus.
     """
 
     @abc.abstractmethod
@@ -144,10 +144,10 @@ class AbstractFocusZoom(AbstractLinearZoom):
 
 
 class PolynomialZoom(AbstractLinearZoom):
-    """The paper's model: each coefficient a polynomial of `degree` n in 1/f (eq. 9-10).
+    """The paper's model: a polynomial of `degree` n in 1/f for each coefficient (eq. 9-10).
 
     Attributes:
-        degree: n; 0 is one distortion for all focal lengths, 2 the paper's choice.
+        degree: n; 0 means the same distortion at all focal lengths; the paper uses 2.
         parameters: a, where ``k_i(f) = sum_j a[j, i] (focal_ref/f)^j``; None until fitted.
         focal_ref: the shortest focal length fitted.
 

@@ -1,4 +1,4 @@
-"""Scenes with exact truth: the paper's striped board, and a broadcast of football."""
+"""Synthetic scenes with exact truth: the paper's striped board, and a broadcast of football."""
 
 import lazy_loader
 

@@ -1,11 +1,11 @@
-"""Scenes with exact truth: the paper's striped board, seen through a lens that is known.
+"""A synthetic scene with exact truth: the paper's striped board, seen through a known lens.
 
 The paper's first experiment: a board of 31 x 23 white stripes, 1330 x 1010 mm, fronto-parallel at 1185 mm
 from the camera, photographed with a Nikon D90 (4288 x 2848 px, sensor 23.7 mm wide) and a Nikkor 18-200 at
 50 focal lengths from 20.56 to 127.36 mm. The truth here is the pair of polynomials that the paper
 published for that lens. Every stripe has two edges, each a straight line of the scene.
 
-`board_lines` gives those edges as an ideal detector would; `board_photo` takes the photograph.
+`board_lines` gives those edges as an ideal detector would; `board_photo` renders a photo.
 """
 
 import dataclasses
@@ -168,9 +168,9 @@ def with_noise(
     Args:
         lines: the lines.
         key: of `jax.random`.
-        std: standard deviation, px, of each coordinate of each point; of all lines, or of each.
-        correlation: of the error of a point with that of the next on its line, from 0 to less than 1. With
-            0.8 an edge of many points is known as well as from a ninth of them, were they independent.
+        std: standard deviation, px, of each coordinate of each point: one for all lines, or one per line.
+        correlation: correlation of the error of a point with that of the next on its line, from 0 to less
+            than 1. With 0.8 an edge of many points is as certain as from a ninth of them if independent.
     """
     fresh = jax.random.normal(key, lines.points.shape, jnp.asarray(lines.points).dtype)
     correlation = jnp.asarray(correlation, fresh.dtype)
@@ -230,7 +230,7 @@ def board_photo(
     levels: tuple[float | int, float | int] = (35, 215),
     seed: int = 0,
 ) -> UInt8[np.ndarray, "height width"]:
-    """A photograph of the board: white stripes of both directions, all else dark, as the sensor sees it.
+    """Render a photo of the board: white stripes in both directions on a dark background.
 
     Each pixel integrates the blurred scene over its own square: analytically across a border, and by two
     Gauss points along it. Blurring an image of pixels instead would move its borders by up to 0.02 px.
@@ -240,14 +240,14 @@ def board_photo(
         focal: the focal length.
         board: the board and the camera's pixels; by default the paper's, whatever the image size.
         blur: standard deviation, px, of the Gaussian blur of the optics; at most an eighth of a stripe, for
-            each border is blurred by itself.
+            each border is blurred separately.
         noise: standard deviation, grey levels, of the noise of each pixel.
-        vignetting: the part of the light that is missing in the corners.
+        vignetting: the fraction of light lost in the corners.
         levels: grey levels of dark and white in the middle, of 255.
         seed: of the noise.
 
     Raises:
-        ValueError: the lens is of another family than the radial polynomial.
+        ValueError: the lens has another distortion model than the radial polynomial.
     """
     if not isinstance(lens.family, RadialPolynomial):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""A scene with exact truth like the paper's second experiment: a football broadcast that zooms.
+"""A synthetic scene with exact truth like the paper's second experiment: a zooming football broadcast.
 
 The paper had 841 frames, 1920 x 1080 px, of an unknown camera, and took 55 of them, at 45.16 to 156.55 mm,
 to fit the polynomials that it prints; these are the truth here. It found the focal lengths by homographies,
@@ -52,7 +52,7 @@ def broadcast_lines(
     noise: float | int = 0,
     seed: int = 0,
 ) -> Lines:
-    """The middles of a pitch's straight markings at each focal length, as a detector would give them.
+    """The centre lines of a pitch's straight markings at each focal length, as a detector would give them.
 
     Args:
         lens: the true lens; its dtype is the result's.

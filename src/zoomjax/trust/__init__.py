@@ -1,4 +1,4 @@
-"""How far a fit can be trusted: bands, bounds, cross-validation, the choice of a model, the next photo."""
+"""Reliability of a fit: bands, Cramér–Rao bounds, cross-validation, model selection and the next photo."""
 
 import lazy_loader
 

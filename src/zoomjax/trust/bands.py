@@ -1,10 +1,10 @@
-"""How far a fitted lens may be off: standard deviations and bands of whatever is computed from it.
+"""Uncertainty of a fitted lens: standard deviations and bands of anything computed from it.
 
 The delta method: a quantity q(a) of the parameters a, whose covariance is C, has the covariance
-``(dq/da) C (dq/da)^T``. For the coefficients at a focal length, and for where the lens puts a point, of any
-zoom model that is linear in its parameters, that is exact, for those points' q is linear too.
+``(dq/da) C (dq/da)^T``. For a zoom model that is linear in its parameters, this is exact for the
+coefficients at a focal length and for corrected points, because these q are linear too.
 
-Once per call one derivative by each parameter; nothing is fitted or sampled.
+Each call computes one derivative with respect to each parameter; nothing is fitted or sampled.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ def std_of(fit: ZoomFit, function: Callable[[ZoomLens], PyTree]) -> PyTree:
 
     Args:
         fit: the fit.
-        function: from a lens to arrays, differentiable by JAX.
+        function: a function from a lens to arrays, differentiable by JAX.
 
     Returns:
         What `function` returns, each number replaced by its standard deviation: infinite where it depends
@@ -70,7 +70,7 @@ def coefficient_std(fit: ZoomFit, focal: Focals) -> Float[Array, "*focal terms"]
     Args:
         fit: the fit.
         focal: one focal length or an array of them, in the lens's unit. Beyond the fitted range the bands
-            widen as the model's parameters let them: they know nothing of the model being wrong there.
+            widen with the uncertainty of the parameters, but do not include errors of the model itself.
 
     Returns:
         For each focal length N numbers, infinite where the lines do not determine them.
@@ -89,7 +89,7 @@ def coefficient_std(fit: ZoomFit, focal: Focals) -> Float[Array, "*focal terms"]
 @kinds_checked
 @eqx.filter_jit
 def displacement_covariance(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Array, "*both 2 2"]:
-    """Covariance, px^2, of where the lens puts points: of corrected positions, and so of displacements.
+    """Covariance of corrected points, and so of displacements, px^2.
 
     Args:
         fit: the fit.
@@ -98,7 +98,7 @@ def displacement_covariance(fit: ZoomFit, points: Points, *, focal: Focals) -> F
 
     Returns:
         A matrix for each point, for x and y; infinite on its diagonal where the lines do not determine it.
-        Radial lenses are uncertain along the radius alone: their matrices have rank 1.
+        For radial models only the radius is uncertain: their matrices have rank 1.
 
     Example:
         >>> import numpy as np
@@ -114,9 +114,9 @@ def displacement_covariance(fit: ZoomFit, points: Points, *, focal: Focals) -> F
 @kinds_checked
 @eqx.filter_jit
 def displacement_std(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Array, "*both"]:
-    """Standard deviation, px, of where the lens puts points: the root of the mean squared distance.
+    """Standard deviation of corrected points, px: the root of the mean squared distance.
 
-    For radial lenses it is the standard deviation along the radius.
+    For radial models it is the standard deviation along the radius.
 
     Args:
         fit, points, focal: as for `displacement_covariance`.
@@ -140,14 +140,14 @@ def displacement_std(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Ar
 def displacement_band(
     fit: ZoomFit, points: Points, *, focal: Focals, level: ScalarLike = 0.95
 ) -> tuple[Float[Array, "*both"], Float[Array, "*both"]]:
-    """Between what outward displacements, px, the true one lies, with a probability of `level`.
+    """Confidence interval of the outward displacement of points, px.
 
-    The displacement is how much farther from the centre of distortion the corrected point is than the
-    point itself; negative where correcting moves it inwards.
+    The displacement is the distance of the corrected point from the centre of distortion minus that of the
+    point itself; negative where the correction moves it inwards.
 
     Args:
         fit, points, focal: as for `displacement_covariance`.
-        level: between 0 and 1.
+        level: the confidence level, between 0 and 1.
 
     Returns:
         The lower and the upper end for each point.

@@ -1,4 +1,4 @@
-"""How exactly a lens can be known from given lines at all: the Cramer-Rao bound.
+"""The Cramer-Rao bound: the smallest possible covariance of a lens estimated from given lines.
 
 A point is seen at ``y = y0 + e``, e normal with a standard deviation of s px in x and in y. The true
 point y0 is anywhere on the curve that the lens makes of a straight line, ``F = n . U(y0) - c = 0``, where
@@ -39,18 +39,18 @@ _NODES = 8  # of Gauss and Legendre, along x, y and 1/f: exact where the square 
 def cramer_rao(
     lens: ZoomLens, lines: Lines, *, std: Float[AnyArray, "line"] | ScalarLike
 ) -> Float[Array, "parameter parameter"]:
-    """The covariance of the zoom model's parameters that no unbiased estimate falls below.
+    """Cramer-Rao bound on the covariance of the zoom model's parameters, for any unbiased estimate.
 
     Args:
-        lens: the true lens. Its centre is taken to be known.
-        lines: points without noise, that this lens makes straight; see `scenes.board_lines`. Weights
-            of lines are of no account.
-        std: standard deviation, px, of the error of each coordinate of each point: of all lines, or of
-            each. Errors are normal and independent.
+        lens: the true lens. Its centre is assumed to be known.
+        lines: points without noise that this lens makes straight; see `scenes.board_lines`. Weights of
+            lines are ignored.
+        std: standard deviation, px, of the error of each coordinate of each point: one number for all
+            lines, or one per line. Errors are normal and independent.
 
     Returns:
-        Of the flattened parameters, in the order of `ZoomFit.covariance`; all infinite on the diagonal
-        where the lines do not determine them, or the lens folds at one of their points.
+        The covariance of the flattened parameters, in the order of `ZoomFit.covariance`. Its diagonal is
+        infinite if the lines do not determine them, or the lens folds at one of their points.
 
     Raises:
         ValueError: `std` is not positive and finite, or not one number or one a line.
@@ -75,7 +75,7 @@ def _cramer_rao(lens, lines, std):
     triangle = jnp.linalg.qr(rows.reshape(-1, rows.shape[-1]), mode="r")
     size = jnp.linalg.norm(triangle, axis=0)
     eps = 64 * jnp.finfo(size.dtype).eps
-    told = size > eps * jnp.sqrt(jnp.sum(most, axis=0))  # or rounding is all that the lines say
+    told = size > eps * jnp.sqrt(jnp.sum(most, axis=0))  # else rounding errors dominate
     size = jnp.where(told, size, 1)
     _, values, right = jnp.linalg.svd(triangle / size[None])
     determined = jnp.all(told) & (values[-1] > eps)
@@ -88,9 +88,10 @@ def _cramer_rao(lens, lines, std):
 def displacement_bound(
     lens: ZoomLens, lines: Lines, *, std: Float[AnyArray, "line"] | ScalarLike
 ) -> Float[Array, ""]:
-    """What the RMS error of a fitted lens's displacements, px, does not fall below: the Cramer-Rao bound.
+    """Cramer-Rao lower bound on the RMS error of a fitted lens's displacements, px.
 
-    The mean is over noise, image and focal range, as in `displacement_rms`, which tells the error itself.
+    The mean is over noise, image and focal range, as in `displacement_rms`, which computes the actual
+    error.
 
     Args:
         lens, lines, std: as for `cramer_rao`, whose errors also apply.
@@ -126,10 +127,10 @@ def _displacement_bound(lens, lines, std):
 @kinds_checked
 @eqx.filter_jit
 def displacement_rms(lens: ZoomLens, other: ZoomLens) -> Float[Array, ""]:
-    """How far apart, px, two lenses correct the same point to: the RMS over image and focal range.
+    """RMS distance between the corrections of two lenses, px, over image and focal range.
 
-    Points are spread evenly over the first lens's image, and focal lengths, evenly in 1/f, over its range.
-    By Gauss and Legendre's rule, exact for polynomials in 1/f of degree up to 7 with up to 3 terms.
+    The mean is over the first lens's image and over its focal range, uniform in 1/f. It is computed by
+    Gauss-Legendre quadrature, exact for polynomials in 1/f of degree up to 7 with up to 3 terms.
 
     Example:
         >>> from zoomjax import scenes

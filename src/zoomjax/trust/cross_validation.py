@@ -1,8 +1,8 @@
-"""Straightness of lines that a fit has not seen: cross-validation over focal lengths, frames or lines.
+"""Cross-validation over focal lengths, frames or lines: straightness of lines not used in the fit.
 
-The lines are parted into folds. Each fold is left out in turn, its lines counting nothing, and measured by
-the model of the others. For models that are linear in their parameters see `_linear_folds`; others are
-fitted anew for each fold.
+The lines are split into folds. Each fold is left out in turn, with weight 0 for its lines, and measured
+with the model fitted to the others. For models that are linear in their parameters see `_linear_folds`;
+others are fitted again for each fold.
 """
 
 import equinox as eqx
@@ -37,10 +37,11 @@ def held_out_zoom(
     folds: int | None = None,
     seed: int = 0,
 ) -> Float[np.ndarray, "frame"]:
-    """RMS, px, of each frame under zoom models fitted without it.
+    """Cross-validated RMS of each frame, px, under zoom models fitted without it.
 
-    By default one frame is left out at a time, and corrected as its focal length says by the model of all
-    others. A frame at the shortest or longest focal length is extrapolated to, if no other has it.
+    By default one frame is left out at a time, and corrected by the model of all others at its focal
+    length. For a frame at the shortest or longest focal length the model extrapolates, unless another frame
+    has it.
 
     Args:
         lines: the lines, or, much faster, ``compress(lines)``.
@@ -48,8 +49,8 @@ def held_out_zoom(
         hold_out, folds, seed: as for `select_model`.
 
     Returns:
-        The root of eq. 3 of each frame, of the lines left out. NaN where the model cannot be fitted to what
-        is left, and for frames that are never left out.
+        The root of eq. 3 of each frame, of the lines left out. NaN where the model cannot be fitted to the
+        remaining lines, and for frames that are never left out.
 
     Example:
         >>> from zoomjax import compress, fit_zoom, scenes
@@ -76,14 +77,15 @@ def held_out_zoom(
 def held_out_frames(
     lines: AbstractLines, *, terms: int = 2, folds: int | None = None, seed: int = 0
 ) -> Float[np.ndarray, "frame"]:
-    """RMS, px, of each frame's lines under fits of the other lines of that frame.
+    """Cross-validated RMS of each frame, px, under fits of other lines of the same frame.
 
-    What a frame by itself knows of lines that it has not seen: the noise, and what too few lines cost.
+    It measures how well the separate fit of a frame predicts further lines: the noise, and the error from
+    too few lines.
 
     Args:
         lines, terms: as for `fit_frames`.
-        folds: into how many parts a frame's lines are parted; 10 by default.
-        seed: of the parting.
+        folds: number of parts into which a frame's lines are split; 10 by default.
+        seed: random seed of the split.
 
     Returns:
         The root of eq. 3 of each frame, of all its lines, each as it was left out. NaN for a frame with
@@ -112,7 +114,7 @@ def held_out_frames(
 
 
 def judge(lines: CompressedLines | FamilyLines, zoom: AbstractZoom, terms: int, parts: Folds) -> Judged:
-    """A model's errors on lines that it has seen and has not.
+    """A model's errors on the lines of the fit, and on lines left out.
 
     Args:
         lines: from `small_lines`, or those lines with another family.

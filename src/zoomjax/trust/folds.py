@@ -1,4 +1,4 @@
-"""Folds: which lines are left out together, and what each line weighs."""
+"""Folds: which lines are left out together, and the weight of each line."""
 
 from typing import Literal, NamedTuple, get_args
 
@@ -58,8 +58,8 @@ def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
     """
     if isinstance(lines, ImageLines | FamilyLines):
         raise TypeError(
-            "Lines held out are measured in the corrected image, and by the radial polynomial: pass the "
-            "lines without in_image or with_family. (select_model compares families, given "
+            "Cross-validation measures distances in the corrected image, under the radial polynomial: pass "
+            "the lines without in_image or with_family. (To compare families, give select_model "
             "Candidate(zoom, terms, family).)"
         )
     if not isinstance(lines, AbstractLines):
@@ -72,7 +72,7 @@ def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
         raise ValueError("Argument lines must hold finite points, but it holds NaN or infinite ones.")
     if not own_weights(small).any():
         raise ValueError(
-            "Argument lines must have a line that counts, but all have a weight of 0 or too few points."
+            "Argument lines must have a usable line, but all have a weight of 0 or too few points."
         )
     return small
 
@@ -99,11 +99,14 @@ def folds_of(lines: CompressedLines, hold_out: HoldOut, folds: int | None, seed:
         group, number, needed = frame, len(focal), "two or more frames"
     else:
         distinct, place = np.unique(focal, return_inverse=True)
-        number, needed = len(distinct) - 2, "4 distinct focal lengths or more, for both ends stay"
+        number, needed = (
+            len(distinct) - 2,
+            "4 or more distinct focal lengths, as both ends are never left out",
+        )
         group = np.where((place > 0) & (place <= number), place - 1, -1)[frame]
     if number < 2:
         raise ValueError(
-            f'Argument hold_out is "{hold_out}", which takes {needed}; there are fewer. Ask for '
+            f'Argument hold_out is "{hold_out}", which needs {needed}; there are fewer. Use '
             'hold_out="line", or add images at other focal lengths.'
         )
     parts = min(most, number)

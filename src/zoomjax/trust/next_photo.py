@@ -1,12 +1,13 @@
-"""Where to photograph next: the focal length and part of the image that would narrow the bands most.
+"""The next photo: the focal length and part of the image that would narrow the bands most.
 
-A further photo changes the covariance ``H^-1 D H^-1`` of the fit (`covariance`) by what its lines add to
-H and D, which depends on where they are and not on what will be measured there. So every candidate's band
-is known beforehand: focal lengths over the range, nine parts of the image, lines level or upright,
-as many and as long as in the photos there are. The noise, whatever its size, is taken to stay as it is.
+A further photo changes the covariance ``H^-1 D H^-1`` of the fit (`covariance`) through its lines' terms of
+H and D, which depend on where the lines are and not on what is measured there. So the band with each
+candidate is known in advance. Candidates are focal lengths over the range, nine parts of the image, and
+horizontal or vertical lines, as many and as long as in the existing photos. The noise is assumed to stay
+the same.
 
 Directions that no line determines get a prior, normalised coefficients of about 1, so that candidates can
-be compared there too. One small Jacobian a candidate; nothing is fitted.
+be compared there too. The cost is one small Jacobian per candidate; nothing is fitted.
 """
 
 import dataclasses
@@ -46,13 +47,13 @@ _ALIKE = 1.02  # bands that differ by less are as good as each other
 
 @dataclasses.dataclass(frozen=True)
 class Suggestion:
-    """The photo that would help most, and what each candidate would leave.
+    """The photo that would reduce the uncertainty most, and the uncertainty with each candidate.
 
     Attributes:
-        focal: the focal length to photograph at.
-        direction: "horizontal" or "vertical": of the lines.
-        region: the part of the image that they should run through, in words.
-        before, after: the standard deviation of the displacement, px, as it is and as it would be: the
+        focal: the focal length of the photo.
+        direction: direction of its lines, "horizontal" or "vertical".
+        region: the part of the image with the lines, in words.
+        before, after: the standard deviation of the displacement, px, without and with the photo: the
             geometric mean over image and focal range. Infinite where the lines do not determine the lens.
         focals: the candidates' focal lengths.
         regions: their parts of the image, in words.
@@ -72,16 +73,16 @@ class Suggestion:
 
     @property
     def sentence(self) -> str:
-        """What to do next, in words."""
+        """The suggestion in words."""
         photo = (
             f"Next, photograph {self.direction} lines through {self.region} of the image at f = "
             f"{self.focal:.4g} {self.focal_unit}"
         )
         if not np.isfinite(self.before):
-            return f"{photo}: of all there is to add, that would determine the lens best."
+            return f"{photo}: of all candidates, this one would determine the lens best."
         return (
-            f"{photo}: the standard deviation of the displacement, in the mean over image and range, would "
-            f"fall from {self.before:.2g} to {self.after:.2g} px."
+            f"{photo}: the standard deviation of the displacement, averaged over image and focal range, "
+            f"would fall from {self.before:.2g} to {self.after:.2g} px."
         )
 
 
@@ -90,19 +91,19 @@ class Suggestion:
 def suggest_next(
     fit: ZoomFit, lines: AbstractLines, *, focal_range: tuple[float, float] | None = None
 ) -> Suggestion:
-    """The further photo that would shrink the displacement's band most.
+    """Suggest the next photo: the one that would narrow the band of the displacement most.
 
     Args:
         fit: the fit.
-        lines: what it was fitted to, compressed or not.
-        focal_range: from the shortest to the longest focal length that matters, in the lens's unit; by
-            default those fitted.
+        lines: the lines of the fit, compressed or not.
+        focal_range: the shortest and the longest focal length of interest, in the lens's unit; by default
+            the fitted range.
 
     Returns:
-        The best of the candidates, and all of them.
+        The best candidate, and the values of all candidates.
 
     Raises:
-        ValueError: `focal_range` is not two positive numbers in order, or no line counts.
+        ValueError: `focal_range` is not two positive numbers in order, or no line is usable.
 
     Example:
         >>> from zoomjax import compress, fit_zoom, scenes
@@ -119,13 +120,13 @@ def suggest_next(
         )
     if isinstance(fit.lens.zoom, AbstractFocusZoom) or fit.lens.shift is not None:
         raise ValueError(
-            "Photos are suggested for lenses that depend on the focal length alone, about one centre of "
-            "distortion: this one depends on the focus, or its centre moves along the zoom."
+            "Argument fit must have a lens that depends on the focal length alone and has one centre of "
+            "distortion, but it depends on the focus, or its centre moves along the zoom."
         )
     lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
     if not np.any(counted_frames(lines)):
         raise ValueError(
-            "Argument lines must have a line that counts, but all have a weight of 0 or too few points."
+            "Argument lines must have a usable line, but all have a weight of 0 or too few points."
         )
     focals = np.unique(1 / np.linspace(1 / low, 1 / high, _FOCALS))
     number, length, counts = _typical(lines)

@@ -1,10 +1,9 @@
-"""Choosing the model: which zoom model, degree, number of coefficients and family the lines ask for.
+"""Model selection: zoom model, degree, number of coefficients and distortion model.
 
-More parameters always bring the lines that were fitted closer to straightness; what tells is how straight a
-model makes lines that it has not seen (`cross_validation`). Their mean squared distance E is known to a
-standard error only, from the scatter over the focal lengths, frames or lines that were left out; but two
-models are judged on the same ones, and most of what scatters is common to both. So differences are
-compared, paired:
+More parameters always make the fitted lines straighter. The criterion is therefore the straightness of
+lines that were left out of the fit (`cross_validation`). Their mean squared distance E has a standard
+error, from the scatter over the focal lengths, frames or lines that were left out. Two models are measured
+on the same ones, and most of the scatter is common to both. So differences are compared, paired:
 
     s^2 = n/(n-1) sum_u a_u^2 (d_u - d)^2,   d_u = E_u(model)/2R(model) - E_u(best)/2R(best),
 
@@ -46,7 +45,7 @@ class Candidate:
     Attributes:
         zoom: such as ``PolynomialZoom(degree=2)``.
         terms: N, of eq. 2.
-        family: what the coefficients mean, such as ``Division()``.
+        family: the distortion model, such as ``Division()``.
     """
 
     zoom: AbstractZoom
@@ -77,16 +76,16 @@ class Candidate:
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What became of a candidate. All RMS are of the same lines, px; NaN where there is none.
+    """The figures of one candidate. All RMS are of the same lines, px; NaN where not available.
 
     Attributes:
         candidate: the candidate.
-        parameters: how many numbers it has to follow the lines; a prior makes it fewer than it has.
-        rms: of the lines as fitted.
-        held_out: of the lines, each left out of the fit that it is measured by.
-        held_out_std: its standard error.
-        difference: of `held_out` to that of the best candidate.
-        difference_std: its standard error, paired.
+        parameters: effective number of parameters; a prior makes it smaller than the actual number.
+        rms: RMS of the lines in the fit (in sample).
+        held_out: cross-validated RMS: each line is measured by a fit without it.
+        held_out_std: standard error of `held_out`.
+        difference: difference of `held_out` from that of the best candidate.
+        difference_std: standard error of `difference`, paired.
         problem: why it was not compared, in a sentence; empty if it was.
     """
 
@@ -102,15 +101,16 @@ class Verdict:
 
 @dataclasses.dataclass(frozen=True)
 class Selection:
-    """The model chosen, its fit, and how all candidates compared. ``print(selection)`` shows a table.
+    """The selected model, its fit, and the comparison of all candidates. ``print(selection)`` shows a
+    table.
 
     Attributes:
         chosen: the simplest candidate within one standard error of the best.
-        best: the candidate of least held-out error.
-        fit: of the chosen model, to all lines.
-        verdicts: of all candidates, in their order.
+        best: the candidate of least cross-validated error.
+        fit: the fit of the chosen model to all lines.
+        verdicts: the figures of all candidates, in their order.
         hold_out: what was left out: "focal", "frame" or "line".
-        folds: in how many parts.
+        folds: number of folds.
     """
 
     chosen: Candidate
@@ -185,41 +185,41 @@ def select_model(
     folds: int | None = None,
     seed: int = 0,
 ) -> Selection:
-    """Choose the zoom model that makes lines straight that it has not seen, and none more complicated.
+    """Select a model by cross-validation, with the one-standard-error rule.
 
-    Parts of the lines are left out in turn, and measured by the fit of the others. Of the candidates that
-    do so as well as the best, within one standard error of the difference, the one with the fewest
-    parameters is chosen, and fitted to all lines.
+    Parts of the lines are left out in turn, and measured with the fit of the others. Of the candidates that
+    are as good as the best within one standard error of the difference, the one with the fewest parameters
+    is chosen, and fitted to all lines.
 
     Args:
         lines: the lines, or ``compress(lines, terms=3)``.
-        candidates: zoom models, or `Candidate` where `terms` is not 2 or the family another. By default
-            polynomials in 1/f of degree 0 to 3 with 1 to 3 coefficients (or as many as the lines are
-            compressed for), and `SmoothZoom`.
-        hold_out: what is left out. "focal": focal lengths, with all of their frames, but never the shortest
-            and the longest, so that nothing is extrapolated; it tells how well a model does between the
-            focal lengths photographed, which is what it is for. "frame": frames, those at both ends too,
-            where the model is then extrapolated unless another frame has that focal length. "line": lines,
-            of each frame a part; it tells whether coefficients are determined, and little of the focal
-            lengths in between. By default "focal" with four or more distinct focal lengths, and "line"
-            with fewer.
-        folds: into how many parts; by default each focal length or frame by itself, but no more than 50
-            parts, and 10 parts of the lines.
-        seed: of the random parting, where parts hold more than one. What is in a part does not depend on
-            anything else.
+        candidates: zoom models, or `Candidate` for other `terms` than 2 or another distortion model. By
+            default polynomials in 1/f of degree 0 to 3 with 1 to 3 coefficients (or as many as the lines
+            are compressed for), and `SmoothZoom`.
+        hold_out: what is left out. "focal": focal lengths with all of their frames, but never the shortest
+            and the longest, so that nothing is extrapolated; this measures the interpolation between the
+            photographed focal lengths, which is the purpose of the model. "frame": frames, also those at
+            both ends, where the model extrapolates unless another frame has that focal length. "line": a
+            part of the lines of each frame; this shows whether coefficients are determined, but little
+            about focal lengths in between. By default "focal" with four or more distinct focal lengths, and
+            "line" with fewer.
+        folds: number of parts; by default one for each focal length or frame, but at most 50, and 10 parts
+            of the lines.
+        seed: random seed of the split, where parts hold more than one. The split depends on nothing else.
 
     Returns:
-        The choice. Candidates that cannot be fitted, or not to what is left, are in its table with the
-        reason, and so are those of which a fold does not converge.
+        The selection. Candidates that cannot be fitted, to all lines or to a fold's, or of which a fold
+        does not converge, are in its table with the reason.
 
-    Raises:
-        ValueError: no candidate can be compared, there is nothing that can be left out, or an argument is
-            none of those above.
-        TypeError: `lines` or a candidate is something else.
+        Raises:
+        ValueError: no candidate can be compared, nothing can be left out, or an argument is not one of
+        those
+            above.
+        TypeError: `lines` or a candidate has the wrong type.
 
-    The fits of folds are not made invertible, the chosen one is, by `fit_zoom`. Candidates that are linear
-    in their parameters are cross-validated at hundreds of fits a second; others, and those of another
-    family, fit by fit.
+        The fits of folds are not made invertible; the final fit is, by `fit_zoom`. Candidates that are
+        linear in their parameters are cross-validated at hundreds of fits a second; others, and those of
+        another distortion model, with a separate fit for each fold.
 
     References:
         L. Breiman, J. Friedman, R. Olshen, C. Stone, "Classification and regression trees" (1984), 3.4.3.
