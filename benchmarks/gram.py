@@ -22,7 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import zoomjax as zj
-from shared import RESULTS, machine, machine_line, table, write
+
+from .shared import RESULTS, machine, machine_line, table, write
 
 POINTS = 3427
 """A line: with 2,986 lines, the points of benchmarks/fit.py."""

@@ -14,7 +14,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from shared import RESULTS, machine, machine_line
+from .shared import RESULTS, machine, machine_line
 
 HERE = Path(__file__).parent
 

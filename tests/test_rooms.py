@@ -4,6 +4,7 @@ import re
 import xml.etree.ElementTree as ET
 
 import pytest
+
 from docs.make import rooms
 
 from .test_layers import FILES, ROOMS, own, room

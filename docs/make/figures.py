@@ -11,6 +11,7 @@ thousandfold (ms). All other figures are settings, definitions, the paper's, or 
 docs/given.toml lists them, page by page, in the words around them.
 """
 
+import ast
 import json
 import re
 import tomllib
@@ -37,6 +38,7 @@ class Figure(NamedTuple):
     """A figure on a page: its number as stated, the value, and the text around it."""
 
     stated: str
+    at: int
     value: float
     digits: int
     around: str
@@ -71,14 +73,14 @@ def figures(text: str) -> Iterator[Figure]:
     for found in FIGURE.finditer(text):
         number = found["number"]
         if "." in number or "e" in number or found["unit"]:
-            plain = number.replace(",", "")
-            mantissa, _, power = plain.partition("e")
+            bare = number.replace(",", "")
+            mantissa, _, power = bare.partition("e")
             million = 6 if (found["unit"] or "").endswith("million") else 0
             digits = len(mantissa.partition(".")[2]) - int(power or 0) - million
             sign = -1 if found["sign"] in ("-", "−") else 1
-            yield Figure(
-                number, sign * float(plain), digits, text[max(0, found.start() - 30) : found.end() + 20]
-            )
+            around = text[max(0, found.start() - 30) : found.end() + 20]
+            value = sign * float(bare) * 10**million
+            yield Figure(number, found.start("number"), value, digits, around)
 
 
 def values(source: str) -> list[float]:
@@ -113,14 +115,34 @@ def borne_out(figure: Figure, known: list[float]) -> bool:
     return any(abs(abs(value) - abs(figure.value)) <= 0.5000001 * step for value in known)
 
 
+def docstrings(module: Path) -> str:
+    """The docstrings of a module, those of its constants included, without examples: as paragraphs."""
+    texts = [
+        node.value.value
+        for node in ast.walk(ast.parse(module.read_text()))
+        if isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    ]
+    plain_text = [re.sub(r"^ *Example:\n.*", "", text, flags=re.DOTALL | re.MULTILINE) for text in texts]
+    return "\n\n".join(re.sub(r"\n\s*\n|\n +", "\n", text.strip()) for text in plain_text)
+
+
 def given(page: Path) -> dict[str, list[str]]:
     """The words around the figures of a page that no results hold, by what holds them."""
     return tomllib.loads(GIVEN.read_text()).get(str(page.relative_to(ROOT)), {})
 
 
 def unsupported(page: Path) -> list[str]:
-    """What is wrong on a page: figures that nothing bears out, and listed words that it lacks."""
-    return unsupported_in(page.read_text(), [words for listed in given(page).values() for words in listed])
+    """What is wrong on a page: figures that nothing bears out, and listed words that it lacks.
+
+    Of a module its docstrings are looked at, and listed words may be gone.
+    """
+    allowed = [words for listed in given(page).values() for words in listed]
+    if page.suffix == ".py":
+        text = docstrings(page)
+        return unsupported_in(text, [words for words in allowed if words in plain(text)])
+    return unsupported_in(page.read_text(), allowed)
 
 
 def unsupported_in(text: str, allowed: list[str]) -> list[str]:
@@ -131,11 +153,12 @@ def unsupported_in(text: str, allowed: list[str]) -> list[str]:
         f"docs/given.toml: not on the page any more: {words}" for words in allowed if words not in whole
     ]
     for passage in passages(text):
-        rest = passage.text
-        for words in allowed:
-            rest = rest.replace(words, "…")
+        listed = [
+            (m.start(), m.end()) for words in allowed for m in re.finditer(re.escape(words), passage.text)
+        ]
         known = [value for source in passage.sources for value in values(source)]
-        bad = [figure for figure in figures(rest) if not borne_out(figure, known)]
+        open_ = [f for f in figures(passage.text) if not any(start <= f.at < end for start, end in listed)]
+        bad = [figure for figure in open_ if not borne_out(figure, known)]
         where = ", ".join(passage.sources) or "no results named"
         wrong += [f"{figure.stated} in “{figure.around}” ({where})" for figure in bad]
     return wrong

@@ -26,8 +26,8 @@ TOLERANCE = 0.01
 
 _TRIALS = ((8, 0), (16, 2))
 """Degree, and steps of Newton's method after it, tried in this order. Degree 8 alone is enough for
-photographic lenses (2e-4 px on the Nikkor 18-200). Near a fold the inverse has a square-root singularity
-that no polynomial follows: there the steps help (5 % before it they reach 8e-4 px)."""
+photographic lenses (benchmarks/results/correct.md has its error). Near a fold the inverse has a
+square-root singularity that no polynomial follows: there the steps help."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,11 +11,11 @@ rows a line, whatever the number of points. Triangles of the same line `merge`, 
 memory can be compressed in chunks of points.
 
 R is found by modified Gram-Schmidt, not by way of the Gram matrix ``R^T R``, although sums of monomials
-would give that in one read of the points. Squaring the condition number would lose residuals below about
-1e-4 px in float64, and 0.6 px in float32, which is useless. Gram-Schmidt takes the same time when it
-works on a run of a thousand points at a time, whose columns stay in the fastest cache. Its floor is near
-the dtype's own: 2e-14 of half the image diagonal in float64, 2e-6 in float32, which is 1e-11 px and 1e-3 px
-in a 640 x 480 image (measured on straight, coincident and far lines of 3 to a million points).
+would give that in one read of the points. Squaring the condition number would lose small residuals, in
+float32 those of most lines, and would save no time (benchmarks/results/gram.md): Gram-Schmidt works on a
+run of a thousand points at a time, whose columns stay in the fastest cache. Its floor is near the dtype's
+own: 2e-14 of half the image diagonal in float64, 2e-6 in float32 (benchmarks/reliability_core.py searches
+for lines that break it).
 
 Lines sharded over devices are reduced where they are: no point is exchanged.
 """
@@ -352,7 +352,7 @@ def _orthogonalise(columns):
     """R of the transposed argument, by modified Gram-Schmidt.
 
     Its R is as accurate as Householder's (Björck 1967), which is all that is kept, and it is made of
-    products of a few long vectors. Batched `jnp.linalg.qr` took 4 times the time (2,987 lines).
+    products of a few long vectors. Batched `jnp.linalg.qr` is slower.
     """
     size = columns.shape[0]
     rows = []

@@ -56,8 +56,7 @@ class Division(AbstractRadial):
     def expansion_terms(self, size: int) -> int:
         """8, or its own number if that is more.
 
-        The error of L up to the corner, measured: for |k1| up to 0.1 5e-14, to 0.3 3e-9, to 0.5 1.5e-6
-        (of half the diagonal: 6e-4 px at 640 x 480); for (-0.3, -0.2), half way to the pole, 2e-5.
+        The error of L up to the corner is that of rounding for weak distortion, and grows towards the pole.
         """
         return max(8, size)
 
