@@ -64,7 +64,7 @@ def test_lines_that_determine_nothing_are_reported(calibration):
     assert None in summary["parameter_sigma"]
     assert summary["warnings"][0] == summary["result"]
     assert summary["warnings"][1].startswith(
-        "3 of 3 frames have no good model of their own (frames 0, 1, 2)"
+        "3 of 3 frames have no good separate fit (frames 0, 1, 2)"
     )
 
 
@@ -72,7 +72,7 @@ def test_results_are_written_together_or_not_at_all(calibration, tmp_path, monke
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("zoomjax.app.calibration.plot_model", fail)  # the last of the four files
+    monkeypatch.setattr("zoomjax.app.plot.plot_model", fail)  # the last of the four files
     with pytest.raises(OSError, match="disk full"):
         calibration.write(tmp_path)
     assert list(tmp_path.iterdir()) == []
