@@ -104,7 +104,7 @@ def cells():
                 yield pytest.param(row, way, dtype, id=f"{row.name}-{way}-{dtype}", marks=marks)
 
 
-@pytest.mark.filterwarnings("ignore:.*beyond that its distortion is extrapolated:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*beyond it the distortion is extrapolated:UserWarning")
 @pytest.mark.parametrize(("row", "way", "dtype"), list(cells()))
 def test_cell(row, way, dtype):
     most = LOOSE.get(way, {}).get(dtype, tolerance(dtype))

@@ -343,9 +343,7 @@ def test_other_size_is_scaled_and_other_aspect_explained(clip, tmp_path):
 
 
 def test_outside_of_the_fitted_range_is_said(clip, tmp_path):
-    with pytest.warns(
-        UserWarning, match="fitted on 20 to 80 mm: beyond that its distortion is extrapolated"
-    ):
+    with pytest.warns(UserWarning, match="fitted, 20 to 80 mm: beyond it the distortion is extrapolated"):
         undistort_video(clip, tmp_path / "out.mp4", lens=lens(), focal=15.0)
 
 
