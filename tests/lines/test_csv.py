@@ -103,7 +103,7 @@ def test_focal_lengths_in_the_file_and_beside_it_are_refused(tmp_path):
     rows = "".join(f"0,0,{i},{i * i},24\n" for i in range(4))
     path = write(tmp_path / "lines.csv", "frame,line,x,y,focal\n" + rows)
     with pytest.raises(
-        ValueError, match=r"lines\.csv: it has a column focal, and .* Leave one of them out"
+        ValueError, match=r"lines\.csv: it has a column focal, but .* Leave one of them out"
     ):
         read_lines_csv(path, image_size=SIZE, focal={0: 50.0})
     assert read_lines_csv(path, image_size=SIZE).focal.tolist() == [24]

@@ -200,7 +200,9 @@ def _judge(zoom, result, determined, certificate):
     about_model = RESULTS.where(determined, about_model, RESULTS.undetermined)
     about_model = RESULTS.where(finite, about_model, nonfinite)
     solved = result if isinstance(result, RESULTS) else RESULTS.promote(result)
-    return RESULTS.where(solved == good, about_model, solved)
+    # Along what the lines do not determine a solver may wander up to its last step: that is then the reason.
+    wandered = (solved == RESULTS.nonlinear_max_steps_reached) & ~determined & finite
+    return RESULTS.where((solved == good) | wandered, about_model, solved)
 
 
 def is_invertible(fit):
