@@ -200,7 +200,7 @@ def _judge(zoom, result, determined, certificate):
     about_model = RESULTS.where(determined, about_model, RESULTS.undetermined)
     about_model = RESULTS.where(finite, about_model, nonfinite)
     solved = result if isinstance(result, RESULTS) else RESULTS.promote(result)
-    # Along what the lines do not determine a solver may wander up to its last step: that is then the reason.
+    # A solver may wander to its last step along what the lines do not determine: that is then the reason.
     wandered = (solved == RESULTS.nonlinear_max_steps_reached) & ~determined & finite
     return RESULTS.where((solved == good) | wandered, about_model, solved)
 
