@@ -63,9 +63,7 @@ def test_lines_that_determine_nothing_are_reported(calibration):
     assert summary["rms_held_out"] is None  # two focal lengths do not make a quadratic
     assert None in summary["parameter_sigma"]
     assert summary["warnings"][0] == summary["result"]
-    assert summary["warnings"][1].startswith(
-        "3 of 3 frames have no good separate fit (frames 0, 1, 2)"
-    )
+    assert summary["warnings"][1].startswith("3 of 3 frames have no good separate fit (frames 0, 1, 2)")
 
 
 def test_results_are_written_together_or_not_at_all(calibration, tmp_path, monkeypatch):
