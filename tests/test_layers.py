@@ -29,7 +29,7 @@ LIBRARIES = {
     "app": {"matplotlib", "typer", "rich", "cv2", "jinja2"},
     "correct": {"cv2"},
     "detect": {"cv2"},
-    "io": {"cv2", "av", "PIL", "pillow_heif", "tifffile"},
+    "io": {"cv2", "av", "PIL", "pillow_heif", "rawpy", "tifffile"},
     "torch": {"torch"},
 }
 """Libraries of images, plots, terminals and video, and where they may be imported."""
