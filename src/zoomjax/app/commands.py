@@ -5,6 +5,7 @@ float64.
 """
 
 import contextlib
+import dataclasses
 import importlib.metadata
 import sys
 from collections.abc import Callable
@@ -241,7 +242,10 @@ def undistort(
     lens: Annotated[
         Path, typer.Argument(metavar="lens.json", help="The lens written by zoomjax calibrate.")
     ],
-    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help="Photos, or one video.")],
+    inputs: Annotated[
+        list[Path],
+        typer.Argument(metavar="INPUT...", help="Photos or videos, folders of them, or patterns."),
+    ],
     output: Annotated[
         Path,
         typer.Option(
@@ -252,14 +256,16 @@ def undistort(
         str | None,
         typer.Option(
             help="A focal length, or a CSV file: columns time,focal or frame,focal for a video, "
-            "image,focal for photos. Default for photos: their EXIF data."
+            "image,focal for photos; for several videos a folder of such files with their names. Default "
+            "for photos: their EXIF data."
         ),
     ] = None,
     keep: Annotated[
         str,
         typer.Option(
-            help="Framing of the corrected image: same (as the input), all (every input pixel) or valid "
-            "(no empty borders). The framing stays constant while zooming."
+            help="Framing of the corrected image: same (as the input), all (every input pixel), valid (no "
+            "empty borders) or grow (every input pixel at its size, on a larger canvas). The framing stays "
+            "constant while zooming."
         ),
     ] = "same",
     interpolation: Annotated[
@@ -275,24 +281,35 @@ def undistort(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace existing files, but never an input.")
     ] = False,
+    redistort: Annotated[
+        bool, typer.Option("--redistort", help="Go back: apply the distortion to corrected images.")
+    ] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Also accept photos that zoomjax has corrected already.")
+    ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Leave what an earlier run has written, and do the rest.")
+    ] = False,
 ) -> None:
-    """Correct photos or a video, each image at its own focal length.
+    """Correct photos or videos, each image at its own focal length.
 
-    Photos that cannot be corrected are reported and skipped. The exit status
+    Files that cannot be corrected are reported and skipped. The exit status
     is then 1, or 2 if all were skipped.
     """
     set_up_jax()
     from .undistort_files import Job, undistort_files
 
     with progress_bar("Correcting", timed=False) as progress:
-        done = undistort_files(
-            Job(lens, tuple(inputs), output, focal, keep, interpolation, border, hold, overwrite), progress
-        )
+        job = Job(lens, tuple(inputs), output, focal, keep, interpolation, border, hold, overwrite)
+        job = dataclasses.replace(job, redistort=redistort, again=again, resume=resume)
+        done = undistort_files(job, progress)
     print(plain(done.sentence))
+    for note in done.notes:
+        print(plain(note))
     for path, reason in done.skipped.items():
         print(plain(f"Skipped {path}: {with_flags(reason)}"), file=sys.stderr)
     if done.skipped:
-        raise typer.Exit(2 if len(done.skipped) == len(inputs) else 1)
+        raise typer.Exit(1 if done.written else 2)
 
 
 @app.command()

@@ -145,5 +145,6 @@ def starts(output: Any, named: Path, copied: Sequence[Any]) -> None:
     except (ValueError, av.error.FFmpegError) as error:
         names = ", ".join(_name(stream) for stream in copied) or "these pictures"
         raise ValueError(
-            f"Cannot write {names} to a {named.suffix} file: {error}. Choose .mov or .mkv."
+            f"Cannot write {names} to a {named.suffix} file: {getattr(error, 'strerror', None) or error}. "
+            "Choose .mov or .mkv."
         ) from error

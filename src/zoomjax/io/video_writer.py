@@ -41,10 +41,11 @@ _PROFILES = {"Proxy": "0", "LT": "1", "Standard": "2", "HQ": "3", "4444": "4", "
 """Of ProRes: FFmpeg's names, and the encoder's numbers."""
 
 _TAKES = {
+    "mov": {"libx264", "libx265", "prores_ks"},
     "mpegts": {"libx264", "libx265"},
     "mxf": {"libx264", "prores_ks"},
 }
-"""Encoders for containers that do not tell FFmpeg which they take."""
+"""Encoders for containers that do not tell FFmpeg which they take, or tell it wrong (VP9 in .mov)."""
 
 _SUBSAMPLED = re.compile(r"yuvj?4(?:20|22|11|10)p(\d+le)?")
 
