@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import ExifTags, Image, PngImagePlugin
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from zoomjax.io.metadata import Metadata, geometry_of, marked
 from zoomjax.io.photo import read_focal, read_metadata, read_pages, read_photo
@@ -238,3 +239,21 @@ def test_the_mark_leaves_the_packet_as_it_is():
     assert geometry_of(back) == "distorted"
     assert len(back.xmp) == len(once.xmp) - 2
     assert geometry_of(marked(Metadata(xmp=b"no packet"), "undistorted")) == "undistorted"
+
+
+def test_notes_of_the_maker_are_left_out_of_tiff_files_and_named(tmp_path, image):
+    given = Image.Exif()
+    given[ExifTags.IFD.Exif] = {
+        ExifTags.Base.MakerNote: b"notes of a maker",
+        ExifTags.Base.FocalLength: 35.0,
+    }
+    block = given.tobytes().removeprefix(b"Exif\0\0")
+    assert write(tmp_path / "a.jpg", image, Metadata(exif=block)) == []
+    assert read_metadata(tmp_path / "a.jpg").exif == block
+    assert write(tmp_path / "a.tif", image, Metadata(exif=block)) == ["the camera maker's notes"]
+    folders = ImageFileDirectory_v2()
+    folders[ExifTags.IFD.Exif] = {ExifTags.Base.MakerNote: b"notes of a maker"}
+    Image.fromarray(image).save(tmp_path / "b.tif", tiffinfo=folders)
+    with tifffile.TiffFile(tmp_path / "b.tif") as file:
+        assert "MakerNote" in file.pages[0].tags["ExifTag"].value
+    assert "the camera maker's notes" in read_pages(tmp_path / "b.tif").others

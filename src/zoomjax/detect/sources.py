@@ -109,7 +109,8 @@ def find_photos(inputs: Iterable[str | os.PathLike[str]]) -> list[Source]:
 def once(paths: Sequence[Path]) -> tuple[list[Path], dict[Path, Path]]:
     """Each file once, and for those that are left out the file that they are or lead to."""
     first: dict[Path, Path] = {}
-    again = {path: same for path in paths if (same := first.setdefault(path.resolve(), path)) is not path}
+    real = {path: Path(os.path.realpath(path)) for path in paths}
+    again = {path: same for path in paths if (same := first.setdefault(real[path], path)) is not path}
     return list(first.values()), again
 
 

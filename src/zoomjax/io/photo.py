@@ -21,7 +21,7 @@ from .headers import announced_format, announced_size, jpeg_segments
 from .heic import HEIC_SUFFIXES, decode_heic, heic_metadata
 from .jpeg import is_cmyk, jpeg_metadata
 from .metadata import Metadata
-from .photo_writer import FORMATS
+from .photo_writer import FORMATS, MAKER_NOTES
 from .png import png_metadata
 from .raw import RAW_SUFFIXES, decode_raw, raw_metadata, raw_size
 from .tiff import read_tiff, tiff_metadata, tiff_size
@@ -183,7 +183,9 @@ def _tiff(content: bytes, most_pages: int) -> Photo:
     if most_pages > 1 and (number := tiff_size(content)) > _MOST_PIXELS:
         raise ValueError(f"its pages have {number:,} pixels, more than {_MOST_PIXELS:,}")
     pages = read_tiff(content, most_pages=most_pages)
-    return Photo(tuple((page.image, page.metadata) for page in pages), (), any(page.cmyk for page in pages))
+    others = (MAKER_NOTES,) if any(page.notes for page in pages) else ()
+    cmyk = any(page.cmyk for page in pages)
+    return Photo(tuple((page.image, page.metadata) for page in pages), others, cmyk)
 
 
 def _heic(content: bytes, most_pages: int) -> Photo:

@@ -1,5 +1,6 @@
 """Photos encoded with their metadata, and what of these a format does not hold."""
 
+import re
 import struct
 from collections.abc import Sequence
 
@@ -27,6 +28,12 @@ _JPEG = [
     *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
 ]
 _WEBP = [cv2.IMWRITE_WEBP_QUALITY, 101]  # above 100: without loss
+
+_MAKER_NOTES = re.compile(rb"\x7c\x92[\x01\x07]\0|\x92\x7c\0[\x01\x07]")
+"""Their tag and type in EXIF data, in both orders of bytes."""
+
+MAKER_NOTES = "the camera maker's notes"
+"""How messages call what does not survive being moved, and is left out of TIFF files."""
 
 Pages = Sequence[tuple[np.ndarray, Metadata]]
 
@@ -59,6 +66,8 @@ def encoded_photo(pages: Pages, suffix: str) -> tuple[bytes, list[str]]:
     kind = suffix.lower()
     if kind in (".tif", ".tiff"):
         lost = ["the camera's data in EXIF"] if is_big(pages) else []
+        if any(_MAKER_NOTES.search(metadata.exif) for _, metadata in pages):
+            lost.append(MAKER_NOTES)
         return encode_tiff(pages), [*lost, *_lost(pages, "exif", "xmp", "icc", "iptc", "dpi")]
     [(image, metadata)] = pages
     if kind == ".avif":

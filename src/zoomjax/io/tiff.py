@@ -54,12 +54,14 @@ class TiffPage:
         metadata: the page's own.
         orientation: 1 to 8, which is not applied to the pixels.
         cmyk: whether the file holds four colours for print, of which `image` has three.
+        notes: whether the page holds notes of the camera's maker, which `metadata` lacks.
     """
 
     image: np.ndarray
     metadata: Metadata
     orientation: int
     cmyk: bool
+    notes: bool
 
 
 def read_tiff(content: bytes, *, most_pages: int = _MOST_PAGES) -> list[TiffPage]:
@@ -100,6 +102,8 @@ def _page(content: bytes, file: tifffile.TiffFile, number: int) -> TiffPage:
         separate = page.planarconfig == 2 and page.samplesperpixel > 1
         cmyk = getattr(page.photometric, "name", "") == "SEPARATED"
         compression = getattr(page.compression, "name", str(page.compression))
+        folder = page.tags.valueof(int(ExifTags.IFD.Exif))
+        notes = isinstance(folder, dict) and "MakerNote" in folder
     except MemoryError:
         raise
     except Exception as error:  # as above
@@ -109,7 +113,7 @@ def _page(content: bytes, file: tifffile.TiffFile, number: int) -> TiffPage:
         raise ValueError(f"its colours are stored one after the other and compressed ({compression})")
     if image is None:
         image = as_stored(_by_opencv(content, number), orientation)  # OpenCV turns TIFF files
-    return TiffPage(image, metadata, orientation, cmyk)
+    return TiffPage(image, metadata, orientation, cmyk, notes)
 
 
 def _plain(page: Any) -> np.ndarray | None:
