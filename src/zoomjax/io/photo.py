@@ -37,23 +37,31 @@ def read_focal(source: str | os.PathLike[str]) -> float | None:
         OSError: it cannot be read.
         ValueError: it is not a photo or not a regular file, or has more than 4 GB.
     """
+    block = read_exif(source)
+    return None if block is None else exif_focal(block)
+
+
+def read_exif(source: str | os.PathLike[str]) -> bytes | None:
+    """Read a photo's EXIF data; None if it has none. No pixel is decoded. It raises as `read_focal`."""
     path = Path(source)
     try:
         with open_photo(path) as file:
             kind = announced_format(file.read(16))
             file.seek(0)
             if kind == "HEIC":
-                return metadata_focal(heic_metadata(file.read(_MOST_BYTES)))
-            block = find_exif(file, kind)
+                return next(_exif_blocks(heic_metadata(file.read(_MOST_BYTES))), None)
+            return find_exif(file, kind)
     except ValueError as error:
         raise ValueError(f"Cannot read a photograph from {path}: {error}.") from error
-    return None if block is None else exif_focal(block)
 
 
 def metadata_focal(metadata: Metadata) -> float | None:
     """The focal length, mm, in the metadata from `read_photo`."""
-    blocks = (data.tobytes() for kind, data in metadata if kind == cv2.IMAGE_METADATA_EXIF)
-    return next((exif_focal(block) for block in blocks), None)
+    return next((exif_focal(block) for block in _exif_blocks(metadata)), None)
+
+
+def _exif_blocks(metadata: Metadata) -> Iterator[bytes]:
+    return (data.tobytes() for kind, data in metadata if kind == cv2.IMAGE_METADATA_EXIF)
 
 
 def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, Metadata]:
