@@ -27,7 +27,7 @@ class Job:
     """Settings of a correction.
 
     Attributes:
-        lens: file of the lens.
+        lens: the lens, or its file.
         inputs: photos, or one video.
         output: file for a single input, else a folder.
         focal: a number, a CSV file, or None for the photos' EXIF data.
@@ -36,7 +36,7 @@ class Job:
         overwrite: whether existing files may be replaced; inputs never are.
     """
 
-    lens: Path
+    lens: Path | ZoomLens
     inputs: tuple[Path, ...]
     output: Path
     focal: str | None = None
@@ -70,7 +70,7 @@ def undistort_files(job: Job, progress: Callable[[int, int], None] = lambda done
     """
     check_sampling(job.interpolation, job.border)
     check_keep(job.keep)
-    lens = load_lens(job.lens)
+    lens = job.lens if isinstance(job.lens, ZoomLens) else load_lens(job.lens)
     photos = [path for path in job.inputs if path.suffix.lower() in SUFFIXES]
     if photos and len(photos) < len(job.inputs):
         raise ValueError("Give photos or a video, not both.")
@@ -170,6 +170,11 @@ def _photo_targets(job: Job) -> list[Path]:
     return [job.output / _target_name(path) for path in job.inputs]
 
 
+def check_photo_targets(job: Job) -> None:
+    """Refuse photos that would be written to one file, to an input, or in place of another file."""
+    _check_targets(job, _photo_targets(job))
+
+
 def _target_name(photo: Path) -> str:
     """The photo's name, with the suffix .png for formats that can only be read (HEIC)."""
     return photo.name if photo.suffix.lower() in FORMATS else f"{photo.stem}.png"
@@ -177,7 +182,8 @@ def _target_name(photo: Path) -> str:
 
 def _check_targets(job: Job, targets: Sequence[Path]) -> None:
     tables = [] if job.focal is None else [job.focal]
-    refuse_inputs(targets, [*job.inputs, job.lens, *tables])
+    lens = [job.lens] if isinstance(job.lens, Path) else []
+    refuse_inputs(targets, [*job.inputs, *lens, *tables])
     refuse_existing(targets, overwrite=job.overwrite)
 
 

@@ -55,6 +55,17 @@ def read_exif(source: str | os.PathLike[str]) -> bytes | None:
         raise ValueError(f"Cannot read a photograph from {path}: {error}.") from error
 
 
+def read_size(source: str | os.PathLike[str]) -> tuple[int, int]:
+    """Read a photo's width and height, px, from its header. It raises as `read_focal`."""
+    path = Path(source)
+    try:
+        with open_photo(path) as file:
+            _, width, height = announced_size(file.read(_MOST_BYTES))
+    except ValueError as error:
+        raise ValueError(f"Cannot read a photograph from {path}: {error}.") from error
+    return width, height
+
+
 def metadata_focal(metadata: Metadata) -> float | None:
     """The focal length, mm, in the metadata from `read_photo`."""
     return next((exif_focal(block) for block in _exif_blocks(metadata)), None)
