@@ -1,4 +1,4 @@
-"""The package is ten rooms on a private base, and imports go one way: from a room to rooms below it."""
+"""The package is eleven rooms on a private base, and imports go one way: from a room to rooms below it."""
 
 import ast
 from pathlib import Path
@@ -13,6 +13,7 @@ ROOMS = (
     "fit",
     "scenes",
     "correct",
+    "lenses",
     "lines",
     "detect",
     "focal",
@@ -30,6 +31,7 @@ LIBRARIES = {
     "correct": {"cv2"},
     "detect": {"cv2"},
     "io": {"cv2", "av", "PIL", "pillow_heif", "rawpy", "tifffile"},
+    "lenses": {"lensfunpy"},
     "torch": {"torch"},
 }
 """Libraries of images, plots, terminals and video, and where they may be imported."""

@@ -6,7 +6,7 @@ FLAGS = {
     name: f"--{name.replace('_', '-')}"
     for name in (
         *("border", "degree", "detector", "focal", "focal_sigma", "focal_unit", "hold", "interpolation"),
-        *("again", "keep", "overwrite", "terms"),
+        *("again", "crop", "keep", "lens", "overwrite", "terms"),
     )
 }
 """Options of the command line by the names of the library's arguments."""

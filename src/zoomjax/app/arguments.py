@@ -42,18 +42,35 @@ def read_lines(
     if path.suffix == ".csv":
         from ..lines.csv import read_focal_csv, read_lines_csv
 
-        if image_size is None:
+        if (size := size_of(image_size)) is None:
             raise ValueError(f"The image size of {path} is not known: give --image-size, e.g. 1920x1080.")
-        width, _, height = image_size.lower().partition("x")
-        if not (width.isdigit() and height.isdigit()):
-            raise ValueError(f"--image-size must be like 1920x1080, but it is {image_size!r}.")
         return read_lines_csv(
             path,
-            image_size=(int(width), int(height)),
+            image_size=size,
             focal=None if focal is None else read_focal_csv(Path(focal)),
             focal_unit=focal_unit or "mm",
         )
     raise ValueError(f"Cannot calibrate from {path}: give lines.npz, or a CSV file frame,line,x,y[,focal].")
+
+
+def split_lens(inputs: list[Path]) -> tuple[Path, tuple[Path, ...]]:
+    """The file of the lens, which comes first, and what to correct."""
+    if len(inputs) < 2:
+        raise ValueError(
+            "Give the lens and then what to correct: lens.json photos/*.jpg. Without a lens of your own, "
+            "--lens auto takes that of the EXIF data."
+        )
+    return inputs[0], tuple(inputs[1:])
+
+
+def size_of(text: str | None) -> tuple[int, int] | None:
+    """Width and height from WxH."""
+    if text is None:
+        return None
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise ValueError(f"--image-size must be like 1920x1080, but it is {text!r}.")
+    return int(width), int(height)
 
 
 def number_of_cores() -> int:

@@ -27,8 +27,10 @@ from .arguments import (
     read_lines,
     refuse_image_options,
     refuse_to_replace,
+    split_lens,
     unit_of,
 )
+from .commands_lens import lens
 from .console import REPORT, progress_bar, show_calibration, show_images, stages, tell, tell_written
 
 if TYPE_CHECKING:
@@ -239,12 +241,13 @@ def calibrate(
 
 @app.command()
 def undistort(
-    lens: Annotated[
-        Path, typer.Argument(metavar="lens.json", help="The lens written by zoomjax calibrate.")
-    ],
     inputs: Annotated[
         list[Path],
-        typer.Argument(metavar="INPUT...", help="Photos or videos, folders of them, or patterns."),
+        typer.Argument(
+            metavar="[lens.json] INPUT...",
+            help="The lens written by zoomjax calibrate, unless --lens is given; photos or videos, folders "
+            "of them, or patterns.",
+        ),
     ],
     output: Annotated[
         Path,
@@ -252,6 +255,14 @@ def undistort(
             "-o", "--output", metavar="OUT", help="Output file for a single input, else a folder."
         ),
     ],
+    lens: Annotated[
+        str | None,
+        typer.Option(
+            metavar="auto|NAME",
+            help="In place of lens.json, a lens of the library (zoomjax lens): that of each photo's EXIF "
+            "data, or by its name.",
+        ),
+    ] = None,
     focal: Annotated[
         str | None,
         typer.Option(
@@ -299,17 +310,27 @@ def undistort(
     set_up_jax()
     from .undistort_files import Job, undistort_files
 
+    file, files = split_lens(inputs) if lens is None else (None, tuple(inputs))
+    job = Job(file, files, output, focal, keep, interpolation, border, hold, overwrite)
+    job = dataclasses.replace(job, redistort=redistort, again=again, resume=resume)
     with progress_bar("Correcting", timed=False) as progress:
-        job = Job(lens, tuple(inputs), output, focal, keep, interpolation, border, hold, overwrite)
-        job = dataclasses.replace(job, redistort=redistort, again=again, resume=resume)
-        done = undistort_files(job, progress)
-    print(plain(done.sentence))
+        if lens is None:
+            done = undistort_files(job, progress)
+        else:
+            from .library_lens import undistort_by_library
+
+            done = undistort_by_library(job, lens, progress)
+    if done.sentence:
+        print(plain(done.sentence))
     for note in done.notes:
         print(plain(note))
     for path, reason in done.skipped.items():
         print(plain(f"Skipped {path}: {with_flags(reason)}"), file=sys.stderr)
     if done.skipped:
         raise typer.Exit(1 if done.written else 2)
+
+
+app.command()(lens)
 
 
 @app.command()

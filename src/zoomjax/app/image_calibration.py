@@ -19,6 +19,7 @@ from ..io.focal_track import FocalTrack, read_focal_track
 from ..io.text_table import plain_number
 from ._flags import with_flags
 from .calibration import CLEARS, FILES, Calibration, calibrate, focal_sigmas
+from .equipment import with_equipment
 from .focal_sources import Board, Focals, check_way, choose_focals, lines_of
 from .overlay import draw_lines
 from .results_folder import results_folder
@@ -277,9 +278,20 @@ def calibrate_images(
         done = ImageCalibration(job, calibration, used, focals, tuple(d.name for d in detections), unused)
         hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}
         if not hopeless:
-            return done
+            return _with_equipment(done)
         unused = unused | dict.fromkeys(sorted(hopeless), _NONE_AGREES)
         used = tuple(d for d in used if d.name not in hopeless)
+
+
+def _with_equipment(done: ImageCalibration) -> ImageCalibration:
+    """The same with camera and lens in the lens, as the photos used tell."""
+    if done.job.video is not None:
+        return done
+    names = {detection.name for detection in done.used}
+    photos = [s.path for s in done.job.sources()[0] if s.path is not None and s.name in names]
+    zoom = done.calibration.zoom
+    zoom = dataclasses.replace(zoom, lens=with_equipment(zoom.lens, photos))
+    return dataclasses.replace(done, calibration=dataclasses.replace(done.calibration, zoom=zoom))
 
 
 _NONE_AGREES = (

@@ -21,7 +21,7 @@ from ..io.metadata import geometry_of
 from ..io.photo import read_metadata
 from ..models.lens import ZoomLens, load_lens
 from ..models.sizes import at_focal, lens_for_size
-from .undistort_inputs import find_inputs, focal_number, targets_of
+from .undistort_inputs import Found, find_inputs, focal_number, targets_of
 
 if TYPE_CHECKING:
     from ..correct.video import CorrectedVideo
@@ -32,7 +32,7 @@ class Job:
     """Settings of a correction.
 
     Attributes:
-        lens: file of the lens.
+        lens: file of the lens; None if it is found for each photo (`library_lens`).
         inputs: photos or videos, folders or patterns.
         output: file for a single input, else a folder.
         focal: a number, a CSV file, a folder of these for videos, or None for the photos' EXIF data.
@@ -44,7 +44,7 @@ class Job:
         resume: whether what an earlier run has written is left as it is.
     """
 
-    lens: Path
+    lens: Path | None
     inputs: tuple[Path, ...]
     output: Path
     focal: str | None = None
@@ -90,17 +90,33 @@ def undistort_files(job: Job, progress: Progress = lambda done, total: None) -> 
     """
     check_sampling(job.interpolation, job.border)
     check_keep(job.keep)
+    if job.lens is None:
+        raise ValueError("Argument lens must be the file of a lens.")
     lens = load_lens(job.lens)
+    found = photos_or_videos(job)
+    work = _videos if found.videos else undistort_photos
+    files = found.videos or found.photos
+    targets = targets_of(files, job.output, job.inputs)
+    return with_refused(work(job, lens, [path for path, _ in files], targets, progress), found)
+
+
+def photos_or_videos(job: Job) -> Found:
+    """The photos or the videos that are given.
+
+    Raises:
+        FileNotFoundError, ValueError: as `find_inputs`; or there are both, or neither.
+    """
     found = find_inputs(job.inputs, job.output)
     if found.photos and found.videos:
         raise ValueError("Give photos or videos, not both.")
     if not found.photos and not found.videos:
         path, reason = next(iter(found.refused.items()))
         raise ValueError(f"Cannot correct {path}: {reason}.")
-    work = _videos if found.videos else _photos
-    files = found.videos or found.photos
-    targets = targets_of(files, job.output, job.inputs)
-    done = work(job, lens, [path for path, _ in files], targets, progress)
+    return found
+
+
+def with_refused(done: Outcome, found: Found) -> Outcome:
+    """An outcome, with what was left out beforehand."""
     skipped = {**{str(path): reason for path, reason in found.refused.items()}, **done.skipped}
     return dataclasses.replace(done, skipped=skipped, notes=(*found.notes, *done.notes))
 
@@ -111,7 +127,7 @@ def _videos(
     from .undistort_videos import tracks_of, undistort_videos
 
     tracks = tracks_of(job.focal, sources, hold=job.hold)
-    todo = _todo(job, sources, targets, lambda path: True)
+    todo = to_do(job, sources, targets, lambda path: True)
     correct = functools.partial(
         undistort_videos,
         lens=lens,
@@ -144,9 +160,10 @@ def _kept(target: Path, video: "CorrectedVideo", number: int) -> list[str]:
     return [f"{begins}: {', '.join(names)}." for begins, names in sentences if names]
 
 
-def _photos(
+def undistort_photos(
     job: Job, lens: ZoomLens, sources: Sequence[Path], targets: Sequence[Path], progress: Progress
 ) -> Outcome:
+    """Correct photos by one lens, whatever the job's own; it raises as `undistort_files`."""
     if job.hold:
         raise ValueError(
             "Argument hold is for a video's track of focal lengths, and the inputs are photos."
@@ -154,7 +171,7 @@ def _photos(
     correction = Correction(
         lens, lambda size: job.keep, job.interpolation, job.border, job.redistort, job.again
     )
-    todo = _todo(job, sources, targets, lambda path: _is_marked(path, correction.geometry))
+    todo = to_do(job, sources, targets, lambda path: _is_marked(path, correction.geometry))
     focal_of = _photo_focals(job, lens)
     skipped: dict[Path, Exception] = {}
     correction = dataclasses.replace(correction, keep=_common_keep(job, lens, sources, focal_of, skipped))
@@ -209,8 +226,11 @@ def _is_marked(path: Path, geometry: str) -> bool:
         return False
 
 
-def _todo(
-    job: Job, sources: Sequence[Path], targets: Sequence[Path], is_result: Callable[[Path], bool]
+def to_do(
+    job: Job,
+    sources: Sequence[Path],
+    targets: Sequence[Path],
+    is_result: Callable[[Path], bool] = lambda path: False,
 ) -> list[tuple[Path, Path]]:
     """Sources and targets that are to be done: with `resume`, those without a result.
 
@@ -218,7 +238,8 @@ def _todo(
         FileExistsError, ValueError: a target exists, or is an input.
     """
     tables = [] if job.focal is None else [job.focal]
-    refuse_inputs(targets, [*sources, job.lens, *tables])
+    lens = [] if job.lens is None else [job.lens]
+    refuse_inputs(targets, [*sources, *lens, *tables])
     pairs = list(zip(sources, targets, strict=True))
     if job.resume:
         pairs = [pair for pair in pairs if not (os.path.lexists(pair[1]) and is_result(pair[1]))]

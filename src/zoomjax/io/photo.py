@@ -54,17 +54,30 @@ def read_focal(source: str | os.PathLike[str]) -> float | None:
         OSError: it cannot be read.
         ValueError: it is not a photo or not a regular file, or has more than 4 GB.
     """
+    block = read_exif(source)
+    return None if block is None else exif_focal(block)
+
+
+def read_exif(source: str | os.PathLike[str]) -> bytes | None:
+    """Read a photo's EXIF data; None if it has none. No pixel is decoded. It raises as `read_focal`."""
     path = Path(source)
     whole: dict[str, Callable[[bytes], Metadata]] = {"HEIC": heic_metadata, "AVIF": avif_metadata}
     with _named(path), open_photo(path) as file:
         if path.suffix.lower() in RAW_SUFFIXES:
-            return metadata_focal(raw_metadata(file.read(_MOST_BYTES)))
+            return raw_metadata(file.read(_MOST_BYTES)).exif or None
         kind = announced_format(file.read(16))
         file.seek(0)
         if kind in whole:
-            return metadata_focal(whole[kind](file.read(_MOST_BYTES)))
-        block = find_exif(file, kind)
-    return None if block is None else exif_focal(block)
+            return whole[kind](file.read(_MOST_BYTES)).exif or None
+        return find_exif(file, kind)
+
+
+def read_size(source: str | os.PathLike[str]) -> tuple[int, int]:
+    """Read a photo's width and height, px, from its header. It raises as `read_focal`."""
+    path = Path(source)
+    with _named(path), open_photo(path) as file:
+        _, width, height = announced_size(file.read(_MOST_BYTES))
+    return width, height
 
 
 def metadata_focal(metadata: Metadata) -> float | None:
