@@ -30,7 +30,7 @@ def test_lines_are_coloured_by_how_far_they_are_from_straight():
     blue, _, red = np.moveaxis(picture[50, [30, 50, 70]].astype(int), -1, 0)
     assert blue[0] > blue[1] > blue[2]
     assert red[0] < red[1] < red[2]
-    assert tuple(picture[50, 70]) == colour(1.0)
+    assert (colour(0.0), colour(9.0)) == ((255, 200, 0), (0, 120, 255))
 
 
 def test_numbers_are_written_and_a_legend_is_added():

@@ -150,7 +150,7 @@ def test_names_are_escaped_and_lead_to_their_pictures(calibration):
     assert [unquote(link) for link in links] == [f"lines/{name}.jpg" for name in names]
     assert all(re.fullmatch(r"[\w/.%-]+", link) for link in links)
     assert "Warning: <b>two</b> lines & more" in page.text
-    assert 'Focal lengths: "here" <there>.' in page.text
+    assert 'Focal lengths "here" <there>.' in page.text
 
 
 def test_what_is_not_determined_is_said(calibration):
