@@ -58,7 +58,8 @@ def _tell_usage(error: Exception) -> NoReturn:
         print(message)
     else:
         command = context.command_path if context else "zoomjax"
-        print(f"Error: {plain(message)} See {command} --help.", file=sys.stderr)
+        told = plain(message).replace("Value error, ", "").rstrip(".")
+        print(f"Error: {told}. See {command} --help.", file=sys.stderr)
     sys.exit(2)
 
 
