@@ -36,10 +36,13 @@ from .options import (
     UNDISTORT_EXAMPLES,
     AsJson,
     Detector,
+    Distance,
     DryRun,
     Exclude,
     FocalUnit,
     Overlays,
+    Pitch,
+    Pixel,
     Quiet,
     Strict,
     excluded,
@@ -180,28 +183,9 @@ def calibrate(
             rich_help_panel=FOCAL,
         ),
     ] = None,
-    pitch: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MM[xMM]",
-            help="For --focal board: distance between neighbouring lines of the board, across and down.",
-            rich_help_panel=FOCAL,
-        ),
-    ] = None,
-    distance: Annotated[
-        float | None,
-        typer.Option(
-            metavar="MM",
-            help="For --focal board: distance from the camera to the board.",
-            rich_help_panel=FOCAL,
-        ),
-    ] = None,
-    pixel: Annotated[
-        float | None,
-        typer.Option(
-            metavar="MM", help="For --focal board: pixel size on the sensor.", rich_help_panel=FOCAL
-        ),
-    ] = None,
+    pitch: Pitch = None,
+    distance: Distance = None,
+    pixel: Pixel = None,
     frames: Annotated[
         int,
         typer.Option(min=1, help="For a video: maximum number of frames used.", rich_help_panel=INPUT),

@@ -47,6 +47,27 @@ Exclude = Annotated[
     ),
 ]
 
+Pitch = Annotated[
+    str | None,
+    typer.Option(
+        metavar="MM[xMM]",
+        help="For --focal board: distance between neighbouring lines of the board, across and down.",
+        rich_help_panel=FOCAL,
+    ),
+]
+Distance = Annotated[
+    float | None,
+    typer.Option(
+        metavar="MM",
+        help="For --focal board: distance from the camera to the board.",
+        rich_help_panel=FOCAL,
+    ),
+]
+Pixel = Annotated[
+    float | None,
+    typer.Option(metavar="MM", help="For --focal board: pixel size on the sensor.", rich_help_panel=FOCAL),
+]
+
 CALIBRATE_EXAMPLES = """\
 Examples:
 
