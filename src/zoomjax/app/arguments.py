@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .options import FIT, OUTPUT
+
 if TYPE_CHECKING:
     from ..lines.lines import Lines
     from .focal_sources import Board
@@ -17,10 +19,13 @@ Overwrite = Annotated[
     typer.Option(
         "--overwrite",
         help="Also replace files that zoomjax did not write, or that were changed since.",
+        rich_help_panel=OUTPUT,
     ),
 ]
-Degree = Annotated[int, typer.Option(min=0, help="Degree of the polynomials in 1/f.")]
-Terms = Annotated[int, typer.Option(min=1, help="Number of distortion coefficients, k1 to kN.")]
+Degree = Annotated[int, typer.Option(min=0, help="Degree of the polynomials in 1/f.", rich_help_panel=FIT)]
+Terms = Annotated[
+    int, typer.Option(min=1, help="Number of distortion coefficients, k1 to kN.", rich_help_panel=FIT)
+]
 
 
 def read_lines(

@@ -29,6 +29,7 @@ from ..lines.compressed import compress
 from ..lines.lines import Lines
 from ..models.invertibility import Certificate
 from ..models.zoom import PolynomialZoom
+from ..trust.assessment import NEGLIGIBLE, Assessment, assess
 from ..trust.bands import displacement_std
 from ..trust.cross_validation import held_out_frames, held_out_zoom
 from ..trust.next_photo import Suggestion, suggest_next
@@ -40,6 +41,9 @@ FILES = ("lens.json", "lines.npz", "summary.json", "model.png")
 
 CLEARS = ("lines/*",)
 """Files of an earlier calibration that `Calibration.write` removes: pictures of its lines."""
+
+_ENOUGH = NEGLIGIBLE / 5
+"""Standard deviation of the displacement, in diagonals, below which no further photo is needed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +61,7 @@ class Calibration:
         focal_sigma: standard deviation of each frame's focal length, included in the bands; 0: exact.
         held_out: each frame's RMS, px, under the zoom model fitted to all others; NaN if that fit fails.
         each_held_out: each frame's RMS, px, each tenth of its lines under the model of its other lines.
+        assessment: the verdict, with what was found and what to do about it.
         selection: how the model was selected; None if it was given.
     """
 
@@ -71,6 +76,7 @@ class Calibration:
     focal_sigma: np.ndarray
     held_out: np.ndarray
     each_held_out: np.ndarray
+    assessment: Assessment
     selection: Selection | None = None
 
     def corner(self) -> list[tuple[float, float, float]]:
@@ -99,6 +105,20 @@ class Calibration:
         return (
             "Standard deviations include those of the focal lengths, "
             f"{share.min():.2%} to {share.max():.2%}. The next photo is chosen without them."
+        )
+
+    def enough(self) -> bool:
+        """Whether a further photo could improve nothing that can be seen."""
+        visible = _ENOUGH * self.assessment.evidence.diagonal
+        return self.assessment.verdict == "good" and self.next.before < visible
+
+    def advice(self) -> str:
+        """What to photograph next, or that there is enough."""
+        if not self.enough():
+            return self.next.sentence
+        return (
+            f"Enough: the standard deviation of the displacement is {self.next.before:.2g} px, averaged "
+            f"over image and focal range, and would be {self.next.after:.2g} px with the best next photo."
         )
 
     def rows(self) -> list[tuple[str, np.ndarray]]:
@@ -149,48 +169,55 @@ class Calibration:
             "rms_held_out": _finite(self.held_out),
             "rms_frames_held_out": _finite(self.each_held_out),
         }
-        return {
-            "rms_none": rms_over_frames(self.none),
-            "rms_algebraic": rms_over_frames(self.algebraic),
-            "rms_frames": float(self.each.rms),
-            "rms_zoom": float(self.zoom.rms),
-            "rms_held_out": _finite([rms_over_frames(self.held_out)])[0],
-            "rms_frames_held_out": _finite([rms_over_frames(self.each_held_out)])[0],
-            "frames": len(self.none),
-            "lines": len(frame),
-            "rejected_lines": int(self.rejected.sum()),
-            "rejected": [
-                {"line": int(line), "frame": int(frame[line]), "rms": float(self.line_rms[line])}
-                for line in np.flatnonzero(self.rejected)[np.argsort(-self.line_rms[self.rejected])]
-            ],
-            "points": int(np.sum(np.asarray(self.lines.mask))),
-            "focal_range": [low, high],
-            "focal_unit": lens.focal_unit,
-            "image_size": list(lens.image_size),
-            "result": RESULTS[self.zoom.result] or "successful",
-            "certificate": _plain(self.zoom.certificate),
-            "rms_unconstrained": float(self.zoom.rms_unconstrained),
-            "frames_without_a_model": sum(map(bool, self.each.messages())),
-            "warnings": self.warnings(),
-            "pixel_polynomials": self.pixel_polynomials().tolist(),
-            "parameters": np.asarray(lens.zoom.parameters).tolist(),
-            "corner_displacement": [
-                {"focal": f, "px": moved, "std": _finite([std])[0]} for f, moved, std in self.corner()
-            ],
-            "next_photo": {
-                "focal": self.next.focal,
-                "direction": self.next.direction,
-                "region": self.next.region,
-                "displacement_std": _finite([self.next.before])[0],
-                "displacement_std_with_it": _finite([self.next.after])[0],
-                "sentence": self.next.sentence,
-            },
-            "parameter_sigma": _finite(np.sqrt(np.diag(np.asarray(self.zoom.covariance)))),
-            "per_frame": [dict(zip(fits, row, strict=True)) for row in zip(*fits.values(), strict=True)],
-            "versions": {
-                name: importlib.metadata.version(name) for name in ("zoomjax", "jax", "optimistix")
-            },
-        } | ({"selection": self.selection.summary()} if self.selection else {})
+        return (
+            self.assessment.summary()
+            | {
+                "rms_none": rms_over_frames(self.none),
+                "rms_algebraic": rms_over_frames(self.algebraic),
+                "rms_frames": float(self.each.rms),
+                "rms_zoom": float(self.zoom.rms),
+                "rms_held_out": _finite([rms_over_frames(self.held_out)])[0],
+                "rms_frames_held_out": _finite([rms_over_frames(self.each_held_out)])[0],
+                "frames": len(self.none),
+                "lines": len(frame),
+                "rejected_lines": int(self.rejected.sum()),
+                "rejected": [
+                    {"line": int(line), "frame": int(frame[line]), "rms": float(self.line_rms[line])}
+                    for line in np.flatnonzero(self.rejected)[np.argsort(-self.line_rms[self.rejected])]
+                ],
+                "points": int(np.sum(np.asarray(self.lines.mask))),
+                "focal_range": [low, high],
+                "focal_unit": lens.focal_unit,
+                "image_size": list(lens.image_size),
+                "result": RESULTS[self.zoom.result] or "successful",
+                "certificate": _plain(self.zoom.certificate),
+                "rms_unconstrained": float(self.zoom.rms_unconstrained),
+                "frames_without_a_model": sum(map(bool, self.each.messages())),
+                "warnings": self.warnings(),
+                "pixel_polynomials": self.pixel_polynomials().tolist(),
+                "parameters": np.asarray(lens.zoom.parameters).tolist(),
+                "corner_displacement": [
+                    {"focal": f, "px": moved, "std": _finite([std])[0]} for f, moved, std in self.corner()
+                ],
+                "next_photo": {
+                    "focal": self.next.focal,
+                    "direction": self.next.direction,
+                    "region": self.next.region,
+                    "displacement_std": _finite([self.next.before])[0],
+                    "displacement_std_with_it": _finite([self.next.after])[0],
+                    "enough": self.enough(),
+                    "sentence": self.advice(),
+                },
+                "parameter_sigma": _finite(np.sqrt(np.diag(np.asarray(self.zoom.covariance)))),
+                "per_frame": [
+                    dict(zip(fits, row, strict=True)) for row in zip(*fits.values(), strict=True)
+                ],
+                "versions": {
+                    name: importlib.metadata.version(name) for name in ("zoomjax", "jax", "optimistix")
+                },
+            }
+            | ({"selection": self.selection.summary()} if self.selection else {})
+        )
 
     def pixel_polynomials(self) -> np.ndarray:
         """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as printed in the paper."""
@@ -289,22 +316,26 @@ def calibrate(
     stage("Fitting each frame separately")
     each = fit_frames(small, terms=terms, throw=False)
     stage("Fitting the zoom polynomial")
-    zoom = selection.fit if selection else fit_zoom(small, zoom=model, terms=terms)
+    exact = selection.fit if selection else fit_zoom(small, zoom=model, terms=terms)
     sigma = np.broadcast_to(focal_sigma, lines.focal.shape)
-    none = np.asarray(frame_rms(small, None))
-    several = len(none) > 1
+    zoom = with_focal_sigma(exact, small, focal_sigma=sigma) if sigma.any() else exact
+    stage("Checking the fit on lines left out")
+    held_out, each_held_out = np.full(len(sigma), np.nan), held_out_frames(small, terms=terms)
+    if len(sigma) > 1:
+        held_out = held_out_zoom(small, zoom=model, terms=terms)
     return Calibration(
         lines=lines,
-        zoom=with_focal_sigma(zoom, small, focal_sigma=sigma) if sigma.any() else zoom,
+        zoom=zoom,
         each=each,
-        none=none,
+        none=np.asarray(frame_rms(small, None)),
         algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=model, terms=terms))),
         rejected=rejected,
         line_rms=np.asarray(line_rms(small, coefficients_by(zoom.lens.zoom, small))),
-        next=suggest_next(zoom, small),  # from the noise alone, without focal_sigma
+        next=suggest_next(exact, small),  # from the noise alone, without focal_sigma
         focal_sigma=sigma,
-        held_out=held_out_zoom(small, zoom=model, terms=terms) if several else np.full_like(none, np.nan),
-        each_held_out=held_out_frames(small, terms=terms),
+        held_out=held_out,
+        each_held_out=each_held_out,
+        assessment=assess(lines, zoom, compressed=small, held_out=held_out, each_held_out=each_held_out),
         selection=selection,
     )
 

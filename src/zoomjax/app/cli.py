@@ -8,17 +8,22 @@ import os
 import signal
 import sys
 import warnings
+from typing import NoReturn
 
 try:
-    import typer  # noqa: F401
+    import typer
 except ModuleNotFoundError:
     sys.exit('The command line needs the extra "app": pip install "zoomjax[app]"')
 
 from .._core.text import plain
+from . import commands_lens, commands_reproduce  # noqa: F401, they add their commands
 from ._compiled import UNKEPT, forget_compiled
 from ._flags import with_flags
 from ._interrupts import INTERRUPTED, LAST_WORDS, end_run, leave, swallowed
 from .commands import app
+
+USAGE: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "UsageError")
+"""What Typer raises for mistakes in the command line."""
 
 
 def main() -> None:
@@ -32,7 +37,9 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # unless the shell ignores it
         signal.signal(signal.SIGINT, end_run)
     try:
-        app()
+        sys.exit(app(standalone_mode=False))
+    except USAGE as error:
+        _tell_usage(error)
     except (ValueError, OSError, RuntimeError, MemoryError) as error:
         print(f"Error: {_sentence(error)}", file=sys.stderr)
         sys.exit(2)
@@ -42,6 +49,19 @@ def main() -> None:
         if isinstance(exit.code, int) and exit.code in LAST_WORDS:
             leave(exit.code)
         raise
+
+
+def _tell_usage(error: Exception) -> NoReturn:
+    """A mistake in the command line, in the same style; the help where there are no arguments at all."""
+    context = getattr(error, "ctx", None)
+    message = getattr(error, "format_message", error.__str__)()
+    if type(error).__name__ == "NoArgsIsHelpError":
+        print(message)
+    else:
+        command = context.command_path if context else "zoomjax"
+        told = plain(message).replace("Value error, ", "").rstrip(".")
+        print(f"Error: {told}. See {command} --help.", file=sys.stderr)
+    sys.exit(2)
 
 
 def _sentence(error: BaseException) -> str:

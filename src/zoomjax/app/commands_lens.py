@@ -8,8 +8,10 @@ import typer
 from .._core.text import plain
 from ._compiled import set_up_jax
 from .arguments import size_of
+from .commands import app
 
 
+@app.command(epilog='Example: `zoomjax lens "nikkor 18-200" -o lens.json`')
 def lens(
     search: Annotated[
         str, typer.Argument(metavar="SEARCH", help='Words of the name, such as "nikkor 18-200".')

@@ -16,7 +16,7 @@ def with_equipment(lens: ZoomLens, photos: Iterable[Path]) -> ZoomLens:
 
     Photos without EXIF data, or of formats whose data cannot be read any more, say nothing.
     """
-    found = [_equipment(photo) for photo in photos]
+    found = [equipment_of(photo) for photo in photos]
     crops = [crop for one in found if (crop := one.crop_factor(lens.image_size))]
     crop = crops[0] if crops and max(crops) - min(crops) <= _SAME * min(crops) else None
     pitch = None if crop is None else FILM / (crop * 2 * lens.scale)
@@ -29,7 +29,8 @@ def with_equipment(lens: ZoomLens, photos: Iterable[Path]) -> ZoomLens:
     return dataclasses.replace(lens, pixel_pitch=pitch, about=about)
 
 
-def _equipment(photo: Path) -> Equipment:
+def equipment_of(photo: Path) -> Equipment:
+    """Camera and lens of a photo; a photo that cannot be read says nothing."""
     try:
         return read_equipment(photo)
     except (OSError, ValueError):
