@@ -1,4 +1,4 @@
-"""The package is ten rooms on a private base, and imports go one way: from a room to rooms below it."""
+"""The package is eleven rooms on a private base, and imports go one way: from a room to rooms below it."""
 
 import ast
 from pathlib import Path
@@ -16,6 +16,7 @@ ROOMS = (
     "lines",
     "detect",
     "focal",
+    "interop",
     "models",
     "io",
     "_core",
@@ -30,6 +31,7 @@ LIBRARIES = {
     "correct": {"cv2"},
     "detect": {"cv2"},
     "io": {"cv2", "av", "PIL", "pillow_heif", "tifffile"},
+    "interop": {"OpenEXR", "yaml"},
     "torch": {"torch"},
 }
 """Libraries of images, plots, terminals and video, and where they may be imported."""

@@ -44,16 +44,21 @@ def read_lines(
 
         if image_size is None:
             raise ValueError(f"The image size of {path} is not known: give --image-size, e.g. 1920x1080.")
-        width, _, height = image_size.lower().partition("x")
-        if not (width.isdigit() and height.isdigit()):
-            raise ValueError(f"--image-size must be like 1920x1080, but it is {image_size!r}.")
         return read_lines_csv(
             path,
-            image_size=(int(width), int(height)),
+            image_size=size_of(image_size),
             focal=None if focal is None else read_focal_csv(Path(focal)),
             focal_unit=focal_unit or "mm",
         )
     raise ValueError(f"Cannot calibrate from {path}: give lines.npz, or a CSV file frame,line,x,y[,focal].")
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """The image size in a text such as 1920x1080."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise ValueError(f"--image-size must be like 1920x1080, but it is {text!r}.")
+    return int(width), int(height)
 
 
 def number_of_cores() -> int:

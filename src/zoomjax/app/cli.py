@@ -1,4 +1,4 @@
-"""The command line: ``zoomjax demo``, ``calibrate``, ``undistort`` and ``reproduce``.
+"""The command line: ``zoomjax calibrate``, ``undistort``, ``export``, ``import`` and others.
 
 Errors go to stderr with exit status 2, and leave no partial result.
 """
@@ -18,7 +18,7 @@ from .._core.text import plain
 from ._compiled import UNKEPT, forget_compiled
 from ._flags import with_flags
 from ._interrupts import INTERRUPTED, LAST_WORDS, end_run, leave, swallowed
-from .commands import app
+from .interop_commands import app
 
 
 def main() -> None:
