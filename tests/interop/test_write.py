@@ -73,7 +73,9 @@ def test_at_its_focal_lengths_a_file_does_as_the_lens(name, lens, tmp_path):
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_between_its_focal_lengths_a_file_does_as_reported(name, lens, tmp_path):
+@pytest.mark.parametrize("kind", ["landscape", "portrait", "px", "decentred"])
+def test_between_its_focal_lengths_a_file_does_as_reported(name, kind, tmp_path):
+    lens = LENSES[kind]()
     path = tmp_path / f"lens{WRITTEN[name].suffixes[0]}"
     report = zj.interop.write(lens, path, format=name, pixel_pitch=PITCH)
     nodes = np.array(report.focal)
@@ -88,11 +90,11 @@ def test_more_focal_lengths_are_written_for_a_lower_tolerance(tmp_path):
     lens = LENSES["landscape"]()
     reports = [
         zj.interop.write(lens, tmp_path / f"{t}.json", format="gyroflow", pixel_pitch=PITCH, tolerance=t)
-        for t in (0.5, 0.05)
+        for t in (0.5, 0.1)
     ]
     assert len(reports[0].focal) < len(reports[1].focal)
     assert reports[0].worst <= 0.5
-    assert reports[1].worst <= 0.05
+    assert reports[1].worst <= 0.1
 
 
 def test_what_a_format_cannot_do_is_said(tmp_path):
@@ -126,7 +128,7 @@ def test_maps_say_where_to_sample(name, tmp_path):
             with OpenEXR.File(
                 str(tmp_path / "maps" / f"{kind}.{focal}.exr"), separate_channels=True
             ) as file:
-                header = file.header()
+                header = dict(file.header())
                 red, green = (np.array(file.channels()[c].pixels) for c in "RG")
             assert red.dtype == np.float32
             assert np.asarray(header["displayWindow"]).tolist() == [[0, 0], [w - 1, h - 1]]
