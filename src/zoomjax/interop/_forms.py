@@ -16,6 +16,7 @@ ridge makes the coefficients a smooth function of the data, so that they can be 
 import abc
 import dataclasses
 from collections.abc import Callable
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -38,9 +39,11 @@ class AbstractForm(abc.ABC):
 
     Attributes:
         corrects: whether it maps distorted to corrected points; else corrected to distorted ones.
+        any_scale: whether the tool scales corrected images as it likes, so that distances count up to that.
     """
 
     corrects: bool
+    any_scale: ClassVar[bool] = False
 
     @property
     @abc.abstractmethod

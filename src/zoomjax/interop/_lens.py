@@ -27,6 +27,9 @@ from ._forms import Form
 from ._samples import distortions, pairs_of
 from .base import Contents, Node, Sampled
 
+_MUCH = 0.5
+"""px at the nodes from which a user is told of tables."""
+
 _TERMS = 2
 """Coefficients by default, as everywhere in zoomjax."""
 
@@ -61,11 +64,12 @@ def lens_of(
         (d + (c - centre) / scale, u + (c - centre) / scale)
         for (d, u, _), c in zip(found, centres, strict=True)
     ]
+    any_scale = [isinstance(node, Node) and node.form.any_scale for node in nodes]
     family, exact = _family(nodes, terms)
     if zoom is None:
         zoom = _default_zoom(family, len(focal), terms)
     count = terms or (_TERMS if isinstance(zoom, SmoothZoom) else _terms(nodes, exact))
-    model = _fitted(zoom, focal, points, family, count, exact)
+    model = _fitted(zoom, focal, points, any_scale, family, count)
     spread = np.ptp(centres, axis=0).max()
     if spread > 0.5:
         notes.append(
@@ -79,7 +83,10 @@ def lens_of(
         focal_unit=contents.focal_unit,
         family=family,
     )
-    return lens, _worst(lens, focal, points, centre), tuple(notes)
+    worst = _worst(lens, focal, points, any_scale)
+    if worst > _MUCH and not isinstance(model, TableZoom):
+        notes.append("The zoom model smooths the file's values: a table, TableZoom(), keeps them.")
+    return lens, worst, tuple(notes)
 
 
 def _averaged(nodes: tuple[Node | Sampled, ...]) -> list[Node | Sampled]:
@@ -134,9 +141,9 @@ def _fitted(
     zoom: AbstractLinearZoom,
     focal: np.ndarray,
     points: list[Pairs],
+    any_scale: list[bool],
     family: AbstractFamily,
     terms: int,
-    exact: bool,
 ) -> AbstractLinearZoom:
     """The zoom model with the parameters of least squares."""
     size = family.size(terms)
@@ -144,8 +151,12 @@ def _fitted(
     assert isinstance(prepared, AbstractLinearZoom)
     basis = np.asarray(jax.vmap(prepared.basis)(jnp.asarray(focal)), float)  # (node, basis)
     rows, right = [], []
-    for phi, (distorted, corrected) in zip(basis, points, strict=True):
+    for phi, (distorted, corrected), scaled in zip(basis, points, any_scale, strict=True):
         matrix, change = _equations(family, distorted, corrected, terms)
+        if scaled:  # the scale is one more unknown, which drops out
+            outwards = corrected.ravel() / np.linalg.norm(corrected)
+            matrix = matrix - np.outer(outwards, outwards @ matrix)
+            change = change - outwards * (outwards @ change)
         share = 1 / math.sqrt(len(distorted))
         rows.append(np.einsum("b,rk->rbk", phi, matrix).reshape(len(matrix), -1) * share)
         right.append(change * share)
@@ -182,11 +193,15 @@ def _prior(zoom: AbstractPriorZoom, number: int) -> np.ndarray:
     return float(zoom.error) * np.asarray(jax.vmap(row, out_axes=1)(jnp.eye(number)), float)
 
 
-def _worst(lens: ZoomLens, focal: np.ndarray, points: list[Pairs], centre: np.ndarray) -> float:
+def _worst(lens: ZoomLens, focal: np.ndarray, points: list[Pairs], any_scale: list[bool]) -> float:
     """The greatest distance of corrected points to those of the file, px."""
-    worst = 0.0
-    for distortion, (distorted, corrected) in zip(distortions(lens, focal), points, strict=True):
+    worst, centre = 0.0, np.asarray(lens.centre)
+    for distortion, (distorted, corrected), scaled in zip(
+        distortions(lens, focal), points, any_scale, strict=True
+    ):
         found = (np.asarray(distortion.undistort(distorted * lens.scale + centre)) - centre) / lens.scale
+        if scaled:
+            corrected = corrected * np.sum(found * corrected) / np.sum(corrected * corrected)
         distance = np.hypot(*(found - corrected).T)
         worst = max(worst, float(distance.max()) if np.isfinite(distance).all() else np.inf)
     return worst * lens.scale

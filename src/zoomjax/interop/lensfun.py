@@ -18,9 +18,9 @@ import dataclasses
 import math
 import xml.etree.ElementTree as ET
 from fractions import Fraction
+from typing import ClassVar
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from .._core.text import plain
 from ._forms import AbstractForm, Form, minimax
@@ -35,6 +35,7 @@ class PtLens(AbstractForm):
     """``d = u (g0 + g1 u + g2 u² + g3 u³)``: ptlens with its scale free, for radii in any unit."""
 
     corrects: bool = False
+    any_scale: ClassVar[bool] = True
 
     @property
     def orders(self) -> np.ndarray:
@@ -54,21 +55,22 @@ class PtLens(AbstractForm):
         return change + _ONE
 
     def distances(self, theta: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """How far mapped points are off, with the corrected ones scaled so that this is least."""
-
-        def at(scale: float) -> np.ndarray:
-            return np.hypot(*(self(theta, scale * start) - end).T)
-
-        best = minimize_scalar(
-            lambda scale: at(scale).max(), bounds=_SCALES, method="bounded", options={"xatol": 1e-8}
-        )
-        return at(float(np.asarray(best.x)))  # pyright: ignore[reportAttributeAccessIssue]
+        """How far mapped points are off, with the corrected ones scaled so that the RMS is least."""
+        scale = 1.0
+        for _ in range(_STEPS):
+            found = self(theta, scale * start)
+            slope = (self(theta, (scale + _STEP) * start) - found) / _STEP
+            scale -= np.sum(slope * (found - end)) / np.sum(slope * slope)
+        return np.hypot(*(self(theta, scale * start) - end).T)
 
 
-_SCALES = (0.9, 1.1)
-"""Between which the scale of the corrected image is sought."""
+_STEPS, _STEP = 4, 1e-6
+"""Of Gauss and Newton, for the scale of the corrected image, and of its difference quotient."""
 
 _ONE = np.array([1.0, 0, 0, 0])
+
+
+_SCALED = "lensfun scales the corrected image here: positions agree up to that."
 
 
 class Lensfun(Format):
@@ -149,7 +151,7 @@ class Lensfun(Format):
         told = "Put maker, model and mount of your camera's EXIF data into the file before you use it."
         if isinstance(nodes[0].form, Form):
             return (told,)
-        return (told, "The model ptlens scales the corrected image: positions agree up to that scale.")
+        return told, _SCALED
 
     def recognises(self, head: str) -> bool:
         """By its root."""
@@ -178,7 +180,8 @@ class Lensfun(Format):
             for entry in entries
             if entry.attrib["model"] != "none"
         ]
-        return Contents(tuple(nodes), size, "mm")
+        scaled = any(node.form.any_scale for node in nodes)
+        return Contents(tuple(nodes), size, "mm", (_SCALED,) * scaled)
 
 
 def float_fraction(text: str) -> Fraction:
