@@ -30,8 +30,8 @@ from .base import Contents, Node, Sampled
 _MUCH = 0.5
 """px at the nodes from which a user is told of tables."""
 
-_TERMS = 2
-"""Coefficients by default, as everywhere in zoomjax."""
+_TERMS, _KEPT = 2, AbstractFamily.most_terms
+"""Coefficients of a `SmoothZoom`, whose prior is for two, and of models that keep a file's values."""
 
 Pairs = tuple[np.ndarray, np.ndarray]
 
@@ -44,7 +44,8 @@ def lens_of(
     Args:
         contents: of the file.
         zoom: the zoom model; None for the default, which depends on the contents.
-        terms: number of radial coefficients; None for two, or for those of the file where it is ours.
+        terms: number of radial coefficients; None for two of a `SmoothZoom`, else for those of the file
+            where its formula is ours, or four.
 
     Returns:
         The lens, its greatest error at the nodes, px of the corrected image, and notes.
@@ -121,9 +122,9 @@ def _family(nodes: list[Node | Sampled], terms: int | None) -> tuple[AbstractFam
 
 
 def _terms(nodes: list[Node | Sampled], exact: bool) -> int:
-    """As many as the file has where they are ours."""
+    """As many as the file has where they are ours, else as many as there may be."""
     if not exact:
-        return _TERMS
+        return _KEPT
     formulas = [(n.form, n.theta) for n in nodes if isinstance(n, Node)]
     used = [p for form, theta in formulas if isinstance(form, Form) for p in form.split(theta)[:2]]
     return max([1, *(int(np.max(np.flatnonzero(part), initial=-1)) + 1 for part in used)])

@@ -173,7 +173,8 @@ def read(
         convention: for STMaps: "centres" (Nuke), "gyroflow" or "alicevision".
         zoom: the zoom model, linear in its parameters. By default `SmoothZoom`; `TableZoom` for tangential
             distortion and the division model, and to keep what the file says at its focal lengths.
-        terms: number of radial coefficients; by default 2, or those of a file with our own formula.
+        terms: number of radial coefficients; by default 2 for `SmoothZoom`, else those of a file with our
+            own formula, or 4.
 
     Raises:
         OSError: the file cannot be read.
