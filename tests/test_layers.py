@@ -1,4 +1,4 @@
-"""The package is eleven rooms on a private base, and imports go one way: from a room to rooms below it."""
+"""The package is twelve rooms on a private base, and imports go one way: from a room to rooms below it."""
 
 import ast
 from pathlib import Path
@@ -17,6 +17,7 @@ ROOMS = (
     "lines",
     "detect",
     "focal",
+    "interop",
     "models",
     "io",
     "_core",
@@ -31,6 +32,7 @@ LIBRARIES = {
     "correct": {"cv2"},
     "detect": {"cv2"},
     "io": {"cv2", "av", "PIL", "pillow_heif", "rawpy", "tifffile"},
+    "interop": {"OpenEXR", "yaml"},
     "lenses": {"lensfunpy"},
     "torch": {"torch"},
 }

@@ -5,10 +5,21 @@ import re
 FLAGS = {
     name: f"--{name.replace('_', '-')}"
     for name in (
-        *("border", "degree", "detector", "focal", "focal_sigma", "focal_unit", "hold", "interpolation"),
-        *("again", "crop", "keep", "lens", "overwrite", "terms"),
+        *(
+            "again",
+            "border",
+            "convention",
+            "crop",
+            "degree",
+            "detector",
+            "direction",
+            "focal",
+            "focal_sigma",
+        ),
+        *("focal_unit", "hold", "image_size", "interpolation", "keep", "lens", "name"),
+        *("overwrite", "pixel_pitch", "terms", "tolerance"),
     )
-}
+} | {"format": "--to", "track": "--focal"}
 """Options of the command line by the names of the library's arguments."""
 
 # Within a message, a capital letter marks the content of a file: "Cannot read a.npz: Argument focal ..."

@@ -1,4 +1,4 @@
-"""The command line: ``zoomjax demo``, ``calibrate``, ``undistort`` and ``reproduce``.
+"""The command line: ``zoomjax calibrate``, ``undistort``, ``export``, ``import`` and others.
 
 Errors go to stderr with exit status 2, and leave no partial result.
 """
@@ -16,7 +16,7 @@ except ModuleNotFoundError:
     sys.exit('The command line needs the extra "app": pip install "zoomjax[app]"')
 
 from .._core.text import plain
-from . import commands_lens, commands_reproduce  # noqa: F401, they add their commands
+from . import commands_interop, commands_lens, commands_reproduce  # noqa: F401, they add their commands
 from ._compiled import UNKEPT, forget_compiled
 from ._flags import with_flags
 from ._interrupts import INTERRUPTED, LAST_WORDS, end_run, leave, swallowed
