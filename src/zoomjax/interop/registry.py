@@ -89,8 +89,9 @@ def write(
             has it.
         focal: focal lengths in the lens's unit. Formats that interpolate choose them if it is left out.
         track: focal lengths by frame instead, one entry or file for each frame.
-        pixel_pitch: mm from one pixel to the next: the sensor's width over that of the image in px. Formats
-            with focal lengths in px need it for lenses in mm, those with a sensor's size always.
+        pixel_pitch: mm from one pixel to the next: the sensor's width over that of the image in px; by
+            default the lens's own. Formats with focal lengths in px need it for lenses in mm, those with a
+            sensor's size always.
         tolerance: for formats that interpolate: focal lengths are added until the error between them is
             below this, px, or more of them gain nothing.
         convention: for STMaps: "centres" (Nuke), "gyroflow" or "alicevision".
