@@ -1,6 +1,6 @@
 """Rendered facades and halls with clutter, seen through a known lens, for `benchmarks.wide`.
 
-A plane in perspective holds what is straight: ledges, window frames, floor markings, some behind arches, discs and
+A plane in perspective holds what is straight: ledges, window frames, floor markings, and arches, discs and
 people-sized blobs that are not. The lens is the division model about a centre that is not the image's.
 """
 

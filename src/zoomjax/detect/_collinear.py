@@ -6,15 +6,15 @@ All pieces are corrected. Two of them join, end to end, when
   uncertainty allow;
 - the same side is brighter, with like contrast, or, where the brighter side flips as at the corners of a
   checkerboard, they touch;
-- the gap is explained: no longer than some times the visible part of the shorter one, or outside of the image;
+- the gap is explained: no longer than some times the visible part of the shorter one, or outside the image;
 - they do not run beside each other: the two edges of a thin bar stay two lines;
 - each is the nearest such neighbour of the other.
 
-What has joined is taken for pieces, and joins again: first with ends nearby, then with any. At last each piece is
-left out of its line in turn, and stays only if the rest predicts it.
+What has joined is taken for pieces, and joins again: first with ends nearby, then with any. At last each
+piece is left out of its line in turn, and stays only if the rest predicts it.
 
-A line is known by sums over its points (weights, first and second moments) that add up when pieces join, with
-weights that make distances px of the image.
+A line is known by sums over its points (weights, first and second moments) that add up when pieces join,
+with weights that make distances px of the image.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ _LIKE = 6
 """Neighbouring points whose errors are alike."""
 
 _BLOOM = 1.0
-"""px by which an edge may jump where its brighter side flips: bright parts grow on sensors and by sharpening."""
+"""px by which an edge may jump where its brighter side flips: bright parts grow on sensors."""
 
 _SIGMAS = 3.0
 _ROUGH = 0.6
@@ -274,7 +274,7 @@ def _on_line(units: _Units, longer: np.ndarray, shorter: np.ndarray, sigma: floa
 
 
 def _predicted(sums: np.ndarray, ends: np.ndarray, stretch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (p, 2) of ends (p, 2, 2) from lines, and how certain the lines are there, px of the image."""
+    """Distances (p, 2) of ends (p, 2, 2) from lines, and the lines' uncertainty there, px of the image."""
     middle, normal, _ = _line(sums)
     direction = _along(normal)
     offset = ends - middle[:, None]

@@ -5,9 +5,9 @@ each. It is the division model with two terms, which follows lenses from strong 
 
     corrected = centre + (x - centre) / (1 + k1 t + k2 t^2),  t = |x - centre|^2 / scale^2,
 
-and its centre. Distances of corrected points to their lines are divided by the local stretch across the line,
-which makes them px of the image, where the noise is. Lines that do not become straight (arcs, folds in a
-cloth) are weighted down as a whole.
+and its centre. Distances of corrected points to their lines are divided by the local stretch across the
+line, which makes them px of the image, where the noise is. Lines that do not become straight (arcs, folds
+in a cloth) are weighted down as a whole.
 """
 
 import dataclasses
@@ -61,9 +61,9 @@ class OneFrame:
         return self.centre + self.scale * z / self._divisor(np.sum(z * z, axis=-1))[..., None]
 
     def stretch(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """(...), by how much the surroundings of points are stretched along unit normals of corrected lines.
+        """(...), by how much the surroundings of points are stretched along normals of corrected lines.
 
-        Both are (..., 2): points in the image, normals in the corrected one.
+        Both are (..., 2): points in the image, unit normals in the corrected one.
         """
         z = (points - self.centre) / self.scale
         t = np.sum(z * z, axis=-1)
@@ -78,8 +78,8 @@ class OneFrame:
     def fitted(self, lines: list[np.ndarray], samples: int = 24) -> "OneFrame":
         """The model that straightens lines, (n, 2) px each, best; this one if there is none.
 
-        Levenberg and Marquardt's method on the distances to the lines, from the model as it is. `samples` of
-        each line's points are used.
+        Levenberg and Marquardt's method on the distances to the lines, from the model as it is. `samples`
+        of each line's points are used.
         """
         if not lines:
             return self
@@ -108,7 +108,7 @@ class OneFrame:
         return model
 
     def errors(self, points: np.ndarray) -> np.ndarray:
-        """(l, s), distances of the points (l, s, 2) of lines to the best lines, to first order px of the image."""
+        """(l, s), distances of points (l, s, 2) to the best lines, to first order px of the image."""
         corrected = self.undistort(points)
         weight = np.ones(points.shape[:-1])
         for _ in range(2):  # the first line is only good enough for the stretch along its normal
@@ -163,7 +163,7 @@ def extent(line: np.ndarray) -> float:
 
 
 def _weights(error: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Of whole lines, by their errors, px: Geman and McClure's, with the median as the scale; long lines more."""
+    """Of whole lines, by length and by Geman and McClure's function of their errors over the median."""
     rms = np.sqrt(np.mean(error**2, axis=1))
     spread = max(2 * float(np.median(rms)), _LEAST_SPREAD)
     return length / np.mean(length) / (1 + (rms / spread) ** 2) ** 2

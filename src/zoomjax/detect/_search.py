@@ -1,16 +1,18 @@
 """How bent a photograph is, before any edges are joined: an extended Hough transform.
 
-The unknown is one number, the square of the angle a that the image's corner is off the axis of an equidistant
-fisheye, which corrects a radius r, in halves of the diagonal, to ``tan(a r) / a``. Real fisheyes are near it, all
-weaker barrel distortion is the same to first order, and negative squares, ``tanh``, are pincushion. (The division
-model with one term is not as near: its best for the upper and the lower half of a fisheye's image differ.)
+The unknown is one number, the square of the angle a that the image's corner is off the axis of an
+equidistant fisheye, which corrects a radius r, in halves of the diagonal, to ``tan(a r) / a``. Real
+fisheyes are near it, all weaker barrel distortion is the same to first order, and negative squares,
+``tanh``, are pincushion. (The division model with one term is not as near: its best for the upper and the
+lower half of a fisheye's image differ.)
 
-For each candidate all pieces of edges are corrected about the image's centre; every sample of a piece votes, with
-its length, for the line through it in its direction, and the candidate counts the squares of the votes. Where the
-straight lines of the scene become straight, the many pieces of one line, and the whole of a long one, vote alike.
+For each candidate all pieces of edges are corrected about the image's centre; every sample of a piece
+votes, with its length, for the line through it in its direction, and the candidate counts the squares of
+the votes. Where the straight lines of the scene become straight, the many pieces of one line, and the
+whole of a long one, vote alike.
 
-A line has an orientation and an offset, which is counted in px of the image: that of the line's foot, where it
-is nearest to the centre.
+A line has an orientation and an offset, which is counted in px of the image: that of the line's foot,
+where it is nearest to the centre.
 """
 
 import cv2
@@ -26,8 +28,9 @@ _STEP = 0.1
 """Of the candidates: for a weak lens the corner moves by 3 % of its radius from one to the next."""
 
 _CELL = (np.radians(0.4), 1.2)
-"""Orientation, and px of an image of 700 px half diagonal (others in proportion). Cells of 1 degree and 3 px cannot
-tell the rows of windows of a facade apart: there its best corner moves by 3.7 times its radius instead of 1.6."""
+"""Orientation, and px of an image of 700 px half diagonal (others in proportion). Cells of 1 degree and 3
+px cannot tell the rows of windows of a facade apart: there its best corner moves by 3.7 times its radius
+instead of 1.6."""
 
 _SAMPLE = 8.0
 """px along a piece from one vote to the next; more where there are more than `_MOST` of them."""

@@ -3,8 +3,8 @@
 As in the paper's first experiment, sub-pixel edges (`_edge_points`) are linked into smooth pieces
 (`_segments`). A Hough transform with distortion as one more unknown then tells how bent the photograph is
 (`_search`). Under that model, in which lines of the scene are straight, pieces are joined to lines
-(`_collinear`). The lines fit the model again (`_frame_model`), and both take turns, so that lines get longer as
-the model gets better. The two edges of a stripe are separate lines.
+(`_collinear`). The lines fit the model again (`_frame_model`), and both take turns, so that lines get
+longer as the model gets better. The two edges of a stripe are separate lines.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ _MOST_FITTED = 150
 """So many of the longest lines are enough to estimate it."""
 
 _TURNS = (1.0, 0.6, 0.4)
-"""px by which lines may be bent since the model is not exact: at most, turn by turn. The least is `_EXACT`."""
+"""px, at most, by which lines may be bent as the model is not exact, turn by turn; at least `_EXACT`."""
 
 _EXACT = 0.15
 _ROUGHEST = 4.0
@@ -46,8 +46,8 @@ class Edges:
 
     Attributes:
         lines: for each line an (n, 2) array of points, px, in order along it, the longest line first.
-        unexplained: share, 0 to 1, of the length of all strong long smooth edges that is on none of the lines.
-            Arcs and trees have it, too; where it is large, the lines are little of what there is.
+        unexplained: share, 0 to 1, of the length of all long and smooth edges that is on none of the lines.
+            Arcs and branches add to it; where it is large, the lines are little of what there is.
     """
 
     lines: tuple[np.ndarray, ...]
