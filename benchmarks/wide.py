@@ -84,7 +84,8 @@ def facade(folder: Path) -> dict:
     assert image is not None
     size = (image.shape[1], image.shape[0])
     detector, times = EdgeDetector(), []
-    for _ in range(4):
+    edges = detector.find(image)
+    for _ in range(3):
         start = time.process_time()
         edges = detector.find(image)
         times.append(time.process_time() - start)
@@ -93,7 +94,7 @@ def facade(folder: Path) -> dict:
     result: dict[str, Any] = {
         "lines": len(edges.lines),
         "unexplained": edges.unexplained,
-        "cpu_s": float(np.median(times[1:])),
+        "cpu_s": float(np.median(times)),
         "reach": float(max(np.hypot(*(line - centre).T).max() for line in edges.lines) / np.hypot(*centre)),
         "their_reach": float(
             max(np.hypot(*(line - centre).T).max() for line in theirs) / np.hypot(*centre)
@@ -212,21 +213,21 @@ def markdown(results: dict) -> str:
             f"{house['unexplained']:.0%} of the strong long edges are on none. They reach to "
             f"{house['reach']:.2f} of the way to the corner, the points of the authors' program to "
             f"{house['their_reach']:.2f}: beyond, the models extrapolate. Displacements, px, at shares of the "
-            "way to the corner; straightness is that of the authors' points, px of the image, over the better "
-            "nine tenths of their lines.",
+            "way to the corner; straightness is that of the authors' points, px of the image, over the "
+            "better nine tenths of their lines.",
             "",
             *table(["", "RMS", "rejected", "straightness", *map(str, RADII)], fits),
             "",
             "## An action camera's board",
             "",
-            f"{plate['lines']} lines in all photos, {plate['rejected']} rejected; RMS {plate['rms_px']:.2f} px. On "
-            f"the corners of the {plate['photos']} whole boards the correction is {plate['apart_px']:.2f} px RMS "
+            f"{plate['lines']} lines in all photos, {plate['rejected']} rejected; RMS {plate['rms_px']:.2f} px. "
+            f"On the corners of the {plate['photos']} whole boards the correction is {plate['apart_px']:.2f} px RMS "
             "from that of `cv2.calibrateCamera`, up to a homography.",
             "",
             "## Rendered scenes",
             "",
-            f"{len(scenes['scenes'])} scenes, noise of 3 grey levels, JPEG, centre off by up to 5 %: the lens is "
-            f"within {WITHIN} px RMS of the image of the true one, up to a homography, in "
+            f"{len(scenes['scenes'])} scenes, noise of 3 grey levels, JPEG, centre off by up to 5 %: the lens "
+            f"is within {WITHIN} px RMS of the image of the true one, up to a homography, in "
             f"{scenes['success']:.0%}; median {scenes['median_px']:.2f} px.",
             "",
             *table(["corner displacement", "within", "median, px"], groups),

@@ -71,15 +71,16 @@ def render(made: Scene) -> np.ndarray:
     _people(big, rng)
     image = cv2.resize(big, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
     image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.5, 1.1))
-    distance = np.hypot(
-        *(np.stack(np.mgrid[0:height, 0:width]) - np.array([height, width])[:, None, None] / 2)
-    )
+    row, column = np.indices((height, width))
+    distance = np.hypot(row - height / 2, column - width / 2)
     image *= 1 - 0.3 * (distance / np.hypot(width, height) * 2) ** 2
     image += rng.normal(0, 3, image.shape)
     _, packed = cv2.imencode(
         ".jpg", np.clip(np.rint(image), 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 90]
     )
-    return cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE)
+    photo = cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE)
+    assert photo is not None
+    return photo
 
 
 def _facade(rng: np.random.Generator) -> tuple[np.ndarray, tuple[int, int]]:

@@ -80,7 +80,8 @@ def test_stretch_is_the_gradient_of_the_corrected_offset():
 def test_the_model_is_fitted_to_bent_lines_but_not_to_arcs():
     """A fisheye about a centre that is not the image's, and two circles."""
     true = OneFrame(SIZE, (-0.45, -0.08), (0.03, -0.02))
-    grid = np.stack(np.meshgrid(np.linspace(0, 479, 200), np.linspace(0, 319, 130)), axis=-1).reshape(-1, 2)
+    places = np.meshgrid(np.linspace(0, 479, 200), np.linspace(0, 319, 130))
+    grid = np.stack(places, axis=-1).reshape(-1, 2)
     flat = true.undistort(grid)
     lines = []
     for axis in (0, 1):
@@ -100,6 +101,7 @@ def test_the_model_is_fitted_to_bent_lines_but_not_to_arcs():
 def test_a_facade_is_found_whole(data):
     """That on which the paper's authors show their program: the roof, the ledges and the windows' columns."""
     image = cv2.imread(str(data / "wide" / "building.png"))
+    assert image is not None
     found = zj.EdgeDetector().find(image)
     assert len(found.lines) >= 40
     assert found.unexplained < 0.4

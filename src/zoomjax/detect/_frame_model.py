@@ -110,14 +110,17 @@ class OneFrame:
     def errors(self, points: np.ndarray) -> np.ndarray:
         """(l, s), distances of points (l, s, 2) to the best lines, to first order px of the image."""
         corrected = self.undistort(points)
-        weight = np.ones(points.shape[:-1])
-        for _ in range(2):  # the first line is only good enough for the stretch along its normal
-            mean = np.sum(weight[..., None] * corrected, axis=1) / np.sum(weight, axis=1)[:, None]
-            centred = corrected - mean[:, None]
-            normal = normals(centred, weight)
-            stretch = self.stretch(points, np.broadcast_to(normal[:, None], points.shape))
-            weight = stretch**-2.0
+        # The first line is good enough for the stretch along its normal only.
+        _, _, stretch = self._lines(points, corrected, np.ones(points.shape[:-1]))
+        centred, normal, stretch = self._lines(points, corrected, stretch**-2.0)
         return np.einsum("lsc,lc->ls", centred, normal) / stretch
+
+    def _lines(self, points: np.ndarray, corrected: np.ndarray, weight: np.ndarray):
+        """Corrected points about the mean of their line, its normals, and the stretch along these."""
+        mean = np.sum(weight[..., None] * corrected, axis=1) / np.sum(weight, axis=1)[:, None]
+        centred = corrected - mean[:, None]
+        normal = normals(centred, weight)
+        return centred, normal, self.stretch(points, np.broadcast_to(normal[:, None], points.shape))
 
     def _slopes(self, points: np.ndarray, error: np.ndarray) -> np.ndarray:
         """(l, s, 4), derivatives of the errors by the model's values."""
