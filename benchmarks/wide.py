@@ -212,22 +212,23 @@ def markdown(results: dict) -> str:
             f"{house['lines']} lines, found in {house['cpu_s']:.2f} s of one core's time; "
             f"{house['unexplained']:.0%} of the strong long edges are on none. They reach to "
             f"{house['reach']:.2f} of the way to the corner, the points of the authors' program to "
-            f"{house['their_reach']:.2f}: beyond, the models extrapolate. Displacements, px, at shares of the "
-            "way to the corner; straightness is that of the authors' points, px of the image, over the "
-            "better nine tenths of their lines.",
+            f"{house['their_reach']:.2f}: beyond, the models extrapolate. Displacements, px, at shares "
+            "of the way to the corner; straightness is that of the authors' points, px of the image, "
+            "over the better nine tenths of their lines.",
             "",
             *table(["", "RMS", "rejected", "straightness", *map(str, RADII)], fits),
             "",
             "## An action camera's board",
             "",
-            f"{plate['lines']} lines in all photos, {plate['rejected']} rejected; RMS {plate['rms_px']:.2f} px. "
-            f"On the corners of the {plate['photos']} whole boards the correction is {plate['apart_px']:.2f} px RMS "
-            "from that of `cv2.calibrateCamera`, up to a homography.",
+            f"{plate['lines']} lines in all photos, {plate['rejected']} rejected; RMS "
+            f"{plate['rms_px']:.2f} px. On the corners of the {plate['photos']} whole boards the "
+            f"correction is {plate['apart_px']:.2f} px RMS from that of `cv2.calibrateCamera`, up to a "
+            "homography.",
             "",
             "## Rendered scenes",
             "",
-            f"{len(scenes['scenes'])} scenes, noise of 3 grey levels, JPEG, centre off by up to 5 %: the lens "
-            f"is within {WITHIN} px RMS of the image of the true one, up to a homography, in "
+            f"{len(scenes['scenes'])} scenes, noise of 3 grey levels, JPEG, centre off by up to 5 %: "
+            f"the lens is within {WITHIN} px RMS of the image of the true one, up to a homography, in "
             f"{scenes['success']:.0%}; median {scenes['median_px']:.2f} px.",
             "",
             *table(["corner displacement", "within", "median, px"], groups),

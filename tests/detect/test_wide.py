@@ -99,7 +99,7 @@ def test_the_model_is_fitted_to_bent_lines_but_not_to_arcs():
 
 
 def test_a_facade_is_found_whole(data):
-    """That on which the paper's authors show their program: the roof, the ledges and the windows' columns."""
+    """That on which the paper's authors show their program: roof, ledges and columns of windows."""
     image = cv2.imread(str(data / "wide" / "building.png"))
     assert image is not None
     found = zj.EdgeDetector().find(image)
