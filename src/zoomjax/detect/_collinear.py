@@ -59,7 +59,7 @@ _ROUNDS = (24, 24, 24, 0, 0, 0)
 """In each round, the number of ends looked at for each end; 0: all of the `_MOST` longest units."""
 
 _MARGIN = 8.0
-"""px from the image's edge within which an edge leaves the image: there are no edge points within 5 px."""
+"""px from the image's edge within which an edge leaves the image: nearer there are no edge points."""
 
 _MOST = 1200
 _LEAST = 10.0

@@ -22,15 +22,17 @@ from ._frame_model import tangent_ratio
 from ._segments import Fragments, main_direction
 
 _RANGE = (-2.0, 2.1)
-"""Candidates: the corner moves inwards by 0.37 of its radius, to outwards by 4.5 times that."""
+"""Candidates, from strong pincushion to more than a fisheye's barrel distortion."""
 
 _STEP = 0.1
-"""Of the candidates: for a weak lens the corner moves by 3 % of its radius from one to the next."""
+"""From one candidate to the next."""
 
 _CELL = (np.radians(0.4), 1.2)
-"""Orientation, and px of an image of 700 px half diagonal (others in proportion). Cells of 1 degree and 3
-px cannot tell the rows of windows of a facade apart: there its best corner moves by 3.7 times its radius
-instead of 1.6."""
+"""Orientation, and offset at the scale `_HALF_DIAGONAL`. Larger cells cannot tell the rows of windows of a
+facade apart, and take it for more bent than it is."""
+
+_HALF_DIAGONAL = 700
+"""px, of the image for which cells are given: others in proportion."""
 
 _SAMPLE = 8.0
 """px along a piece from one vote to the next; more where there are more than `_MOST` of them."""
@@ -95,7 +97,7 @@ def _score(z, direction, weight, square: float) -> float:
     offset = ratio * (z[:, 1] * np.cos(angle) - z[:, 0] * np.sin(angle))
     a = np.sqrt(abs(square)) + 1e-9
     inverse = np.arctan(a * offset) if square > 0 else np.arctanh(np.clip(a * offset, -0.999, 0.999))
-    rows, columns = int(np.pi / _CELL[0]), int(2.2 * 700 / _CELL[1])
+    rows, columns = int(np.pi / _CELL[0]), int(2.2 * _HALF_DIAGONAL / _CELL[1])
     row = (angle / np.pi * rows).astype(int) % rows
     column = np.clip((inverse / a / 2.2 + 0.5) * columns, 0, columns - 1e-6).astype(int)
     votes = np.bincount(row * columns + column, weight, minlength=rows * columns)
