@@ -1,12 +1,9 @@
 """Plots of where lines lie, in the image and over the zoom, and of how residuals depend on the radius."""
 
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from ..fit.energy import coefficients_by
-from ..fit.family_lines import with_family
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 
@@ -83,14 +80,15 @@ def plot_radius(lines: Lines, lens: ZoomLens, weight: np.ndarray) -> Figure:
 
 def _residuals(lines: Lines, lens: ZoomLens, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances of points from the centre, and of corrected points from their lines, px."""
-    some = with_family(lines.about(lens.centre), lens.family).take(
-        jnp.asarray(chosen), jnp.ones(len(chosen), bool)
-    )
-    coefficients = coefficients_by(lens.zoom, lines)[jnp.asarray(lines.frame)[jnp.asarray(chosen)]]
-    rows = np.asarray(some.corrected(coefficients))
-    mask = np.asarray(lines.mask)[chosen]
-    gram = np.einsum("lpc,lpd->lcd", rows, rows)
-    normal = np.linalg.eigh(gram)[1][..., 0]
+    points, mask = np.asarray(lines.points)[chosen], np.asarray(lines.mask)[chosen]
+    frame, focal = np.asarray(lines.frame)[chosen], np.asarray(lines.focal)
+    corrected = np.zeros(points.shape)
+    for index in np.unique(frame):
+        own = (frame == index)[:, None] & mask
+        corrected[own] = lens(float(focal[index])).undistort(points[own])
+    mean = corrected.sum(axis=1) / mask.sum(axis=1)[:, None]
+    rows = np.where(mask[..., None], corrected - mean[:, None], 0)
+    normal = np.linalg.eigh(np.einsum("lpc,lpd->lcd", rows, rows))[1][..., 0]
     residual = np.einsum("lpc,lc->lp", rows, normal)
-    away = np.asarray(lines.points)[chosen] - np.asarray(lens.centre)
+    away = points - np.asarray(lens.centre)
     return np.hypot(away[..., 0], away[..., 1])[mask], residual[mask]

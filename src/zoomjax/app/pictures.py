@@ -72,7 +72,9 @@ def _pictures(images: "ImageCalibration", frame: int, image: UInt8[np.ndarray, "
         framing = frame_output(distortion, (small.shape[1], small.shape[0]), keep="all")
         corrected = undistort_image(small, distortion, keep=framing, border_value=128)
     origin, enlarged = np.asarray(framing.origin), float(framing.scale)
-    shown = [(np.asarray(distortion.undistort(_at(line, scale))) - origin) * enlarged for line in lines]
+    joined = np.asarray(distortion.undistort(_at(np.concatenate(lines), scale)))  # all lines at once
+    ends = np.cumsum([len(line) for line in lines])[:-1]
+    shown = np.split((joined - origin) * enlarged, ends)
     known = [points[np.isfinite(points).all(axis=1)] for points in shown]
     after = draw_lines(corrected, known, **look)
     crops = {int(line): _crop(image, lines[place]) for line, place in zip(named, labels, strict=True)}
