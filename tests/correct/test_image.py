@@ -255,7 +255,7 @@ def test_interpolations(rng, name, flag):
         ({"border": "wrap"}, "border must be one of constant"),
         ({"border_value": [1, 2]}, "one number, or one for each of the 3 channels"),
         ({"border_value": 300}, "border_value must be a value of uint8"),
-        ({"keep": "most"}, 'keep must be "same", "all" or "valid"'),
+        ({"keep": "most"}, 'keep must be "same", "all", "valid" or "grow"'),
         ({"size": (0, 3)}, "size must be two positive integers"),
         ({"size": (40000, 3)}, "at most 32766 px a side"),
         ({"keep": zj.correct.frame_output(BARREL, SIZE), "size": (3, 3)}, "size must be left out"),

@@ -88,9 +88,9 @@ def test_maps_are_read_in_both_directions_and_three_conventions(convention, dire
     back = zj.interop.read(path, convention=convention)
     assert back.report.worst < 0.02
     assert np.asarray(back.lens.centre) == pytest.approx(np.asarray(lens.centre), abs=0.01)
-    assert np.asarray(back.lens(24.0).coefficients) == pytest.approx(
-        np.asarray(lens(24.0).coefficients), abs=1e-4
-    )
+    two, more = np.split(np.asarray(back.lens(24.0).coefficients), [2])
+    assert two == pytest.approx(np.asarray(lens(24.0).coefficients), abs=1e-4)
+    assert more == pytest.approx(0, abs=1e-4)
     if convention == "gyroflow":
         moved = np.asarray(zj.interop.read(path).lens.centre - back.lens.centre)
         assert np.abs(moved).max() > 0.1  # which shows that the convention matters
