@@ -116,3 +116,12 @@ def test_the_commands_list_write_and_say_what_to_give(tmp_path):
     assert zj.load_lens(tmp_path / "lens.json").image_size == SIZE
     assert question.startswith("Error: 2 lenses fit 'nikkor 18-200': choose ")
     assert "--lens auto" in hint
+
+
+def test_without_lensfunpy_the_command_says_what_to_install():
+    blocked = "import sys; sys.modules['lensfunpy'] = None; from zoomjax.app.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", blocked, "lens", "nikkor"], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr == (
+        'Error: The library of lenses needs the extra "lensfun": pip install "zoomjax[lensfun]"\n'
+    )

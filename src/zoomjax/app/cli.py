@@ -40,7 +40,7 @@ def main() -> None:
         sys.exit(app(standalone_mode=False))
     except USAGE as error:
         _tell_usage(error)
-    except (ValueError, OSError, RuntimeError, MemoryError) as error:
+    except (ValueError, OSError, RuntimeError, MemoryError, ImportError) as error:
         print(f"Error: {_sentence(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:  # outside of Typer
