@@ -10,6 +10,7 @@ from .cramer_rao_bounds import displacement_bound as displacement_bound
 from .cramer_rao_bounds import displacement_rms as displacement_rms
 from .cross_validation import held_out_frames as held_out_frames
 from .cross_validation import held_out_zoom as held_out_zoom
+from .misfit import with_misfit as with_misfit
 from .next_photo import Suggestion as Suggestion
 from .next_photo import suggest_next as suggest_next
 from .selection import Candidate as Candidate
