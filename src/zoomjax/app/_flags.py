@@ -5,8 +5,8 @@ import re
 FLAGS = {
     name: f"--{name.replace('_', '-')}"
     for name in (
-        *("border", "degree", "detector", "focal", "focal_sigma", "focal_unit", "hold", "interpolation"),
-        *("keep", "overwrite", "terms"),
+        *("border", "centre", "degree", "detector", "focal", "focal_sigma", "focal_unit", "hold"),
+        *("interpolation", "keep", "model", "overwrite", "terms"),
     )
 }
 """Options of the command line by the names of the library's arguments."""

@@ -19,8 +19,28 @@ Overwrite = Annotated[
         help="Also replace files that zoomjax did not write, or that were changed since.",
     ),
 ]
-Degree = Annotated[int, typer.Option(min=0, help="Degree of the polynomials in 1/f.")]
-Terms = Annotated[int, typer.Option(min=1, help="Number of distortion coefficients, k1 to kN.")]
+ModelName = Annotated[
+    str | None,
+    typer.Option(
+        "--model",
+        help="Zoom model: auto (of least cross-validation error), polynomial (in 1/f), smooth (with a "
+        "prior from real lenses) or spline. Default: auto, or polynomial with --degree.",
+    ),
+]
+Degree = Annotated[
+    int | None, typer.Option(min=0, help="Degree of the polynomials in 1/f; default: chosen.")
+]
+Terms = Annotated[
+    int | None, typer.Option(min=1, help="Number of distortion coefficients, k1 to kN; default: chosen.")
+]
+Centre = Annotated[
+    str,
+    typer.Option(
+        metavar="fit|image|X,Y",
+        help="Centre of distortion: fit (where the lines determine it, else the image's), image, or its "
+        "coordinates in px.",
+    ),
+]
 
 
 def read_lines(
@@ -54,6 +74,21 @@ def read_lines(
             focal_unit=focal_unit or "mm",
         )
     raise ValueError(f"Cannot calibrate from {path}: give lines.npz, or a CSV file frame,line,x,y[,focal].")
+
+
+def centre_of(text: str) -> str | tuple[float, float]:
+    """The centre of distortion as `calibrate` takes it."""
+    from ..io.text_table import plain_number
+
+    if text in ("fit", "image"):
+        return text
+    numbers = [plain_number(part) for part in text.split(",")]
+    x, y = numbers if len(numbers) == 2 else (None, None)
+    if x is None or y is None:
+        raise ValueError(
+            f"--centre must be fit, image, or X,Y in px as in 959.5,539.5, but it is {text!r}."
+        )
+    return x, y
 
 
 def number_of_cores() -> int:

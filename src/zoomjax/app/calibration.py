@@ -18,21 +18,26 @@ from jaxtyping import Float
 
 from .._core.types import AnyArray
 from ..fit.algebraic import algebraic_zoom
+from ..fit.centre import fit_centre
 from ..fit.energy import coefficients_by, line_rms
 from ..fit.focal_lengths import with_focal_sigma
 from ..fit.frames import fit_frames
 from ..fit.result import RESULTS, FrameFits, ZoomFit
-from ..fit.robust import fit_robust
+from ..fit.robust import reweighted
 from ..fit.straightness import frame_rms
-from ..fit.zoom import fit_zoom
-from ..lines.compressed import compress
+from ..fit.zoom import CentreChoice, about_centre, fit_zoom
+from ..lines.compressed import CompressedLines, compress
+from ..lines.free_centre import AnyCentreLines, compress_any_centre
 from ..lines.lines import Lines
 from ..models.invertibility import Certificate
 from ..models.zoom import PolynomialZoom
 from ..trust.bands import displacement_std
+from ..trust.centre_choice import choose_centre
 from ..trust.cross_validation import held_out_frames, held_out_zoom
+from ..trust.misfit import with_misfit
 from ..trust.next_photo import Suggestion, suggest_next
-from ..trust.selection import Selection, default_candidates, select_model
+from ..trust.selection import Candidate, Selection
+from .model_choice import CentreFound, WantedModel
 from .results_folder import results_folder
 
 FILES = ("lens.json", "lines.npz", "summary.json", "model.png")
@@ -57,6 +62,7 @@ class Calibration:
         focal_sigma: standard deviation of each frame's focal length, included in the bands; 0: exact.
         held_out: each frame's RMS, px, under the zoom model fitted to all others; NaN if that fit fails.
         each_held_out: each frame's RMS, px, each tenth of its lines under the model of its other lines.
+        centre: the centre of distortion, and how it was found.
         selection: how the model was selected; None if it was given.
     """
 
@@ -71,6 +77,7 @@ class Calibration:
     focal_sigma: np.ndarray
     held_out: np.ndarray
     each_held_out: np.ndarray
+    centre: CentreFound
     selection: Selection | None = None
 
     def corner(self) -> list[tuple[float, float, float]]:
@@ -106,13 +113,18 @@ class Calibration:
         return [
             ("no correction", self.none),
             ("frame by frame", np.asarray(self.each.frame_rms)),
-            ("zoom polynomial (algebraic)", self.algebraic),
-            ("zoom polynomial", np.asarray(self.zoom.frame_rms)),
+            (f"{self.kind} (algebraic)", self.algebraic),
+            (self.kind, np.asarray(self.zoom.frame_rms)),
         ]
+
+    @property
+    def kind(self) -> str:
+        """What the zoom model is called in tables."""
+        return "zoom polynomial" if isinstance(self.zoom.lens.zoom, PolynomialZoom) else "zoom model"
 
     def held_out_rows(self) -> dict[str, np.ndarray]:
         """For some of the `rows`, each frame's RMS on lines that were not used in the fit, px."""
-        return {"frame by frame": self.each_held_out, "zoom polynomial": self.held_out}
+        return {"frame by frame": self.each_held_out, self.kind: self.held_out}
 
     def warnings(self, names: Sequence[str] | None = None) -> list[str]:
         """User-facing warnings about the zoom model, and about frames without a good fit.
@@ -172,7 +184,10 @@ class Calibration:
             "rms_unconstrained": float(self.zoom.rms_unconstrained),
             "frames_without_a_model": sum(map(bool, self.each.messages())),
             "warnings": self.warnings(),
+            "model": type(lens.zoom).__name__,
+            "centre": self.centre.summary(),
             "pixel_polynomials": self.pixel_polynomials().tolist(),
+            "coefficients": self.coefficient_rows(),
             "parameters": np.asarray(lens.zoom.parameters).tolist(),
             "corner_displacement": [
                 {"focal": f, "px": moved, "std": _finite([std])[0]} for f, moved, std in self.corner()
@@ -193,11 +208,22 @@ class Calibration:
         } | ({"selection": self.selection.summary()} if self.selection else {})
 
     def pixel_polynomials(self) -> np.ndarray:
-        """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as printed in the paper."""
+        """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as printed in the paper.
+
+        None, of shape (0, 0), for another model.
+        """
         model = self.zoom.lens.zoom
-        assert isinstance(model, PolynomialZoom)  # `calibrate` fits no other
+        if not isinstance(model, PolynomialZoom):
+            return np.zeros((0, 0))
         normalised = np.asarray(model.in_inverse_focal())
         return normalised / self.zoom.lens.scale ** (2 * np.arange(1, normalised.shape[1] + 1))
+
+    def coefficient_rows(self) -> list[list[float]]:
+        """Focal length and k1, ..., kN, px, at some focal lengths over the range, evenly in 1/f."""
+        lens = self.zoom.lens
+        low, high = (float(f) for f in lens.focal_range)
+        focal = np.unique(1 / np.linspace(1 / low, 1 / high, 5))
+        return [[f, *np.asarray(lens(f).pixel_coefficients).tolist()] for f in focal.tolist()]
 
     def write(
         self,
@@ -243,70 +269,90 @@ class Calibration:
 def calibrate(
     lines: Lines,
     *,
-    degree: int = 2,
-    terms: int = 2,
+    model: WantedModel = WantedModel(),  # noqa: B008, it is frozen
+    centre: CentreChoice | None = "fit",
     robust: bool = False,
     focal_sigma: float | Float[np.ndarray, "frame"] = 0.0,
-    select: bool = False,
     stage: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
-    """Fit the zoom polynomial, and the models it is compared with.
+    """Fit the zoom model, and the models it is compared with.
 
     Args:
         lines: the lines; computed in float64 if that is enabled, whatever their dtype.
-        degree: degree of the polynomials in 1/f.
-        terms: number of distortion coefficients.
+        model: the zoom model; by default the one of least cross-validation error.
+        centre: the centre of distortion: "fit", "image", its coordinates, px, or None for that of the
+            lines. With "fit" it is that of the lines where they do not determine another, or where lines
+            that were not fitted are not straighter about it.
         robust: whether to reject lines that are not straight in the scene. All figures are then computed
             from the remaining lines.
         focal_sigma: standard deviation of the focal lengths: a number, or one per frame; 0 where exact.
-        select: whether to choose degree and terms by `select_model`, among the polynomials. Lines are then
-            rejected under the quadratic.
         stage: called with a description before each step that takes time.
+
+    Raises:
+        ValueError: an argument is not one of these, or there are too few focal lengths for the model.
+        RuntimeError: the solver failed.
     """
-    if select:
-        degree, terms = min(2, np.unique(np.asarray(lines.focal)).size - 1), 2
-    model = PolynomialZoom(degree=degree)
-    model.prepare(lines.focal, terms)  # raises if there are too few focal lengths, before any work
+    base = model.base(lines.focal)
+    base.zoom.prepare(lines.focal, base.terms)  # raises if there are too few focal lengths, before any work
     stage("Compressing the lines")
     widest = jnp.result_type(float)
     data = jax.tree.map(
         lambda a: jnp.asarray(a, widest) if jnp.issubdtype(a.dtype, jnp.floating) else a, lines
     )
-    choices = [c for c in default_candidates() if isinstance(c.zoom, PolynomialZoom)] if select else []
-    small = compress(data, max([terms, *(choice.terms for choice in choices)]))
-    rejected = np.zeros(len(lines.frame), bool)
+    most = model.most_terms(lines)
+    free = isinstance(centre, str) and centre == "fit"
+    held = compress_any_centre(data, most) if free else compress(about_centre(data, centre), most)
+    if free and held.weight is None:
+        held = held.weighted(np.ones(held.frame.shape))  # as where some are left out: one compiled program
+    small = held.about(held.centre)
     if robust:
         stage("Rejecting lines that are not straight")
-        weight = fit_robust(small, zoom=model, terms=terms, throw=False).weight
-        small, lines = small.weighted(weight), lines.weighted(weight)
-        rejected = np.asarray(weight) == 0
+        small = reweighted(small, base.zoom, base.terms)[0]
+        held = held.weighted(np.asarray(small.weight))
+    choice = None
+    if isinstance(held, AnyCentreLines):
+        stage("Fitting the centre of distortion")
+        choice = choose_centre(held, zoom=base.zoom, terms=base.terms)
+        if choice.better:
+            small = held.about(choice.found.fit.lens.centre)
     selection = None
-    if choices:
-        stage("Selecting the model")
-        selection = select_model(small, choices)
-        model, terms = selection.chosen.zoom, selection.chosen.terms
-        assert isinstance(model, PolynomialZoom)
+    if model.automatic:
+        stage("Choosing the model")
+        selection = model.choose(small)
+        base = selection.chosen
     stage("Fitting each frame separately")
-    each = fit_frames(small, terms=terms, throw=False)
-    stage("Fitting the zoom polynomial")
-    zoom = selection.fit if selection else fit_zoom(small, zoom=model, terms=terms)
+    each = fit_frames(small, terms=base.terms, throw=False)
+    stage("Fitting the zoom model")
+    if isinstance(held, AnyCentreLines) and choice is not None and choice.better:
+        zoom = fit_centre(held, zoom=base.zoom, terms=base.terms).fit
+        small = held.about(zoom.lens.centre)
+    else:
+        zoom = fit_zoom(small, zoom=base.zoom, terms=base.terms)
+    if robust:
+        lines = lines.weighted(np.asarray(small.weight))
     sigma = np.broadcast_to(focal_sigma, lines.focal.shape)
     none = np.asarray(frame_rms(small, None))
     several = len(none) > 1
+    sure = with_focal_sigma(zoom, small, focal_sigma=sigma) if sigma.any() else zoom
     return Calibration(
-        lines=lines,
-        zoom=with_focal_sigma(zoom, small, focal_sigma=sigma) if sigma.any() else zoom,
+        lines=lines.about(np.asarray(zoom.lens.centre)),
+        zoom=with_misfit(sure, small),
         each=each,
         none=none,
-        algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=model, terms=terms))),
-        rejected=rejected,
+        algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=base.zoom, terms=base.terms))),
+        rejected=np.asarray(small.weight) == 0 if robust else np.zeros(len(lines.frame), bool),
         line_rms=np.asarray(line_rms(small, coefficients_by(zoom.lens.zoom, small))),
         next=suggest_next(zoom, small),  # from the noise alone, without focal_sigma
         focal_sigma=sigma,
-        held_out=held_out_zoom(small, zoom=model, terms=terms) if several else np.full_like(none, np.nan),
-        each_held_out=held_out_frames(small, terms=terms),
+        held_out=_held_out(small, base) if several else np.full_like(none, np.nan),
+        each_held_out=held_out_frames(small, terms=base.terms),
+        centre=CentreFound.of(zoom, choice),
         selection=selection,
     )
+
+
+def _held_out(lines: CompressedLines, model: Candidate) -> np.ndarray:
+    return held_out_zoom(lines, zoom=model.zoom, terms=model.terms)
 
 
 def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray, "frame"]:

@@ -9,6 +9,9 @@ import signal
 import sys
 import warnings
 
+# Lines are reduced by many small factorisations, which threads of OpenBLAS only slow down.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 try:
     import typer  # noqa: F401
 except ModuleNotFoundError:

@@ -18,10 +18,13 @@ from .._core.text import plain
 from ._compiled import set_up_jax
 from ._flags import with_flags
 from .arguments import (
+    Centre,
     Degree,
+    ModelName,
     Overwrite,
     Terms,
     board_of,
+    centre_of,
     number_of_cores,
     read_lines,
     refuse_image_options,
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
     from ..lines.lines import Lines
     from .calibration import Calibration
     from .image_calibration import ImageCalibration, ImageJob
+    from .model_choice import WantedModel
 
 app = typer.Typer(
     add_completion=False,
@@ -114,11 +118,10 @@ def calibrate(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.", file_okay=False)
     ],
-    degree: Degree = 2,
-    terms: Terms = 2,
-    select: Annotated[
-        bool, typer.Option("--select", help="Select degree and terms by cross-validation.")
-    ] = False,
+    model: ModelName = None,
+    degree: Degree = None,
+    terms: Terms = None,
+    centre: Centre = "fit",
     robust: Annotated[
         bool,
         typer.Option(
@@ -187,10 +190,10 @@ def calibrate(
     """
     set_up_jax()
     from .calibration import CLEARS, FILES
+    from .model_choice import WantedModel
     from .results_folder import results_folder
 
-    if select and (degree, terms) != (2, 2):
-        raise ValueError("--select chooses degree and terms: leave --degree and --terms out.")
+    wanted = WantedModel(model or "auto", degree, terms)
     if any(path.lower().endswith((".npz", ".csv")) for path in inputs):
         refuse_image_options(
             {"--pitch": pitch, "--distance": distance, "--pixel": pixel, "--jobs": jobs}, inputs
@@ -202,7 +205,7 @@ def calibrate(
         with results as folder, stages() as stage:
             stage("Reading the lines")
             lines = read_lines([Path(path) for path in inputs], focal, image_size, focal_unit)
-            calibration = _calibrate(lines, degree, terms, focal_sigma, stage, folder, select, robust)
+            calibration = _calibrate(lines, wanted, centre_of(centre), focal_sigma, stage, folder, robust)
         show_calibration(calibration)
         if robust:
             rejected = int(calibration.rejected.sum())
@@ -221,9 +224,8 @@ def calibrate(
         focal_unit=unit_of(focal_unit),
         focal_sigma=focal_sigma,
         board=board_of(pitch, distance, pixel),
-        degree=degree,
-        terms=terms,
-        select=select,
+        model=wanted,
+        centre=centre_of(centre),
         frames=frames,
         workers=jobs or number_of_cores(),
         cache=cache_folder("detections") if cache else None,
@@ -333,12 +335,11 @@ def reproduce(
 
 def _calibrate(
     lines: "Lines",
-    degree: int,
-    terms: int,
+    model: "WantedModel",
+    centre: "str | tuple[float, float]",
     focal_sigma: str | None,
     stage: Callable[[str], None],
     folder: Path,
-    select: bool,
     robust: bool,
 ) -> "Calibration":
     from .calibration import calibrate, focal_sigmas
@@ -346,7 +347,7 @@ def _calibrate(
 
     sigma = focal_sigmas(focal_sigma or "0", lines.focal)
     calibration = calibrate(
-        lines, degree=degree, terms=terms, focal_sigma=sigma, select=select, robust=robust, stage=stage
+        lines, model=model, centre=centre, focal_sigma=sigma, robust=robust, stage=stage
     )
     stage("Writing the results")
     calibration.make(folder, pages={REPORT: report(calibration)})
