@@ -214,7 +214,7 @@ def select_model(
             of the lines.
         seed: random seed of the split, where parts hold more than one. The split depends on nothing else.
         rule: "one standard error", or "least": the candidate of least error, or, of those whose error is
-            above it by no more than 0.05 %, the one with the fewest parameters.
+            above it by next to nothing, the one with the fewest parameters.
 
     Returns:
         The selection. Candidates that cannot be fitted, to all lines or to a fold's, or of which a fold
