@@ -2,7 +2,19 @@
 
 import importlib
 
-ROOMS = ("models", "focal", "io", "detect", "lines", "correct", "scenes", "fit", "trust")
+ROOMS = (
+    "models",
+    "focal",
+    "io",
+    "interop",
+    "detect",
+    "lenses",
+    "lines",
+    "correct",
+    "scenes",
+    "fit",
+    "trust",
+)
 
 DOORS = {room: importlib.import_module(f"zoomjax.{room}") for room in (*ROOMS, "app")}
 

@@ -1,4 +1,4 @@
-"""The package is ten rooms on a private base, and imports go one way: from a room to rooms below it."""
+"""The package is twelve rooms on a private base, and imports go one way: from a room to rooms below it."""
 
 import ast
 from pathlib import Path
@@ -13,9 +13,11 @@ ROOMS = (
     "fit",
     "scenes",
     "correct",
+    "lenses",
     "lines",
     "detect",
     "focal",
+    "interop",
     "models",
     "io",
     "_core",
@@ -29,7 +31,9 @@ LIBRARIES = {
     "app": {"matplotlib", "typer", "rich", "cv2", "jinja2"},
     "correct": {"cv2"},
     "detect": {"cv2"},
-    "io": {"cv2", "av", "PIL", "pillow_heif", "tifffile"},
+    "io": {"cv2", "av", "PIL", "pillow_heif", "rawpy", "tifffile"},
+    "interop": {"OpenEXR", "yaml"},
+    "lenses": {"lensfunpy"},
     "torch": {"torch"},
 }
 """Libraries of images, plots, terminals and video, and where they may be imported."""

@@ -77,6 +77,8 @@ def given(tmp_path_factory):
     straight_lines_bent(folder / "lines.csv")
     table(folder / "frames.csv", "frame,focal", enumerate((24, 50, 80, 105)))
     calibrate(board()).write(folder / "mylens")
+    lens = scenes.nikkor_18_200((4288, 2848))
+    zj.interop.write(lens, folder / "zoom.xml", format="lensfun", pixel_pitch=0.0055)
     return folder
 
 

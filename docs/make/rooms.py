@@ -51,6 +51,7 @@ ABOUT = {
     "lines": "lines and compression",
     "detect": "images to lines",
     "focal": "focal lengths from planes",
+    "interop": "other tools' formats",
     "models": "distortion and zoom models",
     "io": "EXIF, tables, video",
     "_core": "types, checks, files",

@@ -12,7 +12,19 @@ import lazy_loader
 
 _getattr, _, _names = lazy_loader.attach_stub(__name__, __file__)
 
-_ROOMS = ("models", "focal", "io", "detect", "lines", "correct", "scenes", "fit", "trust")
+_ROOMS = (
+    "models",
+    "focal",
+    "io",
+    "interop",
+    "detect",
+    "lenses",
+    "lines",
+    "correct",
+    "scenes",
+    "fit",
+    "trust",
+)
 
 _MODULES = {**dict.fromkeys(_ROOMS, "numpy"), "plot": "matplotlib", "torch": "torch"}
 """Modules that are reached as attributes, and what each of them needs."""

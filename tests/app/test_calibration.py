@@ -25,7 +25,7 @@ def calibration():
 def test_stages_are_told(calibration):
     told = []
     calibrate(calibration.lines, **GIVEN, stage=told.append)
-    assert len(told) == 3
+    assert len(told) == 4
 
 
 def test_pixel_polynomials_give_the_coefficients_of_the_lens(calibration):

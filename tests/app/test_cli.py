@@ -176,6 +176,56 @@ def test_calibrate_takes_photographs(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "again" / "summary.json").read_text())["rms_zoom"] == first["rms_zoom"]
 
 
+def test_the_verdict_is_the_first_line_and_decides_strict_runs(calibrated, tmp_path):
+    out, done = calibrated
+    summary = json.loads((out / "summary.json").read_text())
+    assert next(iter(summary)) == "verdict"
+    assert summary["verdict"] == "good"
+    assert done.stdout.split("\n")[0].startswith("Good: ")
+    t = np.linspace(-200, 200, 50)
+    radial = [np.stack([319.5 + t * c, 239.5 + t * s], -1) for c, s in ((1, 0), (0, 1), (0.6, 0.8))]
+    lines = zj.Lines.from_ragged(radial * 3, np.repeat([0, 1, 2], 3), [20, 40, 80], image_size=(640, 480))
+    lines.save(tmp_path / "lines.npz")
+    strict = zoomjax("calibrate", "lines.npz", "-o", "out", "--strict", "--quiet", cwd=tmp_path)
+    assert strict.returncode == 3
+    assert strict.stdout.startswith("Not determined: ")
+    assert not STAGE.search(strict.stderr)
+    assert (tmp_path / "out" / "lens.json").exists()
+
+
+def test_results_as_json_are_the_summary(calibrated, tmp_path):
+    source = calibrated[0] / "lines.npz"
+    done = zoomjax("calibrate", source, "-o", tmp_path / "o", "--json", "--strict", "--exclude", "0,2")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert summary == json.loads((tmp_path / "o" / "summary.json").read_text())
+    assert [row["line"] for row in summary["rejected"]] in ([0, 2], [2, 0])
+
+
+def test_a_dry_run_writes_nothing(calibrated, tmp_path):
+    write_photos(tmp_path / "shots", number=3, image_size=(268, 178))
+    done = zoomjax("calibrate", "shots", "-o", "out", "--dry-run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "3 photos, by the detector edges:" in done.stdout
+    assert "20.56 mm" in done.stdout
+    assert not (tmp_path / "out").exists()
+    done = zoomjax("calibrate", calibrated[0] / "lines.npz", "-o", tmp_path / "o", "--dry-run")
+    assert "lines in 5 frames, f = 20.56 to 127.36 mm" in done.stdout
+    assert not (tmp_path / "o").exists()
+
+
+def test_help_has_examples_and_fits_a_terminal():
+    for command in ("calibrate", "undistort", "demo", "reproduce"):
+        done = subprocess.run(
+            [*COMMAND, command, "--help"],
+            capture_output=True,
+            text=True,
+            env=os.environ | {"COLUMNS": "80"},
+        )
+        assert f"zoomjax {command} " in done.stdout[done.stdout.index("Example") :]
+        assert max(map(len, done.stdout.splitlines())) <= 80
+
+
 WRONG = {
     "no such file": (["missing.npz"], "missing.npz"),
     "not a lines file": (["foreign.npz"], "foreign.npz"),
@@ -190,8 +240,12 @@ WRONG = {
         "Missing or wrong: --pitch",
     ),
     "not a source of focal lengths": (["a.jpg", "--focal", "zoom"], "is not a source of focal lengths"),
-    "a unit that is none": (["a.jpg", "--focal-unit", "km"], "mm or px"),
-    "no such detector": (["a.jpg", "--detector", "circles"], "edges, grid, pitch"),
+    "a unit that is none": (["a.jpg", "--focal-unit", "km"], "'mm', 'px'"),
+    "no such detector": (["a.jpg", "--detector", "circles"], "Error: Invalid value for '--detector'"),
+    "no such option": (["a.jpg", "--detect", "edges"], "Error: No such option: --detect"),
+    "a line that is none": (["lines.npz", "--exclude", "1,x"], "--exclude must be numbers of lines"),
+    "a line that is not there": (["lines.npz", "--exclude", "9999"], "There is no line 9999"),
+    "lines of images": (["a.jpg", "--exclude", "3"], "--exclude is for a file of lines"),
     "two files": (["lines.npz", "lines.npz"], "one file"),
     "options for another kind": (["lines.npz", "--image-size", "640x480"], "for CSV files"),
     "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),

@@ -9,7 +9,7 @@ import typer
 
 import zoomjax
 from zoomjax.app._flags import FLAGS, with_flags
-from zoomjax.app.commands import app
+from zoomjax.app.cli import app
 
 ROOT = Path(zoomjax.__file__).parent
 LIBRARY = [path for path in sorted(ROOT.rglob("*.py")) if path.relative_to(ROOT).parts[0] != "app"]

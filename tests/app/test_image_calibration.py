@@ -15,6 +15,7 @@ from zoomjax.app import demo
 from zoomjax.app.console import show_images
 from zoomjax.app.image_calibration import ImageJob, calibrate_images
 from zoomjax.app.model_choice import WantedModel
+from zoomjax.app.pictures import pictures
 from zoomjax.app.report import report
 from zoomjax.io.exif import exif_with_focal
 
@@ -89,6 +90,42 @@ def test_results_are_written_with_the_lines_over_each_image(done, tmp_path):
     assert sum(image["lines"] for image in summary["images"]) == summary["lines"]
     assert summary["unused"] == done.unused
     assert summary["rms_frames"] <= summary["rms_zoom"] < 0.1 < summary["rms_none"]
+
+
+def test_the_report_shows_photos_before_and_after(done):
+    shown = pictures(done, most=3)
+    focal = [float(done.calibration.lines.focal[one.frame]) for one in shown]
+    assert focal == sorted(focal)
+    assert len(focal) == 3
+    for one in shown:
+        before, after = (cv2.imdecode(np.frombuffer(of, np.uint8), 1) for of in (one.before, one.after))
+        assert before.shape == after.shape == (372, 560, 3)
+        assert np.abs(before.astype(int) - after).mean() > 1
+        own = np.flatnonzero(np.asarray(done.calibration.lines.frame) == one.frame)
+        worst = own[np.argsort(-done.calibration.line_rms[own])[:3]]
+        assert list(one.crops) == worst.tolist()
+    page = report(done.calibration, done, pictures=shown)
+    assert page.count("data:image/jpeg;base64,") == 3 * (2 + 3)
+    assert f"line {next(iter(shown[0].crops))}: " in page
+    assert "3 of 5 photos are shown" in page
+    assert len(page) < 3_000_000
+
+
+def test_of_many_photos_some_are_drawn(done, monkeypatch):
+    monkeypatch.setattr("zoomjax.app.image_calibration.MOST_OVERLAYS", 3)
+    drawn = [bool(name) for name in done.overlays()]
+    assert sum(drawn) == 3
+    assert drawn[int(np.argmax(done.calibration.zoom.frame_rms))]
+    every = dataclasses.replace(done, job=dataclasses.replace(done.job, overlays="all"))
+    assert all(every.overlays())
+    none = dataclasses.replace(done, job=dataclasses.replace(done.job, overlays="none"))
+    assert not any(none.overlays())
+    page = report(done.calibration, done)
+    assert page.count('href="lines/') == 3
+
+
+def test_the_verdict_is_good(done):
+    assert done.calibration.assessment.verdict == "good"
 
 
 def test_lines_that_are_not_straight_are_rejected(folder, tmp_path):

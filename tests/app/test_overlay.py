@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from zoomjax.app.overlay import draw_lines
+from zoomjax.app.overlay import colour, draw_lines
 
 LINE = np.stack([np.full(80, 30.0), np.arange(10.0, 90.0)], axis=-1)
 
@@ -24,11 +24,25 @@ def test_rejected_lines_are_dashed_and_red():
     assert 0.3 < red[15:85, 30].mean() < 0.8
 
 
-def test_neighbours_have_different_colours():
-    lines = [LINE + np.array([10.0 * i, 0]) for i in (0, 2, 1, 3)]
-    picture = draw_lines(np.zeros((100, 100), np.uint8), lines, [False] * 4)
-    colours = [tuple(picture[50, 30 + 10 * i]) for i in range(4)]
-    assert len(set(colours)) == 4
+def test_lines_are_coloured_by_how_far_they_are_from_straight():
+    lines = [LINE + np.array([20.0 * i, 0]) for i in range(3)]
+    picture = draw_lines(np.zeros((100, 100), np.uint8), lines, [False] * 3, rms=[0.0, 0.5, 9.0], limit=1.0)
+    blue, _, red = np.moveaxis(picture[50, [30, 50, 70]].astype(int), -1, 0)
+    assert blue[0] > blue[1] > blue[2]
+    assert red[0] < red[1] < red[2]
+    assert (colour(0.0), colour(9.0)) == ((255, 200, 0), (0, 120, 255))
+
+
+def test_numbers_are_written_and_a_legend_is_added():
+    image = np.zeros((300, 400, 3), np.uint8)
+    line = LINE + np.array([170.0, 100.0])
+    bare = draw_lines(image, [line], [False])
+    picture = draw_lines(image, [line], [False], labels={0: "17"}, legend=True)
+    assert picture.shape[0] > 300
+    assert picture.shape[1] == 400
+    rows, columns = np.nonzero((picture[:300] != bare).any(axis=-1))
+    assert 100 < rows.mean() < 200
+    assert 170 < columns.mean() < 230
 
 
 @pytest.mark.parametrize("shape", [(3000, 4000), (4000, 3000, 3)])

@@ -16,7 +16,7 @@ import pytest
 import zoomjax.app.report
 from zoomjax import RESULTS
 from zoomjax.app.calibration import calibrate
-from zoomjax.app.report import report
+from zoomjax.app.report import Run, report
 
 from .._browser import opened
 
@@ -45,7 +45,7 @@ class Page(HTMLParser):
             self.words.append(" ")
 
     def handle_data(self, data):
-        if self.open and self.open[-1] != "style":
+        if self.open and self.open[-1] not in ("style", "script"):
             self.words.append(data)
 
     @property
@@ -78,17 +78,23 @@ def page(text):
 
 def test_page_is_well_formed_and_by_itself(page, text):
     ids = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
-    assert len(ids) == len(set(ids)) == 5
-    assert "script" not in {tag for tag, _ in page.elements}
+    assert len(ids) == len(set(ids))
+    assert {"verdict", "next", "zoom", "straightness", "coverage", "lens", "distortion", "frames"} <= set(
+        ids
+    )
+    assert [kind.get("type") for tag, kind in page.elements if tag == "script"] == [
+        "application/json",
+        None,
+    ]
     for source in page.all("img", "src"):
         assert source.startswith(("data:image/svg+xml;base64,", "data:image/png;base64,"))
         assert len(base64.b64decode(source.split(",")[1], validate=True)) > 1000
-    assert len(page.all("img", "src")) == 4
+    assert len(page.all("img", "src")) == 6
     assert all(page.all("img", "alt"))
     assert page.all("a", "href") == ["lens.json", "summary.json", "lines.npz", "model.png"]
     outside = [attributes for tag, attributes in page.elements if tag in ("link", "iframe", "object")]
     assert not outside
-    assert not re.search(r"url\(|@import", text)
+    assert not re.search(r"url\(|@import|fetch\(|XMLHttp|https?://(?!www\.w3\.org/2000/svg)", text)
     assert len(text) < 2_000_000
 
 
@@ -137,14 +143,14 @@ def test_names_are_escaped_and_lead_to_their_pictures(calibration):
         focals=SimpleNamespace(origin='"here" <there>'),
     )
     page = Page(report(calibration, images))
-    assert "script" not in {tag for tag, _ in page.elements}
+    assert sum(tag == "script" for tag, _ in page.elements) == 2  # its own
     for name in names:
         assert name in page.text
     links = page.all("a", "href")[: len(names)]
     assert [unquote(link) for link in links] == [f"lines/{name}.jpg" for name in names]
     assert all(re.fullmatch(r"[\w/.%-]+", link) for link in links)
     assert "Warning: <b>two</b> lines & more" in page.text
-    assert 'Focal lengths: "here" <there>.' in page.text
+    assert 'Focal lengths "here" <there>.' in page.text
 
 
 def test_what_is_not_determined_is_said(calibration):
@@ -156,7 +162,6 @@ def test_what_is_not_determined_is_said(calibration):
     page = Page(report(dataclasses.replace(calibration, zoom=zoom)))
     assert "Warning: The lines do not determine" in page.text
     assert "not determined" in page.text
-    assert "largest standard deviation at the corner unknown" in page.text
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -177,9 +182,50 @@ def test_long_lists_are_cut_to_the_worst_frames(calibration, monkeypatch):
     page = Page(report(calibration))
     assert "Of 4 frames, the 2 that the polynomial fits worst are shown." in page.text
     rms = np.asarray(calibration.zoom.frame_rms)
-    frames = page.text[page.text.index("RMS distance in px") :]
+    frames = page.text[page.text.index("worst lines are listed") :]
     for frame in range(4):
         assert (f"{rms[frame]:.3f}" in frames) == (frame in np.argsort(-rms)[:2])
+
+
+def test_the_verdict_leads(page, calibration):
+    found = calibration.assessment
+    assert page.text.index(found.sentence) < page.text.index("Straightness")
+    assert "before → after correction, in photos left out of the fit" in page.text
+
+
+def test_frames_are_sorted_by_focal_length(noisy):
+    mixed = eqx.tree_at(lambda lines: lines.focal, noisy, noisy.focal[::-1])
+    page = Page(report(calibrate(mixed)))
+    rows = page.text[page.text.index("worst lines 3 ") :]
+    assert [rows.index(f" {frame} {float(f):.4g} ") for frame, f in enumerate(mixed.focal)][::-1] == sorted(
+        rows.index(f" {frame} {float(f):.4g} ") for frame, f in enumerate(mixed.focal)
+    )
+
+
+def test_the_slider_shows_the_lens(text, calibration):
+    data = json.loads(re.search(r'id="lens-data">(.*?)</script>', text)[1])
+    lens = calibration.zoom.lens
+    for step in (0, 20, 40):
+        corner = np.asarray(lens(data["focal"][step]).undistort(np.zeros(2)))
+        moved = np.hypot(*(corner - lens.centre)) - np.hypot(*np.asarray(lens.centre))
+        assert data["moved"][step][-1] == pytest.approx(moved, abs=0.02)
+        line = np.array(data["grid"][step][0]), np.array(data["straight"][0])
+        bent = np.asarray(lens(data["focal"][step]).distort(line[1].astype(float))) - line[1]
+        np.testing.assert_allclose(line[0] - line[1], data["times"] * bent, atol=0.6 * data["times"] + 1)
+
+
+def test_what_was_run_is_said(calibration):
+    run = Run("A <b>lens</b>", (("Command", "zoomjax calibrate 'a b' -o out"),))
+    page = Page(report(calibration, run=run))
+    assert page.text.startswith("A <b>lens</b>:")
+    assert "Command zoomjax calibrate 'a b' -o out" in page.text
+
+
+def test_enough_is_said_when_a_further_photo_shows_nothing(clean):
+    exact = calibrate(clean)
+    assert exact.enough()
+    assert "Enough: the standard deviation of the displacement is" in Page(report(exact)).text
+    assert exact.summary()["next_photo"]["enough"] is True
 
 
 PROBE = """<!DOCTYPE html><meta charset="utf-8"><title>probe</title>
@@ -194,6 +240,16 @@ onload = () => {{
     needed: page.documentElement.scrollWidth,
     images: images.length,
     shown: images.filter((image) => image.complete && image.naturalWidth > 0).length,
+    moved: (() => {{
+      const input = page.getElementById("zoom-at"), label = page.getElementById("zoom-label");
+      const seen = [label.textContent, page.querySelector("#zoom-grid .bent").getAttribute("d")];
+      input.focus();
+      const focused = page.activeElement === input;
+      input.value = 40;
+      input.dispatchEvent(new Event("input"));
+      return [focused, seen[0], label.textContent, input.getAttribute("aria-valuetext"),
+        page.querySelector("#zoom-grid .bent").getAttribute("d") !== seen[1]];
+    }})(),
     boxes: [...page.querySelectorAll(".box")].filter((box) => box.scrollWidth > box.clientWidth).length,
   }});
 }};
@@ -210,6 +266,12 @@ def test_in_a_browser(text, tmp_path, width):
     found = json.loads(re.search(r'<pre id="found">(.*?)</pre>', document)[1])
     assert found["width"] == width
     assert found["needed"] == width
-    assert found["images"] == found["shown"] == 4
+    assert found["images"] == found["shown"] == 6
+    focused, first, last, told, redrawn = found["moved"]
+    assert focused
+    assert redrawn
+    assert first.startswith("f = 20.56 mm: the corner moves by")
+    assert last.startswith("f = 127.4 mm: the corner moves by")
+    assert told == last
     if width == 360:
         assert found["boxes"] > 0

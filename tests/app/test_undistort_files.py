@@ -10,6 +10,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 import zoomjax as zj
 from zoomjax.app.undistort_files import Job, undistort_files
@@ -45,6 +46,9 @@ def folder(tmp_path_factory):
     (folder / "focal.csv").write_text("image,focal\na.jpg,30\nb.jpg,30\nc.jpg,30\n")
     (folder / "table.csv").write_text("image,focal\nb.jpg,30\n")
     (folder / "empty.mp4").write_bytes(b"")
+    (folder / "copy.mp4").write_bytes((folder / "zoom.mp4").read_bytes())
+    (folder / "notes.txt").write_text("Straight lines.")
+    Image.fromarray(picture(0)).save(folder / "picture.gif")
     return folder
 
 
@@ -83,7 +87,7 @@ WRONG = {
     "no such track": (["zoom.mp4", "--focal", "none.csv"], "none.csv"),
     "short track": (["zoom.mp4", "--focal", "short.csv"], "or hold its ends (--hold)"),
     "negative": (["zoom.mp4", "--focal", "-3"], "--focal must be a positive"),
-    "two videos": (["zoom.mp4", "zoom.mp4", "--focal", "30"], "one video at a time"),
+    "two videos": (["zoom.mp4", "copy.mp4", "--focal", "30"], "of 2 videos must be a folder"),
     "both kinds": (["zoom.mp4", "a.jpg"], "not both"),
     "table too short": (["a.jpg", "--focal", "table.csv"], "no focal length for a.jpg"),
     "table of something else": (["a.jpg", "--focal", "track.csv"], 'must name the columns "image,focal"'),
@@ -96,7 +100,9 @@ WRONG = {
     "hold of photos": (["none.jpg", "a.jpg", "--hold"], "--hold is for"),
     "decimal comma": (["none.jpg", "a.jpg", "--focal", "20,5"], "with a decimal point"),
     "over an input": (["a.jpg", "b.jpg", "-o", "."], "is the input"),
-    "same name": (["a.jpg", "./a.jpg"], "same name"),
+    "a GIF": (["picture.gif", "--focal", "30"], "it is a GIF image: convert it to TIFF or PNG first"),
+    "no photo": (["notes.txt", "--focal", "30"], "it is not a photo: names of photos end in"),
+    "nothing": (["none*.jpg"], "No photo or video fits the pattern none*.jpg"),
 }
 
 
@@ -194,10 +200,11 @@ def test_one_file_that_is_there_is_found_before_any_work(folder, tmp_path):
 @pytest.mark.parametrize("names", [("a.jpg", "A.JPG"), ("\u00e9.jpg", "e\u0301.jpg")])
 def test_names_that_some_systems_take_for_one_are_refused(folder, tmp_path, names):
     inputs = []
-    for where, name in zip("xy", names, strict=True):
-        (tmp_path / where).mkdir()
-        inputs.append(tmp_path / where / name)
+    for name in names:
+        inputs.append(tmp_path / name)
         inputs[-1].write_bytes((folder / "a.jpg").read_bytes())
+    if len(list(tmp_path.iterdir())) < 2:
+        pytest.skip("This file system does the same.")
     with pytest.raises(ValueError, match="have the same name"):
         undistort_files(Job(folder / "lens.json", tuple(inputs), tmp_path / "out", "30"))
     assert not (tmp_path / "out").exists()

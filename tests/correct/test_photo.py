@@ -6,10 +6,13 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tifffile
+from PIL import ExifTags, Image
 
 import zoomjax as zj
 from zoomjax.correct.photo import photo_focal
-from zoomjax.io.photo import read_focal, read_photo
+from zoomjax.io.metadata import Metadata
+from zoomjax.io.photo import read_focal, read_pages, read_photo
 from zoomjax.io.tiff import encode_tiff
 
 from .._exif import exif
@@ -113,7 +116,7 @@ def test_tiff_files_take_and_give_metadata(tmp_path, rng, suffixes):
     block, image = exif((3500, 100), orientation=6), picture(rng)
     source, target = (tmp_path / f"{name}{suffix}" for name, suffix in zip("ab", suffixes, strict=True))
     if suffixes[0] == ".tif":
-        source.write_bytes(encode_tiff(image, [(cv2.IMAGE_METADATA_EXIF, np.frombuffer(block, np.uint8))]))
+        source.write_bytes(encode_tiff([(image, Metadata(exif=block))]))
     else:
         write(source, image, block)
     zj.undistort_photo(source, target, lens=lens())  # 35 mm, from the EXIF data
@@ -127,7 +130,7 @@ def test_tiff_files_take_and_give_metadata(tmp_path, rng, suffixes):
 
 def test_what_has_no_room_for_metadata_says_so(tmp_path, rng):
     source = write(tmp_path / "in.png", picture(rng), exif())
-    with pytest.warns(UserWarning, match=r"Metadata of .*in\.png are not kept"):
+    with pytest.warns(UserWarning, match=r"Not kept of .*in\.png in a \.bmp file: EXIF data\."):
         zj.undistort_photo(source, tmp_path / "out.bmp", lens=lens())
 
 
@@ -175,3 +178,63 @@ def test_another_size_of_the_same_aspect_is_scaled_and_said(tmp_path, rng):
         scaled = zj.models.lens_for_size(lens((384, 256)), SIZE)
     expected = zj.undistort_image(cv2.imread(str(source)), scaled(20.0))
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "out.png")), expected)
+
+
+def test_pages_of_a_tiff_file_are_corrected_each(tmp_path, rng):
+    pages = [Image.fromarray(picture(rng)) for _ in range(3)]
+    profile = bytes(range(256))
+    pages[0].save(tmp_path / "in.tif", save_all=True, append_images=pages[1:], icc_profile=profile)
+    zj.undistort_photo(tmp_path / "in.tif", tmp_path / "out.tif", lens=lens(), focal=20.0)
+    photo = read_pages(tmp_path / "out.tif")
+    assert len(photo.pages) == 3
+    for (found, metadata), page in zip(photo.pages, pages, strict=True):
+        np.testing.assert_array_equal(found[..., ::-1], zj.undistort_image(np.asarray(page), lens()(20.0)))
+        assert metadata.icc == profile
+    with pytest.raises(ValueError, match=r"Cannot write .*in\.tif: it has 3 pages.*choose \.tif"):
+        zj.undistort_photo(tmp_path / "in.tif", tmp_path / "out.jpg", lens=lens(), focal=20.0)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_tiff_of_any_orientation_is_corrected_as_stored(tmp_path, rng, orientation):
+    given, image = Image.Exif(), picture(rng)
+    given[ExifTags.Base.Orientation] = orientation
+    Image.fromarray(image).save(tmp_path / "in.tif", exif=given, compression="tiff_lzw")
+    zj.undistort_photo(tmp_path / "in.tif", tmp_path / "out.tif", lens=lens(), focal=20.0)
+    with tifffile.TiffFile(tmp_path / "out.tif") as out:
+        np.testing.assert_array_equal(out.asarray(), zj.undistort_image(image, lens()(20.0)))
+        assert out.pages[0].tags["Orientation"].value == orientation
+
+
+def test_colours_of_print_are_refused(tmp_path, rng):
+    Image.fromarray(picture(rng)).convert("CMYK").save(tmp_path / "in.jpg")
+    with pytest.raises(ValueError, match=r"in\.jpg is in the four colours of print \(CMYK\).* RGB first"):
+        zj.undistort_photo(tmp_path / "in.jpg", tmp_path / "out.jpg", lens=lens(), focal=20.0)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp", ".avif"])
+def test_what_is_corrected_is_not_corrected_twice(tmp_path, rng, suffix):
+    source, once, twice = (tmp_path / f"{name}{suffix}" for name in ("in", "once", "twice"))
+    Image.fromarray(picture(rng)).save(source)
+    zj.undistort_photo(source, once, lens=lens(), focal=20.0)
+    with pytest.raises(ValueError, match=r"once.* is undistorted by zoomjax already.*argument again"):
+        zj.undistort_photo(once, twice, lens=lens(), focal=20.0)
+    assert not twice.exists()
+    zj.undistort_photo(once, twice, lens=lens(), focal=20.0, again=True)
+    zj.correct.redistort_photo(once, tmp_path / f"back{suffix}", lens=lens(), focal=20.0)
+    zj.undistort_photo(tmp_path / f"back{suffix}", twice, lens=lens(), focal=20.0)
+
+
+@pytest.mark.parametrize("keep", ["same", "all", "valid", "grow"])
+def test_back_is_where_it_began(tmp_path, rng, keep):
+    """Of what is still there: with "grow" everything, at full size."""
+    image = cv2.GaussianBlur(picture(rng), (0, 0), 3)
+    cv2.imwrite(str(tmp_path / "in.png"), image)
+    arguments = {"lens": lens(), "focal": 20.0, "keep": keep, "interpolation": "cubic"}
+    zj.undistort_photo(tmp_path / "in.png", tmp_path / "out.png", **arguments)
+    zj.correct.redistort_photo(tmp_path / "out.png", tmp_path / "back.png", **arguments)
+    back = cv2.imread(str(tmp_path / "back.png"))
+    assert back.shape == image.shape
+    middle = np.s_[30:-30, 40:-40] if keep in ("same", "valid") else np.s_[2:-2, 2:-2]
+    assert np.abs(back[middle].astype(int) - image[middle]).max() <= 4
+    wrong = cv2.imread(str(tmp_path / "out.png"))[: SIZE[1], : SIZE[0]]
+    assert np.abs(wrong[middle].astype(int) - image[middle]).max() > 10

@@ -66,10 +66,20 @@ def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path, image):
     assert names(find_photos([tmp_path])) == ["1x/board.png", "3x/board.png"]
 
 
-def test_the_same_file_twice_is_refused(tmp_path, image):
+def test_the_same_file_twice_is_used_once(tmp_path, image):
     cv2.imwrite(str(tmp_path / "a.png"), image)
-    with pytest.raises(ValueError, match=r"a\.png is given twice"):
-        find_photos([tmp_path, tmp_path / "a.png"])
+    with pytest.warns(UserWarning, match=r"a\.png is given twice: it is used once"):
+        assert names(find_photos([tmp_path, tmp_path / "a.png"])) == ["a.png"]
+    (tmp_path / "b.png").symlink_to("a.png")
+    with pytest.warns(UserWarning, match=r"b\.png is the same file as .*a\.png: it is used once"):
+        assert names(find_photos([tmp_path])) == ["a.png"]
+
+
+def test_of_a_raw_file_and_the_photo_made_from_it_the_photo_is_used(tmp_path, image):
+    cv2.imwrite(str(tmp_path / "a.jpg"), image)
+    for name in ("a.NEF", "b.NEF"):
+        (tmp_path / name).write_bytes(b"as a camera writes it")
+    assert names(find_photos([tmp_path])) == ["a.jpg", "b.NEF"]
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
 from zoomjax.io.exif import exif_focal
+from zoomjax.io.metadata import Metadata
 from zoomjax.io.photo import read_focal, read_photo
 from zoomjax.io.tiff import as_stored, encode_tiff, tiff_metadata
 
@@ -28,12 +29,7 @@ def block(orientation=6):
     return exif.tobytes().removeprefix(b"Exif\0\0")
 
 
-KINDS = {
-    cv2.IMAGE_METADATA_EXIF: block(),
-    cv2.IMAGE_METADATA_XMP: b"<x:xmpmeta/>",
-    cv2.IMAGE_METADATA_ICCP: bytes(range(256)),
-}
-METADATA = [(kind, np.frombuffer(data, np.uint8)) for kind, data in KINDS.items()]
+METADATA = Metadata(exif=block(), xmp=b"<x:xmpmeta/>", icc=bytes(range(256)))
 
 
 def decoded(content):
@@ -49,11 +45,10 @@ def picture(rng, dtype, channels):
 @pytest.mark.parametrize(("dtype", "channels"), DEPTHS)
 def test_pixels_come_back_as_they_were(rng, tmp_path, dtype, channels):
     image = picture(rng, dtype, channels)
-    (path := tmp_path / "a.tif").write_bytes(encode_tiff(image, METADATA))
+    (path := tmp_path / "a.tif").write_bytes(encode_tiff([(image, METADATA)]))
     back, _ = read_photo(path)
     assert back.dtype == dtype
-    seen = image[..., 3] == 255 if (dtype, channels) == (np.uint8, 4) else ...  # OpenCV multiplies by alpha
-    np.testing.assert_array_equal(back[seen], image[seen])
+    np.testing.assert_array_equal(back, image)
     stored = tifffile.imread(path) if dtype == np.float32 else None
     if stored is not None:
         np.testing.assert_array_equal(stored[..., ::-1], image)
@@ -62,8 +57,8 @@ def test_pixels_come_back_as_they_were(rng, tmp_path, dtype, channels):
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_the_orientation_does_not_turn_pixels(rng, tmp_path, orientation):
     image = picture(rng, np.uint16, 3)
-    metadata = [(cv2.IMAGE_METADATA_EXIF, np.frombuffer(block(orientation), np.uint8))]
-    (path := tmp_path / "a.tif").write_bytes(encode_tiff(image, metadata))
+    metadata = Metadata(exif=block(orientation))
+    (path := tmp_path / "a.tif").write_bytes(encode_tiff([(image, metadata)]))
     np.testing.assert_array_equal(read_photo(path)[0], image)
     turned = decoded(path.read_bytes())
     assert (turned.shape == image.shape and (turned == image).all()) == (orientation == 1)
@@ -71,13 +66,11 @@ def test_the_orientation_does_not_turn_pixels(rng, tmp_path, orientation):
 
 
 def test_metadata_come_back(rng, tmp_path):
-    (path := tmp_path / "a.tif").write_bytes(encode_tiff(picture(rng, np.uint16, 3), METADATA))
-    found = {kind: data.tobytes() for kind, data in read_photo(path)[1]}
-    assert exif_focal(found[cv2.IMAGE_METADATA_EXIF]) == read_focal(path) == 35.5
-    assert found.keys() == KINDS.keys()
-    for kind in (cv2.IMAGE_METADATA_XMP, cv2.IMAGE_METADATA_ICCP):
-        assert found[kind] == KINDS[kind]
-    again = encode_tiff(picture(rng, np.uint8, 3), read_photo(path)[1])
+    (path := tmp_path / "a.tif").write_bytes(encode_tiff([(picture(rng, np.uint16, 3), METADATA)]))
+    found = read_photo(path)[1]
+    assert exif_focal(found.exif) == read_focal(path) == 35.5
+    assert (found.xmp, found.icc) == (METADATA.xmp, METADATA.icc)
+    again = encode_tiff([(picture(rng, np.uint8, 3), found)])
     with tifffile.TiffFile(io.BytesIO(again)) as file:
         tags = file.pages.first.tags
         assert tags["ExifTag"].value["DateTimeOriginal"] == "2020:01:02 03:04:05"
@@ -95,21 +88,20 @@ def test_what_describes_the_storage_of_pixels_does_not_go_over(rng):
     file, given = io.BytesIO(), Image.Exif()
     given[ExifTags.Base.Orientation] = 6
     Image.fromarray(picture(rng, np.uint8, 3)).save(file, "TIFF", exif=given, compression="tiff_lzw")
-    file.seek(0)
-    metadata, orientation = tiff_metadata(file)
+    metadata, orientation = tiff_metadata(file.getvalue())
     assert orientation == 6
     exif = Image.Exif()
-    exif.load(dict(metadata)[cv2.IMAGE_METADATA_EXIF].tobytes())
+    exif.load(metadata.exif)
     assert not {256, 257, 258, 259, 273, 278, 279} & set(exif)
 
 
 @pytest.mark.parametrize("content", [b"", b"II*\0", b"II*\0" + struct.pack("<IH", 8, 9) + b"\xff" * 50])
 def test_damaged_files_have_no_metadata(content):
-    assert tiff_metadata(io.BytesIO(content)) == ([], 1)
+    assert tiff_metadata(content) == (Metadata(), 1)
 
 
 def test_damaged_exif_data_are_left_out(rng):
     image = picture(rng, np.uint8, 3)
     for damaged in (b"", b"nothing", block()[:30]):
-        content = encode_tiff(image, [(cv2.IMAGE_METADATA_EXIF, np.frombuffer(damaged, np.uint8))])
+        content = encode_tiff([(image, Metadata(exif=damaged))])
         np.testing.assert_array_equal(decoded(content), image)

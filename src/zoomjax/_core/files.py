@@ -101,6 +101,36 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary folder, whose files go to the folder `path` only if the block succeeds.
+
+    The folder is made if it is not there. Files of the same names in it are replaced, others stay.
+
+    Raises:
+        OSError: `path` is a file, or its parent does not exist or cannot be written; the message names it.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, "cannot make a folder where there is a file", str(path))
+    _remove_left_once(path.parent.absolute())
+    with unfinished(path):
+        try:
+            part = Path(tempfile.mkdtemp(dir=path.parent, prefix=TEMPORARY))
+        except OSError as error:
+            raise type(error)(
+                error.errno, f"cannot write in the folder {path.parent}: {error.strerror}"
+            ) from error
+        try:
+            with locked(part):
+                yield part
+            path.mkdir(exist_ok=True)
+            for file in sorted(part.iterdir()):
+                file.replace(path / file.name)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+
+
 def refuse_existing(targets: Iterable[Path], *, overwrite: bool) -> None:
     """Refuse to replace existing files: to be called before any work.
 

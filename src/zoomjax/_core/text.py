@@ -12,6 +12,8 @@ def plain(text: str) -> str:
     Control characters (escape sequences, line breaks), those that turn the direction of writing, and
     bytes that are no text are shown as in Python: ``\\x1b``.
     """
+    if text.isascii() and text.isprintable():  # at once: pictures in a page are millions of characters
+        return text
     return "".join(c if _is_harmless(c) else c.encode("unicode_escape").decode() for c in text)
 
 

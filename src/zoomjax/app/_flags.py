@@ -5,10 +5,22 @@ import re
 FLAGS = {
     name: f"--{name.replace('_', '-')}"
     for name in (
-        *("border", "centre", "degree", "detector", "focal", "focal_sigma", "focal_unit", "hold"),
-        *("interpolation", "keep", "model", "overwrite", "terms"),
+        *(
+            "again",
+            "border",
+            "centre",
+            "convention",
+            "crop",
+            "degree",
+            "detector",
+            "direction",
+            "focal",
+            "focal_sigma",
+        ),
+        *("focal_unit", "hold", "image_size", "interpolation", "keep", "lens", "model", "name"),
+        *("overwrite", "pixel_pitch", "terms", "tolerance"),
     )
-}
+} | {"format": "--to", "track": "--focal"}
 """Options of the command line by the names of the library's arguments."""
 
 # Within a message, a capital letter marks the content of a file: "Cannot read a.npz: Argument focal ..."

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .options import FIT, OUTPUT
+
 if TYPE_CHECKING:
     from ..lines.lines import Lines
     from .focal_sources import Board
@@ -17,6 +19,7 @@ Overwrite = Annotated[
     typer.Option(
         "--overwrite",
         help="Also replace files that zoomjax did not write, or that were changed since.",
+        rich_help_panel=OUTPUT,
     ),
 ]
 ModelName = Annotated[
@@ -25,13 +28,20 @@ ModelName = Annotated[
         "--model",
         help="Zoom model: auto (of least cross-validation error), polynomial (in 1/f), smooth (with a "
         "prior from real lenses) or spline. Default: auto, or polynomial with --degree.",
+        rich_help_panel=FIT,
     ),
 ]
 Degree = Annotated[
-    int | None, typer.Option(min=0, help="Degree of the polynomials in 1/f; default: chosen.")
+    int | None,
+    typer.Option(min=0, help="Degree of the polynomials in 1/f; default: chosen.", rich_help_panel=FIT),
 ]
 Terms = Annotated[
-    int | None, typer.Option(min=1, help="Number of distortion coefficients, k1 to kN; default: chosen.")
+    int | None,
+    typer.Option(
+        min=1,
+        help="Number of distortion coefficients, k1 to kN; default: chosen.",
+        rich_help_panel=FIT,
+    ),
 ]
 Centre = Annotated[
     str,
@@ -39,6 +49,7 @@ Centre = Annotated[
         metavar="fit|image|X,Y",
         help="Centre of distortion: fit (where the lines determine it, else the image's), image, or its "
         "coordinates in px.",
+        rich_help_panel=FIT,
     ),
 ]
 
@@ -62,14 +73,11 @@ def read_lines(
     if path.suffix == ".csv":
         from ..lines.csv import read_focal_csv, read_lines_csv
 
-        if image_size is None:
+        if (size := size_of(image_size)) is None:
             raise ValueError(f"The image size of {path} is not known: give --image-size, e.g. 1920x1080.")
-        width, _, height = image_size.lower().partition("x")
-        if not (width.isdigit() and height.isdigit()):
-            raise ValueError(f"--image-size must be like 1920x1080, but it is {image_size!r}.")
         return read_lines_csv(
             path,
-            image_size=(int(width), int(height)),
+            image_size=size,
             focal=None if focal is None else read_focal_csv(Path(focal)),
             focal_unit=focal_unit or "mm",
         )
@@ -89,6 +97,26 @@ def centre_of(text: str) -> str | tuple[float, float]:
             f"--centre must be fit, image, or X,Y in px as in 959.5,539.5, but it is {text!r}."
         )
     return x, y
+
+
+def split_lens(inputs: list[Path]) -> tuple[Path, tuple[Path, ...]]:
+    """The file of the lens, which comes first, and what to correct."""
+    if len(inputs) < 2:
+        raise ValueError(
+            "Give the lens and then what to correct: lens.json photos/*.jpg. Without a lens of your own, "
+            "--lens auto takes that of the EXIF data."
+        )
+    return inputs[0], tuple(inputs[1:])
+
+
+def size_of(text: str | None) -> tuple[int, int] | None:
+    """Width and height from WxH."""
+    if text is None:
+        return None
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise ValueError(f"--image-size must be like 1920x1080, but it is {text!r}.")
+    return int(width), int(height)
 
 
 def number_of_cores() -> int:

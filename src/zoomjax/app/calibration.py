@@ -11,32 +11,26 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from .._core.types import AnyArray
 from ..fit.algebraic import algebraic_zoom
-from ..fit.centre import fit_centre
 from ..fit.energy import coefficients_by, line_rms
 from ..fit.focal_lengths import with_focal_sigma
-from ..fit.frames import fit_frames
 from ..fit.result import RESULTS, FrameFits, ZoomFit
-from ..fit.robust import reweighted
 from ..fit.straightness import frame_rms
-from ..fit.zoom import CentreChoice, about_centre, fit_zoom
-from ..lines.compressed import CompressedLines, compress
-from ..lines.free_centre import AnyCentreLines, compress_any_centre
+from ..fit.zoom import CentreChoice
 from ..lines.lines import Lines
 from ..models.invertibility import Certificate
 from ..models.zoom import PolynomialZoom
+from ..trust.assessment import NEGLIGIBLE, Assessment, assess
 from ..trust.bands import displacement_std
-from ..trust.centre_choice import choose_centre
 from ..trust.cross_validation import held_out_frames, held_out_zoom
 from ..trust.misfit import with_misfit
 from ..trust.next_photo import Suggestion, suggest_next
-from ..trust.selection import Candidate, Selection
+from ..trust.selection import Selection
+from .fitting import fitted
 from .model_choice import CentreFound, WantedModel
 from .results_folder import results_folder
 
@@ -45,6 +39,9 @@ FILES = ("lens.json", "lines.npz", "summary.json", "model.png")
 
 CLEARS = ("lines/*",)
 """Files of an earlier calibration that `Calibration.write` removes: pictures of its lines."""
+
+_ENOUGH = NEGLIGIBLE / 5
+"""Standard deviation of the displacement, in diagonals, below which no further photo is needed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +60,7 @@ class Calibration:
         held_out: each frame's RMS, px, under the zoom model fitted to all others; NaN if that fit fails.
         each_held_out: each frame's RMS, px, each tenth of its lines under the model of its other lines.
         centre: the centre of distortion, and how it was found.
+        assessment: the verdict, with what was found and what to do about it.
         selection: how the model was selected; None if it was given.
     """
 
@@ -78,6 +76,7 @@ class Calibration:
     held_out: np.ndarray
     each_held_out: np.ndarray
     centre: CentreFound
+    assessment: Assessment
     selection: Selection | None = None
 
     def corner(self) -> list[tuple[float, float, float]]:
@@ -106,6 +105,20 @@ class Calibration:
         return (
             "Standard deviations include those of the focal lengths, "
             f"{share.min():.2%} to {share.max():.2%}. The next photo is chosen without them."
+        )
+
+    def enough(self) -> bool:
+        """Whether a further photo could improve nothing that can be seen."""
+        visible = _ENOUGH * self.assessment.evidence.diagonal
+        return self.assessment.verdict == "good" and self.next.before < visible
+
+    def advice(self) -> str:
+        """What to photograph next, or that there is enough."""
+        if not self.enough():
+            return self.next.sentence
+        return (
+            f"Enough: the standard deviation of the displacement is {self.next.before:.2g} px, averaged "
+            f"over image and focal range, and would be {self.next.after:.2g} px with the best next photo."
         )
 
     def rows(self) -> list[tuple[str, np.ndarray]]:
@@ -161,51 +174,58 @@ class Calibration:
             "rms_held_out": _finite(self.held_out),
             "rms_frames_held_out": _finite(self.each_held_out),
         }
-        return {
-            "rms_none": rms_over_frames(self.none),
-            "rms_algebraic": rms_over_frames(self.algebraic),
-            "rms_frames": float(self.each.rms),
-            "rms_zoom": float(self.zoom.rms),
-            "rms_held_out": _finite([rms_over_frames(self.held_out)])[0],
-            "rms_frames_held_out": _finite([rms_over_frames(self.each_held_out)])[0],
-            "frames": len(self.none),
-            "lines": len(frame),
-            "rejected_lines": int(self.rejected.sum()),
-            "rejected": [
-                {"line": int(line), "frame": int(frame[line]), "rms": float(self.line_rms[line])}
-                for line in np.flatnonzero(self.rejected)[np.argsort(-self.line_rms[self.rejected])]
-            ],
-            "points": int(np.sum(np.asarray(self.lines.mask))),
-            "focal_range": [low, high],
-            "focal_unit": lens.focal_unit,
-            "image_size": list(lens.image_size),
-            "result": RESULTS[self.zoom.result] or "successful",
-            "certificate": _plain(self.zoom.certificate),
-            "rms_unconstrained": float(self.zoom.rms_unconstrained),
-            "frames_without_a_model": sum(map(bool, self.each.messages())),
-            "warnings": self.warnings(),
-            "model": type(lens.zoom).__name__,
-            "centre": self.centre.summary(),
-            "pixel_polynomials": self.pixel_polynomials().tolist(),
-            "coefficients": self.coefficient_rows(),
-            "parameters": np.asarray(lens.zoom.parameters).tolist(),
-            "corner_displacement": [
-                {"focal": f, "px": moved, "std": _finite([std])[0]} for f, moved, std in self.corner()
-            ],
-            "next_photo": {
-                "focal": self.next.focal,
-                "direction": self.next.direction,
-                "region": self.next.region,
-                "displacement_std": _finite([self.next.before])[0],
-                "displacement_std_with_it": _finite([self.next.after])[0],
-                "sentence": self.next.sentence,
-            },
-            "parameter_sigma": _finite(np.sqrt(np.diag(np.asarray(self.zoom.covariance)))),
-            "per_frame": [dict(zip(fits, row, strict=True)) for row in zip(*fits.values(), strict=True)],
-            "versions": {
-                name: importlib.metadata.version(name) for name in ("zoomjax", "jax", "optimistix")
-            },
-        } | ({"selection": self.selection.summary()} if self.selection else {})
+        return (
+            self.assessment.summary()
+            | {
+                "rms_none": rms_over_frames(self.none),
+                "rms_algebraic": rms_over_frames(self.algebraic),
+                "rms_frames": float(self.each.rms),
+                "rms_zoom": float(self.zoom.rms),
+                "rms_held_out": _finite([rms_over_frames(self.held_out)])[0],
+                "rms_frames_held_out": _finite([rms_over_frames(self.each_held_out)])[0],
+                "frames": len(self.none),
+                "lines": len(frame),
+                "rejected_lines": int(self.rejected.sum()),
+                "rejected": [
+                    {"line": int(line), "frame": int(frame[line]), "rms": float(self.line_rms[line])}
+                    for line in np.flatnonzero(self.rejected)[np.argsort(-self.line_rms[self.rejected])]
+                ],
+                "points": int(np.sum(np.asarray(self.lines.mask))),
+                "focal_range": [low, high],
+                "focal_unit": lens.focal_unit,
+                "image_size": list(lens.image_size),
+                "result": RESULTS[self.zoom.result] or "successful",
+                "certificate": _plain(self.zoom.certificate),
+                "rms_unconstrained": float(self.zoom.rms_unconstrained),
+                "frames_without_a_model": sum(map(bool, self.each.messages())),
+                "warnings": self.warnings(),
+                "model": type(lens.zoom).__name__,
+                "centre": self.centre.summary(),
+                "pixel_polynomials": self.pixel_polynomials().tolist(),
+                "coefficients": self.coefficient_rows(),
+                "parameters": np.asarray(lens.zoom.parameters).tolist(),
+                "corner_displacement": [
+                    {"focal": f, "px": moved, "std": _finite([std])[0]} for f, moved, std in self.corner()
+                ],
+                "next_photo": {
+                    "focal": self.next.focal,
+                    "direction": self.next.direction,
+                    "region": self.next.region,
+                    "displacement_std": _finite([self.next.before])[0],
+                    "displacement_std_with_it": _finite([self.next.after])[0],
+                    "enough": self.enough(),
+                    "sentence": self.advice(),
+                },
+                "parameter_sigma": _finite(np.sqrt(np.diag(np.asarray(self.zoom.covariance)))),
+                "per_frame": [
+                    dict(zip(fits, row, strict=True)) for row in zip(*fits.values(), strict=True)
+                ],
+                "versions": {
+                    name: importlib.metadata.version(name) for name in ("zoomjax", "jax", "optimistix")
+                },
+            }
+            | ({"selection": self.selection.summary()} if self.selection else {})
+        )
 
     def pixel_polynomials(self) -> np.ndarray:
         """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as printed in the paper.
@@ -292,67 +312,32 @@ def calibrate(
         ValueError: an argument is not one of these, or there are too few focal lengths for the model.
         RuntimeError: the solver failed.
     """
-    base = model.base(lines.focal)
-    base.zoom.prepare(lines.focal, base.terms)  # raises if there are too few focal lengths, before any work
-    stage("Compressing the lines")
-    widest = jnp.result_type(float)
-    data = jax.tree.map(
-        lambda a: jnp.asarray(a, widest) if jnp.issubdtype(a.dtype, jnp.floating) else a, lines
-    )
-    most = model.most_terms(lines)
-    free = isinstance(centre, str) and centre == "fit"
-    held = compress_any_centre(data, most) if free else compress(about_centre(data, centre), most)
-    if free and held.weight is None:
-        held = held.weighted(np.ones(held.frame.shape))  # as where some are left out: one compiled program
-    small = held.about(held.centre)
-    if robust:
-        stage("Rejecting lines that are not straight")
-        small = reweighted(small, base.zoom, base.terms)[0]
-        held = held.weighted(np.asarray(small.weight))
-    choice = None
-    if isinstance(held, AnyCentreLines):
-        stage("Fitting the centre of distortion")
-        choice = choose_centre(held, zoom=base.zoom, terms=base.terms)
-        if choice.better:
-            small = held.about(choice.found.fit.lens.centre)
-    selection = None
-    if model.automatic:
-        stage("Choosing the model")
-        selection = model.choose(small)
-        base = selection.chosen
-    stage("Fitting each frame separately")
-    each = fit_frames(small, terms=base.terms, throw=False)
-    stage("Fitting the zoom model")
-    if isinstance(held, AnyCentreLines) and choice is not None and choice.better:
-        zoom = fit_centre(held, zoom=base.zoom, terms=base.terms).fit
-        small = held.about(zoom.lens.centre)
-    else:
-        zoom = fit_zoom(small, zoom=base.zoom, terms=base.terms)
-    if robust:
-        lines = lines.weighted(np.asarray(small.weight))
+    exact, each, used = fitted(lines, model, centre, robust=robust, stage=stage)
+    small, terms = used.lines, used.model.terms
     sigma = np.broadcast_to(focal_sigma, lines.focal.shape)
-    none = np.asarray(frame_rms(small, None))
-    several = len(none) > 1
-    sure = with_focal_sigma(zoom, small, focal_sigma=sigma) if sigma.any() else zoom
+    zoom = with_focal_sigma(exact, small, focal_sigma=sigma) if sigma.any() else exact
+    zoom = with_misfit(zoom, small)
+    stage("Checking the fit on lines left out")
+    held_out, each_held_out = np.full(len(sigma), np.nan), held_out_frames(small, terms=terms)
+    if len(sigma) > 1:
+        held_out = held_out_zoom(small, zoom=used.model.zoom, terms=terms)
+    lines = (lines.weighted(np.asarray(small.weight)) if robust else lines).about(np.asarray(small.centre))
     return Calibration(
-        lines=lines.about(np.asarray(zoom.lens.centre)),
-        zoom=with_misfit(sure, small),
+        lines=lines,
+        zoom=zoom,
         each=each,
-        none=none,
-        algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=base.zoom, terms=base.terms))),
+        none=np.asarray(frame_rms(small, None)),
+        algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=used.model.zoom, terms=terms))),
         rejected=np.asarray(small.weight) == 0 if robust else np.zeros(len(lines.frame), bool),
         line_rms=np.asarray(line_rms(small, coefficients_by(zoom.lens.zoom, small))),
-        next=suggest_next(zoom, small),  # from the noise alone, without focal_sigma
+        next=suggest_next(exact, small),  # from the noise alone, without focal_sigma
         focal_sigma=sigma,
-        held_out=_held_out(small, base) if several else np.full_like(none, np.nan),
-        each_held_out=held_out_frames(small, terms=base.terms),
-        centre=CentreFound.of(zoom, choice),
-        selection=selection,
+        held_out=held_out,
+        each_held_out=each_held_out,
+        centre=CentreFound.of(exact, used.centre),
+        assessment=assess(lines, zoom, compressed=small, held_out=held_out, each_held_out=each_held_out),
+        selection=used.selection,
     )
-
-
-def _held_out(lines: CompressedLines, model: Candidate) -> np.ndarray:
-    return held_out_zoom(lines, zoom=model.zoom, terms=model.terms)
 
 
 def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray, "frame"]:

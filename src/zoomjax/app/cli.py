@@ -1,4 +1,4 @@
-"""The command line: ``zoomjax demo``, ``calibrate``, ``undistort`` and ``reproduce``.
+"""The command line: ``zoomjax calibrate``, ``undistort``, ``export``, ``import`` and others.
 
 Errors go to stderr with exit status 2, and leave no partial result.
 """
@@ -8,20 +8,25 @@ import os
 import signal
 import sys
 import warnings
+from typing import NoReturn
 
 # Lines are reduced by many small factorisations, which threads of OpenBLAS only slow down.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 try:
-    import typer  # noqa: F401
+    import typer
 except ModuleNotFoundError:
     sys.exit('The command line needs the extra "app": pip install "zoomjax[app]"')
 
 from .._core.text import plain
+from . import commands_interop, commands_lens, commands_reproduce  # noqa: F401, they add their commands
 from ._compiled import UNKEPT, forget_compiled
 from ._flags import with_flags
 from ._interrupts import INTERRUPTED, LAST_WORDS, end_run, leave, swallowed
 from .commands import app
+
+USAGE: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "UsageError")
+"""What Typer raises for mistakes in the command line."""
 
 
 def main() -> None:
@@ -35,7 +40,9 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # unless the shell ignores it
         signal.signal(signal.SIGINT, end_run)
     try:
-        app()
+        sys.exit(app(standalone_mode=False))
+    except USAGE as error:
+        _tell_usage(error)
     except (ValueError, OSError, RuntimeError, MemoryError) as error:
         print(f"Error: {_sentence(error)}", file=sys.stderr)
         sys.exit(2)
@@ -45,6 +52,19 @@ def main() -> None:
         if isinstance(exit.code, int) and exit.code in LAST_WORDS:
             leave(exit.code)
         raise
+
+
+def _tell_usage(error: Exception) -> NoReturn:
+    """A mistake in the command line, in the same style; the help where there are no arguments at all."""
+    context = getattr(error, "ctx", None)
+    message = getattr(error, "format_message", error.__str__)()
+    if type(error).__name__ == "NoArgsIsHelpError":
+        print(message)
+    else:
+        command = context.command_path if context else "zoomjax"
+        told = plain(message).replace("Value error, ", "").rstrip(".")
+        print(f"Error: {told}. See {command} --help.", file=sys.stderr)
+    sys.exit(2)
 
 
 def _sentence(error: BaseException) -> str:

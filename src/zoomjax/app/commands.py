@@ -4,12 +4,11 @@ Commands import what they need when they run, so that ``--help`` does not wait f
 float64.
 """
 
-import contextlib
+import dataclasses
 import importlib.metadata
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -29,19 +28,36 @@ from .arguments import (
     read_lines,
     refuse_image_options,
     refuse_to_replace,
+    split_lens,
     unit_of,
 )
-from .console import REPORT, progress_bar, show_calibration, show_images, stages, tell, tell_written
-
-if TYPE_CHECKING:
-    from ..lines.lines import Lines
-    from .calibration import Calibration
-    from .image_calibration import ImageCalibration, ImageJob
-    from .model_choice import WantedModel
+from .console import REPORT, progress_bar, show_calibration, show_images, stages
+from .options import (
+    CALIBRATE_EXAMPLES,
+    FIT,
+    FOCAL,
+    INPUT,
+    UNDISTORT_EXAMPLES,
+    AsJson,
+    Detector,
+    Distance,
+    DryRun,
+    Exclude,
+    FocalUnit,
+    Overlays,
+    Pitch,
+    Pixel,
+    Quiet,
+    Strict,
+    excluded,
+)
+from .plans import images_plan, lines_plan, tell_plan, without
+from .runs import calibrate_images, calibrate_lines, title_of
+from .shown import Shown
 
 app = typer.Typer(
-    add_completion=False,
     no_args_is_help=True,
+    rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     help="Calibrate the distortion of zoom lenses from images of straight lines, and correct images.",
 )
@@ -62,7 +78,7 @@ def options(
     """Calibrate the distortion of zoom lenses from images of straight lines, and correct images."""
 
 
-@app.command()
+@app.command(epilog="Example: `zoomjax demo -o demo`")
 def demo(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder for the results.", file_okay=False)
@@ -92,7 +108,8 @@ def demo(
     with results_folder(output, names, clears=[*CLEARS, "photos/*"], overwrite=overwrite) as folder:
         with progress_bar("Rendering photos of the board") as progress:
             made = demo.write_photos(folder / "photos", number=photos, seed=seed, progress=progress)
-        done = _calibrate_images(ImageJob(tuple(made), workers=number_of_cores()), folder)
+        job = ImageJob(tuple(made), workers=number_of_cores())
+        done = calibrate_images(job, folder, title="The paper's board")
         focal = sorted(done.focals.focal.values())
         lens = done.calibration.zoom.lens
         demo.write_before_after(made[0], folder / "before-after.jpg", lens, focal[0])
@@ -105,7 +122,7 @@ def demo(
     )
 
 
-@app.command()
+@app.command(epilog=CALIBRATE_EXAMPLES)
 def calibrate(
     inputs: Annotated[
         list[str],
@@ -128,13 +145,15 @@ def calibrate(
             "--robust",
             help="For a file of lines: reject lines that are not straight in the scene. For images this is "
             "always done.",
+            rich_help_panel=FIT,
         ),
     ] = False,
     detector: Annotated[
-        str,
+        Detector,
         typer.Option(
             help="What to detect in images: edges (any straight edges), grid (checkerboards and dot grids) "
-            "or pitch (markings of a sports pitch)."
+            "or pitch (markings of a sports pitch).",
+            rich_help_panel=INPUT,
         ),
     ] = "edges",
     focal: Annotated[
@@ -143,43 +162,55 @@ def calibrate(
             help="Source of the focal lengths: a CSV file (columns image,focal; for a video time,focal or "
             "frame,focal; for CSV lines frame,focal), a number, exif, board (parallel to the sensor) or "
             "plane (oblique views of a flat grid). Default for photos: board if --pitch is given, else "
-            "exif, else plane."
+            "exif, else plane.",
+            rich_help_panel=FOCAL,
         ),
     ] = None,
     focal_unit: Annotated[
-        str | None, typer.Option(help="Unit of focal lengths in a CSV file or number: mm (default) or px.")
+        FocalUnit | None,
+        typer.Option(
+            help="Unit of focal lengths in a CSV file or number. Default: mm.", rich_help_panel=FOCAL
+        ),
     ] = None,
     focal_sigma: Annotated[
         str | None,
         typer.Option(
             help="Standard deviation of the focal lengths, in their unit or per cent, e.g. 0.3 or 1%. "
             "Standard deviations of the results include it. Default: the estimate of plane or board, the "
-            "CSV column sigma, or else 0."
+            "CSV column sigma, or else 0.",
+            rich_help_panel=FOCAL,
         ),
     ] = None,
-    pitch: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MM[xMM]",
-            help="For --focal board: distance between neighbouring lines of the board, across and down.",
-        ),
-    ] = None,
-    distance: Annotated[
-        float | None,
-        typer.Option(metavar="MM", help="For --focal board: distance from the camera to the board."),
-    ] = None,
-    pixel: Annotated[
-        float | None, typer.Option(metavar="MM", help="For --focal board: pixel size on the sensor.")
-    ] = None,
-    frames: Annotated[int, typer.Option(min=1, help="For a video: maximum number of frames used.")] = 60,
+    pitch: Pitch = None,
+    distance: Distance = None,
+    pixel: Pixel = None,
+    frames: Annotated[
+        int,
+        typer.Option(min=1, help="For a video: maximum number of frames used.", rich_help_panel=INPUT),
+    ] = 60,
     jobs: Annotated[
         int | None,
-        typer.Option(min=1, help="Number of processes that detect lines; default: one per core."),
+        typer.Option(
+            min=1,
+            help="Number of processes that detect lines; default: one per core.",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
-    cache: Annotated[bool, typer.Option(help="Cache detections, and use cached ones.")] = True,
+    cache: Annotated[
+        bool, typer.Option(help="Cache detections, and use cached ones.", rich_help_panel=INPUT)
+    ] = True,
     image_size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="For CSV lines: image size in px, e.g. 1920x1080.")
+        str | None,
+        typer.Option(
+            metavar="WxH", help="For CSV lines: image size in px, e.g. 1920x1080.", rich_help_panel=INPUT
+        ),
     ] = None,
+    exclude: Exclude = None,
+    overlays: Overlays = "some",
+    strict: Strict = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    dry_run: DryRun = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Calibrate a zoom lens from photos, a video or a file of lines.
@@ -189,33 +220,46 @@ def calibrate(
     of an earlier run in the same folder are replaced.
     """
     set_up_jax()
-    from .calibration import CLEARS, FILES
+    show = Shown(strict, quiet, as_json)
     from .model_choice import WantedModel
-    from .results_folder import results_folder
 
     wanted = WantedModel(model or "auto", degree, terms)
     if any(path.lower().endswith((".npz", ".csv")) for path in inputs):
         refuse_image_options(
             {"--pitch": pitch, "--distance": distance, "--pixel": pixel, "--jobs": jobs}, inputs
         )
+        from .calibration import CLEARS, FILES
+        from .results_folder import results_folder
+
         for path in map(Path, inputs):
             if path.resolve() == (output / "lines.npz").resolve():
                 raise ValueError(f"The results would replace the input {path}: give another folder.")
         results = results_folder(output, [*FILES, REPORT], clears=CLEARS, overwrite=overwrite)
-        with results as folder, stages() as stage:
+        if dry_run:
+            lines = read_lines([Path(path) for path in inputs], focal, image_size, focal_unit)
+            return tell_plan(lines_plan(lines, excluded(exclude)), output)
+        with results as folder, stages(quiet=quiet) as stage:
             stage("Reading the lines")
             lines = read_lines([Path(path) for path in inputs], focal, image_size, focal_unit)
-            calibration = _calibrate(lines, wanted, centre_of(centre), focal_sigma, stage, folder, robust)
-        show_calibration(calibration)
-        if robust:
-            rejected = int(calibration.rejected.sum())
-            print(f"\n{rejected} lines are not straight in the scene and were rejected.")
-        tell(calibration.warnings())
-        tell_written(output)
-        return
+            lines = without(lines, excluded(exclude))
+            calibration = calibrate_lines(
+                lines,
+                folder,
+                stage,
+                model=wanted,
+                centre=centre_of(centre),
+                focal_sigma=focal_sigma,
+                robust=robust,
+                title=title_of(inputs),
+            )
+        return show.lines(calibration, output, robust=robust)
     if image_size is not None:
         raise ValueError("--image-size is for a CSV of lines: images have their own.")
+    if exclude:
+        raise ValueError("--exclude is for a file of lines: give the lines.npz of the calibration.")
+    from .calibration import CLEARS
     from .image_calibration import ImageJob
+    from .results_folder import results_folder
 
     job = ImageJob(
         tuple(inputs),
@@ -229,39 +273,55 @@ def calibrate(
         frames=frames,
         workers=jobs or number_of_cores(),
         cache=cache_folder("detections") if cache else None,
+        overlays=overlays,
     )
     refuse_to_replace(job, output)
+    if dry_run:
+        return tell_plan(images_plan(job), output)
     names = [*job.results(), REPORT]
     with results_folder(output, names, clears=CLEARS, overwrite=overwrite) as folder:
-        done = _calibrate_images(job, folder)
-    show_calibration(done.calibration)
-    show_images(done, output)
+        done = calibrate_images(job, folder, title=title_of(inputs), quiet=quiet)
+    return show.images(done, output)
 
 
-@app.command()
+@app.command(epilog=UNDISTORT_EXAMPLES)
 def undistort(
-    lens: Annotated[
-        Path, typer.Argument(metavar="lens.json", help="The lens written by zoomjax calibrate.")
+    inputs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="[lens.json] INPUT...",
+            help="The lens written by zoomjax calibrate, unless --lens is given; photos or videos, folders "
+            "of them, or patterns.",
+        ),
     ],
-    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help="Photos, or one video.")],
     output: Annotated[
         Path,
         typer.Option(
             "-o", "--output", metavar="OUT", help="Output file for a single input, else a folder."
         ),
     ],
+    lens: Annotated[
+        str | None,
+        typer.Option(
+            metavar="auto|NAME",
+            help="In place of lens.json, a lens of the library (zoomjax lens): that of each photo's EXIF "
+            "data, or by its name.",
+        ),
+    ] = None,
     focal: Annotated[
         str | None,
         typer.Option(
             help="A focal length, or a CSV file: columns time,focal or frame,focal for a video, "
-            "image,focal for photos. Default for photos: their EXIF data."
+            "image,focal for photos; for several videos a folder of such files with their names. Default "
+            "for photos: their EXIF data."
         ),
     ] = None,
     keep: Annotated[
         str,
         typer.Option(
-            help="Framing of the corrected image: same (as the input), all (every input pixel) or valid "
-            "(no empty borders). The framing stays constant while zooming."
+            help="Framing of the corrected image: same (as the input), all (every input pixel), valid (no "
+            "empty borders) or grow (every input pixel at its size, on a larger canvas). The framing stays "
+            "constant while zooming."
         ),
     ] = "same",
     interpolation: Annotated[
@@ -277,99 +337,39 @@ def undistort(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace existing files, but never an input.")
     ] = False,
+    redistort: Annotated[
+        bool, typer.Option("--redistort", help="Go back: apply the distortion to corrected images.")
+    ] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Also accept photos that zoomjax has corrected already.")
+    ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Leave what an earlier run has written, and do the rest.")
+    ] = False,
 ) -> None:
-    """Correct photos or a video, each image at its own focal length.
+    """Correct photos or videos, each image at its own focal length.
 
-    Photos that cannot be corrected are reported and skipped. The exit status
+    Files that cannot be corrected are reported and skipped. The exit status
     is then 1, or 2 if all were skipped.
     """
     set_up_jax()
     from .undistort_files import Job, undistort_files
 
+    file, files = split_lens(inputs) if lens is None else (None, tuple(inputs))
+    job = Job(file, files, output, focal, keep, interpolation, border, hold, overwrite)
+    job = dataclasses.replace(job, redistort=redistort, again=again, resume=resume)
     with progress_bar("Correcting", timed=False) as progress:
-        done = undistort_files(
-            Job(lens, tuple(inputs), output, focal, keep, interpolation, border, hold, overwrite), progress
-        )
-    print(plain(done.sentence))
+        if lens is None:
+            done = undistort_files(job, progress)
+        else:
+            from .library_lens import undistort_by_library
+
+            done = undistort_by_library(job, lens, progress)
+    if done.sentence:
+        print(plain(done.sentence))
+    for note in done.notes:
+        print(plain(note))
     for path, reason in done.skipped.items():
         print(plain(f"Skipped {path}: {with_flags(reason)}"), file=sys.stderr)
     if done.skipped:
-        raise typer.Exit(2 if len(done.skipped) == len(inputs) else 1)
-
-
-@app.command()
-def reproduce(
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.", file_okay=False)
-    ],
-    overwrite: Overwrite = False,
-) -> None:
-    """Repeat the two experiments of Alvarez et al. (2012) on synthetic scenes.
-
-    The paper's images are not public, so the scenes are made from its
-    published numbers. Writes reproduce.md, with the tables next to those of
-    the paper, Figures 5 to 10 as PNG and PDF, and reproduce.json.
-    """
-    set_up_jax()
-    from rich.console import Console
-    from rich.table import Table
-
-    from . import reproduce as again
-    from .results_folder import results_folder
-
-    with results_folder(output, again.FILES, overwrite=overwrite) as folder, stages() as stage:
-        experiments = again.reproduce(folder, stage)
-    console = Console()
-    for title, experiment in zip(("Table 1, striped board", "Table 2, football"), experiments, strict=True):
-        table = Table("", title=f"\n{title}: RMS residuals", title_justify="left", box=None)
-        for column in ("the paper", "here", "difference"):
-            table.add_column(column, justify="right", no_wrap=True)
-        for row in experiment.rows:
-            table.add_row(row.name, *row.cells())
-        console.print(table, highlight=False)
-    print(
-        "\nAll scenes are synthetic. Tables, figures and the origin of each number are in "
-        f"{plain(str(output / 'reproduce.md'))}."
-    )
-
-
-def _calibrate(
-    lines: "Lines",
-    model: "WantedModel",
-    centre: "str | tuple[float, float]",
-    focal_sigma: str | None,
-    stage: Callable[[str], None],
-    folder: Path,
-    robust: bool,
-) -> "Calibration":
-    from .calibration import calibrate, focal_sigmas
-    from .report import report
-
-    sigma = focal_sigmas(focal_sigma or "0", lines.focal)
-    calibration = calibrate(
-        lines, model=model, centre=centre, focal_sigma=sigma, robust=robust, stage=stage
-    )
-    stage("Writing the results")
-    calibration.make(folder, pages={REPORT: report(calibration)})
-    return calibration
-
-
-def _calibrate_images(job: "ImageJob", folder: Path) -> "ImageCalibration":
-    from .image_calibration import calibrate_images
-    from .report import report
-
-    with contextlib.ExitStack() as shown:
-        progress = shown.enter_context(progress_bar("Detecting lines"))
-
-        def stage(name: str) -> None:
-            nonlocal current
-            if current is None:  # replace the bar by the stages
-                shown.close()
-                current = shown.enter_context(stages())
-            current(name)
-
-        current: Callable[[str], None] | None = None
-        done = calibrate_images(job, progress=progress, stage=stage)
-        stage("Drawing the lines and writing the results")
-        done.make(folder, pages={REPORT: report(done.calibration, done)})
-    return done
+        raise typer.Exit(1 if done.written else 2)

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -19,12 +20,18 @@ if TYPE_CHECKING:
 
 REPORT = "report.html"
 
+_TICK = 10.0
+"""Seconds between signs of life where there is no terminal."""
+
 
 @contextlib.contextmanager
-def progress_bar(what: str, timed: bool = True) -> Iterator[Callable[[int, int], None]]:
+def progress_bar(
+    what: str, timed: bool = True, *, quiet: bool = False
+) -> Iterator[Callable[[int, int], None]]:
     """Yield a function of the number done and the total (0: unknown) that updates a bar on stderr.
 
-    If `timed`, the elapsed time is printed at the end, as for a stage.
+    If `timed`, the elapsed time is printed at the end, as for a stage. Where there is no terminal, a line
+    is printed every ten seconds. If `quiet`, nothing is printed.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -37,18 +44,24 @@ def progress_bar(what: str, timed: bool = True) -> Iterator[Callable[[int, int],
         TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
-    start = time.perf_counter()
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    start = told = time.perf_counter()
+    with Progress(
+        *columns, console=console, transient=True, disable=quiet or not console.is_terminal
+    ) as bar:
         task = bar.add_task(what, total=None, rate="")
 
         def show(done: int, total: int) -> None:
+            nonlocal told
             go_on()
+            if not (quiet or console.is_terminal) and time.perf_counter() - told > _TICK:
+                told = time.perf_counter()
+                _stage_done(console, f"{what}: {done} of {total or 'unknown'}", start)
             speed = bar.tasks[0].speed
             rate = f"{speed:.1f} per s" if speed else ""
             bar.update(task, completed=done, total=total or None, rate=rate)
 
         yield show
-    if timed:
+    if timed and not quiet:
         _stage_done(console, what, start)
 
 
@@ -57,18 +70,24 @@ def _stage_done(console: "Console", name: str, start: float) -> None:
 
 
 @contextlib.contextmanager
-def stages() -> Iterator[Callable[[str], None]]:
-    """Yield a function that starts a stage: it shows its name, and prints the previous stage's time."""
+def stages(*, quiet: bool = False) -> Iterator[Callable[[str], None]]:
+    """Yield a function that starts a stage: it shows its name, and prints the previous stage's time.
+
+    Where there is no terminal, a line is printed every ten seconds. If `quiet`, nothing is printed.
+    """
     from rich.console import Console
 
-    console = Console(stderr=True)
+    console = Console(stderr=True, quiet=quiet)
     begun: list[tuple[str, float]] = []
 
     def finish() -> None:
         if begun:
             _stage_done(console, *begun.pop())
 
-    with console.status("Starting") as status:
+    with contextlib.ExitStack() as shown:
+        status = shown.enter_context(console.status("Starting"))
+        if not console.is_terminal:
+            shown.enter_context(_ticking(lambda: [_stage_done(console, *last) for last in begun[-1:]]))
 
         def stage(name: str) -> None:
             go_on()
@@ -81,10 +100,46 @@ def stages() -> Iterator[Callable[[str], None]]:
         finish()
 
 
+@contextlib.contextmanager
+def _ticking(tell: Callable[[], object]) -> Iterator[None]:
+    """Call a function every ten seconds."""
+    over = threading.Event()
+
+    def tick() -> None:
+        while not over.wait(_TICK):
+            tell()
+
+    thread = threading.Thread(target=tick, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def show_verdict(calibration: "Calibration") -> None:
+    """Print the verdict, and for each finding what to do."""
+    from rich.console import Console
+    from rich.text import Text
+
+    found, console = calibration.assessment, Console()
+    verdict, _, reason = found.sentence.partition(":")
+    colour = {"good": "green", "doubtful": "yellow"}.get(found.verdict, "red")
+    console.print(Text.assemble((f"{verdict}:", f"bold {colour}"), reason))
+    for place, finding in enumerate(found.findings):
+        known = place == 0 and found.verdict != "good"  # from the line above
+        console.print(Text(f"  - {'' if known else _capital(finding.found) + ' '}{finding.advice}"))
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
 def show_calibration(
     calibration: "Calibration", magnification: Callable[[float], float] | None = None
 ) -> None:
-    """Print the table of RMS values, the polynomials and the displacement of a corner."""
+    """Print the verdict, the table of RMS values, the polynomials and the displacement of a corner."""
     from rich.console import Console
     from rich.table import Table
 
@@ -94,6 +149,7 @@ def show_calibration(
     summary = calibration.summary()
     unit = summary["focal_unit"]
     low, high = summary["focal_range"]
+    show_verdict(calibration)
     console.print(
         f"\n{summary['points']:,} points on {summary['lines']:,} lines in {summary['frames']} frames, "
         f"f = {low:g} to {high:g} {unit}\n",
@@ -103,20 +159,18 @@ def show_calibration(
         title="RMS distance of corrected points to straight lines", title_justify="left", box=None
     )
     table.add_column("", no_wrap=True)
+    table.add_column("px, held out", justify="right", no_wrap=True)
     table.add_column("px", justify="right")
     if magnification:
-        table.add_column("mm on the board", justify="right")
-    table.add_column("vs. frame by frame", justify="right", no_wrap=True)
-    table.add_column("px, held out", justify="right", no_wrap=True)
+        table.add_column("mm on board", justify="right")
     held_out = {name: rms_over_frames(frames) for name, frames in calibration.held_out_rows().items()}
     for name, frames in calibration.rows():
         value = rms_over_frames(frames)
-        cells = [name, f"{value:.4f}"]
+        left_out = held_out.get(name, math.nan)
+        cells = [name, f"{left_out:.4f}" if left_out > 0 else "", f"{value:.4f}"]
         if magnification:
             scale = [magnification(float(f)) for f in calibration.lines.focal]
             cells.append(f"{rms_over_frames(frames / scale):.4f}")
-        cells.append("" if name == "frame by frame" else _excess(value / summary["rms_frames"]))
-        cells.append(f"{held_out[name]:.4f}" if held_out.get(name, math.nan) > 0 else "")
         table.add_row(*cells)
     console.print(table)
     console.print()
@@ -134,7 +188,7 @@ def show_calibration(
     console.print(f"\nThe correction moves a corner by {', '.join(corner)}.", highlight=False)
     if allowed_for := calibration.allowed_for():
         console.print(allowed_for, highlight=False)
-    console.print(calibration.next.sentence, highlight=False)
+    console.print(calibration.advice(), highlight=False)
 
 
 def _coefficients(calibration: "Calibration") -> "Table":
@@ -180,7 +234,3 @@ def tell_written(folder: Path, also: Sequence[str] = ()) -> None:
     """Print where the results are."""
     files = [REPORT, "lens.json", "lines.npz", "summary.json", "model.png", *also]
     print(f"\nWritten to {plain(str(folder))}: {', '.join(files)}")
-
-
-def _excess(ratio: float) -> str:
-    return f"{100 * (ratio - 1):+.2f} %" if ratio < 2 else f"{ratio:.1f} times"

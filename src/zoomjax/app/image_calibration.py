@@ -20,10 +20,16 @@ from ..io.focal_track import FocalTrack, read_focal_track
 from ..io.text_table import plain_number
 from ._flags import with_flags
 from .calibration import CLEARS, FILES, Calibration, calibrate, focal_sigmas
+from .choice import chosen_frames, colour_limit
+from .equipment import with_equipment
 from .focal_sources import Board, Focals, check_way, choose_focals, lines_of
 from .model_choice import WantedModel
 from .overlay import draw_lines
 from .results_folder import results_folder
+from .verdict import findings_of_photos
+
+MOST_OVERLAYS = 200
+"""Images drawn with their lines, unless all are asked for."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of images done and their total."""
@@ -46,6 +52,8 @@ class ImageJob:
         frames: maximum number of frames used from a video.
         workers: number of processes.
         cache: folder for cached detections; None: no cache.
+        overlays: which images are drawn with their lines: "some" (all up to 200, beyond that the worst and
+            others over the zoom), "all" or "none".
     """
 
     inputs: tuple[str | os.PathLike[str], ...]
@@ -59,6 +67,7 @@ class ImageJob:
     frames: int = 60
     workers: int = 1
     cache: Path | None = None
+    overlays: str = "some"
 
     def __post_init__(self):
         """Check the settings before any work.
@@ -128,10 +137,14 @@ class ImageCalibration:
     images: tuple[str, ...]
     unused: dict[str, str]
 
+    def members(self) -> list[np.ndarray]:
+        """For each used image, the numbers of its lines among those of the calibration."""
+        counts = [len(detection.lines) for detection in self.used]
+        return np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+
     def rejected(self) -> list[np.ndarray]:
         """For each used image, which of its lines were rejected as not straight in the scene."""
-        counts = [len(detection.lines) for detection in self.used]
-        return np.split(self.calibration.rejected, np.cumsum(counts)[:-1])
+        return [self.calibration.rejected[members] for members in self.members()]
 
     def about(self) -> dict[str, Any]:
         """The entries of summary.json about the images."""
@@ -165,9 +178,14 @@ class ImageCalibration:
         return warnings + self.calibration.warnings([plain(detection.name) for detection in self.used])
 
     def overlays(self) -> list[str]:
-        """For each used image, the name of its picture with detected lines in ``lines/``."""
+        """For each used image, the name of its picture in ``lines/``; empty if it is not drawn."""
         numbers = {name: number for number, name in enumerate(self.images, start=1)}
-        return [_overlay(numbers[detection.name], detection.name) for detection in self.used]
+        most = {"some": MOST_OVERLAYS, "all": len(self.used), "none": 0}[self.job.overlays]
+        drawn = set(chosen_frames(self.calibration, most)) if most else set()
+        return [
+            _overlay(numbers[detection.name], detection.name) if frame in drawn else ""
+            for frame, detection in enumerate(self.used)
+        ]
 
     def write(
         self,
@@ -195,21 +213,33 @@ class ImageCalibration:
 
     def _draw(self, folder: Path, progress: Progress) -> None:
         used = {
-            detection.name: (detection, rejected, folder / target)
-            for detection, rejected, target in zip(self.used, self.rejected(), self.overlays(), strict=True)
+            detection.name: (detection, members, folder / target)
+            for detection, members, target in zip(self.used, self.members(), self.overlays(), strict=True)
+            if target
         }
 
+        limit = colour_limit(self.calibration)
+
         def draw(source: Source) -> None:
-            detection, rejected, target = used[source.name]
-            picture = draw_lines(source.read()[0], detection.lines, rejected.tolist())
+            detection, members, target = used[source.name]
+            picture = draw_lines(
+                source.read()[0],
+                detection.lines,
+                self.calibration.rejected[members].tolist(),
+                rms=self.calibration.line_rms[members],
+                limit=limit,
+                labels={place: str(line) for place, line in enumerate(members.tolist())},
+                legend=True,
+            )
             done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
             assert done
             target.write_bytes(content.tobytes())
 
         sources = (source for source in self.job.sources()[0] if source.name in used)
         if self.job.video is not None:
-            for source in sources:
+            for done, source in enumerate(sources, start=1):
                 draw(source)
+                progress(done, len(used))
         else:
             with concurrent.futures.ThreadPoolExecutor(self.job.workers) as pool:
                 for done, _ in enumerate(pool.map(draw, sources), start=1):
@@ -276,9 +306,30 @@ def calibrate_images(
         done = ImageCalibration(job, calibration, used, focals, tuple(d.name for d in detections), unused)
         hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}
         if not hopeless:
-            return done
+            return _with_findings(_with_equipment(done))
         unused = unused | dict.fromkeys(sorted(hopeless), _NONE_AGREES)
         used = tuple(d for d in used if d.name not in hopeless)
+
+
+def _with_equipment(done: ImageCalibration) -> ImageCalibration:
+    """The same with camera and lens in the lens, as the photos used tell."""
+    if done.job.video is not None:
+        return done
+    photos = [Path(detection.file) for detection in done.used]
+    zoom = done.calibration.zoom
+    zoom = dataclasses.replace(zoom, lens=with_equipment(zoom.lens, photos))
+    return dataclasses.replace(done, calibration=dataclasses.replace(done.calibration, zoom=zoom))
+
+
+def _with_findings(done: ImageCalibration) -> ImageCalibration:
+    """The same with what the photos say about themselves in the verdict."""
+    if done.job.video is not None:
+        return done
+    found = findings_of_photos(Path(detection.file) for detection in done.used)
+    assessment = done.calibration.assessment.joined_by(found)
+    return dataclasses.replace(
+        done, calibration=dataclasses.replace(done.calibration, assessment=assessment)
+    )
 
 
 _NONE_AGREES = (

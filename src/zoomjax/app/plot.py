@@ -103,12 +103,14 @@ def plot_residues(
         unit: unit of the RMS values.
     """
     focal = np.asarray(lines.focal)
-    order = np.argsort(focal)
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = figure.subplots()
-    axes.plot(1 / focal[order], none[order], "--", color="0.45", label="no correction")
-    axes.plot(1 / focal[order], zoom[order], color=_MODEL, linewidth=1.8, label="zoom model")
-    axes.plot(1 / focal[order], each[order], ":", color=_FRAMES, linewidth=2.2, label="frame by frame")
+    size = 4 if len(focal) < 100 else 2.5
+    axes.plot(1 / focal, none, "x", color="0.55", markersize=size + 1, label="no correction")
+    axes.plot(
+        1 / focal, each, "o", color=_FRAMES, markersize=size + 2, fillstyle="none", label="frame by frame"
+    )
+    axes.plot(1 / focal, zoom, "o", color=_MODEL, markersize=size, label="zoom model")
     axes.set_ylim(0)
     axes.set_ylabel(f"RMS distance to the lines  ({unit})")
     axes.set_xlabel(f"$1/f$  (1/{lines.focal_unit})")

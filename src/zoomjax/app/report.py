@@ -1,18 +1,23 @@
 """report.html: a calibration on one page.
 
-The page is self-contained: style and plots are embedded, and there is no script. Its text is in
-``templates/report.html``, its colours are in ``templates/report.css``; this module computes the values.
-Plots are drawn for a light background; browsers in dark mode invert them.
+The page is self-contained: style, script, plots and pictures are embedded, and nothing is loaded. Its text
+is in ``templates/report.html``, its colours are in ``report.css`` beside it, and its slider is drawn by
+``report.js``; this module computes the values. Plots are drawn for a light background; browsers in dark
+mode invert them.
 
 Runs once per calibration; most of the time is plotting.
 """
 
 import base64
+import dataclasses
 import functools
 import io
+import json
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import jinja2
+import markupsafe
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
@@ -20,52 +25,123 @@ from matplotlib.figure import Figure
 from .._core.text import plain
 from ..trust.selection import COLUMNS
 from .calibration import Calibration, rms_over_frames
+from .choice import colour_limit
+from .coverage import plot_coverage, plot_radius
+from .pictures import Pictures
 from .plot import plot_distortion, plot_model, plot_primitives, plot_residues
+from .slider import slider
 
 if TYPE_CHECKING:
     from .image_calibration import ImageCalibration
 
 _MOST_FRAMES = 300
-"""Limit for the list of frames and for vector plots. It keeps the page readable and far below 2 MB."""
+"""Limit for the list of frames and for vector plots. It keeps the page readable."""
+
+_COLUMNS = ("zoom", "left out", "alone", "none", "lines", "worst lines")
+"""Of the list of frames: RMS distances, the number of lines and the worst of them."""
 
 _WORST, _WORST_REJECTED = 3, 2
 """How many lines of a frame are listed: of those that count, and of the rejected ones."""
 
 
-def report(calibration: Calibration, images: "ImageCalibration | None" = None) -> str:
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What was run, for the report.
+
+    Attributes:
+        title: what was calibrated, such as the folder's name.
+        rows: names and values: command, folder, date, camera.
+    """
+
+    title: str = ""
+    rows: tuple[tuple[str, str], ...] = ()
+
+
+def report(
+    calibration: Calibration,
+    images: "ImageCalibration | None" = None,
+    *,
+    pictures: Sequence[Pictures] = (),
+    run: Run | None = None,
+) -> str:
     """Render the report as HTML.
 
     Args:
         calibration: the calibration to report.
         images: the images in which the lines were found. The page then lists them by name, with links to
             their pictures in the folder ``lines/`` next to it.
+        pictures: pictures of some of the images, to be embedded.
+        run: what was run.
     """
     lens = calibration.zoom.lens
     low, high = (float(f) for f in lens.focal_range)
     versions = calibration.summary()["versions"]
+    run, moving = run or Run(), slider(calibration.zoom)
     return (
         _templates()
         .get_template("report.html")
         .render(
+            title=run.title,
             about=[
-                f"f = {low:.4g} to {high:.4g} {lens.focal_unit}",
+                f"f = {low:.4g} to {high:.4g} {lens.focal_unit}"
+                if low < high
+                else f"f = {low:.4g} {lens.focal_unit}",
                 f"{lens.image_size[0]} × {lens.image_size[1]} px",
-                _number(len(calibration.none), "frame"),
+                _number(len(calibration.none), "photo" if images else "frame"),
                 _number(len(calibration.rejected), "line"),
                 _number(int(np.sum(np.asarray(calibration.lines.mask))), "point"),
             ],
+            verdict=calibration.assessment,
             cards=_cards(calibration),
             warnings=images.warnings() if images else calibration.warnings(),
+            slider=_embedded(moving),
+            slider_times=f"{moving['times']:g}" if moving and moving["times"] > 1 else None,
+            limit=f"{colour_limit(calibration):.2g}" if pictures and images else None,
+            photos=[_photo(calibration, images, one) for one in pictures] if images else [],
             straightness=_straightness(calibration),
+            coverage=_coverage(calibration),
             lens=_lens(calibration),
             distortion=_distortion(calibration),
-            next=calibration.next.sentence,
+            next=calibration.advice(),
             frames=_frames(calibration, images),
             images=images,
+            run=run.rows,
             files=["lens.json", "summary.json", "lines.npz", "model.png"],
             versions=", ".join(f"{name} {of}" for name, of in versions.items()),
         )
     )
+
+
+def _embedded(data: dict[str, Any] | None) -> markupsafe.Markup | None:
+    """Numbers as JSON within a page: nothing in it can end the script."""
+    if data is None:
+        return None
+    return markupsafe.Markup(
+        json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    )
+
+
+def _photo(calibration: Calibration, images: "ImageCalibration", one: Pictures) -> dict[str, Any]:
+    """A photo before and after, with crops of its worst lines."""
+    focal = float(np.asarray(calibration.lines.focal)[one.frame])
+    rms = np.asarray(calibration.zoom.frame_rms)[one.frame], calibration.none[one.frame]
+    return {
+        "name": images.used[one.frame].name,
+        "focal": f"{focal:.5g}",
+        "unit": calibration.lines.focal_unit,
+        "rms": [f"{float(value):.2g}" if np.isfinite(value) else "–" for value in rms],
+        "before": _data(one.before, "jpeg"),
+        "after": _data(one.after, "jpeg"),
+        "crops": [
+            {"line": line, "rms": f"{calibration.line_rms[line]:.2g}", "source": _data(crop, "jpeg")}
+            for line, crop in one.crops.items()
+        ],
+    }
+
+
+def _data(content: bytes, kind: str) -> str:
+    """A picture as a data URL."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 @functools.cache
@@ -88,20 +164,42 @@ def _shown(text: str) -> str:
 
 
 def _cards(calibration: Calibration) -> list[tuple[str, str]]:
-    """The key figures at the top of the page."""
-    none, zoom, each = (
-        rms_over_frames(values)
-        for values in (calibration.none, calibration.zoom.frame_rms, calibration.each.frame_rms)
-    )
-    std = max(std for _, _, std in calibration.corner())
-    certified = bool(calibration.zoom.certificate.certified)
-    return [
-        (f"{zoom:.3g} px", "RMS distance to straight lines, zoom polynomial"),
-        (f"{none / zoom:.3g} times" if zoom > 0 else "∞", "straighter than without correction"),
-        (_excess(zoom, each), "RMS, compared with a separate fit of each frame"),
-        (f"± {std:.2g} px" if np.isfinite(std) else "unknown", "largest standard deviation at the corner"),
-        ("proved" if certified else "not proved", "invertible at every focal length"),
+    """The key figures at the top of the page: of photos left out, where they are known."""
+    found = calibration.assessment.evidence
+    left_out, own = (rms_over_frames(of) for of in (calibration.held_out, calibration.each_held_out))
+    none, zoom = (rms_over_frames(of) for of in (calibration.none, calibration.zoom.frame_rms))
+    after = left_out if np.isfinite(left_out) else zoom
+    cards = [
+        (
+            f"{_short(none)} → {_short(after)} px",
+            "from straight: lines before → after correction",
+        ),
+        (f"{none / after:.3g} times" if after > 0 else "∞", "straighter"),
+        (
+            f"{_short(found.displacement)} px",
+            "average shift of pixels by the correction",
+        ),
+        (f"± {_short(found.std)} px" if np.isfinite(found.std) else "unknown", "uncertainty of that shift"),
     ]
+    if np.isfinite(left_out) and np.isfinite(own):
+        cards[0] = (cards[0][0], cards[0][1] + ", in photos left out of the fit")
+        cards.append((f"{_short(own)} px", "the same with a correction for each photo alone"))
+    return cards
+
+
+def _short(value: float) -> str:
+    """Two digits of a length, or all before the decimal point."""
+    return f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}"
+
+
+def _coverage(calibration: Calibration) -> list[dict[str, Any]]:
+    weight = (~calibration.rejected).astype(float)
+    lens = calibration.zoom.lens
+    plots = [
+        _plot(plot_coverage(calibration.lines, weight), "Coverage of the image and of the zoom by lines")
+    ]
+    label = "Residuals against the distance from the centre"
+    return [*plots, _plot(plot_radius(calibration.lines, lens, weight), label, class_="box plot")]
 
 
 def _straightness(calibration: Calibration) -> dict[str, Any]:
@@ -118,8 +216,8 @@ def _straightness(calibration: Calibration) -> dict[str, Any]:
         "rows": [
             (
                 name,
-                f"{value:.4f}",
                 f"{held_out[name]:.4f}" if held_out.get(name, np.nan) > 0 else "",
+                f"{value:.4f}",
                 "" if name == "frame by frame" else _excess(value, each),
             )
             for name, value in ((name, rms_over_frames(frames)) for name, frames in calibration.rows())
@@ -207,20 +305,21 @@ def _distortion(calibration: Calibration) -> dict[str, Any]:
 def _frames(calibration: Calibration, images: "ImageCalibration | None") -> dict[str, Any]:
     """The list of frames, each with its least straight lines."""
     summary = calibration.summary()["per_frame"]
-    shown = np.sort(np.argsort(-np.asarray(calibration.zoom.frame_rms), kind="stable")[:_MOST_FRAMES])
+    worst = np.argsort(-np.asarray(calibration.zoom.frame_rms), kind="stable")[:_MOST_FRAMES]
+    shown = worst[np.lexsort([worst, np.asarray(calibration.lines.focal)[worst]])]
     lines = calibration.lines
     members = np.split(
         np.argsort(lines.frame, kind="stable"),
         np.cumsum(np.bincount(lines.frame, minlength=len(summary)))[:-1],
     )
-    unit = f"f, {lines.focal_unit}"
+    unit, overlays = f"f, {lines.focal_unit}", images.overlays() if images else [""] * len(summary)
     return {
         "number": len(summary),
-        "head": ["frame", unit, "polynomial", "separate", "uncorrected", "lines", "worst lines"],
+        "head": ["photo" if images else "frame", unit, *_COLUMNS],
         "rows": [
             {
                 "name": images.used[number].name if images else str(number),
-                "picture": f"lines/{images.overlays()[number]}" if images else None,
+                "picture": f"lines/{overlays[number]}" if overlays[number] else None,
                 "cells": _frame_cells(summary[number], calibration.rejected[members[number]]),
                 "worst": _worst_lines(calibration, members[number]),
             }
@@ -233,7 +332,7 @@ def _frame_cells(frame: dict[str, Any], rejected: np.ndarray) -> list[str]:
     """Its focal length, RMS values and number of lines."""
     values = (
         "" if frame[key] is None else f"{frame[key]:.3f}"  # of a frame whose lines are all rejected
-        for key in ("rms_zoom", "rms_frames", "rms_none")
+        for key in ("rms_zoom", "rms_held_out", "rms_frames", "rms_none")
     )
     counted = f"{frame['lines']:,}" + (f" ({rejected.sum()} rejected)" if rejected.any() else "")
     return [f"{frame['focal']:.4g}", *values, counted]
@@ -286,7 +385,6 @@ def _plot(
     file = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "zoomjax"}):
         figure.savefig(file, format=kind, dpi=150, metadata={"Date": None} if kind == "svg" else {})
-    content = base64.b64encode(file.getvalue()).decode()
     width, height = (f"{96 * side:.0f}" for side in figure.get_size_inches())
-    source = f"data:image/{kind.replace('svg', 'svg+xml')};base64,{content}"
+    source = _data(file.getvalue(), kind.replace("svg", "svg+xml"))
     return {"source": source, "label": label, "class": class_, "width": width, "height": height}

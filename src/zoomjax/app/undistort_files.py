@@ -2,10 +2,11 @@
 
 import dataclasses
 import functools
-import mimetypes
-import unicodedata
+import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -13,13 +14,17 @@ import numpy as np
 from .._core.files import refuse_existing, refuse_inputs, whole_file
 from ..correct.framing import Framing, check_keep, frame_output
 from ..correct.image import check_sampling
-from ..correct.photo import corrected_photo, photo_focal
+from ..correct.photo import Correction, corrected_photo, photo_focal
+from ..correct.redistort import check_framed
 from ..io.focal_table import read_focal_table
-from ..io.focal_track import read_focal_track
-from ..io.photo import FORMATS, SUFFIXES
-from ..io.text_table import plain_number
+from ..io.metadata import geometry_of
+from ..io.photo import read_metadata
 from ..models.lens import ZoomLens, load_lens
 from ..models.sizes import at_focal, lens_for_size
+from .undistort_inputs import Found, find_inputs, focal_number, targets_of
+
+if TYPE_CHECKING:
+    from ..correct.video import CorrectedVideo
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,16 +32,19 @@ class Job:
     """Settings of a correction.
 
     Attributes:
-        lens: file of the lens.
-        inputs: photos, or one video.
+        lens: file of the lens; None if it is found for each photo (`library_lens`).
+        inputs: photos or videos, folders or patterns.
         output: file for a single input, else a folder.
-        focal: a number, a CSV file, or None for the photos' EXIF data.
+        focal: a number, a CSV file, a folder of these for videos, or None for the photos' EXIF data.
         keep, interpolation, border: as for `undistort_image`; one framing for all photos.
         hold: whether a track's first and last focal lengths are used beyond its ends.
         overwrite: whether existing files may be replaced; inputs never are.
+        redistort: whether corrected files are given, and distortion is applied.
+        again: whether photos that are corrected already are corrected again.
+        resume: whether what an earlier run has written is left as it is.
     """
 
-    lens: Path
+    lens: Path | None
     inputs: tuple[Path, ...]
     output: Path
     focal: str | None = None
@@ -45,6 +53,9 @@ class Job:
     border: str = "constant"
     hold: bool = False
     overwrite: bool = False
+    redistort: bool = False
+    again: bool = False
+    resume: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,136 +64,195 @@ class Outcome:
 
     Attributes:
         sentence: a sentence on what was written.
-        skipped: for each photo that was not corrected, by path, the reason.
+        skipped: for each file that was not corrected, by path, the reason.
+        written: the number of files that are corrected, now or earlier.
+        notes: sentences on what was kept, what was not, and what was left out.
     """
 
     sentence: str
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
+    written: int = 0
+    notes: tuple[str, ...] = ()
 
 
-def undistort_files(job: Job, progress: Callable[[int, int], None] = lambda done, total: None) -> Outcome:
-    """Correct photos or a video. Of several photos, those that cannot be corrected are skipped.
+Progress = Callable[[int, int], None]
+_BAD_FILE = (ValueError, OSError, RuntimeError, MemoryError, cv2.error)
+"""Errors of one file that do not stop the others."""
+
+
+def undistort_files(job: Job, progress: Progress = lambda done, total: None) -> Outcome:
+    """Correct photos or videos. Of several files, those that cannot be corrected are skipped.
 
     Raises:
         OSError, ValueError: the options, the lens, the table of focal lengths or the targets are wrong,
-            checked before any work; or the errors of `undistort_video`, or of `undistort_photo` for a
-            single photo. If a target cannot be written, the files before it are complete.
+            checked before any work; or the errors of `undistort_video` or `undistort_photo` for a single
+            file. If a target cannot be written, the files before it are complete.
     """
     check_sampling(job.interpolation, job.border)
     check_keep(job.keep)
+    if job.lens is None:
+        raise ValueError("Argument lens must be the file of a lens.")
     lens = load_lens(job.lens)
-    photos = [path for path in job.inputs if path.suffix.lower() in SUFFIXES]
-    if photos and len(photos) < len(job.inputs):
-        raise ValueError("Give photos or a video, not both.")
-    if photos:
-        return _photos(job, lens, progress)
-    if len(job.inputs) > 1:
-        raise ValueError(f"Give one video at a time; there are {len(job.inputs)}.")
-    return _video(job, lens, progress)
+    found = photos_or_videos(job)
+    work = _videos if found.videos else undistort_photos
+    files = found.videos or found.photos
+    targets = targets_of(files, job.output, job.inputs)
+    return with_refused(work(job, lens, [path for path, _ in files], targets, progress), found)
 
 
-def _video(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> Outcome:
-    from ..correct.video import undistort_video
+def photos_or_videos(job: Job) -> Found:
+    """The photos or the videos that are given.
 
-    if job.focal is None:
-        raise ValueError(
-            "A video needs argument focal: one focal length, or a CSV file with time,focal or frame,focal."
-        )
-    number = _number(job.focal)
-    if number is not None and job.hold:
-        raise ValueError("Argument hold is for a track of focal lengths, and argument focal is one number.")
-    focal = read_focal_track(job.focal, hold=job.hold) if number is None else number
-    target = job.output / job.inputs[0].name if job.output.is_dir() else job.output
-    _check_targets(job, [target])
-    done = undistort_video(
-        job.inputs[0],
-        target,
+    Raises:
+        FileNotFoundError, ValueError: as `find_inputs`; or there are both, or neither.
+    """
+    found = find_inputs(job.inputs, job.output)
+    if found.photos and found.videos:
+        raise ValueError("Give photos or videos, not both.")
+    if not found.photos and not found.videos:
+        path, reason = next(iter(found.refused.items()))
+        raise ValueError(f"Cannot correct {path}: {reason}.")
+    return found
+
+
+def with_refused(done: Outcome, found: Found) -> Outcome:
+    """An outcome, with what was left out beforehand."""
+    skipped = {**{str(path): reason for path, reason in found.refused.items()}, **done.skipped}
+    return dataclasses.replace(done, skipped=skipped, notes=(*found.notes, *done.notes))
+
+
+def _videos(
+    job: Job, lens: ZoomLens, sources: Sequence[Path], targets: Sequence[Path], progress: Progress
+) -> Outcome:
+    from .undistort_videos import tracks_of, undistort_videos
+
+    tracks = tracks_of(job.focal, sources, hold=job.hold)
+    todo = to_do(job, sources, targets, lambda path: True)
+    correct = functools.partial(
+        undistort_videos,
         lens=lens,
-        focal=focal,
         keep=job.keep,
         interpolation=job.interpolation,
         border=job.border,
-        progress=progress,
+        back=job.redistort,
     )
-    return Outcome(f"{done.frames} frames corrected, scale {done.scale:.4f}: {target}")
+    done, skipped = correct(
+        [(source, target, tracks[source]) for source, target in todo], progress=progress
+    )
+    if len(sources) == 1 and skipped:
+        raise next(iter(skipped.values()))
+    earlier = len(sources) - len(todo)
+    frames, written = sum(video.frames for video in done.values()), len(done)
+    if len(sources) == 1 and done:
+        [(target, video)] = done.items()
+        sentence = f"{frames} frames {_done(job)}, scale {video.scale:.4f}: {target}"
+    else:
+        sentence = f"{_counted(written, len(sources), earlier, job, 'video')}, {frames} frames"
+    notes = [note for target, video in done.items() for note in _kept(target, video, len(sources))]
+    bad = {str(path): str(error) for path, error in skipped.items()}
+    return Outcome(sentence, bad, written + earlier, tuple(notes))
 
 
-def _photos(job: Job, lens: ZoomLens, progress: Callable[[int, int], None]) -> Outcome:
+def _kept(target: Path, video: "CorrectedVideo", number: int) -> list[str]:
+    """What of a video was kept and what was not, each in a sentence."""
+    of = f" of {target.name}" if number > 1 else ""
+    sentences = ((f"Kept{of}", video.kept), (f"Not kept{of}", video.not_kept))
+    return [f"{begins}: {', '.join(names)}." for begins, names in sentences if names]
+
+
+def undistort_photos(
+    job: Job, lens: ZoomLens, sources: Sequence[Path], targets: Sequence[Path], progress: Progress
+) -> Outcome:
+    """Correct photos by one lens, whatever the job's own; it raises as `undistort_files`."""
     if job.hold:
         raise ValueError(
             "Argument hold is for a video's track of focal lengths, and the inputs are photos."
         )
-    targets = _photo_targets(job)
-    _check_targets(job, targets)
+    correction = Correction(
+        lens, lambda size: job.keep, job.interpolation, job.border, job.redistort, job.again
+    )
+    todo = to_do(job, sources, targets, lambda path: _is_marked(path, correction.geometry))
     focal_of = _photo_focals(job, lens)
     skipped: dict[Path, Exception] = {}
-    keep = _common_keep(job, lens, focal_of, skipped)
-    for done, (source, target) in enumerate(zip(job.inputs, targets, strict=True), start=1):
+    correction = dataclasses.replace(correction, keep=_common_keep(job, lens, sources, focal_of, skipped))
+    lost: Counter[tuple[str, str]] = Counter()
+    for number, (source, target) in enumerate(todo, start=1):
         if source not in skipped:
             try:
-                content = corrected_photo(
-                    source,
-                    target.suffix,
-                    lens=lens,
-                    focal=focal_of(source),
-                    keep=keep,
-                    interpolation=job.interpolation,
-                    border=job.border,
-                )
-            except _BAD_PHOTO as error:
+                content, missing = corrected_photo(source, target.suffix, correction, focal_of(source))
+            except _BAD_FILE as error:
                 skipped[source] = error
             else:
+                lost.update((target.suffix.lower(), name) for name in missing)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with whole_file(target) as part:
                     part.write_bytes(content)
-        progress(done, len(targets))
-    if len(job.inputs) == 1 and skipped:
+        progress(number, len(todo))
+    if len(sources) == 1 and skipped:
         raise next(iter(skipped.values()))
-    written, number = len(targets) - len(skipped), len(targets)
-    count = f"{number} photo{'s' * (number > 1)}" if not skipped else f"{written} of {number} photos"
-    return Outcome(f"{count} corrected: {job.output}", {str(p): str(e) for p, e in skipped.items()})
+    earlier = len(sources) - len(todo)
+    bad = {str(source): str(skipped[source]) for source, _ in todo if source in skipped}
+    written = len(todo) - len(bad)
+    return Outcome(
+        _counted(written, len(sources), earlier, job, "photo"), bad, written + earlier, _losses(lost)
+    )
 
 
-_BAD_PHOTO = (ValueError, OSError, MemoryError, cv2.error)
-"""Errors of one photo that do not stop the others."""
+def _counted(written: int, number: int, earlier: int, job: Job, what: str) -> str:
+    count = (
+        f"{number} {what}{'s' * (number > 1)}" if written == number else f"{written} of {number} {what}s"
+    )
+    before = f" now, {earlier} earlier" if earlier else ""
+    return f"{count} {_done(job)}{before}: {job.output}"
 
 
-def _photo_targets(job: Job) -> list[Path]:
-    """The target of each photo."""
-    folder = job.output.is_dir() or job.output.suffix.lower() not in FORMATS
-    if not folder and len(job.inputs) > 1:
-        raise ValueError(
-            f"The output of {len(job.inputs)} photos must be a folder, but it is the file {job.output}."
-        )
-    if not folder:
-        return [job.output]
-    kind = mimetypes.guess_type(job.output.name)[0] or ""
-    if not job.output.is_dir() and kind.startswith(("image/", "video/")):
-        raise ValueError(f"The output must end in one of {', '.join(FORMATS)}, but it is {job.output}.")
-    names: dict[str, Path] = {}
-    for path in job.inputs:
-        # Many file systems ignore case, and treat different encodings of an accent alike.
-        other = names.setdefault(unicodedata.normalize("NFC", _target_name(path)).casefold(), path)
-        if other is not path:
-            raise ValueError(
-                f"The photos {other} and {path} have the same name and would be written to the same file."
-            )
-    return [job.output / _target_name(path) for path in job.inputs]
+def _done(job: Job) -> str:
+    return "redistorted" if job.redistort else "corrected"
 
 
-def _target_name(photo: Path) -> str:
-    """The photo's name, with the suffix .png for formats that can only be read (HEIC)."""
-    return photo.name if photo.suffix.lower() in FORMATS else f"{photo.stem}.png"
+def _losses(lost: Counter[tuple[str, str]]) -> tuple[str, ...]:
+    """What could not be kept, each once."""
+    return tuple(
+        f"Not kept in {number} {suffix} file{'s' * (number > 1)}: {name}."
+        for (suffix, name), number in sorted(lost.items())
+    )
 
 
-def _check_targets(job: Job, targets: Sequence[Path]) -> None:
+def _is_marked(path: Path, geometry: str) -> bool:
+    """Whether a photo is a result of the same work; a format that holds no mark counts as one."""
+    try:
+        return path.suffix.lower() == ".bmp" or geometry_of(read_metadata(path)) == geometry
+    except _BAD_FILE:
+        return False
+
+
+def to_do(
+    job: Job,
+    sources: Sequence[Path],
+    targets: Sequence[Path],
+    is_result: Callable[[Path], bool] = lambda path: False,
+) -> list[tuple[Path, Path]]:
+    """Sources and targets that are to be done: with `resume`, those without a result.
+
+    Raises:
+        FileExistsError, ValueError: a target exists, or is an input.
+    """
     tables = [] if job.focal is None else [job.focal]
-    refuse_inputs(targets, [*job.inputs, job.lens, *tables])
-    refuse_existing(targets, overwrite=job.overwrite)
+    lens = [] if job.lens is None else [job.lens]
+    refuse_inputs(targets, [*sources, *lens, *tables])
+    pairs = list(zip(sources, targets, strict=True))
+    if job.resume:
+        pairs = [pair for pair in pairs if not (os.path.lexists(pair[1]) and is_result(pair[1]))]
+    refuse_existing([target for _, target in pairs], overwrite=job.overwrite)
+    return pairs
 
 
 def _common_keep(
-    job: Job, lens: ZoomLens, focal_of: Callable[[Path], float], skipped: dict[Path, Exception]
+    job: Job,
+    lens: ZoomLens,
+    sources: Sequence[Path],
+    focal_of: Callable[[Path], float],
+    skipped: dict[Path, Exception],
 ) -> Callable[[tuple[int, int]], str | Framing]:
     """The framing for each image size, common to all focal lengths of the photos.
 
@@ -191,10 +261,10 @@ def _common_keep(
     if job.keep == "same":
         return lambda size: job.keep
     focals = []
-    for source in job.inputs:
+    for source in sources:
         try:
             focals.append(focal_of(source))
-        except _BAD_PHOTO as error:
+        except _BAD_FILE as error:
             skipped[source] = error
     if not focals:
         return lambda size: job.keep
@@ -204,8 +274,12 @@ def _common_keep(
 
     @functools.cache
     def keep(size: tuple[int, int]) -> Framing:
-        scaled = lens_for_size(lens, size)
-        return frame_output([at_focal(scaled, f) for f in spread], size, keep=job.keep)
+        original = lens.image_size if job.redistort and job.keep == "grow" else size
+        scaled = lens_for_size(lens, original)
+        framing = frame_output([at_focal(scaled, f) for f in spread], original, keep=job.keep)
+        if job.redistort:
+            check_framed(framing, size)
+        return framing
 
     return keep
 
@@ -214,20 +288,7 @@ def _photo_focals(job: Job, lens: ZoomLens) -> Callable[[Path], float]:
     """A function giving a photo's focal length: from the table, the number or its EXIF data."""
     if job.focal is None:
         return functools.cache(lambda path: photo_focal(path, lens))
-    number = _number(job.focal)
+    number = focal_number(job.focal)
     if number is not None:
         return lambda path: number
     return read_focal_table(job.focal).need
-
-
-def _number(text: str) -> float | None:
-    """The focal length, or None if the text names a file."""
-    number = plain_number(text)
-    if number is None and not Path(text).exists() and not text.lower().endswith(".csv"):
-        raise ValueError(
-            "Argument focal must be a positive number, with a decimal point, or a CSV file, "
-            f"but it is {text!r}."
-        )
-    if number is not None and number <= 0:
-        raise ValueError(f"Argument focal must be a positive number, but it is {text}.")
-    return number

@@ -5,6 +5,7 @@ RGB, and no rounding in between. Per frame: the focal length's distortion, one m
 theirs, and frames at one focal length all), and `cv2.remap` of each plane.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from ..models.sizes import at_focal
 from .framing import Framing
 from .image import position_map, remap
 from .maps import OUTSIDE, Plane
+from .redistort import redistortion_map
 
 _PACKED = {
     **{"nv12": "yuv420p", "nv21": "yuv420p", "p010le": "yuv420p10le", "p012le": "yuv420p12le"},
@@ -33,10 +35,17 @@ class FrameWarper:
         lens: for frames of this size.
         framing: of the output; common to all frames.
         interpolation, border: as for `undistort_image`; a constant border is black.
+        back: whether corrected frames are given, and distortion is applied.
     """
 
-    def __init__(self, lens: ZoomLens, framing: Framing, *, interpolation: str, border: str):
+    def __init__(
+        self, lens: ZoomLens, framing: Framing, *, interpolation: str, border: str, back: bool = False
+    ):
         self.framing = framing
+        self.given, self.made = (framing.size, lens.image_size)[:: 1 if back else -1]
+        self._positions: Callable[..., tuple[np.ndarray, np.ndarray]] = (
+            redistortion_map if back else position_map
+        )
         self._lens, self._interpolation, self._border = lens, interpolation, border
         self._dtype = np.asarray(lens.centre).dtype
         self._key: tuple[float, str] | None = None
@@ -46,17 +55,17 @@ class FrameWarper:
         """The corrected frame, with the times and colours of the given one.
 
         Raises:
-            ValueError: the frame has another size than the lens.
+            ValueError: the frame has another size than the first.
         """
         size = (frame.width, frame.height)
-        if size != self._lens.image_size:
+        if size != self.given:
             raise ValueError(
                 f"The frame at {frame.time or 0:.3f} s has {size[0]} x {size[1]} px, but earlier ones have "
-                f"{self._lens.image_size[0]} x {self._lens.image_size[1]} px. Split the video there."
+                f"{self.given[0]} x {self.given[1]} px. Split the video there."
             )
         name = planar_format(frame.format.name)
         given = frame if frame.format.name == name else frame.reformat(format=name)
-        result = av.VideoFrame(*self.framing.size, name)
+        result = av.VideoFrame(*self.made, name)
         result.pts, result.time_base, result.duration = frame.pts, frame.time_base, frame.duration
         result.color_range, result.colorspace = frame.color_range, frame.colorspace
         for component, maps, fill in zip(
@@ -78,9 +87,9 @@ class FrameWarper:
         """One pair of maps a component, kept while the focal length stays the same."""
         if (focal, name) != self._key:
             distortion = at_focal(self._lens, np.asarray(focal, self._dtype))
-            planes = sampled_planes(name, self.framing.size)
+            planes = sampled_planes(name, self.made)
             made = {
-                plane: position_map(
+                plane: self._positions(
                     distortion,
                     self.framing,
                     self._lens.image_size,

@@ -3,7 +3,8 @@
 Correction bends the border of an image, so the result is not a rectangle. A framing is an affine map from
 pixels p of the output to corrected points, ``x = origin + p / scale``: with ``keep="same"`` it is the
 identity, ``"all"`` shrinks until every pixel of the input is shown, ``"valid"`` enlarges until no pixel
-of the output lies outside of the input. One framing for all focal lengths of a zoom, instead of one per
+of the output lies outside of the input, ``"grow"`` adds a border on all sides (overscan) until every pixel
+of the input is shown at scale 1. One framing for all focal lengths of a zoom, instead of one per
 frame, keeps the framing of a corrected video constant while zooming.
 """
 
@@ -20,6 +21,9 @@ from ..models.distortion import Distortion
 from ..models.lens import ZoomLens
 from ..models.sizes import check_aspect, check_image_size, checked_distortion, lens_for_size
 from ._inverse_polynomial import fold_radius
+
+LARGEST = 32766
+"""px a side: `cv2.remap` counts in 16 bits."""
 
 _INSET = 0.02
 """px: how far inside the border "valid" stays, so that errors of positions do not mix the border in."""
@@ -70,9 +74,10 @@ def frame_output(
             1/f over the fitted range.
         image_size: (width, height) px of the distorted images. A `ZoomLens` for another size is scaled.
         keep: "same" for the geometry of the input, "all" to show every pixel of every input, "valid" to
-            show nothing beyond any input's border. Where a lens folds (see `Distortion.monotone_radius`),
-            only the part within the fold is used.
-        size: (width, height) px of the output; by default `image_size`.
+            show nothing beyond any input's border, "grow" for the geometry of the input on a canvas that is
+            enlarged, by as many pixels on opposite sides, until it shows every pixel of every input. Where
+            a lens folds (see `Distortion.monotone_radius`), only the part within the fold is used.
+        size: (width, height) px of the output; by default `image_size`. Not with "grow".
 
     Raises:
         ValueError: a size or `keep` is not valid, there is no distortion, one is for images of another size
@@ -89,6 +94,8 @@ def frame_output(
     image_size = checked_size(image_size)
     size = image_size if size is None else checked_size(size, "size")
     check_keep(keep)
+    if keep == "grow" and size != image_size:
+        raise ValueError('Argument size must be left out with keep="grow", which determines it.')
     middle, reach = (np.array(image_size) - 1) / 2, (np.array(size) - 1) / 2
     if isinstance(distortions, ZoomLens):
         distortions = lens_for_size(distortions, image_size)
@@ -99,8 +106,12 @@ def frame_output(
         return _framing(1.0, middle, size, image_size)
     inset = _INSET if keep == "valid" else 0.0
     outlines = [_outline(d, image_size, inset) for d in each]
+    low, high = np.min(outlines, axis=(0, 1)), np.max(outlines, axis=(0, 1))
+    if keep == "grow":
+        return _framing(
+            1.0, middle, _grown(np.maximum(middle - low, high - middle), image_size), image_size
+        )
     if keep == "all":
-        low, high = np.min(outlines, axis=(0, 1)), np.max(outlines, axis=(0, 1))
         middle = (low + high) / 2
         scale = float(np.min(reach / np.maximum((high - low) / 2, 1e-6)))
     else:
@@ -118,14 +129,26 @@ def frame_output(
     return _framing(scale, middle, size, image_size)
 
 
+def _grown(reach: np.ndarray, image_size: tuple[int, int]) -> tuple[int, int]:
+    """The image's size and whole pixels on each side, until it reaches so far from the middle, px."""
+    more = np.ceil(np.maximum(reach - (np.array(image_size) - 1) / 2 - 1e-6, 0))
+    width, height = (int(side + 2 * border) for side, border in zip(image_size, more, strict=True))
+    if max(width, height) > LARGEST:
+        raise ValueError(
+            f'Argument keep="grow" needs a canvas of {width} x {height} px, more than {LARGEST} px a side. '
+            'Use keep="all".'
+        )
+    return width, height
+
+
 def check_keep(keep: str) -> None:
     """Refuse names that are not known.
 
     Raises:
         ValueError: it is none of those that `frame_output` takes.
     """
-    if keep not in ("same", "all", "valid"):
-        raise ValueError(f'Argument keep must be "same", "all" or "valid", but it is {keep!r}.')
+    if keep not in ("same", "all", "valid", "grow"):
+        raise ValueError(f'Argument keep must be "same", "all", "valid" or "grow", but it is {keep!r}.')
 
 
 def check_framing(framing: Framing, image_size: tuple[int, int], name: str) -> None:

@@ -18,7 +18,7 @@ from ..models.distortion import Distortion
 from ..models.lens import ZoomLens
 from ..models.sizes import check_channels_last, check_image_size, checked_distortion, lens_for_size
 from ._inverse_polynomial import fit_inverse, fold_radius
-from .framing import Framing, check_framing, frame_output
+from .framing import LARGEST, Framing, check_framing, frame_output
 from .maps import OUTSIDE, Plane, source_positions
 
 _INTERPOLATION = {
@@ -34,9 +34,6 @@ _BORDER = {
 }
 _MARGIN = 8.0
 """px beyond the image's corner that an interpolation (Lanczos: 4) may still reach back from."""
-
-_LARGEST = 32766
-"""px a side: `cv2.remap` counts in 16 bits."""
 
 _WORKING = {"bool": "uint8", "int8": "int16", "int32": "float64", "uint32": "float64", "float16": "float32"}
 """What `cv2.remap` does not know is computed in a type that holds all of its values."""
@@ -63,8 +60,8 @@ def undistort_image(
         distortion: the distortion of this image, in its pixels; or a lens, which is scaled to images of
             another size with the same aspect ratio.
         focal: the focal length, if a lens is given.
-        keep: the part to show, "same", "all" or "valid"; or a `Framing` from `frame_output`, which also
-            gives the scale and can be used for many images of one size.
+        keep: the part to show, "same", "all", "valid" or "grow"; or a `Framing` from `frame_output`, which
+            also gives the scale and can be used for many images of one size.
         size: (width, height) px of the result; by default the image's. Not with a `Framing`.
         interpolation: "nearest", "linear", "cubic" or "lanczos".
         border: fill outside of the image: "constant", "replicate" or "reflect".
@@ -90,7 +87,7 @@ def undistort_image(
         >>> undistort_image(np.eye(4, 6, dtype=np.uint8) * 200, d).shape
         (4, 6)
     """
-    _check_image(image)
+    check_image(image)
     check_sampling(interpolation, border)
     height, width = image.shape[:2]
     distortion = _distortion(distortion, focal, (width, height))
@@ -104,8 +101,8 @@ def undistort_image(
         raise ValueError(
             "Argument size must be left out with a Framing, but it is given: the framing has one."
         )
-    if max(keep.size) > _LARGEST:
-        raise ValueError(f"Argument size must be at most {_LARGEST} px a side, but it is {keep.size}.")
+    if max(keep.size) > LARGEST:
+        raise ValueError(f"Argument size must be at most {LARGEST} px a side, but it is {keep.size}.")
     folded = warn_of_fold(distortion, (width, height))
     x, y = position_map(distortion, keep, (width, height), extend=border != "constant")
     fill = border_values(border_value, math.prod(image.shape[2:]), image.dtype)
@@ -272,7 +269,12 @@ def check_sampling(interpolation: str, border: str) -> None:
             raise ValueError(f"Argument {name} must be one of {', '.join(known)}, but it is {value!r}.")
 
 
-def _check_image(image) -> None:
+def check_image(image) -> None:
+    """Refuse what is no image that OpenCV can warp.
+
+    Raises:
+        ValueError: it is none; the message says what to do.
+    """
     if not isinstance(image, np.ndarray) or image.ndim < 2 or 0 in image.shape:
         shape = getattr(image, "shape", type(image).__name__)
         raise ValueError(
@@ -285,9 +287,9 @@ def _check_image(image) -> None:
             "Argument image must be boolean, integer of up to 32 bits or floating, but its dtype is "
             f"{image.dtype}. Convert it with image.astype(...)."
         )
-    if max(image.shape[:2]) > _LARGEST:
+    if max(image.shape[:2]) > LARGEST:
         raise ValueError(
-            f"Argument image must be at most {_LARGEST} px a side, but its shape is {image.shape}."
+            f"Argument image must be at most {LARGEST} px a side, but its shape is {image.shape}."
         )
 
 

@@ -1,35 +1,60 @@
 """Correction of photo files at the focal length in their EXIF data, with their metadata.
 
 Pixels are used as stored, before rotation by the orientation tag, because the lens model refers to these.
-The tag is copied with the other metadata, so that the result is shown the same way up.
+The tag is copied with the other metadata, so that the result is shown the same way up. A mark in the XMP
+packet tells that a photo is corrected, so that it is not corrected twice.
 """
 
+import contextlib
+import dataclasses
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from .._core.files import refuse_inputs, whole_file
-from ..io.photo import FORMATS, metadata_focal, read_focal, read_photo
-from ..io.tiff import Metadata, encode_tiff
+from ..io.metadata import geometry_of, marked
+from ..io.photo import FORMATS, Photo, metadata_focal, read_focal, read_pages
+from ..io.photo_writer import check_written, encoded_photo
 from ..models.lens import ZoomLens
 from .framing import Framing, framing_for_size
 from .image import undistort_image
+from .redistort import redistort_image
 
-_OPTIONS = {
-    ".jpg": [
-        *(cv2.IMWRITE_JPEG_QUALITY, 97),
-        *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
-    ],
-    ".webp": [cv2.IMWRITE_WEBP_QUALITY, 101],  # above 100: without loss
-}
-_OPTIONS[".jpeg"] = _OPTIONS[".jpg"]
 
-_NO_METADATA = (".bmp",)
-"""Formats that hold no metadata."""
+@dataclasses.dataclass(frozen=True)
+class Correction:
+    """What is done to photos.
+
+    Attributes:
+        lens: the lens; for another size of the same aspect ratio it is scaled.
+        keep: what to show, given a photo's size.
+        interpolation, border: as for `undistort_image`.
+        back: whether corrected photos are given, and distortion is applied.
+        again: whether photos are accepted that carry the mark of the same work.
+    """
+
+    lens: ZoomLens
+    keep: Callable[[tuple[int, int]], str | Framing] = lambda size: "same"
+    interpolation: str = "linear"
+    border: str = "constant"
+    back: bool = False
+    again: bool = False
+
+    @property
+    def geometry(self) -> str:
+        """What the photos are afterwards, as the mark has it."""
+        return "distorted" if self.back else "undistorted"
+
+    def __call__(self, image: np.ndarray, focal: float | int) -> np.ndarray:
+        """The corrected image, at a focal length in the lens's unit."""
+        keep = self.keep((image.shape[1], image.shape[0]))
+        warp = redistort_image if self.back else undistort_image
+        return warp(
+            image, self.lens, focal=focal, keep=keep, interpolation=self.interpolation, border=self.border
+        )
 
 
 def undistort_photo(
@@ -41,40 +66,72 @@ def undistort_photo(
     keep: str | Framing = "same",
     interpolation: str = "linear",
     border: str = "constant",
+    again: bool = False,
 ) -> None:
-    """Correct a photo and write it to a new file, with its metadata.
+    """Correct a photo and write it to a new file, with its metadata and a mark in its XMP.
 
     Args:
-        source: the photo: JPEG, PNG, WebP, TIFF, BMP, or HEIC with the extra ``heic``. All its bits and
-            channels are kept.
+        source: the photo: JPEG, PNG, WebP, TIFF, BMP or AVIF; HEIC with the extra ``heic``, RAW with
+            ``raw``. All its bits and channels are kept, and all pages of a TIFF file.
         target: the file to write, completely or not at all. Its suffix sets the format; JPEG in quality 97.
         lens: the lens; for another size of the same aspect ratio it is scaled.
         focal: focal length in the lens's unit; by default that in the EXIF data.
         keep: as for `undistort_image`; a `Framing` for images of another size is scaled as the lens is.
         interpolation, border: as for `undistort_image`.
+        again: whether to correct a photo whose mark tells that it is corrected.
 
     Raises:
         FileNotFoundError: there is no such photo.
         OSError: the target cannot be written; nothing is left of it.
-        ValueError: the photo cannot be decoded, has no focal length, or has another aspect ratio than the
-            lens; or the target is the photo itself, its suffix is unknown, or its format cannot store such
-            pixels.
+        ValueError: the photo cannot be decoded, is in the colours of print (CMYK), has no focal length, is
+            corrected already, or has another aspect ratio than the lens; or the target is the photo itself,
+            its suffix is unknown, or its format cannot store such pixels or several pages.
 
         Warns:
-        UserWarning: as `undistort_image` and `ZoomLens` do; or metadata are lost, as in BMP files.
+        UserWarning: as `undistort_image` and `ZoomLens` do; or metadata are lost, as IPTC data in PNG.
     """
+    _convert(source, target, focal, Correction(lens, _scaled(keep), interpolation, border, again=again))
+
+
+def redistort_photo(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    lens: ZoomLens,
+    focal: float | int | None = None,
+    keep: str | Framing = "same",
+    interpolation: str = "linear",
+    border: str = "constant",
+    again: bool = False,
+) -> None:
+    """Apply distortion to a corrected photo, as `redistort_image`, and write it to a new file.
+
+    Arguments and errors are those of `undistort_photo`; `keep` tells how the photo was corrected.
+    """
+    _convert(source, target, focal, Correction(lens, _scaled(keep), interpolation, border, True, again))
+
+
+def _scaled(keep: str | Framing) -> Callable[[tuple[int, int]], str | Framing]:
+    def framing(size: tuple[int, int]) -> str | Framing:
+        if not isinstance(keep, Framing) or size == keep.size:
+            return keep
+        return framing_for_size(keep, size)
+
+    return framing
+
+
+def _convert(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    focal: float | int | None,
+    correction: Correction,
+) -> None:
     target = Path(target)
     check_target(target)
     refuse_inputs([target], [source])
-    content = corrected_photo(
-        source,
-        target.suffix,
-        lens=lens,
-        focal=focal,
-        keep=lambda size: framing_for_size(keep, size) if isinstance(keep, Framing) else keep,
-        interpolation=interpolation,
-        border=border,
-    )
+    content, lost = corrected_photo(source, target.suffix, correction, focal)
+    if lost:
+        warnings.warn(not_kept(source, target.suffix, lost), stacklevel=3)
     with whole_file(target) as part:
         part.write_bytes(content)
 
@@ -91,40 +148,54 @@ def check_target(target: Path) -> None:
         )
 
 
-def corrected_photo(
-    source: str | os.PathLike[str],
-    suffix: str,
-    *,
-    lens: ZoomLens,
-    focal: float | int | None,
-    keep: Callable[[tuple[int, int]], str | Framing],
-    interpolation: str,
-    border: str,
-) -> bytes:
-    """What `undistort_photo` writes into a file with that suffix, and raises of the source.
+def not_kept(source: str | os.PathLike[str], suffix: str, lost: list[str]) -> str:
+    """A sentence about what a photo loses."""
+    return f"Not kept of {os.fspath(source)} in a {suffix} file: {', '.join(lost)}."
 
-    `keep` tells what to show, given the photograph's size.
+
+def corrected_photo(
+    source: str | os.PathLike[str], suffix: str, correction: Correction, focal: float | int | None
+) -> tuple[bytes, list[str]]:
+    """What `undistort_photo` writes into a file with that suffix, and names of what it does not hold.
+
+    Raises what `undistort_photo` raises of the source.
     """
-    suffix = suffix.lower()
-    image, metadata = read_photo(source)
-    bits, channels = 8 * image.dtype.itemsize, 1 if image.ndim == 2 else image.shape[2]
-    if bits not in FORMATS[suffix][0] or channels not in FORMATS[suffix][1]:
-        raise ValueError(
-            f"Cannot write {channels} channels of {bits} bits, as in {os.fspath(source)}, to a {suffix} "
-            "file: choose .png or .tif."
-        )
+    photo = read_pages(source)
+    _check(photo, source, suffix, correction)
     if focal is None:
-        focal = _known(metadata_focal(metadata) if lens.focal_unit == "mm" else None, source, lens)
-    size = (image.shape[1], image.shape[0])
-    corrected = undistort_image(
-        image, lens, focal=focal, keep=keep(size), interpolation=interpolation, border=border
-    )
-    if metadata and suffix in _NO_METADATA:
-        warnings.warn(
-            f"Metadata of {os.fspath(source)} are not kept: BMP files cannot store metadata.",
-            stacklevel=3,
+        known = metadata_focal(photo.pages[0][1]) if correction.lens.focal_unit == "mm" else None
+        focal = _known(known, source, correction.lens)
+    pages = [
+        (correction(image, focal), marked(metadata, correction.geometry)) for image, metadata in photo.pages
+    ]
+    with _blamed(source):
+        content, lost = encoded_photo(pages, suffix)
+    mark_alone = not any(metadata.xmp for _, metadata in photo.pages)
+    lost = [name for name in lost if not (name == "XMP" and mark_alone)]
+    return content, [*lost, *photo.others]
+
+
+def _check(photo: Photo, source: str | os.PathLike[str], suffix: str, correction: Correction) -> None:
+    name = os.fspath(source)
+    if photo.cmyk:
+        raise ValueError(
+            f"{name} is in the four colours of print (CMYK), which are not kept: convert it to RGB first."
         )
-    return _encoded(corrected, suffix, metadata)
+    if not correction.again and geometry_of(photo.pages[0][1]) == correction.geometry:
+        raise ValueError(
+            f"{name} is {correction.geometry} by zoomjax already. Give the original, or argument again."
+        )
+    with _blamed(source):
+        check_written(photo.pages, suffix)
+
+
+@contextlib.contextmanager
+def _blamed(source: str | os.PathLike[str]) -> Generator[None, None, None]:
+    """Errors of writing name the photo."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"Cannot write {os.fspath(source)}: {error}.") from error
 
 
 def photo_focal(source: str | os.PathLike[str], lens: ZoomLens) -> float:
@@ -144,20 +215,3 @@ def _known(focal: float | None, source: str | os.PathLike[str], lens: ZoomLens) 
             f"{lens.focal_unit}. Give it (argument focal)."
         )
     return focal
-
-
-def _encoded(image: np.ndarray, suffix: str, metadata: Metadata) -> bytes:
-    if suffix in (".tif", ".tiff"):
-        return encode_tiff(image, metadata)
-    options = _OPTIONS.get(suffix, [])
-    try:
-        if metadata and suffix not in _NO_METADATA:
-            kinds, blocks = zip(*metadata, strict=True)
-            done, content = cv2.imencodeWithMetadata(suffix, image, list(kinds), list(blocks), options)
-        else:
-            done, content = cv2.imencode(suffix, image, options)
-    except cv2.error as error:
-        raise ValueError(f"Cannot write this photograph as {suffix}: {error.err}.") from error
-    if not done:
-        raise ValueError(f"Cannot write an image of {image.dtype} and shape {image.shape} as {suffix}.")
-    return content.tobytes()

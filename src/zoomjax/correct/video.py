@@ -1,8 +1,8 @@
 """Correction of zooming video with PyAV, each frame at its own focal length.
 
 Decoding, warping (`_planes`) and encoding overlap in three threads with a few frames between them, so that
-memory use stays constant. Frame times, frame rate, colour description, orientation, tags and audio packets
-are copied unchanged.
+memory use stays constant. Frame times, frame rate, colour description, orientation, tags, sound, and what
+else the container holds are copied unchanged; the result says what was kept and what was not.
 """
 
 import dataclasses
@@ -19,13 +19,15 @@ from .._core.files import refuse_inputs, whole_file
 from ..io.focal_track import FocalTrack
 from ..io.pyav import av
 from ..io.video_reader import Report, decoded_items, numbered, opened_video
-from ..io.video_writer import CONTAINER, FrameWriter, display_matrix
+from ..io.video_streams import CONTAINER, Carried, carried
+from ..io.video_writer import FrameWriter, first_frame
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal, lens_for_size
 from ._planes import FrameWarper
 from ._prefetch import ahead
 from .framing import Framing, check_keep, frame_output, framing_for_size
 from .image import check_sampling, warn_of_fold
+from .redistort import check_framed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,11 +38,15 @@ class CorrectedVideo:
         frames: number of frames written.
         lost: number of announced frames that cannot be decoded, or only with errors.
         scale: output pixels per corrected pixel, the same for all frames.
+        kept: names of what went over beside the pictures: sound, subtitles, chapters, metadata.
+        not_kept: names of what did not.
     """
 
     frames: int
     lost: int
     scale: float
+    kept: tuple[str, ...] = ()
+    not_kept: tuple[str, ...] = ()
 
 
 def undistort_video(
@@ -60,11 +66,12 @@ def undistort_video(
 
     Args:
         source: the video. Its frames are used as stored, before any rotation for display.
-        target: the file to write, completely or not at all: .mp4, .mov, .m4v, .mkv, .webm, .avi, .ts.
+        target: the file to write, completely or not at all: .mp4, .mov, .m4v, .mkv, .webm, .avi, .ts,
+            .mxf.
         lens: the lens; for frames of another size of the same aspect ratio it is scaled.
         focal: one focal length for all frames, or a track, in the lens's unit.
-        keep: "same", "all" or "valid", one framing for all focal lengths of the track; or a `Framing`,
-            which for frames of another size is scaled as the lens is.
+        keep: "same", "all", "valid" or "grow", one framing for all focal lengths of the track; or a
+            `Framing`, which for frames of another size is scaled as the lens is.
         interpolation, border: as for `undistort_image`; a constant border is black.
         encoder: FFmpeg's name of the encoder; by default one for the source's own format, or for H.264.
         options: options of the encoder; by default for visually lossless quality.
@@ -82,6 +89,67 @@ def undistort_video(
         UserWarning: frames cannot be decoded, or are interlaced; focal lengths are outside of the fitted
             range; the lens is for another size, or folds within the frames.
     """
+    return _convert(
+        source,
+        target,
+        lens=lens,
+        focal=focal,
+        keep=keep,
+        interpolation=interpolation,
+        border=border,
+        encoder=encoder,
+        options=options,
+        progress=progress,
+        back=False,
+    )
+
+
+def redistort_video(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    lens: ZoomLens,
+    focal: float | int | FocalTrack,
+    keep: str | Framing = "same",
+    interpolation: str = "linear",
+    border: str = "constant",
+    encoder: str | None = None,
+    options: dict[str, str] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> CorrectedVideo:
+    """Apply distortion to a corrected video, as `redistort_image`, and write it to a new file.
+
+    Arguments, result and errors are those of `undistort_video`; `keep` tells how the video was corrected.
+    """
+    return _convert(
+        source,
+        target,
+        lens=lens,
+        focal=focal,
+        keep=keep,
+        interpolation=interpolation,
+        border=border,
+        encoder=encoder,
+        options=options,
+        progress=progress,
+        back=True,
+    )
+
+
+def _convert(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    lens: ZoomLens,
+    focal: float | int | FocalTrack,
+    keep: str | Framing,
+    interpolation: str,
+    border: str,
+    encoder: str | None,
+    options: dict[str, str] | None,
+    progress: Callable[[int, int], None],
+    back: bool,
+) -> CorrectedVideo:
     target = Path(target)
     if target.suffix.lower() not in CONTAINER:
         raise ValueError(
@@ -91,22 +159,18 @@ def undistort_video(
     if not isinstance(keep, Framing):
         check_keep(keep)
     refuse_inputs([target], [source])
+    track = focal if isinstance(focal, FocalTrack) else _constant(float(focal))
     with opened_video(source) as input_, whole_file(target) as part:
         video = input_.streams.best("video")
         size = (video.codec_context.width, video.codec_context.height)
-        lens = lens_for_size(lens, size)
-        track = focal if isinstance(focal, FocalTrack) else _constant(float(focal))
         _check_length(track, video)
-        lens.check_range(track.focal)
-        if isinstance(keep, Framing):
-            framing = framing_for_size(keep, size)
-        else:
-            framing = _common_framing(lens, track.focal, keep)
-        warper = FrameWarper(lens, framing, interpolation=interpolation, border=border)
-        report = Report(video.frames)
-        items = ahead(_warped(ahead(decoded_items(input_, video, report)), warper, track, report, source))
+        lens, framing = _geometry(lens, track, keep, size, back)
+        warper = FrameWarper(lens, framing, interpolation=interpolation, border=border, back=back)
+        report, along = Report(video.frames), carried(input_, video, target)
+        decoded = ahead(decoded_items(input_, video, report, along.streams))
+        items = ahead(_warped(decoded, warper, track, report, source))
         try:
-            _write(items, part, target, input_, video, encoder, options, report, progress)
+            writer = _write(items, part, target, input_, video, encoder, options, along, report, progress)
         finally:
             items.close()
     lost = max(report.corrupt, report.announced - report.written if report.announced else 0)
@@ -114,9 +178,30 @@ def undistort_video(
         warnings.warn(
             f"{lost} of {max(report.announced, report.written)} frames of {os.fspath(source)} cannot "
             f"be decoded ({report.error or 'the file ends early'}): {report.written} were written.",
-            stacklevel=2,
+            stacklevel=3,
         )
-    return CorrectedVideo(report.written, lost, float(framing.scale))
+    return CorrectedVideo(
+        report.written, lost, float(framing.scale), tuple(writer.kept), tuple(writer.not_kept)
+    )
+
+
+def _geometry(
+    lens: ZoomLens, track: FocalTrack, keep: str | Framing, size: tuple[int, int], back: bool
+) -> tuple[ZoomLens, Framing]:
+    """The lens for the distorted frames, and the framing of the corrected ones, from the size of either."""
+    if back and isinstance(keep, Framing):
+        original = keep.image_size or size
+    else:
+        original = lens.image_size if back and keep == "grow" else size
+    lens = lens_for_size(lens, original)
+    lens.check_range(track.focal)
+    if isinstance(keep, Framing):
+        framing = keep if back else framing_for_size(keep, size)
+    else:
+        framing = _common_framing(lens, track.focal, keep)
+    if back:
+        check_framed(framing, size)
+    return lens, framing
 
 
 def _constant(focal: float) -> FocalTrack:
@@ -156,12 +241,12 @@ def _warped(
     report: Report,
     source: str | os.PathLike[str],
 ) -> Generator[Any, None, None]:
-    """Each frame corrected; packets of audio as they are."""
+    """Each frame corrected; other packets as they are."""
     try:
         for item, number, time in numbered(items, report, source):
             if isinstance(item, av.VideoFrame):
-                if report.orientation is None:
-                    report.orientation = display_matrix(item)
+                if report.first is None:
+                    report.first = first_frame(item)
                 yield warper(item, track.at(number, time))
             else:
                 yield item
@@ -177,12 +262,13 @@ def _write(
     video: Any,
     encoder: str | None,
     options: dict[str, str] | None,
+    along: Carried,
     report: Report,
     progress: Callable[[int, int], None],
-) -> None:
-    """Encode the frames and copy the packets as they come."""
+) -> FrameWriter:
+    """Encode the frames and copy the packets as they come; the writer, which is done."""
     items = iter(items)
-    early = []  # audio before the first frame, of which the encoder must know the size and orientation
+    early = []  # packets before the first frame, of which the encoder must know the size and orientation
     for item in items:
         early.append(item)
         if isinstance(item, av.VideoFrame):
@@ -190,7 +276,7 @@ def _write(
     else:
         raise ValueError(f"Cannot read a video from {input_.name}: none of its frames can be decoded.")
     with FrameWriter(
-        part, target, input_, video, early[-1], encoder, options, report.orientation
+        part, target, input_, video, early[-1], report.first, encoder, options, along
     ) as writer:
         for item in itertools.chain(early, items):
             if not isinstance(item, av.VideoFrame):
@@ -199,3 +285,4 @@ def _write(
             writer.encode(item)
             report.written += 1
             progress(report.written, report.announced)
+    return writer

@@ -4,6 +4,7 @@ from .base import AbstractDetector as AbstractDetector
 from .batch import Detection as Detection
 from .batch import detect as detect
 from .edges import EdgeDetector as EdgeDetector
+from .edges import Edges as Edges
 from .grid import GridDetector as GridDetector
 from .grid import find_checkerboard as find_checkerboard
 from .grid import find_dots as find_dots

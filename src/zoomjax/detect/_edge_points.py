@@ -50,6 +50,7 @@ class EdgePoints:
     Attributes:
         position: (n, 2), px.
         normal: (n, 2), unit vectors towards the brighter side.
+        slope: (n,), how steep the grey levels are there, in one unit for all.
         pixel: (n, 2), the column and row of the pixel that holds each point.
         image_size: (width, height) px.
         polar: whether one side differs from the other, so that opposite normals are no neighbours.
@@ -57,6 +58,7 @@ class EdgePoints:
 
     position: np.ndarray
     normal: np.ndarray
+    slope: np.ndarray
     pixel: np.ndarray
     image_size: tuple[int, int]
     polar: bool = True
@@ -89,9 +91,9 @@ def edge_points(grey: np.ndarray) -> EdgePoints:
     length = np.hypot(*gradient.T)
     normal = gradient / length[:, None]
     keep = _runs_on(at, flat, normal, length, width, noise)
-    at, shift, normal = at[keep], shift[keep], normal[keep]
+    at, shift, normal, length = at[keep], shift[keep], normal[keep], length[keep]
     pixel = np.stack([at % width, at // width], axis=-1)
-    return EdgePoints(pixel + shift, normal.astype(float), pixel, (width, height))
+    return EdgePoints(pixel + shift, normal.astype(float), length.astype(float), pixel, (width, height))
 
 
 def _noise(slopes: list[np.ndarray]) -> float:

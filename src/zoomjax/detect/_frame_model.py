@@ -1,86 +1,172 @@
-"""The distortion of one frame, from its longest borders, to tell what runs straight across the image.
+"""The distortion of one frame while its lines are being found: which edges run straight across the image?
 
-A working model for joining only, in NumPy: numbers of lines and points differ from frame to frame, and JAX
-would compile for each. Two radial terms and two decentering ones (Brown's p1 and p2, for a centre of
-distortion that is not the image's), all linear, minimise eq. 3, with lines that do not become straight
-(arcs, folds in a cloth) weighted down as a whole.
+A working model in NumPy: numbers of lines and points differ from frame to frame, and JAX would compile for
+each. It is the division model with two terms, which follows lenses from strong pincushion to fisheyes,
+
+    corrected = centre + (x - centre) / (1 + k1 t + k2 t^2),  t = |x - centre|^2 / scale^2,
+
+and its centre. Distances of corrected points to their lines are divided by the local stretch across the
+line, which makes them px of the image, where the noise is. Lines that do not become straight (arcs, folds
+in a cloth) are weighted down as a whole.
 """
+
+import dataclasses
 
 import numpy as np
 
-_PRIOR = np.array([1.0, 1.0, 0.02, 0.02])
-"""Standard deviations of k1, k2, p1, p2 before anything is seen: real lenses have less."""
+_PRIOR = np.array([1.0, 0.3, 0.05, 0.05])
+"""Standard deviations of k1 and k2 about the start, and of the centre, in scales, before lines are seen."""
 
-_STEPS = 8
+_STEPS = 6
 _LEAST_SPREAD = 0.1
 """px: a spread of the lines' errors that noise alone gives. Below, no line is doubtful."""
 
+_LEAST_DIVISOR = 0.12
+"""Smallest 1 + k1 t + k2 t^2 at the corner: beyond, the lens sees more than a plane can show."""
 
+
+@dataclasses.dataclass(frozen=True)
 class OneFrame:
-    """Radial and decentering distortion about the centre of an image of one size."""
+    """Radial distortion in images of one size.
 
-    def __init__(self, image_size: tuple[int, int]):
-        self.centre = (np.array(image_size) - 1) / 2
-        self.scale = np.hypot(*image_size) / 2
-        self.k = np.zeros(4)  # k1, k2, p1, p2, normalised
+    Attributes:
+        image_size: (width, height) px.
+        k: k1 and k2.
+        shift: of the centre of distortion from that of the image, in scales.
+    """
+
+    image_size: tuple[int, int]
+    k: tuple[float, float] = (0.0, 0.0)
+    shift: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def of_angle(cls, image_size: tuple[int, int], square: float) -> "OneFrame":
+        """The model nearest to the lens of `_search`, by the square of the corner's angle."""
+        k1 = -square / 3
+        return cls(image_size, (k1, float(1 / tangent_ratio(np.array([square]))[0]) - 1 - k1))
+
+    @property
+    def scale(self) -> float:
+        """px: half of the image's diagonal."""
+        return float(np.hypot(*self.image_size)) / 2
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(2,), the centre of distortion, px."""
+        return (np.array(self.image_size) - 1) / 2 + self.scale * np.array(self.shift)
 
     def undistort(self, points: np.ndarray) -> np.ndarray:
         """Corrected positions of points (..., 2), px."""
-        x, y = ((points[..., axis] - self.centre[axis]) / self.scale for axis in (0, 1))
-        t = x * x + y * y
-        k1, k2, p1, p2 = self.k
-        factor = 1 + t * (k1 + t * k2) + 2 * (p1 * x + p2 * y)
-        corrected = np.empty(points.shape)
-        corrected[..., 0] = self.centre[0] + self.scale * (x * factor + p1 * t)
-        corrected[..., 1] = self.centre[1] + self.scale * (y * factor + p2 * t)
-        return corrected
+        z = (points - self.centre) / self.scale
+        return self.centre + self.scale * z / self._divisor(np.sum(z * z, axis=-1))[..., None]
 
-    def fit(self, lines: list[np.ndarray], samples: int = 64) -> None:
-        """Find the coefficients that straighten lines, (n, 2) px each; leave them if there is none.
+    def stretch(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """(...), by how much the surroundings of points are stretched along normals of corrected lines.
 
-        Gauss-Newton on eq. 3 for the normals of each step, from the coefficients as they are. `samples` of
-        each line's points are used.
+        Both are (..., 2): points in the image, unit normals in the corrected one.
+        """
+        z = (points - self.centre) / self.scale
+        t = np.sum(z * z, axis=-1)
+        divisor = self._divisor(t)
+        growth = -2 * (self.k[0] + 2 * self.k[1] * t) / divisor**2
+        pulled = normal / divisor[..., None] + (growth * np.sum(z * normal, axis=-1))[..., None] * z
+        return np.hypot(pulled[..., 0], pulled[..., 1])
+
+    def _divisor(self, t: np.ndarray) -> np.ndarray:
+        return np.maximum(1 + t * (self.k[0] + t * self.k[1]), _LEAST_DIVISOR)
+
+    def fitted(self, lines: list[np.ndarray], samples: int = 24) -> "OneFrame":
+        """The model that straightens lines, (n, 2) px each, best; this one if there is none.
+
+        Levenberg and Marquardt's method on the distances to the lines, from the model as it is. `samples`
+        of each line's points are used.
         """
         if not lines:
-            return
+            return self
         chosen = [line[np.linspace(0, len(line) - 1, samples).round().astype(int)] for line in lines]
-        z = (np.stack(chosen) - self.centre) / self.scale
-        basis = np.stack([z, *_columns(z)], axis=1)
-        basis -= basis.mean(axis=2, keepdims=True)  # (line, term, sample, 2)
+        points, length = np.stack(chosen), np.array([extent(line) for line in lines])
+        start = model = self
+        damping = 1e-3
+        error = model.errors(points)
+        weight = _weights(error, length)
+        loss = model._loss(error, weight, start)
         for _ in range(_STEPS):
-            corrected = basis[:, 0] + np.einsum("k,lksc->lsc", self.k, basis[:, 1:])
-            normal = normals(corrected)
-            error = np.einsum("lsc,lc->ls", corrected, normal)
-            weight = _weights(self.scale * np.sqrt(np.mean(error**2, axis=1))) * self.scale**2
-            slope = np.einsum("lksc,lc->lks", basis[:, 1:], normal)
-            hessian = np.einsum("l,lks,ljs->kj", weight, slope, slope) + np.diag(_PRIOR**-2.0)
-            gradient = np.einsum("l,lks,ls->k", weight, slope, error) + self.k / _PRIOR**2
-            self.k = self.k - np.linalg.solve(hessian, gradient)
+            slope = model._slopes(points, error)
+            apart = model._values() - start._prior_mean()
+            hessian = np.einsum("l,lsk,lsj->kj", weight, slope, slope) + np.diag(_PRIOR**-2.0)
+            gradient = np.einsum("l,lsk,ls->k", weight, slope, error) + apart / _PRIOR**2
+            step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
+            other = model._at(model._values() - step)
+            new_error = other.errors(points)
+            new_loss = other._loss(new_error, weight, start)
+            if not new_loss < loss or 1 + sum(other.k) <= _LEAST_DIVISOR:
+                damping *= 10
+                continue
+            model, error, damping = other, new_error, damping / 5
+            weight = _weights(error, length)
+            loss = model._loss(error, weight, start)
+        return model
+
+    def errors(self, points: np.ndarray) -> np.ndarray:
+        """(l, s), distances of points (l, s, 2) to the best lines, to first order px of the image."""
+        corrected = self.undistort(points)
+        # The first line is good enough for the stretch along its normal only.
+        _, _, stretch = self._lines(points, corrected, np.ones(points.shape[:-1]))
+        centred, normal, stretch = self._lines(points, corrected, stretch**-2.0)
+        return np.einsum("lsc,lc->ls", centred, normal) / stretch
+
+    def _lines(self, points: np.ndarray, corrected: np.ndarray, weight: np.ndarray):
+        """Corrected points about the mean of their line, its normals, and the stretch along these."""
+        mean = np.sum(weight[..., None] * corrected, axis=1) / np.sum(weight, axis=1)[:, None]
+        centred = corrected - mean[:, None]
+        normal = normals(centred, weight)
+        return centred, normal, self.stretch(points, np.broadcast_to(normal[:, None], points.shape))
+
+    def _slopes(self, points: np.ndarray, error: np.ndarray) -> np.ndarray:
+        """(l, s, 4), derivatives of the errors by the model's values."""
+        values, step = self._values(), 1e-5
+        moved = [self._at(values + step * unit).errors(points) for unit in np.eye(4)]
+        # The sign of a normal is arbitrary: that which is nearer is the same line's.
+        flipped = [np.where(np.sum(m * error, axis=1) < 0, -1, 1)[:, None] * m for m in moved]
+        return np.stack([(m - error) / step for m in flipped], axis=-1)
+
+    def _values(self) -> np.ndarray:
+        return np.array([*self.k, *self.shift])
+
+    def _prior_mean(self) -> np.ndarray:
+        return np.array([*self.k, 0.0, 0.0])
+
+    def _at(self, values: np.ndarray) -> "OneFrame":
+        k1, k2, x, y = map(float, values)
+        return OneFrame(self.image_size, (k1, k2), (x, y))
+
+    def _loss(self, error: np.ndarray, weight: np.ndarray, start: "OneFrame") -> float:
+        prior = (self._values() - start._prior_mean()) / _PRIOR
+        return float(np.sum(weight[:, None] * error**2) + np.sum(prior**2))
 
 
-def _columns(z: np.ndarray) -> np.ndarray:
-    """(4, ..., 2), what a unit of each coefficient adds to normalised positions (..., 2)."""
-    x, y = z[..., 0], z[..., 1]
-    t = x * x + y * y
-    return np.stack(
-        [
-            t[..., None] * z,
-            (t * t)[..., None] * z,
-            np.stack([t + 2 * x * x, 2 * x * y], axis=-1),
-            np.stack([2 * x * y, t + 2 * y * y], axis=-1),
-        ]
-    )
+def tangent_ratio(square: np.ndarray) -> np.ndarray:
+    """``tan(x) / x`` for squares of x, ``tanh(x) / x`` where they are negative."""
+    x = np.sqrt(np.maximum(abs(square), 1e-12))
+    return np.where(square > 0, np.tan(x), np.tanh(x)) / x
 
 
-def normals(centred: np.ndarray) -> np.ndarray:
+def normals(centred: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """(l, 2), the unit normals of the best lines through points (l, s, 2) about their mean."""
     x, y = np.moveaxis(centred, -1, 0)
-    xx, xy, yy = np.sum(x * x, axis=-1), np.sum(x * y, axis=-1), np.sum(y * y, axis=-1)
+    w = np.ones(x.shape) if weight is None else weight
+    xx, xy, yy = np.sum(w * x * x, axis=-1), np.sum(w * x * y, axis=-1), np.sum(w * y * y, axis=-1)
     angle = np.arctan2(2 * xy, xx - yy) / 2
     return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
 
 
-def _weights(rms: np.ndarray) -> np.ndarray:
-    """Of whole lines, by their errors, px: Geman and McClure's, with the median as the scale."""
+def extent(line: np.ndarray) -> float:
+    """px from the first point to the last."""
+    return float(np.hypot(*(line[-1] - line[0])))
+
+
+def _weights(error: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Of whole lines, by length and by Geman and McClure's function of their errors over the median."""
+    rms = np.sqrt(np.mean(error**2, axis=1))
     spread = max(2 * float(np.median(rms)), _LEAST_SPREAD)
-    return 1 / (1 + (rms / spread) ** 2) ** 2
+    return length / np.mean(length) / (1 + (rms / spread) ** 2) ** 2

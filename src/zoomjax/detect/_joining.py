@@ -91,7 +91,8 @@ def _ends(pieces: Fragments) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, n
     ends = []
     for start, outwards in ((pieces.start, -1), (pieces.start + pieces.count - size, 1)):
         within = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
-        end = Fragments(pieces.points[np.repeat(start, size) + within], np.cumsum(size) - size, size)
+        rows = np.repeat(start, size) + within
+        end = Fragments.of(pieces.points[rows], pieces.gradient[rows], size)
         middle = end.sums(end.points) / size[:, None]
         direction = main_direction(end, middle)
         first, last = end.points[end.start], end.points[end.start + size - 1]

@@ -76,7 +76,8 @@ def ridge_points(image: np.ndarray, grass: Grass) -> EdgePoints:
     position -= margin
     keep &= ((position > _BORDER) & (position < np.subtract(size, _BORDER + 1))).all(axis=1)
     position = position[keep]
-    return EdgePoints(position, normal[keep], np.rint(position).astype(np.intp), size, polar=False)
+    pixel, even = np.rint(position).astype(np.intp), np.ones(len(position))
+    return EdgePoints(position, normal[keep], even, pixel, size, polar=False)
 
 
 def _least_height(hat: np.ndarray, mask: np.ndarray) -> float:

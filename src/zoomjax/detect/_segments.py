@@ -34,18 +34,20 @@ class Fragments:
 
     Attributes:
         points: (n, 2), px.
+        gradient: (n, 2), towards the brighter side of the edge, as long as the grey levels are steep.
         start: (f,), where each piece starts in `points`.
         count: (f,), its number of points.
     """
 
     points: np.ndarray
+    gradient: np.ndarray
     start: np.ndarray
     count: np.ndarray
 
     @classmethod
-    def of(cls, points: np.ndarray, count: np.ndarray) -> "Fragments":
+    def of(cls, points: np.ndarray, gradient: np.ndarray, count: np.ndarray) -> "Fragments":
         """Pieces of so many points each, one after the other."""
-        return cls(points, np.cumsum(count) - count, count)
+        return cls(points, gradient, np.cumsum(count) - count, count)
 
     def piece(self) -> np.ndarray:
         """(n,), the piece that each point belongs to."""
@@ -60,7 +62,7 @@ class Fragments:
 
 def fragments(edges: EdgePoints) -> Fragments:
     """The gently bent pieces of at least 8 points that the edge points make."""
-    pieces = _ordered(edges.position, _linked(edges))
+    pieces = _ordered(edges.position, edges.normal * edges.slope[:, None], _linked(edges))
     straight = []
     for _ in range(_HALVINGS + 1):
         if not len(pieces.start):
@@ -68,12 +70,14 @@ def fragments(edges: EdgePoints) -> Fragments:
         rms, second_half = _straightness(pieces)
         piece = pieces.piece()
         crooked = (rms > _CROOKED)[piece]
-        straight.append(Fragments.of(pieces.points[~crooked], pieces.count[rms <= _CROOKED]))
-        pieces = _ordered(pieces.points[crooked], (2 * piece + second_half)[crooked])
+        kept = pieces.count[rms <= _CROOKED]
+        straight.append(Fragments.of(pieces.points[~crooked], pieces.gradient[~crooked], kept))
+        half = (2 * piece + second_half)[crooked]
+        pieces = _ordered(pieces.points[crooked], pieces.gradient[crooked], half)
     if not straight:
         return pieces
-    points, count = (np.concatenate([getattr(f, name) for f in straight]) for name in ("points", "count"))
-    return Fragments.of(points, count)
+    names = ("points", "gradient", "count")
+    return Fragments.of(*(np.concatenate([getattr(f, name) for f in straight]) for name in names))
 
 
 def _linked(edges: EdgePoints) -> np.ndarray:
@@ -99,14 +103,14 @@ def _linked(edges: EdgePoints) -> np.ndarray:
     return connected_components(graph, directed=False)[1]
 
 
-def _ordered(points: np.ndarray, label: np.ndarray) -> Fragments:
+def _ordered(points: np.ndarray, gradient: np.ndarray, label: np.ndarray) -> Fragments:
     """Pieces by label, each in order along its main direction, without the short ones."""
     count = np.bincount(label)
     long = count >= _LEAST_POINTS
     kept = long[label]
-    points, label = points[kept], (np.cumsum(long) - 1)[label[kept]]
+    points, gradient, label = points[kept], gradient[kept], (np.cumsum(long) - 1)[label[kept]]
     order = np.argsort(label, kind="stable")
-    pieces = Fragments.of(points[order], count[long])
+    pieces = Fragments.of(points[order], gradient[order], count[long])
     if not len(pieces.count):
         return pieces
     label = label[order]
@@ -114,7 +118,7 @@ def _ordered(points: np.ndarray, label: np.ndarray) -> Fragments:
     direction = main_direction(pieces, mean)
     along = np.einsum("pc,pc->p", pieces.points - mean[label], direction[label])
     order = np.argsort(label * (2 * np.ptp(along) + 1) + along)  # by label, then along
-    return Fragments.of(pieces.points[order], pieces.count)
+    return Fragments.of(pieces.points[order], pieces.gradient[order], pieces.count)
 
 
 def main_direction(pieces: Fragments, mean: np.ndarray) -> np.ndarray:

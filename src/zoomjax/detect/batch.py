@@ -52,6 +52,8 @@ class Detection:
         focal: the focal length from the image's EXIF data or the video's track, or None.
         nodes: (row, column, 2) px, the nodes of a checkerboard or grid of dots, if one was searched for and
             found: NaN where a dot is not seen.
+        unexplained: share of the length of the strong long edges that no line explains, as in `Edges`; None
+            for other detectors than `EdgeDetector`.
         problem: why the image cannot be used; empty if it can.
     """
 
@@ -62,6 +64,7 @@ class Detection:
     focal: float | None = None
     nodes: np.ndarray | None = None
     problem: str = ""
+    unexplained: float | None = None
 
 
 def detect(
@@ -115,10 +118,21 @@ def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detec
         wanted = grid == "all" or (grid == "without focal length" and focal is None)
         own = isinstance(detector, GridDetector)
         nodes = (detector if own else GridDetector()).find(image) if own or wanted else None
-        lines = tuple(_thinned(line) for line in (detector.lines(nodes) if own else detector(image)))
+        lines, unexplained = _lines(detector, image, nodes)
     except Exception as error:
         return found(size, problem=f"the detector failed: {type(error).__name__}: {_sentence(error)}")
-    return found(size, lines, focal, nodes, "" if lines else _NO_LINES)
+    return found(size, lines, focal, nodes, "" if lines else _NO_LINES, unexplained)
+
+
+def _lines(
+    detector: AbstractDetector, image: np.ndarray, nodes
+) -> tuple[tuple[np.ndarray, ...], float | None]:
+    """The thinned lines, and the share of edges that they leave unexplained."""
+    if isinstance(detector, EdgeDetector):
+        edges = detector.find(image)
+        return tuple(map(_thinned, edges.lines)), edges.unexplained
+    lines = detector.lines(nodes) if isinstance(detector, GridDetector) else detector(image)
+    return tuple(map(_thinned, lines)), None
 
 
 def _sentence(error: Exception) -> str:
@@ -184,6 +198,7 @@ def _save(detection: Detection, file: Path) -> None:
         focal=np.array(np.nan if detection.focal is None else detection.focal),
         nodes=np.zeros((0, 0, 2)) if detection.nodes is None else detection.nodes,
         problem=np.array(detection.problem),
+        unexplained=np.array(np.nan if detection.unexplained is None else detection.unexplained),
     )
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -200,7 +215,7 @@ def _load(file: Path, source: Source) -> Detection | None:
             points, nodes = np.asarray(stored["points"], float), np.asarray(stored["nodes"], float)
             counts, focal = stored["counts"].tolist(), float(stored["focal"])
             width, height = map(int, stored["image_size"].tolist())
-            problem = str(stored["problem"])
+            problem, unexplained = str(stored["problem"]), float(stored["unexplained"])
         sound = (
             points.shape == (sum(counts), 2) and np.isfinite(points).all() and min(counts, default=1) > 0
         )
@@ -216,4 +231,5 @@ def _load(file: Path, source: Source) -> Detection | None:
         focal=source.focal or (None if np.isnan(focal) else focal),
         nodes=nodes if nodes.size else None,
         problem=problem,
+        unexplained=None if np.isnan(unexplained) else unexplained,
     )

@@ -1,32 +1,57 @@
-"""Detection of straight edges, such as the borders of stripes and squares.
+"""Detection of straight edges, however bent by the lens: stripes, squares, buildings, halls.
 
 As in the paper's first experiment, sub-pixel edges (`_edge_points`) are linked into smooth pieces
-(`_segments`), and pieces of one border are joined by arcs (`_joining`). Then the distortion of the frame is
-estimated from the longest borders (`_frame_model`). In the corrected image every border is a straight line,
-and all pieces that lie on it are added. This is done twice. The two edges of a stripe are separate lines.
+(`_segments`). A Hough transform with distortion as one more unknown then tells how bent the photograph is
+(`_search`). Under that model, in which lines of the scene are straight, pieces are joined to lines
+(`_collinear`). The lines fit the model again (`_frame_model`), and both take turns, so that lines get
+longer as the model gets better. The two edges of a stripe are separate lines.
 """
+
+import dataclasses
 
 import cv2
 import numpy as np
 
+from ._collinear import collinear
 from ._edge_points import edge_points
-from ._frame_model import OneFrame, normals
-from ._joining import border_lines, joined
+from ._frame_model import OneFrame, extent
+from ._joining import border_lines
+from ._search import likely_angle
 from ._segments import Fragments, fragments
 from .base import AbstractDetector
 
-_LONG = 0.2
-"""Share of the image's shorter side that a border must extend over to inform the frame's distortion."""
+_LEAST_FITTED = 0.1
+"""Share of the image's shorter side that a line must extend over to inform the frame's distortion."""
 
 _LEAST_LINES = 3
-"""Number of long borders needed to estimate the distortion of a frame."""
+"""Number of such lines needed to estimate the distortion of a frame."""
 
-_ENOUGH = 100
-"""Number of points that represent a line."""
+_MOST_FITTED = 150
+"""So many of the longest lines are enough to estimate it."""
 
-_LEAST_TOLERANCE = 0.5
-_GREATEST_TOLERANCE = 2.0
-"""px, bounds of the distance at which a piece is still on a border: three times the borders' RMS."""
+_TURNS = (1.0, 0.6, 0.4)
+"""px, at most, by which lines may be bent as the model is not exact, turn by turn; at least `_EXACT`."""
+
+_EXACT = 0.15
+_ROUGHEST = 4.0
+"""Greatest RMS of a line, in such px of the last turn, and the least one that counts as rough."""
+
+_STRONG = 0.05
+"""Share of the image's shorter side from which on a piece of an edge should be explained by some line."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Edges:
+    """What `EdgeDetector.find` finds in an image.
+
+    Attributes:
+        lines: for each line an (n, 2) array of points, px, in order along it, the longest line first.
+        unexplained: share, 0 to 1, of the length of all long and smooth edges that is on none of the lines.
+            Arcs and branches add to it; where it is large, the lines are little of what there is.
+    """
+
+    lines: tuple[np.ndarray, ...]
+    unexplained: float
 
 
 class EdgeDetector(AbstractDetector):
@@ -68,34 +93,40 @@ class EdgeDetector(AbstractDetector):
         Raises:
             ValueError: the image is not such an array.
         """
+        return list(self.find(image).lines)
+
+    def find(self, image: np.ndarray) -> Edges:
+        """Detect edges, and say how bent the image is and how much of it the lines explain.
+
+        Args:
+            image: as for calls.
+
+        Raises:
+            ValueError: the image is not such an array.
+        """
         grey = as_grey(image)
         size = (grey.shape[1], grey.shape[0])
         pieces = fragments(edge_points(grey))
-        model = OneFrame(size)
-        border = joined(pieces, model.scale)
-        least = _LONG * min(size)
-        tolerance = _GREATEST_TOLERANCE
-        for _ in range(2):
-            long = [line for line in border_lines(pieces, border) if _extent(line) >= least]
+        model = OneFrame.of_angle(size, likely_angle(pieces, size))
+        label, sigma = np.zeros(0, int), _TURNS[0]
+        for most in _TURNS:
+            sigma = min(sigma, most)
+            label = collinear(pieces, model, sigma)
+            long = _long(pieces, label, _LEAST_FITTED * min(size))
             if len(long) < _LEAST_LINES:
                 break
-            model.fit(long)
-            rms = np.median([_rms(model.undistort(_few(line))) for line in long])
-            tolerance = float(np.clip(3 * rms, _LEAST_TOLERANCE, _GREATEST_TOLERANCE))
-            border = _absorbed(pieces, border, model, tolerance)
-        return self._good(border_lines(pieces, border), model, tolerance, min(size))
+            model = model.fitted(long)
+            sigma = float(np.clip(2 * np.median([_rms(line, model) for line in long]), _EXACT, 1.0))
+        good = [self._is_good(line, model, sigma, min(size)) for line in border_lines(pieces, label)]
+        return _found(pieces, label, np.array(good, bool), min(size))
 
-    def _good(self, lines, model: OneFrame, tolerance: float, side: int) -> list[np.ndarray]:
-        """The lines that are long, visible and straight enough, the longest first."""
-        kept = []
-        for line in lines:
-            extent = _extent(line)
-            if extent < self.least_length * side or len(line) < self.least_cover * _steps(line):
-                continue
-            if _rms(model.undistort(_few(line))) <= 2 * tolerance:
-                kept.append((extent, line))
-        kept.sort(key=lambda entry: -entry[0])
-        return [line for _, line in kept]
+    def _is_good(self, line: np.ndarray, model: OneFrame, sigma: float, side: int) -> bool:
+        """Whether a line is long, visible and straight enough."""
+        if extent(line) < self.least_length * side:
+            return False
+        if len(line) < self.least_cover * np.max(abs(line[-1] - line[0])):
+            return False
+        return _rms(line, model) <= _ROUGHEST * max(sigma, 0.25)
 
 
 def as_grey(image: np.ndarray) -> np.ndarray:
@@ -118,57 +149,34 @@ def as_grey(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
 
 
-def _absorbed(pieces: Fragments, border: np.ndarray, model: OneFrame, tolerance: float) -> np.ndarray:
-    """The border of each piece, after the borders, the longest first, took all pieces that lie on them."""
-    corrected = model.undistort(pieces.points)
-    ends = corrected[pieces.start], corrected[pieces.start + pieces.count - 1]
-    label = border[pieces.piece()]
-    order = np.argsort(label, kind="stable")
-    names, start = np.unique(label[order], return_index=True)
-    groups = np.split(corrected[order], start[1:])
-    groups = [_few(group) for group in groups]
-    lengths = [np.hypot(*np.ptp(group, axis=0)) for group in groups]
-    result = np.full(len(border), -1)
-    for number, index in enumerate(np.argsort(lengths)[::-1]):
-        group = groups[index]
-        free = result < 0
-        if not free[border == names[index]].any():
-            continue
-        mean = group.mean(axis=0)
-        normal = normals((group - mean)[None])[0]
-        on = free & np.all([abs((end - mean) @ normal) < tolerance for end in ends], axis=0)
-        if _is_smooth(group - mean, normal, tolerance):  # bent more than a line may be, but one border
-            on |= free & (border == names[index])
-        result[on] = number
-    return np.where(result < 0, result.max() + 1 + border, result)
+def _long(pieces: Fragments, label: np.ndarray, least: float) -> list[np.ndarray]:
+    """The longest lines, of at least so many px."""
+    tips = np.concatenate([pieces.points[pieces.start], pieces.points[pieces.start + pieces.count - 1]])
+    number = int(label.max(initial=-1)) + 1
+    low, high = np.full((number, 2), np.inf), np.full((number, 2), -np.inf)
+    np.minimum.at(low, np.tile(label, 2), tips)
+    np.maximum.at(high, np.tile(label, 2), tips)
+    large = np.hypot(*(high - low).T) >= least
+    lines = border_lines(pieces, np.where(large[label], label, -1))[int(not large[label].all()) :]
+    return sorted((line for line in lines if extent(line) >= least), key=extent, reverse=True)[
+        :_MOST_FITTED
+    ]
 
 
-def _is_smooth(centred: np.ndarray, normal: np.ndarray, tolerance: float) -> bool:
-    """Whether points follow a cubic along a line about as well as a line may be followed."""
-    along, across = centred @ (normal[1], -normal[0]), centred @ normal
-    powers = np.vander(along / max(np.ptp(along), 1e-9), 4)
-    rest = across - powers @ np.linalg.lstsq(powers, across, rcond=None)[0]
-    return float(np.sqrt(np.mean(rest**2))) < tolerance / 2
+def _found(pieces: Fragments, label: np.ndarray, good: np.ndarray, side: int) -> Edges:
+    """The good lines, and what they leave of the strong long pieces."""
+    names = np.unique(label)
+    lines = [line for line, keep in zip(border_lines(pieces, label), good, strict=True) if keep]
+    last = pieces.start + pieces.count - 1
+    length = np.hypot(*(pieces.points[last] - pieces.points[pieces.start]).T)
+    strong = length >= _STRONG * side
+    on = np.isin(label, names[good])
+    total = float(length[strong].sum())
+    left = float(length[strong & ~on].sum()) / total if total else 0.0
+    return Edges(tuple(sorted(lines, key=extent, reverse=True)), left)
 
 
-def _few(points: np.ndarray) -> np.ndarray:
-    """Enough of a line's points, spread over it, to tell how it runs and how rough it is."""
-    if len(points) <= _ENOUGH:
-        return points
-    return points[np.linspace(0, len(points) - 1, _ENOUGH).round().astype(int)]
-
-
-def _extent(line: np.ndarray) -> float:
-    """px from the first point to the last."""
-    return float(np.hypot(*(line[-1] - line[0])))
-
-
-def _steps(line: np.ndarray) -> float:
-    """Rows or columns from end to end, whichever are more: a border has a point in each."""
-    return float(np.max(abs(line[-1] - line[0])))
-
-
-def _rms(line: np.ndarray) -> float:
-    """px about the best line."""
-    centred = line - line.mean(axis=0)
-    return float(np.sqrt(np.mean((centred @ normals(centred[None])[0]) ** 2)))
+def _rms(line: np.ndarray, model: OneFrame) -> float:
+    """px of the image about the best line."""
+    some = line[np.linspace(0, len(line) - 1, 64).round().astype(int)]
+    return float(np.sqrt(np.mean(model.errors(some[None]) ** 2)))

@@ -5,7 +5,7 @@ import glob
 import hashlib
 import os
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 
 from ..io.focal_track import FocalTrack
 from ..io.photo import SUFFIXES, metadata_focal, open_photo, read_photo
+from ..io.raw import RAW_SUFFIXES
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".m2ts", ".mpg", ".mxf", ".ts")
 """Of files that count as videos."""
@@ -91,50 +92,80 @@ def find_photos(inputs: Iterable[str | os.PathLike[str]]) -> list[Source]:
 
     Raises:
         FileNotFoundError: an input does not exist, or no file fits a pattern.
-        ValueError: an input is not a photo, a folder has none, or a photo is given twice.
+        ValueError: an input is not a photo, or a folder has none.
+
+        Warns:
+        UserWarning: a photo is given twice, perhaps through a link; it is used once.
     """
     paths: list[Path] = []
     for given in inputs:
         paths += _expanded(os.fspath(given))
-    seen: set[Path] = set()
-    for path in paths:
-        real = path.resolve()
-        if real in seen:
-            raise ValueError(f"The photograph {path} is given twice. Give each once.")
-        seen.add(real)
+    paths, again = once(paths)
+    if again:
+        warnings.warn(twice(again), stacklevel=2)
     return [Source(name, path) for name, path in zip(_names(paths), paths, strict=True)]
+
+
+def once(paths: Sequence[Path]) -> tuple[list[Path], dict[Path, Path]]:
+    """Each file once, and for those that are left out the file that they are or lead to."""
+    first: dict[Path, Path] = {}
+    real = {path: Path(os.path.realpath(path)) for path in paths}
+    again = {path: same for path in paths if (same := first.setdefault(real[path], path)) is not path}
+    return list(first.values()), again
+
+
+def twice(again: dict[Path, Path]) -> str:
+    """A sentence about files that were given twice."""
+    path, same = next(iter(again.items()))
+    what = "is given twice" if path == same else f"is the same file as {same}"
+    more = f", and {len(again) - 1} more are like it" if len(again) > 1 else ""
+    return f"{path} {what}{more}: it is used once."
 
 
 def _expanded(given: str) -> list[Path]:
     path = Path(given)
     if path.is_dir():
-        return _within(path)
+        return _photos_within(path)
     if path.exists():
         if path.suffix.lower() not in SUFFIXES:
             raise ValueError(f"{path} is not a photo: the file name must end in {', '.join(SUFFIXES)}.")
         return [path]
     found = [Path(name) for name in sorted(glob.glob(given, recursive=True))]
     photos = [p for p in found if p.suffix.lower() in SUFFIXES and p.is_file()]
-    photos = photos or [inner for p in found if p.is_dir() for inner in _within(p)]
+    photos = photos or [inner for p in found if p.is_dir() for inner in _photos_within(p)]
     if not photos:
         what = "no photograph fits the pattern" if glob.has_magic(given) else "there is no file or folder"
         raise FileNotFoundError(f"Cannot find photographs: {what} {given}.")
     return photos
 
 
-def _within(folder: Path) -> list[Path]:
+def _photos_within(folder: Path) -> list[Path]:
+    found = files_within(folder, SUFFIXES)
+    if not found:
+        raise ValueError(f"There are no photographs in the folder {folder} ({', '.join(SUFFIXES)}).")
+    return found
+
+
+def files_within(folder: Path, suffixes: Sequence[str]) -> list[Path]:
+    """Files with these suffixes in a folder and those within it, hidden ones and results left out.
+
+    Of a RAW file beside a photo of the same name, the photo is meant: it was developed from it.
+    """
     results = {lens.with_name(name) for lens in folder.rglob("lens.json") for name in RESULTS}
     found = sorted(
         path
         for path in folder.rglob("*")
-        if path.suffix.lower() in SUFFIXES
+        if path.suffix.lower() in suffixes
         and path.is_file()
         and not any(part.startswith(".") for part in path.relative_to(folder).parts)
         and not results.intersection((path, *path.parents))
     )
-    if not found:
-        raise ValueError(f"There are no photographs in the folder {folder} ({', '.join(SUFFIXES)}).")
-    return found
+    developed = {path.with_suffix("") for path in found if path.suffix.lower() not in RAW_SUFFIXES}
+    return [
+        path
+        for path in found
+        if path.suffix.lower() not in RAW_SUFFIXES or path.with_suffix("") not in developed
+    ]
 
 
 def _names(paths: list[Path]) -> list[str]:

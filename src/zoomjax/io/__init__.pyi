@@ -1,5 +1,7 @@
 # The public names of this room: read by type checkers, and by lazy_loader at run time.
 
+from .equipment import Equipment as Equipment
+from .equipment import read_equipment as read_equipment
 from .exif import exif_focal as exif_focal
 from .exif import exif_with_focal as exif_with_focal
 from .focal_table import FocalTable as FocalTable

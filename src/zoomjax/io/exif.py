@@ -38,18 +38,31 @@ def exif_with_focal(focal: float) -> bytes:
     return exif.tobytes().removeprefix(_PREFIX)
 
 
-def parse_exif(file: File) -> Image.Exif | None:
-    """The EXIF data of a TIFF file, which EXIF data are by themselves; None if they are damaged."""
+def parse_exif(file: File, offset: int | None = None) -> Image.Exif | None:
+    """The EXIF data of a TIFF file, which EXIF data are by themselves; None if they are damaged.
+
+    An offset leads to another page than the first.
+    """
     exif = Image.Exif()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of damage, which does not matter unless the focal length is gone
         try:
-            exif.load_from_fp(file)
+            if offset is None:
+                exif.load_from_fp(file)
+            else:
+                _load_page(exif, file, offset)
             for folder in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):
                 exif.get_ifd(folder)  # read while warnings are caught
         except Exception:  # Pillow raises errors of many kinds where offsets lead nowhere
             return None
     return exif
+
+
+def _load_page(exif: Image.Exif, file: File, offset: int) -> None:
+    """Load what a TIFF file has at an offset, in the file's own order of bytes."""
+    head = file.read(8)
+    exif.endian, exif.bigtiff = ("<" if head[:2] == b"II" else ">"), head[2:3] == b"+" or head[3:4] == b"+"
+    exif.load_from_fp(file, offset)
 
 
 def find_exif(file: File, kind: str) -> bytes | None:

@@ -8,11 +8,12 @@ import re
 import struct
 from collections.abc import Iterator
 
+from .avif import avif_size
 from .heic import heic_size
 
 
 def announced_format(content: bytes) -> str:
-    """Format ("JPEG", "PNG", "WebP", "TIFF", "BMP" or "HEIC") of a file that begins like this.
+    """Format ("JPEG", "PNG", "WebP", "TIFF", "BMP", "AVIF" or "HEIC") of a file that begins like this.
 
     Raises:
         ValueError: the content has another format.
@@ -22,7 +23,15 @@ def announced_format(content: bytes) -> str:
     for begins, name, _ in _FORMATS:
         if begins.match(content):
             return name
-    raise ValueError("it is damaged, or of an unknown format")
+    raise ValueError(unknown(content))
+
+
+def unknown(content: bytes) -> str:
+    """What a file is that is no photo in a known format, as far as its beginning tells."""
+    name = next((name for begins, name in _OTHERS if begins.match(content)), None)
+    if name is None:
+        return "it is damaged, or of an unknown format"
+    return f"it is {name}: convert it to TIFF or PNG first" if "video" not in name else f"it is {name}"
 
 
 def announced_size(content: bytes) -> tuple[str, int, int]:
@@ -36,8 +45,8 @@ def announced_size(content: bytes) -> tuple[str, int, int]:
             try:
                 return name, *size(content)
             except (struct.error, OverflowError, StopIteration):  # it ends early, or leads out of the file
-                break
-    raise ValueError("it is damaged, or of an unknown format")
+                raise ValueError("it is damaged, or of an unknown format") from None
+    raise ValueError(unknown(content))
 
 
 def jpeg_segments(content: bytes) -> Iterator[tuple[int, int]]:
@@ -114,5 +123,24 @@ _FORMATS = (
     (re.compile(rb"RIFF....WEBPVP8[ LX]", re.DOTALL), "WebP", _webp),
     (re.compile(rb"II[*+]\0|MM\0[*+]"), "TIFF", _tiff),
     (re.compile(rb"BM"), "BMP", _bmp),
+    (re.compile(rb"....ftypavif", re.DOTALL), "AVIF", avif_size),
     (re.compile(rb"....ftyp(hei[cmsx]|hev[cx]|mif1)", re.DOTALL), "HEIC", heic_size),
 )
+
+_OTHERS = (
+    (re.compile(rb"GIF8[79]a"), "a GIF image"),
+    (re.compile(rb"\0\0\0\x0cjP  |\xff\x4f\xff\x51"), "a JPEG 2000 image"),
+    (re.compile(rb"\xff\x0a|\0\0\0\x0cJXL "), "a JPEG XL image"),
+    (re.compile(rb"....ftypavis", re.DOTALL), "a sequence of AVIF images"),
+    (re.compile(rb"....ftypcrx ", re.DOTALL), "a RAW photo without the suffix of one"),
+    (re.compile(rb"8BPS"), "a Photoshop file"),
+    (re.compile(rb"v/1\x01"), "an OpenEXR image"),
+    (re.compile(rb"SDPX|XPDS"), "a DPX image"),
+    (re.compile(rb"#\?RADIANCE"), "a Radiance image"),
+    (re.compile(rb"P[1-7]\s"), "a PNM image"),
+    (re.compile(rb"\x00\x00\x01\x00"), "an icon"),
+    (re.compile(rb"%PDF"), "a PDF document"),
+    (re.compile(rb"(\xef\xbb\xbf)?\s*<(\?xml|svg)"), "an SVG drawing or another XML document"),
+    (re.compile(rb"....ftyp|\x1aE\xdf\xa3|RIFF....AVI ", re.DOTALL), "a video"),
+)
+"""What is often taken for a photo, and how messages call it."""

@@ -5,21 +5,17 @@ write beside the one that the decoder follows.
 """
 
 import io
+from collections.abc import Mapping
 from types import ModuleType
+from typing import Any
 
-import cv2
 import numpy as np
 
 from .exif import parse_exif
-from .tiff import Metadata, as_stored, orientation_of
+from .metadata import Metadata
+from .tiff import as_stored, orientation_of
 
 HEIC_SUFFIXES = (".heic", ".heif")
-
-_KINDS = {
-    "exif": cv2.IMAGE_METADATA_EXIF,
-    "xmp": cv2.IMAGE_METADATA_XMP,
-    "icc_profile": cv2.IMAGE_METADATA_ICCP,
-}
 
 
 def heic_size(content: bytes) -> tuple[int, int]:
@@ -37,12 +33,14 @@ def heic_metadata(content: bytes) -> Metadata:
     Raises:
         ValueError: as `heic_size`.
     """
-    found = {kind: _opened(content).info.get(name) for name, kind in _KINDS.items()}
-    return [
-        (kind, np.frombuffer(block.removeprefix(b"Exif\0\0"), np.uint8))
-        for kind, block in found.items()
-        if isinstance(block, bytes) and block
-    ]
+    return metadata_in(_opened(content).info)
+
+
+def metadata_in(info: Mapping[Any, Any]) -> Metadata:
+    """What Pillow, and libraries that follow it, tell of a picture."""
+    exif, xmp, icc = (info.get(name) for name in ("exif", "xmp", "icc_profile"))
+    exif, xmp, icc = (block if isinstance(block, bytes) else b"" for block in (exif, xmp, icc))
+    return Metadata(exif=exif.removeprefix(b"Exif\0\0"), xmp=xmp, icc=icc)
 
 
 def decode_heic(content: bytes) -> tuple[np.ndarray, Metadata]:
@@ -56,8 +54,7 @@ def decode_heic(content: bytes) -> tuple[np.ndarray, Metadata]:
         image = np.array(picture)  # a copy: the memory goes with the picture
     except Exception as error:  # of whatever kind libheif's are
         raise ValueError("the file is damaged or cut off") from error
-    exif = next((block.tobytes() for kind, block in metadata if kind == cv2.IMAGE_METADATA_EXIF), b"")
-    parsed = parse_exif(io.BytesIO(exif))
+    parsed = parse_exif(io.BytesIO(metadata.exif))
     return as_stored(image, 1 if parsed is None else orientation_of(parsed)), metadata
 
 

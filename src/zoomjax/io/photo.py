@@ -4,29 +4,46 @@ Pixels are used as stored, before rotation by the orientation tag, because the l
 """
 
 import contextlib
+import dataclasses
 import io
 import os
 import stat
-from collections.abc import Iterator
+import struct
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from .avif import avif_metadata, decode_avif
 from .exif import exif_focal, find_exif
 from .headers import announced_format, announced_size, jpeg_segments
 from .heic import HEIC_SUFFIXES, decode_heic, heic_metadata
-from .tiff import Metadata, as_stored, tiff_metadata
+from .jpeg import is_cmyk, jpeg_metadata
+from .metadata import Metadata
+from .photo_writer import FORMATS, MAKER_NOTES
+from .png import png_metadata
+from .raw import RAW_SUFFIXES, decode_raw, raw_metadata, raw_size
+from .tiff import read_tiff, tiff_metadata, tiff_size
+from .webp import webp_metadata
 
-FORMATS = {  # suffix: bits a sample, and numbers of channels, that the format holds
-    **dict.fromkeys([".jpg", ".jpeg"], ((8,), (1, 3))),
-    ".png": ((8, 16), (1, 3, 4)),
-    ".webp": ((8,), (3, 4)),
-    **dict.fromkeys([".tif", ".tiff"], ((8, 16, 32, 64), (1, 3, 4))),
-    ".bmp": ((8,), (1, 3, 4)),
-}
-SUFFIXES = (*FORMATS, *HEIC_SUFFIXES)
+SUFFIXES = (*FORMATS, *HEIC_SUFFIXES, *RAW_SUFFIXES)
 """Of files that count as photographs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Photo:
+    """A photo file.
+
+    Attributes:
+        pages: pixels as stored, as OpenCV has them, and metadata; several in a TIFF file only.
+        others: what else the file holds that is not among these, such as "further pictures".
+        cmyk: whether it holds the four colours of print, of which the pixels have three.
+    """
+
+    pages: tuple[tuple[np.ndarray, Metadata], ...]
+    others: tuple[str, ...] = ()
+    cmyk: bool = False
 
 
 def read_focal(source: str | os.PathLike[str]) -> float | None:
@@ -37,27 +54,50 @@ def read_focal(source: str | os.PathLike[str]) -> float | None:
         OSError: it cannot be read.
         ValueError: it is not a photo or not a regular file, or has more than 4 GB.
     """
-    path = Path(source)
-    try:
-        with open_photo(path) as file:
-            kind = announced_format(file.read(16))
-            file.seek(0)
-            if kind == "HEIC":
-                return metadata_focal(heic_metadata(file.read(_MOST_BYTES)))
-            block = find_exif(file, kind)
-    except ValueError as error:
-        raise ValueError(f"Cannot read a photograph from {path}: {error}.") from error
+    block = read_exif(source)
     return None if block is None else exif_focal(block)
+
+
+def read_exif(source: str | os.PathLike[str]) -> bytes | None:
+    """Read a photo's EXIF data; None if it has none. No pixel is decoded. It raises as `read_focal`."""
+    path = Path(source)
+    whole: dict[str, Callable[[bytes], Metadata]] = {"HEIC": heic_metadata, "AVIF": avif_metadata}
+    with _named(path), open_photo(path) as file:
+        if path.suffix.lower() in RAW_SUFFIXES:
+            return raw_metadata(file.read(_MOST_BYTES)).exif or None
+        kind = announced_format(file.read(16))
+        file.seek(0)
+        if kind in whole:
+            return whole[kind](file.read(_MOST_BYTES)).exif or None
+        return find_exif(file, kind)
+
+
+def read_size(source: str | os.PathLike[str]) -> tuple[int, int]:
+    """Read a photo's width and height, px, from its header. It raises as `read_focal`."""
+    path = Path(source)
+    with _named(path), open_photo(path) as file:
+        _, width, height = announced_size(file.read(_MOST_BYTES))
+    return width, height
 
 
 def metadata_focal(metadata: Metadata) -> float | None:
     """The focal length, mm, in the metadata from `read_photo`."""
-    blocks = (data.tobytes() for kind, data in metadata if kind == cv2.IMAGE_METADATA_EXIF)
-    return next((exif_focal(block) for block in blocks), None)
+    return exif_focal(metadata.exif) if metadata.exif else None
+
+
+def read_metadata(source: str | os.PathLike[str]) -> Metadata:
+    """Read a photo's metadata, of its first page. No pixel is decoded; raises as `read_focal`."""
+    path = Path(source)
+    with _named(path), open_photo(path) as file:
+        content = file.read(_MOST_BYTES)
+        if path.suffix.lower() in RAW_SUFFIXES:
+            return raw_metadata(content)
+        kind = announced_format(content)
+        return _METADATA[kind](content) if kind in _METADATA else Metadata()
 
 
 def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, Metadata]:
-    """Read the pixels as stored, and metadata (EXIF, XMP, colour profile) as pairs of kind and bytes.
+    """Read the pixels as stored, and metadata; of a TIFF file, those of its first page.
 
     The header is checked before anything is decoded, and only regular files are opened.
 
@@ -66,36 +106,48 @@ def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, Metadata]:
         OSError: it cannot be read.
         ValueError: it cannot be decoded, or has more than 500 million pixels or 4 GB.
     """
-    path = Path(source)
-    try:
+    return _read(Path(source), most_pages=1).pages[0]
+
+
+def read_pages(source: str | os.PathLike[str]) -> Photo:
+    """Read all pages of a photo file, and what else is known of it; raises as `read_photo`."""
+    return _read(Path(source), most_pages=_MOST_PAGES)
+
+
+def _read(path: Path, *, most_pages: int) -> Photo:
+    with _named(path):
         with open_photo(path) as file:
             content = file.read(_MOST_BYTES)
         if not content:
             raise ValueError("the file is empty")
+        if path.suffix.lower() in RAW_SUFFIXES:
+            _check_pixels(*raw_size(content))
+            return Photo((decode_raw(content),))
         kind, width, height = announced_size(content)
-        if width * height > _MOST_PIXELS:
-            raise ValueError(f"its header announces {width}x{height} px, more than {_MOST_PIXELS:,} in all")
-        if kind == "JPEG" and all(mark != _END for mark, _ in jpeg_segments(content)):
-            raise ValueError("the file is damaged or cut off")  # OpenCV fills up what is missing with grey
-        if kind == "HEIC":
-            return decode_heic(content)
-        image, metadata = _decoded(np.frombuffer(content, np.uint8), metadata=kind in _WITH_METADATA)
-        if kind == "TIFF":
-            metadata, orientation = tiff_metadata(io.BytesIO(content))
-            image = as_stored(image, orientation)  # OpenCV turns TIFF files, whatever it is asked
-        return image, metadata
+        _check_pixels(width, height)
+        return _DECODERS.get(kind, _plain)(content, most_pages)
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Errors of a photo name it."""
+    try:
+        yield
     except (ValueError, MemoryError) as error:
         reason = error if isinstance(error, ValueError) else "there is not enough memory for it"
         raise ValueError(f"Cannot read a photograph from {path}: {reason}.") from error
 
 
-_WITH_METADATA = ("JPEG", "PNG", "WebP")
-"""Formats whose metadata OpenCV knows."""
+def _check_pixels(width: int, height: int) -> None:
+    if width * height > _MOST_PIXELS:
+        raise ValueError(f"its header announces {width}x{height} px, more than {_MOST_PIXELS:,} in all")
+
 
 _MOST_BYTES = 4_000_000_000
 _MOST_PIXELS = 500_000_000
 """Cameras that shift their sensor give 400 million; three bytes each, and five times that to find lines."""
 
+_MOST_PAGES = 10_000
 _END = 0xD9
 """The marker at the end of a JPEG's picture; phones append films and other pictures."""
 
@@ -123,19 +175,79 @@ def open_photo(path: Path) -> Iterator[io.BufferedReader]:
         yield file
 
 
-def _decoded(content: np.ndarray, *, metadata: bool) -> tuple[np.ndarray, Metadata]:
-    kinds, blocks = [], []
+def _jpeg(content: bytes, most_pages: int) -> Photo:
+    if all(mark != _END for mark, _ in jpeg_segments(content)):
+        raise ValueError("the file is damaged or cut off")  # OpenCV fills up what is missing with grey
+    metadata, others = jpeg_metadata(content)
+    return Photo(((_decoded(content), metadata),), tuple(others), is_cmyk(content))
+
+
+def _png(content: bytes, most_pages: int) -> Photo:
+    metadata, others = png_metadata(content)
+    return Photo(((_decoded(content), metadata),), tuple(others))
+
+
+def _webp(content: bytes, most_pages: int) -> Photo:
+    metadata, others = webp_metadata(content)
+    return Photo(((_decoded(content), metadata),), tuple(others))
+
+
+def _tiff(content: bytes, most_pages: int) -> Photo:
+    if most_pages > 1 and (number := tiff_size(content)) > _MOST_PIXELS:
+        raise ValueError(f"its pages have {number:,} pixels, more than {_MOST_PIXELS:,}")
+    pages = read_tiff(content, most_pages=most_pages)
+    others = (MAKER_NOTES,) if any(page.notes for page in pages) else ()
+    cmyk = any(page.cmyk for page in pages)
+    return Photo(tuple((page.image, page.metadata) for page in pages), others, cmyk)
+
+
+def _heic(content: bytes, most_pages: int) -> Photo:
+    return Photo((decode_heic(content),))
+
+
+def _avif(content: bytes, most_pages: int) -> Photo:
+    image, metadata, others = decode_avif(content)
+    return Photo(((image, metadata),), tuple(others))
+
+
+def _bmp_metadata(content: bytes) -> Metadata:
+    if len(content) < 46 or struct.unpack_from("<I", content, 14)[0] < 40:
+        return Metadata()
+    across, down = (round(value * 0.0254, 2) for value in struct.unpack_from("<ii", content, 38))
+    return Metadata(dpi=(across, down) if across > 0 and down > 0 else None)
+
+
+def _plain(content: bytes, most_pages: int) -> Photo:
+    return Photo(((_decoded(content), _bmp_metadata(content)),))
+
+
+_DECODERS: dict[str, Callable[[bytes, int], Photo]] = {
+    "JPEG": _jpeg,
+    "PNG": _png,
+    "WebP": _webp,
+    "TIFF": _tiff,
+    "HEIC": _heic,
+    "AVIF": _avif,
+}
+_METADATA: dict[str, Callable[[bytes], Metadata]] = {
+    "JPEG": lambda content: jpeg_metadata(content)[0],
+    "PNG": lambda content: png_metadata(content)[0],
+    "WebP": lambda content: webp_metadata(content)[0],
+    "TIFF": lambda content: tiff_metadata(content)[0],
+    "HEIC": heic_metadata,
+    "AVIF": avif_metadata,
+    "BMP": _bmp_metadata,
+}
+
+
+def _decoded(content: bytes) -> np.ndarray:
+    flags = cv2.IMREAD_UNCHANGED
     try:
-        if metadata:
-            image, kinds, blocks = cv2.imdecodeWithMetadata(content, flags=cv2.IMREAD_UNCHANGED)
-        else:
-            image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error as error:
         if error.code == cv2.Error.StsNoMem:
             raise MemoryError from error
         raise ValueError(f"OpenCV cannot decode it ({error.err})") from error
     if image is None:
         raise ValueError("it is damaged, or of an unknown format")
-    return image, [
-        (int(kind), np.asarray(data, np.uint8)) for kind, data in zip(kinds, blocks, strict=True)
-    ]
+    return image

@@ -1,10 +1,14 @@
-"""Metadata of TIFF files, which OpenCV neither reads nor writes: read by Pillow, written by tifffile.
+"""TIFF files of one page or several: pixels as they are stored, and metadata.
 
-OpenCV decodes TIFF files still, as it does all others: tifffile needs a package of codecs for most of them.
+Plain pages are decoded by tifffile. It needs a package of codecs for most ways of compressing, so OpenCV
+decodes the others; metadata are read by Pillow, and all is written by tifffile.
 """
 
+import dataclasses
 import io
+import logging
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -13,10 +17,8 @@ import tifffile
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-from .exif import File, parse_exif
-
-Metadata = list[tuple[int, np.ndarray]]
-"""EXIF data, XMP and colour profiles, as OpenCV gives and takes them: pairs of kind and bytes."""
+from .exif import parse_exif
+from .metadata import Metadata
 
 _BASE, _FOLDERS = ExifTags.Base, (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)
 
@@ -28,30 +30,168 @@ _RESOLUTION = (_BASE.XResolution, _BASE.YResolution, _BASE.ResolutionUnit)
 _DESCRIBING = (*_TEXTS, *_RESOLUTION, _BASE.Orientation, *_FOLDERS)
 """Tags that tell of the photograph, and not of how its pixels are stored."""
 
-_OTHERS = ((cv2.IMAGE_METADATA_XMP, 700, 1), (cv2.IMAGE_METADATA_ICCP, 34675, 7))
-"""Kinds of metadata that are the content of one tag, and the tag's type."""
+_OTHERS = (("xmp", 700, 1), ("icc", 34675, 7), ("iptc", 34377, 7))
+"""Fields that are the content of one tag, and the tag's type."""
+
+_IPTC = 33723
+"""The tag of IPTC data by themselves, beside those in Photoshop's resources."""
+
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what is damaged is said by an error
 
 _MOST_BYTES = 100_000_000  # of metadata
+_MOST_PAGES = 10_000
+
+_PLAIN = {"NONE", "ADOBE_DEFLATE", "DEFLATE", "PACKBITS", "LZMA"}
+"""Compressions that tifffile undoes by itself."""
 
 
-def tiff_metadata(file: File) -> tuple[Metadata, int]:
-    """The metadata of a TIFF file, and its orientation, 1 to 8, which decoders may have undone."""
-    exif = parse_exif(file)
+@dataclasses.dataclass(frozen=True)
+class TiffPage:
+    """A page of a TIFF file.
+
+    Attributes:
+        image: the pixels as stored, with blue, green, red and alpha as OpenCV has them.
+        metadata: the page's own.
+        orientation: 1 to 8, which is not applied to the pixels.
+        cmyk: whether the file holds four colours for print, of which `image` has three.
+        notes: whether the page holds notes of the camera's maker, which `metadata` lacks.
+    """
+
+    image: np.ndarray
+    metadata: Metadata
+    orientation: int
+    cmyk: bool
+    notes: bool
+
+
+def read_tiff(content: bytes, *, most_pages: int = _MOST_PAGES) -> list[TiffPage]:
+    """The pages of a TIFF file, or the first of them.
+
+    Raises:
+        ValueError: it is damaged, or its pixels are stored in a way that cannot be decoded.
+    """
+    with _opened(content) as file:
+        return [_page(content, file, number) for number in range(min(_number(file), most_pages))]
+
+
+def tiff_size(content: bytes) -> int:
+    """The number of pixels of all pages, as their headers tell; raises as `read_tiff`."""
+    with _opened(content) as file:
+        return sum(int(np.prod(file.pages[number].shape[:2])) for number in range(_number(file)))
+
+
+def _opened(content: bytes) -> tifffile.TiffFile:
+    try:
+        return tifffile.TiffFile(io.BytesIO(content))
+    except Exception as error:  # of many kinds where offsets lead nowhere
+        raise ValueError("the file is damaged or cut off") from error
+
+
+def _number(file: tifffile.TiffFile) -> int:
+    try:
+        return len(file.pages)
+    except Exception as error:  # as above
+        raise ValueError("the file is damaged or cut off") from error
+
+
+def _page(content: bytes, file: tifffile.TiffFile, number: int) -> TiffPage:
+    try:
+        page: Any = file.pages[number]
+        metadata, orientation = tiff_metadata(content, page.offset)
+        image = _plain(page)
+        separate = page.planarconfig == 2 and page.samplesperpixel > 1
+        cmyk = getattr(page.photometric, "name", "") == "SEPARATED"
+        compression = getattr(page.compression, "name", str(page.compression))
+        folder = page.tags.valueof(int(ExifTags.IFD.Exif))
+        notes = isinstance(folder, dict) and "MakerNote" in folder
+    except MemoryError:
+        raise
+    except Exception as error:  # as above
+        raise ValueError("the file is damaged or cut off") from error
+    if image is None and separate and page.dtype != np.uint8:
+        # OpenCV takes its planes for interleaved, and shows noise.
+        raise ValueError(f"its colours are stored one after the other and compressed ({compression})")
+    if image is None:
+        image = as_stored(_by_opencv(content, number), orientation)  # OpenCV turns TIFF files
+    return TiffPage(image, metadata, orientation, cmyk, notes)
+
+
+def _plain(page: Any) -> np.ndarray | None:
+    """A page decoded by tifffile, exactly as stored; None if OpenCV has to."""
+    if (
+        page.compression.name not in _PLAIN
+        or page.photometric.name not in ("MINISBLACK", "RGB")
+        or page.dtype not in (np.uint8, np.uint16, np.float32, np.float64)
+        or page.bitspersample != 8 * np.dtype(page.dtype).itemsize
+        or page.samplesperpixel not in (1, 3, 4)
+        or page.predictor not in (1, 2)
+    ):
+        return None
+    values = page.asarray()
+    if page.planarconfig == 2 and page.samplesperpixel > 1:
+        values = np.moveaxis(values, 0, -1)
+    if values.ndim not in (2, 3):
+        return None
+    values = values[..., [2, 1, 0, 3][: values.shape[2]]] if values.ndim == 3 else values
+    return np.ascontiguousarray(values.astype(values.dtype.newbyteorder("="), copy=False))
+
+
+def _by_opencv(content: bytes, number: int) -> np.ndarray:
+    data = np.frombuffer(content, np.uint8)
+    try:
+        _, found = cv2.imdecodemulti(data, cv2.IMREAD_UNCHANGED, range=(number, number + 1))
+    except cv2.error as error:
+        if error.code == cv2.Error.StsNoMem:
+            raise MemoryError from error
+        raise ValueError(f"OpenCV cannot decode it ({error.err})") from error
+    if not found:
+        raise ValueError("it is damaged, or of an unknown format")
+    return np.asarray(found[0])
+
+
+def tiff_metadata(content: bytes, offset: int | None = None) -> tuple[Metadata, int]:
+    """The metadata of the page at an offset, else of the first, and its orientation, 1 to 8."""
+    exif = parse_exif(io.BytesIO(content), offset)
     if exif is None:
-        return [], 1
-    others = [(kind, exif.get(tag)) for kind, tag, _ in _OTHERS]
+        return Metadata(), 1
+    fields = {name: exif.get(tag) for name, tag, _ in _OTHERS}
+    iptc = exif.get(_IPTC)
+    dpi = _dpi(exif)
     for tag in set(exif) - set(_DESCRIBING):
         del exif[tag]
     for tag in set(_TEXTS) & set(exif):
         exif[tag] = _bytes(exif[tag])  # else Pillow writes ASCII alone
     orientation = orientation_of(exif)
-    blocks = [(kind, block) for kind, block in others if isinstance(block, bytes)]
-    if len(exif):
-        blocks.insert(0, (cv2.IMAGE_METADATA_EXIF, exif.tobytes().removeprefix(b"Exif\0\0")))
-    metadata = [
-        (kind, np.frombuffer(block, np.uint8)) for kind, block in blocks if len(block) < _MOST_BYTES
-    ]
-    return metadata, orientation
+    fields["exif"] = exif.tobytes().removeprefix(b"Exif\0\0") if len(exif) else b""
+    if isinstance(iptc, bytes) and not fields["iptc"]:
+        fields["iptc"] = _resource(iptc)
+    known: dict[str, Any] = {
+        k: v for k, v in fields.items() if isinstance(v, bytes) and len(v) < _MOST_BYTES
+    }
+    return Metadata(**known, dpi=dpi), orientation
+
+
+def _dpi(exif: Image.Exif) -> tuple[float, float] | None:
+    across, down, unit = (exif.get(tag) for tag in _RESOLUTION)
+    if unit == 1 or across is None or down is None or not (0 < across < 1e6 and 0 < down < 1e6):
+        return None
+    inch = 2.54 if unit == 3 else 1.0
+    return float(across) * inch, float(down) * inch
+
+
+_RESOURCE = b"8BIM\x04\x04\0\0"
+"""What IPTC data begin with among Photoshop's resources."""
+
+
+def _resource(iptc: bytes) -> bytes:
+    """IPTC data as one of Photoshop's resources."""
+    return _RESOURCE + struct.pack(">I", len(iptc)) + iptc + bytes(len(iptc) % 2)
+
+
+def _iptc_of(resources: bytes) -> bytes:
+    """The IPTC data among Photoshop's resources; empty if there are none."""
+    _, found, after = resources.partition(_RESOURCE)
+    return after[4 : 4 + int.from_bytes(after[:4], "big")] if found else b""
 
 
 def orientation_of(exif: Image.Exif) -> int:
@@ -73,24 +213,40 @@ def as_stored(image: np.ndarray, orientation: int) -> np.ndarray:
     return np.ascontiguousarray(image[:: -1 if down else 1, :: -1 if across else 1])
 
 
-def encode_tiff(image: np.ndarray, metadata: Metadata) -> bytes:
-    """A TIFF file, without loss, of an image as OpenCV has them and of metadata."""
-    blocks = {kind: data.tobytes() for kind, data in metadata}
-    exif = parse_exif(io.BytesIO(blocks.get(cv2.IMAGE_METADATA_EXIF, b"").removeprefix(b"Exif\0\0")))
-    exif = Image.Exif() if exif is None else exif
+def encode_tiff(pages: Sequence[tuple[np.ndarray, Metadata]]) -> bytes:
+    """A TIFF file, without loss, of images as OpenCV has them, each with its metadata."""
+    content, folders = io.BytesIO(), []
+    with tifffile.TiffWriter(content, byteorder="<", bigtiff=is_big(pages)) as file:
+        for image, metadata in pages:
+            folders.append(_append(file, image, metadata, folders=not is_big(pages)))
+    _put_folders(content, folders)
+    return content.getvalue()
+
+
+def is_big(pages: Sequence[tuple[np.ndarray, Metadata]]) -> bool:
+    """Whether offsets of 32 bits may not reach over all pages: then folders of EXIF data are left out."""
+    return sum(image.nbytes for image, _ in pages) > 2**32 - 2**26
+
+
+def _append(
+    file: tifffile.TiffWriter, image: np.ndarray, metadata: Metadata, *, folders: bool
+) -> dict[int, dict[int, Any]]:
+    """Write a page; the folders that it lacks still."""
+    exif = parse_exif(io.BytesIO(metadata.exif)) or Image.Exif()
+    blocks = {name: getattr(metadata, name) for name, _, _ in _OTHERS}
     tags: list[Any] = [(tag, 2, 0, _bytes(exif[tag]), True) for tag in _TEXTS if tag in exif]
-    tags += [(tag, kind, len(blocks[of]), blocks[of], True) for of, tag, kind in _OTHERS if of in blocks]
+    tags += [(tag, kind, len(blocks[of]), blocks[of], True) for of, tag, kind in _OTHERS if blocks[of]]
+    if iptc := _iptc_of(metadata.iptc):
+        tags.append((_IPTC, 7, len(iptc), iptc, True))
     if exif.get(_BASE.Orientation) in range(1, 9):
         tags.append((_BASE.Orientation, 3, 1, exif[_BASE.Orientation], True))
-    folders = {int(tag): folder for tag in _FOLDERS if (folder := exif.get_ifd(tag))}
-    tags += [(tag + 1, 4, 1, 0, True) for tag in folders]
+    later = {int(tag): folder for tag in _FOLDERS if folders and (folder := exif.get_ifd(tag))}
+    tags += [(tag + 1, 4, 1, 0, True) for tag in later]
     integers = image.dtype.kind == "u"
     channels = 1 if image.ndim == 2 else image.shape[2]
-    content = io.BytesIO()
-    tifffile.imwrite(
-        content,
+    dpi = metadata.dpi or _dpi(exif)
+    file.write(
         image if channels == 1 else image[..., [2, 1, 0, 3][:channels]],
-        byteorder="<",
         photometric="minisblack" if channels == 1 else "rgb",
         extrasamples=["unassalpha"] if channels == 4 else None,
         compression="zlib" if integers else None,
@@ -100,32 +256,27 @@ def encode_tiff(image: np.ndarray, metadata: Metadata) -> bytes:
         metadata=None,
         software=False,
         extratags=tags,
-        **_resolution(exif),
+        **({"resolution": dpi, "resolutionunit": 2} if dpi else {}),
     )
-    _put_folders(content, folders)
-    return content.getvalue()
+    return later
 
 
-def _resolution(exif: Image.Exif) -> dict[str, Any]:
-    across, down, unit = (exif.get(tag) for tag in _RESOLUTION)
-    if across is None or down is None or not (0 < across < 1e6 and 0 < down < 1e6):
-        return {}
-    return {"resolution": (float(across), float(down)), "resolutionunit": unit if unit in (1, 2, 3) else 2}
-
-
-def _put_folders(content: io.BytesIO, folders: dict[int, dict[int, Any]]) -> None:
-    """Append folders of EXIF data, which tifffile does not write.
+def _put_folders(content: io.BytesIO, folders: Sequence[dict[int, dict[int, Any]]]) -> None:
+    """Append each page's folders of EXIF data, which tifffile does not write.
 
     It does not even write tags that lead to them: so they get these tags' numbers here, one less.
     """
     content.seek(0)
+    places = []
     with tifffile.TiffFile(content) as file:
-        tags = {tag: file.pages.first.tags[tag + 1] for tag in folders}
-        places = {tag: (entry.offset, entry.valueoffset) for tag, entry in tags.items()}
-    for tag, (entry, value) in places.items():
+        for page, own in zip(file.pages, folders, strict=True):
+            for tag in own:
+                entry = page.aspage().tags[tag + 1]
+                places.append((own[tag], tag, entry.offset, entry.valueoffset))
+    for of, tag, entry, value in places:
         folder = ImageFileDirectory_v2(b"II*\0\0\0\0\0", group=tag)
-        for key, of in folders[tag].items():
-            folder[key] = of
+        for key, what in of.items():
+            folder[key] = what
         at = content.seek(0, io.SEEK_END)
         content.write(folder.tobytes(at))
         for place, field in ((entry, struct.pack("<H", tag)), (value, struct.pack("<I", at))):

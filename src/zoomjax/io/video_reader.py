@@ -6,7 +6,7 @@ import functools
 import math
 import os
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,7 @@ class Report:
     corrupt: int = 0
     failed: int = 0
     error: str = ""
-    orientation: list[int] | None = None
+    first: Any = None
 
 
 def opened_video(source: str | os.PathLike[str]) -> Any:
@@ -104,9 +104,11 @@ def _frame_numbers(source: str | os.PathLike[str]) -> dict[int, int]:
     return {stamp: number for number, stamp in enumerate(sorted(stamps))}
 
 
-def decoded_items(input_: Any, video: Any, report: Report) -> Generator[Any, None, None]:
-    """Frames and audio packets, in the file's order; what is damaged is counted and passed over."""
-    packets = input_.demux([video, *input_.streams.audio])
+def decoded_items(
+    input_: Any, video: Any, report: Report, others: Sequence[Any] = ()
+) -> Generator[Any, None, None]:
+    """Frames and packets of other streams, in the file's order; damaged ones are counted and left out."""
+    packets = input_.demux([video, *others])
     while report.corrupt < _MOST_ERRORS:
         try:
             packet = next(packets, None)

@@ -1,6 +1,8 @@
-"""Writing a video like a given one: its times, colours, orientation, tags and sound, other pictures."""
+"""Writing a video like a given one: its times, colours, orientation and tags, and all that goes along."""
 
 import contextlib
+import dataclasses
+import re
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -8,17 +10,8 @@ from typing import Any
 import numpy as np
 
 from .pyav import av
-
-CONTAINER = {
-    ".mp4": "mp4",
-    ".m4v": "mp4",
-    ".mov": "mov",
-    ".mkv": "matroska",
-    ".webm": "webm",
-    ".avi": "avi",
-    ".ts": "mpegts",
-}
-"""Suffixes of files that can be written, and FFmpeg's names of their formats."""
+from .video_hdr import side_data, with_hdr
+from .video_streams import CONTAINER, Carried, put, starts
 
 _ENCODER = {
     "h264": "libx264",
@@ -29,6 +22,8 @@ _ENCODER = {
     "prores": "prores_ks",
 }
 """Encoders of the formats that are kept; others (MPEG-2, Motion JPEG, ...) become H.264."""
+
+_FORMATS = {"libx264": "H.264", "libvpx-vp9": "VP9"}
 
 _OPTIONS = {
     "libx264": {"crf": "18"},
@@ -42,6 +37,32 @@ _OWN_TAGS = {"major_brand", "minor_version", "compatible_brands", "encoder", "du
 """Tags that describe a file itself, not what it shows."""
 
 
+_PROFILES = {"Proxy": "0", "LT": "1", "Standard": "2", "HQ": "3", "4444": "4", "XQ": "5"}
+"""Of ProRes: FFmpeg's names, and the encoder's numbers."""
+
+_TAKES = {
+    "mov": {"libx264", "libx265", "prores_ks"},
+    "mpegts": {"libx264", "libx265"},
+    "mxf": {"libx264", "prores_ks"},
+}
+"""Encoders for containers that do not tell FFmpeg which they take, or tell it wrong (VP9 in .mov)."""
+
+_SUBSAMPLED = re.compile(r"yuvj?4(?:20|22|11|10)p(\d+le)?")
+
+
+@dataclasses.dataclass(frozen=True)
+class FirstFrame:
+    """What the source's first frame tells of all.
+
+    Attributes:
+        orientation: how players turn and mirror the pictures: FFmpeg's nine fixed-point numbers, or None.
+        side: what the frame carries besides, by FFmpeg's names.
+    """
+
+    orientation: list[int] | None
+    side: dict[str, bytes]
+
+
 class FrameWriter(contextlib.AbstractContextManager):
     """A video file that is being written; within ``with``, which finishes it.
 
@@ -51,9 +72,13 @@ class FrameWriter(contextlib.AbstractContextManager):
         input_: the container to resemble, open for reading.
         video: its stream of pictures.
         first: the first frame that will be encoded.
+        like: what the source's first frame tells.
         encoder: FFmpeg's name, or None for one of the source's format that the container takes.
         options: of the encoder, or None for those of `_OPTIONS`.
-        orientation: how to turn the pictures for display (`display_matrix`), or None.
+        along: what is copied besides.
+
+    Attributes:
+        kept, not_kept: names of what went over beside the pictures, and of what did not.
 
     Raises:
         ValueError: the container takes no such encoder or sound, or the encoder no such frames.
@@ -66,10 +91,14 @@ class FrameWriter(contextlib.AbstractContextManager):
         input_: Any,
         video: Any,
         first: Any,
+        like: FirstFrame,
         encoder: str | None,
         options: dict[str, str] | None,
-        orientation: list[int] | None,
+        along: Carried,
     ):
+        self.kept, self.not_kept = list(along.kept), list(along.not_kept)
+        self._last: int | None = None
+        self._moved = 0
         self._output = av.open(
             str(path), "w", format=CONTAINER[named.suffix.lower()], metadata_errors="surrogateescape"
         )
@@ -77,27 +106,36 @@ class FrameWriter(contextlib.AbstractContextManager):
             self._output.metadata.update(
                 {key: value for key, value in input_.metadata.items() if key not in _OWN_TAGS}
             )
-            name = encoder or self._encoder(video.codec_context.name)
-            self._stream = self._pictures(name, video, first, options)
-            self._stream.set_display_matrix(orientation)
+            name = encoder or self._encoder(video.codec_context.name, named)
+            self._stream = self._pictures(name, video, first, like, options, free=encoder is None)
+            self._stream.set_display_matrix(like.orientation)
             with _blamed(name):
                 self._stream.codec_context.open(strict=False)
-            self._sound = {stream.index: self._copied(stream, named) for stream in input_.streams.audio}
+            self._copies = put(self._output, along, named)
+            starts(self._output, named, along.streams)
         except BaseException:
-            self._output.close()
+            with contextlib.suppress(Exception):
+                self._output.close()
             raise
 
     def encode(self, frame: Any) -> None:
-        """Write a frame, at its own time."""
+        """Write a frame, at its own time, or just after one that has the same time."""
+        if frame.pts is not None:
+            if self._last is not None and frame.pts <= self._last:
+                frame.pts = self._last + 1
+                self._moved += 1
+            self._last = frame.pts
         self._output.mux(self._stream.encode(frame))
 
     def copy(self, packet: Any) -> None:
-        """Write a packet of the source's sound as it is."""
-        packet.stream = self._sound[packet.stream.index]
+        """Write a packet of another of the source's streams as it is."""
+        packet.stream = self._copies[packet.stream.index]
         self._output.mux(packet)
 
     def __exit__(self, kind, error, trace) -> None:
         """Finish the file; after an error, only let go of it."""
+        if self._moved:
+            self.not_kept.append(f"times of {self._moved} frames, which others had before them")
         try:
             if kind is None:
                 self._output.mux(self._stream.encode(None))
@@ -105,21 +143,45 @@ class FrameWriter(contextlib.AbstractContextManager):
             with contextlib.nullcontext() if kind is None else contextlib.suppress(Exception):
                 self._output.close()
 
-    def _encoder(self, source: str) -> str:
+    def _encoder(self, source: str, named: Path) -> str:
         """The first of the source's own encoder, H.264 and VP9 that the container takes."""
-        wanted = (_ENCODER.get(source, "libx264"), "libx264", "libvpx-vp9")
-        return next(name for name in wanted if name in self._output.supported_codecs)
+        takes = _TAKES.get(self._output.format.name, self._output.supported_codecs)
+        name = next(
+            name for name in (_ENCODER.get(source, "libx264"), "libx264", "libvpx-vp9") if name in takes
+        )
+        if name != _ENCODER.get(source):
+            self.not_kept.append(
+                f"the format {source}, which became {_FORMATS[name]} in a {named.suffix} file"
+            )
+        return name
 
-    def _pictures(self, name: str, source: Any, first: Any, options: dict[str, str] | None) -> Any:
+    def _pictures(
+        self,
+        name: str,
+        source: Any,
+        first: Any,
+        like: FirstFrame,
+        options: dict[str, str] | None,
+        *,
+        free: bool,
+    ) -> Any:
         """The stream to encode into, with the times and colours of the source."""
         rate = source.average_rate or source.guessed_rate or 25
+        given = source.codec_context
+        chosen = _options(name, given) if options is None else options
+        chosen, kept, lost = with_hdr(name, chosen, like.side)
+        self.kept += kept
+        self.not_kept += lost
         with _blamed(name):
-            stream: Any = self._output.add_stream(
-                name, rate=rate, options=dict(_OPTIONS.get(name, {}) if options is None else options)
-            )
-        context, given = stream.codec_context, source.codec_context
+            stream: Any = self._output.add_stream(name, rate=rate, options=dict(chosen))
+        context = stream.codec_context
         context.width, context.height = first.width, first.height
-        context.pix_fmt = _encodable(context, first.format.name)
+        wanted = first.format.name
+        if free and name in ("libx264", "libx265") and (first.width % 2 or first.height % 2):
+            wanted = _SUBSAMPLED.sub(r"yuv444p\1", wanted)
+        context.pix_fmt = _encodable(context, wanted)
+        if context.pix_fmt != first.format.name:
+            self.not_kept.append(f"the pixel format {first.format.name}, which became {context.pix_fmt}")
         context.time_base = source.time_base
         for what in ("color_range", "color_primaries", "color_trc", "colorspace"):
             setattr(context, what, getattr(given, what))
@@ -130,16 +192,17 @@ class FrameWriter(contextlib.AbstractContextManager):
         stream.metadata.update({k: v for k, v in source.metadata.items() if k.lower() not in _OWN_TAGS})
         return stream
 
-    def _copied(self, source: Any, named: Path) -> Any:
-        try:
-            stream = self._output.add_stream_from_template(source)
-        except ValueError as error:
-            raise ValueError(
-                f"Cannot keep the sound, {source.codec_context.name}, in a {named.suffix} file. Choose the "
-                f"suffix of the source, or .mkv."
-            ) from error
-        stream.metadata.update(source.metadata)
-        return stream
+
+def _options(name: str, source: Any) -> dict[str, str]:
+    """Options of an encoder for a source, by default for quality at which differences do not show."""
+    if name == "prores_ks" and source.name == "prores" and source.profile in _PROFILES:
+        return {"profile": _PROFILES[source.profile]}
+    return dict(_OPTIONS.get(name, {}))
+
+
+def first_frame(frame: Any) -> FirstFrame:
+    """What a source's first frame tells of all."""
+    return FirstFrame(display_matrix(frame), side_data(frame))
 
 
 def display_matrix(frame: Any) -> list[int] | None:

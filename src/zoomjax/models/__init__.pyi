@@ -1,6 +1,7 @@
 # The public names of this room: read by type checkers, and by lazy_loader at run time.
 
 from ._bernstein import Pieces as Pieces
+from .about import About as About
 from .brown_conrady import BrownConrady as BrownConrady
 from .camera import Camera as Camera
 from .distortion import Distortion as Distortion

@@ -29,8 +29,8 @@ class Camera(eqx.Module):
         lens: from `fit_zoom` or `load_lens`.
         principal: the principal point, px: where the optical axis meets the image. By default the centre of
             distortion.
-        pixel_pitch: mm from one pixel to the next, for lenses whose focal lengths are in mm; None for
-            lenses in px.
+        pixel_pitch: mm from one pixel to the next, for lenses whose focal lengths are in mm; by default the
+            lens's own. None for lenses in px.
 
     Example:
         >>> import jax.numpy as jnp
@@ -58,10 +58,12 @@ class Camera(eqx.Module):
             raise TypeError(
                 f"Argument lens must be a ZoomLens, but its type is {type(self.lens).__name__}."
             )
-        if (self.lens.focal_unit == "mm") == (self.pixel_pitch is None):
+        known = self.pixel_pitch is not None or self.lens.pixel_pitch is not None
+        if not known if self.lens.focal_unit == "mm" else self.pixel_pitch is not None:
             raise ValueError(
                 "Argument pixel_pitch, mm from one pixel to the next (the sensor's width over that of the "
-                "image in px), must be given for a lens whose focal lengths are in mm."
+                "image in px), must be given for a lens whose focal lengths are in mm and that does not "
+                "know it itself."
                 if self.pixel_pitch is None
                 else "Argument pixel_pitch must be left out: the lens's focal lengths are in px already."
             )
@@ -129,8 +131,9 @@ class Camera(eqx.Module):
         """Points, the principal point and focal lengths in px, ready to broadcast."""
         principal = _as(self.lens.centre if self.principal is None else self.principal, points)
         length = _as(focal, points)
-        if self.pixel_pitch is not None:
-            length = length / _as(self.pixel_pitch, points)
+        if self.lens.focal_unit == "mm":
+            pitch = self.lens.pixel_pitch if self.pixel_pitch is None else self.pixel_pitch
+            length = length / _as(pitch, points)
         return aligned((points, 1), (principal, 1), (length, 0))
 
 

@@ -357,10 +357,12 @@ def _check(coefficients, centre, scale, family):
             raise ValueError(f"Argument {name} must hold real numbers, but its dtype is {part.dtype}.")
     size = coefficients.shape[-1] if coefficients.ndim else 0
     sizes = [family.size(terms) for terms in range(1, family.most_terms + 1)]
-    if size not in sizes:
+    more = [family.size(terms) for terms in family.more_terms]
+    if size not in (*sizes, *more):
         opencv = ": OpenCV's (k1, k2, p1, p2, k3, ...) are of another model" * (size in (5, 8, 12, 14))
         raise ValueError(
-            f"Argument coefficients must hold from {min(sizes)} to {max(sizes)} numbers for a "
+            f"Argument coefficients must hold from {min(sizes)} to {max(sizes)} numbers"
+            f"{''.join(f', or {number}' for number in more)}, for a "
             f"{type(family).__name__}, but its shape is {coefficients.shape}{opencv}."
         )
     if centre.shape[-1:] != (2,):

@@ -91,6 +91,8 @@ class AbstractFamily(eqx.Module):
 
     formula: ClassVar[str]
     most_terms: ClassVar[int] = 4
+    more_terms: ClassVar[tuple[int, ...]] = ()
+    """Radial coefficients that a distortion may have beyond those that fits to lines determine."""
 
     @abc.abstractmethod
     def size(self, terms: int) -> int:

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import warnings
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax
@@ -19,6 +20,7 @@ from .._core.checks import checked_size, checked_unit
 from .._core.fields import check_finite, check_positive, check_range, check_shapes, numbers
 from .._core.files import whole_file
 from .._core.types import AnyArray, FocalLike, Point, Points, traced
+from .about import About, checked_about, checked_pitch
 from .distortion import Distortion, as_points, compiled, mapped
 from .family import AbstractFamily
 from .polynomial import RadialPolynomial
@@ -44,6 +46,8 @@ class ZoomLens(eqx.Module):
         focal_unit: "mm" or "px".
         focus_range: the least and greatest focus fitted, if the zoom model depends on it.
         family: the distortion model of the coefficients, by default the radial polynomial.
+        pixel_pitch: width of a pixel of these images on the sensor, mm; None if it is not known.
+        about: words and numbers by name, such as camera, lens and crop_factor; see `About`.
 
     Example:
         >>> import jax.numpy as jnp
@@ -62,6 +66,8 @@ class ZoomLens(eqx.Module):
     shift: AbstractZoom | None = None
     focus_range: Float[AnyArray, "2"] | None = eqx.field(default=None, converter=numbers("focus_range"))
     family: AbstractFamily = RadialPolynomial()
+    pixel_pitch: float | None = eqx.field(static=True, default=None, converter=checked_pitch)
+    about: Mapping[str, str | float] = eqx.field(static=True, default=About(), converter=checked_about)
 
     def __check_init__(self):
         """Check the geometry, and that the zoom model gives the family's coefficients."""
@@ -240,6 +246,10 @@ class ZoomLens(eqx.Module):
         if self.shift is not None:
             content["shift"] = described(self.shift)
             content["shift_meaning"] = "centre at f = centre + scale (k_1(f), k_2(f)) of the model in shift"
+        if self.pixel_pitch is not None:
+            content["pixel_pitch"] = self.pixel_pitch
+        if self.about:
+            content["about"] = dict(self.about)
         with whole_file(path) as part:
             part.write_text(json.dumps(content, indent=2) + "\n")
 
@@ -350,6 +360,8 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
             shift=zoom_from(content["shift"], 2) if "shift" in content else None,
             focus_range=_pair(content, "focus_range") if "focus_range" in content else None,
             family=family_named(content.get("family", "RadialPolynomial")),
+            pixel_pitch=content.get("pixel_pitch"),
+            about=content.get("about", {}),
         )
         if not math.isclose(content["scale"], lens.scale, rel_tol=1e-6):
             raise ValueError("its scale is not half the diagonal of its image_size")

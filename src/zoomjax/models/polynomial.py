@@ -16,6 +16,7 @@ class RadialPolynomial(AbstractRadial):
         "corrected = centre + z * scale * (1 + k1 r^2 + ... + kN r^2N), "
         "z = (distorted - centre) / scale, r^2 = z.z"
     )
+    more_terms: ClassVar[tuple[int, ...]] = (6, 7)  # 5 and 8 numbers are most likely OpenCV's
 
     def factor(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
         """L."""

@@ -27,8 +27,9 @@ _SAME_SCALE = 0.01
 def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
     """The same lens for images of the same view with more or fewer pixels.
 
-    The normalised coefficients are unchanged; the centre becomes ``(c + 1/2) w'/w - 1/2``. Focal lengths
-    are unchanged, also those in px: they refer to images of the lens's original size.
+    The normalised coefficients are unchanged; the centre becomes ``(c + 1/2) w'/w - 1/2``, and the pixel
+    pitch is that of the other pixels. Focal lengths are unchanged, also those in px: they refer to images
+    of the lens's original size.
 
     Args:
         lens: the lens.
@@ -57,7 +58,10 @@ def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
     )
     centre = jnp.asarray(lens.centre)
     ratio = jnp.asarray([width / old_width, height / old_height], centre.dtype)
-    return dataclasses.replace(lens, centre=(centre + 0.5) * ratio - 0.5, image_size=size)
+    pitch = None if lens.pixel_pitch is None else lens.pixel_pitch * lens.scale / (math.hypot(*size) / 2)
+    return dataclasses.replace(
+        lens, centre=(centre + 0.5) * ratio - 0.5, image_size=size, pixel_pitch=pitch
+    )
 
 
 def check_aspect(image_size: tuple[int, int], lens_size: tuple[int, int]) -> None:

@@ -1,5 +1,8 @@
 # The public names of this room: read by type checkers, and by lazy_loader at run time.
 
+from .assessment import Assessment as Assessment
+from .assessment import Finding as Finding
+from .assessment import assess as assess
 from .bands import coefficient_std as coefficient_std
 from .bands import displacement_band as displacement_band
 from .bands import displacement_covariance as displacement_covariance
@@ -10,6 +13,8 @@ from .cramer_rao_bounds import displacement_bound as displacement_bound
 from .cramer_rao_bounds import displacement_rms as displacement_rms
 from .cross_validation import held_out_frames as held_out_frames
 from .cross_validation import held_out_zoom as held_out_zoom
+from .evidence import Evidence as Evidence
+from .evidence import evidence as evidence
 from .misfit import with_misfit as with_misfit
 from .next_photo import Suggestion as Suggestion
 from .next_photo import suggest_next as suggest_next

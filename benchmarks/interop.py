@@ -1,0 +1,186 @@
+"""Lenses in the formats of other tools: the error of each, focal lengths written, and times.
+
+    pip install '.[bench,interop]'
+    python -m benchmarks.interop [--every N] [--output FILE]
+
+One strong zoom, 18 to 200 mm, +7 % to -2 % at the corner of 4288 x 2848 px, is written in every format and
+read again. Then zooms of the lensfun database with five or more focal lengths, every N-th, are read and
+written again as lensfun files. Errors are those of the reports: the greatest over the image, at the focal
+lengths written and between, where the tool interpolates.
+"""
+
+import argparse
+import importlib.metadata
+import tempfile
+import time
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import zoomjax as zj
+
+from .shared import RESULTS, machine, machine_line, table, write
+
+SIZE, PITCH = (4288, 2848), 0.0055
+FOCAL = [18.0, 24.0, 35.0, 50.0, 85.0, 200.0]
+MAP_SIZE = (1920, 1080)
+"""Of STMaps, whose time is that of their pixels."""
+
+
+def strong_zoom(size: tuple[int, int]) -> zj.ZoomLens:
+    """18 to 200 mm."""
+    k = np.array([[-0.022, 0.002], [0.095, -0.015], [-0.006, 0.0]])
+    centre = (np.array(size) - 1) / 2 + 6.5
+    return zj.ZoomLens(zj.PolynomialZoom(2, k, np.array(18.0)), centre, np.array([18.0, 200.0]), size)
+
+
+def measure_format(fmt: zj.interop.Format, folder: Path) -> dict:
+    """Write and read one format."""
+    lens = strong_zoom(MAP_SIZE if fmt.name == "stmap" else SIZE)
+    path = folder / (fmt.name if fmt.zoom == "one" else f"{fmt.name}{fmt.suffixes[0]}")
+    focal = None if fmt.zoom == "interpolated" else FOCAL
+    start = time.perf_counter()
+    out = zj.interop.write(lens, path, format=fmt.name, focal=focal, pixel_pitch=PITCH)
+    middle = time.perf_counter()
+    silent = FOCAL if fmt.name in ("nuke", "pftrack") else None
+    back = zj.interop.read(path, image_size=lens.image_size, focal=silent).report
+    return {
+        "exact": fmt.exact,
+        "focal": len(out.focal),
+        "at_nodes": out.at_nodes,
+        "between": out.between,
+        "read": back.at_nodes,
+        "write_s": middle - start,
+        "read_s": time.perf_counter() - middle,
+    }
+
+
+def database() -> list[ET.Element]:
+    """The rectilinear zooms of lensfun's database with five or more focal lengths."""
+    import lensfunpy
+
+    lenses = []
+    for path in sorted((Path(lensfunpy.__file__).parent / "db_files").glob("*.xml")):
+        for lens in ET.parse(path).getroot().iter("lens"):
+            entries = lens.findall("calibration/distortion")
+            straight = (lens.findtext("type") or "rectilinear") == "rectilinear"
+            if straight and len({entry.get("focal") for entry in entries}) >= 5:
+                lenses.append(lens)
+    return lenses
+
+
+def measure_database(lenses: list[ET.Element], folder: Path) -> dict:
+    """Read lenses as smooth zooms and as tables, and write the smooth ones again."""
+    smooth, tables, written, refused, seconds = [], [], [], [], []
+    for lens in lenses:
+        root = ET.Element("lensdatabase", version="1")
+        root.append(lens)
+        ET.ElementTree(root).write(folder / "in.xml")
+        start = time.perf_counter()
+        found = zj.interop.read(folder / "in.xml", image_size=SIZE)
+        seconds.append(time.perf_counter() - start)
+        smooth.append(found.report.worst)
+        kept = zj.interop.read(folder / "in.xml", image_size=SIZE, zoom=zj.models.TableZoom(), terms=2)
+        tables.append(kept.report.worst)
+        try:
+            report = zj.interop.write(
+                found.lens, folder / "out.xml", format="lensfun", pixel_pitch=PITCH, overwrite=True
+            )
+            written.append(report.worst)
+        except ValueError as error:
+            refused.append(f"{lens.findtext('model')}: {error}")
+    return {
+        "smooth": smooth,
+        "table": tables,
+        "written": written,
+        "refused": refused,
+        "median_read_s": float(np.median(seconds)),
+    }
+
+
+def page(results: dict) -> str:
+    """The results as a page."""
+    rows = [
+        [
+            name,
+            "exact" if row["exact"] else "refitted",
+            str(row["focal"]),
+            f"{row['at_nodes']:.2g}",
+            "" if row["between"] is None else f"{row['between']:.2g}",
+            f"{row['read']:.2g}",
+            f"{row['write_s']:.1f}",
+            f"{row['read_s']:.1f}",
+        ]
+        for name, row in results["formats"].items()
+    ]
+    head = ["", "formula", "focal lengths", "error at them, px", "between, px", "read again, px"]
+    found = results["database"]
+    errors = [
+        [
+            name,
+            f"{np.median(found[key]):.2f}",
+            f"{np.quantile(found[key], 0.9):.2f}",
+            f"{max(found[key]):.1f}",
+        ]
+        for name, key in (
+            ("read as SmoothZoom, against the table", "smooth"),
+            ("read as TableZoom of two coefficients, against the table", "table"),
+            ("SmoothZoom written for lensfun again", "written"),
+        )
+    ]
+    return "\n".join(
+        [
+            "# Lenses in the formats of other tools",
+            "",
+            f"`python -m benchmarks.interop --every {results['every']}`: errors are the greatest over the "
+            "image.",
+            "",
+            "## A strong zoom in every format",
+            "",
+            f"18 to 200 mm at {SIZE[0]} x {SIZE[1]} px (maps: {MAP_SIZE[0]} x {MAP_SIZE[1]} px), tolerance "
+            "0.1 px. Read again, the error is that of the zoom model through the file's focal lengths. "
+            "Times are of a first call, with compiling.",
+            "",
+            *table([*head, "writing, s", "reading, s"], rows),
+            "",
+            "## The lensfun database",
+            "",
+            f"{len(found['smooth'])} of its {results['lenses']} rectilinear zooms with five or more focal "
+            f"lengths, at {SIZE[0]} x {SIZE[1]} px: the greatest error of each lens, px of the corrected "
+            f"image. {len(found['refused'])} fold over within the image and are not written.",
+            "",
+            *table(["", "median", "90 %", "worst"], errors),
+            "",
+            machine_line(results["machine"]),
+            "",
+        ]
+    )
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--output", type=Path, default=RESULTS / "interop.md")
+    parser.add_argument("--every", type=int, default=1, help="use every N-th lens of the database")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    versions = {name: importlib.metadata.version(name) for name in ("lensfunpy", "OpenEXR")}
+    lenses = database()
+    with tempfile.TemporaryDirectory() as name:
+        both = [fmt for fmt in zj.interop.formats() if fmt.writes and fmt.reads]
+        results = {
+            "machine": machine() | versions,
+            "every": options.every,
+            "lenses": len(lenses),
+            "formats": {fmt.name: measure_format(fmt, Path(name)) for fmt in both},
+            "database": measure_database(lenses[:: options.every], Path(name)),
+        }
+    write(options.output, page(results), results)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,194 @@
+"""The commands for other tools' formats: ``zoomjax export``, ``import`` and ``formats``."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .._core.text import plain
+from ._compiled import set_up_jax
+from .arguments import Overwrite, size_of
+from .commands import app
+
+if TYPE_CHECKING:
+    from ..interop.base import Report
+
+RESULTS = ("lens.json", "import.json")
+"""What an import writes."""
+
+
+@app.command("export")
+def export(
+    lens: Annotated[
+        Path, typer.Argument(metavar="lens.json", help="The lens written by zoomjax calibrate.")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="OUT",
+            help="Output file; a folder for STMaps, and where each focal length is a file.",
+        ),
+    ],
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="The format; see zoomjax formats.")],
+    focal: Annotated[
+        str | None,
+        typer.Option(
+            help="Focal lengths, separated by commas, or a CSV file with the columns frame,focal: an entry "
+            "for each frame. Formats that interpolate choose them by themselves."
+        ),
+    ] = None,
+    pixel_pitch: Annotated[
+        float | None,
+        typer.Option(
+            metavar="MM",
+            help="Pixel size on the sensor: the sensor's width over that of the image in px. Default: that "
+            "in lens.json.",
+        ),
+    ] = None,
+    tolerance: Annotated[
+        float,
+        typer.Option(
+            metavar="PX",
+            help="For formats that interpolate: largest error between the focal lengths written.",
+        ),
+    ] = 0.1,
+    convention: Annotated[
+        str, typer.Option(help="Of STMaps: centres (Nuke), gyroflow or alicevision.")
+    ] = "centres",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
+) -> None:
+    """Write a lens in another tool's format, and report its error there."""
+    set_up_jax()
+    from ..interop.registry import write
+    from ..io.focal_track import read_focal_track
+    from ..models.lens import load_lens
+
+    tracked = focal is not None and focal.lower().endswith(".csv")
+    report = write(
+        load_lens(lens),
+        output,
+        format=to,
+        focal=None if tracked or focal is None else _numbers(focal),
+        track=read_focal_track(Path(focal)) if tracked and focal is not None else None,
+        pixel_pitch=pixel_pitch,
+        tolerance=tolerance,
+        convention=convention,
+        overwrite=overwrite,
+    )
+    _show(report)
+    print(f"Written to {plain(str(output))}.")
+
+
+@app.command("import")
+def import_(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="The file, or a folder of files of one format, one a focal length."
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.", file_okay=False)
+    ],
+    of: Annotated[
+        str | None,
+        typer.Option("--from", metavar="FORMAT", help="The format; by default it is recognised."),
+    ] = None,
+    image_size: Annotated[
+        str | None,
+        typer.Option(metavar="WxH", help="Image size in px, for files that do not say it, e.g. 6000x4000."),
+    ] = None,
+    focal: Annotated[
+        str | None,
+        typer.Option(
+            help="Focal lengths of the files or entries, separated by commas, where these do not say them."
+        ),
+    ] = None,
+    crop: Annotated[
+        float | None,
+        typer.Option(help="For lensfun: crop factor of the camera; default: that of the calibration."),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the lens, or a part of it, for files of several.")
+    ] = None,
+    direction: Annotated[
+        str | None,
+        typer.Option(help="Of STMaps: undistort or redistort; default: what the file name says."),
+    ] = None,
+    convention: Annotated[
+        str, typer.Option(help="Of STMaps: centres (Nuke), gyroflow or alicevision.")
+    ] = "centres",
+    table: Annotated[
+        bool,
+        typer.Option(
+            "--table",
+            help="Keep the file's own values at its focal lengths, and interpolate linearly in 1/f.",
+        ),
+    ] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Read a lens from another tool's file.
+
+    Writes lens.json, and import.json with its error at the file's focal
+    lengths.
+    """
+    set_up_jax()
+    from ..interop.registry import read
+    from ..models.tables import TableZoom
+    from .results_folder import results_folder
+
+    found = read(
+        source,
+        format=of,
+        image_size=None if image_size is None else size_of(image_size),
+        focal=None if focal is None else _numbers(focal),
+        crop=crop,
+        name=name,
+        direction=direction,
+        convention=convention,
+        zoom=TableZoom() if table else None,
+    )
+    with results_folder(output, RESULTS, overwrite=overwrite) as folder:
+        found.lens.save(folder / RESULTS[0])
+        content = dataclasses.asdict(found.report) | {"files": [str(file) for file in found.report.files]}
+        (folder / RESULTS[1]).write_text(json.dumps(content, indent=2) + "\n")
+    _show(found.report)
+    print(f"Written to {plain(str(output))}: {', '.join(RESULTS)}")
+
+
+@app.command("formats")
+def formats() -> None:
+    """List the formats of other tools: what can be done, how well, zooming, and who reads them."""
+    from ..interop.registry import FORMATS
+
+    for fmt in FORMATS:
+        ways = "export, import" if fmt.writes and fmt.reads else "export" if fmt.writes else "import"
+        exact = "exact" if fmt.exact else "refitted"
+        print(f"{fmt.name:<12}{ways:<16}{exact:<10}{_ZOOM[fmt.zoom]:<26}{fmt.tools}")
+
+
+_ZOOM = {
+    "one": "one zoom a file",
+    "list": "an entry a zoom or frame",
+    "interpolated": "interpolated",
+}
+"""What a format knows of zooming, in words."""
+
+
+def _show(report: "Report") -> None:
+    for line in str(report).splitlines():
+        print(plain(line))
+
+
+def _numbers(text: str) -> list[float]:
+    """Numbers separated by commas."""
+    from ..io.text_table import plain_number
+
+    found = [plain_number(part) for part in text.split(",")]
+    if None in found:
+        raise ValueError(f"--focal must be focal lengths separated by commas, but it is {text!r}.")
+    return [number for number in found if number is not None]

@@ -1,0 +1,94 @@
+"""Plots of where lines lie, in the image and over the zoom, and of how residuals depend on the radius."""
+
+import numpy as np
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+from ..lines.lines import Lines
+from ..models.lens import ZoomLens
+
+_INK, _LINES = "#c2410c", "#1e3a5f"
+_SHADES = LinearSegmentedColormap.from_list("coverage", ["#ffffff", "#1e3a5f"])
+_CELLS, _RINGS = 16, 12
+_MOST_POINTS = 200_000  # are enough to average over
+
+
+def plot_coverage(lines: Lines, weight: np.ndarray) -> Figure:
+    """Plot how many lines pass each part of the image, and how many there are at each focal length.
+
+    Args:
+        lines: the lines.
+        weight: of each line; those of weight 0 are left out.
+    """
+    width, height = lines.image_size
+    figure = Figure(figsize=(9.6, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    counted = np.asarray(lines.mask) & (weight > 0)[:, None]
+    line, point = np.nonzero(counted)
+    cell = max(width, height) / _CELLS
+    columns, rows = (int(np.ceil(side / cell)) for side in (width, height))
+    x, y = np.clip(np.asarray(lines.points)[line, point] // cell, 0, [columns - 1, rows - 1]).T.astype(int)
+    passed = np.unique((line * rows + y) * columns + x) % (rows * columns)
+    number = np.bincount(passed, minlength=rows * columns).reshape(rows, columns)
+    extent = (0, columns * cell, rows * cell, 0)
+    shown = left.imshow(number, cmap=_SHADES, extent=extent, vmin=0, interpolation="nearest")
+    left.set(xlim=(0, width), ylim=(height, 0), xlabel="$x$  (px)", ylabel="$y$  (px)")
+    left.set_title("lines through each part of the image", fontsize=10)
+    figure.colorbar(shown, ax=left, shrink=0.8)
+    focal = np.asarray(lines.focal)
+    per_frame = np.bincount(np.asarray(lines.frame)[weight > 0], minlength=len(focal))
+    right.vlines(focal, 0, per_frame, color=_LINES, linewidth=1)
+    right.plot(focal, per_frame, "o", color=_LINES, markersize=4)
+    right.set(ylim=(0, None), xlabel=f"$f$  ({lines.focal_unit})", ylabel="lines")
+    if focal.max() > 2 * focal.min():
+        right.set_xscale("log")
+        right.xaxis.set_major_formatter(lambda f, _: f"{f:g}")
+        right.xaxis.set_minor_formatter(lambda f, _: f"{f:g}")
+        right.tick_params(axis="x", which="both", labelsize=8)
+    right.set_title("lines in each photo", fontsize=10)
+    right.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def plot_radius(lines: Lines, lens: ZoomLens, weight: np.ndarray) -> Figure:
+    """Plot the RMS residual of points against their distance from the centre of distortion.
+
+    Args:
+        lines: the lines.
+        lens: the lens that corrects them.
+        weight: of each line; those of weight 0 are left out.
+    """
+    kept = np.flatnonzero(weight > 0)
+    step = max(1, int(np.asarray(lines.mask)[kept].sum() / _MOST_POINTS))
+    radius, residual = _residuals(lines, lens, kept[::step])
+    edges = np.linspace(0, radius.max() + 1e-9, _RINGS + 1)
+    ring = np.digitize(radius, edges) - 1
+    number = np.bincount(ring, minlength=_RINGS)[:_RINGS]
+    squares = np.bincount(ring, residual**2, minlength=_RINGS)[:_RINGS]
+    known = number > 0
+    figure = Figure(figsize=(6.4, 3.4), layout="constrained")
+    axes = figure.subplots()
+    middle = (edges[1:] + edges[:-1]) / 2
+    rms = np.sqrt(squares[known] / number[known])
+    axes.plot(middle[known], rms, "o", color=_INK, markersize=5)
+    axes.set(ylim=(0, 1.15 * rms.max() or 1), xlim=(0, edges[-1]))
+    axes.set_xlabel("distance from the centre of distortion  (px)")
+    axes.set_ylabel("RMS residual  (px)")
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _residuals(lines: Lines, lens: ZoomLens, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances of points from the centre, and of corrected points from their lines, px."""
+    points, mask = np.asarray(lines.points)[chosen], np.asarray(lines.mask)[chosen]
+    frame, focal = np.asarray(lines.frame)[chosen], np.asarray(lines.focal)
+    corrected = np.zeros(points.shape)
+    for index in np.unique(frame):
+        own = (frame == index)[:, None] & mask
+        corrected[own] = lens(float(focal[index])).undistort(points[own])
+    mean = corrected.sum(axis=1) / mask.sum(axis=1)[:, None]
+    rows = np.where(mask[..., None], corrected - mean[:, None], 0)
+    normal = np.linalg.eigh(np.einsum("lpc,lpd->lcd", rows, rows))[1][..., 0]
+    residual = np.einsum("lpc,lc->lp", rows, normal)
+    away = points - np.asarray(lens.centre)
+    return np.hypot(away[..., 0], away[..., 1])[mask], residual[mask]

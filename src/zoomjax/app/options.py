@@ -1,0 +1,102 @@
+"""Options of the command line that commands share, and the examples in their help."""
+
+from typing import Annotated, Literal
+
+import typer
+
+FIT, FOCAL, INPUT, OUTPUT = "Lens", "Focal lengths", "Images and lines", "Output"
+"""Panels of the help."""
+
+Detector = Literal["edges", "grid", "pitch"]
+FocalUnit = Literal["mm", "px"]
+OverlaysOf = Literal["some", "all", "none"]
+
+Strict = Annotated[
+    bool,
+    typer.Option("--strict", help="End with status 3 unless the verdict is good.", rich_help_panel=OUTPUT),
+]
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "--quiet", "-q", help="Print the verdict, warnings and errors only.", rich_help_panel=OUTPUT
+    ),
+]
+AsJson = Annotated[
+    bool,
+    typer.Option("--json", help="Print summary.json in place of the tables.", rich_help_panel=OUTPUT),
+]
+DryRun = Annotated[
+    bool,
+    typer.Option("--dry-run", help="Say what would be read and written, and stop.", rich_help_panel=OUTPUT),
+]
+Overlays = Annotated[
+    OverlaysOf,
+    typer.Option(
+        help="For images: which ones to draw with their lines. some: all up to 200, beyond that the "
+        "worst and others over the zoom.",
+        rich_help_panel=OUTPUT,
+    ),
+]
+Exclude = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="LINE",
+        help="For a file of lines: leave out lines by their numbers in overlays and report, e.g. 15,17; "
+        "may be repeated.",
+        rich_help_panel=INPUT,
+    ),
+]
+
+Pitch = Annotated[
+    str | None,
+    typer.Option(
+        metavar="MM[xMM]",
+        help="For --focal board: distance between neighbouring lines of the board, across and down.",
+        rich_help_panel=FOCAL,
+    ),
+]
+Distance = Annotated[
+    float | None,
+    typer.Option(
+        metavar="MM",
+        help="For --focal board: distance from the camera to the board.",
+        rich_help_panel=FOCAL,
+    ),
+]
+Pixel = Annotated[
+    float | None,
+    typer.Option(metavar="MM", help="For --focal board: pixel size on the sensor.", rich_help_panel=FOCAL),
+]
+
+CALIBRATE_EXAMPLES = """\
+Examples:
+
+  zoomjax calibrate photos/ -o mylens
+
+  zoomjax calibrate photos/*.jpg --focal focal.csv -o mylens
+
+  zoomjax calibrate zoom.mp4 --focal track.csv -o mylens
+
+  zoomjax calibrate mylens/lines.npz --exclude 15,17 -o better
+"""
+
+UNDISTORT_EXAMPLES = """\
+Examples:
+
+  zoomjax undistort mylens/lens.json photo.jpg -o corrected.jpg
+
+  zoomjax undistort mylens/lens.json clip.mp4 --focal track.csv -o corrected.mp4
+"""
+
+
+def excluded(given: list[str] | None) -> list[int]:
+    """Line numbers from the option.
+
+    Raises:
+        ValueError: one is not a whole number of at least 0.
+    """
+    words = [word.strip() for text in given or () for word in text.split(",")]
+    for word in words:
+        if not (word.isascii() and word.isdigit()):
+            raise ValueError(f"--exclude must be numbers of lines such as 15 or 15,17, but it is {word!r}.")
+    return sorted({int(word) for word in words})

@@ -1,0 +1,111 @@
+"""Small pictures of a calibration's photos for the report: before and after, and crops of the worst lines.
+
+Each is a JPEG of some tens of kB. Read once per chosen photo; nothing is decoded for the others.
+"""
+
+import dataclasses
+import warnings
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from ..correct.framing import frame_output
+from ..correct.image import undistort_image
+from ..detect.sources import shrunk
+from ..models.distortion import Distortion
+from .choice import chosen_frames, colour_limit
+from .overlay import draw_lines
+
+if TYPE_CHECKING:
+    from .image_calibration import ImageCalibration
+
+MOST = 12
+"""Photos shown: the page stays small enough to be sent by mail."""
+
+_WIDE = 560  # px of the longer side
+_CROP, _CROP_SIDE = 3, 260  # crops per photo, and px of their side
+_QUALITY = 78
+
+
+@dataclasses.dataclass(frozen=True)
+class Pictures:
+    """Pictures of one photo, as JPEG.
+
+    Attributes:
+        frame: its number among the frames of the calibration.
+        before, after: the photo and its correction, each with the lines.
+        crops: the photo about the middle of its worst lines, by the lines' numbers in ``lines.npz``.
+    """
+
+    frame: int
+    before: bytes
+    after: bytes
+    crops: dict[int, bytes]
+
+
+def pictures(images: "ImageCalibration", most: int = MOST) -> list[Pictures]:
+    """Pictures of at most so many photos, sorted by f: those fitted worst, and others over the zoom."""
+    chosen = dict.fromkeys(chosen_frames(images.calibration, most))
+    names = {images.used[frame].name: frame for frame in chosen}
+    found = {}
+    for source in images.job.sources()[0]:
+        if (frame := names.get(source.name)) is not None:
+            found[frame] = _pictures(images, frame, source.read()[0])
+    return [found[frame] for frame in chosen if frame in found]
+
+
+def _pictures(images: "ImageCalibration", frame: int, image: UInt8[np.ndarray, "..."]) -> Pictures:
+    calibration = images.calibration
+    members = np.flatnonzero(np.asarray(calibration.lines.frame) == frame)
+    rms, rejected = calibration.line_rms[members], calibration.rejected[members]
+    lines = images.used[frame].lines
+    named = members[np.argsort(-np.where(rejected, 0, rms), kind="stable")[:_CROP]]
+    labels = {int(np.flatnonzero(members == line)[0]): str(line) for line in named}
+    small, scale = shrunk(image, _WIDE)
+    look = {"rejected": rejected.tolist(), "rms": rms, "labels": labels, "limit": colour_limit(calibration)}
+    before = draw_lines(small, [_at(line, scale) for line in lines], **look)
+    distortion = _resized(calibration.zoom.lens(float(calibration.lines.focal[frame])), image, small)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of folds, which the report states
+        framing = frame_output(distortion, (small.shape[1], small.shape[0]), keep="all")
+        corrected = undistort_image(small, distortion, keep=framing, border_value=128)
+    origin, enlarged = np.asarray(framing.origin), float(framing.scale)
+    joined = np.asarray(distortion.undistort(_at(np.concatenate(lines), scale)))  # all lines at once
+    ends = np.cumsum([len(line) for line in lines])[:-1]
+    shown = np.split((joined - origin) * enlarged, ends)
+    known = [points[np.isfinite(points).all(axis=1)] for points in shown]
+    after = draw_lines(corrected, known, **look)
+    crops = {int(line): _crop(image, lines[place]) for line, place in zip(named, labels, strict=True)}
+    return Pictures(frame, _jpeg(before), _jpeg(after), crops)
+
+
+def _crop(image: np.ndarray, line: np.ndarray) -> bytes:
+    """The photo about the middle of a line, with the line's points."""
+    middle = line[len(line) // 2]
+    half = max(_CROP_SIDE, round(0.12 * max(image.shape[:2]))) // 2
+    x, y = (
+        int(np.clip(round(float(at)) - half, 0, max(side - 2 * half, 0)))
+        for at, side in zip(middle, image.shape[1::-1], strict=True)
+    )
+    part, scale = shrunk(np.ascontiguousarray(image[y : y + 2 * half, x : x + 2 * half]), _CROP_SIDE)
+    return _jpeg(draw_lines(part, [_at(line - [x, y], scale)], [False], dim=1.0))
+
+
+def _at(points: np.ndarray, scale: float) -> np.ndarray:
+    """Points in an image made smaller."""
+    return (points + 0.5) * scale - 0.5
+
+
+def _resized(distortion: Distortion, image: np.ndarray, small: np.ndarray) -> Distortion:
+    """The distortion of an image made smaller."""
+    ratio = small.shape[1] / image.shape[1]
+    centre = (np.asarray(distortion.centre) + 0.5) * ratio - 0.5
+    return dataclasses.replace(distortion, centre=centre, scale=np.asarray(distortion.scale) * ratio)
+
+
+def _jpeg(picture: np.ndarray) -> bytes:
+    done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    assert done
+    return content.tobytes()

@@ -1,0 +1,75 @@
+"""Correction of several videos one after the other, each with its own focal lengths."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from ..correct.video import CorrectedVideo, redistort_video, undistort_video
+from ..io.focal_track import FocalTrack, read_focal_track
+from ..models.lens import ZoomLens
+from .undistort_inputs import focal_number
+
+Focal = float | FocalTrack
+
+
+def tracks_of(focal: str | None, videos: Sequence[Path], *, hold: bool) -> dict[Path, Focal]:
+    """The focal lengths of each video.
+
+    Args:
+        focal: a number, a CSV file for one video, or a folder of CSV files named as the videos are.
+        videos: the videos.
+        hold: whether a track's first and last focal lengths are used beyond its ends.
+
+    Raises:
+        OSError, ValueError: a track is missing or wrong, or the options do not fit each other.
+    """
+    if focal is None:
+        raise ValueError(
+            "A video needs argument focal: one focal length, a CSV file with time,focal or frame,focal, or "
+            "for several videos a folder of such files with their names."
+        )
+    number = focal_number(focal)
+    if number is not None:
+        if hold:
+            raise ValueError(
+                "Argument hold is for a track of focal lengths, and argument focal is one number."
+            )
+        return dict.fromkeys(videos, number)
+    if not Path(focal).is_dir():
+        if len(videos) > 1:
+            raise ValueError(
+                f"The track {focal} is for one video, and there are {len(videos)}: give argument focal a "
+                f"folder with a track for each, such as {videos[0].stem}.csv."
+            )
+        return dict.fromkeys(videos, read_focal_track(focal, hold=hold))
+    return {video: read_focal_track(Path(focal) / f"{video.stem}.csv", hold=hold) for video in videos}
+
+
+def undistort_videos(
+    work: Sequence[tuple[Path, Path, Focal]],
+    *,
+    lens: ZoomLens,
+    keep: str,
+    interpolation: str,
+    border: str,
+    back: bool,
+    progress: Callable[[int, int], None],
+) -> tuple[dict[Path, CorrectedVideo], dict[Path, Exception]]:
+    """Correct each source into its target; the results by target, and the errors of sources by source."""
+    done, skipped = {}, {}
+    correct = redistort_video if back else undistort_video
+    for source, target, focal in work:
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            done[target] = correct(
+                source,
+                target,
+                lens=lens,
+                focal=focal,
+                keep=keep,
+                interpolation=interpolation,
+                border=border,
+                progress=progress,
+            )
+        except (ValueError, OSError) as error:
+            skipped[source] = error
+    return done, skipped

@@ -1,0 +1,5 @@
+"""Lenses in the formats of other tools: written for them, and read from them."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,147 @@
+"""What the OpenCV family shares: a camera matrix, and coefficients for radii in focal lengths.
+
+Its formula maps corrected to distorted points, ``x_d = x (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ +
+k6 r⁶)`` and decentering p1, p2, with x in focal lengths from the principal point, which is the centre of
+distortion. Files order the coefficients k1 k2 p1 p2 k3 k4 k5 k6, and count pixels from pixel centres.
+"""
+
+import dataclasses
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..models.family import AbstractRadial
+from ..models.lens import ZoomLens
+from ._forms import Form
+from .base import Contents, Export, Import, Node
+
+
+@dataclasses.dataclass(frozen=True)
+class Pinhole:
+    """One camera of the OpenCV family.
+
+    Attributes:
+        focal: focal length in the lens's unit.
+        f: focal length in px.
+        centre: principal point, px from the centre of the top-left pixel.
+        k: radial coefficients, k1, k2, ..., without gaps: numerators, then denominators.
+        p: p1 and p2.
+    """
+
+    focal: float
+    f: float
+    centre: np.ndarray
+    k: np.ndarray
+    p: np.ndarray
+
+    @property
+    def coefficients(self) -> list[float]:
+        """In OpenCV's order: k1, k2, p1, p2, k3, ..."""
+        return [*self.k[:2].tolist(), *self.p.tolist(), *self.k[2:].tolist()]
+
+
+def formula(lens: ZoomLens, numerators: int, denominators: int = 0) -> Form:
+    """OpenCV's formula, with decentering where the lens has it."""
+    return Form(numerators, denominators, tangential=not isinstance(lens.family, AbstractRadial))
+
+
+def pinhole(node: Node, job: Export) -> Pinhole:
+    """A node as a camera; ValueError if the focal length in px is not known."""
+    assert isinstance(node.form, Form)
+    f = float(job.focal_px(node.focal))
+    numerators, denominators, p = node.form.split(node.form.rescaled(node.theta, f / job.lens.scale))
+    return Pinhole(node.focal, f, node.centre, np.concatenate([numerators, denominators]), p)
+
+
+def node_of(camera: Pinhole, size: tuple[int, int], *, numerators: int = 3) -> Node:
+    """The node of a camera whose coefficients past the `numerators` are denominators."""
+    numbers = np.array([camera.f, *camera.centre, *camera.k, *camera.p], float)
+    if not np.isfinite(numbers).all() or camera.f <= 0:
+        raise ValueError("its focal lengths and coefficients must be finite numbers")
+    if len(camera.k) > 6 and np.any(camera.k[6:]):
+        raise ValueError("it has coefficients beyond k6 (thin prism, tilt), which zoomjax has no model of")
+    k = camera.k[:6]
+    form = Form(min(len(k), numerators), max(len(k) - numerators, 0), tangential=True)
+    theta = form.rescaled(np.concatenate([k, camera.p]), math.hypot(*size) / 2 / camera.f)
+    return Node(camera.focal, form, theta, np.asarray(camera.centre, float))
+
+
+def from_opencv(focal: float | None, matrix: Any, coefficients: Any, size: tuple[int, int]) -> Node:
+    """The node of a camera matrix and coefficients in OpenCV's order; its focal length is in px if None."""
+    matrix = np.asarray(matrix, float).reshape(3, 3)
+    fx, fy, cx, cy = square(matrix[0, 0], matrix[1, 1], size), matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    del fy
+    values = np.asarray(coefficients, float).ravel()
+    values = np.append(values, np.zeros(max(0, 4 - len(values))))
+    k, p = np.append(values[:2], values[4:]), values[2:4]
+    centre = np.array([cx, cy])
+    return node_of(Pinhole(fx if focal is None else focal, fx, centre, k, p), size)
+
+
+def square(fx: Any, fy: Any, size: tuple[int, int]) -> float:
+    """The focal length of square pixels; ValueError if they are not."""
+    fx, fy = float(fx), float(fy)
+    if not (math.isfinite(fx) and math.isfinite(fy) and fx > 0 and fy > 0):
+        raise ValueError("its focal lengths in px must be positive numbers")
+    if abs(fx - fy) * max(size) > 0.01 * max(fx, fy) * max(size):
+        raise ValueError(f"its pixels are not square: fx is {fx:g} and fy is {fy:g}")
+    return (fx + fy) / 2
+
+
+def contents(nodes: list[Node], size: tuple[int, int], job: Import) -> Contents:
+    """Of cameras whose focal lengths are in px, unless other ones are given in mm."""
+    if job.focal is not None:
+        if len(job.focal) != len(nodes):
+            raise ValueError(f"argument focal must hold {len(nodes)} focal lengths, one for each camera")
+        nodes = [dataclasses.replace(n, focal=f) for n, f in zip(nodes, job.focal, strict=True)]
+    return Contents(tuple(nodes), size, "px" if job.focal is None else "mm")
+
+
+def one_size(sizes: list[tuple[int, int]]) -> tuple[int, int]:
+    """The image size that all entries share; ValueError if they do not."""
+    if len(set(sizes)) != 1:
+        raise ValueError(f"its cameras must have one image size, but they have {len(set(sizes))}")
+    return sizes[0]
+
+
+def matrix_rows(camera: Pinhole) -> list[list[float]]:
+    """The camera matrix."""
+    return [
+        [camera.f, 0.0, float(camera.centre[0])],
+        [0.0, camera.f, float(camera.centre[1])],
+        [0.0, 0.0, 1.0],
+    ]
+
+
+def numbers(values: Any) -> str:
+    """Numbers with all digits, separated by commas."""
+    return ", ".join(repr(float(value)) for value in np.ravel(values))
+
+
+def load_yaml(path: Path) -> Any:
+    """A YAML file of plain values, or of OpenCV's matrices; no code can be in it."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        """Safe, and knows OpenCV's matrices."""
+
+    def matrix(loader, node):
+        return loader.construct_mapping(node, deep=True)
+
+    Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix)
+    text = path.read_text(encoding="utf-8")
+    try:
+        found = yaml.load(re.sub(r"\A%YAML:1\.0", "%YAML 1.1", text), Loader)
+    except yaml.YAMLError as error:
+        raise ValueError(f"it is no YAML: {' '.join(str(error).split())[:200]}") from error
+    if not isinstance(found, dict):
+        raise ValueError("it is no table of names and values")
+    return found
+
+
+def data_of(value: Any) -> np.ndarray:
+    """A matrix: OpenCV's or ROS's with its data, or lists."""
+    return np.asarray(value["data"] if isinstance(value, dict) else value, float)

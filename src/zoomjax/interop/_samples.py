@@ -1,0 +1,105 @@
+"""Pairs of distorted and corrected points over an image."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from .._core.text import plain
+from ..models.distortion import Distortion
+from ..models.family import AbstractRadial
+from ..models.lens import ZoomLens
+from .base import Node
+
+_RAYS, _RADII = 16, 24
+"""Points lie on rays from the centre, to the corners and in between, denser towards the border."""
+
+_AT_ONCE = 16
+"""Focal lengths that a lens is asked for at once: JAX compiles for each number of them."""
+
+_BEYOND, _STEPS = 4.0, 800
+"""How far the corrected radius is followed, in units of the corner's, and in how many steps."""
+
+
+def distortions(lens: ZoomLens, focal: Float[np.ndarray, "focal"]) -> list[Distortion]:
+    """The distortion at each focal length, of NumPy arrays in float64."""
+    found = []
+    for first in range(0, len(focal), _AT_ONCE):
+        part = np.asarray(focal[first : first + _AT_ONCE], float)
+        many = lens(np.pad(part, (0, _AT_ONCE - len(part)), mode="edge"))
+        k = np.asarray(many.coefficients, float)
+        centre = np.broadcast_to(np.asarray(many.centre, float), (_AT_ONCE, 2))
+        found += [
+            Distortion(k[i], centre[i], np.float64(lens.scale), many.family) for i in range(len(part))
+        ]
+    return found
+
+
+def pairs(
+    distortion: Distortion, size: tuple[int, int], focal: float, *, all_rays: bool = False
+) -> tuple[Float[np.ndarray, "point 2"], Float[np.ndarray, "point 2"]]:
+    """Distorted and corrected points of an image, in half diagonals from the centre.
+
+    A radial distortion is the same in all directions: one ray, to the farthest corner, tells it all unless
+    `all_rays` are asked for.
+
+    Raises:
+        ValueError: the image folds over.
+    """
+    centre, scale = np.asarray(distortion.centre), float(distortion.scale)
+    ends = border(size, centre)
+    if isinstance(distortion.family, AbstractRadial) and not all_rays:
+        ends = ends[[np.argmax(np.hypot(*ends.T))]]
+    part = np.sin(np.linspace(0, np.pi / 2, _RADII + 1)[1:])
+    distorted = (part[:, None, None] * ends).reshape(-1, 2)
+    corrected = (np.asarray(distortion.undistort(distorted + centre)) - centre) / scale
+    if not np.isfinite(corrected).all():
+        raise ValueError(
+            f"The lens folds over within the image at the focal length {focal:g}, and has no corrected "
+            "points there: zj.models.certify says where. Fit it again with fewer terms, or export focal "
+            "lengths at which it does not."
+        )
+    return distorted / scale, corrected
+
+
+def border(size: tuple[int, int], centre: np.ndarray) -> Float[np.ndarray, "ray 2"]:
+    """The ends of rays on the border of the image, from the centre: all corners, and points between."""
+    width, height = np.array(size) - 1.0
+    part = np.linspace(0, 1, _RAYS // 4, endpoint=False)[:, None]
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]])
+    sides = [
+        start + part * (end - start) for start, end in zip(corners, np.roll(corners, -1, 0), strict=True)
+    ]
+    return np.concatenate(sides) - centre
+
+
+def pairs_of(node: Node, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Distorted and corrected points of an image by a tool's formula, in half diagonals from the centre.
+
+    Corrected points are followed outwards until their distorted ones leave the image, or turn back.
+
+    Returns:
+        Both, and whether the formula reaches the border of the image everywhere.
+    """
+    scale = math.hypot(*size) / 2
+    ends = border(size, node.centre) / scale
+    length = np.hypot(*ends.T)
+    part = np.sin(np.linspace(0, np.pi / 2, _RADII + 1)[1:])
+    if node.form.corrects:
+        distorted = (part[:, None, None] * ends).reshape(-1, 2)
+        corrected = node.form(node.theta, distorted)
+        grows = np.diff(np.hypot(*corrected.T).reshape(_RADII, -1), axis=0, prepend=0) > 0
+        keep = np.logical_and.accumulate(grows, axis=0).ravel()
+        return distorted[keep], corrected[keep], bool(keep.all())
+    chosen, whole = [], True
+    for direction, end in zip(ends / length[:, None], length, strict=True):
+        radius = np.linspace(0, _BEYOND * end, _STEPS + 1)[1:]
+        reached = np.hypot(*node.form(node.theta, radius[:, None] * direction).T)
+        rises = np.diff(reached, prepend=0) > 0
+        last = len(radius) if rises.all() else int(np.argmin(rises))
+        if last == 0:
+            raise ValueError(f"its distortion at the focal length {plain(f'{node.focal:g}')} is no map")
+        whole &= bool(reached[last - 1] >= end)
+        chosen.append(np.interp(part * end, reached[:last], radius[:last])[:, None] * direction)
+    corrected = np.concatenate(chosen)
+    return node.form(node.theta, corrected), corrected, whole

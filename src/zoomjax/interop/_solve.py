@@ -1,0 +1,150 @@
+"""Which focal lengths and coefficients a file gets, and how far its reader is from the lens.
+
+At each focal length the lens's own coefficients are taken where the tool's formula is ours, else the
+formula is fitted anew. Between focal lengths the tool's own interpolation is run on the numbers of the
+file, and more focal lengths are taken until that is within the tolerance, or gains nothing.
+"""
+
+import dataclasses
+import itertools
+
+import numpy as np
+
+from ..models.brown_conrady import BrownConrady
+from ..models.distortion import Distortion
+from ..models.division import Division
+from ..models.polynomial import RadialPolynomial
+from ._forms import AbstractForm, Form
+from ._samples import distortions, pairs
+from .base import Export, Format, Node
+
+_FEW = 5
+"""Focal lengths at which formulas are compared."""
+
+_NUMBERS = (2, 3, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97, 129)
+"""Of focal lengths that are tried."""
+
+_BETWEEN = (0.2, 0.5, 0.8)
+"""Where errors are looked at, between two focal lengths."""
+
+_NEAR = 1.05
+"""Beyond the tolerance, errors between focal lengths are not worth more nodes at this ratio to theirs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Solution:
+    """The nodes of a file, and their errors, px (see `Report`)."""
+
+    nodes: list[Node]
+    at_nodes: float
+    between: float | None
+
+    @property
+    def worst(self) -> float:
+        """The greatest error anywhere."""
+        return max(self.at_nodes, self.between or 0.0)
+
+
+def solve(fmt: Format, job: Export) -> Solution:
+    """The nodes of a file, by the best of the format's formulas: the first within the tolerance."""
+    low, high = np.asarray(job.lens.focal_range, float) if job.focal is None else (0, 0)
+    focal = np.array(job.focal) if job.focal is not None else np.geomspace(low, high, _FEW)
+    if low == high and job.focal is None:
+        focal = focal[:1]
+    maker = min(_makers(fmt, focal, job), key=lambda made: made[1])[0]
+    if fmt.zoom != "interpolated" or len(focal) == 1:
+        return Solution(*maker.nodes(focal), None)
+    if job.focal is not None:
+        return _checked(fmt, *maker.nodes(focal), job)
+    for number in _NUMBERS:
+        found = _checked(fmt, *maker.nodes(fmt.spread(low, high, number)), job)
+        if (found.between or 0.0) <= max(job.tolerance, _NEAR * found.at_nodes) or number == _NUMBERS[-1]:
+            return found
+    raise AssertionError
+
+
+def _makers(fmt: Format, focal: np.ndarray, job: Export) -> list[tuple["_Maker", float]]:
+    """A maker of nodes for each formula up to the first within the tolerance, and its error at some."""
+    tried = []
+    for form in fmt.forms(job.lens):
+        tried.append((maker := _Maker(form, job), maker.nodes(focal)[1]))
+        if tried[-1][1] <= job.tolerance:
+            break
+    return tried
+
+
+class _Maker:
+    """Makes the nodes of one formula, each once."""
+
+    def __init__(self, form: AbstractForm, job: Export):
+        self.form, self.job = form, job
+        self.made: dict[float, tuple[Node, float]] = {}
+
+    def nodes(self, focal: np.ndarray) -> tuple[list[Node], float]:
+        """A node at each focal length, and the greatest error at one, px."""
+        missing = np.array(sorted({float(f) for f in focal} - set(self.made)))
+        if missing.size:
+            for f, distortion in zip(missing, distortions(self.job.lens, missing), strict=True):
+                self.made[float(f)] = self._node(float(f), distortion)
+        nodes, errors = zip(*(self.made[float(f)] for f in focal), strict=True)
+        frames = self.job.frames or [None] * len(nodes)
+        nodes = [dataclasses.replace(n, frame=frame) for n, frame in zip(nodes, frames, strict=True)]
+        return nodes, max(errors)
+
+    def _node(self, focal: float, distortion: Distortion) -> tuple[Node, float]:
+        job, centre = self.job, np.asarray(distortion.centre)
+        start, end = _from_to(self.form, distortion, focal, job)
+        theta = same(self.form, distortion)
+        theta = self.form.fit(start, end) if theta is None else theta
+        node = Node(focal, self.form, theta, centre)
+        return node, _error(node, centre, start, end, job)
+
+
+def _from_to(
+    form: AbstractForm, distortion: Distortion, focal: float, job: Export
+) -> tuple[np.ndarray, np.ndarray]:
+    """The points that a formula maps, and what to, in half diagonals from the centre."""
+    all_rays = job.lens.shift is not None
+    distorted, corrected = pairs(distortion, job.lens.image_size, focal, all_rays=all_rays)
+    return (distorted, corrected) if form.corrects else (corrected, distorted)
+
+
+def _checked(fmt: Format, nodes: list[Node], at_nodes: float, job: Export) -> Solution:
+    """The solution of formats that interpolate: their reader is run between the nodes, and at them."""
+    focal = np.array([node.focal for node in nodes])
+    numbers = np.array([fmt.foreign(node, job) for node in nodes])
+    inside = np.concatenate([a + (b - a) * np.array(_BETWEEN) for a, b in itertools.pairwise(focal)])
+    worst = {True: at_nodes, False: 0.0}
+    tried = np.concatenate([focal, inside])
+    for place, (f, distortion) in enumerate(zip(tried, distortions(job.lens, tried), strict=True)):
+        read = fmt.native(fmt.interpolate(focal, numbers, float(f)), float(f), nodes[0], job)
+        start, end = _from_to(nodes[0].form, distortion, float(f), job)
+        at_node = place < len(focal)
+        error = _error(read, np.asarray(distortion.centre), start, end, job)
+        worst[at_node] = max(worst[at_node], error)
+    return Solution(nodes, worst[True], worst[False] if len(focal) > 1 else None)
+
+
+def _error(node: Node, centre: np.ndarray, start: np.ndarray, end: np.ndarray, job: Export) -> float:
+    """The greatest distance, px, of what a node makes of points from what the lens makes of them."""
+    offset = (centre - node.centre) / job.lens.scale
+    distance = node.form.distances(node.theta, start + offset, end + offset)
+    return float(distance.max() * job.lens.scale) if np.isfinite(distance).all() else np.inf
+
+
+def same(form: AbstractForm, distortion: Distortion) -> np.ndarray | None:
+    """The lens's own coefficients for a formula that holds it, else None."""
+    if not isinstance(form, Form) or not form.corrects:
+        return None
+    k, family = np.asarray(distortion.coefficients, float), type(distortion.family)
+    theta = np.zeros(len(form.orders))
+    numerators, denominators, p = form.split(theta)  # views: what is written there is in theta
+    if family is RadialPolynomial and len(k) <= len(numerators):
+        numerators[: len(k)] = k
+    elif family is Division and len(k) <= len(denominators):
+        denominators[: len(k)] = k
+    elif family is BrownConrady and len(k) - 2 <= len(numerators) and form.tangential:
+        numerators[: len(k) - 2], p[:] = k[:-2], k[-2:]
+    else:
+        return None
+    return theta

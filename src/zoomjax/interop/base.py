@@ -1,0 +1,264 @@
+"""What a file format is: one small abstract class, and what goes in and comes out.
+
+A lens is written as *nodes*, one for each focal length: coefficients of the tool's formula (`_forms`). A
+format says which formulas its tool knows, how the tool interpolates between focal lengths, if it does, and
+what the file looks like. Which focal lengths and coefficients to write is decided in `_solve`; how a zoom
+lens is made from the nodes of a file, in `_lens`.
+"""
+
+import abc
+import dataclasses
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ..models.lens import ZoomLens
+from ._forms import AbstractForm
+
+Theta = np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Node:
+    """The distortion at one focal length, in a tool's formula.
+
+    Attributes:
+        focal: focal length in the lens's unit.
+        form: the formula.
+        theta: its coefficients, for radii in half image diagonals.
+        centre: centre of distortion, px, (0, 0) being the centre of the top-left pixel.
+        frame: number of the frame in a track; None without one.
+    """
+
+    focal: float
+    form: AbstractForm
+    theta: Theta
+    centre: np.ndarray
+    frame: int | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Sampled:
+    """The distortion at one focal length as pairs of points, px.
+
+    Attributes:
+        focal: focal length in the lens's unit.
+        distorted, corrected: the pairs, (point, 2).
+        centre: centre of distortion, px; None if not known.
+    """
+
+    focal: float
+    distorted: np.ndarray
+    corrected: np.ndarray
+    centre: np.ndarray | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """How well a lens went into a file or came out of it.
+
+    Attributes:
+        format: name of the format.
+        focal: focal lengths of the nodes, increasing or in the order of frames.
+        at_nodes: the greatest error at the nodes, px, over the whole image. A file that maps corrected to
+            distorted points is judged in the distorted image, others in the corrected one.
+        between: the greatest error between the nodes, where the tool interpolates, px; None where it does
+            not.
+        notes: what the user should know: how the file is to be used, and where the format cannot do better.
+        files: the files written, or read.
+    """
+
+    format: str
+    focal: tuple[float, ...]
+    at_nodes: float
+    between: float | None
+    notes: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()
+
+    @property
+    def worst(self) -> float:
+        """The greatest error anywhere, px."""
+        return max(self.at_nodes, self.between or 0.0)
+
+    def __str__(self) -> str:
+        number = len(self.focal)
+        text = f"{self.format}: {number} focal length{'s' * (number > 1)}, error up to "
+        text += f"{self.at_nodes:.2g} px at {'them' if number > 1 else 'it'}"
+        if self.between is not None:
+            text += f" and {self.between:.2g} px between"
+        return "\n".join([f"{text}.", *self.notes])
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """What is to be written.
+
+    Attributes:
+        lens: the lens.
+        focal: focal lengths to write, in the lens's unit; None to choose them.
+        frames: the number of the frame of each; None without a track.
+        pixel_pitch: mm from one pixel to the next; None if not known.
+        tolerance: error between focal lengths that more of them must keep, px.
+        convention: of pixel positions, for STMaps.
+    """
+
+    lens: ZoomLens
+    focal: tuple[float, ...] | None = None
+    frames: tuple[int, ...] | None = None
+    pixel_pitch: float | None = None
+    tolerance: float = 0.1
+    convention: str = "centres"
+
+    @property
+    def pitch(self) -> float:
+        """mm from one pixel to the next; ValueError if not known."""
+        if self.pixel_pitch is None:
+            raise ValueError(
+                "Argument pixel_pitch, mm from one pixel to the next (the sensor's width over that of the "
+                "image in px), must be given: this format needs the size of the sensor."
+            )
+        return self.pixel_pitch
+
+    def focal_px(self, focal: Any) -> Any:
+        """Focal lengths in px; ValueError if the pixel pitch is needed and not known."""
+        return focal if self.lens.focal_unit == "px" else focal / self.pitch
+
+    def focal_mm(self, focal: Any) -> Any:
+        """Focal lengths in mm; ValueError if the pixel pitch is needed and not known."""
+        return focal if self.lens.focal_unit == "mm" else focal * self.pitch
+
+
+@dataclasses.dataclass(frozen=True)
+class Import:
+    """What is to be read, and what the file may not say.
+
+    Attributes:
+        path: the file, or a folder of them.
+        paths: the files.
+        image_size: (width, height) px; None if the file says it.
+        focal: focal lengths of the files or entries, for those that do not say them.
+        crop: crop factor of the camera, for lensfun.
+        name: of the lens, in files of several; a part of it will do.
+        direction: of an STMap: "undistort" or "redistort".
+        convention: of pixel positions, for STMaps.
+    """
+
+    path: Path
+    paths: tuple[Path, ...]
+    image_size: tuple[int, int] | None = None
+    focal: tuple[float, ...] | None = None
+    crop: float | None = None
+    name: str | None = None
+    direction: str | None = None
+    convention: str = "centres"
+
+    def size(self, found: tuple[int, int] | None = None) -> tuple[int, int]:
+        """The image size: as given, else as found in the file; ValueError if neither."""
+        size = self.image_size or found
+        if size is None:
+            raise ValueError("it holds no image size: give argument image_size, (width, height) in px")
+        return size
+
+
+@dataclasses.dataclass(frozen=True)
+class Contents:
+    """What a file holds.
+
+    Attributes:
+        nodes: by focal length.
+        image_size: (width, height) px.
+        focal_unit: "mm" or "px".
+        notes: what the user should know.
+    """
+
+    nodes: tuple[Node | Sampled, ...]
+    image_size: tuple[int, int]
+    focal_unit: str
+    notes: tuple[str, ...] = ()
+
+
+class Format(abc.ABC):
+    """A file format of another tool.
+
+    Attributes:
+        name: in arguments and tables.
+        tools: who reads it.
+        suffixes: of its files; the first is that of files written.
+        exact: whether the tool's formula is ours, so that radial polynomials lose nothing but digits.
+        zoom: what the format knows of zooming: "one" focal length a file, a "list" of independent ones, or
+            "interpolated" between its nodes.
+        reads, writes: which of both this package does.
+        note: what a user of the file should know.
+        folder: whether it is always a folder of files, made of the lens itself and of no formula.
+    """
+
+    name: ClassVar[str]
+    tools: ClassVar[str]
+    suffixes: ClassVar[tuple[str, ...]]
+    exact: ClassVar[bool] = False
+    zoom: ClassVar[str] = "one"
+    reads: ClassVar[bool] = True
+    writes: ClassVar[bool] = True
+    note: ClassVar[str | None] = None
+    folder: ClassVar[bool] = False
+
+    def forms(self, lens: ZoomLens) -> tuple[AbstractForm, ...]:
+        """The tool's formulas that suit the lens, the preferred one first."""
+        raise NotImplementedError(f"The format {self.name} is read only.")
+
+    def foreign(self, node: Node, job: Export) -> np.ndarray:
+        """The numbers that the tool interpolates, of formats that do."""
+        raise NotImplementedError
+
+    def native(self, numbers: np.ndarray, focal: float, like: Node, job: Export) -> Node:
+        """The node at a focal length that interpolated numbers mean."""
+        raise NotImplementedError
+
+    def interpolate(self, focal: np.ndarray, numbers: np.ndarray, at: float) -> np.ndarray:
+        """The tool's own interpolation, by default linear: of numbers (node, n) at focal lengths."""
+        return np.array([np.interp(at, focal, column) for column in numbers.T])
+
+    def spread(self, low: float, high: float, number: int) -> np.ndarray:
+        """That many focal lengths over a range, by default in geometric progression."""
+        return np.geomspace(low, high, number)
+
+    def text(self, nodes: list[Node], job: Export) -> str:
+        """The file."""
+        raise NotImplementedError
+
+    def write(self, nodes: list[Node], job: Export, target: Path) -> None:
+        """Write the file, or the one of several that holds these nodes."""
+        target.write_text(self.text(nodes, job), encoding="utf-8")
+
+    def file_names(self, job: Export) -> list[str]:
+        """The names of several files in a folder: each node's, by its focal length or frame."""
+        return [f"{stem}{self.suffixes[0]}" for stem in self.stems(job)]
+
+    def stems(self, job: Export) -> list[str]:
+        """A name for each node."""
+        if job.frames is not None:
+            return [f"{frame:06d}" for frame in job.frames]
+        return [f"{focal:.10g}" for focal in job.focal or ()]
+
+    def bare_nodes(self, job: Export) -> list[Node]:
+        """Nodes without a formula, of formats that are folders."""
+        raise NotImplementedError
+
+    def write_all(self, nodes: list[Node], job: Export, folder: Path) -> list[float]:
+        """Write a file for each node; return errors that writing itself made, px, if there are any."""
+        for node, name in zip(nodes, self.file_names(job), strict=True):
+            self.write([node], job, folder / name)
+        return []
+
+    def notes(self, nodes: list[Node], job: Export) -> tuple[str, ...]:
+        """What the user of this very file should know."""
+        return () if self.note is None else (self.note,)
+
+    def recognises(self, head: str) -> bool:
+        """Whether a file of one of the `suffixes` is of this format, by its first characters."""
+        return True
+
+    def read(self, job: Import) -> Contents:
+        """What the file holds; ValueError, KeyError and the like where it is damaged."""
+        raise NotImplementedError(f"The format {self.name} is written only.")

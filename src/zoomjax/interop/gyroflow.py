@@ -1,0 +1,96 @@
+"""Gyroflow's lens profiles: OpenCV's eight coefficients, with entries that Gyroflow interpolates.
+
+Keys of ``interpolations`` are focal lengths in the unit of the camera's metadata, mm. Between them Gyroflow
+takes camera matrix and coefficients, which are for radii in focal lengths, as linear in f, also beyond both
+ends.
+"""
+
+import dataclasses
+import json
+
+import numpy as np
+
+from ._pinhole import contents, formula, from_opencv, matrix_rows, one_size, pinhole
+from .base import Contents, Export, Format, Import, Node
+
+
+class Gyroflow(Format):
+    """Gyroflow's JSON with interpolations over the zoom."""
+
+    name, tools, suffixes = "gyroflow", "Gyroflow", (".json",)
+    zoom = "interpolated"
+    note = (
+        "Gyroflow goes by the focal length in the video's metadata, and extrapolates linearly beyond the "
+        "first and last."
+    )
+
+    def forms(self, lens):
+        """Rational, three over three."""
+        return (formula(lens, 3, 3),)
+
+    def foreign(self, node: Node, job: Export) -> np.ndarray:
+        """Focal length in px, centre, coefficients in its units."""
+        f = float(job.focal_px(node.focal))
+        return np.concatenate([[f], node.centre, node.form.rescaled(node.theta, f / job.lens.scale)])
+
+    def native(self, numbers: np.ndarray, focal: float, like: Node, job: Export) -> Node:
+        """What Gyroflow makes of interpolated numbers."""
+        theta = like.form.rescaled(numbers[3:], job.lens.scale / numbers[0])
+        return dataclasses.replace(like, focal=focal, theta=theta, centre=numbers[1:3])
+
+    def text(self, nodes: list[Node], job: Export) -> str:
+        """A profile whose base is the first focal length."""
+        width, height = job.lens.image_size
+        entries = {}
+        for node in nodes:
+            mm = float(job.focal_mm(node.focal))
+            camera = pinhole(node, job)
+            entries[f"{mm:.9g}"] = {
+                "camera_matrix": matrix_rows(camera),
+                "distortion_coeffs": camera.coefficients,
+                "focal_length": mm,
+            }
+        first = next(iter(entries.values()))
+        profile = {
+            "name": "zoomjax",
+            "note": "",
+            "calibrated_by": "zoomjax",
+            "camera_brand": "",
+            "camera_model": "",
+            "lens_model": "zoomjax",
+            "calibrator_version": "zoomjax",
+            "focal_length": first["focal_length"],
+            "fisheye_params": {key: first[key] for key in ("camera_matrix", "distortion_coeffs")},
+            "calib_dimension": {"w": width, "h": height},
+            "orig_dimension": {"w": width, "h": height},
+            "asymmetrical": True,
+            "distortion_model": "opencv_standard",
+            "interpolations": entries,
+        }
+        return json.dumps(profile, indent=1) + "\n"
+
+    def recognises(self, head: str) -> bool:
+        """By its keys."""
+        return '"fisheye_params"' in head
+
+    def read(self, job: Import) -> Contents:
+        """The entries, or the base of a profile without them."""
+        table = json.loads(job.paths[0].read_text(encoding="utf-8"))
+        model = table.get("distortion_model", "opencv_fisheye")
+        if model != "opencv_standard":
+            raise ValueError(f"its distortion model {model!r} is not opencv_standard")
+        nodes, sizes = [], []
+        entries = table.get("interpolations") or {}
+        mm = bool(entries) or bool(table.get("focal_length"))
+        for key, own in (entries or {table.get("focal_length"): {}}).items():
+            entry = {**table, **own}
+            size = job.size((int(entry["calib_dimension"]["w"]), int(entry["calib_dimension"]["h"])))
+            parameters = {**table["fisheye_params"], **own.get("fisheye_params", {}), **own}
+            matrix = np.array(parameters["camera_matrix"], float)
+            if not table.get("asymmetrical"):
+                matrix[:2, 2] = np.array(size) / 2
+            k = parameters["distortion_coeffs"]
+            nodes.append(from_opencv(float(key) if mm else None, matrix, k, size))
+            sizes.append(size)
+        found = contents(nodes, one_size(sizes), job)
+        return Contents(found.nodes, found.image_size, "mm" if mm else found.focal_unit)

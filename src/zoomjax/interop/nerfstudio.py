@@ -1,0 +1,69 @@
+"""nerfstudio's transforms.json: intrinsics for each frame, three radial terms and decentering.
+
+Files written hold no poses: copy the entries of each frame into your own. Keys at the top level overrule
+those of all frames there. Principal points count from the corner of the top-left pixel.
+"""
+
+import json
+
+import numpy as np
+
+from ._pinhole import Pinhole, contents, formula, node_of, one_size, pinhole, square
+from .base import Contents, Export, Format, Import, Node
+
+_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "p1", "p2")
+
+
+class Nerfstudio(Format):
+    """Intrinsics of nerfstudio's frames."""
+
+    name, tools, suffixes = "nerfstudio", "nerfstudio, instant-ngp", (".json",)
+    zoom = "list"
+    note = "The file has no poses: copy the entries of each frame into those of your transforms.json."
+
+    def forms(self, lens):
+        """Three terms."""
+        return (formula(lens, 3),)
+
+    def text(self, nodes: list[Node], job: Export) -> str:
+        """A frame for each focal length."""
+        frames = []
+        for node in nodes:
+            camera = pinhole(node, job)
+            k1, k2, p1, p2, k3 = camera.coefficients
+            cx, cy = (camera.centre + 0.5).tolist()
+            values = (camera.f, camera.f, cx, cy, *job.lens.image_size, k1, k2, k3, p1, p2)
+            about = {"focal": node.focal, "focal_unit": job.lens.focal_unit}
+            if node.frame is not None:
+                about["frame"] = node.frame
+            frames.append({**about, **dict(zip(_KEYS, values, strict=True))})
+        return json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1) + "\n"
+
+    def recognises(self, head: str) -> bool:
+        """By its keys."""
+        return '"fl_x"' in head
+
+    def read(self, job: Import) -> Contents:
+        """All frames, or the one camera of all."""
+        table = json.loads(job.paths[0].read_text(encoding="utf-8"))
+        if table.get("camera_model", "OPENCV") != "OPENCV":
+            raise ValueError(f"its camera model {table['camera_model']!r} is not OPENCV")
+        common = {key: table[key] for key in (*_KEYS, "k4") if key in table}
+        nodes, sizes, units = [], [], set()
+        for frame in table["frames"] or [{}]:
+            values = {**frame, **common}
+            size = job.size((int(values["w"]), int(values["h"])))
+            f = square(values["fl_x"], values.get("fl_y", values["fl_x"]), size)
+            if values.get("k4"):
+                raise ValueError("it has a fourth radial coefficient, which is not supported")
+            k = np.array([values.get(key, 0.0) for key in ("k1", "k2", "k3")], float)
+            p = np.array([values.get(key, 0.0) for key in ("p1", "p2")], float)
+            mm = values.get("focal_unit") == "mm"
+            focal = float(values["focal"]) if mm else f
+            nodes.append(
+                node_of(Pinhole(focal, f, np.array([values["cx"], values["cy"]]) - 0.5, k, p), size)
+            )
+            sizes.append(size)
+            units.add(mm)
+        found = contents(nodes, one_size(sizes), job)
+        return Contents(found.nodes, found.image_size, "mm" if units == {True} else found.focal_unit)

@@ -1,0 +1,118 @@
+"""OpenTrackIO, SMPTE's camera tracking data, with OpenLensIO's "Brown-Conrady D-U", which is our formula.
+
+    x_u = x (1 + k1 r² + k3 r⁴ + k5 r⁶) / (1 + k2 r² + k4 r⁴ + k6 r⁶) + decentering,  x in mm, y down
+
+Odd slots are the numerator and even ones the denominator: polynomials and division models of up to three
+terms are exact. A track is one JSON object a line, one for each focal length or frame. Tangential
+coefficients are in 1/mm, as in the formula (OpenLensIO's text says 1/mm²).
+"""
+
+import json
+import math
+
+import numpy as np
+
+from ..models.family import AbstractRadial
+from ._forms import Form
+from .base import Contents, Export, Format, Import, Node
+
+_MODEL = "Brown-Conrady D-U"
+_FORM = Form(3, 3, tangential=True, corrects=True)
+_SLOTS = np.array([0, 2, 4, 1, 3, 5])
+"""Of the numerators, then of the denominators."""
+
+
+class OpenTrackIO(Format):
+    """Samples of OpenTrackIO with a lens's distortion."""
+
+    name, tools, suffixes = (
+        "opentrackio",
+        "Unreal Engine, disguise, Vizrt, stYpe, Mo-Sys",
+        (".jsonl", ".json"),
+    )
+    exact, zoom = True, "list"
+
+    def forms(self, lens):
+        """Rational, three over three, from distorted to corrected points."""
+        return (Form(3, 3, tangential=not isinstance(lens.family, AbstractRadial), corrects=True),)
+
+    def text(self, nodes: list[Node], job: Export) -> str:
+        """A sample on each line."""
+        return "".join(
+            json.dumps(self._sample(node, number, job)) + "\n" for number, node in enumerate(nodes)
+        )
+
+    def _sample(self, node: Node, number: int, job: Export) -> dict:
+        assert isinstance(node.form, Form)
+        pitch, size = job.pitch, np.array(job.lens.image_size)
+        numerators, denominators, p = node.form.split(
+            node.form.rescaled(node.theta, 1 / (job.lens.scale * pitch))
+        )
+        radial = np.zeros(6)
+        radial[_SLOTS] = np.concatenate([numerators, denominators])
+        x, y = ((node.centre - (size - 1) / 2) * pitch).tolist()
+        width, height = (size * pitch).tolist()
+        low, high = np.asarray(job.lens.focal_range, float)
+        share = float(np.clip((node.focal - low) / (high - low), 0, 1)) if high > low else 0.0
+        return {
+            "protocol": {"name": "OpenTrackIO", "version": [1, 0, 1]},
+            "static": {
+                "camera": {
+                    "activeSensorPhysicalDimensions": {"width": width, "height": height},
+                    "activeSensorResolution": {"width": int(size[0]), "height": int(size[1])},
+                }
+            },
+            "timing": {"sequenceNumber": number if node.frame is None else node.frame},
+            "lens": {
+                "pinholeFocalLength": float(job.focal_mm(node.focal)),
+                "encoders": {"zoom": share},
+                "distortion": [{"model": _MODEL, "radial": radial.tolist(), "tangential": p.tolist()}],
+                "distortionOffset": {"x": x, "y": y},
+                "projectionOffset": {"x": 0.0, "y": 0.0},
+            },
+        }
+
+    def recognises(self, head: str) -> bool:
+        """By the name of the protocol."""
+        return "OpenTrackIO" in head
+
+    def read(self, job: Import) -> Contents:
+        """One sample a line, or one of several lines; what is static may be in the first alone."""
+        nodes, camera, size = [], {}, None
+        for sample in _samples(job.paths[0].read_text(encoding="utf-8")):
+            camera = {**camera, **sample.get("static", {}).get("camera", {})}
+            lens = sample["lens"]
+            resolution = camera.get("activeSensorResolution")
+            size = job.size(
+                None if resolution is None else (int(resolution["width"]), int(resolution["height"]))
+            )
+            pitch = float(camera["activeSensorPhysicalDimensions"]["width"]) / size[0]
+            nodes.append(_node(lens, pitch, size))
+        assert size is not None
+        return Contents(tuple(nodes), size, "mm")
+
+
+def _samples(text: str) -> list[dict]:
+    try:
+        return [json.loads(text)]
+    except json.JSONDecodeError:
+        found = [json.loads(line) for line in text.splitlines() if line.strip()]
+        if not found:
+            raise ValueError("it is empty") from None
+        return found
+
+
+def _node(lens: dict, pitch: float, size: tuple[int, int]) -> Node:
+    chosen = [entry for entry in lens["distortion"] if entry.get("model", _MODEL) == _MODEL]
+    if not chosen:
+        models = ", ".join(repr(entry["model"]) for entry in lens["distortion"])
+        raise ValueError(f"its distortion model {models} is not {_MODEL!r}")
+    radial = np.append(np.asarray(chosen[0]["radial"], float), np.zeros(6))[:6]
+    tangential = np.append(np.asarray(chosen[0].get("tangential", []), float), np.zeros(2))[:2]
+    theta = np.concatenate([radial[_SLOTS], tangential])
+    if not np.isfinite(theta).all():
+        raise ValueError("its coefficients must be finite numbers")
+    offset = lens.get("distortionOffset", {"x": 0.0, "y": 0.0})
+    centre = (np.array(size) - 1) / 2 + np.array([offset["x"], offset["y"]], float) / pitch
+    focal = float(lens["pinholeFocalLength"])
+    return Node(focal, _FORM, _FORM.rescaled(theta, math.hypot(*size) / 2 * pitch), centre)

@@ -1,0 +1,67 @@
+"""PFTrack's .pfb (PFBarrel): two coefficients in keys over the frames of a track.
+
+``x_u = x (1 + C3 r² + C5 r⁴)`` with the diagonal over the square root of 2 for radius 1. The centre is a
+fraction of the image's size, y up, counted from pixel centres. Without a track the focal lengths are frames
+1, 2, ....
+"""
+
+import numpy as np
+
+from ._forms import Form
+from .base import Contents, Export, Format, Import, Node
+
+_FORM = Form(2, corrects=True)
+_UNIT = np.sqrt(2)
+"""Half diagonals that are radius 1."""
+
+_HEADER = "#PFBarrel 2011 v2"
+
+
+class PFTrack(Format):
+    """PFTrack's lens distortion with keys."""
+
+    name, tools, suffixes = "pftrack", "PFTrack, Natron", (".pfb",)
+    exact, zoom = True, "list"
+
+    def forms(self, lens):
+        """Two terms from distorted to corrected points."""
+        return (_FORM,)
+
+    def text(self, nodes: list[Node], job: Export) -> str:
+        """One value a line."""
+        width, height = job.lens.image_size
+        lines = [_HEADER, width, height, 1, width, height, "High Order", 1, len(nodes)]
+        for number, node in enumerate(nodes, start=1):
+            x, y = (node.centre / np.array([width, height])).tolist()
+            keys = (_FORM.rescaled(node.theta, _UNIT)).tolist()
+            up = (height - 1 - node.centre[1]) / height
+            del y
+            lines += [number if node.frame is None else node.frame, *map(repr, [*keys, x, float(up)])]
+        return "\n".join(map(str, [*lines, ""]))
+
+    def recognises(self, head: str) -> bool:
+        """By its first line."""
+        return head.startswith("#PFBarrel")
+
+    def read(self, job: Import) -> Contents:
+        """All keys; focal lengths are those of argument focal, one for each."""
+        text = job.paths[0].read_text(encoding="utf-8")
+        lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+        width, height, aspect = int(lines[0]), int(lines[1]), float(lines[2])
+        if aspect != 1 or lines[5] != "High Order":
+            raise ValueError("its pixels are not square, or its model is not of high order")
+        number = int(lines[7])
+        if job.focal is None or len(job.focal) != number:
+            raise ValueError(f"it holds no focal lengths: give argument focal, {number} of them")
+        values = np.array(lines[8 : 8 + 5 * number], float).reshape(number, 5)
+        size = job.size((width, height))
+        nodes = [
+            Node(
+                focal,
+                _FORM,
+                _FORM.rescaled(row[1:3], 1 / _UNIT),
+                np.array([row[3] * width, height - 1 - row[4] * height]),
+            )
+            for focal, row in zip(job.focal, values, strict=True)
+        ]
+        return Contents(tuple(nodes), size, "mm")

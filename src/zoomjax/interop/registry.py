@@ -1,0 +1,335 @@
+"""All formats, and writing and reading by their names."""
+
+import dataclasses
+import math
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._core.arguments import check_kind, kinds_checked
+from .._core.checks import checked_size
+from .._core.files import refuse_existing, whole_file, whole_folder
+from ..io.focal_track import FocalTrack
+from ..models.lens import ZoomLens
+from ..models.zoom import AbstractFocusZoom, AbstractLinearZoom
+from ._lens import lens_of
+from ._solve import Solution, solve
+from .base import Export, Format, Import, Report
+from .colmap import COLMAP
+from .gyroflow import Gyroflow
+from .kalibr import Kalibr
+from .lcp import LCP
+from .lensfun import Lensfun
+from .mrcal import Mrcal
+from .nerfstudio import Nerfstudio
+from .nuke import Nuke
+from .opencv import OpenCV
+from .opentrackio import OpenTrackIO
+from .pftrack import PFTrack
+from .ros import ROS
+from .stmap import STMap
+from .unreal import Unreal
+
+FORMATS: tuple[Format, ...] = (
+    *(STMap(), Nuke(), OpenTrackIO(), PFTrack()),
+    *(Lensfun(), Gyroflow(), Unreal()),
+    *(OpenCV(), ROS(), Kalibr(), Mrcal(), COLMAP(), Nerfstudio(), LCP()),
+)
+"""In the order of `formats` and of the documentation."""
+
+_BIGGEST = 256 * 2**20
+"""Bytes of a text file that is read."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """A lens from another tool's file.
+
+    Attributes:
+        lens: the lens.
+        report: the format, the focal lengths in the file, and how far the lens is from the file there.
+    """
+
+    lens: ZoomLens
+    report: Report
+
+
+def formats() -> tuple[Format, ...]:
+    """The formats of other tools that zoomjax writes and reads.
+
+    Example:
+        >>> [format.name for format in formats() if format.exact][:1]
+        ['stmap']
+    """
+    return FORMATS
+
+
+@kinds_checked
+def write(
+    lens: ZoomLens,
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,
+    focal: float | int | Sequence[float | int] | np.ndarray | None = None,
+    track: FocalTrack | None = None,
+    pixel_pitch: float | int | None = None,
+    tolerance: float | int = 0.1,
+    convention: str = "centres",
+    overwrite: bool = False,
+) -> Report:
+    """Write a lens in another tool's format.
+
+    Args:
+        lens: any lens that depends on the focal length alone.
+        path: the file; for several focal lengths in a format of one a file, and for STMaps, a folder.
+        format: name of the format, one of `formats`; by default that of the path's suffix, where only one
+            has it.
+        focal: focal lengths in the lens's unit. Formats that interpolate choose them if it is left out.
+        track: focal lengths by frame instead, one entry or file for each frame.
+        pixel_pitch: mm from one pixel to the next: the sensor's width over that of the image in px; by
+            default the lens's own. Formats with focal lengths in px need it for lenses in mm, those with a
+            sensor's size always.
+        tolerance: for formats that interpolate: focal lengths are added until the error between them is
+            below this, px, or more of them gain nothing.
+        convention: for STMaps: "centres" (Nuke), "gyroflow" or "alicevision".
+        overwrite: whether files that exist may be replaced.
+
+    Returns:
+        How far what was written is from the lens.
+
+    Raises:
+        OSError: the file cannot be written; nothing is left of it.
+        ValueError: an argument is missing or wrong, or the lens folds over within the image.
+
+    Example:
+        >>> import pathlib, tempfile, zoomjax as zj
+        >>> folder = pathlib.Path(tempfile.mkdtemp())
+        >>> lens = zj.scenes.nikkor_18_200()
+        >>> report = write(lens, folder / "lens.xml", format="lensfun", pixel_pitch=0.0055)
+        >>> zj.interop.read(folder / "lens.xml", image_size=lens.image_size).lens.focal_unit
+        'mm'
+    """
+    path = Path(path)
+    fmt = _format_to_write(format, path)
+    if isinstance(lens.zoom, AbstractFocusZoom):
+        raise ValueError("Argument lens depends on the focus: choose one first, lens.at_focus(focus).")
+    job = Export(
+        lens,
+        *_focal_lengths(fmt, lens, focal, track),
+        pixel_pitch=lens.pixel_pitch if pixel_pitch is None else _positive("pixel_pitch", pixel_pitch),
+        tolerance=_positive("tolerance", tolerance),
+        convention=convention,
+    )
+    several = fmt.folder or (fmt.zoom == "one" and job.focal is not None and len(job.focal) > 1)
+    names = fmt.file_names(job) if several else []
+    refuse_existing([path / name for name in names] if several else [path], overwrite=overwrite)
+    found = Solution(fmt.bare_nodes(job), 0.0, None) if fmt.folder else solve(fmt, job)
+    written = [0.0]
+    if several:
+        with whole_folder(path) as folder:
+            written += fmt.write_all(found.nodes, job, folder)
+    else:
+        with whole_file(path) as part:
+            fmt.write(found.nodes, job, part)
+    return Report(
+        fmt.name,
+        tuple(node.focal for node in found.nodes),
+        max(found.at_nodes, *written),
+        found.between,
+        (*fmt.notes(found.nodes, job), *_shortfall(fmt, found, job)),
+        tuple(path / name for name in names) if several else (path,),
+    )
+
+
+def read(
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,
+    image_size: tuple[int, int] | None = None,
+    focal: float | int | Sequence[float | int] | np.ndarray | None = None,
+    crop: float | int | None = None,
+    name: str | None = None,
+    direction: str | None = None,
+    convention: str = "centres",
+    zoom: AbstractLinearZoom | None = None,
+    terms: int | None = None,
+) -> Reading:
+    """Read a lens that another tool measured or wrote.
+
+    Distortion that maps corrected to distorted points is fitted by ours, which maps the other way; focal
+    lengths between those of the file are a zoom model's. The report says how far the lens is from the file.
+
+    Args:
+        path: the file; or a folder of files of one format, one a focal length.
+        format: name of the format, one of `formats`; by default it is recognised.
+        image_size: (width, height) px, for formats that do not say it.
+        focal: focal lengths of the files in the order of their names, for STMaps; by default those in
+            their headers.
+        crop: for lensfun: crop factor of the camera; by default that of the calibration.
+        name: of the lens, for files of several; a part of it will do.
+        direction: for STMaps: "undistort" or "redistort"; by default the file name says it.
+        convention: for STMaps: "centres" (Nuke), "gyroflow" or "alicevision".
+        zoom: the zoom model, linear in its parameters. By default `SmoothZoom`; `TableZoom` for tangential
+            distortion and the division model, and to keep what the file says at its focal lengths.
+        terms: number of radial coefficients; by default 2 for `SmoothZoom`, else those of a file with our
+            own formula, or 4.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is damaged, of no known format, or does not say what an argument must then say.
+    """
+    check_kind("path", path, (str, os.PathLike))
+    path = Path(path)
+    paths = _files(path)
+    fmt = _format_to_read(format, paths[0])
+    job = Import(
+        path,
+        tuple(paths),
+        None if image_size is None else checked_size(image_size),
+        None if focal is None else tuple(np.atleast_1d(np.asarray(focal, float)).tolist()),
+        None if crop is None else _positive("crop", crop),
+        name,
+        direction,
+        convention,
+    )
+    try:
+        contents = fmt.read(job)
+        if not contents.nodes:
+            raise ValueError("it holds no distortion")
+        for node in contents.nodes:
+            if not (math.isfinite(node.focal) and node.focal > 0):
+                raise ValueError(f"its focal length {node.focal} is not a positive number")
+        lens, worst, notes = lens_of(contents, zoom, terms)
+    except FileNotFoundError:
+        raise
+    except _DAMAGED as error:
+        reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
+        raise ValueError(f"Cannot read a {fmt.name} lens from {path}: {reason}.") from error
+    nodes = tuple(sorted({node.focal for node in contents.nodes}))
+    return Reading(lens, Report(fmt.name, nodes, worst, None, notes, tuple(paths)))
+
+
+_DAMAGED = (
+    *(ValueError, TypeError, KeyError, IndexError, AttributeError, ArithmeticError, RecursionError),
+    *(OSError, SyntaxError, RuntimeError),
+)
+"""What reading a damaged file may raise; errors of XML are syntax errors."""
+
+
+def named(name: str) -> Format:
+    """The format of this name; ValueError if there is none."""
+    for fmt in FORMATS:
+        if fmt.name == name:
+            return fmt
+    raise ValueError(f"Argument format must be one of {_names(FORMATS)}, but it is {name!r}.")
+
+
+def _names(formats: Iterable[Format]) -> str:
+    return ", ".join(fmt.name for fmt in formats)
+
+
+def _format_to_write(name: str | None, path: Path) -> Format:
+    if name is not None:
+        if not (fmt := named(name)).writes:
+            raise ValueError(f"The format {name} can be read only.")
+        return fmt
+    found = [fmt for fmt in FORMATS if fmt.writes and fmt.suffixes[0] == path.suffix.lower()]
+    if len(found) != 1:
+        raise ValueError(
+            f"Argument format must be given, one of {_names(found or FORMATS)}: the name {path.name} does "
+            "not tell it."
+        )
+    return found[0]
+
+
+def _format_to_read(name: str | None, path: Path) -> Format:
+    if name is not None:
+        if not (fmt := named(name)).reads:
+            raise ValueError(f"The format {name} can be written only.")
+        return fmt
+    if path.stat().st_size > _BIGGEST:
+        raise ValueError(f"{path} is larger than {_BIGGEST >> 20} MiB: no lens file is.")
+    with open(path, "rb") as file:
+        head = file.read(20000).decode("utf-8", "replace")
+    for fmt in FORMATS:
+        if fmt.reads and path.suffix.lower() in fmt.suffixes and fmt.recognises(head):
+            return fmt
+    raise ValueError(f"{path} is of no format that is known: {_names(f for f in FORMATS if f.reads)} are.")
+
+
+def _files(path: Path) -> list[Path]:
+    """The file itself, or the files of a folder that have a suffix of some format."""
+    if not path.is_dir():
+        if not path.is_file():
+            raise FileNotFoundError(2, "No such file", str(path))
+        return [path]
+    known = {suffix for fmt in FORMATS for suffix in fmt.suffixes}
+    found = sorted(file for file in path.iterdir() if file.is_file() and file.suffix.lower() in known)
+    if len({file.suffix.lower() for file in found}) != 1:
+        raise ValueError(
+            f"The folder {path} must hold files of one format, but it holds "
+            f"{', '.join(sorted({file.suffix for file in found})) or 'none'}: give one file."
+        )
+    return found
+
+
+def _focal_lengths(
+    fmt: Format, lens: ZoomLens, focal: Any, track: FocalTrack | None
+) -> tuple[tuple[float, ...] | None, tuple[int, ...] | None]:
+    """The focal lengths to write and their frames, each None where it is the format's to choose."""
+    if track is not None:
+        return _tracked(fmt, track, focal)
+    if focal is None:
+        low, high = np.asarray(lens.focal_range, float).tolist()
+        if fmt.zoom == "interpolated":
+            return None, None
+        if low == high:
+            return (low,), None
+        raise ValueError(
+            f"Argument focal must be given, one focal length or several: the format {fmt.name} does not "
+            "interpolate between them. Or give argument track, one for each frame."
+        )
+    values = np.atleast_1d(np.asarray(focal, float))
+    if values.ndim != 1 or not (np.isfinite(values) & (values > 0)).all() or not values.size:
+        raise ValueError(f"Argument focal must hold positive numbers, but it is {focal!r}.")
+    return tuple(np.unique(values).tolist()), None
+
+
+def _tracked(fmt: Format, track: FocalTrack, focal: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
+    if focal is not None:
+        raise ValueError("Argument track must be left out where argument focal is given: give one of them.")
+    if fmt.zoom == "interpolated":
+        raise ValueError(
+            f"Argument track must be left out: the format {fmt.name} goes by the focal length, not by "
+            "frames."
+        )
+    if track.by_time:
+        raise ValueError("Argument track must be in frames (columns frame,focal), but it is in seconds.")
+    first, last = math.ceil(track.position[0]), math.floor(track.position[-1])
+    frames = range(first, last + 1)
+    return tuple(track.at(frame, math.nan) for frame in frames), tuple(frames)
+
+
+def _positive(name: str, value: Any) -> float:
+    number = float(value) if isinstance(value, int | float | np.number) else math.nan
+    if not (math.isfinite(number) and number > 0):
+        raise ValueError(f"Argument {name} must be a positive number, but it is {value!r}.")
+    return number
+
+
+def _shortfall(fmt: Format, found: Solution, job: Export) -> tuple[str, ...]:
+    """What is said where the tolerance is missed."""
+    if found.worst <= job.tolerance:
+        return ()
+    if found.between is not None and found.between > max(job.tolerance, 1.1 * found.at_nodes):
+        return (
+            f"Between the focal lengths the error exceeds the tolerance of {job.tolerance:g} px: more of "
+            "them would help.",
+        )
+    return (
+        f"The formula of {fmt.name} cannot follow this lens within {job.tolerance:g} px, however many "
+        "focal lengths are written.",
+    )

@@ -1,0 +1,286 @@
+"""STMaps: images whose pixels say where to sample another image, as Nuke, Fusion, Flame and Blender use.
+
+Two for each focal length: ``undistort`` says for a pixel of the corrected image where it is in the
+distorted one, ``redistort`` the other way round. Red is ``(x + 0.5)/w``, green ``1 - (y + 0.5)/h``, from
+the bottom left corner; 32-bit float. The corrected image of a barrel lens is larger than the photo: the
+data window of ``undistort`` is its bounding box (overscan), the display window that of the photo.
+
+Two writers put positions elsewhere, `convention`: "gyroflow" has x/w and 1 - y/h, "alicevision" x/(w - 1)
+and 1 - y/(h - 1).
+"""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
+
+from ..models.distortion import Distortion
+from ..models.family import AbstractRadial
+from ._forms import Form
+from ._samples import border, distortions
+from .base import Contents, Export, Format, Import, Node, Sampled
+
+_ROWS = 128
+"""Of a map that are computed at once."""
+
+_KNOTS = 2049
+"""Of the spline that stands for a radial map."""
+
+_SAMPLED = 40
+"""Pixels along each side that a lens is fitted to."""
+
+_LEAST = 0.05
+"""Share of a map's pixels that must lie within the image."""
+
+_TERMS = 3
+"""Coefficients of the polynomial by which the centre of maps is found."""
+
+_FOCAL, _UNIT = "zoomjaxFocal", "zoomjaxFocalUnit"
+"""Attributes of the header."""
+
+_OUTSIDE = -1.0
+"""Where there is nothing to sample."""
+
+
+class STMap(Format):
+    """Pairs of EXR maps, one pair for each focal length or frame."""
+
+    name, tools, suffixes = "stmap", "Nuke, Natron, Fusion, Flame, After Effects", (".exr",)
+    exact, folder = True, True
+
+    def file_names(self, job: Export) -> list[str]:
+        """Two for each node."""
+        return [f"{kind}.{stem}.exr" for stem in self.stems(job) for kind in ("undistort", "redistort")]
+
+    def bare_nodes(self, job: Export) -> list[Node]:
+        """The focal lengths."""
+        _offset(job.convention)
+        frames = job.frames or [None] * len(job.focal or ())
+        centre = np.asarray(job.lens.centre)
+        return [
+            Node(f, Form(0), np.zeros(0), centre, n) for f, n in zip(job.focal or (), frames, strict=True)
+        ]
+
+    def write_all(self, nodes: list[Node], job: Export, folder: Path) -> list[float]:
+        """The maps; returns the greatest rounding errors, px."""
+        names = iter(self.file_names(job))
+        each = distortions(job.lens, np.array([node.focal for node in nodes]))
+        size, errors = job.lens.image_size, []
+        window = _union([_corrected_window(d, size) for d in each])
+        for node, distortion in zip(nodes, each, strict=True):
+            header = {_FOCAL: float(node.focal), _UNIT: job.lens.focal_unit}
+            for method, box in (("distort", window), ("undistort", (0, 0, size[0] - 1, size[1] - 1))):
+                found = _quick(distortion, method, box)
+                error = _write_map(folder / next(names), found, box, size, job.convention, header)
+                errors.append(error)
+        return errors
+
+    def recognises(self, head: str) -> bool:
+        """By EXR's magic number."""
+        return head.startswith("v/1\x01")
+
+    def read(self, job: Import) -> Contents:
+        """One map a focal length, of one direction; the others of a folder are left out."""
+        nodes, units, size = [], set(), None
+        wanted = job.direction or _direction(job.paths[0])
+        if wanted not in ("undistort", "redistort"):
+            raise ValueError('argument direction must be "undistort" or "redistort"')
+        paths = [path for path in job.paths if job.direction or _direction(path) == wanted]
+        if job.focal is not None and len(job.focal) != len(paths):
+            raise ValueError(f"argument focal must hold {len(paths)} focal lengths, one for each file")
+        for number, path in enumerate(paths):
+            header, red, green = _open(path)
+            size = job.size(_window_size(header["displayWindow"]))
+            focal = header.get(_FOCAL) if job.focal is None else job.focal[number]
+            if focal is None:
+                raise ValueError("it does not say its focal length: give argument focal, one for each file")
+            nodes.append(Sampled(float(focal), *_pairs(header, red, green, size, wanted, job.convention)))
+            units.add(str(header.get(_UNIT, "mm")))
+        assert size is not None
+        centre = _centre(nodes, size)
+        nodes = [dataclasses.replace(node, centre=centre) for node in nodes]
+        return Contents(tuple(nodes), size, "px" if units == {"px"} else "mm")
+
+
+def _centre(nodes: list[Sampled], size: tuple[int, int]) -> np.ndarray:
+    """The centre of distortion of all maps, px: that about which polynomials come nearest to them."""
+    middle, scale = (np.array(size) - 1) / 2, math.hypot(*size) / 2
+    each = [((n.distorted - middle) / scale, (n.corrected - middle) / scale) for n in nodes]
+
+    def residuals(shift: np.ndarray) -> np.ndarray:
+        parts = []
+        for distorted, corrected in each:
+            z = distorted - shift
+            t = np.sum(z * z, -1, keepdims=True)
+            matrix = np.stack([(z * t ** (i + 1)).ravel() for i in range(_TERMS)], -1)
+            change = (corrected - distorted).ravel()
+            parts.append(matrix @ np.linalg.lstsq(matrix, change, rcond=None)[0] - change)
+        return np.concatenate(parts)
+
+    found = least_squares(residuals, np.zeros(2), x_scale=0.01, diff_step=1e-6, xtol=1e-12, ftol=1e-12)
+    shift = found.x if np.abs(found.x).max() < 0.5 else np.zeros(2)
+    return middle + scale * shift
+
+
+def _offset(convention: str) -> tuple[float, int]:
+    """What is added to pixel positions, and to the size, of a convention."""
+    table = {"centres": (0.5, 0), "gyroflow": (0.0, 0), "alicevision": (0.0, -1)}
+    if convention not in table:
+        raise ValueError(
+            f"Argument convention must be one of {', '.join(table)}, but it is {convention!r}."
+        )
+    return table[convention]
+
+
+def to_map(points: np.ndarray, size: tuple[int, int], convention: str) -> np.ndarray:
+    """Positions in px as red and green."""
+    add, more = _offset(convention)
+    share = (points + add) / (np.array(size) + more)
+    return np.stack([share[..., 0], 1 - share[..., 1]], axis=-1)
+
+
+def from_map(values: np.ndarray, size: tuple[int, int], convention: str) -> np.ndarray:
+    """Red and green as positions in px."""
+    add, more = _offset(convention)
+    share = np.stack([values[..., 0], 1 - values[..., 1]], axis=-1)
+    return share * (np.array(size) + more) - add
+
+
+def _corrected_window(distortion: Distortion, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """The pixels that the corrected image and the display window cover: x and y of both ends."""
+    ends = border(size, np.asarray(distortion.centre)) + np.asarray(distortion.centre)
+    corrected = np.asarray(distortion.undistort(ends))
+    if not np.isfinite(corrected).all():
+        raise ValueError(
+            "The lens folds over within the image, and has no corrected border there: zj.models.certify "
+            "says where. Export focal lengths at which it does not."
+        )
+    low = np.minimum(np.floor(corrected.min(0)), 0)
+    high = np.maximum(np.ceil(corrected.max(0)), np.array(size) - 1)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def _union(windows: list[tuple[int, int, int, int]]) -> tuple[int, int, int, int]:
+    table = np.array(windows)
+    return (*(int(v) for v in table[:, :2].min(0)), *(int(v) for v in table[:, 2:].max(0)))  # pyright: ignore[reportReturnType]
+
+
+def _quick(distortion: Distortion, method: str, window: tuple[int, int, int, int]) -> Any:
+    """``distort`` or ``undistort``, of millions of points: if radial, by a spline of the squared radius.
+
+    With so many knots it is within rounding errors of 32-bit floats.
+    """
+    exact = getattr(distortion, method)
+    if not isinstance(distortion.family, AbstractRadial):
+        return exact
+    centre, scale = np.asarray(distortion.centre), float(distortion.scale)
+    corners = np.array(np.meshgrid(window[::2], window[1::2])).reshape(2, -1).T - centre
+    t = np.linspace(0, 1.001 * np.max(np.sum(corners**2, -1)), _KNOTS) / scale**2
+    radius = np.sqrt(t[1:])
+    ratio = (exact(centre + scale * radius[:, None] * np.array([1.0, 0.0])) - centre)[:, 0] / scale / radius
+    if not np.isfinite(ratio).all():
+        return exact
+    spline = CubicSpline(t, np.append(1.0, ratio))
+
+    def found(points: np.ndarray) -> np.ndarray:
+        z = points - centre
+        return centre + z * spline(np.sum(z * z, -1) / scale**2)[..., None]
+
+    return found
+
+
+def _write_map(
+    path: Path,
+    map_of: Any,
+    window: tuple[int, int, int, int],
+    size: tuple[int, int],
+    convention: str,
+    header: dict[str, Any],
+) -> float:
+    """Write one map; return the greatest rounding error, px."""
+    OpenEXR = open_exr()
+    x = np.arange(window[0], window[2] + 1, dtype=float)
+    pixels = np.zeros((window[3] - window[1] + 1, len(x), 3), np.float32)
+    worst = 0.0
+    for first in range(0, len(pixels), _ROWS):
+        y = np.arange(first, min(first + _ROWS, len(pixels)), dtype=float) + window[1]
+        grid = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)
+        found = to_map(np.asarray(map_of(grid)), size, convention)
+        exists = np.isfinite(found)
+        rows = pixels[first : first + len(y), :, :2]
+        rows[:] = np.where(exists, found, _OUTSIDE)
+        rounding = np.where(exists, abs(rows - found), 0) * np.array(size)
+        worst = max(worst, float(np.hypot(*np.moveaxis(rounding, -1, 0)).max()))
+    about = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "dataWindow": (window[:2], window[2:]),
+        "displayWindow": ((0, 0), (size[0] - 1, size[1] - 1)),
+        **header,
+    }
+    with OpenEXR.File(about, {"RGB": pixels}) as file:
+        file.write(str(path))
+    return worst
+
+
+def open_exr() -> Any:
+    """The module OpenEXR."""
+    try:
+        import OpenEXR
+    except ModuleNotFoundError as error:
+        raise ValueError('EXR files need the extra "interop": pip install "zoomjax[interop]".') from error
+    return OpenEXR
+
+
+def _open(path: Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
+    """Header, red and green of a map."""
+    with open_exr().File(str(path), separate_channels=True) as file:
+        channels, header = file.channels(), dict(file.header())
+        if not {"R", "G"} <= set(channels):
+            raise ValueError(f"it has no channels R and G, but {', '.join(channels)}")
+        return header, np.array(channels["R"].pixels, float), np.array(channels["G"].pixels, float)
+
+
+def _window_size(window: Any) -> tuple[int, int]:
+    low, high = np.asarray(window)
+    return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
+
+
+def _direction(path: Path) -> str:
+    """The direction that a file's name tells; ValueError if it does not."""
+    for word in ("undistort", "redistort"):
+        if word in path.name.lower():
+            return word
+    raise ValueError(
+        'its name does not tell its direction: give argument direction, "undistort" or "redistort"'
+    )
+
+
+def _pairs(
+    header: dict[str, Any],
+    red: np.ndarray,
+    green: np.ndarray,
+    size: tuple[int, int],
+    direction: str,
+    convention: str,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distorted and corrected points, px, thinned out, within the photo."""
+    left, top = np.asarray(header["dataWindow"])[0] - np.asarray(header["displayWindow"])[0]
+    rows, columns = (
+        np.unique(np.linspace(0, n - 1, min(n, _SAMPLED)).round().astype(int)) for n in red.shape
+    )
+    grid = np.stack(np.broadcast_arrays(columns + float(left), rows[:, None] + float(top)), -1).reshape(
+        -1, 2
+    )
+    values = np.stack([red, green], -1)[rows][:, columns].reshape(-1, 2)
+    other = from_map(values, size, convention)
+    distorted, corrected = (other, grid) if direction == "undistort" else (grid, other)
+    inside = np.all((distorted >= -0.5) & (distorted <= np.array(size) - 0.5), axis=-1)
+    inside &= np.all(np.isfinite(corrected), axis=-1)
+    if inside.mean() < _LEAST:
+        raise ValueError("hardly any of its pixels lies within the image: is the convention right?")
+    return distorted[inside], corrected[inside]

@@ -1,0 +1,144 @@
+"""Unreal Engine's .ulens: tables over focus and zoom of its Spherical lens model.
+
+OpenCV's k1 k2 k3 p1 p2, for radii in focal lengths; Fx, Fy, Cx and Cy are shares of the image's width and
+height. Zoom is the focal length in the lens's unit, focus one entry. Unreal takes the tables as linear
+between entries, but eases the first and last interval: those are made short.
+"""
+
+import dataclasses
+import json
+
+import numpy as np
+
+from ._pinhole import Pinhole, contents, formula, node_of, one_size, pinhole, square
+from .base import Contents, Export, Format, Import, Node
+
+_END = 0.01
+"""Length of the first and last interval, as a share of their neighbours'."""
+
+_TABLES = {
+    "DistortionTable": "FocusEncoder, ZoomEncoder, K1, K2, K3, P1, P2",
+    "FocalLengthTable": "FocusEncoder, ZoomEncoder, Fx, Fy",
+    "ImageCenterTable": "FocusEncoder, ZoomEncoder, Cx, Cy",
+    "NodalOffsetTable": "FocusEncoder, ZoomEncoder, Qx, Qy, Qz, Qw, Tx, Ty, Tz",
+}
+
+
+class Unreal(Format):
+    """Unreal's lens file exchange format."""
+
+    name, tools, suffixes = "unreal", "Unreal Engine", (".ulens",)
+    zoom = "interpolated"
+    note = "Unreal's reader of OpenTrackIO takes the lens without a refit."
+
+    def forms(self, lens):
+        """Three terms."""
+        return (formula(lens, 3),)
+
+    def foreign(self, node: Node, job: Export) -> np.ndarray:
+        """Focal length in px, centre, coefficients in its units."""
+        f = float(job.focal_px(node.focal))
+        return np.concatenate([[f], node.centre, node.form.rescaled(node.theta, f / job.lens.scale)])
+
+    def native(self, numbers: np.ndarray, focal: float, like: Node, job: Export) -> Node:
+        """What Unreal makes of interpolated numbers."""
+        theta = like.form.rescaled(numbers[3:], job.lens.scale / numbers[0])
+        return dataclasses.replace(like, focal=focal, theta=theta, centre=numbers[1:3])
+
+    def interpolate(self, focal: np.ndarray, numbers: np.ndarray, at: float) -> np.ndarray:
+        """Linear, but with a slope of 0 at both ends, as its automatic tangents have it."""
+        i = int(np.clip(np.searchsorted(focal, at, side="right") - 1, 0, max(len(focal) - 2, 0)))
+        if len(focal) < 2:
+            return numbers[0]
+        t = (at - focal[i]) / (focal[i + 1] - focal[i])
+        rise = numbers[i + 1] - numbers[i]
+        if i == 0:  # the slope is 0 at the start
+            t = t * t * (2 - t)
+        if i == len(focal) - 2 and i > 0:
+            t = 1 - (1 - t) ** 2 * (1 + t)
+        return numbers[i] + t * rise
+
+    def spread(self, low: float, high: float, number: int) -> np.ndarray:
+        """Geometric, with one more close to each end."""
+        focal = np.geomspace(low, high, number)
+        first, last = low + _END * (focal[1] - low), high - _END * (high - focal[-2])
+        return np.array([low, first, *focal[1:-1], last, high])
+
+    def text(self, nodes: list[Node], job: Export) -> str:
+        """All tables at the same nodes."""
+        size = np.array(job.lens.image_size)
+        rows: dict[str, list[list[float]]] = {name: [] for name in _TABLES}
+        for node in nodes:
+            camera = pinhole(node, job)
+            k1, k2, p1, p2, k3 = camera.coefficients
+            rows["DistortionTable"].append([k1, k2, k3, p1, p2])
+            rows["FocalLengthTable"].append((camera.f / size).tolist())
+            rows["ImageCenterTable"].append(((camera.centre + 0.5) / size).tolist())
+            rows["NodalOffsetTable"].append([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        width, height = (size * job.pitch).tolist()
+        table = {
+            "metadata": {
+                "type": "LensFile",
+                "version": "0.0.0",
+                "lensInfo": {"serialNumber": "", "modelName": "zoomjax", "distortionModel": "Spherical"},
+                "name": "zoomjax",
+                "nodalOffsetCoordinateSystem": "OpenCV",
+                "fxFyUnits": "Normalized",
+                "cxCyUnits": "Normalized",
+                "userMetadata": [],
+            },
+            "sensorDimensions": {"width": width, "height": height, "units": "Millimeters"},
+            "imageDimensions": {"width": int(size[0]), "height": int(size[1])},
+            "cameraParameterTables": [
+                {"parameterName": name, "header": header, "data": _data(nodes, rows[name])}
+                for name, header in _TABLES.items()
+            ],
+            "encoderTables": [],
+        }
+        return json.dumps(table, indent=1) + "\n"
+
+    def recognises(self, head: str) -> bool:
+        """By its type."""
+        return '"LensFile"' in head
+
+    def read(self, job: Import) -> Contents:
+        """The tables, at one focus."""
+        table = json.loads(job.paths[0].read_text(encoding="utf-8"))
+        if table["metadata"]["lensInfo"]["distortionModel"] != "Spherical":
+            raise ValueError("its distortion model is not Spherical")
+        size = job.size((int(table["imageDimensions"]["width"]), int(table["imageDimensions"]["height"])))
+        tables = {entry["parameterName"]: _rows(entry) for entry in table["cameraParameterTables"]}
+        if len({row["FocusEncoder"] for row in tables["DistortionTable"]}) > 1:
+            raise ValueError("it has entries at more than one focus, and zoomjax reads files of one")
+        nodes = []
+        for row in tables["DistortionTable"]:
+            zoom = row["ZoomEncoder"]
+            focal, middle = (_at(tables[name], zoom) for name in ("FocalLengthTable", "ImageCenterTable"))
+            f = square(focal["Fx"] * size[0], focal["Fy"] * size[1], size)
+            centre = np.array([middle["Cx"] * size[0], middle["Cy"] * size[1]]) - 0.5
+            k, p = (np.array([row[name] for name in names]) for names in (("K1", "K2", "K3"), ("P1", "P2")))
+            nodes.append(node_of(Pinhole(f, f, centre, k, p), size))
+        return contents(nodes, one_size([size]), job)
+
+
+def _data(nodes: list[Node], rows: list[list[float]]) -> str:
+    return "; ".join(
+        ", ".join(map(repr, [0, node.focal, *row])) for node, row in zip(nodes, rows, strict=True)
+    )
+
+
+def _rows(entry: dict) -> list[dict[str, float]]:
+    names = [name.strip() for name in entry["header"].split(",")]
+    return [
+        dict(zip(names, map(float, row.split(",")), strict=True))
+        for row in entry["data"].split(";")
+        if row.strip()
+    ]
+
+
+def _at(rows: list[dict[str, float]], zoom: float) -> dict[str, float]:
+    """The entry at a zoom, which the table must have."""
+    for row in rows:
+        if np.isclose(row["ZoomEncoder"], zoom, rtol=1e-9):
+            return row
+    raise ValueError(f"its tables are not at the same zooms: one has no entry at {zoom:g}")

@@ -1,0 +1,121 @@
+"""What a photo was taken with, from its EXIF data: camera, lens, and the width of a pixel.
+
+The width of a pixel has two sources. The resolution of the focal plane, in pixels of the image that the
+camera wrote, is the more exact. The focal length of equal view on film of 36 x 24 mm is rounded to whole
+mm. Where both are there and differ by more than a fifth, the first is taken for a mistake of the camera.
+"""
+
+import dataclasses
+import io
+import math
+import os
+from typing import Any
+
+from PIL import ExifTags
+
+from .exif import parse_exif
+from .photo import read_exif
+
+FILM = math.hypot(36, 24)
+"""Diagonal of the film that crop factors refer to, mm."""
+
+_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+"""The unit of the resolution of the focal plane, mm."""
+
+_DISAGREE = 1.2
+_LEAST, _MOST = 0.2, 30.0
+"""Crop factors that there are: from plates to the smallest phones."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Equipment:
+    """Camera and lens of a photo, as far as its EXIF data tell.
+
+    Attributes:
+        maker, camera: of the body; empty if not known.
+        lens: the lens; empty if not known.
+        focal: focal length, mm.
+        plane_pitch: mm from pixel to pixel in the image as the camera wrote it.
+        written: width and height px of that image.
+        crop: crop factor, from the focal length of equal view on film.
+    """
+
+    maker: str = ""
+    camera: str = ""
+    lens: str = ""
+    focal: float | None = None
+    plane_pitch: float | None = None
+    written: tuple[int, int] | None = None
+    crop: float | None = None
+
+    def crop_factor(self, image_size: tuple[int, int]) -> float | None:
+        """Crop factor of an image of this size: the diagonal of film over that of the sensor shown."""
+        direct = self._direct(image_size)
+        if direct is not None and self.crop is not None:
+            return direct if 1 / _DISAGREE < direct / self.crop < _DISAGREE else self.crop
+        return direct or self.crop
+
+    def pixel_pitch(self, image_size: tuple[int, int]) -> float | None:
+        """Width of a pixel on the sensor, mm, of an image of this size; None if it is not known."""
+        crop = self.crop_factor(image_size)
+        return None if crop is None else FILM / (crop * math.hypot(*image_size))
+
+    def _direct(self, image_size: tuple[int, int]) -> float | None:
+        """The crop factor by the resolution of the focal plane; None for a part of what was written."""
+        if self.plane_pitch is None:
+            return None
+        here = sorted(image_size)
+        written = sorted(self.written or image_size)
+        if abs(here[0] * written[1] - here[1] * written[0]) > 0.01 * here[1] * written[1]:
+            return None
+        crop = FILM / (self.plane_pitch * math.hypot(*written))
+        return crop if _LEAST < crop < _MOST else None
+
+
+def read_equipment(source: str | os.PathLike[str]) -> Equipment:
+    """Camera and lens in a photo's EXIF data; nothing is known where they have none. No pixel is decoded.
+
+    Raises:
+        FileNotFoundError: there is no such photo.
+        OSError: it cannot be read.
+        ValueError: it is not a photo or not a regular file, or has more than 4 GB.
+    """
+    block = read_exif(source)
+    return Equipment() if block is None else exif_equipment(block)
+
+
+def exif_equipment(block: bytes) -> Equipment:
+    """Camera and lens in EXIF data, or at the start of a TIFF file."""
+    exif = parse_exif(io.BytesIO(block.removeprefix(b"Exif\0\0")))
+    if exif is None:
+        return Equipment()
+    tags, base = exif.get_ifd(ExifTags.IFD.Exif), ExifTags.Base
+    focal, film = _positive(tags.get(base.FocalLength)), _positive(tags.get(base.FocalLengthIn35mmFilm))
+    unit = _MM.get(tags.get(base.FocalPlaneResolutionUnit, 2))
+    resolution = _positive(tags.get(base.FocalPlaneXResolution))
+    width, height = (_positive(tags.get(tag)) for tag in (base.ExifImageWidth, base.ExifImageHeight))
+    crop = film / focal if film and focal else None
+    return Equipment(
+        maker=_text(exif.get(base.Make)),
+        camera=_text(exif.get(base.Model)),
+        lens=_text(tags.get(base.LensModel)),
+        focal=focal,
+        plane_pitch=unit / resolution if unit and resolution else None,
+        written=(int(width), int(height)) if width and height else None,
+        crop=crop if crop and _LEAST < crop < _MOST else None,
+    )
+
+
+def _positive(value: Any) -> float | None:
+    """A positive number; None for what is none, such as 0/0 and the words of damaged data."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if 0 < number < 4e9 else None
+
+
+def _text(value: Any) -> str:
+    """A name without what fills up its field; empty for what is none, as dashes."""
+    text = " ".join(value.split("\0")[0].split()) if isinstance(value, str) else ""
+    return text if any(letter.isalnum() for letter in text) else ""

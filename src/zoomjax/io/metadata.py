@@ -1,0 +1,91 @@
+"""What a photo file tells besides its pixels, whatever its format; and the mark of what zoomjax has made.
+
+The mark is a property in the XMP packet: EXIF data stay as they are, byte for byte, because the notes
+of camera makers in them do not survive being moved.
+"""
+
+import dataclasses
+import importlib.metadata
+import re
+
+NAMESPACE = "https://zoomjax.invalid/ns/1.0/"
+"""Of zoomjax's properties in XMP: a name, which leads nowhere."""
+
+GEOMETRIES = ("undistorted", "distorted")
+"""What the mark can tell: that distortion was removed from a photo, or applied to it again."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Metadata:
+    """Metadata of a photo, or of a page of a TIFF file.
+
+    Attributes:
+        exif: EXIF data, from their TIFF header on; empty if there are none.
+        xmp: the XMP packet.
+        icc: the colour profile.
+        iptc: Photoshop's image resources, as in JPEG and TIFF files, which hold the IPTC data.
+        comment: a comment in no known encoding.
+        dpi: pixels per inch across and down, or None.
+        chunks: what only a file of the same format can hold: pairs of name and content.
+    """
+
+    exif: bytes = b""
+    xmp: bytes = b""
+    icc: bytes = b""
+    iptc: bytes = b""
+    comment: bytes = b""
+    dpi: tuple[float, float] | None = None
+    chunks: tuple[tuple[bytes, bytes], ...] = ()
+
+
+NAMES = {
+    "exif": "EXIF data",
+    "xmp": "XMP",
+    "icc": "the colour profile",
+    "iptc": "IPTC data",
+    "comment": "the comment",
+    "dpi": "the resolution",
+}
+"""How messages call the fields."""
+
+
+def missing(metadata: Metadata, *held: str) -> list[str]:
+    """Names of the fields that are filled but not among those that a format holds."""
+    return [name for field, name in NAMES.items() if field not in held and getattr(metadata, field)]
+
+
+def geometry_of(metadata: Metadata) -> str | None:
+    """What the mark tells: "undistorted", "distorted", or None without a mark."""
+    found = _MARK.search(metadata.xmp)
+    return None if found is None else found[1].decode()
+
+
+def marked(metadata: Metadata, geometry: str) -> Metadata:
+    """The metadata with the mark, in place of an earlier one. The rest of the XMP packet stays as it is."""
+    xmp = _DESCRIPTION.sub(b"", metadata.xmp)
+    version = importlib.metadata.version("zoomjax")
+    description = (
+        f'<rdf:Description rdf:about="" xmlns:zoomjax="{NAMESPACE}" zoomjax:Version="{version}" '
+        f'zoomjax:Geometry="{geometry}" xmlns:rdf="{_RDF}"/>'
+    ).encode()
+    end = max(xmp.rfind(f"</{prefix}:RDF>".encode()) for prefix in ("rdf", "RDF"))
+    if end < 0:  # no packet, or one that is damaged, or in UTF-16, which only old programs wrote
+        xmp, end = _EMPTY, _EMPTY.index(b"</rdf:RDF>")
+    return dataclasses.replace(metadata, xmp=xmp[:end] + description + xmp[end:])
+
+
+_RDF = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
+
+_EMPTY = (
+    '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
+    f'<rdf:RDF xmlns:rdf="{_RDF}"></rdf:RDF></x:xmpmeta><?xpacket end="w"?>'
+).encode()
+
+_DESCRIPTION = re.compile(rb'<rdf:Description [^<>]*xmlns:zoomjax="[^<>]*/>')
+
+_MARK = re.compile(
+    re.escape(f'xmlns:zoomjax="{NAMESPACE}"').encode()
+    + rb'[^<>]*zoomjax:Geometry="('
+    + "|".join(GEOMETRIES).encode()
+    + rb')"'
+)

@@ -1,0 +1,65 @@
+"""RAW photos as cameras write them, developed by rawpy (LibRaw): the extra ``raw``.
+
+Developed plainly and the same for all: the camera's white balance, no automatic brightness, sRGB, 16 bits,
+the pixels as stored on the sensor. LibRaw does not correct distortion, nor does it turn the picture.
+"""
+
+import io
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from .metadata import Metadata
+from .tiff import tiff_metadata
+
+RAW_SUFFIXES = (
+    *(".dng", ".nef", ".nrw", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"),
+    *(".3fr", ".iiq", ".erf", ".mos", ".mrw", ".rwl"),
+)
+
+
+def raw_size(content: bytes) -> tuple[int, int]:
+    """Width and height of the developed picture. No pixel is decoded.
+
+    Raises:
+        ValueError: rawpy is not installed, or cannot read it.
+    """
+    with _opened(content) as raw:
+        return int(raw.sizes.width), int(raw.sizes.height)
+
+
+def raw_metadata(content: bytes) -> Metadata:
+    """EXIF data and XMP, of formats that are TIFF files inside; empty for others.
+
+    The colour profile is left out: the picture is developed to sRGB.
+    """
+    if content[:2] not in (b"II", b"MM"):
+        return Metadata()
+    metadata, _ = tiff_metadata(content)
+    return Metadata(exif=metadata.exif, xmp=metadata.xmp, iptc=metadata.iptc)
+
+
+def decode_raw(content: bytes) -> tuple[np.ndarray, Metadata]:
+    """The developed picture, 16 bits of blue, green and red, not turned; raises as `raw_size`."""
+    with _opened(content) as raw:
+        try:
+            image = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=16, user_flip=0)
+        except Exception as error:  # of LibRaw's own kinds
+            raise ValueError("the file is damaged or cut off") from error
+    return np.ascontiguousarray(image[..., ::-1]), raw_metadata(content)
+
+
+@contextmanager
+def _opened(content: bytes) -> Generator[Any, None, None]:
+    try:
+        import rawpy
+    except ModuleNotFoundError as error:
+        raise ValueError('RAW files need the extra "raw": pip install "zoomjax[raw]"') from error
+    try:
+        raw = rawpy.imread(io.BytesIO(content))
+    except Exception as error:  # as above
+        raise ValueError("it is damaged, or LibRaw does not know this camera") from error
+    with raw:
+        yield raw

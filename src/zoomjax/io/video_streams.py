@@ -1,0 +1,150 @@
+"""What a video file holds beside its pictures, and which of it another container can hold.
+
+Sound, subtitles and data go over packet by packet; chapters, attachments and time codes as a whole.
+"""
+
+import dataclasses
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from .pyav import av
+
+CONTAINER = {
+    ".mp4": "mp4",
+    ".m4v": "mp4",
+    ".mov": "mov",
+    ".mkv": "matroska",
+    ".webm": "webm",
+    ".avi": "avi",
+    ".ts": "mpegts",
+    ".mxf": "mxf",
+}
+"""Suffixes of files that can be written, and FFmpeg's names of their formats."""
+
+_DATA = {"mpegts": ("klv", "timed_id3", "scte_35"), "mov": ("klv",)}
+"""Data tracks that FFmpeg writes into a container; others have no place in it."""
+
+_TRANSPORT = ("dvbsub", "dvb_subtitle", "dvb_teletext", "libzvbi_teletextdec")
+"""Subtitles of transport streams, of which FFmpeg takes any, and makes data of the others."""
+
+_CHAPTERS = ("mp4", "mov", "matroska", "webm")
+_TIME_CODES = ("mp4", "mov", "mxf")
+_ATTACHMENTS = ("matroska",)
+
+
+@dataclasses.dataclass(frozen=True)
+class Carried:
+    """What goes over to another container.
+
+    Attributes:
+        streams: streams whose packets are copied.
+        chapters: the chapters, empty if the container holds none.
+        attachments: files such as fonts, as streams.
+        kept: names of all this, for the user.
+        not_kept: names of what is left behind.
+    """
+
+    streams: tuple[Any, ...]
+    chapters: tuple[Any, ...]
+    attachments: tuple[Any, ...]
+    kept: tuple[str, ...]
+    not_kept: tuple[str, ...]
+
+
+def carried(input_: Any, video: Any, named: Path) -> Carried:
+    """What of an open file, beside one stream of pictures, goes over to a file of a name."""
+    container = CONTAINER[named.suffix.lower()]
+    streams, attachments, kept, lost = [], [], [], []
+    for stream in input_.streams:
+        if stream is video:
+            continue
+        if stream.type == "audio" or _holds(container, stream):
+            streams.append(stream)
+            kept.append(_name(stream))
+        elif stream.type == "attachment" and container in _ATTACHMENTS:
+            attachments.append(stream)
+            kept.append(_name(stream))
+        elif stream.type == "data" and stream.metadata.get("timecode") and container in _TIME_CODES:
+            kept.append(f"the time code {stream.metadata['timecode']}")  # written from the tag
+        else:
+            lost.append(_name(stream))
+    chapters = input_.chapters()
+    if chapters:
+        (kept if container in _CHAPTERS else lost).append(f"chapters ({len(chapters)})")
+    held = tuple(chapters) if container in _CHAPTERS else ()
+    return Carried(tuple(streams), held, tuple(attachments), tuple(kept), tuple(lost))
+
+
+def _holds(container: str, stream: Any) -> bool:
+    """Whether a container takes the packets of a stream of subtitles or data."""
+    if stream.type == "data":
+        return stream.name in _DATA.get(container, ())
+    if stream.type != "subtitle":
+        return False
+    if container in ("mpegts", "mxf"):
+        return container == "mpegts" and stream.codec_context.name in _TRANSPORT
+    with av.open(io.BytesIO(), "w", format=container) as scratch:
+        try:
+            scratch.add_stream_from_template(stream)
+        except ValueError:
+            return False
+    return True
+
+
+_KINDS = {"audio": "sound", "subtitle": "subtitles", "data": "data", "video": "a further picture"}
+
+
+def _name(stream: Any) -> str:
+    """What messages call a stream: its kind, its codec and its language."""
+    if stream.type == "attachment":
+        return f"the attachment {stream.metadata.get('filename', stream.index)}"
+    context = getattr(stream, "codec_context", None)
+    codec = getattr(stream, "name", None) if context is None else context.name
+    about = [codec or "of no known kind", stream.metadata.get("language")]
+    return f"{_KINDS.get(stream.type, stream.type)} ({', '.join(filter(None, about))})"
+
+
+def put(output: Any, what: Carried, named: Path) -> dict[int, Any]:
+    """Add all this to a container before its first packet; the new streams by the numbers of the old.
+
+    Raises:
+        ValueError: the container does not take the sound.
+    """
+    if what.chapters:
+        output.set_chapters(list(what.chapters))
+    for stream in what.attachments:
+        name = stream.metadata.get("filename", f"attachment-{stream.index}")
+        output.add_attachment(name, stream.mimetype or "application/octet-stream", bytes(stream.data))
+    return {stream.index: _copied(output, stream, named) for stream in what.streams}
+
+
+def _copied(output: Any, source: Any, named: Path) -> Any:
+    try:
+        stream = output.add_stream_from_template(source)
+    except ValueError as error:
+        raise ValueError(
+            f"Cannot keep the sound, {source.codec_context.name}, in a {named.suffix} file. Choose the "
+            "suffix of the source, or .mkv."
+        ) from error
+    stream.metadata.update(source.metadata)
+    if source.type != "data":
+        stream.disposition = source.disposition
+    return stream
+
+
+def starts(output: Any, named: Path, copied: Sequence[Any]) -> None:
+    """Write the head of a container.
+
+    Raises:
+        ValueError: the container does not take these streams.
+    """
+    try:
+        output.start_encoding()
+    except (ValueError, av.error.FFmpegError) as error:
+        names = ", ".join(_name(stream) for stream in copied) or "these pictures"
+        raise ValueError(
+            f"Cannot write {names} to a {named.suffix} file: {getattr(error, 'strerror', None) or error}. "
+            "Choose .mov or .mkv."
+        ) from error

@@ -1,0 +1,70 @@
+"""Facts about a lens beside its numbers: what `ZoomLens.about` holds."""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+USUAL = ("camera", "lens", "crop_factor", "source")
+"""Names that zoomjax itself writes."""
+
+
+class About(Mapping[str, str | float]):
+    """Words and numbers by name, which do not change: a mapping that can be hashed.
+
+    Lenses with other facts are other trees for JAX, because the facts are static. To stack lenses, or to
+    share what is compiled for one of them, leave the facts out: ``dataclasses.replace(lens, about={})``.
+
+    Example:
+        >>> about = About({"camera": "NIKON D300", "crop_factor": 1.5})
+        >>> about["camera"], len(about), about == {"camera": "NIKON D300", "crop_factor": 1.5}
+        ('NIKON D300', 2, True)
+    """
+
+    def __init__(self, entries: Mapping[str, str | float] = {}) -> None:
+        self._entries = dict(entries)
+
+    def __getitem__(self, name: str) -> str | float:
+        return self._entries[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __hash__(self) -> int:
+        return hash(frozenset(self._entries.items()))
+
+    def __repr__(self) -> str:
+        return f"About({self._entries!r})"
+
+
+def checked_about(value: Any) -> About:
+    """Facts from a mapping of names to words and finite numbers."""
+    plain = isinstance(value, Mapping) and all(map(_is_plain, value, value.values()))
+    if not plain:
+        raise ValueError(
+            f"Argument about must be a dictionary of words and finite numbers by name, but it is {value!r}."
+        )
+    return About(value)
+
+
+def checked_pitch(value: Any) -> float | None:
+    """The width of a pixel, mm, or None where it is not known."""
+    if value is None:
+        return None
+    try:
+        pitch = math.nan if isinstance(value, bool | str) else float(value)
+    except (TypeError, ValueError):
+        pitch = math.nan
+    if not 0 < pitch < math.inf:
+        raise ValueError(
+            "Argument pixel_pitch must be the width of a pixel on the sensor in mm, a positive number, or "
+            f"None, but it is {value!r}."
+        )
+    return pitch
+
+
+def _is_plain(name: Any, value: Any) -> bool:
+    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(name, str) and (number or isinstance(value, str))

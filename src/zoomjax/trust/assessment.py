@@ -1,0 +1,245 @@
+"""The verdict on a fit: good, doubtful or not determined, with what was found and what to do about it.
+
+A lens is good if its correction is right to within a small part of itself. Three errors are compared with
+the displacement (RMS over the image, at its largest): that of the noise (the bands), half the distance
+between lenses fitted to halves of the lines where it exceeds what noise explains, and the error of frames
+left out beyond that of their own fits. An error below `NEGLIGIBLE` of the image's diagonal does no harm,
+however small the displacement.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from .._core.arguments import kinds_checked
+from .._core.types import of_known_values
+from ..fit.result import RESULTS, ZoomFit
+from ..lines.base import AbstractLines
+from ..lines.lines import Lines
+from .evidence import Evidence, evidence
+
+Verdict = Literal["good", "doubtful", "not determined"]
+
+VERDICTS: tuple[Verdict, ...] = ("good", "doubtful", "not determined")
+"""From the best to the worst."""
+
+NEGLIGIBLE = 2.5e-4
+"""Of the image's diagonal: an error that does no harm."""
+
+_DOUBTFUL, _UNDETERMINED = 0.1, 0.5  # errors, in displacements
+_BEYOND_NOISE = 3.0  # how many times farther apart halves are than by chance
+_UNPREDICTED = 1.5  # how many times the RMS of frames left out may exceed that of their own fits
+_REJECTED = 1 / 3  # of the lines
+_FEW_LINES = 5  # per frame
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """One thing that was found.
+
+    Attributes:
+        about: what it is about, in a word or two.
+        verdict: the best verdict that it allows; "good" for a remark.
+        found: a sentence with figures.
+        advice: a sentence on what to do.
+    """
+
+    about: str
+    verdict: Verdict
+    found: str
+    advice: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Assessment:
+    """The verdict on a fit.
+
+    Attributes:
+        findings: what was found, the worst first.
+        evidence: what it was found in.
+    """
+
+    findings: tuple[Finding, ...]
+    evidence: Evidence
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of the findings' verdicts; "good" if there are none."""
+        return VERDICTS[max((VERDICTS.index(finding.verdict) for finding in self.findings), default=0)]
+
+    @property
+    def sentence(self) -> str:
+        """The verdict and its main reason."""
+        if self.verdict == "good":
+            return (
+                f"Good: the correction moves points by {_px(self.evidence.displacement)} px on average, "
+                f"with a standard deviation of {_px(self.evidence.std)} px."
+            )
+        return f"{self.verdict.capitalize()}: {self.findings[0].found}"
+
+    def joined_by(self, findings: Sequence[Finding]) -> "Assessment":
+        """The assessment with further findings."""
+        ranked = sorted([*self.findings, *findings], key=lambda of: -VERDICTS.index(of.verdict))
+        return dataclasses.replace(self, findings=tuple(ranked))
+
+    def summary(self) -> dict[str, Any]:
+        """The verdict, its findings and figures as plain values; None for what is not known."""
+        figures = dataclasses.asdict(self.evidence)
+        known = {
+            name: value if not isinstance(value, float) or np.isfinite(value) else None
+            for name, value in figures.items()
+        }
+        return {
+            "verdict": self.verdict,
+            "verdict_sentence": self.sentence,
+            "findings": [dataclasses.asdict(finding) for finding in self.findings],
+            "evidence": known,
+        }
+
+
+@kinds_checked
+@of_known_values
+def assess(
+    lines: Lines,
+    fit: ZoomFit,
+    *,
+    compressed: AbstractLines | None = None,
+    held_out: Float[np.ndarray, "frame"] | None = None,
+    each_held_out: Float[np.ndarray, "frame"] | None = None,
+) -> Assessment:
+    """Judge a fit.
+
+    Args:
+        lines: the lines of the fit, with their points and weights.
+        fit: the fit.
+        compressed: the same lines compressed for the fit's distortion model, if they are at hand.
+        held_out, each_held_out: from `held_out_zoom` and `held_out_frames`, if they are to be judged.
+
+    Raises:
+        ValueError: no line is usable.
+
+    Example:
+        >>> from zoomjax import compress, fit_zoom, scenes
+        >>> focal = scenes.focal_sweep(4)
+        >>> lines = scenes.board_lines(scenes.nikkor_18_200(), focal, spacing=99, noise=0.5)
+        >>> assess(lines, fit_zoom(compress(lines))).verdict
+        'good'
+    """
+    found = evidence(lines, fit, compressed=compressed)
+    findings = [*_of_bands(found, fit), *_of_halves(found), *_of_lines(found)]
+    if held_out is not None and each_held_out is not None:
+        findings += _of_frames(found, np.asarray(lines.focal), held_out, each_held_out)
+    return Assessment((), found).joined_by(findings)
+
+
+def _judged(error: float, of: Evidence) -> Verdict:
+    """What an error of the displacement, px, allows."""
+    if not np.isfinite(error):
+        return "not determined"
+    if error <= NEGLIGIBLE * of.diagonal or error <= _DOUBTFUL * of.displacement:
+        return "good"
+    return "doubtful" if error <= _UNDETERMINED * of.displacement else "not determined"
+
+
+def _of_bands(of: Evidence, fit: ZoomFit) -> Iterator[Finding]:
+    more = "Add photos with long straight lines near the edges of the image, at several focal lengths."
+    if bool(fit.result == RESULTS.folded):
+        yield Finding(
+            "fold",
+            "not determined",
+            "the corrected image folds over.",
+            "Add lines near the corners, or choose a smaller degree or fewer terms.",
+        )
+    if not np.isfinite(of.std):
+        yield Finding("bands", "not determined", "the lines do not determine the correction.", more)
+    elif (verdict := _judged(of.std, of)) != "good":
+        found = (
+            f"the correction moves points by {_px(of.displacement)} px on average, but is uncertain by "
+            f"{_px(of.std)} px."
+        )
+        yield Finding("bands", verdict, found, more)
+    if of.lines < _FEW_LINES * of.frames:
+        yield Finding(
+            "few lines",
+            "doubtful",
+            f"there are only {of.lines} usable lines in {of.frames} photos, fewer than {_FEW_LINES} each.",
+            "Photograph a scene with more straight lines, or try another detector.",
+        )
+
+
+_PARTED = {
+    "lines": (
+        "two halves of the lines give different corrections",
+        "Some lines are not straight in the scene, or too few determine the lens: look at the drawn lines.",
+    ),
+    "directions": (
+        "steep and flat lines give different corrections",
+        "Check that the photographed thing is straight and flat: a board may be bent, a cup is round.",
+    ),
+    "frames": (
+        "two halves of the photos give different corrections",
+        "Check that all photos come from one lens, and that their focal lengths are right.",
+    ),
+}
+
+
+def _of_halves(of: Evidence) -> Iterator[Finding]:
+    for halves in of.halves:
+        error = halves.apart / 2
+        if halves.excess <= _BEYOND_NOISE or (verdict := _judged(error, of)) == "good":
+            continue
+        if halves.parting == "directions" and not of.crooked:
+            verdict = "good"  # what either direction tells alone, the lines of both do not contradict
+        found, advice = _PARTED[halves.parting]
+        yield Finding(
+            f"halves by {halves.parting}",
+            verdict,
+            f"{found}, {_px(halves.apart)} px apart where noise explains {_px(halves.expected)} px.",
+            advice,
+        )
+
+
+def _of_lines(of: Evidence) -> Iterator[Finding]:
+    if of.rejected > _REJECTED * (of.lines + of.rejected):
+        yield Finding(
+            "rejected lines",
+            "doubtful",
+            f"{of.rejected} of {of.lines + of.rejected} lines were rejected as not straight.",
+            "Look at the drawn lines: if they follow straight things, photos of two lenses may be mixed.",
+        )
+    if not of.crooked:
+        return
+    found = (
+        f"corrected lines deviate by {_px(of.rms)} px from straight ones, while their points scatter by "
+        f"{_px(of.noise)} px only."
+    )
+    hardly = of.rms_uncorrected < 2 * of.rms
+    yield Finding(
+        "crooked lines",
+        "doubtful" if hardly else "good",
+        found[:-1] + (f"; uncorrected, by {_px(of.rms_uncorrected)} px." if hardly else "."),
+        "Check that the photographed lines are straight and the board is flat; else choose a larger model.",
+    )
+
+
+def _of_frames(of: Evidence, focal: np.ndarray, zoom: np.ndarray, each: np.ndarray) -> Iterator[Finding]:
+    """Frames left out and their own fits, but not those at the ends of the zoom, which are extrapolated."""
+    inner = (focal > focal.min()) & (focal < focal.max()) & np.isfinite(zoom) & np.isfinite(each)
+    if inner.sum() < 2:
+        return
+    joint, own = (float(np.sqrt(np.mean(values[inner] ** 2))) for values in (zoom, each))
+    if joint > _UNPREDICTED * own and joint > NEGLIGIBLE * of.diagonal / 2:
+        yield Finding(
+            "photos left out",
+            "doubtful",
+            f"the model leaves {_px(joint)} px in photos that it was not fitted to, but {_px(own)} px in "
+            "each photo by itself.",
+            "Check that all photos come from one lens with the right focal lengths, or try another model.",
+        )
+
+
+def _px(value: float) -> str:
+    return f"{value:.2g}" if value < 100 else f"{value:.0f}"

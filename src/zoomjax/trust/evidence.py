@@ -1,0 +1,293 @@
+"""Evidence about a fit, in px: what it explains, what it leaves, and whether its parts agree.
+
+- *Noise* is how far points scatter about a smooth curve through their own line: polynomials of degree
+  `_CURVE` along each corrected line. A line that is bent as a whole is smooth, so the noise is that of the
+  edges alone, and an RMS far above it says that lines are not straight or that the model is too simple.
+- *Displacement and its standard deviation* are averaged over the image at several focal lengths.
+- *Halves*: the model is fitted to one half of the lines and to the other, by a Gauss-Newton step from the
+  fit of all. Noise makes the two lenses differ by what the bands predict; whatever else bends lines (a
+  curved board, two lenses in one data set) makes them differ by more. The lines are parted in three ways:
+  evenly, by direction, by frame.
+
+Once per fit: a pass over the points of at most `_MOST_LINES` lines, and a Jacobian of the compressed ones.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
+
+from .._core.arguments import kinds_checked
+from .._core.types import of_known_values
+from ..fit.energy import (
+    coefficients_by,
+    frame_energy,
+    linearised,
+    prior_jacobian,
+    prior_residuals,
+)
+from ..fit.family_lines import compress_family, with_family
+from ..fit.result import ZoomFit
+from ..lines.base import AbstractLines
+from ..lines.lines import Lines
+from ..models.lens import ZoomLens
+from ..models.sizes import at_focal
+from ..models.zoom import AbstractZoom, with_parameters
+from .folds import own_weights
+
+_CURVE = 5
+_FOCALS = 3  # over the range, evenly in 1/f
+_GRID = 9  # points a side of the image
+_MOST_LINES, _LINES_AT_ONCE = 2000, 256  # enough to average over, and a few MB of memory
+_LEAST_POINTS = 12  # of a line whose noise counts
+_LEAST_SHARE = 0.2  # of the lines, that each direction needs
+_SCATTER = 2.7  # noises, by which lines that are not straight exceed it
+_SINGULAR = 1e-10  # eigenvalues, of the largest
+
+
+@dataclasses.dataclass(frozen=True)
+class Halves:
+    """Two lenses, each fitted to a half of the lines.
+
+    Attributes:
+        parting: how the lines were parted: "lines", "directions" or "frames".
+        apart: px between points corrected by the one and by the other, RMS over the image, at the focal
+            length where it is largest.
+        expected: the same by the bands of both, at that focal length.
+    """
+
+    parting: str
+    apart: float
+    expected: float
+
+    @property
+    def excess(self) -> float:
+        """How many times farther apart they are than their bands predict."""
+        return self.apart / self.expected if self.expected > 0 else np.inf * bool(self.apart)
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """What `assess` judges by. Lengths are in px.
+
+    Attributes:
+        lines, frames, focals: how many lines, frames and distinct focal lengths count.
+        rejected: how many lines have a weight of 0.
+        rms, rms_uncorrected: RMS distance to straight lines, with and without the correction.
+        noise: RMS distance of points to smooth curves through their lines; NaN where they have few points.
+        displacement: how far the correction moves points, RMS over the image, where that is largest.
+        std: standard deviation of the displacement, averaged likewise, where that is largest.
+        halves: the agreement of halves of the lines, as far as halves determine a lens.
+        diagonal: of the image.
+    """
+
+    lines: int
+    rejected: int
+    frames: int
+    focals: int
+    rms: float
+    rms_uncorrected: float
+    noise: float
+    displacement: float
+    std: float
+    halves: tuple[Halves, ...]
+    diagonal: float
+
+    @property
+    def crooked(self) -> bool:
+        """Whether lines deviate from straight ones by far more than the noise of their points."""
+        return bool(self.rms > _SCATTER * self.noise)
+
+
+@kinds_checked
+@of_known_values
+def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = None) -> Evidence:
+    """Collect the evidence about a fit.
+
+    Args:
+        lines: the lines of the fit, with their points and weights.
+        fit: the fit.
+        compressed: the same lines compressed for the fit's distortion model, if they are at hand.
+
+    Raises:
+        ValueError: no line is usable.
+
+    Example:
+        >>> from zoomjax import compress, fit_zoom, scenes
+        >>> focal = scenes.focal_sweep(4)
+        >>> lines = scenes.board_lines(scenes.nikkor_18_200(), focal, spacing=99, noise=0.5)
+        >>> bool(0.4 < evidence(lines, fit_zoom(compress(lines))).noise < 0.6)
+        True
+    """
+    lens = fit.lens
+    centre = lens.centre if lens.shift is None else jax.vmap(lens)(jnp.asarray(lines.focal)).centre
+    placed = lines.about(centre)
+    if compressed is None:
+        terms = np.asarray(lens.zoom(lens.focal_range[0])).size
+        compressed = compress_family(placed, lens.family, terms=terms)
+    weight = own_weights(compressed)
+    if not weight.any():
+        raise ValueError(
+            "Argument lines must have a usable line, but all have a weight of 0 or too few points."
+        )
+    frames = np.unique(np.asarray(lines.frame)[weight > 0])
+    dtype = fit.covariance.dtype
+    low, high = (float(f) for f in lens.focal_range)
+    focals = 1 / np.linspace(1 / low, 1 / high, _FOCALS)
+    moved, rows = map(
+        np.asarray, _derivatives(lens, jnp.asarray(_raster(lens), dtype), jnp.asarray(focals, dtype))
+    )
+    zero = jnp.zeros((len(lines.focal), np.size(lens.zoom(lens.focal_range[0]))), dtype)
+    before = np.asarray(frame_energy(compressed, zero))
+    return Evidence(
+        lines=int((weight > 0).sum()),
+        rejected=0 if lines.weight is None else int((np.asarray(lines.weight) == 0).sum()),
+        frames=len(frames),
+        focals=np.unique(np.asarray(lines.focal)[frames]).size,
+        rms=float(fit.rms),
+        rms_uncorrected=float(np.sqrt(np.nanmean(before))),
+        noise=_noise(with_family(placed, lens.family), lens, np.flatnonzero(weight)),
+        displacement=float(np.max(_over_image(np.linalg.norm(moved, axis=-1)))),
+        std=float(np.max(_spread(rows, np.asarray(fit.covariance)))),
+        halves=tuple(_halves(compressed, fit, weight, rows)),
+        diagonal=2 * lens.scale,
+    )
+
+
+def _noise(lines: AbstractLines, lens: ZoomLens, counted: np.ndarray) -> float:
+    """RMS distance, px, of corrected points to smooth curves through their lines."""
+    chosen = counted[np.unique(np.linspace(0, len(counted) - 1, _MOST_LINES).astype(int))]
+    counts, coefficients = np.asarray(lines.counts), coefficients_by(lens.zoom, lines)
+    squares = []
+    for part in np.array_split(chosen, -(-len(chosen) // _LINES_AT_ONCE)):
+        index = jnp.asarray(np.resize(part, min(_LINES_AT_ONCE, len(chosen))))
+        rows = np.asarray(_corrected(lines, index, coefficients))
+        pairs = zip(rows[: len(part)], counts[part].astype(int), strict=True)
+        squares += [_roughness(points[:count]) for points, count in pairs if count >= _LEAST_POINTS]
+    return float(np.sqrt(np.mean(squares))) if squares else np.nan
+
+
+@eqx.filter_jit
+def _corrected(lines, index, coefficients):
+    some = lines.take(index, jnp.ones(len(index), bool))
+    return some.corrected(coefficients[lines.frame[index]])
+
+
+def _roughness(points: np.ndarray) -> float:
+    """Variance, px^2, of points about a polynomial along the line through them."""
+    points = points - points.mean(axis=0)
+    along, across = (points @ np.linalg.eigh(points.T @ points)[1]).T[::-1]
+    basis = np.polynomial.chebyshev.chebvander(along / (np.abs(along).max() or 1), _CURVE)
+    rest = across - basis @ np.linalg.lstsq(basis, across, rcond=None)[0]
+    return float(rest @ rest) / (len(across) - _CURVE - 1)
+
+
+def _halves(lines: AbstractLines, fit: ZoomFit, weight: np.ndarray, rows: np.ndarray) -> Iterator[Halves]:
+    """The agreement of halves, in the partings that determine lenses."""
+    prior, terms = _normal_terms(lines, fit.lens.zoom)
+    for name, first in _partings(lines, fit, weight).items():
+        one, other = (
+            _half(prior, *(values[half & (weight > 0)] for values in terms)) for half in (first, ~first)
+        )
+        if one is None or other is None:
+            continue
+        apart = _over_image(np.linalg.norm(rows @ (one[0] - other[0]), axis=-1))
+        expected = _spread(rows, one[1] + other[1])
+        at = int(np.argmax(apart))
+        yield Halves(name, float(apart[at]), float(expected[at]))
+
+
+def _half(prior, gram, gradient):
+    """The step from the fit to that of some lines, and its covariance; None if they do not determine it.
+
+    Args:
+        prior: the normal matrix of the model's prior.
+        gram, gradient: of each line.
+    """
+    total = prior + gram.sum(axis=0)
+    size = np.sqrt(np.diagonal(total))
+    if not size.all():
+        return None
+    scaled = total / size / size[:, None]
+    values, vectors = np.linalg.eigh(scaled)
+    if values[0] < _SINGULAR * values[-1]:
+        return None
+    inverse = (vectors / values) @ vectors.T / size / size[:, None]
+    scatter = gradient - gradient.mean(axis=0)
+    return -inverse @ gradient.sum(axis=0), inverse @ (scatter.T @ scatter) @ inverse
+
+
+def _normal_terms(
+    lines: AbstractLines, zoom: AbstractZoom
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """The normal matrix of the prior; that of each line, and its gradient with a share of the prior's."""
+    residuals, jacobian, prior, prior_gradient = map(np.asarray, _linearised(lines, zoom))
+    gram = np.einsum("lrp,lrq->lpq", jacobian, jacobian)
+    gradient = np.einsum("lrp,lr->lp", jacobian, residuals) + 2 * prior_gradient / len(residuals)
+    return prior.T @ prior, (gram, gradient)
+
+
+@eqx.filter_jit
+def _linearised(lines, zoom):
+    weighted, jacobian = linearised(lines, zoom)
+    prior = prior_jacobian(lines, zoom)
+    pulled = prior_residuals(lines, zoom)
+    pull = jnp.zeros(prior.shape[1], prior.dtype) if pulled is None else prior.T @ pulled
+    return weighted, jacobian, prior, pull
+
+
+def _partings(lines: AbstractLines, fit: ZoomFit, weight: np.ndarray) -> dict[str, np.ndarray]:
+    """Which lines are in the first half, by the name of the parting."""
+    frame, focal = np.asarray(lines.frame), np.asarray(lines.focal)
+    counted = np.flatnonzero(weight)
+    rng = np.random.default_rng(0)
+    order = counted[np.lexsort([rng.random(len(counted)), frame[counted]])]
+    evenly = np.zeros(len(frame), bool)
+    evenly[order[::2]] = True
+    rank = np.empty(len(focal), int)
+    rank[np.argsort(focal, kind="stable")] = np.arange(len(focal))
+    parted = {"lines": evenly, "frames": rank[frame] % 2 == 0}
+    rows = np.asarray(lines.corrected(coefficients_by(fit.lens.zoom, lines)[frame]))
+    steep = (rows[..., 1] ** 2).sum(axis=1) > (rows[..., 0] ** 2).sum(axis=1)
+    if _LEAST_SHARE <= steep[counted].mean() <= 1 - _LEAST_SHARE:
+        parted["directions"] = steep
+    return parted
+
+
+def _raster(lens: ZoomLens) -> np.ndarray:
+    """Points over the image: (point, 2) px."""
+    sides = (np.linspace(0, side - 1, _GRID) for side in lens.image_size)
+    return np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+
+
+@eqx.filter_jit
+def _derivatives(lens, points, focals):
+    """Displacements of points at focal lengths, and their derivatives by the parameters."""
+    flat, unravel = ravel_pytree(lens.zoom.parameters)
+
+    def moved(flat):
+        zoom = with_parameters(lens.zoom, unravel(flat))
+        other = eqx.tree_at(lambda lens: lens.zoom, lens, zoom)
+        return jax.vmap(lambda f: at_focal(other, f).undistort(points) - points)(focals)
+
+    return moved(flat), jax.jacfwd(moved)(flat)
+
+
+def _spread(rows: np.ndarray, covariance: np.ndarray) -> Float[np.ndarray, "focal"]:
+    """Standard deviation of corrected points, px, RMS over the image, at each focal length."""
+    unknown = np.isinf(np.diagonal(covariance))
+    if (unknown & (np.nan_to_num(rows) != 0).any(axis=(0, 1, 2))).any():
+        return np.full(len(rows), np.inf)
+    variance = np.einsum("fpcq,qs,fpcs->fp", rows, np.where(np.isinf(covariance), 0, covariance), rows)
+    return _over_image(np.sqrt(np.maximum(variance, 0)))
+
+
+def _over_image(lengths: np.ndarray) -> Float[np.ndarray, "focal"]:
+    """RMS over the image; points beyond a fold have no length and are left out."""
+    known = np.where(np.isnan(lengths), 0, lengths)
+    return np.sqrt((known**2).sum(axis=1) / np.maximum((~np.isnan(lengths)).sum(axis=1), 1))

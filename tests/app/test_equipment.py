@@ -1,0 +1,44 @@
+"""The camera and lens of a calibration's photos in the lens."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from zoomjax import scenes
+from zoomjax.app.equipment import with_equipment
+
+from ..io.test_equipment import CROP, FOCAL, PITCH, SIZE, block, plane
+
+SENSOR = plane(25.4 / PITCH, 2)
+
+
+def photo(path, maker="NIKON CORPORATION", camera="NIKON D300", lens="18-200", sensor=SENSOR):
+    content = block(of={"Make": maker, "Model": camera}, LensModel=lens, **FOCAL, **sensor)
+    Image.fromarray(np.zeros((8, 12, 3), np.uint8)).save(path, exif=content)
+    return path
+
+
+@pytest.fixture
+def lens():
+    return scenes.nikkor_18_200(SIZE)
+
+
+def test_what_all_photos_agree_on_is_in_the_lens(lens, tmp_path):
+    (tmp_path / "none.jpg").write_bytes(b"")
+    found = with_equipment(
+        lens, [photo(tmp_path / "a.jpg"), photo(tmp_path / "b.jpg"), tmp_path / "none.jpg"]
+    )
+    assert found.about == {"camera": "NIKON D300", "lens": "18-200", "crop_factor": round(CROP, 3)}
+    assert found.pixel_pitch == pytest.approx(PITCH, rel=1e-5)
+
+
+def test_what_photos_do_not_agree_on_is_left_out(lens, tmp_path):
+    other = photo(tmp_path / "b.jpg", maker="Canon", camera="EOS 5D", sensor=plane(12.7 / PITCH, 2))
+    found = with_equipment(lens, [photo(tmp_path / "a.jpg"), other])
+    assert found.about == {"lens": "18-200"}
+    assert found.pixel_pitch is None
+
+
+def test_the_maker_is_named_once(lens, tmp_path):
+    found = with_equipment(lens, [photo(tmp_path / "a.jpg", maker="SONY", camera="ILCE-7M3")])
+    assert found.about["camera"] == "SONY ILCE-7M3"

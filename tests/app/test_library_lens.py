@@ -1,0 +1,104 @@
+"""``zoomjax undistort --lens`` and ``zoomjax lens``: photos with EXIF data, corrected by the library."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+import zoomjax as zj
+from zoomjax.app.library_lens import rows, undistort_by_library, write_lens
+from zoomjax.app.undistort_files import Job
+from zoomjax.io import read_photo
+
+from .._commands import SEVERAL
+from ..io.test_equipment import block
+
+SIZE = (300, 200)
+NIKKOR = "Nikon AF-S DX VR Zoom-Nikkor 18-200mm f/3.5-5.6G IF-ED"
+D300 = {"Make": "NIKON CORPORATION", "Model": "NIKON D300"}
+
+
+def photo(path, body=D300, lens=NIKKOR, focal=18):
+    axes = np.arange(SIZE[1])[:, None], np.arange(SIZE[0])[None]
+    image = np.stack([127 + 100 * np.sin(axes[0] / 9) * np.cos(axes[1] / 9)] * 3, -1).astype(np.uint8)
+    named = {"LensModel": lens} if lens else {}
+    Image.fromarray(image).save(path, exif=block(of=body, FocalLength=IFDRational(focal, 1), **named))
+    return path
+
+
+def job(folder, *photos, output="out", **more):
+    return Job(folder, photos, folder / output, **more)
+
+
+def test_photos_of_two_lenses_are_corrected_each_by_its_own(tmp_path):
+    canon = {"Make": "Canon", "Model": "Canon EOS 600D"}
+    first = photo(tmp_path / "a.png")
+    second = photo(tmp_path / "b.png", canon, "EF-S18-55mm f/3.5-5.6 IS II")
+    unknown = photo(tmp_path / "c.png", lens="")
+    done = undistort_by_library(job(tmp_path, first, second, unknown), "auto")
+    assert f"{NIKKOR}, crop factor 1.523, within" in done.sentence
+    assert "Canon EF-S 18-55mm f/3.5-5.6 IS II, crop factor 1.613, within" in done.sentence
+    assert list(done.skipped) == [str(unknown)]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.png", "b.png"]
+    lens = zj.lenses.load(NIKKOR, image_size=SIZE, crop=1.523)
+    expected = zj.undistort_image(read_photo(first)[0], lens, focal=18.0)
+    np.testing.assert_array_equal(read_photo(tmp_path / "out" / "a.png")[0], expected)
+    assert np.abs(expected.astype(float) - read_photo(first)[0]).max() > 20
+
+
+def test_one_photo_that_several_lenses_fit_is_a_question_that_a_name_answers(tmp_path):
+    path = photo(tmp_path / "a.png", lens="18.0-200.0 mm f/3.5-5.6")
+    with pytest.raises(ValueError, match=r"2 lenses .*: choose argument lens, .* or .*"):
+        undistort_by_library(job(tmp_path, path, output="b.png"), "auto")
+    done = undistort_by_library(job(tmp_path, path, output="b.png"), NIKKOR)
+    assert done.sentence.startswith(NIKKOR)
+    assert (tmp_path / "b.png").exists()
+
+
+def test_photos_of_one_name_are_refused_before_any_work(tmp_path):
+    (tmp_path / "more").mkdir()
+    both = photo(tmp_path / "a.png"), photo(tmp_path / "more" / "a.png", lens="")
+    with pytest.raises(ValueError, match="have the same name"):
+        undistort_by_library(job(tmp_path, *both), "auto")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_search_shows_what_lenses_become_and_writes_the_one(tmp_path):
+    found, more = rows("nikkor 18-200", SIZE)
+    assert [row.name for row in found] == [NIKKOR, f"{NIKKOR} II"]
+    assert more < 0
+    assert all(float(row.error) < 1 for row in found)
+    write_lens(NIKKOR, tmp_path / "lens", size=SIZE, crop=None, overwrite=False)
+    assert zj.load_lens(tmp_path / "lens" / "lens.json").about["lens"] == NIKKOR
+    with pytest.raises(FileExistsError, match="would be replaced"):
+        write_lens(NIKKOR, tmp_path / "lens", size=SIZE, crop=None, overwrite=False)
+
+
+def test_the_commands_list_write_and_say_what_to_give(tmp_path):
+    jobs = [
+        ["lens", "nikkor 18-200"],
+        ["lens", NIKKOR, "-o", "lens.json", "--image-size", "300x200"],
+        ["lens", "nikkor 18-200", "-o", "other.json"],
+        ["undistort", "a.jpg", "-o", "out"],
+    ]
+    done = subprocess.run(
+        [sys.executable, "-c", SEVERAL],
+        input=json.dumps([(str(tmp_path), ["zoomjax", *words]) for words in jobs]),
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    (listed, table), (made, said), (asked, question), (refused, hint) = json.loads(
+        done.stdout.splitlines()[-1]
+    )
+    assert (listed, made, asked, refused) == (0, 0, 2, 2)
+    assert table.count("AF-S") == 2
+    assert said.startswith(NIKKOR)
+    assert zj.load_lens(tmp_path / "lens.json").image_size == SIZE
+    assert question.startswith("Error: 2 lenses fit 'nikkor 18-200': choose ")
+    assert "--lens auto" in hint

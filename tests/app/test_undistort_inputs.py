@@ -1,0 +1,174 @@
+"""What ``zoomjax undistort`` makes of folders, patterns, links, marks and files of all kinds."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+import zoomjax as zj
+from zoomjax.app.undistort_files import Job, undistort_files
+from zoomjax.io.metadata import geometry_of
+from zoomjax.io.photo import read_metadata
+
+from .._clips import FRAMES, SIZE, focal, lens, luma, picture, write_clip
+from .._exif import exif
+from ..correct import test_photo
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A lens and a folder of photos in folders, with what else lies there."""
+    lens().save(tmp_path / "lens.json")
+    for name in ("in/a.jpg", "in/day/a.jpg", "in/day/b.png"):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        test_photo.write(path, cv2.cvtColor(picture(0), cv2.COLOR_GRAY2BGR), exif((40, 1), orientation=1))
+    (tmp_path / "in/notes.txt").write_text("straight")
+    (tmp_path / "in/.hidden.jpg").write_bytes(b"not a photo")
+    return tmp_path
+
+
+def job(folder, *inputs, out="out", **settings):
+    return Job(folder / "lens.json", tuple(folder / path for path in inputs), folder / out, **settings)
+
+
+def files(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def test_a_folder_keeps_its_structure(folder):
+    done = undistort_files(job(folder, "in"))
+    assert done.sentence == f"3 photos corrected: {folder / 'out'}"
+    assert files(folder / "out") == ["a.jpg", "day/a.jpg", "day/b.png"]
+    before, after = (cv2.imread(str(folder / where / "day/b.png")) for where in ("in", "out"))
+    np.testing.assert_array_equal(after, zj.undistort_image(before, lens()(40.0)))
+
+
+def test_a_pattern_keeps_the_structure_below_its_fixed_part(folder):
+    undistort_files(job(folder, "in/**/*.jpg"))
+    assert files(folder / "out") == ["a.jpg", "day/a.jpg"]
+
+
+def test_files_of_one_name_keep_folders_that_tell_them_apart(folder):
+    undistort_files(job(folder, "in/a.jpg", "in/day/a.jpg"))
+    assert files(folder / "out") == ["a.jpg", "day/a.jpg"]
+
+
+def test_results_in_the_folder_itself_are_no_inputs(folder):
+    for _ in range(2):
+        undistort_files(job(folder, "in", out="in/out", overwrite=True))
+    assert files(folder / "in/out") == ["a.jpg", "day/a.jpg", "day/b.png"]
+
+
+def test_links_to_one_photo_are_corrected_once(folder):
+    (folder / "in/z.jpg").symlink_to("a.jpg")
+    done = undistort_files(job(folder, "in"))
+    assert files(folder / "out") == ["a.jpg", "day/a.jpg", "day/b.png"]
+    assert any("z.jpg is the same file as" in note for note in done.notes)
+
+
+def test_corrected_photos_are_refused_and_corrected_again_if_that_is_said(folder):
+    undistort_files(job(folder, "in"))
+    (folder / "out/new.jpg").write_bytes((folder / "in/a.jpg").read_bytes())
+    done = undistort_files(job(folder, "out", out="twice"))
+    assert done.sentence.startswith("1 of 4 photos corrected")
+    assert len(done.skipped) == 3
+    assert all("is undistorted by zoomjax already" in why for why in done.skipped.values())
+    assert files(folder / "twice") == ["new.jpg"]
+    assert undistort_files(job(folder, "out", out="thrice", again=True)).written == 4
+
+
+def test_a_run_is_resumed(folder):
+    undistort_files(job(folder, "in/day"))
+    undistort_files(job(folder, "in/a.jpg", out="out/extra.jpg"))
+    times = {path: path.stat().st_mtime_ns for path in (folder / "out").glob("*.*")}
+    (folder / "in/day/c.jpg").write_bytes((folder / "in/a.jpg").read_bytes())
+    done = undistort_files(job(folder, "in/day", resume=True))
+    assert done.sentence == f"1 of 3 photos corrected now, 2 earlier: {folder / 'out'}"
+    assert done.written == 3
+    assert times == {path: path.stat().st_mtime_ns for path in times}
+    (folder / "out/b.png").write_bytes((folder / "in/day/b.png").read_bytes())  # of somebody else
+    with pytest.raises(FileExistsError, match=r"b\.png already exists"):
+        undistort_files(job(folder, "in/day", resume=True))
+
+
+def test_bad_files_of_every_kind_are_named_and_skipped(folder):
+    shown = Image.fromarray(picture(0))
+    shown.save(folder / "in/b.gif")
+    shown.save(folder / "in/b.jp2")
+    shown.save(folder / "in/b.pdf")
+    shown.convert("CMYK").save(folder / "in/b.jpg", exif=b"Exif\0\0" + exif((40, 1), orientation=1))
+    (folder / "in/c.jpg").write_bytes((folder / "in/a.jpg").read_bytes()[:700])
+    (folder / "in/d.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(40))
+    (folder / "in/e.dng").write_bytes(b"II*\0" + bytes(40))
+    bad = ("b.gif", "b.jp2", "b.pdf", "b.jpg", "c.jpg", "d.heic", "e.dng", "none.jpg", "notes.txt")
+    done = undistort_files(job(folder, *(f"in/{name}" for name in (*bad, "a.jpg")), focal="30"))
+    why = {path.rsplit("/", 1)[1]: reason for path, reason in done.skipped.items()}
+    assert files(folder / "out") == ["a.jpg"]
+    for name, reason in {
+        "b.gif": "a GIF image",
+        "b.jp2": "a JPEG 2000 image",
+        "b.pdf": "a PDF document",
+        "b.jpg": "CMYK",
+        "c.jpg": "damaged or cut off",
+        "d.heic": "damaged, or of an unknown format",
+        "e.dng": "LibRaw does not know",
+        "none.jpg": "no photograph",
+        "notes.txt": "it is not a photo",
+    }.items():
+        assert reason in why.pop(name)
+    assert not why
+
+
+def test_what_a_format_does_not_hold_is_said_once(folder):
+    block = b"8BIM\x04\x04\0\0\0\0\0\0"
+    for number in range(3):
+        Image.fromarray(picture(0)).save(folder / f"{number}.tif", tiffinfo={34377: block})
+    [first, *_] = undistort_files(job(folder, "*.tif", focal="30")).notes or ("",)
+    assert first == ""  # TIFF holds all
+    done = undistort_files(job(folder, "0.tif", out="0.png", focal="30"))
+    assert done.notes == ("Not kept in 1 .png file: IPTC data.",)
+
+
+def test_redistorted_photos_are_those_of_the_beginning(folder):
+    smooth = cv2.GaussianBlur(cv2.imread(str(folder / "in/day/b.png")), (0, 0), 2)
+    cv2.imwrite(str(folder / "s.png"), smooth)
+    settings = {"focal": "30", "keep": "grow", "interpolation": "cubic"}
+    undistort_files(job(folder, "s.png", out="grown.png", **settings))
+    assert cv2.imread(str(folder / "grown.png")).shape > smooth.shape
+    done = undistort_files(job(folder, "grown.png", out="back.png", redistort=True, **settings))
+    assert done.sentence == f"1 photo redistorted: {folder / 'back.png'}"
+    back = cv2.imread(str(folder / "back.png"))
+    assert np.abs(back.astype(int) - smooth)[2:-2, 2:-2].max() <= 4
+    assert geometry_of(read_metadata(folder / "back.png")) == "distorted"
+    with pytest.raises(ValueError, match="with which it was corrected"):
+        undistort_files(
+            job(folder, "grown.png", out="no.png", redistort=True, **settings | {"focal": "40"})
+        )
+
+
+def test_several_videos_each_with_its_own_track(folder):
+    (folder / "tracks").mkdir()
+    for name, text in (("a", f"0,20\n{FRAMES - 1},80\n"), ("b", "0,30\n99,30\n")):
+        write_clip(folder / f"{name}.mp4", sound=name == "a")
+        (folder / f"tracks/{name}.csv").write_text(f"frame,focal\n{text}")
+    done = undistort_files(job(folder, "*.mp4", focal=str(folder / "tracks")))
+    assert done.sentence == f"2 videos corrected: {folder / 'out'}, {2 * FRAMES} frames"
+    assert done.notes == ("Kept of a.mp4: sound (aac, und).",)
+    for name, last in (("a", 80.0), ("b", 30.0)):
+        expected = zj.undistort_image(luma(folder / f"{name}.mp4")[0][-1], lens()(last))
+        assert np.median(abs(luma(folder / f"out/{name}.mp4")[0][-1].astype(int) - expected)) <= 2
+    assert float(focal(FRAMES - 1)) == pytest.approx(80)
+    with pytest.raises(ValueError, match=r"a\.csv is for one video, and there are 2.* such as a\.csv"):
+        undistort_files(job(folder, "*.mp4", focal=str(folder / "tracks/a.csv"), out="other"))
+    again = undistort_files(job(folder, "*.mp4", focal=str(folder / "tracks"), resume=True))
+    assert again.sentence.startswith("0 of 2 videos corrected now, 2 earlier")
+    (folder / "c.mp4").write_bytes(b"no video")
+    (folder / "tracks/c.csv").write_text("frame,focal\n0,20\n")
+    skipping = dataclasses.replace(job(folder, "b.mp4", "c.mp4", out="new"), focal=str(folder / "tracks"))
+    done = undistort_files(skipping)
+    assert list(done.skipped) == [str(folder / "c.mp4")]
+    assert files(folder / "new") == ["b.mp4"]
+    assert luma(folder / "new/b.mp4")[0].shape[:0:-1] == SIZE

@@ -1,0 +1,250 @@
+"""What goes along with the pictures, in files of FFmpeg's encoders: copied where it can be, else said."""
+
+import struct
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax.correct.video import redistort_video, undistort_video
+
+from .._clips import FRAMES, SIZE, lens, luma, picture, write_clip
+
+MILLI = Fraction(1, 1000)
+CHAPTERS = [
+    {"id": 1, "start": 0, "end": 300, "time_base": MILLI, "metadata": {"title": "Wide"}},
+    {"id": 2, "start": 300, "end": 800, "time_base": MILLI, "metadata": {"title": "Long"}},
+]
+
+
+def clip(
+    path, *, encoder="libx264", pixels="yuv420p", size=SIZE, stamps=range(4), options=None, rich=False
+):
+    """Frames at these times of 1/25 s; if rich, with subtitles, chapters and an attachment."""
+    with av.open(str(path), "w") as out:
+        video = out.add_stream(encoder, rate=25, options=options or {})
+        video.width, video.height = size
+        video.pix_fmt = pixels
+        video.codec_context.time_base = Fraction(1, 25)
+        if rich:
+            texts = out.add_mux_stream("subrip")
+            texts.time_base, texts.metadata["language"] = MILLI, "eng"
+            out.set_chapters(CHAPTERS)
+            out.add_attachment("font.ttf", "font/ttf", b"letters" * 9)
+        for number in stamps:
+            grey = av.VideoFrame.from_ndarray(np.resize(picture(number), size[::-1]), "gray")
+            frame = grey.reformat(format=pixels)
+            frame.pts, frame.time_base = number, Fraction(1, 25)
+            out.mux(video.encode(frame))
+            if rich and number == 1:
+                packet = av.Packet(b"Straight lines")
+                packet.stream, packet.pts, packet.dts, packet.duration = texts, 40, 40, 80
+                packet.time_base = MILLI
+                out.mux(packet)
+        out.mux(video.encode(None))
+    return path
+
+
+def packets(path, kind):
+    with av.open(str(path)) as container:
+        return [
+            (float(p.pts * p.time_base), bytes(p))
+            for p in container.demux()
+            if p.stream.type == kind and p.dts is not None
+        ]
+
+
+def test_subtitles_chapters_and_attachments_go_over(tmp_path):
+    source = clip(tmp_path / "in.mkv", rich=True)
+    done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=20.0)
+    assert packets(tmp_path / "out.mkv", "subtitle") == packets(source, "subtitle")
+    assert packets(source, "subtitle") == [(0.04, b"Straight lines")]
+    with av.open(str(tmp_path / "out.mkv")) as out:
+        assert [chapter["metadata"]["title"] for chapter in out.chapters()] == ["Wide", "Long"]
+        assert [float(c["end"] * c["time_base"]) for c in out.chapters()] == [0.3, 0.8]
+        [font] = [stream for stream in out.streams if stream.type == "attachment"]
+        assert bytes(font.data) == b"letters" * 9
+        assert out.streams.subtitles[0].metadata["language"] == "eng"
+    assert done.kept == ("subtitles (srt, eng)", "the attachment font.ttf", "chapters (2)")
+    assert done.not_kept == ()
+
+
+def test_what_a_container_does_not_hold_is_said(tmp_path):
+    source = clip(tmp_path / "in.mkv", rich=True)
+    done = undistort_video(source, tmp_path / "out.mp4", lens=lens(), focal=20.0)
+    assert done.kept == ("chapters (2)",)
+    assert done.not_kept == ("subtitles (srt, eng)", "the attachment font.ttf")
+    done = undistort_video(source, tmp_path / "out.avi", lens=lens(), focal=20.0)
+    assert done.not_kept == ("subtitles (srt, eng)", "the attachment font.ttf", "chapters (2)")
+
+
+def test_data_of_transport_streams_go_over(tmp_path):
+    with av.open(str(tmp_path / "in.ts"), "w", format="mpegts") as out:
+        video, data = out.add_stream("libx264", rate=25), out.add_data_stream("klv")
+        video.width, video.height = SIZE
+        video.pix_fmt, data.time_base = "yuv420p", Fraction(1, 90000)
+        for number in range(10):
+            frame = av.VideoFrame.from_ndarray(picture(number), "gray").reformat(format="yuv420p")
+            frame.pts = number
+            out.mux(video.encode(frame))
+            packet = av.Packet(b"zoom %d" % number)
+            packet.stream, packet.time_base = data, Fraction(1, 90000)
+            packet.pts = packet.dts = 3600 * number
+            out.mux(packet)
+        out.mux(video.encode(None))
+    done = undistort_video(tmp_path / "in.ts", tmp_path / "out.ts", lens=lens(), focal=20.0)
+    assert (done.frames, done.kept, done.not_kept) == (10, ("data (klv)",), ())
+    found = packets(tmp_path / "out.ts", "data")
+    assert [content for _, content in found] == [b"zoom %d" % number for number in range(10)]
+    assert len(luma(tmp_path / "out.ts")[0]) == 10
+    done = undistort_video(tmp_path / "in.ts", tmp_path / "out.mp4", lens=lens(), focal=20.0)
+    assert done.not_kept == ("data (klv)",)
+
+
+def test_the_time_code_goes_over(tmp_path):
+    with av.open(str(tmp_path / "in.mov"), "w") as out:
+        video = out.add_stream("libx264", rate=25)
+        video.width, video.height = SIZE
+        video.pix_fmt, video.metadata["timecode"] = "yuv420p", "01:02:03:04"
+        for number in range(3):
+            frame = av.VideoFrame.from_ndarray(picture(number), "gray").reformat(format="yuv420p")
+            out.mux(video.encode(frame))
+        out.mux(video.encode(None))
+    for name in ("out.mov", "out.mp4"):
+        done = undistort_video(tmp_path / "in.mov", tmp_path / name, lens=lens(), focal=20.0)
+        assert done.kept == ("the time code 01:02:03:04",)
+        with av.open(str(tmp_path / name)) as out:
+            assert out.streams.data[0].metadata["timecode"] == "01:02:03:04"
+
+
+MASTERING = "G(13250,34500)B(7500,3000)R(34000,16000)WP(15635,16450)L(10000000,50)"
+HDR = {
+    "libx265": {"x265-params": f"log-level=error:master-display={MASTERING}:max-cll=1000,400"},
+    "libx264": {"x264-params": f"mastering-display={MASTERING}:cll=1000,400"},
+    "libsvtav1": {
+        "svtav1-params": "mastering-display=G(0.265,0.69)B(0.15,0.06)R(0.68,0.32)WP(0.3127,0.329)"
+        "L(1000.0,0.005):content-light=1000,400"
+    },
+}
+
+
+def hdr(path):
+    """Numbers of the mastering display, as real ones, and of the light level."""
+    with av.open(str(path)) as container:
+        found = {item.type.name: bytes(item) for item in next(container.decode(video=0)).side_data}
+    numbers = struct.unpack("<22i", found["MASTERING_DISPLAY_METADATA"])
+    display = [a / b for a, b in zip(numbers[:20:2], numbers[1:20:2], strict=True)]
+    return display, struct.unpack("<2I", found["CONTENT_LIGHT_LEVEL"])
+
+
+@pytest.mark.parametrize("encoder", HDR)
+def test_mastering_metadata_are_kept(tmp_path, encoder):
+    source = clip(tmp_path / "in.mkv", encoder=encoder, pixels="yuv420p10le", options=HDR[encoder])
+    done = undistort_video(source, tmp_path / "out.mp4", lens=lens(), focal=20.0)
+    assert done.kept == ("the mastering display", "the content light level")
+    before, after = hdr(source), hdr(tmp_path / "out.mp4")
+    np.testing.assert_allclose(after[0], before[0], atol=3e-4)
+    np.testing.assert_allclose(
+        before[0], [0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329, 0.005, 1000], atol=1e-3
+    )
+    assert before[1] == after[1] == (1000, 400)
+
+
+def test_mastering_metadata_that_an_encoder_does_not_write_are_said(tmp_path):
+    source = clip(tmp_path / "in.mkv", encoder="libx265", pixels="yuv420p10le", options=HDR["libx265"])
+    done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=20.0, encoder="ffv1")
+    assert done.not_kept == ("the mastering display", "the content light level")
+
+
+@pytest.mark.parametrize("profile", ["Proxy", "LT", "Standard", "HQ"])
+def test_the_profile_of_prores_is_kept(tmp_path, profile):
+    number = ["Proxy", "LT", "Standard", "HQ"].index(profile)
+    options = {"profile": str(number)}
+    source = clip(tmp_path / "in.mov", encoder="prores_ks", pixels="yuv422p10le", options=options)
+    undistort_video(source, tmp_path / "out.mov", lens=lens(), focal=20.0)
+    with av.open(str(tmp_path / "out.mov")) as out:
+        assert out.streams.video[0].codec_context.profile == profile
+
+
+@pytest.mark.parametrize("encoder", ["libx264", "libx265"])
+def test_frames_of_equal_times_are_moved_by_a_tick(tmp_path, encoder):
+    """A file of FFV1, whose packets are their own key frames, with two frames at one time."""
+    plain = clip(tmp_path / "plain.mkv", encoder="ffv1", stamps=range(6))
+    with av.open(str(plain)) as given, av.open(str(tmp_path / "in.mkv"), "w") as out:
+        stream = out.add_stream_from_template(given.streams.video[0])
+        for packet in given.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                if packet.pts == 120:
+                    packet.pts = packet.dts = 80
+                out.mux(packet)
+    assert np.diff(luma(tmp_path / "in.mkv")[1]).min() == 0
+    options = {"x265-params": "log-level=error"} if encoder == "libx265" else {}
+    done = undistort_video(
+        tmp_path / "in.mkv", tmp_path / "out.mkv", lens=lens(), focal=20.0, encoder=encoder, options=options
+    )
+    frames, times = luma(tmp_path / "out.mkv")
+    assert len(frames) == done.frames == 6
+    assert np.diff(times).min() > 0
+    np.testing.assert_allclose(times, luma(tmp_path / "in.mkv")[1], atol=0.0021)
+    assert "times of 1 frames, which others had before them" in done.not_kept
+
+
+@pytest.mark.parametrize(("encoder", "expected"), [("libx264", "h264"), ("prores_ks", "prores")])
+def test_mxf_is_written(tmp_path, encoder, expected):
+    pixels = "yuv420p" if encoder == "libx264" else "yuv422p10le"
+    source = clip(tmp_path / "in.mov", encoder=encoder, pixels=pixels)
+    done = undistort_video(source, tmp_path / "out.mxf", lens=lens(), focal=20.0)
+    assert done.frames == 4
+    with av.open(str(tmp_path / "out.mxf")) as out:
+        assert out.format.name == "mxf"
+        assert out.streams.video[0].codec_context.name == expected
+    before, after = (luma(tmp_path / name)[0] for name in ("in.mov", "out.mxf"))
+    assert np.median(abs(after[0].astype(int) - zj.undistort_image(before[0], lens()(20.0)))) <= 2
+
+
+def test_sound_that_mxf_does_not_take_is_a_sentence(tmp_path):
+    source = write_clip(tmp_path / "in.mp4", 4)
+    with pytest.raises(ValueError, match=r"sound.*aac.*\.mxf.*Choose .*\.mkv"):
+        undistort_video(source, tmp_path / "out.mxf", lens=lens(), focal=20.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.mp4"]
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".mov", ".ts"])
+@pytest.mark.parametrize("encoder", ["libvpx-vp9", "mjpeg"])
+def test_odd_sizes_are_kept(tmp_path, encoder, suffix):
+    size = (SIZE[0] + 1, SIZE[1] + 1)
+    pixels = "yuvj420p" if encoder == "mjpeg" else "yuv420p"
+    source = clip(tmp_path / "in.mkv", encoder=encoder, pixels=pixels, size=size, stamps=range(2))
+    done = undistort_video(source, tmp_path / f"out{suffix}", lens=lens(size), focal=20.0)
+    assert luma(tmp_path / f"out{suffix}")[0].shape == (2, *size[::-1])
+    changed = any("became yuv444p" in name or "became yuvj444p" in name for name in done.not_kept)
+    assert changed == (encoder == "mjpeg" or suffix in (".ts", ".mov"))
+    became = any("which became H.264" in name for name in done.not_kept)
+    assert became == changed
+
+
+def test_transport_streams_are_written(tmp_path):
+    source = write_clip(tmp_path / "in.ts")
+    done = undistort_video(source, tmp_path / "out.ts", lens=lens(), focal=20.0)
+    assert done.frames == FRAMES
+    assert packets(tmp_path / "out.ts", "audio") == packets(source, "audio")
+    assert len(luma(tmp_path / "out.ts")[0]) == FRAMES
+
+
+def test_back_is_where_it_began(tmp_path):
+    source = clip(tmp_path / "in.mkv", encoder="ffv1")
+    track = zj.io.FocalTrack(np.array([0.0, 3.0]), np.array([20.0, 80.0]), by_time=False)
+    arguments = {"lens": lens(), "focal": track, "keep": "grow", "interpolation": "cubic"}
+    undistort_video(source, tmp_path / "out.mkv", **arguments)
+    redistort_video(tmp_path / "out.mkv", tmp_path / "back.mkv", **arguments)
+    before, grown, after = (luma(tmp_path / name)[0] for name in ("in.mkv", "out.mkv", "back.mkv"))
+    assert grown.shape[1] > before.shape[1]
+    assert after.shape == before.shape
+    difference = np.abs(after.astype(int) - before)[:, 3:-3, 3:-3]
+    assert np.percentile(difference, 99) <= 6
+    assert difference.mean() < 0.5
+    with pytest.raises(ValueError, match="with which it was corrected"):
+        redistort_video(source, tmp_path / "no.mkv", **arguments)

@@ -1,0 +1,79 @@
+"""``zoomjax export``, ``import`` and ``formats``, as a user runs them."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+import zoomjax as zj
+
+from .._commands import SEVERAL
+from ._lenses import LENSES
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """What commands said, each with its status: run in one process, after each other."""
+    folder = tmp_path_factory.mktemp("commands")
+    LENSES["landscape"]().save(folder / "lens.json")
+    (folder / "track.csv").write_text("frame,focal\n1,20\n3,40\n")
+    (folder / "bad.json").write_text('{"fisheye_params": 1}')
+    lines = {
+        "formats": "formats",
+        "lensfun": "export lens.json --to lensfun --pixel-pitch 0.0367 -o a.xml",
+        "again": "export lens.json --to lensfun --pixel-pitch 0.0367 -o a.xml",
+        "overwrite": "export lens.json --to lensfun --pixel-pitch 0.0367 -o a.xml --overwrite",
+        "track": "export lens.json --to pftrack --focal track.csv -o a.pfb",
+        "no pitch": "export lens.json --to opencv --focal 24 -o a.yaml",
+        "no focal": "export lens.json --to pftrack -o b.pfb",
+        "no format": "export lens.json --to that -o b.pfb",
+        "import": "import a.xml --image-size 640x480 -o back",
+        "no size": "import a.xml -o never",
+        "damaged": "import bad.json -o never",
+    }
+    jobs = [[str(folder), ["zoomjax", *line.split()]] for line in lines.values()]
+    done = subprocess.run(
+        [sys.executable, "-c", SEVERAL], input=json.dumps(jobs), capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return folder, dict(zip(lines, json.loads(done.stdout), strict=True))
+
+
+def test_formats_are_listed(told):
+    status, text = told[1]["formats"]
+    assert status == 0
+    assert len(text.splitlines()) == len(zj.interop.formats())
+
+
+def test_a_lens_goes_out_and_comes_back(told):
+    folder, said = told
+    status, text = said["lensfun"]
+    assert status == 0, text
+    assert "px between." in text
+    assert said["overwrite"][0] == 0
+    assert (folder / "a.pfb").read_text().startswith("#PFBarrel")
+    status, text = said["import"]
+    assert status == 0, text
+    assert zj.load_lens(folder / "back" / "lens.json").focal_unit == "mm"
+    assert json.loads((folder / "back" / "import.json").read_text())["format"] == "lensfun"
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("again", "a.xml already exists and would be replaced: choose another place, or give --overwrite."),
+        ("no pitch", "Error: --pixel-pitch, mm from one pixel to the next"),
+        ("no focal", "Error: --focal must be given, one focal length or several"),
+        ("no format", "Error: --to must be one of stmap, nuke"),
+        ("no size", "it holds no image size: give --image-size"),
+        ("damaged", "Error: Cannot read a gyroflow lens from bad.json: "),
+    ],
+)
+def test_an_error_is_one_sentence_with_the_names_of_options(told, name, sentence):
+    folder, said = told
+    status, text = said[name]
+    assert status == 2
+    assert sentence in text
+    assert len(text.strip().splitlines()) == 1
+    assert not (folder / "never").exists()

@@ -1,0 +1,259 @@
+"""Metadata from format to format, in files of Pillow and tifffile: what is kept, and what is said."""
+
+import io
+import struct
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from PIL import ExifTags, Image, PngImagePlugin
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+from zoomjax.io.metadata import Metadata, geometry_of, marked
+from zoomjax.io.photo import read_focal, read_metadata, read_pages, read_photo
+from zoomjax.io.photo_writer import encoded_photo
+
+from .._exif import exif
+
+XMP = (
+    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    b'<rdf:Description rdf:about="" xmlns:dc="http://purl.org/dc/elements/1.1/" dc:source="a ruler"/>'
+    b"</rdf:RDF></x:xmpmeta>"
+)
+ICC = b"\0\0\0\0" + bytes(range(256)) * 300  # longer than a segment of a JPEG file
+IIM = b"\x1c\x02\x78\x00\x05ruler"  # a caption
+IPTC = b"8BIM\x04\x04\0\0" + struct.pack(">I", len(IIM)) + IIM
+FULL = Metadata(exif=exif(), xmp=XMP, icc=ICC, iptc=IPTC, comment=b"a comment", dpi=(300.0, 300.0))
+
+
+@pytest.fixture
+def image(rng):
+    noise = cv2.GaussianBlur(rng.uniform(size=(40, 60, 3)), (0, 0), 3)
+    return ((noise - noise.min()) / np.ptp(noise) * 255).astype(np.uint8)
+
+
+def write(path, image, metadata=FULL):
+    content, lost = encoded_photo([(image, metadata)], path.suffix)
+    path.write_bytes(content)
+    return lost
+
+
+HELD = {
+    ".jpg": {"exif", "xmp", "icc", "iptc", "comment", "dpi"},
+    ".png": {"exif", "xmp", "icc", "comment", "dpi"},
+    ".tif": {"exif", "xmp", "icc", "iptc", "dpi"},
+    ".webp": {"exif", "xmp", "icc"},
+    ".avif": {"exif", "xmp", "icc"},
+    ".bmp": {"dpi"},
+}
+
+
+@pytest.mark.parametrize("suffix", HELD)
+def test_all_that_a_format_holds_comes_back_and_the_rest_is_named(tmp_path, image, suffix):
+    lost = write(tmp_path / f"a{suffix}", image)
+    found = read_pages(tmp_path / f"a{suffix}").pages[0][1]
+    assert read_metadata(tmp_path / f"a{suffix}") == found
+    for field in ("xmp", "icc", "iptc", "comment"):
+        assert getattr(found, field) == (getattr(FULL, field) if field in HELD[suffix] else b"")
+    assert (found.dpi is not None) == ("dpi" in HELD[suffix])
+    if found.dpi:
+        np.testing.assert_allclose(found.dpi, 300, atol=0.02)  # PNG and BMP count per metre
+    assert read_focal(tmp_path / f"a{suffix}") == (35.0 if "exif" in HELD[suffix] else None)
+    names = {"exif": "EXIF data", "xmp": "XMP", "icc": "the colour profile", "iptc": "IPTC data"}
+    names |= {"comment": "the comment", "dpi": "the resolution"}
+    assert set(lost) == {names[field] for field in names.keys() - HELD[suffix]}
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp", ".avif"])
+def test_other_programs_find_them(tmp_path, image, suffix):
+    write(tmp_path / f"a{suffix}", image)
+    with Image.open(tmp_path / f"a{suffix}") as opened:
+        opened.load()
+        assert opened.getexif().get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] == 35
+        assert opened.info["icc_profile"] == ICC
+        assert b"a ruler" in (opened.info.get("xmp") or opened.info["XML:com.adobe.xmp"].encode())
+        if suffix in (".jpg", ".png", ".tif"):
+            assert opened.info["dpi"][0] == pytest.approx(300, abs=0.02)
+        if suffix == ".jpg":
+            assert opened.info["photoshop"][0x0404] == IIM
+            assert opened.info["comment"] == b"a comment"
+        if suffix == ".tif":
+            assert opened.tag_v2[33723] == IIM
+        if suffix == ".png":
+            assert opened.text["Comment"] == "a comment"
+
+
+def test_what_pillow_writes_is_read(tmp_path, image):
+    picture = Image.fromarray(image)
+    picture.save(
+        tmp_path / "a.jpg",
+        dpi=(72, 72),
+        comment=b"hello",
+        icc_profile=ICC,
+        xmp=XMP,
+        exif=b"Exif\0\0" + exif(),
+    )
+    found = read_metadata(tmp_path / "a.jpg")
+    assert (found.comment, found.icc, found.xmp, found.exif) == (b"hello", ICC, XMP, exif())
+    assert found.dpi == (72, 72)
+    text = PngImagePlugin.PngInfo()
+    text.add_itxt("XML:com.adobe.xmp", XMP.decode(), zip=True)
+    text.add_text("Title", "Edges")
+    picture.save(tmp_path / "a.png", pnginfo=text, icc_profile=ICC)
+    found = read_metadata(tmp_path / "a.png")
+    assert (found.xmp, found.icc) == (XMP, ICC)
+    write(tmp_path / "b.png", image, found)
+    with Image.open(tmp_path / "b.png") as opened:
+        assert opened.text["Title"] == "Edges"
+
+
+def test_further_pictures_are_named(tmp_path, image):
+    pictures = [Image.fromarray(image), Image.fromarray(255 - image)]
+    for name, form in (("a.jpg", "MPO"), ("a.png", "PNG"), ("a.webp", "WEBP")):
+        pictures[0].save(tmp_path / name, form, save_all=True, append_images=pictures[1:])
+        assert read_pages(tmp_path / name).others == ("further pictures",)
+
+
+@pytest.mark.parametrize("compression", [None, "tiff_lzw", "tiff_deflate", "packbits"])
+def test_each_page_of_a_tiff_file_is_read(tmp_path, image, compression):
+    pages = [Image.fromarray(image), Image.fromarray(255 - image)]
+    pages[0].save(
+        tmp_path / "a.tif", save_all=True, append_images=pages[1:], compression=compression, icc_profile=ICC
+    )
+    photo = read_pages(tmp_path / "a.tif")
+    for (found, _), page in zip(photo.pages, pages, strict=True):
+        np.testing.assert_array_equal(found[..., ::-1], np.asarray(page))
+    content, _ = encoded_photo(photo.pages, ".tif")
+    with tifffile.TiffFile(io.BytesIO(content)) as again:
+        assert len(again.pages) == 2
+        assert again.pages[0].tags["InterColorProfile"].value == ICC
+        np.testing.assert_array_equal(again.pages[1].asarray(), np.asarray(pages[1]))
+    with pytest.raises(ValueError, match=r"2 pages, which a \.jpg file does not hold: choose \.tif"):
+        encoded_photo(photo.pages, ".jpg")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_planes_of_a_tiff_file_one_after_the_other_are_colours(tmp_path, image, dtype):
+    """OpenCV takes them for interleaved."""
+    planes = np.moveaxis(image.astype(dtype), -1, 0)
+    tifffile.imwrite(tmp_path / "a.tif", planes, photometric="rgb", planarconfig="separate")
+    np.testing.assert_array_equal(read_photo(tmp_path / "a.tif")[0][..., ::-1], image)
+
+
+def test_alpha_does_not_darken_colours(tmp_path, image):
+    clear = np.dstack([image, np.full(image.shape[:2], 90, np.uint8)])
+    Image.fromarray(clear).save(tmp_path / "a.tif")
+    np.testing.assert_array_equal(read_photo(tmp_path / "a.tif")[0][..., [2, 1, 0, 3]], clear)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".tif"])
+def test_colours_of_print_are_noticed(tmp_path, image, suffix):
+    Image.fromarray(image).convert("CMYK").save(tmp_path / f"a{suffix}")
+    assert read_pages(tmp_path / f"a{suffix}").cmyk
+    Image.fromarray(image).save(tmp_path / f"b{suffix}")
+    assert not read_pages(tmp_path / f"b{suffix}").cmyk
+
+
+def test_avif_of_ten_bits_keeps_them(tmp_path, image):
+    deep = image.astype(np.uint16) << 2
+    options = [cv2.IMWRITE_AVIF_DEPTH, 10, cv2.IMWRITE_AVIF_QUALITY, 100]
+    (tmp_path / "a.avif").write_bytes(cv2.imencode(".avif", deep, options)[1].tobytes())
+    found, _ = read_photo(tmp_path / "a.avif")
+    assert found.dtype == np.uint16
+    np.testing.assert_array_equal(found >> 6, deep)
+    assert found.max() > 65000  # white is white
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_avif_is_not_turned_and_keeps_its_orientation(tmp_path, image, orientation):
+    given = Image.Exif()
+    given[ExifTags.Base.Orientation] = orientation
+    Image.fromarray(image).save(tmp_path / "a.avif", quality=100, subsampling="4:4:4", exif=given)
+    found, metadata = read_photo(tmp_path / "a.avif")
+    assert np.abs(found[..., ::-1].astype(int) - image).max() <= 6
+    write(tmp_path / "b.avif", found, metadata)
+    with Image.open(tmp_path / "b.avif") as again:
+        assert again.getexif().get(ExifTags.Base.Orientation, 1) == orientation
+
+
+NAMES = {
+    "GIF": "a GIF image",
+    "JPEG2000": "a JPEG 2000 image",
+    "PDF": "a PDF document",
+    "PPM": "a PNM image",
+    "ICO": "an icon",
+}
+
+
+@pytest.mark.parametrize("form", NAMES)
+def test_what_is_no_photo_is_called_by_its_name(tmp_path, image, form):
+    Image.fromarray(image).save(tmp_path / "a.jpg", form)
+    for read in (read_photo, read_focal):
+        with pytest.raises(ValueError, match=f"it is {NAMES[form]}: convert it to TIFF or PNG first"):
+            read(tmp_path / "a.jpg")
+
+
+def bayer(image):
+    """What a sensor behind a mosaic of red, green, green and blue sees, 12 of 16 bits."""
+    mosaic = image[..., 1].astype(np.uint16) * 16
+    mosaic[::2, ::2], mosaic[1::2, 1::2] = image[::2, ::2, 0] * 16.0, image[1::2, 1::2, 2] * 16.0
+    return mosaic
+
+
+def test_raw_is_developed_with_all_its_bits(tmp_path, image):
+    pytest.importorskip("rawpy")
+    image = np.repeat(cv2.resize(image, (300, 200)).mean(2, keepdims=True), 3, axis=2).astype(np.uint8)
+    matrix = np.array([[1, 1], [0, 1], [0, 1], [0, 1], [1, 1], [0, 1], [0, 1], [0, 1], [1, 1]], np.int32)
+    tags = [
+        (271, 2, 0, "Ruler", True),
+        (272, 2, 0, "Ruler One", True),
+        (50706, 1, 4, (1, 4, 0, 0), True),  # a DNG file
+        (50708, 2, 0, "Ruler One", True),
+        (33421, 3, 2, (2, 2), True),
+        (33422, 1, 4, (0, 1, 1, 2), True),
+        (50717, 4, 1, 4095, True),
+        (50721, 10, 9, matrix.ravel().tolist(), True),
+        (50778, 3, 1, 21, True),
+        (700, 1, len(XMP), XMP, True),
+    ]
+    tifffile.imwrite(tmp_path / "a.dng", bayer(image), photometric=32803, metadata=None, extratags=tags)
+    found, metadata = read_photo(tmp_path / "a.dng")
+    assert found.dtype == np.uint16
+    assert found.shape == (200, 300, 3)
+    assert metadata.xmp == XMP
+    grey = [cv2.GaussianBlur(each.astype(float).mean(2), (0, 0), 2) for each in (found, image)]
+    assert np.corrcoef(grey[0].ravel(), grey[1].ravel())[0, 1] > 0.95
+    (tmp_path / "b.dng").write_bytes((tmp_path / "a.dng").read_bytes()[:90])
+    with pytest.raises(ValueError, match="damaged, or LibRaw does not know this camera"):
+        read_photo(tmp_path / "b.dng")
+
+
+def test_the_mark_leaves_the_packet_as_it_is():
+    once = marked(Metadata(xmp=XMP), "undistorted")
+    assert geometry_of(once) == "undistorted"
+    assert geometry_of(Metadata(xmp=XMP)) is None
+    assert once.xmp.startswith(XMP[: XMP.index(b"</rdf:RDF>")])
+    assert once.xmp.endswith(b"</rdf:RDF></x:xmpmeta>")
+    back = marked(once, "distorted")
+    assert geometry_of(back) == "distorted"
+    assert len(back.xmp) == len(once.xmp) - 2
+    assert geometry_of(marked(Metadata(xmp=b"no packet"), "undistorted")) == "undistorted"
+
+
+def test_notes_of_the_maker_are_left_out_of_tiff_files_and_named(tmp_path, image):
+    given = Image.Exif()
+    given[ExifTags.IFD.Exif] = {
+        ExifTags.Base.MakerNote: b"notes of a maker",
+        ExifTags.Base.FocalLength: 35.0,
+    }
+    block = given.tobytes().removeprefix(b"Exif\0\0")
+    assert write(tmp_path / "a.jpg", image, Metadata(exif=block)) == []
+    assert read_metadata(tmp_path / "a.jpg").exif == block
+    assert write(tmp_path / "a.tif", image, Metadata(exif=block)) == ["the camera maker's notes"]
+    folders = ImageFileDirectory_v2()
+    folders[ExifTags.IFD.Exif] = {ExifTags.Base.MakerNote: b"notes of a maker"}
+    Image.fromarray(image).save(tmp_path / "b.tif", tiffinfo=folders)
+    with tifffile.TiffFile(tmp_path / "b.tif") as file:
+        assert "MakerNote" in file.pages[0].tags["ExifTag"].value
+    assert "the camera maker's notes" in read_pages(tmp_path / "b.tif").others
