@@ -59,12 +59,26 @@ def test_one_photo_that_several_lenses_fit_is_a_question_that_a_name_answers(tmp
     assert (tmp_path / "b.png").exists()
 
 
-def test_photos_of_one_name_are_refused_before_any_work(tmp_path):
+def test_photos_of_one_name_keep_their_folders(tmp_path):
     (tmp_path / "more").mkdir()
-    both = photo(tmp_path / "a.png"), photo(tmp_path / "more" / "a.png", lens="")
-    with pytest.raises(ValueError, match="have the same name"):
+    both = photo(tmp_path / "a.png"), photo(tmp_path / "more" / "a.png")
+    done = undistort_by_library(job(tmp_path, *both), "auto")
+    assert done.written == 2
+    assert {
+        path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.png")
+    } == {
+        "a.png",
+        "more/a.png",
+    }
+
+
+def test_targets_that_exist_are_refused_before_any_work(tmp_path):
+    both = photo(tmp_path / "a.png"), photo(tmp_path / "b.png")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "b.png").write_text("the user's own")
+    with pytest.raises(FileExistsError):
         undistort_by_library(job(tmp_path, *both), "auto")
-    assert not (tmp_path / "out").exists()
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["b.png"]
 
 
 def test_a_search_shows_what_lenses_become_and_writes_the_one(tmp_path):
