@@ -16,17 +16,27 @@ from zoomjax import scenes
 
 SEED = 2012
 
-# What the command line compiles, and finds in images, is kept between the tests, and not beyond them.
-_CACHE = tempfile.TemporaryDirectory(prefix="zoomjax-tests-")
-os.environ["ZOOMJAX_CACHE"] = _CACHE.name
+# What the command line compiles, and finds in images, is kept between the tests of all workers, and not beyond
+# them. Workers inherit the folder.
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    _CACHE = tempfile.TemporaryDirectory(prefix="zoomjax-tests-")
+    os.environ["ZOOMJAX_CACHE"] = _CACHE.name
 
-# Tests compile far more than they compute: so without costly optimisation.
+# Tests compile far more than they compute: so without costly optimisation, and without the emitters of fusions,
+# whose own compiler (MLIR) takes two thirds of the time that remains.
 os.environ.setdefault(
-    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    " --xla_cpu_use_fusion_emitters=false",
 )
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Programs are kept for all workers and files; a size that is limited makes JAX lock the folder while it writes.
+jax.config.update("jax_compilation_cache_dir", str(Path(os.environ["ZOOMJAX_CACHE"]) / "tests"))
+jax.config.update("jax_compilation_cache_max_size", 10**10)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 hypothesis.settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=50)
 hypothesis.settings.load_profile("fixed")
 
