@@ -4,8 +4,8 @@ All pieces are corrected. Two of them join, end to end, when
 
 - both ends of the shorter one lie where the longer one's line says, within what the lines' and the model's
   uncertainty allow;
-- the same side is brighter, with like contrast, or, where the brighter side flips as at the corners of a
-  checkerboard, they touch;
+- the same side is brighter, with like contrast; or the brighter side flips, as at the corners of a
+  checkerboard, and they touch, or each has flipped before;
 - the gap is explained: no longer than some times the visible part of the shorter one, or outside the image;
 - they do not run beside each other: the two edges of a thin bar stay two lines;
 - each is the nearest such neighbour of the other.
@@ -46,6 +46,9 @@ _TURN = 0.02
 _GAP = 2.5
 """Longest gap, in lengths of what is visible of the shorter side of it."""
 
+_CORNER = 4.0
+"""px that an edge loses at each end where it meets another: near corners there are no edge points."""
+
 _TOUCH = 14.0
 """px between pieces of one edge whose brighter side flips: corners are blurred, and hold no points."""
 
@@ -80,6 +83,7 @@ class _Units:
         contrast: (u, 2), logarithm of the slope of the grey levels.
         length: (u,), px in the image.
         leaves: (u, 2), whether the edge leaves the image there.
+        flips: (u,), whether the brighter side changes within.
     """
 
     sums: np.ndarray
@@ -90,6 +94,7 @@ class _Units:
     contrast: np.ndarray
     length: np.ndarray
     leaves: np.ndarray
+    flips: np.ndarray
 
 
 def collinear(pieces: Fragments, model: OneFrame, sigma: float) -> np.ndarray:
@@ -151,6 +156,7 @@ def _units(pieces: Fragments, model: OneFrame) -> _Units:
         np.stack([contrast, contrast], axis=-1),
         np.hypot(*chord.T),
         inside < _MARGIN,
+        np.zeros(len(pieces.count), bool),
     )
 
 
@@ -184,6 +190,12 @@ def _merged(units: _Units, group: np.ndarray) -> _Units:
     unit, end = picked // 2, picked % 2  # (number, 2): at the first and the last place
     forwards = np.where(along[unit, 1] > along[unit, 0], 1, -1)
     tips = units.tips[unit, end]
+    side = units.bright * np.sign(along[:, 1] - along[:, 0])[:, None]
+    least, most = np.ones(number), -np.ones(number)
+    np.minimum.at(least, group, side.min(axis=1))
+    np.maximum.at(most, group, side.max(axis=1))
+    flips = least < most
+    np.logical_or.at(flips, group, units.flips)
     return _Units(
         sums,
         middle[:, None] + place[picked][..., None] * _along(normal)[:, None],
@@ -193,6 +205,7 @@ def _merged(units: _Units, group: np.ndarray) -> _Units:
         units.contrast[unit, end],
         np.hypot(*(tips[:, 1] - tips[:, 0]).T),
         units.leaves[unit, end],
+        flips,
     )
 
 
@@ -247,9 +260,11 @@ def _joined(units: _Units, longer: np.ndarray, shorter: np.ndarray, sigma: float
     gap = np.hypot(*(units.tips[longer, meet] - units.tips[shorter, met]).T)
     along = (own[:, 1] > own[:, 0]) == (other[:, 1] > other[:, 0])
     same = units.bright[longer, meet] * units.bright[shorter, met] * np.where(along, 1, -1) > 0
+    same |= units.flips[longer] & units.flips[shorter]
     visible = np.minimum(units.sums[longer, 6], units.sums[shorter, 6])
     outside = units.leaves[longer, meet] & units.leaves[shorter, met]
-    most = np.where(same, np.where(outside, np.inf, np.maximum(_GAP * visible, _TOUCH)), _TOUCH)
+    explained = np.maximum(_GAP * visible + 2 * _CORNER, _TOUCH)
+    most = np.where(same, np.where(outside, np.inf, explained), _TOUCH)
     fits = (passed * scale < _OVERLAP) & (gap <= most)
     fits &= abs(units.contrast[longer, meet] - units.contrast[shorter, met]) < np.log(_CONTRAST)
     first, second = (2 * longer + meet)[fits], (2 * shorter + met)[fits]

@@ -38,7 +38,7 @@ _SAMPLE = 8.0
 """px along a piece from one vote to the next; more where there are more than `_MOST` of them."""
 
 _MOST = 6000
-_LEAST_EXTENT = 12.0
+_LEAST_EXTENT = 8.0
 """px, of pieces that vote: shorter ones do not know their direction."""
 
 
