@@ -411,7 +411,7 @@ LEFT_OUT = {
     **dict.fromkeys(
         (
             *("frame_output", "select_model", "held_out_zoom", "held_out_frames"),
-            *("suggest_next", "reject_points", "barrel_crossover"),
+            *("suggest_next", "reject_points", "barrel_crossover", "assess", "evidence"),
         ),
         BY_VALUES,
     ),
@@ -419,6 +419,8 @@ LEFT_OUT = {
         (
             *("load_lens", "load_lines", "read_focal_csv", "read_focal_track", "read_lines_csv"),
             *("write_lines_csv", "undistort_image", "undistort_photo", "undistort_video"),
+            *("redistort_image", "redistort_photo", "redistort_video", "read", "write", "formats"),
+            *("find", "load", "match", "names"),
         ),
         FILES,
     ),

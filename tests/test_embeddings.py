@@ -117,7 +117,10 @@ def test_cell(row, way, dtype):
 def test_over_four_devices(dtype, slow):
     result = subprocess.run(
         [sys.executable, table.__file__, dtype, *(["slow"] if slow else [])],
-        env={**os.environ, "XLA_FLAGS": f"--xla_force_host_platform_device_count={table.DEVICES}"},
+        env={
+            **os.environ,
+            "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={table.DEVICES}",
+        },
         capture_output=True,
         text=True,
         check=False,

@@ -55,7 +55,7 @@ class Calibration:
         zoom: the zoom model's fit.
         each: separate fits of the frames.
         none, algebraic: each frame's RMS, px, without correction and with the algebraic estimate.
-        rejected: which lines have weight 0 because they are not straight in the scene.
+        rejected: which lines have weight 0: left out by hand, or because they are not straight in the scene.
         line_rms: RMS of each line under the zoom model, px, rejected lines included.
         next: the photo that would reduce the uncertainty most.
         focal_sigma: standard deviation of each frame's focal length, included in the bands; 0: exact.
@@ -301,7 +301,7 @@ def calibrate(
     )
     choices = [c for c in default_candidates() if isinstance(c.zoom, PolynomialZoom)] if select else []
     small = compress(data, max([terms, *(choice.terms for choice in choices)]))
-    rejected = np.zeros(len(lines.frame), bool)
+    rejected = np.zeros(len(lines.frame), bool) if lines.weight is None else np.asarray(lines.weight) == 0
     if robust:
         stage("Rejecting lines that are not straight")
         weight = fit_robust(small, zoom=model, terms=terms, throw=False).weight

@@ -21,6 +21,10 @@ from ..models.zoom import AbstractPriorZoom, AbstractZoom, with_parameters
 from .energy import coefficients_by, line_weights, prior_error, prior_jacobian
 
 
+_ROUNDING = 64
+"""Error of the corrected points without noise, in units in the last place of their mean radius."""
+
+
 def parameter_covariance(
     lines: AbstractLines,
     zoom: AbstractZoom,
@@ -133,6 +137,11 @@ def _feigned(lines, zoom, weights, energy, extra):
     # The residuals have the noise of the corrected image, shrunk by L: divide by its mean square.
     kappa = jnp.concatenate([jnp.ones_like(k[:, :1]), k], axis=1)[lines.frame]
     variance_in_image = energy / jnp.einsum("li,lij,lj->", kappa, moments, kappa)
+    # Points without noise have that of their rounding, which sums over a line multiply.
+    mean = jnp.sum(moments, axis=0)
+    radius = lines.scale * jnp.sqrt(mean[1, 1] / _positive(mean[0, 0]))
+    rounding = _ROUNDING * jnp.finfo(moments.dtype).eps * radius
+    variance_in_image = jnp.maximum(variance_in_image, rounding**2)
     by_parameter, tangential = (rows[lines.frame] for rows in jax.jacfwd(coefficients_at)(flat))
     # (line, terms, parameter). Decentering moves points by squares of x and y: noise enters its derivative
     # by matrices whose mean square over all directions is 12 r^2.

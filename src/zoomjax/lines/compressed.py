@@ -348,6 +348,11 @@ def _triangle_jvp(primals, tangents):
     return r, jnp.matmul(jnp.where(kept[:, None], q, 0), columns_dot.T, precision=EXACT)
 
 
+_INDEPENDENT = 8
+"""Least part of a column that the others do not have, in units in the last place of its norm. What is less is
+rounding, which a compiler may compute in one way here and in another there."""
+
+
 def _orthogonalise(columns):
     """R of the transposed argument, by modified Gram-Schmidt.
 
@@ -356,12 +361,16 @@ def _orthogonalise(columns):
     """
     size = columns.shape[0]
     rows = []
+    least = (_INDEPENDENT * jnp.finfo(columns.dtype).eps) ** 2
+    removed = jnp.zeros(size, columns.dtype)  # the squared norm of what was taken from each column
     for done in range(size):
         products = jnp.matmul(columns, columns[0], precision=EXACT)
         norm = jnp.sqrt(products[0])
-        inverse = jnp.where(norm > 0, 1 / jnp.where(norm > 0, norm, 1), 0)
+        independent = products[0] > least * removed[0]
+        inverse = jnp.where(independent, 1 / jnp.where(independent, norm, 1), 0)
         row = products * inverse
         rows.append(jnp.pad(row, (done, 0)))
+        removed = removed[1:] + row[1:] ** 2
         columns = columns[1:] - (row[1:] * inverse)[:, None] * columns[:1]
     return jnp.stack(rows)
 
