@@ -1,6 +1,7 @@
 """What all tests share: float64, strict ranks, one seed, and small scenes with exact truth."""
 
 import os
+import platform
 import tempfile
 from pathlib import Path
 
@@ -16,24 +17,28 @@ from zoomjax import scenes
 
 SEED = 2012
 
-# What the command line compiles, and finds in images, is kept between the tests of all workers, and not beyond
-# them. Workers inherit the folder.
+# What the command line compiles, and finds in images, is kept between the tests of all workers, and not
+# beyond them. Workers inherit the folder.
 if "PYTEST_XDIST_WORKER" not in os.environ:
     _CACHE = tempfile.TemporaryDirectory(prefix="zoomjax-tests-")
     os.environ["ZOOMJAX_CACHE"] = _CACHE.name
 
-# Tests compile far more than they compute: so without costly optimisation, and without the emitters of fusions,
-# whose own compiler (MLIR) takes two thirds of the time that remains.
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-    " --xla_cpu_use_fusion_emitters=false",
-)
+# Tests compile far more than they compute: so without costly optimisation, and without the emitters of
+# fusions, whose own compiler (MLIR) takes two thirds of the time that remains. The older emitters compute a
+# value again where it is used again, and then multiply and add in one rounding here, in two there; without
+# such instructions both are the same.
+FLAGS = [
+    "--xla_backend_optimization_level=0",
+    "--xla_llvm_disable_expensive_passes=true",
+    "--xla_cpu_use_fusion_emitters=false",
+    *(["--xla_cpu_max_isa=AVX"] if platform.machine() in ("x86_64", "AMD64") else []),
+]
+os.environ.setdefault("XLA_FLAGS", " ".join(FLAGS))
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Programs are kept for all workers and files; a size that is limited makes JAX lock the folder while it writes.
+# Programs are kept for all workers and files; with a limited size JAX locks the folder while it writes.
 jax.config.update("jax_compilation_cache_dir", str(Path(os.environ["ZOOMJAX_CACHE"]) / "tests"))
 jax.config.update("jax_compilation_cache_max_size", 10**10)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

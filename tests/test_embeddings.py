@@ -88,8 +88,8 @@ HERE = dict(
     )
 )
 LOOSE = {"grad": {"float32": 5e-2, "float64": 1e-4}}
-FEW = ("jit, closed over", "grad")
-"""What is tested always, of float32, and of rows that compile for long; all with ``-m exhaustive``."""
+FEW = {("float32", False): ("jit, closed over", "grad"), ("float64", True): ("grad",)}
+"""Ways tested always, of float32, and of rows that compile for long; all with ``-m exhaustive``."""
 
 
 def cells():
@@ -99,7 +99,7 @@ def cells():
                 if row.constant and way in table.DERIVATIVES:
                     continue
                 always = dtype == "float64" and not row.slow
-                few = way in FEW and (dtype == "float64" or not row.slow)
+                few = way in FEW.get((dtype, row.slow), ())
                 marks = () if always else pytest.mark.slow if few else pytest.mark.exhaustive
                 yield pytest.param(row, way, dtype, id=f"{row.name}-{way}-{dtype}", marks=marks)
 
@@ -115,12 +115,10 @@ def test_cell(row, way, dtype):
 @pytest.mark.parametrize("slow", [False, pytest.param(True, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("dtype", [pytest.param("float32", marks=pytest.mark.exhaustive), "float64"])
 def test_over_four_devices(dtype, slow):
+    four = f"--xla_force_host_platform_device_count={table.DEVICES}"
     result = subprocess.run(
         [sys.executable, table.__file__, dtype, *(["slow"] if slow else [])],
-        env={
-            **os.environ,
-            "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={table.DEVICES}",
-        },
+        env={**os.environ, "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} {four}"},
         capture_output=True,
         text=True,
         check=False,

@@ -19,7 +19,20 @@ from nbconvert import MarkdownExporter
 
 ROOT = Path(__file__).parents[2]
 
-ROOMS = ("models", "lines", "fit", "trust", "correct", "interop", "detect", "focal", "io", "scenes", "app")
+ROOMS = (
+    "models",
+    "lines",
+    "fit",
+    "trust",
+    "correct",
+    "interop",
+    "lenses",
+    "detect",
+    "focal",
+    "io",
+    "scenes",
+    "app",
+)
 """In the order in which a reader meets them."""
 
 

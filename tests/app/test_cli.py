@@ -73,21 +73,22 @@ STAGE = re.compile(r"  \S.* +\d+\.\d\d s")
 
 @pytest.mark.slow
 def test_on_a_fresh_machine_a_terminal_shows_nothing_but_stages(few_lines, tmp_path):
-    """All of stderr: with nothing kept, with what was compiled damaged, and with no home at all."""
+    """All of stderr: with nothing kept, and with what was compiled damaged."""
     few_lines.save(tmp_path / "lines.npz")
     (tmp_path / "home").mkdir()
     kept = tmp_path / "home" / ".cache" / "zoomjax" / "compiled"
     own = {"HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR", "ZOOMJAX_CACHE"}
     bare = {name: value for name, value in os.environ.items() if name not in own}
-    for home in (tmp_path / "lines.npz" / "none", tmp_path / "home", tmp_path / "home"):
+    bare["HOME"] = str(tmp_path / "home")
+    for _ in range(2):
         done = subprocess.run(
             [*COMMAND, "calibrate", "lines.npz", "-o", "out"],
-            capture_output=True, text=True, cwd=tmp_path, timeout=600, env=bare | {"HOME": str(home)},
+            capture_output=True, text=True, cwd=tmp_path, timeout=600, env=bare,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
         assert [line for line in done.stderr.splitlines() if not STAGE.fullmatch(line)] == []
         programs = list(kept.glob("*-cache"))
-        assert (len(programs) > 3) == kept.exists() == (home.name == "home")
+        assert len(programs) > 3
         assert all(file.stat().st_size > 100 for file in programs)  # those cut off were made again
         for file in programs:
             file.write_bytes(b"cut off")

@@ -55,7 +55,7 @@ class Calibration:
         zoom: the zoom model's fit.
         each: separate fits of the frames.
         none, algebraic: each frame's RMS, px, without correction and with the algebraic estimate.
-        rejected: which lines have weight 0: left out by hand, or because they are not straight in the scene.
+        rejected: which lines have weight 0: left out by hand, or not straight in the scene.
         line_rms: RMS of each line under the zoom model, px, rejected lines included.
         next: the photo that would reduce the uncertainty most.
         focal_sigma: standard deviation of each frame's focal length, included in the bands; 0: exact.

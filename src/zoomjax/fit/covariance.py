@@ -20,7 +20,6 @@ from ..lines.base import AbstractLines
 from ..models.zoom import AbstractPriorZoom, AbstractZoom, with_parameters
 from .energy import coefficients_by, line_weights, prior_error, prior_jacobian
 
-
 _ROUNDING = 64
 """Error of the corrected points without noise, in units in the last place of their mean radius."""
 

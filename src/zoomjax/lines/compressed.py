@@ -349,7 +349,7 @@ def _triangle_jvp(primals, tangents):
 
 
 _INDEPENDENT = 8
-"""Least part of a column that the others do not have, in units in the last place of its norm. What is less is
+"""Least part of a column that the others do not have, in units in the last place of its norm. Below is
 rounding, which a compiler may compute in one way here and in another there."""
 
 
