@@ -17,7 +17,7 @@ POINTS = np.array([[0.0, 0.0], [4287.0, 2847.0], [3000.0, 400.0]])
 
 
 @pytest.mark.parametrize(
-    ("draws", "slack"), [(150, (9, 5)), pytest.param(1000, (3, 3), marks=pytest.mark.slow)]
+    ("draws", "slack"), [(150, (9, 5)), pytest.param(1000, (3, 3), marks=pytest.mark.exhaustive)]
 )
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
 def test_bands_hold_the_truth_as_often_as_they_say(correlation, draws, slack):
