@@ -38,9 +38,10 @@ os.environ.setdefault("XLA_FLAGS", " ".join(FLAGS))
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Programs are kept for all workers and files; with a limited size JAX locks the folder while it writes.
-jax.config.update("jax_compilation_cache_dir", str(Path(os.environ["ZOOMJAX_CACHE"]) / "tests"))
-jax.config.update("jax_compilation_cache_max_size", 10**10)
+# Programs are kept from file to file, for each worker by itself: JAX locks the folder only if its size is
+# limited, and then reads all of it for each program.
+_KEPT = Path(os.environ["ZOOMJAX_CACHE"]) / "tests" / os.environ.get("PYTEST_XDIST_WORKER", "alone")
+jax.config.update("jax_compilation_cache_dir", str(_KEPT))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 hypothesis.settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=50)
 hypothesis.settings.load_profile("fixed")

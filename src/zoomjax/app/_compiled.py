@@ -25,7 +25,7 @@ def set_up_jax() -> None:
     if folder and "JAX_COMPILATION_CACHE_DIR" not in os.environ and _can_write(folder):
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_compilation_cache_max_size", _MOST_COMPILED)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.03)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # no messages about fonts and its own folders
 
 
