@@ -153,7 +153,7 @@ def test_float32_bands_agree_and_refining_wants_float64(sweep):
 # Coverage
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_bands_with_rounded_focal_lengths_hold_the_truth_as_often_as_they_say():
     """Taken as exact the 95 % are 30 %; the refined lens is better and its bands as true."""
     from benchmarks.trust import rounded_focal

@@ -75,14 +75,15 @@ def exact_least(parameters):
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize(("degree", "terms"), [(2, 2), (1, 1), pytest.param(3, 3, marks=pytest.mark.slow)])
-def test_never_wrong_of_a_hundred_thousand_models(degree, terms, dtype):
-    parameters = polynomials(degree, 100_000, degree, terms).astype(dtype).astype(float)
+@pytest.mark.parametrize("number", [10_000, pytest.param(100_000, marks=pytest.mark.exhaustive)])
+def test_never_wrong_of_many_models(number, degree, terms, dtype):
+    parameters = polynomials(degree, number, degree, terms).astype(dtype).astype(float)
     ours, least = certified(parameters, dtype), dense_least(parameters)
     assert (np.asarray(ours.least) <= least).all()
     np.testing.assert_array_equal(ours.certified, np.asarray(ours.least) > 0)
     assert not (np.asarray(ours.certified) & (least <= 0)).any()
     # What it refuses folds, but for a few that fold between the samples or next to it.
-    assert (np.asarray(ours.certified) != (least > 0)).mean() < 3e-4
+    assert (np.asarray(ours.certified) != (least > 0)).mean() < 5e-4
     assert 0.2 < np.mean(ours.certified) < 0.8
     # The smallest slope that it found is one.
     assert (np.asarray(ours.slope) >= np.asarray(ours.least)).all()

@@ -12,7 +12,8 @@ def chosen_frames(calibration: Calibration, most: int) -> list[int]:
     if len(order) <= most:
         return order.tolist()
     worst = np.argsort(-np.nan_to_num(np.asarray(calibration.zoom.frame_rms)))[: most // 3]
-    spread = order[np.linspace(0, len(order) - 1, most - len(worst)).round().astype(int)]
+    others = order[~np.isin(order, worst)]
+    spread = others[np.linspace(0, len(others) - 1, most - len(worst)).round().astype(int)]
     chosen = set(worst.tolist()) | set(spread.tolist())
     return [frame for frame in order.tolist() if frame in chosen]
 
