@@ -3,6 +3,7 @@
 import os
 import platform
 import tempfile
+import time
 from pathlib import Path
 
 import equinox as eqx
@@ -50,6 +51,22 @@ hypothesis.settings.load_profile("fixed")
 def pytest_itemcollected(item):
     if item.get_closest_marker("exhaustive"):
         item.add_marker(pytest.mark.slow)  # also of those that are left out by -m "not slow"
+
+
+def pytest_collection_modifyitems(items):
+    """Slow tests last, so that quick ones are not kept waiting and `SECONDS` leaves out slow ones alone."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+
+
+SECONDS = float(os.environ.get("ZOOMJAX_TEST_SECONDS", "inf"))
+"""After so long, no slow test begins; those left are skipped, and the summary counts them."""
+
+_BEGAN = time.monotonic()
+
+
+def pytest_runtest_setup(item):
+    if time.monotonic() - _BEGAN > SECONDS and item.get_closest_marker("slow"):
+        pytest.skip(f"More than {SECONDS:g} s have passed (ZOOMJAX_TEST_SECONDS): slow tests are left out.")
 
 
 def pytest_report_header(config):

@@ -137,6 +137,7 @@ def _good(fit):
     return zj.RESULTS[fit.result] == "" or fit.result in (zj.RESULTS.undetermined, zj.RESULTS.constrained)
 
 
+@pytest.mark.slow
 @hypothesis.given(scenes(KINDS))
 def test_finite_input_never_gives_nan(scene):
     points, focal = scene

@@ -217,6 +217,7 @@ def test_fit_and_covariance(name):
     assert (np.abs(numbers - true)[known] < 4 * np.sqrt(np.diag(known_part)) + 1e-9).all()
 
 
+@pytest.mark.slow
 @every
 def test_robust_fit(name):
     """The crooked line is rejected, and no other is missed by much."""
@@ -228,6 +229,7 @@ def test_robust_fit(name):
     assert np.abs(difference).max() < 0.3
 
 
+@pytest.mark.slow
 @every
 def test_cross_validation(name):
     """Lines left out are straight too, and less so than those fitted."""
@@ -278,6 +280,7 @@ def test_damaged_files_are_refused_or_harmless(name, tmp_path):
         holder[key] = kept
 
 
+@pytest.mark.slow
 @every
 def test_image_correction(name):
     """A pixel of the corrected image shows what is where its centre is distorted to."""

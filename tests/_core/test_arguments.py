@@ -91,6 +91,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("call", "message"), MISTAKES.values(), ids=MISTAKES)
 def test_a_sentence_says_what_to_pass(call, message, things):
     with pytest.raises(TypeError, match=message):

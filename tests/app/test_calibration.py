@@ -19,6 +19,7 @@ def calibration():
     return calibrate(lines)
 
 
+@pytest.mark.slow
 def test_stages_are_told(calibration):
     told = []
     calibrate(calibration.lines, stage=told.append)
@@ -45,6 +46,7 @@ def test_summary_is_json_and_agrees_with_the_fits(calibration):
     assert "selection" not in summary
 
 
+@pytest.mark.slow
 def test_the_model_can_be_chosen(calibration):
     chosen = calibrate(calibration.lines, select=True)
     summary = json.loads(json.dumps(chosen.summary(), allow_nan=False))
@@ -53,6 +55,7 @@ def test_the_model_can_be_chosen(calibration):
     assert summary["rms_zoom"] == pytest.approx(float(calibration.zoom.rms), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_lines_that_determine_nothing_are_reported(calibration):
     t = np.linspace(-200, 200, 50)
     radial = [np.stack([319.5 + t * c, 239.5 + t * s], -1) for c, s in ((1, 0), (0, 1), (0.6, 0.8))]
@@ -76,6 +79,7 @@ def test_results_are_written_together_or_not_at_all(calibration, tmp_path, monke
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_zoomcam_gives_the_reference_figures(data):
     from benchmarks.real.zoomcam import read_zoomcam
 
@@ -110,6 +114,7 @@ def test_deviations_are_numbers_or_per_cent():
             focal_sigmas(text, np.ones(2))
 
 
+@pytest.mark.slow
 def test_a_frame_whose_lines_are_all_rejected_has_no_figures():
     """In `summary.json`, which is JSON without NaN, and in the tables."""
     lines = scenes.board_lines(scenes.nikkor_18_200(), scenes.focal_sweep(5), spacing=60, noise=0.4)

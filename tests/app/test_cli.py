@@ -54,6 +54,7 @@ def test_help_does_not_wait_for_jax():
     assert time.perf_counter() - start < 30  # the figure itself is measured, not tested
 
 
+@pytest.mark.slow
 def test_calibrate_writes_all_results(calibrated, few_lines):
     out, done = calibrated
     expected = [".zoomjax.json", "lens.json", "lines.npz", "model.png", "report.html", "summary.json"]
@@ -71,7 +72,7 @@ def test_calibrate_writes_all_results(calibrated, few_lines):
 STAGE = re.compile(r"  \S.* +\d+\.\d\d s")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_on_a_fresh_machine_a_terminal_shows_nothing_but_stages(few_lines, tmp_path):
     """All of stderr: with nothing kept, and with what was compiled damaged."""
     few_lines.save(tmp_path / "lines.npz")
@@ -108,6 +109,7 @@ def test_calibrate_gives_the_lens_that_the_library_gives(calibrated, few_lines):
     np.testing.assert_array_equal(zj.load_lines(out / "lines.npz").points, few_lines.points)
 
 
+@pytest.mark.slow
 def test_calibrate_allows_for_uncertain_focal_lengths(calibrated, tmp_path):
     exact = json.loads((calibrated[0] / "summary.json").read_text())
     done = zoomjax("calibrate", calibrated[0] / "lines.npz", "-o", tmp_path, "--focal-sigma", "1%")
@@ -124,6 +126,7 @@ def test_calibrate_allows_for_uncertain_focal_lengths(calibrated, tmp_path):
     assert "--focal-sigma must be a number such as 0.3, or 1%" in refused.stderr
 
 
+@pytest.mark.slow
 def test_calibrate_reads_csv(calibrated, few_lines, tmp_path):
     write_lines_csv(few_lines, tmp_path / "lines.csv")
     done = zoomjax("calibrate", tmp_path / "lines.csv", "--image-size", "4288x2848", "-o", tmp_path)
@@ -133,7 +136,7 @@ def test_calibrate_reads_csv(calibrated, few_lines, tmp_path):
     assert of_csv["rms_zoom"] == pytest.approx(of_npz["rms_zoom"], rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_demo_photographs_the_board_and_finds_the_papers_lens(tmp_path):
     """And calibrating its photographs again takes what was found in them from the cache."""
     done = zoomjax("demo", cwd=tmp_path)
@@ -153,6 +156,7 @@ def test_demo_photographs_the_board_and_finds_the_papers_lens(tmp_path):
     assert "Largest error of the calibrated lens" in done.stdout
 
 
+@pytest.mark.slow
 def test_calibrate_takes_photographs(tmp_path, monkeypatch):
     """Two processes, one bad file, the default source of focal lengths; then once more, from the cache."""
     monkeypatch.setenv("ZOOMJAX_CACHE", str(tmp_path / "cache"))
@@ -177,6 +181,7 @@ def test_calibrate_takes_photographs(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "again" / "summary.json").read_text())["rms_zoom"] == first["rms_zoom"]
 
 
+@pytest.mark.slow
 def test_the_verdict_is_the_first_line_and_decides_strict_runs(calibrated, tmp_path):
     out, done = calibrated
     summary = json.loads((out / "summary.json").read_text())
@@ -194,6 +199,7 @@ def test_the_verdict_is_the_first_line_and_decides_strict_runs(calibrated, tmp_p
     assert (tmp_path / "out" / "lens.json").exists()
 
 
+@pytest.mark.slow
 def test_results_as_json_are_the_summary(calibrated, tmp_path):
     source = calibrated[0] / "lines.npz"
     done = zoomjax("calibrate", source, "-o", tmp_path / "o", "--json", "--strict", "--exclude", "0,2")
@@ -203,6 +209,7 @@ def test_results_as_json_are_the_summary(calibrated, tmp_path):
     assert [row["line"] for row in summary["rejected"]] in ([0, 2], [2, 0])
 
 
+@pytest.mark.slow
 def test_a_dry_run_writes_nothing(calibrated, tmp_path):
     write_photos(tmp_path / "shots", number=3, image_size=(268, 178))
     done = zoomjax("calibrate", "shots", "-o", "out", "--dry-run", cwd=tmp_path)
@@ -318,6 +325,7 @@ def test_version():
     assert zoomjax("--version").stdout == f"zoomjax {importlib.metadata.version('zoomjax')}\n"
 
 
+@pytest.mark.slow
 def test_what_is_wrong_with_a_model_is_told_on_stderr(tmp_path):
     t = np.linspace(-200, 200, 50)
     radial = [np.stack([319.5 + t * c, 239.5 + t * s], -1) for c, s in ((1, 0), (0, 1), (0.6, 0.8))]

@@ -107,6 +107,7 @@ BOARD = scenes.StripedBoard.before(scenes.nikkor_18_200(SIZE))
 PITCHES = tuple(BOARD.size[axis] / BOARD.stripes[axis] / 2 for axis in (0, 1))  # 21.45 and 21.96 mm
 
 
+@pytest.mark.slow
 def test_the_pitch_of_a_board_gives_the_focal_length_within_a_thousandth(striped):
     focal, detections = striped
     found = choose_focals(detections, board=Board(PITCHES, BOARD.distance, BOARD.pixel))
@@ -158,6 +159,7 @@ def oblique(focal, tilts, k=(0.05, -0.02)):
         yield Detection(name, name, SIZE, tuple(zj.detect.GridDetector.lines(seen)), None, seen)
 
 
+@pytest.mark.slow
 def test_oblique_views_of_a_grid_give_focal_lengths():
     """Their distortion is not known: it is found first. Tilts about one axis are plane rotations."""
     tilts = ((0.5, 0.0), (0.0, 0.6), (-0.6, 0.0))

@@ -46,6 +46,7 @@ def done(folder):
     return calibrated
 
 
+@pytest.mark.slow
 def test_the_lens_is_that_of_the_photographs(done):
     lens, truth = done.calibration.zoom.lens, scenes.nikkor_18_200(SIZE)
     assert demo.worst_error(lens, truth, done.focals.focal.values()) < 0.1
@@ -53,6 +54,7 @@ def test_the_lens_is_that_of_the_photographs(done):
     np.testing.assert_allclose(lens.focal_range, [20.56, 127.36])
 
 
+@pytest.mark.slow
 def test_bad_images_are_reported_and_do_not_matter(done):
     assert [d.name[:5] for d in done.used] == ["board"] * 5
     expected = {
@@ -129,6 +131,7 @@ def test_the_verdict_is_good(done):
     assert done.calibration.assessment.verdict == "good"
 
 
+@pytest.mark.slow
 def test_lines_that_are_not_straight_are_rejected(folder, tmp_path):
     """A stripe bent by 2.5 px in one of the photographs: too little for the detector."""
     for path in sorted(folder.glob("board*")):
@@ -149,6 +152,7 @@ def test_lines_that_are_not_straight_are_rejected(folder, tmp_path):
     assert demo.worst_error(spoiled.calibration.zoom.lens, truth, [20.56, 50.0, 127.36]) < 0.1
 
 
+@pytest.mark.slow
 def test_an_image_none_of_whose_lines_agrees_is_not_used(folder, tmp_path):
     """One line, drawn by hand."""
     for path in sorted(folder.glob("board*")):
@@ -172,6 +176,7 @@ def test_an_image_none_of_whose_lines_agrees_is_not_used(folder, tmp_path):
     assert len(done.used) == 5
 
 
+@pytest.mark.slow
 def test_a_zooming_video_is_calibrated(tmp_path):
     clips.write_clip(tmp_path / "zoom.mp4", sound=False)
     track = [f"{n},{clips.focal(n)}" for n in range(clips.FRAMES)]

@@ -11,6 +11,7 @@ from zoomjax import scenes
 from zoomjax.app.plot import plot_distortion, plot_model
 
 
+@pytest.mark.slow
 def test_model_plot_shows_every_frame_and_the_polynomial():
     lens = scenes.nikkor_18_200()
     lines = scenes.board_lines(lens, scenes.focal_sweep(6), spacing=80)

@@ -76,6 +76,7 @@ def page(text):
     return Page(text)
 
 
+@pytest.mark.slow
 def test_page_is_well_formed_and_by_itself(page, text):
     ids = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
     assert len(ids) == len(set(ids))

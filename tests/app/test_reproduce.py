@@ -7,6 +7,8 @@ import pytest
 
 from zoomjax.app import reproduce
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):

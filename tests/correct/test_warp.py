@@ -216,6 +216,7 @@ def test_bad_arguments(image, interpolation, message):
         zj.warp_image(image, LENSES[0], interpolation=interpolation)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [(1.290903, -0.486014), (0.55, -0.28), (-0.33, 0.0), (0.1, -0.02)])
 def test_every_pixel_has_arrived(k):
     """Also where Newton's method jumps between two points for ever, and at the fold."""

@@ -30,6 +30,7 @@ def matched(lines, lens, focal):
     return result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("blur", "noise", "within"), [(0.7, 0, 0.03), (0, 0, 0.03), (1, 5, 0.10)])
 @pytest.mark.parametrize("focal", [20.56, 60.0])
 def test_borders_are_found_where_they_are(focal, blur, noise, within):

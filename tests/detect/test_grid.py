@@ -295,6 +295,7 @@ def test_a_real_grid_of_dots_is_found(data):
             assert np.median(abs(rest)) < 0.05
 
 
+@pytest.mark.slow
 def test_football_shows_no_grid(data):
     frames = sorted((data / "broadcast_frames").glob("*.jpg"))[::5]
     assert len(frames) > 3

@@ -9,7 +9,7 @@ LEAST_SHOWN = 4.0
 """MB: of 120 small pictures, 9 MB would be held if each were kept."""
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_photographs_frames_and_bad_files_leave_nothing_behind():
     from benchmarks import reliability_memory
 

@@ -38,6 +38,7 @@ def found(lines):
     return zj.fit.fit_centre(lines)
 
 
+@pytest.mark.slow
 def test_without_noise_the_centre_is_the_true_one(aside):
     found = zj.fit.fit_centre(zj.lines.compress_any_centre(seen(aside)))
     np.testing.assert_allclose(found.fit.lens.centre, aside.centre, atol=1e-6)
@@ -67,6 +68,7 @@ def test_lines_and_compressed_lines_give_one_answer(aside, found):
     np.testing.assert_allclose(again.centre, found.centre, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_many_draws(aside, lines):
     """Standard deviations of the centre, by drawing the noise anew."""
     clean = seen(aside)
@@ -96,6 +98,7 @@ def test_a_centre_that_moves_is_followed(truth):
     )
 
 
+@pytest.mark.slow
 def test_each_frame_by_itself(aside, lines):
     found = zj.fit.fit_frame_centres(lines)
     assert found.determined.all()
@@ -109,6 +112,7 @@ def test_each_frame_by_itself(aside, lines):
     np.testing.assert_allclose(found.each.distortion(2).centre, found.each.centre[2])
 
 
+@pytest.mark.slow
 def test_where_the_lines_do_not_tell_it_stays():
     """Nothing is distorted here, so that there is no centre."""
     rng = np.random.default_rng(SEED)

@@ -46,6 +46,7 @@ every_way = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.slow
 @every_way
 def test_it_is_all_lines_at_once(way, noisy):
     lines = noisy.weighted(0.5 + np.arange(noisy.frame.shape[0]) % 3)

@@ -37,6 +37,7 @@ def test_weights_are_one_over_frames_lines_and_points(ragged):
     close(line_weights(ragged), expected, rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_residuals_are_weighted_distances(ragged):
     residuals = eqx.filter_jit(zj.fit.residuals)(ragged, jnp.zeros((3, 1)))
     weights = line_weights(ragged)
@@ -258,6 +259,7 @@ def test_gradients_past_frames_without_weight_are_finite(weight, left, ragged):
     assert (gradient[~np.isin(RAGGED_FRAMES, left)] == 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weighted", [False, True])
 def test_energies_of_float32_lines_are_float32(weighted, ragged):
     points = [line.astype(np.float32) for line in ragged.to_ragged()]

@@ -36,6 +36,7 @@ def refined(rounded):
 # What errors do to the parameters
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zoom", [None, pytest.param(zj.SmoothZoom(), marks=pytest.mark.slow)])
 def test_response_is_that_of_fits_at_other_focal_lengths(sweep, zoom):
     model = zj.fit_zoom(sweep, zoom=zoom).lens.zoom
@@ -50,6 +51,7 @@ def test_response_is_that_of_fits_at_other_focal_lengths(sweep, zoom):
         np.testing.assert_allclose(response[:, frame], expected, atol=1e-4 * np.max(np.abs(expected)))
 
 
+@pytest.mark.slow
 def test_covariance_grows_by_the_response(sweep):
     fit = zj.fit_zoom(sweep)
     sigma = np.linspace(0.0, 0.9, 10)

@@ -71,6 +71,7 @@ def test_weights_and_centres_are_kept(noisy):
     )
 
 
+@pytest.mark.slow
 def test_all_fits_take_them(noisy, small, fit):
     lines = zj.fit.in_image(small)
     zoom = zj.fit_zoom(lines)

@@ -60,6 +60,7 @@ def found(spoiled):
     return zj.fit.reject_points(spoiled[0])
 
 
+@pytest.mark.slow
 def test_the_lens_is_that_without_blunders(good, spoiled, found):
     focal = np.asarray(good.focal)
     plain = zj.fit_zoom(zj.compress(good)).lens

@@ -45,6 +45,7 @@ def displacement_rms(one, other, focal):
     return np.sqrt(np.mean(squares))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outward", [False, True])
 @pytest.mark.parametrize("sagitta", [(5, 50), (20, 200)])
 def test_arcs_instead_of_three_lines_in_ten_do_no_harm(board, sagitta, outward):

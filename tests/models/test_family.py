@@ -71,6 +71,7 @@ def test_where_there_is_no_inverse_is_nan(family, k, tight):
     assert np.isnan(d.distort(jnp.array([jnp.nan, 3.0]))).all()
 
 
+@pytest.mark.slow
 @every
 def test_derivatives(family, k, tight):
     del tight

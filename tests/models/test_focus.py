@@ -92,6 +92,7 @@ def test_pieces_bound_the_coefficients(model):
     assert (np.ptp(k, axis=0) > 0.8 * (high - low)).all()
 
 
+@pytest.mark.slow
 def test_a_lens_that_breathes_is_recovered(seen):
     small = zj.compress(seen)
     fit = zj.fit_zoom(small, zoom=zj.models.FocusSplineZoom(5, 3))
@@ -121,6 +122,7 @@ def test_models_of_the_focal_length_alone_ignore_the_focus(seen):
     np.testing.assert_array_equal(with_it.lens.zoom.parameters, plain.lens.zoom.parameters)
 
 
+@pytest.mark.slow
 def test_robust_fits_and_frames_and_centres_keep_the_focus(seen):
     small = zj.compress(seen)
     noisy = zj.compress(scenes.with_noise(seen, jax.random.key(0), std=0.1))

@@ -56,6 +56,7 @@ def through(lens, lines, bend):
     return moved(lines, points)
 
 
+@pytest.mark.slow
 def test_a_flat_board_is_good(lines):
     found = assessed(lines)
     assert (found.verdict, found.findings) == ("good", ())
@@ -157,6 +158,7 @@ def test_the_worst_finding_comes_first(lines):
     assert joined.sentence == "Not determined: not determined."
 
 
+@pytest.mark.slow
 def test_the_real_zoom_camera_is_good(data):
     """Its board is paper that is not flat: a remark, as the lines hardly exceed their own scatter."""
     from benchmarks.real.zoomcam import read_zoomcam

@@ -16,6 +16,7 @@ POINTS = np.array([[0.0, 0.0], [4287.0, 2847.0], [3000.0, 400.0]])
 # Against repeated noise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("draws", "slack"), [(150, (9, 5)), pytest.param(1000, (3, 3), marks=pytest.mark.exhaustive)]
 )
@@ -147,6 +148,7 @@ def test_points_that_are_none_raise(fit, unchecked):
 # Rounding
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_bands_are_never_narrower_than_rounding_allows(dtype, truth):
     """Focal lengths that are nearly the same: parameters with huge variances, of which a small one is left.

@@ -67,6 +67,7 @@ def whole_information(lens, lines, std):
     return design
 
 
+@pytest.mark.exhaustive
 def test_bound_is_that_of_the_whole_information(lens, scene, rng):
     std = rng.uniform(0.2, 1, len(scene.frame))
     design = whole_information(lens, scene, std)
@@ -125,6 +126,7 @@ def test_lines_through_the_centre_bound_nothing(lens):
     assert np.isinf(zj.trust.displacement_bound(lens, lines, std=1.0))
 
 
+@pytest.mark.slow
 def test_fits_come_near_the_bound(lens, scene):
     """By their own sandwich: no weights beat the bound, and eq. 13's cost less than a tenth."""
     small = zj.compress(scene)

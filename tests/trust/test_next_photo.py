@@ -50,6 +50,7 @@ def central(lens):
     return zj.Lines.from_ragged(lines, frame, focal, image_size=SIZE)
 
 
+@pytest.mark.slow
 def test_photos_at_the_wide_end_want_one_at_the_long_end(wide):
     suggestion = zj.suggest_next(*fitted(wide), focal_range=RANGE)
     assert suggestion.focal == pytest.approx(RANGE[1])
@@ -57,6 +58,7 @@ def test_photos_at_the_wide_end_want_one_at_the_long_end(wide):
     assert "f = 127.4 mm" in suggestion.sentence
 
 
+@pytest.mark.slow
 def test_lines_in_the_middle_want_some_at_the_border(central):
     """Upright lines along the left or right edge, or through the corners, which is nearly as good."""
     suggestion = zj.suggest_next(*fitted(central))
@@ -75,6 +77,7 @@ def mean_std(fit, focals):
     return float(jnp.exp(jnp.mean(jnp.log(zj.displacement_std(fit, points, focal=focals)))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["wide", "central"])
 def test_adding_what_is_suggested_helps_more_than_adding_others(scene, lens, request):
     """Photos really added and refitted: the bands are the predicted ones, and so is their order."""
@@ -135,6 +138,7 @@ def test_a_range_that_is_none_raises(bad, central):
         zj.suggest_next(*fitted(central), focal_range=bad)
 
 
+@pytest.mark.slow
 def test_a_single_focal_length_is_a_range_too(central):
     one = zj.compress(central).take(jnp.arange(8), jnp.ones(8, bool))
     fit = zj.fit_zoom(one, zoom=zj.PolynomialZoom(degree=0))

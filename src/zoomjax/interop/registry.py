@@ -289,8 +289,8 @@ def _focal_lengths(
         if low == high:
             return (low,), None
         raise ValueError(
-            "Argument focal must be given, one focal length or several, or a track with one for each frame: "
-            f"the format {fmt.name} does not interpolate between them."
+            "Argument focal must be given, one focal length or several, or a track with one for each "
+            f"frame: the format {fmt.name} does not interpolate between them."
         )
     values = np.atleast_1d(np.asarray(focal, float))
     if values.ndim != 1 or not (np.isfinite(values) & (values > 0)).all() or not values.size:
