@@ -65,6 +65,7 @@ def is_a_sentence(done, status=2):
     return told[-1]
 
 
+@pytest.mark.slow
 def test_what_was_edited_is_replaced_only_when_that_is_asked_for(folder):
     (folder / "out" / "lens.json").write_text("edited")
     before = contents(folder)

@@ -313,6 +313,7 @@ def sound_lens(lens):
         assert lens.zoom(f).shape == (columns,)
 
 
+@pytest.mark.slow
 @MANY
 @given(steps=mutations(), which=st.integers(0, 6))
 def test_bytes_of_a_lens(steps, which, lenses, folder):

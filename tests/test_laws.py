@@ -79,6 +79,7 @@ def same(first, second, focal):
             np.testing.assert_allclose(corner(first.lens, f), corner(second.lens, f), atol=1e-3)
 
 
+@pytest.mark.slow
 @few
 @hypothesis.given(scenes(), st.randoms(use_true_random=False))
 def test_the_order_of_lines_and_frames_does_not_matter(scene, random):
@@ -107,6 +108,7 @@ def test_padding_does_not_matter(scene):
     same(fitted(lines), fitted(wider), focal)
 
 
+@pytest.mark.slow
 @few
 @hypothesis.given(scenes())
 def test_the_size_of_a_pixel_does_not_matter(scene):

@@ -195,6 +195,7 @@ def test_certificate(name):
 # What is fitted
 
 
+@pytest.mark.slow
 @every
 def test_fit_and_covariance(name):
     """The lens that bent the lines comes back, within 4 of its standard deviations; 0.02 px are noise."""

@@ -146,6 +146,7 @@ def test_unknown_name_raises():
         zj.nonsense  # noqa: B018
 
 
+@pytest.mark.slow
 def test_the_design_in_ten_lines(noisy, tmp_path):
     """The lines that the design promises, as a user would write them."""
     lines = zj.Lines.from_ragged(

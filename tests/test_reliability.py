@@ -7,6 +7,7 @@ from benchmarks import reliability_core
 COUNTS = {"compression": 96, "certificates": 300, "fits": len(reliability_core.SCENES)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "search",
     [name if name == "compression" else pytest.param(name, marks=pytest.mark.slow) for name in COUNTS],

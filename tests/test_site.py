@@ -48,6 +48,7 @@ def pages(folder):
     return {path.resolve(): Page(path) for path in paths}
 
 
+@pytest.mark.slow
 def test_nothing_is_loaded_from_elsewhere(pages, folder):
     for path, page in pages.items():
         for address in page.loaded:
@@ -74,6 +75,7 @@ def test_every_room_has_a_page():
     assert set(site.ROOMS) == set(DOORS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room", site.ROOMS)
 def test_every_public_name_has_its_entry(pages, folder, room):
     places = pages[(folder / "api" / f"{room}.html").resolve()].places

@@ -43,6 +43,7 @@ def test_one_number_is_that_of_all():
     assert choose_focals([of("a.jpg", 24.0), of("b.jpg")], "35").focal == {"a.jpg": 35.0, "b.jpg": 35.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("way", "message"),
     [
@@ -130,6 +131,7 @@ def upright(*positions):
     return Detection("a.png", "a.png", SIZE, lines)
 
 
+@pytest.mark.slow
 def test_lines_that_are_no_boards_tell_nothing():
     board = Board((20.0, 20.0), 1000.0, 0.01)
     with pytest.raises(ValueError, match="no evenly spaced lines of a board"):
@@ -138,6 +140,7 @@ def test_lines_that_are_no_boards_tell_nothing():
         choose_focals([upright(30, 30, 30)], board=board)
 
 
+@pytest.mark.slow
 def test_missing_lines_and_lines_in_pieces_do_not_matter():
     board = Board((20.0, 20.0), 1000.0, 0.01)
     [even] = choose_focals([upright(100, 200, 300, 400, 500, 600, 700)], board=board).focal.values()

@@ -251,6 +251,7 @@ def test_results_in_the_photographs_own_folder_touch_none_of_them(hostile, tmp_p
         hostile.write(tmp_path)
 
 
+@pytest.mark.slow
 def test_hostile_names_give_no_orders(hostile, tmp_path, capsys):
     show_images(hostile, tmp_path / "[red]out\x1b[0m")
     shown = "".join(capsys.readouterr())

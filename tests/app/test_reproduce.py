@@ -22,6 +22,7 @@ def rows(experiment):
     return {(row.name, row.unit): row for row in experiment.rows}
 
 
+@pytest.mark.slow
 def test_the_baselines_are_those_of_the_paper(done):
     _, (board, football), _ = done
     for experiment, name, tolerance in (

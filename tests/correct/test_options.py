@@ -139,6 +139,7 @@ def test_what_is_kept_is_the_same_part_in_every_size(made, tmp_path, kind):
             assert np.median(abs(alike - cv2.resize(found[0], (48, 32), interpolation=cv2.INTER_AREA))) <= 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keep", ["same", "all", "valid"])
 def test_focal_lengths_of_a_table_share_one_framing(made, tmp_path, keep):
     for kind, table, focal in (

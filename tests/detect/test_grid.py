@@ -122,6 +122,7 @@ def test_every_row_and_column_is_a_line_in_order(pattern):
         np.testing.assert_allclose(line, expected, atol=0.2)
 
 
+@pytest.mark.slow
 def test_the_lines_of_several_images_give_back_their_lens():
     """The whole way: images, lines, fit."""
     k = LENSES["barrel"]
@@ -281,6 +282,7 @@ def test_the_boards_of_a_real_zoom_camera_are_found(data):
     assert np.median(np.sqrt(squared)) < 0.2
 
 
+@pytest.mark.slow
 def test_a_real_grid_of_dots_is_found(data):
     image = cv2.imread(str(data / "line_patterns" / "dot_pattern_05.jpg"))
     grid = zj.detect.GridDetector().find(image)

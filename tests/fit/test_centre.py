@@ -84,6 +84,7 @@ def test_deviations_are_those_of_many_draws(aside, lines):
     assert (abs(ratio - 1) < 0.35).all()  # three standard deviations of a ratio of 40 draws
 
 
+@pytest.mark.slow
 def test_a_centre_that_moves_is_followed(truth):
     shift = zj.PolynomialZoom(1, jnp.array([[0.0, 0.002], [0.01, -0.006]]), jnp.asarray(FOCAL.min()))
     moving = zj.ZoomLens(truth.zoom, truth.centre, truth.focal_range, truth.image_size, shift=shift)
@@ -128,6 +129,7 @@ def test_where_the_lines_do_not_tell_it_stays():
     assert (found.std > 0.02 * lines.scale).any()
 
 
+@pytest.mark.slow
 def test_other_zoom_models_have_centres_too(lines):
     found = zj.fit.fit_centre(lines, zoom=zj.models.PowerZoom(), terms=1)
     assert found.determined

@@ -43,6 +43,7 @@ def best(lines):
     return zj.fit_zoom(lines)
 
 
+@pytest.mark.slow
 def test_without_the_demand_the_fit_folds_and_says_where(free):
     assert free.result == RESULTS.folded
     assert not free.certificate.certified
@@ -63,6 +64,7 @@ def test_the_fit_is_invertible_and_says_what_that_cost(free, best):
     np.testing.assert_allclose(best.lens(20.0).distort(corner), [0, 0], atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("terms", [1, 2])
 def test_there_is_no_better_one(terms, folding):
     """By SciPy, from no distortion, under the same inequalities."""

@@ -74,6 +74,7 @@ def test_undetermined_stays_infinite(sweep):
 # Focal lengths that are refined
 
 
+@pytest.mark.slow
 def test_refined_focal_lengths_are_nearer_to_the_truth(truth, sweep, rounded, refined):
     given, found = (np.asarray(f - sweep.focal) for f in (rounded.focal, refined.focal))
     assert np.sqrt(np.mean(found**2)) < 0.8 * np.sqrt(np.mean(given**2))
@@ -91,6 +92,7 @@ def test_refined_focal_lengths_are_nearer_to_the_truth(truth, sweep, rounded, re
     assert refined.fit.rms < plain.rms
 
 
+@pytest.mark.slow
 def test_the_joint_minimum_is_one(rounded, refined):
     """No single focal length, moved either way, lowers the joint energy, with the model fitted again."""
     from zoomjax.fit.focal_lengths import _prior_weights

@@ -116,6 +116,7 @@ def test_points_without_noise_all_stay(clean):
     assert not zj.fit.reject_points(clean).rejected.any()
 
 
+@pytest.mark.slow
 def test_lines_of_few_points_keep_them():
     rng = np.random.default_rng(3)
     t = np.linspace(10.0, 470.0, 4)

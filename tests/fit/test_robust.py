@@ -64,6 +64,7 @@ def test_arcs_instead_of_three_lines_in_ten_do_no_harm(board, sagitta, outward):
     assert rms.min() > 2 * robust.scale
 
 
+@pytest.mark.slow
 def test_without_arcs_nothing_is_rejected_and_next_to_nothing_lost(truth, board):
     """The error over draws of noise is that of the plain fit, within 5 % of its variance."""
     focal = np.asarray(board.focal)
@@ -82,6 +83,7 @@ def test_without_arcs_nothing_is_rejected_and_next_to_nothing_lost(truth, board)
     assert ours < 1.05 * plain
 
 
+@pytest.mark.slow
 def test_compressed_and_all_points_agree(board):
     spoiled, _ = with_arcs(board, 0.2, sagitta=(5, 50), outward=False)
     ours, full = zj.fit_robust(zj.compress(spoiled)), zj.fit_robust(spoiled)
@@ -90,6 +92,7 @@ def test_compressed_and_all_points_agree(board):
     np.testing.assert_allclose(ours.line_rms, full.line_rms, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_float32_stays_float32(board):
     spoiled, arcs = with_arcs(board, 0.2, sagitta=(5, 50), outward=False)
     single = zj.compress(
@@ -115,6 +118,7 @@ def test_own_weights_are_kept_as_factors(board):
     assert np.median(np.asarray(robust.weight)[own == 0.5]) == pytest.approx(0.5, rel=0.1)
 
 
+@pytest.mark.slow
 def test_solver_and_steps_are_those_of_the_last_fit(small):
     robust = zj.fit_robust(small)
     gauss = zj.fit_robust(small, solver=optx.GaussNewton(rtol=1e-9, atol=1e-9))
@@ -126,6 +130,7 @@ def test_solver_and_steps_are_those_of_the_last_fit(small):
     assert zj.fit_robust(small, max_steps=1, throw=False).fit.steps <= 1
 
 
+@pytest.mark.slow
 def test_a_frame_of_which_nothing_is_left_has_no_error(board):
     """Not the best of all errors, 0, nor a share in the mean."""
     wave = 60 * np.sin(np.linspace(0, 9, board.points.shape[1]))[None, :, None]

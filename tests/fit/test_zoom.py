@@ -57,6 +57,7 @@ FOCAL = np.array([20.0, 40.0, 80.0])
 # Exact and noisy scenes
 
 
+@pytest.mark.slow
 def test_scene_without_noise_comes_back_from_all_points(clean, truth):
     fit = zj.fit_zoom(clean)
     assert largest_difference(fit.lens, truth, clean.focal) <= 1e-8
@@ -218,6 +219,7 @@ def tiny():
     return zj.Lines.from_ragged(points, frame, np.array([20.0, 60.0]), image_size=SIZE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compressed", [False, True])
 def test_fit_is_differentiable_with_respect_to_the_points(compressed, tiny):
     def fitted(points):
@@ -345,6 +347,7 @@ def test_covariance_does_not_depend_on_the_unit_of_focal_lengths(lens):
     np.testing.assert_allclose(fit.covariance, other.covariance, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("degree", "terms"), [(2, 2), (3, 3)])
 def test_covariance_in_float32_is_that_in_float64(degree, terms, noisy):
     """The higher ones have condition numbers whose square float32 cannot hold."""
@@ -373,6 +376,7 @@ def test_lines_through_the_centre_determine_nothing(noise, compressed, lens):
     assert "do not determine" in RESULTS[fit.result]
 
 
+@pytest.mark.slow
 def test_frames_whose_lines_determine_nothing_say_so(lens):
     """In the first frame all lines pass through the centre; in the others they do not."""
     through, past = (
@@ -443,6 +447,7 @@ RIVALS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "truth"), RIVALS.values(), ids=RIVALS)
 def test_a_lens_of_a_rivals_kind_comes_back(model, truth, lens):
     focal = np.array([20.0, 25.0, 30.0, 40.0, 55.0, 80.0])

@@ -321,6 +321,7 @@ def test_points_at_the_same_places_say_more_if_the_places_are_known(rng):
     assert abs(together.focal - lines.focal) < 3 * lines.std
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_differences(rng):
     """Far from an exact fit, where the squares' second derivatives are not Gauss and Newton's."""
     noisy = seen_on(FIELD) + 5 * rng.standard_normal((5, 5, 2))
@@ -420,6 +421,7 @@ def zoomcam(data):
 REAL_PLANE = np.stack(np.meshgrid(np.arange(22.0), np.arange(15.0)), axis=-1).reshape(-1, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("zoom", "within"),
     # At the longest, OpenCV's calibration of the same corners is 8 % longer than the authors' too.

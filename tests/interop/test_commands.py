@@ -40,6 +40,7 @@ def told(tmp_path_factory):
     return folder, dict(zip(lines, json.loads(done.stdout), strict=True))
 
 
+@pytest.mark.slow
 def test_formats_are_listed(told):
     status, text = told[1]["formats"]
     assert status == 0

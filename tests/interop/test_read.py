@@ -33,6 +33,7 @@ def given(name, lens):
     return size | ({"focal": FOCAL} if name in SILENT else {})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOTH)
 def test_a_lens_comes_back(name, written):
     lens, found = written

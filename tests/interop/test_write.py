@@ -72,6 +72,7 @@ def test_at_its_focal_lengths_a_file_does_as_the_lens(name, lens, tmp_path):
         assert report.worst < MARGIN
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize("kind", ["landscape", "portrait", "px", "decentred"])
 def test_between_its_focal_lengths_a_file_does_as_reported(name, kind, tmp_path):

@@ -246,6 +246,7 @@ def test_second_derivatives_for_fits_are_those_through_all_points(scene, ragged,
     np.testing.assert_allclose(mixed(True), full, rtol=0, atol=1e-9 * np.max(np.abs(full)))
 
 
+@pytest.mark.slow
 def test_lines_spread_over_devices_stay_where_they_are():
     """The same triangles, bit by bit, without an exchange of points; energies exchange a sum a frame."""
     devices = "--xla_force_host_platform_device_count=4"

@@ -57,6 +57,7 @@ def test_what_is_behind_is_masked_and_has_no_derivative(camera):
     assert (by_points[0] != 0).any()
 
 
+@pytest.mark.slow
 def test_derivatives(camera, pixels):
     rays = jnp.asarray(camera.rays(pixels[::9], FOCAL)[0])
     assert_derivatives_agree(lambda p: camera.project(p, FOCAL)[0], rays, step=1e-5)

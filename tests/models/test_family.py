@@ -41,6 +41,7 @@ def lens_of(family, k, change=0.5):
     return zj.ZoomLens(zoom, jnp.asarray(CENTRE), jnp.asarray(RANGE), SIZE, family=family)
 
 
+@pytest.mark.slow
 @every
 def test_there_and_back(family, k, tight):
     grid = jnp.asarray(image_grid(SIZE, 9))
@@ -202,6 +203,7 @@ def fitted(request):
     return lens, lines, small, terms, zj.fit_zoom(small, zoom=zj.PolynomialZoom(degree=1), terms=terms)
 
 
+@pytest.mark.slow
 def test_fit_recovers_the_lens(fitted):
     lens, _, _, terms, fit = fitted
     assert fit.lens.family == lens.family
@@ -232,6 +234,7 @@ def test_points_and_their_compression_give_one_fit(fitted):
         np.testing.assert_allclose(zj.frame_rms(same, fit.lens), fit.frame_rms, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_frames_by_themselves(fitted):
     lens, _, small, terms, _ = fitted
     fits = zj.fit_frames(small, terms=terms)
@@ -266,6 +269,7 @@ def test_lines_compressed_for_another_family_are_refused(family, terms, message,
         zj.fit_zoom(zj.compress(ragged), family=family, zoom=zj.PolynomialZoom(degree=1), terms=terms)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("family", "k", "tight"), list(FAMILIES.values())[1:], ids=list(FAMILIES)[1:])
 def test_a_fit_is_made_invertible(family, k, tight):
     """Lines of a lens that does not fold, corrected by one that would."""
@@ -280,6 +284,7 @@ def test_a_fit_is_made_invertible(family, k, tight):
     assert ours.rms >= free.rms * (1 - 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("family", "k", "tight"), FAMILIES.values(), ids=FAMILIES)
 def test_images_are_corrected_by_the_exact_inverse(family, k, tight):
     del tight
@@ -297,6 +302,7 @@ def test_images_are_corrected_by_the_exact_inverse(family, k, tight):
     assert (fit_inverse(d, 250.0) is None) == isinstance(family, zj.models.BrownConrady)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("family", "k", "tight"), FAMILIES.values(), ids=FAMILIES)
 def test_positions_are_differentiable(family, k, tight):
     del tight

@@ -109,6 +109,7 @@ def test_a_lens_that_breathes_is_recovered(seen):
     np.testing.assert_allclose(zj.frame_rms(small, fit.lens), fit.frame_rms, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_points_and_triangles_give_one_answer(seen):
     full, small = (
         zj.fit_zoom(lines, zoom=zj.models.FocusSplineZoom(2, 2)) for lines in (seen, zj.compress(seen))
@@ -144,6 +145,7 @@ def test_files_keep_the_focus(seen, tmp_path):
     assert json.loads((tmp_path / "lens.json").read_text())["focus_range"] == [0.0, 1.0]
 
 
+@pytest.mark.slow
 def test_a_missing_focus_says_what_to_do(small, seen, model, truth):
     with pytest.raises(ValueError, match="needs the focus of each frame"):
         zj.fit_zoom(small, zoom=zj.models.FocusSplineZoom())

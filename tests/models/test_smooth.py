@@ -109,6 +109,7 @@ def test_file_keeps_model_and_prior(smooth, tmp_path):
 # Fits with a prior
 
 
+@pytest.mark.slow
 def test_without_weight_the_fit_is_the_plain_one(small):
     """Degree 3 at four focal lengths: as many numbers as there are."""
     free = zj.fit_zoom(small, zoom=zj.PolynomialZoom(degree=3))
@@ -123,6 +124,7 @@ def test_with_much_weight_the_fit_is_the_prior_mean(small):
     assert np.abs(coefficients(held, small.focal)).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_the_fit_is_the_mode_of_the_posterior(small, smooth):
     def objective(flat):
         zoom = with_parameters(smooth.lens.zoom, flat.reshape(7, 2))
@@ -150,6 +152,7 @@ def repeated(lines, times):
     )
 
 
+@pytest.mark.slow
 def test_many_frames_outweigh_the_prior(small):
     """What the prior changes falls in proportion to their number."""
     free = zj.fit_zoom(small, zoom=zj.PolynomialZoom(degree=3))
@@ -161,6 +164,7 @@ def test_many_frames_outweigh_the_prior(small):
     assert pull(40) == pytest.approx(pull(10) / 4, rel=0.2)
 
 
+@pytest.mark.slow
 def test_two_focal_lengths_are_enough(clean):
     """The prior bridges the gap better than the straight line that they determine."""
     kept = np.isin(np.asarray(clean.frame), [0, 3])
@@ -218,6 +222,7 @@ def test_covariance_is_that_of_the_posterior_where_noise_is_what_the_error_says(
     assert min(between) > max(at)
 
 
+@pytest.mark.slow
 def test_gradient_of_the_fit_is_that_of_finite_differences(noisy):
     """With respect to a dilation of all points, through the implicit function theorem."""
 
@@ -231,6 +236,7 @@ def test_gradient_of_the_fit_is_that_of_finite_differences(noisy):
     np.testing.assert_allclose(jax.grad(corner)(at), difference, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradient_with_respect_to_the_prior(small):
     def corner(error):
         return jnp.sum(fitted(small, error=error).lens.zoom(jnp.asarray(30.0)))
@@ -240,6 +246,7 @@ def test_gradient_with_respect_to_the_prior(small):
     np.testing.assert_allclose(jax.grad(corner)(error), difference, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_in_float32_it_is_the_same_to_its_tolerance(small, smooth):
     single = jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, small)
     fit = zj.fit_zoom(single, zoom=zj.SmoothZoom())
@@ -253,6 +260,7 @@ def test_models_without_a_prior_have_no_prior_residuals(small, fit):
     assert prior_residuals(small, fit.lens.zoom) is None
 
 
+@pytest.mark.slow
 def test_a_fitted_model_is_where_the_next_fit_starts(small, smooth):
     again = zj.fit_zoom(small, zoom=smooth.lens.zoom)
     np.testing.assert_allclose(again.lens.zoom.parameters, smooth.lens.zoom.parameters, atol=1e-9)

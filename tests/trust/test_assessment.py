@@ -128,6 +128,7 @@ def test_few_lines_are_not_good(lines):
     assert found.evidence.lines == 12
 
 
+@pytest.mark.slow
 def test_lines_through_the_centre_determine_nothing(lens, lines):
     points = np.array(lines.points)
     centre = (np.array(SIZE) - 1) / 2

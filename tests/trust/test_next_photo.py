@@ -122,6 +122,7 @@ def test_compressed_or_not_is_the_same(central):
     )
 
 
+@pytest.mark.slow
 def test_where_nothing_is_determined_something_is_suggested_all_the_same(lens):
     t = np.linspace(-200, 200, 50)
     radial = [np.stack([319.5 + t * c, 211.5 + t * s], -1) for c, s in ((1, 0), (0, 1), (0.6, 0.8))]

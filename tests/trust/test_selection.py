@@ -74,6 +74,7 @@ def rms_of(lines, zoom):
     return np.asarray(zj.frame_rms(lines, jax.vmap(zoom)(lines.focal)))
 
 
+@pytest.mark.slow
 @every_model
 def test_a_frame_left_out_is_corrected_by_the_fit_of_the_others(zoom, terms, lines):
     """Fits of one shape, so that each model is compiled once."""
@@ -319,6 +320,7 @@ def test_frames_that_cannot_be_left_out_are_nan(lines):
     assert np.isfinite(held_out_zoom(few, zoom=zj.PolynomialZoom(degree=1))).all()
 
 
+@pytest.mark.slow
 def test_families_are_compared(scene):
     """A lens that the division model describes, and the polynomial not so well, with one term each."""
     zoom = zj.PolynomialZoom(1, jnp.array([[0.0], [-0.25]]), jnp.asarray(20.0))
