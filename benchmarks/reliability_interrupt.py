@@ -1,12 +1,12 @@
 """Commands interrupted at random moments: what is left of their results, and of the user's files.
 
 Each command is run to its end, to know how long it takes and what it writes. Then, again and again in a
-copy of the folder, it gets SIGINT, SIGTERM or SIGKILL at a moment drawn evenly over that time. Counted are
-runs after which
+copy of the folder, it gets SIGINT, SIGTERM or SIGKILL at a moment drawn evenly over that time. Several are
+tried at once, one a processor. Counted are runs after which
 
 - lost: a file of the user's is not as it was;
-- wrong: a file under its final name is not whole; results are part old, part new; or, but for SIGKILL,
-  something temporary is left;
+- wrong: a file under its final name is not whole (of commands that write the same bytes each time: not
+  those bytes); results are part old, part new; or, but for SIGKILL, something temporary is left;
 - crashed: the exit status is none that belongs to the signal, or there is a traceback once the command
   has begun;
 - hung: it, or a process that it began, is still there a minute later.
@@ -15,6 +15,7 @@ runs after which
 """
 
 import argparse
+import concurrent.futures
 import contextlib
 import dataclasses
 import json
@@ -25,12 +26,18 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import av
+import cv2
 import numpy as np
 import psutil
 
+import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.app.demo import write_photos
 from zoomjax.app.results_folder import LIST
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
@@ -53,15 +60,23 @@ class Command:
         name: what it is called in the results.
         arguments: of the command line.
         folder: with the user's files, then with the results of a run to its end beside them.
-        seconds: that this took.
+        together: whether all its results appear at once, so that there are all or none.
+        again: whether it replaces its own results unasked, and so is tried over them, too.
+        same: whether it writes the same bytes each time.
+        seconds: that the run to its end took.
         users: the user's files and what they hold.
+        results: what the run to its end wrote.
     """
 
     name: str
     arguments: list[str]
     folder: Path
+    together: bool = True
+    again: bool = True
+    same: bool = True
     seconds: float = 0.0
     users: dict[str, bytes] = dataclasses.field(default_factory=dict)
+    results: dict[str, bytes] = dataclasses.field(default_factory=dict)
 
     def prepare(self, environment: dict[str, str]) -> None:
         """Run it to its end, twice: the second time nothing is compiled."""
@@ -70,65 +85,129 @@ class Command:
             (self.folder / name).write_text("the user's own")
         self.users = _contents(self.folder)
         for _ in range(2):
-            if self.name == "undistort":
-                shutil.rmtree(self.folder / "out" / "corrected", ignore_errors=True)
+            for name in set(_contents(self.folder)) - set(self.users):
+                (self.folder / name).unlink()
             start = time.monotonic()
             done = subprocess.run(
                 [*_MAIN, *self.arguments], cwd=self.folder, env=environment, capture_output=True, text=True
             )
             self.seconds = time.monotonic() - start
             assert done.returncode == 0, done.stderr
+        now = _contents(self.folder)
+        self.results = {name: content for name, content in now.items() if name not in self.users}
+        assert self.results
 
 
-def commands(folder: Path, names: tuple[str, ...]) -> list[Command]:
-    """The commands of these names, each with its files."""
-    made = []
-    for name in names:
-        (own := folder / name).mkdir()
-        lens = scenes.nikkor_18_200()
-        if name == "lines":
-            lines = scenes.board_lines(lens, scenes.focal_sweep(5), spacing=60, noise=0.3)
-            lines.save(own / "lines.npz")
-            arguments = ["calibrate", "lines.npz", "-o", "out"]
-        else:
-            from zoomjax.app.demo import write_photos
-
-            write_photos(own / "photos", number=3, image_size=(536, 356))
-            arguments = ["calibrate", "photos", "-o", "out", "--degree", "1", "--jobs", "2", "--no-cache"]
-            if name == "undistort":
-                lens.save(own / "lens.json")
-                photos = sorted(f"photos/{path.name}" for path in (own / "photos").iterdir())
-                arguments = ["undistort", "lens.json", *photos, "-o", "out/corrected"]
-        made.append(Command(name, arguments, own))
-    return made
+def _lines(folder: Path) -> Command:
+    lines = scenes.board_lines(scenes.nikkor_18_200(), scenes.focal_sweep(5), spacing=60, noise=0.3)
+    lines.save(folder / "lines.npz")
+    return Command("calibrate, lines", ["calibrate", "lines.npz", "-o", "out"], folder, same=False)
 
 
-def run(count: int, seed: int, names: tuple[str, ...] = ("lines", "lines", "undistort", "photos")) -> dict:
-    """So many interrupted runs of the commands, in turn.
+def _photos(folder: Path) -> Command:
+    write_photos(folder / "photos", number=3, image_size=(536, 356))
+    arguments = ["calibrate", "photos", "-o", "out", "--degree", "1", "--jobs", "2", "--no-cache"]
+    return Command("calibrate, photos", arguments, folder, same=False)
+
+
+def _undistort(folder: Path) -> Command:
+    write_photos(folder / "photos", number=3, image_size=(536, 356))
+    scenes.nikkor_18_200().save(folder / "lens.json")
+    arguments = ["undistort", "lens.json", "photos", "-o", "out/corrected"]
+    return Command("undistort, photos", arguments, folder, together=False, again=False)
+
+
+def _video(folder: Path) -> Command:
+    scenes.nikkor_18_200((320, 214)).save(folder / "lens.json")
+    rng = np.random.default_rng(0)
+    image = cv2.GaussianBlur(rng.uniform(0, 255, (214, 320, 3)).astype(np.float32), (0, 0), 2)
+    with av.open(str(folder / "clip.mp4"), "w") as out:
+        video: Any = out.add_stream("libx264", rate=30)
+        video.width, video.height, video.pix_fmt = 320, 214, "yuv420p"
+        for number in range(60):
+            frame = av.VideoFrame.from_ndarray(np.roll(image, number, 1).astype(np.uint8), "bgr24")
+            out.mux(video.encode(frame.reformat(format="yuv420p")))
+        out.mux(video.encode(None))
+    arguments = ["undistort", "lens.json", "clip.mp4", "-o", "out/corrected.mp4", "--focal", "24"]
+    return Command("undistort, video", arguments, folder, again=False, same=False)
+
+
+def _export(folder: Path) -> Command:
+    scenes.nikkor_18_200().save(folder / "lens.json")
+    arguments = ["export", "lens.json", "--to", "opencv", "-o", "out/opencv", "--focal", "24,35,50,85"]
+    return Command("export", [*arguments, "--pixel-pitch", "0.0055"], folder, again=False)
+
+
+def _stmap(folder: Path) -> Command:
+    scenes.nikkor_18_200((160, 107)).save(folder / "lens.json")
+    arguments = ["export", "lens.json", "--to", "stmap", "-o", "out/maps", "--focal", "24,35,50,85"]
+    return Command("export, STMaps", arguments, folder, again=False)
+
+
+def _import(folder: Path) -> Command:
+    zj.interop.write(
+        scenes.nikkor_18_200(), folder / "lens.xml", format="lensfun", pixel_pitch=0.0055, tolerance=1.0
+    )
+    arguments = ["import", "lens.xml", "-o", "out", "--image-size", "1072x712"]
+    return Command("import", arguments, folder, same=False)
+
+
+COMMANDS = {
+    "lines": _lines,
+    "photos": _photos,
+    "undistort": _undistort,
+    "video": _video,
+    "export": _export,
+    "stmap": _stmap,
+    "import": _import,
+}
+"""What makes each command, with its files, in an empty folder."""
+
+
+def run(count: int, seed: int, names: tuple[str, ...] = tuple(COMMANDS)) -> dict[str, dict]:
+    """So many interrupted runs of each command.
 
     Returns:
-        How many were tried, wrong, lost, crashed, hung; and what was seen of those that were.
+        For each command: how many were tried, wrong, lost, crashed, hung; and what was seen of those.
     """
+    return {command.name: found for command, found in _each(count, seed, names)}
+
+
+def _each(count: int, seed: int, names: tuple[str, ...]) -> Iterator[tuple[Command, dict]]:
+    with tempfile.TemporaryDirectory(prefix="zoomjax-interrupt-") as name:
+        folder = Path(name)
+        environment = os.environ | {"ZOOMJAX_CACHE": str(folder / "cache")}
+        for name in names:
+            (own := folder / name).mkdir()
+            command = COMMANDS[name](own)
+            command.prepare(environment)
+            yield command, _interrupted(command, count, seed, folder, environment)
+
+
+def _interrupted(
+    command: Command, count: int, seed: int, folder: Path, environment: dict[str, str]
+) -> dict[str, Any]:
+    """So many runs of one command."""
     rng = np.random.default_rng(seed)
     found: dict = {"tried": 0, "wrong": 0, "lost": 0, "crashed": 0, "hung": 0, "finished": 0, "seen": []}
-    with tempfile.TemporaryDirectory(prefix="zoomjax-interrupt-") as folder:
-        environment = os.environ | {"ZOOMJAX_CACHE": str(Path(folder) / "cache")}
-        made = {command.name: command for command in commands(Path(folder), tuple(dict.fromkeys(names)))}
-        for command in made.values():
-            command.prepare(environment)
+
+    def trial(number: int, kind: signal.Signals, again: bool, moment: float) -> list[tuple[str, str]]:
+        told = _trial(command, folder / f"trial{number}", environment, kind, moment, again)
+        return [(what, f"{kind.name} after {moment:.2f} s: {what}: {text}") for what, text in told]
+
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        trials = []
         for number in range(count):
-            command = made[names[number % len(names)]]
             kind = SIGNALS[int(rng.integers(len(SIGNALS)))]
-            again = bool(rng.integers(2)) and command.name != "undistort"  # over earlier results
+            again = bool(rng.integers(2)) and command.again  # over earlier results
             moment = float(rng.uniform(0, command.seconds))
-            outcome = _trial(command, Path(folder) / "trial", environment, kind, moment, again)
+            trials.append(pool.submit(trial, number, kind, again, moment))
+        for result in trials:
             found["tried"] += 1
-            for what, told in outcome:
+            for what, told in result.result():
                 found[what] += 1
                 if what != "finished":
-                    found["seen"].append(
-                        f"{command.name}, {kind.name} after {moment:.2f} s: {what}: {told}"
-                    )
+                    found["seen"].append(told)
     return found
 
 
@@ -143,7 +222,7 @@ def _trial(
     """One run; what was wrong with it, each kind once."""
     shutil.copytree(command.folder, folder)
     if not again:
-        for name in set(_contents(folder)) - set(command.users):
+        for name in command.results:
             (folder / name).unlink()
     process = subprocess.Popen(
         [*_MAIN, *command.arguments],
@@ -189,23 +268,32 @@ def _wrong(command: Command, folder: Path, new: dict[str, bytes], *, killed: boo
     """What is wrong with the results; empty if nothing is."""
     results = {name for name in new if name not in command.users and "/.zoomjax-" not in f"/{name}"}
     for name in results - {f"out/{LIST}"}:
-        if not new[name].endswith(_ENDS.get(Path(name).suffix, b"")):
+        if not _whole(command, name, folder / name, new[name]):
             return f"{name} is half"
-        if name.endswith(".npz"):
-            np.load(folder / name, allow_pickle=False)["points"]
     temporary = [name for name in new if "/.zoomjax-" in f"/{name}"]
     if temporary and not killed:
         return f"{temporary[0]} is left"
-    if command.name == "undistort":
-        return ""  # each photo is a result of its own
-    expected = {name for name in _contents(command.folder) if name not in command.users}
-    if results and results != expected and not killed:
-        return f"there are {len(results)} of {len(expected)} files"
-    if results and not killed:
+    if not command.together or killed:
+        return ""
+    if results and results != set(command.results):
+        return f"there are {len(results)} of {len(command.results)} files"
+    if f"out/{LIST}" in results:
         listed = json.loads(new[f"out/{LIST}"])["files"]
         if any(len(prints) > 1 for prints in listed.values()):
             return "old and new results are mixed"
     return ""
+
+
+def _whole(command: Command, name: str, path: Path, content: bytes) -> bool:
+    """Whether a result is all there."""
+    if command.same:
+        return content == command.results.get(name)
+    if path.suffix == ".npz":
+        np.load(path, allow_pickle=False)["points"]
+    if path.suffix == ".mp4":
+        with av.open(str(path)) as video:
+            return sum(1 for _ in video.decode(video=0)) == 60
+    return content.endswith(_ENDS.get(path.suffix, b""))
 
 
 def _children(pid: int) -> list[psutil.Process]:
@@ -226,5 +314,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("count", type=int, nargs="?", default=200)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--command", nargs="+", choices=COMMANDS, default=list(COMMANDS))
     given = parser.parse_args()
-    print(json.dumps(run(given.count, given.seed), indent=2))
+    for command, found in _each(given.count, given.seed, tuple(given.command)):
+        print(f"{command.name}, {command.seconds:.1f} s:", json.dumps(found, indent=2), flush=True)

@@ -210,10 +210,10 @@ def test_two_processes_in_one_folder_leave_the_results_of_one(folder):
 def test_signals_at_random_moments_lose_nothing():
     from benchmarks.reliability_interrupt import run
 
-    found = run(6, seed=3, names=("lines", "lines", "undistort"))
-    assert found.pop("tried") == 6
-    assert not found["seen"]
-    assert not any(found[what] for what in ("wrong", "lost", "crashed", "hung"))
+    for row in run(4, seed=3, names=("lines", "undistort", "export")).values():
+        assert row["tried"] == 4
+        assert not row["seen"]
+        assert not any(row[what] for what in ("wrong", "lost", "crashed", "hung"))
 
 
 @posix
