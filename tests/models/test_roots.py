@@ -138,6 +138,23 @@ def test_nothing_is_corrected_to_the_other_side_of_a_pole(dtype):
     assert 0 < known.sum() < len(pole)
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
+def test_a_divisor_that_is_nothing_but_rounding_gives_no_number(dtype, array):
+    """It may be another one for each coordinate: some points at a pole were corrected to the side."""
+    d = unit([-0.05616449, -2.22666717], dtype, zj.models.Division())
+    eps = np.finfo(dtype).eps
+    radius = d.monotone_radius * (1 - np.concatenate([np.arange(8), 2.0 ** np.arange(3, 20)]) * eps)
+    angle = np.linspace(-2, 2, len(radius))
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1).astype(dtype)
+    corrected = np.asarray(d.undistort(array(points)))
+    known = np.isfinite(corrected).all(axis=1)
+    assert known[-8:].all()
+    assert not known[:4].any()
+    assert np.hypot(*corrected[known].T).max() <= radius.max() / (64 * eps)
+    assert np.arctan2(*corrected[known].T) == pytest.approx(np.arctan2(*points[known].T), abs=0.1)
+
+
 def test_nan_ends_the_search():
     d = unit([np.nan, 0.1])
     assert np.isnan(d.distort(on_axis(np.array([0.5, 1.0])))).all()

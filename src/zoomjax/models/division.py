@@ -6,8 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.arrays import namespace
 from .._core.types import AnyArray, Elements
 from .family import AbstractRadial, radial_factor, radial_orders, radial_slope, times
+
+_ROUNDING = 64
+"""Last digits of 1. A divisor of so many has an error of some per cent, and compilers may compute it once
+for each coordinate, with different errors: the corrected point would not even lie in its direction."""
 
 
 class Division(AbstractRadial):
@@ -35,8 +40,10 @@ class Division(AbstractRadial):
     )
 
     def factor(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
-        """L."""
-        return 1 / radial_factor(squared, k)
+        """L; NaN next to a pole, where the divisor is nothing but rounding."""
+        xp, divisor = namespace(squared, k), radial_factor(squared, k)
+        known = abs(divisor) > _ROUNDING * np.finfo(divisor.dtype).eps
+        return xp.where(known, 1 / xp.where(known, divisor, 1), np.nan)
 
     def slope(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
         """``(1 - k1 t - 3 k2 t^2 - ...) / (1 + k1 t + ...)^2``."""
