@@ -25,7 +25,7 @@ def run(count: int = 1000, seed: int = 0, readers: list[str] | None = None) -> d
     """For each reader: tried, wrong, lost, crashed, hung; read and refused; the first examples; seconds."""
     with Outcomes(os.cpu_count() or 1) as outcomes:
         return {
-            name: _one(outcomes, name, count, seed)
+            name: _one(outcomes, name, round(READERS[name].share * count), seed)
             for name in READERS
             if readers is None or name in readers
         }

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
+from benchmarks.mutations import LCP
 from zoomjax.models import BrownConrady, Division, RadialPolynomial, TableZoom
 
 from ._lenses import LENSES, PITCH
@@ -138,19 +139,6 @@ def test_lensfun_and_the_lens_agree_up_to_scale(name, focal, crop, tmp_path):
     scale = np.sum(ours * theirs) / np.sum(theirs * theirs)
     assert np.hypot(*(ours - scale * theirs).T).max() <= back.report.worst + 0.02
     assert back.report.worst < 0.5
-
-
-LCP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
-<rdf:Description xmlns:stCamera="http://ns.adobe.com/photoshop/1.0/camera-profile"
- xmlns:photoshop="http://ns.adobe.com/photoshop/1.0/"><photoshop:CameraProfiles><rdf:Seq>
-<rdf:li><rdf:Description stCamera:FocalLength="18" stCamera:FocusDistance="1" stCamera:ImageWidth="600"
- stCamera:ImageLength="400"><stCamera:PerspectiveModel><rdf:Description stCamera:FocalLengthX="0.5"
- stCamera:RadialDistortParam1="9"/></stCamera:PerspectiveModel></rdf:Description></rdf:li>
-<rdf:li><rdf:Description stCamera:FocalLength="18" stCamera:FocusDistance="10" stCamera:ImageWidth="600"
- stCamera:ImageLength="400"><stCamera:PerspectiveModel><rdf:Description stCamera:FocalLengthX="0.8"
- stCamera:ImageXCenter="0.51" stCamera:ImageYCenter="0.49" stCamera:RadialDistortParam1="-0.1"
- stCamera:RadialDistortParam2="0.02"/></stCamera:PerspectiveModel></rdf:Description></rdf:li>
-</rdf:Seq></photoshop:CameraProfiles></rdf:Description></rdf:RDF></x:xmpmeta>"""
 
 
 def test_an_adobe_profile_is_opencvs_formula_at_the_farthest_focus(tmp_path):
