@@ -385,10 +385,8 @@ def _foreign(name: str, suffix: str) -> Reader:
     def corpus(folder: Path) -> list[bytes]:
         if name == "lcp":
             return [LCP.encode()]
-        zj.interop.write(
-            scenes.nikkor_18_200(size), folder / "sound", format=name, focal=focal, pixel_pitch=0.05
-        )
-        made = folder / "sound"
+        made = folder / f"sound-{name}"
+        zj.interop.write(scenes.nikkor_18_200(size), made, format=name, focal=focal, pixel_pitch=0.05)
         return [path.read_bytes() for path in (sorted(made.iterdir()) if made.is_dir() else [made])]
 
     def read(path: Path) -> zj.ZoomLens:
