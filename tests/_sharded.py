@@ -9,6 +9,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import zoomjax as zj
+from zoomjax import scenes
 from zoomjax.lines.compressed import _columns, _reduce_shards, _sharding_of_lines
 from zoomjax.lines.free_centre import _monomials
 
@@ -43,6 +44,7 @@ def main() -> None:
     assert len(jax.devices()) == 4
     lines = scene()
     over = NamedSharding(Mesh(np.array(jax.devices()), ("line",)), PartitionSpec("line"))
+    over_points = NamedSharding(over.mesh, PartitionSpec("line"))
     every = tuple(jax.device_put(getattr(lines, name), over) for name in ("points", "mask", "frame"))
     layouts = {
         "points alone": eqx.tree_at(lambda data: data.points, lines, every[0]),
@@ -71,6 +73,20 @@ def main() -> None:
                 sums = exchanged(eqx.filter_jit(function).lower(measured, K).compile())
                 assert set(sums) == {"all-reduce"}, sums
                 assert sums["all-reduce"] <= FRAMES, sums
+    distortion = scenes.nikkor_18_200()(35.0)
+    points = jnp.asarray(np.random.default_rng(2).uniform(0, 400, (5000, 2)))
+
+    def total(distortion, points):
+        return jnp.sum(distortion.undistort(points) ** 2)
+
+    for number in (5000, 4000):  # not, and a multiple of devices times anything
+        gradient = eqx.filter_jit(eqx.filter_grad(total))
+        spread = jax.device_put(points[:number], over_points)
+        found = gradient(distortion, spread).coefficients
+        expected = gradient(distortion, points[:number]).coefficients
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+        sums = exchanged(gradient.lower(distortion, spread).compile())
+        assert max(sums.values()) <= 4 * len(jax.devices()), sums
     print("as on one device")
 
 

@@ -49,6 +49,11 @@ def together(x: Any, y: Any) -> Any:
     return namespace(x, y).stack([x, y], axis=-1)
 
 
+def apart(values: Any) -> tuple[Any, ...]:
+    """The elements along the first axis; derivatives by them are not padded, as by ``values[0]``."""
+    return tuple(jnp.unstack(values) if isinstance(values, jax.Array) else values)
+
+
 def once(values: Any) -> Any:
     """Arrays as they are, computed once: XLA would compute them anew wherever they are used.
 

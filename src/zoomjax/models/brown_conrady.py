@@ -5,7 +5,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.arrays import namespace
+from .._core.arrays import apart, namespace
 from .._core.types import AnyArray, Elements
 from ._roots import until
 from .family import AbstractFamily, Pair, first_root, radial_factor, radial_orders, times
@@ -48,9 +48,9 @@ class BrownConrady(AbstractFamily):
 
     def correct(self, z: Pair, squared: Float[AnyArray, "..."], k: Elements) -> Pair:
         """``z L(t) + t q + 2 (q.z) z``."""
-        qx, qy = k[-1], k[-2]
+        *radial, qy, qx = apart(k)
         x, y = z
-        factor = radial_factor(squared, k[:-2]) + 2 * (qx * x + qy * y)
+        factor = radial_factor(squared, radial) + 2 * (qx * x + qy * y)
         return x * factor + squared * qx, y * factor + squared * qy
 
     def limit(self, k: Elements) -> Float[AnyArray, "..."]:

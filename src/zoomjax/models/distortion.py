@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._core.arguments import check_kind
 from .._core.arrays import aligned, as_array, finite, namespace, once, together
+from .._core.spread import spread
 from .._core.types import AnyArray, Elements, Points, traced
 from .family import AbstractFamily, AbstractRadial, Pair
 from .polynomial import RadialPolynomial
@@ -152,8 +153,8 @@ def mapped(method: str, family: AbstractFamily, points: Any, k: Any, centre: Any
             leaves = ((points, 1), (np.asarray(k), 1), (np.asarray(centre), 1), (np.asarray(scale), 0))
             points, *distortion = (leaf[None] for leaf in aligned(*leaves))
             if method == "undistort":
-                return _undistorted(points, family, *distortion, spread=False)[0]
-            at = _normal(_apart(points), *distortion, spread=False)
+                return _undistorted(points, family, *distortion, spreading=False)[0]
+            at = _normal(_apart(points), *distortion, spreading=False)
             return together(*at.in_pixels(family.distort(at.z, at.k, family.limit(at.k))))[0]
     return compiled(method, _given, jnp.asarray(points), (family, k, centre, scale))
 
@@ -199,26 +200,26 @@ class _Normal(NamedTuple):
         return self.centre[0] + self.scale * z[0], self.centre[1] + self.scale * z[1]
 
 
-def _normal(points, k, centre, scale, *, spread=True) -> _Normal:
+def _normal(points, k, centre, scale, *, spreading=True) -> _Normal:
     """Of points (x, y) in px.
 
-    If spread, coefficients, centre and scale get the shape of the points: each has then one sum over all
-    points in a gradient, and not one for each place where it is used. Without gradients it is better left:
-    what depends on the distortion alone would be computed for each point.
+    If `spreading`, coefficients, centre and scale get the shape of the points: a gradient has then one sum
+    over all points for each, all in one pass, and not one for each place where they are used. Without
+    gradients it is better left: what depends on the distortion alone would be computed for each point.
     """
     leaves = ((points[0], 0), (points[1], 0), (k, 1), (centre, 1), (scale, 0))
     x, y, k, centre, scale = aligned(*((leaf.astype(points[0].dtype), own) for leaf, own in leaves))
     xp = namespace(k)
     own = xp.moveaxis(k, -1, 0)
     cx, cy = centre[..., 0], centre[..., 1]
-    if not spread:
+    if not spreading:
         return _Normal(((x - cx) / scale, (y - cy) / scale), own, own, (cx, cy), scale)
     # JAX's know of symbolic shapes, for `jax.export`; and NumPy's do not wait for JAX.
     broadcast_shapes = (jnp if xp is jnp else np).broadcast_shapes
     shape = broadcast_shapes(x.shape, k.shape[:-1], centre.shape[:-1], scale.shape)
-    cx, cy, scale = (xp.broadcast_to(a, shape) for a in (cx, cy, scale))
+    cx, cy, scale, *k = spread([cx, cy, scale, *own], shape)
     z = (x - cx) / scale, (y - cy) / scale
-    return _Normal(z, xp.broadcast_to(own, (len(own), *shape)), own, (cx, cy), scale)
+    return _Normal(z, xp.stack(k) if k else xp.zeros((0, *shape), x.dtype), own, (cx, cy), scale)
 
 
 def _apart(points):
@@ -228,7 +229,7 @@ def _apart(points):
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _corrected(distortion_of, points, operands):
     """Corrected points, with the same derivatives as what is written: they are computed another way."""
-    return _undistorted(points, *distortion_of(operands), spread=False)
+    return _undistorted(points, *distortion_of(operands), spreading=False)
 
 
 @_corrected.defjvp
@@ -238,9 +239,9 @@ def _corrected_jvp(distortion_of, primals, tangents):
     )
 
 
-def _undistorted(points, family, k, centre, scale, *, spread=True):
+def _undistorted(points, family, k, centre, scale, *, spreading=True):
     """Corrected points; NaN beyond the limit."""
-    at = _normal(_apart(points), k, centre, scale, spread=spread)
+    at = _normal(_apart(points), k, centre, scale, spreading=spreading)
     xp, (x, y) = namespace(at.k), at.z
     squared = x * x + y * y
     within = family.within(_constant(squared), _constant(at.own), digits=4)
@@ -269,7 +270,7 @@ def _distorted(distortion_of, points, operands):
     """
 
     family, *distortion = distortion_of(operands)
-    at = _normal(_apart(points), *distortion, spread=False)
+    at = _normal(_apart(points), *distortion, spreading=False)
     if isinstance(family, AbstractRadial):
         q = _ratio(distortion_of, points, operands)
         return together(*at.in_pixels((at.z[0] * q, at.z[1] * q)))
@@ -286,7 +287,7 @@ def _ratio(distortion_of, points, operands):
 
     def normal():
         family, *distortion = distortion_of(operands)
-        at = _normal(_apart(points), *distortion, spread=False)
+        at = _normal(_apart(points), *distortion, spreading=False)
         return family, at.z[0] * at.z[0] + at.z[1] * at.z[1], at.k
 
     def certain():

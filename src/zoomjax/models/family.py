@@ -19,13 +19,14 @@ those of the points.
 """
 
 import abc
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._core.arrays import namespace
+from .._core.arrays import apart, namespace
 from .._core.types import AnyArray, Elements
 from ._roots import first_positive_root, first_quadratic_root, increasing_root, newton_root
 
@@ -33,14 +34,16 @@ Pair = tuple[Float[AnyArray, "..."], Float[AnyArray, "..."]]
 """A point (x, y). Coordinates are taken apart once: gradients by slices of a stack are padded arrays."""
 
 
-def radial_factor(squared_radius: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
+def radial_factor(
+    squared_radius: Float[AnyArray, "..."], k: Elements | Sequence[Any]
+) -> Float[AnyArray, "..."]:
     """L(t) of eq. 2 for normalised squared radii `t` and coefficients `k = (k1, ..., kN)`.
 
     The same code for NumPy and JAX, as all of a radial family's formulas.
     """
-    factor = 0 * squared_radius if len(k) == 0 else k[-1] * squared_radius
-    for coefficient in k[-2::-1]:
-        factor = (factor + coefficient) * squared_radius
+    factor = 0 * squared_radius
+    for number, coefficient in enumerate(reversed(apart(k))):
+        factor = ((factor + coefficient) if number else coefficient) * squared_radius
     return 1 + factor
 
 
