@@ -13,6 +13,10 @@ from zoomjax.app.calibration import calibrate, focal_sigmas, rms_over_frames
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.report import report
 
+_TRUTH = scenes.nikkor_18_200()
+UNDISTORTED = eqx.tree_at(
+    lambda lens: lens.zoom.parameters, _TRUTH, 1e-9 * np.asarray(_TRUTH.zoom.parameters)
+)
 GIVEN = {"model": WantedModel("polynomial"), "centre": None}  # degree 2 about the centre of the lines
 
 
@@ -49,7 +53,8 @@ def test_summary_is_json_and_agrees_with_the_fits(calibration):
     assert "selection" not in summary
 
 
-def test_by_default_model_and_centre_are_chosen(calibration):
+@pytest.mark.slow
+def test_by_default_model_and_centre_are_chosen():
     """Seen through degree 2, about a centre beside the image's."""
     truth = scenes.nikkor_18_200()
     middle = np.asarray(truth.centre)
@@ -64,14 +69,46 @@ def test_by_default_model_and_centre_are_chosen(calibration):
     assert (std < 10).all()
     np.testing.assert_allclose(np.asarray(found.zoom.lens.centre), centre)
     chosen = summary["selection"]["chosen"]
-    assert chosen == summary["selection"]["best"] or "degree" in chosen
     by_name = {row["candidate"]: row for row in summary["selection"]["candidates"]}
     assert by_name[chosen]["held_out"] <= 1.0005 * min(
         row["held_out"] for row in by_name.values() if not row["problem"]
     )
+    fewer = [row for row in by_name.values() if row["parameters"] < by_name[chosen]["parameters"]]
+    assert all(row["problem"] or row["held_out"] > 1.0005 * by_name[chosen]["held_out"] for row in fewer)
     assert found.zoom.joint is not None
+    page = report(found)
+    assert "The centre of distortion was fitted: " in page
+    assert all(f">{name}<" in page for name in by_name)
+    own = np.asarray(zj.trust.displacement_std(found.zoom, middle, focal=50.0))
+    alone = eqx.tree_at(lambda fit: fit.joint, found.zoom, None)
+    assert own > 2 * np.asarray(zj.trust.displacement_std(alone, middle, focal=50.0))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("centre", ["image", (300.0, 200.0), None])
+def test_a_centre_that_is_given_is_taken(centre, calibration):
+    lines = calibration.lines.about(np.array([1000.0, 700.0]))
+    found = calibrate(lines, model=WantedModel(degree=1), centre=centre)
+    expected = {"image": calibration.lines.centre, None: lines.centre}.get(centre, centre)
+    np.testing.assert_allclose(found.zoom.lens.centre, expected)
+    np.testing.assert_allclose(found.lines.centre, expected)
+    assert found.centre.how == ("image" if centre == "image" else "given")
+    assert found.zoom.joint is None
+
+
+@pytest.mark.slow
+def test_the_centre_stays_where_lines_do_not_determine_it():
+    """Nothing is distorted, and lines left out by hand stay so."""
+    lines = scenes.board_lines(UNDISTORTED, scenes.focal_sweep(4), spacing=150, noise=0.3)
+    lines = lines.weighted((np.arange(len(lines.frame)) > 1).astype(float))
+    found = calibrate(lines, model=WantedModel(degree=0, terms=1))
+    assert found.centre.how == "image"
+    assert "was kept at the middle of the image" in found.centre.sentence
+    np.testing.assert_array_equal(found.zoom.lens.centre, lines.centre)
+    assert np.flatnonzero(found.rejected).tolist() == [0, 1]
+
+
+@pytest.mark.slow
 def test_one_photo_works_out_of_the_box():
     lines = scenes.board_lines(scenes.nikkor_18_200(), scenes.focal_sweep(2)[:1], spacing=60, noise=0.3)
     found = calibrate(lines)
