@@ -411,7 +411,7 @@ LEFT_OUT = {
     **dict.fromkeys(
         (
             *("frame_output", "select_model", "held_out_zoom", "held_out_frames"),
-            *("suggest_next", "reject_points", "barrel_crossover", "assess", "evidence"),
+            *("suggest_next", "reject_points", "barrel_crossover", "assess", "evidence", "with_misfit"),
         ),
         BY_VALUES,
     ),

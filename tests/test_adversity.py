@@ -39,13 +39,16 @@ def contents(folder):
     }
 
 
+FORCED = ("--degree", "2", "--centre", "image")
+
+
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory):
     """Lines, and their results in ``out``."""
     folder = tmp_path_factory.mktemp("calibrated")
     lens, focal = scenes.nikkor_18_200(), scenes.focal_sweep(5)
     scenes.board_lines(lens, focal, spacing=60, noise=0.3).save(folder / "lines.npz")
-    done = zoomjax("calibrate", "lines.npz", "-o", "out", cwd=folder)
+    done = zoomjax("calibrate", "lines.npz", "-o", "out", *FORCED, cwd=folder)
     assert done.returncode == 0, done.stderr
     return folder
 

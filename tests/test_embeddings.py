@@ -143,6 +143,7 @@ KNOWN = {
     "select_model": lambda x: zj.select_model(traced_lines(x)),
     "held_out_zoom": lambda x: zj.trust.held_out_zoom(traced_lines(x)),
     "held_out_frames": lambda x: zj.trust.held_out_frames(traced_lines(x)),
+    "with_misfit": lambda x: zj.trust.with_misfit(table.fit(), traced_lines(x)),
     "reject_points": lambda x: zj.fit.reject_points(traced_lines(x)),
     "suggest_next": lambda x: zj.suggest_next(table.fit(), traced_lines(x)),
     "barrel_crossover": lambda x: zj.models.barrel_crossover(np.array([20.0, 30.0]), x[:2, 0]),

@@ -22,6 +22,7 @@ from docs.make.tables import ROOT, pages
 from zoomjax import scenes
 from zoomjax.app.calibration import calibrate
 from zoomjax.app.demo import write_photos
+from zoomjax.app.model_choice import WantedModel
 
 from ._commands import SEVERAL
 
@@ -76,7 +77,7 @@ def given(tmp_path_factory):
     table(folder / "views.csv", "image,focal", ((f"{n}.png", f) for n, f in enumerate(FOCAL)))
     straight_lines_bent(folder / "lines.csv")
     table(folder / "frames.csv", "frame,focal", enumerate((24, 50, 80, 105)))
-    calibrate(board()).write(folder / "mylens")
+    calibrate(board(), model=WantedModel("polynomial"), centre=None).write(folder / "mylens")
     lens = scenes.nikkor_18_200((4288, 2848))
     zj.interop.write(lens, folder / "zoom.xml", format="lensfun", pixel_pitch=0.0055)
     return folder

@@ -5,6 +5,7 @@ tables, and writes it to benchmarks/results with the figures beside it as JSON.
 """
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -144,10 +145,12 @@ def main(
     jax.config.update("jax_enable_x64", True)
     results = {"machine": machine(), **run(data)}
     results["cpu_seconds"] = time.process_time()
-    write(output, "\n".join(whole_page(results, name, page(results))), results)
+    specification = sys.modules["__main__"].__spec__
+    module = specification.name if specification else f"benchmarks.real.{name}"
+    write(output, "\n".join(whole_page(results, module, page(results))), results)
 
 
-def whole_page(results: dict, name: str, lines: list[str]) -> list[str]:
+def whole_page(results: dict, module: str, lines: list[str]) -> list[str]:
     """The page of a study with the command that makes it, and where it ran."""
-    command = f"`python -m benchmarks.real.study_{name}`: {results['cpu_seconds']:.0f} s of CPU time."
+    command = f"`python -m {module}`: {results['cpu_seconds']:.0f} s of CPU time."
     return [*lines[:2], command, "", *lines[2:], "", machine_line(results["machine"]), ""]

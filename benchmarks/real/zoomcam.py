@@ -22,18 +22,32 @@ def read_zoomcam(folder: Path) -> Lines:
     Args:
         folder: holds ``corners_22x15.npz`` and ``focal_px.csv``.
     """
-    with np.load(folder / "corners_22x15.npz") as stored:
-        zoom, corners = stored["zoom"], stored["corners"]
-    table = np.loadtxt(folder / "focal_px.csv", delimiter=",", skiprows=1)
+    corners, zoom, focal = _corners(folder)
     zooms, frame = np.unique(zoom, return_inverse=True)
-    focal = dict(table.tolist())
     return Lines.from_grids(
-        corners,
-        frame,
-        [focal[z] for z in zooms.tolist()],
+        corners, frame, [focal[z] for z in zooms.tolist()], image_size=(1280, 720), focal_unit="px"
+    )
+
+
+def read_photos(folder: Path) -> Lines:
+    """The same lines, one frame a photo, in double precision."""
+    corners, zoom, focal = _corners(folder)
+    frames = np.arange(len(zoom))
+    return Lines.from_grids(
+        corners.astype(float),
+        frames,
+        [focal[z] for z in zoom.tolist()],
         image_size=(1280, 720),
         focal_unit="px",
     )
+
+
+def _corners(folder: Path) -> tuple[np.ndarray, np.ndarray, dict[float, float]]:
+    """The corners of each photo, its zoom, and the focal length of each zoom."""
+    with np.load(folder / "corners_22x15.npz") as stored:
+        zoom, corners = stored["zoom"], stored["corners"]
+    table = np.loadtxt(folder / "focal_px.csv", delimiter=",", skiprows=1)
+    return corners, zoom, dict(table.tolist())
 
 
 if __name__ == "__main__":

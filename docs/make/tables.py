@@ -162,6 +162,7 @@ def real() -> str:
     clips = table_of(
         "broadcast.md", "The centre known: the mean principal point of the frames learnt from"
     )[1]
+    assumed = table_of("broadcast.md", "The centre assumed: the middle of the image")[1]
     pitch = table_of("pitch.md")[1]
     lenses = table_of("lensfun.md", "A focal length left out")[1]
     degree, each, none = "zoom polynomial, degree 2", "each frame by itself", "no correction"
@@ -169,8 +170,13 @@ def real() -> str:
     rows = [
         ["a zoom camera's checkerboard: other photos of the same zooms", *camera, "px off straight"],
         [
-            "broadcast cameras of known lenses: other frames of the clip",
+            "broadcast cameras of known lenses: other frames of the clip; centre of distortion known",
             *(clips[row][2] for row in (none, each, degree)),
+            "px off the truth, over the image",
+        ],
+        [
+            "the same, the centre taken to be the middle of the image",
+            *(assumed[row][2] for row in (none, each, degree)),
             "px off the truth, over the image",
         ],
         [

@@ -10,19 +10,26 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app.calibration import calibrate, focal_sigmas, rms_over_frames
+from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.report import report
+
+_TRUTH = scenes.nikkor_18_200()
+UNDISTORTED = eqx.tree_at(
+    lambda lens: lens.zoom.parameters, _TRUTH, 1e-9 * np.asarray(_TRUTH.zoom.parameters)
+)
+GIVEN = {"model": WantedModel("polynomial"), "centre": None}  # degree 2 about the centre of the lines
 
 
 @pytest.fixture(scope="module")
 def calibration():
     lines = scenes.board_lines(scenes.nikkor_18_200(), scenes.focal_sweep(5), spacing=60, noise=0.4)
-    return calibrate(lines)
+    return calibrate(lines, **GIVEN)
 
 
 @pytest.mark.slow
 def test_stages_are_told(calibration):
     told = []
-    calibrate(calibration.lines, stage=told.append)
+    calibrate(calibration.lines, **GIVEN, stage=told.append)
     assert len(told) == 4
 
 
@@ -47,12 +54,67 @@ def test_summary_is_json_and_agrees_with_the_fits(calibration):
 
 
 @pytest.mark.slow
-def test_the_model_can_be_chosen(calibration):
-    chosen = calibrate(calibration.lines, select=True)
-    summary = json.loads(json.dumps(chosen.summary(), allow_nan=False))
-    assert summary["selection"]["chosen"] == "degree 2, 2 terms"
-    assert len(summary["selection"]["candidates"]) == 12
-    assert summary["rms_zoom"] == pytest.approx(float(calibration.zoom.rms), rel=1e-9)
+def test_by_default_model_and_centre_are_chosen():
+    """Seen through degree 2, about a centre beside the image's."""
+    truth = scenes.nikkor_18_200()
+    middle = np.asarray(truth.centre)
+    aside = eqx.tree_at(lambda lens: lens.centre, truth, truth.centre + np.array([20.0, -12.0]))
+    lines = scenes.board_lines(aside, scenes.focal_sweep(8), spacing=90, noise=0.3)
+    lines = eqx.tree_at(lambda lines: lines.centre, lines, middle)
+    found = calibrate(lines)
+    summary = json.loads(json.dumps(found.summary(), allow_nan=False))
+    assert summary["centre"]["how"] == "fitted"
+    centre, std = np.array([summary["centre"][axis] for axis in "xy"]), np.array(summary["centre"]["std"])
+    assert (abs(centre - np.asarray(aside.centre)) < 4 * std).all()
+    assert (std < 10).all()
+    np.testing.assert_allclose(np.asarray(found.zoom.lens.centre), centre)
+    chosen = summary["selection"]["chosen"]
+    by_name = {row["candidate"]: row for row in summary["selection"]["candidates"]}
+    assert by_name[chosen]["held_out"] <= 1.0005 * min(
+        row["held_out"] for row in by_name.values() if not row["problem"]
+    )
+    fewer = [row for row in by_name.values() if row["parameters"] < by_name[chosen]["parameters"]]
+    assert all(row["problem"] or row["held_out"] > 1.0005 * by_name[chosen]["held_out"] for row in fewer)
+    assert found.zoom.joint is not None
+    page = report(found)
+    assert "The centre of distortion was fitted: " in page
+    assert all(f">{name}<" in page for name in by_name)
+    own = np.asarray(zj.trust.displacement_std(found.zoom, middle, focal=50.0))
+    alone = eqx.tree_at(lambda fit: fit.joint, found.zoom, None)
+    assert own > 2 * np.asarray(zj.trust.displacement_std(alone, middle, focal=50.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("centre", ["image", (300.0, 200.0), None])
+def test_a_centre_that_is_given_is_taken(centre, calibration):
+    lines = calibration.lines.about(np.array([1000.0, 700.0]))
+    found = calibrate(lines, model=WantedModel(degree=1), centre=centre)
+    expected = {"image": calibration.lines.centre, None: lines.centre}.get(centre, centre)
+    np.testing.assert_allclose(found.zoom.lens.centre, expected)
+    np.testing.assert_allclose(found.lines.centre, expected)
+    assert found.centre.how == ("image" if centre == "image" else "given")
+    assert found.zoom.joint is None
+
+
+@pytest.mark.slow
+def test_the_centre_stays_where_lines_do_not_determine_it():
+    """Nothing is distorted, and lines left out by hand stay so."""
+    lines = scenes.board_lines(UNDISTORTED, scenes.focal_sweep(4), spacing=150, noise=0.3)
+    lines = lines.weighted((np.arange(len(lines.frame)) > 1).astype(float))
+    found = calibrate(lines, model=WantedModel(degree=0, terms=1))
+    assert found.centre.how == "image"
+    assert "was kept at the middle of the image" in found.centre.sentence
+    np.testing.assert_array_equal(found.zoom.lens.centre, lines.centre)
+    assert np.flatnonzero(found.rejected).tolist() == [0, 1]
+
+
+@pytest.mark.slow
+def test_one_photo_works_out_of_the_box():
+    lines = scenes.board_lines(scenes.nikkor_18_200(), scenes.focal_sweep(2)[:1], spacing=60, noise=0.3)
+    found = calibrate(lines)
+    assert found.zoom.lens.zoom.degree == 0
+    assert found.zoom.rms < 0.35
+    assert ">nan<" not in report(found)
 
 
 @pytest.mark.slow
@@ -60,7 +122,7 @@ def test_lines_that_determine_nothing_are_reported(calibration):
     t = np.linspace(-200, 200, 50)
     radial = [np.stack([319.5 + t * c, 239.5 + t * s], -1) for c, s in ((1, 0), (0, 1), (0.6, 0.8))]
     lines = zj.Lines.from_ragged(radial * 3, np.repeat([0, 1, 2], 3), [20, 40, 80], image_size=(640, 480))
-    summary = json.loads(json.dumps(calibrate(lines).summary(), allow_nan=False))
+    summary = json.loads(json.dumps(calibrate(lines, **GIVEN).summary(), allow_nan=False))
     assert "do not determine" in summary["result"]
     assert summary["frames_without_a_model"] == 3
     assert summary["rms_held_out"] is None  # two focal lengths do not make a quadratic
@@ -86,7 +148,7 @@ def test_zoomcam_gives_the_reference_figures(data):
     lines = read_zoomcam(data / "zoomcam")
     assert len(lines.focal) == 5
     assert len(lines.frame) == 116 * (15 + 22)
-    by_degree = {d: calibrate(lines, degree=d) for d in (0, 1, 2)}
+    by_degree = {d: calibrate(lines, model=WantedModel(degree=d), centre=None) for d in (0, 1, 2)}
     assert float(by_degree[2].each.rms) == pytest.approx(0.8796, abs=5e-4)
     for degree, rms in {0: 0.9969, 1: 0.8855, 2: 0.8809}.items():
         assert float(by_degree[degree].zoom.rms) == pytest.approx(rms, abs=5e-4)
@@ -97,7 +159,7 @@ def test_zoomcam_gives_the_reference_figures(data):
 
 def test_bands_allow_for_uncertain_focal_lengths(calibration):
     sigma = 0.01 * np.asarray(calibration.lines.focal)
-    allowed = calibrate(calibration.lines, focal_sigma=focal_sigmas("1%", calibration.lines.focal))
+    allowed = calibrate(calibration.lines, **GIVEN, focal_sigma=focal_sigmas("1%", calibration.lines.focal))
     expected = zj.fit.with_focal_sigma(calibration.zoom, zj.compress(calibration.lines), focal_sigma=sigma)
     np.testing.assert_allclose(allowed.zoom.covariance, expected.covariance, rtol=1e-6)
     assert all(a[2] > b[2] for a, b in zip(allowed.corner(), calibration.corner(), strict=True))
@@ -123,7 +185,7 @@ def test_a_frame_whose_lines_are_all_rejected_has_no_figures():
     lines = eqx.tree_at(
         lambda data: data.points, lines, lines.points + np.where(bad[:, None, None], wave, 0)
     )
-    spoiled = calibrate(lines, robust=True)
+    spoiled = calibrate(lines, **GIVEN, robust=True)
     assert spoiled.rejected[bad].all()
     summary = json.loads(json.dumps(spoiled.summary(), allow_nan=False))
     for key in ("rms_none", "rms_frames", "rms_zoom"):

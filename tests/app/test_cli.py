@@ -17,6 +17,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.app.arguments import centre_of
 from zoomjax.app.demo import write_photos
 from zoomjax.lines.csv import write_lines_csv
 
@@ -35,11 +36,14 @@ def few_lines():
     return scenes.board_lines(scenes.nikkor_18_200(), scenes.focal_sweep(5), spacing=40, noise=0.3)
 
 
+FORCED = ("--degree", 2, "--centre", "image")  # nothing is chosen: faster, and what the library does
+
+
 @pytest.fixture(scope="module")
 def calibrated(few_lines, tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrated")
     few_lines.save(folder / "lines.npz")
-    done = zoomjax("calibrate", folder / "lines.npz", "-o", folder / "out")
+    done = zoomjax("calibrate", folder / "lines.npz", "-o", folder / "out", *FORCED)
     assert done.returncode == 0, done.stderr
     return folder / "out", done
 
@@ -110,9 +114,37 @@ def test_calibrate_gives_the_lens_that_the_library_gives(calibrated, few_lines):
 
 
 @pytest.mark.slow
+def test_calibrate_is_told_centre_and_model(calibrated, tmp_path):
+    source, given = (
+        calibrated[0] / "lines.npz",
+        ("--centre", "2150,1420", "--model", "spline", "--terms", 1),
+    )
+    done = zoomjax("calibrate", source, "-o", tmp_path, *given)
+    assert done.returncode == 0, done.stderr
+    assert "The centre of distortion is taken as given: (2150.0, 1420.0) px." in done.stdout
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["model"] == "SplineZoom"
+    assert "selection" not in summary
+    assert summary["centre"]["how"] == "given"
+    lens = zj.load_lens(tmp_path / "lens.json")
+    np.testing.assert_allclose(lens.centre, [2150, 1420])
+    assert lens(50.0).coefficients.shape == (1,)
+    default = json.loads((calibrated[0] / "summary.json").read_text())
+    assert default["centre"]["how"] == "image"
+    assert (default["centre"]["x"], default["centre"]["y"]) == (2143.5, 1423.5)
+
+
+def test_centres_are_read():
+    assert [centre_of(text) for text in ("fit", "image", "959.5,-1e1")] == ["fit", "image", (959.5, -10.0)]
+    for text in ("", "1", "1,2,3", "nan,1", "a,b"):
+        with pytest.raises(ValueError, match="must be fit, image, or X,Y"):
+            centre_of(text)
+
+
+@pytest.mark.slow
 def test_calibrate_allows_for_uncertain_focal_lengths(calibrated, tmp_path):
     exact = json.loads((calibrated[0] / "summary.json").read_text())
-    done = zoomjax("calibrate", calibrated[0] / "lines.npz", "-o", tmp_path, "--focal-sigma", "1%")
+    done = zoomjax("calibrate", calibrated[0] / "lines.npz", "-o", tmp_path, *FORCED, "--focal-sigma", "1%")
     assert done.returncode == 0, done.stderr
     assert "include those of the focal lengths, 1.00% to 1.00%" in done.stdout
     told = json.loads((tmp_path / "summary.json").read_text())
@@ -129,7 +161,8 @@ def test_calibrate_allows_for_uncertain_focal_lengths(calibrated, tmp_path):
 @pytest.mark.slow
 def test_calibrate_reads_csv(calibrated, few_lines, tmp_path):
     write_lines_csv(few_lines, tmp_path / "lines.csv")
-    done = zoomjax("calibrate", tmp_path / "lines.csv", "--image-size", "4288x2848", "-o", tmp_path)
+    size = ("--image-size", "4288x2848")
+    done = zoomjax("calibrate", tmp_path / "lines.csv", *size, "-o", tmp_path, *FORCED)
     assert done.returncode == 0, done.stderr
     of_csv = json.loads((tmp_path / "summary.json").read_text())
     of_npz = json.loads((calibrated[0] / "summary.json").read_text())
@@ -202,7 +235,8 @@ def test_the_verdict_is_the_first_line_and_decides_strict_runs(calibrated, tmp_p
 @pytest.mark.slow
 def test_results_as_json_are_the_summary(calibrated, tmp_path):
     source = calibrated[0] / "lines.npz"
-    done = zoomjax("calibrate", source, "-o", tmp_path / "o", "--json", "--strict", "--exclude", "0,2")
+    options = ("--json", "--strict", "--exclude", "0,2", *FORCED)
+    done = zoomjax("calibrate", source, "-o", tmp_path / "o", *options)
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)
     assert summary == json.loads((tmp_path / "o" / "summary.json").read_text())
@@ -257,7 +291,9 @@ WRONG = {
     "two files": (["lines.npz", "lines.npz"], "one file"),
     "options for another kind": (["lines.npz", "--image-size", "640x480"], "for CSV files"),
     "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),
-    "a model chosen and given": (["lines.npz", "--select", "--degree", "1"], "leave --degree"),
+    "a degree of another model": (["lines.npz", "--model", "spline", "--degree", "1"], "for polynomials"),
+    "no such model": (["lines.npz", "--model", "best"], "--model must be one of auto, polynomial"),
+    "a centre that is none": (["lines.npz", "--centre", "middle"], "--centre must be fit, image, or X,Y"),
     "csv without image size": (["lines.csv"], "--image-size"),
     "csv with a bad image size": (["lines.csv", "--image-size", "big"], "1920x1080"),
     "csv without focal lengths": (["bare.csv", "--image-size", "640x480"], "frame,focal"),

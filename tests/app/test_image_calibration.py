@@ -14,6 +14,7 @@ from zoomjax import scenes
 from zoomjax.app import demo
 from zoomjax.app.console import show_images
 from zoomjax.app.image_calibration import ImageJob, calibrate_images
+from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.pictures import pictures
 from zoomjax.app.report import report
 from zoomjax.io.exif import exif_with_focal
@@ -181,7 +182,9 @@ def test_a_zooming_video_is_calibrated(tmp_path):
     clips.write_clip(tmp_path / "zoom.mp4", sound=False)
     track = [f"{n},{clips.focal(n)}" for n in range(clips.FRAMES)]
     (tmp_path / "track.csv").write_text("\n".join(["frame,focal", *track]))
-    job = ImageJob((tmp_path / "zoom.mp4",), focal=str(tmp_path / "track.csv"), degree=1, frames=8)
+    job = ImageJob(
+        (tmp_path / "zoom.mp4",), focal=str(tmp_path / "track.csv"), model=WantedModel(degree=1), frames=8
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         done = calibrate_images(job)

@@ -16,6 +16,7 @@ import pytest
 import zoomjax.app.report
 from zoomjax import RESULTS
 from zoomjax.app.calibration import calibrate
+from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.report import Run, report
 
 from .._browser import opened
@@ -57,12 +58,13 @@ class Page(HTMLParser):
 
 
 REJECTED = 7
+GIVEN = {"model": WantedModel("polynomial"), "centre": None}
 
 
 @pytest.fixture(scope="module")
 def calibration(noisy):
     """Four frames of the board, and one of the lines rejected."""
-    done = calibrate(noisy)
+    done = calibrate(noisy, **GIVEN)
     return dataclasses.replace(done, rejected=np.arange(len(done.rejected)) == REJECTED)
 
 
@@ -196,7 +198,7 @@ def test_the_verdict_leads(page, calibration):
 
 def test_frames_are_sorted_by_focal_length(noisy):
     mixed = eqx.tree_at(lambda lines: lines.focal, noisy, noisy.focal[::-1])
-    page = Page(report(calibrate(mixed)))
+    page = Page(report(calibrate(mixed, **GIVEN)))
     rows = page.text[page.text.index("worst lines 3 ") :]
     assert [rows.index(f" {frame} {float(f):.4g} ") for frame, f in enumerate(mixed.focal)][::-1] == sorted(
         rows.index(f" {frame} {float(f):.4g} ") for frame, f in enumerate(mixed.focal)
@@ -223,7 +225,7 @@ def test_what_was_run_is_said(calibration):
 
 
 def test_enough_is_said_when_a_further_photo_shows_nothing(clean):
-    exact = calibrate(clean)
+    exact = calibrate(clean, **GIVEN)
     assert exact.enough()
     assert "Enough: the standard deviation of the displacement is" in Page(report(exact)).text
     assert exact.summary()["next_photo"]["enough"] is True

@@ -63,6 +63,27 @@ def test_it_is_the_minimum_of_the_energy(lines, found):
     assert zj.fit_zoom(lines.about(found.centre[0])).rms == pytest.approx(float(best), rel=1e-9)
 
 
+def test_fits_take_a_centre(aside, lines, found):
+    fit = zj.fit_zoom(lines, centre="fit")
+    np.testing.assert_allclose(fit.lens.centre, found.fit.lens.centre, atol=1e-9)
+    np.testing.assert_allclose(fit.joint, found.covariance)
+    kept = zj.fit_zoom(lines, centre="image")
+    np.testing.assert_allclose(kept.rms, found.rms_fixed, rtol=1e-9)
+    assert kept.joint is None
+    told = zj.fit_zoom(lines, centre=tuple(np.asarray(aside.centre).tolist()))
+    np.testing.assert_array_equal(told.lens.centre, aside.centre)
+    assert fit.rms < told.rms < kept.rms
+
+
+@pytest.mark.parametrize("centre", ["middle", (1.0,), (np.nan, 1.0)])
+@pytest.mark.usefixtures("unchecked")
+def test_a_centre_that_is_none_is_told(centre, lines):
+    with pytest.raises(ValueError, match='must be "fit", "image" or two coordinates'):
+        zj.fit_zoom(lines, centre=centre)
+    with pytest.raises(ValueError, match="not compressed about one centre"):
+        zj.fit_zoom(lines.about(lines.centre), centre="fit")
+
+
 def test_lines_and_compressed_lines_give_one_answer(aside, found):
     again = zj.fit.fit_centre(seen(aside, NOISE))
     np.testing.assert_allclose(again.centre, found.centre, atol=1e-6)

@@ -57,9 +57,23 @@ def test_covariance_grows_by_the_response(sweep):
     sigma = np.linspace(0.0, 0.9, 10)
     wide = zj.fit.with_focal_sigma(fit, sweep, focal_sigma=sigma)
     response = np.asarray(_response(sweep, fit.lens.zoom)) * (sigma / np.asarray(sweep.focal))
-    np.testing.assert_allclose(wide.covariance, fit.covariance + response @ response.T, rtol=1e-9)
+    more, whole = np.asarray(wide.covariance - fit.covariance), response @ response.T
+    size = np.sqrt(np.diag(whole))  # what photos share already is not added again
+    for matrix in (more, whole - more):
+        assert np.linalg.eigvalsh(matrix / size / size[:, None]).min() > -1e-6
+    assert np.trace(more / size / size[:, None]) > 0.9 * len(size)
     same = zj.fit.with_focal_sigma(fit, sweep, focal_sigma=0)
-    np.testing.assert_array_equal(same.covariance, fit.covariance)
+    np.testing.assert_allclose(same.covariance, fit.covariance, rtol=1e-9)
+
+
+def test_focal_lengths_are_kept_where_the_model_is_wrong(truth):
+    """Degree 1 does not follow this zoom, and would have the focal lengths do it."""
+    lines = zj.compress(scenes.board_lines(truth, scenes.focal_sweep(8), spacing=200.0, noise=0.3))
+    found = zj.fit.fit_focal(lines, 0.05 * lines.focal, zoom=zj.PolynomialZoom(degree=1))
+    before = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=1))
+    assert not found.helped
+    np.testing.assert_array_equal(found.focal, lines.focal)
+    np.testing.assert_allclose(found.fit.lens.zoom.parameters, before.lens.zoom.parameters, rtol=1e-6)
 
 
 def test_undetermined_stays_infinite(sweep):

@@ -12,8 +12,8 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.trust.cross_validation import held_out_frames, held_out_zoom, judge
-from zoomjax.trust.folds import HoldOut, folds_of
-from zoomjax.trust.selection import compare, default_candidates
+from zoomjax.trust.folds import HoldOut, Judged, folds_of, shares
+from zoomjax.trust.selection import compare, compare_judged, default_candidates
 
 FOCALS = 7
 POLYNOMIALS = [
@@ -161,6 +161,24 @@ def test_the_simplest_within_one_standard_error_is_chosen(selection):
     assert selection.chosen is min(good, key=lambda v: v.parameters).candidate
 
 
+@pytest.mark.parametrize(("worse", "chosen"), [(1.02, (0, 1)), (1.0003, (0, 0))])
+def test_least_error_is_a_rule_of_its_own(worse, chosen, lines, rng):
+    """The one with fewer numbers is worse on average, though not on every focal length."""
+    candidates = [zj.trust.Candidate(zj.PolynomialZoom(degree=degree)) for degree in (0, 1)]
+    parts = folds_of(lines, "focal", None, 0)
+    square = np.where(parts.fold >= 0, 1.0, np.nan)
+    scatter = 1 + 0.3 * (-1.0) ** parts.unit
+    scatter = scatter / np.average(scatter[parts.fold >= 0], weights=shares(lines)[parts.fold >= 0])
+    errors = [
+        Judged(np.ones(len(square)), square * scatter * worse**2, 2.0, ""),
+        Judged(np.ones(len(square)), square, 4.0, ""),
+    ]
+    rules = ("one standard error", "least")
+    found = [compare_judged(lines, candidates, errors, parts, rule)[1:] for rule in rules]
+    assert [candidates.index(simplest) for _, simplest in found] == list(chosen)
+    assert [candidates.index(best) for best, _ in found] == [1, 1]
+
+
 def test_paired_errors_are_those_of_the_differences_of_two_roots(lines):
     """A first-order formula, beside the jackknife over what is left out."""
     parts = folds_of(lines, "frame", None, 0)
@@ -290,6 +308,7 @@ def test_default_candidates_are_what_the_lines_serve_and_few_focal_lengths_leave
         ({"hold_out": "photo"}, '"focal", "frame" or "line"'),
         ({"folds": 1}, "at least 2"),
         ({"candidates": []}, "is empty"),
+        ({"rule": "best"}, '"one standard error" or "least"'),
         ({"candidates": [zj.PolynomialZoom(degree=9)]}, "No candidate can be compared"),
     ],
 )

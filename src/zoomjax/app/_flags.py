@@ -8,6 +8,7 @@ FLAGS = {
         *(
             "again",
             "border",
+            "centre",
             "convention",
             "crop",
             "degree",
@@ -16,7 +17,7 @@ FLAGS = {
             "focal",
             "focal_sigma",
         ),
-        *("focal_unit", "hold", "image_size", "interpolation", "keep", "lens", "name"),
+        *("focal_unit", "hold", "image_size", "interpolation", "keep", "lens", "model", "name"),
         *("overwrite", "pixel_pitch", "terms", "tolerance"),
     )
 } | {"format": "--to", "track": "--focal"}

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -22,9 +22,35 @@ Overwrite = Annotated[
         rich_help_panel=OUTPUT,
     ),
 ]
-Degree = Annotated[int, typer.Option(min=0, help="Degree of the polynomials in 1/f.", rich_help_panel=FIT)]
+ModelName = Annotated[
+    str | None,
+    typer.Option(
+        "--model",
+        help="Zoom model: auto (of least cross-validation error), polynomial (in 1/f), smooth (with a "
+        "prior from real lenses) or spline. Default: auto, or polynomial with --degree.",
+        rich_help_panel=FIT,
+    ),
+]
+Degree = Annotated[
+    int | None,
+    typer.Option(min=0, help="Degree of the polynomials in 1/f; default: chosen.", rich_help_panel=FIT),
+]
 Terms = Annotated[
-    int, typer.Option(min=1, help="Number of distortion coefficients, k1 to kN.", rich_help_panel=FIT)
+    int | None,
+    typer.Option(
+        min=1,
+        help="Number of distortion coefficients, k1 to kN; default: chosen.",
+        rich_help_panel=FIT,
+    ),
+]
+Centre = Annotated[
+    str,
+    typer.Option(
+        metavar="fit|image|X,Y",
+        help="Centre of distortion: fit (where the lines determine it, else the image's), image, or its "
+        "coordinates in px.",
+        rich_help_panel=FIT,
+    ),
 ]
 
 
@@ -56,6 +82,21 @@ def read_lines(
             focal_unit=focal_unit or "mm",
         )
     raise ValueError(f"Cannot calibrate from {path}: give lines.npz, or a CSV file frame,line,x,y[,focal].")
+
+
+def centre_of(text: str) -> Literal["fit", "image"] | tuple[float, float]:
+    """The centre of distortion as `calibrate` takes it."""
+    from ..io.text_table import plain_number
+
+    if text == "fit" or text == "image":
+        return text
+    numbers = [plain_number(part) for part in text.split(",")]
+    x, y = numbers if len(numbers) == 2 else (None, None)
+    if x is None or y is None:
+        raise ValueError(
+            f"--centre must be fit, image, or X,Y in px as in 959.5,539.5, but it is {text!r}."
+        )
+    return x, y
 
 
 def split_lens(inputs: list[Path]) -> tuple[Path, tuple[Path, ...]]:

@@ -11,8 +11,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -20,20 +18,20 @@ from .._core.types import AnyArray
 from ..fit.algebraic import algebraic_zoom
 from ..fit.energy import coefficients_by, line_rms
 from ..fit.focal_lengths import with_focal_sigma
-from ..fit.frames import fit_frames
 from ..fit.result import RESULTS, FrameFits, ZoomFit
-from ..fit.robust import fit_robust
 from ..fit.straightness import frame_rms
-from ..fit.zoom import fit_zoom
-from ..lines.compressed import compress
+from ..fit.zoom import CentreArgument
 from ..lines.lines import Lines
 from ..models.invertibility import Certificate
-from ..models.zoom import PolynomialZoom
+from ..models.zoom import AbstractLinearZoom, PolynomialZoom
 from ..trust.assessment import NEGLIGIBLE, Assessment, assess
 from ..trust.bands import displacement_std
 from ..trust.cross_validation import held_out_frames, held_out_zoom
+from ..trust.misfit import with_misfit
 from ..trust.next_photo import Suggestion, suggest_next
-from ..trust.selection import Selection, default_candidates, select_model
+from ..trust.selection import Selection
+from .fitting import fitted
+from .model_choice import CentreFound, WantedModel
 from .results_folder import results_folder
 
 FILES = ("lens.json", "lines.npz", "summary.json", "model.png")
@@ -61,6 +59,7 @@ class Calibration:
         focal_sigma: standard deviation of each frame's focal length, included in the bands; 0: exact.
         held_out: each frame's RMS, px, under the zoom model fitted to all others; NaN if that fit fails.
         each_held_out: each frame's RMS, px, each tenth of its lines under the model of its other lines.
+        centre: the centre of distortion, and how it was found.
         assessment: the verdict, with what was found and what to do about it.
         selection: how the model was selected; None if it was given.
     """
@@ -76,6 +75,7 @@ class Calibration:
     focal_sigma: np.ndarray
     held_out: np.ndarray
     each_held_out: np.ndarray
+    centre: CentreFound
     assessment: Assessment
     selection: Selection | None = None
 
@@ -126,13 +126,18 @@ class Calibration:
         return [
             ("no correction", self.none),
             ("frame by frame", np.asarray(self.each.frame_rms)),
-            ("zoom polynomial (algebraic)", self.algebraic),
-            ("zoom polynomial", np.asarray(self.zoom.frame_rms)),
+            (f"{self.kind} (algebraic)", self.algebraic),
+            (self.kind, np.asarray(self.zoom.frame_rms)),
         ]
+
+    @property
+    def kind(self) -> str:
+        """What the zoom model is called in tables."""
+        return "zoom polynomial" if isinstance(self.zoom.lens.zoom, PolynomialZoom) else "zoom model"
 
     def held_out_rows(self) -> dict[str, np.ndarray]:
         """For some of the `rows`, each frame's RMS on lines that were not used in the fit, px."""
-        return {"frame by frame": self.each_held_out, "zoom polynomial": self.held_out}
+        return {"frame by frame": self.each_held_out, self.kind: self.held_out}
 
     def warnings(self, names: Sequence[str] | None = None) -> list[str]:
         """User-facing warnings about the zoom model, and about frames without a good fit.
@@ -194,7 +199,10 @@ class Calibration:
                 "rms_unconstrained": float(self.zoom.rms_unconstrained),
                 "frames_without_a_model": sum(map(bool, self.each.messages())),
                 "warnings": self.warnings(),
+                "model": type(lens.zoom).__name__,
+                "centre": self.centre.summary(),
                 "pixel_polynomials": self.pixel_polynomials().tolist(),
+                "coefficients": self.coefficient_rows(),
                 "parameters": np.asarray(lens.zoom.parameters).tolist(),
                 "corner_displacement": [
                     {"focal": f, "px": moved, "std": _finite([std])[0]} for f, moved, std in self.corner()
@@ -220,11 +228,22 @@ class Calibration:
         )
 
     def pixel_polynomials(self) -> np.ndarray:
-        """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as printed in the paper."""
+        """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as printed in the paper.
+
+        None, of shape (0, 0), for another model.
+        """
         model = self.zoom.lens.zoom
-        assert isinstance(model, PolynomialZoom)  # `calibrate` fits no other
+        if not isinstance(model, PolynomialZoom):
+            return np.zeros((0, 0))
         normalised = np.asarray(model.in_inverse_focal())
         return normalised / self.zoom.lens.scale ** (2 * np.arange(1, normalised.shape[1] + 1))
+
+    def coefficient_rows(self) -> list[list[float]]:
+        """Focal length and k1, ..., kN, px, at some focal lengths over the range, evenly in 1/f."""
+        lens = self.zoom.lens
+        low, high = (float(f) for f in lens.focal_range)
+        focal = np.unique(1 / np.linspace(1 / low, 1 / high, 5))
+        return [[f, *np.asarray(lens(f).pixel_coefficients).tolist()] for f in focal.tolist()]
 
     def write(
         self,
@@ -270,73 +289,57 @@ class Calibration:
 def calibrate(
     lines: Lines,
     *,
-    degree: int = 2,
-    terms: int = 2,
+    model: WantedModel = WantedModel(),  # noqa: B008, it is frozen
+    centre: CentreArgument | None = "fit",
     robust: bool = False,
     focal_sigma: float | Float[np.ndarray, "frame"] = 0.0,
-    select: bool = False,
     stage: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
-    """Fit the zoom polynomial, and the models it is compared with.
+    """Fit the zoom model, and the models it is compared with.
 
     Args:
         lines: the lines; computed in float64 if that is enabled, whatever their dtype.
-        degree: degree of the polynomials in 1/f.
-        terms: number of distortion coefficients.
+        model: the zoom model; by default the one of least cross-validation error.
+        centre: the centre of distortion: "fit", "image", its coordinates, px, or None for that of the
+            lines. With "fit" it is that of the lines where they do not determine another, or where lines
+            that were not fitted are not straighter about it.
         robust: whether to reject lines that are not straight in the scene. All figures are then computed
             from the remaining lines.
         focal_sigma: standard deviation of the focal lengths: a number, or one per frame; 0 where exact.
-        select: whether to choose degree and terms by `select_model`, among the polynomials. Lines are then
-            rejected under the quadratic.
         stage: called with a description before each step that takes time.
+
+    Raises:
+        ValueError: an argument is not one of these, or there are too few focal lengths for the model.
+        RuntimeError: the solver failed.
     """
-    if select:
-        degree, terms = min(2, np.unique(np.asarray(lines.focal)).size - 1), 2
-    model = PolynomialZoom(degree=degree)
-    model.prepare(lines.focal, terms)  # raises if there are too few focal lengths, before any work
-    stage("Compressing the lines")
-    widest = jnp.result_type(float)
-    data = jax.tree.map(
-        lambda a: jnp.asarray(a, widest) if jnp.issubdtype(a.dtype, jnp.floating) else a, lines
-    )
-    choices = [c for c in default_candidates() if isinstance(c.zoom, PolynomialZoom)] if select else []
-    small = compress(data, max([terms, *(choice.terms for choice in choices)]))
-    rejected = np.zeros(len(lines.frame), bool) if lines.weight is None else np.asarray(lines.weight) == 0
-    if robust:
-        stage("Rejecting lines that are not straight")
-        weight = fit_robust(small, zoom=model, terms=terms, throw=False).weight
-        small, lines = small.weighted(weight), lines.weighted(weight)
-        rejected = np.asarray(weight) == 0
-    selection = None
-    if choices:
-        stage("Selecting the model")
-        selection = select_model(small, choices)
-        model, terms = selection.chosen.zoom, selection.chosen.terms
-        assert isinstance(model, PolynomialZoom)
-    stage("Fitting each frame separately")
-    each = fit_frames(small, terms=terms, throw=False)
-    stage("Fitting the zoom polynomial")
-    exact = selection.fit if selection else fit_zoom(small, zoom=model, terms=terms)
+    used = fitted(lines, model, centre, robust=robust, stage=stage)
+    exact, small, terms, chosen = used.zoom, used.lines, used.model.terms, used.model.zoom
+    assert isinstance(chosen, AbstractLinearZoom)  # `WantedModel` has no other
     sigma = np.broadcast_to(focal_sigma, lines.focal.shape)
     zoom = with_focal_sigma(exact, small, focal_sigma=sigma) if sigma.any() else exact
+    zoom = with_misfit(zoom, small)
     stage("Checking the fit on lines left out")
     held_out, each_held_out = np.full(len(sigma), np.nan), held_out_frames(small, terms=terms)
     if len(sigma) > 1:
-        held_out = held_out_zoom(small, zoom=model, terms=terms)
+        held_out = held_out_zoom(small, zoom=chosen, terms=terms)
+    lines = (lines.weighted(np.asarray(small.weight)) if robust else lines).about(np.asarray(small.centre))
     return Calibration(
         lines=lines,
         zoom=zoom,
-        each=each,
+        each=used.each,
         none=np.asarray(frame_rms(small, None)),
-        algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=model, terms=terms))),
-        rejected=rejected,
+        algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=chosen, terms=terms))),
+        rejected=np.asarray(lines.weight) == 0
+        if lines.weight is not None
+        else np.zeros(len(lines.frame), bool),
         line_rms=np.asarray(line_rms(small, coefficients_by(zoom.lens.zoom, small))),
         next=suggest_next(exact, small),  # from the noise alone, without focal_sigma
         focal_sigma=sigma,
         held_out=held_out,
         each_held_out=each_held_out,
+        centre=used.centre,
         assessment=assess(lines, zoom, compressed=small, held_out=held_out, each_held_out=each_held_out),
-        selection=selection,
+        selection=used.selection,
     )
 
 

@@ -10,6 +10,9 @@ import sys
 import warnings
 from typing import NoReturn
 
+# Lines are reduced by many small factorisations, which threads of OpenBLAS only slow down.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 try:
     import typer
 except ModuleNotFoundError:

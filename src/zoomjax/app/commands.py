@@ -17,10 +17,13 @@ from .._core.text import plain
 from ._compiled import set_up_jax
 from ._flags import with_flags
 from .arguments import (
+    Centre,
     Degree,
+    ModelName,
     Overwrite,
     Terms,
     board_of,
+    centre_of,
     number_of_cores,
     read_lines,
     refuse_image_options,
@@ -132,16 +135,10 @@ def calibrate(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.", file_okay=False)
     ],
-    degree: Degree = 2,
-    terms: Terms = 2,
-    select: Annotated[
-        bool,
-        typer.Option(
-            "--select",
-            help="Select degree and terms by cross-validation.",
-            rich_help_panel=FIT,
-        ),
-    ] = False,
+    model: ModelName = None,
+    degree: Degree = None,
+    terms: Terms = None,
+    centre: Centre = "fit",
     robust: Annotated[
         bool,
         typer.Option(
@@ -224,8 +221,9 @@ def calibrate(
     """
     set_up_jax()
     show = Shown(strict, quiet, as_json)
-    if select and (degree, terms) != (2, 2):
-        raise ValueError("--select chooses degree and terms: leave --degree and --terms out.")
+    from .model_choice import WantedModel
+
+    wanted = WantedModel(model or "auto", degree, terms)
     if any(path.lower().endswith((".npz", ".csv")) for path in inputs):
         refuse_image_options(
             {"--pitch": pitch, "--distance": distance, "--pixel": pixel, "--jobs": jobs}, inputs
@@ -248,10 +246,9 @@ def calibrate(
                 lines,
                 folder,
                 stage,
-                degree=degree,
-                terms=terms,
+                model=wanted,
+                centre=centre_of(centre),
                 focal_sigma=focal_sigma,
-                select=select,
                 robust=robust,
                 title=title_of(inputs),
             )
@@ -271,9 +268,8 @@ def calibrate(
         focal_unit=unit_of(focal_unit),
         focal_sigma=focal_sigma,
         board=board_of(pitch, distance, pixel),
-        degree=degree,
-        terms=terms,
-        select=select,
+        model=wanted,
+        centre=centre_of(centre),
         frames=frames,
         workers=jobs or number_of_cores(),
         cache=cache_folder("detections") if cache else None,

@@ -13,6 +13,7 @@ from ._interrupts import go_on
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
     from .calibration import Calibration
     from .image_calibration import ImageCalibration
@@ -175,15 +176,33 @@ def show_calibration(
     console.print()
     if calibration.selection:
         print(calibration.selection, end="\n\n")
-    for i, column in enumerate(calibration.pixel_polynomials().T, start=1):
+    polynomials = calibration.pixel_polynomials()
+    for i, column in enumerate(polynomials.T, start=1):
         powers = ["", *(f" /f{'' if j == 1 else f'^{j}'}" for j in range(1, len(column)))]
         terms = " ".join(f"{value:+.4e}{power}" for value, power in zip(column, powers, strict=True))
         console.print(f"k{i}(f) = {terms}   px^-{2 * i}", highlight=False)
+    if not polynomials.size:
+        console.print(_coefficients(calibration))
+    console.print(f"\n{calibration.centre.sentence}", highlight=False)
     corner = [f"{moved:+.2f} ± {std:.2g} px at {f:.4g} {unit}" for f, moved, std in calibration.corner()]
     console.print(f"\nThe correction moves a corner by {', '.join(corner)}.", highlight=False)
     if allowed_for := calibration.allowed_for():
         console.print(allowed_for, highlight=False)
     console.print(calibration.advice(), highlight=False)
+
+
+def _coefficients(calibration: "Calibration") -> "Table":
+    """A table of the coefficients at some focal lengths."""
+    from rich.table import Table
+
+    rows = calibration.coefficient_rows()
+    table = Table(box=None)
+    table.add_column(f"f, {calibration.zoom.lens.focal_unit}", justify="right")
+    for i in range(1, len(rows[0])):
+        table.add_column(f"k{i}, px^-{2 * i}", justify="right")
+    for focal, *values in rows:
+        table.add_row(f"{focal:.4g}", *(f"{value:+.4e}" for value in values))
+    return table
 
 
 def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from .._core.text import numbered_name, plain
 from ..detect.batch import DETECTORS, Detection, detect
 from ..detect.sources import VIDEO_SUFFIXES, Source, find_photos, video_frames
+from ..fit.zoom import CentreArgument
 from ..io.focal_track import FocalTrack, read_focal_track
 from ..io.text_table import plain_number
 from ._flags import with_flags
@@ -22,6 +23,7 @@ from .calibration import CLEARS, FILES, Calibration, calibrate, focal_sigmas
 from .choice import chosen_frames, colour_limit
 from .equipment import with_equipment
 from .focal_sources import Board, Focals, check_way, choose_focals, lines_of
+from .model_choice import WantedModel
 from .overlay import draw_lines
 from .results_folder import results_folder
 from .verdict import findings_of_photos
@@ -45,9 +47,8 @@ class ImageJob:
         focal_sigma: standard deviation of the focal lengths: a number in their unit, or a percentage such
             as "1%"; None for the standard deviation given by their source.
         board: the board, for ``focal="board"``.
-        degree: degree of the polynomials in 1/f.
-        terms: number of distortion coefficients.
-        select: whether to select degree and terms by cross-validation.
+        model: the zoom model.
+        centre: centre of distortion: "fit", "image" or its coordinates, px.
         frames: maximum number of frames used from a video.
         workers: number of processes.
         cache: folder for cached detections; None: no cache.
@@ -61,9 +62,8 @@ class ImageJob:
     focal_unit: str = "mm"
     focal_sigma: str | None = None
     board: Board | None = None
-    degree: int = 2
-    terms: int = 2
-    select: bool = False
+    model: WantedModel = WantedModel()  # noqa: RUF009, it is frozen
+    centre: CentreArgument = "fit"
     frames: int = 60
     workers: int = 1
     cache: Path | None = None
@@ -297,11 +297,10 @@ def calibrate_images(
         sigma = np.array([focals.deviation.get(d.name, 0.0) for d in used])
         calibration = calibrate(
             lines,
-            degree=job.degree,
-            terms=job.terms,
+            model=job.model,
+            centre=job.centre,
             robust=True,
             focal_sigma=sigma,
-            select=job.select,
             stage=stage,
         )
         done = ImageCalibration(job, calibration, used, focals, tuple(d.name for d in detections), unused)

@@ -232,6 +232,8 @@ def _lens(calibration: Calibration) -> dict[str, Any]:
     return {
         "unit": calibration.zoom.lens.focal_unit,
         "centre": f"{x:.6g}, {y:.6g}",
+        "centre_found": calibration.centre.sentence,
+        "coefficients": _coefficients(calibration),
         "polynomials": [
             [_term(value, power) for power, value in enumerate(column)]
             for column in calibration.pixel_polynomials().T
@@ -243,6 +245,14 @@ def _lens(calibration: Calibration) -> dict[str, Any]:
             kind="svg" if len(calibration.none) <= _MOST_FRAMES else "png",
         ),
     }
+
+
+def _coefficients(calibration: Calibration) -> list[tuple[str, ...]]:
+    """Of a model other than polynomials, focal lengths and coefficients, px; nothing for these."""
+    if calibration.pixel_polynomials().size:
+        return []
+    rows = calibration.coefficient_rows()
+    return [(f"{f:.4g}", *(f"{value:+.4e}" for value in values)) for f, *values in rows]
 
 
 def _certificate(calibration: Calibration) -> str:

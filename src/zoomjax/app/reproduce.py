@@ -25,6 +25,7 @@ from ..scenes.board import StripedBoard, board_lines, focal_sweep, nikkor_18_200
 from ..scenes.broadcast import broadcast_lines, broadcast_zoom
 from . import plot
 from .calibration import Calibration, calibrate, rms_over_frames
+from .model_choice import WantedModel
 
 NOTES = (
     "Table 1 in mm does not follow from Table 1 in pixels: by eq. 7 a pixel is at most 0.31 mm on the "
@@ -94,7 +95,7 @@ def board_experiment(
     truth, focal = nikkor_18_200(), focal_sweep(50)
     stage("Generating the lines of the board")
     lines = board_lines(truth, focal, spacing=spacing, noise=_BOARD_NOISE, imperfection=_BENDS, seed=1)
-    calibration = calibrate(lines, stage=stage)
+    calibration = calibrate(lines, model=WantedModel("polynomial"), centre=None, stage=stage)
     per_mm = np.array([StripedBoard.before(truth).magnification(float(f)) for f in focal])
     pixels = [rms_over_frames(values) for values in _residues(calibration)]
     mm = [rms_over_frames(values / per_mm) for values in _residues(calibration)]
@@ -125,7 +126,7 @@ def broadcast_experiment(stage: Callable[[str], None] = lambda _: None) -> Exper
     low, high = (float(f) for f in truth.focal_range)
     stage("Generating the lines of the broadcast")
     lines = broadcast_lines(truth, focal_sweep(55, low, high), noise=_BROADCAST_NOISE, seed=2)
-    calibration = calibrate(lines, stage=stage)
+    calibration = calibrate(lines, model=WantedModel("polynomial"), centre=None, stage=stage)
     stage("Correcting all 841 frames")
     video = broadcast_lines(truth, focal_sweep(841, low, high), noise=_BROADCAST_NOISE, seed=3)
     pixels = [rms_over_frames(values) for values in _residues(calibration)]

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING
 from .console import REPORT, progress_bar, stages
 
 if TYPE_CHECKING:
+    from ..fit.zoom import CentreArgument
     from ..lines.lines import Lines
     from .calibration import Calibration
     from .image_calibration import ImageCalibration, ImageJob
+    from .model_choice import WantedModel
     from .report import Run
 
 
@@ -23,10 +25,9 @@ def calibrate_lines(
     folder: Path,
     stage: Callable[[str], None],
     *,
-    degree: int,
-    terms: int,
+    model: "WantedModel",
+    centre: "CentreArgument",
     focal_sigma: str | None,
-    select: bool,
     robust: bool,
     title: str,
 ) -> "Calibration":
@@ -36,7 +37,7 @@ def calibrate_lines(
 
     sigma = focal_sigmas(focal_sigma or "0", lines.focal)
     calibration = calibrate(
-        lines, degree=degree, terms=terms, focal_sigma=sigma, select=select, robust=robust, stage=stage
+        lines, model=model, centre=centre, focal_sigma=sigma, robust=robust, stage=stage
     )
     stage("Writing the results")
     calibration.make(folder, pages={REPORT: report(calibration, run=what_is_run(title))})

@@ -13,8 +13,8 @@ from .energy import residuals as residuals
 from .family_lines import FamilyLines as FamilyLines
 from .family_lines import compress_family as compress_family
 from .family_lines import with_family as with_family
-from .focal_lengths import FocalFit as FocalFit
-from .focal_lengths import fit_focal as fit_focal
+from .focal_fit import FocalFit as FocalFit
+from .focal_fit import fit_focal as fit_focal
 from .focal_lengths import with_focal_sigma as with_focal_sigma
 from .frames import fit_frames as fit_frames
 from .image_metric import ImageLines as ImageLines

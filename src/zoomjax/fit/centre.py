@@ -28,9 +28,9 @@ from ..models.lens import ZoomLens
 from ..models.zoom import AbstractZoom, PolynomialZoom, with_parameters
 from ._least_squares import Solver, default_solver
 from .covariance import parameter_covariance
-from .energy import linearised
+from .energy import AbstractJointZoom, linearised
+from .minimise import fit_about, minimise
 from .result import RESULTS, FrameFits, ZoomFit, collected
-from .zoom import fit_zoom, minimise
 
 _MOST_UNCERTAIN = 0.05
 """Largest standard deviation of a centre, in half diagonals, with which it is accepted."""
@@ -84,7 +84,7 @@ class FrameCentres(eqx.Module):
         raise TypeError("FrameCentres are not a lens: use found.each.distortion(frame).")
 
 
-class _CentredZoom(AbstractZoom):
+class _CentredZoom(AbstractJointZoom):
     """From a focal length to the coefficients and, after them, the offset of the centre, normalised."""
 
     zoom: AbstractZoom
@@ -98,6 +98,9 @@ class _CentredZoom(AbstractZoom):
     def __call__(self, focal: ScalarLike) -> Coefficients:
         zoom, centre = self.parts()
         return jnp.concatenate([zoom(focal), centre(focal)])
+
+    def first(self) -> AbstractZoom:
+        return self.parts()[0]
 
     def parts(self) -> tuple[AbstractZoom, AbstractZoom]:
         """Both models, with the parameters of this one."""
@@ -146,30 +149,46 @@ def fit_centre(
     if not isinstance(lines, AnyCentreLines):
         lines = compress_any_centre(lines, 2 if terms is None else terms)
     options = {"max_steps": max_steps, "throw": throw}
-    fixed = fit_zoom(lines.about(lines.centre), zoom=zoom, terms=terms, solver=solver, **options)
+    fixed = fit_about(lines.about(lines.centre), zoom, terms, solver=solver, **options)
     model = (PolynomialZoom(degree=0) if centre is None else centre).prepare(lines.focal, 2)
     start = _both(fixed.lens.zoom, model)
     found, covariance, std, determined = _search(lines, start, solver or default_solver(lines), max_steps)
     _, moved = found.parts()
     each = lines.centre[None] + lines.scale * jax.vmap(moved)(lines.focal)
     # Once more about these centres, for all else that is to know of a fit: the same compiled program.
-    fit = fit_zoom(lines.about(each), zoom=zoom, terms=terms, solver=solver, **options)
+    fit = fit_about(lines.about(each), zoom, terms, solver=solver, **options)
     own = fit.covariance.shape[0]
+    joint = jnp.where(determined, covariance, jnp.zeros_like(covariance).at[:own, :own].set(fit.covariance))
     lens = _lens(lines, fit.lens, moved, each)
     certificate = fit.certificate if lens.shift is None else certify(lens)
     good: Any = RESULTS.successful  # an inherited member, which pyright takes for another class's
     folded = certificate.folded & (fit.result == good)
     fit = eqx.tree_at(
-        lambda fit: (fit.lens, fit.covariance, fit.certificate, fit.result),
+        lambda fit: (fit.lens, fit.covariance, fit.joint, fit.certificate, fit.result),
         fit,
         (
             lens,
             jnp.where(determined & jnp.isfinite(fit.covariance), covariance[:own, :own], fit.covariance),
+            joint,
             certificate,
             RESULTS.where(folded, RESULTS.folded, fit.result),
         ),
+        is_leaf=lambda leaf: leaf is None,
     )
     return CentreFit(fit, each, std, determined, fixed.rms, covariance)
+
+
+def refit_centre(lines: AnyCentreLines, found: CentreFit) -> AbstractZoom:
+    """Coefficients and centre of least energy for other weights of the lines, started from a fit.
+
+    A model that gives the coefficients and, after them, the centre's offset, for `AnyCentreLines`.
+    """
+    lens, centre = found.fit.lens, found.fit.lens.shift
+    if centre is None:
+        offset = (lens.centre - jnp.asarray(lines.centre))[None] / lens.scale
+        centre = with_parameters(PolynomialZoom(degree=0).prepare(lines.focal, 2), offset)
+    joint, *_ = _search(lines, _both(lens.zoom, centre), default_solver(lines), 256)
+    return joint
 
 
 @kinds_checked

@@ -8,7 +8,8 @@ whole: points are not independent, but lines are assumed to be. A line pulls at 
 score ``J_l^T r_l``, the same from its compressed rows, and the squares of the scores make the line-by-line
 sandwich ``H^-1 (sum_l g_l g_l^T) H^-1``. That estimate alone is too uncertain, since a few lines decide a
 parameter. So it is shrunk towards the shape for independent points, by an amount given by its own scatter
-(Ledoit and Wolf 2004). docs/trust.md has the measured coverage, and that of alternatives.
+(Ledoit and Wolf 2004). The same is then done for whole photos, whose lines may err together.
+docs/trust.md has the measured coverage, and that of alternatives.
 """
 
 import jax
@@ -17,8 +18,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from ..lines.base import AbstractLines
-from ..models.zoom import AbstractPriorZoom, AbstractZoom, with_parameters
-from .energy import coefficients_by, line_weights, prior_error, prior_jacobian
+from ..models.zoom import AbstractZoom, with_parameters
+from .energy import coefficients_by, counted_frames, line_weights, prior_error, prior_jacobian, prior_of
 
 _ROUNDING = 64
 """Error of the corrected points without noise, in units in the last place of their mean radius."""
@@ -30,6 +31,7 @@ def parameter_covariance(
     weighted: Float[Array, "line rows"],
     jacobian: Float[Array, "line rows parameter"],
     extra: int = 0,
+    photos: bool = True,
 ) -> tuple[Float[Array, "parameter parameter"], Bool[Array, ""]]:
     """Covariance of the flattened parameters, and whether the lines determine them all.
 
@@ -47,6 +49,7 @@ def parameter_covariance(
         zoom: the fitted model.
         weighted, jacobian: the residuals, times the root of their weights, and their derivatives.
         extra: how many numbers the model gives after the coefficients.
+        photos: whether lines of one photo may err together.
     """
     energy = jnp.sum(weighted**2)
     weights = line_weights(lines)
@@ -78,10 +81,16 @@ def parameter_covariance(
     terms = jax.eval_shape(coefficients_by, zoom, lines).shape[1]
     scores = terms * jnp.sum(weights > 0) - jnp.sum(good)
     score = jnp.einsum("lri,lr->li", jacobian, weighted)
-    covariance = inverse @ _of_whole_lines(score, leverage, share, scores) @ inverse.T
-    if isinstance(zoom, AbstractPriorZoom):
+    covariance = _of_whole_lines(score, leverage, share, scores)
+    if photos:
+        frames = lines.focal.shape[0]
+        of_photos = [jax.ops.segment_sum(of, lines.frame, frames) for of in (score, leverage, share)]
+        free = terms * jnp.sum(counted_frames(lines)) - jnp.sum(good)
+        covariance = _of_whole_photos(of_photos, covariance, free)
+    covariance = inverse @ covariance @ inverse.T
+    if (own := prior_of(zoom)) is not None:
         # The prior draws the parameters to its mean: by how much, in the mean over what it expects.
-        half = prior_error(lines, zoom) * inverse @ (prior @ inverse).T
+        half = prior_error(lines, own) * inverse @ (prior @ inverse).T
         covariance = covariance + half @ half.T
     either = undetermined[:, None] | undetermined[None]
     infinite = jnp.where(jnp.eye(size.shape[0], dtype=bool), jnp.inf, 0)
@@ -114,6 +123,39 @@ def _of_whole_lines(score, leverage, share, scores):
     nu = jnp.minimum(jnp.trace(independent) ** 2 / _positive(jnp.sum(share**2)), scores)
     size = c + 2 * jnp.maximum(c, 1) / _positive(nu)
     return jnp.where((nu > 0) & (c > 0), size * shape, independent)
+
+
+def _of_whole_photos(of_photos, by_line, free):
+    """The covariance where the lines of a photo may err together, in the parameters of `_of_whole_lines`.
+
+    A bent board bends all lines of a photo alike, and a wrong focal length or a model that does not follow
+    the lens does the same. Were the lines independent, with the covariance C = `by_line`, split into A_m
+    over the photos as `share` is, the scores g_m of the photos would have in the mean
+
+        E sum_m |g_m|^2 = sum_m tr(A_m - 2 H_m A_m + H_m C H_m),    H_m = J_m^T J_m,
+
+    since the fit takes ``H_m sum_k g_k`` from each. This is exact whatever the leverages, so that it serves
+    few photos too. The ratio phi of what is found to that enlarges C where it is above 1. It has `free`
+    degrees of freedom, the coefficients that the photos would have by themselves less the parameters; for
+    these few, ``2 (phi - 1)/free`` is added. The shape is that of C, shrunk less towards it the more
+    photos there are, as for lines.
+    """
+    score, leverage, share = of_photos
+    length = jnp.sum(score**2, axis=1)
+    own = share * (jnp.trace(by_line) / _positive(jnp.trace(jnp.sum(share, axis=0))))
+    taken = jnp.einsum("mij,mji->", leverage, own)
+    left = jnp.trace(jnp.sum(own, axis=0)) - 2 * taken
+    left = left + jnp.einsum("mij,jk,mki->", leverage, by_line, leverage)
+    ratio = jnp.sum(length) / _positive(left)
+    known = (free > 0) & (left > 0) & (ratio > 1)
+    ratio = jnp.where(known, ratio, 1)
+    total = score.T @ score
+    total = total * (ratio * jnp.trace(by_line) / _positive(jnp.trace(total)))
+    apart = jnp.sum((total - ratio * by_line) ** 2)
+    by_chance = jnp.sum(total**2) / _positive(free) + jnp.trace(total) ** 2 / _positive(free)
+    shrink = jnp.clip(by_chance / _positive(apart), 0, 1)
+    shape = shrink * by_line + (1 - shrink) * total / ratio
+    return jnp.where(known, (ratio + 2 * (ratio - 1) / _positive(free)) * shape, by_line)
 
 
 def _positive(value):

@@ -8,6 +8,7 @@ Weights are the paper's: a point counts ``1 / (M Nl(m) Np(l, m))``, so that ever
 and within it every line. The M frames are those that have a line of a weight above 0.
 """
 
+import abc
 import math
 
 import equinox as eqx
@@ -130,9 +131,22 @@ def coefficients_by(zoom: AbstractZoom, lines: AbstractLines) -> Float[Array, "f
 
 def prior_residuals(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "row"] | None:
     """Residuals of the prior of a zoom model, px; None for a model without a prior."""
-    if not isinstance(zoom, AbstractPriorZoom):
-        return None
-    return prior_error(lines, zoom) * zoom.standardised()
+    prior = prior_of(zoom)
+    return None if prior is None else prior_error(lines, prior) * prior.standardised()
+
+
+def prior_of(zoom: AbstractZoom) -> AbstractPriorZoom | None:
+    """The model with a prior that this one is, or that it is made of (`AbstractJointZoom`)."""
+    zoom = zoom.first() if isinstance(zoom, AbstractJointZoom) else zoom
+    return zoom if isinstance(zoom, AbstractPriorZoom) else None
+
+
+class AbstractJointZoom(AbstractZoom):
+    """A zoom model together with another model, fitted at once."""
+
+    @abc.abstractmethod
+    def first(self) -> AbstractZoom:
+        """The zoom model, with its present parameters."""
 
 
 def prior_error(lines: AbstractLines, zoom: AbstractPriorZoom) -> Float[Array, ""]:
@@ -144,7 +158,7 @@ def prior_error(lines: AbstractLines, zoom: AbstractPriorZoom) -> Float[Array, "
 def prior_jacobian(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "row parameter"]:
     """Derivatives of `prior_residuals` by the flattened parameters; no rows for a model without a prior."""
     flat, unravel = ravel_pytree(zoom.parameters)
-    if not isinstance(zoom, AbstractPriorZoom):
+    if prior_of(zoom) is None:
         return jnp.zeros((0, flat.size), flat.dtype)
     return jax.jacfwd(lambda flat: prior_residuals(lines, with_parameters(zoom, unravel(flat))))(flat)
 
@@ -169,8 +183,18 @@ def energy_by_frame(lines: AbstractLines, weighted: Float[Array, "line rows"]) -
 @eqx.filter_jit
 def line_rms(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "line"]:
     """Root of the mean squared distance of each line's corrected points to it, px, whatever its weight."""
+    return jnp.sqrt(_line_squares(lines, coefficients))
+
+
+@eqx.filter_jit
+def line_squares(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "line"]:
+    """Mean squared distance of each line's corrected points to it, px^2, under a zoom model."""
+    return _line_squares(lines, coefficients_by(zoom, lines))
+
+
+def _line_squares(lines, coefficients):
     distances = jax.vmap(line_residuals)(lines.corrected(coefficients[lines.frame]))
-    return jnp.sqrt(jnp.sum(distances**2, axis=1) / jnp.maximum(lines.counts, 1))
+    return jnp.sum(distances**2, axis=1) / jnp.maximum(lines.counts, 1)
 
 
 @kinds_checked

@@ -9,7 +9,8 @@ Frames meet in the energy only through their coefficients k_m = k(f_m): near the
 frames of quadratics in k_m, found by N + 1 gradients whatever the number of frames, and all derivatives
 by a and t are those of that sum.
 
-The lines also determine where on its curve k(f) a frame lies. `fit_focal` minimises, over a and t together,
+The other half is in `focal_fit`, which estimates the focal lengths from the lines, too: the functions here
+that it needs minimise, over a and t together,
 
     E(a, t) + sum_m tau_m (t_m f_m / sigma_m)^2 .
 
@@ -19,54 +20,31 @@ is independent of the others. The fit's own covariance C tells s: with G = J^T J
 the lines, ``tr(G C) = s^2 sum_l w_l h_l``. So noise that is correlated along a line is taken into account.
 """
 
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int, Num, ScalarLike
+from jaxtyping import Array, Bool, Float, Num, ScalarLike
 
 from .._core.arguments import kinds_checked
 from .._core.types import AnyArray, Focal, traced
 from ..lines.base import AbstractLines
-from ..models.zoom import AbstractPriorZoom, AbstractZoom, with_parameters
+from ..models.zoom import AbstractPriorZoom, with_parameters
 from .covariance import parameter_covariance
 from .energy import coefficients_by, line_weights, linearised, prior_error, prior_residuals, residuals
 from .family_lines import with_family
 from .result import ZoomFit
-from .zoom import fit_zoom
 
 Sigma = ScalarLike | Num[AnyArray, "frame"]
 
-_MOST_STEPS = 100
+MOST_STEPS = 100
 """Of the joint minimisation, which takes 5 to 15."""
 
 _LEAST_NOISE = 1e-3
 """px: points are not taken for better than that, or a scene without noise would leave the prior no say."""
-
-
-class FocalFit(eqx.Module):
-    """A zoom lens fitted together with the focal lengths of its frames.
-
-    Attributes:
-        fit: the fit at the estimated focal lengths; its covariance includes their remaining uncertainty.
-        focal: the estimated focal length of each frame.
-        std: their standard deviations, same unit; at most about those given, and 0 where 0 was given.
-        given: the focal lengths of the lines.
-        steps: number of steps the joint solver took.
-    """
-
-    fit: ZoomFit
-    focal: Float[Array, "frame"]
-    std: Float[Array, "frame"]
-    given: Float[Array, "frame"]
-    steps: Int[Array, ""]
-
-    def __call__(self, *_: Any, **__: Any) -> NoReturn:
-        """Raise TypeError: the lens of its fit is asked."""
-        raise TypeError("A FocalFit is not a lens: use found.fit.lens, as in found.fit.lens(35.0).")
 
 
 @kinds_checked
@@ -97,94 +75,20 @@ def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma) 
         >>> bool(wide[0] < wide[1])
         True
     """
-    sigma = _checked_sigma(focal_sigma, lines.focal)
+    sigma = checked_sigma(focal_sigma, lines.focal)
     if not traced(sigma) and not np.isfinite(sigma).all():
         raise ValueError(
-            f"Argument focal_sigma must hold finite numbers, but it is {focal_sigma}. {_UNKNOWN}"
+            f"Argument focal_sigma must hold finite numbers, but it is {focal_sigma}. {UNKNOWN}"
         )
     if fit.lens.shift is not None:
         raise ValueError(
             "Argument fit must have a lens with a fixed centre, but its centre moves along the zoom."
         )
     lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
-    return _widened(fit, lines, jnp.diag(sigma / jnp.asarray(lines.focal)) ** 2)
+    return widened(fit, lines, jnp.diag(sigma / jnp.asarray(lines.focal)) ** 2)
 
 
-@kinds_checked
-def fit_focal(
-    lines: AbstractLines,
-    focal_sigma: Sigma,
-    *,
-    zoom: AbstractZoom | None = None,
-    terms: int | None = None,
-    invertible: bool = True,
-    throw: bool = True,
-) -> FocalFit:
-    """Fit the zoom model and the focal lengths together, with the given focal lengths as a prior.
-
-    Straight lines alone do not determine focal lengths: after a change of all focal lengths by an
-    increasing function, another zoom model makes every line as straight. A polynomial in 1/f stays one if
-    1/f is scaled and shifted, so the lines cannot correct scale and offset at all. The scale of the result
-    is therefore that of the given focal lengths; the lines correct single ones that deviate from a smooth
-    k(f). Deviations that the zoom model cannot follow are attributed to focal lengths, too.
-
-    Args:
-        lines: the lines, or, much faster and with the same answer, ``compress(lines)``.
-        focal_sigma: standard deviation of the given focal lengths, in their unit: a number, or one per
-            frame. 0 keeps a focal length fixed; infinity means that it is unknown, and the given one is
-            only the start.
-        zoom, terms, invertible, throw: as for `fit_zoom`, whose errors also apply.
-
-    Raises:
-        ValueError: `focal_sigma` is not valid, or is infinite for all frames but those at one focal length;
-            or the lines are in float32, whose rounding errors can outweigh the prior.
-        RuntimeError: the solver failed (see `throw`).
-
-    Example:
-        >>> import jax
-        >>> from zoomjax import compress, scenes
-        >>> jax.config.update("jax_enable_x64", True)
-        >>> truth, focal = scenes.nikkor_18_200(), scenes.focal_sweep(8)
-        >>> lines = scenes.board_lines(truth, focal, spacing=99, noise=0.1)
-        >>> given = eqx.tree_at(lambda lines: lines.focal, lines, jax.numpy.asarray(focal.round()))
-        >>> found = fit_focal(compress(given), 0.29)
-        >>> bool(abs(found.focal - focal).mean() < abs(found.given - focal).mean())
-        True
-        >>> jax.config.update("jax_enable_x64", False)
-    """
-    sigma = _checked_sigma(focal_sigma, lines.focal)
-    given = jnp.asarray(lines.focal)
-    if given.dtype != jnp.float64:
-        raise ValueError(
-            "Focal lengths are refined in float64 only: "
-            f'jax.config.update("jax_enable_x64", True), and not lines in {given.dtype}.'
-        )
-    if not traced((sigma, given)) and np.unique(given[np.isfinite(sigma)]).size < 2:
-        raise ValueError(
-            "Argument focal_sigma must be finite for frames at two different focal lengths or more, but it "
-            f"is {focal_sigma}. {_UNKNOWN}"
-        )
-    start = fit_zoom(lines, zoom=zoom, terms=terms, invertible=False, throw=throw)
-    t, model, steps, reached = _refined(lines, start.lens.zoom, sigma / given)
-    if throw and not traced(reached) and not reached:
-        raise RuntimeError(
-            f"The focal lengths did not converge in {_MOST_STEPS} steps: the lines hardly determine those "
-            "with a large focal_sigma. Leave these frames out, or measure their focal lengths."
-        )
-    focal = given * jnp.exp(t)
-    refined = _at(lines, focal)
-    fit = fit_zoom(refined, zoom=model, invertible=invertible, throw=throw)
-    covariance = _posterior(refined, fit.lens.zoom, sigma / given)
-    return FocalFit(
-        fit=_widened(fit, refined, covariance),
-        focal=focal,
-        std=focal * jnp.sqrt(jnp.diagonal(covariance)),
-        given=given,
-        steps=steps,
-    )
-
-
-_UNKNOWN = (
+UNKNOWN = (
     "Straight lines alone do not determine focal lengths: after a change of all focal lengths by an "
     "increasing function, another zoom model makes every line as straight. Take them from EXIF data or a "
     "table, or measure them from a board (focal_from_board) or a plane (focal_from_planes, "
@@ -192,13 +96,11 @@ _UNKNOWN = (
 )
 
 
-def _checked_sigma(focal_sigma: Any, focal: Focal) -> Float[Array, "frame"]:
+def checked_sigma(focal_sigma: Any, focal: Focal) -> Float[Array, "frame"]:
     """The standard deviation of each frame's focal length."""
     focal = jnp.asarray(focal)
     if focal_sigma is None:
-        raise ValueError(
-            f"Argument focal_sigma must be a number or one a frame, but it is None. {_UNKNOWN}"
-        )
+        raise ValueError(f"Argument focal_sigma must be a number or one a frame, but it is None. {UNKNOWN}")
     sigma = jnp.asarray(focal_sigma, focal.dtype)
     if sigma.shape not in ((), focal.shape):
         raise ValueError(
@@ -207,7 +109,7 @@ def _checked_sigma(focal_sigma: Any, focal: Focal) -> Float[Array, "frame"]:
         )
     if not traced(sigma):
         if np.isnan(sigma).any():
-            raise ValueError(f"Argument focal_sigma must hold numbers, but it is {focal_sigma}. {_UNKNOWN}")
+            raise ValueError(f"Argument focal_sigma must hold numbers, but it is {focal_sigma}. {UNKNOWN}")
         if (np.asarray(sigma) < 0).any():
             raise ValueError(f"Argument focal_sigma must be at least 0, but it is {focal_sigma}.")
     return jnp.broadcast_to(sigma, focal.shape)
@@ -245,7 +147,7 @@ def _response(lines, zoom) -> Float[Array, "parameter frame"]:
     def half(flat, t):
         model = with_parameters(zoom, unravel(flat))
         prior = prior_residuals(lines, model)
-        return near(coefficients_by(model, _at(lines, focal * jnp.exp(t)))) + (
+        return near(coefficients_by(model, at_focal_lengths(lines, focal * jnp.exp(t)))) + (
             0 if prior is None else jnp.sum(prior**2) / 2
         )
 
@@ -262,19 +164,44 @@ def _inverse(matrix):
 
 
 @eqx.filter_jit
-def _widened(fit, lines, covariance):
-    """The fit with its covariance enlarged by that of the logarithms of the focal lengths."""
-    response = _response(lines, fit.lens.zoom)
-    own = fit.covariance
-    infinite = jnp.isinf(jnp.diagonal(own))
-    more = jnp.where(infinite[:, None] | infinite[None], 0, response @ covariance @ response.T)
-    return eqx.tree_at(lambda fit: fit.covariance, fit, own + more)
+def widened(fit, lines, covariance):
+    """The fit with its covariance enlarged by that of the logarithms of the focal lengths.
+
+    Wrong focal lengths also show as errors that the lines of a photo share, for which the covariance allows
+    already: only what goes beyond that is added. A fitted centre is held where it is.
+    """
+    zoom = fit.lens.zoom
+    response = _response(lines, zoom)
+    weighted, jacobian = linearised(lines, zoom)
+    by_line, _ = parameter_covariance(lines, zoom, weighted, jacobian, photos=False)
+    infinite = jnp.isinf(jnp.diagonal(fit.covariance)) | jnp.isinf(jnp.diagonal(by_line))
+    known = ~(infinite[:, None] | infinite[None])
+    own, by_line = (jnp.where(known, matrix, 0) for matrix in (fit.covariance, by_line))
+    size = jnp.sqrt(jnp.maximum(jnp.diagonal(own), 0))
+    unit = jnp.where(size > 0, size, 1)
+    both = unit[:, None] * unit[None]
+    shared = _positive_part((own - by_line) / both)
+    of_focal = jnp.where(known, response @ covariance @ response.T, 0) / both
+    more = _positive_part(of_focal - shared) * both
+    wider = jnp.where(known, fit.covariance + more, fit.covariance)
+    fit = eqx.tree_at(lambda fit: fit.covariance, fit, wider)
+    if fit.joint is None:
+        return fit
+    number = wider.shape[0]
+    joint = fit.joint.at[:number, :number].add(jnp.where(known, more, 0))
+    return eqx.tree_at(lambda fit: fit.joint, fit, joint)
+
+
+def _positive_part(matrix):
+    """A symmetric matrix without its negative eigenvalues."""
+    values, vectors = jnp.linalg.eigh(matrix)
+    return (vectors * jnp.maximum(values, 0)[None]) @ vectors.T
 
 
 def _prior_weights(lines, zoom) -> Float[Array, "frame"]:
     """tau of each frame, px^2: see the module."""
     weighted, jacobian = linearised(lines, zoom)
-    covariance, _ = parameter_covariance(lines, zoom, weighted, jacobian)
+    covariance, _ = parameter_covariance(lines, zoom, weighted, jacobian, photos=False)
     known = jnp.isfinite(jnp.diagonal(covariance))
     covariance = jnp.where(known[:, None] & known[None], covariance, 0)
     weights, frames = line_weights(lines), lines.focal.shape[0]
@@ -295,7 +222,7 @@ class _Joint(NamedTuple):
     middle: Float[Array, "unknown unknown"]
 
 
-def _at(lines, focal):
+def at_focal_lengths(lines, focal):
     """The lines with other focal lengths of their frames."""
     return eqx.tree_at(lambda lines: lines.focal, lines, focal)
 
@@ -311,7 +238,7 @@ def _joint(lines, zoom, relative, known, tau, t) -> _Joint:
 
     def coefficients(both):
         model = with_parameters(zoom, unravel(both[:number]))
-        return coefficients_by(model, _at(lines, _focal_of(lines, relative, both[number:])))
+        return coefficients_by(model, at_focal_lengths(lines, _focal_of(lines, relative, both[number:])))
 
     def priors(both):
         own = prior_residuals(lines, with_parameters(zoom, unravel(both[:number])))
@@ -338,7 +265,7 @@ def _prior_noise(lines, zoom):
 
 
 @eqx.filter_jit
-def _refined(lines, zoom, relative):
+def refined(lines, zoom, relative):
     """log f relative to the given ones, and the zoom model with them, by damped Gauss-Newton steps."""
     known = jnp.isfinite(relative)
     relative = jnp.where(known, relative, 1)
@@ -350,7 +277,10 @@ def _refined(lines, zoom, relative):
 
     def energy(flat, t, tau):
         total = jnp.sum(
-            residuals(lines, coefficients_by(model(flat), _at(lines, _focal_of(lines, relative, t)))) ** 2
+            residuals(
+                lines, coefficients_by(model(flat), at_focal_lengths(lines, _focal_of(lines, relative, t)))
+            )
+            ** 2
         )
         prior = prior_residuals(lines, model(flat))
         return (
@@ -359,7 +289,7 @@ def _refined(lines, zoom, relative):
 
     def turn(state):
         flat, t, damping, _, steps = state
-        moved = _at(lines, _focal_of(lines, relative, t))
+        moved = at_focal_lengths(lines, _focal_of(lines, relative, t))
         tau = _prior_weights(moved, model(flat))
         joint = _joint(lines, model(flat), relative, known, tau, t)
         matrix = joint.gauss_newton
@@ -377,7 +307,7 @@ def _refined(lines, zoom, relative):
 
     def goes_on(state):
         *_, change, steps = state
-        return (change > tolerance) & (steps < _MOST_STEPS)
+        return (change > tolerance) & (steps < MOST_STEPS)
 
     zero, inf = jnp.zeros_like(relative), jnp.asarray(jnp.inf, relative.dtype)
     start = (flat, zero, jnp.zeros_like(inf), inf, jnp.asarray(0))
@@ -387,7 +317,7 @@ def _refined(lines, zoom, relative):
 
 
 @eqx.filter_jit
-def _posterior(lines, zoom, relative):
+def posterior(lines, zoom, relative):
     """Covariance of the logarithms of the focal lengths, given the lines and the prior, at the minimum."""
     known = jnp.isfinite(relative)
     relative = jnp.where(known, relative, 1)

@@ -17,9 +17,9 @@ from ..models.zoom import PolynomialZoom, with_parameters
 from ._least_squares import Solver, default_solver
 from .constrained import or_else, refit_zoom
 from .family_lines import points_of, with_family
+from .minimise import fit_prepared
 from .prepare import algebraic_start, compressed_as_measured
 from .result import FrameFits, collected, described_fit, is_invertible, outcome_of, thrown
-from .zoom import fit_prepared
 
 
 @kinds_checked

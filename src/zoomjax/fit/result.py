@@ -81,6 +81,11 @@ class ZoomFit(eqx.Module):
         certificate: whether the lens is invertible over its image and focal range.
         rms_unconstrained: `rms` of the fit without the constraint of invertibility: the same, unless the
             model was refitted. The result is then `constrained`, unless there is a worse one.
+        joint: covariance of the zoom model's parameters and, after them, of the fitted centre (x, y, in
+            half diagonals; for a centre that moves, the parameters of its model); None where the centre
+            was given.
+        misfit: covariance of what the lens's coefficients are off the model at any focal length: see
+            `zoomjax.trust.with_misfit`; None where it was not estimated.
     """
 
     lens: ZoomLens
@@ -91,6 +96,8 @@ class ZoomFit(eqx.Module):
     steps: Int[Array, ""]
     certificate: Certificate
     rms_unconstrained: Float[Array, ""]
+    joint: Float[Array, "both both"] | None = None
+    misfit: Float[Array, "terms terms"] | None = None
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
         """Raise TypeError: call the lens of the fit instead."""

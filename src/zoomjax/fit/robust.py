@@ -24,7 +24,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
-from ..lines.base import AbstractLines
+from ..lines.base import AbstractLines, SomeLines
 from ..models.family import AbstractFamily
 from ..models.polynomial import RadialPolynomial
 from ..models.zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
@@ -104,16 +104,23 @@ def fit_robust(
         [10]
     """
     lines = lines if family is None else with_family(lines, family)
-    start, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
-    new = zoom is None or zoom.parameters is None
-    if new and isinstance(start, AbstractLinearZoom) and isinstance(lines.family, RadialPolynomial):
-        start = algebraic_zoom(lines, zoom=start, terms=terms).zoom
-    weighted, model = _reweighted(lines, start)
+    weighted, model = reweighted(lines, zoom, terms)
     fit = fit_zoom(
         weighted, zoom=model, solver=solver, max_steps=max_steps, invertible=invertible, throw=throw
     )
     line_rms, median = _line_rms(lines, fit.lens.zoom)
-    return RobustFit(fit=fit, weight=weighted.weight, line_rms=line_rms, scale=median)
+    return RobustFit(fit=fit, weight=jnp.asarray(weighted.weight), line_rms=line_rms, scale=median)
+
+
+def reweighted(
+    lines: SomeLines, zoom: AbstractZoom | None = None, terms: int | None = None
+) -> tuple[SomeLines, AbstractZoom]:
+    """The lines with the weights of `fit_robust`, and the model of its last turn."""
+    start, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
+    new = zoom is None or zoom.parameters is None
+    if new and isinstance(start, AbstractLinearZoom) and isinstance(lines.family, RadialPolynomial):
+        start = algebraic_zoom(lines, zoom=start, terms=terms).zoom
+    return _reweighted(lines, start)
 
 
 @eqx.filter_jit

@@ -3,27 +3,31 @@
 The unknowns are the parameters of the zoom model alone, as the lines are eliminated (`energy`). Solvers are
 those of optimistix, with Jacobians by automatic differentiation. A fitted model is differentiable with
 respect to the points by the implicit function theorem. A model that is not certified to be invertible is
-refitted under that constraint (`constrained`).
-
-Compiled once for a shape of the lines; once per fit an algebraic start and, after it, the covariance and
-the certificate; per iteration one Jacobian of the residuals.
+refitted under that constraint (`constrained`). The work is in `minimise` and, for a fitted centre, in
+`centre`.
 """
 
-import equinox as eqx
-import jax
-import optimistix as optx
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
-from ..lines.base import AbstractLines
+from .._core.types import AnyArray
+from ..lines.base import AbstractLines, SomeLines
+from ..lines.compressed import CompressedLines
+from ..lines.free_centre import AnyCentreLines
+from ..lines.lines import Lines
 from ..models.family import AbstractFamily
-from ..models.zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
-from ._least_squares import Solver, default_solver
-from .algebraic import algebraic_parameters
-from .constrained import or_else, refit_zoom
-from .energy import coefficients_by, prior_residuals, residuals
+from ..models.zoom import AbstractZoom
+from ._least_squares import Solver
+from .centre import fit_centre
 from .family_lines import with_family
-from .prepare import algebraic_start, compressed_as_measured, ready_model
-from .result import ZoomFit, described_fit, outcome_of, thrown
+from .minimise import fit_about
+from .result import ZoomFit
+
+CentreArgument = Literal["fit", "image"] | tuple[float, float] | Float[AnyArray, "2"]
+"""The centre of distortion: fitted, the image's, or its coordinates, px."""
 
 
 @kinds_checked
@@ -33,6 +37,7 @@ def fit_zoom(
     zoom: AbstractZoom | None = None,
     family: AbstractFamily | None = None,
     terms: int | None = None,
+    centre: CentreArgument | None = None,
     solver: Solver | None = None,
     max_steps: int = 256,
     invertible: bool = True,
@@ -49,6 +54,9 @@ def fit_zoom(
             (`compress_family`); or `Division`, or `BrownConrady`, which has two additional coefficients.
         terms: the number N of radial distortion coefficients (eq. 2): by default 2, or as many as a `zoom`
             with parameters has.
+        centre: the centre of distortion: "fit" fits it too, one for all focal lengths, where the lines
+            determine it (`fit_centre`); "image" is the middle of the image; two coordinates, px, are
+            taken as they are. By default that of the lines.
         solver: any optimistix least-squares solver or minimiser; Levenberg-Marquardt by default, with
             tolerances for the dtype of the lines.
         max_steps: the maximum number of solver steps.
@@ -64,7 +72,8 @@ def fit_zoom(
 
     Raises:
         ValueError: there are fewer distinct focal lengths than the zoom model needs, the lines were
-            compressed for fewer terms, or the parameters of `zoom` are for another number of terms.
+            compressed for fewer terms or about another centre, or the parameters of `zoom` are for another
+            number of terms.
         TypeError: an argument has the wrong type, such as the class PolynomialZoom instead of an instance.
         RuntimeError: the solver failed (see `throw`).
 
@@ -79,37 +88,32 @@ def fit_zoom(
         True
     """
     lines = lines if family is None else with_family(lines, family)
-    model, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
-    start = None
-    if isinstance(model, AbstractLinearZoom) and (zoom is None or zoom.parameters is None):
-        start = algebraic_start(lines, terms)
-    solver = default_solver(lines) if solver is None else solver
-    fit, outcome = fit_prepared(lines, start, model, terms, solver, max_steps)
-    if invertible:
-        fit, outcome = or_else(fit, outcome, lambda: refit_zoom(compressed_as_measured(lines, terms), fit))
-    return thrown(fit, outcome, throw)
+    options: Any = {"solver": solver, "max_steps": max_steps, "throw": throw}
+    if isinstance(centre, str) and centre == "fit":
+        if not isinstance(lines, Lines | AnyCentreLines) or not invertible:
+            raise ValueError(
+                'Argument centre is "fit", which needs lines that are not compressed about one centre, '
+                "under the radial polynomial and with invertible=True: pass the lines themselves, or "
+                "compress_any_centre(lines)."
+            )
+        return fit_centre(lines, zoom=zoom, terms=terms, **options).fit
+    return fit_about(about_centre(lines, centre), zoom, terms, invertible=invertible, **options)
 
 
-@eqx.filter_jit
-def fit_prepared(lines, start, zoom, terms, solver, max_steps):
-    """The fit of a prepared model, and its outcome."""
-    if start is not None:
-        zoom = with_parameters(zoom, algebraic_parameters(start, zoom, terms))
-    zoom, result, steps = minimise(lines, zoom, solver, max_steps)
-    fit = described_fit(lines, zoom, result, steps)
-    return fit, outcome_of(fit)
-
-
-def minimise(lines, zoom, solver, max_steps):
-    """The model at the minimum of the global energy, from its own parameters as the start."""
-
-    def function(parameters, args):
-        lines, zoom = args
-        zoom = with_parameters(zoom, parameters)
-        return residuals(lines, coefficients_by(zoom, lines)), prior_residuals(lines, zoom)
-
-    start = jax.tree.map(jax.lax.stop_gradient, zoom.parameters)
-    solution = optx.least_squares(
-        function, solver, start, args=(lines, zoom), max_steps=max_steps, throw=False
-    )
-    return with_parameters(zoom, solution.value), solution.result, solution.stats["num_steps"]
+def about_centre(lines: SomeLines, centre: CentreArgument | None) -> SomeLines | CompressedLines:
+    """The lines about the centre of distortion that an argument names; None: their own."""
+    if centre is None:
+        return lines.about(lines.centre) if isinstance(lines, AnyCentreLines) else lines
+    if isinstance(centre, str):
+        if centre != "image":
+            raise ValueError(
+                f'Argument centre must be "fit", "image" or two coordinates in px, but it is {centre!r}.'
+            )
+        centre = (np.array(lines.image_size) - 1) / 2
+    centre = np.asarray(centre, float)
+    if centre.shape != (2,) or not np.isfinite(centre).all():
+        raise ValueError(
+            f'Argument centre must be "fit", "image" or two coordinates in px, but it is {centre}.'
+        )
+    found: Any = lines.about(centre)
+    return found

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_size, checked_terms
 from .._core.fields import check_shapes, integers, numbers
-from .._core.types import Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Point
+from .._core.types import Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Point, traced
 from .base import AbstractLines, focus_of
 from .compressed import EXACT, CompressedLines, triangle, triangles_of
 from .lines import Lines
@@ -154,7 +154,7 @@ def compress_any_centre(lines: Lines, terms: int = 2) -> AnyCentreLines:
         ((2, 21, 21), (2, 7, 7))
     """
     return AnyCentreLines(
-        triangle=triangles_of(lines, _monomials, checked_terms(terms)),
+        triangle=_triangles(lines, checked_terms(terms)),
         frame=lines.frame,
         focal=lines.focal,
         centre=lines.centre,
@@ -166,12 +166,32 @@ def compress_any_centre(lines: Lines, terms: int = 2) -> AnyCentreLines:
     )
 
 
-def _monomials(z, valid, terms):
+_FEW_POINTS = 2_000_000
+"""Up to so many points LAPACK reduces them, which needs no compiling; beyond, compiled code is faster."""
+
+
+def _triangles(lines, terms):
+    """R of each line's monomials."""
+    here = not traced(lines) and jax.default_backend() == "cpu" and lines.points.size <= 2 * _FEW_POINTS
+    if not here or len(getattr(lines.points, "devices", set)()) > 1:
+        return triangles_of(lines, _monomials, terms)
+    centre, mask = np.asarray(lines.centre, float), np.asarray(lines.mask)
+    size = (2 * terms + 2) * (2 * terms + 3) // 2
+    found = np.zeros((len(mask), size, size))
+    for line, (points, there) in enumerate(zip(np.asarray(lines.points), mask, strict=True)):
+        z = (points[there].astype(float) - centre).T / lines.scale
+        rows = _monomials(z, np.ones(z.shape[1]), terms, np)
+        r = np.linalg.qr(rows.T, mode="r")
+        found[line, : len(r)] = r * np.where(np.diagonal(r) < 0, -1, 1)[:, None]
+    return jnp.asarray(found, jnp.asarray(lines.points).dtype)
+
+
+def _monomials(z, valid, terms, xp=jnp):
     """The rows ``x^a y^b`` of one line, by degree ``a + b``, then by b; zero where it has no point."""
     degree = [valid[None]]
     for _ in range(2 * terms + 1):
-        degree.append(jnp.concatenate([z[:1] * degree[-1], z[1:] * degree[-1][-1:]]))
-    return jnp.concatenate(degree)
+        degree.append(xp.concatenate([z[:1] * degree[-1], z[1:] * degree[-1][-1:]]))
+    return xp.concatenate(degree)
 
 
 def _powers(terms):

@@ -15,6 +15,7 @@ from .cross_validation import held_out_frames as held_out_frames
 from .cross_validation import held_out_zoom as held_out_zoom
 from .evidence import Evidence as Evidence
 from .evidence import evidence as evidence
+from .misfit import with_misfit as with_misfit
 from .next_photo import Suggestion as Suggestion
 from .next_photo import suggest_next as suggest_next
 from .selection import Candidate as Candidate

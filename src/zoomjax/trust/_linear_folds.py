@@ -206,7 +206,7 @@ def _move(at, damping):
 
 def _state(lanes, weights, design, parameters, known=None):
     """The lines' sums, put together as the model's basis says."""
-    lines = _pass(lanes, design.basis @ parameters) if known is None else known
+    lines = passed(lanes, design.basis @ parameters) if known is None else known
     gradient, matrix = (lanes.total(weights * a) for a in (lines.gradient, lines.matrix))
     rows, flat = design.basis[lanes.frame[lanes.starts]], parameters.reshape(-1)
     pulled = design.precision @ flat
@@ -222,7 +222,7 @@ def _state(lanes, weights, design, parameters, known=None):
     )
 
 
-def _pass(lanes, coefficients):
+def passed(lanes, coefficients):
     """One pass over the lines.
 
     With the direction t of a line and its normal n, the residuals are r = n.c and ``sum r (t.c) = 0``. A

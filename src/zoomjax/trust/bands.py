@@ -4,6 +4,10 @@ The delta method: a quantity q(a) of the parameters a, whose covariance is C, ha
 ``(dq/da) C (dq/da)^T``. For a zoom model that is linear in its parameters, this is exact for the
 coefficients at a focal length and for corrected points, because these q are linear too.
 
+The parameters are those of the zoom model; those of the centre of distortion, where it was fitted
+(`ZoomFit.joint`); and what the lens is off the model at any focal length, where that was estimated
+(`ZoomFit.misfit`).
+
 Each call computes one derivative with respect to each parameter; nothing is fitted or sampled.
 """
 
@@ -18,11 +22,11 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float, Num, PyTree, ScalarLike
 
 from .._core.arguments import kinds_checked
-from .._core.types import AnyArray, Points
+from .._core.types import AnyArray, Coefficients, Focal, Points
 from ..fit.result import ZoomFit
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
-from ..models.zoom import with_parameters
+from ..models.zoom import AbstractZoom, with_parameters
 
 Focals = Num[AnyArray | ScalarLike, "*focal"]
 
@@ -50,16 +54,52 @@ def std_of(fit: ZoomFit, function: Callable[[ZoomLens], PyTree]) -> PyTree:
         >>> std_of(fit, lambda lens: lens(50.0).distort(pixel)).shape
         (2,)
     """
-    lens = fit.lens
-    flat, unravel = ravel_pytree(lens.zoom.parameters)
+    flat, lens_at, covariance = _uncertain(fit)
+    derivatives = jax.jacfwd(lambda flat: function(lens_at(flat)))(flat)
+    return jax.tree.map(lambda rows: _root(_variance(covariance, rows)), derivatives)
 
-    def at(flat):
-        return function(
-            eqx.tree_at(lambda lens: lens.zoom, lens, with_parameters(lens.zoom, unravel(flat)))
-        )
 
-    derivatives = jax.jacfwd(at)(flat)
-    return jax.tree.map(lambda rows: _root(_variance(fit.covariance, rows)), derivatives)
+class _OffZoom(AbstractZoom):
+    """A zoom model off by the same coefficients at every focal length."""
+
+    zoom: AbstractZoom
+    parameters: Float[Array, "terms"]
+
+    def prepare(self, focal: Focal, terms: int) -> "_OffZoom":
+        return _OffZoom(zoom=self.zoom.prepare(focal, terms), parameters=jnp.zeros(terms))
+
+    def __call__(self, *settings: ScalarLike) -> Coefficients:
+        return self.zoom(*settings) + self.parameters
+
+
+def _uncertain(fit):
+    """What of a lens is uncertain, flattened; the lens that other such numbers make; their covariance.
+
+    These are the parameters of the zoom model; after them the centre, if it was fitted; and then what the
+    coefficients are off the model, 0 in the lens, if the misfit was estimated.
+    """
+    lens, covariance = fit.lens, fit.covariance
+    centre = off = None
+    if fit.joint is not None:
+        covariance = fit.joint
+        centre = lens.centre / lens.scale if lens.shift is None else lens.shift.parameters
+    if fit.misfit is not None:
+        covariance = jax.scipy.linalg.block_diag(covariance, fit.misfit)
+        off = jnp.zeros(fit.misfit.shape[0], covariance.dtype)
+    flat, unravel = ravel_pytree((lens.zoom.parameters, centre, off))
+
+    def lens_at(flat):
+        parameters, centre, off = unravel(flat)
+        zoom = with_parameters(lens.zoom, parameters)
+        zoom = zoom if off is None else _OffZoom(zoom=zoom, parameters=off)
+        moved = eqx.tree_at(lambda lens: lens.zoom, lens, zoom)
+        if centre is None:
+            return moved
+        if lens.shift is None:
+            return eqx.tree_at(lambda lens: lens.centre, moved, lens.scale * centre)
+        return eqx.tree_at(lambda lens: lens.shift, moved, with_parameters(lens.shift, centre))
+
+    return flat, lens_at, covariance
 
 
 @kinds_checked
@@ -98,7 +138,7 @@ def displacement_covariance(fit: ZoomFit, points: Points, *, focal: Focals) -> F
 
     Returns:
         A matrix for each point, for x and y; infinite on its diagonal where the lines do not determine it.
-        For radial models only the radius is uncertain: their matrices have rank 1.
+        For radial models about a given centre only the radius is uncertain: their matrices have rank 1.
 
     Example:
         >>> import numpy as np
@@ -167,7 +207,7 @@ def displacement_band(
         offset = point - jnp.asarray(fit.lens.centre, point.dtype)
         squared = offset @ offset
         outward = offset / jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 1)
-        variance = _variance(fit.covariance, outward @ _point_rows(fit, point, f))
+        variance = _variance(_uncertain(fit)[2], outward @ _point_rows(fit, point, f))
         middle = (at_focal(fit.lens, f).undistort(point) - point) @ outward
         half = quantile.astype(point.dtype) * _root(variance)
         return jnp.stack([middle - half, middle + half])
@@ -193,21 +233,16 @@ def _each_point(function, result, fit, points, focal):
 
 
 def _point_rows(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 parameter"]:
-    """Derivatives of one corrected point by the parameters."""
-    flat, unravel = ravel_pytree(fit.lens.zoom.parameters)
-
-    def corrected(flat):
-        zoom = with_parameters(fit.lens.zoom, unravel(flat))
-        return at_focal(eqx.tree_at(lambda lens: lens.zoom, fit.lens, zoom), f).undistort(point)
-
-    return jax.jacfwd(corrected)(flat)
+    """Derivatives of one corrected point by all that is uncertain."""
+    flat, lens_at, _ = _uncertain(fit)
+    return jax.jacfwd(lambda flat: at_focal(lens_at(flat), f).undistort(point))(flat)
 
 
 def _point_covariance(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 2"]:
     """Of one corrected point."""
-    rows = _point_rows(fit, point, f)
-    variance = _variance(fit.covariance, rows)
-    covariance = rows @ _finite(fit.covariance) @ rows.T
+    rows, (_, _, own) = _point_rows(fit, point, f), _uncertain(fit)
+    variance = _variance(own, rows)
+    covariance = rows @ _finite(own) @ rows.T
     unknown = jnp.any(jnp.isinf(variance))
     off_diagonal = jnp.where(unknown, 0, covariance)
     return jnp.where(jnp.eye(2, dtype=bool), variance[:, None], off_diagonal)

@@ -5,9 +5,6 @@ with the model fitted to the others. For models that are linear in their paramet
 others are fitted again for each fold.
 """
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
@@ -15,7 +12,7 @@ from jaxtyping import Float
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_terms
 from .._core.types import of_known_values
-from ..fit.energy import coefficients_by, line_residuals, settings
+from ..fit.energy import line_squares, settings
 from ..fit.family_lines import FamilyLines
 from ..fit.result import RESULTS
 from ..fit.zoom import fit_zoom
@@ -142,7 +139,7 @@ def _judge_by_fits(lines, zoom, terms, parts):
     """By a fit of its own for each fold, starting from that of all lines."""
     own = own_weights(lines)
     everything = fit_zoom(lines, zoom=zoom, terms=terms, invertible=False, throw=False)
-    seen = np.asarray(_squares(lines, everything.lens.zoom))
+    seen = np.asarray(line_squares(lines, everything.lens.zoom))
     unseen, failed = np.full(seen.shape, np.nan), 0
     problem = ""
     for fold in range(parts.number):
@@ -158,16 +155,9 @@ def _judge_by_fits(lines, zoom, terms, parts):
         fit = fit_zoom(lines.weighted(kept), zoom=start, invertible=False, throw=False)
         if fit.result in (RESULTS.successful, RESULTS.undetermined, RESULTS.folded):
             out = parts.fold == fold
-            unseen[out] = np.asarray(_squares(lines, fit.lens.zoom))[out]
+            unseen[out] = np.asarray(line_squares(lines, fit.lens.zoom))[out]
         else:
             failed += 1
     if failed:
         problem = problem or f"{failed} of {parts.number} folds do not converge"
     return Judged(seen, unseen, float(ravel_pytree(everything.lens.zoom.parameters)[0].size), problem)
-
-
-@eqx.filter_jit
-def _squares(lines, zoom):
-    """Mean squared distance of each line, px^2."""
-    corrected = lines.corrected(coefficients_by(zoom, lines)[lines.frame])
-    return jnp.sum(jax.vmap(line_residuals)(corrected) ** 2, axis=1) / jnp.maximum(lines.counts, 1)

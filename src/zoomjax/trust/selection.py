@@ -14,6 +14,7 @@ simplest of the models whose R is above the best one's by no more than s.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -36,6 +37,11 @@ from .folds import Folds, HoldOut, Judged, folds_of, shares, small_lines
 
 _TERMS = 3  # of the default candidates, at most
 _DEGREES = 4
+
+Rule = Literal["one standard error", "least"]
+
+_TIE = 5e-4
+"""Part of the error: candidates that differ by less are as good as each other, under the rule "least"."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,8 +190,9 @@ def select_model(
     hold_out: HoldOut | None = None,
     folds: int | None = None,
     seed: int = 0,
+    rule: Rule = "one standard error",
 ) -> Selection:
-    """Select a model by cross-validation, with the one-standard-error rule.
+    """Select a model by cross-validation, by default with the one-standard-error rule.
 
     Parts of the lines are left out in turn, and measured with the fit of the others. Of the candidates that
     are as good as the best within one standard error of the difference, the one with the fewest parameters
@@ -206,6 +213,8 @@ def select_model(
         folds: number of parts; by default one for each focal length or frame, but at most 50, and 10 parts
             of the lines.
         seed: random seed of the split, where parts hold more than one. The split depends on nothing else.
+        rule: "one standard error", or "least": the candidate of least error, or, of those whose error is
+            above it by next to nothing, the one with the fewest parameters.
 
     Returns:
         The selection. Candidates that cannot be fitted, to all lines or to a fold's, or of which a fold
@@ -237,6 +246,8 @@ def select_model(
         compared = default_candidates(most)
     else:
         compared = tuple(c if isinstance(c, Candidate) else Candidate(c) for c in candidates)
+    if rule not in get_args(Rule):
+        raise ValueError(f'Argument rule must be "one standard error" or "least", but it is {rule!r}.')
     if not compared:
         raise ValueError("Argument candidates must hold one or more zoom models, but it is empty.")
     own = lines.terms if isinstance(lines, CompressedLines) else max(c.terms for c in compared)
@@ -245,7 +256,7 @@ def select_model(
     if hold_out is None:
         hold_out = "focal" if np.unique(np.asarray(small.focal)).size > 3 else "line"
     parts = folds_of(small, hold_out, folds, seed)
-    verdicts, best, chosen = compare(small, compared, parts, forms)
+    verdicts, best, chosen = compare(small, compared, parts, forms, rule)
     fit = fit_zoom(forms[chosen.family], zoom=chosen.zoom, terms=chosen.terms)
     return Selection(chosen, best, fit, verdicts, hold_out, parts.number)
 
@@ -271,7 +282,7 @@ def _in_family(lines, small, family, terms):
     )
 
 
-def _judged(lines, candidate, parts):
+def judged_candidate(lines, candidate, parts):
     """The errors, or why there are none."""
     zoom = with_parameters(candidate.zoom, None)
     try:
@@ -289,12 +300,18 @@ def compare(
     candidates: Sequence[Candidate],
     parts: Folds,
     forms: Mapping[AbstractFamily, AbstractLines] | None = None,
+    rule: Rule = "one standard error",
 ) -> tuple[tuple[Verdict, ...], Candidate, Candidate]:
     """The verdicts, the best candidate and the chosen one; see `select_model`.
 
     `forms` are the same lines for other families than the radial polynomial.
     """
-    errors = [_judged((forms or {}).get(c.family, lines), c, parts) for c in candidates]
+    errors = [judged_candidate((forms or {}).get(c.family, lines), c, parts) for c in candidates]
+    return compare_judged(lines, candidates, errors, parts, rule)
+
+
+def compare_judged(lines, candidates, errors, parts, rule):
+    """The same of candidates whose errors, or why there are none, are known."""
     share = shares(lines)
     counted = (parts.unit >= 0) & (share > 0)
     unit, share = parts.unit[counted], share[counted] / share[counted].sum()
@@ -315,9 +332,14 @@ def compare(
         _verdict(candidate, judged, unseen.get(i), unseen[best], weight, by_unit)
         for i, (candidate, judged) in enumerate(zip(candidates, errors, strict=True))
     ]
-    within = [v for v in verdicts if not v.problem and v.difference <= v.difference_std]
+    within = [v for v in verdicts if not v.problem and v.difference <= _allowed(v, rule)]
     chosen = min(within, key=lambda v: (round(v.parameters, 6), v.held_out)).candidate
     return tuple(verdicts), candidates[best], chosen
+
+
+def _allowed(verdict, rule):
+    """By how much a candidate may be above the best to be chosen."""
+    return verdict.difference_std if rule == "one standard error" else _TIE * verdict.held_out
 
 
 def _verdict(candidate, judged, unseen, best, weight, by_unit):

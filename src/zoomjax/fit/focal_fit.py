@@ -1,0 +1,165 @@
+"""Estimation of focal lengths from the lines, together with the zoom model.
+
+The energy that is minimised, and its derivatives, are in `focal_lengths`. What the zoom model cannot follow
+would go into the focal lengths: they are refined only where that makes frames straighter that were not
+fitted, at their given focal lengths.
+"""
+
+from typing import Any, NoReturn
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core.arguments import kinds_checked
+from .._core.types import traced
+from ..lines.base import AbstractLines
+from ..models.zoom import AbstractZoom
+from .energy import line_squares, line_weights
+from .focal_lengths import (
+    MOST_STEPS,
+    UNKNOWN,
+    Sigma,
+    at_focal_lengths,
+    checked_sigma,
+    posterior,
+    refined,
+    widened,
+    with_focal_sigma,
+)
+from .result import ZoomFit
+from .zoom import fit_zoom
+
+_FOLDS, _FEWEST = 4, 8
+"""Parts of the frames that are left out in turn, where there are so many frames."""
+
+
+class FocalFit(eqx.Module):
+    """A zoom lens fitted together with the focal lengths of its frames.
+
+    Attributes:
+        fit: the fit at the estimated focal lengths; its covariance includes their remaining uncertainty.
+        focal: the estimated focal length of each frame.
+        std: their standard deviations, same unit; at most about those given, and 0 where 0 was given.
+        given: the focal lengths of the lines.
+        steps: number of steps the joint solver took.
+        helped: whether the focal lengths were refined. If not, `focal` and `std` are those given, and the
+            covariance of the fit includes their uncertainty.
+    """
+
+    fit: ZoomFit
+    focal: Float[Array, "frame"]
+    std: Float[Array, "frame"]
+    given: Float[Array, "frame"]
+    steps: Int[Array, ""]
+    helped: Bool[Array, ""]
+
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: the lens of its fit is asked."""
+        raise TypeError("A FocalFit is not a lens: use found.fit.lens, as in found.fit.lens(35.0).")
+
+
+@kinds_checked
+def fit_focal(
+    lines: AbstractLines,
+    focal_sigma: Sigma,
+    *,
+    zoom: AbstractZoom | None = None,
+    terms: int | None = None,
+    invertible: bool = True,
+    throw: bool = True,
+) -> FocalFit:
+    """Fit the zoom model and the focal lengths together, with the given focal lengths as a prior.
+
+    Straight lines alone do not determine focal lengths: after a change of all focal lengths by an
+    increasing function, another zoom model makes every line as straight. A polynomial in 1/f stays one if
+    1/f is scaled and shifted, so the lines cannot correct scale and offset at all. The scale of the result
+    is therefore that of the given focal lengths; the lines correct single ones that deviate from a smooth
+    k(f). Deviations that the zoom model cannot follow are attributed to focal lengths, too. So frames are
+    left out in four parts, and corrected at their given focal lengths by the model of the others: where
+    they are not straighter with the others' focal lengths refined, all are kept as given. (Not so with
+    fewer than 8 frames, with focal lengths that are unknown, or under ``jit``.)
+
+    Args:
+        lines: the lines, or, much faster and with the same answer, ``compress(lines)``.
+        focal_sigma: standard deviation of the given focal lengths, in their unit: a number, or one per
+            frame. 0 keeps a focal length fixed; infinity means that it is unknown, and the given one is
+            only the start.
+        zoom, terms, invertible, throw: as for `fit_zoom`, whose errors also apply.
+
+    Raises:
+        ValueError: `focal_sigma` is not valid, or is infinite for all frames but those at one focal length;
+            or the lines are in float32, whose rounding errors can outweigh the prior.
+        RuntimeError: the solver failed (see `throw`).
+
+    Example:
+        >>> import jax
+        >>> from zoomjax import compress, scenes
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> truth, focal = scenes.nikkor_18_200(), scenes.focal_sweep(8)
+        >>> lines = scenes.board_lines(truth, focal, spacing=99, noise=0.1)
+        >>> given = eqx.tree_at(lambda lines: lines.focal, lines, jax.numpy.asarray(focal.round()))
+        >>> found = fit_focal(compress(given), 0.29)
+        >>> bool(abs(found.focal - focal).mean() < abs(found.given - focal).mean())
+        True
+        >>> jax.config.update("jax_enable_x64", False)
+    """
+    sigma = checked_sigma(focal_sigma, lines.focal)
+    given = jnp.asarray(lines.focal)
+    if given.dtype != jnp.float64:
+        raise ValueError(
+            "Focal lengths are refined in float64 only: "
+            f'jax.config.update("jax_enable_x64", True), and not lines in {given.dtype}.'
+        )
+    if not traced((sigma, given)) and np.unique(given[np.isfinite(sigma)]).size < 2:
+        raise ValueError(
+            "Argument focal_sigma must be finite for frames at two different focal lengths or more, but it "
+            f"is {focal_sigma}. {UNKNOWN}"
+        )
+    start = fit_zoom(lines, zoom=zoom, terms=terms, invertible=False, throw=throw)
+    if not _helps(lines, start, sigma / given):
+        fit = fit_zoom(lines, zoom=start.lens.zoom, invertible=invertible, throw=throw)
+        fit = with_focal_sigma(fit, lines, focal_sigma=sigma)
+        return FocalFit(fit, given, sigma, given, jnp.asarray(0), jnp.asarray(False))
+    t, model, steps, reached = refined(lines, start.lens.zoom, sigma / given)
+    if throw and not traced(reached) and not reached:
+        raise RuntimeError(
+            f"The focal lengths did not converge in {MOST_STEPS} steps: the lines hardly determine those "
+            "with a large focal_sigma. Leave these frames out, or measure their focal lengths."
+        )
+    focal = given * jnp.exp(t)
+    moved = at_focal_lengths(lines, focal)
+    fit = fit_zoom(moved, zoom=model, invertible=invertible, throw=throw)
+    covariance = posterior(moved, fit.lens.zoom, sigma / given)
+    return FocalFit(
+        fit=widened(fit, moved, covariance),
+        focal=focal,
+        std=focal * jnp.sqrt(jnp.diagonal(covariance)),
+        given=given,
+        steps=steps,
+        helped=jnp.asarray(True),
+    )
+
+
+def _helps(lines: AbstractLines, start: ZoomFit, relative: Float[Array, "frame"]) -> bool:
+    """Whether frames that are left out are straighter where the others' focal lengths are refined."""
+    number = lines.focal.shape[0]
+    if number < _FEWEST or traced((lines, relative)) or not np.isfinite(relative).all():
+        return True
+    frame, weight = np.asarray(lines.frame), line_weights(lines)
+    if lines.weight is None:
+        lines = lines.weighted(jnp.ones(frame.shape))
+    given = jnp.asarray(lines.focal)
+    order = np.argsort(np.argsort(given, kind="stable"))
+    total = np.zeros(2)
+    for fold in range(_FOLDS):
+        out = (order % _FOLDS == fold)[frame]
+        kept = lines.weighted(jnp.asarray(lines.weight) * ~out)
+        before = fit_zoom(kept, zoom=start.lens.zoom, invertible=False, throw=False).lens.zoom
+        _, after, _, reached = refined(kept, before, relative)
+        if not reached:
+            continue
+        share = np.asarray(weight * lines.counts) * out
+        total += [share @ np.asarray(line_squares(lines, model)) for model in (before, after)]
+    return bool(total[1] <= total[0])

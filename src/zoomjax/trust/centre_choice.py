@@ -1,0 +1,67 @@
+"""Whether to fit the centre of distortion: held-out straightness about a fitted centre and a given one."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..fit.centre import CentreFit, fit_centre, refit_centre
+from ..fit.energy import line_squares
+from ..lines.free_centre import AnyCentreLines
+from ..models.zoom import AbstractZoom, with_parameters
+from .cross_validation import judge
+from .folds import folds_of, own_weights, shares
+
+_FOLDS = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class CentreChoice:
+    """The centre of distortion found, and lines that were not fitted about it and about the given one.
+
+    Attributes:
+        found: the fit with its centre.
+        fitted: cross-validated RMS about the fitted centre, px; each part of the lines has another one,
+            fitted to the others.
+        given: the same about the lines' own centre.
+    """
+
+    found: CentreFit
+    fitted: float
+    given: float
+
+    @property
+    def better(self) -> bool:
+        """Whether the lines determine the centre, and lines left out are straighter about it."""
+        return bool(self.found.determined) and self.fitted <= self.given
+
+
+def choose_centre(lines: AnyCentreLines, *, zoom: AbstractZoom, terms: int = 2) -> CentreChoice:
+    """Fit the centre of distortion, one for all focal lengths, and cross-validate it.
+
+    A fifth of the frames is left out at a time, or, with fewer than five, of the lines of each frame.
+
+    Args:
+        lines: the lines, compressed for any centre.
+        zoom: the zoom model, without parameters.
+        terms: its number of coefficients.
+
+    Raises:
+        ValueError, RuntimeError: as for `fit_centre`.
+    """
+    if lines.weight is None:
+        lines = lines.weighted(np.ones(lines.frame.shape))  # as in every fold: one compiled program
+    found = fit_centre(lines, zoom=zoom, terms=terms)
+    small = lines.about(lines.centre)
+    parts = folds_of(small, "frame" if len(lines.focal) >= _FOLDS else "line", _FOLDS, 0)
+    given = judge(small, with_parameters(zoom, None), terms, parts).unseen
+    own, fitted = own_weights(small), np.full(given.shape, np.nan)
+    for fold in range(parts.number) if found.determined else ():
+        out = parts.fold == fold
+        kept = lines.weighted(jnp.asarray(own * ~out))
+        fitted[out] = np.asarray(line_squares(lines, refit_centre(kept, found)))[out]
+    share = np.where(np.isfinite(given) & np.isfinite(fitted), shares(small), 0)
+    if not share.any():
+        return CentreChoice(found, np.nan, np.nan)
+    fitted, given = (float(np.sqrt(np.average(np.nan_to_num(of), weights=share))) for of in (fitted, given))
+    return CentreChoice(found, fitted, given)

@@ -1,0 +1,46 @@
+"""Model selection in two stages: first the zoom model, then its number of coefficients."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..fit.zoom import fit_zoom
+from ..lines.compressed import CompressedLines
+from ..models.smooth import SmoothZoom
+from ..models.zoom import AbstractZoom
+from .folds import HoldOut, folds_of
+from .selection import Candidate, Selection, compare_judged, judged_candidate
+
+
+def select_in_stages(
+    lines: CompressedLines, zooms: Sequence[AbstractZoom], terms: Sequence[int], *, folds: int = 10
+) -> Selection:
+    """Select a zoom model with the first of the numbers of coefficients, and then that number.
+
+    Far fewer candidates than all pairs; the candidate of least error, as with the rule "least". A zoom
+    model whose prior is for another number of coefficients keeps its own.
+
+    Args:
+        lines: the lines, compressed for the largest of `terms`.
+        zooms: zoom models, specified but not fitted.
+        terms: numbers of coefficients.
+        folds: parts into which focal lengths are split, or lines where there are fewer than four.
+
+    Raises:
+        ValueError: no candidate can be compared.
+    """
+    many = np.unique(np.asarray(lines.focal)).size > 3
+    hold_out: HoldOut = "focal" if many else "line"
+    most = min(folds, np.unique(np.asarray(lines.focal)).size - 2) if many else folds
+    parts = folds_of(lines, hold_out, most, 0)
+    candidates = [Candidate(zoom, terms[0]) for zoom in zooms]
+    errors = [judged_candidate(lines, candidate, parts) for candidate in candidates]
+    _, best, chosen = compare_judged(lines, candidates, errors, parts, "least")
+    more = [
+        Candidate(chosen.zoom, number) for number in terms[1:] if not isinstance(chosen.zoom, SmoothZoom)
+    ]
+    errors += [judged_candidate(lines, candidate, parts) for candidate in more]
+    candidates += more
+    verdicts, best, chosen = compare_judged(lines, candidates, errors, parts, "least")
+    fit = fit_zoom(lines, zoom=chosen.zoom, terms=chosen.terms)
+    return Selection(chosen, best, fit, verdicts, hold_out, parts.number)
