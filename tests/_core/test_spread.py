@@ -94,6 +94,13 @@ def test_sums_keep_their_digits(number, rng):
     assert total[0] == pytest.approx(math.fsum(terms), rel=4e-6)
 
 
+@pytest.mark.parametrize("shape", [(0,), (3, 0), (0, 3)])
+def test_no_points_have_gradients_of_zero(shape):
+    one = jnp.ones((1,) * len(shape))
+    gradient = jax.grad(lambda x: jnp.sum(spread([x, x], shape)[0]))(one)
+    np.testing.assert_array_equal(gradient, 0 * one)
+
+
 def test_numpy_stays_numpy():
     [array] = spread([np.ones(1)], (4,))
     assert isinstance(array, np.ndarray)

@@ -53,10 +53,14 @@ def _sums(arrays, shape):
         return arrays
     kept = [axis for axis in range(len(full)) if axis not in axes]
     lead = [full[axis] for axis in kept]
-    rows = [jnp.transpose(array, (*kept, *axes)).reshape(*lead, -1) for array in arrays]
-    if _in_blocks(number := math.prod(full[axis] for axis in axes)):
-        width = [(0, 0)] * len(lead) + [(0, -number % _BLOCK)]
-        rows = _sums_of_rows([jnp.pad(row, width).reshape(*lead, -1, _BLOCK) for row in rows])
+    number = math.prod(full[axis] for axis in axes)
+    rows = [jnp.transpose(array, (*kept, *axes)).reshape(*lead, number) for array in arrays]
+    if _in_blocks(number):
+        missing = -number % _BLOCK
+        blocks = (*lead, (number + missing) // _BLOCK, _BLOCK)
+        rows = _sums_of_rows(
+            [jnp.pad(row, [(0, 0)] * len(lead) + [(0, missing)]).reshape(blocks) for row in rows]
+        )
     return [total.reshape(shape) for total in _sums_of_rows(rows)]
 
 
