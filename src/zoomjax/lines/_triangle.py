@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-EXACT = jax.lax.Precision.HIGHEST  # some accelerators otherwise multiply float32 with 10 bits
+from .._core.products import EXACT
 
 _RUN = 1100  # points orthogonalised together: 7 columns of them fill a cache of 48 to 64 KB in float64
 

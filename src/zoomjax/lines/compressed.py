@@ -23,6 +23,7 @@ Lines sharded over devices are reduced where they are: no point is exchanged.
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -34,8 +35,9 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_size, checked_terms
 from .._core.fields import check_shapes, integers, numbers
+from .._core.products import EXACT
 from .._core.types import Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Point, traced
-from ._triangle import EXACT, triangle
+from ._triangle import triangle
 from .base import AbstractLines, focus_of
 from .lines import Lines
 
@@ -110,7 +112,8 @@ class CompressedLines(AbstractLines):
         """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1, with an order of at most 2 N + 1."""
         columns = self.triangle[..., 1:].reshape(*self.triangle.shape[:2], -1, 2)
         halves = [(total // 2, total - total // 2) for total in range(order)]
-        products = [jnp.einsum("lrc,lrd->lcd", columns[:, :, i], columns[:, :, j]) for i, j in halves]
+        product = partial(jnp.einsum, "lrc,lrd->lcd", precision=EXACT)
+        products = [product(columns[:, :, i], columns[:, :, j]) for i, j in halves]
         return jnp.stack(products, axis=1)
 
     def about(self, centre: Centres) -> "CompressedLines":

@@ -20,8 +20,9 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_size, checked_terms
 from .._core.fields import check_shapes, integers, numbers
+from .._core.products import EXACT
 from .._core.types import Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Point, traced
-from ._triangle import EXACT, triangle
+from ._triangle import triangle
 from .base import AbstractLines, focus_of
 from .compressed import CompressedLines, triangles_of
 from .lines import Lines
