@@ -62,8 +62,8 @@ def paired(functions: dict, repeats: int) -> dict[str, float]:
     return {name: float(np.median(values)) for name, values in times.items()}
 
 
-def measure(dtype: type, number: int, repeats: int) -> dict[str, float]:
-    """Times, s, and errors, px."""
+def operands(dtype: type, number: int):
+    """The paper's lens, its distortion midway, points all over the image, and a focal length for each."""
     rng = np.random.default_rng(0)
     lens = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), scenes.nikkor_18_200())
     size = np.array(lens.image_size) - 1
@@ -71,6 +71,11 @@ def measure(dtype: type, number: int, repeats: int) -> dict[str, float]:
     low, high = (float(end) for end in lens.focal_range)
     focal = jnp.asarray(rng.uniform(low, high, number), dtype)
     d = lens(float(np.sqrt(low * high)))
+    return lens, d, points, focal
+
+
+def functions(lens: Any, d: Distortion, points: AnyArray, focal: AnyArray) -> dict[str, tuple]:
+    """What is timed, compiled, with its arguments."""
     ones = jnp.ones_like(points)
 
     def coefficients(f):
@@ -85,7 +90,7 @@ def measure(dtype: type, number: int, repeats: int) -> dict[str, float]:
         return jax.jit(jax.grad(lambda d, p: jnp.sum(function(d, p) * ones), by))
 
     undistort, distort = (lambda d, p: d.undistort(p)), (lambda d, p: d.distort(p))
-    compiled = {
+    return {
         "bare formula": (jax.jit(bare), (d, points)),
         "undistort": (jax.jit(undistort), (d, points)),
         "plain Newton": (jax.jit(newton), (d, points)),
@@ -100,6 +105,12 @@ def measure(dtype: type, number: int, repeats: int) -> dict[str, float]:
         "plain Newton, f a point": (jax.jit(lambda f, p: newton(bent(f), p)), (focal, points)),
         "distort, f a point": (jax.jit(lambda f, p: lens.distort(p, f)), (focal, points)),
     }
+
+
+def measure(dtype: type, number: int, repeats: int) -> dict[str, float]:
+    """Times, s, and errors, px."""
+    lens, d, points, focal = operands(dtype, number)
+    compiled = functions(lens, d, points, focal)
     calls: dict[str, Any] = {
         name: lambda function=function, arguments=arguments: function(*arguments)
         for name, (function, arguments) in compiled.items()

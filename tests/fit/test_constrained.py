@@ -98,20 +98,24 @@ def test_there_is_no_better_one(terms, folding):
     assert slack(zoom.parameters.ravel()).min() > 0
 
 
+LAST_BITS = 0 if jax.default_backend() == "cpu" else 1e-14
+"""Of numbers that are to be the same. A GPU adds up lines in any order, another one in each run."""
+
+
 def test_a_good_fit_stays_as_it_is_to_the_last_bit(small, fit):
     free = zj.fit_zoom(small, invertible=False)
     assert fit.result == RESULTS.successful
     assert fit.certificate.certified
     assert fit.rms_unconstrained == fit.rms
     for one, other in zip(jax.tree.leaves(fit), jax.tree.leaves(free), strict=True):
-        np.testing.assert_array_equal(one, other)
+        np.testing.assert_allclose(one, other, rtol=LAST_BITS)
 
 
 def test_good_frames_stay_as_they_are(small, frame_fits):
     free = zj.fit_frames(small, invertible=False)
     assert np.asarray(frame_fits.certificate.certified).all()
     for one, other in zip(jax.tree.leaves(frame_fits), jax.tree.leaves(free), strict=True):
-        np.testing.assert_array_equal(one, other)
+        np.testing.assert_allclose(one, other, rtol=LAST_BITS)
 
 
 @pytest.mark.slow

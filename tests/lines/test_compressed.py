@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
+from zoomjax.lines import _triangle
 
 from ..conftest import moved
 
@@ -68,6 +69,28 @@ def test_lines_longer_than_a_run_of_points(rng):
     long = straight_lines(3001)
     long = moved(long, long.points + rng.standard_normal(long.points.shape))
     assert_same_for_fits(zj.compress(long), long, coefficients(rng, 2))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_columns_apart_as_on_a_gpu_give_the_same_triangle(dtype, rng):
+    """Also of straight lines, and through the centre, where both leave out the same columns."""
+    eps = np.finfo(dtype).eps
+    t = np.linspace(-0.4, 0.6, 301)
+    lines = [np.stack([t, 0.3 * t]), np.stack([0 * t + 0.5, t]), np.stack([t, 0.1 + 0.05 * t**2])]
+    lines.append(lines[0] + 1e-3 * rng.standard_normal(lines[0].shape))
+    for z in lines:
+        squared = np.sum(z * z, axis=0)
+        columns = jnp.asarray(np.vstack([squared**0, z, squared * z, squared**2 * z]), dtype)
+        one, other = (np.asarray(f(columns)) for f in (_triangle._orthogonalise, apart))
+        size = np.linalg.norm(one, axis=0)
+        np.testing.assert_allclose(
+            other.T @ other / np.outer(size, size), one.T @ one / np.outer(size, size), atol=20 * eps
+        )
+        np.testing.assert_array_equal(np.diag(one) > 0, np.diag(other) > 0)
+
+
+def apart(columns):
+    return _triangle._orthogonalise_apart(list(columns))
 
 
 def test_straight_lines_stay_straight_to_rounding():

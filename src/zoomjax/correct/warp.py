@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, DTypeLike, Float, Num
 
+from .._core.products import EXACT
 from ..models.distortion import Distortion
 from ..models.family import AbstractRadial
 from ..models.sizes import check_channels_last, check_image_size, checked_distortion
@@ -170,7 +171,7 @@ def _arrived_ratio(family, k, squared, scale):
     angle = jnp.arccos(jnp.clip(v, -1, 1))
     design = jnp.cos(jnp.outer(angle, jnp.arange(_DEGREE + 1, dtype=k.dtype)))
     q, triangle = jnp.linalg.qr(design * rho[:, None])
-    powers = jax.scipy.linalg.solve_triangular(triangle, q.T @ r)
+    powers = jax.scipy.linalg.solve_triangular(triangle, jnp.matmul(q.T, r, precision=EXACT))
     bound = rho[-1] ** 2
 
     def start(squared):

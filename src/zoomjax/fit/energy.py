@@ -18,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.arguments import kinds_checked
+from .._core.products import exact_products
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines
 from ..models.zoom import (
@@ -33,6 +34,7 @@ from ..models.zoom import (
 _CUT = 0.73
 
 
+@exact_products
 def line_normal(centred: Float[Array, "rows 2"]) -> Float[Array, "2"]:
     """The unit normal of the total-least-squares line of points about their mean.
 
@@ -48,6 +50,7 @@ def line_normal(centred: Float[Array, "rows 2"]) -> Float[Array, "2"]:
     return jnp.stack([-jnp.sin(twice / 2), jnp.cos(twice / 2)])
 
 
+@exact_products
 def line_residuals(centred: Float[Array, "rows 2"]) -> Float[Array, "rows"]:
     """Signed distances of points about their mean to their own best line, in their unit."""
     return centred @ line_normal(centred)

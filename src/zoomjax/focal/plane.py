@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
+from .._core.products import exact_products
 from .._core.types import AnyArray
 from ._homography import homography, homography_from_lines
 from .estimate import FocalEstimate, check_pairs, estimate_of
@@ -121,6 +122,7 @@ def focal_from_lines(
 
 
 @eqx.filter_jit
+@exact_products
 def _focal_from_planes(points, plane, principal):
     image = points - principal[None, None]
     plane = plane - jnp.mean(plane, axis=0, keepdims=True)
@@ -138,6 +140,7 @@ def _focal_from_planes(points, plane, principal):
 
 
 @eqx.filter_jit
+@exact_products
 def _focal_from_lines(points, mask, lines, principal):
     extra = max(0, 9 - mask.size)  # with as many rows as the table below has columns, or more
     present = jnp.pad(mask.ravel(), (0, extra))[:, None]

@@ -12,10 +12,10 @@ memory can be compressed in chunks of points.
 
 R is found by modified Gram-Schmidt, not by way of the Gram matrix ``R^T R``, although sums of monomials
 would give that in one read of the points. Squaring the condition number would lose small residuals, in
-float32 those of most lines, and would save no time (benchmarks/results/gram.md): Gram-Schmidt works on a
-run of a thousand points at a time, whose columns stay in the fastest cache. Its floor is near the dtype's
-own: 2e-14 of half the image diagonal in float64, 2e-6 in float32 (benchmarks/reliability_core.py searches
-for lines that break it).
+float32 those of most lines, and would save no time (benchmarks/results/gram.md): on a CPU Gram-Schmidt
+works on a run of a thousand points at a time, whose columns stay in the fastest cache. Its floor is near
+the dtype's own: 2e-14 of half the image diagonal in float64, 2e-6 in float32
+(benchmarks/reliability_core.py searches for lines that break it).
 
 Lines sharded over devices are reduced where they are: no point is exchanged.
 """
@@ -23,6 +23,7 @@ Lines sharded over devices are reduced where they are: no point is exchanged.
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -34,11 +35,14 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_size, checked_terms
 from .._core.fields import check_shapes, integers, numbers
+from .._core.products import EXACT
 from .._core.types import Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Point, traced
+from ._triangle import triangle
 from .base import AbstractLines, focus_of
 from .lines import Lines
 
-_RUN = 1100  # points orthogonalised together: 7 columns of them fill a cache of 48 to 64 KB in float64
+_AT_ONCE = 2**22
+"""Points of lines that a GPU reduces side by side: their columns, some hundred MB, are in its memory."""
 
 _COMPILED: set[tuple] = set()  # shapes that have been reduced in this process
 
@@ -108,7 +112,8 @@ class CompressedLines(AbstractLines):
         """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1, with an order of at most 2 N + 1."""
         columns = self.triangle[..., 1:].reshape(*self.triangle.shape[:2], -1, 2)
         halves = [(total // 2, total - total // 2) for total in range(order)]
-        products = [jnp.einsum("lrc,lrd->lcd", columns[:, :, i], columns[:, :, j]) for i, j in halves]
+        product = partial(jnp.einsum, "lrc,lrd->lcd", precision=EXACT)
+        products = [product(columns[:, :, i], columns[:, :, j]) for i, j in halves]
         return jnp.stack(products, axis=1)
 
     def about(self, centre: Centres) -> "CompressedLines":
@@ -252,7 +257,7 @@ def _reduce_shards(points, mask, centre, scale, columns, terms, sharding):
             one, there = line
             return _reduce_line(one, there, centre, scale, columns, terms)
 
-        return jax.lax.map(reduce_one, (points, mask), batch_size=_lines_at_once())
+        return jax.lax.map(reduce_one, (points, mask), batch_size=_lines_at_once(points.shape[1]))
 
     over, whole = sharding.spec, PartitionSpec()
     spread = jax.shard_map(own, mesh=sharding.mesh, in_specs=(over, over, whole), out_specs=over)
@@ -298,18 +303,21 @@ def _reduce_run(lines, start, size, columns, terms):
         )
         return _reduce_line(points, mask, lines.centre, lines.scale, columns, terms)
 
-    return jax.lax.map(reduce_one, start + jnp.arange(size), batch_size=_lines_at_once())
+    at_once = _lines_at_once(lines.points.shape[1])
+    return jax.lax.map(reduce_one, start + jnp.arange(size), batch_size=at_once)
 
 
-def _lines_at_once():
+def _lines_at_once(points):
     """How many lines are reduced side by side: one where they are to stay in the cache."""
-    return None if jax.default_backend() == "cpu" else 256
+    return None if jax.default_backend() == "cpu" else max(1, _AT_ONCE // points)
 
 
 def _reduce_line(points, mask, centre, scale, columns, terms):
-    # x and y apart by a product with the identity, exact: faster than slicing on the CPU.
     offset = jnp.where(mask[:, None], points - centre[None], 0)
-    z = jnp.einsum("pc,cd->dp", offset, jnp.eye(2, dtype=offset.dtype), precision=EXACT)
+    if jax.default_backend() == "cpu":  # x and y apart by a product with the identity, exact: faster there
+        z = jnp.einsum("pc,cd->dp", offset, jnp.eye(2, dtype=offset.dtype), precision=EXACT)
+    else:
+        z = offset.T
     return triangle(columns(z / scale, mask.astype(z.dtype), terms))
 
 
@@ -320,59 +328,3 @@ def _columns(z, valid, terms):
     for _ in range(terms):
         columns.append(columns[-1] * squared)
     return jnp.concatenate(columns)
-
-
-@jax.custom_jvp
-def triangle(columns: Float[Array, "rows point"]) -> Float[Array, "rows rows"]:
-    """R of the transposed argument, by runs of points whose triangles are then reduced together."""
-    size, points = columns.shape
-    runs = -(-points // _RUN)
-    whole = points - points % runs
-    triangles = jax.vmap(_orthogonalise, in_axes=1)(columns[:, :whole].reshape(size, runs, -1))
-    # The few points left over join the triangles: padding thousands to fill a run is slow.
-    return _orthogonalise(jnp.concatenate([triangles.reshape(-1, size).T, columns[:, whole:]], axis=1))
-
-
-@triangle.defjvp
-def _triangle_jvp(primals, tangents):
-    """A tangent of R that is right for every function of ``R^T R``, which is all that the fits use.
-
-    R itself has no derivative at an exactly straight line, whose columns are dependent; ``R^T R`` has.
-    With ``A = Q R``, ``dR = Q^T dA`` (Q held fixed) gives ``R^T dR + dR^T R = A^T dA + dA^T A`` exactly.
-    """
-    [columns], [columns_dot] = primals, tangents
-    r = triangle(columns)
-    kept = jnp.diagonal(r) > 0
-    regular = r + jnp.diag(jnp.where(kept, 0, 1).astype(r.dtype))
-    q = jax.scipy.linalg.solve_triangular(regular, columns, trans="T")
-    return r, jnp.matmul(jnp.where(kept[:, None], q, 0), columns_dot.T, precision=EXACT)
-
-
-_INDEPENDENT = 8
-"""Least part of a column that the others do not have, in units in the last place of its norm. Below is
-rounding, which a compiler may compute in one way here and in another there."""
-
-
-def _orthogonalise(columns):
-    """R of the transposed argument, by modified Gram-Schmidt.
-
-    Its R is as accurate as Householder's (Björck 1967), which is all that is kept, and it is made of
-    products of a few long vectors. Batched `jnp.linalg.qr` is slower.
-    """
-    size = columns.shape[0]
-    rows = []
-    least = (_INDEPENDENT * jnp.finfo(columns.dtype).eps) ** 2
-    removed = jnp.zeros(size, columns.dtype)  # the squared norm of what was taken from each column
-    for done in range(size):
-        products = jnp.matmul(columns, columns[0], precision=EXACT)
-        norm = jnp.sqrt(products[0])
-        independent = products[0] > least * removed[0]
-        inverse = jnp.where(independent, 1 / jnp.where(independent, norm, 1), 0)
-        row = products * inverse
-        rows.append(jnp.pad(row, (done, 0)))
-        removed = removed[1:] + row[1:] ** 2
-        columns = columns[1:] - (row[1:] * inverse)[:, None] * columns[:1]
-    return jnp.stack(rows)
-
-
-EXACT = jax.lax.Precision.HIGHEST  # some accelerators otherwise multiply float32 with 10 bits

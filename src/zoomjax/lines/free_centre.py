@@ -20,9 +20,11 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_size, checked_terms
 from .._core.fields import check_shapes, integers, numbers
+from .._core.products import EXACT
 from .._core.types import Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Point, traced
+from ._triangle import triangle
 from .base import AbstractLines, focus_of
-from .compressed import EXACT, CompressedLines, triangle, triangles_of
+from .compressed import CompressedLines, triangles_of
 from .lines import Lines
 
 
@@ -78,8 +80,11 @@ class AnyCentreLines(AbstractLines):
         The last two of the `coefficients`, after (k1, ..., kN), are the centre's offset from `centre`,
         normalised.
         """
-        combine = jax.vmap(lambda r, k: r[1:] @ _corrected_point(self.terms, k[:-2], k[-2:]).T)
-        return self.scale * combine(self.triangle, coefficients)
+
+        def combine(r, k):
+            return jnp.matmul(r[1:], _corrected_point(self.terms, k[:-2], k[-2:]).T, precision=EXACT)
+
+        return self.scale * jax.vmap(combine)(self.triangle, coefficients)
 
     def decentred(
         self, k: Float[Array, "line terms"], tangential: Float[Array, "line 2"]
@@ -93,7 +98,7 @@ class AnyCentreLines(AbstractLines):
                 [jnp.stack([3 * p[1], 2 * p[0], p[1]]), jnp.stack([p[0], 2 * p[1], 3 * p[0]])]
             )
             radial = _corrected_point(self.terms, k, none)
-            return r[1:] @ radial.at[:, 3:6].add(squares).T
+            return jnp.matmul(r[1:], radial.at[:, 3:6].add(squares).T, precision=EXACT)
 
         return self.scale * jax.vmap(combine)(self.triangle, k, tangential)
 

@@ -6,6 +6,7 @@ nesting would waste 27 times the memory on the paper's data). Compressed lines a
 
 import os
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -29,6 +30,7 @@ from .._core.checks import (
 )
 from .._core.fields import booleans, check_shapes, integers, known, numbers
 from .._core.files import whole_file
+from .._core.products import EXACT
 from .._core.types import AnyArray, Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Mask, Point
 from ..models.family import AbstractFamily
 from .base import AbstractLines, focus_of
@@ -239,7 +241,8 @@ class Lines(AbstractLines):
         """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1."""
         z = jnp.where(self.mask[..., None], (self.points - self.centre[None, None]) / self.scale, 0)
         squared = jnp.sum(z * z, axis=-1, keepdims=True)
-        return jnp.stack([jnp.einsum("lpc,lpd->lcd", squared**i * z, z) for i in range(order)], axis=1)
+        product = partial(jnp.einsum, "lpc,lpd->lcd", precision=EXACT)
+        return jnp.stack([product(squared**i * z, z) for i in range(order)], axis=1)
 
     def about(self, centre: Centres) -> "Lines":
         """The same lines about another centre of distortion, px: that of all frames, or of each frame.
