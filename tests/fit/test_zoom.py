@@ -307,10 +307,9 @@ def test_second_fit_of_the_same_shapes_compiles_nothing(clean, noisy, compilatio
 # Covariance
 
 
-@pytest.fixture(scope="module")
-def draws(lens):
-    """A hundred fits of one small scene, each with its own noise, and the noise."""
-    clean = distorted_lines(lens, FOCAL, offset=180.0)
+def repeated(lens, focal):
+    """A hundred fits of one scene, each with its own noise, and the noise."""
+    clean = distorted_lines(lens, focal, offset=180.0)
     rng = np.random.default_rng(1)
     noise = 0.1
     fits = [
@@ -323,15 +322,31 @@ def draws(lens):
     return fits, noise
 
 
-def test_covariance_is_that_of_repeated_measurements(draws, lens):
-    fits, _ = draws
+@pytest.fixture(scope="module")
+def draws(lens):
+    return repeated(lens, FOCAL)
+
+
+def test_covariance_is_that_of_repeated_measurements(lens):
+    """With 24 photos: with three, how much those differ by chance is in it, too."""
+    fits, _ = repeated(lens, np.repeat(FOCAL, 8))
     estimates = np.stack([parameters(fit).ravel() for fit in fits])
     covariance = np.mean([fit.covariance for fit in fits], axis=0)
     # Standard deviations over 100 draws are known to 7 %: three of those.
     np.testing.assert_allclose(estimates.std(axis=0, ddof=1), np.sqrt(np.diag(covariance)), rtol=0.22)
     error = estimates - np.asarray(lens.zoom.parameters).ravel()
     squared = np.einsum("di,ij,dj->d", error, np.linalg.inv(covariance), error)
-    assert squared.mean() == pytest.approx(4, abs=3 * np.sqrt(2 * 4 / 100))  # chi squared of 4 unknowns
+    # Chi squared of 4 unknowns; variances are 1.1 times as large, as photos also differ by chance.
+    assert squared.mean() == pytest.approx(4 / 1.1, abs=3 * np.sqrt(2 * 4 / 100))
+
+
+def test_bands_hold_as_often_as_they_say_with_few_photos(draws, lens):
+    """Three photos: in 95 % of the draws, within three points and their error by chance."""
+    fits, _ = draws
+    truth = np.asarray(lens.zoom.parameters)
+    off = [abs(parameters(fit) - truth).ravel() / np.sqrt(np.diag(fit.covariance)) for fit in fits]
+    within = (np.stack(off) < 1.96).mean()
+    assert within == pytest.approx(0.95, abs=0.03 + 2 * np.sqrt(0.95 * 0.05 / 100))
 
 
 def test_rms_is_the_noise_of_the_image(draws):
