@@ -212,8 +212,8 @@ def page(r: dict) -> str:
             "",
             *table(["", *heads], points),
             "",
-            "Whether Newton's steps arrived everywhere is a branch of `distort`. That this is what it costs "
-            "beyond plain Newton, as the host waits for the device, is a guess: it was not profiled.",
+            "Whether Newton's steps arrived everywhere is a branch of `distort`. That this is what it "
+            "costs beyond plain Newton, as the host waits for the device, is a guess: it was not profiled.",
             "",
             "## Images",
             "",

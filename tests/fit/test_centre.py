@@ -152,6 +152,6 @@ def test_where_the_lines_do_not_tell_it_stays():
 
 @pytest.mark.slow
 def test_other_zoom_models_have_centres_too(lines):
-    found = zj.fit.fit_centre(lines, zoom=zj.models.PowerZoom(), terms=1)
+    found = zj.fit.fit_centre(lines, zoom=zj.models.PowerZoom())
     assert found.determined
     assert found.fit.rms < found.rms_fixed

@@ -160,10 +160,10 @@ def test_the_worst_finding_comes_first(lines):
 
 
 @pytest.mark.slow
-def test_the_real_zoom_camera_is_good(data):
-    """Its board is paper that is not flat: a remark, as the lines hardly exceed their own scatter."""
+def test_the_real_zoom_camera_is_doubtful(data):
+    """Its board is paper that is not flat: zooms differ by more than lines explain, which bands include."""
     from benchmarks.real.zoomcam import read_zoomcam
 
     found = assessed(read_zoomcam(data / "zoomcam"))
-    assert found.verdict == "good"
-    assert about(found) == {"halves by directions": "good"}
+    assert found.verdict == "doubtful"
+    assert about(found) == {"bands": "doubtful", "halves by directions": "good"}

@@ -86,7 +86,7 @@ def parameter_covariance(
         frames = lines.focal.shape[0]
         of_photos = [jax.ops.segment_sum(of, lines.frame, frames) for of in (score, leverage, share)]
         free = terms * jnp.sum(counted_frames(lines)) - jnp.sum(good)
-        covariance = _of_whole_photos(of_photos, covariance, free)
+        covariance = _of_whole_photos(of_photos, covariance, free, terms)
     covariance = inverse @ covariance @ inverse.T
     if (own := prior_of(zoom)) is not None:
         # The prior draws the parameters to its mean: by how much, in the mean over what it expects.
@@ -125,7 +125,7 @@ def _of_whole_lines(score, leverage, share, scores):
     return jnp.where((nu > 0) & (c > 0), size * shape, independent)
 
 
-def _of_whole_photos(of_photos, by_line, free):
+def _of_whole_photos(of_photos, by_line, free, terms):
     """The covariance where the lines of a photo may err together, in the parameters of `_of_whole_lines`.
 
     A bent board bends all lines of a photo alike, and a wrong focal length or a model that does not follow
@@ -136,9 +136,9 @@ def _of_whole_photos(of_photos, by_line, free):
 
     since the fit takes ``H_m sum_k g_k`` from each. This is exact whatever the leverages, so that it serves
     few photos too. The ratio phi of what is found to that enlarges C where it is above 1. It has `free`
-    degrees of freedom, the coefficients that the photos would have by themselves less the parameters; for
-    these few, ``2 (phi - 1)/free`` is added. The shape is that of C, shrunk less towards it the more
-    photos there are, as for lines.
+    degrees of freedom, the coefficients that the photos would have by themselves, `terms` each, less the
+    parameters; for these few, ``2 (phi - 1)/free`` is added. The shape is that of C, shrunk less towards it
+    the more photos are left over, `free` by `terms`, as for lines.
     """
     score, leverage, share = of_photos
     length = jnp.sum(score**2, axis=1)
@@ -152,7 +152,7 @@ def _of_whole_photos(of_photos, by_line, free):
     total = score.T @ score
     total = total * (ratio * jnp.trace(by_line) / _positive(jnp.trace(total)))
     apart = jnp.sum((total - ratio * by_line) ** 2)
-    by_chance = jnp.sum(total**2) / _positive(free) + jnp.trace(total) ** 2 / _positive(free)
+    by_chance = (jnp.sum(total**2) + jnp.trace(total) ** 2) * (terms / _positive(free))
     shrink = jnp.clip(by_chance / _positive(apart), 0, 1)
     shape = shrink * by_line + (1 - shrink) * total / ratio
     return jnp.where(known, (ratio + 2 * (ratio - 1) / _positive(free)) * shape, by_line)

@@ -135,7 +135,7 @@ class Selection:
             return v.candidate.name, "", "", "", "", f"not compared: {v.problem.partition('. ')[0]}"
         return (
             v.candidate.name,
-            f"{v.parameters:.1f}".removesuffix(".0"),
+            f"{abs(round(v.parameters, 1)):.1f}".removesuffix(".0"),  # rounding may be below 0
             f"{v.rms:.4f}",
             f"{v.held_out:.4f} ± {v.held_out_std:.4f}",
             "best" if v.candidate is self.best else f"{v.difference:+.5f} ± {v.difference_std:.5f}",
