@@ -29,6 +29,12 @@ def scene() -> zj.Lines:
     )
 
 
+def gram(triangles) -> np.ndarray:
+    """``R^T R`` of each line, whose points are 300."""
+    triangles = np.asarray(triangles)
+    return np.einsum("lij,lik->ljk", triangles, triangles) / 300
+
+
 def exchanged(compiled) -> dict[str, int]:
     """How many numbers each kind of collective of a compiled program exchanges."""
     found: dict[str, int] = {}
@@ -58,7 +64,8 @@ def main() -> None:
         np.testing.assert_array_equal(small.triangle, plain.triangle)
         of_any = zj.lines.compress_any_centre(data).triangle
         assert of_any.sharding.is_equivalent_to(over, 3)
-        np.testing.assert_array_equal(of_any, any_centre.triangle)
+        # One device leaves few points to LAPACK, whose R has other digits, and the same R^T R.
+        np.testing.assert_allclose(gram(of_any), gram(any_centre.triangle), rtol=0, atol=1e-12)
 
         sharding = _sharding_of_lines(data)
         for columns in (_columns, _monomials):
