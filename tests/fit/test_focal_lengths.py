@@ -66,16 +66,6 @@ def test_covariance_grows_by_the_response(sweep):
     np.testing.assert_allclose(same.covariance, fit.covariance, rtol=1e-9)
 
 
-def test_focal_lengths_are_kept_where_the_model_is_wrong(truth):
-    """Degree 1 does not follow this zoom, and would have the focal lengths do it."""
-    lines = zj.compress(scenes.board_lines(truth, scenes.focal_sweep(8), spacing=200.0, noise=0.3))
-    found = zj.fit.fit_focal(lines, 0.05 * lines.focal, zoom=zj.PolynomialZoom(degree=1))
-    before = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=1))
-    assert not found.helped
-    np.testing.assert_array_equal(found.focal, lines.focal)
-    np.testing.assert_allclose(found.fit.lens.zoom.parameters, before.lens.zoom.parameters, rtol=1e-6)
-
-
 def test_undetermined_stays_infinite(sweep):
     fit = zj.fit_zoom(sweep)
     own = fit.covariance[0, 0]

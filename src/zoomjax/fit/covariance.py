@@ -152,7 +152,7 @@ def _of_whole_photos(of_photos, by_line, free, terms):
     total = score.T @ score
     total = total * (ratio * jnp.trace(by_line) / _positive(jnp.trace(total)))
     apart = jnp.sum((total - ratio * by_line) ** 2)
-    by_chance = (jnp.sum(total**2) + jnp.trace(total) ** 2) * (terms / _positive(free))
+    by_chance = terms * (jnp.sum(total**2) + jnp.trace(total) ** 2) / _positive(free)
     shrink = jnp.clip(by_chance / _positive(apart), 0, 1)
     shape = shrink * by_line + (1 - shrink) * total / ratio
     return jnp.where(known, (ratio + 2 * (ratio - 1) / _positive(free)) * shape, by_line)

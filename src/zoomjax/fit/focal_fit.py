@@ -1,8 +1,6 @@
 """Estimation of focal lengths from the lines, together with the zoom model.
 
-The energy that is minimised, and its derivatives, are in `focal_lengths`. What the zoom model cannot follow
-would go into the focal lengths: they are refined only where that makes frames straighter that were not
-fitted, at their given focal lengths.
+The energy that is minimised, and its derivatives, are in `focal_lengths`.
 """
 
 from typing import Any, NoReturn
@@ -10,13 +8,12 @@ from typing import Any, NoReturn
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
 from .._core.types import traced
 from ..lines.base import AbstractLines
 from ..models.zoom import AbstractZoom
-from .energy import line_squares, line_weights
 from .focal_lengths import (
     MOST_STEPS,
     UNKNOWN,
@@ -26,13 +23,9 @@ from .focal_lengths import (
     posterior,
     refined,
     widened,
-    with_focal_sigma,
 )
 from .result import ZoomFit
 from .zoom import fit_zoom
-
-_FOLDS, _FEWEST = 4, 8
-"""Parts of the frames that are left out in turn, where there are so many frames."""
 
 
 class FocalFit(eqx.Module):
@@ -44,8 +37,6 @@ class FocalFit(eqx.Module):
         std: their standard deviations, same unit; at most about those given, and 0 where 0 was given.
         given: the focal lengths of the lines.
         steps: number of steps the joint solver took.
-        helped: whether the focal lengths were refined. If not, `focal` and `std` are those given, and the
-            covariance of the fit includes their uncertainty.
     """
 
     fit: ZoomFit
@@ -53,7 +44,6 @@ class FocalFit(eqx.Module):
     std: Float[Array, "frame"]
     given: Float[Array, "frame"]
     steps: Int[Array, ""]
-    helped: Bool[Array, ""]
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
         """Raise TypeError: the lens of its fit is asked."""
@@ -76,10 +66,7 @@ def fit_focal(
     increasing function, another zoom model makes every line as straight. A polynomial in 1/f stays one if
     1/f is scaled and shifted, so the lines cannot correct scale and offset at all. The scale of the result
     is therefore that of the given focal lengths; the lines correct single ones that deviate from a smooth
-    k(f). Deviations that the zoom model cannot follow are attributed to focal lengths, too. So frames are
-    left out in four parts, and corrected at their given focal lengths by the model of the others: where
-    they are not straighter with the others' focal lengths refined, all are kept as given. (Not so with
-    fewer than 8 frames, with focal lengths that are unknown, or under ``jit``.)
+    k(f). Deviations that the zoom model cannot follow are attributed to focal lengths, too.
 
     Args:
         lines: the lines, or, much faster and with the same answer, ``compress(lines)``.
@@ -118,10 +105,6 @@ def fit_focal(
             f"is {focal_sigma}. {UNKNOWN}"
         )
     start = fit_zoom(lines, zoom=zoom, terms=terms, invertible=False, throw=throw)
-    if not _helps(lines, start, sigma / given):
-        fit = fit_zoom(lines, zoom=start.lens.zoom, invertible=invertible, throw=throw)
-        fit = with_focal_sigma(fit, lines, focal_sigma=sigma)
-        return FocalFit(fit, given, sigma, given, jnp.asarray(0), jnp.asarray(False))
     t, model, steps, reached = refined(lines, start.lens.zoom, sigma / given)
     if throw and not traced(reached) and not reached:
         raise RuntimeError(
@@ -138,28 +121,4 @@ def fit_focal(
         std=focal * jnp.sqrt(jnp.diagonal(covariance)),
         given=given,
         steps=steps,
-        helped=jnp.asarray(True),
     )
-
-
-def _helps(lines: AbstractLines, start: ZoomFit, relative: Float[Array, "frame"]) -> bool:
-    """Whether frames that are left out are straighter where the others' focal lengths are refined."""
-    number = lines.focal.shape[0]
-    if number < _FEWEST or traced((lines, relative)) or not np.isfinite(relative).all():
-        return True
-    frame, weight = np.asarray(lines.frame), line_weights(lines)
-    if lines.weight is None:
-        lines = lines.weighted(jnp.ones(frame.shape))
-    given = jnp.asarray(lines.focal)
-    order = np.argsort(np.argsort(given, kind="stable"))
-    total = np.zeros(2)
-    for fold in range(_FOLDS):
-        out = (order % _FOLDS == fold)[frame]
-        kept = lines.weighted(jnp.asarray(lines.weight) * ~out)
-        before = fit_zoom(kept, zoom=start.lens.zoom, invertible=False, throw=False).lens.zoom
-        _, after, _, reached = refined(kept, before, relative)
-        if not reached:
-            continue
-        share = np.asarray(weight * lines.counts) * out
-        total += [share @ np.asarray(line_squares(lines, model)) for model in (before, after)]
-    return bool(total[1] <= total[0])
