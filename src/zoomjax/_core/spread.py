@@ -17,7 +17,7 @@ import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-Shape = tuple[int, ...]
+Shape = tuple[Any, ...]  # of integers, or of symbols for `jax.export`
 
 _BLOCK = 1024
 """Numbers summed one by one; the sums of blocks are then summed, so that float32 keeps its digits."""
