@@ -79,7 +79,7 @@ def fit_zoom(
 
     Example:
         >>> import jax.numpy as jnp, numpy as np
-        >>> from zoomjax import Lines, compress
+        >>> from zoomjax import Lines, PolynomialZoom, compress
         >>> t = np.linspace(0.0, 479.0, 50)
         >>> bent = [np.stack([x + f * (t / 240 - 1) ** 2, t], axis=-1) for f in (1, 2) for x in (9, 599)]
         >>> lines = Lines.from_ragged(bent, [0, 0, 1, 1], [50, 100], image_size=(640, 480))
