@@ -9,7 +9,7 @@ step,
 
 Of its squares W, ``q s^2`` come from noise and from errors of single photos, for q numbers and the variance
 s^2 that is left. So the mean of ``d d^T`` over the frames, times ``1 - q s^2 / W`` where that is positive
-(James and Stein 1961), is the covariance of the misfit; it vanishes when the model is right.
+(James and Stein 1961), is the covariance of the misfit; next to none remains when the model is right.
 """
 
 import equinox as eqx
