@@ -1,0 +1,155 @@
+"""A start for `fit_motion`: frames chained one after the other, from guesses of the first field of view.
+
+The rays of the first frame follow from a guess of its focal length. Each frame after it is fitted to the
+rays that frames before it gave (log f and rotation, robustly), and its views give or improve rays. All
+guesses run side by side; the one that leaves the least median residual is the start.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+FIELDS_OF_VIEW = (70.0, 45.0, 28.0, 17.0, 10.0, 5.0)
+"""Guesses, degrees across the image."""
+
+_TURNS = 12  # Gauss-Newton steps a frame
+_LEAST_VIEWS = 4
+
+
+class Path(NamedTuple):
+    """A camera that turns and zooms, and what it sees.
+
+    Attributes:
+        log_focal: of each frame, of f in px.
+        rotation: of each frame, from the scene to the camera: x right, y down, z forward.
+        rays: direction of each track in the scene, of length 1.
+    """
+
+    log_focal: Float[Array, "frame"]
+    rotation: Float[Array, "frame 3 3"]
+    rays: Float[Array, "track 3"]
+
+
+class _State(NamedTuple):
+    log_focal: Array
+    rotation: Array
+    rays: Array  # sums of directions, weighted
+    residual: Array  # median of the frame's
+
+
+def turned(vector: Float[Array, "3"], rotation: Float[Array, "3"]) -> Float[Array, "3"]:
+    """A vector turned by a rotation vector (Rodrigues' formula), smooth at 0."""
+    squared = jnp.sum(rotation**2)
+    safe = jnp.where(squared > 1e-12, squared, 1.0)
+    angle = jnp.sqrt(safe)
+    first = jnp.where(squared > 1e-12, jnp.sin(angle) / angle, 1 - squared / 6)
+    second = jnp.where(squared > 1e-12, (1 - jnp.cos(angle)) / safe, 0.5 - squared / 24)
+    cross = jnp.cross(rotation, vector)
+    return vector + first * cross + second * jnp.cross(rotation, cross)
+
+
+def rotation_vector(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """The rotation vector of a rotation matrix, of an angle below 180 degrees; smooth at 0."""
+    twice = jnp.stack(
+        [matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]
+    )
+    squared = jnp.sum(twice**2)  # (2 sin)^2
+    safe = jnp.where(squared > 1e-12, squared, 1.0)
+    angle = jnp.arctan2(jnp.sqrt(safe), jnp.trace(matrix) - 1)
+    return twice * jnp.where(squared > 1e-12, angle / jnp.sqrt(safe), 0.5)
+
+
+def shrunk_ray(ray: Float[Array, "3"], factor: Float[Array, ""]) -> Float[Array, "3"]:
+    """A direction at `factor` times its angle to the z axis."""
+    across = jnp.sum(ray[:2] ** 2)
+    safe = jnp.where(across > 1e-16, across, 1.0)
+    sine = jnp.sqrt(safe)
+    angle = factor * jnp.arctan2(sine, ray[2])
+    scale = jnp.where(across > 1e-16, jnp.sin(angle) / sine, factor)
+    along = jnp.where(across > 1e-16, jnp.cos(angle), 1.0)
+    return jnp.concatenate([scale * ray[:2], along[None]])
+
+
+def start_of(
+    points: Float[Array, "view 2"], tracks: int, width: float, by_frame: tuple
+) -> tuple[Path, Array]:
+    """The best chain of all guesses, and the median of its residuals, px.
+
+    Args:
+        points: of each view, about the centre of the image, px.
+        tracks: their number.
+        width: of the image, px.
+        by_frame: of `views_by_frame`.
+    """
+    track, view, present = by_frame
+    seen = points[view]
+    guesses = width / 2 / np.tan(np.radians(FIELDS_OF_VIEW) / 2)
+
+    def chain(focal):
+        state = _State(jnp.log(focal), jnp.eye(3), jnp.zeros((tracks, 3)), jnp.zeros(()))
+
+        def step(state, frame):
+            state = _next(state, *frame)
+            return state, (state.log_focal, state.rotation, state.residual)
+
+        final, (log_focal, rotation, residual) = jax.lax.scan(step, state, (track, present, seen))
+        norm = jnp.linalg.norm(final.rays, axis=1, keepdims=True)
+        rays = jnp.where(norm > 0, final.rays / jnp.where(norm > 0, norm, 1), jnp.array([[0.0, 0.0, 1.0]]))
+        return Path(log_focal, rotation, rays), jnp.nanmean(residual)
+
+    paths, residuals = jax.vmap(chain)(jnp.asarray(guesses, points.dtype))
+    best = jnp.argmin(jnp.where(jnp.isfinite(residuals), residuals, jnp.inf))
+    return jax.tree.map(lambda leaf: leaf[best], paths), residuals[best]
+
+
+def views_by_frame(
+    track: Int[np.ndarray, "view"], moment: Int[np.ndarray, "view"], frames: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The views of each frame, padded: their tracks, their numbers, which are there."""
+    order = np.argsort(moment, kind="stable")
+    count = np.bincount(moment, minlength=frames)
+    place = np.arange(len(moment)) - np.repeat(np.cumsum(count) - count, count)
+    padded = np.zeros((2, frames, count.max()), np.int32)
+    padded[:, moment[order], place] = track[order], order
+    return padded[0], padded[1], np.arange(padded.shape[2]) < count[:, None]
+
+
+def _next(state, track, present, seen):
+    """The state after one more frame: its focal length and rotation, and the rays with its views."""
+    known = present & (jnp.sum(state.rays[track] ** 2, axis=1) > 0)
+    directions = state.rays[track]
+    directions = directions / jnp.maximum(jnp.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+    enough = jnp.sum(known) >= _LEAST_VIEWS
+
+    def residuals(unknown):
+        ahead = jax.vmap(lambda ray: turned(state.rotation @ ray, unknown[1:]))(directions)
+        depth = jnp.maximum(ahead[:, 2:], 0.05)
+        return jnp.exp(state.log_focal + unknown[0]) * ahead[:, :2] / depth - seen
+
+    def spread(unknown):
+        size = jnp.where(known, jnp.linalg.norm(residuals(unknown), axis=1), jnp.nan)
+        return jnp.maximum(jnp.nan_to_num(jnp.nanmedian(size)), 0.1)
+
+    def turn(unknown, _):
+        error, scale = residuals(unknown), 2 * spread(unknown)
+        weight = jnp.where(known, 1 / (1 + jnp.sum(error**2, axis=1) / scale**2), 0)
+        jacobian = jax.jacfwd(residuals)(unknown)
+        normal = jnp.einsum("vri,vrj,v->ij", jacobian, jacobian, weight)
+        right = jnp.einsum("vri,vr,v->i", jacobian, error, weight)
+        normal = normal + 1e-9 * (1 + jnp.trace(normal)) * jnp.eye(4)
+        return unknown - jnp.clip(jnp.linalg.solve(normal, right), -0.3, 0.3), None
+
+    unknown, _ = jax.lax.scan(turn, jnp.zeros(4, seen.dtype), None, length=_TURNS)
+    unknown = jnp.where(enough, unknown, 0)
+    rotation = jax.vmap(turned, (1, None), 1)(state.rotation, unknown[1:])
+    focal = jnp.exp(state.log_focal + unknown[0])
+    ahead = jnp.concatenate([seen / focal, jnp.ones_like(seen[:, :1])], axis=1)
+    direction = ahead @ rotation / jnp.linalg.norm(ahead, axis=1, keepdims=True)
+    size = jnp.linalg.norm(residuals(unknown), axis=1)
+    weight = jnp.where(known, 1 / (1 + (size / (3 * spread(unknown))) ** 2), 1.0)
+    rays = state.rays.at[track].add(jnp.where(present, weight, 0)[:, None] * direction)
+    residual = jnp.where(enough, spread(unknown), jnp.nan)
+    return _State(jnp.log(focal), rotation, rays, residual)

@@ -1,0 +1,370 @@
+"""Linear least squares for many frames, many rays and one lens, in time that is linear in the frames.
+
+Each row belongs to one view: it depends on the four numbers of its frame, on the two of its ray, and on the
+lens. Rays are eliminated point by point (Schur complement). What is left couples frames that see a common
+ray. With frames in blocks as long as the longest track, only neighbouring blocks are coupled, and a block
+Cholesky factorisation goes from block to block; the lens is a border of few columns.
+
+Normal equations square the condition of the problem: float64 only.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+
+class Unknowns(NamedTuple):
+    """What is solved for.
+
+    Attributes:
+        frames: four numbers a frame: log f, and a rotation vector.
+        rays: two numbers a ray.
+        lens: a tree of arrays.
+    """
+
+    frames: Float[Array, "frame 4"]
+    rays: Float[Array, "track 2"]
+    lens: PyTree
+
+
+class Rows(NamedTuple):
+    """Residuals: of the views, and of what is known beforehand of frames and lens.
+
+    Attributes:
+        views: of each view; they depend on its frame, its ray and the lens.
+        frames: of each frame, a number for each of its own.
+        lens: of the lens alone.
+    """
+
+    views: Float[Array, "view 2"]
+    frames: Float[Array, "frame 4"]
+    lens: Float[Array, "row"]
+
+
+class Structure(eqx.Module):
+    """Which track and which frame each view belongs to; views are sorted by track, then by frame.
+
+    Attributes:
+        track, frame: of each view.
+        place: of each view among those whose tracks begin in the same block; `members` of all blocks.
+        begin: the block in which its track begins.
+        tracks: their number.
+        block: frames in a block: at least as many as a track is long, from its first to its last.
+        blocks: how many there are.
+        most: the largest number of tracks that begin in a block.
+    """
+
+    track: Int[Array, "view"]
+    frame: Int[Array, "view"]
+    place: Int[Array, "view"]
+    begin: Int[Array, "view"]
+    tracks: int = eqx.field(static=True)
+    block: int = eqx.field(static=True)
+    blocks: int = eqx.field(static=True)
+    most: int = eqx.field(static=True)
+
+
+def structure_of(track: Int[np.ndarray, "view"], frame: Int[np.ndarray, "view"], frames: int) -> Structure:
+    """The structure of views that are sorted by track, then by frame."""
+    tracks, first = np.unique(track, return_index=True)
+    last = np.append(first[1:], len(track)) - 1
+    block = min(max(int(np.max(frame[last] - frame[first])) + 1, 8), frames)
+    begin = frame[first] // block
+    order = np.argsort(begin, kind="stable")
+    count = np.bincount(begin, minlength=-(-frames // block))
+    place = np.empty(len(tracks), int)
+    place[order] = np.arange(len(tracks)) - np.repeat(np.cumsum(count) - count, count)
+    return Structure(
+        *(jnp.asarray(a, jnp.int32) for a in (track, frame, place[track], begin[track])),
+        tracks=len(tracks),
+        block=block,
+        blocks=len(count),
+        most=int(count.max()),
+    )
+
+
+class Reduced(NamedTuple):
+    """The normal equations without the rays.
+
+    Attributes:
+        diagonal, above: blocks of the frames' matrix, and those that couple each to the next.
+        border: of frames and lens.
+        corner: of the lens.
+        right_frames, right_lens: the right-hand side.
+        rays: what the rays are found from: the inverses of their blocks, what couples them to the frames
+            of their views and to the lens, and their right-hand side.
+    """
+
+    diagonal: Float[Array, "block n n"]
+    above: Float[Array, "block n n"]
+    border: Float[Array, "block n lens"]
+    corner: Float[Array, "lens lens"]
+    right_frames: Float[Array, "block n"]
+    right_lens: Float[Array, "lens"]
+    rays: tuple[Array, Array, Array, Array]
+
+
+def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, damping: Array) -> Reduced:
+    """The normal equations of ``jacobian x = rows``, with `damping` added to the diagonal.
+
+    Args:
+        jacobian: maps `Unknowns` to `Rows`. All columns come from 6 products and one for each number of
+            the lens, as no row has two frames or two rays.
+        rows: the right-hand side.
+        like: the unknowns' shapes.
+        structure: which frame each view belongs to.
+        damping: added to each unknown's diagonal entry.
+    """
+    by_frame, by_ray, by_lens = _columns(jacobian, like)
+    views, by_track = rows.views[..., None], structure.track
+
+    def summed(of_views):
+        return jax.ops.segment_sum(of_views, by_track, structure.tracks, indices_are_sorted=True)
+
+    inverse = _inverse(summed(_products(by_ray.views, by_ray.views)) + damping * jnp.eye(2)[None])
+    coupling = _products(by_frame.views, by_ray.views)
+    to_lens = summed(_products(by_lens.views, by_ray.views))
+    right_ray = summed(_products(by_ray.views, views))
+    solved, lens_solved = _times(inverse, right_ray), _times(inverse, to_lens.swapaxes(1, 2))
+
+    border = _products(by_frame.views, by_lens.views) - _times(coupling, lens_solved[by_track])
+    right = (_products(by_frame.views, views) - _times(coupling, solved[by_track]))[..., 0]
+    extra = jnp.eye(4)[None] * (by_frame.frames**2 + damping)[:, :, None]
+    own = _products(by_frame.views, by_frame.views)
+    diagonal, above = _frame_blocks(own, _times(coupling, _root(inverse)[by_track]), extra, structure)
+    corner = jnp.einsum("vri,vrj->ij", by_lens.views, by_lens.views) + by_lens.lens.T @ by_lens.lens
+    corner = corner - jnp.einsum("tik,tkj->ij", to_lens, lens_solved) + damping * jnp.eye(len(corner))
+    right_lens = jnp.einsum("vri,vr->i", by_lens.views, rows.views) + by_lens.lens.T @ rows.lens
+    right_lens = right_lens - jnp.einsum("tij,tj->i", to_lens, solved[..., 0])
+    own_right = _by_block(right, structure) + _padded(by_frame.frames * rows.frames, structure)
+    return Reduced(
+        diagonal,
+        above,
+        _by_block(border, structure),
+        corner,
+        own_right,
+        right_lens,
+        (inverse, coupling, to_lens, right_ray[..., 0]),
+    )
+
+
+def _columns(jacobian, like):
+    """The Jacobian's columns of each row: by its frame, by its ray and by the lens; the last axis."""
+    lens, unravel = ravel_pytree(like.lens)
+    nothing = jax.tree.map(jnp.zeros_like, like)
+
+    def along(**directions):
+        return jacobian(nothing._replace(**directions))
+
+    def stacked(make, size):
+        out = jax.vmap(make)(jnp.eye(size))
+        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), out)
+
+    by_frame = stacked(lambda e: along(frames=jnp.broadcast_to(e, like.frames.shape)), 4)
+    by_ray = stacked(lambda e: along(rays=jnp.broadcast_to(e, like.rays.shape)), 2)
+    by_lens = stacked(lambda e: along(lens=unravel(e)), lens.size)
+    own = jnp.diagonal(by_frame.frames, axis1=1, axis2=2)
+    return by_frame._replace(frames=own), by_ray, by_lens
+
+
+def _products(left, right):
+    """Of each view, the sum over its two rows of the products of their columns.
+
+    As loops that XLA fuses: a product of matrices with two rows would be a call each.
+    """
+    x, y = (left[:, row, :, None] * right[:, row, None, :] for row in (0, 1))
+    return x + y
+
+
+def _times(left, right):
+    """Products of matrices of two columns and of two rows."""
+    x, y = (left[:, :, column, None] * right[:, None, column, :] for column in (0, 1))
+    return x + y
+
+
+def _inverse(matrix):
+    """Inverses of symmetric 2 x 2 matrices."""
+    a, b, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
+    return _symmetric(d, -b, a) / (a * d - b * b)[:, None, None]
+
+
+def _root(matrix):
+    """Lower triangles L of symmetric 2 x 2 matrices L L^T."""
+    first = jnp.sqrt(matrix[:, 0, 0])
+    off = matrix[:, 0, 1] / first
+    last = jnp.sqrt(matrix[:, 1, 1] - off**2)
+    return jnp.stack([jnp.stack([first, 0 * off], 1), jnp.stack([off, last], 1)], 1)
+
+
+def _symmetric(a, b, d):
+    return jnp.stack([jnp.stack([a, b], 1), jnp.stack([b, d], 1)], 1)
+
+
+def _frame_blocks(own, halves, extra, structure):
+    """The frames' matrix by blocks: their own parts, less what the eliminated rays couple.
+
+    A track begins in a block and ends in it or in the next: it couples frames of these two, by the products
+    of its `halves`.
+    """
+    size, blocks, n = structure.block, structure.blocks, 4 * structure.block
+    each = jnp.zeros((blocks * size, 4, 4), own.dtype).at[structure.frame].add(own)
+    filled = jnp.broadcast_to(jnp.eye(4), (blocks * size - len(extra), 4, 4))  # no frames there
+    each = (each + jnp.concatenate([extra, filled])).reshape(blocks, size, 4, 4)
+    place = jnp.arange(size)
+    diagonal = jnp.zeros((blocks, size, 4, size, 4), own.dtype)
+    diagonal = diagonal.at[:, place, :, place].set(each.swapaxes(0, 1)).reshape(blocks, n, n)
+    within = structure.frame - structure.begin * size
+
+    def of_block(number):
+        here = jnp.where(structure.begin == number, structure.place, structure.most)  # or dropped
+        rows = (
+            jnp.zeros((structure.most, 2 * size, 4, 2), own.dtype).at[here, within].set(halves, mode="drop")
+        )
+        rows = rows.transpose(1, 2, 0, 3).reshape(2 * n, -1)
+        return rows @ rows.T
+
+    coupled = jax.lax.map(of_block, jnp.arange(blocks))
+    diagonal = diagonal - coupled[:, :n, :n]
+    diagonal = diagonal.at[1:].add(-coupled[:-1, n:, n:])
+    return diagonal, -coupled[:, :n, n:]
+
+
+def _by_block(values, structure):
+    """What each view adds to its frame, summed, by blocks."""
+    frames = structure.block * structure.blocks
+    total = jnp.zeros((frames, *values.shape[1:]), values.dtype).at[structure.frame].add(values)
+    return total.reshape(structure.blocks, 4 * structure.block, *values.shape[2:])
+
+
+def _padded(values, structure):
+    """Numbers of frames, by blocks."""
+    frames = structure.block * structure.blocks
+    return jnp.zeros((frames, 4), values.dtype).at[: len(values)].set(values).reshape(structure.blocks, -1)
+
+
+def _factored(matrix):
+    """Cholesky factors of the diagonal, and what couples each block to the one before, by blocks."""
+
+    def step(before, blocks):
+        diagonal, above, first = blocks
+        coupling = jnp.where(first, 0, solve_triangular(before, above, lower=True))  # L^-1 O
+        factor = jnp.linalg.cholesky(diagonal - coupling.T @ coupling)
+        return factor, (factor, coupling)
+
+    number = len(matrix.diagonal)
+    shifted = jnp.roll(matrix.above, 1, axis=0)
+    start = jnp.eye(matrix.diagonal.shape[1], dtype=matrix.diagonal.dtype)
+    _, factors = jax.lax.scan(step, start, (matrix.diagonal, shifted, jnp.arange(number) == 0))
+    return factors
+
+
+def _solve_blocks(factors, right):
+    """The solution of the frames' equations for the columns of a right-hand side, by blocks."""
+
+    def forward(before, blocks):
+        factor, coupling, right = blocks
+        value = solve_triangular(factor, right - coupling.T @ before, lower=True)
+        return value, value
+
+    def backward(after, blocks):
+        factor, coupling_of_next, value = blocks
+        value = solve_triangular(factor, value - coupling_of_next @ after, lower=True, trans=1)
+        return value, value
+
+    factor, coupling = factors
+    zero = jnp.zeros_like(right[0])
+    _, values = jax.lax.scan(forward, zero, (factor, coupling, right))
+    following = jnp.roll(coupling, -1, axis=0).at[-1].set(0)
+    _, values = jax.lax.scan(backward, zero, (factor, following, values), reverse=True)
+    return values
+
+
+def solution(matrix: Reduced, like: Unknowns, structure: Structure) -> Unknowns:
+    """The unknowns that solve the normal equations."""
+    lens, unravel = ravel_pytree(like.lens)
+    right = jnp.concatenate([matrix.right_frames[..., None], matrix.border], axis=-1)
+    solved = _solve_blocks(_factored(matrix), right)
+    own, by_lens = solved[..., 0], solved[..., 1:]
+    corner = matrix.corner - jnp.einsum("bni,bnj->ij", matrix.border, by_lens)
+    right_lens = matrix.right_lens - jnp.einsum("bni,bn->i", matrix.border, own)
+    of_lens = cho_solve((jnp.linalg.cholesky(corner), True), right_lens) if lens.size else right_lens
+    frames = (own - by_lens @ of_lens).reshape(-1, 4)
+    inverse, coupling, to_lens, right_ray = matrix.rays
+    coupled = jnp.sum(coupling * frames[structure.frame][..., None], axis=1)
+    right_ray = right_ray - jax.ops.segment_sum(coupled, structure.track, structure.tracks)
+    right_ray = right_ray - jnp.einsum("tij,i->tj", to_lens, of_lens)
+    rays = _times(inverse, right_ray[..., None])[..., 0]
+    return Unknowns(frames[: len(like.frames)], rays, unravel(of_lens))
+
+
+def covariances(
+    matrix: Reduced, frames: int
+) -> tuple[Float[Array, "frame 4 4"], Float[Array, "lens lens"], Float[Array, "frame 4 lens"]]:
+    """Covariances of each frame's numbers, of the lens, and of both, for a noise of 1 in each row."""
+    factors = _factored(matrix)
+    by_lens = _solve_blocks(factors, matrix.border)
+    corner = matrix.corner - jnp.einsum("bni,bnj->ij", matrix.border, by_lens)
+    lens = jnp.linalg.inv(corner)
+    factor, coupling = factors
+    size = factor.shape[1]
+    identity = jnp.eye(size, dtype=factor.dtype)
+
+    def backward(after, blocks):  # selected inverse: S_i = T + (T O) S_{i+1} (T O)^T
+        factor, coupling_of_next = blocks
+        own = cho_solve((factor, True), identity)
+        gain = solve_triangular(factor, coupling_of_next, lower=True, trans=1)
+        value = own + gain @ after @ gain.T
+        return value, value
+
+    following = jnp.roll(coupling, -1, axis=0).at[-1].set(0)
+    _, own = jax.lax.scan(backward, jnp.zeros_like(identity), (factor, following), reverse=True)
+    blocks = own.reshape(len(own), size // 4, 4, size // 4, 4)
+    place = jnp.arange(size // 4)
+    own = blocks[:, place, :, place].swapaxes(0, 1).reshape(-1, 4, 4)[:frames]
+    by_lens = by_lens.reshape(-1, 4, by_lens.shape[-1])[:frames]
+    own = own + jnp.einsum("fij,jk,flk->fil", by_lens, lens, by_lens)
+    return own, lens, -jnp.einsum("fij,jk->fik", by_lens, lens)
+
+
+class Schur(lx.AbstractLinearSolver):
+    """Steps of a damped Gauss-Newton method for `Unknowns` and `Rows`, by `reduced` and `solution`."""
+
+    structure: Structure
+
+    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
+        """The operator itself."""
+        del options
+        return operator
+
+    def compute(
+        self, state: Any, vector: PyTree[Array], options: dict[str, Any]
+    ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
+        """The unknowns: of rows, and of as many equations that damp each unknown."""
+        del options
+        rows, _ = vector
+        like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), state.in_structure())
+        _, damped = state.mv(like._replace(frames=jnp.ones_like(like.frames)))
+        matrix = reduced(
+            lambda x: state.mv(x)[0], rows, like, self.structure, damped.frames.ravel()[0] ** 2
+        )
+        result: Any = lx.RESULTS.successful
+        return solution(matrix, like, self.structure), result, {}
+
+    def transpose(self, state: Any, options: dict[str, Any]) -> Any:
+        """Not needed: steps of a solver are not differentiated."""
+        raise NotImplementedError("The steps of this solver have no transpose: pass another solver.")
+
+    def conj(self, state: Any, options: dict[str, Any]) -> Any:
+        """Real numbers stay what they are."""
+        return state, options
+
+    def assume_full_rank(self) -> bool:
+        """The damping of each step sees to it."""
+        return True

@@ -1,0 +1,437 @@
+"""Focal lengths, rotations and the lens of a camera that turns and zooms, from tracks alone.
+
+The unknowns are log f and the rotation of each frame, a ray of each track, the zoom model, and the offset
+of the centre of distortion. A ray X is seen in frame t at ``p = f_t (y1, y2)/y3`` with ``y = R_t X``, and
+the point that was observed is corrected to c. The residual in the image is ``J^-1 (c - p)``, where J is the
+derivative of the correction at the observed point: one step of Newton's method for the inverse, exact to
+second order. Residuals have a Cauchy loss, with a scale from their median.
+
+The solver is optimistix' Levenberg-Marquardt with a linear solver made for this problem (`_schur`), linear
+in the number of frames. The start needs no guess (`_motion_start`); the lens joins by a prior that widens.
+"""
+
+from typing import Any, NoReturn
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from .._core.arguments import kinds_checked
+from .._core.checks import checked_terms
+from .._core.types import AnyArray
+from ..models.family import AbstractFamily
+from ..models.lens import ZoomLens
+from ..models.polynomial import RadialPolynomial
+from ..models.zoom import (
+    AbstractFocusZoom,
+    AbstractPriorZoom,
+    AbstractZoom,
+    PolynomialZoom,
+    with_parameters,
+)
+from ..tracks.tracks import Tracks
+from ._least_squares import RoundingTrustRegion
+from ._motion_start import Path, rotation_vector, shrunk_ray, start_of, turned, views_by_frame
+from ._schur import Rows, Schur, Structure, Unknowns, covariances, reduced, structure_of
+from .result import RESULTS
+
+_CAUCHY = 2.3849
+"""Of the noise: where the loss begins to flatten; 95 % efficient for normal errors."""
+
+_MEDIAN_OF_SIZE = 1.1774  # of the length of a vector of two normal numbers
+_STAGES = ((0.03, 1e-4), *[(1.0, 0.05)] * 5)
+"""Standard deviations of the parameters of the zoom model, and of the centre's offset in half image
+diagonals. The noise is estimated anew after each stage; they end where the solver does."""
+
+_MOST_STEPS = 20  # of a stage
+
+_GAUGE = 1e4  # weight of the first frame's rotation, which is the origin: px a radian
+_LOOSE = 1e-3  # of a frame that no track sees
+_LONGEST = 48
+"""Frames of a track that share a ray. Longer ones are cut, so that only frames near each other are coupled:
+that they show the same point says little more, and a cubic cost is saved."""
+
+_UNKNOWN_SCALE = 0.1
+"""Standard deviation of log f from which the focal lengths have no scale."""
+
+
+class MotionFit(eqx.Module):
+    """The lens and the path of a camera that turns and zooms.
+
+    Attributes:
+        lens: the zoom lens, with focal lengths in px.
+        focal: focal length of each frame, px.
+        focal_std: its standard deviation, px. Nearly all of it is a factor common to all frames.
+        rotation: of each frame, from the scene to the camera, whose axes are x right, y down and z
+            forward. The first frame's is the identity.
+        rays: direction of each track in the scene, of length 1.
+        covariance: of the zoom model's parameters, flattened row by row.
+        residual: distance between each view and where the model puts it, px; NaN for padding.
+        noise: standard deviation of a coordinate of a point, px, from the median of the residuals.
+        result: how the fit ended; ``RESULTS[fit.result]`` is a sentence. `undetermined`: the tracks do not
+            determine the scale of the focal lengths, as where the camera zooms and does not turn. Only
+            their ratios are known then, and the distortion straightens lines all the same.
+        steps: number of steps the solver took in the last stage.
+    """
+
+    lens: ZoomLens
+    focal: Float[Array, "frame"]
+    focal_std: Float[Array, "frame"]
+    rotation: Float[Array, "frame 3 3"]
+    rays: Float[Array, "track 3"]
+    covariance: Float[Array, "parameter parameter"]
+    residual: Float[Array, "track view"]
+    noise: Float[Array, ""]
+    result: RESULTS
+    steps: Any
+
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: call the lens of the fit instead."""
+        raise TypeError("A MotionFit is not a lens: use fit.lens, as in fit.lens(2400.0).")
+
+
+@kinds_checked
+def fit_motion(
+    tracks: Tracks,
+    *,
+    zoom: AbstractZoom | None = None,
+    family: AbstractFamily | None = None,
+    terms: int = 2,
+    shift: AbstractZoom | None = PolynomialZoom(degree=1),  # noqa: B008, it is frozen
+    focal: Float[AnyArray, "frame"] | None = None,
+    focal_std: float | Float[AnyArray, "frame"] = np.inf,
+    throw: bool = True,
+) -> MotionFit:
+    """Fit focal lengths, rotations and a zoom lens to tracks of points that are far away or do not move.
+
+    The camera turns about its entrance pupil, or about a point near it beside the distance of the scene,
+    and zooms. Computed in float64, which has to be enabled.
+
+    Args:
+        tracks: the tracks.
+        zoom: the zoom model; `PolynomialZoom` of degree 2 by default.
+        family: the distortion model; `RadialPolynomial` by default.
+        terms: the number N of radial distortion coefficients.
+        shift: zoom model of the offset of the centre of distortion from the centre of the image: linear
+            in 1/f by default; None if there is none.
+        focal: focal lengths that are known beforehand, px; NaN where not.
+        focal_std: their standard deviations, px.
+        throw: whether to raise if the fit fails. Otherwise see `MotionFit.result`. `undetermined` never
+            raises.
+
+    Raises:
+        ValueError: float64 is not enabled, or the number of known focal lengths is not that of the frames.
+        RuntimeError: the fit failed (see `throw`).
+
+    References:
+        L. de Agapito, E. Hayman, I. Reid, "Self-calibration of rotating and zooming cameras", IJCV 2001.
+        M. Brown, D. Lowe, "Automatic panoramic image stitching using invariant features", IJCV 2007.
+    """
+    if not jax.config.jax_enable_x64:
+        raise ValueError(
+            "fit_motion needs float64, and it is not enabled: call "
+            'jax.config.update("jax_enable_x64", True) first.'
+        )
+    zoom = PolynomialZoom() if zoom is None else zoom
+    if isinstance(zoom, AbstractFocusZoom):
+        raise ValueError("Argument zoom depends on the focus, which tracks do not have.")
+    family = RadialPolynomial() if family is None else family
+    terms = checked_terms(terms, family.most_terms)
+    known, known_std = _known_focal(focal, focal_std, tracks.frames)
+    track, view = np.nonzero(np.asarray(tracks.mask))
+    moment = np.asarray(tracks.frame)[track, view]
+    data = _Data(
+        points=jnp.asarray(tracks.points, float)[track, view] - (np.array([tracks.image_size]) - 1) / 2,
+        structure=structure_of(_pieces(track, moment), moment, tracks.frames),
+        empty=jnp.asarray(np.bincount(moment, minlength=tracks.frames) == 0),
+        log_focal=jnp.log(known),
+        log_std=known_std / known,
+        scale=tracks.scale,
+    )
+    path, spread = _started(data, views_by_frame(np.asarray(data.structure.track), moment, tracks.frames))
+    fit, residual = _in_stages(data, path, spread, zoom, shift, family, terms, tracks.image_size)
+    padded = jnp.full(np.shape(tracks.mask), jnp.nan).at[track, view].set(residual)
+    rays = np.zeros((len(tracks.mask), 3))
+    np.add.at(rays, track, np.asarray(fit.rays)[np.asarray(data.structure.track)])
+    rays = jnp.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    fit = eqx.tree_at(lambda fit: (fit.residual, fit.rays), fit, (padded, rays))
+    failed = (fit.result != RESULTS.successful) & (fit.result != RESULTS.undetermined)
+    if throw and bool(failed):
+        raise RuntimeError(f"The fit failed. {RESULTS[fit.result]}")
+    return fit
+
+
+class _Data(eqx.Module):
+    """Tracks, as the residuals need them.
+
+    Attributes:
+        points: about the centre of the image, px.
+        structure: which track and frame each view belongs to.
+        empty: frames that no track sees.
+        log_focal, log_std: what is known of log f beforehand; infinite standard deviations.
+        scale: half the image diagonal, px.
+    """
+
+    points: Float[Array, "view 2"]
+    structure: Structure
+    empty: Array
+    log_focal: Float[Array, "frame"]
+    log_std: Float[Array, "frame"]
+    scale: float = eqx.field(static=True)
+
+
+class _Model(eqx.Module):
+    """What the unknowns are measured from: a path, and a lens."""
+
+    path: Path
+    zoom: AbstractZoom
+    shift: AbstractZoom | None
+    family: AbstractFamily
+
+
+def _known_focal(focal, focal_std, frames):
+    """Known focal lengths and standard deviations of all frames; 1 and infinity where there is none."""
+    values = np.full(frames, np.nan) if focal is None else np.asarray(focal, float)
+    if values.shape != (frames,):
+        raise ValueError(
+            f"Argument focal must have one number for each of the {frames} frames, NaN where it is not "
+            f"known, but its shape is {values.shape}."
+        )
+    there = np.isfinite(values)
+    if (values[there] <= 0).any() or not (np.asarray(focal_std) > 0).all():
+        raise ValueError("Arguments focal and focal_std must be positive.")
+    std = np.where(there, np.broadcast_to(focal_std, frames), np.inf)
+    return np.where(there, values, 1.0), std
+
+
+def _pieces(track, moment):
+    """Names of the tracks' pieces, each at most `_LONGEST` frames long, for each view."""
+    _, first, number = np.unique(track, return_index=True, return_inverse=True)
+    part = (moment - moment[first][number]) // _LONGEST
+    return np.unique(np.stack([track, part]), axis=1, return_inverse=True)[1].ravel()
+
+
+@eqx.filter_jit
+def _started(data, by_frame):
+    return start_of(data.points, data.structure.tracks, 1.6 * data.scale, by_frame)
+
+
+def _in_stages(data, path, spread, zoom, shift, family, terms, image_size):
+    """The fit, with a prior of the lens that widens from stage to stage: the program is the same."""
+    focal = np.exp(np.asarray(path.log_focal))
+    model = _Model(
+        path,
+        zoom.prepare(focal, family.size(terms)),
+        None if shift is None else shift.prepare(focal, 2),
+        family,
+    )
+    noise, result, steps = spread / _MEDIAN_OF_SIZE, None, None
+    for number, prior in enumerate(_STAGES):
+        model, noise, result, steps = _solved(data, model, noise, jnp.array(prior))
+        if number > 1 and result == RESULTS.successful:
+            break
+    return _described(data, model, noise, jnp.array(_STAGES[-1]), result, steps, image_size)
+
+
+def _zeros(model, frames, tracks):
+    shift = None if model.shift is None else model.shift.parameters
+    return Unknowns(
+        jnp.zeros((frames, 4)), jnp.zeros((tracks, 2)), (model.zoom.parameters, shift, jnp.zeros(()))
+    )
+
+
+def _moved(model, unknowns):
+    """The path and the lens that the unknowns stand for.
+
+    One of them is a common factor of all focal lengths, by which angles shrink. It is redundant, and it is
+    the direction that tracks determine worst: along it, the other unknowns change little.
+    """
+    parameters, offsets, factor = unknowns.lens
+    zoom = with_parameters(model.zoom, parameters)
+    shift = None if model.shift is None else with_parameters(model.shift, offsets)
+    shrunk = jnp.exp(-factor)
+    log_focal = model.path.log_focal + unknowns.frames[:, 0] + factor
+
+    def ray(ray, step):
+        return shrunk_ray(ray, shrunk) + step @ _tangents(ray)
+
+    def rotation(matrix, step):
+        extra = (shrunk - 1) * rotation_vector(matrix)  # about the same axis
+        return jax.vmap(lambda column: turned(turned(column, extra), step), 1, 1)(matrix)
+
+    rays = jax.vmap(ray)(model.path.rays, unknowns.rays)
+    rotations = jax.vmap(rotation)(model.path.rotation, unknowns.frames[:, 1:])
+    return Path(log_focal, rotations, rays), zoom, shift
+
+
+def _tangents(ray):
+    """Two vectors of length 1 across a ray."""
+    helper = jnp.where(jnp.abs(ray[0]) < 0.7, jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0]))
+    first = jnp.cross(ray, helper)
+    first = first / jnp.linalg.norm(first)
+    return jnp.stack([first, jnp.cross(ray, first)])
+
+
+def _corrected(point, coefficients, offset, family, scale):
+    """A point corrected, px about the centre of the image."""
+    z = (point - offset * scale) / scale
+    return scale * jnp.stack(family.correct((z[0], z[1]), z @ z, coefficients)) + offset * scale
+
+
+def _view(point, focal, coefficients, offset, ahead, family, scale):
+    """The residual of one view, px of the image."""
+
+    def corrected(point):
+        return _corrected(point, coefficients, offset, family, scale)
+
+    depth = jnp.where(ahead[2] > 0.05, ahead[2], 0.05)
+    missed = corrected(point) - focal * ahead[:2] / depth
+    (a, b), (c, d) = jax.jacfwd(corrected)(point)
+    determinant = a * d - b * c
+    determinant = jnp.where(determinant > 0.05, determinant, 0.05)
+    return jnp.stack([d * missed[0] - b * missed[1], a * missed[1] - c * missed[0]]) / determinant
+
+
+def _views(data, model, unknowns):
+    """Residuals of all views, px."""
+    path, zoom, shift = _moved(model, unknowns)
+    focal = jnp.exp(path.log_focal)
+    coefficients = jax.vmap(zoom)(focal)
+    offset = jnp.zeros((len(focal), 2)) if shift is None else jax.vmap(shift)(focal)
+
+    def view(point, frame, track):
+        ahead = _product(path.rotation[frame], path.rays[track])
+        return _view(
+            point, focal[frame], coefficients[frame], offset[frame], ahead, model.family, data.scale
+        )
+
+    return jax.vmap(view)(data.points, data.structure.frame, data.structure.track)
+
+
+def _product(matrix, vector):
+    """A matrix times a vector, as a sum that XLA fuses with what uses it."""
+    x, y, z = (matrix[:, column] * vector[column] for column in range(3))
+    return x + y + z
+
+
+def _averaged(data, model):
+    """Each ray as the mean of the directions in which its views see it: a start, and near the best."""
+    focal = jnp.exp(model.path.log_focal)
+    coefficients = jax.vmap(model.zoom)(focal)
+    offset = jnp.zeros((len(focal), 2)) if model.shift is None else jax.vmap(model.shift)(focal)
+
+    def direction(point, frame):
+        straight = _corrected(point, coefficients[frame], offset[frame], model.family, data.scale)
+        ahead = jnp.concatenate([straight / focal[frame], jnp.ones(1)])
+        return _product(model.path.rotation[frame].T, ahead) / jnp.linalg.norm(ahead)
+
+    seen = jax.vmap(direction)(data.points, data.structure.frame)
+    rays = jax.ops.segment_sum(seen, data.structure.track, data.structure.tracks)
+    return rays / jnp.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def _rows(unknowns, args):
+    """All residuals, robust, in units of the noise."""
+    data, model, noise, prior = args
+    views = _views(data, model, unknowns) / noise
+    squared = jnp.sum(views**2, axis=-1, keepdims=True) / _CAUCHY**2
+    safe = jnp.where(squared > 1e-8, squared, 1.0)
+    views = views * jnp.where(squared > 1e-8, jnp.sqrt(jnp.log1p(safe) / safe), 1 - squared / 4)
+    return Rows(views, _about_frames(data, model, unknowns), _about_lens(model, unknowns, prior))
+
+
+def _about_frames(data, model, unknowns):
+    """What is known of frames: the first is the origin, and focal lengths may be given.
+
+    That log f hardly changes but by the common factor is said so weakly that it only parts the two.
+    """
+    weight = jnp.where(data.empty, _LOOSE, 0.0).at[0].set(_GAUGE)
+    own = unknowns.frames[:, 0]
+    known = (model.path.log_focal + own + unknowns.lens[2] - data.log_focal) / data.log_std
+    log_focal = jnp.where(jnp.isinf(data.log_std), own, known)
+    return jnp.concatenate([log_focal[:, None], weight[:, None] * unknowns.frames[:, 1:]], axis=1)
+
+
+def _about_lens(model, unknowns, prior):
+    """The prior of the lens."""
+    parameters, offsets, _ = unknowns.lens
+    rows = [ravel_pytree(parameters)[0] / prior[0], ravel_pytree(offsets)[0] / prior[1]]
+    if isinstance(model.zoom, AbstractPriorZoom):
+        rows.append(with_parameters(model.zoom, parameters).standardised())
+    return jnp.concatenate(rows)
+
+
+@eqx.filter_jit
+def _solved(data, model, noise, prior):
+    """The path and the lens of least energy, the noise, the solver's status and its steps."""
+    solver = optx.LevenbergMarquardt(
+        rtol=1e-6, atol=1e-6, norm=optx.rms_norm, linear_solver=Schur(data.structure)
+    )
+    solver = eqx.tree_at(lambda s: s.search, solver, RoundingTrustRegion())
+    model = eqx.tree_at(lambda m: m.path.rays, model, _averaged(data, model))
+    start = _zeros(model, len(model.path.log_focal), len(model.path.rays))
+    solution = optx.least_squares(
+        _rows, solver, start, args=(data, model, noise, prior), max_steps=_MOST_STEPS, throw=False
+    )
+    found = solution.value
+    path, zoom, shift = _moved(model, found)
+    rays = path.rays / jnp.linalg.norm(path.rays, axis=1, keepdims=True)
+    moved = _Model(path._replace(rays=rays), zoom, shift, model.family)
+    size = jnp.linalg.norm(_views(data, model, found), axis=-1)
+    noise = jnp.median(size) / _MEDIAN_OF_SIZE
+    noise = jnp.maximum(noise, 1e-6)  # of tracks without noise
+    return moved, noise, RESULTS.promote(solution.result), solution.stats["num_steps"]
+
+
+@eqx.filter_jit
+def _described(data, model, noise, prior, result, steps, image_size):
+    """The fit with its residuals, covariance and status."""
+    frames, tracks = len(model.path.log_focal), len(model.path.rays)
+    zeros = _zeros(model, frames, tracks)
+
+    def plain(unknowns):  # without the loss: its efficiency is in `inflation`
+        views = jnp.where(inlier[..., None], _views(data, model, unknowns) / noise, 0)
+        return Rows(views, _about_frames(data, model, unknowns), _about_lens(model, unknowns, prior))
+
+    missed = _views(data, model, zeros)
+    squared = jnp.sum(missed**2, axis=-1) / (noise * _CAUCHY) ** 2
+    inlier = squared < 9  # beyond, the loss nearly ignores a view
+    rows, jacobian = jax.linearize(plain, zeros)
+    matrix = reduced(jacobian, rows, zeros, data.structure, jnp.asarray(0.0))
+    own, lens, both = covariances(matrix, frames)
+    log_variance = own[:, 0, 0] + 2 * both[:, 0, -1] + lens[-1, -1]
+    free = jnp.sum(2 * inlier) / (jnp.sum(2 * inlier) - 4 * frames - 2 * tracks - len(lens))
+    inflation = 1.05 * free
+    size = ravel_pytree(model.zoom.parameters)[0].size
+    focal, log_std = jnp.exp(model.path.log_focal), jnp.sqrt(log_variance * inflation)
+    finite = jnp.all(jnp.isfinite(lens)) & jnp.all(jnp.isfinite(focal))
+    known = jnp.min(jnp.where(data.empty, jnp.inf, log_std)) < _UNKNOWN_SCALE
+    good: Any = RESULTS.successful
+    status = RESULTS.where((result == good) & ~known, RESULTS.undetermined, result)
+    status = RESULTS.where(finite, status, RESULTS.nonfinite)
+    fitted = ZoomLens(
+        zoom=model.zoom,
+        centre=(jnp.asarray(image_size, jnp.float64) - 1) / 2,
+        focal_range=jnp.stack([jnp.min(focal), jnp.max(focal)]),
+        image_size=image_size,
+        focal_unit="px",
+        shift=model.shift,
+        family=model.family,
+    )
+    fit = MotionFit(
+        lens=fitted,
+        focal=focal,
+        focal_std=focal * log_std,
+        rotation=model.path.rotation,
+        rays=model.path.rays,
+        covariance=lens[:size, :size] * inflation,
+        residual=jnp.zeros(()),  # `fit_motion` fills it in, padded as the tracks are
+        noise=noise * jnp.sqrt(free),
+        result=status,
+        steps=steps,
+    )
+    return fit, jnp.linalg.norm(missed, axis=-1)

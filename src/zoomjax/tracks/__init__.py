@@ -1,0 +1,5 @@
+"""Tracks: points of a scene, followed from frame to frame of a clip."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

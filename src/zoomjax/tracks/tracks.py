@@ -1,0 +1,144 @@
+"""Points of a scene, followed from frame to frame of a clip."""
+
+import math
+import warnings
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from .._core.checks import checked_integer, checked_size
+from .._core.fields import booleans, check_indices, check_shapes, integers, known, numbers
+from .._core.types import AnyArray
+
+
+class Tracks(eqx.Module):
+    """Points of a scene as a clip shows them, as padded tensors; `Tracks.from_arrays` makes them.
+
+    Attributes:
+        points: ``(x, y)`` px of each view of each track; (0, 0) is the centre of the top-left pixel.
+        frame: the frame of each view, from 0, increasing along a track.
+        mask: which entries are views rather than padding.
+        image_size: (width, height) px.
+        frames: number of frames of the clip. A frame without views is allowed.
+        number: the name that each track was given, an integer.
+    """
+
+    points: Float[AnyArray, "track view 2"] = eqx.field(converter=numbers("points"))
+    frame: Int[AnyArray, "track view"] = eqx.field(converter=integers("frame"))
+    mask: Bool[AnyArray, "track view"] = eqx.field(converter=booleans("mask"))
+    image_size: tuple[int, int] = eqx.field(static=True, converter=checked_size)
+    frames: int = eqx.field(static=True, converter=lambda frames: checked_integer("frames", frames, 1))
+    number: Int[AnyArray, "track"] = eqx.field(converter=integers("number"))
+
+    def __check_init__(self):
+        """Check that the shapes agree, that frames exist, and that views are numbers."""
+        check_shapes(
+            {
+                "points": (self.points, ("track", "view", 2)),
+                "frame": (self.frame, ("track", "view")),
+                "mask": (self.mask, ("track", "view")),
+                "number": (self.number, ("track",)),
+            }
+        )
+        check_indices("frame", self.frame, self.frames, "the frames of the clip")
+        points, mask = known(self.points), known(self.mask)
+        if points is not None and mask is not None and not np.isfinite(points[mask]).all():
+            raise ValueError("Argument points must be finite where mask is set: clear the mask there.")
+
+    @classmethod
+    def from_arrays(
+        cls,
+        track: ArrayLike,
+        frame: ArrayLike,
+        points: ArrayLike,
+        *,
+        image_size: Sequence[int],
+        frames: int | None = None,
+    ) -> "Tracks":
+        """Make tracks from one entry per view, in any order.
+
+        Args:
+            track: for each view an integer that names its track.
+            frame: for each view the index of its frame, from 0.
+            points: for each view ``(x, y)``, px.
+            image_size: (width, height) px.
+            frames: number of frames of the clip; by default one more than the last frame with a view.
+
+        Raises:
+            ValueError: shapes do not agree, a frame does not exist, a point is not finite, a track has two
+                views in one frame, or no track has two views.
+
+        Warns:
+            UserWarning: tracks of one view are dropped; the message counts them.
+
+        Example:
+            >>> tracks = Tracks.from_arrays(
+            ...     [0, 0, 1, 1], [0, 1, 0, 1], [[1, 2], [2, 2], [5, 2], [6, 2]], image_size=(8, 6)
+            ... )
+            >>> tracks.points.shape, tracks.frames
+            ((2, 2, 2), 2)
+        """
+        size = checked_size(image_size)
+        names, moments, places = _views(track, frame, points)
+        frames = int(moments.max()) + 1 if frames is None else checked_integer("frames", frames, 1)
+        if moments.max() >= frames:
+            raise ValueError(
+                f"Argument frame must hold indices from 0 to {frames - 1}, but it has {moments.max()}."
+            )
+        order = np.lexsort((moments, names))
+        names, moments, places = names[order], moments[order], places[order]
+        twice = (np.diff(names) == 0) & (np.diff(moments) == 0)
+        if twice.any():
+            place = int(np.argmax(twice))
+            raise ValueError(f"Track {names[place]} has two views in frame {moments[place]}: keep one.")
+        number, count = np.unique(names, return_counts=True)
+        first = np.cumsum(count) - count
+        if (single := count < 2).any():
+            if single.all():
+                raise ValueError("No track has two views: a track says something where it is seen again.")
+            warnings.warn(
+                f"Dropped {single.sum()} of {len(count)} tracks: they have one view.", stacklevel=2
+            )
+            number, count, first = number[~single], count[~single], first[~single]
+        view = np.arange(count.max())
+        mask = view < count[:, None]
+        entry = np.where(mask, first[:, None] + view, first[:, None])  # padding repeats the first view
+        return cls(
+            points=jnp.asarray(places[entry]),
+            frame=jnp.asarray(moments[entry], jnp.int32),
+            mask=jnp.asarray(mask),
+            image_size=size,
+            frames=frames,
+            number=jnp.asarray(number, jnp.int32),
+        )
+
+    @property
+    def scale(self) -> float:
+        """The length in px that is radius 1: half the image diagonal."""
+        return math.hypot(*self.image_size) / 2
+
+
+def _views(track, frame, points):
+    """Each view's track, frame and point as arrays, checked."""
+    names, moments = (np.asarray(values) for values in (track, frame))
+    places = np.asarray(points)
+    if not np.issubdtype(places.dtype, np.floating) or places.dtype.itemsize < 4:
+        places = places.astype(np.float64)
+    for name, values in {"track": names, "frame": moments}.items():
+        if values.ndim != 1 or not values.size or not np.issubdtype(values.dtype, np.integer):
+            raise ValueError(f"Argument {name} must hold one integer a view, but it is {values!r}.")
+    if not len(names) == len(moments) == len(places) or places.shape[1:] != (2,):
+        raise ValueError(
+            f"Arguments track, frame and points must have one entry a view, but their shapes are "
+            f"{names.shape}, {moments.shape} and {places.shape}."
+        )
+    if moments.min() < 0:
+        raise ValueError(f"Argument frame must hold indices from 0, but it has {moments.min()}.")
+    if not np.isfinite(places).all():
+        bad = int(np.argmin(np.isfinite(places).all(axis=1)))
+        raise ValueError(f"Argument points must be finite, but points[{bad}] is {places[bad]}.")
+    return names, moments, places

@@ -1,0 +1,64 @@
+"""The linear solver of `fit_motion` beside a dense one."""
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from zoomjax.fit._schur import Rows, Schur, Unknowns, covariances, reduced, structure_of
+
+
+def problem(rng, frames, tracks, longest):
+    """Rows that depend linearly on their frame, their ray and the lens, at random."""
+    first = rng.integers(0, frames - 1, tracks)
+    count = np.minimum(rng.integers(2, longest + 1, tracks), frames - first)
+    track = np.repeat(np.arange(tracks), count)
+    frame = np.concatenate([f + np.arange(n) for f, n in zip(first, count, strict=True)])
+    structure = structure_of(track, frame, frames)
+    of_frame, of_ray, of_lens = (rng.normal(size=(len(track), 2, n)) for n in (4, 2, 3))
+    about = rng.uniform(0.5, 2, (frames, 4))
+
+    def jacobian(x):
+        views = jnp.einsum("vij,vj->vi", of_frame, x.frames[frame])
+        views += jnp.einsum("vij,vj->vi", of_ray, x.rays[track]) + of_lens @ x.lens[0]
+        return Rows(views, about * x.frames, x.lens[0] / 3)
+
+    like = Unknowns(jnp.zeros((frames, 4)), jnp.zeros((tracks, 2)), (jnp.zeros(3), None))
+    rows = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), jacobian(like))
+    return jacobian, rows, like, structure
+
+
+@pytest.mark.parametrize(("frames", "longest"), [(30, 5), (9, 9), (3, 2), (17, 8)])
+def test_steps_are_those_of_dense_least_squares(rng, frames, longest):
+    jacobian, rows, like, structure = problem(rng, frames, 40, longest)
+    flat, unravel = ravel_pytree(like)
+    dense = jax.jacfwd(lambda x: ravel_pytree(jacobian(unravel(x)))[0])(flat)
+    damping = 0.3
+    damped = np.concatenate([dense, np.sqrt(damping) * np.eye(flat.size)])
+    right = np.concatenate([ravel_pytree(rows)[0], np.zeros(flat.size)])
+    expected = np.linalg.lstsq(damped, right)[0]
+
+    def operator(x):
+        return jacobian(x), jax.tree.map(lambda leaf: np.sqrt(damping) * leaf, x)
+
+    linear = lx.FunctionLinearOperator(operator, jax.eval_shape(lambda: like))
+    found = jax.jit(
+        lambda rows: lx.linear_solve(linear, (rows, like), Schur(structure), throw=False).value
+    )(rows)
+    np.testing.assert_allclose(ravel_pytree(found)[0], expected, atol=1e-9)
+
+
+def test_covariances_are_blocks_of_the_dense_inverse(rng):
+    jacobian, rows, like, structure = problem(rng, 21, 60, 6)
+    flat, unravel = ravel_pytree(like)
+    dense = np.asarray(jax.jacfwd(lambda x: ravel_pytree(jacobian(unravel(x)))[0])(flat))
+    inverse = np.linalg.inv(dense.T @ dense)
+    matrix = jax.jit(lambda: reduced(jacobian, rows, like, structure, jnp.asarray(0.0)))()
+    own, lens, both = covariances(matrix, 21)
+    for frame in range(21):
+        here = slice(4 * frame, 4 * frame + 4)
+        np.testing.assert_allclose(own[frame], inverse[here, here], atol=1e-10)
+        np.testing.assert_allclose(both[frame], inverse[here, -3:], atol=1e-10)
+    np.testing.assert_allclose(lens, inverse[-3:, -3:], atol=1e-10)

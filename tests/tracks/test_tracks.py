@@ -1,0 +1,55 @@
+"""Tracks as padded tensors, from one entry a view."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zoomjax.tracks import Tracks
+
+
+@given(st.data())
+def test_views_come_back_in_any_order(data):
+    length = data.draw(st.lists(st.integers(2, 5), min_size=1, max_size=6))
+    track = np.repeat(np.arange(len(length)) * 7, length)
+    frame = np.concatenate([np.arange(n) * 2 for n in length])
+    points = np.stack([track + 0.5, frame + 0.25], axis=1)
+    order = data.draw(st.permutations(range(len(track))))
+    tracks = Tracks.from_arrays(track[order], frame[order], points[order], image_size=(64, 48))
+    assert np.asarray(tracks.number).tolist() == sorted(set(track.tolist()))
+    row, view = np.nonzero(np.asarray(tracks.mask))
+    np.testing.assert_array_equal(np.asarray(tracks.frame)[row, view], frame)
+    np.testing.assert_array_equal(np.asarray(tracks.points)[row, view], points)
+    assert tracks.frames == frame.max() + 1
+
+
+def test_tracks_of_one_view_are_dropped():
+    with pytest.warns(UserWarning, match="Dropped 1 of 2 tracks"):
+        tracks = Tracks.from_arrays([3, 3, 4], [0, 1, 0], np.zeros((3, 2)), image_size=(8, 6))
+    assert np.asarray(tracks.number).tolist() == [3]
+
+
+@pytest.mark.parametrize(
+    ("track", "frame", "points", "frames", "message"),
+    [
+        ([0, 0], [0, 0], np.zeros((2, 2)), None, "two views in frame 0"),
+        ([0, 1], [0, 0], np.zeros((2, 2)), None, "No track has two views"),
+        ([0, 0], [0, 1], [[0, 0], [np.nan, 1]], None, r"points\[1\]"),
+        ([0, 0], [0, 5], np.zeros((2, 2)), 3, "from 0 to 2"),
+        ([0, 0], [-1, 5], np.zeros((2, 2)), None, "from 0"),
+        ([0.0, 0.0], [0, 1], np.zeros((2, 2)), None, "one integer a view"),
+        ([0, 0], [0, 1], np.zeros((2, 3)), None, "one entry a view"),
+        ([], [], np.zeros((0, 2)), None, "one integer a view"),
+    ],
+)
+def test_mistakes_are_told(track, frame, points, frames, message):
+    with pytest.raises(ValueError, match=message):
+        Tracks.from_arrays(track, frame, points, image_size=(8, 6), frames=frames)
+
+
+def test_sizes_and_masks_are_checked():
+    good = Tracks.from_arrays([0, 0], [0, 1], np.zeros((2, 2)), image_size=(8, 6))
+    with pytest.raises(ValueError, match="mask"):
+        Tracks(good.points, good.frame, good.mask[:, :1], (8, 6), 2, good.number)
+    with pytest.raises(ValueError, match="from 0 to 0"):
+        Tracks(good.points, good.frame, good.mask, (8, 6), 1, good.number)
