@@ -10,10 +10,6 @@ from .._core.arrays import namespace
 from .._core.types import AnyArray, Elements
 from .family import AbstractRadial, radial_factor, radial_orders, radial_slope, times
 
-_ROUNDING = 64
-"""Last digits of 1. A divisor of so many has an error of some per cent, and compilers may compute it once
-for each coordinate, with different errors: the corrected point would not even lie in its direction."""
-
 
 class Division(AbstractRadial):
     """Fitzgibbon's division model ``L = 1 / (1 + k1 t + ... + kN t^N)``: few terms for strong barrel
@@ -40,9 +36,13 @@ class Division(AbstractRadial):
     )
 
     def factor(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
-        """L; NaN next to a pole, where the divisor is nothing but rounding."""
+        """L; NaN next to a pole, where half of the divisor's digits, or more, are rounding.
+
+        Compilers may compute it once for each coordinate, with different errors: the corrected point would
+        not even lie in its direction.
+        """
         xp, divisor = namespace(squared, k), radial_factor(squared, k)
-        known = abs(divisor) > _ROUNDING * np.finfo(divisor.dtype).eps
+        known = abs(divisor) > np.sqrt(np.finfo(divisor.dtype).eps)
         return xp.where(known, 1 / xp.where(known, divisor, 1), np.nan)
 
     def slope(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
