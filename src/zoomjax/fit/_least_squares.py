@@ -34,12 +34,13 @@ class RoundingTrustRegion(optx.AbstractSearch):
     """`optimistix.ClassicalTrustRegion` as described above."""
 
     classical: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion()
+    first_damping: float | Array = _FIRST_DAMPING
 
     def init(self, y: PyTree, f_info_struct: Any) -> Any:
         """The state before the first step."""
         state = self.classical.init(y, f_info_struct)
         dtype = jnp.result_type(*jax.tree.leaves(y))  # optimistix takes JAX's widest
-        return eqx.tree_at(lambda s: s.step_size, state, jnp.array(1 / _FIRST_DAMPING, dtype))
+        return eqx.tree_at(lambda s: s.step_size, state, jnp.array(1 / self.first_damping, dtype))
 
     def step(
         self,

@@ -10,7 +10,7 @@ The solver is optimistix' Levenberg-Marquardt with a linear solver made for this
 in the number of frames. The start needs no guess (`_motion_start`); the lens joins by a prior that widens.
 """
 
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import equinox as eqx
 import jax
@@ -43,14 +43,37 @@ _CAUCHY = 2.3849
 """Of the noise: where the loss begins to flatten; 95 % efficient for normal errors."""
 
 _MEDIAN_OF_SIZE = 1.1774  # of the length of a vector of two normal numbers
-_STAGES = ((0.03, 1e-4), *[(1.0, 0.05)] * 5)
-"""Standard deviations of the parameters of the zoom model, and of the centre's offset in half image
-diagonals. The noise is estimated anew after each stage; they end where the solver does."""
 
-_MOST_STEPS = 20  # of a stage
 
-_GAUGE = 1e4  # weight of the first frame's rotation, which is the origin: px a radian
-_LOOSE = 1e-3  # of a frame that no track sees
+class _Stage(NamedTuple):
+    """How the noise is taken, and when to stop.
+
+    Attributes:
+        parameters: standard deviation of each parameter of the zoom model before there is any data.
+        centre: of the offset of the centre, half image diagonals.
+        wider: times the noise that the residuals before the stage have: the loss is flat beyond.
+        change: a step that moves the residuals by less, in all and in units of the noise, is the last.
+            1 is the standard deviation of the estimate along the step.
+        damping: of the first step.
+    """
+
+    parameters: float
+    centre: float
+    wider: float
+    change: float
+    damping: float
+
+
+_STAGES = (
+    _Stage(0.3, 0.01, 4.0, change=1.0, damping=1e-3),
+    _Stage(1.0, 0.05, 1.0, change=3.0, damping=1e-4),
+    *[_Stage(1.0, 0.05, 1.0, change=0.1, damping=1e-7)] * 4,
+)
+"""They widen the prior of the lens and narrow the loss; they end where the noise and the solver do."""
+
+_MOST_STEPS = 30  # of a stage
+
+_OWN = 0.05  # standard deviation of a frame's log f beside the common factor
 _LONGEST = 48
 """Frames of a track that share a ray. Longer ones are cut, so that only frames near each other are coupled:
 that they show the same point says little more, and a cubic cost is saved."""
@@ -230,31 +253,54 @@ def _in_stages(data, path, spread, zoom, shift, family, terms, image_size):
         family,
     )
     noise, result, steps = spread / _MEDIAN_OF_SIZE, None, None
-    for number, prior in enumerate(_STAGES):
-        model, noise, result, steps = _solved(data, model, noise, jnp.array(prior))
+    for number, stage in enumerate(_STAGES):
+        model, noise, result, steps = _solved(data, model, noise * stage.wider, _arrays(stage))
         if number > 1 and result == RESULTS.successful:
             break
-    return _described(data, model, noise, jnp.array(_STAGES[-1]), result, steps, image_size)
+    return _described(data, model, noise, _arrays(_STAGES[-1]), result, steps, image_size)
 
 
-def _zeros(model, frames, tracks):
-    shift = None if model.shift is None else model.shift.parameters
+def _arrays(stage):
+    """Numbers that the compiled program takes, and is not compiled for."""
+    return jax.tree.map(jnp.asarray, stage)
+
+
+def _units(data, model, noise):
+    """How much of each unknown moves all views that it belongs to by the noise, and no more.
+
+    Damping then treats a focal length, a rotation, a ray and a coefficient alike.
+    """
+    structure, half = data.structure, data.scale / 2
+    focal = jnp.exp(model.path.log_focal)
+    ones = jnp.ones(len(data.points))
+    in_frame = jnp.zeros(len(focal)).at[structure.frame].add(ones)
+    in_ray = jax.ops.segment_sum(ones, structure.track, structure.tracks)
+    focal_of_ray = jax.ops.segment_sum(focal[structure.frame], structure.track, structure.tracks) / in_ray
+    lever = jnp.stack([jnp.full(len(focal), half), focal, focal, jnp.full(len(focal), half)], axis=1)
+    of_lens = noise / (half * jnp.sqrt(len(data.points)))
     return Unknowns(
-        jnp.zeros((frames, 4)), jnp.zeros((tracks, 2)), (model.zoom.parameters, shift, jnp.zeros(()))
+        noise / (lever * jnp.sqrt(jnp.maximum(in_frame, 1))[:, None]),
+        jnp.broadcast_to((noise / (focal_of_ray * jnp.sqrt(in_ray)))[:, None], (structure.tracks, 2)),
+        jax.tree.map(lambda leaf: jnp.full(leaf.shape, of_lens), _lens_parameters(model)),
     )
 
 
-def _moved(model, unknowns):
-    """The path and the lens that the unknowns stand for.
+def _lens_parameters(model):
+    """Those of the zoom model and of the centre's offset, and the common factor of focal lengths."""
+    return model.zoom.parameters, None if model.shift is None else model.shift.parameters, jnp.zeros(())
+
+
+def _moved(model, steps):
+    """The path and the lens after steps.
 
     One of them is a common factor of all focal lengths, by which angles shrink. It is redundant, and it is
     the direction that tracks determine worst: along it, the other unknowns change little.
     """
-    parameters, offsets, factor = unknowns.lens
+    parameters, offsets, factor = jax.tree.map(jnp.add, _lens_parameters(model), steps.lens)
     zoom = with_parameters(model.zoom, parameters)
     shift = None if model.shift is None else with_parameters(model.shift, offsets)
     shrunk = jnp.exp(-factor)
-    log_focal = model.path.log_focal + unknowns.frames[:, 0] + factor
+    log_focal = model.path.log_focal + steps.frames[:, 0] + factor
 
     def ray(ray, step):
         return shrunk_ray(ray, shrunk) + step @ _tangents(ray)
@@ -263,8 +309,8 @@ def _moved(model, unknowns):
         extra = (shrunk - 1) * rotation_vector(matrix)  # about the same axis
         return jax.vmap(lambda column: turned(turned(column, extra), step), 1, 1)(matrix)
 
-    rays = jax.vmap(ray)(model.path.rays, unknowns.rays)
-    rotations = jax.vmap(rotation)(model.path.rotation, unknowns.frames[:, 1:])
+    rays = jax.vmap(ray)(model.path.rays, steps.rays)
+    rotations = jax.vmap(rotation)(model.path.rotation, steps.frames[:, 1:])
     return Path(log_focal, rotations, rays), zoom, shift
 
 
@@ -277,9 +323,9 @@ def _tangents(ray):
 
 
 def _corrected(point, coefficients, offset, family, scale):
-    """A point corrected, px about the centre of the image."""
-    z = (point - offset * scale) / scale
-    return scale * jnp.stack(family.correct((z[0], z[1]), z @ z, coefficients)) + offset * scale
+    """A point corrected, px about the centre of distortion, which is the principal point, too."""
+    z = point / scale - offset
+    return scale * jnp.stack(family.correct((z[0], z[1]), z @ z, coefficients))
 
 
 def _view(point, focal, coefficients, offset, ahead, family, scale):
@@ -296,18 +342,15 @@ def _view(point, focal, coefficients, offset, ahead, family, scale):
     return jnp.stack([d * missed[0] - b * missed[1], a * missed[1] - c * missed[0]]) / determinant
 
 
-def _views(data, model, unknowns):
+def _views(data, path, zoom, shift, family):
     """Residuals of all views, px."""
-    path, zoom, shift = _moved(model, unknowns)
     focal = jnp.exp(path.log_focal)
     coefficients = jax.vmap(zoom)(focal)
     offset = jnp.zeros((len(focal), 2)) if shift is None else jax.vmap(shift)(focal)
 
     def view(point, frame, track):
         ahead = _product(path.rotation[frame], path.rays[track])
-        return _view(
-            point, focal[frame], coefficients[frame], offset[frame], ahead, model.family, data.scale
-        )
+        return _view(point, focal[frame], coefficients[frame], offset[frame], ahead, family, data.scale)
 
     return jax.vmap(view)(data.points, data.structure.frame, data.structure.track)
 
@@ -335,75 +378,88 @@ def _averaged(data, model):
 
 
 def _rows(unknowns, args):
-    """All residuals, robust, in units of the noise."""
-    data, model, noise, prior = args
-    views = _views(data, model, unknowns) / noise
+    """All residuals, robust, in units of the noise; `unknowns` are steps in their `_units`."""
+    data, model, noise, stage = args
+    steps = jax.tree.map(jnp.multiply, unknowns, _units(data, model, noise))
+    path, zoom, shift = _moved(model, steps)
+    views = _views(data, path, zoom, shift, model.family) / noise
     squared = jnp.sum(views**2, axis=-1, keepdims=True) / _CAUCHY**2
     safe = jnp.where(squared > 1e-8, squared, 1.0)
     views = views * jnp.where(squared > 1e-8, jnp.sqrt(jnp.log1p(safe) / safe), 1 - squared / 4)
-    return Rows(views, _about_frames(data, model, unknowns), _about_lens(model, unknowns, prior))
+    return Rows(views, _about_frames(data, path, unknowns, steps), _about_lens(zoom, shift, stage))
 
 
-def _about_frames(data, model, unknowns):
+def _about_frames(data, path, unknowns, steps):
     """What is known of frames: the first is the origin, and focal lengths may be given.
 
     That log f hardly changes but by the common factor is said so weakly that it only parts the two.
     """
-    weight = jnp.where(data.empty, _LOOSE, 0.0).at[0].set(_GAUGE)
-    own = unknowns.frames[:, 0]
-    known = (model.path.log_focal + own + unknowns.lens[2] - data.log_focal) / data.log_std
-    log_focal = jnp.where(jnp.isinf(data.log_std), own, known)
+    weight = jnp.where(data.empty, 1.0, 0.0).at[0].set(1.0)
+    known = (path.log_focal - data.log_focal) / data.log_std
+    log_focal = jnp.where(jnp.isinf(data.log_std), steps.frames[:, 0] / _OWN, known)
     return jnp.concatenate([log_focal[:, None], weight[:, None] * unknowns.frames[:, 1:]], axis=1)
 
 
-def _about_lens(model, unknowns, prior):
+def _about_lens(zoom, shift, prior):
     """The prior of the lens."""
-    parameters, offsets, _ = unknowns.lens
-    rows = [ravel_pytree(parameters)[0] / prior[0], ravel_pytree(offsets)[0] / prior[1]]
-    if isinstance(model.zoom, AbstractPriorZoom):
-        rows.append(with_parameters(model.zoom, parameters).standardised())
+    rows = [ravel_pytree(zoom.parameters)[0] / prior.parameters]
+    if shift is not None:
+        rows.append(ravel_pytree(shift.parameters)[0] / prior.centre)
+    if isinstance(zoom, AbstractPriorZoom):
+        rows.append(zoom.standardised())
     return jnp.concatenate(rows)
 
 
+def _of_residuals(change):
+    """The size of a change of the residuals. Steps are not asked: along weak directions they say little."""
+    return jnp.zeros(()) if isinstance(change, Unknowns) else optx.two_norm(change)
+
+
 @eqx.filter_jit
-def _solved(data, model, noise, prior):
+def _solved(data, model, noise, stage):
     """The path and the lens of least energy, the noise, the solver's status and its steps."""
     solver = optx.LevenbergMarquardt(
-        rtol=1e-6, atol=1e-6, norm=optx.rms_norm, linear_solver=Schur(data.structure)
+        rtol=0.0, atol=stage.change, norm=_of_residuals, linear_solver=Schur(data.structure)
     )
-    solver = eqx.tree_at(lambda s: s.search, solver, RoundingTrustRegion())
+    solver = eqx.tree_at(lambda s: s.search, solver, RoundingTrustRegion(first_damping=stage.damping))
     model = eqx.tree_at(lambda m: m.path.rays, model, _averaged(data, model))
-    start = _zeros(model, len(model.path.log_focal), len(model.path.rays))
+    start = jax.tree.map(jnp.zeros_like, _units(data, model, noise))
     solution = optx.least_squares(
-        _rows, solver, start, args=(data, model, noise, prior), max_steps=_MOST_STEPS, throw=False
+        _rows, solver, start, args=(data, model, noise, stage), max_steps=_MOST_STEPS, throw=False
     )
-    found = solution.value
-    path, zoom, shift = _moved(model, found)
+    steps = jax.tree.map(jnp.multiply, solution.value, _units(data, model, noise))
+    path, zoom, shift = _moved(model, steps)
+    size = jnp.linalg.norm(_views(data, path, zoom, shift, model.family), axis=-1)
     rays = path.rays / jnp.linalg.norm(path.rays, axis=1, keepdims=True)
+    noise = jnp.maximum(jnp.median(size) / _MEDIAN_OF_SIZE, 1e-6)  # of tracks without noise
     moved = _Model(path._replace(rays=rays), zoom, shift, model.family)
-    size = jnp.linalg.norm(_views(data, model, found), axis=-1)
-    noise = jnp.median(size) / _MEDIAN_OF_SIZE
-    noise = jnp.maximum(noise, 1e-6)  # of tracks without noise
     return moved, noise, RESULTS.promote(solution.result), solution.stats["num_steps"]
 
 
 @eqx.filter_jit
-def _described(data, model, noise, prior, result, steps, image_size):
+def _described(data, model, noise, stage, result, steps, image_size):
     """The fit with its residuals, covariance and status."""
     frames, tracks = len(model.path.log_focal), len(model.path.rays)
-    zeros = _zeros(model, frames, tracks)
+    units = _units(data, model, noise)
+    zeros = jax.tree.map(jnp.zeros_like, units)
 
     def plain(unknowns):  # without the loss: its efficiency is in `inflation`
-        views = jnp.where(inlier[..., None], _views(data, model, unknowns) / noise, 0)
-        return Rows(views, _about_frames(data, model, unknowns), _about_lens(model, unknowns, prior))
+        steps = jax.tree.map(jnp.multiply, unknowns, units)
+        path, zoom, shift = _moved(model, steps)
+        views = _views(data, path, zoom, shift, model.family) / noise
+        views = jnp.where(inlier[..., None], views, 0)
+        return Rows(views, _about_frames(data, path, unknowns, steps), _about_lens(zoom, shift, stage))
 
-    missed = _views(data, model, zeros)
+    missed = _views(data, model.path, model.zoom, model.shift, model.family)
     squared = jnp.sum(missed**2, axis=-1) / (noise * _CAUCHY) ** 2
     inlier = squared < 9  # beyond, the loss nearly ignores a view
     rows, jacobian = jax.linearize(plain, zeros)
     matrix = reduced(jacobian, rows, zeros, data.structure, jnp.asarray(0.0))
     own, lens, both = covariances(matrix, frames)
-    log_variance = own[:, 0, 0] + 2 * both[:, 0, -1] + lens[-1, -1]
+    of_lens = ravel_pytree(units.lens)[0]
+    lens = lens * jnp.outer(of_lens, of_lens)
+    unit = units.frames[:, 0]
+    log_variance = own[:, 0, 0] * unit**2 + 2 * both[:, 0, -1] * unit * of_lens[-1] + lens[-1, -1]
     free = jnp.sum(2 * inlier) / (jnp.sum(2 * inlier) - 4 * frames - 2 * tracks - len(lens))
     inflation = 1.05 * free
     size = ravel_pytree(model.zoom.parameters)[0].size

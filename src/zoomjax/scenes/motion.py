@@ -75,50 +75,53 @@ def motion_tracks(
         seed: of everything random.
     """
     rng = np.random.default_rng(seed)
-    frames, (width, height) = len(focal), lens.image_size
-    points: list[np.ndarray] = []
-    first, last = np.zeros(0, int), np.zeros(0, int)
-    for frame in range(frames):
-        # Tracks end by age; those that leave the image end there, below.
-        short = views - np.sum((first <= frame) & (last > frame))
-        if short <= 0:
-            continue
-        pixels = rng.uniform(0, [width - 1, height - 1], (short, 2))
-        corrected = np.asarray(lens(float(focal[frame])).undistort(pixels)) - np.asarray(lens.centre)
-        ahead = np.column_stack([corrected / focal[frame], np.ones(short)])
-        away = rng.uniform(*distance, short)
-        points += list(away[:, None] * (ahead / np.linalg.norm(ahead, axis=1)[:, None]) @ rotation[frame])
-        first = np.append(first, np.full(short, frame))
-        last = np.append(last, frame + 1 + rng.geometric(1 / life, short))
-    scene = np.array(points)
-    on_move = rng.uniform(size=len(scene)) < moving
-    seen = _seen(lens, focal, rotation, scene, pupil)
-    age = np.arange(frames)[None, :] - first[:, None]
-    speed = rng.normal(0, 2, (len(scene), 1, 2)) * on_move[:, None, None]
-    walk = drift * np.cumsum(rng.standard_normal(seen.shape), axis=1)
-    seen = seen + speed * age[..., None] + walk + noise * rng.standard_normal(seen.shape)
-    there = (age >= 0) & (np.arange(frames) < last[:, None]) & np.isfinite(seen).all(axis=-1)
-    inside = there & ((seen >= 0) & (seen <= [width - 1, height - 1])).all(axis=-1)
-    inside &= np.cumsum((age >= 0) & ~inside, axis=1) == 0  # a track ends where it leaves the image
-    keep = inside.sum(axis=1) > 1
-    track, frame = np.nonzero(inside[keep])
+    corner = np.array(lens.image_size) - 1
+    scene, last, speed, walk = np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2))
+    first, alive = np.zeros(0, int), np.zeros(0, int)
+    entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for frame, (f, turn) in enumerate(zip(focal, rotation, strict=True)):
+        alive = alive[last[alive] > frame]
+        walk[alive] += drift * rng.standard_normal((len(alive), 2))
+        alive, seen = _inside(lens, f, turn, scene, alive, pupil, speed * (frame - first)[:, None] + walk)
+        new = max(views - len(alive), 0)
+        ahead = np.asarray(lens(float(f)).undistort(rng.uniform(0, corner, (new, 2))))
+        ahead = np.column_stack([(ahead - np.asarray(lens.centre)) / f, np.ones(new)])
+        ahead *= rng.uniform(*distance, (new, 1)) / np.linalg.norm(ahead, axis=1, keepdims=True)
+        on_move = rng.uniform(size=(new, 1)) < moving
+        added = len(scene) + np.arange(new)
+        scene = np.concatenate([scene, (ahead + np.array([0, 0, pupil])) @ turn])
+        speed = np.concatenate([speed, rng.normal(0, 2, (new, 2)) * on_move])
+        walk = np.concatenate([walk, np.zeros((new, 2))])
+        first = np.append(first, np.full(new, frame))
+        last = np.append(last, frame + 1 + rng.geometric(1 / life, new))
+        added, seen_first = _inside(lens, f, turn, scene, added, pupil, walk)
+        alive, seen = np.append(alive, added), np.concatenate([seen, seen_first])
+        entries.append((alive, np.full(len(alive), frame), seen + noise * rng.standard_normal(seen.shape)))
+    track, moment, seen = (np.concatenate(column) for column in zip(*entries, strict=True))
+    twice = np.bincount(track, minlength=len(scene)) > 1
+    number = np.cumsum(twice) - 1
     tracks = Tracks.from_arrays(
-        track, frame, seen[keep][track, frame], image_size=lens.image_size, frames=frames
+        number[track[twice[track]]],
+        moment[twice[track]],
+        seen[twice[track]],
+        image_size=lens.image_size,
+        frames=len(focal),
     )
-    return MotionScene(tracks, np.asarray(focal), np.asarray(rotation), scene[keep], on_move[keep])
+    return MotionScene(
+        tracks, np.asarray(focal), np.asarray(rotation), scene[twice], (speed[twice] != 0).any(axis=1)
+    )
 
 
-def _seen(lens, focal, rotation, scene, pupil):
-    """Where the points of a scene are seen in each frame, px; NaN where not: (track, frame, 2)."""
-    centre = np.asarray(lens.centre)
-    seen = np.full((len(scene), len(focal), 2), np.nan)
-    for frame, (f, r) in enumerate(zip(focal, rotation, strict=True)):
-        ahead = scene @ r.T - [0, 0, pupil]
-        front = ahead[:, 2] > 0
-        straight = centre + f * ahead[front, :2] / ahead[front, 2:]
-        near = np.abs(straight - centre).max(axis=1) < 3 * max(lens.image_size)
-        seen[np.flatnonzero(front)[near], frame] = np.asarray(lens(float(f)).distort(straight[near]))
-    return seen
+def _inside(lens, focal, rotation, scene, which, pupil, shift):
+    """Which points of a scene a frame shows, and where, px."""
+    centre, corner = np.asarray(lens.centre), np.array(lens.image_size) - 1
+    ahead = scene[which] @ rotation.T - [0, 0, pupil]
+    front = ahead[:, 2] > 0
+    which, ahead = which[front], ahead[front]
+    straight = centre + focal * ahead[:, :2] / ahead[:, 2:]
+    seen = np.asarray(lens(float(focal)).distort(straight)) + shift[which]
+    inside = ((seen >= 0) & (seen <= corner)).all(axis=1)  # not where it is NaN
+    return which[inside], seen[inside]
 
 
 def _rotation(pan: float, tilt: float) -> Float[np.ndarray, "3 3"]:
