@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ._schur import bucket
+
 FIELDS_OF_VIEW = (70.0, 45.0, 28.0, 17.0, 10.0, 5.0)
 """Guesses, degrees across the image."""
 
@@ -112,7 +114,7 @@ def views_by_frame(
     order = np.argsort(moment, kind="stable")
     count = np.bincount(moment, minlength=frames)
     place = np.arange(len(moment)) - np.repeat(np.cumsum(count) - count, count)
-    padded = np.zeros((2, frames, count.max()), np.int32)
+    padded = np.zeros((2, frames, bucket(int(count.max()))), np.int32)
     padded[:, moment[order], place] = track[order], order
     return padded[0], padded[1], np.arange(padded.shape[2]) < count[:, None]
 

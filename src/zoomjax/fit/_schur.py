@@ -71,11 +71,16 @@ class Structure(eqx.Module):
     most: int = eqx.field(static=True)
 
 
-def structure_of(track: Int[np.ndarray, "view"], frame: Int[np.ndarray, "view"], frames: int) -> Structure:
-    """The structure of views that are sorted by track, then by frame."""
+def structure_of(
+    track: Int[np.ndarray, "view"], frame: Int[np.ndarray, "view"], frames: int, block: int | None = None
+) -> Structure:
+    """The structure of views that are sorted by track, then by frame.
+
+    A block is as long as the longest track unless it is given.
+    """
     tracks, first = np.unique(track, return_index=True)
     last = np.append(first[1:], len(track)) - 1
-    block = min(max(int(np.max(frame[last] - frame[first])) + 1, 8), frames)
+    block = min(max(int(np.max(frame[last] - frame[first])) + 1, 8), frames) if block is None else block
     begin = frame[first] // block
     order = np.argsort(begin, kind="stable")
     count = np.bincount(begin, minlength=-(-frames // block))
@@ -87,6 +92,36 @@ def structure_of(track: Int[np.ndarray, "view"], frame: Int[np.ndarray, "view"],
         block=block,
         blocks=len(count),
         most=int(count.max()),
+    )
+
+
+def bucket(size: int) -> int:
+    """The least of 1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, ... that is at least `size`.
+
+    Programs are compiled for few sizes, and nothing is a quarter larger than it needs to be.
+    """
+    step = 2 ** max(int(size - 1).bit_length() - 3, 0)
+    return -(-size // step) * step
+
+
+def padded(structure: Structure) -> Structure:
+    """The structure with more views, which belong to no block, and more tracks, to which these belong."""
+    more = bucket(len(structure.track)) - len(structure.track)
+    last = structure.tracks  # at least one more
+    return Structure(
+        *(
+            jnp.asarray(np.pad(values, (0, more), constant_values=filling))
+            for values, filling in (
+                (structure.track, last),
+                (structure.frame, 0),
+                (structure.place, 0),
+                (structure.begin, structure.blocks),
+            )
+        ),
+        tracks=bucket(structure.tracks + 1),
+        block=structure.block,
+        blocks=structure.blocks,
+        most=bucket(structure.most),
     )
 
 
@@ -192,14 +227,16 @@ def _times(left, right):
 def _inverse(matrix):
     """Inverses of symmetric 2 x 2 matrices."""
     a, b, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
-    return _symmetric(d, -b, a) / (a * d - b * b)[:, None, None]
+    determinant = a * d - b * b
+    determinant = jnp.where(determinant > 0, determinant, jnp.inf)  # of a ray without views
+    return _symmetric(d, -b, a) / determinant[:, None, None]
 
 
 def _root(matrix):
     """Lower triangles L of symmetric 2 x 2 matrices L L^T."""
     first = jnp.sqrt(matrix[:, 0, 0])
-    off = matrix[:, 0, 1] / first
-    last = jnp.sqrt(matrix[:, 1, 1] - off**2)
+    off = matrix[:, 0, 1] / jnp.where(first > 0, first, 1)
+    last = jnp.sqrt(jnp.maximum(matrix[:, 1, 1] - off**2, 0))
     return jnp.stack([jnp.stack([first, 0 * off], 1), jnp.stack([off, last], 1)], 1)
 
 

@@ -17,13 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+import scipy.sparse.csgraph
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_terms
 from .._core.types import AnyArray
 from ..models.family import AbstractFamily
+from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ..models.zoom import (
@@ -36,8 +38,18 @@ from ..models.zoom import (
 from ..tracks.tracks import Tracks
 from ._least_squares import RoundingTrustRegion
 from ._motion_start import Path, rotation_vector, shrunk_ray, start_of, turned, views_by_frame
-from ._schur import Rows, Schur, Structure, Unknowns, covariances, reduced, structure_of
-from .result import RESULTS
+from ._schur import (
+    Rows,
+    Schur,
+    Structure,
+    Unknowns,
+    bucket,
+    covariances,
+    padded,
+    reduced,
+    structure_of,
+)
+from .result import RESULTS, ZoomFit, failed, judged
 
 _CAUCHY = 2.3849
 """Of the noise: where the loss begins to flatten; 95 % efficient for normal errors."""
@@ -78,6 +90,8 @@ _LONGEST = 48
 """Frames of a track that share a ray. Longer ones are cut, so that only frames near each other are coupled:
 that they show the same point says little more, and a cubic cost is saved."""
 
+_INFLATION = 1 / 0.95  # of variances, by what the loss loses
+
 _UNKNOWN_SCALE = 0.1
 """Standard deviation of log f from which the focal lengths have no scale."""
 
@@ -86,31 +100,39 @@ class MotionFit(eqx.Module):
     """The lens and the path of a camera that turns and zooms.
 
     Attributes:
-        lens: the zoom lens, with focal lengths in px.
-        focal: focal length of each frame, px.
+        fit: the lens, with focal lengths in px, and its uncertainty. `ZoomFit.rms` is of the distances
+            between views and where the model puts them, px of the image, without those that it takes for
+            mistakes; `ZoomFit.joint` includes the centre. Its result `undetermined` says that the tracks do
+            not determine the scale of the focal lengths, as where the camera zooms and does not turn: only
+            their ratios are known then, and the distortion straightens lines all the same.
+        focal: focal length of each frame, px; NaN for a frame without tracks.
         focal_std: its standard deviation, px. Nearly all of it is a factor common to all frames.
+        covariance: of the zoom model's parameters, of those of the centre's offset, and of the logarithm of
+            that factor.
         rotation: of each frame, from the scene to the camera, whose axes are x right, y down and z
-            forward. The first frame's is the identity.
+            forward. The first frame's is the identity. So is that of the first frame after a cut, across
+            which no track goes: how the camera turned between them is not known.
+        shot: number of the shot that each frame belongs to, from 0: a new one begins with each cut; -1 for
+            a frame without tracks.
         rays: direction of each track in the scene, of length 1.
-        covariance: of the zoom model's parameters, flattened row by row.
         residual: distance between each view and where the model puts it, px; NaN for padding.
         noise: standard deviation of a coordinate of a point, px, from the median of the residuals.
-        result: how the fit ended; ``RESULTS[fit.result]`` is a sentence. `undetermined`: the tracks do not
-            determine the scale of the focal lengths, as where the camera zooms and does not turn. Only
-            their ratios are known then, and the distortion straightens lines all the same.
-        steps: number of steps the solver took in the last stage.
     """
 
-    lens: ZoomLens
+    fit: ZoomFit
     focal: Float[Array, "frame"]
     focal_std: Float[Array, "frame"]
+    covariance: Float[Array, "all all"]
     rotation: Float[Array, "frame 3 3"]
+    shot: Int[Array, "frame"]
     rays: Float[Array, "track 3"]
-    covariance: Float[Array, "parameter parameter"]
     residual: Float[Array, "track view"]
     noise: Float[Array, ""]
-    result: RESULTS
-    steps: Any
+
+    @property
+    def lens(self) -> ZoomLens:
+        """The zoom lens."""
+        return self.fit.lens
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
         """Raise TypeError: call the lens of the fit instead."""
@@ -143,8 +165,8 @@ def fit_motion(
             in 1/f by default; None if there is none.
         focal: focal lengths that are known beforehand, px; NaN where not.
         focal_std: their standard deviations, px.
-        throw: whether to raise if the fit fails. Otherwise see `MotionFit.result`. `undetermined` never
-            raises.
+        throw: whether to raise if the fit fails. Otherwise see `ZoomFit.result`. `undetermined` and
+            `folded` never raise.
 
     Raises:
         ValueError: float64 is not enabled, or the number of known focal lengths is not that of the frames.
@@ -167,24 +189,44 @@ def fit_motion(
     known, known_std = _known_focal(focal, focal_std, tracks.frames)
     track, view = np.nonzero(np.asarray(tracks.mask))
     moment = np.asarray(tracks.frame)[track, view]
+    shot = _shots(track, moment, tracks.frames)
+    frames = bucket(tracks.frames)
+    more = frames - tracks.frames
+    structure = structure_of(_pieces(track, moment), moment, frames, min(_LONGEST, frames))
+    wide = padded(structure)
+    points = np.asarray(tracks.points, float)[track, view] - (np.array([tracks.image_size]) - 1) / 2
+    views = len(wide.track) - len(points)
     data = _Data(
-        points=jnp.asarray(tracks.points, float)[track, view] - (np.array([tracks.image_size]) - 1) / 2,
-        structure=structure_of(_pieces(track, moment), moment, tracks.frames),
-        empty=jnp.asarray(np.bincount(moment, minlength=tracks.frames) == 0),
-        log_focal=jnp.log(known),
-        log_std=known_std / known,
+        points=jnp.asarray(np.pad(points, ((0, views), (0, 0)))),
+        there=jnp.arange(len(wide.track)) < len(points),
+        structure=wide,
+        fixed=jnp.asarray(
+            np.pad((shot < 0) | (np.diff(shot, prepend=-1) > 0), (0, more), constant_values=1)
+        ),
+        log_focal=jnp.asarray(np.pad(np.log(known), (0, more))),
+        log_std=jnp.asarray(np.pad(known_std / known, (0, more), constant_values=np.inf)),
+        unknowns=jnp.asarray(4.0 * np.sum(shot >= 0) + 2 * structure.tracks),
         scale=tracks.scale,
     )
-    path, spread = _started(data, views_by_frame(np.asarray(data.structure.track), moment, tracks.frames))
-    fit, residual = _in_stages(data, path, spread, zoom, shift, family, terms, tracks.image_size)
-    padded = jnp.full(np.shape(tracks.mask), jnp.nan).at[track, view].set(residual)
+    path, spread = _started(data, views_by_frame(np.asarray(structure.track), moment, frames))
+    parts, missed = _in_stages(data, path, spread, zoom, shift, family, terms, tracks.image_size)
+    for name in ("focal", "focal_std", "rotation"):
+        parts[name] = parts[name][: tracks.frames]
+    parts["fit"] = eqx.tree_at(
+        lambda fit: fit.frame_rms, parts["fit"], parts["fit"].frame_rms[: tracks.frames]
+    )
+    residual = jnp.full(np.shape(tracks.mask), jnp.nan).at[track, view].set(missed[: len(points)])
     rays = np.zeros((len(tracks.mask), 3))
-    np.add.at(rays, track, np.asarray(fit.rays)[np.asarray(data.structure.track)])
+    np.add.at(rays, track, np.asarray(parts.pop("rays"))[np.asarray(structure.track)])
     rays = jnp.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-    fit = eqx.tree_at(lambda fit: (fit.residual, fit.rays), fit, (padded, rays))
-    failed = (fit.result != RESULTS.successful) & (fit.result != RESULTS.undetermined)
-    if throw and bool(failed):
-        raise RuntimeError(f"The fit failed. {RESULTS[fit.result]}")
+    fit = MotionFit(**parts, rays=rays, residual=residual, shot=jnp.asarray(shot, jnp.int32))
+    return thrown_motion(fit) if throw else fit
+
+
+def thrown_motion(fit: MotionFit) -> MotionFit:
+    """The fit, raising RuntimeError where its solver failed."""
+    if bool(failed(fit.fit.result)):
+        raise RuntimeError(f"The fit failed. {RESULTS[fit.fit.result]}")
     return fit
 
 
@@ -193,17 +235,21 @@ class _Data(eqx.Module):
 
     Attributes:
         points: about the centre of the image, px.
+        there: which views there are; others pad.
         structure: which track and frame each view belongs to.
-        empty: frames that no track sees.
+        fixed: frames whose rotation is given: the first of each shot, and those that no track sees.
         log_focal, log_std: what is known of log f beforehand; infinite standard deviations.
+        unknowns: how many numbers of frames and rays are fitted.
         scale: half the image diagonal, px.
     """
 
     points: Float[Array, "view 2"]
+    there: Bool[Array, "view"]
     structure: Structure
-    empty: Array
+    fixed: Bool[Array, "frame"]
     log_focal: Float[Array, "frame"]
     log_std: Float[Array, "frame"]
+    unknowns: Float[Array, ""]
     scale: float = eqx.field(static=True)
 
 
@@ -231,6 +277,20 @@ def _known_focal(focal, focal_std, frames):
     return np.where(there, values, 1.0), std
 
 
+def _shots(track, moment, frames):
+    """The number of each frame's shot; -1 for frames without views. A track goes through no cut."""
+    same = track[1:] == track[:-1]
+    links = scipy.sparse.coo_array(
+        (np.ones(same.sum()), (moment[:-1][same], moment[1:][same])), (frames,) * 2
+    )
+    _, names = scipy.sparse.csgraph.connected_components(links, directed=False)
+    seen = np.bincount(moment, minlength=frames) > 0
+    _, first, place = np.unique(names[seen], return_index=True, return_inverse=True)
+    shot = np.full(frames, -1)
+    shot[seen] = np.argsort(np.argsort(first))[place]
+    return shot
+
+
 def _pieces(track, moment):
     """Names of the tracks' pieces, each at most `_LONGEST` frames long, for each view."""
     _, first, number = np.unique(track, return_index=True, return_inverse=True)
@@ -240,7 +300,10 @@ def _pieces(track, moment):
 
 @eqx.filter_jit
 def _started(data, by_frame):
-    return start_of(data.points, data.structure.tracks, 1.6 * data.scale, by_frame)
+    """The best chain of frames, scaled to focal lengths that are known, and its residuals' median."""
+    path, spread = start_of(data.points, data.structure.tracks, 1.6 * data.scale, by_frame)
+    off = jnp.where(jnp.isinf(data.log_std), jnp.nan, data.log_focal - path.log_focal)
+    return _scaled(path, jnp.nan_to_num(jnp.nanmedian(off))), spread
 
 
 def _in_stages(data, path, spread, zoom, shift, family, terms, image_size):
@@ -272,12 +335,14 @@ def _units(data, model, noise):
     """
     structure, half = data.structure, data.scale / 2
     focal = jnp.exp(model.path.log_focal)
-    ones = jnp.ones(len(data.points))
+    ones = data.there.astype(float)
     in_frame = jnp.zeros(len(focal)).at[structure.frame].add(ones)
     in_ray = jax.ops.segment_sum(ones, structure.track, structure.tracks)
-    focal_of_ray = jax.ops.segment_sum(focal[structure.frame], structure.track, structure.tracks) / in_ray
+    in_ray = jnp.maximum(in_ray, 1)
+    focal_of_ray = jax.ops.segment_sum(ones * focal[structure.frame], structure.track, structure.tracks)
+    focal_of_ray = jnp.maximum(focal_of_ray / in_ray, 1.0)
     lever = jnp.stack([jnp.full(len(focal), half), focal, focal, jnp.full(len(focal), half)], axis=1)
-    of_lens = noise / (half * jnp.sqrt(len(data.points)))
+    of_lens = noise / (half * jnp.sqrt(jnp.sum(ones)))
     return Unknowns(
         noise / (lever * jnp.sqrt(jnp.maximum(in_frame, 1))[:, None]),
         jnp.broadcast_to((noise / (focal_of_ray * jnp.sqrt(in_ray)))[:, None], (structure.tracks, 2)),
@@ -299,19 +364,29 @@ def _moved(model, steps):
     parameters, offsets, factor = jax.tree.map(jnp.add, _lens_parameters(model), steps.lens)
     zoom = with_parameters(model.zoom, parameters)
     shift = None if model.shift is None else with_parameters(model.shift, offsets)
-    shrunk = jnp.exp(-factor)
-    log_focal = model.path.log_focal + steps.frames[:, 0] + factor
+    path = _scaled(model.path, factor)
 
-    def ray(ray, step):
-        return shrunk_ray(ray, shrunk) + step @ _tangents(ray)
+    def ray(ray, start, step):
+        return ray + step @ _tangents(start)
 
     def rotation(matrix, step):
-        extra = (shrunk - 1) * rotation_vector(matrix)  # about the same axis
-        return jax.vmap(lambda column: turned(turned(column, extra), step), 1, 1)(matrix)
+        return jax.vmap(lambda column: turned(column, step), 1, 1)(matrix)
 
-    rays = jax.vmap(ray)(model.path.rays, steps.rays)
-    rotations = jax.vmap(rotation)(model.path.rotation, steps.frames[:, 1:])
-    return Path(log_focal, rotations, rays), zoom, shift
+    rays = jax.vmap(ray)(path.rays, model.path.rays, steps.rays)
+    rotations = jax.vmap(rotation)(path.rotation, steps.frames[:, 1:])
+    return Path(path.log_focal + steps.frames[:, 0], rotations, rays), zoom, shift
+
+
+def _scaled(path, factor):
+    """A path with all focal lengths larger by a factor, whose logarithm is given, and smaller angles."""
+    shrunk = jnp.exp(-factor)
+
+    def rotation(matrix):
+        extra = (shrunk - 1) * rotation_vector(matrix)  # about the same axis
+        return jax.vmap(lambda column: turned(column, extra), 1, 1)(matrix)
+
+    rays = jax.vmap(shrunk_ray, (0, None))(path.rays, shrunk)
+    return Path(path.log_focal + factor, jax.vmap(rotation)(path.rotation), rays)
 
 
 def _tangents(ray):
@@ -352,7 +427,8 @@ def _views(data, path, zoom, shift, family):
         ahead = _product(path.rotation[frame], path.rays[track])
         return _view(point, focal[frame], coefficients[frame], offset[frame], ahead, family, data.scale)
 
-    return jax.vmap(view)(data.points, data.structure.frame, data.structure.track)
+    views = jax.vmap(view)(data.points, data.structure.frame, data.structure.track)
+    return jnp.where(data.there[:, None], views, 0)
 
 
 def _product(matrix, vector):
@@ -374,7 +450,8 @@ def _averaged(data, model):
 
     seen = jax.vmap(direction)(data.points, data.structure.frame)
     rays = jax.ops.segment_sum(seen, data.structure.track, data.structure.tracks)
-    return rays / jnp.linalg.norm(rays, axis=1, keepdims=True)
+    length = jnp.linalg.norm(rays, axis=1, keepdims=True)
+    return jnp.where(length > 0, rays / jnp.where(length > 0, length, 1), jnp.array([0.0, 0.0, 1.0]))
 
 
 def _rows(unknowns, args):
@@ -394,10 +471,9 @@ def _about_frames(data, path, unknowns, steps):
 
     That log f hardly changes but by the common factor is said so weakly that it only parts the two.
     """
-    weight = jnp.where(data.empty, 1.0, 0.0).at[0].set(1.0)
     known = (path.log_focal - data.log_focal) / data.log_std
     log_focal = jnp.where(jnp.isinf(data.log_std), steps.frames[:, 0] / _OWN, known)
-    return jnp.concatenate([log_focal[:, None], weight[:, None] * unknowns.frames[:, 1:]], axis=1)
+    return jnp.concatenate([log_focal[:, None], data.fixed[:, None] * unknowns.frames[:, 1:]], axis=1)
 
 
 def _about_lens(zoom, shift, prior):
@@ -431,7 +507,8 @@ def _solved(data, model, noise, stage):
     path, zoom, shift = _moved(model, steps)
     size = jnp.linalg.norm(_views(data, path, zoom, shift, model.family), axis=-1)
     rays = path.rays / jnp.linalg.norm(path.rays, axis=1, keepdims=True)
-    noise = jnp.maximum(jnp.median(size) / _MEDIAN_OF_SIZE, 1e-6)  # of tracks without noise
+    size = jnp.where(data.there, size, jnp.nan)
+    noise = jnp.maximum(jnp.nanmedian(size) / _MEDIAN_OF_SIZE, 1e-6)  # of tracks without noise
     moved = _Model(path._replace(rays=rays), zoom, shift, model.family)
     return moved, noise, RESULTS.promote(solution.result), solution.stats["num_steps"]
 
@@ -439,7 +516,7 @@ def _solved(data, model, noise, stage):
 @eqx.filter_jit
 def _described(data, model, noise, stage, result, steps, image_size):
     """The fit with its residuals, covariance and status."""
-    frames, tracks = len(model.path.log_focal), len(model.path.rays)
+    frames = len(model.path.log_focal)
     units = _units(data, model, noise)
     zeros = jax.tree.map(jnp.zeros_like, units)
 
@@ -452,7 +529,7 @@ def _described(data, model, noise, stage, result, steps, image_size):
 
     missed = _views(data, model.path, model.zoom, model.shift, model.family)
     squared = jnp.sum(missed**2, axis=-1) / (noise * _CAUCHY) ** 2
-    inlier = squared < 9  # beyond, the loss nearly ignores a view
+    inlier = data.there & (squared < 9)  # beyond, the loss nearly ignores a view
     rows, jacobian = jax.linearize(plain, zeros)
     matrix = reduced(jacobian, rows, zeros, data.structure, jnp.asarray(0.0))
     own, lens, both = covariances(matrix, frames)
@@ -460,34 +537,49 @@ def _described(data, model, noise, stage, result, steps, image_size):
     lens = lens * jnp.outer(of_lens, of_lens)
     unit = units.frames[:, 0]
     log_variance = own[:, 0, 0] * unit**2 + 2 * both[:, 0, -1] * unit * of_lens[-1] + lens[-1, -1]
-    free = jnp.sum(2 * inlier) / (jnp.sum(2 * inlier) - 4 * frames - 2 * tracks - len(lens))
-    inflation = 1.05 * free
-    size = ravel_pytree(model.zoom.parameters)[0].size
-    focal, log_std = jnp.exp(model.path.log_focal), jnp.sqrt(log_variance * inflation)
-    finite = jnp.all(jnp.isfinite(lens)) & jnp.all(jnp.isfinite(focal))
-    known = jnp.min(jnp.where(data.empty, jnp.inf, log_std)) < _UNKNOWN_SCALE
-    good: Any = RESULTS.successful
-    status = RESULTS.where((result == good) & ~known, RESULTS.undetermined, result)
-    status = RESULTS.where(finite, status, RESULTS.nonfinite)
+    count = 2 * jnp.sum(inlier)
+    free = count / (count - data.unknowns - len(lens))
+    inflation = _INFLATION * free
+    zoom_size = ravel_pytree(model.zoom.parameters)[0].size
+    joint, log_std = lens[:-1, :-1] * inflation, jnp.sqrt(log_variance * inflation)
+    focal = jnp.exp(model.path.log_focal)
+    unseen = jnp.zeros(frames).at[data.structure.frame].add(1.0 * data.there) == 0
     fitted = ZoomLens(
         zoom=model.zoom,
         centre=(jnp.asarray(image_size, jnp.float64) - 1) / 2,
-        focal_range=jnp.stack([jnp.min(focal), jnp.max(focal)]),
+        focal_range=jnp.stack(
+            [jnp.min(focal, where=~unseen, initial=jnp.inf), jnp.max(focal, where=~unseen, initial=0)]
+        ),
         image_size=image_size,
         focal_unit="px",
         shift=model.shift,
         family=model.family,
     )
-    fit = MotionFit(
-        lens=fitted,
-        focal=focal,
-        focal_std=focal * log_std,
-        rotation=model.path.rotation,
-        rays=model.path.rays,
-        covariance=lens[:size, :size] * inflation,
-        residual=jnp.zeros(()),  # `fit_motion` fills it in, padded as the tracks are
-        noise=noise * jnp.sqrt(free),
-        result=status,
-        steps=steps,
+    known = jnp.min(jnp.where(unseen, jnp.inf, log_std)) < _UNKNOWN_SCALE
+    certificate = certificate_of(
+        fitted.zoom, fitted.centre, fitted.focal_range, image_size, family=model.family, shift=model.shift
     )
-    return fit, jnp.linalg.norm(missed, axis=-1)
+    kept = jnp.where(inlier, jnp.sum(missed**2, axis=-1), 0)
+    in_frame = [jnp.zeros(frames).at[data.structure.frame].add(leaf) for leaf in (kept, 1.0 * inlier)]
+    rms = jnp.sqrt(jnp.sum(kept) / jnp.sum(inlier))
+    fit = ZoomFit(
+        lens=fitted,
+        rms=rms,
+        frame_rms=jnp.sqrt(in_frame[0] / in_frame[1]),
+        covariance=joint[:zoom_size, :zoom_size],
+        result=judged(fitted.zoom, result, known, certificate),
+        steps=steps,
+        certificate=certificate,
+        rms_unconstrained=rms,
+        joint=None if model.shift is None else joint,
+    )
+    parts = {
+        "fit": fit,
+        "focal": jnp.where(unseen, jnp.nan, focal),
+        "focal_std": jnp.where(unseen, jnp.nan, focal * log_std),
+        "covariance": lens * inflation,
+        "rotation": model.path.rotation,
+        "rays": model.path.rays,
+        "noise": noise * jnp.sqrt(free),
+    }
+    return parts, jnp.linalg.norm(missed, axis=-1)

@@ -175,7 +175,7 @@ def described_fit(lines, zoom, result, steps):
         rms=rms,
         frame_rms=jnp.sqrt(errors),
         covariance=covariance,
-        result=_judge(zoom, result, determined, certificate),
+        result=judged(zoom, result, determined, certificate),
         steps=steps,
         certificate=certificate,
         rms_unconstrained=rms,
@@ -198,7 +198,7 @@ def collected(lines, fits):
     )
 
 
-def _judge(zoom, result, determined, certificate):
+def judged(zoom, result, determined, certificate):
     """The worst status, of the solver and of the model."""
     finite = jnp.all(jnp.isfinite(ravel_pytree(zoom.parameters)[0]))
     good: Any = RESULTS.successful  # inherited members, which pyright takes for another class's
@@ -215,10 +215,10 @@ def _judge(zoom, result, determined, certificate):
 def is_invertible(fit):
     """Whether no refit is needed: the model is invertible, or the fit failed, or it has no certificate."""
     stated = ~jnp.isneginf(fit.certificate.least)
-    return fit.certificate.certified | ~stated | _failed(fit.result)
+    return fit.certificate.certified | ~stated | failed(fit.result)
 
 
-def _failed(result):
+def failed(result):
     """Whether a solver failed. A status about the model is not a failure."""
     told = (result == RESULTS.undetermined) | (result == RESULTS.folded) | (result == RESULTS.constrained)
     return (result != RESULTS.successful) & ~told
@@ -226,20 +226,20 @@ def _failed(result):
 
 def outcome_of(fit):
     """Whether the fit is invertible; whether a solver failed, in which frame first, and its status."""
-    failed = jnp.atleast_1d(_failed(fit.result))
-    frame = jnp.argmax(failed)
+    bad = jnp.atleast_1d(failed(fit.result))
+    frame = jnp.argmax(bad)
     result = jax.tree.map(lambda value: jnp.atleast_1d(value)[frame], fit.result)
-    return jnp.all(is_invertible(fit)), (jnp.any(failed), frame, result)
+    return jnp.all(is_invertible(fit)), (jnp.any(bad), frame, result)
 
 
 def thrown(fit, outcome, throw):
     """The fit, raising where its solver failed."""
-    _, (failed, frame, result) = outcome
+    _, (bad, frame, result) = outcome
     if not throw:
         return fit
-    if traced(failed):
-        return result.error_if(fit, failed)
-    if failed:
+    if traced(bad):
+        return result.error_if(fit, bad)
+    if bad:
         where = f"Frame {int(frame)}: " if isinstance(fit, FrameFits) else ""
         raise RuntimeError(f"The fit failed. {where}{RESULTS[result]}")
     return fit

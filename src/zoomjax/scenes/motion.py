@@ -28,7 +28,12 @@ class MotionScene(NamedTuple):
 
 
 def pan_and_zoom(
-    lens: ZoomLens, frames: int = 150, *, pan: float | int = 30, tilt: float | int = 5
+    lens: ZoomLens,
+    frames: int = 150,
+    *,
+    pan: float | int = 30,
+    tilt: float | int = 5,
+    seed: int | None = None,
 ) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame 3 3"]]:
     """A camera that pans to and fro, tilts, and zooms over its lens's range: focal lengths and rotations.
 
@@ -36,13 +41,19 @@ def pan_and_zoom(
         lens: with focal lengths in px.
         frames: number of frames.
         pan, tilt: angles from end to end, degrees.
+        seed: of where the camera begins its to and fro; by default always the same.
     """
     t = np.linspace(0, 1, frames)
+    begins = np.array([0.0, 0.0, 0.7])
+    if seed is not None:
+        begins = np.random.default_rng(seed).uniform(0, 2 * np.pi, 3)
+    # One turn in 150 frames, however many there are.
+    zooms, pans, tilts = (2 * np.pi * np.outer([1, 1.3, 2.1], t * max(frames / 150, 1)).T + begins).T
     low, high = np.log(np.asarray(lens.focal_range))
-    focal = np.exp(low + (high - low) * (0.5 - 0.5 * np.cos(2 * np.pi * t)))
+    focal = np.exp(low + (high - low) * (0.5 - 0.5 * np.cos(zooms)))
     focal = np.clip(focal, *np.asarray(lens.focal_range))
-    across = np.radians(pan) / 2 * np.sin(2 * np.pi * 1.3 * t)
-    up = np.radians(tilt) / 2 * np.sin(2 * np.pi * 2.1 * t + 0.7)
+    across = np.radians(pan) / 2 * np.sin(pans)
+    up = np.radians(tilt) / 2 * np.sin(tilts)
     return focal, np.stack([_rotation(a, b) for a, b in zip(across, up, strict=True)])
 
 

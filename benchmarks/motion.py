@@ -1,0 +1,278 @@
+"""Focal lengths and the lens from how a clip moves: errors beside the Cramér-Rao bound, and times.
+
+    python -m benchmarks.motion [--sections NAME ...] [--clips N] [--output FILE]
+
+`simulated`: tracks with exact truth, of random lenses on random paths; everything is started from nothing.
+f is the RMS over the clips of the error of all focal lengths, relative. The lens's error is the RMS
+distance of corrected points over the image, without a shift common to all of them, which turns the camera.
+The bound of each is what the covariance of the fit says, without what the robust loss loses. A clip diverged
+if its focal lengths are off by more than 3 times the bound and 1 %, and the fit says nothing.
+
+`real`: the paths and lenses of the shared broadcast clips, frame by frame; tracks of points of a stadium,
+noise 0.5 px, the centre unknown. The pupil is on the axis of rotation, or before it.
+
+`time`: seconds of a second fit in the process, tracking apart, and the memory of the process.
+
+Results go to benchmarks/results/motion.md and motion.json.
+"""
+
+import argparse
+import json
+import os
+import resource
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zoomjax import PolynomialZoom, ZoomLens
+from zoomjax.fit import RESULTS, MotionFit, fit_motion
+from zoomjax.scenes import MotionScene, motion_tracks, pan_and_zoom
+
+from .shared import RESULTS as FOLDER
+from .shared import machine, machine_line, table, write
+
+SIZE = (1920, 1080)
+_SHOWN = np.stack(np.meshgrid(*(np.linspace(0, n - 1, 9) for n in SIZE)), -1).reshape(-1, 2)
+_DRAWS = 60
+
+KINDS: dict[str, tuple[dict, dict]] = {
+    "pan 30°, zoom 1:4": ({}, {}),
+    "noise 0.5 px": ({}, {"noise": 0.5}),
+    "pan 10°": ({"pan": 10}, {}),
+    "pan 5°": ({"pan": 5}, {}),
+    "pan 2°": ({"pan": 2}, {}),
+    "pan 1°": ({"pan": 1}, {}),
+    "no tilt": ({"tilt": 0}, {}),
+    "zoom 1:10": ({"ratio": 10.0}, {}),
+    "f 2,400 to 7,100 px, pan 10°": ({"low": 2400.0, "ratio": 2.96, "pan": 10}, {}),
+    "50 tracks a frame": ({}, {"views": 50}),
+    "tracks live 10 frames": ({}, {"life": 10}),
+    "30 % of tracks on moving things": ({}, {"moving": 0.3}),
+}
+"""Path and tracks that differ from the first line's."""
+
+
+def random_scene(seed: int, path: dict, tracks: dict, frames: int = 150) -> tuple[ZoomLens, MotionScene]:
+    """A random lens, and tracks of it on a random path."""
+    rng = np.random.default_rng(seed)
+    given = {"low": 1200.0, "ratio": 4.0, "pan": 30, "tilt": 5} | path
+    low, high = given["low"], given["low"] * given["ratio"]
+    k = rng.normal(size=(3, 2)) * [[0.02, 0.005], [0.05, 0.01], [0.1, 0.03]]
+    centre = (np.array(SIZE) - 1) / 2 + rng.normal(0, 6, 2)
+    zoom = PolynomialZoom(2, jnp.asarray(k), jnp.array(low))
+    lens = ZoomLens(zoom, jnp.asarray(centre), jnp.array([low, high]), SIZE, "px")
+    where = pan_and_zoom(lens, frames, pan=given["pan"], tilt=given["tilt"], seed=seed)
+    options = {"views": 200, "life": 40, "noise": 0.3} | tracks
+    return lens, motion_tracks(lens, *where, seed=seed, **options)
+
+
+def displaced(lens: ZoomLens, other: ZoomLens, focal: np.ndarray, own: np.ndarray) -> float:
+    """RMS distance over the image of points corrected by two lenses at their own focal lengths, px."""
+    missed = np.array(
+        [
+            np.asarray(other(float(b)).undistort(_SHOWN)) - np.asarray(lens(float(a)).undistort(_SHOWN))
+            for a, b in zip(focal, own, strict=True)
+        ]
+    )
+    missed -= np.mean(missed, axis=1, keepdims=True)
+    return float(np.sqrt(np.mean(np.sum(missed**2, axis=-1))))
+
+
+def bounds(fit: MotionFit, frames: np.ndarray, rng: np.random.Generator) -> tuple[float, float]:
+    """What the covariance says of the errors of f, relative, and of the lens, px: RMS."""
+    from jax.flatten_util import ravel_pytree
+
+    from zoomjax.models.zoom import with_parameters
+
+    lens = fit.lens
+    assert lens.shift is not None
+    start, unravel = ravel_pytree((lens.zoom.parameters, lens.shift.parameters))
+    focal = np.asarray(fit.focal)[frames]
+    draws = rng.multivariate_normal(np.zeros(len(start) + 1), 0.95 * np.asarray(fit.covariance), _DRAWS)
+    sizes = []
+    for draw in draws:
+        zoom, shift = unravel(start + draw[:-1])
+        moved = ZoomLens(
+            with_parameters(lens.zoom, zoom),
+            lens.centre,
+            lens.focal_range * np.array([0.5, 2]),
+            lens.image_size,
+            "px",
+            shift=with_parameters(lens.shift, shift),
+        )
+        sizes.append(displaced(lens, moved, focal, focal * np.exp(draw[-1])))
+    std = np.asarray(fit.focal_std / fit.focal)
+    return float(np.sqrt(0.95 * np.nanmean(std**2))), float(np.sqrt(np.mean(np.square(sizes))))
+
+
+def errors(lens: ZoomLens, scene: MotionScene, fit: MotionFit, frames: np.ndarray) -> tuple[float, float]:
+    """Of all focal lengths, relative, and of the lens, px: RMS."""
+    own = np.asarray(fit.focal)
+    return float(np.sqrt(np.nanmean((own / scene.focal - 1) ** 2))), displaced(
+        lens, fit.lens, scene.focal[frames], own[frames]
+    )
+
+
+def wide(lens: ZoomLens) -> ZoomLens:
+    """The lens, taken beyond its focal lengths: a fitted f may lie there by its error."""
+    return ZoomLens(
+        lens.zoom,
+        lens.centre,
+        lens.focal_range * np.array([0.5, 2]),
+        lens.image_size,
+        "px",
+        shift=lens.shift,
+    )
+
+
+def simulated(clips: int) -> dict:
+    """Errors and bounds of each kind of clip."""
+    rows = {}
+    for kind, (path, tracks) in KINDS.items():
+        found = []
+        for seed in range(clips):
+            lens, scene = random_scene(seed, path, tracks)
+            begin = time.perf_counter()
+            fit = fit_motion(scene.tracks, throw=False)
+            seconds = time.perf_counter() - begin
+            frames = np.arange(0, len(scene.focal), 15)
+            own, bound = (
+                errors(wide(lens), scene, fit, frames),
+                bounds(fit, frames, np.random.default_rng(0)),
+            )
+            good = bool(fit.fit.result == RESULTS.successful)
+            found.append(
+                {
+                    "f": own[0],
+                    "lens": own[1],
+                    "f_bound": bound[0],
+                    "lens_bound": bound[1],
+                    "good": good,
+                    "diverged": good and own[0] > max(3 * bound[0], 0.01),
+                    "seconds": seconds,
+                }
+            )
+        mean = {
+            name: float(np.sqrt(np.mean([clip[name] ** 2 for clip in found])))
+            for name in ("f", "f_bound", "lens", "lens_bound")
+        }
+        rows[kind] = mean | {
+            "clips": clips,
+            "diverged": sum(clip["diverged"] for clip in found),
+            "told": sum(not clip["good"] for clip in found),
+            "seconds": float(np.median([clip["seconds"] for clip in found])),
+            "found": found,
+        }
+        print(kind, {k: v for k, v in rows[kind].items() if k != "found"}, flush=True)
+    return rows
+
+
+def timed(lengths: tuple[int, ...] = (150, 1500, 10_000)) -> dict:
+    """Seconds of a fit, the second in the process, and the most memory that the process has had."""
+    rows = {}
+    for frames in lengths:
+        lens, scene = random_scene(0, {}, {}, frames)
+        seconds = []
+        for _ in range(2):
+            begin = time.perf_counter()
+            fit = fit_motion(scene.tracks, throw=False)
+            jax.block_until_ready(fit.focal)
+            seconds.append(time.perf_counter() - begin)
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+        shown = np.arange(0, frames, max(frames // 10, 1))
+        own = errors(wide(lens), scene, fit, shown)
+        rows[f"{frames:,}"] = {
+            "first": seconds[0],
+            "second": seconds[1],
+            "GB": memory,
+            "f": own[0],
+            "lens": own[1],
+        }
+        print(frames, rows[f"{frames:,}"], flush=True)
+    return rows
+
+
+def page(results: dict) -> str:
+    """The page that the results make."""
+    lines = [
+        "# Lens and focal lengths from motion",
+        "",
+        "`benchmarks/motion.py` says how it is measured.",
+        "",
+    ]
+    if "simulated" in results:
+        rows = [
+            [
+                kind,
+                f"{100 * r['f']:.3f}",
+                f"{100 * r['f_bound']:.3f}",
+                f"{r['f'] / r['f_bound']:.2f}",
+                f"{r['lens']:.3f}",
+                f"{r['lens_bound']:.3f}",
+                f"{r['lens'] / r['lens_bound']:.2f}",
+                str(r["clips"]),
+                str(r["diverged"]),
+                str(r["told"]),
+            ]
+            for kind, r in results["simulated"]["rows"].items()
+        ]
+        header = [
+            "simulated tracks",
+            "f, %",
+            "bound",
+            "ratio",
+            "lens, px",
+            "bound",
+            "ratio",
+            "clips",
+            "diverged",
+            "refused",
+        ]
+        lines += [
+            "## Simulated tracks",
+            "",
+            *table(header, rows),
+            "",
+            machine_line(results["simulated"]["machine"]),
+            "",
+        ]
+    if "time" in results:
+        rows = [
+            [
+                frames,
+                f"{r['first']:.1f}",
+                f"{r['second']:.1f}",
+                f"{r['GB']:.1f}",
+                f"{100 * r['f']:.3f}",
+                f"{r['lens']:.3f}",
+            ]
+            for frames, r in results["time"]["rows"].items()
+        ]
+        header = ["frames", "first fit, s", "second, s", "GB", "f, %", "lens, px"]
+        lines += ["## Time", "", *table(header, rows), "", machine_line(results["time"]["machine"]), ""]
+    return "\n".join(lines)
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    names = ("simulated", "time")
+    parser.add_argument("--sections", nargs="+", choices=names, default=list(names))
+    parser.add_argument("--clips", type=int, default=20, help="of each kind")
+    parser.add_argument("--output", type=Path, default=FOLDER / "motion.md")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    stored = options.output.with_suffix(".json")
+    results = json.loads(stored.read_text()) if stored.exists() else {}
+    for name in options.sections:
+        rows = simulated(options.clips) if name == "simulated" else timed()
+        results[name] = {"rows": rows, "machine": machine()}
+        write(options.output, page(results), results)
+
+
+if __name__ == "__main__":
+    main()
