@@ -5,8 +5,8 @@
 `simulated`: tracks with exact truth, of random lenses on random paths; everything is started from nothing.
 f is the RMS over the clips of the error of all focal lengths, relative. The lens's error is the RMS
 distance of corrected points over the image, without a shift common to all of them, which turns the camera.
-The bound of each is what the covariance of the fit says, without what the robust loss loses. A clip diverged
-if its focal lengths are off by more than 3 times the bound and 1 %, and the fit says nothing.
+The bound of each is what the covariance of the fit says, without what the robust loss loses. A clip
+diverged if its focal lengths are off by more than 3 times the bound and 1 %, and the fit says nothing.
 
 `real`: the paths and lenses of the shared broadcast clips, frame by frame; tracks of points of a stadium,
 noise 0.5 px, the centre unknown. The pupil is on the axis of rotation, or before it.
@@ -18,14 +18,15 @@ Results go to benchmarks/results/motion.md and motion.json.
 
 import argparse
 import json
-import os
 import resource
 import time
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from zoomjax import PolynomialZoom, ZoomLens
 from zoomjax.fit import RESULTS, MotionFit, fit_motion
@@ -69,40 +70,31 @@ def random_scene(seed: int, path: dict, tracks: dict, frames: int = 150) -> tupl
     return lens, motion_tracks(lens, *where, seed=seed, **options)
 
 
+@eqx.filter_jit
+def corrected(lens: ZoomLens, focal: jax.Array) -> jax.Array:
+    """Points of the image corrected at each focal length, without what is common to all of them, px."""
+    points = jax.vmap(lambda f: lens(f).undistort(_SHOWN))(focal)
+    return points - jnp.mean(points, axis=1, keepdims=True)
+
+
 def displaced(lens: ZoomLens, other: ZoomLens, focal: np.ndarray, own: np.ndarray) -> float:
     """RMS distance over the image of points corrected by two lenses at their own focal lengths, px."""
-    missed = np.array(
-        [
-            np.asarray(other(float(b)).undistort(_SHOWN)) - np.asarray(lens(float(a)).undistort(_SHOWN))
-            for a, b in zip(focal, own, strict=True)
-        ]
-    )
-    missed -= np.mean(missed, axis=1, keepdims=True)
-    return float(np.sqrt(np.mean(np.sum(missed**2, axis=-1))))
+    missed = corrected(other, jnp.asarray(own)) - corrected(lens, jnp.asarray(focal))
+    return float(jnp.sqrt(jnp.mean(jnp.sum(missed**2, axis=-1))))
 
 
 def bounds(fit: MotionFit, frames: np.ndarray, rng: np.random.Generator) -> tuple[float, float]:
     """What the covariance says of the errors of f, relative, and of the lens, px: RMS."""
-    from jax.flatten_util import ravel_pytree
-
-    from zoomjax.models.zoom import with_parameters
-
-    lens = fit.lens
+    lens = wide(fit.lens)
     assert lens.shift is not None
     start, unravel = ravel_pytree((lens.zoom.parameters, lens.shift.parameters))
     focal = np.asarray(fit.focal)[frames]
-    draws = rng.multivariate_normal(np.zeros(len(start) + 1), 0.95 * np.asarray(fit.covariance), _DRAWS)
     sizes = []
-    for draw in draws:
-        zoom, shift = unravel(start + draw[:-1])
-        moved = ZoomLens(
-            with_parameters(lens.zoom, zoom),
-            lens.centre,
-            lens.focal_range * np.array([0.5, 2]),
-            lens.image_size,
-            "px",
-            shift=with_parameters(lens.shift, shift),
-        )
+    for draw in rng.multivariate_normal(
+        np.zeros(len(start) + 1), 0.95 * np.asarray(fit.covariance), _DRAWS
+    ):
+        parameters = unravel(start + draw[:-1])
+        moved = eqx.tree_at(lambda lens: (lens.zoom.parameters, lens.shift.parameters), lens, parameters)
         sizes.append(displaced(lens, moved, focal, focal * np.exp(draw[-1])))
     std = np.asarray(fit.focal_std / fit.focal)
     return float(np.sqrt(0.95 * np.nanmean(std**2))), float(np.sqrt(np.mean(np.square(sizes))))
@@ -112,7 +104,7 @@ def errors(lens: ZoomLens, scene: MotionScene, fit: MotionFit, frames: np.ndarra
     """Of all focal lengths, relative, and of the lens, px: RMS."""
     own = np.asarray(fit.focal)
     return float(np.sqrt(np.nanmean((own / scene.focal - 1) ** 2))), displaced(
-        lens, fit.lens, scene.focal[frames], own[frames]
+        lens, wide(fit.lens), scene.focal[frames], own[frames]
     )
 
 
