@@ -1,9 +1,9 @@
 """Rendered clips with exact truth: a camera on a tripod turns and zooms before a distant panorama.
 
-A pixel x shows the ray ``X = R^T (z, 1)``, ``z = (undistorted x - centre) / f``, and the ray shows the texture
-at ``2 density (X1, X2) / (|X| + X3)``: a stereographic map, which keeps angles, mirrored at the texture's
-borders again and again. Each pixel averages samples of it, taken from copies that are averaged down to the
-samples' spacing.
+A pixel x shows the ray ``X = R^T (z, 1)``, ``z = (undistorted x - centre) / f``, and the ray shows the
+texture at ``2 density (X1, X2) / (|X| + X3)``: a stereographic map, which keeps angles, mirrored at the
+texture's borders again and again. Each pixel averages samples of it, taken from copies averaged down to their
+spacing.
 
 Once a clip: the texture and its smaller copies. Once a frame: the samples' places, in one compiled program.
 """
@@ -189,7 +189,7 @@ def motion_clip(
 
 
 def leaves(size: tuple[int, int] = (2048, 1024), *, seed: int = 0) -> UInt8[np.ndarray, "high wide 3"]:
-    """A texture with sharp edges and corners of all sizes: tilted rectangles, smaller ones over larger ones.
+    """A texture with sharp edges and corners of all sizes: tilted rectangles, small over large.
 
     Args:
         size: (width, height) px.

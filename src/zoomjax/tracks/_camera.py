@@ -14,8 +14,8 @@ _FEWEST = 12
 def camera_motion(before: Points, after: Points, size: tuple[int, int]) -> Homography:
     """The homography that most points follow from a frame to the next; the identity where none is seen.
 
-    Captions stay, and may be most of what is seen. So where most points stay but others move, those decide if
-    they move together and from all over the image.
+    Captions stay, and may be most of what is seen. So where most points stay but others move, those
+    decide, if they move together and are all over the image.
 
     Args:
         before, after: the points in both frames, px.

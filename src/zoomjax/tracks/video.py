@@ -1,9 +1,9 @@
 """Tracks found in the frames of a clip: corners that spread over the image, followed without drift.
 
-Each track begins at a corner. Pyramidal Lucas-Kanade, there and back, leads from a frame to the next (Bouguet
-2001); from there the track is matched with the patch of the frame where it began, bent as the camera's motion
-bends it (Shi, Tomasi 1994). So errors do not add up along a track. A track ends where it is not like that patch
-any more, when its scale has changed by 12 %, or after its life; others begin.
+Each track begins at a corner. Pyramidal Lucas-Kanade, there and back, leads from a frame to the next
+(Bouguet 2001); from there the track is matched with the patch of the frame where it began, bent as the
+camera's motion bends it (Shi, Tomasi 1994). So errors do not add up along a track. A track ends where it is
+not like that patch any more, when its scale has changed by 1.4, or after its life; others begin.
 
 Captions and logos stay in their place while the camera moves: such tracks are left out. Nothing is linked
 across a cut. Memory holds two frames, whatever the clip's length.
@@ -31,7 +31,8 @@ def track_video(
 ) -> Tracks:
     """Follow points through a clip: what a calibration from motion begins with.
 
-    Frames may be repeated, as in conversions from 25 to 30 frames/s, black or blurred; the clip may have cuts.
+    Frames may be repeated, as in conversions from 25 to 30 frames/s, black or blurred, and the clip may
+    have cuts.
 
     Args:
         clip: a video that PyAV decodes, of any length.
@@ -45,8 +46,8 @@ def track_video(
 
     Raises:
         FileNotFoundError: there is no such clip.
-        ValueError: it is no video, none of its frames decodes, it has fewer than two frames, or nothing in it
-            can be followed.
+        ValueError: it is no video, none of its frames decodes, it has fewer than two frames, or nothing in
+            it can be followed.
 
     Warns:
         UserWarning: the clip is interlaced.
