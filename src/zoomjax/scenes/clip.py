@@ -2,8 +2,8 @@
 
 A pixel x shows the ray ``X = R^T (z, 1)``, ``z = (undistorted x - centre) / f``, and the ray shows the
 texture at ``2 density (X1, X2) / (|X| + X3)``: a stereographic map, which keeps angles, mirrored at the
-texture's borders again and again. Each pixel averages samples of it, taken from copies averaged down to their
-spacing.
+texture's borders again and again. Each pixel averages samples of it, taken from copies averaged
+down to their spacing.
 
 Once a clip: the texture and its smaller copies. Once a frame: the samples' places, in one compiled program.
 """
@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..correct.image import remap
@@ -84,19 +84,19 @@ class MotionClip:
     def rays(self, frame: int, points: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point 3"]:
         """The rays of the scene, of length 1, that points of a frame show, px."""
         focal, rotation = self._camera(self._time(frame, points[:, 1]))
-        ahead = np.asarray(_ahead(self.lens, focal, points))
+        ahead = _each(_ahead, self.lens, focal, points)
         rays = np.einsum("pji,pj->pi", rotation, ahead)
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def points(self, frame: int, rays: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point 2"]:
         """Where a frame shows rays, px: perhaps outside of it; NaN behind the camera."""
-        time = np.full(len(rays), float(frame))
+        time, seen = np.full(len(rays), float(frame)), np.empty((len(rays), 2))
         for _ in range(8 if self.shutter else 1):  # the row tells the time, and the time the row
             focal, rotation = self._camera(time)
             ahead = np.einsum("pij,pj->pi", rotation, rays)
             with np.errstate(divide="ignore", invalid="ignore"):
                 flat = np.where(ahead[:, 2:] > 0, ahead[:, :2] / ahead[:, 2:], np.nan)
-            seen = np.asarray(_seen(self.lens, focal, flat))
+            seen = _each(_seen, self.lens, focal, flat)
             time = self._time(frame, np.nan_to_num(seen[:, 1]))
         return seen
 
@@ -251,13 +251,17 @@ def _write_captions(image: np.ndarray) -> None:
         box[:] = blocks.repeat(block, axis=0).repeat(block, axis=1)[: len(box), : box.shape[1]]
 
 
-def _ahead(lens: ZoomLens, focal: np.ndarray, points: np.ndarray) -> Float[Array, "point 3"]:
-    """Rays of the camera, each through a point at a focal length of its own."""
-    return _flat_rays(lens, jnp.asarray(focal), jnp.asarray(points))
+def _each(function, lens: ZoomLens, focal: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """A compiled function of points, each at a focal length of its own; compiled for few numbers of them."""
+    more = (0, 2 ** int(np.ceil(np.log2(max(len(values), 16)))) - len(values))
+    focal = np.pad(focal, more, constant_values=float(lens.focal_range[0]))
+    return np.asarray(function(lens, focal, np.pad(values, (more, (0, 0)))))[: len(values)]
 
 
 @eqx.filter_jit
-def _flat_rays(lens, focal, points):
+def _ahead(lens, focal, points):
+    """Rays of the camera through points."""
+
     def one(f, point):
         flat = (jnp.asarray(lens(f).undistort(point)) - jnp.asarray(lens.centre)) / f
         return jnp.append(flat, 1)
@@ -266,13 +270,9 @@ def _flat_rays(lens, focal, points):
 
 
 @eqx.filter_jit
-def _distorted(lens, focal, flat):
+def _seen(lens, focal, flat):
+    """Where flat points are seen, px."""
     return jax.vmap(lambda f, z: lens(f).distort(lens.centre + f * z))(focal, flat)
-
-
-def _seen(lens: ZoomLens, focal: np.ndarray, flat: np.ndarray) -> Float[Array, "point 2"]:
-    """Where flat points, each at a focal length of its own, are seen, px."""
-    return _distorted(lens, jnp.asarray(focal), jnp.asarray(flat))
 
 
 @eqx.filter_jit

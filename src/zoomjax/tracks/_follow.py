@@ -72,8 +72,8 @@ class _Active:
 
     def __add__(self, others: "_Active") -> "_Active":
         pairs = [(getattr(self, f.name), getattr(others, f.name)) for f in dataclasses.fields(self)]
-        *arrays, (one, two) = pairs
-        return _Active(*(np.concatenate(pair) for pair in arrays), one + two)
+        arrays = [np.concatenate(pair) for pair in pairs[:-1]]
+        return _Active(*arrays, patches=self.patches + others.patches)  # pyright: ignore[reportCallIssue]
 
     @property
     def is_still(self) -> np.ndarray:
@@ -125,7 +125,8 @@ class Follower:
         ended = [np.concatenate(parts) for parts in zip(*self._ended, strict=True)]
         keep[ended[0]] = ~self._on_captions(*ended[1:])
         keep &= np.bincount(number, minlength=self._next) >= min(3, self.frame + 1)
-        return tuple(values[keep[number]] for values in (number, frame, points))
+        kept = keep[number]
+        return number[kept], frame[kept], points[kept]
 
     def _follow(self, image: Grey, small: Grey) -> None:
         assert self._active is not None
@@ -137,6 +138,9 @@ class Follower:
             good[:] = False
         self._end(active[~good])
         active, flow = active[good], flow[good]
+        self._active = active
+        if not len(flow):
+            return
         motion = camera_motion(active.point, flow, self.size)
         active.shape = local_shape(motion, active.point) @ active.shape
         active.carried = carried(motion, active.carried)
@@ -175,7 +179,7 @@ class Follower:
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
         """Which points have their patches in the image."""
-        return ((points > HALF + 2) & (points < np.array(self.size) - HALF - 3)).all(axis=1)
+        return np.all((points > HALF + 2) & (points < np.array(self.size) - HALF - 3), axis=1)
 
     def _begin(self, image: Grey, small: Grey) -> None:
         """New tracks in the cells of the image that have few."""
