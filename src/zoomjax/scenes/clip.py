@@ -252,7 +252,7 @@ def _write_captions(image: np.ndarray) -> None:
 
 
 def _each(function, lens: ZoomLens, focal: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """A compiled function of points, each at a focal length of its own; compiled for few numbers of them."""
+    """A compiled function of points, each at a focal length of its own; compiled for few sizes."""
     more = (0, 2 ** int(np.ceil(np.log2(max(len(values), 16)))) - len(values))
     focal = np.pad(focal, more, constant_values=float(lens.focal_range[0]))
     return np.asarray(function(lens, focal, np.pad(values, (more, (0, 0)))))[: len(values)]

@@ -24,10 +24,10 @@ _NEAR = 2.0
 """px: how far the match may be from where the flow leads."""
 
 _ALIKE = 0.85
-"""Least correlation with the patch of the anchor. With 0.75 twice as many gross errors remain."""
+"""Least correlation with the patch of the anchor."""
 
 _GROWTH = 1.4
-"""Change of scale after which a track ends: with 1.12 the error is as large, and lives a third as long."""
+"""Change of scale after which a track ends: patches are bent, and the error hardly grows up to there."""
 
 _WEAKEST = 3.0
 """Least mean square of the slope across a corner's weaker direction, (grey levels / px)^2."""
