@@ -120,6 +120,19 @@ def test_a_still_moment_throws_nothing_away(texture):
     assert clip.is_caption(tracks.views()[2].astype(float)).mean() < 0.01
 
 
+def test_a_fast_pan_is_followed(texture):
+    """By a seventh of the image's width a frame, from the first one on."""
+    focal, rotation = pan_and_zoom(lens(), 24, pan=100)
+    clip = motion_clip(lens(), focal[:5], rotation[:5], texture=texture, noise=1.5)
+    tracks = track_frames(clip.frames())
+    number, frame, points = tracks.views()
+    steps = np.diff(points, axis=0)[(np.diff(number) == 0) & (np.diff(frame) == 1)]
+    assert np.median(np.abs(steps[:, 0])) > SIZE[0] / 7
+    assert per_frame(tracks).min() > 20
+    age, error = errors(tracks, clip)
+    assert np.mean(np.abs(error[age > 0]).max(axis=1) < 0.5) > 0.95
+
+
 def test_a_clip_that_never_moves_has_tracks(texture):
     clip = make(texture, 6)
     still = motion_clip(lens(), clip.focal[:1].repeat(6), clip.rotation[:1].repeat(6, 0), texture=texture)
@@ -200,3 +213,23 @@ def test_tiny_frames_have_no_room_for_tracks():
 def test_two_frames_are_enough(plain):
     tracks = track_frames(plain[1][:2])
     assert per_frame(tracks).min() > 60
+
+
+@pytest.mark.slow
+def test_a_zooming_broadcast_with_moving_things_and_captions(tmp_path):
+    """Half-size television, zoomed by 1:2, a third of it moving, through H.264 at the encoder's own quality."""
+    true = lens((960, 540), 2.0)
+    clip = motion_clip(true, *pan_and_zoom(true, 60, pan=20), noise=2, moving=0.3, caption=True)
+    tracks = track_video(write_frames(tmp_path / "broadcast.mp4", clip.frames()))
+    assert per_frame(tracks).min() > 150
+    assert np.asarray(tracks.mask).sum(axis=1).mean() > 9
+    _, frame, points = tracks.views()
+    assert clip.is_caption(points.astype(float)).mean() < 0.005
+    moving = np.zeros(len(frame), bool)
+    for m in range(60):
+        moving[frame == m] = clip.is_moving(m, points[frame == m].astype(float))
+    assert moving.mean() < 0.35
+    age, error = errors(tracks, clip)
+    scene = error[(age > 0) & ~moving]
+    assert 1.48 * np.median(np.abs(scene)) < 0.08
+    assert np.mean(np.abs(scene).max(axis=1) < 0.5) > 0.98

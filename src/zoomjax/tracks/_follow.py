@@ -10,12 +10,11 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from ._camera import camera_motion, carried, local_shape
+from ._flow import Grey, followed
 from ._patches import HALF, Patches
-
-Grey = UInt8[np.ndarray, "height width"]
 
 _BACK = 0.4
 """px: how near the flow there and back must return."""
@@ -88,9 +87,7 @@ class Follower:
         """For frames of a size, (width, height) px, so many tracks at a time, and frames of a track."""
         self.size, self.most, self.life = size, most, life
         self.shrunk = 1 if min(size) < _LARGE else 2
-        self.levels = int(np.clip(np.log2(min(size) / self.shrunk / 60), 0, 5))
         self.frame = -1
-        self.cuts: list[int] = []
         self._rng = np.random.default_rng(0)
         self._small: Grey | None = None
         self._active: _Active | None = None
@@ -114,7 +111,7 @@ class Follower:
         self._small = small
 
     def views(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Track, frame and point of each view, of tracks on the scene that have three views or more."""
+        """Track, frame and point of each view, of tracks on the scene that have two views or more."""
         if self._active is not None:
             self._end(self._active)
             self._active = None
@@ -124,7 +121,7 @@ class Follower:
         keep = np.zeros(self._next, bool)
         ended = [np.concatenate(parts) for parts in zip(*self._ended, strict=True)]
         keep[ended[0]] = ~self._on_captions(*ended[1:])
-        keep &= np.bincount(number, minlength=self._next) >= min(3, self.frame + 1)
+        keep &= np.bincount(number, minlength=self._next) > 1
         kept = keep[number]
         return number[kept], frame[kept], points[kept]
 
@@ -134,8 +131,7 @@ class Follower:
         flow, good = self._flow(small, active)
         count = good.sum()
         if len(good) >= 10 and count < _SURVIVORS * len(good):
-            self.cuts.append(self.frame)
-            good[:] = False
+            good[:] = False  # a cut: those few are chance, or captions
         self._end(active[~good])
         active, flow = active[good], flow[good]
         self._active = active
@@ -160,21 +156,10 @@ class Follower:
         """Where the points are in the next frame, and for which the way back returns."""
         assert self._small is not None
         half = (self.shrunk - 1) / 2  # from the middle of the first pixel of the one to that of the other
-        before = ((active.point - half) / self.shrunk).astype(np.float32)
-        options = {
-            "winSize": (2 * HALF + 1, 2 * HALF + 1),
-            "maxLevel": self.levels,
-            "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01),
-            "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-            "minEigThreshold": 1e-5,
-        }
-        guess = before + (active.speed / self.shrunk).astype(np.float32)
-        after, there, _ = cv2.calcOpticalFlowPyrLK(self._small, small, before, guess, **options)
-        start = before + (after - guess)  # not the answer
-        back, here, _ = cv2.calcOpticalFlowPyrLK(small, self._small, after, start, **options)
-        good = (there.ravel() > 0) & (here.ravel() > 0)
-        good &= np.linalg.norm(back - before, axis=1) < _BACK / self.shrunk
-        after = self.shrunk * after.astype(np.float64) + half
+        before = (active.point - half) / self.shrunk
+        guess = before + active.speed / self.shrunk
+        after, good = followed(self._small, small, before, guess, back=_BACK / self.shrunk)
+        after = self.shrunk * after + half
         return after, good & self._inside(after)
 
     def _inside(self, points: np.ndarray) -> np.ndarray:

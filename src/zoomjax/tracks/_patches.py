@@ -42,7 +42,7 @@ class Patches:
 
     @classmethod
     def cut(cls, image: UInt8[np.ndarray, "height width"], anchors: Points) -> "Patches":
-        """The patches of an image around points, all of which lie `HALF` + 1 px within it."""
+        """The patches of an image around points, each of which has its patch and a px more within it."""
         n, side = len(anchors), 2 * HALF + 3
         wide = _sampled(image, anchors[:, None] + _grid(HALF + 1)).reshape(n, side, side)
         values, scale = _normalised(wide[:, 1:-1, 1:-1].reshape(n, -1))

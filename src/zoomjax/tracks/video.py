@@ -41,8 +41,8 @@ def track_video(
         progress: called after each frame with the number of frames done and announced (0 if unknown).
 
     Returns:
-        The tracks, of three views at least (of two in a clip of two frames). The error of a point is some
-        0.1 px at sharp corners; that of its track's first point is 0 by definition.
+        The tracks, of two views at least. The error of a point is some 0.1 px at sharp corners; that of its
+        track's first point is 0 by definition.
 
     Raises:
         FileNotFoundError: there is no such clip.
