@@ -90,6 +90,11 @@ def test_tracks_spread_over_the_image(plain):
     assert len(cells) == 7 * 4
 
 
+def test_few_tracks_spread_too(plain):
+    _, frame, points = track_frames(plain[1][:3], most=12).views()
+    assert len({tuple(cell) for cell in (points[frame == 2] // 128).astype(int)}) >= 6
+
+
 def test_most_and_life_are_kept(plain):
     tracks = track_frames(plain[1], most=30, life=6)
     assert per_frame(tracks).max() <= 30
@@ -217,12 +222,12 @@ def test_two_frames_are_enough(plain):
 
 @pytest.mark.slow
 def test_a_zooming_broadcast_with_moving_things_and_captions(tmp_path):
-    """Half-size television, zoomed by 1:2, a third of it moving, through H.264 at the encoder's own quality."""
+    """Zoomed by 1:2, a third of it moving, through H.264 at the encoder's own quality."""
     true = lens((960, 540), 2.0)
     clip = motion_clip(true, *pan_and_zoom(true, 60, pan=20), noise=2, moving=0.3, caption=True)
     tracks = track_video(write_frames(tmp_path / "broadcast.mp4", clip.frames()))
-    assert per_frame(tracks).min() > 150
-    assert np.asarray(tracks.mask).sum(axis=1).mean() > 9
+    assert per_frame(tracks)[1:].min() > 150
+    assert np.asarray(tracks.mask).sum(axis=1).mean() > 6
     _, frame, points = tracks.views()
     assert clip.is_caption(points.astype(float)).mean() < 0.005
     moving = np.zeros(len(frame), bool)

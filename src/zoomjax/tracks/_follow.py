@@ -6,13 +6,13 @@ image has too few tracks, corners for new ones.
 """
 
 import dataclasses
-from itertools import pairwise
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
 from ._camera import camera_motion, carried, local_shape
+from ._corners import best_corners
 from ._flow import Grey, followed
 from ._patches import HALF, Patches
 
@@ -35,7 +35,7 @@ _LARGE = 600
 """px a side: frames that are larger are halved for the flow, which only has to lead near."""
 
 _CELLS = (16, 9)
-"""That tracks are spread over, across and down."""
+"""That tracks are spread over, across and down; fewer if there are fewer tracks."""
 
 _REFILL = 20
 """Corners are looked for when one in so many tracks has ended."""
@@ -86,6 +86,8 @@ class Follower:
     def __init__(self, size: tuple[int, int], *, most: int, life: int):
         """For frames of a size, (width, height) px, so many tracks at a time, and frames of a track."""
         self.size, self.most, self.life = size, most, life
+        fewer = min(1.0, (most / (_CELLS[0] * _CELLS[1])) ** 0.5)
+        self.cells = (max(1, round(fewer * _CELLS[0])), max(1, round(fewer * _CELLS[1])))
         self.shrunk = 1 if min(size) < _LARGE else 2
         self.frame = -1
         self._rng = np.random.default_rng(0)
@@ -204,33 +206,28 @@ class Follower:
         room = self.most - len(points)
         if room <= self.most // _REFILL and len(points):
             return np.zeros((0, 2))
-        strength = cv2.cornerMinEigenVal(small, 7, ksize=3) * (255 / 2 / self.shrunk) ** 2
         self._captions = self._captions[self._captions[:, 2] > self.frame]
-        for x, y in np.concatenate([points, self._captions[:, :2]]) / self.shrunk:
-            cv2.circle(strength, (round(x), round(y)), 2 * HALF // self.shrunk, 0.0, -1)
-        edge = HALF // self.shrunk + 3
-        best = []
-        columns, rows = (
-            np.linspace(edge, n - edge, k + 1).astype(int)
-            for n, k in zip(small.shape[::-1], _CELLS, strict=True)
+        place, strength = best_corners(
+            small,
+            self.cells,
+            taken=np.concatenate([points, self._captions[:, :2]]) / self.shrunk,
+            apart=2 * HALF // self.shrunk,
+            edge=HALF // self.shrunk + 3,
+            weakest=_WEAKEST * self.shrunk**2,
         )
-        for top, bottom in pairwise(rows):
-            for left, right in pairwise(columns):
-                if right > left and bottom > top:
-                    _, value, _, (x, y) = cv2.minMaxLoc(strength[top:bottom, left:right])
-                    best.append((left + x, top + y, value))
-        if not best:
-            return np.zeros((0, 2))
-        best = np.array(best)
-        place = self.shrunk * best[:, :2]
-        best, place = best[keep := best[:, 2] > _WEAKEST], place[keep]
-        cell = np.array(self.size) / _CELLS
-        taken = np.zeros(_CELLS, int)
-        np.add.at(taken, tuple((points // cell).astype(int).clip(0, np.array(_CELLS) - 1).T), 1)
-        crowd = taken[tuple((place // cell).astype(int).clip(0, np.array(_CELLS) - 1).T)]
-        order = np.lexsort((-best[:, 2], crowd))
-        order = order[crowd[order] <= self.most // taken.size]
+        place = self.shrunk * place
+        number = np.zeros(self.cells, int)
+        np.add.at(number, self._cell(points), 1)
+        crowd = number[self._cell(place)]
+        order = np.lexsort((-strength, crowd))
+        order = order[crowd[order] <= self.most // number.size]
         return place[order[:room]]
+
+    def _cell(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The column and the row of each point's cell."""
+        place = points // (np.array(self.size) / self.cells)
+        column, row = place.astype(int).clip(0, np.array(self.cells) - 1).T
+        return column, row
 
     def _end(self, ended: _Active) -> None:
         """Keep what tells captions from the scene."""
