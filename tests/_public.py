@@ -10,6 +10,7 @@ ROOMS = (
     "detect",
     "lenses",
     "lines",
+    "tracks",
     "correct",
     "scenes",
     "fit",

@@ -1,4 +1,4 @@
-"""The package is twelve rooms on a private base, and imports go one way: from a room to rooms below it."""
+"""The package is thirteen rooms on a private base, and imports go one way: from a room to those below."""
 
 import ast
 from pathlib import Path
@@ -15,6 +15,7 @@ ROOMS = (
     "correct",
     "lenses",
     "lines",
+    "tracks",
     "detect",
     "focal",
     "interop",
@@ -35,6 +36,7 @@ LIBRARIES = {
     "interop": {"OpenEXR", "yaml"},
     "lenses": {"lensfunpy"},
     "torch": {"torch"},
+    "tracks": {"cv2"},
 }
 """Libraries of images, plots, terminals and video, and where they may be imported."""
 

@@ -49,6 +49,7 @@ ABOUT = {
     "scenes": "scenes with exact truth",
     "correct": "points, images, video",
     "lines": "lines and compression",
+    "tracks": "points followed in clips",
     "detect": "images to lines",
     "focal": "focal lengths from planes",
     "interop": "other tools' formats",

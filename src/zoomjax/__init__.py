@@ -20,6 +20,7 @@ _ROOMS = (
     "detect",
     "lenses",
     "lines",
+    "tracks",
     "correct",
     "scenes",
     "fit",

@@ -11,6 +11,7 @@ from . import lines as lines
 from . import models as models
 from . import scenes as scenes
 from . import torch as torch
+from . import tracks as tracks
 from . import trust as trust
 from .app import plot as plot
 from .correct import Framing as Framing

@@ -265,7 +265,7 @@ SPOILED = {
     "text": (lambda path: path.write_text("frame,line,x,y\n"), "Cannot read lines"),
     "other archive": (replace_by_zip, "Cannot read lines"),
     "single array": (save_single_array, "not an .npz archive"),
-    "foreign arrays": (lambda path: np.savez(path, corners=ROW), "no line primitives"),
+    "foreign arrays": (lambda path: np.savez(path, corners=ROW), "holds no lines; Lines.save"),
     "pickled": (lambda path: rewrite(path, points=np.array([ROW, None], object)), "allow_pickle"),
     "newer version": (lambda path: rewrite(path, version=99), "version is 99"),
     "older version": (lambda path: rewrite(path, version=0), "version is 0"),

@@ -64,6 +64,9 @@ _INSTEAD = {
     ("AbstractZoom", "int"): "PolynomialZoom(degree=...) is one of that degree",
     ("str", "ZoomLens"): "it is loaded already",
     ("str", "Lines"): "they are loaded already",
+    ("Tracks", "str"): "load_tracks(path) reads a file",
+    ("Tracks", "PosixPath"): "load_tracks(path) reads a file",
+    ("str", "Tracks"): "they are loaded already",
 }
 """What to pass instead of something that is near to what is wanted."""
 

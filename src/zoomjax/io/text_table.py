@@ -85,6 +85,16 @@ class TextTable:
                 f"{name} in row {self.rows[bad]} must be {must}, but it is {self.numbers[name][bad]:.17g}"
             )
 
+    def integers(self, name: str) -> np.ndarray:
+        """A column of integers, int64.
+
+        Raises:
+            ValueError: a number is none; the message names the row.
+        """
+        values = self.numbers[name]
+        self.check(name, (abs(values) < 2**53) & (values == np.floor(values)), "an integer")
+        return values.astype(np.int64)
+
 
 def read_text_table(
     path: str | os.PathLike[str],

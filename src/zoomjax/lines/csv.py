@@ -13,7 +13,7 @@ import numpy as np
 
 from .._core.arguments import kinds_checked
 from .._core.files import whole_file
-from ..io.text_table import TextTable, read_text_table
+from ..io.text_table import read_text_table
 from .lines import Lines
 
 
@@ -41,7 +41,7 @@ def read_lines_csv(
     """
     table = read_text_table(path, "lines", numbers=("frame", "line", "x", "y"), optional=("focal",))
     columns = table.numbers
-    frame, line = (_integers(table, name) for name in ("frame", "line"))
+    frame, line = (table.integers(name) for name in ("frame", "line"))
     frames, index = np.unique(frame, return_inverse=True)
     if "focal" in columns:
         if focal is not None:
@@ -105,7 +105,7 @@ def read_focal_csv(path: str | os.PathLike[str]) -> dict[int, float]:
         ValueError: a column is missing, a value is not a positive number, or a frame is listed twice.
     """
     table = read_text_table(path, "focal lengths", numbers=("frame", "focal"))
-    frame, focal = _integers(table, "frame"), table.numbers["focal"]
+    frame, focal = table.integers("frame"), table.numbers["focal"]
     table.check("focal", focal > 0, "positive")
     first = np.zeros(frame.size, bool)
     first[np.unique(frame, return_index=True)[1]] = True
@@ -113,9 +113,3 @@ def read_focal_csv(path: str | os.PathLike[str]) -> dict[int, float]:
         bad = int(np.argmin(first))
         raise table.error(f"frame {frame[bad]} comes twice, the second time in row {table.rows[bad]}")
     return dict(zip(frame.tolist(), focal.tolist(), strict=True))
-
-
-def _integers(table: TextTable, name: str) -> np.ndarray:
-    values = table.numbers[name]
-    table.check(name, (abs(values) < 2**53) & (values == np.floor(values)), "an integer")
-    return values.astype(np.int64)

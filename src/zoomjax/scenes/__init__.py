@@ -1,4 +1,4 @@
-"""Synthetic scenes with exact truth: the paper's striped board, and a broadcast of football."""
+"""Synthetic scenes with exact truth: the paper's striped board, a broadcast, and moving cameras."""
 
 import lazy_loader
 

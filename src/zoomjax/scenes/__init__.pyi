@@ -8,6 +8,9 @@ from .board import nikkor_18_200 as nikkor_18_200
 from .board import with_noise as with_noise
 from .broadcast import broadcast_lines as broadcast_lines
 from .broadcast import broadcast_zoom as broadcast_zoom
+from .clip import MotionClip as MotionClip
+from .clip import leaves as leaves
+from .clip import motion_clip as motion_clip
 from .motion import MotionScene as MotionScene
 from .motion import motion_tracks as motion_tracks
 from .motion import pan_and_zoom as pan_and_zoom

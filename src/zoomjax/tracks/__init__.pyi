@@ -1,3 +1,8 @@
 # The public names of this room: read by type checkers, and by lazy_loader at run time.
 
+from .csv import read_tracks_csv as read_tracks_csv
+from .csv import write_tracks_csv as write_tracks_csv
+from .npz import load_tracks as load_tracks
 from .tracks import Tracks as Tracks
+from .video import track_frames as track_frames
+from .video import track_video as track_video

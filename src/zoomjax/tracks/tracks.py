@@ -1,6 +1,7 @@
 """Points of a scene, followed from frame to frame of a clip."""
 
 import math
+import os
 import warnings
 from collections.abc import Sequence
 
@@ -10,9 +11,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from .._core.arguments import check_kind
 from .._core.checks import checked_integer, checked_size
 from .._core.fields import booleans, check_indices, check_shapes, integers, known, numbers
+from .._core.files import whole_file
 from .._core.types import AnyArray
+
+FORMAT, VERSION = "zoomjax.tracks", 1
 
 
 class Tracks(eqx.Module):
@@ -116,6 +121,31 @@ class Tracks(eqx.Module):
             number=jnp.asarray(number, jnp.int32),
         )
 
+    def views(
+        self,
+    ) -> tuple[Int[np.ndarray, "entry"], Int[np.ndarray, "entry"], Float[np.ndarray, "entry 2"]]:
+        """Each view's track, as `number` calls it, its frame and its point, as `from_arrays` takes them."""
+        mask = np.asarray(self.mask)
+        names = np.repeat(np.asarray(self.number), mask.sum(axis=1))
+        return names, np.asarray(self.frame)[mask], np.asarray(self.points)[mask]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all fields, in their dtypes, to a ``.npz`` file that `load_tracks` reads."""
+        check_kind("path", path, (str, os.PathLike))
+        _, frame, points = self.views()
+        with whole_file(path) as part, part.open("wb") as file:
+            np.savez(
+                file,
+                format=FORMAT,
+                version=VERSION,
+                points=points,
+                frame=frame,
+                counts=np.asarray(self.mask).sum(axis=1),
+                number=np.asarray(self.number),
+                image_size=np.array(self.image_size),
+                frames=self.frames,
+            )
+
     @property
     def scale(self) -> float:
         """The length in px that is radius 1: half the image diagonal."""
@@ -131,6 +161,8 @@ def _views(track, frame, points):
     for name, values in {"track": names, "frame": moments}.items():
         if values.ndim != 1 or not values.size or not np.issubdtype(values.dtype, np.integer):
             raise ValueError(f"Argument {name} must hold one integer a view, but it is {values!r}.")
+        if values.max() >= 2**31 or values.min() < -(2**31):
+            raise ValueError(f"Argument {name} must hold integers of 32 bits, but it has {values.max()}.")
     if not len(names) == len(moments) == len(places) or places.shape[1:] != (2,):
         raise ValueError(
             f"Arguments track, frame and points must have one entry a view, but their shapes are "

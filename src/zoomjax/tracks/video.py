@@ -1,0 +1,98 @@
+"""Tracks found in the frames of a clip: corners that spread over the image, followed without drift.
+
+Each track begins at a corner. Pyramidal Lucas-Kanade, there and back, leads from a frame to the next
+(Bouguet 2001); from there the track is matched with the patch of the frame where it began, bent as the
+camera's motion bends it (Shi, Tomasi 1994). So errors do not add up along a track. A track ends where it is
+not like that patch any more, when its scale has changed by 1.4, or after its life; others begin.
+
+Captions and logos stay in their place while the camera moves: such tracks are left out. Nothing is linked
+across a cut. Memory holds two frames, whatever the clip's length.
+"""
+
+import os
+from collections.abc import Callable, Iterable
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from .._core.checks import checked_integer
+from ..io.video_reader import decode_video
+from ._follow import Follower
+from .tracks import Tracks
+
+
+def track_video(
+    clip: str | os.PathLike[str],
+    *,
+    most: int = 200,
+    life: int = 45,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Tracks:
+    """Follow points through a clip: what a calibration from motion begins with.
+
+    Frames may be repeated, as in conversions from 25 to 30 frames/s, black or blurred, and the clip may
+    have cuts.
+
+    Args:
+        clip: a video that PyAV decodes, of any length.
+        most: number of tracks at a time, at most.
+        life: the most frames that a track is followed.
+        progress: called after each frame with the number of frames done and announced (0 if unknown).
+
+    Returns:
+        The tracks, of two views at least. The error of a point is some 0.1 px at sharp corners; that of its
+        track's first point is 0 by definition.
+
+    Raises:
+        FileNotFoundError: there is no such clip.
+        ValueError: it is no video, none of its frames decodes, it has fewer than two frames, or nothing in
+            it can be followed.
+
+    Warns:
+        UserWarning: the clip is interlaced.
+    """
+    with decode_video(clip) as (announced, items):
+
+        def images() -> Iterable[UInt8[np.ndarray, "height width 3"]]:
+            for done, (_, _, image) in enumerate(items, 1):
+                yield image()
+                progress(done, announced)
+
+        try:
+            return track_frames(images(), most=most, life=life)
+        except ValueError as error:
+            raise ValueError(f"Cannot track points in {os.fspath(clip)}: {error}") from error
+
+
+def track_frames(
+    frames: Iterable[UInt8[np.ndarray, "height width *channels"]], *, most: int = 200, life: int = 45
+) -> Tracks:
+    """Follow points through images, as `track_video` through the frames of a clip.
+
+    Args:
+        frames: grey, or blue, green, red; all of one size.
+        most: number of tracks at a time, at most.
+        life: the most frames that a track is followed.
+
+    Raises:
+        ValueError: there are fewer than two frames, they differ in size, or nothing can be followed.
+    """
+    most, life = checked_integer("most", most, 1), checked_integer("life", life, 2)
+    follower = None
+    for image in frames:
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+        size = (grey.shape[1], grey.shape[0])
+        follower = Follower(size, most=most, life=life) if follower is None else follower
+        if size != follower.size:
+            raise ValueError(f"Frames of {follower.size} and of {size} px follow each other.")
+        follower.add(grey)
+    number = 0 if follower is None else follower.frame + 1
+    if follower is None or number < 2:
+        raise ValueError("It has fewer than two frames.")
+    track, frame, points = follower.views()
+    if not len(track):
+        raise ValueError(
+            "Nothing in it can be followed: it shows no corners, or nothing but what stays in its place."
+        )
+    return Tracks.from_arrays(track, frame, points, image_size=follower.size, frames=number)
