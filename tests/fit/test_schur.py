@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from zoomjax.fit._schur import Rows, Schur, Unknowns, covariances, reduced, structure_of
+from zoomjax.fit._schur import Rows, Schur, Unknowns, covariances, reduced
+from zoomjax.fit._structure import structure_of
 
 
 def problem(rng, frames, tracks, longest):

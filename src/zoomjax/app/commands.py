@@ -31,6 +31,7 @@ from .arguments import (
     split_lens,
     unit_of,
 )
+from .clips import ClipJob, calibrate_clip, wants_motion
 from .console import REPORT, progress_bar, show_calibration, show_images, stages
 from .options import (
     CALIBRATE_EXAMPLES,
@@ -160,9 +161,10 @@ def calibrate(
         str | None,
         typer.Option(
             help="Source of the focal lengths: a CSV file (columns image,focal; for a video time,focal or "
-            "frame,focal; for CSV lines frame,focal), a number, exif, board (parallel to the sensor) or "
-            "plane (oblique views of a flat grid). Default for photos: board if --pitch is given, else "
-            "exif, else plane.",
+            "frame,focal; for CSV lines frame,focal), a number, exif, board (parallel to the sensor), "
+            "plane (oblique views of a flat grid), or for a video motion (how the image moves as the "
+            "camera turns and zooms). Default for photos: board if --pitch is given, else exif, else "
+            "plane; for a video: motion.",
             rich_help_panel=FOCAL,
         ),
     ] = None,
@@ -216,8 +218,10 @@ def calibrate(
     """Calibrate a zoom lens from photos, a video or a file of lines.
 
     Writes lens.json, summary.json, report.html, model.png and lines.npz. From
-    images it also writes lines/: each image with its detected lines. Results
-    of an earlier run in the same folder are replaced.
+    images it also writes lines/: each image with its detected lines. From a
+    video without focal lengths it writes track.csv, the focal length of each
+    frame, and panorama.jpg in their place. Results of an earlier run in the
+    same folder are replaced.
     """
     set_up_jax()
     show = Shown(strict, quiet, as_json)
@@ -261,6 +265,10 @@ def calibrate(
     from .image_calibration import ImageJob
     from .results_folder import results_folder
 
+    if wants_motion(inputs, focal, pitch):
+        unused = {"--focal-sigma": focal_sigma, "--pitch": pitch, "--distance": distance, "--pixel": pixel}
+        clip = ClipJob(inputs, output, wanted, centre_of(centre), unused, overwrite)
+        return calibrate_clip(clip, show, dry_run=dry_run)
     job = ImageJob(
         tuple(inputs),
         detector=detector,

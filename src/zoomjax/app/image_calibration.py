@@ -80,7 +80,7 @@ class ImageJob:
             raise ValueError(
                 f"Argument detector must be one of {', '.join(DETECTORS)}, but it is {self.detector!r}."
             )
-        if len(self.inputs) > 1 and any(map(_is_video, self.inputs)):
+        if len(self.inputs) > 1 and any(map(is_video, self.inputs)):
             raise ValueError("Give photos, or one video.")
         check_way(self.focal, self.board, video=self.video is not None)
         focal_sigmas(self.focal_sigma or "0", np.ones(1))
@@ -88,7 +88,7 @@ class ImageJob:
     @property
     def video(self) -> Path | None:
         """The video, if the input is one."""
-        return Path(self.inputs[0]) if _is_video(self.inputs[0]) else None
+        return Path(self.inputs[0]) if is_video(self.inputs[0]) else None
 
     @property
     def grid(self) -> str:
@@ -342,7 +342,8 @@ def _overlay(number: int, name: str) -> str:
     return numbered_name(number, name, ".jpg")
 
 
-def _is_video(path: str | os.PathLike[str]) -> bool:
+def is_video(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a video, by its name."""
     return Path(path).suffix.lower() in VIDEO_SUFFIXES
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ._schur import bucket
+from ._structure import bucket
 
 FIELDS_OF_VIEW = (70.0, 45.0, 28.0, 17.0, 10.0, 5.0)
 """Guesses, degrees across the image."""

@@ -1,16 +1,11 @@
 """Focal lengths, rotations and the lens of a camera that turns and zooms, from tracks alone.
 
-The unknowns are log f and the rotation of each frame, a ray of each track, the zoom model, and the offset
-of the centre of distortion. A ray X is seen in frame t at ``p = f_t (y1, y2)/y3`` with ``y = R_t X``, and
-the point that was observed is corrected to c. The residual in the image is ``J^-1 (c - p)``, where J is the
-derivative of the correction at the observed point: one step of Newton's method for the inverse, exact to
-second order. Residuals have a Cauchy loss, with a scale from their median.
-
-The solver is optimistix' Levenberg-Marquardt with a linear solver made for this problem (`_schur`), linear
-in the number of frames. The start needs no guess (`_motion_start`); the lens joins by a prior that widens.
+What is minimised says `_motion_rows`. The solver is optimistix' Levenberg-Marquardt with a linear solver
+made for this problem (`_schur`), in time that is linear in the number of frames. The start needs no guess
+(`_motion_start`); from there the loss narrows, and the lens joins by a prior that widens.
 """
 
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import equinox as eqx
 import jax
@@ -19,7 +14,7 @@ import numpy as np
 import optimistix as optx
 import scipy.sparse.csgraph
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_terms
@@ -30,67 +25,50 @@ from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ..models.zoom import (
     AbstractFocusZoom,
-    AbstractPriorZoom,
     AbstractZoom,
     PolynomialZoom,
-    with_parameters,
 )
 from ..tracks.tracks import Tracks
 from ._least_squares import RoundingTrustRegion
-from ._motion_start import Path, rotation_vector, shrunk_ray, start_of, turned, views_by_frame
-from ._schur import (
-    Rows,
-    Schur,
-    Structure,
-    Unknowns,
-    bucket,
-    covariances,
-    padded,
-    reduced,
-    structure_of,
+from ._motion_rows import (
+    CAUCHY,
+    Data,
+    Model,
+    Stage,
+    about_frames,
+    about_lens,
+    averaged,
+    moved,
+    residuals_of,
+    rows_of,
+    scaled,
+    units_of,
 )
+from ._motion_start import start_of, views_by_frame
+from ._schur import Rows, Schur, Unknowns, covariances, reduced
+from ._structure import bucket, padded, structure_of
 from .result import RESULTS, ZoomFit, failed, judged
-
-_CAUCHY = 2.3849
-"""Of the noise: where the loss begins to flatten; 95 % efficient for normal errors."""
 
 _MEDIAN_OF_SIZE = 1.1774  # of the length of a vector of two normal numbers
 
 
-class _Stage(NamedTuple):
-    """How the noise is taken, and when to stop.
-
-    Attributes:
-        parameters: standard deviation of each parameter of the zoom model before there is any data.
-        centre: of the offset of the centre, half image diagonals.
-        wider: times the noise that the residuals before the stage have: the loss is flat beyond.
-        change: a step that moves the residuals by less, in all and in units of the noise, is the last.
-            1 is the standard deviation of the estimate along the step.
-        damping: of the first step.
-    """
-
-    parameters: float
-    centre: float
-    wider: float
-    change: float
-    damping: float
-
-
 _STAGES = (
-    _Stage(0.3, 0.01, 4.0, change=1.0, damping=1e-3),
-    _Stage(1.0, 0.05, 1.0, change=3.0, damping=1e-4),
-    *[_Stage(1.0, 0.05, 1.0, change=0.1, damping=1e-7)] * 4,
+    Stage(0.3, 0.01, 4.0, change=1.0, damping=1e-3, own=0.05),
+    Stage(1.0, 0.05, 1.0, change=3.0, damping=1e-4, own=0.05),
+    *[Stage(1.0, 0.05, 1.0, change=0.1, damping=1e-7, own=0.05)] * 4,
 )
 """They widen the prior of the lens and narrow the loss; they end where the noise and the solver do."""
 
 _MOST_STEPS = 30  # of a stage
 
-_OWN = 0.05  # standard deviation of a frame's log f beside the common factor
 _LONGEST = 48
 """Frames of a track that share a ray. Longer ones are cut, so that only frames near each other are coupled:
 that they show the same point says little more, and a cubic cost is saved."""
 
 _INFLATION = 1 / 0.95  # of variances, by what the loss loses
+
+_FREE = 10.0
+"""Standard deviation of a frame's log f, beside the common factor, where nothing is said of it."""
 
 _UNKNOWN_SCALE = 0.1
 """Standard deviation of log f from which the focal lengths have no scale."""
@@ -108,7 +86,7 @@ class MotionFit(eqx.Module):
         focal: focal length of each frame, px; NaN for a frame without tracks.
         focal_std: its standard deviation, px. Nearly all of it is a factor common to all frames.
         covariance: of the zoom model's parameters, of those of the centre's offset, and of the logarithm of
-            that factor.
+            that factor: that of the first frame.
         rotation: of each frame, from the scene to the camera, whose axes are x right, y down and z
             forward. The first frame's is the identity. So is that of the first frame after a cut, across
             which no track goes: how the camera turned between them is not known.
@@ -176,7 +154,7 @@ def fit_motion(
         L. de Agapito, E. Hayman, I. Reid, "Self-calibration of rotating and zooming cameras", IJCV 2001.
         M. Brown, D. Lowe, "Automatic panoramic image stitching using invariant features", IJCV 2007.
     """
-    if not jax.config.jax_enable_x64:
+    if jnp.zeros(()).dtype != jnp.float64:
         raise ValueError(
             "fit_motion needs float64, and it is not enabled: call "
             'jax.config.update("jax_enable_x64", True) first.'
@@ -196,13 +174,14 @@ def fit_motion(
     wide = padded(structure)
     points = np.asarray(tracks.points, float)[track, view] - (np.array([tracks.image_size]) - 1) / 2
     views = len(wide.track) - len(points)
-    data = _Data(
+    data = Data(
         points=jnp.asarray(np.pad(points, ((0, views), (0, 0)))),
         there=jnp.arange(len(wide.track)) < len(points),
         structure=wide,
         fixed=jnp.asarray(
             np.pad((shot < 0) | (np.diff(shot, prepend=-1) > 0), (0, more), constant_values=1)
         ),
+        pinned=_first((shot >= 0) & np.isinf(known_std), frames),
         log_focal=jnp.asarray(np.pad(np.log(known), (0, more))),
         log_std=jnp.asarray(np.pad(known_std / known, (0, more), constant_values=np.inf)),
         unknowns=jnp.asarray(4.0 * np.sum(shot >= 0) + 2 * structure.tracks),
@@ -230,38 +209,6 @@ def thrown_motion(fit: MotionFit) -> MotionFit:
     return fit
 
 
-class _Data(eqx.Module):
-    """Tracks, as the residuals need them.
-
-    Attributes:
-        points: about the centre of the image, px.
-        there: which views there are; others pad.
-        structure: which track and frame each view belongs to.
-        fixed: frames whose rotation is given: the first of each shot, and those that no track sees.
-        log_focal, log_std: what is known of log f beforehand; infinite standard deviations.
-        unknowns: how many numbers of frames and rays are fitted.
-        scale: half the image diagonal, px.
-    """
-
-    points: Float[Array, "view 2"]
-    there: Bool[Array, "view"]
-    structure: Structure
-    fixed: Bool[Array, "frame"]
-    log_focal: Float[Array, "frame"]
-    log_std: Float[Array, "frame"]
-    unknowns: Float[Array, ""]
-    scale: float = eqx.field(static=True)
-
-
-class _Model(eqx.Module):
-    """What the unknowns are measured from: a path, and a lens."""
-
-    path: Path
-    zoom: AbstractZoom
-    shift: AbstractZoom | None
-    family: AbstractFamily
-
-
 def _known_focal(focal, focal_std, frames):
     """Known focal lengths and standard deviations of all frames; 1 and infinity where there is none."""
     values = np.full(frames, np.nan) if focal is None else np.asarray(focal, float)
@@ -275,6 +222,11 @@ def _known_focal(focal, focal_std, frames):
         raise ValueError("Arguments focal and focal_std must be positive.")
     std = np.where(there, np.broadcast_to(focal_std, frames), np.inf)
     return np.where(there, values, 1.0), std
+
+
+def _first(which, frames):
+    """The first that is set, alone."""
+    return jnp.asarray((np.arange(frames) == np.argmax(which)) & which.any())
 
 
 def _shots(track, moment, frames):
@@ -303,13 +255,13 @@ def _started(data, by_frame):
     """The best chain of frames, scaled to focal lengths that are known, and its residuals' median."""
     path, spread = start_of(data.points, data.structure.tracks, 1.6 * data.scale, by_frame)
     off = jnp.where(jnp.isinf(data.log_std), jnp.nan, data.log_focal - path.log_focal)
-    return _scaled(path, jnp.nan_to_num(jnp.nanmedian(off))), spread
+    return scaled(path, jnp.nan_to_num(jnp.nanmedian(off))), spread
 
 
 def _in_stages(data, path, spread, zoom, shift, family, terms, image_size):
     """The fit, with a prior of the lens that widens from stage to stage: the program is the same."""
     focal = np.exp(np.asarray(path.log_focal))
-    model = _Model(
+    model = Model(
         path,
         zoom.prepare(focal, family.size(terms)),
         None if shift is None else shift.prepare(focal, 2),
@@ -320,170 +272,14 @@ def _in_stages(data, path, spread, zoom, shift, family, terms, image_size):
         model, noise, result, steps = _solved(data, model, noise * stage.wider, _arrays(stage))
         if number > 1 and result == RESULTS.successful:
             break
-    return _described(data, model, noise, _arrays(_STAGES[-1]), result, steps, image_size)
+    return _described(
+        data, model, noise, _arrays(_STAGES[-1]._replace(own=_FREE)), result, steps, image_size
+    )
 
 
 def _arrays(stage):
     """Numbers that the compiled program takes, and is not compiled for."""
     return jax.tree.map(jnp.asarray, stage)
-
-
-def _units(data, model, noise):
-    """How much of each unknown moves all views that it belongs to by the noise, and no more.
-
-    Damping then treats a focal length, a rotation, a ray and a coefficient alike.
-    """
-    structure, half = data.structure, data.scale / 2
-    focal = jnp.exp(model.path.log_focal)
-    ones = data.there.astype(float)
-    in_frame = jnp.zeros(len(focal)).at[structure.frame].add(ones)
-    in_ray = jax.ops.segment_sum(ones, structure.track, structure.tracks)
-    in_ray = jnp.maximum(in_ray, 1)
-    focal_of_ray = jax.ops.segment_sum(ones * focal[structure.frame], structure.track, structure.tracks)
-    focal_of_ray = jnp.maximum(focal_of_ray / in_ray, 1.0)
-    lever = jnp.stack([jnp.full(len(focal), half), focal, focal, jnp.full(len(focal), half)], axis=1)
-    of_lens = noise / (half * jnp.sqrt(jnp.sum(ones)))
-    return Unknowns(
-        noise / (lever * jnp.sqrt(jnp.maximum(in_frame, 1))[:, None]),
-        jnp.broadcast_to((noise / (focal_of_ray * jnp.sqrt(in_ray)))[:, None], (structure.tracks, 2)),
-        jax.tree.map(lambda leaf: jnp.full(leaf.shape, of_lens), _lens_parameters(model)),
-    )
-
-
-def _lens_parameters(model):
-    """Those of the zoom model and of the centre's offset, and the common factor of focal lengths."""
-    return model.zoom.parameters, None if model.shift is None else model.shift.parameters, jnp.zeros(())
-
-
-def _moved(model, steps):
-    """The path and the lens after steps.
-
-    One of them is a common factor of all focal lengths, by which angles shrink. It is redundant, and it is
-    the direction that tracks determine worst: along it, the other unknowns change little.
-    """
-    parameters, offsets, factor = jax.tree.map(jnp.add, _lens_parameters(model), steps.lens)
-    zoom = with_parameters(model.zoom, parameters)
-    shift = None if model.shift is None else with_parameters(model.shift, offsets)
-    path = _scaled(model.path, factor)
-
-    def ray(ray, start, step):
-        return ray + step @ _tangents(start)
-
-    def rotation(matrix, step):
-        return jax.vmap(lambda column: turned(column, step), 1, 1)(matrix)
-
-    rays = jax.vmap(ray)(path.rays, model.path.rays, steps.rays)
-    rotations = jax.vmap(rotation)(path.rotation, steps.frames[:, 1:])
-    return Path(path.log_focal + steps.frames[:, 0], rotations, rays), zoom, shift
-
-
-def _scaled(path, factor):
-    """A path with all focal lengths larger by a factor, whose logarithm is given, and smaller angles."""
-    shrunk = jnp.exp(-factor)
-
-    def rotation(matrix):
-        extra = (shrunk - 1) * rotation_vector(matrix)  # about the same axis
-        return jax.vmap(lambda column: turned(column, extra), 1, 1)(matrix)
-
-    rays = jax.vmap(shrunk_ray, (0, None))(path.rays, shrunk)
-    return Path(path.log_focal + factor, jax.vmap(rotation)(path.rotation), rays)
-
-
-def _tangents(ray):
-    """Two vectors of length 1 across a ray."""
-    helper = jnp.where(jnp.abs(ray[0]) < 0.7, jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0]))
-    first = jnp.cross(ray, helper)
-    first = first / jnp.linalg.norm(first)
-    return jnp.stack([first, jnp.cross(ray, first)])
-
-
-def _corrected(point, coefficients, offset, family, scale):
-    """A point corrected, px about the centre of distortion, which is the principal point, too."""
-    z = point / scale - offset
-    return scale * jnp.stack(family.correct((z[0], z[1]), z @ z, coefficients))
-
-
-def _view(point, focal, coefficients, offset, ahead, family, scale):
-    """The residual of one view, px of the image."""
-
-    def corrected(point):
-        return _corrected(point, coefficients, offset, family, scale)
-
-    depth = jnp.where(ahead[2] > 0.05, ahead[2], 0.05)
-    missed = corrected(point) - focal * ahead[:2] / depth
-    (a, b), (c, d) = jax.jacfwd(corrected)(point)
-    determinant = a * d - b * c
-    determinant = jnp.where(determinant > 0.05, determinant, 0.05)
-    return jnp.stack([d * missed[0] - b * missed[1], a * missed[1] - c * missed[0]]) / determinant
-
-
-def _views(data, path, zoom, shift, family):
-    """Residuals of all views, px."""
-    focal = jnp.exp(path.log_focal)
-    coefficients = jax.vmap(zoom)(focal)
-    offset = jnp.zeros((len(focal), 2)) if shift is None else jax.vmap(shift)(focal)
-
-    def view(point, frame, track):
-        ahead = _product(path.rotation[frame], path.rays[track])
-        return _view(point, focal[frame], coefficients[frame], offset[frame], ahead, family, data.scale)
-
-    views = jax.vmap(view)(data.points, data.structure.frame, data.structure.track)
-    return jnp.where(data.there[:, None], views, 0)
-
-
-def _product(matrix, vector):
-    """A matrix times a vector, as a sum that XLA fuses with what uses it."""
-    x, y, z = (matrix[:, column] * vector[column] for column in range(3))
-    return x + y + z
-
-
-def _averaged(data, model):
-    """Each ray as the mean of the directions in which its views see it: a start, and near the best."""
-    focal = jnp.exp(model.path.log_focal)
-    coefficients = jax.vmap(model.zoom)(focal)
-    offset = jnp.zeros((len(focal), 2)) if model.shift is None else jax.vmap(model.shift)(focal)
-
-    def direction(point, frame):
-        straight = _corrected(point, coefficients[frame], offset[frame], model.family, data.scale)
-        ahead = jnp.concatenate([straight / focal[frame], jnp.ones(1)])
-        return _product(model.path.rotation[frame].T, ahead) / jnp.linalg.norm(ahead)
-
-    seen = jax.vmap(direction)(data.points, data.structure.frame)
-    rays = jax.ops.segment_sum(seen, data.structure.track, data.structure.tracks)
-    length = jnp.linalg.norm(rays, axis=1, keepdims=True)
-    return jnp.where(length > 0, rays / jnp.where(length > 0, length, 1), jnp.array([0.0, 0.0, 1.0]))
-
-
-def _rows(unknowns, args):
-    """All residuals, robust, in units of the noise; `unknowns` are steps in their `_units`."""
-    data, model, noise, stage = args
-    steps = jax.tree.map(jnp.multiply, unknowns, _units(data, model, noise))
-    path, zoom, shift = _moved(model, steps)
-    views = _views(data, path, zoom, shift, model.family) / noise
-    squared = jnp.sum(views**2, axis=-1, keepdims=True) / _CAUCHY**2
-    safe = jnp.where(squared > 1e-8, squared, 1.0)
-    views = views * jnp.where(squared > 1e-8, jnp.sqrt(jnp.log1p(safe) / safe), 1 - squared / 4)
-    return Rows(views, _about_frames(data, path, unknowns, steps), _about_lens(zoom, shift, stage))
-
-
-def _about_frames(data, path, unknowns, steps):
-    """What is known of frames: the first is the origin, and focal lengths may be given.
-
-    That log f hardly changes but by the common factor is said so weakly that it only parts the two.
-    """
-    known = (path.log_focal - data.log_focal) / data.log_std
-    log_focal = jnp.where(jnp.isinf(data.log_std), steps.frames[:, 0] / _OWN, known)
-    return jnp.concatenate([log_focal[:, None], data.fixed[:, None] * unknowns.frames[:, 1:]], axis=1)
-
-
-def _about_lens(zoom, shift, prior):
-    """The prior of the lens."""
-    rows = [ravel_pytree(zoom.parameters)[0] / prior.parameters]
-    if shift is not None:
-        rows.append(ravel_pytree(shift.parameters)[0] / prior.centre)
-    if isinstance(zoom, AbstractPriorZoom):
-        rows.append(zoom.standardised())
-    return jnp.concatenate(rows)
 
 
 def _of_residuals(change):
@@ -498,37 +294,38 @@ def _solved(data, model, noise, stage):
         rtol=0.0, atol=stage.change, norm=_of_residuals, linear_solver=Schur(data.structure)
     )
     solver = eqx.tree_at(lambda s: s.search, solver, RoundingTrustRegion(first_damping=stage.damping))
-    model = eqx.tree_at(lambda m: m.path.rays, model, _averaged(data, model))
-    start = jax.tree.map(jnp.zeros_like, _units(data, model, noise))
+    model = eqx.tree_at(lambda m: m.path.rays, model, averaged(data, model))
+    start = jax.tree.map(jnp.zeros_like, units_of(data, model, noise))
     solution = optx.least_squares(
-        _rows, solver, start, args=(data, model, noise, stage), max_steps=_MOST_STEPS, throw=False
+        rows_of, solver, start, args=(data, model, noise, stage), max_steps=_MOST_STEPS, throw=False
     )
-    steps = jax.tree.map(jnp.multiply, solution.value, _units(data, model, noise))
-    path, zoom, shift = _moved(model, steps)
-    size = jnp.linalg.norm(_views(data, path, zoom, shift, model.family), axis=-1)
+    steps = jax.tree.map(jnp.multiply, solution.value, units_of(data, model, noise))
+    path, zoom, shift = moved(model, steps)
+    size = jnp.linalg.norm(residuals_of(data, path, zoom, shift, model.family), axis=-1)
     rays = path.rays / jnp.linalg.norm(path.rays, axis=1, keepdims=True)
     size = jnp.where(data.there, size, jnp.nan)
     noise = jnp.maximum(jnp.nanmedian(size) / _MEDIAN_OF_SIZE, 1e-6)  # of tracks without noise
-    moved = _Model(path._replace(rays=rays), zoom, shift, model.family)
-    return moved, noise, RESULTS.promote(solution.result), solution.stats["num_steps"]
+    there = Model(path._replace(rays=rays), zoom, shift, model.family)
+    return there, noise, RESULTS.promote(solution.result), solution.stats["num_steps"]
 
 
 @eqx.filter_jit
 def _described(data, model, noise, stage, result, steps, image_size):
     """The fit with its residuals, covariance and status."""
     frames = len(model.path.log_focal)
-    units = _units(data, model, noise)
+    units = units_of(data, model, noise)
     zeros = jax.tree.map(jnp.zeros_like, units)
 
     def plain(unknowns):  # without the loss: its efficiency is in `inflation`
         steps = jax.tree.map(jnp.multiply, unknowns, units)
-        path, zoom, shift = _moved(model, steps)
-        views = _views(data, path, zoom, shift, model.family) / noise
+        path, zoom, shift = moved(model, steps)
+        views = residuals_of(data, path, zoom, shift, model.family) / noise
         views = jnp.where(inlier[..., None], views, 0)
-        return Rows(views, _about_frames(data, path, unknowns, steps), _about_lens(zoom, shift, stage))
+        frames = about_frames(data, path, unknowns, steps, stage)
+        return Rows(views, frames, about_lens(data, zoom, shift, unknowns, stage))
 
-    missed = _views(data, model.path, model.zoom, model.shift, model.family)
-    squared = jnp.sum(missed**2, axis=-1) / (noise * _CAUCHY) ** 2
+    missed = residuals_of(data, model.path, model.zoom, model.shift, model.family)
+    squared = jnp.sum(missed**2, axis=-1) / (noise * CAUCHY) ** 2
     inlier = data.there & (squared < 9)  # beyond, the loss nearly ignores a view
     rows, jacobian = jax.linearize(plain, zeros)
     matrix = reduced(jacobian, rows, zeros, data.structure, jnp.asarray(0.0))

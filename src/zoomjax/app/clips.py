@@ -1,0 +1,112 @@
+"""``zoomjax calibrate`` for a clip whose focal lengths nobody knows: from how the image moves."""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from .._core.text import plain
+from .console import progress_bar, stages
+from .plans import tell_plan
+from .shown import NOT_GOOD, Shown
+
+if TYPE_CHECKING:
+    from ..fit.zoom import CentreArgument
+    from .model_choice import WantedModel
+    from .motion_calibration import MotionCalibration
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipJob:
+    """What to calibrate, and how.
+
+    Attributes:
+        inputs: the clip.
+        output: folder of the results.
+        model: the zoom model.
+        centre: of distortion: "fit" or "image".
+        unused: options that have nothing to say here, and what was given for them.
+        overwrite: whether to replace files that zoomjax did not write.
+    """
+
+    inputs: Sequence[str]
+    output: Path
+    model: "WantedModel"
+    centre: "CentreArgument"
+    unused: Mapping[str, object]
+    overwrite: bool = False
+
+    def __post_init__(self):
+        """Check the settings before any work.
+
+        Raises:
+            ValueError: there is not one video, or an option has no effect here.
+        """
+        from .image_calibration import is_video
+
+        if len(self.inputs) != 1 or not is_video(self.inputs[0]):
+            raise ValueError("--focal motion is for one video: its motion tells the focal lengths.")
+        if given := [name for name, value in self.unused.items() if value is not None]:
+            raise ValueError(f"{' and '.join(given)} cannot be used with --focal motion.")
+        if self.centre not in ("fit", "image"):
+            raise ValueError("With --focal motion, --centre is fit or image: it moves along the zoom.")
+
+
+def wants_motion(inputs: Sequence[str], focal: str | None, pitch: str | None) -> bool:
+    """Whether focal lengths are to come from motion: asked for, or a video alone."""
+    from .image_calibration import is_video
+
+    alone = focal is None and pitch is None and len(inputs) == 1 and is_video(inputs[0])
+    return focal == "motion" or alone
+
+
+def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
+    """Calibrate from a clip, write the results and show them."""
+    from .motion_calibration import FILES, calibrate_motion
+    from .results_folder import results_folder
+
+    clip = Path(job.inputs[0])
+    if dry_run:
+        tell_plan([f"Focal lengths and lens from how {plain(str(clip))} moves."], job.output)
+        return
+    with results_folder(job.output, FILES, overwrite=job.overwrite) as folder:
+        with progress_bar("Following points", quiet=show.quiet) as progress:
+            from ..tracks.video import track_video
+
+            tracks = track_video(clip, progress=progress)
+        with stages(quiet=show.quiet) as stage:
+            done = calibrate_motion(clip, tracks, model=job.model, centre=job.centre, stage=stage)
+            done.make(folder, stage)
+    _show(done, job, show)
+    if show.strict and done.verdict != "good":
+        raise typer.Exit(NOT_GOOD)
+
+
+def _show(done: "MotionCalibration", job: ClipJob, show: Shown) -> None:
+    """Print what was found: as JSON, the verdict alone, or all."""
+    from rich.console import Console
+    from rich.text import Text
+
+    if show.as_json:
+        print(json.dumps(json.loads((job.output / "summary.json").read_text()), indent=2))
+        return
+    console = Console()
+    colour = {"good": "green", "doubtful": "yellow"}.get(done.verdict, "red")
+    console.print(Text.assemble((f"{done.verdict.capitalize()}:", f"bold {colour}"), " ", done.sentence()))
+    for finding in done.findings():
+        console.print(Text(f"  - {finding}"))
+    if show.quiet:
+        return
+    for line in done.lines():
+        console.print(line, highlight=False)
+    from .motion_calibration import FILES
+
+    print(f"\nWritten to {plain(str(job.output))}: {', '.join(FILES)}")
+    lens, track = job.output / "lens.json", job.output / "track.csv"
+    print(
+        f"Correct the clip with zoomjax undistort {plain(str(lens))} {plain(job.inputs[0])} "
+        f"--focal {plain(str(track))} -o corrected.mp4"
+    )

@@ -1,0 +1,238 @@
+"""A calibration from how a clip moves: tracks, the fit to them, and a folder of results."""
+
+import csv
+import dataclasses
+import importlib.metadata
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..fit.motion import MotionFit, fit_motion
+from ..fit.result import RESULTS
+from ..fit.zoom import CentreArgument
+from ..io.video_reader import decode_video
+from ..models.zoom import PolynomialZoom
+from ..tracks.tracks import Tracks
+from ..trust.bands import displacement_std
+from .model_choice import WantedModel
+
+FILES = ("lens.json", "track.csv", "tracks.npz", "summary.json", "motion.png", "panorama.jpg")
+"""What `MotionCalibration.make` writes."""
+
+_LOOSE_SCALE = 0.01
+"""Standard deviation of the common factor of focal lengths, relative, from which it is worth a word."""
+
+_ROUGH = 1.0  # px, of the noise of points
+_MISSED = 9.0  # times the noise, squared: views beyond do not follow the model
+_FEW = 0.5  # of the views that do follow it
+_MANY = 9.0  # focal lengths, more than any model needs
+_LEAST_ZOOM = 1.2  # between the ends of the focal lengths
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionCalibration:
+    """The lens and the path of a camera, from a clip.
+
+    Attributes:
+        clip: the clip.
+        tracks: what was followed in it.
+        fit: the lens and the path.
+        times: of each frame, its number in the file and its time, s; NaN where the file has none.
+    """
+
+    clip: Path
+    tracks: Tracks
+    fit: MotionFit
+    times: np.ndarray
+
+    def following(self) -> float:
+        """The share of the views that follow the model: the rest are on things that move, or mistakes."""
+        residual = np.asarray(self.fit.residual)[np.asarray(self.tracks.mask)]
+        return float(np.mean(residual**2 < _MISSED * (2.3849 * float(self.fit.noise)) ** 2))
+
+    def pan_and_tilt(self) -> np.ndarray:
+        """Angles of each frame to the right and up, degrees, from where the first of its shot looks."""
+        ahead = np.asarray(self.fit.rotation)[:, 2]
+        pan, tilt = np.arctan2(ahead[:, 0], ahead[:, 2]), -np.arcsin(np.clip(ahead[:, 1], -1, 1))
+        return np.degrees(np.stack([pan, tilt], axis=1))
+
+    def corner(self) -> list[tuple[float, float, float]]:
+        """Displacement of the image's corner, px, and its standard deviation, at some focal lengths."""
+        lens = self.fit.lens
+        low, high = (float(f) for f in lens.focal_range)
+        focal = [low, float(np.sqrt(low * high)), high]
+        corner = np.zeros(2)
+        centre = np.asarray(lens.centre)
+        std = np.asarray(displacement_std(self.fit.fit, corner, focal=np.array(focal)))
+        moved = [
+            np.hypot(*(np.asarray(lens(f).undistort(corner)) - centre)) - np.hypot(*centre) for f in focal
+        ]
+        return list(zip(focal, map(float, moved), std.tolist(), strict=True))
+
+    def scale_std(self) -> float:
+        """Standard deviation of the factor common to all focal lengths, relative."""
+        return float(np.sqrt(self.fit.covariance[-1, -1]))
+
+    def findings(self) -> list[str]:
+        """What the clip cannot tell, in sentences with what to do about it; empty if all is good."""
+        fit, told = self.fit, []
+        if fit.fit.result == RESULTS.undetermined:
+            told.append(
+                "The camera hardly turns, so the scale of the focal lengths is not determined: only their "
+                "ratios are. The lens straightens lines all the same. Film again and turn the camera by "
+                "some 10 degrees or more while it zooms."
+            )
+        elif fit.fit.result != RESULTS.successful:
+            told.append(RESULTS[fit.fit.result])
+        elif self.scale_std() > _LOOSE_SCALE:
+            told.append(
+                f"All focal lengths have a common factor that is known to {self.scale_std():.1%} only. "
+                "Turn the camera farther while it zooms."
+            )
+        low, high = (float(f) for f in fit.lens.focal_range)
+        if high < _LEAST_ZOOM * low:
+            told.append(
+                f"The focal length hardly changes, {low:.0f} to {high:.0f} px: this is the lens at one zoom."
+            )
+        if (share := self.following()) < _FEW:
+            told.append(
+                f"Only {share:.0%} of the tracked points move as a camera that turns makes them: much in "
+                "the clip moves by itself, or the camera does not stand still. Use a tripod."
+            )
+        if float(fit.noise) > _ROUGH:
+            told.append(
+                f"Points are off the model by {float(fit.noise):.2f} px: the clip is blurred, things near "
+                "the camera shift as it turns, or a rolling shutter bends the image. Turn more slowly."
+            )
+        shots = int(np.max(np.asarray(fit.shot))) + 1
+        if shots > 1:
+            told.append(
+                f"The clip has {shots - 1} cut{'s' * (shots > 2)}. The shots share one lens; the panorama "
+                "is of the longest."
+            )
+        if missing := int(np.sum(~np.isfinite(np.asarray(fit.focal)))):
+            told.append(f"{missing} frames show nothing that can be followed: their f is interpolated.")
+        return told
+
+    @property
+    def verdict(self) -> str:
+        """`poor` where the fit failed or is undetermined, `doubtful` where it is rough, or `good`."""
+        if self.fit.fit.result != RESULTS.successful or self.following() < _FEW:
+            return "poor"
+        rough = float(self.fit.noise) > _ROUGH or self.scale_std() > _LOOSE_SCALE
+        return "doubtful" if rough else "good"
+
+    def sentence(self) -> str:
+        """The verdict's reason, in words."""
+        low, high = (float(f) for f in self.fit.lens.focal_range)
+        pan, tilt = np.ptp(self.pan_and_tilt(), axis=0)
+        return (
+            f"{self.following():.0%} of the tracked points follow a camera that turns by {pan:.1f} by "
+            f"{tilt:.1f} degrees and zooms from {low:.0f} to {high:.0f} px, within "
+            f"{float(self.fit.noise):.2f} px."
+        )
+
+    def lines(self) -> list[str]:
+        """The figures, in lines of text."""
+        views = int(np.sum(np.asarray(self.tracks.mask)))
+        corner = [f"{moved:+.2f} ± {std:.2g} px at {f:.4g} px" for f, moved, std in self.corner()]
+        lens = self.fit.lens
+        low, high = (float(f) for f in lens.focal_range)
+        where = [np.asarray(lens(f).centre) for f in (low, high)]
+        return [
+            f"\n{views:,} views of {len(self.tracks.number):,} points in {self.tracks.frames:,} frames",
+            f"Standard deviation of all focal lengths together: {self.scale_std():.2%}",
+            f"Centre of distortion: ({where[0][0]:.1f}, {where[0][1]:.1f}) px at {low:.0f} px, "
+            f"({where[1][0]:.1f}, {where[1][1]:.1f}) px at {high:.0f} px",
+            f"The correction moves a corner by {', '.join(corner)}.",
+            "Look at panorama.jpg: what is blurred there and does not move by itself is in error.",
+        ]
+
+    def summary(self) -> dict[str, Any]:
+        """All figures as plain numbers and strings, for JSON."""
+        fit, lens = self.fit, self.fit.lens
+        return {
+            "verdict": self.verdict,
+            "findings": self.findings(),
+            "clip": self.clip.name,
+            "frames": self.tracks.frames,
+            "tracks": len(self.tracks.number),
+            "views": int(np.sum(np.asarray(self.tracks.mask))),
+            "views_that_follow": self.following(),
+            "noise": float(fit.noise),
+            "rms": float(fit.fit.rms),
+            "focal_range": [float(f) for f in lens.focal_range],
+            "focal_unit": lens.focal_unit,
+            "focal_scale_std": self.scale_std(),
+            "turned": np.ptp(self.pan_and_tilt(), axis=0).tolist(),
+            "shots": int(np.max(np.asarray(fit.shot))) + 1,
+            "image_size": list(lens.image_size),
+            "result": RESULTS[fit.fit.result] or "successful",
+            "corner_displacement": [{"focal": f, "px": px, "std": std} for f, px, std in self.corner()],
+            "parameters": np.asarray(lens.zoom.parameters).tolist(),
+            "versions": {
+                name: importlib.metadata.version(name) for name in ("zoomjax", "jax", "optimistix")
+            },
+        }
+
+    def write_track(self, path: Path) -> None:
+        """Write ``frame,seconds,focal,sigma``, which `undistort` takes; focal and sigma in px."""
+        focal, std = (np.asarray(values) for values in (self.fit.focal, self.fit.focal_std))
+        known = np.flatnonzero(np.isfinite(focal))
+        every = np.arange(len(focal))
+        focal = 1 / np.interp(every, known, 1 / focal[known])
+        std = np.interp(every, known, std[known])
+        with path.open("w", newline="") as file:
+            table = csv.writer(file)
+            table.writerow(["frame", "seconds", "focal", "sigma"])
+            for (number, seconds), f, sigma in zip(self.times.tolist(), focal, std, strict=True):
+                table.writerow([int(number), f"{seconds:.4f}", f"{f:.4f}", f"{sigma:.4f}"])
+
+    def make(self, folder: Path, stage: Callable[[str], None] = lambda _: None) -> None:
+        """Write the files of `FILES` into an empty folder."""
+        from .motion_plot import plot_motion
+        from .panorama import write_panorama
+
+        stage("Writing the results")
+        self.fit.lens.save(folder / "lens.json")
+        self.tracks.save(folder / "tracks.npz")
+        self.write_track(folder / "track.csv")
+        (folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n")
+        plot_motion(self).savefig(folder / "motion.png", dpi=150)
+        stage("Joining frames into a panorama")
+        write_panorama(self.clip, self.fit, folder / "panorama.jpg")
+
+
+def calibrate_motion(
+    clip: Path,
+    tracks: Tracks,
+    *,
+    model: WantedModel = WantedModel(),  # noqa: B008, it is frozen
+    centre: CentreArgument = "fit",
+    stage: Callable[[str], None] = lambda _: None,
+) -> MotionCalibration:
+    """Fit the path of the camera and the lens to what was followed in a clip.
+
+    Args:
+        clip: the clip.
+        tracks: of `track_video`.
+        model: the zoom model; by default a polynomial of degree 2 in 1/f with two coefficients.
+        centre: the centre of distortion: "fit", linear in 1/f, or "image".
+        stage: called with a description before each step that takes time.
+
+    Raises:
+        ValueError: float64 is not enabled.
+        RuntimeError: the fit failed.
+    """
+    with decode_video(clip) as (_, frames):
+        times = np.array([(number, time) for number, time, _ in frames], float)
+    stage("Fitting the camera's path and the lens")
+    candidate = model.base(np.arange(1.0, _MANY))
+    shift = PolynomialZoom(degree=1) if centre == "fit" else None
+    fit = fit_motion(tracks, zoom=candidate.zoom, terms=candidate.terms, shift=shift)
+    jax.block_until_ready(fit.focal)
+    return MotionCalibration(clip, tracks, fit, times)
