@@ -30,6 +30,7 @@ from jax.flatten_util import ravel_pytree
 
 from zoomjax import PolynomialZoom, ZoomLens
 from zoomjax.fit import RESULTS, MotionFit, fit_motion
+from zoomjax.models import certify
 from zoomjax.scenes import MotionScene, motion_tracks, pan_and_zoom
 
 from .shared import RESULTS as FOLDER
@@ -61,10 +62,13 @@ def random_scene(seed: int, path: dict, tracks: dict, frames: int = 150) -> tupl
     rng = np.random.default_rng(seed)
     given = {"low": 1200.0, "ratio": 4.0, "pan": 30, "tilt": 5} | path
     low, high = given["low"], given["low"] * given["ratio"]
-    k = rng.normal(size=(3, 2)) * [[0.02, 0.005], [0.05, 0.01], [0.1, 0.03]]
     centre = (np.array(SIZE) - 1) / 2 + rng.normal(0, 6, 2)
-    zoom = PolynomialZoom(2, jnp.asarray(k), jnp.array(low))
-    lens = ZoomLens(zoom, jnp.asarray(centre), jnp.array([low, high]), SIZE, "px")
+    while True:
+        k = rng.normal(size=(3, 2)) * [[0.02, 0.005], [0.05, 0.01], [0.1, 0.03]]
+        zoom = PolynomialZoom(2, jnp.asarray(k), jnp.array(low))
+        lens = ZoomLens(zoom, jnp.asarray(centre), jnp.array([low, high]), SIZE, "px")
+        if certify(lens).certified:
+            break
     where = pan_and_zoom(lens, frames, pan=given["pan"], tilt=given["tilt"], seed=seed)
     options = {"views": 200, "life": 40, "noise": 0.3} | tracks
     return lens, motion_tracks(lens, *where, seed=seed, **options)

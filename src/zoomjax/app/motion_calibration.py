@@ -96,7 +96,7 @@ class MotionCalibration:
         low, high = (float(f) for f in fit.lens.focal_range)
         if high < _LEAST_ZOOM * low:
             told.append(
-                f"The focal length hardly changes, {low:.0f} to {high:.0f} px: this is the lens at one zoom."
+                f"The focal length hardly changes, {low:.0f} to {high:.0f} px: this is one zoom only."
             )
         if (share := self.following()) < _FEW:
             told.append(
@@ -105,8 +105,9 @@ class MotionCalibration:
             )
         if float(fit.noise) > _ROUGH:
             told.append(
-                f"Points are off the model by {float(fit.noise):.2f} px: the clip is blurred, things near "
-                "the camera shift as it turns, or a rolling shutter bends the image. Turn more slowly."
+                f"Points are off the model by {float(fit.noise):.2f} px: the clip is blurred, much in it "
+                "moves by itself, things near the camera shift as it turns, or a rolling shutter bends the "
+                "image. Turn more slowly, before a scene at rest."
             )
         shots = int(np.max(np.asarray(fit.shot))) + 1
         if shots > 1:

@@ -1,0 +1,189 @@
+"""A clip and nothing else: the command line finds its focal lengths and its lens."""
+
+import csv
+import json
+import subprocess
+
+import av
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax.app.clips import ClipJob, wants_motion
+from zoomjax.app.model_choice import WantedModel
+from zoomjax.app.motion_calibration import FILES
+from zoomjax.fit.motion import fit_motion
+from zoomjax.scenes import motion_clip, motion_tracks, pan_and_zoom
+
+from .._commands import COMMAND
+
+SIZE, FRAMES = (640, 360), 36
+
+
+def lens():
+    """Barrel at the short end, by 30 px in the corners; the centre 3 px off."""
+    zoom = zj.PolynomialZoom(2, jnp.array([[0.02, 0.0], [-0.05, 0.01], [-0.1, 0.03]]), jnp.array(500.0))
+    return zj.ZoomLens(zoom, jnp.array([322.0, 178.0]), jnp.array([500.0, 1200.0]), SIZE, "px")
+
+
+def path():
+    return pan_and_zoom(lens(), FRAMES, pan=20, tilt=5)
+
+
+def zoomjax(*arguments, cwd):
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, cwd=cwd, timeout=600
+    )
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clip")
+    with av.open(str(folder / "clip.mp4"), "w") as out:
+        video = out.add_stream("libx264", rate=25)
+        video.width, video.height, video.pix_fmt = *SIZE, "yuv420p"
+        for image in motion_clip(lens(), *path(), noise=2).frames():
+            frame = av.VideoFrame.from_ndarray(image, "bgr24")
+            out.mux(video.encode(frame.reformat(format="yuv420p")))
+        out.mux(video.encode(None))
+    return folder / "clip.mp4"
+
+
+@pytest.fixture(scope="module")
+def calibrated(clip):
+    done = zoomjax("calibrate", clip.name, "-o", "out", cwd=clip.parent)
+    assert done.returncode == 0, done.stderr
+    return clip.parent / "out", done
+
+
+def track(folder):
+    with (folder / "track.csv").open() as file:
+        return {k: np.array(v, float) for k, v in zip_rows(csv.DictReader(file)).items()}
+
+
+def zip_rows(rows):
+    rows = list(rows)
+    return {name: [row[name] for row in rows] for name in rows[0]}
+
+
+def test_a_clip_alone_gives_its_focal_lengths_and_its_lens(calibrated):
+    folder, done = calibrated
+    assert {file.name for file in folder.iterdir()} >= set(FILES)
+    assert done.stdout.startswith("Good:")
+    found, focal = track(folder), path()[0]
+    assert abs(found["focal"] / focal - 1).max() < 0.005
+    assert (abs(found["focal"] - focal) < 5 * found["sigma"]).mean() > 0.8
+    np.testing.assert_allclose(found["frame"], np.arange(FRAMES))
+    np.testing.assert_allclose(found["seconds"], np.arange(FRAMES) / 25, atol=1e-3)
+    made, true = zj.load_lens(folder / "lens.json"), lens()
+    points = np.random.default_rng(0).uniform(0, SIZE, (50, 2))
+    for f in (510.0, 800.0, 1190.0):
+        missed = np.asarray(made(f).undistort(points)) - np.asarray(true(f).undistort(points))
+        assert np.hypot(*(missed - missed.mean(axis=0)).T).max() < 0.4
+    assert np.asarray(made(510.0).centre) == pytest.approx(np.array([322, 178]), abs=1)
+
+
+def test_its_summary_says_what_it_found(calibrated):
+    summary = json.loads((calibrated[0] / "summary.json").read_text())
+    assert summary["verdict"] == "good"
+    assert summary["frames"] == FRAMES
+    assert summary["views_that_follow"] > 0.95
+    assert summary["turned"][0] == pytest.approx(20, abs=1)
+    assert summary["corner_displacement"][0]["px"] < -10
+
+
+def test_the_track_corrects_the_clip(clip, calibrated):
+    arguments = ["undistort", "out/lens.json", clip.name, "--focal", "out/track.csv"]
+    done = zoomjax(*arguments, "-o", "corrected.mp4", cwd=clip.parent)
+    assert done.returncode == 0, done.stderr
+    with av.open(str(clip.parent / "corrected.mp4")) as video:
+        assert sum(1 for _ in video.decode(video=0)) == FRAMES
+
+
+def test_the_panorama_is_as_sharp_as_the_frames(calibrated):
+    """The mean of frames that were put beside one another wrongly would be smooth."""
+    import cv2
+
+    panorama = cv2.imread(str(calibrated[0] / "panorama.jpg"), cv2.IMREAD_GRAYSCALE)
+    assert panorama is not None
+    height, width = panorama.shape
+    middle = panorama[height // 3 : -height // 3, width // 3 : -width // 3].astype(float)
+    assert np.abs(np.diff(middle, axis=1)).mean() > 4
+
+
+@pytest.mark.slow
+def test_options_have_their_effect(clip, calibrated):
+    folder, _ = calibrated
+    options = ["--focal", "motion", "--centre", "image", "--degree", "1", "--quiet"]
+    done = zoomjax("calibrate", clip.name, *options, "-o", "other", cwd=clip.parent)
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) < 4
+    first, other = (zj.load_lens(place / "lens.json") for place in (folder, clip.parent / "other"))
+    assert other.shift is None
+    assert first.shift is not None
+    assert np.shape(other.zoom.parameters)[0] == 2
+    done = zoomjax("calibrate", clip.name, "--json", "-o", "third", cwd=clip.parent)
+    assert json.loads(done.stdout)["frames"] == FRAMES
+
+
+def test_a_dry_run_writes_nothing(clip):
+    done = zoomjax("calibrate", clip.name, "-o", "dry", "--dry-run", cwd=clip.parent)
+    assert "Nothing was written" in done.stdout
+    assert not (clip.parent / "dry").exists()
+
+
+@pytest.mark.parametrize(
+    ("inputs", "options", "message"),
+    [
+        (["a.jpg"], {}, "one video"),
+        (["a.mp4", "b.mp4"], {}, "one video"),
+        (["a.mp4"], {"unused": {"--pitch": "3"}}, "--pitch cannot be used"),
+        (["a.mp4"], {"centre": (3.0, 4.0)}, "--centre is fit or image"),
+    ],
+)
+def test_mistakes_are_told(tmp_path, inputs, options, message):
+    settings = {"model": WantedModel(), "centre": "fit", "unused": {}} | options
+    with pytest.raises(ValueError, match=message):
+        ClipJob(inputs, tmp_path, **settings)
+
+
+def test_motion_is_tried_where_nothing_else_is_given():
+    assert wants_motion(["a.mp4"], None, None)
+    assert wants_motion(["a.mp4"], "motion", None)
+    assert not wants_motion(["a.mp4"], "track.csv", None)
+    assert not wants_motion(["a.mp4"], None, "30")
+    assert not wants_motion(["a.jpg"], None, None)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Dropped")
+@pytest.mark.parametrize(
+    ("kind", "verdict", "finding"),
+    [
+        ("still", "poor", "hardly turns"),
+        ("one zoom", "good", "hardly changes"),
+        ("moving", "poor", "moves by itself"),
+        ("cut", "good", "1 cut"),
+    ],
+)
+def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
+    from zoomjax.app.motion_calibration import MotionCalibration
+    from zoomjax.tracks import Tracks
+
+    focal, rotation = path()
+    if kind == "still":
+        rotation = np.broadcast_to(rotation[0], rotation.shape)
+    if kind == "one zoom":
+        focal = np.full(FRAMES, 600.0)
+    moving = 0.8 if kind == "moving" else 0
+    tracks = motion_tracks(lens(), focal, rotation, views=80, life=15, noise=0.1, moving=moving).tracks
+    if kind == "cut":
+        track, frame, points = tracks.views()
+        tracks = Tracks.from_arrays(
+            2 * track + (frame >= FRAMES // 2), frame, points, image_size=SIZE, frames=FRAMES
+        )
+    fit = fit_motion(tracks, throw=False)
+    done = MotionCalibration(tmp_path / "clip.mp4", tracks, fit, np.zeros((FRAMES, 2)))
+    assert any(finding in sentence for sentence in done.findings()), done.findings()
+    assert done.verdict == verdict
