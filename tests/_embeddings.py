@@ -412,6 +412,7 @@ LEFT_OUT = {
         (
             *("frame_output", "select_model", "held_out_zoom", "held_out_frames"),
             *("suggest_next", "reject_points", "barrel_crossover", "assess", "evidence", "with_misfit"),
+            "fit_motion",
         ),
         BY_VALUES,
     ),

@@ -22,6 +22,7 @@ ROOT = Path(__file__).parents[2]
 ROOMS = (
     "models",
     "lines",
+    "tracks",
     "fit",
     "trust",
     "correct",

@@ -312,6 +312,12 @@ def vision() -> str:
     return markdown(heads, list(rows.values()))
 
 
+def motion() -> str:
+    """Focal lengths and lenses from motion, beside the bound."""
+    heads, rows = table_of("motion.md", "Simulated tracks")
+    return markdown(["", *heads[1:]], list(rows.values()))
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "rooms": rooms.table,
     "fit": fit,
@@ -331,5 +337,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "lensfun-forms": lensfun_forms,
     "board-focal": board_focal,
     "vision": vision,
+    "motion": motion,
 }
 """What makes each table, by the name in its marker."""

@@ -54,12 +54,6 @@ class MotionCalibration:
         residual = np.asarray(self.fit.residual)[np.asarray(self.tracks.mask)]
         return float(np.mean(residual**2 < _MISSED * (2.3849 * float(self.fit.noise)) ** 2))
 
-    def pan_and_tilt(self) -> np.ndarray:
-        """Angles of each frame to the right and up, degrees, from where the first of its shot looks."""
-        ahead = np.asarray(self.fit.rotation)[:, 2]
-        pan, tilt = np.arctan2(ahead[:, 0], ahead[:, 2]), -np.arcsin(np.clip(ahead[:, 1], -1, 1))
-        return np.degrees(np.stack([pan, tilt], axis=1))
-
     def corner(self) -> list[tuple[float, float, float]]:
         """Displacement of the image's corner, px, and its standard deviation, at some focal lengths."""
         lens = self.fit.lens
@@ -130,7 +124,7 @@ class MotionCalibration:
     def sentence(self) -> str:
         """The verdict's reason, in words."""
         low, high = (float(f) for f in self.fit.lens.focal_range)
-        pan, tilt = np.ptp(self.pan_and_tilt(), axis=0)
+        pan, tilt = np.ptp(np.asarray(self.fit.pan_and_tilt), axis=0)
         return (
             f"{self.following():.0%} of the tracked points follow a camera that turns by {pan:.1f} by "
             f"{tilt:.1f} degrees and zooms from {low:.0f} to {high:.0f} px, within "
@@ -169,7 +163,7 @@ class MotionCalibration:
             "focal_range": [float(f) for f in lens.focal_range],
             "focal_unit": lens.focal_unit,
             "focal_scale_std": self.scale_std(),
-            "turned": np.ptp(self.pan_and_tilt(), axis=0).tolist(),
+            "turned": np.ptp(np.asarray(self.fit.pan_and_tilt), axis=0).tolist(),
             "shots": int(np.max(np.asarray(fit.shot))) + 1,
             "image_size": list(lens.image_size),
             "result": RESULTS[fit.fit.result] or "successful",
@@ -195,7 +189,7 @@ class MotionCalibration:
 
     def make(self, folder: Path, stage: Callable[[str], None] = lambda _: None) -> None:
         """Write the files of `FILES` into an empty folder."""
-        from .motion_plot import plot_motion
+        from .motion_plot import plot_motion  # so that the rest does not need Matplotlib
         from .panorama import write_panorama
 
         stage("Writing the results")
@@ -203,7 +197,7 @@ class MotionCalibration:
         self.tracks.save(folder / "tracks.npz")
         self.write_track(folder / "track.csv")
         (folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n")
-        plot_motion(self).savefig(folder / "motion.png", dpi=150)
+        plot_motion(self.fit).savefig(folder / "motion.png", dpi=150)
         stage("Joining frames into a panorama")
         write_panorama(self.clip, self.fit, folder / "panorama.jpg")
 

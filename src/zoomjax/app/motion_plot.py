@@ -1,33 +1,29 @@
 """Plots of a calibration from motion: where the camera looked, how it zoomed, and the lens."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ..fit.motion import MotionFit
 from ..trust.bands import displacement_std
-
-if TYPE_CHECKING:
-    from .motion_calibration import MotionCalibration
 
 _MODEL, _FRAMES, _PALE = "#c2410c", "#1e3a5f", "#7da3c8"
 _BAND = 1.96  # standard deviations of a 95 % band
 
 
-def plot_motion(motion: "MotionCalibration") -> Figure:
+def plot_motion(fit: MotionFit) -> Figure:
     """Focal length and direction of each frame, and what the lens does to the corner at each zoom."""
     figure = Figure(figsize=(11, 7), layout="constrained")
     axes = figure.subplots(2, 2)
-    _focal(axes[0, 0], motion)
-    _direction(axes[0, 1], motion)
-    _corner(axes[1, 0], motion)
-    _residuals(axes[1, 1], motion)
+    _focal(axes[0, 0], fit)
+    _direction(axes[0, 1], fit)
+    _corner(axes[1, 0], fit)
+    _residuals(axes[1, 1], fit)
     return figure
 
 
-def _focal(axes: Axes, motion: "MotionCalibration") -> None:
-    focal, std = np.asarray(motion.fit.focal), np.asarray(motion.fit.focal_std)
+def _focal(axes: Axes, fit: MotionFit) -> None:
+    focal, std = np.asarray(fit.focal), np.asarray(fit.focal_std)
     frame = np.arange(len(focal))
     axes.fill_between(frame, focal - _BAND * std, focal + _BAND * std, color=_MODEL, alpha=0.25, lw=0)
     axes.plot(frame, focal, color=_MODEL)
@@ -35,8 +31,8 @@ def _focal(axes: Axes, motion: "MotionCalibration") -> None:
     axes.margins(x=0)
 
 
-def _direction(axes: Axes, motion: "MotionCalibration") -> None:
-    angles, shot = motion.pan_and_tilt(), np.asarray(motion.fit.shot)
+def _direction(axes: Axes, fit: MotionFit) -> None:
+    angles, shot = np.asarray(fit.pan_and_tilt), np.asarray(fit.shot)
     for number in range(shot.max() + 1):
         of_shot = angles[shot == number]
         axes.plot(of_shot[:, 0], of_shot[:, 1], color=_FRAMES, lw=1)
@@ -47,14 +43,14 @@ def _direction(axes: Axes, motion: "MotionCalibration") -> None:
     axes.set_aspect("equal", adjustable="datalim")
 
 
-def _corner(axes: Axes, motion: "MotionCalibration") -> None:
-    lens = motion.fit.lens
+def _corner(axes: Axes, fit: MotionFit) -> None:
+    lens = fit.lens
     low, high = (float(f) for f in lens.focal_range)
     focal = 1 / np.linspace(1 / low, 1 / high, 60)
     corner, centre = np.zeros(2), np.asarray(lens.centre)
     moved = [np.hypot(*(np.asarray(lens(f).undistort(corner)) - centre)) for f in focal]
     moved = np.array(moved) - np.hypot(*centre)
-    std = np.asarray(displacement_std(motion.fit.fit, corner, focal=focal))
+    std = np.asarray(displacement_std(fit.fit, corner, focal=focal))
     axes.fill_between(focal, moved - _BAND * std, moved + _BAND * std, color=_MODEL, alpha=0.25, lw=0)
     axes.plot(focal, moved, color=_MODEL)
     axes.axhline(0, color="0.7", lw=0.8, zorder=0)
@@ -66,12 +62,12 @@ def _corner(axes: Axes, motion: "MotionCalibration") -> None:
     axes.margins(x=0)
 
 
-def _residuals(axes: Axes, motion: "MotionCalibration") -> None:
-    mask = np.asarray(motion.tracks.mask)
-    residual = np.sort(np.asarray(motion.fit.residual)[mask])
+def _residuals(axes: Axes, fit: MotionFit) -> None:
+    residual = np.asarray(fit.residual)
+    residual = np.sort(residual[np.isfinite(residual)])  # others pad
     share = np.arange(1, len(residual) + 1) / len(residual)
     axes.plot(residual, share, color=_FRAMES)
-    noise = float(motion.fit.noise)
+    noise = float(fit.noise)
     sizes = np.geomspace(noise / 10, max(noise * 10, residual[-1]), 200)
     axes.plot(sizes, 1 - np.exp(-((sizes / noise) ** 2) / 2), color=_PALE, ls="--", zorder=0)
     axes.set_xscale("log")

@@ -63,14 +63,12 @@ def _seen(fit, focal, rotation, rays, image):
     distortion = fit.lens(focal)
     ahead = rays @ rotation.T
     front = ahead[..., 2] > _MARGIN
-    straight = (
-        np.asarray(distortion.centre)
-        + focal * ahead[..., :2] / np.where(front, ahead[..., 2], 1)[..., None]
-    )
+    depth = np.where(front, ahead[..., 2], 1)[..., None]
+    straight = np.asarray(distortion.centre) + focal * ahead[..., :2] / depth
     size = np.array(fit.lens.image_size)
-    near = front & (np.abs(straight - size / 2) < size).all(axis=-1)
+    near = np.logical_and(front, (np.abs(straight - size / 2) < size).all(axis=-1))
     place = np.full((*rays.shape[:2], 2), -10.0, np.float32)
     place[near] = np.nan_to_num(np.asarray(distortion.distort(straight[near])), nan=-10.0)
-    inside = ((place >= 0) & (place <= size - 1)).all(axis=-1)
+    inside = np.asarray(((place >= 0) & (place <= size - 1)).all(axis=-1))
     colours = cv2.remap(image, place[..., 0], place[..., 1], cv2.INTER_LINEAR).astype(np.float32)
     return np.concatenate([colours, np.ones_like(colours[..., :1])], axis=-1) * inside[..., None]

@@ -112,6 +112,12 @@ class MotionFit(eqx.Module):
         """The zoom lens."""
         return self.fit.lens
 
+    @property
+    def pan_and_tilt(self) -> Float[Array, "frame 2"]:
+        """Angles of each frame to the right and up, degrees, from where the first of its shot looks."""
+        x, y, z = self.rotation[:, 2].T
+        return jnp.degrees(jnp.stack([jnp.arctan2(x, z), -jnp.arcsin(jnp.clip(y, -1, 1))], axis=1))
+
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
         """Raise TypeError: call the lens of the fit instead."""
         raise TypeError("A MotionFit is not a lens: use fit.lens, as in fit.lens(2400.0).")
