@@ -2,7 +2,7 @@
 
 The rays of the first frame follow from a guess of its focal length. Each frame after it is fitted to the
 rays that frames before it gave (log f and rotation, robustly), and its views give or improve rays. All
-guesses run side by side; the one that leaves the least median residual is the start.
+guesses run side by side; those that leave the least median residuals are starts.
 """
 
 from typing import NamedTuple
@@ -16,6 +16,9 @@ from ._structure import bucket
 
 FIELDS_OF_VIEW = (70.0, 45.0, 28.0, 17.0, 10.0, 5.0)
 """Guesses, degrees across the image."""
+
+STARTS = 3
+"""Chains that are tried further: where a camera turns little, residuals hardly tell good from bad."""
 
 _TURNS = 12  # Gauss-Newton steps a frame
 _LEAST_VIEWS = 4
@@ -75,10 +78,10 @@ def shrunk_ray(ray: Float[Array, "3"], factor: Float[Array, ""]) -> Float[Array,
     return jnp.concatenate([scale * ray[:2], along[None]])
 
 
-def start_of(
+def starts_of(
     points: Float[Array, "view 2"], tracks: int, width: float, by_frame: tuple
 ) -> tuple[Path, Array]:
-    """The best chain of all guesses, and the median of its residuals, px.
+    """The best `STARTS` chains of all guesses, best first, and the medians of their residuals, px.
 
     Args:
         points: of each view, about the centre of the image, px.
@@ -103,7 +106,7 @@ def start_of(
         return Path(log_focal, rotation, rays), jnp.nanmean(residual)
 
     paths, residuals = jax.vmap(chain)(jnp.asarray(guesses, points.dtype))
-    best = jnp.argmin(jnp.where(jnp.isfinite(residuals), residuals, jnp.inf))
+    best = jnp.argsort(jnp.where(jnp.isfinite(residuals), residuals, jnp.inf))[:STARTS]
     return jax.tree.map(lambda leaf: leaf[best], paths), residuals[best]
 
 

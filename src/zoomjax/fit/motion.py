@@ -44,7 +44,7 @@ from ._motion_rows import (
     scaled,
     units_of,
 )
-from ._motion_start import start_of, views_by_frame
+from ._motion_start import STARTS, starts_of, views_by_frame
 from ._schur import Rows, Schur, Unknowns, covariances, reduced
 from ._structure import bucket, padded, structure_of
 from .result import RESULTS, ZoomFit, failed, judged
@@ -193,8 +193,8 @@ def fit_motion(
         unknowns=jnp.asarray(4.0 * np.sum(shot >= 0) + 2 * structure.tracks),
         scale=tracks.scale,
     )
-    path, spread = _started(data, views_by_frame(np.asarray(structure.track), moment, frames))
-    parts, missed = _in_stages(data, path, spread, zoom, shift, family, terms, tracks.image_size)
+    paths, spreads = _started(data, views_by_frame(np.asarray(structure.track), moment, frames))
+    parts, missed = _in_stages(data, paths, spreads, zoom, shift, family, terms, tracks.image_size)
     for name in ("focal", "focal_std", "rotation"):
         parts[name] = parts[name][: tracks.frames]
     parts["fit"] = eqx.tree_at(
@@ -258,29 +258,40 @@ def _pieces(track, moment):
 
 @eqx.filter_jit
 def _started(data, by_frame):
-    """The best chain of frames, scaled to focal lengths that are known, and its residuals' median."""
-    path, spread = start_of(data.points, data.structure.tracks, 1.6 * data.scale, by_frame)
-    off = jnp.where(jnp.isinf(data.log_std), jnp.nan, data.log_focal - path.log_focal)
-    return scaled(path, jnp.nan_to_num(jnp.nanmedian(off))), spread
+    """The best chains of frames, scaled to focal lengths that are known, and their residuals' medians."""
+    paths, spreads = starts_of(data.points, data.structure.tracks, 1.6 * data.scale, by_frame)
+
+    def to_known(path):
+        off = jnp.where(jnp.isinf(data.log_std), jnp.nan, data.log_focal - path.log_focal)
+        return scaled(path, jnp.nan_to_num(jnp.nanmedian(off)))
+
+    return jax.vmap(to_known)(paths), spreads
 
 
-def _in_stages(data, path, spread, zoom, shift, family, terms, image_size):
-    """The fit, with a prior of the lens that widens from stage to stage: the program is the same."""
-    focal = np.exp(np.asarray(path.log_focal))
-    model = Model(
-        path,
-        zoom.prepare(focal, family.size(terms)),
-        None if shift is None else shift.prepare(focal, 2),
-        family,
-    )
-    noise, result, steps = spread / _MEDIAN_OF_SIZE, None, None
-    for number, stage in enumerate(_STAGES):
+def _in_stages(data, paths, spreads, zoom, shift, family, terms, image_size):
+    """The fit, with a prior of the lens that widens from stage to stage: the program is the same.
+
+    The first stage goes from all starts. The one that leaves the least noise goes on.
+    """
+    tried = []
+    for path, spread in zip(_each(paths), spreads, strict=True):
+        focal = np.exp(np.asarray(path.log_focal))
+        prepared = None if shift is None else shift.prepare(focal, 2)
+        model = Model(path, zoom.prepare(focal, family.size(terms)), prepared, family)
+        wide = spread / _MEDIAN_OF_SIZE * _STAGES[0].wider
+        tried.append(_solved(data, model, wide, _arrays(_STAGES[0])))
+    model, noise, result, steps = min(tried, key=lambda found: np.nan_to_num(found[1], nan=np.inf))
+    for number, stage in enumerate(_STAGES[1:]):
         model, noise, result, steps = _solved(data, model, noise * stage.wider, _arrays(stage))
-        if number > 1 and result == RESULTS.successful:
+        if number > 0 and result == RESULTS.successful:
             break
-    return _described(
-        data, model, noise, _arrays(_STAGES[-1]._replace(own=_FREE)), result, steps, image_size
-    )
+    free = _arrays(_STAGES[-1]._replace(own=_FREE))
+    return _described(data, model, noise, free, result, steps, image_size)
+
+
+def _each(paths):
+    """The paths that are stacked in one."""
+    return [jax.tree.map(lambda leaf, place=place: leaf[place], paths) for place in range(STARTS)]
 
 
 def _arrays(stage):
