@@ -146,6 +146,7 @@ KNOWN = {
     "with_misfit": lambda x: zj.trust.with_misfit(table.fit(), traced_lines(x)),
     "reject_points": lambda x: zj.fit.reject_points(traced_lines(x)),
     "suggest_next": lambda x: zj.suggest_next(table.fit(), traced_lines(x)),
+    "fit_motion": lambda x: zj.fit.fit_motion(traced_tracks(x)),
     "barrel_crossover": lambda x: zj.models.barrel_crossover(np.array([20.0, 30.0]), x[:2, 0]),
 }
 
@@ -153,6 +154,12 @@ KNOWN = {
 def traced_lines(x):
     lines = table.lines()
     return eqx.tree_at(lambda lines: lines.points, lines, lines.points * x[0, 0])
+
+
+def traced_tracks(x):
+    points = np.array([[1.0, 2.0], [3.0, 2.0]])
+    tracks = zj.tracks.Tracks.from_arrays([0, 0], [0, 1], points, image_size=(8, 6))
+    return eqx.tree_at(lambda tracks: tracks.points, tracks, tracks.points * x[0, 0])
 
 
 @pytest.mark.parametrize("name", KNOWN)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_terms
-from .._core.types import AnyArray
+from .._core.types import AnyArray, of_known_values
 from ..models.family import AbstractFamily
 from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
@@ -124,6 +124,7 @@ class MotionFit(eqx.Module):
 
 
 @kinds_checked
+@of_known_values
 def fit_motion(
     tracks: Tracks,
     *,
@@ -290,7 +291,7 @@ def _in_stages(data, paths, spreads, zoom, shift, family, terms, image_size):
 
 
 def _each(paths):
-    """The paths that are stacked in one."""
+    """The paths in a stack."""
     return [jax.tree.map(lambda leaf, place=place: leaf[place], paths) for place in range(STARTS)]
 
 
