@@ -28,6 +28,7 @@ from ._commands import SEVERAL
 
 SIZE = (1072, 712)
 FOCAL = (20.56, 30.94, 41.38, 62.46, 127.36)
+TURNING = 24  # frames
 PAGES = {str(page.relative_to(ROOT)): page for page in pages()}
 
 
@@ -71,6 +72,7 @@ def given(tmp_path_factory):
     write_clip(folder / "clip.mp4", [cv2.imread(str(photo))[..., ::-1] for photo in photos])
     table(folder / "track.csv", "frame,focal", enumerate(FOCAL))
     write_clip(folder / "match.mp4", pitch_frames())
+    write_clip(folder / "turning.mp4", turning_frames())
     (folder / "views").mkdir()
     for number, view in enumerate(grid_views()):
         cv2.imwrite(str(folder / "views" / f"{number}.png"), view)
@@ -78,6 +80,7 @@ def given(tmp_path_factory):
     straight_lines_bent(folder / "lines.csv")
     table(folder / "frames.csv", "frame,focal", enumerate((24, 50, 80, 105)))
     calibrate(board(), model=WantedModel("polynomial"), centre=None).write(folder / "mylens")
+    table(folder / "mylens" / "track.csv", "frame,focal", enumerate(np.geomspace(24, 105, TURNING)))
     lens = scenes.nikkor_18_200((4288, 2848))
     zj.interop.write(lens, folder / "zoom.xml", format="lensfun", pixel_pitch=0.0055)
     return folder
@@ -123,6 +126,15 @@ def pitch_frames():
         fixed = np.rint(points * 16).astype(np.int32)
         cv2.polylines(frames[frame], [fixed], False, (250,) * 3, 6, cv2.LINE_AA, 4)
     return frames
+
+
+def turning_frames():
+    """What a camera sees that turns and zooms."""
+    size, focal = (536, 356), jnp.array([400.0, 900.0])
+    zoom = zj.PolynomialZoom(1, jnp.array([[0.0, 0.0], [-0.1, 0.02]]), focal[0])
+    lens = zj.ZoomLens(zoom, (jnp.array(size) - 1) / 2, focal, size, "px")
+    clip = scenes.motion_clip(lens, *scenes.pan_and_zoom(lens, TURNING, pan=20))
+    return [frame[..., ::-1] for frame in clip.frames()]
 
 
 def grid_views():
