@@ -67,8 +67,8 @@ that they show the same point says little more, and a cubic cost is saved."""
 
 _INFLATION = 1 / 0.95  # of variances, by what the loss loses
 
-_FREE = 10.0
-"""Standard deviation of a frame's log f, beside the common factor, where nothing is said of it."""
+_FREE = 10.0  # standard deviation of a frame's log f, beside the common factor, of which nothing is said
+_FAILED = "The fit failed: turn and zoom farther, or fit fewer coefficients about the image's centre."
 
 _UNKNOWN_SCALE = 0.1
 """Standard deviation of log f from which the focal lengths have no scale."""
@@ -212,7 +212,7 @@ def fit_motion(
 def thrown_motion(fit: MotionFit) -> MotionFit:
     """The fit, raising RuntimeError where its solver failed."""
     if bool(failed(fit.fit.result)):
-        raise RuntimeError(f"The fit failed. {RESULTS[fit.fit.result]}")
+        raise RuntimeError(f"{_FAILED} {RESULTS[fit.fit.result]}")
     return fit
 
 
