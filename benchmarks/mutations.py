@@ -208,6 +208,40 @@ def lines_values(lines: zj.Lines) -> bytes:
     return b"".join(np.asarray(field).tobytes() for field in used)
 
 
+def _tracks_files(folder: Path) -> list[bytes]:
+    rng = np.random.default_rng(0)
+    track, frame = np.repeat(np.arange(4), 3), np.tile(np.arange(3), 4)
+    points = rng.uniform(0, 60, (12, 2))
+    zj.tracks.Tracks.from_arrays(track, frame, points, image_size=(64, 64)).save(folder / "tracks.npz")
+    return [(folder / "tracks.npz").read_bytes()]
+
+
+def sound_tracks(tracks: zj.tracks.Tracks) -> None:
+    """Finite points, two a track, each in a frame of its own that there is."""
+    mask, frame = np.asarray(tracks.mask), np.asarray(tracks.frame)
+    assert np.isfinite(np.asarray(tracks.points)[mask]).all()
+    assert (mask.sum(1) >= 2).all()
+    assert frame[mask].min() >= 0
+    assert frame[mask].max() < tracks.frames
+    assert all(len(set(row[there])) == there.sum() for row, there in zip(frame, mask, strict=True))
+
+
+def tracks_values(tracks: zj.tracks.Tracks) -> bytes:
+    """All that a fit uses."""
+    used = (tracks.points, tracks.mask, tracks.frame, tracks.frames, tracks.image_size)
+    return b"".join(np.asarray(field).tobytes() for field in used)
+
+
+def read_tracks_csv(path: Path) -> zj.tracks.Tracks:
+    """With the image size that a caller would give."""
+    return zj.tracks.read_tracks_csv(path, image_size=(64, 64))
+
+
+CSV_TRACKS = b"track,frame,x,y\n" + b"".join(
+    b"%d,%d,%d.5,%d\n" % (n, m, 5 * n + m, 7 * m) for n in range(4) for m in range(3)
+)
+
+
 def every_model() -> list[zj.ZoomLens]:
     """A lens of each zoom model that has a file format."""
     lens, focal = scenes.nikkor_18_200((640, 427)), np.linspace(20.0, 120.0, 7)
@@ -403,6 +437,8 @@ READERS = {
     "lines.npz": Reader(".npz", _lines_files, zj.load_lines, sound_lines, lines_values),
     "lens.json": Reader(".json", _lens_files, zj.load_lens, sound_lens),
     "lines CSV": Reader(".csv", _constant(CSV_LINES), read_lines_csv, sound_lines),
+    "tracks.npz": Reader(".npz", _tracks_files, zj.tracks.load_tracks, sound_tracks, tracks_values),
+    "tracks CSV": Reader(".csv", _constant(CSV_TRACKS), read_tracks_csv, sound_tracks),
     "focal CSV": Reader(
         ".csv", _constant(b"frame,focal\n0,20\n1,35.5\n7,5e1\n"), zj.lines.read_focal_csv, sound_mapping
     ),

@@ -105,7 +105,9 @@ def page(results: dict) -> str:
         ]
         lines += [f"## {name.capitalize()}", "", *table(["", *COLUMNS], rows), ""]
         for row, counts in section["rows"].items():
-            others = [f"{key} {value}" for key, value in counts.items() if key not in COLUMNS]
+            others = [
+                f"{key} {value}" for key, value in counts.items() if key not in COLUMNS and value != []
+            ]
             if others:
                 lines += [f"{row.capitalize()}: {', '.join(others)}.", ""]
         lines += [

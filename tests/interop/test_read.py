@@ -60,6 +60,45 @@ def test_our_own_formula_comes_back_exactly(name, written):
     assert back(35.0).coefficients == pytest.approx(np.asarray(lens(35.0).coefficients), abs=1e-9)
 
 
+NUKE = """LD_3DE4_Radial_Standard_Degree_4 {
+ tde4_filmback_width_cm 3.6
+ tde4_filmback_height_cm 2.4
+ Distortion_Degree_2 %s
+ Quartic_Distortion_Degree_4 %s
+}
+"""
+
+
+@pytest.mark.parametrize(
+    "curve",
+    [
+        "{{curve x1 0.01 x2 0.02 x3 0.04}}",
+        "{{curve i x1 0.01 0.02 0.04}}",
+        "{{curve l x1 0.01 x2 0.02 s0 0.04}}",
+    ],
+)
+def test_curves_of_nuke_are_read_with_keys_left_out(curve, tmp_path):
+    (tmp_path / "a.nk").write_text(NUKE % (curve, "0.001"))
+    told = {"image_size": (360, 240), "focal": (24, 35, 50), "zoom": TableZoom()}
+    lens = zj.interop.read(tmp_path / "a.nk", **told).lens
+    first = [float(lens(f).coefficients[0]) for f in (24.0, 35.0, 50.0)]
+    assert first == pytest.approx([first[0] * n for n in (1, 2, 4)])
+    assert first[0] != 0
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "message"),
+    [
+        ("{{curve x1 0.01 x2 0.02}}", "{{curve x1 0 x5 0}}", "keys at different frames"),
+        ("{{curve}}", "0", "has no keys"),
+    ],
+)
+def test_curves_that_do_not_say_it_all_are_refused(first, second, message, tmp_path):
+    (tmp_path / "a.nk").write_text(NUKE % (first, second))
+    with pytest.raises(ValueError, match=message):
+        zj.interop.read(tmp_path / "a.nk", image_size=(360, 240), focal=(24, 35))
+
+
 @pytest.mark.parametrize(
     ("name", "kind", "family"),
     [

@@ -27,6 +27,16 @@ def test_folders_tell_images_of_one_name_apart(tmp_path):
     assert read.need("9x/other.png") == 35
 
 
+@pytest.mark.parametrize("name", ["/c.jpg", "//c.jpg", "/a/./c.jpg", "../c.jpg"])
+def test_an_absolute_name_is_that_image_alone(tmp_path, name):
+    (tmp_path / "focal.csv").write_text(f"image,focal\n{name},35\n")
+    table = read_focal_table(tmp_path / "focal.csv")
+    assert table.need(name) == 35
+    assert table.row(table.row(name)) == table.row(name)
+    assert table.row("c.jpg") is None
+    assert table.row("/elsewhere/c.jpg") is None
+
+
 def test_one_row_for_two_images_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"one row a\.png for two images, 1x/a\.png and 3x/a\.png"):
         table(tmp_path, "image,focal\na.png,24\n").of(["1x/a.png", "3x/a.png"])

@@ -62,8 +62,10 @@ class Nuke(Format):
         pitch = width / size[0]
         if abs(height / size[1] - pitch) > 1e-6 * pitch:
             raise ValueError("its filmback has another aspect than the image")
-        curves = {name: _keys(knobs.get(name, "0")) for name in _KNOBS}
-        frames = sorted(set().union(*curves.values()))
+        curves = {name: _keys(name, knobs.get(name, "0")) for name in _KNOBS}
+        frames = max((sorted(keys) for keys in curves.values()), key=len)
+        if any(len(keys) > 1 and sorted(keys) != frames for keys in curves.values()):
+            raise ValueError("its curves have keys at different frames")
         if job.focal is None or len(job.focal) != len(frames):
             raise ValueError(f"it holds no focal lengths: give argument focal, {len(frames)} of them")
         offset = [float(knobs.get(f"tde4_lens_center_offset_{axis}_cm", 0)) for axis in "xy"]
@@ -72,16 +74,26 @@ class Nuke(Format):
         for frame, focal in zip(frames, job.focal, strict=True):
             theta = np.zeros(4)
             for name, (place, sign) in _KNOBS.items():
-                theta[place] = sign * curves[name].get(frame, next(iter(curves[name].values())))
+                keys = curves[name]
+                theta[place] = sign * (keys[frame] if len(keys) > 1 else next(iter(keys.values())))
             nodes.append(Node(focal, _DEGREE_4, theta, centre))
         return Contents(tuple(nodes), size, "mm")
 
 
-def _keys(text: str) -> dict[int, float]:
-    """The keys of a knob: of a curve, or one of a constant."""
+def _keys(name: str, text: str) -> dict[int, float]:
+    """The keys of a knob: of a curve, or one of a constant. After a key, values belong to the next frames."""
     if "curve" not in text:
         return {1: float(text)}
-    return {int(x): float(value) for x, value in re.findall(r"x(-?\d+) (\S+?)(?=[\s}])", text)}
+    frame, keys = 1, {}
+    for word in re.sub(r"[{}]", " ", text).split():
+        if re.fullmatch(r"x-?\d+", word):
+            frame = int(word[1:])
+        elif re.match(r"[-+.\d]", word):  # others say how it is interpolated
+            keys[frame] = float(word)
+            frame += 1
+    if not keys:
+        raise ValueError(f"its curve {name} has no keys")
+    return keys
 
 
 def curve(nodes: list[Node], values: np.ndarray) -> str:

@@ -29,7 +29,7 @@ class FocalTable:
     def row(self, image: str | os.PathLike[str]) -> str | None:
         """The name of an image in the table, or None if it is not there."""
         parts = PurePath(image).parts
-        names = ("/".join(parts[start:]) for start in range(len(parts)))
+        names = (PurePath(*parts[start:]).as_posix() for start in range(len(parts)))
         return next((name for name in names if name in self._focals), None)
 
     def need(self, image: str | os.PathLike[str]) -> float:
@@ -91,8 +91,8 @@ def read_focal_table(path: str | os.PathLike[str]) -> FocalTable:
     for row, text, value, std in zip(
         table.rows, table.texts["image"], focal.tolist(), sigma.tolist(), strict=True
     ):
-        name = "/".join(PurePath(text.replace("\\", "/")).parts)
-        if not name:
+        name = PurePath(text.replace("\\", "/")).as_posix()
+        if name == ".":
             raise table.error(f"row {row} must name an image, but image is empty")
         told = (value, None if math.isnan(std) else std)
         if found.setdefault(name, told) != told:
