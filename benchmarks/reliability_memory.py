@@ -86,7 +86,7 @@ def _watched(sources: Iterable[Source], number: int, workers: int) -> dict:
         if done == number - 1:
             late = _held()
     grown = {name: round(late[name] - early[name], 1) for name in early}
-    return {"images": done, "problems": problems, **grown, "seconds": round(time.perf_counter() - start, 1)}
+    return {"tried": done, "problems": problems, **grown, "seconds": round(time.perf_counter() - start, 1)}
 
 
 def _held() -> dict[str, float]:

@@ -14,7 +14,7 @@ def test_photographs_frames_and_bad_files_leave_nothing_behind():
     from benchmarks import reliability_memory
 
     for name, row in reliability_memory.run(photos=160, frames=160, bad=160, workers=1).items():
-        assert row["images"] == 160, name
+        assert row["tried"] == 160, name
         assert (row["problems"] > 100) == (name == "bad files")
         assert row["MB"] < LEAST_SHOWN, name
         assert row["MB of workers"] < LEAST_SHOWN, name
