@@ -1,6 +1,6 @@
 """Focal lengths and the lens from how a clip moves: errors beside the Cramér-Rao bound, and times.
 
-    python -m benchmarks.motion [--sections NAME ...] [--clips N] [--output FILE]
+    python -m benchmarks.motion [--sections NAME ...] [--clips N] [--data FOLDER] [--output FILE]
 
 `simulated`: tracks with exact truth, of random lenses on random paths; everything is started from nothing.
 f is the RMS over the clips of the error of all focal lengths, relative. The lens's error is the RMS
@@ -8,8 +8,10 @@ distance of corrected points over the image, without a shift common to all of th
 The bound of each is what the covariance of the fit says, without what the robust loss loses. A clip
 diverged if its focal lengths are off by more than 3 times the bound and 1 %, and the fit says nothing.
 
-`real`: the paths and lenses of the shared broadcast clips, frame by frame; tracks of points of a stadium,
-noise 0.5 px, the centre unknown. The pupil is on the axis of rotation, or before it.
+`real`: focal lengths, principal points and lenses of the shared broadcast clips, every fourth frame; the
+camera stands where it stood, and what it looks at wanders over the pitch, as the data does not tell that.
+Tracks of points of a stadium, noise 0.5 px, the centre unknown. The pupil is on the axis of rotation, or
+before it; and with the pitch's lines in every fifth frame, a point each 20 px, noise 0.5 px.
 
 `time`: seconds of a second fit in the process, tracking apart, and the memory of the process.
 
@@ -18,6 +20,7 @@ Results go to benchmarks/results/motion.md and motion.json.
 
 import argparse
 import json
+import os
 import resource
 import time
 from pathlib import Path
@@ -28,11 +31,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from zoomjax import PolynomialZoom, ZoomLens
+from zoomjax import Distortion, Lines, PolynomialZoom, ZoomLens
 from zoomjax.fit import RESULTS, MotionFit, fit_motion
 from zoomjax.models import certify
 from zoomjax.scenes import MotionScene, motion_tracks, pan_and_zoom
 
+from .real.study_broadcast import SCALE, Clip, looking_at, pitch_lines, read_clip
 from .shared import RESULTS as FOLDER
 from .shared import machine, machine_line, table, write
 
@@ -166,6 +170,84 @@ def simulated(clips: int) -> dict:
     return rows
 
 
+class FrameLenses:
+    """The lenses of a clip's frames, by focal length: a radial polynomial that inverts OpenCV's."""
+
+    def __init__(self, clip: Clip, frames: np.ndarray):
+        self.image_size, self.focal = SIZE, clip.focal[frames] * (1 + 1e-9 * np.arange(len(frames)))
+        self.centre = clip.principal[frames]
+        self.k = [_inverse(f, k) for f, k in zip(clip.focal[frames], clip.k[frames], strict=True)]
+
+    def __call__(self, focal: float) -> Distortion:
+        """The lens of the frame with this focal length."""
+        frame = int(np.argmin(abs(self.focal - focal)))
+        return Distortion(self.k[frame], self.centre[frame], np.array(SCALE))
+
+
+def _inverse(focal: float, k: np.ndarray) -> np.ndarray:
+    """Five coefficients that correct what OpenCV's distort, over the image."""
+    r = np.linspace(0, 1.1, 200)[1:]
+    bent = r * SCALE * (1 + (r * SCALE / focal) ** 2 * (k[0] + (r * SCALE / focal) ** 2 * k[1])) / SCALE
+    powers = bent[:, None] ** (2 * np.arange(1, 6) + 1)
+    found = np.linalg.lstsq(powers, r - bent)[0]
+    assert abs(powers @ found - (r - bent)).max() * SCALE < 0.02
+    return found
+
+
+def real_scene(
+    clip: Clip, pupil: float, seed: int = 0
+) -> tuple[FrameLenses, MotionScene, Lines, np.ndarray]:
+    """Tracks and pitch lines of a clip; the frames of the lines."""
+    frames = np.arange(0, len(clip.focal), 4)
+    lenses, time = FrameLenses(clip, frames), np.linspace(0, 2 * np.pi * len(frames) / 150, len(frames))
+    aims = np.column_stack([30 * np.sin(1.3 * time), 5 + 10 * np.sin(2.1 * time), 0 * time])
+    turns = np.stack([looking_at(clip.position, aim) for aim in aims])
+    scene = motion_tracks(lenses, lenses.focal, turns, noise=0.5, pupil=pupil, seed=seed)
+    rng = np.random.default_rng(seed)
+    some = np.arange(0, len(frames), 5)
+    seen = [pitch_lines(clip, frames[place], turns[place]) for place in some]
+    points = [line[::5] + rng.normal(0, 0.5, line[::5].shape) for lines in seen for line in lines]
+    number = np.repeat(np.arange(len(some)), [len(lines) for lines in seen])
+    long = [len(line) >= 5 for line in points]
+    points = [np.clip(line, 0, np.array(SIZE) - 1) for line, use in zip(points, long, strict=True) if use]
+    used, place = np.unique(number[long], return_inverse=True)
+    lines = Lines.from_ragged(points, place, np.ones(len(used)), image_size=SIZE, focal_unit="px")
+    return lenses, scene, lines, some[used]
+
+
+def real(folder: Path) -> dict:
+    """Errors of each clip: as it is, with the pupil before the axis, and with the pitch's lines."""
+    rows = {}
+    for path in sorted((folder / "broadcast_cameras").glob("*.npz")):
+        clip = read_clip(path)
+        for kind, pupil, with_lines in (
+            ("", 0, False),
+            (", pupil 0.2 m", 0.2, False),
+            (", lines", 0, True),
+        ):
+            lenses, scene, lines, line_frames = real_scene(clip, pupil)
+            more = {"lines": lines, "line_frames": line_frames} if with_lines else {}
+            begin = time.perf_counter()
+            fit = fit_motion(scene.tracks, throw=False, **more)
+            seconds = time.perf_counter() - begin
+            own, shown = np.asarray(fit.focal), np.arange(0, len(scene.focal), 15)
+            missed = []
+            for frame in shown:
+                pair = (wide(fit.lens)(float(own[frame])), lenses(float(scene.focal[frame])))
+                a, b = (np.asarray(distortion.undistort(_SHOWN)) for distortion in pair)
+                missed.append((a - a.mean(axis=0)) - (b - b.mean(axis=0)))
+            rows[clip.name + kind] = {
+                "frames": len(own),
+                "f": float(np.sqrt(np.mean((own / scene.focal - 1) ** 2))),
+                "f_bound": float(np.sqrt(np.mean((np.asarray(fit.focal_std) / own) ** 2))),
+                "lens": float(np.sqrt(np.mean(np.sum(np.square(missed), axis=-1)))),
+                "good": bool(fit.fit.result == RESULTS.successful),
+                "seconds": seconds,
+            }
+            print(clip.name + kind, rows[clip.name + kind], flush=True)
+    return rows
+
+
 def timed(lengths: tuple[int, ...] = (150, 1500, 10_000)) -> dict:
     """Seconds of a fit, the second in the process, and the most memory that the process has had."""
     rows = {}
@@ -235,6 +317,21 @@ def page(results: dict) -> str:
             machine_line(results["simulated"]["machine"]),
             "",
         ]
+    if "real" in results:
+        rows = [
+            [
+                clip,
+                str(r["frames"]),
+                f"{100 * r['f']:.3f}",
+                f"{100 * r['f_bound']:.3f}",
+                f"{r['lens']:.3f}",
+                "yes" if r["good"] else "no",
+            ]
+            for clip, r in results["real"]["rows"].items()
+        ]
+        header = ["real lenses", "frames", "f, %", "its sd", "lens, px", "successful"]
+        lines += ["## Real lenses", "", *table(header, rows), "", machine_line(results["real"]["machine"])]
+        lines += [""]
     if "time" in results:
         rows = [
             [
@@ -256,16 +353,20 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    names = ("simulated", "time")
+    names = ("simulated", "real", "time")
     parser.add_argument("--sections", nargs="+", choices=names, default=list(names))
     parser.add_argument("--clips", type=int, default=20, help="of each kind")
+    parser.add_argument("--data", type=Path, default=os.environ.get("ZOOMJAX_DATA"), help="shared data")
     parser.add_argument("--output", type=Path, default=FOLDER / "motion.md")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     stored = options.output.with_suffix(".json")
     results = json.loads(stored.read_text()) if stored.exists() else {}
     for name in options.sections:
-        rows = simulated(options.clips) if name == "simulated" else timed()
+        if name == "real" and options.data is None:
+            parser.error("--data or ZOOMJAX_DATA must name the folder of the shared data")
+        make = {"simulated": lambda: simulated(options.clips), "real": lambda: real(options.data)}
+        rows = make.get(name, timed)()
         results[name] = {"rows": rows, "machine": machine()}
         write(options.output, page(results), results)
 

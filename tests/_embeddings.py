@@ -406,16 +406,17 @@ ROWS = [
 
 
 BY_VALUES = "decides by values; refuses those that are traced"
+OUTSIDE_OF_JIT = "differentiable, outside of jit and vmap alone"
 FILES = "reads or writes files, images or videos"
 LEFT_OUT = {
     **dict.fromkeys(
         (
             *("frame_output", "select_model", "held_out_zoom", "held_out_frames"),
             *("suggest_next", "reject_points", "barrel_crossover", "assess", "evidence", "with_misfit"),
-            "fit_motion",
         ),
         BY_VALUES,
     ),
+    "fit_motion": OUTSIDE_OF_JIT,
     **dict.fromkeys(
         (
             *("load_lens", "load_lines", "read_focal_csv", "read_focal_track", "read_lines_csv"),

@@ -5,6 +5,7 @@ import json
 import subprocess
 
 import av
+import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -37,16 +38,20 @@ def zoomjax(*arguments, cwd):
     )
 
 
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("clip")
-    with av.open(str(folder / "clip.mp4"), "w") as out:
+def write_clip(file, images):
+    with av.open(str(file), "w") as out:
         video = out.add_stream("libx264", rate=25)
         video.width, video.height, video.pix_fmt = *SIZE, "yuv420p"
-        for image in motion_clip(lens(), *path(), noise=2).frames():
+        for image in images:
             frame = av.VideoFrame.from_ndarray(image, "bgr24")
             out.mux(video.encode(frame.reformat(format="yuv420p")))
         out.mux(video.encode(None))
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clip")
+    write_clip(folder / "clip.mp4", motion_clip(lens(), *path(), noise=2).frames())
     return folder / "clip.mp4"
 
 
@@ -103,8 +108,6 @@ def test_the_track_corrects_the_clip(clip, calibrated):
 
 def test_the_panorama_is_as_sharp_as_the_frames(calibrated):
     """The mean of frames that were put beside one another wrongly would be smooth."""
-    import cv2
-
     panorama = cv2.imread(str(calibrated[0] / "panorama.jpg"), cv2.IMREAD_GRAYSCALE)
     assert panorama is not None
     height, width = panorama.shape
@@ -125,6 +128,47 @@ def test_options_have_their_effect(clip, calibrated):
     assert np.shape(other.zoom.parameters)[0] == 2
     done = zoomjax("calibrate", clip.name, "--json", "-o", "third", cwd=clip.parent)
     assert json.loads(done.stdout)["frames"] == FRAMES
+
+
+def draw_bars(image, index):
+    """Dark bars that stand in the scene, straight in the world."""
+    focal, rotation = (leaf[index] for leaf in path())
+    distortion = lens()(float(focal))
+    rng = np.random.default_rng(7)
+    for ends in np.concatenate([rng.uniform(-0.6, 0.6, (30, 2, 2)), np.ones((30, 2, 1))], axis=2):
+        a, b = ends @ rotation.T
+        ahead = a + np.linspace(0, 1, 400)[:, None] * (b - a)
+        straight = np.asarray(distortion.centre) + focal * ahead[:, :2] / ahead[:, 2:]
+        bent = np.asarray(distortion.distort(straight))
+        bent = bent[np.isfinite(bent).all(axis=1) & (abs(bent) < 2000).all(axis=1)]
+        at = np.rint(16 * bent).astype(np.int32)
+        cv2.polylines(image, [at], False, rng.uniform(0, 40, 3).tolist(), 5, cv2.LINE_AA, 4)
+    return image
+
+
+@pytest.mark.slow
+def test_lines_of_the_frames_join_if_wanted(tmp_path):
+    frames = [draw_bars(im, i) for i, im in enumerate(motion_clip(lens(), *path(), noise=2).frames())]
+    write_clip(tmp_path / "clip.mp4", frames)
+    for options in (["-o", "out"], ["--lines", "--frames", 9, "-o", "lined"]):
+        done = zoomjax("calibrate", "clip.mp4", *options, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    without, summary = (
+        json.loads((tmp_path / folder / "summary.json").read_text()) for folder in ("out", "lined")
+    )
+    assert without["lines"] == 0
+    assert summary["lines"] > 30
+    assert summary["line_noise"] < 0.3
+    assert summary["verdict"] == "good"
+    assert f"{summary['lines']} straight lines in 9 of them" in done.stdout
+    assert summary["focal_scale_std"] < without["focal_scale_std"]
+    assert abs(track(tmp_path / "lined")["focal"] / path()[0] - 1).max() < 0.005
+
+
+def test_lines_are_an_option_of_motion_alone(clip):
+    done = zoomjax("calibrate", clip.name, "--focal", "30", "--lines", "-o", "no", cwd=clip.parent)
+    assert done.returncode != 0
+    assert "--lines is for --focal motion" in done.stderr
 
 
 def test_a_dry_run_writes_nothing(clip):

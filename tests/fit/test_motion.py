@@ -1,14 +1,20 @@
 """Focal lengths, rotations and the lens from tracks alone, beside the truth."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zoomjax import PolynomialZoom, ZoomLens
+from zoomjax import Lines, PolynomialZoom, ZoomLens
 from zoomjax.fit import RESULTS, fit_motion
+from zoomjax.fit._motion_gradient import sensitive
+from zoomjax.fit._motion_problem import Asked, Given, problem_of
 from zoomjax.fit._motion_start import rotation_vector, shrunk_ray, turned
-from zoomjax.scenes import motion_tracks, pan_and_zoom
+from zoomjax.fit.motion import _fitted
+from zoomjax.lines import compress_any_centre
+from zoomjax.models import BrownConrady, RadialPolynomial
+from zoomjax.scenes import motion_lines, motion_tracks, pan_and_zoom
 from zoomjax.tracks import Tracks
 
 SIZE, FRAMES = (1280, 720), 24
@@ -143,6 +149,154 @@ def test_a_frame_without_tracks_does_not_matter(noisy, fit):
 def test_mistakes_are_told(noisy, changed, message):
     with pytest.raises((ValueError, TypeError), match=message):
         fit_motion(**({"tracks": noisy.tracks} | changed))
+
+
+@pytest.fixture(scope="module")
+def lines(lens, path):
+    return motion_lines(lens, path[0], noise=0.2, seed=1)
+
+
+@pytest.fixture(scope="module")
+def with_lines(noisy, lines):
+    return fit_motion(noisy.tracks, lines=lines)
+
+
+def test_lines_of_the_same_frames_make_the_lens_better(lens, path, fit, with_lines):
+    assert with_lines.fit.result == RESULTS.successful
+    assert displaced(lens, with_lines, path[0]) < 0.8 * displaced(lens, fit, path[0])
+    std = np.asarray(with_lines.focal_std)
+    assert (std < 0.5 * np.asarray(fit.focal_std)).all()
+    assert (abs(np.asarray(with_lines.focal) - path[0]) < 4 * std).all()
+    assert np.sqrt(with_lines.covariance[0, 0]) < 0.7 * np.sqrt(fit.covariance[0, 0])
+    # Distances across a line have the noise of one coordinate.
+    assert float(with_lines.line_noise) == pytest.approx(0.2, rel=0.1)
+    assert np.isnan(fit.line_noise)
+
+
+def test_lines_may_be_compressed_and_have_any_focal_length(noisy, lines, with_lines):
+    middle = (np.array(SIZE) - 1) / 2
+    small = compress_any_centre(lines.about(middle))
+    small = eqx.tree_at(lambda lines: lines.focal, small, jnp.ones(FRAMES))
+    other = fit_motion(noisy.tracks, lines=small)
+    np.testing.assert_allclose(other.focal, with_lines.focal, rtol=1e-5)
+
+
+def test_lines_of_some_frames_alone_count_there(noisy, lines, with_lines, fit):
+    some = np.flatnonzero(np.arange(FRAMES) % 3 == 0)
+    here = np.isin(lines.frame, some)
+    few = Lines.from_ragged(
+        [np.asarray(p)[np.asarray(m)] for p, m in zip(lines.points[here], lines.mask[here], strict=True)],
+        np.searchsorted(some, np.asarray(lines.frame)[here]),
+        np.ones(len(some)),
+        image_size=SIZE,
+    )
+    found = fit_motion(noisy.tracks, lines=few, line_frames=some)
+    std, most, least = (np.sqrt(f.covariance[-1, -1]) for f in (found, fit, with_lines))
+    assert 1.1 * least < std < 0.9 * most
+    assert float(found.line_noise) == pytest.approx(0.2, rel=0.15)
+
+
+def test_a_wrong_line_does_little_harm(lens, path, noisy, lines, with_lines):
+    t = np.linspace(100, 600, 60)
+    bent = np.stack([t + 100, 300 + 0.0004 * (t - 350) ** 2], axis=1)  # by 25 px
+    each = [np.asarray(p)[np.asarray(m)] for p, m in zip(lines.points, lines.mask, strict=True)]
+    frame = [*np.asarray(lines.frame), 2, 5]
+    more = Lines.from_ragged([*each, bent, bent], frame, path[0], image_size=SIZE, focal_unit="px")
+    other = fit_motion(noisy.tracks, lines=more)
+    assert displaced(lens, other, path[0]) < displaced(lens, with_lines, path[0]) + 0.1
+
+
+def test_lines_of_something_else_are_refused(noisy, lines, path):
+    few = Lines.from_ragged([np.asarray(lines.points[0])[:3]], [0], path[0][:1], image_size=SIZE)
+    with pytest.raises(ValueError, match="which of the 24 frames"):
+        fit_motion(noisy.tracks, lines=few)
+    with pytest.raises(ValueError, match="centre of the image"):
+        fit_motion(noisy.tracks, lines=compress_any_centre(lines.about(np.array([100.0, 100.0]))))
+    with pytest.raises(ValueError, match="compressed for 2 terms, but 3"):
+        fit_motion(noisy.tracks, lines=compress_any_centre(lines.about((np.array(SIZE) - 1) / 2)), terms=3)
+    with pytest.raises(ValueError, match="BrownConrady is not"):
+        fit_motion(noisy.tracks, lines=lines, family=BrownConrady())
+
+
+@pytest.fixture(scope="module")
+def rolling(lens, path):
+    return tracked(lens, slow(lens), noise=0.3, shutter=0.6)
+
+
+def slow(lens):
+    """A quarter of the way there and back: 24 frames of a real clip turn by some degrees, not by dozens."""
+    return tuple(leaf[:FRAMES] for leaf in pan_and_zoom(lens, 4 * FRAMES, pan=40, tilt=10))
+
+
+def test_a_rolling_shutter_is_measured(lens, rolling, fit):
+    found = fit_motion(rolling.tracks)
+    assert found.fit.result == RESULTS.successful
+    assert abs(found.readout - 0.6) < 0.03
+    assert found.readout_std < 0.01
+    assert displaced(lens, found, slow(lens)[0]) < 0.6
+    # A global shutter is one that takes no time.
+    assert abs(fit.readout) < 4 * fit.readout_std < 0.06
+
+
+def test_a_shutter_that_is_told_is_taken(lens, rolling):
+    told, denied = (fit_motion(rolling.tracks, readout=value, throw=False) for value in (0.6, 0))
+    assert abs(told.readout - 0.6) < 1e-3
+    focal = slow(lens)[0]
+    assert displaced(lens, told, focal) < 0.6
+    assert displaced(lens, denied, focal) > 2 * displaced(lens, told, focal)
+
+
+def test_a_camera_that_stands_still_tells_nothing_of_its_shutter(lens, path):
+    focal, rotation = path[0][:1].repeat(8), path[1][:1].repeat(8, axis=0)
+    fit = fit_motion(tracked(lens, (focal, rotation), noise=0.3).tracks, throw=False)
+    assert fit.readout_std > 0.4
+
+
+@pytest.mark.slow
+def test_derivatives_are_those_of_the_minimum(noisy, lines):
+    """Newton's method from the fit gives the minimum for other points, with the noise held."""
+    asked = Asked(PolynomialZoom(), RadialPolynomial(), 2, PolynomialZoom(degree=1), None)
+    given = Given(noisy.tracks, lines, None, None, np.inf)
+    _, model, noise = _fitted(given, asked, True)
+    data = problem_of(given, asked).data
+    rng = np.random.default_rng(0)
+    along = jnp.asarray(rng.normal(size=data.points.shape)) * data.there[:, None]
+
+    def minimum(h):
+        moved, found = eqx.tree_at(lambda data: data.points, data, data.points + h * along), model
+        for _ in range(5):
+            found = sensitive(moved, found, noise)
+        return values(found)
+
+    def values(found):
+        return jnp.concatenate([found.path.log_focal[:FRAMES], found.zoom.parameters.ravel()])
+
+    best = model
+    for _ in range(5):
+        best = sensitive(data, best, noise)
+    _, tangent = jax.jvp(
+        lambda points: values(sensitive(eqx.tree_at(lambda d: d.points, data, points), best, noise)),
+        (data.points,),
+        (along,),
+    )
+    finite = (minimum(1e-3) - minimum(-1e-3)) / 2e-3
+    np.testing.assert_allclose(tangent, finite, rtol=2e-3, atol=2e-3 * abs(finite).max())
+
+
+@pytest.mark.slow
+def test_a_fit_is_differentiable_outside_of_jit(noisy, lines):
+    points = jnp.asarray(noisy.tracks.points)
+
+    def corner(points):
+        tracks = eqx.tree_at(lambda tracks: tracks.points, noisy.tracks, points)
+        found = fit_motion(tracks, lines=lines)
+        return jnp.log(found.focal[5]) + found.lens.zoom.parameters[0, 0] + found.rays[3, 0]
+
+    slope = jax.grad(corner)(points)
+    assert np.isfinite(slope).all()
+    seen = np.asarray(noisy.tracks.mask)
+    assert (np.abs(slope[seen]).max(axis=1) > 0).mean() > 0.99
+    assert (slope[~seen] == 0).all()
 
 
 def test_rotations_there_and_back(rng):

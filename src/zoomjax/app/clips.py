@@ -14,6 +14,7 @@ from .plans import tell_plan
 from .shown import NOT_GOOD, Shown
 
 if TYPE_CHECKING:
+    from ..detect.batch import Detection
     from ..fit.zoom import CentreArgument
     from .model_choice import WantedModel
     from .motion_calibration import MotionCalibration
@@ -28,6 +29,11 @@ class ClipJob:
         output: folder of the results.
         model: the zoom model.
         centre: of distortion: "fit" or "image".
+        lines: whether straight lines in the frames are fitted, too; then also:
+        detector: of lines, by name.
+        frames: the most frames in which they are searched for.
+        workers: number of processes that search.
+        cache: folder of what was found in frames before; None for none.
         unused: options that have nothing to say here, and what was given for them.
         overwrite: whether to replace files that zoomjax did not write.
     """
@@ -37,6 +43,11 @@ class ClipJob:
     model: "WantedModel"
     centre: "CentreArgument"
     unused: Mapping[str, object]
+    lines: bool = False
+    detector: str = "edges"
+    frames: int = 60
+    workers: int = 1
+    cache: Path | None = None
     overwrite: bool = False
 
     def __post_init__(self):
@@ -70,19 +81,42 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
 
     clip = Path(job.inputs[0])
     if dry_run:
-        tell_plan([f"Focal lengths and lens from how {plain(str(clip))} moves."], job.output)
+        besides = f", and from lines in up to {job.frames} frames" * job.lines
+        tell_plan([f"Focal lengths and lens from how {plain(str(clip))} moves{besides}."], job.output)
         return
     with results_folder(job.output, FILES, overwrite=job.overwrite) as folder:
         with progress_bar("Following points", quiet=show.quiet) as progress:
             from ..tracks.video import track_video
 
             tracks = track_video(clip, progress=progress)
+        found = _lines(job, show) if job.lines else ()
         with stages(quiet=show.quiet) as stage:
-            done = calibrate_motion(clip, tracks, model=job.model, centre=job.centre, stage=stage)
+            done = calibrate_motion(
+                clip, tracks, found=found, model=job.model, centre=job.centre, stage=stage
+            )
             done.make(folder, stage)
     _show(done, job, show)
     if show.strict and done.verdict != "good":
         raise typer.Exit(NOT_GOOD)
+
+
+def _lines(job: ClipJob, show: Shown) -> "Sequence[Detection]":
+    """What the detector finds in frames of the clip."""
+    from ..detect.batch import DETECTORS, detect
+    from ..detect.sources import video_frames
+
+    frames = video_frames(job.inputs[0], 1.0, job.frames)  # nobody knows its focal lengths
+    found = detect(frames, DETECTORS[job.detector](), workers=job.workers, cache=job.cache)
+    with progress_bar("Detecting lines", quiet=show.quiet) as progress:
+        seen = []
+        for number, detection in enumerate(found, start=1):
+            seen.append(detection)
+            progress(number, job.frames)
+    if not any(detection.lines for detection in seen):
+        raise ValueError(
+            f"No lines were found in {len(seen)} frames of {plain(job.inputs[0])}: leave --lines out."
+        )
+    return seen
 
 
 def _show(done: "MotionCalibration", job: ClipJob, show: Shown) -> None:
@@ -100,7 +134,7 @@ def _show(done: "MotionCalibration", job: ClipJob, show: Shown) -> None:
         console.print(Text(f"  - {finding}"))
     if show.quiet:
         return
-    for line in done.lines():
+    for line in done.figures():
         console.print(line, highlight=False)
     from .motion_calibration import FILES
 

@@ -45,11 +45,13 @@ from .options import (
     DryRun,
     Exclude,
     FocalUnit,
+    Frames,
     Overlays,
     Pitch,
     Pixel,
     Quiet,
     Strict,
+    WithLines,
     excluded,
 )
 from .plans import images_plan, lines_plan, tell_plan, without
@@ -186,10 +188,8 @@ def calibrate(
     pitch: Pitch = None,
     distance: Distance = None,
     pixel: Pixel = None,
-    frames: Annotated[
-        int,
-        typer.Option(min=1, help="For a video: maximum number of frames used.", rich_help_panel=INPUT),
-    ] = 60,
+    with_lines: WithLines = False,
+    frames: Frames = 60,
     jobs: Annotated[
         int | None,
         typer.Option(
@@ -267,8 +267,24 @@ def calibrate(
 
     if wants_motion(inputs, focal, pitch):
         unused = {"--focal-sigma": focal_sigma, "--pitch": pitch, "--distance": distance, "--pixel": pixel}
-        clip = ClipJob(inputs, output, wanted, centre_of(centre), unused, overwrite)
+        clip = ClipJob(
+            inputs,
+            output,
+            wanted,
+            centre_of(centre),
+            unused,
+            lines=with_lines,
+            detector=detector,
+            frames=frames,
+            workers=jobs or number_of_cores(),
+            cache=cache_folder("detections") if cache else None,
+            overwrite=overwrite,
+        )
         return calibrate_clip(clip, show, dry_run=dry_run)
+    if with_lines:
+        raise ValueError(
+            "--lines is for --focal motion: lines are what everything else is calibrated from."
+        )
     job = ImageJob(
         tuple(inputs),
         detector=detector,

@@ -4,17 +4,19 @@ import csv
 import dataclasses
 import importlib.metadata
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from ..detect.batch import Detection
 from ..fit.motion import MotionFit, fit_motion
 from ..fit.result import RESULTS
 from ..fit.zoom import CentreArgument
 from ..io.video_reader import decode_video
+from ..lines.lines import Lines
 from ..models.zoom import PolynomialZoom
 from ..tracks.tracks import Tracks
 from ..trust.bands import displacement_std
@@ -26,7 +28,11 @@ FILES = ("lens.json", "track.csv", "tracks.npz", "summary.json", "motion.png", "
 _LOOSE_SCALE = 0.01
 """Standard deviation of the common factor of focal lengths, relative, from which it is worth a word."""
 
+_TOLD_SHUTTER = 0.1
+"""Standard deviation of the readout, in frames, below which it is told."""
+
 _ROUGH = 1.0  # px, of the noise of points
+_WRONG = 2.0  # px, of the noise of points: what is seen is no camera that turns
 _MISSED = 9.0  # times the noise, squared: views beyond do not follow the model
 _FEW = 0.5  # of the views that do follow it
 _MANY = 9.0  # focal lengths, more than any model needs
@@ -42,12 +48,14 @@ class MotionCalibration:
         tracks: what was followed in it.
         fit: the lens and the path.
         times: of each frame, its number in the file and its time, s; NaN where the file has none.
+        lines: straight lines in its frames that were fitted, too.
     """
 
     clip: Path
     tracks: Tracks
     fit: MotionFit
     times: np.ndarray
+    lines: Lines | None = None
 
     def following(self) -> float:
         """The share of the views that follow the model: the rest are on things that move, or mistakes."""
@@ -100,8 +108,8 @@ class MotionCalibration:
         if float(fit.noise) > _ROUGH:
             told.append(
                 f"Points are off the model by {float(fit.noise):.2f} px: the clip is blurred, much in it "
-                "moves by itself, things near the camera shift as it turns, or a rolling shutter bends the "
-                "image. Turn more slowly, before a scene at rest."
+                "moves by itself, or things near the camera shift as it turns. Turn more slowly, "
+                "before a scene at rest."
             )
         shots = int(np.max(np.asarray(fit.shot))) + 1
         if shots > 1:
@@ -115,8 +123,9 @@ class MotionCalibration:
 
     @property
     def verdict(self) -> str:
-        """`poor` where the fit failed or is undetermined, `doubtful` where it is rough, or `good`."""
-        if self.fit.fit.result != RESULTS.successful or self.following() < _FEW:
+        """`poor` if the fit failed, is undetermined or misses points, `doubtful` if rough, else `good`."""
+        missed = self.following() < _FEW or float(self.fit.noise) > _WRONG
+        if self.fit.fit.result != RESULTS.successful or missed:
             return "poor"
         rough = float(self.fit.noise) > _ROUGH or self.scale_std() > _LOOSE_SCALE
         return "doubtful" if rough else "good"
@@ -131,15 +140,28 @@ class MotionCalibration:
             f"{float(self.fit.noise):.2f} px."
         )
 
-    def lines(self) -> list[str]:
+    def figures(self) -> list[str]:
         """The figures, in lines of text."""
         views = int(np.sum(np.asarray(self.tracks.mask)))
         corner = [f"{moved:+.2f} ± {std:.2g} px at {f:.4g} px" for f, moved, std in self.corner()]
         lens = self.fit.lens
         low, high = (float(f) for f in lens.focal_range)
         where = [np.asarray(lens(f).centre) for f in (low, high)]
+        more = []
+        if self.lines is not None:
+            lines = self.lines
+            more.append(
+                f"{len(lines.frame):,} straight lines in {len(lines.focal):,} of them, "
+                f"off by {float(self.fit.line_noise):.2f} px"
+            )
+        if float(self.fit.readout_std) < _TOLD_SHUTTER:
+            more.append(
+                f"Time from the first row to the last: {float(self.fit.readout):.2f} ± "
+                f"{float(self.fit.readout_std):.2g} of a frame"
+            )
         return [
             f"\n{views:,} views of {len(self.tracks.number):,} points in {self.tracks.frames:,} frames",
+            *more,
             f"Standard deviation of all focal lengths together: {self.scale_std():.2%}",
             f"Centre of distortion: ({where[0][0]:.1f}, {where[0][1]:.1f}) px at {low:.0f} px, "
             f"({where[1][0]:.1f}, {where[1][1]:.1f}) px at {high:.0f} px",
@@ -159,6 +181,10 @@ class MotionCalibration:
             "views": int(np.sum(np.asarray(self.tracks.mask))),
             "views_that_follow": self.following(),
             "noise": float(fit.noise),
+            "lines": 0 if self.lines is None else len(self.lines.frame),
+            "line_noise": None if self.lines is None else float(fit.line_noise),
+            "readout": float(fit.readout),
+            "readout_std": float(fit.readout_std),
             "rms": float(fit.fit.rms),
             "focal_range": [float(f) for f in lens.focal_range],
             "focal_unit": lens.focal_unit,
@@ -206,6 +232,7 @@ def calibrate_motion(
     clip: Path,
     tracks: Tracks,
     *,
+    found: Sequence[Detection] = (),
     model: WantedModel = WantedModel(),  # noqa: B008, it is frozen
     centre: CentreArgument = "fit",
     stage: Callable[[str], None] = lambda _: None,
@@ -215,6 +242,7 @@ def calibrate_motion(
     Args:
         clip: the clip.
         tracks: of `track_video`.
+        found: lines in frames of the clip, by `video_frames` and `detect`.
         model: the zoom model; by default a polynomial of degree 2 in 1/f with two coefficients.
         centre: the centre of distortion: "fit", linear in 1/f, or "image".
         stage: called with a description before each step that takes time.
@@ -228,6 +256,30 @@ def calibrate_motion(
     stage("Fitting the camera's path and the lens")
     candidate = model.base(np.arange(1.0, _MANY))
     shift = PolynomialZoom(degree=1) if centre == "fit" else None
-    fit = fit_motion(tracks, zoom=candidate.zoom, terms=candidate.terms, shift=shift)
+    lines, line_frames = _lines_of(found, times)
+    fit = fit_motion(
+        tracks,
+        zoom=candidate.zoom,
+        terms=candidate.terms,
+        shift=shift,
+        lines=lines,
+        line_frames=line_frames,
+    )
     jax.block_until_ready(fit.focal)
-    return MotionCalibration(clip, tracks, fit, times)
+    return MotionCalibration(clip, tracks, fit, times, lines)
+
+
+def _lines_of(found, times):
+    """All lines, and the numbers of their frames among those of the tracks."""
+    seen = [detection for detection in found if detection.lines]
+    if not seen:
+        return None, None
+    number = [int(Path(detection.name).stem.rpartition("-")[2]) for detection in seen]  # of `video_frames`
+    lines = Lines.from_ragged(
+        [line for detection in seen for line in detection.lines],
+        np.repeat(np.arange(len(seen)), [len(detection.lines) for detection in seen]),
+        np.ones(len(seen)),
+        image_size=seen[0].image_size,
+        focal_unit="px",
+    )
+    return lines, np.searchsorted(times[:, 0], number)

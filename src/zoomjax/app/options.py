@@ -37,6 +37,22 @@ Overlays = Annotated[
         rich_help_panel=OUTPUT,
     ),
 ]
+WithLines = Annotated[
+    bool,
+    typer.Option(
+        "--lines",
+        help="With --focal motion: fit the straight lines that the detector finds in the frames, too.",
+        rich_help_panel=INPUT,
+    ),
+]
+Frames = Annotated[
+    int,
+    typer.Option(
+        min=1,
+        help="For a video: maximum number of frames in which lines are detected.",
+        rich_help_panel=INPUT,
+    ),
+]
 Exclude = Annotated[
     list[str] | None,
     typer.Option(

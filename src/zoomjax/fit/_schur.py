@@ -1,9 +1,10 @@
 """Linear least squares for many frames, many rays and one lens, in time that is linear in the frames.
 
 Each row belongs to one view: it depends on the four numbers of its frame, on the two of its ray, and on the
-lens. Rays are eliminated point by point (Schur complement). What is left couples frames that see a common
-ray. With frames in blocks as long as the longest track, only neighbouring blocks are coupled, and a block
-Cholesky factorisation goes from block to block; the lens is a border of few columns.
+lens; or to a line of a frame, and depends on no ray. Rays are eliminated point by point (Schur complement).
+What is left couples frames that see a common ray. With frames in blocks as long as the longest track, only
+neighbouring blocks are coupled, and a block Cholesky factorisation goes from block to block; the lens is a
+border of few columns.
 
 Normal equations square the condition of the problem: float64 only.
 """
@@ -39,11 +40,13 @@ class Rows(NamedTuple):
 
     Attributes:
         views: of each view; they depend on its frame, its ray and the lens.
+        lines: of each line; they depend on its frame and the lens.
         frames: of each frame, a number for each of its own.
         lens: of the lens alone.
     """
 
     views: Float[Array, "view 2"]
+    lines: Float[Array, "line some"]
     frames: Float[Array, "frame 4"]
     lens: Float[Array, "row"]
 
@@ -95,17 +98,25 @@ def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, dam
     border = _products(by_frame.views, by_lens.views) - _times(coupling, lens_solved[by_track])
     right = (_products(by_frame.views, views) - _times(coupling, solved[by_track]))[..., 0]
     extra = jnp.eye(4)[None] * (by_frame.frames**2 + damping)[:, :, None]
+    extra = extra.at[structure.line_frame].add(_line_products(by_frame.lines, by_frame.lines))
+    line_border = _line_products(by_frame.lines, by_lens.lines)
+    line_right = _line_products(by_frame.lines, rows.lines[..., None])[..., 0]
     own = _products(by_frame.views, by_frame.views)
     diagonal, above = _frame_blocks(own, _times(coupling, _root(inverse)[by_track]), extra, structure)
     corner = jnp.einsum("vri,vrj->ij", by_lens.views, by_lens.views) + by_lens.lens.T @ by_lens.lens
+    corner = corner + jnp.einsum("lri,lrj->ij", by_lens.lines, by_lens.lines)
     corner = corner - jnp.einsum("tik,tkj->ij", to_lens, lens_solved) + damping * jnp.eye(len(corner))
     right_lens = jnp.einsum("vri,vr->i", by_lens.views, rows.views) + by_lens.lens.T @ rows.lens
     right_lens = right_lens - jnp.einsum("tij,tj->i", to_lens, solved[..., 0])
-    own_right = _by_block(right, structure) + _padded(by_frame.frames * rows.frames, structure)
+    right_lens = right_lens + jnp.einsum("lri,lr->i", by_lens.lines, rows.lines)
+    right = _by_block(right, structure.frame, structure)
+    right = right + _by_block(line_right, structure.line_frame, structure)
+    own_right = right + _padded(by_frame.frames * rows.frames, structure)
+    border = _by_block(border, structure.frame, structure)
     return Reduced(
         diagonal,
         above,
-        _by_block(border, structure),
+        border + _by_block(line_border, structure.line_frame, structure),
         corner,
         own_right,
         right_lens,
@@ -116,18 +127,18 @@ def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, dam
 def _columns(jacobian, like):
     """The Jacobian's columns of each row: by its frame, by its ray and by the lens; the last axis."""
     lens, unravel = ravel_pytree(like.lens)
-    nothing = jax.tree.map(jnp.zeros_like, like)
+    along = jnp.eye(6 + lens.size)
+    directions = Unknowns(
+        jnp.broadcast_to(along[:, None, :4], (len(along), *like.frames.shape)),
+        jnp.broadcast_to(along[:, None, 4:6], (len(along), *like.rays.shape)),
+        jax.vmap(unravel)(along[:, 6:]),
+    )
+    out = jax.vmap(jacobian)(directions)  # at once: compiled once
 
-    def along(**directions):
-        return jacobian(nothing._replace(**directions))
+    def columns(part):
+        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf[part], 0, -1), out)
 
-    def stacked(make, size):
-        out = jax.vmap(make)(jnp.eye(size))
-        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), out)
-
-    by_frame = stacked(lambda e: along(frames=jnp.broadcast_to(e, like.frames.shape)), 4)
-    by_ray = stacked(lambda e: along(rays=jnp.broadcast_to(e, like.rays.shape)), 2)
-    by_lens = stacked(lambda e: along(lens=unravel(e)), lens.size)
+    by_frame, by_ray, by_lens = columns(slice(4)), columns(slice(4, 6)), columns(slice(6, None))
     own = jnp.diagonal(by_frame.frames, axis1=1, axis2=2)
     return by_frame._replace(frames=own), by_ray, by_lens
 
@@ -139,6 +150,11 @@ def _products(left, right):
     """
     x, y = (left[:, row, :, None] * right[:, row, None, :] for row in (0, 1))
     return x + y
+
+
+def _line_products(left, right):
+    """Of each line, the sum over its rows of the products of their columns."""
+    return jnp.einsum("lri,lrj->lij", left, right)
 
 
 def _times(left, right):
@@ -196,10 +212,10 @@ def _frame_blocks(own, halves, extra, structure):
     return diagonal, -coupled[:, :n, n:]
 
 
-def _by_block(values, structure):
-    """What each view adds to its frame, summed, by blocks."""
+def _by_block(values, frame, structure):
+    """What each view or line adds to its frame, summed, by blocks."""
     frames = structure.block * structure.blocks
-    total = jnp.zeros((frames, *values.shape[1:]), values.dtype).at[structure.frame].add(values)
+    total = jnp.zeros((frames, *values.shape[1:]), values.dtype).at[frame].add(values)
     return total.reshape(structure.blocks, 4 * structure.block, *values.shape[2:])
 
 
@@ -262,6 +278,19 @@ def solution(matrix: Reduced, like: Unknowns, structure: Structure) -> Unknowns:
     right_ray = right_ray - jnp.einsum("tij,i->tj", to_lens, of_lens)
     rays = _times(inverse, right_ray[..., None])[..., 0]
     return Unknowns(frames[: len(like.frames)], rays, unravel(of_lens))
+
+
+def solution_of(matrix: Reduced, right: Unknowns, structure: Structure) -> Unknowns:
+    """The unknowns for which the normal equations' matrix gives `right`."""
+    inverse, coupling, to_lens, _ = matrix.rays
+    solved = _times(inverse, right.rays[..., None])[..., 0]
+    coupled = jnp.sum(coupling * solved[structure.track][:, None, :], axis=2)
+    own = _padded(right.frames, structure) - _by_block(coupled, structure.frame, structure)
+    of_lens = ravel_pytree(right.lens)[0] - jnp.einsum("tij,tj->i", to_lens, solved)
+    matrix = matrix._replace(
+        right_frames=own, right_lens=of_lens, rays=(inverse, coupling, to_lens, right.rays)
+    )
+    return solution(matrix, right, structure)
 
 
 def covariances(

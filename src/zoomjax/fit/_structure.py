@@ -13,6 +13,7 @@ class Structure(eqx.Module):
         track, frame: of each view.
         place: of each view among those whose tracks begin in the same block; `members` of all blocks.
         begin: the block in which its track begins.
+        line_frame: the frame of each line.
         tracks: their number.
         block: frames in a block: at least as many as a track is long, from its first to its last.
         blocks: how many there are.
@@ -23,6 +24,7 @@ class Structure(eqx.Module):
     frame: Int[Array, "view"]
     place: Int[Array, "view"]
     begin: Int[Array, "view"]
+    line_frame: Int[Array, "line"]
     tracks: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
     blocks: int = eqx.field(static=True)
@@ -30,7 +32,11 @@ class Structure(eqx.Module):
 
 
 def structure_of(
-    track: Int[np.ndarray, "view"], frame: Int[np.ndarray, "view"], frames: int, block: int | None = None
+    track: Int[np.ndarray, "view"],
+    frame: Int[np.ndarray, "view"],
+    frames: int,
+    block: int | None = None,
+    line_frame: Int[np.ndarray, "line"] = np.zeros(0, int),  # noqa: B008, nothing to write to
 ) -> Structure:
     """The structure of views that are sorted by track, then by frame.
 
@@ -45,7 +51,7 @@ def structure_of(
     place = np.empty(len(tracks), int)
     place[order] = np.arange(len(tracks)) - np.repeat(np.cumsum(count) - count, count)
     return Structure(
-        *(jnp.asarray(a, jnp.int32) for a in (track, frame, place[track], begin[track])),
+        *(jnp.asarray(a, jnp.int32) for a in (track, frame, place[track], begin[track], line_frame)),
         tracks=len(tracks),
         block=block,
         blocks=len(count),
@@ -76,6 +82,7 @@ def padded(structure: Structure) -> Structure:
                 (structure.begin, structure.blocks),
             )
         ),
+        line_frame=structure.line_frame,
         tracks=bucket(structure.tracks + 1),
         block=structure.block,
         blocks=structure.blocks,

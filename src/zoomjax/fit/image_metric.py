@@ -58,9 +58,7 @@ class ImageLines(AbstractLines):
         rows = self.lines.corrected(coefficients)
         powers, _ = self.lines.expansion(coefficients)
         moments = self.lines.second_moments(2 * powers.shape[1])
-        squared = jax.vmap(_squared_stretch)(
-            powers, jax.vmap(line_normal)(rows), moments, self.lines.counts
-        )
+        squared = jax.vmap(squared_stretch)(powers, jax.vmap(line_normal)(rows), moments, self.lines.counts)
         # Beyond a fold, where it may vanish, nothing is to be gained either.
         return rows / jnp.sqrt(jnp.maximum(squared, 1e-4))[:, None, None]
 
@@ -122,7 +120,7 @@ def in_image(lines: AbstractLines) -> ImageLines:
     )
 
 
-def _squared_stretch(k, normal, moments, count):
+def squared_stretch(k, normal, moments, count):
     """The mean of ``|J^T n|^2`` over the points of one line; 1 where there are none."""
     terms = k.shape[0]
     kappa = jnp.concatenate([jnp.ones(1, k.dtype), k])

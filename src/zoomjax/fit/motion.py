@@ -2,7 +2,8 @@
 
 What is minimised says `_motion_rows`. The solver is optimistix' Levenberg-Marquardt with a linear solver
 made for this problem (`_schur`), in time that is linear in the number of frames. The start needs no guess
-(`_motion_start`); from there the loss narrows, and the lens joins by a prior that widens.
+(`_motion_start`); from there the loss narrows, and the lens joins by a prior that widens
+(`_motion_stages`).
 """
 
 from typing import Any, NoReturn
@@ -11,16 +12,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-import scipy.sparse.csgraph
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_terms
-from .._core.types import AnyArray, of_known_values
+from .._core.types import AnyArray, traced
+from ..lines.free_centre import AnyCentreLines
+from ..lines.lines import Lines
 from ..models.family import AbstractFamily
-from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ..models.zoom import (
@@ -29,49 +28,14 @@ from ..models.zoom import (
     PolynomialZoom,
 )
 from ..tracks.tracks import Tracks
-from ._least_squares import RoundingTrustRegion
-from ._motion_rows import (
-    CAUCHY,
-    Data,
-    Model,
-    Stage,
-    about_frames,
-    about_lens,
-    averaged,
-    moved,
-    residuals_of,
-    rows_of,
-    scaled,
-    units_of,
-)
-from ._motion_start import STARTS, starts_of, views_by_frame
-from ._schur import Rows, Schur, Unknowns, covariances, reduced
-from ._structure import bucket, padded, structure_of
-from .result import RESULTS, ZoomFit, failed, judged
+from ._motion_gradient import sensitive
+from ._motion_problem import Asked, Given, Problem, problem_of
+from ._motion_rows import Model, Noise, scaled
+from ._motion_stages import in_stages
+from ._motion_start import starts_of, views_by_frame
+from .result import RESULTS, ZoomFit, failed
 
-_MEDIAN_OF_SIZE = 1.1774  # of the length of a vector of two normal numbers
-
-
-_STAGES = (
-    Stage(0.3, 0.01, 4.0, change=1.0, damping=1e-3, own=0.05),
-    Stage(1.0, 0.05, 1.0, change=3.0, damping=1e-4, own=0.05),
-    *[Stage(1.0, 0.05, 1.0, change=0.1, damping=1e-7, own=0.05)] * 4,
-)
-"""They widen the prior of the lens and narrow the loss; they end where the noise and the solver do."""
-
-_MOST_STEPS = 30  # of a stage
-
-_LONGEST = 48
-"""Frames of a track that share a ray. Longer ones are cut, so that only frames near each other are coupled:
-that they show the same point says little more, and a cubic cost is saved."""
-
-_INFLATION = 1 / 0.95  # of variances, by what the loss loses
-
-_FREE = 10.0  # standard deviation of a frame's log f, beside the common factor, of which nothing is said
 _FAILED = "The fit failed: turn and zoom farther, or fit fewer coefficients about the image's centre."
-
-_UNKNOWN_SCALE = 0.1
-"""Standard deviation of log f from which the focal lengths have no scale."""
 
 
 class MotionFit(eqx.Module):
@@ -85,8 +49,8 @@ class MotionFit(eqx.Module):
             their ratios are known then, and the distortion straightens lines all the same.
         focal: focal length of each frame, px; NaN for a frame without tracks.
         focal_std: its standard deviation, px. Nearly all of it is a factor common to all frames.
-        covariance: of the zoom model's parameters, of those of the centre's offset, and of the logarithm of
-            that factor: that of the first frame.
+        covariance: of the zoom model's parameters, of those of the centre's offset, of the readout, and of
+            the logarithm of that factor: that of the first frame.
         rotation: of each frame, from the scene to the camera, whose axes are x right, y down and z
             forward. The first frame's is the identity. So is that of the first frame after a cut, across
             which no track goes: how the camera turned between them is not known.
@@ -95,6 +59,10 @@ class MotionFit(eqx.Module):
         rays: direction of each track in the scene, of length 1.
         residual: distance between each view and where the model puts it, px; NaN for padding.
         noise: standard deviation of a coordinate of a point, px, from the median of the residuals.
+        line_noise: standard deviation of points of lines from these, px of the image; NaN without lines.
+        readout: time that a rolling shutter takes from the first row to the last, in frames.
+        readout_std: its standard deviation. Near 0.5, nothing is known about it: the camera was too slow
+            to tell, and it does no harm.
     """
 
     fit: ZoomFit
@@ -106,6 +74,9 @@ class MotionFit(eqx.Module):
     rays: Float[Array, "track 3"]
     residual: Float[Array, "track view"]
     noise: Float[Array, ""]
+    line_noise: Float[Array, ""]
+    readout: Float[Array, ""]
+    readout_std: Float[Array, ""]
 
     @property
     def lens(self) -> ZoomLens:
@@ -124,7 +95,6 @@ class MotionFit(eqx.Module):
 
 
 @kinds_checked
-@of_known_values
 def fit_motion(
     tracks: Tracks,
     *,
@@ -132,6 +102,9 @@ def fit_motion(
     family: AbstractFamily | None = None,
     terms: int = 2,
     shift: AbstractZoom | None = PolynomialZoom(degree=1),  # noqa: B008, it is frozen
+    lines: Lines | AnyCentreLines | None = None,
+    line_frames: Int[AnyArray, "some"] | None = None,
+    readout: float | int | None = None,
     focal: Float[AnyArray, "frame"] | None = None,
     focal_std: float | Float[AnyArray, "frame"] = np.inf,
     throw: bool = True,
@@ -148,13 +121,22 @@ def fit_motion(
         terms: the number N of radial distortion coefficients.
         shift: zoom model of the offset of the centre of distortion from the centre of the image: linear
             in 1/f by default; None if there is none.
+        lines: straight lines that are seen in the same frames, which weigh by their own noise; or these
+            compressed about the centre of the image. Their focal lengths do not count.
+        line_frames: which of the tracks' frames each frame of the lines is; by default they are the same.
+        readout: time from the first row to the last, in frames: 0 for a global shutter. Fitted by default.
         focal: focal lengths that are known beforehand, px; NaN where not.
         focal_std: their standard deviations, px.
         throw: whether to raise if the fit fails. Otherwise see `ZoomFit.result`. `undetermined` and
             `folded` never raise.
 
+    Focal lengths, rotations, rays and lens are differentiable with respect to points, lines and known focal
+    lengths by ``grad``, ``jvp`` and their kin, outside of ``jit`` and ``vmap``: by the implicit function
+    theorem, with the noise by which residuals are weighted held as it is.
+
     Raises:
-        ValueError: float64 is not enabled, or the number of known focal lengths is not that of the frames.
+        ValueError: float64 is not enabled; the number of known focal lengths is not that of the frames; or
+            the lines are of other frames or images, or the distortion model is not radial.
         RuntimeError: the fit failed (see `throw`).
 
     References:
@@ -171,42 +153,82 @@ def fit_motion(
         raise ValueError("Argument zoom depends on the focus, which tracks do not have.")
     family = RadialPolynomial() if family is None else family
     terms = checked_terms(terms, family.most_terms)
-    known, known_std = _known_focal(focal, focal_std, tracks.frames)
-    track, view = np.nonzero(np.asarray(tracks.mask))
-    moment = np.asarray(tracks.frame)[track, view]
-    shot = _shots(track, moment, tracks.frames)
-    frames = bucket(tracks.frames)
-    more = frames - tracks.frames
-    structure = structure_of(_pieces(track, moment), moment, frames, min(_LONGEST, frames))
-    wide = padded(structure)
-    points = np.asarray(tracks.points, float)[track, view] - (np.array([tracks.image_size]) - 1) / 2
-    views = len(wide.track) - len(points)
-    data = Data(
-        points=jnp.asarray(np.pad(points, ((0, views), (0, 0)))),
-        there=jnp.arange(len(wide.track)) < len(points),
-        structure=wide,
-        fixed=jnp.asarray(
-            np.pad((shot < 0) | (np.diff(shot, prepend=-1) > 0), (0, more), constant_values=1)
+    given = Given(tracks, lines, line_frames, focal, focal_std)
+    asked = Asked(zoom, family, terms, shift, readout)
+    if not traced(given):
+        return _fitted(given, asked, throw)[0]
+    fit, model, noise = _constant(given, asked, throw)
+    problem = problem_of(given, asked)
+    return _with_model(fit, sensitive(problem.data, model, noise), problem)
+
+
+def _fitted(given: Given, asked: Asked, throw: bool) -> tuple[MotionFit, Model, Noise]:
+    """The fit, and what derivatives of it are found from."""
+    if traced(given):
+        raise ValueError(
+            "Arguments of fit_motion must have known values, because its control flow depends on them, but "
+            "some are traced: call it outside of jit and vmap. grad and jvp of it work there."
+        )
+    with jax.ensure_compile_time_eval():
+        found = _solved_motion(given, asked)
+    return (thrown_motion(found[0]), *found[1:]) if throw else found
+
+
+def _solved_motion(given, asked):
+    """The fit, the model that it is of, and the noise."""
+    problem, frames = problem_of(given, asked), given.tracks.frames
+    by_frame = views_by_frame(problem.piece, problem.moment, len(problem.data.log_focal))
+    paths, spreads = _started(problem.data, by_frame)
+    parts, missed, model, noise = in_stages(
+        problem.data, paths, spreads, asked.zoom, asked.shift, asked.family, asked.terms
+    )
+    parts["fit"] = eqx.tree_at(lambda fit: fit.frame_rms, parts["fit"], parts["fit"].frame_rms[:frames])
+    residual = jnp.full(np.shape(given.tracks.mask), jnp.nan)
+    fit = MotionFit(
+        **parts | {name: parts[name][:frames] for name in ("focal", "focal_std", "rotation")},
+        rays=_rays_of(model, problem, len(given.tracks.mask)),
+        residual=residual.at[problem.track, problem.view].set(missed[: len(problem.track)]),
+        shot=jnp.asarray(problem.shot, jnp.int32),
+    )
+    return fit, model, noise
+
+
+def _rays_of(model, problem, tracks):
+    """The direction of each track: the mean of those of its pieces."""
+    rays = jnp.zeros((tracks, 3)).at[problem.track].add(model.path.rays[problem.piece])
+    return rays / jnp.linalg.norm(rays, axis=1, keepdims=True)
+
+
+@eqx.filter_custom_jvp
+def _constant(given: Given, asked: Asked, throw: bool) -> tuple[MotionFit, Model, Noise]:
+    """The fit, as a constant for derivatives."""
+    return _fitted(given, asked, throw)
+
+
+@_constant.def_jvp
+def _no_change(values, changes):
+    del changes
+    found = _constant(*values)
+    return found, jax.tree.map(lambda _: None, found)
+
+
+def _with_model(fit: MotionFit, model: Model, problem: Problem) -> MotionFit:
+    """The fit with focal lengths, rotations, rays, lens and readout of a model."""
+    focal = jnp.exp(model.path.log_focal)[: len(fit.focal)]
+    lens = eqx.tree_at(lambda lens: lens.zoom, fit.lens, model.zoom)
+    if model.shift is not None:
+        lens = eqx.tree_at(lambda lens: lens.shift, lens, model.shift)
+    return eqx.tree_at(
+        lambda fit: (fit.fit.lens, fit.focal, fit.rotation, fit.rays, fit.readout),
+        fit,
+        (
+            lens,
+            jnp.where(jnp.isnan(fit.focal), jnp.nan, focal),
+            model.path.rotation[: len(fit.focal)],
+            _rays_of(model, problem, len(fit.rays)),
+            model.readout,
         ),
-        pinned=_first((shot >= 0) & np.isinf(known_std), frames),
-        log_focal=jnp.asarray(np.pad(np.log(known), (0, more))),
-        log_std=jnp.asarray(np.pad(known_std / known, (0, more), constant_values=np.inf)),
-        unknowns=jnp.asarray(4.0 * np.sum(shot >= 0) + 2 * structure.tracks),
-        scale=tracks.scale,
     )
-    paths, spreads = _started(data, views_by_frame(np.asarray(structure.track), moment, frames))
-    parts, missed = _in_stages(data, paths, spreads, zoom, shift, family, terms, tracks.image_size)
-    for name in ("focal", "focal_std", "rotation"):
-        parts[name] = parts[name][: tracks.frames]
-    parts["fit"] = eqx.tree_at(
-        lambda fit: fit.frame_rms, parts["fit"], parts["fit"].frame_rms[: tracks.frames]
-    )
-    residual = jnp.full(np.shape(tracks.mask), jnp.nan).at[track, view].set(missed[: len(points)])
-    rays = np.zeros((len(tracks.mask), 3))
-    np.add.at(rays, track, np.asarray(parts.pop("rays"))[np.asarray(structure.track)])
-    rays = jnp.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-    fit = MotionFit(**parts, rays=rays, residual=residual, shot=jnp.asarray(shot, jnp.int32))
-    return thrown_motion(fit) if throw else fit
 
 
 def thrown_motion(fit: MotionFit) -> MotionFit:
@@ -214,47 +236,6 @@ def thrown_motion(fit: MotionFit) -> MotionFit:
     if bool(failed(fit.fit.result)):
         raise RuntimeError(f"{_FAILED} {RESULTS[fit.fit.result]}")
     return fit
-
-
-def _known_focal(focal, focal_std, frames):
-    """Known focal lengths and standard deviations of all frames; 1 and infinity where there is none."""
-    values = np.full(frames, np.nan) if focal is None else np.asarray(focal, float)
-    if values.shape != (frames,):
-        raise ValueError(
-            f"Argument focal must have one number for each of the {frames} frames, NaN where it is not "
-            f"known, but its shape is {values.shape}."
-        )
-    there = np.isfinite(values)
-    if (values[there] <= 0).any() or not (np.asarray(focal_std) > 0).all():
-        raise ValueError("Arguments focal and focal_std must be positive.")
-    std = np.where(there, np.broadcast_to(focal_std, frames), np.inf)
-    return np.where(there, values, 1.0), std
-
-
-def _first(which, frames):
-    """The first that is set, alone."""
-    return jnp.asarray((np.arange(frames) == np.argmax(which)) & which.any())
-
-
-def _shots(track, moment, frames):
-    """The number of each frame's shot; -1 for frames without views. A track goes through no cut."""
-    same = track[1:] == track[:-1]
-    links = scipy.sparse.coo_array(
-        (np.ones(same.sum()), (moment[:-1][same], moment[1:][same])), (frames,) * 2
-    )
-    _, names = scipy.sparse.csgraph.connected_components(links, directed=False)
-    seen = np.bincount(moment, minlength=frames) > 0
-    _, first, place = np.unique(names[seen], return_index=True, return_inverse=True)
-    shot = np.full(frames, -1)
-    shot[seen] = np.argsort(np.argsort(first))[place]
-    return shot
-
-
-def _pieces(track, moment):
-    """Names of the tracks' pieces, each at most `_LONGEST` frames long, for each view."""
-    _, first, number = np.unique(track, return_index=True, return_inverse=True)
-    part = (moment - moment[first][number]) // _LONGEST
-    return np.unique(np.stack([track, part]), axis=1, return_inverse=True)[1].ravel()
 
 
 @eqx.filter_jit
@@ -267,134 +248,3 @@ def _started(data, by_frame):
         return scaled(path, jnp.nan_to_num(jnp.nanmedian(off)))
 
     return jax.vmap(to_known)(paths), spreads
-
-
-def _in_stages(data, paths, spreads, zoom, shift, family, terms, image_size):
-    """The fit, with a prior of the lens that widens from stage to stage: the program is the same.
-
-    The first stage goes from all starts. The one that leaves the least noise goes on.
-    """
-    tried = []
-    for path, spread in zip(_each(paths), spreads, strict=True):
-        focal = np.exp(np.asarray(path.log_focal))
-        prepared = None if shift is None else shift.prepare(focal, 2)
-        model = Model(path, zoom.prepare(focal, family.size(terms)), prepared, family)
-        wide = spread / _MEDIAN_OF_SIZE * _STAGES[0].wider
-        tried.append(_solved(data, model, wide, _arrays(_STAGES[0])))
-    model, noise, result, steps = min(tried, key=lambda found: np.nan_to_num(found[1], nan=np.inf))
-    for number, stage in enumerate(_STAGES[1:]):
-        model, noise, result, steps = _solved(data, model, noise * stage.wider, _arrays(stage))
-        if number > 0 and result == RESULTS.successful:
-            break
-    free = _arrays(_STAGES[-1]._replace(own=_FREE))
-    return _described(data, model, noise, free, result, steps, image_size)
-
-
-def _each(paths):
-    """The paths in a stack."""
-    return [jax.tree.map(lambda leaf, place=place: leaf[place], paths) for place in range(STARTS)]
-
-
-def _arrays(stage):
-    """Numbers that the compiled program takes, and is not compiled for."""
-    return jax.tree.map(jnp.asarray, stage)
-
-
-def _of_residuals(change):
-    """The size of a change of the residuals. Steps are not asked: along weak directions they say little."""
-    return jnp.zeros(()) if isinstance(change, Unknowns) else optx.two_norm(change)
-
-
-@eqx.filter_jit
-def _solved(data, model, noise, stage):
-    """The path and the lens of least energy, the noise, the solver's status and its steps."""
-    solver = optx.LevenbergMarquardt(
-        rtol=0.0, atol=stage.change, norm=_of_residuals, linear_solver=Schur(data.structure)
-    )
-    solver = eqx.tree_at(lambda s: s.search, solver, RoundingTrustRegion(first_damping=stage.damping))
-    model = eqx.tree_at(lambda m: m.path.rays, model, averaged(data, model))
-    start = jax.tree.map(jnp.zeros_like, units_of(data, model, noise))
-    solution = optx.least_squares(
-        rows_of, solver, start, args=(data, model, noise, stage), max_steps=_MOST_STEPS, throw=False
-    )
-    steps = jax.tree.map(jnp.multiply, solution.value, units_of(data, model, noise))
-    path, zoom, shift = moved(model, steps)
-    size = jnp.linalg.norm(residuals_of(data, path, zoom, shift, model.family), axis=-1)
-    rays = path.rays / jnp.linalg.norm(path.rays, axis=1, keepdims=True)
-    size = jnp.where(data.there, size, jnp.nan)
-    noise = jnp.maximum(jnp.nanmedian(size) / _MEDIAN_OF_SIZE, 1e-6)  # of tracks without noise
-    there = Model(path._replace(rays=rays), zoom, shift, model.family)
-    return there, noise, RESULTS.promote(solution.result), solution.stats["num_steps"]
-
-
-@eqx.filter_jit
-def _described(data, model, noise, stage, result, steps, image_size):
-    """The fit with its residuals, covariance and status."""
-    frames = len(model.path.log_focal)
-    units = units_of(data, model, noise)
-    zeros = jax.tree.map(jnp.zeros_like, units)
-
-    def plain(unknowns):  # without the loss: its efficiency is in `inflation`
-        steps = jax.tree.map(jnp.multiply, unknowns, units)
-        path, zoom, shift = moved(model, steps)
-        views = residuals_of(data, path, zoom, shift, model.family) / noise
-        views = jnp.where(inlier[..., None], views, 0)
-        frames = about_frames(data, path, unknowns, steps, stage)
-        return Rows(views, frames, about_lens(data, zoom, shift, unknowns, stage))
-
-    missed = residuals_of(data, model.path, model.zoom, model.shift, model.family)
-    squared = jnp.sum(missed**2, axis=-1) / (noise * CAUCHY) ** 2
-    inlier = data.there & (squared < 9)  # beyond, the loss nearly ignores a view
-    rows, jacobian = jax.linearize(plain, zeros)
-    matrix = reduced(jacobian, rows, zeros, data.structure, jnp.asarray(0.0))
-    own, lens, both = covariances(matrix, frames)
-    of_lens = ravel_pytree(units.lens)[0]
-    lens = lens * jnp.outer(of_lens, of_lens)
-    unit = units.frames[:, 0]
-    log_variance = own[:, 0, 0] * unit**2 + 2 * both[:, 0, -1] * unit * of_lens[-1] + lens[-1, -1]
-    count = 2 * jnp.sum(inlier)
-    free = count / (count - data.unknowns - len(lens))
-    inflation = _INFLATION * free
-    zoom_size = ravel_pytree(model.zoom.parameters)[0].size
-    joint, log_std = lens[:-1, :-1] * inflation, jnp.sqrt(log_variance * inflation)
-    focal = jnp.exp(model.path.log_focal)
-    unseen = jnp.zeros(frames).at[data.structure.frame].add(1.0 * data.there) == 0
-    fitted = ZoomLens(
-        zoom=model.zoom,
-        centre=(jnp.asarray(image_size, jnp.float64) - 1) / 2,
-        focal_range=jnp.stack(
-            [jnp.min(focal, where=~unseen, initial=jnp.inf), jnp.max(focal, where=~unseen, initial=0)]
-        ),
-        image_size=image_size,
-        focal_unit="px",
-        shift=model.shift,
-        family=model.family,
-    )
-    known = jnp.min(jnp.where(unseen, jnp.inf, log_std)) < _UNKNOWN_SCALE
-    certificate = certificate_of(
-        fitted.zoom, fitted.centre, fitted.focal_range, image_size, family=model.family, shift=model.shift
-    )
-    kept = jnp.where(inlier, jnp.sum(missed**2, axis=-1), 0)
-    in_frame = [jnp.zeros(frames).at[data.structure.frame].add(leaf) for leaf in (kept, 1.0 * inlier)]
-    rms = jnp.sqrt(jnp.sum(kept) / jnp.sum(inlier))
-    fit = ZoomFit(
-        lens=fitted,
-        rms=rms,
-        frame_rms=jnp.sqrt(in_frame[0] / in_frame[1]),
-        covariance=joint[:zoom_size, :zoom_size],
-        result=judged(fitted.zoom, result, known, certificate),
-        steps=steps,
-        certificate=certificate,
-        rms_unconstrained=rms,
-        joint=None if model.shift is None else joint,
-    )
-    parts = {
-        "fit": fit,
-        "focal": jnp.where(unseen, jnp.nan, focal),
-        "focal_std": jnp.where(unseen, jnp.nan, focal * log_std),
-        "covariance": lens * inflation,
-        "rotation": model.path.rotation,
-        "rays": model.path.rays,
-        "noise": noise * jnp.sqrt(free),
-    }
-    return parts, jnp.linalg.norm(missed, axis=-1)

@@ -81,7 +81,7 @@ class Nuke(Format):
 
 
 def _keys(name: str, text: str) -> dict[int, float]:
-    """The keys of a knob: of a curve, or one of a constant. After a key, values belong to the next frames."""
+    """The keys of a knob: of a curve, or one of a constant. Values after a key are of the next frames."""
     if "curve" not in text:
         return {1: float(text)}
     frame, keys = 1, {}

@@ -12,5 +12,6 @@ from .clip import MotionClip as MotionClip
 from .clip import leaves as leaves
 from .clip import motion_clip as motion_clip
 from .motion import MotionScene as MotionScene
+from .motion import motion_lines as motion_lines
 from .motion import motion_tracks as motion_tracks
 from .motion import pan_and_zoom as pan_and_zoom

@@ -16,10 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.spatial.transform import Rotation, Slerp
 
 from ..correct.image import remap
 from ..models.lens import ZoomLens
+from .motion import camera_between
 
 _SIDE, _PHASES = 0.11, 32
 """Of the cells that moving things stay in: radians, and after how many all repeats."""
@@ -121,13 +121,8 @@ class MotionClip:
         return frame + self.shutter * (y / (self.lens.image_size[1] - 1) - 0.5)
 
     def _camera(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Focal lengths and rotations at any times; before the first frame and after the last they stay."""
-        number = np.arange(len(self.focal))
-        time = np.clip(time, 0, number[-1])
-        focal = np.exp(np.interp(time, number, np.log(self.focal)))
-        if len(number) == 1:
-            return focal, np.broadcast_to(self.rotation, (len(time), 3, 3))
-        return focal, Slerp(number, Rotation.from_matrix(self.rotation))(time).as_matrix()
+        """Focal lengths and rotations at any times."""
+        return camera_between(self.focal, self.rotation)(time)
 
     def _things(self, frame: int) -> tuple[np.ndarray, float, float, float]:
         """Where each thing is from the middle of its cell; the sides of cell and thing; another texture."""

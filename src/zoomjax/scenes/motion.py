@@ -1,10 +1,14 @@
 """Tracks with exact truth: a camera on a tripod that pans, tilts and zooms, and points that it sees."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation, RotationSpline
 
+from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..tracks.tracks import Tracks
 
@@ -68,6 +72,7 @@ def motion_tracks(
     drift: float | int = 0,
     moving: float | int = 0,
     pupil: float | int = 0,
+    shutter: float | int = 0,
     distance: tuple[float, float] = (40.0, 120.0),
     seed: int = 0,
 ) -> MotionScene:
@@ -82,21 +87,24 @@ def motion_tracks(
         drift: of a track, px a frame: a random walk's steps.
         moving: share of tracks on things that move, some 2 px a frame.
         pupil: distance of the entrance pupil before the axis of rotation, m.
+        shutter: time from the first row to the last, in frames: 0 is a global shutter.
         distance: of the scene's points, m.
         seed: of everything random.
     """
     rng = np.random.default_rng(seed)
     corner = np.array(lens.image_size) - 1
+    seen_at = _Seen(lens, camera_between(focal, rotation), float(pupil), float(shutter))
     scene, last, speed, walk = np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2))
     first, alive = np.zeros(0, int), np.zeros(0, int)
     entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for frame, (f, turn) in enumerate(zip(focal, rotation, strict=True)):
         alive = alive[last[alive] > frame]
         walk[alive] += drift * rng.standard_normal((len(alive), 2))
-        alive, seen = _inside(lens, f, turn, scene, alive, pupil, speed * (frame - first)[:, None] + walk)
+        alive, seen = seen_at.inside(frame, scene, alive, speed * (frame - first)[:, None] + walk)
         new = max(views - len(alive), 0)
-        ahead = np.asarray(lens(float(f)).undistort(rng.uniform(0, corner, (new, 2))))
-        ahead = np.column_stack([(ahead - np.asarray(lens.centre)) / f, np.ones(new)])
+        distortion = lens(float(f))
+        ahead = np.asarray(distortion.undistort(rng.uniform(0, corner, (new, 2))))
+        ahead = np.column_stack([(ahead - np.asarray(distortion.centre)) / f, np.ones(new)])
         ahead *= rng.uniform(*distance, (new, 1)) / np.linalg.norm(ahead, axis=1, keepdims=True)
         on_move = rng.uniform(size=(new, 1)) < moving
         added = len(scene) + np.arange(new)
@@ -105,7 +113,7 @@ def motion_tracks(
         walk = np.concatenate([walk, np.zeros((new, 2))])
         first = np.append(first, np.full(new, frame))
         last = np.append(last, frame + 1 + rng.geometric(1 / life, new))
-        added, seen_first = _inside(lens, f, turn, scene, added, pupil, walk)
+        added, seen_first = seen_at.inside(frame, scene, added, walk)
         alive, seen = np.append(alive, added), np.concatenate([seen, seen_first])
         entries.append((alive, np.full(len(alive), frame), seen + noise * rng.standard_normal(seen.shape)))
     track, moment, seen = (np.concatenate(column) for column in zip(*entries, strict=True))
@@ -123,16 +131,97 @@ def motion_tracks(
     )
 
 
-def _inside(lens, focal, rotation, scene, which, pupil, shift):
-    """Which points of a scene a frame shows, and where, px."""
-    centre, corner = np.asarray(lens.centre), np.array(lens.image_size) - 1
-    ahead = scene[which] @ rotation.T - [0, 0, pupil]
-    front = ahead[:, 2] > 0
-    which, ahead = which[front], ahead[front]
-    straight = centre + focal * ahead[:, :2] / ahead[:, 2:]
-    seen = np.asarray(lens(float(focal)).distort(straight)) + shift[which]
-    inside = ((seen >= 0) & (seen <= corner)).all(axis=1)  # not where it is NaN
-    return which[inside], seen[inside]
+def motion_lines(
+    lens: ZoomLens,
+    focal: Float[np.ndarray, "frame"],
+    *,
+    number: int = 10,
+    spacing: float | int = 20,
+    noise: float | int = 0,
+    seed: int = 0,
+) -> Lines:
+    """Straight lines in any direction at each focal length, as a detector would give them.
+
+    Args:
+        lens: the true lens.
+        focal: focal lengths, a frame each.
+        number: of lines in each frame.
+        spacing: distance between neighbouring points of a line, px.
+        noise: standard deviation of each coordinate of each point, px.
+        seed: of everything random.
+    """
+    rng = np.random.default_rng(seed)
+    corner = np.array(lens.image_size) - 1
+    points: list[np.ndarray] = []
+    for f in focal:
+        distortion = lens(float(f))
+        first, last = np.asarray(distortion.undistort(rng.uniform(0, corner, (2, number, 2))))
+        for a, b in zip(first, last, strict=True):
+            along = np.linspace(0, 1, 3 + int(np.linalg.norm(b - a) / spacing))[:, None]
+            seen = np.asarray(distortion.distort(a + along * (b - a)))
+            points.append(np.clip(seen + noise * rng.standard_normal(seen.shape), 0, corner))
+    return Lines.from_ragged(
+        points,
+        np.repeat(np.arange(len(focal)), number),
+        focal,
+        image_size=lens.image_size,
+        focal_unit=lens.focal_unit,
+    )
+
+
+def camera_between(
+    focal: Float[np.ndarray, "frame"], rotation: Float[np.ndarray, "frame 3 3"]
+) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Focal lengths and rotations at any times, in frames, smooth; beyond the clip's ends they stay."""
+    number = np.arange(len(focal))
+    if len(number) == 1:
+        return lambda time: (focal.repeat(len(time)), rotation.repeat(len(time), axis=0))
+    zooms, turns = (
+        PchipInterpolator(number, np.log(focal)),
+        RotationSpline(number, Rotation.from_matrix(rotation)),
+    )
+
+    def camera(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        time = np.clip(time, 0, number[-1])
+        return np.exp(zooms(time)), turns(time).as_matrix()
+
+    return camera
+
+
+class _Seen(NamedTuple):
+    """What a moving camera sees of a scene."""
+
+    lens: ZoomLens
+    camera: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    pupil: float
+    shutter: float
+
+    def inside(self, frame, scene, which, shift):
+        """Which points of a scene a frame shows, and where, px."""
+        corner = np.array(self.lens.image_size) - 1
+        row = np.full(len(which), corner[1] / 2)
+        seen, front = np.zeros((len(which), 2)), np.zeros(len(which), bool)
+        for _ in range(1 + 4 * (self.shutter != 0)):  # the row tells the time, and the time the row
+            time = frame + self.shutter * (row / corner[1] - 0.5)
+            seen, front = self._at(time, scene[which])
+            row = np.where(np.isfinite(seen[:, 1]), seen[:, 1], row)
+        seen = seen + shift[which]
+        inside = front & ((seen >= 0) & (seen <= corner)).all(axis=1)  # not where it is NaN
+        return which[inside], seen[inside]
+
+    def _at(self, time, points):
+        """Where points are seen at times, px, and which are before the camera."""
+        times, which = np.unique(time, return_inverse=True)
+        focal, rotation = self.camera(times)
+        ahead = np.einsum("pij,pj->pi", rotation[which], points) - [0, 0, self.pupil]
+        front = ahead[:, 2] > 0
+        flat = focal[which, None] * ahead[:, :2] / np.where(front, ahead[:, 2], np.inf)[:, None]
+        if len(times) == 1:  # with a global shutter
+            distortion = self.lens(float(focal[0]))
+            return np.asarray(distortion.distort(np.asarray(distortion.centre) + flat)), front
+        distortions = self.lens(focal[which])
+        straight = np.asarray(distortions.centre) + flat
+        return np.asarray(distortions.distort(straight[:, None])[:, 0]), front
 
 
 def _rotation(pan: float, tilt: float) -> Float[np.ndarray, "3 3"]:

@@ -1,0 +1,54 @@
+"""Derivatives of `fit_motion` by its data, by the implicit function theorem.
+
+At the minimum the gradient g of the energy vanishes whatever the data, so that the unknowns change by
+``dx = -H^-1 dg``. H is the whole Hessian, applied without being formed; the equations are solved by
+conjugate gradients, which the Gauss-Newton matrix (`_schur`) preconditions so well that a few steps do.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.sparse.linalg import cg
+
+from ._motion_rows import Data, Model, Noise, Stage, moved, rows_of, units_of
+from ._motion_stages import STAGES
+from ._schur import Unknowns, reduced, solution_of
+
+_TOLERANCE = 1e-10
+_MOST_STEPS = 100
+_LITTLE = 1e-9  # added to the diagonal of the preconditioner: unknowns that no view sees
+
+
+@eqx.filter_jit
+def sensitive(data: Data, model: Model, noise: Noise) -> Model:
+    """The model of least energy, as a function of the data.
+
+    Args:
+        data: tracks and lines.
+        model: that of least energy; a constant.
+        noise: by which residuals are weighted; a constant.
+    """
+    stage = Stage(*(jnp.asarray(value, float) for value in STAGES[-1]))
+    units = units_of(data, model, noise)
+    zeros = jax.tree.map(jnp.zeros_like, units)
+    here = jax.tree.map(jax.lax.stop_gradient, data)
+
+    def gradient(data: Data, unknowns: Unknowns) -> Unknowns:
+        rows, back = jax.vjp(lambda x: rows_of(x, (data, model, noise, stage)), unknowns)
+        return back(rows)[0]
+
+    def times(vector: Unknowns) -> Unknowns:
+        return jax.jvp(lambda x: gradient(here, x), (zeros,), (vector,))[1]
+
+    rows, jacobian = jax.linearize(lambda x: rows_of(x, (here, model, noise, stage)), zeros)
+    matrix = reduced(jacobian, rows, zeros, data.structure, jnp.asarray(_LITTLE))
+
+    def nearly(vector: Unknowns) -> Unknowns:
+        return solution_of(matrix, vector, data.structure)
+
+    def solve(times, right):
+        return cg(times, right, tol=_TOLERANCE, maxiter=_MOST_STEPS, M=nearly)[0]
+
+    right = jax.tree.map(jnp.negative, gradient(data, zeros))
+    steps = jax.lax.custom_linear_solve(times, right, solve, symmetric=True)
+    return moved(model, jax.tree.map(jnp.multiply, steps, units))

@@ -1,0 +1,185 @@
+"""What `fit_motion` is given, in arrays of few sizes, as the residuals need it."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse.csgraph
+from jaxtyping import Float, Int
+
+from .._core.types import AnyArray, traced
+from ..lines.free_centre import AnyCentreLines, compress_any_centre
+from ..lines.lines import Lines
+from ..models.family import AbstractFamily, AbstractRadial
+from ..models.zoom import AbstractZoom
+from ..tracks.tracks import Tracks
+from ._motion_rows import Data
+from ._structure import bucket, padded, structure_of
+
+_READOUT = (0.0, 0.5)
+"""What is known of the readout before there is any data, and its standard deviation, in frames."""
+
+_TOLD = 1e-4  # standard deviation of a readout that is given
+
+_LONGEST = 48
+"""Frames of a track that share a ray. Longer ones are cut, so that only frames near each other are coupled:
+that they show the same point says little more, and a cubic cost is saved."""
+
+
+class Given(NamedTuple):
+    """What a fit is made from."""
+
+    tracks: Tracks
+    lines: Lines | AnyCentreLines | None
+    line_frames: Int[AnyArray, "some"] | None
+    focal: Float[AnyArray, "frame"] | None
+    focal_std: float | int | Float[AnyArray, "frame"]
+
+
+class Asked(NamedTuple):
+    """What is fitted."""
+
+    zoom: AbstractZoom
+    family: AbstractFamily
+    terms: int
+    shift: AbstractZoom | None
+    readout: float | int | None
+
+
+class Problem(NamedTuple):
+    """The data of a fit, and where its views are among the tracks'.
+
+    Attributes:
+        data: as `_motion_rows` needs them.
+        track, view: of each view, its place in the tracks.
+        moment: its frame.
+        piece: its track, cut into pieces.
+        shot: of each frame.
+    """
+
+    data: Data
+    track: np.ndarray
+    view: np.ndarray
+    moment: np.ndarray
+    piece: np.ndarray
+    shot: np.ndarray
+
+
+def problem_of(given: Given, asked: Asked) -> Problem:
+    """The data, in arrays of few sizes. Frames and masks are known; all else may be traced."""
+    tracks = given.tracks
+    focal, std = _known_focal(given.focal, given.focal_std, tracks.frames)
+    track, view = np.nonzero(np.asarray(tracks.mask))
+    moment = np.asarray(tracks.frame)[track, view]
+    shot = _shots(track, moment, tracks.frames)
+    frames = bucket(tracks.frames)
+    more = frames - tracks.frames
+    lines, line_frame = _ready_lines(given, asked.family, asked.family.size(asked.terms))
+    piece = _pieces(track, moment)
+    structure = structure_of(piece, moment, frames, min(_LONGEST, frames), line_frame=line_frame)
+    wide = padded(structure)
+    points = jnp.asarray(tracks.points, float)[track, view] - (np.array([tracks.image_size]) - 1) / 2
+    views = len(wide.track) - len(points)
+    new = (shot < 0) | (np.diff(shot, prepend=-1) > 0)
+    open_ = (shot >= 0) & jnp.isinf(std)
+    data = Data(
+        points=jnp.pad(points, ((0, views), (0, 0))),
+        there=jnp.arange(len(wide.track)) < len(points),
+        structure=wide,
+        fixed=jnp.asarray(np.pad(new, (0, more), constant_values=1)),
+        pinned=jnp.pad((np.arange(tracks.frames) == jnp.argmax(open_)) & jnp.any(open_), (0, more)),
+        log_focal=jnp.pad(jnp.log(focal), (0, more)),
+        log_std=jnp.pad(std / focal, (0, more), constant_values=np.inf),
+        unknowns=jnp.asarray(4.0 * np.sum(shot >= 0) + 2 * structure.tracks),
+        neighbours=jnp.asarray(_neighbours(np.pad(shot, (0, more), constant_values=-1))),
+        readout=jnp.asarray(_READOUT if asked.readout is None else (asked.readout, _TOLD)),
+        lines=lines,
+        moments=None if lines is None else lines.second_moments(2 * lines.terms),
+        scale=tracks.scale,
+        size=tracks.image_size,
+    )
+    return Problem(data, track, view, moment, piece, shot)
+
+
+def _known_focal(focal, focal_std, frames):
+    """Known focal lengths and standard deviations of all frames; 1 and infinity where there is none."""
+    values = jnp.full(frames, jnp.nan) if focal is None else jnp.asarray(focal, float)
+    if values.shape != (frames,):
+        raise ValueError(
+            f"Argument focal must have one number for each of the {frames} frames, NaN where it is not "
+            f"known, but its shape is {values.shape}."
+        )
+    if not traced((focal, focal_std)) and (np.any(values <= 0) or not np.all(np.asarray(focal_std) > 0)):
+        raise ValueError("Arguments focal and focal_std must be positive.")
+    there = jnp.isfinite(values)
+    std = jnp.where(there, jnp.broadcast_to(jnp.asarray(focal_std, float), frames), jnp.inf)
+    return jnp.where(there, values, 1.0), std
+
+
+def _ready_lines(given, family, size):
+    """Compressed lines, padded to one of few numbers of lines, and their frames."""
+    lines, line_frames, tracks = given.lines, given.line_frames, given.tracks
+    if lines is None:
+        return None, np.zeros(0, int)
+    if not isinstance(family, AbstractRadial):
+        raise ValueError(
+            f"Lines are fitted together with tracks for radial families: {type(family).__name__} is not."
+        )
+    if lines.image_size != tracks.image_size:
+        raise ValueError(
+            f"Argument lines is of images of {lines.image_size} px, but the tracks are of "
+            f"{tracks.image_size} px."
+        )
+    frames = np.arange(tracks.frames) if line_frames is None else np.asarray(line_frames)
+    if len(frames) != len(lines.focal) or frames.min() < 0 or frames.max() >= tracks.frames:
+        raise ValueError(
+            f"Argument line_frames must say which of the {tracks.frames} frames of the tracks each of the "
+            f"{len(lines.focal)} frames of the lines is, and it does not."
+        )
+    middle = (np.array(tracks.image_size) - 1) / 2
+    terms = family.expansion_terms(size)
+    small = compress_any_centre(lines.about(middle), terms) if isinstance(lines, Lines) else lines
+    if not np.allclose(small.centre, middle):
+        raise ValueError("Argument lines must be compressed about the centre of the image, and it is not.")
+    if small.terms < terms:
+        raise ValueError(
+            f"Argument lines is compressed for {small.terms} terms, but {terms} are needed: "
+            f"compress_any_centre(lines, terms={terms})."
+        )
+    frame = frames[np.asarray(small.frame)]
+    more = bucket(len(frame)) - len(frame)
+    frame = np.pad(frame, (0, more))
+    triangle = jnp.pad(small.triangle.astype(float), ((0, more), (0, 0), (0, 0)))
+    ones = jnp.ones(1)  # nothing here depends on focal lengths
+    ready = AnyCentreLines(
+        triangle, np.zeros_like(frame), ones, small.centre, small.image_size, small.focal_unit
+    )
+    return ready, frame
+
+
+def _neighbours(shot):
+    """Of each frame, the frames before and after it in the same shot, or itself."""
+    frame = np.arange(len(shot))
+    before, after = np.maximum(frame - 1, 0), np.minimum(frame + 1, len(shot) - 1)
+    return np.stack([np.where(shot[to] == shot, to, frame) for to in (before, after)], axis=1)
+
+
+def _shots(track, moment, frames):
+    """The number of each frame's shot; -1 for frames without views. A track goes through no cut."""
+    same = track[1:] == track[:-1]
+    links = scipy.sparse.coo_array(
+        (np.ones(same.sum()), (moment[:-1][same], moment[1:][same])), (frames,) * 2
+    )
+    _, names = scipy.sparse.csgraph.connected_components(links, directed=False)
+    seen = np.bincount(moment, minlength=frames) > 0
+    _, first, place = np.unique(names[seen], return_index=True, return_inverse=True)
+    shot = np.full(frames, -1)
+    shot[seen] = np.argsort(np.argsort(first))[place]
+    return shot
+
+
+def _pieces(track, moment):
+    """Names of the tracks' pieces, each at most `_LONGEST` frames long, for each view."""
+    _, first, number = np.unique(track, return_index=True, return_inverse=True)
+    part = (moment - moment[first][number]) // _LONGEST
+    return np.unique(np.stack([track, part]), axis=1, return_inverse=True)[1].ravel()

@@ -1,0 +1,235 @@
+"""The stages of `fit_motion`: from a start to the fit, and what is known about it."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+
+from ..models.invertibility import certificate_of
+from ..models.lens import ZoomLens
+from ._least_squares import RoundingTrustRegion
+from ._motion_rows import (
+    CAUCHY,
+    WRONG_LINE,
+    Model,
+    Noise,
+    Speed,
+    Stage,
+    about_frames,
+    about_lens,
+    averaged,
+    line_residuals_of,
+    line_squares_of,
+    moved,
+    residuals_of,
+    rows_of,
+    speed_of,
+    units_of,
+)
+from ._motion_start import STARTS
+from ._schur import Rows, Schur, Unknowns, covariances, reduced
+from .result import RESULTS, ZoomFit, judged
+
+_MEDIAN_OF_SIZE = 1.1774  # of the length of a vector of two normal numbers
+
+
+STAGES = (
+    Stage(0.3, 0.01, 0.05, 4.0, change=1.0, damping=1e-3, own=0.05, fresh=1.0),
+    Stage(1.0, 0.05, 1.0, 1.0, change=3.0, damping=1e-4, own=0.05),
+    *[Stage(1.0, 0.05, 1.0, 1.0, change=0.1, damping=1e-7, own=0.05)] * 4,
+)
+"""They widen the prior of the lens and narrow the loss; they end where the noise and the solver do."""
+
+_SAME = 0.99  # of the noise before a stage: one that leaves less was not the last
+
+_SETTLED = 3.0
+"""Change of the residuals over a whole stage, in all and in units of the noise, that is as good as none."""
+
+_MOST_STEPS = 30  # of a stage
+_EXACT = 1e-6  # px, noise of tracks and lines without noise
+
+_INFLATION = 1 / 0.95  # of variances, by what the loss loses
+
+_FREE = 10.0  # standard deviation of a frame's log f, beside the common factor, of which nothing is said
+
+_UNKNOWN_SCALE = 0.1
+"""Standard deviation of log f from which the focal lengths have no scale."""
+
+
+def in_stages(data, paths, spreads, zoom, shift, family, terms):
+    """The fit, with a prior of the lens that widens from stage to stage: the program is the same.
+
+    The first stage goes from all starts. The one that leaves the least noise goes on.
+
+    Args:
+        data: tracks and lines.
+        paths, spreads: starts, and the medians of their residuals, px.
+        zoom, shift, family, terms: as for `fit_motion`.
+
+    Returns:
+        The parts of a `MotionFit` by name, the sizes of the residuals of all views, the model, and the
+        noise that residuals were weighted by last.
+    """
+    tried = []
+    for path, spread in zip(_each(paths), spreads, strict=True):
+        focal = np.exp(np.asarray(path.log_focal))
+        prepared = None if shift is None else shift.prepare(focal, 2)
+        nothing = Speed(*2 * (jnp.zeros((len(focal), 4)),))
+        prepared_zoom = zoom.prepare(focal, family.size(terms))
+        model = Model(path, prepared_zoom, prepared, data.readout[0], nothing, family)
+        noise = Noise(spread / _MEDIAN_OF_SIZE, jnp.asarray(jnp.nan)).wider(STAGES[0].wider)
+        tried.append(_solved(data, *_arrays((model, noise, STAGES[0]))))
+    model, noise, result, steps = min(tried, key=lambda found: np.nan_to_num(found[1].points, nan=np.inf))
+    weighted_by = noise
+    for number, stage in enumerate(STAGES[1:]):
+        weighted_by = noise.wider(stage.wider)
+        model, noise, result, steps = _solved(data, *_arrays((model, weighted_by, stage)))
+        if number > 0 and result == RESULTS.successful and noise.points > _SAME * weighted_by.points:
+            break
+    free = _arrays(STAGES[-1]._replace(own=_FREE))
+    return *_described(data, model, noise, free, result, steps), *_arrays((model, weighted_by))
+
+
+def _each(paths):
+    """The paths in a stack."""
+    return [jax.tree.map(lambda leaf, place=place: leaf[place], paths) for place in range(STARTS)]
+
+
+def _arrays(tree):
+    """Numbers that the compiled program takes, and is not compiled for, whatever they come from."""
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, jnp.float64) if eqx.is_inexact_array_like(leaf) else leaf, tree
+    )
+
+
+def _of_residuals(change):
+    """The size of a change of the residuals. Steps are not asked: along weak directions they say little."""
+    return jnp.zeros(()) if isinstance(change, Unknowns) else optx.two_norm(change)
+
+
+@eqx.filter_jit
+def _solved(data, model, noise, stage):
+    """The path and the lens of least energy, the noise, the solver's status and its steps.
+
+    A stage whose steps are spent is successful if all of them moved the residuals by less than their noise
+    does: with heavy tails the last steps are many and small.
+    """
+    solver = optx.LevenbergMarquardt(
+        rtol=0.0, atol=stage.change, norm=_of_residuals, linear_solver=Schur(data.structure)
+    )
+    solver = eqx.tree_at(lambda s: s.search, solver, RoundingTrustRegion(first_damping=stage.damping))
+    model = eqx.tree_at(lambda m: m.speed, model, speed_of(model.path, data.neighbours))
+    rays = jnp.where(stage.fresh > 0, averaged(data, model), model.path.rays)
+    model = eqx.tree_at(lambda m: m.path.rays, model, rays)
+    of_lines = stage.wider * _line_noise(data, model)
+    noise = noise._replace(lines=jnp.where(jnp.isnan(noise.lines), of_lines, noise.lines))
+    units = units_of(data, model, noise)
+    solution = optx.least_squares(
+        rows_of,
+        solver,
+        jax.tree.map(jnp.zeros_like, units),
+        args=(data, model, noise, stage),
+        max_steps=_MOST_STEPS,
+        throw=False,
+    )
+    first = residuals_of(data, model)
+    model = moved(model, jax.tree.map(jnp.multiply, solution.value, units))
+    views = residuals_of(data, model)
+    size = jnp.linalg.norm(views, axis=-1)
+    near = (size < 3 * CAUCHY * noise.points)[:, None]
+    settled = optx.two_norm(jnp.where(near, views - first, 0)) < _SETTLED * noise.points
+    points = jnp.nanmedian(jnp.where(data.there, size, jnp.nan)) / _MEDIAN_OF_SIZE
+    rays = model.path.rays / jnp.linalg.norm(model.path.rays, axis=1, keepdims=True)
+    model = eqx.tree_at(lambda m: m.path.rays, model, rays)
+    noise = Noise(jnp.maximum(points, _EXACT), _line_noise(data, model))
+    spent = solution.result == optx.RESULTS.nonlinear_max_steps_reached
+    result = RESULTS.where(settled & spent, RESULTS.successful, RESULTS.promote(solution.result))
+    return model, noise, result, solution.stats["num_steps"]
+
+
+def _line_noise(data, model):
+    """The median of the RMS distances of lines, px; 1 where there are none."""
+    squares = line_squares_of(data, line_residuals_of(data, model))
+    return jnp.maximum(jnp.sqrt(jnp.nanmedian(squares)), _EXACT) if len(squares) else jnp.ones(())
+
+
+@eqx.filter_jit
+def _described(data, model, noise, stage, result, steps):
+    """The fit with its residuals, covariance and status."""
+    frames = len(model.path.log_focal)
+    units = units_of(data, model, noise)
+    zeros = jax.tree.map(jnp.zeros_like, units)
+
+    def plain(unknowns):  # without the loss: its efficiency is in `inflation`
+        steps = jax.tree.map(jnp.multiply, unknowns, units)
+        there = moved(model, steps)
+        views = residuals_of(data, there) / noise.points
+        lines = line_residuals_of(data, there) / noise.lines
+        return Rows(
+            jnp.where(inlier[:, None], views, 0),
+            jnp.where(good[:, None], lines, 0),
+            about_frames(data, there.path, unknowns, steps, stage),
+            about_lens(data, there, unknowns, stage),
+        )
+
+    missed = residuals_of(data, model)
+    squared = jnp.sum(missed**2, axis=-1) / (noise.points * CAUCHY) ** 2
+    good = line_squares_of(data, line_residuals_of(data, model)) < (3 * WRONG_LINE * noise.lines) ** 2
+    inlier = data.there & (squared < 9)  # beyond, the loss nearly ignores a view
+    rows, jacobian = jax.linearize(plain, zeros)
+    matrix = reduced(jacobian, rows, zeros, data.structure, jnp.asarray(0.0))
+    own, lens, both = covariances(matrix, frames)
+    of_lens = ravel_pytree(units.lens)[0]
+    lens = lens * jnp.outer(of_lens, of_lens)
+    unit = units.frames[:, 0]
+    log_variance = own[:, 0, 0] * unit**2 + 2 * both[:, 0, -1] * unit * of_lens[-1] + lens[-1, -1]
+    count = 2 * jnp.sum(inlier)
+    free = count / (count - data.unknowns - len(lens))
+    inflation = _INFLATION * free
+    zoom_size = ravel_pytree(model.zoom.parameters)[0].size
+    joint, log_std = lens[:-2, :-2] * inflation, jnp.sqrt(log_variance * inflation)
+    focal = jnp.exp(model.path.log_focal)
+    unseen = jnp.zeros(frames).at[data.structure.frame].add(1.0 * data.there) == 0
+    fitted = ZoomLens(
+        zoom=model.zoom,
+        centre=(jnp.asarray(data.size, jnp.float64) - 1) / 2,
+        focal_range=jnp.stack(
+            [jnp.min(focal, where=~unseen, initial=jnp.inf), jnp.max(focal, where=~unseen, initial=0)]
+        ),
+        image_size=data.size,
+        focal_unit="px",
+        shift=model.shift,
+        family=model.family,
+    )
+    known = jnp.min(jnp.where(unseen, jnp.inf, log_std)) < _UNKNOWN_SCALE
+    certificate = certificate_of(
+        fitted.zoom, fitted.centre, fitted.focal_range, data.size, family=model.family, shift=model.shift
+    )
+    kept = jnp.where(inlier, jnp.sum(missed**2, axis=-1), 0)
+    in_frame = [jnp.zeros(frames).at[data.structure.frame].add(leaf) for leaf in (kept, 1.0 * inlier)]
+    rms = jnp.sqrt(jnp.sum(kept) / jnp.sum(inlier))
+    fit = ZoomFit(
+        lens=fitted,
+        rms=rms,
+        frame_rms=jnp.sqrt(in_frame[0] / in_frame[1]),
+        covariance=joint[:zoom_size, :zoom_size],
+        result=judged(fitted.zoom, result, known, certificate),
+        steps=steps,
+        certificate=certificate,
+        rms_unconstrained=rms,
+        joint=None if model.shift is None else joint,
+    )
+    parts = {
+        "fit": fit,
+        "focal": jnp.where(unseen, jnp.nan, focal),
+        "focal_std": jnp.where(unseen, jnp.nan, focal * log_std),
+        "covariance": lens * inflation,
+        "rotation": model.path.rotation,
+        "noise": noise.points * jnp.sqrt(free),
+        "line_noise": noise.lines if len(good) else jnp.asarray(jnp.nan),
+        "readout": model.readout,
+        "readout_std": jnp.sqrt(lens[-2, -2] * inflation),
+    }
+    return parts, jnp.linalg.norm(missed, axis=-1)

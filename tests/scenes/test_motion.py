@@ -1,0 +1,53 @@
+"""Tracks with exact truth: where a rolling shutter sees points, and a pupil off its axis."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from zoomjax import PolynomialZoom, ZoomLens
+from zoomjax.scenes import motion_tracks, pan_and_zoom
+
+SIZE = (640, 360)
+
+
+@pytest.fixture(scope="module")
+def lens():
+    zoom = PolynomialZoom(1, jnp.array([[0.02], [-0.1]]), jnp.array(400.0))
+    shift = PolynomialZoom(1, jnp.array([[0.01, -0.02], [0.01, 0.0]]), jnp.array(400.0))
+    return ZoomLens(zoom, jnp.array([319.5, 179.5]), jnp.array([400.0, 1200.0]), SIZE, "px", shift=shift)
+
+
+def views(scene):
+    track, view = np.nonzero(np.asarray(scene.tracks.mask))
+    points, frame = (np.asarray(leaf)[track, view] for leaf in (scene.tracks.points, scene.tracks.frame))
+    return zip(track, frame, points, strict=True)
+
+
+@pytest.mark.parametrize("pupil", [0.0, 0.4])
+def test_a_point_is_seen_where_the_lens_puts_it(lens, pupil):
+    focal, rotation = pan_and_zoom(lens, 12)
+    scene = motion_tracks(lens, focal, rotation, views=10, life=6, pupil=pupil)
+    for track, frame, point in views(scene):
+        ahead = rotation[frame] @ scene.points[track] - [0, 0, pupil]
+        distortion = lens(float(focal[frame]))
+        straight = np.asarray(distortion.centre) + focal[frame] * ahead[:2] / ahead[2]
+        np.testing.assert_allclose(distortion.undistort(point), straight, atol=1e-8)
+
+
+def test_rows_of_a_rolling_shutter_are_seen_one_after_the_other(lens):
+    focal = np.full(9, 800.0)
+    angle = np.radians(0.5) * np.arange(9)  # the camera pans evenly
+    a, b = np.cos(angle), np.sin(angle)
+    rotation = np.stack([np.stack([a, 0 * a, -b], 1), [[0, 1, 0]] * 9, np.stack([b, 0 * a, a], 1)], axis=1)
+    scene = motion_tracks(lens, focal, rotation, views=20, life=20, shutter=0.8)
+    distortion = lens(800.0)
+    for track, frame, point in views(scene):
+        if not 0 < frame < 8:
+            continue
+        time = frame + 0.8 * (point[1] / 359 - 0.5)
+        across, down, ahead = scene.points[track]
+        pan = np.arctan2(across, ahead) - np.radians(0.5) * time
+        depth = np.hypot(across, ahead)
+        straight = 800 * np.array([np.tan(pan), down / depth / np.cos(pan)])
+        there = np.asarray(distortion.undistort(point)) - np.asarray(distortion.centre)
+        np.testing.assert_allclose(there, straight, atol=1e-3)
