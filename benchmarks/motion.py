@@ -24,6 +24,7 @@ import os
 import resource
 import time
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -185,10 +186,10 @@ class FrameLenses:
 
 
 def _inverse(focal: float, k: np.ndarray) -> np.ndarray:
-    """Five coefficients that correct what OpenCV's distort, over the image."""
+    """Four coefficients that correct what OpenCV's distort, over the image."""
     r = np.linspace(0, 1.1, 200)[1:]
     bent = r * SCALE * (1 + (r * SCALE / focal) ** 2 * (k[0] + (r * SCALE / focal) ** 2 * k[1])) / SCALE
-    powers = bent[:, None] ** (2 * np.arange(1, 6) + 1)
+    powers = bent[:, None] ** (2 * np.arange(1, 5) + 1)
     found = np.linalg.lstsq(powers, r - bent)[0]
     assert abs(powers @ found - (r - bent)).max() * SCALE < 0.02
     return found
@@ -199,7 +200,8 @@ def real_scene(
 ) -> tuple[FrameLenses, MotionScene, Lines, np.ndarray]:
     """Tracks and pitch lines of a clip; the frames of the lines."""
     frames = np.arange(0, len(clip.focal), 4)
-    lenses, time = FrameLenses(clip, frames), np.linspace(0, 2 * np.pi * len(frames) / 150, len(frames))
+    lenses: Any = FrameLenses(clip, frames)
+    time = np.linspace(0, 2 * np.pi * len(frames) / 150, len(frames))
     aims = np.column_stack([30 * np.sin(1.3 * time), 5 + 10 * np.sin(2.1 * time), 0 * time])
     turns = np.stack([looking_at(clip.position, aim) for aim in aims])
     scene = motion_tracks(lenses, lenses.focal, turns, noise=0.5, pupil=pupil, seed=seed)

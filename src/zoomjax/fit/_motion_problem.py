@@ -152,7 +152,12 @@ def _ready_lines(given, family, size):
     triangle = jnp.pad(small.triangle.astype(float), ((0, more), (0, 0), (0, 0)))
     ones = jnp.ones(1)  # nothing here depends on focal lengths
     ready = AnyCentreLines(
-        triangle, np.zeros_like(frame), ones, small.centre, small.image_size, small.focal_unit
+        triangle=triangle,
+        frame=jnp.zeros_like(frame),
+        focal=ones,
+        centre=small.centre,
+        image_size=small.image_size,
+        focal_unit=small.focal_unit,
     )
     return ready, frame
 

@@ -55,14 +55,14 @@ class Stage(NamedTuple):
         fresh: 1 if rays begin as means of where their views see them, 0 if as they are.
     """
 
-    parameters: float
-    centre: float
-    readout: float
-    wider: float
-    change: float
-    damping: float
-    own: float
-    fresh: float = 0.0
+    parameters: float | Array
+    centre: float | Array
+    readout: float | Array
+    wider: float | Array
+    change: float | Array
+    damping: float | Array
+    own: float | Array
+    fresh: float | Array = 0.0
 
 
 class Noise(NamedTuple):

@@ -1,5 +1,7 @@
 """The stages of `fit_motion`: from a start to the fit, and what is known about it."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -145,7 +147,8 @@ def _solved(data, model, noise, stage):
     model = eqx.tree_at(lambda m: m.path.rays, model, rays)
     noise = Noise(jnp.maximum(points, _EXACT), _line_noise(data, model))
     spent = solution.result == optx.RESULTS.nonlinear_max_steps_reached
-    result = RESULTS.where(settled & spent, RESULTS.successful, RESULTS.promote(solution.result))
+    good: Any = RESULTS.successful
+    result = RESULTS.where(settled & spent, good, RESULTS.promote(solution.result))
     return model, noise, result, solution.stats["num_steps"]
 
 

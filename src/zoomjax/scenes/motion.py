@@ -198,6 +198,8 @@ class _Seen(NamedTuple):
 
     def inside(self, frame, scene, which, shift):
         """Which points of a scene a frame shows, and where, px."""
+        if not len(which):
+            return which, np.zeros((0, 2))
         corner = np.array(self.lens.image_size) - 1
         row = np.full(len(which), corner[1] / 2)
         seen, front = np.zeros((len(which), 2)), np.zeros(len(which), bool)
