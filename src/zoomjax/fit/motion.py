@@ -61,7 +61,7 @@ class MotionFit(eqx.Module):
         noise: standard deviation of a coordinate of a point, px, from the median of the residuals.
         line_noise: standard deviation of points of lines from these, px of the image; NaN without lines.
         readout: time that a rolling shutter takes from the first row to the last, in frames.
-        readout_std: its standard deviation. Near 0.5, nothing is known about it: the camera was too slow
+        readout_std: its standard deviation. A large one says that nothing is known: the camera was too slow
             to tell, and it does no harm.
     """
 
