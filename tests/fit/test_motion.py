@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 from zoomjax import Lines, PolynomialZoom, ZoomLens
@@ -11,7 +12,7 @@ from zoomjax.fit import RESULTS, fit_motion
 from zoomjax.fit._motion_gradient import sensitive
 from zoomjax.fit._motion_problem import Asked, Given, problem_of
 from zoomjax.fit._motion_start import rotation_vector, shrunk_ray, turned
-from zoomjax.fit.motion import _fitted
+from zoomjax.fit.motion import _fitted, thrown_motion
 from zoomjax.lines import compress_any_centre
 from zoomjax.models import BrownConrady, RadialPolynomial
 from zoomjax.scenes import motion_lines, motion_tracks, pan_and_zoom
@@ -297,6 +298,14 @@ def test_a_fit_is_differentiable_outside_of_jit(noisy, lines):
     seen = np.asarray(noisy.tracks.mask)
     assert (np.abs(slope[seen]).max(axis=1) > 0).mean() > 0.99
     assert (slope[~seen] == 0).all()
+
+
+def test_a_fit_that_does_not_settle_says_what_to_do(fit):
+    result = RESULTS.promote(optx.RESULTS.nonlinear_max_steps_reached)
+    unsettled = eqx.tree_at(lambda fit: fit.fit.result, fit, result)
+    with pytest.raises(RuntimeError, match=r"turn and zoom farther.*did not settle") as told:
+        thrown_motion(unsettled)
+    assert "max_steps" not in str(told.value)
 
 
 def test_rotations_there_and_back(rng):

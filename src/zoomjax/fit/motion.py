@@ -38,6 +38,9 @@ from .result import RESULTS, ZoomFit, failed
 _FAILED = "The fit failed: turn and zoom farther, or fit fewer coefficients about the image's centre."
 
 
+_UNSETTLED = "It did not settle within its steps."
+
+
 class MotionFit(eqx.Module):
     """The lens and the path of a camera that turns and zooms.
 
@@ -234,7 +237,8 @@ def _with_model(fit: MotionFit, model: Model, problem: Problem) -> MotionFit:
 def thrown_motion(fit: MotionFit) -> MotionFit:
     """The fit, raising RuntimeError where its solver failed."""
     if bool(failed(fit.fit.result)):
-        raise RuntimeError(f"{_FAILED} {RESULTS[fit.fit.result]}")
+        spent = fit.fit.result == RESULTS.nonlinear_max_steps_reached
+        raise RuntimeError(f"{_FAILED} {_UNSETTLED if spent else RESULTS[fit.fit.result]}")
     return fit
 
 
