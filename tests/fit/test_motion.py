@@ -215,6 +215,8 @@ def test_lines_of_something_else_are_refused(noisy, lines, path):
         fit_motion(noisy.tracks, lines=compress_any_centre(lines.about(np.array([100.0, 100.0]))))
     with pytest.raises(ValueError, match="compressed for 2 terms, but 3"):
         fit_motion(noisy.tracks, lines=compress_any_centre(lines.about((np.array(SIZE) - 1) / 2)), terms=3)
+    with pytest.raises(ValueError, match="line_frames is for argument lines"):
+        fit_motion(noisy.tracks, line_frames=np.arange(FRAMES))
     with pytest.raises(ValueError, match="BrownConrady is not"):
         fit_motion(noisy.tracks, lines=lines, family=BrownConrady())
 

@@ -120,6 +120,8 @@ def _ready_lines(given, family, size):
     """Compressed lines, padded to one of few numbers of lines, and their frames."""
     lines, line_frames, tracks = given.lines, given.line_frames, given.tracks
     if lines is None:
+        if line_frames is not None:
+            raise ValueError("Argument line_frames is for argument lines, which is not given.")
         return None, np.zeros(0, int)
     if not isinstance(family, AbstractRadial):
         raise ValueError(
