@@ -49,6 +49,16 @@ def together(x: Any, y: Any) -> Any:
     return namespace(x, y).stack([x, y], axis=-1)
 
 
+def interleaved(x: Any, y: Any) -> Any:
+    """As `together`, in half the time on a CPU: one loop over all numbers, which picks x or y by its index.
+
+    For results that are not differentiated through: its transpose would be sums over pairs.
+    """
+    if namespace(x, y) is np:
+        return together(x, y)
+    return jnp.where(jnp.arange(2) == 0, x[..., None], y[..., None])
+
+
 def apart(values: Any) -> tuple[Any, ...]:
     """The elements along the first axis; derivatives by them are not padded, as by ``values[0]``."""
     return tuple(jnp.unstack(values) if isinstance(values, jax.Array) else values)

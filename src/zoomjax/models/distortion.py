@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._core.arguments import check_kind
-from .._core.arrays import aligned, as_array, finite, namespace, once, together
+from .._core.arrays import aligned, as_array, finite, interleaved, namespace, once, together
 from .._core.spread import spread
 from .._core.types import AnyArray, Elements, Points, traced
 from .family import AbstractFamily, AbstractRadial, Pair
@@ -243,22 +243,17 @@ def _undistorted(points, family, k, centre, scale, *, spreading=True):
     """Corrected points; NaN beyond the limit."""
     at = _normal(_apart(points), k, centre, scale, spreading=spreading)
     xp, (x, y) = namespace(at.k), at.z
+    joined = together if spreading else interleaved
     squared = x * x + y * y
     within = family.within(_constant(squared), _constant(at.own), digits=4)
     if isinstance(family, AbstractRadial):
         factor = family.factor(squared, at.k)
         factor = once(xp.where(within & (factor >= 0), factor, np.nan))
-        return together(*at.in_pixels((x * factor, y * factor)))
+        return joined(*at.in_pixels((x * factor, y * factor)))
     new_x, new_y = family.correct(at.z, squared, at.k)
     # An invertible correction is monotone, and never goes to the other side; at a pole rounding does.
     within = within & (x * new_x + y * new_y >= 0)
-    return together(*at.in_pixels((xp.where(within, new_x, np.nan), xp.where(within, new_y, np.nan))))
-
-
-def _by_formula(points, family, k, centre, scale):
-    """Corrected points, also beyond the limit."""
-    at = _normal(points, k, centre, scale)
-    return at.in_pixels(family.correct(at.z, at.z[0] * at.z[0] + at.z[1] * at.z[1], at.k))
+    return joined(*at.in_pixels((xp.where(within, new_x, np.nan), xp.where(within, new_y, np.nan))))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -273,8 +268,8 @@ def _distorted(distortion_of, points, operands):
     at = _normal(_apart(points), *distortion, spreading=False)
     if isinstance(family, AbstractRadial):
         q = _ratio(distortion_of, points, operands)
-        return together(*at.in_pixels((at.z[0] * q, at.z[1] * q)))
-    return together(*at.in_pixels(family.distort(at.z, at.k, family.limit(at.k))))
+        return interleaved(*at.in_pixels((at.z[0] * q, at.z[1] * q)))
+    return interleaved(*at.in_pixels(family.distort(at.z, at.k, family.limit(at.k))))
 
 
 def _ratio(distortion_of, points, operands):
@@ -308,29 +303,46 @@ def _ratio(distortion_of, points, operands):
 
 @_distorted.defjvp
 def _distorted_jvp(distortion_of, primals, tangents):
-    """By the implicit function theorem, whatever the iterations: G(w, a) = p, for the formula G in px."""
-    (points, operands), (points_dot, operands_dot) = primals, tangents
-    w = _distorted(distortion_of, points, operands)
+    """By the implicit function theorem, whatever the iterations: F(z, k) = y, for normalised points.
+
+    What brings them to their units and back is linear in them, and simpler so than as part of F.
+    """
+    w = _distorted(distortion_of, *primals)
     exists = jnp.isfinite(w[..., 0])
-    _, _, centre, _ = distortion_of(operands)
-    centre, _ = aligned((jax.lax.stop_gradient(centre).astype(w.dtype), 1), (w, 1))
-    at = tuple(jnp.where(exists, w[..., i], centre[..., i]) for i in (0, 1))
-    one, zero = jnp.ones_like(at[0]), jnp.zeros_like(at[0])
 
-    def formula(at, operands):
-        family, k, centre, scale = distortion_of(operands)
-        return _by_formula(at, family, jnp.where(jnp.isfinite(k), k, 0), centre, scale)
+    def normal(points, operands):
+        _, k, centre, scale = distortion_of(operands)
+        kept, middle = aligned((exists, 0), (_constant(centre).astype(points.dtype), 1))
+        points = tuple(jnp.where(kept, points[..., i], middle[..., i]) for i in (0, 1))
+        at = _normal(points, jnp.where(jnp.isfinite(k), k, 0), centre, scale)
+        return at.z, at.k, at.centre, at.scale
 
-    def moved(*direction):
-        return jax.jvp(lambda *at: formula(at, operands), at, direction)[1]
+    family = distortion_of(primals[1])[0]
+    (_, k, centre, scale), (y_dot, k_dot, centre_dot, scale_dot) = jax.jvp(normal, primals, tangents)
+    z = tuple(jnp.where(exists, (w[..., i] - centre[i]) / scale, 0) for i in (0, 1))
+    squared = z[0] * z[0] + z[1] * z[1]
+    # dF/dz dz = dy - dF/dk dk.
+    by_k = jax.jvp(lambda k: family.correct(z, squared, k), (k,), (k_dot,))[1]
+    moved, determinant = _solved(family, z, squared, k, (y_dot[0] - by_k[0], y_dot[1] - by_k[1]))
+    weight = jnp.where(exists, 1 / jnp.maximum(determinant, jnp.finfo(w.dtype).eps), 0)
+    return w, together(
+        *(centre_dot[i] + scale_dot * z[i] + scale * weight * moved[i] for i in (0, 1)),
+    )
 
-    # dG/dw dw = dp - dG/da da.
-    by_operands = jax.jvp(lambda operands: formula(at, operands), (operands,), (operands_dot,))[1]
-    rx, ry = (jnp.broadcast_to(points_dot[..., i], one.shape) - by_operands[i] for i in (0, 1))
-    (ax, ay), (bx, by) = moved(one, zero), moved(zero, one)
-    determinant = ax * by - ay * bx
-    weight = jnp.where(exists, 1 / jnp.maximum(determinant, jnp.finfo(one.dtype).eps), 0)
-    return w, together(weight * (by * rx - bx * ry), weight * (ax * ry - ay * rx))
+
+def _solved(family, z, squared, k, r):
+    """The adjugate of ``dF/dz`` times r, and its determinant."""
+    one, zero = jnp.ones_like(squared), jnp.zeros_like(squared)
+    if isinstance(family, AbstractRadial):  # dF/dz = L + 2 L' z z^T
+        factor, bend = jax.jvp(lambda t: family.factor(t, k), (squared,), (2 * one,))
+        slope, along = factor + squared * bend, bend * (z[0] * r[0] + z[1] * r[1])
+        return (slope * r[0] - along * z[0], slope * r[1] - along * z[1]), factor * slope
+
+    def column(*direction):
+        return jax.jvp(lambda *z: family.correct(z, z[0] * z[0] + z[1] * z[1], k), z, direction)[1]
+
+    (ax, ay), (bx, by) = column(one, zero), column(zero, one)
+    return (by * r[0] - bx * r[1], ax * r[1] - ay * r[0]), ax * by - ay * bx
 
 
 def _constant(array):
