@@ -44,7 +44,7 @@ def measure_format(fmt: zj.interop.Format, folder: Path) -> dict:
     start = time.perf_counter()
     out = zj.interop.write(lens, path, format=fmt.name, focal=focal, pixel_pitch=PITCH)
     middle = time.perf_counter()
-    silent = FOCAL if fmt.name in ("nuke", "pftrack") else None
+    silent = FOCAL if fmt.name in ("nuke", "pftrack", "discorpy") else None
     back = zj.interop.read(path, image_size=lens.image_size, focal=silent).report
     return {
         "exact": fmt.exact,

@@ -413,6 +413,7 @@ def _foreign(name: str, suffix: str) -> Reader:
         "lensfun": {"image_size": size},
         "nuke": {"image_size": size, "focal": focal},
         "pftrack": {"focal": focal},
+        "discorpy": {"image_size": size, "focal": focal[:1]},
         "lcp": {},
     }
 

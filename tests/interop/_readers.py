@@ -14,6 +14,8 @@ import lensfunpy
 import numpy as np
 import pycolmap
 import yaml
+from discorpy.losa.loadersaver import load_metadata_txt
+from discorpy.post.postprocessing import unwarp_line_forward
 
 CORRECTS = ("nuke", "opentrackio", "pftrack")
 
@@ -194,10 +196,17 @@ def pftrack(path, focal, points, *, index, size, **_):
     return centre + radius * z * (1 + c3 * r2 + c5 * r2**2)
 
 
+def discorpy(path, focal, points, **_):
+    """Its forward function evaluates the same polynomial as its backward one, at any points (y, x)."""
+    x, y, factors = load_metadata_txt(str(path))
+    [found] = unwarp_line_forward([points[:, ::-1].copy()], x, y, factors)
+    return found[:, ::-1]
+
+
 READERS = {
     reader.__name__: reader
     for reader in (
-        *(opencv, ros, kalibr, mrcal, colmap, nerfstudio),
+        *(opencv, ros, kalibr, mrcal, colmap, nerfstudio, discorpy),
         *(gyroflow, unreal, lensfun, opentrackio, nuke, pftrack),
     )
 }

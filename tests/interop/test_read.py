@@ -13,7 +13,7 @@ from .test_write import shown
 
 BOTH = {fmt.name: fmt for fmt in zj.interop.formats() if fmt.writes and fmt.reads}
 FOCAL = [18, 24, 35, 50, 85, 200]
-SILENT = ("nuke", "pftrack")
+SILENT = ("nuke", "pftrack", "discorpy")
 """Formats that hold no focal lengths."""
 
 
@@ -30,7 +30,7 @@ def written(tmp_path_factory):
 
 def given(name, lens):
     """What a file does not say."""
-    size = {"image_size": lens.image_size} if name in ("lensfun", "nuke") else {}
+    size = {"image_size": lens.image_size} if name in ("lensfun", "nuke", "discorpy") else {}
     return size | ({"focal": FOCAL} if name in SILENT else {})
 
 
@@ -51,6 +51,20 @@ def test_a_lens_comes_back(name, written):
         # The report of the writer is of distorted points, which are up to 1.2 times as dense.
         assert np.hypot(*(got - wanted).T).max() <= 1.3 * (report.worst + back.report.worst) + 0.02
     assert back.report.worst < 0.2
+
+
+def test_files_of_a_folder_are_in_the_order_of_the_numbers_in_their_names(tmp_path):
+    """Else focal lengths given for them would go to others: 105 is before 18 for a dictionary."""
+    lens, focal = LENSES["landscape"](), [18, 24.5, 105, 200]
+    zj.interop.write(lens, tmp_path / "k", format="discorpy", focal=focal)
+    back = zj.interop.read(tmp_path / "k", focal=focal, image_size=lens.image_size, zoom=TableZoom())
+    assert [path.name for path in back.report.files] == ["18.txt", "24.5.txt", "105.txt", "200.txt"]
+    points = shown(lens)
+    for f in focal:
+        moved = np.asarray(back.lens(float(f)).undistort(points)) - np.asarray(
+            lens(float(f)).undistort(points)
+        )
+        assert np.abs(moved).max() < 0.1
 
 
 @pytest.mark.parametrize("name", ["nuke", "opentrackio", "pftrack"])

@@ -6,7 +6,10 @@ import json
 import jsonschema
 import numpy as np
 import OpenEXR
+import OpenImageIO as oiio
 import pytest
+from discorpy.losa.loadersaver import load_metadata_txt
+from discorpy.post.postprocessing import unwarp_image_backward
 from scipy.optimize import minimize_scalar
 
 import zoomjax as zj
@@ -138,6 +141,42 @@ def test_maps_say_where_to_sample(name, tmp_path):
             found = np.stack([red[y, x] * w - 0.5, (1 - green[y, x].astype(float)) * h - 0.5], -1)
             wanted = np.asarray(exact(np.stack([x + left, y + top], -1).astype(float)))
             assert np.abs(found - wanted).max() < 1e-3
+
+
+@pytest.mark.parametrize("name", ["landscape", "portrait", "decentred"])
+def test_openimageio_warps_by_maps(name, tmp_path):
+    """An image of its own coordinates, warped by OpenImageIO, shows where it was sampled."""
+    lens = LENSES[name]()
+    w, h = lens.image_size
+    zj.interop.write(lens, tmp_path / "maps", format="stmap", focal=18)
+    ramp = np.zeros((h, w, 3), np.float32)
+    ramp[..., 1], ramp[..., 0] = np.mgrid[0:h, 0:w]
+    source = oiio.ImageBuf(ramp)
+    for kind, exact in (("undistort", lens(18.0).distort), ("redistort", lens(18.0).undistort)):
+        at = oiio.ImageBuf(str(tmp_path / "maps" / f"{kind}.18.exr"))
+        # The filter "triangle", 2 px wide, is bilinear; the last two: S grows to the right, T upwards.
+        warped = oiio.ImageBufAlgo.st_warp(source, at, "triangle", 2.0, 0, 1, False, True)
+        assert not warped.has_error
+        found = warped.get_pixels(oiio.FLOAT)[10:-10:7, 10:-10:7, :2]
+        y, x = np.mgrid[warped.ybegin : warped.yend, warped.xbegin : warped.xend][:, 10:-10:7, 10:-10:7]
+        wanted = np.asarray(exact(np.stack([x, y], -1).astype(float)))
+        inside = ((wanted > 2) & (wanted < np.array([w, h]) - 3)).all(-1)
+        assert inside.mean() > 0.5
+        assert np.abs(found - wanted)[inside].max() < 0.01
+
+
+@pytest.mark.parametrize("name", ["landscape", "portrait"])
+def test_discorpy_corrects_images(name, tmp_path):
+    lens = LENSES[name]()
+    w, h = lens.image_size
+    report = zj.interop.write(lens, tmp_path / "lens.txt", format="discorpy", focal=24)
+    x, y, factors = load_metadata_txt(str(tmp_path / "lens.txt"))
+    rows, columns = np.mgrid[0:h, 0:w].astype(float)
+    found = np.stack([unwarp_image_backward(ramp, x, y, factors) for ramp in (columns, rows)], -1)
+    wanted = np.asarray(lens(24.0).distort(np.stack([columns, rows], -1)))
+    inside = ((wanted > 1) & (wanted < np.array([w, h]) - 2)).all(-1)
+    assert np.abs(found - wanted)[inside].max() < report.worst + MARGIN
+    assert report.worst < 0.1
 
 
 def test_maps_cover_the_corrected_image(tmp_path):

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import os
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from ._lens import lens_of
 from ._solve import Solution, solve
 from .base import Export, Format, Import, Report
 from .colmap import COLMAP
+from .discorpy import Discorpy
 from .gyroflow import Gyroflow
 from .kalibr import Kalibr
 from .lcp import LCP
@@ -36,7 +38,7 @@ from .unreal import Unreal
 FORMATS: tuple[Format, ...] = (
     *(STMap(), Nuke(), OpenTrackIO(), PFTrack()),
     *(Lensfun(), Gyroflow(), Unreal()),
-    *(OpenCV(), ROS(), Kalibr(), Mrcal(), COLMAP(), Nerfstudio(), LCP()),
+    *(OpenCV(), ROS(), Kalibr(), Mrcal(), COLMAP(), Nerfstudio(), Discorpy(), LCP()),
 )
 """In the order of `formats` and of the documentation."""
 
@@ -166,8 +168,8 @@ def read(
         path: the file; or a folder of files of one format, one a focal length.
         format: name of the format, one of `formats`; by default it is recognised.
         image_size: (width, height) px, for formats that do not say it.
-        focal: focal lengths of the files in the order of their names, for STMaps; by default those in
-            their headers.
+        focal: focal lengths of the files of a folder in the order of their names, numbers in them by value
+            (9 before 18); or those of the entries of a file. By default those that are in them.
         crop: for lensfun: crop factor of the camera; by default that of the calibration.
         name: of the lens, for files of several; a part of it will do.
         direction: for STMaps: "undistort" or "redistort"; by default the file name says it.
@@ -267,13 +269,19 @@ def _files(path: Path) -> list[Path]:
             raise FileNotFoundError(2, "No such file", str(path))
         return [path]
     known = {suffix for fmt in FORMATS for suffix in fmt.suffixes}
-    found = sorted(file for file in path.iterdir() if file.is_file() and file.suffix.lower() in known)
+    found = [file for file in path.iterdir() if file.is_file() and file.suffix.lower() in known]
     if len({file.suffix.lower() for file in found}) != 1:
         raise ValueError(
             f"The folder {path} must hold files of one format, but it holds "
             f"{', '.join(sorted({file.suffix for file in found})) or 'none'}: give one file."
         )
-    return found
+    return sorted(found, key=_by_value)
+
+
+def _by_value(path: Path) -> list[Any]:
+    """Words and numbers of a name in turn, so that 9 is before 18."""
+    parts = re.split(r"(\d+(?:\.\d+)?)", path.stem)
+    return [float(part) if index % 2 else part for index, part in enumerate(parts)]
 
 
 def _focal_lengths(
