@@ -123,7 +123,6 @@ POISON = {
         good, points=np.full_like(np.load(io.BytesIO(good))["points"], np.nan)
     ),
     "text": lambda good: _rezipped(good, focal=np.array("a lot")),
-    "odd nodes": lambda good: _rezipped(good, nodes=np.zeros(7)),
 }
 
 
@@ -141,6 +140,34 @@ def test_a_damaged_or_poisoned_cache_is_no_cache(kind, photos, marker, tmp_path)
     assert looks(marker) == 2  # it was mended
 
 
+def test_lines_and_grids_are_kept_apart(photos, marker, tmp_path, monkeypatch):
+    """So that another source of focal lengths looks for nothing twice."""
+    cache, searched = tmp_path / "cache", []
+    monkeypatch.setattr(zj.detect.GridDetector, "find", lambda *_: searched.append(1))
+    [lines_alone] = detect(photos[:1], marker, cache=cache)
+    assert (looks(marker), len(searched)) == (1, 0)
+    for _ in range(2):
+        [with_grid] = detect(photos[:1], marker, grid="all", cache=cache)
+        same(with_grid, lines_alone)
+        assert (looks(marker), len(searched)) == (1, 1)  # that there is no grid is kept, too
+    [again] = detect(photos[:1], marker, grid="none", cache=cache)
+    same(again, lines_alone)
+    assert (looks(marker), len(searched)) == (1, 1)
+
+
+@pytest.mark.parametrize("kind", ["cut", "empty", "odd"])
+def test_a_damaged_grid_in_the_cache_is_searched_for_again(kind, photos, marker, tmp_path, monkeypatch):
+    cache, found = tmp_path / "cache", np.arange(24.0).reshape(3, 4, 2)
+    monkeypatch.setattr(zj.detect.GridDetector, "find", lambda *_: found)
+    list(detect(photos[:1], marker, grid="all", cache=cache))
+    [file] = (path for path in cache.iterdir() if "nodes" in np.load(path))
+    good = file.read_bytes()
+    file.write_bytes({"cut": good[:100], "empty": b"", "odd": _rezipped(good, nodes=np.zeros(7))}[kind])
+    [again] = detect(photos[:1], marker, grid="all", cache=cache)
+    np.testing.assert_array_equal(again.nodes, found)
+    assert file.read_bytes() == good
+
+
 def test_a_cache_that_cannot_be_written_does_no_harm(photos, marker, tmp_path):
     (tmp_path / "file").write_text("no folder")
     assert len(next(detect(photos[:1], marker, cache=tmp_path / "file" / "cache")).lines) == 1
@@ -152,6 +179,8 @@ def test_the_cache_does_not_keep_a_videos_track(marker, tmp_path):
     for focal in (20.0, 200.0):
         [found] = detect([Source("a", image=image, focal=focal)], marker, cache=tmp_path / "cache")
         assert found.focal == focal
+    [found] = detect([Source("a", image=image)], marker, cache=tmp_path / "cache")
+    assert found.focal is None
     assert looks(marker) == 1
 
 

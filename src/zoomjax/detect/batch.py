@@ -14,6 +14,7 @@ import math
 from collections.abc import Generator, Iterable
 from concurrent.futures import Future
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -89,18 +90,34 @@ def detect(
     task = functools.partial(_detected, detector=detector, grid=grid)
     with contextlib.ExitStack() as stack:
         submit = stack.enter_context(Workers(task, workers, _SECONDS)).submit if workers else task
-        pending: collections.deque[tuple[Path | None, Source, Future | Detection]] = collections.deque()
+        pending: collections.deque[tuple[_Entries | None, Source, Future | Detection]] = collections.deque()
         for source in sources:
-            file = None if cache is None else cache / f"{_key(source, detector, grid)}.npz"
-            known = None if file is None else _load(file, source)
-            pending.append((file, source, submit(source)) if known is None else (None, source, known))
+            entries = None if cache is None else _Entries.of(cache, source, detector)
+            known, missing = (None, True) if entries is None else _known(entries, source, detector, grid)
+            if known is None or missing:
+                pending.append((entries, source, submit(_Task(source, known))))
+            else:
+                pending.append((None, source, known))
             while len(pending) > 2 * workers or (pending and isinstance(pending[0][2], Detection)):
-                yield _finished(*pending.popleft())
+                yield _finished(*pending.popleft(), detector, grid)
         while pending:
-            yield _finished(*pending.popleft())
+            yield _finished(*pending.popleft(), detector, grid)
 
 
-def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detection:
+class _Task(NamedTuple):
+    """An image, and its lines where they are known and only a grid is searched for."""
+
+    source: Source
+    known: Detection | None
+
+
+def _wants_grid(grid: str, detector: AbstractDetector, focal: float | None) -> bool:
+    own = isinstance(detector, GridDetector)
+    return own or grid == "all" or (grid == "without focal length" and focal is None)
+
+
+def _detected(task: _Task, *, detector: AbstractDetector, grid: str) -> Detection:
+    source, known = task
     found = functools.partial(Detection, source.name, source.file)
     try:
         image, focal = source.read()
@@ -115,13 +132,18 @@ def _detected(source: Source, *, detector: AbstractDetector, grid: str) -> Detec
         )
     try:
         focal = source.focal if focal is None else focal
-        wanted = grid == "all" or (grid == "without focal length" and focal is None)
-        own = isinstance(detector, GridDetector)
-        nodes = (detector if own else GridDetector()).find(image) if own or wanted else None
+        wanted = _wants_grid(grid, detector, focal)
+        nodes = _grid_detector(detector).find(image) if wanted else None
+        if known is not None:
+            return dataclasses.replace(known, nodes=nodes)
         lines, unexplained = _lines(detector, image, nodes)
     except Exception as error:
         return found(size, problem=f"the detector failed: {type(error).__name__}: {_sentence(error)}")
     return found(size, lines, focal, nodes, "" if lines else _NO_LINES, unexplained)
+
+
+def _grid_detector(detector: AbstractDetector) -> GridDetector:
+    return detector if isinstance(detector, GridDetector) else GridDetector()
 
 
 def _lines(
@@ -160,14 +182,47 @@ def _thinned(line: np.ndarray) -> np.ndarray:
     return line[:: math.ceil(_SPACING * (len(line) - 1) / max(length, 1e-9))]
 
 
-def _finished(file: Path | None, source: Source, result: Future | Detection) -> Detection:
+def _finished(
+    entries: "_Entries | None",
+    source: Source,
+    result: Future | Detection,
+    detector: AbstractDetector,
+    grid: str,
+) -> Detection:
     try:
         detection = result if isinstance(result, Detection) else result.result()
     except LostError as error:
         return Detection(source.name, source.file, problem=str(error))
-    if file is not None and detection.problem in ("", _NO_LINES):  # other problems may be mended
-        _save(detection, file)
+    if entries is not None and detection.problem in ("", _NO_LINES):  # other problems may be mended
+        of_image = None if detection.focal == source.focal else detection.focal
+        _save(dataclasses.replace(detection, focal=of_image), entries.lines)
+        if _wants_grid(grid, detector, detection.focal):
+            none = np.zeros((0, 0, 2))
+            _write(entries.grid, nodes=none if detection.nodes is None else detection.nodes)
     return detection
+
+
+class _Entries(NamedTuple):
+    """The files of the cache that hold what was found in an image.
+
+    Two, as what is found in one way does not depend on what else was asked for.
+    """
+
+    lines: Path
+    grid: Path
+
+    @classmethod
+    def of(cls, cache: Path, source: Source, detector: AbstractDetector) -> "_Entries":
+        """By what the image shows, and the detectors."""
+        try:
+            shown = source.digest()
+        except (OSError, ValueError) as error:  # reported when it is read
+            shown = repr(error).encode()
+        code = _code() + cv2.__version__.encode()
+        ways = ("lines", detector), ("grid", _grid_detector(detector))
+        return cls(
+            *(cache / f"{hashlib.sha256(code + repr(w).encode() + shown).hexdigest()}.npz" for w in ways)
+        )
 
 
 @functools.cache
@@ -178,28 +233,22 @@ def _code() -> bytes:
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).digest()
 
 
-def _key(source: Source, detector: AbstractDetector, grid: str) -> str:
-    digest = hashlib.sha256(_code() + cv2.__version__.encode() + repr((detector, grid)).encode())
-    try:
-        digest.update(source.digest())
-    except (OSError, ValueError) as error:  # reported when it is read
-        digest.update(repr(error).encode())
-    return digest.hexdigest()
-
-
 def _save(detection: Detection, file: Path) -> None:
     lines = detection.lines
-    content = io.BytesIO()
-    np.savez(
-        content,
+    _write(
+        file,
         points=np.concatenate(lines) if lines else np.zeros((0, 2)),
         counts=np.array([len(line) for line in lines], int),
         image_size=np.array(detection.image_size),
         focal=np.array(np.nan if detection.focal is None else detection.focal),
-        nodes=np.zeros((0, 0, 2)) if detection.nodes is None else detection.nodes,
         problem=np.array(detection.problem),
         unexplained=np.array(np.nan if detection.unexplained is None else detection.unexplained),
     )
+
+
+def _write(file: Path, **arrays: np.ndarray) -> None:
+    content = io.BytesIO()
+    np.savez(content, **arrays)  # pyright: ignore[reportArgumentType]
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(file) as part:
@@ -208,18 +257,41 @@ def _save(detection: Detection, file: Path) -> None:
         pass
 
 
-def _load(file: Path, source: Source) -> Detection | None:
-    """The cached detection, with the image's present name; None if there is none."""
+def _known(
+    entries: _Entries, source: Source, detector: AbstractDetector, grid: str
+) -> tuple[Detection | None, bool]:
+    """The cached detection, and whether a grid is still to be searched for."""
+    known = _load(entries.lines, source)
+    if known is None or not _wants_grid(grid, detector, known.focal):
+        return known, False
+    nodes = _load_nodes(entries.grid)
+    return dataclasses.replace(
+        known, nodes=nodes if nodes is not None and nodes.size else None
+    ), nodes is None
+
+
+def _load_nodes(file: Path) -> np.ndarray | None:
+    """The cached nodes of a grid, empty if there was none; None if nobody has searched."""
     try:
         with file.open("rb") as opened, np.load(opened, allow_pickle=False) as stored:
-            points, nodes = np.asarray(stored["points"], float), np.asarray(stored["nodes"], float)
+            nodes = np.asarray(stored["nodes"], float)
+    except Exception:  # a damaged entry: search again
+        return None
+    return nodes if nodes.ndim == 3 and nodes.shape[2] == 2 else None
+
+
+def _load(file: Path, source: Source) -> Detection | None:
+    """The cached detection, with the image's present name and no nodes; None if there is none."""
+    try:
+        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as stored:
+            points = np.asarray(stored["points"], float)
             counts, focal = stored["counts"].tolist(), float(stored["focal"])
             width, height = map(int, stored["image_size"].tolist())
             problem, unexplained = str(stored["problem"]), float(stored["unexplained"])
         sound = (
             points.shape == (sum(counts), 2) and np.isfinite(points).all() and min(counts, default=1) > 0
         )
-        if not sound or nodes.ndim != 3 or nodes.shape[2] != 2:
+        if not sound:
             return None
     except Exception:  # a damaged entry: detect again
         return None
@@ -229,7 +301,6 @@ def _load(file: Path, source: Source) -> Detection | None:
         image_size=(width, height),
         lines=tuple(np.split(points, np.cumsum(counts)[:-1])) if counts else (),
         focal=source.focal or (None if np.isnan(focal) else focal),
-        nodes=nodes if nodes.size else None,
         problem=problem,
         unexplained=None if np.isnan(unexplained) else unexplained,
     )
