@@ -115,8 +115,16 @@ def test_equation_14_under_jit_and_differentiated(truth):
     "settings", [{"distance": 0.0}, {"distance": -5.0}, {"pixel": 0.0}, {"distance": np.nan}]
 )
 def test_lengths_must_be_positive(settings):
-    with pytest.raises(RuntimeError, match="must be positive"):
+    with pytest.raises(ValueError, match="must be finite and positive"):
         from_board(PLANE, PLANE, **settings)
+
+
+def test_lists_are_arrays(truth):
+    corrected, _, board = photographed(truth, 60.0)
+    listed = from_board(np.asarray(corrected).tolist(), np.asarray(board).tolist())
+    assert float(listed.focal) == pytest.approx(float(from_board(corrected, board).focal))
+    with pytest.raises(ValueError, match="points must hold real numbers"):
+        from_board([["a", "b"]] * 4, PLANE[:4])
 
 
 def test_a_board_of_one_point_raises():

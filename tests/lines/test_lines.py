@@ -1,3 +1,4 @@
+import dataclasses
 import warnings
 import zipfile
 
@@ -335,3 +336,10 @@ def test_writing_that_fails_leaves_the_old_file_and_nothing_else(saved, monkeypa
 def test_a_folder_is_not_replaced_by_a_file(tmp_path):
     with pytest.raises(IsADirectoryError, match="where there is a folder"):
         make().save(tmp_path)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("name", ["points", "mask", "frame", "focal", "centre"])
+def test_nothing_may_be_missing(name):
+    with pytest.raises(ValueError, match=f"Argument {name} must be given, but it is None"):
+        dataclasses.replace(make(), **{name: None})

@@ -85,7 +85,7 @@ def test_a_lens_in_pixels_needs_no_pitch(truth):
     [
         ({}, "pixel_pitch"),
         ({"pixel_pitch": -0.006}, "positive"),
-        ({"pixel_pitch": 0.006, "principal": [1.0, 2.0, 3.0]}, r"principal must be \(x, y\)"),
+        ({"pixel_pitch": 0.006, "principal": [1.0, 2.0, 3.0]}, r"principal must have shape \(2,\)"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
@@ -106,3 +106,37 @@ def test_float32_stays(camera, pixels):
     back, _ = camera.project(rays, FOCAL)
     assert back.dtype == jnp.float32
     np.testing.assert_allclose(back, pixels, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("kind", [np, jnp], ids=["numpy", "jax"])
+def test_the_principal_point_moves_with_the_centre(kind):
+    """By default it is the centre of distortion, also of a lens whose centre moves along the zoom."""
+    zoom, shift = (zj.PolynomialZoom(1, k, 20.0) for k in ([[0.0], [0.1]], [[0.0, 0.0], [0.1, -0.05]]))
+    lens = zj.ZoomLens(zoom, [319.5, 239.5], [20.0, 80.0], (640, 480), "px", shift)
+    camera, focal = zj.models.Camera(lens), kind.asarray([20.0, 40.0])
+    centres = kind.asarray(lens(np.array([20.0, 40.0])).centre)
+    assert np.ptp(centres, axis=0).min() > 9
+    ahead, known = camera.rays(centres, focal)
+    np.testing.assert_allclose(ahead, [[0, 0, 1]] * 2, atol=1e-6)
+    pixels, seen = camera.project(camera.rays(centres + 30, focal)[0], focal)
+    np.testing.assert_allclose(pixels, centres + 30, atol=1e-3)
+    assert known.all()
+    assert seen.all()
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"pixel_pitch": jnp.array(-0.006)},
+        {"pixel_pitch": jnp.array(np.nan)},
+        {"pixel_pitch": [0.006, 0.006]},
+        {"pixel_pitch": 0.006, "principal": [np.nan, 1.0]},
+        {"pixel_pitch": 0.006, "principal": [1.0, 1j]},
+        {"pixel_pitch": 0.006, "principal": "ab"},
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_what_is_no_camera_is_refused(bad):
+    name = list(bad)[-1]
+    with pytest.raises(ValueError, match=f"Argument {name} must"):
+        zj.models.Camera(zj.scenes.nikkor_18_200(), **bad)

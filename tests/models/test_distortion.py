@@ -245,3 +245,29 @@ def test_what_comes_from_within_the_fold_goes_back(dtype):
     inside = np.linspace(0.999, 1, 4000, dtype=dtype) * np.asarray(d.monotone_radius)
     points = np.stack([0.6 * inside, 0.8 * inside], axis=-1).astype(dtype)
     assert np.isfinite(d.distort(d.undistort(points))).all()
+
+
+NO_DISTORTION = {
+    "scale below zero": ([0.1], [0, 0], jnp.array(-400.0)),
+    "scale zero": ([0.1], [0, 0], jnp.array(0.0)),
+    "scale NaN": ([0.1], [0, 0], jnp.array(np.nan)),
+    "scale a word": ([0.1], [0, 0], "400"),
+    "coefficients NaN": ([np.nan], [0, 0], 400.0),
+    "coefficients infinite": (jnp.array([np.inf]), [0, 0], 400.0),
+    "coefficients None": (None, [0, 0], np.array(400.0)),
+    "coefficients words": (["a"], [0, 0], 400.0),
+    "coefficients yes and no": ([True], [0, 0], 400.0),
+    "coefficients objects": (np.array([0.1], object), [0, 0], 400.0),
+    "coefficients complex": ([1j], [0, 0], 400.0),
+    "coefficients of rows": ([[0.1], [0.2, 0.3]], [0, 0], 400.0),
+    "coefficients of OpenCV": ([0.1, 0.0, 0.0, 0.0, 0.0], [0, 0], 400.0),
+    "centre NaN": ([0.1], [np.nan, 0.0], 400.0),
+    "centre None": ([0.1], None, np.array(400.0)),
+}
+
+
+@pytest.mark.parametrize("what", NO_DISTORTION)
+@pytest.mark.usefixtures("unchecked")
+def test_what_is_no_distortion_is_refused_by_name(what):
+    with pytest.raises(ValueError, match=f"Argument {what.split()[0]} must"):
+        zj.Distortion(*NO_DISTORTION[what])

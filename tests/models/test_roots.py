@@ -1,5 +1,6 @@
 """Inverses on what breaks iterations: cycles of Newton's method, folds, points that nearly are at them."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -160,8 +161,11 @@ def test_a_divisor_that_is_nothing_but_rounding_gives_no_number(dtype, array):
 
 
 def test_nan_ends_the_search():
-    d = unit([np.nan, 0.1])
-    assert np.isnan(d.distort(on_axis(np.array([0.5, 1.0])))).all()
+    points = on_axis(np.array([0.5, 1.0]))
+    d = eqx.tree_at(lambda d: d.coefficients, unit([0.0, 0.1]), np.array([np.nan, 0.1]))  # as under jit
+    assert np.isnan(d.distort(points)).all()
+    assert np.isnan(d.undistort(points)).all()
+    assert np.isnan(d.monotone_radius)
     assert not unit([0.1]).has_inverse(np.array([[np.nan, 0.0], [np.inf, 1.0]])).any()
 
 

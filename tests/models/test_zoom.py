@@ -205,3 +205,26 @@ def test_the_crossover_is_where_k1_is_zero():
 def test_two_regions_without_a_crossover_say_where_to_get_it():
     with pytest.raises(ValueError, match="barrel_crossover"):
         zj.models.TwoRegionZoom().prepare(FOCAL, 1)
+
+
+@every_model
+@pytest.mark.usefixtures("unchecked")
+def test_a_model_takes_one_focal_length_and_says_so(model):
+    """Of two it gave k1 at the one and k2 at the other."""
+    zoom = with_random_parameters(model)
+    each = [np.asarray(zoom(f)) for f in (20.0, 40.0)]
+    np.testing.assert_allclose(jax.vmap(zoom)(jnp.array([20.0, 40.0])), each, rtol=1e-12)
+    for several in (np.array([20.0, 40.0]), jnp.array([20.0, 40.0]), [20.0, 40.0], np.array([20.0])):
+        with pytest.raises(ValueError, match=r"must be one focal length; jax.vmap"):
+            zoom(several)
+    for none in (-3.0, 0.0, np.nan, jnp.array(-3.0)):
+        with pytest.raises(ValueError, match="focal must be finite and positive"):
+            zoom(none)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_whole_numbers_are_numbers():
+    zoom = zj.PolynomialZoom.from_inverse_focal([[0], [2]], 20)
+    np.testing.assert_allclose(zoom.parameters, [[0], [0.1]])
+    with pytest.raises(ValueError, match=r"coefficients must have shape \(basis, terms\)"):
+        zj.PolynomialZoom.from_inverse_focal([0.0, 0.1], 20.0)

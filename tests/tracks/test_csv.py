@@ -10,6 +10,7 @@ from zoomjax.tracks import Tracks, read_tracks_csv, write_tracks_csv
 SIZE = (64, 48)
 
 
+@pytest.mark.filterwarnings("ignore:.*lie outside of the image")
 @given(data=st.data(), dtype=st.sampled_from([np.float32, np.float64]))
 def test_what_is_written_is_read_back_to_the_last_digit(data, dtype, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "tracks.csv"

@@ -36,6 +36,7 @@ def test_what_is_saved_is_loaded(dtype, tmp_path):
     assert_same(load_tracks(tmp_path / "tracks.npz"), tracks)
 
 
+@pytest.mark.filterwarnings("ignore:.*lie outside of the image")
 @given(st.lists(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=5), min_size=1, max_size=6))
 def test_any_tracks_come_back(tmp_path_factory, ragged):
     path = tmp_path_factory.getbasetemp() / "any.npz"
@@ -133,3 +134,17 @@ def test_other_kinds_of_things_are_told(saved):
         load_tracks(make())
     with pytest.raises(ValueError, match="holds no lines"):
         zj.load_lines(saved)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_what_is_no_track_is_refused():
+    frame = [0, 1]
+    for points in ([[1, 2j], [2, 2]], [["a", "b"], ["c", "d"]], np.array([[1, 2], [2, 2]], object)):
+        with pytest.raises(ValueError, match="points must hold real numbers"):
+            Tracks.from_arrays([0, 0], frame, points, image_size=SIZE)
+    with pytest.warns(UserWarning, match="1 of 2 points lie outside of the image"):
+        Tracks.from_arrays([0, 0], frame, [[1, 2], [1e6, 2]], image_size=SIZE)
+    with pytest.raises(ValueError, match=r"frame must increase along a track, but frame\[1\] does not"):
+        Tracks(
+            np.zeros((2, 2, 2)), np.array([[0, 1], [1, 1]]), np.ones((2, 2), bool), SIZE, 3, np.arange(2)
+        )

@@ -181,3 +181,60 @@ def test_bands_are_never_narrower_than_rounding_allows(dtype, truth):
         outcomes.append(float(std[0]))
     if dtype == np.float64:
         assert outcomes[0] < 10 * least  # and of use where there are digits left
+
+
+# What has no number has no standard deviation
+
+
+def test_nothing_is_certain_of_what_is_not_a_number(fit):
+    """A derivative of zero of a NaN was a standard deviation of 0."""
+    high = float(fit.lens.focal_range[1])
+    corner = jnp.zeros(2)
+    std = zj.trust.std_of(
+        fit, lambda lens: jnp.stack([lens(f).undistort(corner) for f in (high, high + 1)])
+    )
+    np.testing.assert_array_equal(np.isnan(std), [[False, False], [True, True]])
+    odd = np.array([[np.nan, 0.0], [np.inf, 0.0], [0.0, 0.0]])
+    for found in (
+        zj.displacement_std(fit, odd, focal=30.0),
+        *zj.displacement_band(fit, odd, focal=30.0),
+        zj.trust.displacement_covariance(fit, odd, focal=30.0)[:, 0, 0],
+    ):
+        np.testing.assert_array_equal(np.isfinite(found), [False, False, True])
+
+
+def test_nothing_is_certain_beyond_the_fold():
+    folding = zj.ZoomLens(zj.PolynomialZoom(0, [[-0.5]], 20.0), [319.5, 239.5], [20.0, 20.0], (640, 480))
+    lines = scenes.board_lines(
+        scenes.nikkor_18_200((640, 480)), np.array([20.56, 30.0]), spacing=40.0, noise=0.3
+    )
+    fit = zj.fit_zoom(zj.compress(lines), zoom=zj.PolynomialZoom(degree=0), terms=1)
+    fit = eqx.tree_at(lambda fit: fit.lens, fit, folding)
+    points = np.array([[320.0, 300.0], [0.0, 0.0]])
+    assert np.isnan(np.asarray(folding(20.0).undistort(points))[:, 0]).tolist() == [False, True]
+    assert np.isnan(zj.displacement_std(fit, points, focal=20.0)).tolist() == [False, True]
+
+
+@pytest.mark.parametrize("focal", [np.nan, np.inf, 0.0, -30.0, [30.0, -1.0]])
+def test_focal_lengths_that_are_none_are_refused(fit, focal):
+    for call in (
+        lambda f: zj.displacement_std(fit, POINTS[0], focal=f),
+        lambda f: zj.displacement_band(fit, POINTS[0], focal=f),
+        lambda f: zj.trust.displacement_covariance(fit, POINTS[0], focal=f),
+        lambda f: zj.trust.coefficient_std(fit, f),
+    ):
+        with pytest.raises(ValueError, match="focal must be finite and positive"):
+            call(np.asarray(focal))
+        assert np.isnan(jax.jit(call)(jnp.asarray(focal))).any()
+
+
+def test_a_band_is_about_the_centre_at_its_focal_length(fit):
+    """Which moves along the zoom where the lens has a shift: 3 % of the scale, 77 px, at the short end."""
+    shift = zj.PolynomialZoom(1, [[0.0, 0.0], [0.03, -0.02]], FOCAL[0])
+    moving = eqx.tree_at(lambda fit: fit.lens.shift, fit, shift, is_leaf=lambda leaf: leaf is None)
+    for f in FOCAL:
+        d = moving.lens(float(f))
+        near = np.asarray(d.centre) + np.array([3.0, 4.0])
+        away = np.hypot(*(np.asarray(d.undistort(near)) - np.asarray(d.centre))) - 5
+        low, high = zj.displacement_band(moving, near, focal=f)
+        assert float(low) < away < float(high)

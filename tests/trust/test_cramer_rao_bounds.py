@@ -1,5 +1,7 @@
 """The Cramer-Rao bound: against the whole Fisher information, nuisances and all, and against fits."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -167,3 +169,11 @@ def test_errors_of_points_that_are_none_are_refused(bound, std, clean, truth, un
     }
     with pytest.raises(ValueError, match="Argument std must hold"):
         bound(truth, clean, std=stds.get(std, std))
+
+
+def test_lenses_for_different_images_are_not_compared():
+    lens = scenes.nikkor_18_200()
+    with pytest.raises(ValueError, match=r"must have the image_size of the first lens, \(4288, 2848\)"):
+        zj.trust.displacement_rms(lens, scenes.nikkor_18_200((640, 427)))
+    with pytest.raises(ValueError, match="must have the focal_unit of the first lens, mm"):
+        zj.trust.displacement_rms(lens, dataclasses.replace(lens, focal_unit="px"))

@@ -50,7 +50,7 @@ def checked_centre(centre: Any, size: tuple[int, int]) -> np.ndarray:
     """The centre of distortion, px; that of the image if None."""
     if centre is None:
         return (np.array(size) - 1) / 2
-    middle = _numbers(centre)
+    middle = real_numbers(centre)
     if middle is None or middle.shape != (2,) or not np.isfinite(middle).all():
         raise ValueError(f"Argument centre must be two finite numbers, but it is {centre!r}.")
     return middle
@@ -58,7 +58,7 @@ def checked_centre(centre: Any, size: tuple[int, int]) -> np.ndarray:
 
 def checked_points(line: ArrayLike, index: int) -> np.ndarray:
     """The points of one line, (n, 2), in their dtype if it is float32 or float64."""
-    array = _numbers(line)
+    array = real_numbers(line)
     if array is not None and array.size == 0:
         return np.zeros((0, 2), np.float32)
     if array is None or array.ndim != 2 or array.shape[1] != 2:
@@ -78,7 +78,7 @@ def checked_points(line: ArrayLike, index: int) -> np.ndarray:
 
 def checked_focal(focal: ArrayLike) -> np.ndarray:
     """The focal length of each frame, float64."""
-    focals = _numbers(focal)
+    focals = real_numbers(focal)
     if focals is None or focals.ndim != 1 or not focals.size:
         raise ValueError(f"Argument focal must be a sequence with one number a frame, but it is {focal!r}.")
     good = np.isfinite(focals) & (focals > 0)
@@ -92,7 +92,7 @@ def checked_focal(focal: ArrayLike) -> np.ndarray:
 
 def checked_focus(focus: ArrayLike, frames: int) -> np.ndarray:
     """The focus of each frame, float64."""
-    values = _numbers(focus)
+    values = real_numbers(focus)
     if values is None or values.shape != (frames,) or not np.isfinite(values).all():
         raise ValueError(
             f"Argument focus must hold one finite number for each of the {frames} frames, but it is "
@@ -165,7 +165,7 @@ def _has_three_distinct(line: np.ndarray) -> bool:
     return bool((from_first & (line != second).any(axis=1)).any())
 
 
-def _numbers(values: ArrayLike) -> np.ndarray | None:
+def real_numbers(values: ArrayLike) -> np.ndarray | None:
     """Real numbers as an array, half precision widened; None if they are something else."""
     try:
         array = np.asarray(values)

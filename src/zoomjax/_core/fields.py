@@ -27,6 +27,11 @@ def numbers(name: str) -> Callable[[Any], Any]:
     return _converter(name, "real numbers")
 
 
+def host_numbers(name: str) -> Callable[[Any], Any]:
+    """As `numbers`, but lists become NumPy arrays: what is computed from them needs no compilation."""
+    return _converter(name, "real numbers", np.array)
+
+
 def integers(name: str) -> Callable[[Any], Any]:
     """A converter for a field of integers: lists become arrays."""
     return _converter(name, "integers")
@@ -37,13 +42,13 @@ def booleans(name: str) -> Callable[[Any], Any]:
     return _converter(name, "booleans")
 
 
-def _converter(name: str, kind: str) -> Callable[[Any], Any]:
+def _converter(name: str, kind: str, make: Callable[[Any], Any] = jnp.array) -> Callable[[Any], Any]:
     def convert(value: Any) -> Any:
         if value is None or isinstance(value, bool) or type(value) is object:
             return value
         array = value
         if not hasattr(value, "dtype"):
-            array = _array(value) if isinstance(value, int | float | list | tuple) else None
+            array = _array(value, make) if isinstance(value, int | float | list | tuple) else None
             if array is None:
                 raise ValueError(f"Argument {name} must hold {kind}, but it is {_shown(value)}.")
         elif isinstance(value, np.generic):
@@ -51,19 +56,19 @@ def _converter(name: str, kind: str) -> Callable[[Any], Any]:
         if jnp.issubdtype(array.dtype, _KINDS[kind]):
             return array
         if kind == "real numbers" and jnp.issubdtype(array.dtype, jnp.integer) and hasattr(array, "astype"):
-            return array.astype(jnp.result_type(float))
+            return array.astype(float if isinstance(array, np.ndarray) else jnp.result_type(float))
         raise ValueError(f"Argument {name} must hold {kind}, but its dtype is {array.dtype}.")
 
     return convert
 
 
-def _array(value: Any) -> jax.Array | None:
+def _array(value: Any, make: Callable[[Any], Any]) -> Any:
     """An array of numbers and lists of them; None of anything else."""
     leaves = jax.tree.leaves(value)
     if not all(isinstance(leaf, int | float | complex) or hasattr(leaf, "dtype") for leaf in leaves):
         return None
     try:
-        return jnp.array(value)
+        return make(value)
     except (TypeError, ValueError, OverflowError):  # rows of different lengths
         return None
 
@@ -112,6 +117,13 @@ def known(value: Any) -> np.ndarray | None:
     if isinstance(value, Tracer) or not isinstance(value, jax.Array) or value.size > _FEW:
         return None
     return None if value.is_deleted() or not value.is_fully_addressable else np.asarray(value)
+
+
+def check_present(fields: Mapping[str, Any]) -> None:
+    """Raise ValueError where one of the fields is None and others are arrays: all None are a stand-in."""
+    missing = [name for name, value in fields.items() if value is None]
+    if missing and any(isinstance(value, np.ndarray | jax.Array) for value in fields.values()):
+        raise ValueError(f"Argument {missing[0]} must be given, but it is None.")
 
 
 def check_finite(name: str, value: Any) -> None:

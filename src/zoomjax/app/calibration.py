@@ -32,6 +32,7 @@ from ..trust.next_photo import Suggestion, suggest_next
 from ..trust.selection import Selection
 from .fitting import fitted
 from .model_choice import CentreFound, WantedModel
+from .outward import outward
 from .results_folder import results_folder
 
 FILES = ("lens.json", "lines.npz", "summary.json", "model.png")
@@ -93,9 +94,7 @@ class Calibration:
         corner = np.where(centre > last / 2, 0.0, last)
         focal = [low, *([float(np.sqrt(low * high)), high] if high > low else [])]
         std = np.asarray(displacement_std(self.zoom, corner, focal=np.array(focal)))
-        corrected = [np.asarray(lens(f).undistort(corner)) for f in focal]
-        moved = [np.hypot(*(point - centre)) - np.hypot(*(corner - centre)) for point in corrected]
-        return list(zip(focal, map(float, moved), std.tolist(), strict=True))
+        return list(zip(focal, outward(lens, corner, focal).tolist(), std.tolist(), strict=True))
 
     def allowed_for(self) -> str:
         """A sentence on the uncertainty of focal lengths in the bands; empty if they are exact."""

@@ -82,13 +82,14 @@ def _residuals(lines: Lines, lens: ZoomLens, chosen: np.ndarray) -> tuple[np.nda
     """Distances of points from the centre, and of corrected points from their lines, px."""
     points, mask = np.asarray(lines.points)[chosen], np.asarray(lines.mask)[chosen]
     frame, focal = np.asarray(lines.frame)[chosen], np.asarray(lines.focal)
-    corrected = np.zeros(points.shape)
+    corrected, away = np.zeros(points.shape), np.zeros(points.shape)
     for index in np.unique(frame):
         own = (frame == index)[:, None] & mask
-        corrected[own] = lens(float(focal[index])).undistort(points[own])
+        distortion = lens(float(focal[index]))
+        corrected[own] = distortion.undistort(points[own])
+        away[own] = points[own] - np.asarray(distortion.centre)
     mean = corrected.sum(axis=1) / mask.sum(axis=1)[:, None]
     rows = np.where(mask[..., None], corrected - mean[:, None], 0)
     normal = np.linalg.eigh(np.einsum("lpc,lpd->lcd", rows, rows))[1][..., 0]
     residual = np.einsum("lpc,lc->lp", rows, normal)
-    away = points - np.asarray(lens.centre)
     return np.hypot(away[..., 0], away[..., 1])[mask], residual[mask]

@@ -21,6 +21,7 @@ from ..models.zoom import PolynomialZoom
 from ..tracks.tracks import Tracks
 from ..trust.bands import displacement_std
 from .model_choice import WantedModel
+from .outward import outward
 
 FILES = ("lens.json", "track.csv", "tracks.npz", "summary.json", "motion.png", "panorama.jpg")
 """What `MotionCalibration.make` writes."""
@@ -68,12 +69,8 @@ class MotionCalibration:
         low, high = (float(f) for f in lens.focal_range)
         focal = [low, float(np.sqrt(low * high)), high]
         corner = np.zeros(2)
-        centre = np.asarray(lens.centre)
         std = np.asarray(displacement_std(self.fit.fit, corner, focal=np.array(focal)))
-        moved = [
-            np.hypot(*(np.asarray(lens(f).undistort(corner)) - centre)) - np.hypot(*centre) for f in focal
-        ]
-        return list(zip(focal, map(float, moved), std.tolist(), strict=True))
+        return list(zip(focal, outward(lens, corner, focal).tolist(), std.tolist(), strict=True))
 
     def scale_std(self) -> float:
         """Standard deviation of the factor common to all focal lengths, relative."""

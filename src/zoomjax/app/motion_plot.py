@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 
 from ..fit.motion import MotionFit
 from ..trust.bands import displacement_std
+from .outward import outward
 
 _MODEL, _FRAMES, _PALE = "#c2410c", "#1e3a5f", "#7da3c8"
 _BAND = 1.96  # standard deviations of a 95 % band
@@ -47,9 +48,8 @@ def _corner(axes: Axes, fit: MotionFit) -> None:
     lens = fit.lens
     low, high = (float(f) for f in lens.focal_range)
     focal = 1 / np.linspace(1 / low, 1 / high, 60)
-    corner, centre = np.zeros(2), np.asarray(lens.centre)
-    moved = [np.hypot(*(np.asarray(lens(f).undistort(corner)) - centre)) for f in focal]
-    moved = np.array(moved) - np.hypot(*centre)
+    corner = np.zeros(2)
+    moved = outward(lens, corner, focal)
     std = np.asarray(displacement_std(fit.fit, corner, focal=focal))
     axes.fill_between(focal, moved - _BAND * std, moved + _BAND * std, color=_MODEL, alpha=0.25, lw=0)
     axes.plot(focal, moved, color=_MODEL)

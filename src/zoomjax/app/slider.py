@@ -9,6 +9,7 @@ import numpy as np
 
 from ..fit.result import ZoomFit
 from ..trust.bands import displacement_std
+from .outward import outward
 
 _STEPS, _RADII, _CELLS, _PER_CELL = 41, 25, 12, 3
 _VISIBLE = 0.03  # of the longer side: how far the grid is bent at least, where that is most
@@ -38,8 +39,7 @@ def slider(fit: ZoomFit) -> dict[str, Any] | None:
     corner = np.where(centre > (size - 1) / 2, 0.0, size - 1)
     share = np.linspace(0, 1, _RADII)[:, None]
     along = centre + share * (corner - centre)
-    outward = (corner - centre) / np.hypot(*(corner - centre))
-    moved = np.stack([(np.asarray(lens(float(f)).undistort(along)) - along) @ outward for f in focals])
+    moved = outward(lens, along, focals)
     std = np.asarray(displacement_std(fit, along[None], focal=focals[:, None]))
     ends = np.cumsum([len(line) for line in straight])[:-1]
     return {

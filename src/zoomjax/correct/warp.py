@@ -75,6 +75,8 @@ def warp_image(
         raise ValueError(
             f"Argument image must have shape (height, width, ...) with pixels, but it is {image.shape}."
         )
+    if image.dtype == bool:
+        raise ValueError("Argument image must hold numbers, but its dtype is bool: image.astype(float).")
     if interpolation not in _KERNELS:
         raise ValueError(
             f'Argument interpolation must be "linear" or "cubic", but it is {interpolation!r}.'

@@ -18,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.arguments import kinds_checked
+from .._core.fields import numbers
 from .._core.products import exact_products
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines
@@ -202,9 +203,12 @@ def _line_squares(lines, coefficients):
 
 @kinds_checked
 @eqx.filter_jit
-def global_energy(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, ""]:
+def global_energy(
+    lines: AbstractLines, coefficients: Float[AnyArray, "frame terms"] | list
+) -> Float[Array, ""]:
     """The global energy, px^2: the mean of the frames' errors (eq. 13)."""
-    return jnp.sum(residuals(lines, coefficients) ** 2)
+    k = jnp.asarray(numbers("coefficients")(coefficients))
+    return jnp.sum(residuals(lines, k) ** 2)
 
 
 def linearised(lines, zoom):

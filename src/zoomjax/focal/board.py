@@ -7,15 +7,17 @@ r_c / R is the scale of the similarity that best maps the board's points to the 
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Float
+import numpy as np
+from jaxtyping import Num
 
+from .._core.fields import check_positive
 from .._core.types import AnyArray, Scalar
-from .estimate import FocalEstimate, check_pairs
+from .estimate import FocalEstimate, as_points_of, check_pairs
 
 
 def focal_from_board(
-    points: Float[AnyArray, "point 2"],
-    board: Float[AnyArray, "point 2"],
+    points: Num[AnyArray, "point 2"] | list,
+    board: Num[AnyArray, "point 2"] | list,
     *,
     distance: float | int | Scalar,
     pixel: float | int | Scalar,
@@ -34,8 +36,8 @@ def focal_from_board(
         Errors of distance, pixel and board are not included: f changes by as many per cent as the distance.
 
         Raises:
-        ValueError: shapes differ, or there are fewer than 3 points.
-        RuntimeError: a length is not positive, or all points of the board coincide.
+        ValueError: shapes differ, there are fewer than 3 points, or a length is not positive.
+        RuntimeError: a length that was not known is not positive, or all points of the board coincide.
 
     References:
         Eq. 14 of the paper.
@@ -47,7 +49,10 @@ def focal_from_board(
         >>> print(round(float(focal_from_board(image, board, distance=1000, pixel=0.005).focal), 3))
         50.0
     """
+    points, board = as_points_of("points", points), as_points_of("board", board)
     check_pairs(points, board, fewest=3)
+    check_positive("distance", np.asarray(distance) if isinstance(distance, int | float) else distance)
+    check_positive("pixel", np.asarray(pixel) if isinstance(pixel, int | float) else pixel)
     # A similarity is one complex factor: its absolute value is px in the image per mm on the board.
     seen, known = _complex(points), _complex(board)
     seen, known = seen - jnp.mean(seen), known - jnp.mean(known)

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.fields import numbers
 from ._homography import matrix_of
 
 _WEIGHINGS = 5
@@ -82,6 +83,11 @@ def _inverse_square(entries, root):
     w, information, weight = solve(jnp.maximum(w, 0))
     wrong = w * factor + constant
     return w, information, jnp.sum(wrong[:, :, None] * weight * wrong[:, None, :])
+
+
+def as_points_of(name: str, points) -> jax.Array:
+    """Points, or lists of them, as an array; ValueError if they hold something else."""
+    return jnp.asarray(numbers(name)(points))
 
 
 def check_pairs(points, plane, *, fewest: int) -> None:

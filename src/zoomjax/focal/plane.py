@@ -21,19 +21,19 @@ them. The homography is fitted to the points' distances from the images of their
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Num
 
 from .._core.products import exact_products
 from .._core.types import AnyArray
 from ._homography import homography, homography_from_lines
-from .estimate import FocalEstimate, check_pairs, estimate_of
+from .estimate import FocalEstimate, as_points_of, check_pairs, estimate_of
 
 
 def focal_from_planes(
-    points: Float[AnyArray, "view point 2"],
-    plane: Float[AnyArray, "point 2"],
+    points: Num[AnyArray, "view point 2"] | list,
+    plane: Num[AnyArray, "point 2"] | list,
     *,
-    principal: Float[AnyArray, "2"],
+    principal: Num[AnyArray, "2"] | list | tuple,
 ) -> tuple[FocalEstimate, FocalEstimate]:
     """Estimate the focal length from oblique views of a known plane, by Zhang's two constraints.
 
@@ -63,20 +63,21 @@ def focal_from_planes(
         >>> print(round(float(together.focal), 1), each.focal.shape)
         800.0 (1,)
     """
+    points, plane = as_points_of("points", points), as_points_of("plane", plane)
     if points.ndim != 3 or not len(points):
         raise ValueError(
             "Argument points must have shape (view, point, 2), with a view at least, but its shape is "
             f"{points.shape}."
         )
     check_pairs(points[0], plane, fewest=5)
-    return _focal_from_planes(jnp.asarray(points), jnp.asarray(plane), jnp.asarray(principal))
+    return _focal_from_planes(points, plane, as_points_of("principal", principal))
 
 
 def focal_from_lines(
-    points: Float[AnyArray, "line point 2"],
-    lines: Float[AnyArray, "line 2 2"],
+    points: Num[AnyArray, "line point 2"] | list,
+    lines: Num[AnyArray, "line 2 2"] | list,
     *,
-    principal: Float[AnyArray, "2"],
+    principal: Num[AnyArray, "2"] | list | tuple,
     mask: Bool[AnyArray, "line point"] | None = None,
 ) -> FocalEstimate:
     """Estimate the focal length from one oblique view of known lines of a plane, by Zhang's two
@@ -111,6 +112,7 @@ def focal_from_lines(
         >>> print(round(float(focal_from_lines(image, lines, principal=np.zeros(2)).focal), 1))
         800.0
     """
+    points, lines = as_points_of("points", points), as_points_of("lines", lines)
     if mask is None:
         mask = jnp.ones(points.shape[:2], bool)
     if points.ndim != 3 or points.shape != (*mask.shape, 2) or lines.shape != (len(points), 2, 2):
@@ -118,7 +120,7 @@ def focal_from_lines(
             "Arguments points, mask and lines must have shapes (line, point, 2), (line, point) and "
             f"(line, 2, 2), but their shapes are {points.shape}, {mask.shape} and {lines.shape}."
         )
-    return _focal_from_lines(*map(jnp.asarray, (points, mask, lines, principal)))
+    return _focal_from_lines(points, jnp.asarray(mask), lines, as_points_of("principal", principal))
 
 
 @eqx.filter_jit

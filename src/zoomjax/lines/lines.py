@@ -28,7 +28,7 @@ from .._core.checks import (
     usable_lines,
     warn_of_points_outside,
 )
-from .._core.fields import booleans, check_shapes, integers, known, numbers
+from .._core.fields import booleans, check_present, check_shapes, integers, known, numbers
 from .._core.files import whole_file
 from .._core.products import EXACT
 from .._core.types import AnyArray, Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Mask, Point
@@ -79,6 +79,8 @@ class Lines(AbstractLines):
                 "number": (self.number, ("line",)),
             }
         )
+        needed = ("points", "mask", "frame", "focal", "centre")
+        check_present({name: getattr(self, name) for name in needed})
         points, mask = known(self.points), known(self.mask)
         if points is not None and mask is not None and not np.isfinite(points).all():
             bad = np.argwhere(mask & ~np.isfinite(points).all(axis=-1))

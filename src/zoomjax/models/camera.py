@@ -18,6 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Bool, Float, Num
 
 from .._core.arrays import aligned, as_array, finite, namespace
+from .._core.fields import check_finite, check_positive, check_shapes, numbers
 from .._core.types import AnyArray, FocalLike, Points
 from .lens import ZoomLens
 
@@ -28,7 +29,7 @@ class Camera(eqx.Module):
     Attributes:
         lens: from `fit_zoom` or `load_lens`.
         principal: the principal point, px: where the optical axis meets the image. By default the centre of
-            distortion.
+            distortion, which moves along the zoom if the lens has a `shift`.
         pixel_pitch: mm from one pixel to the next, for lenses whose focal lengths are in mm; by default the
             lens's own. None for lenses in px.
 
@@ -45,12 +46,8 @@ class Camera(eqx.Module):
     """
 
     lens: ZoomLens
-    principal: Float[AnyArray, "2"] | None = eqx.field(
-        default=None, converter=lambda value: None if value is None else as_array(value)
-    )
-    pixel_pitch: Float[AnyArray, ""] | None = eqx.field(
-        default=None, converter=lambda value: None if value is None else as_array(value)
-    )
+    principal: Float[AnyArray, "2"] | None = eqx.field(default=None, converter=numbers("principal"))
+    pixel_pitch: Float[AnyArray, ""] | None = eqx.field(default=None, converter=numbers("pixel_pitch"))
 
     def __check_init__(self):
         """Check that the focal length in px is known, and shapes."""
@@ -67,12 +64,9 @@ class Camera(eqx.Module):
                 if self.pixel_pitch is None
                 else "Argument pixel_pitch must be left out: the lens's focal lengths are in px already."
             )
-        pitch = self.pixel_pitch
-        if isinstance(pitch, np.ndarray) and not (np.isfinite(pitch).all() and (pitch > 0).all()):
-            raise ValueError(f"Argument pixel_pitch must be positive, but it is {pitch}.")
-        shape = getattr(self.principal, "shape", (2,))
-        if shape[-1:] != (2,):
-            raise ValueError(f"Argument principal must be (x, y) px, but its shape is {shape}.")
+        check_shapes({"principal": (self.principal, (2,)), "pixel_pitch": (self.pixel_pitch, ())})
+        check_finite("principal", self.principal)
+        check_positive("pixel_pitch", self.pixel_pitch)
 
     def rays(
         self,
@@ -129,7 +123,11 @@ class Camera(eqx.Module):
 
     def _aligned(self, points: Any, focal: Any) -> list[Any]:
         """Points, the principal point and focal lengths in px, ready to broadcast."""
-        principal = _as(self.lens.centre if self.principal is None else self.principal, points)
+        principal = self.principal
+        if principal is None:
+            moves = self.lens.shift is not None
+            principal = self.lens.centre_at(focal) if moves else self.lens.centre
+        principal = _as(principal, points)
         length = _as(focal, points)
         if self.lens.focal_unit == "mm":
             pitch = self.lens.pixel_pitch if self.pixel_pitch is None else self.pixel_pitch

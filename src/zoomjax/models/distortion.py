@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._core.arguments import check_kind
-from .._core.arrays import aligned, as_array, finite, interleaved, namespace, once, together
+from .._core.arrays import aligned, finite, interleaved, namespace, once, together
+from .._core.fields import check_finite, check_positive, host_numbers
 from .._core.spread import spread
 from .._core.types import AnyArray, Elements, Points, traced
 from .family import AbstractFamily, AbstractRadial, Pair
@@ -51,9 +52,9 @@ class Distortion(eqx.Module):
         [664.49, 498.11]
     """
 
-    coefficients: Float[AnyArray, "*batch terms"] = eqx.field(converter=as_array)
-    centre: Float[AnyArray, "... 2"] = eqx.field(converter=as_array)
-    scale: Float[AnyArray, "..."] = eqx.field(converter=as_array)
+    coefficients: Float[AnyArray, "*batch terms"] = eqx.field(converter=host_numbers("coefficients"))
+    centre: Float[AnyArray, "... 2"] = eqx.field(converter=host_numbers("centre"))
+    scale: Float[AnyArray, "..."] = eqx.field(converter=host_numbers("scale"))
     family: AbstractFamily = RadialPolynomial()
 
     def __check_init__(self):
@@ -75,7 +76,8 @@ class Distortion(eqx.Module):
         For `BrownConrady` a lower bound: the distortion is certain not to fold up to there.
         """
         radius = self.scale * _limit(self.family, self.coefficients)
-        return namespace(radius).asarray(radius)
+        xp, k = namespace(radius, self.coefficients), self.coefficients
+        return xp.asarray(xp.where(xp.isnan(k).any(axis=-1), np.nan, radius))
 
     def undistort(self, points: Points) -> Float[AnyArray, "*points 2"]:
         """Correct distorted `points` (eq. 1).
@@ -140,6 +142,17 @@ def as_points(points: Any) -> Any:
     if jnp.issubdtype(points.dtype, jnp.integer):
         return points.astype(float)
     return points.astype(np.float32) if points.dtype.itemsize < 4 else points
+
+
+def check_broadcast(points: tuple[Any, ...], focal: tuple[Any, ...]) -> None:
+    """Raise ValueError where there are neither as many focal lengths as points nor one for many."""
+    try:
+        jnp.broadcast_shapes(points, focal)
+    except ValueError as error:
+        raise ValueError(
+            f"Argument focal must have a shape that broadcasts with that of the points, {points}, one for "
+            f"all or one for each, but its shape is {focal}."
+        ) from error
 
 
 def mapped(method: str, family: AbstractFamily, points: Any, k: Any, centre: Any, scale: Any) -> Any:
@@ -364,20 +377,11 @@ def _check(coefficients, centre, scale, family):
     check_kind("family", family, (AbstractFamily,))
     parts = {"coefficients": coefficients, "centre": centre, "scale": scale}
     if not all(hasattr(part, "shape") and hasattr(part, "dtype") for part in parts.values()):
+        if any(isinstance(part, np.ndarray | jax.Array) for part in parts.values()):
+            missing = next(name for name, part in parts.items() if not hasattr(part, "dtype"))
+            raise ValueError(f"Argument {missing} must hold real numbers, but it is {parts[missing]!r}.")
         return  # a stand-in, of a pytree's structure
-    for name, part in parts.items():
-        if not jnp.issubdtype(part.dtype, jnp.floating):
-            raise ValueError(f"Argument {name} must hold real numbers, but its dtype is {part.dtype}.")
-    size = coefficients.shape[-1] if coefficients.ndim else 0
-    sizes = [family.size(terms) for terms in range(1, family.most_terms + 1)]
-    more = [family.size(terms) for terms in family.more_terms]
-    if size not in (*sizes, *more):
-        opencv = ": OpenCV's (k1, k2, p1, p2, k3, ...) are of another model" * (size in (5, 8, 12, 14))
-        raise ValueError(
-            f"Argument coefficients must hold from {min(sizes)} to {max(sizes)} numbers"
-            f"{''.join(f', or {number}' for number in more)}, for a "
-            f"{type(family).__name__}, but its shape is {coefficients.shape}{opencv}."
-        )
+    check_terms("coefficients", coefficients.shape[-1] if coefficients.ndim else 0, family)
     if centre.shape[-1:] != (2,):
         raise ValueError(f"Argument centre must be (x, y), but its shape is {centre.shape}.")
     batch = coefficients.shape[:-1]
@@ -387,5 +391,20 @@ def _check(coefficients, centre, scale, family):
                 f"Argument {name} must be one for all distortions or one for each of {batch}, but its "
                 f"shape is {parts[name].shape}."
             )
-    if isinstance(scale, np.ndarray) and not (np.isfinite(scale) & (scale > 0)).all():
-        raise ValueError(f"Argument scale must be positive and finite, but it is {scale}.")
+    check_finite("coefficients", coefficients)
+    check_finite("centre", centre)
+    check_positive("scale", scale)
+
+
+def check_terms(name: str, size: int, family: AbstractFamily) -> None:
+    """Raise ValueError where a distortion model has no such number of coefficients."""
+    sizes = [family.size(terms) for terms in range(1, family.most_terms + 1)]
+    more = [family.size(terms) for terms in family.more_terms]
+    if size in (*sizes, *more):
+        return
+    opencv = ": OpenCV's (k1, k2, p1, p2, k3, ...) are of another model" * (size in (5, 8, 12, 14))
+    raise ValueError(
+        f"Argument {name} must give from {min(sizes)} to {max(sizes)} coefficients"
+        f"{''.join(f', or {number}' for number in more)}, for a {type(family).__name__}, but it gives "
+        f"{size}{opencv}."
+    )

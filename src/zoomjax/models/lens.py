@@ -21,7 +21,7 @@ from .._core.fields import check_finite, check_positive, check_range, check_shap
 from .._core.files import whole_file
 from .._core.types import AnyArray, FocalLike, Point, Points, traced
 from .about import About, checked_about, checked_pitch
-from .distortion import Distortion, as_points, compiled, mapped
+from .distortion import Distortion, as_points, check_broadcast, check_terms, compiled, mapped
 from .family import AbstractFamily
 from .polynomial import RadialPolynomial
 from .registry import array_of, coefficients_shape, described, family_name, family_named, zoom_from
@@ -97,11 +97,8 @@ class ZoomLens(eqx.Module):
             raise ValueError(
                 f"Argument shift must give two numbers, the offset of the centre, but it gives {shift}."
             )
-        if size is not None and isinstance(self.family, AbstractFamily) and size < self.family.size(1):
-            raise ValueError(
-                f"Argument zoom must give {self.family.size(1)} or more coefficients for the family "
-                f"{type(self.family).__name__}, but it gives {size}."
-            )
+        if size is not None and isinstance(self.family, AbstractFamily):
+            check_terms("zoom", size, self.family)
 
     @property
     def scale(self) -> float:
@@ -171,6 +168,7 @@ class ZoomLens(eqx.Module):
     def _mapped(self, method, points, focal, focus):
         points = as_points(points)
         focal = self._checked(focal, stacklevel=5)
+        check_broadcast(points.shape[:-1], focal.shape)
         if isinstance(points, np.ndarray) and not traced((self, focal, focus)):
             d = self._distortion(focal, focus)
             return mapped(method, d.family, points, d.coefficients, d.centre, d.scale)
@@ -193,7 +191,7 @@ class ZoomLens(eqx.Module):
     def _distortion(self, focal, focus, within=False):
         """The distortion; NaN outside of the range, if it is to be `within`, else extrapolated."""
         dtype = jnp.asarray(self.centre).dtype
-        centre, focal = jnp.asarray(self.centre), jnp.asarray(focal, dtype)
+        focal = jnp.asarray(focal, dtype)
         low, high = jnp.moveaxis(jnp.asarray(self.focal_range, dtype), -1, 0)
         inside = (focal >= low * (1 - _SLACK)) & (focal <= high * (1 + _SLACK))
         if within:  # at a focal length that is: a NaN in `focal` would be one in all derivatives
@@ -201,10 +199,18 @@ class ZoomLens(eqx.Module):
         k = _at(self.zoom, focal, focus, dtype)
         if within:
             k = jnp.where(inside[..., None], k, jnp.nan)
-        if self.shift is not None:
-            centre, moved = aligned((centre, 1), (_at(self.shift, focal, None, dtype), 1))
-            centre = centre + self.scale * moved
-        return Distortion(k, centre, jnp.asarray(self.scale, dtype), self.family)
+        return Distortion(k, self.centre_at(focal), jnp.asarray(self.scale, dtype), self.family)
+
+    def centre_at(self, focal: FocalLike) -> Float[AnyArray, "*focal 2"]:
+        """The centre of distortion at focal lengths, px.
+
+        Where it does not move along the zoom it is `centre`, one for all.
+        """
+        centre = jnp.asarray(self.centre)
+        if self.shift is None:
+            return centre
+        centre, moved = aligned((centre, 1), (_at(self.shift, focal, None, centre.dtype), 1))
+        return centre + self.scale * moved
 
     def at_focus(self, focus: ScalarLike) -> "ZoomLens":
         """The lens at one focus: a lens that depends on the focal length alone, for images and video.

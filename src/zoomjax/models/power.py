@@ -10,7 +10,7 @@ from .._core.fields import check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Coefficients, Focal, Scalar, traced
 from ._bernstein import Pieces
 from ._prepared import prepared, zero_parameters
-from .zoom import AbstractZoom, check_distinct
+from .zoom import AbstractZoom, check_distinct, one_focal
 
 _POWER_PIECES = 128
 """Straight lines below a power law, in log f: over a tenfold zoom, and with d2 = -2, at most 2e-4 of its
@@ -54,6 +54,7 @@ class PowerZoom(AbstractZoom):
 
     def __call__(self, focal: ScalarLike) -> Coefficients:
         """The coefficients at one focal length."""
+        focal = one_focal(focal)
         constant, factor, exponent = prepared(self.parameters)
         c = jnp.broadcast_to(jnp.asarray(focal) / prepared(self.focal_ref), exponent.shape)
         return constant + factor * c**exponent

@@ -70,8 +70,12 @@ class AbstractLinearZoom(AbstractZoom):
         return None
 
     def __call__(self, focal: ScalarLike) -> Coefficients:
-        """The coefficients at one focal length."""
-        return _combined(self.basis(focal), _fitted(self))
+        """The coefficients at one focal length.
+
+        Raises:
+            ValueError: it is not one number, or known and not positive.
+        """
+        return _combined(self.basis(one_focal(focal)), _fitted(self))
 
     def pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces | None:
         """The coefficients over a range of focal lengths, as polynomials."""
@@ -81,6 +85,20 @@ class AbstractLinearZoom(AbstractZoom):
         parameters = jnp.asarray(_fitted(self))
         controls = jnp.einsum("pcb,bt->pct", basis.controls, parameters, precision="highest")
         return Pieces(controls, basis.ends, basis.focal_of, (1 + basis.size) @ jnp.abs(parameters))
+
+
+def one_focal(focal: ScalarLike) -> ScalarLike:
+    """A focal length as it is, if it is one number, and positive where it is known.
+
+    Of several a zoom model would mix the coefficients: `jax.vmap` calls it with each.
+    """
+    if isinstance(focal, list | tuple) or np.ndim(focal) != 0:
+        raise ValueError(
+            "Argument focal must be one focal length; jax.vmap(zoom)(focal) takes several, and so does a "
+            f"lens, but its shape is {np.shape(focal)}."
+        )
+    check_positive("focal", focal if hasattr(focal, "dtype") else np.asarray(focal, float))
+    return focal
 
 
 def _combined(basis, parameters):
@@ -138,9 +156,9 @@ class AbstractFocusZoom(AbstractLinearZoom):
         """The coefficients at one focal length and focus.
 
         Raises:
-            ValueError: the focus is missing.
+            ValueError: the focus is missing, or the focal length is not one positive number.
         """
-        return _combined(self.basis(focal, focus), _fitted(self))
+        return _combined(self.basis(one_focal(focal), focus), _fitted(self))
 
 
 class PolynomialZoom(AbstractLinearZoom):
@@ -179,7 +197,8 @@ class PolynomialZoom(AbstractLinearZoom):
         cls, coefficients: Float[AnyArray, "basis terms"], focal_ref: ScalarLike
     ) -> "PolynomialZoom":
         """The model ``k_i(f) = sum_j coefficients[j, i] f^(-j)``, stated about `focal_ref`."""
-        coefficients = jnp.asarray(coefficients)
+        coefficients = jnp.asarray(numbers("coefficients")(coefficients))
+        check_shapes({"coefficients": (coefficients, ("basis", "terms"))})
         focal_ref = jnp.asarray(focal_ref, coefficients.dtype)
         power = jnp.arange(coefficients.shape[0])
         return cls(

@@ -258,7 +258,7 @@ def _ahead(lens, focal, points):
     """Rays of the camera through points."""
 
     def one(f, point):
-        flat = (jnp.asarray(lens(f).undistort(point)) - jnp.asarray(lens.centre)) / f
+        flat = (jnp.asarray(lens(f).undistort(point)) - lens.centre_at(f)) / f
         return jnp.append(flat, 1)
 
     return jax.vmap(one)(focal, points)
@@ -267,7 +267,7 @@ def _ahead(lens, focal, points):
 @eqx.filter_jit
 def _seen(lens, focal, flat):
     """Where flat points are seen, px."""
-    return jax.vmap(lambda f, z: lens(f).distort(lens.centre + f * z))(focal, flat)
+    return jax.vmap(lambda f, z: lens(f).distort(lens.centre_at(f) + f * z))(focal, flat)
 
 
 @eqx.filter_jit
@@ -276,7 +276,7 @@ def _map(lens, focal, rotation, x, y, density, things, size, level):
 
     def row(f, turn, height):
         points = jnp.stack([x, jnp.full_like(x, height)], axis=-1)
-        flat = (lens(f).undistort(points) - jnp.asarray(lens.centre)[None]) / f
+        flat = (lens(f).undistort(points) - lens.centre_at(f)[None]) / f
         rays = [flat[:, 0] * turn[0, i] + flat[:, 1] * turn[1, i] + turn[2, i] for i in range(3)]
         places = _places(jnp.stack(rays, axis=-1), density)
         return places if things is None else _with_things(places, *things)[0]

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from .._core.arguments import check_kind
-from .._core.checks import checked_integer, checked_size
+from .._core.checks import checked_integer, checked_size, real_numbers, warn_of_points_outside
 from .._core.fields import booleans, check_indices, check_shapes, integers, known, numbers
 from .._core.files import whole_file
 from .._core.types import AnyArray
@@ -53,6 +53,15 @@ class Tracks(eqx.Module):
         points, mask = known(self.points), known(self.mask)
         if points is not None and mask is not None and not np.isfinite(points[mask]).all():
             raise ValueError("Argument points must be finite where mask is set: clear the mask there.")
+        frame = known(self.frame)
+        if frame is not None and mask is not None and frame.ndim == 2:
+            falls = (np.diff(frame, axis=1) <= 0) & mask[:, 1:] & mask[:, :-1]
+            if falls.any():
+                place = int(np.argmax(falls.any(axis=1)))
+                raise ValueError(
+                    f"Argument frame must increase along a track, but frame[{place}] does not: "
+                    "Tracks.from_arrays puts views in order."
+                )
 
     @classmethod
     def from_arrays(
@@ -78,7 +87,8 @@ class Tracks(eqx.Module):
                 views in one frame, or no track has two views.
 
         Warns:
-            UserWarning: tracks of one view are dropped; the message counts them.
+            UserWarning: tracks of one view are dropped; the message counts them. Or points lie outside of
+                the image.
 
         Example:
             >>> tracks = Tracks.from_arrays(
@@ -112,6 +122,7 @@ class Tracks(eqx.Module):
         view = np.arange(count.max())
         mask = view < count[:, None]
         entry = np.where(mask, first[:, None] + view, first[:, None])  # padding repeats the first view
+        warn_of_points_outside(places[entry], mask, size)
         return cls(
             points=jnp.asarray(places[entry]),
             frame=jnp.asarray(moments[entry], jnp.int32),
@@ -155,9 +166,9 @@ class Tracks(eqx.Module):
 def _views(track, frame, points):
     """Each view's track, frame and point as arrays, checked."""
     names, moments = (np.asarray(values) for values in (track, frame))
-    places = np.asarray(points)
-    if not np.issubdtype(places.dtype, np.floating) or places.dtype.itemsize < 4:
-        places = places.astype(np.float64)
+    places = real_numbers(points)
+    if places is None:
+        raise ValueError(f"Argument points must hold real numbers, (x, y) a view, but it is {points!r}.")
     for name, values in {"track": names, "frame": moments}.items():
         if values.ndim != 1 or not values.size or not np.issubdtype(values.dtype, np.integer):
             raise ValueError(f"Argument {name} must hold one integer a view, but it is {values!r}.")

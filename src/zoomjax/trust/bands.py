@@ -11,22 +11,43 @@ The parameters are those of the zoom model; those of the centre of distortion, w
 Each call computes one derivative with respect to each parameter; nothing is fitted or sampled.
 """
 
+import functools
+import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, Num, PyTree, ScalarLike
 
 from .._core.arguments import kinds_checked
+from .._core.fields import check_positive
 from .._core.types import AnyArray, Coefficients, Focal, Points
 from ..fit.result import ZoomFit
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
 from ..models.zoom import AbstractZoom, with_parameters
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
+
+
+def _focal_checked(function: Callable[Given, Result]) -> Callable[Given, Result]:
+    """Refuse focal lengths that are none, where they are known: the function itself is compiled."""
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def checked(*args: Given.args, **kwargs: Given.kwargs) -> Result:
+        focal = signature.bind(*args, **kwargs).arguments.get("focal")
+        check_positive("focal", focal if isinstance(focal, jax.Array) else np.asarray(focal, float))
+        return function(*args, **kwargs)
+
+    return checked
+
 
 Focals = Num[AnyArray | ScalarLike, "*focal"]
 
@@ -41,7 +62,7 @@ def std_of(fit: ZoomFit, function: Callable[[ZoomLens], PyTree]) -> PyTree:
 
     Returns:
         What `function` returns, each number replaced by its standard deviation: infinite where it depends
-        on a parameter that the lines do not determine.
+        on a parameter that the lines do not determine, NaN where the number itself is not finite.
 
     Example:
         >>> import jax.numpy as jnp, numpy as np
@@ -55,8 +76,17 @@ def std_of(fit: ZoomFit, function: Callable[[ZoomLens], PyTree]) -> PyTree:
         (2,)
     """
     flat, lens_at, covariance = _uncertain(fit)
-    derivatives = jax.jacfwd(lambda flat: function(lens_at(flat)))(flat)
-    return jax.tree.map(lambda rows: _root(_variance(covariance, rows)), derivatives)
+    derivatives, values = _derivatives(lambda flat: function(lens_at(flat)), flat)
+    return jax.tree.map(
+        lambda rows, value: jnp.where(jnp.isfinite(value), _root(_variance(covariance, rows)), jnp.nan),
+        derivatives,
+        values,
+    )
+
+
+def _derivatives(function, flat):
+    """By all that is uncertain, and the values: where those are NaN, derivatives of zero say nothing."""
+    return jax.jacfwd(lambda flat: (found := function(flat), found), has_aux=True)(flat)
 
 
 class _OffZoom(AbstractZoom):
@@ -103,6 +133,7 @@ def _uncertain(fit):
 
 
 @kinds_checked
+@_focal_checked
 @eqx.filter_jit
 def coefficient_std(fit: ZoomFit, focal: Focals) -> Float[Array, "*focal terms"]:
     """Standard deviations of the normalised coefficients k1(f), ..., kN(f).
@@ -127,6 +158,7 @@ def coefficient_std(fit: ZoomFit, focal: Focals) -> Float[Array, "*focal terms"]
 
 
 @kinds_checked
+@_focal_checked
 @eqx.filter_jit
 def displacement_covariance(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Array, "*both 2 2"]:
     """Covariance of corrected points, and so of displacements, px^2.
@@ -152,6 +184,7 @@ def displacement_covariance(fit: ZoomFit, points: Points, *, focal: Focals) -> F
 
 
 @kinds_checked
+@_focal_checked
 @eqx.filter_jit
 def displacement_std(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Array, "*both"]:
     """Standard deviation of corrected points, px: the root of the mean squared distance.
@@ -176,6 +209,7 @@ def displacement_std(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Ar
 
 
 @kinds_checked
+@_focal_checked
 @eqx.filter_jit
 def displacement_band(
     fit: ZoomFit, points: Points, *, focal: Focals, level: ScalarLike = 0.95
@@ -204,7 +238,7 @@ def displacement_band(
     quantile = norm.ppf((1 + jnp.asarray(level)) / 2)
 
     def band(fit, point, f):
-        offset = point - jnp.asarray(fit.lens.centre, point.dtype)
+        offset = point - fit.lens.centre_at(f).astype(point.dtype)
         squared = offset @ offset
         outward = offset / jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 1)
         variance = _variance(_uncertain(fit)[2], outward @ _point_rows(fit, point, f))
@@ -217,14 +251,14 @@ def displacement_band(
 
 
 def _each_focal(function, fit, focal):
-    focal = jnp.asarray(focal, fit.covariance.dtype)
+    focal = _positive(jnp.asarray(focal, fit.covariance.dtype))
     return jnp.vectorize(function, signature="()->(k)")(focal)
 
 
 def _each_point(function, result, fit, points, focal):
     """Apply a function of the fit, one point and one focal length to all of them."""
     dtype = fit.covariance.dtype
-    points, focal = jnp.asarray(points, dtype), jnp.asarray(focal, dtype)
+    points, focal = jnp.asarray(points, dtype), _positive(jnp.asarray(focal, dtype))
     if points.shape[-1:] != (2,):
         raise ValueError(f"Argument points must have shape (..., 2), but its shape is {points.shape}.")
     both = jnp.broadcast_shapes(points.shape[:-1], focal.shape)
@@ -235,7 +269,13 @@ def _each_point(function, result, fit, points, focal):
 def _point_rows(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 parameter"]:
     """Derivatives of one corrected point by all that is uncertain."""
     flat, lens_at, _ = _uncertain(fit)
-    return jax.jacfwd(lambda flat: at_focal(lens_at(flat), f).undistort(point))(flat)
+    rows, place = _derivatives(lambda flat: at_focal(lens_at(flat), f).undistort(point), flat)
+    return jnp.where(jnp.isfinite(place)[:, None], rows, jnp.nan)
+
+
+def _positive(focal):
+    """NaN instead of focal lengths that are none, which only ``jit`` does not know before."""
+    return jnp.where((focal > 0) & jnp.isfinite(focal), focal, jnp.nan)
 
 
 def _point_covariance(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 2"]:
@@ -258,7 +298,10 @@ def _variance(covariance, rows):
     size = jnp.einsum("...p,pq,...q->...", *map(jnp.abs, (rows, _finite(covariance), rows)))
     rounding = jax.lax.stop_gradient(rows.shape[-1] * jnp.finfo(rows.dtype).eps * size)
     unknown = jnp.isinf(jnp.diagonal(covariance)).astype(rows.dtype)
-    return jnp.where((rows != 0).astype(rows.dtype) @ unknown > 0, jnp.inf, jnp.maximum(finite, rounding))
+    variance = jnp.where(
+        (rows != 0).astype(rows.dtype) @ unknown > 0, jnp.inf, jnp.maximum(finite, rounding)
+    )
+    return jnp.where(jnp.isnan(rows).any(axis=-1), jnp.nan, variance)
 
 
 def _finite(covariance):
@@ -266,7 +309,7 @@ def _finite(covariance):
 
 
 def _root(variance):
-    """The square root, with a gradient of zero at zero, and infinity left as it is."""
+    """The square root, with a gradient of zero at zero; infinity and NaN as they are."""
     regular = (variance > 0) & jnp.isfinite(variance)
     root = jnp.sqrt(jnp.where(regular, variance, 1))
-    return jnp.where(regular, root, jnp.where(jnp.isinf(variance), jnp.inf, 0))
+    return jnp.where(regular, root, jnp.where(jnp.isfinite(variance), 0, variance))

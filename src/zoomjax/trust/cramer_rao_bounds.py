@@ -125,12 +125,15 @@ def _displacement_bound(lens, lines, std):
 
 
 @kinds_checked
-@eqx.filter_jit
 def displacement_rms(lens: ZoomLens, other: ZoomLens) -> Float[Array, ""]:
     """RMS distance between the corrections of two lenses, px, over image and focal range.
 
     The mean is over the first lens's image and over its focal range, uniform in 1/f. It is computed by
     Gauss-Legendre quadrature, exact for polynomials in 1/f of degree up to 7 with up to 3 terms.
+
+    Raises:
+        ValueError: the lenses are for images of different sizes, or their focal lengths have different
+            units.
 
     Example:
         >>> from zoomjax import scenes
@@ -138,6 +141,18 @@ def displacement_rms(lens: ZoomLens, other: ZoomLens) -> Float[Array, ""]:
         >>> float(displacement_rms(lens, lens))
         0.0
     """
+    for name in ("image_size", "focal_unit"):
+        own, others = getattr(lens, name), getattr(other, name)
+        if own != others:
+            raise ValueError(
+                f"Argument other must have the {name} of the first lens, {own}, but it has {others}."
+                + (" lens_for_size gives a lens for another size." if name == "image_size" else "")
+            )
+    return _displacement_rms(lens, other)
+
+
+@eqx.filter_jit
+def _displacement_rms(lens, other):
     points, focal, weight = _field(lens)
     apart = jax.vmap(lambda f: at_focal(lens, f).undistort(points) - at_focal(other, f).undistort(points))(
         focal
