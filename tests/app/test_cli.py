@@ -254,6 +254,11 @@ def test_a_dry_run_writes_nothing(calibrated, tmp_path):
     done = zoomjax("calibrate", calibrated[0] / "lines.npz", "-o", tmp_path / "o", "--dry-run")
     assert "lines in 5 frames, f = 20.56 to 127.36 mm" in done.stdout
     assert not (tmp_path / "o").exists()
+    photos = sorted((tmp_path / "shots").iterdir())
+    (tmp_path / "f.csv").write_text(f"image,focal\n{photos[0].name},50\n{photos[2].name},70.5\n")
+    done = zoomjax("calibrate", "shots", "--focal", "f.csv", "-o", "out", "--dry-run", cwd=tmp_path)
+    told = [line.split(": ")[1] for line in done.stdout.splitlines()[1:4]]
+    assert told == ["50 mm", "not used, as f.csv has no row for it", "70.5 mm"]
 
 
 def test_help_has_examples_and_fits_a_terminal():
@@ -274,7 +279,7 @@ WRONG = {
     "truncated": (["truncated.npz"], "truncated.npz"),
     "unknown kind": (["notes.txt"], "notes.txt is not a photo"),
     "a folder without photos": (["."], "no photographs in the folder"),
-    "options of images for lines": (["lines.npz", "--pitch", "3"], "--pitch are for images"),
+    "options of images for lines": (["lines.npz", "--pitch", "3"], "--pitch has no effect for lines.npz"),
     "an option of lines for images": (["a.jpg", "--image-size", "640x480"], "images have their own"),
     "half a board": (["a.jpg", "--pitch", "20"], "Missing or wrong: --distance, --pixel"),
     "a pitch that is none": (
@@ -322,11 +327,28 @@ def test_a_mistake_is_one_sentence_and_status_2(case, wrong_files):
     assert not (wrong_files / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["lines.npz", "--lines", "--no-cache"], "--lines and --no-cache have no effect for lines.npz"),
+        (["lines.npz", "--detector", "grid"], "--detector has no effect for lines.npz"),
+        (["lines.npz", "--overlays", "all", "--frames", "3"], "--frames and --overlays have no effect"),
+        (["a.png", "--frames", "3"], "--frames has no effect for photos"),
+    ],
+)
+def test_an_option_without_effect_is_refused(options, sentence, wrong_files):
+    (wrong_files / "a.png").write_bytes(b"")
+    done = zoomjax("calibrate", *options, "-o", "out", cwd=wrong_files)
+    (wrong_files / "a.png").unlink()
+    assert done.returncode == 2
+    assert sentence in done.stderr
+
+
 def test_calibrate_does_not_replace_its_input(wrong_files):
     before = (wrong_files / "lines.npz").read_bytes()
     done = zoomjax("calibrate", "lines.npz", "-o", ".", cwd=wrong_files)
     assert done.returncode == 2
-    assert "would replace the input" in done.stderr
+    assert "is the input" in done.stderr
     assert (wrong_files / "lines.npz").read_bytes() == before
 
 

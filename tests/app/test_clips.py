@@ -168,7 +168,25 @@ def test_lines_of_the_frames_join_if_wanted(tmp_path):
 def test_lines_are_an_option_of_motion_alone(clip):
     done = zoomjax("calibrate", clip.name, "--focal", "30", "--lines", "-o", "no", cwd=clip.parent)
     assert done.returncode != 0
-    assert "--lines is for --focal motion" in done.stderr
+    assert "--lines has no effect without --focal motion" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (
+            "--robust --focal-unit mm --overlays all",
+            "--robust and --focal-unit and --overlays have no effect",
+        ),
+        ("--detector grid --no-cache", "--detector and --no-cache have no effect without --lines"),
+        ("--focal motion --pitch 3", "--pitch has no effect with --focal motion"),
+        ("--jobs 1 --frames 9", "--frames and --jobs have no effect without --lines"),
+    ],
+)
+def test_an_option_without_effect_is_refused(clip, options, sentence):
+    done = zoomjax("calibrate", clip.name, *options.split(), "-o", "no", cwd=clip.parent)
+    assert done.returncode == 2
+    assert sentence in done.stderr
 
 
 def test_a_dry_run_writes_nothing(clip):
@@ -182,12 +200,11 @@ def test_a_dry_run_writes_nothing(clip):
     [
         (["a.jpg"], {}, "one video"),
         (["a.mp4", "b.mp4"], {}, "one video"),
-        (["a.mp4"], {"unused": {"--pitch": "3"}}, "--pitch cannot be used"),
         (["a.mp4"], {"centre": (3.0, 4.0)}, "--centre is fit or image"),
     ],
 )
 def test_mistakes_are_told(tmp_path, inputs, options, message):
-    settings = {"model": WantedModel(), "centre": "fit", "unused": {}} | options
+    settings = {"model": WantedModel(), "centre": "fit"} | options
     with pytest.raises(ValueError, match=message):
         ClipJob(inputs, tmp_path, **settings)
 

@@ -9,6 +9,7 @@ from PIL import Image
 
 import zoomjax as zj
 from zoomjax.app.undistort_files import Job, undistort_files
+from zoomjax.detect.sources import find_photos
 from zoomjax.io.metadata import geometry_of
 from zoomjax.io.photo import read_metadata
 
@@ -172,3 +173,30 @@ def test_several_videos_each_with_its_own_track(folder):
     assert list(done.skipped) == [str(folder / "c.mp4")]
     assert files(folder / "new") == ["b.mp4"]
     assert luma(folder / "new/b.mp4")[0].shape[:0:-1] == SIZE
+
+
+def test_nothing_is_written_through_a_link_in_the_output_folder(folder, tmp_path):
+    (tmp_path / "outside").mkdir()
+    (folder / "out").mkdir()
+    (folder / "out" / "day").symlink_to(tmp_path / "outside", target_is_directory=True)
+    with pytest.raises(ValueError, match="out/day is a link"):
+        undistort_files(job(folder, "in", focal="24"))
+    assert files(tmp_path / "outside") == []
+    assert files(folder / "out") == []
+    (tmp_path / "elsewhere").mkdir()  # the folder itself may be a link: it was chosen
+    (folder / "linked").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    undistort_files(job(folder, "in", out="linked", focal="24"))
+    assert files(tmp_path / "elsewhere") == ["a.jpg", "day/a.jpg", "day/b.png"]
+
+
+def test_a_dead_link_and_an_empty_folder_cost_themselves(folder):
+    (folder / "dead.jpg").symlink_to(folder / "nowhere")
+    (folder / "empty.jpg").mkdir()
+    done = undistort_files(job(folder, "in/a.jpg", "dead.jpg", "empty.jpg", focal="24"))
+    assert done.written == 1
+    assert sorted(path.rsplit("/", 1)[1] for path in done.skipped) == ["dead.jpg", "empty.jpg"]
+    assert "Is a directory" in done.skipped[str(folder / "empty.jpg")]
+    photos = [
+        source.name for source in find_photos([folder / name for name in ("in", "dead.jpg", "empty.jpg")])
+    ]
+    assert {"dead.jpg", "empty.jpg"} < {name.rsplit("/", 1)[-1] for name in photos}

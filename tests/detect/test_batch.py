@@ -122,6 +122,9 @@ POISON = {
     "no numbers": lambda good: _rezipped(
         good, points=np.full_like(np.load(io.BytesIO(good))["points"], np.nan)
     ),
+    "a focal length below zero": lambda good: _rezipped(good, focal=np.array(-5.0)),
+    "an infinite focal length": lambda good: _rezipped(good, focal=np.array(np.inf)),
+    "no size": lambda good: _rezipped(good, image_size=np.array([0, 0])),
     "text": lambda good: _rezipped(good, focal=np.array("a lot")),
 }
 

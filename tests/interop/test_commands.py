@@ -9,7 +9,12 @@ import pytest
 import zoomjax as zj
 
 from .._commands import SEVERAL
-from ._lenses import LENSES
+from ._lenses import LENSES, PITCH
+
+
+def inputs_in(folder):
+    """What no command may replace, not even with --overwrite."""
+    return [folder / name for name in ("lens.json", "track.csv", "in/lens.json")]
 
 
 @pytest.fixture(scope="module")
@@ -19,6 +24,10 @@ def told(tmp_path_factory):
     LENSES["landscape"]().save(folder / "lens.json")
     (folder / "track.csv").write_text("frame,focal\n1,20\n3,40\n")
     (folder / "bad.json").write_text('{"fisheye_params": 1}')
+    (folder / "in").mkdir()
+    lens = LENSES["landscape"]()
+    zj.interop.write(lens, folder / "in" / "lens.json", format="gyroflow", pixel_pitch=PITCH)
+    before = {path: path.read_bytes() for path in inputs_in(folder)}
     lines = {
         "formats": "formats",
         "lensfun": "export lens.json --to lensfun --pixel-pitch 0.0367 -o a.xml",
@@ -31,12 +40,16 @@ def told(tmp_path_factory):
         "import": "import a.xml --image-size 640x480 -o back",
         "no size": "import a.xml -o never",
         "damaged": "import bad.json -o never",
+        "its lens": "export lens.json --to gyroflow --pixel-pitch 0.0367 -o lens.json --overwrite",
+        "its track": "export lens.json --to pftrack --focal track.csv -o track.csv --overwrite",
+        "its source": "import in/lens.json -o in --overwrite",
     }
     jobs = [[str(folder), ["zoomjax", *line.split()]] for line in lines.values()]
     done = subprocess.run(
         [sys.executable, "-c", SEVERAL], input=json.dumps(jobs), capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stderr
+    assert {path: path.read_bytes() for path in inputs_in(folder)} == before
     return folder, dict(zip(lines, json.loads(done.stdout), strict=True))
 
 
@@ -69,6 +82,9 @@ def test_a_lens_goes_out_and_comes_back(told):
         ("no format", "Error: --to must be one of stmap, nuke"),
         ("no size", "it holds no image size: give --image-size"),
         ("damaged", "Error: Cannot read a gyroflow lens from bad.json: "),
+        ("its lens", "The output lens.json is the input"),
+        ("its track", "The output track.csv is the input"),
+        ("its source", "The output in/lens.json is the input"),
     ],
 )
 def test_an_error_is_one_sentence_with_the_names_of_options(told, name, sentence):

@@ -165,6 +165,23 @@ def refuse_inputs(targets: Iterable[Path], inputs: Iterable[str | os.PathLike[st
                 raise ValueError(f"The output {target} is the input{what}. Choose another place.")
 
 
+def refuse_links(folder: Path, targets: Iterable[Path]) -> None:
+    """Refuse to write through a link within a folder of results: it may lead out of it.
+
+    The folder itself may be a link, as may be what it lies in.
+
+    Raises:
+        ValueError: a folder between `folder` and one of `targets` is a link.
+    """
+    between = {parent for target in targets for parent in target.parents if folder in parent.parents}
+    for parent in sorted(between):
+        if parent.is_symlink():
+            raise ValueError(
+                f"The folder {parent} is a link, and results are written into {folder} alone. Remove the "
+                "link, or choose another place."
+            )
+
+
 def _several(paths: list[Path]) -> str:
     """That these paths exist: the first, and the number of others."""
     more = len(paths) - 1

@@ -165,10 +165,3 @@ def refuse_to_replace(job: "ImageJob", output: Path) -> None:
         real = (source.path or Path()).resolve()
         if results.intersection((real, *real.parents)):
             raise ValueError(f"The results would replace the photo {source.path}: give another folder.")
-
-
-def refuse_image_options(options: dict[str, object], inputs: list[str]) -> None:
-    """Refuse options for images if the input is a file of lines."""
-    given = [name for name, value in options.items() if value is not None]
-    if given:
-        raise ValueError(f"{' and '.join(given)} are for images, but {inputs[0]} contains lines.")

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,7 +34,6 @@ class ClipJob:
         frames: the most frames in which they are searched for.
         workers: number of processes that search.
         cache: folder of what was found in frames before; None for none.
-        unused: options that have nothing to say here, and what was given for them.
         overwrite: whether to replace files that zoomjax did not write.
     """
 
@@ -42,7 +41,6 @@ class ClipJob:
     output: Path
     model: "WantedModel"
     centre: "CentreArgument"
-    unused: Mapping[str, object]
     lines: bool = False
     detector: str = "edges"
     frames: int = 60
@@ -60,8 +58,6 @@ class ClipJob:
 
         if len(self.inputs) != 1 or not is_video(self.inputs[0]):
             raise ValueError("--focal motion is for one video: its motion tells the focal lengths.")
-        if given := [name for name, value in self.unused.items() if value is not None]:
-            raise ValueError(f"{' and '.join(given)} cannot be used with --focal motion.")
         if self.centre not in ("fit", "image"):
             raise ValueError("With --focal motion, --centre is fit or image: it moves along the zoom.")
 

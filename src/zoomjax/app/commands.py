@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from .._core.files import cache_folder
+from .._core.files import cache_folder, refuse_inputs
 from .._core.text import plain
 from ._compiled import set_up_jax
 from ._flags import with_flags
@@ -26,7 +26,6 @@ from .arguments import (
     centre_of,
     number_of_cores,
     read_lines,
-    refuse_image_options,
     refuse_to_replace,
     split_lens,
     unit_of,
@@ -37,6 +36,8 @@ from .options import (
     CALIBRATE_EXAMPLES,
     FIT,
     FOCAL,
+    IDLE_FOR_LINES,
+    IDLE_FOR_MOTION,
     INPUT,
     UNDISTORT_EXAMPLES,
     AsJson,
@@ -53,6 +54,7 @@ from .options import (
     Strict,
     WithLines,
     excluded,
+    refuse_idle,
 )
 from .plans import images_plan, lines_plan, tell_plan, without
 from .runs import calibrate_images, calibrate_lines, title_of
@@ -127,6 +129,7 @@ def demo(
 
 @app.command(epilog=CALIBRATE_EXAMPLES)
 def calibrate(
+    context: typer.Context,
     inputs: Annotated[
         list[str],
         typer.Argument(
@@ -229,15 +232,11 @@ def calibrate(
 
     wanted = WantedModel(model or "auto", degree, terms)
     if any(path.lower().endswith((".npz", ".csv")) for path in inputs):
-        refuse_image_options(
-            {"--pitch": pitch, "--distance": distance, "--pixel": pixel, "--jobs": jobs}, inputs
-        )
+        refuse_idle(context, IDLE_FOR_LINES, f"for {inputs[0]}, which contains lines")
         from .calibration import CLEARS, FILES
         from .results_folder import results_folder
 
-        for path in map(Path, inputs):
-            if path.resolve() == (output / "lines.npz").resolve():
-                raise ValueError(f"The results would replace the input {path}: give another folder.")
+        refuse_inputs([output / name for name in FILES], inputs)
         results = results_folder(output, [*FILES, REPORT], clears=CLEARS, overwrite=overwrite)
         if dry_run:
             lines = read_lines([Path(path) for path in inputs], focal, image_size, focal_unit)
@@ -266,13 +265,14 @@ def calibrate(
     from .results_folder import results_folder
 
     if wants_motion(inputs, focal, pitch):
-        unused = {"--focal-sigma": focal_sigma, "--pitch": pitch, "--distance": distance, "--pixel": pixel}
+        refuse_idle(context, IDLE_FOR_MOTION, "with --focal motion")
+        if not with_lines:
+            refuse_idle(context, ("detector", "frames", "jobs", "cache"), "without --lines")
         clip = ClipJob(
             inputs,
             output,
             wanted,
             centre_of(centre),
-            unused,
             lines=with_lines,
             detector=detector,
             frames=frames,
@@ -281,10 +281,7 @@ def calibrate(
             overwrite=overwrite,
         )
         return calibrate_clip(clip, show, dry_run=dry_run)
-    if with_lines:
-        raise ValueError(
-            "--lines is for --focal motion: lines are what everything else is calibrated from."
-        )
+    refuse_idle(context, ("with_lines",), "without --focal motion: all else is calibrated from lines")
     job = ImageJob(
         tuple(inputs),
         detector=detector,
@@ -299,6 +296,8 @@ def calibrate(
         cache=cache_folder("detections") if cache else None,
         overlays=overlays,
     )
+    if job.video is None:
+        refuse_idle(context, ("frames",), "for photos")
     refuse_to_replace(job, output)
     if dry_run:
         return tell_plan(images_plan(job), output)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .._core.files import refuse_inputs
 from .._core.text import plain
 from ._compiled import set_up_jax
 from .arguments import Overwrite, size_of
@@ -68,6 +69,7 @@ def export(
     from ..models.lens import load_lens
 
     tracked = focal is not None and focal.lower().endswith(".csv")
+    refuse_inputs([output], [lens, *([focal] if tracked and focal is not None else [])])
     report = write(
         load_lens(lens),
         output,
@@ -141,6 +143,8 @@ def import_(
     from ..models.tables import TableZoom
     from .results_folder import results_folder
 
+    inputs = list(source.iterdir()) if source.is_dir() else [source]
+    refuse_inputs([output / name for name in RESULTS], inputs)
     found = read(
         source,
         format=of,

@@ -1,6 +1,7 @@
 """Options of the command line that commands share, and the examples in their help."""
 
-from typing import Annotated, Literal
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -84,6 +85,14 @@ Pixel = Annotated[
     typer.Option(metavar="MM", help="For --focal board: pixel size on the sensor.", rich_help_panel=FOCAL),
 ]
 
+IDLE_FOR_LINES = (
+    *("pitch", "distance", "pixel", "jobs", "detector", "frames", "cache", "overlays", "with_lines"),
+)
+"""Parameters of calibrate that say nothing about a file of lines."""
+
+IDLE_FOR_MOTION = ("focal_sigma", "focal_unit", "pitch", "distance", "pixel", "robust", "overlays")
+"""And about a clip whose motion gives its focal lengths."""
+
 CALIBRATE_EXAMPLES = """\
 Examples:
 
@@ -103,6 +112,38 @@ Examples:
 
   zoomjax undistort mylens/lens.json clip.mp4 --focal track.csv -o corrected.mp4
 """
+
+
+def refuse_idle(context: typer.Context, names: Iterable[str], where: str) -> None:
+    """Refuse options that have no effect.
+
+    Args:
+        context: of the running command.
+        names: of the command's parameters.
+        where: for what they have none, in words.
+
+    Raises:
+        ValueError: some of them are given.
+    """
+    given = [
+        _flag(parameter, context.params[name])
+        for parameter in context.command.params
+        if (name := parameter.name) in names and _is_given(context, name)
+    ]
+    if given:
+        has, them = ("has", "it") if len(given) == 1 else ("have", "them")
+        raise ValueError(f"{' and '.join(given)} {has} no effect {where}: leave {them} out.")
+
+
+def _is_given(context: typer.Context, name: str) -> bool:
+    source = context.get_parameter_source(name)
+    return source is not None and source.name != "DEFAULT"
+
+
+def _flag(parameter: Any, value: object) -> str:
+    """What was written for a parameter to have a value."""
+    off = parameter.secondary_opts
+    return off[0] if off and value is False else max(parameter.opts, key=len)
 
 
 def excluded(given: list[str] | None) -> list[int]:

@@ -1,6 +1,6 @@
 """What a calibration would do (``--dry-run``), and lines left out by hand (``--exclude``)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,23 +25,40 @@ def lines_plan(lines: "Lines", exclude: Sequence[int]) -> list[str]:
 
 
 def images_plan(job: "ImageJob") -> list[str]:
-    """The photos that would be read, each with the focal length in its EXIF data, in lines of text."""
-    from ..io.photo import read_focal
-
+    """The photos that would be read, each with its focal length as far as it is known before, as text."""
     if job.video is not None:
         return [f"Up to {job.frames} frames of {plain(str(job.video))}, by the detector {job.detector}."]
     sources = list(job.sources()[0])
     told = [f"{len(sources)} photos, by the detector {job.detector}:"]
+    focal_of = _focal_lengths(job, [source.path or Path() for source in sources])
     for source in sources[:_LISTED]:
         try:
-            focal = read_focal(source.path or Path())
+            told.append(f"  {plain(source.name)}: {focal_of(source.path or Path())}")
         except (OSError, ValueError) as error:
             told.append(f"  {plain(source.name)}: {plain(str(error))}")
-        else:
-            told.append(
-                f"  {plain(source.name)}: {'no f in EXIF data' if focal is None else f'{focal:g} mm'}"
-            )
     return [*told, *([f"  and {len(sources) - _LISTED} more"] if len(sources) > _LISTED else [])]
+
+
+def _focal_lengths(job: "ImageJob", photos: Sequence[Path]) -> Callable[[Path], str]:
+    """What is known of a photo's focal length before it is looked at, by the source that is given."""
+    from ..io.focal_table import read_focal_table
+    from ..io.photo import read_focal
+    from ..io.text_table import plain_number
+
+    if job.board is not None or job.focal in ("board", "plane"):
+        return lambda photo: f"f from the {'grid' if job.focal == 'plane' else 'board'} in it"
+    if job.focal is None or job.focal == "exif":
+        none = "no f in EXIF data" + (", f from a grid in it" if job.focal is None else "")
+        return lambda photo: none if (focal := read_focal(photo)) is None else f"{focal:g} mm"
+    if (number := plain_number(job.focal)) is not None:
+        return lambda photo: f"{number:g} {job.focal_unit}"
+    table, name = read_focal_table(job.focal), plain(Path(job.focal).name)
+    known = table.of([str(photo) for photo in photos])
+    return lambda photo: (
+        f"{known[str(photo)]:g} {job.focal_unit}"
+        if str(photo) in known
+        else f"not used, as {name} has no row for it"
+    )
 
 
 def tell_plan(told: Sequence[str], output: Path) -> None:

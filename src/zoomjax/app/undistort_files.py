@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from .._core.files import refuse_existing, refuse_inputs, whole_file
+from .._core.files import refuse_existing, refuse_inputs, refuse_links, whole_file
 from ..correct.framing import Framing, check_keep, frame_output
 from ..correct.image import check_sampling
 from ..correct.photo import Correction, corrected_photo, photo_focal
@@ -149,7 +149,7 @@ def _videos(
     else:
         sentence = f"{_counted(written, len(sources), earlier, job, 'video')}, {frames} frames"
     notes = [note for target, video in done.items() for note in _kept(target, video, len(sources))]
-    bad = {str(path): str(error) for path, error in skipped.items()}
+    bad = {str(path): _reason(error) for path, error in skipped.items()}
     return Outcome(sentence, bad, written + earlier, tuple(notes))
 
 
@@ -191,11 +191,16 @@ def undistort_photos(
     if len(sources) == 1 and skipped:
         raise next(iter(skipped.values()))
     earlier = len(sources) - len(todo)
-    bad = {str(source): str(skipped[source]) for source, _ in todo if source in skipped}
+    bad = {str(source): _reason(skipped[source]) for source, _ in todo if source in skipped}
     written = len(todo) - len(bad)
     return Outcome(
         _counted(written, len(sources), earlier, job, "photo"), bad, written + earlier, _losses(lost)
     )
+
+
+def _reason(error: Exception) -> str:
+    """Of an error of one file, without the error numbers of the operating system."""
+    return (isinstance(error, OSError) and error.strerror) or str(error)
 
 
 def _counted(written: int, number: int, earlier: int, job: Job, what: str) -> str:
@@ -240,6 +245,7 @@ def to_do(
     tables = [] if job.focal is None else [job.focal]
     lens = [] if job.lens is None else [job.lens]
     refuse_inputs(targets, [*sources, *lens, *tables])
+    refuse_links(job.output, targets)
     pairs = list(zip(sources, targets, strict=True))
     if job.resume:
         pairs = [pair for pair in pairs if not (os.path.lexists(pair[1]) and is_result(pair[1]))]

@@ -62,7 +62,8 @@ def find_inputs(inputs: Sequence[Path], output: Path) -> Found:
 
 def _expanded(given: Path, output: Path) -> list[tuple[Path, Path]]:
     """Files, each with its name below the folder or the fixed part of the pattern."""
-    if given.is_dir():
+    named = given.suffix.lower() in (*SUFFIXES, *VIDEO_SUFFIXES)
+    if given.is_dir() and not (named and not any(given.iterdir())):  # which is reported with the others
         return [(path, path.relative_to(given)) for path in _within(given, output)]
     if os.path.lexists(given) or not glob.has_magic(str(given)):
         return [(given, Path(given.name))]

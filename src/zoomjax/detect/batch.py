@@ -289,7 +289,11 @@ def _load(file: Path, source: Source) -> Detection | None:
             width, height = map(int, stored["image_size"].tolist())
             problem, unexplained = str(stored["problem"]), float(stored["unexplained"])
         sound = (
-            points.shape == (sum(counts), 2) and np.isfinite(points).all() and min(counts, default=1) > 0
+            points.shape == (sum(counts), 2)
+            and np.isfinite(points).all()
+            and min(counts, default=1) > 0
+            and min(width, height) >= _SMALLEST
+            and (np.isnan(focal) or 0 < focal < np.inf)
         )
         if not sound:
             return None

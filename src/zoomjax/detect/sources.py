@@ -124,9 +124,10 @@ def twice(again: dict[Path, Path]) -> str:
 
 def _expanded(given: str) -> list[Path]:
     path = Path(given)
-    if path.is_dir():
+    named = path.suffix.lower() in SUFFIXES  # a folder or a dead link may be, too: reported when it is read
+    if path.is_dir() and not (named and not files_within(path, SUFFIXES)):
         return _photos_within(path)
-    if path.exists():
+    if os.path.lexists(path):
         if path.suffix.lower() not in SUFFIXES:
             raise ValueError(f"{path} is not a photo: the file name must end in {', '.join(SUFFIXES)}.")
         return [path]
