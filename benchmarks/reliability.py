@@ -145,8 +145,8 @@ def main():
             "seconds": time.perf_counter() - begin,
             "machine": machine(),
         }
-    results = {name: results[name] for name in SECTIONS if name in results}
-    write(options.output, page(results), results)
+        results = {name: results[name] for name in SECTIONS if name in results}
+        write(options.output, page(results), results)  # after each, as they take hours
     bad = sum(
         counts.get(column, 0)
         for section in results.values()

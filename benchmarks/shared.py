@@ -53,6 +53,7 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
 
 def write(output: Path, page: str, results: dict) -> None:
     """Print a page, and write it with its results beside it as JSON."""
+    output.parent.mkdir(parents=True, exist_ok=True)
     output.write_text(page)
     output.with_suffix(".json").write_text(json.dumps(results, indent=2) + "\n")
     print(page)
