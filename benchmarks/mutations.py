@@ -177,11 +177,16 @@ def _lines_files(folder: Path) -> list[bytes]:
     with np.load(folder / "sound.npz") as file:
         fields = {name: file[name] for name in file.files}
     np.savez_compressed(folder / "packed.npz", **fields)
+    rounded = [np.rint(line * 1024) / 1024 for line in points]  # which is stored in another way
+    zj.Lines.from_ragged(rounded, [0, 1, 1, 0], [20.0, 50.0], image_size=(64, 64)).save(
+        folder / "steps.npz"
+    )
     plain = io.BytesIO()
     with zipfile.ZipFile(folder / "sound.npz") as given, zipfile.ZipFile(plain, "w") as stored:
         for member in given.infolist():  # without checksums that would catch a change: those are made again
             stored.writestr(member.filename, given.read(member))
-    return [(folder / "sound.npz").read_bytes(), (folder / "packed.npz").read_bytes(), plain.getvalue()]
+    files = [(folder / f"{name}.npz").read_bytes() for name in ("sound", "packed", "steps")]
+    return [*files, plain.getvalue()]
 
 
 def sound_lines(lines: zj.Lines) -> None:

@@ -13,6 +13,8 @@ from .._reference import frame_energies
 from ..conftest import RAGGED_COUNTS, RAGGED_FRAMES, RAGGED_SIZE
 
 ROW = np.stack([np.arange(5.0), np.full(5, 2.0)], axis=-1)
+BETWEEN = (0.9 * ROW, 0.9 * ROW + 1)
+"""Lines of points that are no whole steps: those are stored in another way."""
 SIZE = (6, 4)
 
 
@@ -236,7 +238,7 @@ def test_shapes_that_disagree_raise():
 @pytest.fixture
 def saved(tmp_path):
     path = tmp_path / "lines.npz"
-    make().save(path)
+    make(BETWEEN).save(path)
     return path
 
 
@@ -328,7 +330,7 @@ def test_writing_that_fails_leaves_the_old_file_and_nothing_else(saved, monkeypa
 
     monkeypatch.setattr(np, "savez", fill_the_disk)
     with pytest.raises(OSError, match="No space left"):
-        make().save(saved)
+        make(BETWEEN).save(saved)
     assert saved.read_bytes() == before
     assert list(saved.parent.iterdir()) == [saved]
 
@@ -343,3 +345,22 @@ def test_a_folder_is_not_replaced_by_a_file(tmp_path):
 def test_nothing_may_be_missing(name):
     with pytest.raises(ValueError, match=f"Argument {name} must be given, but it is None"):
         dataclasses.replace(make(), **{name: None})
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_whole_steps_are_saved_small_and_whole(dtype, tmp_path):
+    rng, t = np.random.default_rng(0), np.arange(0, 600, 4.0)[:, None]
+    rows = [
+        np.rint(1024 * (t * [0.9, 0.1] + [0, 10 * i] + 0.1 * rng.standard_normal((150, 2)))) / 1024
+        for i in range(40)
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        lines = make([row.astype(dtype) for row in rows], [0, 1] * 20, image_size=(640, 480))
+        lines.save(tmp_path / "small.npz")
+        back = zj.load_lines(tmp_path / "small.npz")
+        exact = make([row.astype(dtype) + dtype(1e-4) for row in rows], [0, 1] * 20, image_size=(640, 480))
+        exact.save(tmp_path / "large.npz")
+    assert_same(back, lines)
+    share = (tmp_path / "small.npz").stat().st_size / (tmp_path / "large.npz").stat().st_size
+    assert share < (0.25 if dtype is np.float64 else 0.5)

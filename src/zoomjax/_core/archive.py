@@ -30,7 +30,7 @@ def read_archive(
         path: the file.
         what: what it holds, for errors.
         make: makes it from the file's arrays; a KeyError is an array that is missing.
-        format: the name and the version of the format, as the file's ``format`` and ``version`` state them.
+        format: the name and the last version of the format; the file states both.
         writer: what writes such files, for errors.
 
     Raises:
@@ -42,9 +42,10 @@ def read_archive(
     try:
         if str(stored.get("format")) != format[0]:
             raise ValueError(f"it holds no {what}; {writer} writes such a file")
-        if (version := stored["version"].item()) != format[1]:
+        if (version := stored["version"].item()) not in range(1, format[1] + 1):
             raise ValueError(
-                f"its format version is {version!r} and this zoomjax reads {format[1]}; update zoomjax"
+                f"its format version is {version!r} and this zoomjax reads up to {format[1]}; "
+                "update zoomjax"
             )
         return make(stored)
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError) as error:

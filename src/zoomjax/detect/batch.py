@@ -1,7 +1,8 @@
 """Detection in many images: in several processes, with a cache. Bad images are reported and skipped.
 
 Only points are kept, at most one every `_SPACING` px of a line: detectors smooth over some px, so that
-closer neighbours share their noise and add little information.
+closer neighbours share their noise and add little information. They are rounded to steps of 1/1024 px, far
+below any noise, which files then hold in a tenth of the space.
 """
 
 import collections
@@ -20,6 +21,7 @@ import cv2
 import numpy as np
 
 from .._core.files import whole_file
+from .._core.steps import STEP
 from ._workers import LostError, Workers
 from .base import AbstractDetector
 from .edges import EdgeDetector
@@ -175,11 +177,12 @@ _NO_LINES = (
 
 
 def _thinned(line: np.ndarray) -> np.ndarray:
-    """Points of a line, in order, `_SPACING` px apart or more."""
+    """Points of a line, in order, `_SPACING` px apart or more, to whole steps."""
     if len(line) < 3:
         return line
     length = float(np.hypot(*(line[-1] - line[0])))
-    return line[:: math.ceil(_SPACING * (len(line) - 1) / max(length, 1e-9))]
+    some = line[:: math.ceil(_SPACING * (len(line) - 1) / max(length, 1e-9))]
+    return np.rint(some / STEP) * STEP
 
 
 def _finished(

@@ -6,6 +6,7 @@ import numpy as np
 
 from .._core.archive import checked_counts, read_archive
 from .._core.arguments import kinds_checked
+from .._core.steps import unpacked
 from .lines import FORMAT, VERSION, Lines
 
 
@@ -21,7 +22,8 @@ def load_lines(path: str | os.PathLike[str]) -> Lines:
 
 
 def _lines(stored: dict[str, np.ndarray]) -> Lines:
-    points, counts = stored["points"], checked_counts(stored["counts"], stored["points"])
+    points = unpacked(stored["steps"], stored["step"]) if "steps" in stored else stored["points"]
+    counts = checked_counts(stored["counts"], points)
     lines = Lines.from_ragged(
         np.split(points, np.cumsum(counts)[:-1]),
         stored["frame"],

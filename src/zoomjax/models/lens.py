@@ -20,8 +20,9 @@ from .._core.checks import checked_size, checked_unit
 from .._core.fields import check_finite, check_positive, check_range, check_shapes, numbers
 from .._core.files import whole_file
 from .._core.types import AnyArray, FocalLike, Point, Points, traced
+from ._arguments import as_points, check_broadcast, check_terms
 from .about import About, checked_about, checked_pitch
-from .distortion import Distortion, as_points, check_broadcast, check_terms, compiled, mapped
+from .distortion import Distortion, compiled, mapped
 from .family import AbstractFamily
 from .polynomial import RadialPolynomial
 from .registry import array_of, coefficients_shape, described, family_name, family_named, zoom_from

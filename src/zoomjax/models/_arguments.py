@@ -1,0 +1,82 @@
+"""What distortions are made of and act on: shapes, and values where they are known."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._core.arguments import check_kind
+from .._core.fields import check_finite, check_positive
+from .family import AbstractFamily
+
+
+def as_points(points: Any) -> Any:
+    """Points as an array (..., 2) of float32 or float64.
+
+    Raises:
+        ValueError: they are not real numbers, or of another shape.
+    """
+    if not isinstance(points, jax.Array):
+        try:
+            points = np.asarray(points)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"Argument points must be an array of shape (..., 2): {error}.") from error
+    if points.shape[-1:] != (2,):
+        raise ValueError(f"Argument points must have shape (..., 2), but its shape is {points.shape}.")
+    if not jnp.issubdtype(points.dtype, jnp.integer) and not jnp.issubdtype(points.dtype, jnp.floating):
+        raise ValueError(f"Argument points must hold real numbers, but its dtype is {points.dtype}.")
+    if jnp.issubdtype(points.dtype, jnp.integer):
+        return points.astype(float)
+    return points.astype(np.float32) if points.dtype.itemsize < 4 else points
+
+
+def check_broadcast(points: tuple[Any, ...], focal: tuple[Any, ...]) -> None:
+    """Raise ValueError where there are neither as many focal lengths as points nor one for many."""
+    try:
+        jnp.broadcast_shapes(points, focal)
+    except ValueError as error:
+        raise ValueError(
+            f"Argument focal must have a shape that broadcasts with that of the points, {points}, one for "
+            f"all or one for each, but its shape is {focal}."
+        ) from error
+
+
+def check_distortion(coefficients, centre, scale, family):
+    """What a `Distortion` is made of: shapes, and values where they are known."""
+    if isinstance(family, bool) or type(family) is object:
+        return  # stands for one in filters and trees
+    check_kind("family", family, (AbstractFamily,))
+    parts = {"coefficients": coefficients, "centre": centre, "scale": scale}
+    if not all(hasattr(part, "shape") and hasattr(part, "dtype") for part in parts.values()):
+        if any(isinstance(part, np.ndarray | jax.Array) for part in parts.values()):
+            missing = next(name for name, part in parts.items() if not hasattr(part, "dtype"))
+            raise ValueError(f"Argument {missing} must hold real numbers, but it is {parts[missing]!r}.")
+        return  # a stand-in, of a pytree's structure
+    check_terms("coefficients", coefficients.shape[-1] if coefficients.ndim else 0, family)
+    if centre.shape[-1:] != (2,):
+        raise ValueError(f"Argument centre must be (x, y), but its shape is {centre.shape}.")
+    batch = coefficients.shape[:-1]
+    for name, shape in (("centre", centre.shape[:-1]), ("scale", scale.shape)):
+        if shape not in ((), batch):
+            raise ValueError(
+                f"Argument {name} must be one for all distortions or one for each of {batch}, but its "
+                f"shape is {parts[name].shape}."
+            )
+    check_finite("coefficients", coefficients)
+    check_finite("centre", centre)
+    check_positive("scale", scale)
+
+
+def check_terms(name: str, size: int, family: AbstractFamily) -> None:
+    """Raise ValueError where a distortion model has no such number of coefficients."""
+    sizes = [family.size(terms) for terms in range(1, family.most_terms + 1)]
+    more = [family.size(terms) for terms in family.more_terms]
+    if size in (*sizes, *more):
+        return
+    opencv = ": OpenCV's (k1, k2, p1, p2, k3, ...) are of another model" * (size in (5, 8, 12, 14))
+    raise ValueError(
+        f"Argument {name} must give from {min(sizes)} to {max(sizes)} coefficients"
+        f"{''.join(f', or {number}' for number in more)}, for a {type(family).__name__}, but it gives "
+        f"{size}{opencv}."
+    )
