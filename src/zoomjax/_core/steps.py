@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 STEP = 1 / 1024
-"""px. Its rounding, 0.0003 px RMS, is a hundredth of the noise of the best detectors."""
+"""px. Its rounding is far below the noise of any detector."""
 
 _MOST = 2**30
 """Steps: a million px, on either side."""

@@ -221,11 +221,12 @@ class Lines(AbstractLines):
         }
         points = np.asarray(self.points)[np.asarray(self.mask)]
         small = packed(points)
+        stored: dict[str, Any] = {"points": points} if small is None else small
         with whole_file(path) as part, part.open("wb") as file:
             (np.savez if small is None else np.savez_compressed)(
                 file,
                 **fields,
-                **({"points": points} if small is None else small),
+                **stored,
                 format=FORMAT,
                 version=1 if small is None else VERSION,  # older readers know points alone
                 counts=np.asarray(self.mask).sum(1),
