@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zoomjax._core.text import numbered_name, plain
+from zoomjax._core.text import numbered_name, plain, span
 
 names = st.text(max_size=300) | st.text(
     st.sampled_from("./\\:*?<>|\"' -=~a\x1b\n\udcff\u202e"), max_size=300
@@ -57,3 +57,9 @@ def test_made_names_are_files_names_everywhere(number, name):
 )
 def test_made_names_can_be_read(name, made):
     assert numbered_name(3, name, ".jpg") == made
+
+
+def test_a_span_of_one_value_is_that_value():
+    assert span(20.56, 127.36, "mm") == "20.56 to 127.36 mm"
+    assert span(28.0, 28.0, "mm") == "28 mm"
+    assert span(1000.01, 1000.02, "px") == "1000 px"

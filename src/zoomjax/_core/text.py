@@ -24,6 +24,12 @@ def _is_harmless(character: str) -> bool:
     )
 
 
+def span(low: float, high: float, unit: str) -> str:
+    """Two ends in their unit, or the one value that both are."""
+    ends = [f"{value:.5g}" for value in (low, high)]
+    return f"{' to '.join(dict.fromkeys(ends))} {unit}"
+
+
 def numbered_name(number: int, name: str, suffix: str) -> str:
     """A file's name for what is made of the image `name`: with its number, so that no two are the same.
 

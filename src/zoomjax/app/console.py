@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .._core.text import plain
+from .._core.text import plain, span
 from ._interrupts import go_on
 
 if TYPE_CHECKING:
@@ -147,12 +147,12 @@ def show_calibration(
 
     console = Console()
     summary = calibration.summary()
-    unit = summary["focal_unit"]
     low, high = summary["focal_range"]
     show_verdict(calibration)
     console.print(
-        f"\n{summary['points']:,} points on {summary['lines']:,} lines in {summary['frames']} frames, "
-        f"f = {low:g} to {high:g} {unit}\n",
+        f"\n{summary['points']:,} points on {summary['lines']:,} lines in "
+        f"{summary['frames']} frame{'s' * (summary['frames'] > 1)}, "
+        f"f = {span(low, high, summary['focal_unit'])}\n",
         highlight=False,
     )
     table = Table(

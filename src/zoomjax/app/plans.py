@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._core.text import plain
+from .._core.text import plain, span
 
 if TYPE_CHECKING:
     from ..lines.lines import Lines
@@ -20,7 +20,7 @@ def lines_plan(lines: "Lines", exclude: Sequence[int]) -> list[str]:
     left, focal = len(lines.frame) - len(exclude), np.asarray(without(lines, exclude).focal)
     return [
         f"{left:,} of {len(lines.frame):,} lines in {len(focal)} frames, "
-        f"f = {focal.min():g} to {focal.max():g} {lines.focal_unit}."
+        f"f = {span(float(focal.min()), float(focal.max()), lines.focal_unit)}."
     ]
 
 

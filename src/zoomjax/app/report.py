@@ -22,7 +22,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from .._core.text import plain
+from .._core.text import plain, span
 from ..trust.selection import COLUMNS
 from .calibration import Calibration, rms_over_frames
 from .choice import colour_limit
@@ -83,9 +83,7 @@ def report(
         .render(
             title=run.title,
             about=[
-                f"f = {low:.4g} to {high:.4g} {lens.focal_unit}"
-                if low < high
-                else f"f = {low:.4g} {lens.focal_unit}",
+                f"f = {span(low, high, lens.focal_unit)}",
                 f"{lens.image_size[0]} × {lens.image_size[1]} px",
                 _number(len(calibration.none), "photo" if images else "frame"),
                 _number(len(calibration.rejected), "line"),
@@ -264,10 +262,10 @@ def _certificate(calibration: Calibration) -> str:
     )
     if proof.certified:
         return (
-            "The lens is proved to be invertible: the corrected image does not fold over at any focal "
-            f"length from {low:.4g} to {high:.4g} {lens.focal_unit}. The slope of the corrected radius (1 "
-            f"without distortion, 0 at a fold) is at least {float(proof.least):.3g}; the smallest slope "
-            f"found is {found}."
+            "The lens is proved to be invertible: the corrected image does not fold over at "
+            f"{'any focal length from ' * (low < high)}{span(low, high, lens.focal_unit)}. The slope of "
+            "the corrected radius (1 without distortion, 0 at a fold) is at least "
+            f"{float(proof.least):.3g}; the smallest slope found is {found}."
         )
     if proof.folded:
         return (
