@@ -125,7 +125,7 @@ LENS = {
     "class of a family": ({"family": zj.models.Division}, "it is the class Division: pass an instance"),
     "two for Brown and Conrady": (
         {"family": zj.models.BrownConrady()},
-        "zoom must give 3 or more coefficients for the family BrownConrady, but it gives 2",
+        "zoom must give from 3 to 6 coefficients, for a BrownConrady, but it gives 2",
     ),
     "a shift of three": (
         {"shift": zj.PolynomialZoom(0, [[0.0, 0.0, 0.0]], 20.0)},

@@ -271,3 +271,21 @@ NO_DISTORTION = {
 def test_what_is_no_distortion_is_refused_by_name(what):
     with pytest.raises(ValueError, match=f"Argument {what.split()[0]} must"):
         zj.Distortion(*NO_DISTORTION[what])
+
+
+@pytest.mark.parametrize("method", ["undistort", "distort"])
+def test_gradients_of_single_points_under_vmap(method):
+    """Where a compiled function is batched and then differentiated, value and derivative share an axis."""
+    d = zj.Distortion(jnp.array([0.1, -0.02]), jnp.zeros(2), jnp.array(400.0))
+    points = jnp.array([[10.0, 20.0], [-150.0, 80.0], [30.0, -200.0]])
+
+    def total(points):
+        return jax.vmap(lambda p: jnp.sum((getattr(d, method)(p) - p) * jnp.array([1.0, 2.0])))(
+            points
+        ).sum()
+
+    whole = jax.grad(lambda p: jnp.sum((getattr(d, method)(p) - p) * jnp.array([[1.0, 2.0]])))(points)
+    np.testing.assert_allclose(jax.grad(total)(points), whole, rtol=1e-12, atol=1e-14)
+    each = jax.vmap(jax.hessian(lambda p: jnp.sum(getattr(d, method)(p) ** 2)))(points)
+    assert each.shape == (3, 2, 2)
+    np.testing.assert_allclose(each, jnp.swapaxes(each, 1, 2), rtol=1e-9, atol=1e-12)

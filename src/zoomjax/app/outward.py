@@ -13,7 +13,7 @@ def outward(lens: ZoomLens, points: np.ndarray, focal: Iterable[float]) -> np.nd
     The centre is that at the focal length, if it moves along the zoom.
     """
 
-    def at(f: float) -> np.ndarray:
+    def at(f):
         distortion = lens(float(f))
         centre = np.asarray(distortion.centre)
         before, after = points - centre, np.asarray(distortion.undistort(points)) - centre

@@ -216,9 +216,11 @@ def _corrected(distortion_of, points, operands):
 
 @_corrected.defjvp
 def _corrected_jvp(distortion_of, primals, tangents):
-    return jax.jvp(
+    """The value is that of the same function: under vmap it must have its batch axis at the same place."""
+    _, moved = jax.jvp(
         lambda points, operands: _undistorted(points, *distortion_of(operands)), primals, tangents
     )
+    return _corrected(distortion_of, *primals), moved
 
 
 def _undistorted(points, family, k, centre, scale, *, spreading=True):
