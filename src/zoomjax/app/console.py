@@ -147,12 +147,13 @@ def show_calibration(
 
     console = Console()
     summary = calibration.summary()
+    unit = summary["focal_unit"]
     low, high = summary["focal_range"]
     show_verdict(calibration)
     console.print(
         f"\n{summary['points']:,} points on {summary['lines']:,} lines in "
         f"{summary['frames']} frame{'s' * (summary['frames'] > 1)}, "
-        f"f = {span(low, high, summary['focal_unit'])}\n",
+        f"f = {span(low, high, unit)}\n",
         highlight=False,
     )
     table = Table(
