@@ -140,10 +140,20 @@ def opentrackio(path, focal, points, *, index, size, **_):
 
 def knob(text, name, index):
     """The value of a Nuke knob, or that of a key."""
+    [value] = components(text, name, index)
+    return value
+
+
+def components(text, name, index):
+    """The values of a knob of one component or several, each a number or a curve with a key for each."""
     value = re.search(rf"^ {name} (.+)$", text, re.MULTILINE)[1]
-    if "curve" not in value:
-        return float(value)
-    return [float(v) for v in re.findall(r"x\d+ ([^ }]+)", value)][index]
+    inner = value[1:-1] if value.startswith("{") else value
+    found = []
+    for curve, number in re.findall(r"\{curve ([^{}]+)\}|([^ {}]+)", inner):
+        found.append(
+            [float(v) for v in re.findall(r"x\d+ (\S+)", curve)][index] if curve else float(number)
+        )
+    return found
 
 
 def nuke(path, focal, points, *, index, size, **_):
@@ -170,7 +180,7 @@ def nuke(path, focal, points, *, index, size, **_):
 
 
 def nuke_rational(text, points, index, size):
-    centre = re.search(r"^ centre \{(.+)\}$", text, re.MULTILINE)[1].split()
+    centre = components(text, "centre", index)
     half = np.hypot(*size) / 2
     z = (points - (np.array(size) - 1) / 2) / half * [1, -1] - np.array(centre, float)
     r2 = np.sum(z * z, -1, keepdims=True)

@@ -40,9 +40,16 @@ def told(tmp_path_factory):
         "import": "import a.xml --image-size 640x480 -o back",
         "no size": "import a.xml -o never",
         "damaged": "import bad.json -o never",
+        "no effect": "export lens.json --to opencv --focal 24 --pixel-pitch 0.0367 --tolerance 1 -o b.yaml",
+        "no convention": "export lens.json --to nuke --focal 24 --convention nonsense -o b.nk",
+        "no crop": "import a.pfb --focal 20,26,40 --crop 1.5 -o never",
+        "a folder": "export lens.json --to stmap --focal 24 -o st.exr",
+        "another size": "import in/lens.json --image-size 641x480 -o never",
         "its lens": "export lens.json --to gyroflow --pixel-pitch 0.0367 -o lens.json --overwrite",
         "its track": "export lens.json --to pftrack --focal track.csv -o track.csv --overwrite",
+        "its folder": "export lens.json --to opencv --focal 24,35 --pixel-pitch 0.0367 -o . --overwrite",
         "its source": "import in/lens.json -o in --overwrite",
+        "its source by a folder not there": "import in/lens.json -o in/new/.. --overwrite",
     }
     jobs = [[str(folder), ["zoomjax", *line.split()]] for line in lines.values()]
     done = subprocess.run(
@@ -81,9 +88,15 @@ def test_a_lens_goes_out_and_comes_back(told):
         ("no focal", "Error: --focal must be given, one focal length or several"),
         ("no format", "Error: --to must be one of stmap, nuke"),
         ("no size", "it holds no image size: give --image-size"),
+        ("no effect", "Error: --tolerance has no effect on the format opencv: leave it out."),
+        ("no convention", "Error: --convention has no effect on the format nuke: leave it out."),
+        ("no crop", "Error: --crop has no effect on the format pftrack: leave it out."),
+        ("a folder", "Error: The format stmap is several files here, and st.exr is to be their folder"),
+        ("another size", "its images are 640x480 px: leave out --image-size, which is 641x480."),
         ("damaged", "Error: Cannot read a gyroflow lens from bad.json: "),
         ("its lens", "The output lens.json is the input"),
         ("its track", "The output track.csv is the input"),
+        ("its folder", "lens.json is in the folder ., where files are replaced: choose another"),
         ("its source", "The output in/lens.json is the input"),
     ],
 )
@@ -93,4 +106,4 @@ def test_an_error_is_one_sentence_with_the_names_of_options(told, name, sentence
     assert status == 2
     assert sentence in text
     assert len(text.strip().splitlines()) == 1
-    assert not (folder / "never").exists()
+    assert not any((folder / name).exists() for name in ("never", "st.exr", "b.yaml", "b.nk"))

@@ -1,5 +1,8 @@
 """Lenses from other tools' files: what zoomjax wrote, what others did, and what is damaged."""
 
+import json
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -9,9 +12,10 @@ from benchmarks.mutations import LCP
 from zoomjax.models import BrownConrady, Division, RadialPolynomial, TableZoom
 
 from ._lenses import LENSES, PITCH
+from ._readers import project
 from .test_write import shown
 
-BOTH = {fmt.name: fmt for fmt in zj.interop.formats() if fmt.writes and fmt.reads}
+BOTH = {fmt.name: fmt for fmt in zj.interop.formats() if fmt.writes}
 FOCAL = [18, 24, 35, 50, 85, 200]
 SILENT = ("nuke", "pftrack", "discorpy")
 """Formats that hold no focal lengths."""
@@ -100,6 +104,69 @@ def test_curves_of_nuke_are_read_with_keys_left_out(curve, tmp_path):
     assert first[0] != 0
 
 
+def test_focal_lengths_of_nuke_are_those_of_the_node(tmp_path):
+    """In cm, as a curve; a constant is that of all frames only where there is one."""
+    text = NUKE % ("{{curve x1 0.01 x2 0.02}}", "0.001")
+    (tmp_path / "a.nk").write_text(
+        text.replace(" {\n", " {\n tde4_focal_length_cm {{curve x1 2.4 x2 3.5}}\n")
+    )
+    back = zj.interop.read(tmp_path / "a.nk", image_size=(360, 240), zoom=TableZoom())
+    assert back.report.focal == (24, 35)
+    assert [float(back.lens(f).coefficients[0]) for f in (24.0, 35.0)] == pytest.approx([0.01, 0.02])
+    (tmp_path / "b.nk").write_text(text.replace(" {\n", " {\n tde4_focal_length_cm 2.4\n"))
+    with pytest.raises(ValueError, match="give argument focal, 2 of them"):
+        zj.interop.read(tmp_path / "b.nk", image_size=(360, 240))
+
+
+def test_nukes_own_node_is_read(tmp_path):
+    """As AliceVision writes it: fewer numerators, knobs of other kinds, and a centre with curves."""
+    (tmp_path / "a.nk").write_text(
+        "LensDistortion2 {\n\n distortionModelPreset Custom\n"
+        " distortionNumerator0 {{curve x1 0.05 x2 0.04 }}\n\n distortionNumerator1 -0.01\n"
+        " centre {{curve x1 0.02 x2 0.03 } {curve x1 -0.01 x2 0.01 }}\n output Undistort\n"
+        " distortionScalingType Format\n distortionOrder {2 0}\n normalisationType Diagonal\n}\n"
+        "Blur {\n distortionNumerator0 9\n}\n"
+    )
+    told = {"image_size": (301, 401), "focal": (24, 35), "zoom": TableZoom()}
+    back = zj.interop.read(tmp_path / "a.nk", **told)
+    for focal, k1 in ((24.0, 0.05), (35.0, 0.04)):
+        assert back.lens(focal).coefficients == pytest.approx([k1, -0.01], abs=2e-3)
+    half = np.hypot(301, 401) / 2  # the mean of (0.02, -0.01) and (0.03, 0.01), y up
+    assert np.asarray(back.lens.centre) == pytest.approx([150 + 0.025 * half, 200], abs=1e-9)
+    assert any("centres differ" in note for note in back.report.notes)
+
+
+@pytest.mark.parametrize(
+    ("knob", "message"),
+    [
+        ("normalisationType Width", "its normalisationType is Width, and only Diagonal is read"),
+        ("projection Fisheye", "its projection is Fisheye, and only Rectilinear is read"),
+        ("distortionOrder {40 0}", "up to 12 coefficients"),
+    ],
+)
+def test_a_node_of_nuke_in_another_geometry_is_refused(knob, message, tmp_path):
+    (tmp_path / "a.nk").write_text(f"LensDistortion2 {{\n distortionNumerator0 0.1\n {knob}\n}}\n")
+    with pytest.raises(ValueError, match=message):
+        zj.interop.read(tmp_path / "a.nk", image_size=(360, 240), focal=24)
+
+
+@pytest.mark.parametrize("kind", ["division", "wide, three terms", "decentred", "px", "moving centre"])
+def test_a_node_that_was_written_for_nuke_is_read_again(kind, tmp_path):
+    lens = LENSES[kind]()
+    focal = np.geomspace(*np.asarray(lens.focal_range), 3)
+    zj.interop.write(lens, tmp_path / "a.nk", format="nuke", focal=focal, pixel_pitch=PITCH)
+    own = "LensDistortion2" in (tmp_path / "a.nk").read_text()
+    told = {"image_size": lens.image_size, "zoom": TableZoom()} | ({"focal": focal} if own else {})
+    back = zj.interop.read(tmp_path / "a.nk", **told)
+    assert type(back.lens.family) is type(lens.family)
+    factor = PITCH if lens.focal_unit == "px" and not own else 1.0
+    assert back.report.focal == pytest.approx(focal * factor)
+    for f in focal:
+        moved = back.lens(f * factor).undistort(shown(lens)) - lens(f).undistort(shown(lens))
+        assert np.abs(moved).max() <= back.report.worst + 1e-9
+    assert back.report.worst < (2.0 if kind == "moving centre" else 1e-8)
+
+
 @pytest.mark.parametrize(
     ("first", "second", "message"),
     [
@@ -149,6 +216,34 @@ def test_maps_are_read_in_both_directions_and_three_conventions(convention, dire
     if convention == "gyroflow":
         moved = np.asarray(zj.interop.read(path).lens.centre - back.lens.centre)
         assert np.abs(moved).max() > 0.1  # which shows that the convention matters
+
+
+@pytest.mark.parametrize("focal", [[24], [18, 50, 200]])
+@pytest.mark.parametrize("direction", ["undistort", "redistort"])
+def test_maps_of_a_decentred_lens_come_back_decentred(direction, focal, tmp_path):
+    """Else they would come back as radial about another centre, a pixel off."""
+    lens = LENSES["decentred"]()
+    zj.interop.write(lens, tmp_path / "m", format="stmap", focal=focal)
+    back = zj.interop.read(tmp_path / "m", direction=direction, focal=None)
+    assert isinstance(back.lens.family, BrownConrady)
+    assert np.asarray(back.lens.centre) == pytest.approx(np.asarray(lens.centre), abs=0.05)
+    assert back.report.worst < 1e-3
+    for f in focal:
+        moved = back.lens(float(f)).undistort(shown(lens)) - lens(float(f)).undistort(shown(lens))
+        assert np.abs(moved).max() < 1e-3
+    radial = zj.interop.read(
+        tmp_path / "m", direction=direction, family=RadialPolynomial(), zoom=TableZoom()
+    )
+    assert isinstance(radial.lens.family, RadialPolynomial)
+    assert radial.report.worst > 0.05
+
+
+@pytest.mark.parametrize(("family", "most"), [(Division(), 0.2), (BrownConrady(), 0.1)])
+def test_a_distortion_model_that_is_asked_for_is_taken(family, most, written):
+    _, found = written
+    back = zj.interop.read(found["opentrackio"][0], family=family, zoom=TableZoom())
+    assert type(back.lens.family) is type(family)
+    assert back.report.worst < most
 
 
 LENSFUN = """<lensdatabase version="1">
@@ -207,6 +302,54 @@ def test_an_adobe_profile_is_opencvs_formula_at_the_farthest_focus(tmp_path):
     assert back.report.worst < 0.3
 
 
+FX, FY, K = 500.0, 504.5, (-0.25, 0.06, 1e-3, -5e-4)
+"""A camera with pixels that are 0.9 % from square, and k1, k2, p1, p2."""
+
+NOT_QUITE_SQUARE = {
+    "colmap.txt": f"1 OPENCV 640 480 {FX} {FY} 330.5 235.5 {' '.join(map(str, K))}\n",
+    "kalibr.yaml": f"cam0:\n  camera_model: pinhole\n  intrinsics: [{FX}, {FY}, 330, 235]\n"
+    f"  distortion_model: radtan\n  distortion_coeffs: {list(K)}\n  resolution: [640, 480]\n",
+    "nerfstudio.json": json.dumps(
+        {"fl_x": FX, "fl_y": FY, "cx": 330.5, "cy": 235.5, "w": 640, "h": 480, "frames": []}
+        | dict(zip(("k1", "k2", "p1", "p2"), K, strict=True))
+    ),
+}
+
+
+@pytest.mark.parametrize("name", [*NOT_QUITE_SQUARE, "division.txt"])
+def test_the_error_of_pixels_that_are_not_square_is_reported(name, tmp_path):
+    """Ours are square: what the lens cannot do as the tool with its own fx and fy is in the report."""
+    division = f"1 DIVISION 640 480 {FX} {FY} 330.5 235.5 -0.3\n"
+    (tmp_path / name).write_text(NOT_QUITE_SQUARE.get(name, division))
+    back = zj.interop.read(tmp_path / name)
+    f, c = np.array([FX, FY]), np.array([330.0, 235.0])
+    if name == "division.txt":
+        distorted = shown(back.lens)
+        rays = (distorted - c) / f
+        corrected = rays / (1 - 0.3 * np.sum(rays**2, -1, keepdims=True)) * f + c
+    else:
+        corrected = np.stack(np.meshgrid(np.linspace(-60, 700, 25), np.linspace(-60, 540, 25)), -1)
+        corrected = corrected.reshape(-1, 2)
+        distorted = project([[FX, 0, c[0]], [0, FY, c[1]], [0, 0, 1]], K, corrected)
+        inside = ((distorted >= 0) & (distorted <= [639, 479])).all(-1)
+        corrected, distorted = corrected[inside], distorted[inside]
+    found = np.asarray(back.lens(float(f.mean())).undistort(distorted))
+    worst = np.hypot(*(found - corrected).T).max()
+    assert 0.1 < worst <= back.report.worst + 0.01
+    assert any("0.89 % from square" in note for note in back.report.notes)
+
+
+def test_pixels_that_are_not_square_and_a_skew_are_refused(tmp_path):
+    (tmp_path / "a.txt").write_text("1 PINHOLE 640 480 500 510 320 240\n")
+    with pytest.raises(ValueError, match="its pixels are not square: fx is 500 and fy is 510"):
+        zj.interop.read(tmp_path / "a.txt")
+    matrix = "camera_matrix: {data: [500, 3, 320, 0, 500, 240, 0, 0, 1]}\n"
+    rest = "image_width: 640\nimage_height: 480\ndistortion_model: plumb_bob\n"
+    (tmp_path / "a.yaml").write_text(rest + matrix + "distortion_coefficients: {data: [0, 0, 0, 0]}\n")
+    with pytest.raises(ValueError, match="its camera matrix is skewed, by 3"):
+        zj.interop.read(tmp_path / "a.yaml")
+
+
 def test_plumb_bob_and_one_entry_without_a_zoom(tmp_path):
     (tmp_path / "c.yaml").write_text(
         "image_width: 600\nimage_height: 400\ncamera_name: c\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
@@ -240,7 +383,8 @@ def test_a_damaged_file_is_one_sentence(name, written, tmp_path):
         bad = tmp_path / f"{kind}-undistort{source.suffix}"
         bad.write_bytes(content)
         try:
-            zj.interop.read(bad, format=name, **given(name, lens) | {"focal": 18})
+            focal = {"focal": 18} if "focal" in BOTH[name].options else {}
+            zj.interop.read(bad, format=name, **given(name, lens) | focal)
         except ValueError as error:
             told.append(str(error))
     assert len(told) >= 4
@@ -279,3 +423,13 @@ def test_yaml_and_python_in_a_file_are_not_run(tmp_path):
     (tmp_path / "a.cameramodel").write_text("{'lensmodel': __import__('os').getcwd()}")
     with pytest.raises(ValueError, match="Cannot read a mrcal lens"):
         zj.interop.read(tmp_path / "a.cameramodel")
+
+
+def test_a_coefficient_that_is_no_finite_number_is_refused_at_once(tmp_path, recwarn):
+    """1e400 is infinite: fits went on with it, and warned twenty times."""
+    path = tmp_path / "a.xml"
+    zj.interop.write(LENSES["landscape"](), path, format="lensfun", focal=[18, 35, 70], pixel_pitch=PITCH)
+    path.write_text(re.sub(r'k2="[^"]*"', 'k2="1e400"', path.read_text(), count=1))
+    with pytest.raises(ValueError, match="coefficients or centre at 18 are not finite numbers"):
+        zj.interop.read(path, image_size=LENSES["landscape"]().image_size)
+    assert not recwarn.list

@@ -37,7 +37,7 @@ def error(name, path, lens, focal, index=0):
     corrected = np.asarray(lens(focal).undistort(distorted))
     start, end = (distorted, corrected) if name in CORRECTS else (corrected, distorted)
     mm = focal if lens.focal_unit == "mm" else focal * PITCH
-    centre = np.asarray(lens.centre)
+    centre = np.asarray(lens.centre_at(focal))
 
     def at(scale):
         points = centre + scale * (start - centre)
@@ -77,7 +77,7 @@ def test_at_its_focal_lengths_a_file_does_as_the_lens(name, lens, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TABLES)
-@pytest.mark.parametrize("kind", ["landscape", "portrait", "px", "decentred"])
+@pytest.mark.parametrize("kind", LENSES)
 def test_between_its_focal_lengths_a_file_does_as_reported(name, kind, tmp_path):
     lens = LENSES[kind]()
     path = tmp_path / f"lens{WRITTEN[name].suffixes[0]}"
@@ -120,7 +120,7 @@ def test_samples_of_opentrackio_are_of_its_schema(lens, tmp_path):
         jsonschema.validate(json.loads(line), schema)
 
 
-@pytest.mark.parametrize("name", ["landscape", "portrait", "decentred"])
+@pytest.mark.parametrize("name", ["landscape", "portrait", "decentred", "moving centre"])
 def test_maps_say_where_to_sample(name, tmp_path):
     lens = LENSES[name]()
     w, h = lens.image_size

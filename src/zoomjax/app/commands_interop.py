@@ -12,6 +12,7 @@ from .._core.text import plain
 from ._compiled import set_up_jax
 from .arguments import Overwrite, size_of
 from .commands import app
+from .options import ResultsFolder, place
 
 if TYPE_CHECKING:
     from ..interop.base import Report
@@ -32,6 +33,7 @@ def export(
             "--output",
             metavar="OUT",
             help="Output file; a folder for STMaps, and where each focal length is a file.",
+            callback=place,
         ),
     ],
     to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="The format; see zoomjax formats.")],
@@ -51,15 +53,17 @@ def export(
         ),
     ] = None,
     tolerance: Annotated[
-        float,
+        float | None,
         typer.Option(
             metavar="PX",
-            help="For formats that interpolate: largest error between the focal lengths written.",
+            help="For formats that interpolate: largest error between the focal lengths written. Default: "
+            "0.1.",
         ),
-    ] = 0.1,
+    ] = None,
     convention: Annotated[
-        str, typer.Option(help="Of STMaps: centres (Nuke), gyroflow or alicevision.")
-    ] = "centres",
+        str | None,
+        typer.Option(help="Of STMaps: centres (Nuke), gyroflow or alicevision. Default: centres."),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
     """Write a lens in another tool's format, and report its error there."""
@@ -69,7 +73,11 @@ def export(
     from ..models.lens import load_lens
 
     tracked = focal is not None and focal.lower().endswith(".csv")
-    refuse_inputs([output], [lens, *([focal] if tracked and focal is not None else [])])
+    inputs = [lens, *([Path(focal)] if tracked and focal is not None else [])]
+    refuse_inputs([output], inputs)
+    for path in inputs if overwrite else []:
+        if path.resolve().parent == output.resolve():
+            raise ValueError(f"{path} is in the folder {output}, where files are replaced: choose another.")
     report = write(
         load_lens(lens),
         output,
@@ -93,9 +101,7 @@ def import_(
             metavar="FILE", help="The file, or a folder of files of one format, one a focal length."
         ),
     ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.", file_okay=False)
-    ],
+    output: ResultsFolder,
     of: Annotated[
         str | None,
         typer.Option("--from", metavar="FORMAT", help="The format; by default it is recognised."),
@@ -115,15 +121,17 @@ def import_(
         typer.Option(help="For lensfun: crop factor of the camera; default: that of the calibration."),
     ] = None,
     name: Annotated[
-        str | None, typer.Option(help="Name of the lens, or a part of it, for files of several.")
+        str | None,
+        typer.Option(help="For lensfun: name of the lens, or a part of it, for files of several."),
     ] = None,
     direction: Annotated[
         str | None,
         typer.Option(help="Of STMaps: undistort or redistort; default: what the file name says."),
     ] = None,
     convention: Annotated[
-        str, typer.Option(help="Of STMaps: centres (Nuke), gyroflow or alicevision.")
-    ] = "centres",
+        str | None,
+        typer.Option(help="Of STMaps: centres (Nuke), gyroflow or alicevision. Default: centres."),
+    ] = None,
     table: Annotated[
         bool,
         typer.Option(
@@ -170,7 +178,7 @@ def formats() -> None:
     from ..interop.registry import FORMATS
 
     for fmt in FORMATS:
-        ways = "export, import" if fmt.writes and fmt.reads else "export" if fmt.writes else "import"
+        ways = "export, import" if fmt.writes else "import"
         exact = "exact" if fmt.exact else "refitted"
         print(f"{fmt.name:<12}{ways:<16}{exact:<10}{_ZOOM[fmt.zoom]:<26}{fmt.tools}")
 

@@ -9,6 +9,7 @@ least squares problem for all focal lengths m,
 the positions of all points counting alike, as in the energy of `fit_zoom` with its prior.
 """
 
+import dataclasses
 import math
 
 import jax
@@ -23,6 +24,7 @@ from ..models.polynomial import RadialPolynomial
 from ..models.smooth import SmoothZoom
 from ..models.tables import TableZoom
 from ..models.zoom import AbstractLinearZoom, AbstractPriorZoom, PolynomialZoom, with_parameters
+from ._centre import centre_and_family
 from ._forms import Form
 from ._samples import distortions, pairs_of
 from .base import Contents, Node, Sampled
@@ -33,11 +35,19 @@ _MUCH = 0.5
 _TERMS, _KEPT = 2, AbstractFamily.most_terms
 """Coefficients of a `SmoothZoom`, whose prior is for two, and of models that keep a file's values."""
 
+
+class UnsuitedError(ValueError):
+    """The zoom model that was asked for does not suit the contents of a file that is sound."""
+
+
 Pairs = tuple[np.ndarray, np.ndarray]
 
 
 def lens_of(
-    contents: Contents, zoom: AbstractLinearZoom | None, terms: int | None
+    contents: Contents,
+    zoom: AbstractLinearZoom | None,
+    terms: int | None,
+    family: AbstractFamily | None = None,
 ) -> tuple[ZoomLens, float, tuple[str, ...]]:
     """The zoom lens of a file's contents.
 
@@ -46,6 +56,7 @@ def lens_of(
         zoom: the zoom model; None for the default, which depends on the contents.
         terms: number of radial coefficients; None for two of a `SmoothZoom`, else for those of the file
             where its formula is ours, or four.
+        family: the distortion model; None for that which holds the file's values, or is nearest to them.
 
     Returns:
         The lens, its greatest error at the nodes, px of the corrected image, and notes.
@@ -53,6 +64,9 @@ def lens_of(
     nodes = sorted(_averaged(contents.nodes), key=lambda node: node.focal)
     focal = np.array([node.focal for node in nodes])
     size, notes = contents.image_size, list(contents.notes)
+    if sampled := [node for node in nodes if isinstance(node, Sampled)]:
+        centre, family = centre_and_family(sampled, size, family)
+        nodes = [dataclasses.replace(node, centre=centre) for node in nodes]
     scale, centres = math.hypot(*size) / 2, [_centre(node, size) for node in nodes]
     centre = np.mean(centres, axis=0)
     found = [_pairs(node, size) for node in nodes]
@@ -66,7 +80,8 @@ def lens_of(
         for (d, u, _), c in zip(found, centres, strict=True)
     ]
     any_scale = [isinstance(node, Node) and node.form.any_scale for node in nodes]
-    family, exact = _family(nodes, terms)
+    own, exact = _family(nodes, terms)
+    family, exact = (own, exact) if family is None or type(family) is type(own) else (family, False)
     if zoom is None:
         zoom = _default_zoom(family, len(focal), terms)
     count = terms or (_TERMS if isinstance(zoom, SmoothZoom) else _terms(nodes, exact))
@@ -85,7 +100,10 @@ def lens_of(
         family=family,
     )
     worst = _worst(lens, focal, points, any_scale)
-    if worst > _MUCH and not isinstance(model, TableZoom):
+    stretched = [abs(node.stretch[0] / node.stretch[1] - 1) for node in nodes if isinstance(node, Node)]
+    if (most := max(stretched, default=0.0)) > 0:
+        notes.append(f"The file's pixels are up to {100 * most:.2g} % from square: the lens's are square.")
+    if worst > _MUCH and len(focal) > 1 and not isinstance(model, TableZoom):
         notes.append("The zoom model smooths the file's values: a table, TableZoom(), keeps them.")
     return lens, worst, tuple(notes)
 
@@ -127,7 +145,8 @@ def _terms(nodes: list[Node | Sampled], exact: bool) -> int:
         return _KEPT
     formulas = [(n.form, n.theta) for n in nodes if isinstance(n, Node)]
     used = [p for form, theta in formulas if isinstance(form, Form) for p in form.split(theta)[:2]]
-    return max([1, *(int(np.max(np.flatnonzero(part), initial=-1)) + 1 for part in used)])
+    most = max([1, *(int(np.max(np.flatnonzero(part), initial=-1)) + 1 for part in used)])
+    return min(most, _KEPT)
 
 
 def _default_zoom(family: AbstractFamily, number: int, terms: int | None) -> AbstractLinearZoom:
@@ -148,7 +167,10 @@ def _fitted(
 ) -> AbstractLinearZoom:
     """The zoom model with the parameters of least squares."""
     size = family.size(terms)
-    prepared = zoom.prepare(jnp.asarray(focal), size)
+    try:
+        prepared = zoom.prepare(jnp.asarray(focal), size)
+    except ValueError as error:
+        raise UnsuitedError(str(error)) from error
     assert isinstance(prepared, AbstractLinearZoom)
     basis = np.asarray(jax.vmap(prepared.basis)(jnp.asarray(focal)), float)  # (node, basis)
     rows, right = [], []

@@ -16,7 +16,10 @@ import numpy as np
 from ..models.family import AbstractRadial
 from ..models.lens import ZoomLens
 from ._forms import Form
-from .base import Contents, Export, Import, Node
+from .base import Contents, Export, Import, InterpolatedFormat, Node, read_text
+
+_SQUARE = 0.01
+"""Share by which fx and fy may differ."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +32,7 @@ class Pinhole:
         centre: principal point, px from the centre of the top-left pixel.
         k: radial coefficients, k1, k2, ..., without gaps: numerators, then denominators.
         p: p1 and p2.
+        stretch: by how much fx and fy are more than `f`, as a factor.
     """
 
     focal: float
@@ -36,6 +40,7 @@ class Pinhole:
     centre: np.ndarray
     k: np.ndarray
     p: np.ndarray
+    stretch: tuple[float, float] = (1.0, 1.0)
 
     @property
     def coefficients(self) -> list[float]:
@@ -46,6 +51,20 @@ class Pinhole:
 def formula(lens: ZoomLens, numerators: int, denominators: int = 0) -> Form:
     """OpenCV's formula, with decentering where the lens has it."""
     return Form(numerators, denominators, tangential=not isinstance(lens.family, AbstractRadial))
+
+
+class Pinholes(InterpolatedFormat):
+    """A format whose tool interpolates camera matrices and coefficients for radii in focal lengths."""
+
+    def foreign(self, node: Node, job: Export) -> np.ndarray:
+        """Focal length in px, centre, coefficients in its units."""
+        f = float(job.focal_px(node.focal))
+        return np.concatenate([[f], node.centre, node.form.rescaled(node.theta, f / job.lens.scale)])
+
+    def native(self, numbers: np.ndarray, focal: float, like: Node, job: Export) -> Node:
+        """What the tool makes of interpolated numbers."""
+        theta = like.form.rescaled(numbers[3:], job.lens.scale / numbers[0])
+        return dataclasses.replace(like, focal=focal, theta=theta, centre=numbers[1:3])
 
 
 def pinhole(node: Node, job: Export) -> Pinhole:
@@ -66,29 +85,34 @@ def node_of(camera: Pinhole, size: tuple[int, int], *, numerators: int = 3) -> N
     k = camera.k[:6]
     form = Form(min(len(k), numerators), max(len(k) - numerators, 0), tangential=True)
     theta = form.rescaled(np.concatenate([k, camera.p]), math.hypot(*size) / 2 / camera.f)
-    return Node(camera.focal, form, theta, np.asarray(camera.centre, float))
+    return Node(camera.focal, form, theta, np.asarray(camera.centre, float), stretch=camera.stretch)
 
 
 def from_opencv(focal: float | None, matrix: Any, coefficients: Any, size: tuple[int, int]) -> Node:
     """The node of a camera matrix and coefficients in OpenCV's order; its focal length is in px if None."""
-    matrix = np.asarray(matrix, float).reshape(3, 3)
-    fx, fy, cx, cy = square(matrix[0, 0], matrix[1, 1], size), matrix[1, 1], matrix[0, 2], matrix[1, 2]
-    del fy
+    (fx, skew, cx), (_, fy, cy), _ = np.asarray(matrix, float).reshape(3, 3)
+    if skew:
+        raise ValueError(f"its camera matrix is skewed, by {skew:g}, and zoomjax has no model of that")
+    f, stretch = focal_px(fx, fy)
     values = np.asarray(coefficients, float).ravel()
     values = np.append(values, np.zeros(max(0, 4 - len(values))))
     k, p = np.append(values[:2], values[4:]), values[2:4]
-    centre = np.array([cx, cy])
-    return node_of(Pinhole(fx if focal is None else focal, fx, centre, k, p), size)
+    return node_of(Pinhole(f if focal is None else focal, f, np.array([cx, cy]), k, p, stretch), size)
 
 
-def square(fx: Any, fy: Any, size: tuple[int, int]) -> float:
-    """The focal length of square pixels; ValueError if they are not."""
+def focal_px(fx: Any, fy: Any) -> tuple[float, tuple[float, float]]:
+    """The focal length in px of pixels that are nearly square, and what it is times for x and for y.
+
+    Raises:
+        ValueError: the pixels are not square.
+    """
     fx, fy = float(fx), float(fy)
     if not (math.isfinite(fx) and math.isfinite(fy) and fx > 0 and fy > 0):
         raise ValueError("its focal lengths in px must be positive numbers")
-    if abs(fx - fy) * max(size) > 0.01 * max(fx, fy) * max(size):
+    if abs(fx - fy) > _SQUARE * max(fx, fy):
         raise ValueError(f"its pixels are not square: fx is {fx:g} and fy is {fy:g}")
-    return (fx + fy) / 2
+    f = (fx + fy) / 2
+    return f, (fx / f, fy / f)
 
 
 def contents(nodes: list[Node], size: tuple[int, int], job: Import) -> Contents:
@@ -98,13 +122,6 @@ def contents(nodes: list[Node], size: tuple[int, int], job: Import) -> Contents:
             raise ValueError(f"argument focal must hold {len(nodes)} focal lengths, one for each camera")
         nodes = [dataclasses.replace(n, focal=f) for n, f in zip(nodes, job.focal, strict=True)]
     return Contents(tuple(nodes), size, "px" if job.focal is None else "mm")
-
-
-def one_size(sizes: list[tuple[int, int]]) -> tuple[int, int]:
-    """The image size that all entries share; ValueError if they do not."""
-    if len(set(sizes)) != 1:
-        raise ValueError(f"its cameras must have one image size, but they have {len(set(sizes))}")
-    return sizes[0]
 
 
 def matrix_rows(camera: Pinhole) -> list[list[float]]:
@@ -125,14 +142,14 @@ def load_yaml(path: Path) -> Any:
     """A YAML file of plain values, or of OpenCV's matrices; no code can be in it."""
     import yaml
 
-    class Loader(yaml.SafeLoader):
+    class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # pyright: ignore[reportGeneralTypeIssues]
         """Safe, and knows OpenCV's matrices."""
 
     def matrix(loader, node):
         return loader.construct_mapping(node, deep=True)
 
     Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix)
-    text = path.read_text(encoding="utf-8")
+    text = read_text(path)
     try:
         found = yaml.load(re.sub(r"\A%YAML:1\.0", "%YAML 1.1", text), Loader)
     except yaml.YAMLError as error:

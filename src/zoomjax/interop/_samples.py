@@ -87,14 +87,14 @@ def pairs_of(node: Node, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray,
     part = np.sin(np.linspace(0, np.pi / 2, _RADII + 1)[1:])
     if node.form.corrects:
         distorted = (part[:, None, None] * ends).reshape(-1, 2)
-        corrected = node.form(node.theta, distorted)
+        corrected = node(distorted)
         grows = np.diff(np.hypot(*corrected.T).reshape(_RADII, -1), axis=0, prepend=0) > 0
         keep = np.logical_and.accumulate(grows, axis=0).ravel()
         return distorted[keep], corrected[keep], bool(keep.all())
     chosen, whole = [], True
     for direction, end in zip(ends / length[:, None], length, strict=True):
         radius = np.linspace(0, _BEYOND * end, _STEPS + 1)[1:]
-        reached = np.hypot(*node.form(node.theta, radius[:, None] * direction).T)
+        reached = np.hypot(*node(radius[:, None] * direction).T)
         rises = np.diff(reached, prepend=0) > 0
         last = len(radius) if rises.all() else int(np.argmin(rises))
         if last == 0:
@@ -102,4 +102,4 @@ def pairs_of(node: Node, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray,
         whole &= bool(reached[last - 1] >= end)
         chosen.append(np.interp(part * end, reached[:last], radius[:last])[:, None] * direction)
     corrected = np.concatenate(chosen)
-    return node.form(node.theta, corrected), corrected, whole
+    return node(corrected), corrected, whole

@@ -2,11 +2,13 @@
 
 At each focal length the lens's own coefficients are taken where the tool's formula is ours, else the
 formula is fitted anew. Between focal lengths the tool's own interpolation is run on the numbers of the
-file, and more focal lengths are taken until that is within the tolerance, or gains nothing.
+file, and more focal lengths are taken until that is within the tolerance, or gains nothing. What was
+written is read again: the error that is reported is that of the file.
 """
 
 import dataclasses
 import itertools
+from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +18,7 @@ from ..models.division import Division
 from ..models.polynomial import RadialPolynomial
 from ._forms import AbstractForm, Form
 from ._samples import distortions, pairs
-from .base import Export, Format, Node
+from .base import Export, Format, Import, InterpolatedFormat, Node, NodeFormat
 
 _FEW = 5
 """Focal lengths at which formulas are compared."""
@@ -45,14 +47,14 @@ class Solution:
         return max(self.at_nodes, self.between or 0.0)
 
 
-def solve(fmt: Format, job: Export) -> Solution:
+def solve(fmt: NodeFormat, job: Export) -> Solution:
     """The nodes of a file, by the best of the format's formulas: the first within the tolerance."""
     low, high = np.asarray(job.lens.focal_range, float) if job.focal is None else (0, 0)
     focal = np.array(job.focal) if job.focal is not None else np.geomspace(low, high, _FEW)
     if low == high and job.focal is None:
         focal = focal[:1]
     maker = min(_makers(fmt, focal, job), key=lambda made: made[1])[0]
-    if fmt.zoom != "interpolated" or len(focal) == 1:
+    if not isinstance(fmt, InterpolatedFormat) or len(focal) == 1:
         return Solution(*maker.nodes(focal), None)
     if job.focal is not None:
         return _checked(fmt, *maker.nodes(focal), job)
@@ -63,7 +65,7 @@ def solve(fmt: Format, job: Export) -> Solution:
     raise AssertionError
 
 
-def _makers(fmt: Format, focal: np.ndarray, job: Export) -> list[tuple["_Maker", float]]:
+def _makers(fmt: NodeFormat, focal: np.ndarray, job: Export) -> list[tuple["_Maker", float]]:
     """A maker of nodes for each formula up to the first within the tolerance, and its error at some."""
     tried = []
     for form in fmt.forms(job.lens):
@@ -109,8 +111,9 @@ def _from_to(
     return (distorted, corrected) if form.corrects else (corrected, distorted)
 
 
-def _checked(fmt: Format, nodes: list[Node], at_nodes: float, job: Export) -> Solution:
+def _checked(fmt: InterpolatedFormat, nodes: list[Node], at_nodes: float, job: Export) -> Solution:
     """The solution of formats that interpolate: their reader is run between the nodes, and at them."""
+    nodes = fmt.kept(nodes)
     focal = np.array([node.focal for node in nodes])
     numbers = np.array([fmt.foreign(node, job) for node in nodes])
     inside = np.concatenate([a + (b - a) * np.array(_BETWEEN) for a, b in itertools.pairwise(focal)])
@@ -130,6 +133,29 @@ def _error(node: Node, centre: np.ndarray, start: np.ndarray, end: np.ndarray, j
     offset = (centre - node.centre) / job.lens.scale
     distance = node.form.distances(node.theta, start + offset, end + offset)
     return float(distance.max() * job.lens.scale) if np.isfinite(distance).all() else np.inf
+
+
+def error_written(fmt: Format, nodes: list[Node], job: Export, files: list[Path]) -> float:
+    """The greatest error, px, of what files hold at their nodes, by the format's own reader.
+
+    Args:
+        fmt: the format.
+        nodes: what was written.
+        job: of the lens.
+        files: one with all nodes, or one for each of them.
+    """
+    parts = [nodes] if len(files) == 1 else [[node] for node in nodes]
+    focal = sorted({node.focal for node in nodes})
+    exact = dict(zip(focal, distortions(job.lens, np.array(focal)), strict=True))
+    worst = 0.0
+    for file, part in zip(files, parts, strict=True):
+        told = tuple(node.focal for node in part)
+        found = fmt.read(Import(file, (file,), job.lens.image_size, told)).nodes
+        for node, f in zip(found, told, strict=True):
+            assert isinstance(node, Node)
+            start, end = _from_to(node.form, exact[f], f, job)
+            worst = max(worst, _error(node, np.asarray(exact[f].centre), start, end, job))
+    return worst
 
 
 def same(form: AbstractForm, distortion: Distortion) -> np.ndarray | None:

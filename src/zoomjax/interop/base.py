@@ -1,9 +1,9 @@
-"""What a file format is: one small abstract class, and what goes in and comes out.
+"""What a file format is: small abstract classes, and what goes in and comes out.
 
 A lens is written as *nodes*, one for each focal length: coefficients of the tool's formula (`_forms`). A
-format says which formulas its tool knows, how the tool interpolates between focal lengths, if it does, and
-what the file looks like. Which focal lengths and coefficients to write is decided in `_solve`; how a zoom
-lens is made from the nodes of a file, in `_lens`.
+`NodeFormat` says which formulas its tool knows and what the file looks like, an `InterpolatedFormat` also
+how the tool interpolates between focal lengths. Which focal lengths and coefficients to write is decided in
+`_solve`; how a zoom lens is made from the nodes of a file, in `_lens`.
 """
 
 import abc
@@ -15,6 +15,9 @@ import numpy as np
 
 from ..models.lens import ZoomLens
 from ._forms import AbstractForm
+
+TOLERANCE, CONVENTION = 0.1, "centres"
+"""What is taken if it is not given."""
 
 Theta = np.ndarray
 
@@ -29,6 +32,8 @@ class Node:
         theta: its coefficients, for radii in half image diagonals.
         centre: centre of distortion, px, (0, 0) being the centre of the top-left pixel.
         frame: number of the frame in a track; None without one.
+        stretch: by how much the tool's unit of x and of y is longer than `theta` has it: (1, 1) unless its
+            pixels are not quite square.
     """
 
     focal: float
@@ -36,6 +41,11 @@ class Node:
     theta: Theta
     centre: np.ndarray
     frame: int | None = None
+    stretch: tuple[float, float] = (1.0, 1.0)
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        """What the tool makes of points, in half image diagonals from the centre."""
+        return self.form(self.theta, z / np.array(self.stretch)) * np.array(self.stretch)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,8 +117,15 @@ class Export:
     focal: tuple[float, ...] | None = None
     frames: tuple[int, ...] | None = None
     pixel_pitch: float | None = None
-    tolerance: float = 0.1
-    convention: str = "centres"
+    tolerance: float = TOLERANCE
+    convention: str = CONVENTION
+
+    @property
+    def stems(self) -> list[str]:
+        """A name for each focal length or frame."""
+        if self.frames is not None:
+            return [f"{frame:06d}" for frame in self.frames]
+        return [f"{focal:.10g}" for focal in self.focal or ()]
 
     @property
     def pitch(self) -> float:
@@ -136,7 +153,7 @@ class Import:
     Attributes:
         path: the file, or a folder of them.
         paths: the files.
-        image_size: (width, height) px; None if the file says it.
+        image_size: (width, height) px, for files that do not say it.
         focal: focal lengths of the files or entries, for those that do not say them.
         crop: crop factor of the camera, for lensfun.
         name: of the lens, in files of several; a part of it will do.
@@ -151,14 +168,16 @@ class Import:
     crop: float | None = None
     name: str | None = None
     direction: str | None = None
-    convention: str = "centres"
+    convention: str = CONVENTION
 
     def size(self, found: tuple[int, int] | None = None) -> tuple[int, int]:
-        """The image size: as given, else as found in the file; ValueError if neither."""
-        size = self.image_size or found
-        if size is None:
+        """The image size, found in the file or given; ValueError if neither, or both and unlike."""
+        if found is None and self.image_size is None:
             raise ValueError("it holds no image size: give argument image_size, (width, height) in px")
-        return size
+        if found is not None and self.image_size not in (None, found):
+            here, given = ("x".join(map(str, size)) for size in (found, self.image_size or found))
+            raise ValueError(f"its images are {here} px: leave out argument image_size, which is {given}")
+        return found or self.image_size or (0, 0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,8 +197,24 @@ class Contents:
     notes: tuple[str, ...] = ()
 
 
+def one_size(sizes: list[tuple[int, int]]) -> tuple[int, int]:
+    """The image size that all entries share; ValueError if they do not."""
+    if len(found := sorted(set(sizes))) != 1:
+        names = ", ".join(f"{width}x{height}" for width, height in found[:3]) or "none"
+        raise ValueError(
+            f"a lens is for images of one size, and it has {len(found)} of them ({names}): put the entries "
+            "of each size into a file or folder of their own, and read these one after the other"
+        )
+    return found[0]
+
+
+def read_text(path: Path) -> str:
+    """The text of a file in UTF-8, without the mark that some programs put before it."""
+    return path.read_text(encoding="utf-8-sig")
+
+
 class Format(abc.ABC):
-    """A file format of another tool.
+    """A file format of another tool, which is read at least.
 
     Attributes:
         name: in arguments and tables.
@@ -188,9 +223,10 @@ class Format(abc.ABC):
         exact: whether the tool's formula is ours, so that radial polynomials lose nothing but digits.
         zoom: what the format knows of zooming: "one" focal length a file, a "list" of independent ones, or
             "interpolated" between its nodes.
-        reads, writes: which of both this package does.
-        note: what a user of the file should know.
-        folder: whether it is always a folder of files, made of the lens itself and of no formula.
+        writes: whether it is written, too.
+        note: what a user of a file should know.
+        options: those arguments of `write` and `read` that not every format uses, and this one does. All
+            use ``focal`` for writing.
     """
 
     name: ClassVar[str]
@@ -198,22 +234,58 @@ class Format(abc.ABC):
     suffixes: ClassVar[tuple[str, ...]]
     exact: ClassVar[bool] = False
     zoom: ClassVar[str] = "one"
-    reads: ClassVar[bool] = True
     writes: ClassVar[bool] = True
     note: ClassVar[str | None] = None
-    folder: ClassVar[bool] = False
+    options: ClassVar[tuple[str, ...]] = ()
 
+    def recognises(self, head: str) -> bool:
+        """Whether a file of one of the `suffixes` is of this format, by its first characters."""
+        return True
+
+    @abc.abstractmethod
+    def read(self, job: Import) -> Contents:
+        """What the file holds; ValueError, KeyError and the like where it is damaged."""
+
+    def file_names(self, job: Export) -> list[str]:
+        """The names of several files in a folder: each node's, by its focal length or frame."""
+        return [f"{stem}{self.suffixes[0]}" for stem in job.stems]
+
+
+class NodeFormat(Format):
+    """A format of nodes: a formula's coefficients at each focal length, as text."""
+
+    options = ("focal",)
+
+    @abc.abstractmethod
     def forms(self, lens: ZoomLens) -> tuple[AbstractForm, ...]:
         """The tool's formulas that suit the lens, the preferred one first."""
-        raise NotImplementedError(f"The format {self.name} is read only.")
 
+    @abc.abstractmethod
+    def text(self, nodes: list[Node], job: Export) -> str:
+        """The file."""
+
+    def notes(self, nodes: list[Node], job: Export) -> tuple[str, ...]:
+        """What the user of this very file should know."""
+        return () if self.note is None else (self.note,)
+
+
+class InterpolatedFormat(NodeFormat):
+    """A format whose tool interpolates between the nodes."""
+
+    zoom = "interpolated"
+    options = ("tolerance", "focal")
+
+    @abc.abstractmethod
     def foreign(self, node: Node, job: Export) -> np.ndarray:
-        """The numbers that the tool interpolates, of formats that do."""
-        raise NotImplementedError
+        """The numbers that the tool interpolates."""
 
+    @abc.abstractmethod
     def native(self, numbers: np.ndarray, focal: float, like: Node, job: Export) -> Node:
         """The node at a focal length that interpolated numbers mean."""
-        raise NotImplementedError
+
+    def kept(self, nodes: list[Node]) -> list[Node]:
+        """The nodes with what the file holds once for all of them, by default nothing."""
+        return nodes
 
     def interpolate(self, focal: np.ndarray, numbers: np.ndarray, at: float) -> np.ndarray:
         """The tool's own interpolation, by default linear: of numbers (node, n) at focal lengths."""
@@ -223,42 +295,10 @@ class Format(abc.ABC):
         """That many focal lengths over a range, by default in geometric progression."""
         return np.geomspace(low, high, number)
 
-    def text(self, nodes: list[Node], job: Export) -> str:
-        """The file."""
-        raise NotImplementedError
 
-    def write(self, nodes: list[Node], job: Export, target: Path) -> None:
-        """Write the file, or the one of several that holds these nodes."""
-        target.write_text(self.text(nodes, job), encoding="utf-8")
+class FolderFormat(Format):
+    """A format that is always a folder of files, made of the lens itself and of no formula."""
 
-    def file_names(self, job: Export) -> list[str]:
-        """The names of several files in a folder: each node's, by its focal length or frame."""
-        return [f"{stem}{self.suffixes[0]}" for stem in self.stems(job)]
-
-    def stems(self, job: Export) -> list[str]:
-        """A name for each node."""
-        if job.frames is not None:
-            return [f"{frame:06d}" for frame in job.frames]
-        return [f"{focal:.10g}" for focal in job.focal or ()]
-
-    def bare_nodes(self, job: Export) -> list[Node]:
-        """Nodes without a formula, of formats that are folders."""
-        raise NotImplementedError
-
-    def write_all(self, nodes: list[Node], job: Export, folder: Path) -> list[float]:
-        """Write a file for each node; return errors that writing itself made, px, if there are any."""
-        for node, name in zip(nodes, self.file_names(job), strict=True):
-            self.write([node], job, folder / name)
-        return []
-
-    def notes(self, nodes: list[Node], job: Export) -> tuple[str, ...]:
-        """What the user of this very file should know."""
-        return () if self.note is None else (self.note,)
-
-    def recognises(self, head: str) -> bool:
-        """Whether a file of one of the `suffixes` is of this format, by its first characters."""
-        return True
-
-    def read(self, job: Import) -> Contents:
-        """What the file holds; ValueError, KeyError and the like where it is damaged."""
-        raise NotImplementedError(f"The format {self.name} is written only.")
+    @abc.abstractmethod
+    def write_all(self, job: Export, folder: Path) -> float:
+        """Write the files; return the greatest error that writing itself made, px."""

@@ -9,8 +9,8 @@ import numpy as np
 from ..models.division import Division
 from ..models.lens import ZoomLens
 from ._forms import Form
-from ._pinhole import Pinhole, contents, formula, node_of, one_size, pinhole, square
-from .base import Contents, Export, Format, Import, Node
+from ._pinhole import Pinhole, contents, focal_px, formula, node_of, pinhole
+from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text
 
 _ORDER = {
     "SIMPLE_PINHOLE": "f cx cy",
@@ -25,7 +25,7 @@ _ORDER = {
 """Of the parameters of COLMAP's camera models that are read."""
 
 
-class COLMAP(Format):
+class COLMAP(NodeFormat):
     """COLMAP's list of cameras."""
 
     name, tools, suffixes = "colmap", "COLMAP, GLOMAP, gsplat", (".txt",)
@@ -60,7 +60,7 @@ class COLMAP(Format):
     def read(self, job: Import) -> Contents:
         """All cameras, of one image size."""
         nodes, sizes = [], []
-        for line in job.paths[0].read_text(encoding="utf-8").splitlines():
+        for line in read_text(job.paths[0]).splitlines():
             if not line.strip() or line.lstrip().startswith("#"):
                 continue
             _, model, width, height, *words = line.split()
@@ -78,10 +78,11 @@ def _at_some(lens: ZoomLens) -> np.ndarray:
 
 
 def _node(model: str, values: dict[str, float], size: tuple[int, int]) -> Node:
-    f = square(values.get("fx", values.get("f")), values.get("fy", values.get("f")), size)
+    f, stretch = focal_px(values.get("fx", values.get("f")), values.get("fy", values.get("f")))
     centre = np.array([values["cx"], values["cy"]]) - 0.5
     k = np.array([values.get(f"k{i}", 0.0) for i in range(1, 7)])
     if not model.endswith("DIVISION"):
-        return node_of(Pinhole(f, f, centre, k, np.array([values.get(p, 0.0) for p in ("p1", "p2")])), size)
+        p = np.array([values.get(name, 0.0) for name in ("p1", "p2")])
+        return node_of(Pinhole(f, f, centre, k, p, stretch), size)
     form = Form(0, 1, corrects=True)
-    return Node(f, form, form.rescaled(k[:1], np.hypot(*size) / 2 / f), centre)
+    return Node(f, form, form.rescaled(k[:1], np.hypot(*size) / 2 / f), centre, stretch=stretch)

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ._forms import AbstractForm, minimax
-from ._pinhole import contents, one_size
-from .base import Contents, Export, Format, Import, Node
+from ._pinhole import contents
+from .base import Contents, Export, Import, Node, NodeFormat, read_text
 
 _TERMS = 6
 """Written: those of discorpy's own examples, and one more."""
@@ -56,7 +56,7 @@ class Powers(AbstractForm):
         return change + one
 
 
-class Discorpy(Format):
+class Discorpy(NodeFormat):
     """discorpy's coefficients of its backward model."""
 
     name, tools, suffixes = "discorpy", "discorpy, of X-ray tomography", (".txt",)
@@ -83,7 +83,7 @@ class Discorpy(Format):
             raise ValueError(f"it holds no focal length: give argument focal, {len(job.paths)} of them")
         nodes, size = [], job.size()
         for path, focal in zip(job.paths, job.focal, strict=True):
-            lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+            lines = [line for line in read_text(path).splitlines() if line.strip()]
             names, values = zip(*(line.split("=") for line in lines), strict=True)
             terms = len(lines) - 2
             if [n.strip() for n in names] != ["xcenter", "ycenter", *(f"factor{i}" for i in range(terms))]:
@@ -94,4 +94,4 @@ class Discorpy(Format):
             form = Powers(terms)
             theta = form.rescaled(numbers[2:], math.hypot(*size) / 2)
             nodes.append(Node(focal, form, theta, numbers[:2]))
-        return contents(nodes, one_size([size]), job)
+        return contents(nodes, size, job)

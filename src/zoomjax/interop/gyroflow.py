@@ -5,20 +5,18 @@ takes camera matrix and coefficients, which are for radii in focal lengths, as l
 ends.
 """
 
-import dataclasses
 import json
 
 import numpy as np
 
-from ._pinhole import contents, formula, from_opencv, matrix_rows, one_size, pinhole
-from .base import Contents, Export, Format, Import, Node
+from ._pinhole import Pinholes, contents, formula, from_opencv, matrix_rows, pinhole
+from .base import Contents, Export, Import, Node, one_size, read_text
 
 
-class Gyroflow(Format):
+class Gyroflow(Pinholes):
     """Gyroflow's JSON with interpolations over the zoom."""
 
     name, tools, suffixes = "gyroflow", "Gyroflow", (".json",)
-    zoom = "interpolated"
     note = (
         "Gyroflow goes by the focal length in the video's metadata, and extrapolates linearly beyond the "
         "first and last."
@@ -27,16 +25,6 @@ class Gyroflow(Format):
     def forms(self, lens):
         """Rational, three over three."""
         return (formula(lens, 3, 3),)
-
-    def foreign(self, node: Node, job: Export) -> np.ndarray:
-        """Focal length in px, centre, coefficients in its units."""
-        f = float(job.focal_px(node.focal))
-        return np.concatenate([[f], node.centre, node.form.rescaled(node.theta, f / job.lens.scale)])
-
-    def native(self, numbers: np.ndarray, focal: float, like: Node, job: Export) -> Node:
-        """What Gyroflow makes of interpolated numbers."""
-        theta = like.form.rescaled(numbers[3:], job.lens.scale / numbers[0])
-        return dataclasses.replace(like, focal=focal, theta=theta, centre=numbers[1:3])
 
     def text(self, nodes: list[Node], job: Export) -> str:
         """A profile whose base is the first focal length."""
@@ -75,7 +63,7 @@ class Gyroflow(Format):
 
     def read(self, job: Import) -> Contents:
         """The entries, or the base of a profile without them."""
-        table = json.loads(job.paths[0].read_text(encoding="utf-8"))
+        table = json.loads(read_text(job.paths[0]))
         model = table.get("distortion_model", "opencv_fisheye")
         if model != "opencv_standard":
             raise ValueError(f"its distortion model {model!r} is not opencv_standard")

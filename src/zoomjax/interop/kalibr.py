@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from ._pinhole import contents, formula, from_opencv, load_yaml, numbers, one_size, pinhole
-from .base import Contents, Export, Format, Import, Node
+from ._pinhole import contents, formula, from_opencv, load_yaml, numbers, pinhole
+from .base import Contents, Export, Import, Node, NodeFormat, one_size
 
 
-class Kalibr(Format):
+class Kalibr(NodeFormat):
     """Kalibr's camchain: two radial coefficients and decentering."""
 
     name, tools, suffixes = "kalibr", "Kalibr, VINS, OpenVINS, Basalt", (".yaml", ".yml")

@@ -1,9 +1,9 @@
 """Adobe's lens profiles, .lcp: read only.
 
 Radial coefficients 1 to 3 are OpenCV's k1, k2, k3, for radii in focal lengths; ``FocalLengthX`` is the
-focal length as a share of the image's longer side, and the centre a share of its width and height. Of
-entries at one focal length, that of the farthest focus counts. Whether centres count from pixel centres or
-corners is not documented: here from corners.
+focal length as a share of the image's longer side, ``FocalLengthY`` the same for y, and the centre a share
+of its width and height. Of entries at one focal length, that of the farthest focus counts. Whether centres
+count from pixel centres or corners is not documented: here from corners.
 """
 
 import math
@@ -12,8 +12,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ._pinhole import Pinhole, node_of, one_size
-from .base import Contents, Format, Import, Node
+from ._pinhole import Pinhole, focal_px, node_of
+from .base import Contents, Format, Import, Node, one_size
 
 _CAMERA = "{http://ns.adobe.com/photoshop/1.0/camera-profile}"
 
@@ -70,10 +70,10 @@ def _values(element: ET.Element) -> dict[str, str]:
 
 
 def _node(focal: float, model: dict[str, str], size: tuple[int, int]) -> Node:
-    share = float(model.get("FocalLengthX", 0)) or focal / math.hypot(36, 24) * math.hypot(*size) / max(
-        size
-    )
+    usual = focal / math.hypot(36, 24) * math.hypot(*size) / max(size)
+    share = float(model.get("FocalLengthX", 0)) or usual
+    f, stretch = focal_px(share * max(size), (float(model.get("FocalLengthY", 0)) or share) * max(size))
     place = [float(model.get(name, 0.5)) for name in ("ImageXCenter", "ImageYCenter")]
     k = np.array([float(model.get(f"RadialDistortParam{i}", 0)) for i in (1, 2, 3)])
     p = np.array([float(model.get(f"TangentialDistortParam{i}", 0)) for i in (1, 2)])
-    return node_of(Pinhole(focal, share * max(size), np.array(place) * size - 0.5, k, p), size)
+    return node_of(Pinhole(focal, f, np.array(place) * size - 0.5, k, p, stretch), size)

@@ -24,7 +24,7 @@ import numpy as np
 
 from .._core.text import plain
 from ._forms import AbstractForm, Form, minimax
-from .base import Contents, Export, Format, Import, Node
+from .base import Contents, Export, Import, InterpolatedFormat, Node
 
 DIAGONAL = math.hypot(36, 24)
 """mm, of crop factor 1."""
@@ -73,15 +73,21 @@ _ONE = np.array([1.0, 0, 0, 0])
 _SCALED = "lensfun scales the corrected image here: positions agree up to that."
 
 
-class Lensfun(Format):
+class Lensfun(InterpolatedFormat):
     """A lens of the lensfun database: poly5 or ptlens at several focal lengths."""
 
     name, tools, suffixes = "lensfun", "darktable, Hugin, RawTherapee, digiKam", (".xml",)
-    zoom = "interpolated"
+    options = ("tolerance", "crop", "name")
 
     def forms(self, lens):
         """poly5, then ptlens."""
         return Form(2), PtLens()
+
+    def kept(self, nodes: list[Node]) -> list[Node]:
+        """One centre, as far from the farthest of the nodes' own on either side."""
+        each = np.array([node.centre for node in nodes])
+        centre = (each.min(axis=0) + each.max(axis=0)) / 2
+        return [dataclasses.replace(node, centre=centre) for node in nodes]
 
     def foreign(self, node: Node, job: Export) -> np.ndarray:
         """The terms: k1, k2 or a, b, c."""
@@ -117,7 +123,7 @@ class Lensfun(Format):
         """A database of one lens."""
         size = job.lens.image_size
         low, high = (float(job.focal_mm(nodes[i].focal)) for i in (0, -1))
-        offset = np.mean([node.centre for node in nodes], axis=0) - (np.array(size) - 1) / 2
+        offset = nodes[0].centre - (np.array(size) - 1) / 2
         x, y = offset / ((min(size) - 1) / 2)
         model, names = ("poly5", "k1 k2") if isinstance(nodes[0].form, Form) else ("ptlens", "a b c")
         entries = []

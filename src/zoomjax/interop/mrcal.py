@@ -4,8 +4,8 @@ import ast
 
 import numpy as np
 
-from ._pinhole import contents, formula, from_opencv, numbers, one_size, pinhole
-from .base import Contents, Export, Format, Import, Node
+from ._pinhole import contents, formula, from_opencv, numbers, pinhole
+from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text
 
 _COEFFICIENTS = {
     "LENSMODEL_PINHOLE": 0,
@@ -15,7 +15,7 @@ _COEFFICIENTS = {
 }
 
 
-class Mrcal(Format):
+class Mrcal(NodeFormat):
     """mrcal's camera model with OpenCV's coefficients."""
 
     name, tools, suffixes = "mrcal", "mrcal", (".cameramodel",)
@@ -49,7 +49,7 @@ class Mrcal(Format):
         """Plain values of Python, and no code."""
         nodes, sizes = [], []
         for path in job.paths:
-            table = ast.literal_eval(path.read_text(encoding="utf-8"))
+            table = ast.literal_eval(read_text(path))
             model = table["lensmodel"]
             if model not in _COEFFICIENTS:
                 raise ValueError(f"its lens model {model!r} is none of {', '.join(_COEFFICIENTS)}")

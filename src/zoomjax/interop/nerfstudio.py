@@ -8,13 +8,16 @@ import json
 
 import numpy as np
 
-from ._pinhole import Pinhole, contents, formula, node_of, one_size, pinhole, square
-from .base import Contents, Export, Format, Import, Node
+from ._pinhole import Pinhole, contents, focal_px, formula, node_of, pinhole
+from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text
+
+_MODELS = ("OPENCV", "RADIAL", "SIMPLE_RADIAL", "PINHOLE", "SIMPLE_PINHOLE")
+"""That nerfstudio takes for one and the same, coefficients that are not there for 0."""
 
 _KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "p1", "p2")
 
 
-class Nerfstudio(Format):
+class Nerfstudio(NodeFormat):
     """Intrinsics of nerfstudio's frames."""
 
     name, tools, suffixes = "nerfstudio", "nerfstudio, instant-ngp", (".json",)
@@ -45,24 +48,23 @@ class Nerfstudio(Format):
 
     def read(self, job: Import) -> Contents:
         """All frames, or the one camera of all."""
-        table = json.loads(job.paths[0].read_text(encoding="utf-8"))
-        if table.get("camera_model", "OPENCV") != "OPENCV":
-            raise ValueError(f"its camera model {table['camera_model']!r} is not OPENCV")
+        table = json.loads(read_text(job.paths[0]))
+        if (model := table.get("camera_model", "OPENCV")) not in _MODELS:
+            raise ValueError(f"its camera model {model!r} is none of {', '.join(_MODELS)}")
         common = {key: table[key] for key in (*_KEYS, "k4") if key in table}
         nodes, sizes, units = [], [], set()
         for frame in table["frames"] or [{}]:
             values = {**frame, **common}
             size = job.size((int(values["w"]), int(values["h"])))
-            f = square(values["fl_x"], values.get("fl_y", values["fl_x"]), size)
+            f, stretch = focal_px(values["fl_x"], values.get("fl_y", values["fl_x"]))
             if values.get("k4"):
                 raise ValueError("it has a fourth radial coefficient, which is not supported")
             k = np.array([values.get(key, 0.0) for key in ("k1", "k2", "k3")], float)
             p = np.array([values.get(key, 0.0) for key in ("p1", "p2")], float)
             mm = values.get("focal_unit") == "mm"
             focal = float(values["focal"]) if mm else f
-            nodes.append(
-                node_of(Pinhole(focal, f, np.array([values["cx"], values["cy"]]) - 0.5, k, p), size)
-            )
+            centre = np.array([values["cx"], values["cy"]]) - 0.5
+            nodes.append(node_of(Pinhole(focal, f, centre, k, p, stretch), size))
             sizes.append(size)
             units.add(mm)
         found = contents(nodes, one_size(sizes), job)

@@ -2,23 +2,31 @@
 
 Radial polynomials and Brown-Conrady of up to two terms become 3DEqualizer's "Radial - Standard, Degree 4",
 ``x (1 + c2 r² + c4 r⁴) + ...`` with half the filmback's diagonal for radius 1 and y up; all others Nuke's
-own LensDistortion2 with a rational model of three over three. Without a track the focal lengths are frames
-1, 2, ....
+own LensDistortion2 with a rational model of three over three. The centre has a curve where it moves. Both
+nodes are read; only the first has focal lengths. Without a track the focal lengths are frames 1, 2, ....
 """
 
+import math
 import re
 
 import numpy as np
 
+from .._core.text import plain
 from ..models.brown_conrady import BrownConrady
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ._forms import Form
-from .base import Contents, Export, Format, Import, Node
+from .base import Contents, Export, Import, Node, NodeFormat, read_text
 
 _DEGREE_4 = Form(2, tangential=True, corrects=True)
 _RATIONAL = Form(3, 3, corrects=True)
-_NODE = "LD_3DE4_Radial_Standard_Degree_4"
+_NODE, _OWN_NODE = "LD_3DE4_Radial_Standard_Degree_4", "LensDistortion2"
+_SETTINGS = {"normalisationType": "Diagonal", "projection": "Rectilinear"}
+"""Of Nuke's own node, as they are written and must be."""
+
+_MOST = 12
+"""Coefficients that are read."""
+
 _KNOBS = {
     "Distortion_Degree_2": (0, 1.0),
     "Quartic_Distortion_Degree_4": (1, 1.0),
@@ -28,7 +36,7 @@ _KNOBS = {
 """Knobs by the coefficient of `_DEGREE_4` that they hold, and its sign: y is up there."""
 
 
-class Nuke(Format):
+class Nuke(NodeFormat):
     """A node for Nuke, with curves."""
 
     name, tools, suffixes = "nuke", "Nuke with 3DEqualizer's nodes", (".nk",)
@@ -49,38 +57,99 @@ class Nuke(Format):
 
     def recognises(self, head: str) -> bool:
         """By the class of the node."""
-        return _NODE in head or "LensDistortion2" in head
+        return _NODE in head or _OWN_NODE in head
 
     def read(self, job: Import) -> Contents:
-        """3DEqualizer's node; focal lengths are those of argument focal, one for each key."""
-        text = job.paths[0].read_text(encoding="utf-8")
-        knobs = dict(re.findall(r"^\s*([A-Za-z]\w*) (.+)$", text, re.MULTILINE))
-        if _NODE not in text:
-            raise ValueError(f"it has no node {_NODE}, the only one that is read")
-        width, height = (float(knobs[f"tde4_filmback_{side}_cm"]) for side in ("width", "height"))
+        """The first node; focal lengths are those of its curve, or of argument focal, one for each key."""
+        kind, knobs = _first_node(read_text(job.paths[0]))
         size = job.size()
-        pitch = width / size[0]
-        if abs(height / size[1] - pitch) > 1e-6 * pitch:
-            raise ValueError("its filmback has another aspect than the image")
-        curves = {name: _keys(name, knobs.get(name, "0")) for name in _KNOBS}
-        frames = max((sorted(keys) for keys in curves.values()), key=len)
-        if any(len(keys) > 1 and sorted(keys) != frames for keys in curves.values()):
+        form, terms, centre, focal = (_read_degree_4 if kind == _NODE else _read_rational)(knobs, size)
+        curves = [*terms, *centre]
+        frames = max(map(sorted, curves), key=len)
+        if any(len(keys) > 1 and sorted(keys) != frames for keys in curves):
             raise ValueError("its curves have keys at different frames")
-        if job.focal is None or len(job.focal) != len(frames):
+        values = _at_frames(curves, frames)
+        if job.focal is not None and len(job.focal) == len(frames):
+            told = job.focal
+        elif job.focal is None and focal is not None and sorted(focal) == frames:
+            told = [10 * focal[frame] for frame in frames]  # mm in a cm
+        else:
             raise ValueError(f"it holds no focal lengths: give argument focal, {len(frames)} of them")
-        offset = [float(knobs.get(f"tde4_lens_center_offset_{axis}_cm", 0)) for axis in "xy"]
-        centre = (np.array(size) - 1) / 2 + np.array([offset[0], -offset[1]]) / pitch
-        nodes = []
-        for frame, focal in zip(frames, job.focal, strict=True):
-            theta = np.zeros(4)
-            for name, (place, sign) in _KNOBS.items():
-                keys = curves[name]
-                theta[place] = sign * (keys[frame] if len(keys) > 1 else next(iter(keys.values())))
-            nodes.append(Node(focal, _DEGREE_4, theta, centre))
+        nodes = [Node(f, form, row[:-2], row[-2:]) for f, row in zip(told, values, strict=True)]
         return Contents(tuple(nodes), size, "mm")
 
 
-def _keys(name: str, text: str) -> dict[int, float]:
+Keys = dict[int, float]
+"""The values of a knob by frame: of a curve, or one of a constant."""
+
+
+def _first_node(text: str) -> tuple[str, dict[str, str]]:
+    """The class of the first node that is read, and its knobs."""
+    found = re.search(rf"^\s*({_NODE}|{_OWN_NODE})\s*\{{(.*?)^\s*\}}", text, re.MULTILINE | re.DOTALL)
+    if found is None:
+        raise ValueError(f"it has no whole node {_NODE} or {_OWN_NODE}")
+    return found[1], dict(re.findall(r"^\s*([A-Za-z]\w*) +(\S.*?)\s*$", found[2], re.MULTILINE))
+
+
+def _read_degree_4(
+    knobs: dict[str, str], size: tuple[int, int]
+) -> tuple[Form, list[Keys], list[Keys], Keys | None]:
+    """Formula, curves of its coefficients and of the centre in px, and that of the focal length in cm."""
+    width, height = (float(knobs[f"tde4_filmback_{side}_cm"]) for side in ("width", "height"))
+    pitch = width / size[0]
+    if abs(height / size[1] - pitch) > 1e-6 * pitch:
+        raise ValueError("its filmback has another aspect than the image")
+    names = sorted(_KNOBS, key=lambda name: _KNOBS[name][0])
+    terms = [_times(_keys(name, knobs.get(name, "0")), _KNOBS[name][1]) for name in names]
+    name = "tde4_lens_center_offset_{}_cm"
+    offset = [_keys(name.format(axis), knobs.get(name.format(axis), "0")) for axis in "xy"]
+    centre = _in_pixels(offset, 1 / pitch, size)
+    focal = knobs.get("tde4_focal_length_cm")
+    return _DEGREE_4, terms, centre, None if focal is None else _keys("tde4_focal_length_cm", focal)
+
+
+def _read_rational(
+    knobs: dict[str, str], size: tuple[int, int]
+) -> tuple[Form, list[Keys], list[Keys], Keys | None]:
+    """The same of LensDistortion2, which has no focal length."""
+    for name, value in _SETTINGS.items():
+        if knobs.get(name, value) != value:
+            raise ValueError(f"its {name} is {plain(knobs[name])}, and only {value} is read")
+    over, under = map(int, re.findall(r"\d+", knobs.get("distortionOrder", "{3 3}")))
+    if not 0 < over + under <= _MOST:
+        raise ValueError(f"it must have up to {_MOST} coefficients")
+    names = [f"distortionNumerator{i}" for i in range(over)]
+    names += [f"distortionDenominator{i}" for i in range(under)]
+    terms = [_keys(name, knobs.get(name, "0")) for name in names]
+    x, y = re.findall(r"\{[^{}]*\}|[^\s{}]+", re.sub(r"\A\{|\}\Z", "", knobs.get("centre", "{0 0}")))
+    centre = _in_pixels([_keys("centre", x), _keys("centre", y)], math.hypot(*size) / 2, size)
+    return Form(over, under, corrects=True), terms, centre, None
+
+
+def _in_pixels(offset: list[Keys], unit: float, size: tuple[int, int]) -> list[Keys]:
+    """Curves of the centre in px, of its offset from the middle, y up, in a unit."""
+    x, y = (_times(keys, sign * unit) for keys, sign in zip(offset, (1, -1), strict=True))
+    return [
+        {frame: value + (side - 1) / 2 for frame, value in keys.items()}
+        for keys, side in zip((x, y), size, strict=True)
+    ]
+
+
+def _times(keys: Keys, factor: float) -> Keys:
+    return {frame: factor * value for frame, value in keys.items()}
+
+
+def _at_frames(curves: list[Keys], frames: list[int]) -> np.ndarray:
+    """The values of curves, (frame, curve); those of constants at each."""
+    return np.array(
+        [
+            [keys[frame] if len(keys) > 1 else next(iter(keys.values())) for keys in curves]
+            for frame in frames
+        ]
+    )
+
+
+def _keys(name: str, text: str) -> Keys:
     """The keys of a knob: of a curve, or one of a constant. Values after a key are of the next frames."""
     if "curve" not in text:
         return {1: float(text)}
@@ -96,36 +165,42 @@ def _keys(name: str, text: str) -> dict[int, float]:
     return keys
 
 
-def curve(nodes: list[Node], values: np.ndarray) -> str:
-    """A knob's value, or its curve over frames."""
+def _values(nodes: list[Node], values: np.ndarray) -> str:
+    """A knob's value, or its curve over frames where it changes along the zoom."""
+    return f"{{{text}}}" if (text := _component(nodes, values)).startswith("{") else text
+
+
+def _component(nodes: list[Node], values: np.ndarray) -> str:
+    """The same of one component of a knob of several."""
     if len(nodes) == 1:
         return repr(float(values[0]))
     frames = [number if node.frame is None else node.frame for number, node in enumerate(nodes, start=1)]
     keys = " ".join(f"x{frame} {float(value)!r}" for frame, value in zip(frames, values, strict=True))
-    return f"{{{{curve {keys}}}}}"
+    return f"{{curve {keys}}}"
 
 
-def _offsets(nodes: list[Node], job: Export) -> np.ndarray:
-    """Of the centres from the middle of the image, y up, px."""
+def _centres(nodes: list[Node], job: Export) -> np.ndarray:
+    """From the middle of the image, y up, px; of one node where they do not move."""
     middle = (np.array(job.lens.image_size) - 1) / 2
-    return np.array([node.centre - middle for node in nodes]) * [1, -1]
+    found = np.array([node.centre - middle for node in nodes]) * [1, -1]
+    return found[:1] if np.ptp(found, axis=0).max() == 0 else found
 
 
 def _degree_4(nodes: list[Node], job: Export) -> str:
     cm = job.pitch / 10
     width, height = job.lens.image_size
-    x, y = (_offsets(nodes, job) * cm).T
+    x, y = (_centres(nodes, job) * cm).T
     theta = np.array([node.theta for node in nodes])
     lines = [
         f"{_NODE} {{",
         " direction undistort",
-        f" tde4_focal_length_cm {curve(nodes, np.array([job.focal_mm(n.focal) / 10 for n in nodes]))}",
+        f" tde4_focal_length_cm {_values(nodes, np.array([job.focal_mm(n.focal) / 10 for n in nodes]))}",
         f" tde4_filmback_width_cm {width * cm!r}",
         f" tde4_filmback_height_cm {height * cm!r}",
-        f" tde4_lens_center_offset_x_cm {curve(nodes[:1], x)}",
-        f" tde4_lens_center_offset_y_cm {curve(nodes[:1], y)}",
+        f" tde4_lens_center_offset_x_cm {_values(nodes[: len(x)], x)}",
+        f" tde4_lens_center_offset_y_cm {_values(nodes[: len(y)], y)}",
         " tde4_pixel_aspect 1",
-        *(f" {name} {curve(nodes, sign * theta[:, place])}" for name, (place, sign) in _KNOBS.items()),
+        *(f" {name} {_values(nodes, sign * theta[:, place])}" for name, (place, sign) in _KNOBS.items()),
         " name zoomjax",
         "}",
         "",
@@ -134,18 +209,17 @@ def _degree_4(nodes: list[Node], job: Export) -> str:
 
 
 def _lens_distortion(nodes: list[Node], job: Export) -> str:
-    x, y = (_offsets(nodes, job) / job.lens.scale).T
+    x, y = (_centres(nodes, job) / job.lens.scale).T
     theta = np.array([node.theta for node in nodes])
     lines = [
-        "LensDistortion2 {",
+        f"{_OWN_NODE} {{",
         " distortionModelPreset Custom",
         f" distortionOrder {{{_RATIONAL.numerators} {_RATIONAL.denominators}}}",
-        " normalisationType Diagonal",
-        " projection Rectilinear",
+        *(f" {name} {value}" for name, value in _SETTINGS.items()),
         " output Undistort",
-        f" centre {{{curve(nodes[:1], x)} {curve(nodes[:1], y)}}}",
-        *(f" distortionNumerator{i} {curve(nodes, theta[:, i])}" for i in range(3)),
-        *(f" distortionDenominator{i} {curve(nodes, theta[:, 3 + i])}" for i in range(3)),
+        f" centre {{{_component(nodes[: len(x)], x)} {_component(nodes[: len(y)], y)}}}",
+        *(f" distortionNumerator{i} {_values(nodes, theta[:, i])}" for i in range(3)),
+        *(f" distortionDenominator{i} {_values(nodes, theta[:, 3 + i])}" for i in range(3)),
         " name zoomjax",
         "}",
         "",

@@ -12,13 +12,12 @@ from ._pinhole import (
     load_yaml,
     matrix_rows,
     numbers,
-    one_size,
     pinhole,
 )
-from .base import Contents, Export, Format, Import, Node
+from .base import Contents, Export, Import, Node, NodeFormat, one_size
 
 
-class OpenCV(Format):
+class OpenCV(NodeFormat):
     """OpenCV's calibration as YAML: camera_matrix and distortion_coefficients."""
 
     name, tools, suffixes = "opencv", "OpenCV", (".yaml", ".yml")

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..models.family import AbstractRadial
 from ._forms import Form
-from .base import Contents, Export, Format, Import, Node
+from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text
 
 _MODEL = "Brown-Conrady D-U"
 _FORM = Form(3, 3, tangential=True, corrects=True)
@@ -22,7 +22,7 @@ _SLOTS = np.array([0, 2, 4, 1, 3, 5])
 """Of the numerators, then of the denominators."""
 
 
-class OpenTrackIO(Format):
+class OpenTrackIO(NodeFormat):
     """Samples of OpenTrackIO with a lens's distortion."""
 
     name, tools, suffixes = (
@@ -31,6 +31,7 @@ class OpenTrackIO(Format):
         (".jsonl", ".json"),
     )
     exact, zoom = True, "list"
+    options = ()
 
     def forms(self, lens):
         """Rational, three over three, from distorted to corrected points."""
@@ -77,29 +78,27 @@ class OpenTrackIO(Format):
         return "OpenTrackIO" in head
 
     def read(self, job: Import) -> Contents:
-        """One sample a line, or one of several lines; what is static may be in the first alone."""
-        nodes, camera, size = [], {}, None
-        for sample in _samples(job.paths[0].read_text(encoding="utf-8")):
+        """Samples, one a line, in an array, or one alone; what is static may be in the first of them."""
+        nodes, camera, sizes = [], {}, []
+        for sample in _samples(read_text(job.paths[0])):
             camera = {**camera, **sample.get("static", {}).get("camera", {})}
-            lens = sample["lens"]
             resolution = camera.get("activeSensorResolution")
-            size = job.size(
-                None if resolution is None else (int(resolution["width"]), int(resolution["height"]))
-            )
+            found = None if resolution is None else (int(resolution["width"]), int(resolution["height"]))
+            sizes.append(size := job.size(found))
             pitch = float(camera["activeSensorPhysicalDimensions"]["width"]) / size[0]
-            nodes.append(_node(lens, pitch, size))
-        assert size is not None
-        return Contents(tuple(nodes), size, "mm")
+            nodes.append(_node(sample["lens"], pitch, size))
+        return Contents(tuple(nodes), one_size(sizes), "mm")
 
 
 def _samples(text: str) -> list[dict]:
     try:
-        return [json.loads(text)]
+        found = json.loads(text)
     except json.JSONDecodeError:
         found = [json.loads(line) for line in text.splitlines() if line.strip()]
-        if not found:
-            raise ValueError("it is empty") from None
-        return found
+    found = [found] if isinstance(found, dict) else found
+    if not found:
+        raise ValueError("it is empty")
+    return found
 
 
 def _node(lens: dict, pitch: float, size: tuple[int, int]) -> Node:

@@ -8,7 +8,7 @@ fraction of the image's size, y up, counted from pixel centres. Without a track 
 import numpy as np
 
 from ._forms import Form
-from .base import Contents, Export, Format, Import, Node
+from .base import Contents, Export, Import, Node, NodeFormat, read_text
 
 _FORM = Form(2, corrects=True)
 _UNIT = np.sqrt(2)
@@ -17,7 +17,7 @@ _UNIT = np.sqrt(2)
 _HEADER = "#PFBarrel 2011 v2"
 
 
-class PFTrack(Format):
+class PFTrack(NodeFormat):
     """PFTrack's lens distortion with keys."""
 
     name, tools, suffixes = "pftrack", "PFTrack, Natron", (".pfb",)
@@ -45,7 +45,7 @@ class PFTrack(Format):
 
     def read(self, job: Import) -> Contents:
         """All keys; focal lengths are those of argument focal, one for each."""
-        text = job.paths[0].read_text(encoding="utf-8")
+        text = read_text(job.paths[0])
         lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
         width, height, aspect = int(lines[0]), int(lines[1]), float(lines[2])
         if aspect != 1 or lines[5] != "High Order":

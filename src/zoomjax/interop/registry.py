@@ -10,15 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from .._core.arguments import check_kind, kinds_checked
+from .._core.arguments import kinds_checked
 from .._core.checks import checked_size
 from .._core.files import refuse_existing, whole_file, whole_folder
 from ..io.focal_track import FocalTrack
+from ..models.family import AbstractFamily
 from ..models.lens import ZoomLens
 from ..models.zoom import AbstractFocusZoom, AbstractLinearZoom
-from ._lens import lens_of
-from ._solve import Solution, solve
-from .base import Export, Format, Import, Report
+from ._lens import UnsuitedError, lens_of
+from ._options import check_model, check_options, focal_lengths, positive, positives
+from ._solve import Solution, error_written, solve
+from .base import CONVENTION, TOLERANCE, Export, FolderFormat, Format, Import, Node, NodeFormat, Report
 from .colmap import COLMAP
 from .discorpy import Discorpy
 from .gyroflow import Gyroflow
@@ -78,8 +80,8 @@ def write(
     focal: float | int | Sequence[float | int] | np.ndarray | None = None,
     track: FocalTrack | None = None,
     pixel_pitch: float | int | None = None,
-    tolerance: float | int = 0.1,
-    convention: str = "centres",
+    tolerance: float | int | None = None,
+    convention: str | None = None,
     overwrite: bool = False,
 ) -> Report:
     """Write a lens in another tool's format.
@@ -89,14 +91,15 @@ def write(
         path: the file; for several focal lengths in a format of one a file, and for STMaps, a folder.
         format: name of the format, one of `formats`; by default that of the path's suffix, where only one
             has it.
-        focal: focal lengths in the lens's unit. Formats that interpolate choose them if it is left out.
+        focal: focal lengths in the lens's unit, for entries in this order; formats that interpolate have
+            them sorted, and choose them if it is left out.
         track: focal lengths by frame instead, one entry or file for each frame.
         pixel_pitch: mm from one pixel to the next: the sensor's width over that of the image in px; by
             default the lens's own. Formats with focal lengths in px need it for lenses in mm, those with a
             sensor's size always.
         tolerance: for formats that interpolate: focal lengths are added until the error between them is
-            below this, px, or more of them gain nothing.
-        convention: for STMaps: "centres" (Nuke), "gyroflow" or "alicevision".
+            below this, px, or more of them gain nothing; 0.1 by default.
+        convention: for STMaps: "centres" (Nuke, the default), "gyroflow" or "alicevision".
         overwrite: whether files that exist may be replaced.
 
     Returns:
@@ -104,7 +107,8 @@ def write(
 
     Raises:
         OSError: the file cannot be written; nothing is left of it.
-        ValueError: an argument is missing or wrong, or the lens folds over within the image.
+        ValueError: an argument is missing, wrong or without effect on the format, or the lens folds over
+            within the image.
 
     Example:
         >>> import pathlib, tempfile, zoomjax as zj
@@ -116,36 +120,56 @@ def write(
     """
     path = Path(path)
     fmt = _format_to_write(format, path)
+    check_options(fmt, {"tolerance": tolerance, "convention": convention})
     if isinstance(lens.zoom, AbstractFocusZoom):
         raise ValueError("Argument lens depends on the focus: choose one first, lens.at_focus(focus).")
     job = Export(
         lens,
-        *_focal_lengths(fmt, lens, focal, track),
-        pixel_pitch=lens.pixel_pitch if pixel_pitch is None else _positive("pixel_pitch", pixel_pitch),
-        tolerance=_positive("tolerance", tolerance),
-        convention=convention,
+        *focal_lengths(fmt, lens, focal, track),
+        pixel_pitch=lens.pixel_pitch if pixel_pitch is None else positive("pixel_pitch", pixel_pitch),
+        tolerance=TOLERANCE if tolerance is None else positive("tolerance", tolerance),
+        convention=convention or CONVENTION,
     )
-    several = fmt.folder or (fmt.zoom == "one" and job.focal is not None and len(job.focal) > 1)
-    names = fmt.file_names(job) if several else []
-    refuse_existing([path / name for name in names] if several else [path], overwrite=overwrite)
-    found = Solution(fmt.bare_nodes(job), 0.0, None) if fmt.folder else solve(fmt, job)
-    written = [0.0]
+    folder = isinstance(fmt, FolderFormat)
+    several = folder or (fmt.zoom == "one" and job.focal is not None and len(job.focal) > 1)
+    if several and path.suffix.lower() in fmt.suffixes:
+        raise ValueError(
+            f"The format {fmt.name} is several files here, and {path} is to be their folder: give a name "
+            f"without {path.suffix}."
+        )
+    files = tuple(path / name for name in fmt.file_names(job)) if several else (path,)
+    refuse_existing(list(files), overwrite=overwrite)
+    if isinstance(fmt, FolderFormat):
+        with whole_folder(path) as part:
+            worst = fmt.write_all(job, part)
+        return Report(fmt.name, job.focal or (), worst, None, files=files)
+    assert isinstance(fmt, NodeFormat)
+    found = solve(fmt, job)
     if several:
-        with whole_folder(path) as folder:
-            written += fmt.write_all(found.nodes, job, folder)
+        with whole_folder(path) as part:
+            parts = [part / file.name for file in files]
+            written = _write_nodes(fmt, found.nodes, job, parts)
     else:
         with whole_file(path) as part:
-            fmt.write(found.nodes, job, part)
+            written = _write_nodes(fmt, found.nodes, job, [part])
     return Report(
         fmt.name,
         tuple(node.focal for node in found.nodes),
-        max(found.at_nodes, *written),
+        max(found.at_nodes, written),
         found.between,
         (*fmt.notes(found.nodes, job), *_shortfall(fmt, found, job)),
-        tuple(path / name for name in names) if several else (path,),
+        files,
     )
 
 
+def _write_nodes(fmt: NodeFormat, nodes: list[Node], job: Export, files: list[Path]) -> float:
+    """Write one file, or one for each node; return the greatest error of what they then hold, px."""
+    for file, part in zip(files, [nodes] if len(files) == 1 else [[n] for n in nodes], strict=True):
+        file.write_text(fmt.text(part, job), encoding="utf-8")
+    return error_written(fmt, nodes, job, files)
+
+
+@kinds_checked
 def read(
     path: str | os.PathLike[str],
     *,
@@ -155,9 +179,10 @@ def read(
     crop: float | int | None = None,
     name: str | None = None,
     direction: str | None = None,
-    convention: str = "centres",
+    convention: str | None = None,
     zoom: AbstractLinearZoom | None = None,
     terms: int | None = None,
+    family: AbstractFamily | None = None,
 ) -> Reading:
     """Read a lens that another tool measured or wrote.
 
@@ -167,35 +192,42 @@ def read(
     Args:
         path: the file; or a folder of files of one format, one a focal length.
         format: name of the format, one of `formats`; by default it is recognised.
-        image_size: (width, height) px, for formats that do not say it.
+        image_size: (width, height) px, for files that do not say it; it must not contradict those that do.
         focal: focal lengths of the files of a folder in the order of their names, numbers in them by value
             (9 before 18); or those of the entries of a file. By default those that are in them.
         crop: for lensfun: crop factor of the camera; by default that of the calibration.
         name: of the lens, for files of several; a part of it will do.
         direction: for STMaps: "undistort" or "redistort"; by default the file name says it.
-        convention: for STMaps: "centres" (Nuke), "gyroflow" or "alicevision".
+        convention: for STMaps: "centres" (Nuke, the default), "gyroflow" or "alicevision".
         zoom: the zoom model, linear in its parameters. By default `SmoothZoom`; `TableZoom` for tangential
             distortion and the division model, and to keep what the file says at its focal lengths.
         terms: number of radial coefficients; by default 2 for `SmoothZoom`, else those of a file with our
             own formula, or 4.
+        family: the distortion model: `RadialPolynomial`, `Division` or `BrownConrady`. By default that
+            which holds the file's coefficients, or is nearest to its maps.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is damaged, of no known format, or does not say what an argument must then say.
+        ValueError: it is damaged, of no known format, or does not say what an argument must then say; or an
+            argument is wrong, contradicts the file, or has no effect on the format.
     """
-    check_kind("path", path, (str, os.PathLike))
+    size = None if image_size is None else checked_size(image_size)
+    told = None if focal is None else positives("focal", focal)
+    check_model(terms, family)
     path = Path(path)
     paths = _files(path)
     fmt = _format_to_read(format, paths[0])
+    given = {"focal": focal, "crop": crop, "name": name, "direction": direction, "convention": convention}
+    check_options(fmt, given)
     job = Import(
         path,
         tuple(paths),
-        None if image_size is None else checked_size(image_size),
-        None if focal is None else tuple(np.atleast_1d(np.asarray(focal, float)).tolist()),
-        None if crop is None else _positive("crop", crop),
+        size,
+        told,
+        None if crop is None else positive("crop", crop),
         name,
         direction,
-        convention,
+        convention or CONVENTION,
     )
     try:
         contents = fmt.read(job)
@@ -204,8 +236,10 @@ def read(
         for node in contents.nodes:
             if not (math.isfinite(node.focal) and node.focal > 0):
                 raise ValueError(f"its focal length {node.focal} is not a positive number")
-        lens, worst, notes = lens_of(contents, zoom, terms)
-    except FileNotFoundError:
+            if isinstance(node, Node) and not np.isfinite([*node.theta, *node.centre]).all():
+                raise ValueError(f"its coefficients or centre at {node.focal:g} are not finite numbers")
+        lens, worst, notes = lens_of(contents, zoom, terms, family)
+    except (FileNotFoundError, UnsuitedError):
         raise
     except _DAMAGED as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
@@ -249,17 +283,15 @@ def _format_to_write(name: str | None, path: Path) -> Format:
 
 def _format_to_read(name: str | None, path: Path) -> Format:
     if name is not None:
-        if not (fmt := named(name)).reads:
-            raise ValueError(f"The format {name} can be written only.")
-        return fmt
+        return named(name)
     if path.stat().st_size > _BIGGEST:
         raise ValueError(f"{path} is larger than {_BIGGEST >> 20} MiB: no lens file is.")
     with open(path, "rb") as file:
-        head = file.read(20000).decode("utf-8", "replace")
+        head = file.read(20000).decode("utf-8-sig", "replace")
     for fmt in FORMATS:
-        if fmt.reads and path.suffix.lower() in fmt.suffixes and fmt.recognises(head):
+        if path.suffix.lower() in fmt.suffixes and fmt.recognises(head):
             return fmt
-    raise ValueError(f"{path} is of no format that is known: {_names(f for f in FORMATS if f.reads)} are.")
+    raise ValueError(f"{path} is of no format that is known: {_names(FORMATS)} are.")
 
 
 def _files(path: Path) -> list[Path]:
@@ -282,50 +314,6 @@ def _by_value(path: Path) -> list[Any]:
     """Words and numbers of a name in turn, so that 9 is before 18."""
     parts = re.split(r"(\d+(?:\.\d+)?)", path.stem)
     return [float(part) if index % 2 else part for index, part in enumerate(parts)]
-
-
-def _focal_lengths(
-    fmt: Format, lens: ZoomLens, focal: Any, track: FocalTrack | None
-) -> tuple[tuple[float, ...] | None, tuple[int, ...] | None]:
-    """The focal lengths to write and their frames, each None where it is the format's to choose."""
-    if track is not None:
-        return _tracked(fmt, track, focal)
-    if focal is None:
-        low, high = np.asarray(lens.focal_range, float).tolist()
-        if fmt.zoom == "interpolated":
-            return None, None
-        if low == high:
-            return (low,), None
-        raise ValueError(
-            "Argument focal must be given, one focal length or several, or a track with one for each "
-            f"frame: the format {fmt.name} does not interpolate between them."
-        )
-    values = np.atleast_1d(np.asarray(focal, float))
-    if values.ndim != 1 or not (np.isfinite(values) & (values > 0)).all() or not values.size:
-        raise ValueError(f"Argument focal must hold positive numbers, but it is {focal!r}.")
-    return tuple(np.unique(values).tolist()), None
-
-
-def _tracked(fmt: Format, track: FocalTrack, focal: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
-    if focal is not None:
-        raise ValueError("Argument track must be left out where argument focal is given: give one of them.")
-    if fmt.zoom == "interpolated":
-        raise ValueError(
-            f"Argument track must be left out: the format {fmt.name} goes by the focal length, not by "
-            "frames."
-        )
-    if track.by_time:
-        raise ValueError("Argument track must be in frames (columns frame,focal), but it is in seconds.")
-    first, last = math.ceil(track.position[0]), math.floor(track.position[-1])
-    frames = range(first, last + 1)
-    return tuple(track.at(frame, math.nan) for frame in frames), tuple(frames)
-
-
-def _positive(name: str, value: Any) -> float:
-    number = float(value) if isinstance(value, int | float | np.number) else math.nan
-    if not (math.isfinite(number) and number > 0):
-        raise ValueError(f"Argument {name} must be a positive number, but it is {value!r}.")
-    return number
 
 
 def _shortfall(fmt: Format, found: Solution, job: Export) -> tuple[str, ...]:

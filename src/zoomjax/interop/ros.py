@@ -12,15 +12,14 @@ from ._pinhole import (
     load_yaml,
     matrix_rows,
     numbers,
-    one_size,
     pinhole,
 )
-from .base import Contents, Export, Format, Import, Node
+from .base import Contents, Export, Import, Node, NodeFormat, one_size
 
 _IDENTITY = [1, 0, 0, 0, 1, 0, 0, 0, 1]
 
 
-class ROS(Format):
+class ROS(NodeFormat):
     """ROS camera_info: plumb_bob is read, rational_polynomial read and written."""
 
     name, tools, suffixes = "ros", "ROS, ROS 2", (".yaml", ".yml")

@@ -9,20 +9,17 @@ Two writers put positions elsewhere, `convention`: "gyroflow" has x/w and 1 - y/
 and 1 - y/(h - 1).
 """
 
-import dataclasses
-import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.optimize import least_squares
 
 from ..models.distortion import Distortion
 from ..models.family import AbstractRadial
-from ._forms import Form
 from ._samples import border, distortions
-from .base import Contents, Export, Format, Import, Node, Sampled
+from .base import Contents, Export, FolderFormat, Import, Sampled, one_size
 
 _ROWS = 128
 """Of a map that are computed at once."""
@@ -36,48 +33,44 @@ _SAMPLED = 40
 _LEAST = 0.05
 """Share of a map's pixels that must lie within the image."""
 
-_TERMS = 3
-"""Coefficients of the polynomial by which the centre of maps is found."""
-
 _FOCAL, _UNIT = "zoomjaxFocal", "zoomjaxFocalUnit"
 """Attributes of the header."""
+
+CONVENTIONS = {"centres": (0.5, 0), "gyroflow": (0.0, 0), "alicevision": (0.0, -1)}
+"""What is added to pixel positions, and to the size."""
+
+DIRECTIONS = ("undistort", "redistort")
+"""Of maps, as they are in file names."""
 
 _OUTSIDE = -1.0
 """Where there is nothing to sample."""
 
 
-class STMap(Format):
+class STMap(FolderFormat):
     """Pairs of EXR maps, one pair for each focal length or frame."""
 
     name, tools, suffixes = "stmap", "Nuke, Natron, Fusion, Flame, After Effects", (".exr",)
-    exact, folder = True, True
+    exact = True
+    options = ("convention", "direction", "focal")
 
     def file_names(self, job: Export) -> list[str]:
         """Two for each node."""
-        return [f"{kind}.{stem}.exr" for stem in self.stems(job) for kind in ("undistort", "redistort")]
+        return [f"{kind}.{stem}.exr" for stem in job.stems for kind in DIRECTIONS]
 
-    def bare_nodes(self, job: Export) -> list[Node]:
-        """The focal lengths."""
-        _offset(job.convention)
-        frames = job.frames or [None] * len(job.focal or ())
-        centre = np.asarray(job.lens.centre)
-        return [
-            Node(f, Form(0), np.zeros(0), centre, n) for f, n in zip(job.focal or (), frames, strict=True)
-        ]
-
-    def write_all(self, nodes: list[Node], job: Export, folder: Path) -> list[float]:
-        """The maps; returns the greatest rounding errors, px."""
+    def write_all(self, job: Export, folder: Path) -> float:
+        """The maps; returns the greatest error of rounding and of what is quicker than the lens, px."""
         names = iter(self.file_names(job))
-        each = distortions(job.lens, np.array([node.focal for node in nodes]))
-        size, errors = job.lens.image_size, []
+        focal = job.focal or ()
+        each = distortions(job.lens, np.array(focal))
+        size, worst = job.lens.image_size, 0.0
         window = _union([_corrected_window(d, size) for d in each])
-        for node, distortion in zip(nodes, each, strict=True):
-            header = {_FOCAL: float(node.focal), _UNIT: job.lens.focal_unit}
+        for f, distortion in zip(focal, each, strict=True):
+            header = {_FOCAL: float(f), _UNIT: job.lens.focal_unit}
             for method, box in (("distort", window), ("undistort", (0, 0, size[0] - 1, size[1] - 1))):
-                found = _quick(distortion, method, box)
-                error = _write_map(folder / next(names), found, box, size, job.convention, header)
-                errors.append(error)
-        return errors
+                found, error = _quick(distortion, method, box)
+                rounding = _write_map(folder / next(names), found, box, size, job.convention, header)
+                worst = max(worst, error + rounding)
+        return worst
 
     def recognises(self, head: str) -> bool:
         """By EXR's magic number."""
@@ -85,67 +78,31 @@ class STMap(Format):
 
     def read(self, job: Import) -> Contents:
         """One map a focal length, of one direction; the others of a folder are left out."""
-        nodes, units, size = [], set(), None
-        wanted = job.direction or _direction(job.paths[0])
-        if wanted not in ("undistort", "redistort"):
-            raise ValueError('argument direction must be "undistort" or "redistort"')
-        paths = [path for path in job.paths if job.direction or _direction(path) == wanted]
+        nodes, units, sizes = [], set(), []
+        wanted, paths = _of_one_direction(job)
         if job.focal is not None and len(job.focal) != len(paths):
             raise ValueError(f"argument focal must hold {len(paths)} focal lengths, one for each file")
         for number, path in enumerate(paths):
             header, red, green = _open(path)
-            size = job.size(_window_size(header["displayWindow"]))
+            sizes.append(size := job.size(_window_size(header["displayWindow"])))
             focal = header.get(_FOCAL) if job.focal is None else job.focal[number]
             if focal is None:
                 raise ValueError("it does not say its focal length: give argument focal, one for each file")
             nodes.append(Sampled(float(focal), *_pairs(header, red, green, size, wanted, job.convention)))
             units.add(str(header.get(_UNIT, "mm")))
-        assert size is not None
-        centre = _centre(nodes, size)
-        nodes = [dataclasses.replace(node, centre=centre) for node in nodes]
-        return Contents(tuple(nodes), size, "px" if units == {"px"} else "mm")
-
-
-def _centre(nodes: list[Sampled], size: tuple[int, int]) -> np.ndarray:
-    """The centre of distortion of all maps, px: that about which polynomials come nearest to them."""
-    middle, scale = (np.array(size) - 1) / 2, math.hypot(*size) / 2
-    each = [((n.distorted - middle) / scale, (n.corrected - middle) / scale) for n in nodes]
-
-    def residuals(shift: np.ndarray) -> np.ndarray:
-        parts = []
-        for distorted, corrected in each:
-            z = distorted - shift
-            t = np.sum(z * z, -1, keepdims=True)
-            matrix = np.stack([(z * t ** (i + 1)).ravel() for i in range(_TERMS)], -1)
-            change = (corrected - distorted).ravel()
-            parts.append(matrix @ np.linalg.lstsq(matrix, change, rcond=None)[0] - change)
-        return np.concatenate(parts)
-
-    found = least_squares(residuals, np.zeros(2), x_scale=0.01, diff_step=1e-6, xtol=1e-12, ftol=1e-12)
-    shift = found.x if np.abs(found.x).max() < 0.5 else np.zeros(2)
-    return middle + scale * shift
-
-
-def _offset(convention: str) -> tuple[float, int]:
-    """What is added to pixel positions, and to the size, of a convention."""
-    table = {"centres": (0.5, 0), "gyroflow": (0.0, 0), "alicevision": (0.0, -1)}
-    if convention not in table:
-        raise ValueError(
-            f"Argument convention must be one of {', '.join(table)}, but it is {convention!r}."
-        )
-    return table[convention]
+        return Contents(tuple(nodes), one_size(sizes), "px" if units == {"px"} else "mm")
 
 
 def to_map(points: np.ndarray, size: tuple[int, int], convention: str) -> np.ndarray:
     """Positions in px as red and green."""
-    add, more = _offset(convention)
+    add, more = CONVENTIONS[convention]
     share = (points + add) / (np.array(size) + more)
     return np.stack([share[..., 0], 1 - share[..., 1]], axis=-1)
 
 
 def from_map(values: np.ndarray, size: tuple[int, int], convention: str) -> np.ndarray:
     """Red and green as positions in px."""
-    add, more = _offset(convention)
+    add, more = CONVENTIONS[convention]
     share = np.stack([values[..., 0], 1 - values[..., 1]], axis=-1)
     return share * (np.array(size) + more) - add
 
@@ -169,28 +126,32 @@ def _union(windows: list[tuple[int, int, int, int]]) -> tuple[int, int, int, int
     return (*(int(v) for v in table[:, :2].min(0)), *(int(v) for v in table[:, 2:].max(0)))  # pyright: ignore[reportReturnType]
 
 
-def _quick(distortion: Distortion, method: str, window: tuple[int, int, int, int]) -> Any:
+def _quick(
+    distortion: Distortion, method: str, window: tuple[int, int, int, int]
+) -> tuple[Callable[[np.ndarray], Any], float]:
     """``distort`` or ``undistort``, of millions of points: if radial, by a spline of the squared radius.
 
-    With so many knots it is within rounding errors of 32-bit floats.
+    With so many knots it is within rounding errors of 32-bit floats: its greatest error on a ray, px, comes
+    second.
     """
     exact = getattr(distortion, method)
     if not isinstance(distortion.family, AbstractRadial):
-        return exact
+        return exact, 0.0
     centre, scale = np.asarray(distortion.centre), float(distortion.scale)
     corners = np.array(np.meshgrid(window[::2], window[1::2])).reshape(2, -1).T - centre
     t = np.linspace(0, 1.001 * np.max(np.sum(corners**2, -1)), _KNOTS) / scale**2
     radius = np.sqrt(t[1:])
     ratio = (exact(centre + scale * radius[:, None] * np.array([1.0, 0.0])) - centre)[:, 0] / scale / radius
     if not np.isfinite(ratio).all():
-        return exact
+        return exact, 0.0
     spline = CubicSpline(t, np.append(1.0, ratio))
 
     def found(points: np.ndarray) -> np.ndarray:
         z = points - centre
         return centre + z * spline(np.sum(z * z, -1) / scale**2)[..., None]
 
-    return found
+    ray = centre + scale * np.sqrt((t[1:] + t[:-1]) / 2)[:, None] * np.array([0.6, 0.8])
+    return found, float(np.abs(found(ray) - np.asarray(exact(ray))).max())
 
 
 def _write_map(
@@ -250,14 +211,15 @@ def _window_size(window: Any) -> tuple[int, int]:
     return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
 
 
-def _direction(path: Path) -> str:
-    """The direction that a file's name tells; ValueError if it does not."""
-    for word in ("undistort", "redistort"):
-        if word in path.name.lower():
-            return word
-    raise ValueError(
-        'its name does not tell its direction: give argument direction, "undistort" or "redistort"'
-    )
+def _of_one_direction(job: Import) -> tuple[str, list[Path]]:
+    """The direction that is read, and its files: those whose names tell it, else all."""
+    told = [next((way for way in DIRECTIONS if way in path.name.lower()), None) for path in job.paths]
+    wanted = job.direction or told[0]
+    if wanted is None:
+        raise ValueError(
+            'its name does not tell its direction: give argument direction, "undistort" or "redistort"'
+        )
+    return wanted, [p for p, way in zip(job.paths, told, strict=True) if way == wanted] or list(job.paths)
 
 
 def _pairs(

@@ -5,13 +5,12 @@ height. Zoom is the focal length in the lens's unit, focus one entry. Unreal tak
 between entries, but eases the first and last interval: those are made short.
 """
 
-import dataclasses
 import json
 
 import numpy as np
 
-from ._pinhole import Pinhole, contents, formula, node_of, one_size, pinhole, square
-from .base import Contents, Export, Format, Import, Node
+from ._pinhole import Pinhole, Pinholes, contents, focal_px, formula, node_of, pinhole
+from .base import Contents, Export, Import, Node, read_text
 
 _END = 0.01
 """Length of the first and last interval, as a share of their neighbours'."""
@@ -24,26 +23,15 @@ _TABLES = {
 }
 
 
-class Unreal(Format):
+class Unreal(Pinholes):
     """Unreal's lens file exchange format."""
 
     name, tools, suffixes = "unreal", "Unreal Engine", (".ulens",)
-    zoom = "interpolated"
     note = "Unreal's reader of OpenTrackIO takes the lens without a refit."
 
     def forms(self, lens):
         """Three terms."""
         return (formula(lens, 3),)
-
-    def foreign(self, node: Node, job: Export) -> np.ndarray:
-        """Focal length in px, centre, coefficients in its units."""
-        f = float(job.focal_px(node.focal))
-        return np.concatenate([[f], node.centre, node.form.rescaled(node.theta, f / job.lens.scale)])
-
-    def native(self, numbers: np.ndarray, focal: float, like: Node, job: Export) -> Node:
-        """What Unreal makes of interpolated numbers."""
-        theta = like.form.rescaled(numbers[3:], job.lens.scale / numbers[0])
-        return dataclasses.replace(like, focal=focal, theta=theta, centre=numbers[1:3])
 
     def interpolate(self, focal: np.ndarray, numbers: np.ndarray, at: float) -> np.ndarray:
         """Linear, but with a slope of 0 at both ends, as its automatic tangents have it."""
@@ -103,7 +91,7 @@ class Unreal(Format):
 
     def read(self, job: Import) -> Contents:
         """The tables, at one focus."""
-        table = json.loads(job.paths[0].read_text(encoding="utf-8"))
+        table = json.loads(read_text(job.paths[0]))
         if table["metadata"]["lensInfo"]["distortionModel"] != "Spherical":
             raise ValueError("its distortion model is not Spherical")
         size = job.size((int(table["imageDimensions"]["width"]), int(table["imageDimensions"]["height"])))
@@ -114,11 +102,11 @@ class Unreal(Format):
         for row in tables["DistortionTable"]:
             zoom = row["ZoomEncoder"]
             focal, middle = (_at(tables[name], zoom) for name in ("FocalLengthTable", "ImageCenterTable"))
-            f = square(focal["Fx"] * size[0], focal["Fy"] * size[1], size)
+            f, stretch = focal_px(focal["Fx"] * size[0], focal["Fy"] * size[1])
             centre = np.array([middle["Cx"] * size[0], middle["Cy"] * size[1]]) - 0.5
             k, p = (np.array([row[name] for name in names]) for names in (("K1", "K2", "K3"), ("P1", "P2")))
-            nodes.append(node_of(Pinhole(f, f, centre, k, p), size))
-        return contents(nodes, one_size([size]), job)
+            nodes.append(node_of(Pinhole(f, f, centre, k, p, stretch), size))
+        return contents(nodes, size, job)
 
 
 def _data(nodes: list[Node], rows: list[list[float]]) -> str:

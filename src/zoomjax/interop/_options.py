@@ -1,0 +1,110 @@
+"""Checks of the arguments of `write` and `read`, before a file is looked at."""
+
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from .._core.checks import checked_terms
+from ..io.focal_track import FocalTrack
+from ..models.brown_conrady import BrownConrady
+from ..models.division import Division
+from ..models.family import AbstractFamily
+from ..models.lens import ZoomLens
+from ..models.polynomial import RadialPolynomial
+from .base import Format
+from .stmap import CONVENTIONS, DIRECTIONS
+
+_FAMILIES = (RadialPolynomial, Division, BrownConrady)
+"""Distortion models of lenses that are read."""
+
+_CHOICES = {"convention": tuple(CONVENTIONS), "direction": DIRECTIONS}
+"""What some arguments may be."""
+
+_DIGITS = 9
+"""Of focal lengths in files: those that agree so far are one."""
+
+
+def check_options(fmt: Format, given: dict[str, Any]) -> None:
+    """Raise ValueError where an option was given that the format does not use, or one that is wrong."""
+    for name, value in given.items():
+        if value is None:
+            continue
+        if name not in fmt.options:
+            raise ValueError(f"Argument {name} has no effect on the format {fmt.name}: leave it out.")
+        if name in _CHOICES and value not in _CHOICES[name]:
+            raise ValueError(
+                f"Argument {name} must be one of {', '.join(_CHOICES[name])}, but it is {value!r}."
+            )
+
+
+def positive(name: str, value: Any) -> float:
+    """A positive number."""
+    number = float(value) if isinstance(value, int | float | np.number) else math.nan
+    if not (math.isfinite(number) and number > 0):
+        raise ValueError(f"Argument {name} must be a positive number, but it is {value!r}.")
+    return number
+
+
+def check_model(terms: Any, family: Any) -> None:
+    """Raise ValueError where a lens that is read cannot be of this distortion model."""
+    if terms is not None:
+        checked_terms(terms, AbstractFamily.most_terms)
+    if family is not None and not isinstance(family, _FAMILIES):
+        names = ", ".join(f"{kind.__name__}()" for kind in _FAMILIES)
+        raise ValueError(f"Argument family must be one of {names}, but it is {family!r}.")
+
+
+def positives(name: str, values: Any) -> tuple[float, ...]:
+    """One positive number or several."""
+    try:
+        found = np.atleast_1d(np.asarray(values, float))
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    if found.ndim != 1 or not (np.isfinite(found) & (found > 0)).all() or not found.size:
+        raise ValueError(f"Argument {name} must hold positive numbers, but it is {values!r}.")
+    return tuple(found.tolist())
+
+
+def focal_lengths(
+    fmt: Format, lens: ZoomLens, focal: Any, track: FocalTrack | None
+) -> tuple[tuple[float, ...] | None, tuple[int, ...] | None]:
+    """The focal lengths to write and their frames, each None where it is the format's to choose."""
+    if track is not None:
+        return _tracked(fmt, track, focal)
+    if focal is None:
+        low, high = np.asarray(lens.focal_range, float).tolist()
+        if fmt.zoom == "interpolated":
+            return None, None
+        if low == high:
+            return (low,), None
+        raise ValueError(
+            "Argument focal must be given, one focal length or several, or a track with one for each "
+            f"frame: the format {fmt.name} does not interpolate between them."
+        )
+    values = positives("focal", focal)
+    if fmt.zoom == "list":
+        return values, None
+    most, times = Counter(f"{value:.{_DIGITS}g}" for value in values).most_common(1)[0]
+    if times > 1:
+        raise ValueError(
+            f"Argument focal must hold each focal length once for the format {fmt.name}, but {most} is "
+            f"there {times} times."
+        )
+    return (tuple(sorted(values)) if fmt.zoom == "interpolated" else values), None
+
+
+def _tracked(fmt: Format, track: FocalTrack, focal: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
+    if focal is not None:
+        raise ValueError("Argument track must be left out where argument focal is given: give one of them.")
+    if fmt.zoom == "interpolated":
+        raise ValueError(
+            f"Argument track must be left out: the format {fmt.name} goes by the focal length, not by "
+            "frames."
+        )
+    if track.by_time:
+        raise ValueError("Argument track must be in frames (columns frame,focal), but it is in seconds.")
+    first, last = math.ceil(track.position[0]), math.floor(track.position[-1])
+    frames = range(first, last + 1)
+    return tuple(track.at(frame, math.nan) for frame in frames), tuple(frames)
