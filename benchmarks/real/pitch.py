@@ -2,7 +2,7 @@
 
     python -m benchmarks.real.pitch
 
-reads the data folder that the environment variable ZOOMJAX_DATA names, and prints four tables.
+reads the data folder that the environment variable ZOOMJAX_DATA names, and prints five tables.
 
 ``pitch_lines/wc14_half.json``: 93 frames of football, 1280 x 720 px, with points on named lines, and
 a camera without distortion that another program predicts. The first table is of the points as they are, the
@@ -10,6 +10,8 @@ second of the points corrected by one coefficient for all frames, fitted by `fit
 of the lines of 3 points or more. The rows are numbers of straight lines in view. ``ratio`` is to the other
 program's focal length, which is no truth: how far its camera is from the points is printed below. In the
 third table it is, because the points are moved to where that camera sees their lines, and then randomly.
+The fourth table is of the corrected lines without their names: how many frames get them all again from
+`name_pitch_lines`, some, none, or a wrong one. Its limits were set on these frames.
 
 ``zoomcam``: 116 photos of a board, at five zooms whose focal lengths come from another calibration.
 """
@@ -23,7 +25,7 @@ import jax
 import numpy as np
 
 from zoomjax import Distortion, Lines, PolynomialZoom, fit_zoom, frame_rms
-from zoomjax.focal import FocalEstimate, focal_from_pitch, focal_from_planes
+from zoomjax.focal import FocalEstimate, focal_from_pitch, focal_from_planes, name_pitch_lines
 from zoomjax.focal.pitch import PITCH_LINES
 
 from .zoomcam import read_zoomcam
@@ -134,6 +136,7 @@ def pitch(folder: Path) -> None:
     ):
         estimates = [focal_from_pitch(lines, principal=PRINCIPAL) for lines in annotations]
         print_frames(title, estimates, frames)
+    print_names(corrected)
     missed = np.array([_rms_distance(*pair) for pair in zip(seen, feet, strict=True)])
     k1 = float(distortion.coefficients[0])
     print(f"\nk1 = {k1:.4f}; straightness {rms[0]:.2f} px, with it {rms[1]:.2f}")
@@ -141,6 +144,27 @@ def pitch(folder: Path) -> None:
         f"The other program's camera: {np.median(missed):.2f} px from the points in the median frame, more "
         f"than 50 px in {np.sum(missed > 50)}"
     )
+
+
+def print_names(annotations: list[dict[str, np.ndarray]]) -> None:
+    """How many frames get the names of their lines again."""
+    print("\nNames found\n lines frames   all  some  none wrong")
+    found = [
+        name_pitch_lines(list(lines.values()), principal=PRINCIPAL, image_size=SIZE)
+        for lines in annotations
+    ]
+    right = [
+        all(name in lines and np.array_equal(lines[name], points) for name, points in names.items())
+        for names, lines in zip(found, annotations, strict=True)
+    ]
+    share = np.array([len(names) / len(lines) for names, lines in zip(found, annotations, strict=True)])
+    number = np.array([len(lines) for lines in annotations])
+    for name, (least, most) in ROWS.items():
+        row = (number >= least) & (number <= most)
+        kinds = (share == 1, (share > 0) & (share < 1), share == 0)
+        columns = [row & np.array(right) & kind for kind in kinds]
+        counts = [np.sum(row), *map(np.sum, columns), np.sum(row & ~np.array(right))]
+        print(f"{name:>6}", "".join(f"{count:6}" for count in counts))
 
 
 def zoomcam(folder: Path) -> None:

@@ -1,5 +1,7 @@
 """Focal lengths from every source, on rendered boards with exact truth."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,11 +9,13 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app.focal_sources import Board, check_way, choose_focals
+from zoomjax.app.image_calibration import ImageJob
 from zoomjax.detect.batch import Detection, detect
 from zoomjax.detect.sources import Source
 
 SIZE = (1072, 712)
 PRINCIPAL = (np.array(SIZE) - 1) / 2
+SENSOR = 36.0  # mm, the width of that of scenes.broadcast_zoom
 
 
 def of(name, focal=None):
@@ -179,3 +183,35 @@ def test_a_square_view_tells_nothing():
     found = choose_focals(detections, "plane")
     assert set(found.focal) == {"1000-0.png", "1000-1.png"}
     assert "too frontal" in found.absent
+
+
+def test_markings_of_a_pitch_tell_the_focal_lengths_of_frames():
+    lens, focal = scenes.broadcast_zoom(), np.array([47.0, 60.0, 80.0, 110.0])
+    lines = scenes.broadcast_lines(lens, focal, spacing=12, noise=0.3)
+    ragged, frame = lines.to_ragged(), np.asarray(lines.frame)
+    detections = [
+        Detection(
+            f"{m}.jpg",
+            image_size=lens.image_size,
+            lines=tuple(ragged[n] for n in np.flatnonzero(frame == m)),
+        )
+        for m in range(len(focal))
+    ]
+    found = choose_focals(detections, "pitch")
+    assert found.unit == "px"
+    assert found.origin == "the markings of the pitch"
+    assert len(found.focal) >= 3
+    for name, value in found.focal.items():
+        true = focal[int(name[0])] / SENSOR * lens.image_size[0]
+        assert abs(value / true - 1) < max(0.03, 4 * found.deviation[name] / value)
+    with pytest.raises(ValueError, match="its lines cannot be told to be the markings of a football pitch"):
+        choose_focals([dataclasses.replace(detections[0], lines=detections[0].lines[:2])], "pitch")
+
+
+@pytest.mark.parametrize("video", [False, True])
+def test_a_pitch_is_a_source_that_needs_its_detector(video):
+    check_way("pitch", None, video=video)
+    with pytest.raises(ValueError, match='needs the markings of a pitch: give argument detector "pitch"'):
+        ImageJob(("a.mp4" if video else "a.jpg",), detector="edges", focal="pitch")
+    job = ImageJob(("a.mp4" if video else "a.jpg",), detector="pitch", focal="pitch" if video else None)
+    assert job.grid == "none"

@@ -114,3 +114,89 @@ def test_focal_lengths_of_real_broadcasts(frames):
     few = [sum(name in PITCH_LINES for name in frame["lines"]) < 4 for frame in frames]
     assert np.isnan(focal[few]).all()
     assert np.nanmedian([estimate.rms for estimate in estimates]) < 1.5
+
+
+def named(lines):
+    return zj.focal.name_pitch_lines(lines, principal=PRINCIPAL, image_size=(1280, 720))
+
+
+def in_image(annotations, rng, noise=0.5):
+    """What is in the picture of at least 60 px, with noise, in any order."""
+    lines = {}
+    for name, points in annotations.items():
+        points = points[np.all((points >= 0) & (points <= [1279, 719]), axis=1)]
+        if len(points) > 2 and np.hypot(*np.ptp(points, axis=0)) > 60:
+            lines[name] = points + noise * rng.standard_normal(points.shape)
+    return {name: lines[name] for name in rng.permutation(list(lines)).tolist()}
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_lines_are_called_by_their_names_or_not_at_all(seed):
+    rng = np.random.default_rng(seed)
+    focal, pan, tilt = rng.uniform(1500, 5000), rng.uniform(-0.5, 0.5), rng.uniform(1.3, 1.42)
+    names = [name for name in PITCH_LINES if rng.uniform() < 0.85]
+    lines = in_image(seen(focal, names, pan=pan, tilt=tilt, number=200), rng)
+    some = dict(named(list(lines.values())))
+    for name, points in some.items():
+        np.testing.assert_array_equal(points, lines[name])
+    if some:
+        assert len(some) == len(lines)
+        estimate = from_pitch(some)
+        assert abs(estimate.focal / focal - 1) < max(0.02, 5 * estimate.std / focal)
+    elif len(lines) > 6:
+        ways = {PITCH_LINES[name][0][0] == PITCH_LINES[name][1][0] for name in lines}
+        pytest.fail(f"{sorted(lines)} have no names, {ways}")
+
+
+def test_lines_of_other_things_have_no_name():
+    rng = np.random.default_rng(7)
+    lines = in_image(seen(1800.0, list(PITCH_LINES), number=200), rng)
+    assert len(lines) > 6
+    other = [np.linspace([100, 650], [900, 690], 20), np.linspace([1200, 60], [1270, 500], 20)]
+    found = named([*other, *lines.values()])
+    assert sorted(found) == sorted(lines)
+    for name, points in found.items():
+        np.testing.assert_array_equal(points, lines[name])
+
+
+def test_pieces_of_a_line_are_one():
+    lines = in_image(seen(3000.0, number=200), np.random.default_rng(3))
+    longest = max(lines, key=lambda name: len(lines[name]))
+    cut = np.array_split(lines.pop(longest), 2)
+    found = named([*cut, *lines.values()])
+    np.testing.assert_array_equal(found[longest], np.concatenate(cut))
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [],
+        [np.zeros((5, 2))] * 6,
+        [np.linspace([0, y], [1279, y + 20], 30) for y in (100, 200, 300, 400, 500)],  # of one direction
+        [np.linspace([300, 100], end, 30) for end in ([900, 150], [800, 600], [100, 700], [1200, 400])],
+        [np.linspace([640, 360] + 300 * np.array([np.cos(a), np.sin(a)]), [640, 100], 9) for a in range(7)],
+    ],
+    ids=["none", "points", "parallels", "a fan", "a star"],
+)
+def test_lines_that_are_no_pitch_have_no_names(lines):
+    assert named(lines) == {}
+
+
+def test_positions_that_are_none_are_refused():
+    with pytest.raises(ValueError, match="'line 1' must be a finite array"):
+        named([np.zeros((3, 2)), np.full((3, 2), np.nan)])
+
+
+def test_real_annotations_get_their_names(frames):
+    """Frames of 2 to 9 lines: two in three are named, all of those with 7 lines or more, none wrongly."""
+    bend = zj.Distortion(np.array([-0.0416]), PRINCIPAL, np.array(np.hypot(1280, 720) / 2))
+    number = {True: 0, False: 0}
+    for frame in frames:
+        lines = {name: np.array(points) for name, points in frame["lines"].items() if name in PITCH_LINES}
+        lines = {name: np.asarray(bend.undistort(points)) for name, points in lines.items()}
+        found = named(list(lines.values()))
+        for name, points in found.items():
+            np.testing.assert_array_equal(points, lines[name])
+        number[bool(found)] += 1
+        assert found or len(lines) < 7
+    assert number[True] >= 62

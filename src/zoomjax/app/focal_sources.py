@@ -1,9 +1,10 @@
 """The focal length of each image, from the best available source.
 
 Sources are EXIF data, a table, a number, or the images themselves: a board parallel to the sensor at a
-known distance (eq. 14), or oblique views of a flat grid (Zhang's constraints). The last two need corrected
-points, and the correction is not known yet. So points are corrected twice: first by a separate fit of each
-image, which needs no focal length, then by the zoom model fitted with the focal lengths found.
+known distance (eq. 14), or oblique views of a flat grid or of a football pitch (Zhang's constraints). These
+need corrected points, and the correction is not known yet. So points are corrected twice: first without
+focal lengths, by a separate fit of each image (of a pitch, which has few lines, by one fit of all), then by
+the zoom model fitted with the focal lengths found.
 """
 
 import dataclasses
@@ -19,6 +20,7 @@ from ..fit.frames import fit_frames
 from ..fit.robust import fit_robust
 from ..focal.board import focal_from_board
 from ..focal.estimate import FocalEstimate
+from ..focal.pitch import focal_from_pitch, name_pitch_lines
 from ..focal.plane import focal_from_planes
 from ..io.focal_table import read_focal_table
 from ..io.focal_track import read_focal_track
@@ -31,10 +33,16 @@ from ..models.zoom import PolynomialZoom
 WAYS = (
     'a CSV file with the columns "image,focal" (--focal focal.csv); EXIF data in the photos '
     "(--focal exif); a board parallel to the sensor (--focal board --pitch MM --distance MM --pixel MM); "
-    "or oblique photos of a flat checkerboard or dot grid (--focal plane)"
+    "oblique photos of a flat checkerboard or dot grid (--focal plane); or markings of a football pitch "
+    "(--focal pitch)"
 )
 
-_VIDEO_WAYS = "one focal length, a CSV file with time,focal or frame,focal, or plane or board as for photos"
+_VIDEO_WAYS = (
+    "one focal length, a CSV file with time,focal or frame,focal, or plane, board or pitch as for photos"
+)
+
+MEASURED = ("plane", "board", "pitch")
+"""Sources that are the images themselves."""
 
 _MOST_UNCERTAIN = 0.2
 """Largest standard deviation, relative to the focal length, of an estimate that is used."""
@@ -87,7 +95,7 @@ def check_way(way: str | None, board: Board | None, *, video: bool) -> None:
             raise ValueError(_NO_BOARD)
     elif video and way in (None, "exif"):
         raise ValueError(f"A video needs --focal: {_VIDEO_WAYS}.")
-    elif way not in (None, "exif", "plane") and _number(way) is None:
+    elif way not in (None, "exif", "plane", "pitch") and _number(way) is None:
         if not way.lower().endswith(".csv"):
             raise ValueError(
                 f"--focal is {way!r}, which is not a source of focal lengths. Give "
@@ -110,8 +118,8 @@ def choose_focals(
 
     Args:
         detections: detections of images of one size, all with lines.
-        way: the source: "exif", "board", "plane", a number or a CSV file. None for the best available one:
-            the `board` if it is given, else EXIF data, else an oblique grid.
+        way: the source: "exif", "board", "plane", "pitch", a number or a CSV file. None for the best
+            available one: the `board` if it is given, else EXIF data, else an oblique grid.
         unit: unit of a number or of the focal lengths in a CSV file.
         board: the board, for "board".
 
@@ -133,6 +141,8 @@ def choose_focals(
         )
     elif way == "plane":
         found = _estimated(detections, "px", "homographies of the grid", _NO_PLANE, _from_plane)
+    elif way == "pitch":
+        found = _estimated(detections, "px", "the markings of the pitch", _NO_PITCH, _from_pitch, few=True)
     elif (number := _number(way)) is not None:
         found = Focals({d.name: number for d in detections}, unit, "--focal", "")
     else:
@@ -157,6 +167,11 @@ def choose_focals(
 
 _NO_PLANE = "no flat grid was found in it, or the view is too frontal to determine a focal length"
 
+
+_NO_PITCH = (
+    "its lines cannot be told to be the markings of a football pitch, of which at least four must be seen, "
+    "two along and two across it, or they do not determine a focal length"
+)
 
 _NOT_THE_BOARD = (
     "no evenly spaced lines of a board were found in it, or their pitch differs between the two directions "
@@ -184,18 +199,34 @@ Estimator = Callable[[Detection, Distortion], FocalEstimate | None]
 
 
 def _estimated(
-    detections: Sequence[Detection], unit: str, origin: str, absent: str, estimate: Estimator
+    detections: Sequence[Detection],
+    unit: str,
+    origin: str,
+    absent: str,
+    estimate: Estimator,
+    *,
+    few: bool = False,
 ) -> Focals:
-    """Focal lengths from corrected points. The correction is done twice, see the module."""
-    each = fit_frames(compress(lines_of(detections, np.ones(len(detections)), unit)), throw=False)
-    corrections = [each.distortion(frame) for frame in range(len(detections))]
+    """Focal lengths from corrected points. The correction is done twice, see the module.
+
+    Where images have `few` lines, the corrections have one coefficient, at first the same in all of them.
+    """
+    without = compress(lines_of(detections, np.ones(len(detections)), unit))
+    if few:
+        one = fit_robust(without, zoom=PolynomialZoom(degree=0), terms=1, throw=False).fit.lens
+        corrections = [one(1.0)] * len(detections)
+    else:
+        each = fit_frames(without, throw=False)
+        corrections = [each.distortion(frame) for frame in range(len(detections))]
     found = _all(detections, corrections, estimate)
     usable = [d for d in detections if d.name in found]
     if len(usable) > 2:
         focal = np.array([float(found[d.name].focal) for d in usable])
         lines = compress(lines_of(usable, focal, unit))
         degree = min(2, np.unique(focal).size - 1)
-        lens = fit_robust(lines, zoom=PolynomialZoom(degree=degree), terms=2, throw=False).fit.lens
+        lens = fit_robust(
+            lines, zoom=PolynomialZoom(degree=degree), terms=1 if few else 2, throw=False
+        ).fit.lens
         found = _all(usable, [lens(float(f)) for f in focal], estimate) or found
     return Focals(
         {name: float(f.focal) for name, f in found.items()},
@@ -250,6 +281,13 @@ def _from_plane(detection: Detection, correction: Distortion) -> FocalEstimate |
     points, places = known
     _, each = focal_from_planes(points[None], places, principal=np.asarray(correction.centre))
     return jax.tree.map(lambda a: a[0], each)
+
+
+def _from_pitch(detection: Detection, correction: Distortion) -> FocalEstimate | None:
+    principal = np.asarray(correction.centre)
+    corrected = [np.asarray(correction.undistort(jnp.asarray(line))) for line in detection.lines]
+    named = name_pitch_lines(corrected, principal=principal, image_size=detection.image_size)
+    return focal_from_pitch(named, principal=principal) if named else None
 
 
 def _from_board(board: Board) -> Estimator:

@@ -22,7 +22,7 @@ from ._flags import with_flags
 from .calibration import CLEARS, FILES, Calibration, calibrate, focal_sigmas
 from .choice import chosen_frames, colour_limit
 from .equipment import with_equipment
-from .focal_sources import Board, Focals, check_way, choose_focals, lines_of
+from .focal_sources import MEASURED, Board, Focals, check_way, choose_focals, lines_of
 from .model_choice import WantedModel
 from .overlay import draw_lines
 from .results_folder import results_folder
@@ -83,6 +83,10 @@ class ImageJob:
         if len(self.inputs) > 1 and any(map(is_video, self.inputs)):
             raise ValueError("Give photos, or one video.")
         check_way(self.focal, self.board, video=self.video is not None)
+        if self.focal == "pitch" and self.detector != "pitch":
+            raise ValueError(
+                'Argument focal "pitch" needs the markings of a pitch: give argument detector "pitch", too.'
+            )
         focal_sigmas(self.focal_sigma or "0", np.ones(1))
 
     @property
@@ -95,7 +99,8 @@ class ImageJob:
         """In which images to search for a grid for the focal length: `detect`'s argument ``grid``."""
         if self.focal == "plane" or (self.focal == "board" and self.detector == "grid"):
             return "all"
-        return "without focal length" if self.focal is None and self.board is None else "none"
+        needed = self.focal is None and self.board is None and self.detector != "pitch"
+        return "without focal length" if needed else "none"
 
     def sources(self) -> tuple[Iterable[Source], int]:
         """The images and their number."""
@@ -111,7 +116,7 @@ class ImageJob:
 
     def _track(self) -> FocalTrack | float:
         """The focal track of a video; 1 where focal lengths are estimated from its frames."""
-        if self.focal in (None, "plane", "board"):
+        if self.focal in (None, *MEASURED):
             return 1.0
         number = plain_number(self.focal)
         return read_focal_track(self.focal) if number is None else number
@@ -283,9 +288,11 @@ def calibrate_images(
     if not usable:
         raise ValueError(_nothing(detections))
     stage("Finding the focal lengths")
-    way = "track" if job.video and job.focal not in (None, "plane", "board") else job.focal
+    way = "track" if job.video and job.focal not in (None, *MEASURED) else job.focal
     if job.video and job.focal is None:
         way = "board"
+    if way is None and job.detector == "pitch" and not job.board and not any(d.focal for d in usable):
+        way = "pitch"
     focals = choose_focals(usable, way, unit=job.focal_unit, board=job.board)
     unused |= {d.name: focals.absent for d in usable if d.name not in focals.focal}
     if job.focal_sigma is not None:

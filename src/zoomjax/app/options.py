@@ -1,9 +1,12 @@
 """Options of the command line that commands share, and the examples in their help."""
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+
+from .._core.files import settled
 
 FIT, FOCAL, INPUT, OUTPUT = "Lens", "Focal lengths", "Images and lines", "Output"
 """Panels of the help."""
@@ -54,6 +57,29 @@ Frames = Annotated[
         rich_help_panel=INPUT,
     ),
 ]
+
+
+def place(output: Path | None) -> Path | None:
+    """Where results go, whatever folders are made on the way; for the options `--output`."""
+    return None if output is None else settled(output)
+
+
+ResultsFolder = Annotated[
+    Path,
+    typer.Option(
+        "-o", "--output", metavar="DIR", help="Folder for the results.", file_okay=False, callback=place
+    ),
+]
+FileOrFolder = Annotated[
+    Path,
+    typer.Option(
+        "-o",
+        "--output",
+        metavar="OUT",
+        help="Output file for a single input, else a folder.",
+        callback=place,
+    ),
+]
 Exclude = Annotated[
     list[str] | None,
     typer.Option(
@@ -102,7 +128,7 @@ Examples:
 
   zoomjax calibrate zoom.mp4 --focal track.csv -o mylens
 
-  zoomjax calibrate mylens/lines.npz --exclude 15,17 -o better
+  zoomjax calibrate mylens --exclude 15,17 -o mylens
 """
 
 UNDISTORT_EXAMPLES = """\
@@ -144,6 +170,12 @@ def _flag(parameter: Any, value: object) -> str:
     """What was written for a parameter to have a value."""
     off = parameter.secondary_opts
     return off[0] if off and value is False else max(parameter.opts, key=len)
+
+
+def detector_for(context: typer.Context, detector: Detector, focal: str | None) -> Detector:
+    """The detector: as given, else that of markings where these give the focal length."""
+    given = str(context.get_parameter_source("detector")).endswith("COMMANDLINE")
+    return "pitch" if focal == "pitch" and not given else detector
 
 
 def excluded(given: list[str] | None) -> list[int]:

@@ -5,14 +5,16 @@ them, "top" is far from it and "bottom" near; "Big rect." is the penalty area, "
 and "main" its side parallel to the goal line.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from .._core.checks import checked_size
 from .._core.types import AnyArray
+from ._markings import find_markings
 from .estimate import FocalEstimate
 from .plane import focal_from_lines
 
@@ -92,6 +94,68 @@ def focal_from_pitch(
         points[row, :number] = used.get(name, 0)
         mask[row, :number] = True
     return focal_from_lines(points, np.array(list(PITCH_LINES.values())), principal=principal, mask=mask)
+
+
+def name_pitch_lines(
+    lines: Sequence[ArrayLike], *, principal: Float[AnyArray, "2"], image_size: tuple[int, int]
+) -> dict[str, np.ndarray]:
+    """Find out which markings of a football pitch straight lines in one picture are.
+
+    A search over the cameras that could see four of the lines as four of the markings. The camera stands
+    upright, 2 to 80 m over the ground; lines need not be seen whole. From the far side of the pitch all
+    looks as from the near one, so that names are those of the pitch turned by half a turn.
+
+    Args:
+        lines: corrected positions along each line, px, (n, 2), in any order; lines of other things are
+            accepted while they are few.
+        principal: the principal point, px; the centre of distortion is the usual choice.
+        image_size: (width, height) px.
+
+    Returns:
+        For each name in `PITCH_LINES` that was found the positions on it, as `focal_from_pitch` takes them.
+        It is empty if the lines do not tell clearly: if they are fewer than four, or where cameras with
+        other focal lengths explain them as well.
+
+    Raises:
+        ValueError: positions are not finite (n, 2) arrays.
+
+    Example:
+        >>> import numpy as np
+        >>> from zoomjax.focal.pitch import PITCH_LINES
+        >>> names, lines = [name for name in PITCH_LINES if "left" in name or name == "Side line top"], []
+        >>> for name in names:
+        ...     x, y = np.linspace(*PITCH_LINES[name], 9).T
+        ...     seen = 2000 * np.stack([x + 40, 0.28 * y + 6], axis=-1) / (80 - 0.96 * y)[:, None] + 500
+        ...     lines.append(seen[(seen.min(axis=1) > 0) & (seen.max(axis=1) < 999)])
+        >>> named = name_pitch_lines(lines, principal=np.array([500.0, 500.0]), image_size=(1000, 1000))
+        >>> sorted(named) == sorted(name for name, seen in zip(names, lines) if len(seen) > 1)
+        True
+    """
+    principal, size = np.asarray(principal, float), np.array(checked_size(image_size))
+    unit = float(np.hypot(*size)) / 2
+    points = [_positions(f"line {number}", line) for number, line in enumerate(lines)]
+    points = [line for line in points if len(line) > 1 and np.ptp(line, axis=0).any()]
+    if len(points) < 4:
+        return {}
+    segments = np.stack([_ends((line - principal) / unit) for line in points])
+    found = find_markings(segments, np.array(list(PITCH_LINES.values())), size / 2 / unit)
+    if found is None or not found.clear:
+        return {}
+    names = list(PITCH_LINES)
+    return {
+        names[index]: np.concatenate(
+            [line for line, own in zip(points, found.marking, strict=True) if own == index]
+        )
+        for index in sorted(set(found.marking.tolist()) - {-1})
+    }
+
+
+def _ends(line: np.ndarray) -> np.ndarray:
+    """The ends of the straight line nearest to points."""
+    middle = line.mean(axis=0)
+    direction = np.linalg.svd(line - middle, full_matrices=False)[2][0]
+    along = (line - middle) @ direction
+    return middle + np.array([[along.min()], [along.max()]]) * direction
 
 
 def _positions(name: str, points: ArrayLike) -> np.ndarray:
