@@ -94,6 +94,21 @@ def main() -> None:
         np.testing.assert_allclose(found, expected, rtol=1e-12)
         sums = exchanged(gradient.lower(distortion, spread).compile())
         assert max(sums.values()) <= 4 * len(jax.devices()), sums
+    spread, plain = jax.device_put(points[:4000], over_points), distortion.distort(points[:4000])
+    local = jax.shard_map(
+        lambda points: distortion.distort(points),
+        mesh=over.mesh,
+        in_specs=PartitionSpec("line"),
+        out_specs=PartitionSpec("line"),
+    )
+    # That Newton's steps arrived everywhere is one flag; on each device by itself it is none.
+    for function, expected in ((lambda p: distortion.distort(p), {"all-reduce": 1}), (local, {})):
+        program = eqx.filter_jit(function)
+        found = exchanged(program.lower(spread).compile())
+        assert found == expected, found
+        np.testing.assert_allclose(program(spread), plain, rtol=1e-12)
+    found = exchanged(eqx.filter_jit(lambda p: distortion.undistort(p)).lower(spread).compile())
+    assert found == {}, found
     print("as on one device")
 
 

@@ -74,6 +74,25 @@ def test_a_focal_length_for_each_point_in_another_process(method, tmp_path):
     np.testing.assert_allclose(result, getattr(lens, method)(table.points(), table.EACH), rtol=1e-13)
 
 
+@pytest.mark.parametrize("method", ["undistort", "distort"])
+def test_a_lens_by_its_leaves_in_another_process(method, tmp_path):
+    """Another lens than that of the export, read where there is no zoomjax; the lens itself is refused."""
+    lens = table.lens()
+    leaves, structure = jax.tree.flatten(lens)
+    [n] = export.symbolic_shape("n")
+    points = jax.ShapeDtypeStruct((n, 2), jnp.float64)
+    specs = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
+    function = exported(
+        lambda points, *leaves: getattr(structure.unflatten(leaves)(35.0), method)(points), points, *specs
+    )
+    other = eqx.tree_at(lambda lens: lens.centre, lens, lens.centre + 1)
+    [result] = elsewhere(function, tmp_path, table.points(), *jax.tree.leaves(other))
+    np.testing.assert_allclose(result, getattr(other(35.0), method)(table.points()), rtol=1e-12)
+    whole = exported(lambda lens, points: getattr(lens(35.0), method)(points), lens, points)
+    with pytest.raises(ValueError, match="Cannot serialize"):
+        whole.serialize()
+
+
 def test_images_of_any_size_in_another_process(tmp_path, unchecked):
     # Unchecked, as symbolic sides are no int.
     d = table.small_distortion()

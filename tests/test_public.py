@@ -23,6 +23,7 @@ MEMBERS = {
     "Lines": "from_ragged to_ragged save points mask frame focal image_size",
     "ZoomLens": "save zoom centre image_size",
     "Distortion": "undistort distort coefficients pixel_coefficients centre",
+    "Camera": "rays project lens principal pixel_pitch",
     "ZoomFit": "lens rms frame_rms covariance result",
     "FrameFits": "coefficients rms frame_rms",
 }
@@ -113,8 +114,9 @@ except ValueError as error:
 def test_modules_are_reached_as_attributes():
     assert zj.scenes.nikkor_18_200().focal_unit == "mm"
     assert callable(zj.plot.plot_model)
-    assert {*ROOMS, "plot", "__version__"} <= set(dir(zj))
-    assert not {*ROOMS, "plot", "torch"} & set(zj.__all__)
+    assert zj.camera.Camera is zj.Camera is zj.models.Camera
+    assert {*ROOMS, "camera", "plot", "__version__"} <= set(dir(zj))
+    assert not {*ROOMS, "camera", "plot", "torch"} & set(zj.__all__)
 
 
 @pytest.mark.parametrize("door", DOORS.values(), ids=DOORS)

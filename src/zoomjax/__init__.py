@@ -27,7 +27,7 @@ _ROOMS = (
     "trust",
 )
 
-_MODULES = {**dict.fromkeys(_ROOMS, "numpy"), "plot": "matplotlib", "torch": "torch"}
+_MODULES = {**dict.fromkeys((*_ROOMS, "camera"), "numpy"), "plot": "matplotlib", "torch": "torch"}
 """Modules that are reached as attributes, and what each of them needs."""
 
 __all__ = [name for name in _names if name not in _MODULES]  # pyright: ignore[reportUnsupportedDunderAll]

@@ -30,10 +30,12 @@ from .fit import frame_rms as frame_rms
 from .lines import Lines as Lines
 from .lines import compress as compress
 from .lines import load_lines as load_lines
+from .models import Camera as Camera
 from .models import Distortion as Distortion
 from .models import PolynomialZoom as PolynomialZoom
 from .models import SmoothZoom as SmoothZoom
 from .models import ZoomLens as ZoomLens
+from .models import camera as camera
 from .models import load_lens as load_lens
 from .trust import displacement_band as displacement_band
 from .trust import displacement_std as displacement_std

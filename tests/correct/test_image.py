@@ -288,3 +288,9 @@ def test_float32_lens_serves_as_well(rng):
     )
     difference = cv2.absdiff(zj.undistort_image(image, BARREL), zj.undistort_image(image, single))
     assert difference.max() <= 1
+
+
+def test_masks_are_refused_and_not_dropped():
+    image = np.ma.array(np.zeros((40, 60), np.uint8), mask=True)
+    with pytest.raises(ValueError, match="image is a masked array"):
+        zj.undistort_image(image, zj.scenes.nikkor_18_200((60, 40))(35.0))

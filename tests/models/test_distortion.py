@@ -289,3 +289,109 @@ def test_gradients_of_single_points_under_vmap(method):
     each = jax.vmap(jax.hessian(lambda p: jnp.sum(getattr(d, method)(p) ** 2)))(points)
     assert each.shape == (3, 2, 2)
     np.testing.assert_allclose(each, jnp.swapaxes(each, 1, 2), rtol=1e-9, atol=1e-12)
+
+
+FOLDING = {
+    "polynomial": ([-0.4, 0.02], zj.models.RadialPolynomial()),
+    "three terms": ([-0.4, 0.02, 0.001], zj.models.RadialPolynomial()),
+    "Division": ([0.4], zj.models.Division()),
+    "BrownConrady": ([-0.3, 0.001, -0.002], zj.models.BrownConrady()),
+}
+NOWHERE = {
+    "beyond the fold": [2000.0, 1500.0],
+    "at infinity": [np.inf, 3.0],
+    "NaN": [np.nan, 2.0],
+    "far away": [1e9, -1e9],
+}
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "case", ["polynomial", *(pytest.param(case, marks=pytest.mark.slow) for case in list(FOLDING)[1:])]
+)
+def test_what_has_no_value_takes_no_part_in_derivatives(case, method):
+    """Masked, all derivatives are those without these points, and by these points zero."""
+    k, family = FOLDING[case]
+    own = jnp.array([[300.0, 200.0], [350.0, 300.0], [319.5, 239.5]])
+    points = jnp.concatenate([own, jnp.array(list(NOWHERE.values()))])
+    numbers = jnp.array([*k, *CENTRE, SCALE])
+
+    def total(numbers, points):
+        *k, x, y, scale = numbers
+        moved = getattr(zj.Distortion(jnp.stack(k), jnp.stack([x, y]), scale, family), method)(points)
+        return jnp.sum(jnp.sin(jnp.where(jnp.isfinite(moved), moved, 0) / 100))
+
+    (by_numbers, by_points), (expected, by_own) = (
+        jax.jit(jax.grad(total, argnums=(0, 1)))(numbers, at) for at in (points, own)
+    )
+    np.testing.assert_allclose(by_numbers, expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(by_points[:3], by_own, rtol=1e-9, atol=1e-15)
+    np.testing.assert_array_equal(by_points[3:], 0)
+    twice, expected = (jax.jit(jax.hessian(total))(numbers, at) for at in (points, own))
+    np.testing.assert_allclose(twice, expected, rtol=1e-7, atol=1e-10)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("case", FOLDING)
+def test_derivatives_are_zero_where_there_is_no_value(case, method):
+    k, family = FOLDING[case]
+    d = zj.Distortion(jnp.array(k), jnp.array(CENTRE), jnp.array(SCALE), family)
+    points = jnp.array(list(NOWHERE.values()))
+    assert not jnp.isfinite(getattr(d, method)(points)).all(axis=1).any()
+    jacobian = jax.jit(jax.jacfwd(lambda d, points: getattr(d, method)(points), argnums=(0, 1)))(d, points)
+    assert all(np.array_equal(leaf, np.zeros_like(leaf)) for leaf in jax.tree.leaves(jacobian))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("terms", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_a_focal_length_without_a_value_takes_no_part_in_derivatives(method, terms):
+    """One out of range, and NaN, each for a point of its own and for a distortion."""
+    zoom = zj.PolynomialZoom(0, jnp.array([[-0.1, 0.02, 0.001][:terms]]), jnp.array(20.0))
+    shift = zj.PolynomialZoom(1, jnp.array([[0.0, 0.0], [0.01, 0.02]]), jnp.array(20.0))
+    lens = zj.ZoomLens(
+        zoom, jnp.array(CENTRE), jnp.array([20.0, 80.0]), (640, 480), shift=shift, focal_unit="px"
+    )
+    points = jnp.array([[300.0, 200.0], [350.0, 300.0], [10.0, 20.0], [30.0, 10.0]])
+    focal = jnp.array([30.0, 50.0, 500.0, jnp.nan])
+
+    def masked(values):
+        return jnp.sum(jnp.where(jnp.isfinite(values), values, 0))
+
+    def rays(lens, points, focal):
+        camera = zj.models.Camera(lens)
+        if method == "undistort":
+            return masked(camera.rays(points, focal)[0])
+        return masked(camera.project(jnp.concatenate([points, 100 + points[:, :1]], axis=1), focal)[0])
+
+    def one_by_one(lens, points, focal):
+        return masked(jax.vmap(lambda p, f: getattr(lens(f), method)(p))(points, focal))
+
+    def together(lens, points, focal):
+        return masked(getattr(lens, method)(points, focal))
+
+    for total in (together, one_by_one, rays):
+        gradient = jax.jit(jax.grad(total, argnums=(0, 1, 2)))
+        found, expected = (gradient(lens, points[:n], focal[:n]) for n in (4, 2))
+        for got, wanted in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
+            got = got if got.shape == wanted.shape else got[: len(wanted)]
+            np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-12)
+        np.testing.assert_array_equal(found[1][2:], 0)
+        np.testing.assert_array_equal(found[2][2:], 0)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("case", ["paper's", "Division"])
+def test_the_residual_is_two_last_digits_of_the_radius(case, dtype, truth, rng):
+    """Of normalised points, as in benchmarks/results/pipeline.md, in long double; NumPy and compiled."""
+    k = np.asarray(truth(58.0).coefficients if case == "paper's" else [-0.2], dtype)
+    family = zj.models.RadialPolynomial() if case == "paper's" else zj.models.Division()
+    d = zj.Distortion(k, np.zeros(2, dtype), np.ones((), dtype), family)
+    z = rng.uniform(-0.7, 0.7, (100_000, 2)).astype(dtype)
+    exact = z.astype(np.longdouble)
+    for points in (z, jnp.asarray(z)):
+        found = np.asarray(d.distort(points)).astype(np.longdouble)
+        t = np.sum(found**2, axis=1)
+        factor = 1 + sum(each * t ** (power + 1) for power, each in enumerate(k.astype(np.longdouble)))
+        corrected = found * (factor if case == "paper's" else 1 / factor)[:, None]
+        missed = np.hypot(*(corrected - exact).T)
+        assert np.max(missed / np.spacing(np.hypot(*exact.T).astype(dtype))) <= 2

@@ -293,3 +293,22 @@ def test_a_centre_that_moves(lens, tmp_path):
     assert eqx.tree_equal(again, moving)
     batched = jax.vmap(again)(jnp.array([20.0, 40.0]))
     np.testing.assert_allclose(batched.centre[1], moving(40.0).centre)
+
+
+@pytest.mark.parametrize("focal", ["35", True, [True], None, [30.0, "35"], {}, b"35"])
+def test_a_focal_length_is_a_number(focal):
+    lens = zj.scenes.nikkor_18_200()
+    for call in (lens, lambda f: lens.undistort([0.0, 0.0], f)):
+        with pytest.raises((ValueError, TypeError), match="focal"):
+            call(focal)
+
+
+def test_masks_are_refused_and_not_dropped():
+    lens = zj.scenes.nikkor_18_200()
+    points = np.ma.array([[1.0, 2.0], [3.0, 4.0]], mask=[[0, 0], [1, 1]])
+    with pytest.raises(ValueError, match="points is a masked array"):
+        lens(35.0).undistort(points)
+    with pytest.raises(ValueError, match="points is a masked array"):
+        lens.distort(points, 35.0)
+    with pytest.raises(ValueError, match="focal is a masked array"):
+        lens(np.ma.array([24.0, 50.0], mask=[0, 1]))

@@ -1,5 +1,8 @@
 """Lenses for images of another size."""
 
+import copy
+import gc
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +12,7 @@ from hypothesis import strategies as st
 
 import zoomjax as zj
 from zoomjax.correct.framing import framing_for_size
+from zoomjax.models._known_sizes import _KNOWN, known_size
 from zoomjax.models.sizes import at_focal, check_image_size
 
 
@@ -24,6 +28,19 @@ def test_scaled_lens_corrects_the_scaled_image_alike(truth):
     points = np.array([[0.0, 0.0], [3000.0, 500.0], [4287.0, 2847.0]])
     expected = (np.asarray(truth(30.0).undistort(points)) + 0.5) / 4 - 0.5
     np.testing.assert_allclose(quarter(30.0).undistort((points + 0.5) / 4 - 0.5), expected, atol=1e-9)
+
+
+def test_the_warning_is_about_the_line_that_calls(truth):
+    """Whichever function of the package it calls."""
+    image, size = np.zeros((712, 1072), np.float32), (1072, 712)
+    for call in (
+        lambda: zj.models.lens_for_size(truth, size),
+        lambda: zj.undistort_image(image, truth, focal=30.0),
+        lambda: zj.correct.frame_output(truth, size),
+    ):
+        with pytest.warns(UserWarning, match="its distortion is scaled") as caught:
+            call()
+        assert {warning.filename for warning in caught} == {__file__}
 
 
 @pytest.mark.filterwarnings("ignore:The lens is for images")
@@ -86,6 +103,78 @@ def test_a_distortion_of_images_of_another_size_is_refused(case):
             ValueError, match=r"images of another size: its centre .* but this image of 640 x 480 px"
         ):
             call()
+
+
+def lens_of(size):
+    zoom = zj.PolynomialZoom(1, jnp.array([[0.1], [0.05]]), jnp.array(20.0))
+    middle = jnp.array([(size[0] - 1) / 2 + 3, (size[1] - 1) / 2 - 2])
+    return zj.ZoomLens(zoom, middle, jnp.array([20.0, 80.0]), size)
+
+
+TRACED = {
+    "lens": lambda call, lens: jax.jit(lambda lens: call(lens(24.0)))(lens),
+    "focal length": lambda call, lens: jax.jit(lambda f: call(lens(f)))(24.0),
+    "gradient": lambda call, lens: jax.grad(lambda lens: call(lens(24.0)).sum())(lens),
+    "vmap": lambda call, lens: jax.vmap(lambda f: call(lens(f)))(jnp.array([24.0, 50.0])),
+    "scan": lambda call, lens: jax.lax.scan(
+        lambda lens, f: (lens, call(lens(f))), lens, jnp.array([24.0, 50.0])
+    ),
+    "lens of another size": lambda call, lens: jax.jit(
+        lambda lens: call(zj.models.lens_for_size(lens, (320, 240))(24.0))
+    )(lens_of((640, 480))),
+}
+
+
+@pytest.mark.filterwarnings("ignore:The lens is for images")
+@pytest.mark.parametrize("case", TRACED)
+def test_the_lens_of_traced_values_refuses_images_of_another_size(case):
+    """Its size is known nevertheless; its own images, and framings made by hand, are taken."""
+    lens, trace = lens_of((320, 240)), TRACED[case]
+    own, other, turned = jnp.zeros((240, 320)), jnp.zeros((120, 160)), jnp.zeros((320, 240))
+    trace(lambda d: zj.warp_image(own, d), lens)
+    for image in (other, turned):
+        with pytest.raises(ValueError, match="is for images of another size"):
+            trace(lambda d, image=image: zj.warp_image(image, d), lens)
+    framing = zj.Framing(jnp.ones(()), jnp.zeros(2), (160, 120))
+    trace(lambda d: zj.warp_image(other, d, framing=framing), lens)
+
+
+def test_a_distortion_changed_by_hand_is_taken_for_any_size():
+    """As for crops: only what a lens returned, as it is, is known to be for a size."""
+    corner, d = jnp.array([100.0, 60.0]), lens_of((320, 240))(24.0)
+    assert known_size(d) == (320, 240)
+    assert known_size(copy.deepcopy(d)) is None
+
+    @jax.jit
+    def cropped(lens, crop):
+        d = lens(24.0)
+        d = zj.Distortion(d.coefficients, d.centre - corner, d.scale)
+        assert known_size(d) is None
+        return zj.warp_image(crop, d)
+
+    assert cropped(lens_of((320, 240)), jnp.zeros((120, 160))).shape == (120, 160)
+
+
+def test_sizes_are_known_as_long_as_what_they_are_of():
+    gc.collect()
+    before, d = len(_KNOWN), [lens_of((320, 240))(f) for f in (24.0, 50.0)]
+    assert len(_KNOWN) == before + 2
+    del d
+    gc.collect()
+    assert len(_KNOWN) == before
+
+
+def test_distortions_of_lenses_go_with_others():
+    lens, by_hand = lens_of((320, 240)), zj.Distortion(jnp.zeros(1), jnp.zeros(2), jnp.array(200.0))
+    mixed = jax.tree.map(lambda a, b: a + b, lens(24.0), by_hand)
+    assert known_size(mixed) is None
+    assert float(mixed.scale) == 400.0
+    chosen = jax.jit(lambda lens, first: jax.lax.cond(first, lambda: lens(24.0), lambda: by_hand))
+    np.testing.assert_allclose(chosen(lens, True).coefficients, lens(24.0).coefficients)
+    assert (
+        float(jax.lax.scan(lambda d, f: (lens(f), d.scale), by_hand, jnp.array([24.0, 50.0]))[0].scale)
+        == 200
+    )
 
 
 OWN = {

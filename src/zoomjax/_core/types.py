@@ -11,7 +11,7 @@ from typing import ParamSpec, TypeVar
 
 import jax
 import numpy as np
-from jax.core import Tracer
+from jax.core import Tracer, eval_context
 from jaxtyping import ArrayLike, Bool, Float, Int, Num, PyTree
 
 AnyArray = jax.Array | np.ndarray
@@ -59,7 +59,7 @@ def of_known_values(function: Callable[_Given, _Result]) -> Callable[_Given, _Re
                 f"Arguments of {function.__name__} must have known values, because its control flow "
                 "depends on them, but some are traced: call it outside of jit, vmap and grad."
             )
-        with jax.ensure_compile_time_eval():
+        with eval_context():  # ensure_compile_time_eval fails inside of an eager `shard_map`
             return function(*args, **kwargs)
 
     return at_once

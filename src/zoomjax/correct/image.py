@@ -16,7 +16,13 @@ from jaxtyping import Shaped
 
 from ..models.distortion import Distortion
 from ..models.lens import ZoomLens
-from ..models.sizes import check_channels_last, check_image_size, checked_distortion, lens_for_size
+from ..models.sizes import (
+    check_channels_last,
+    check_image_size,
+    check_one_image,
+    checked_distortion,
+    lens_for_size,
+)
 from ._inverse_polynomial import fit_inverse, fold_radius
 from .framing import LARGEST, Framing, check_framing, frame_output
 from .maps import OUTSIDE, Plane, source_positions
@@ -63,7 +69,8 @@ def undistort_image(
         keep: the part to show, "same", "all", "valid" or "grow"; or a `Framing` from `frame_output`, which
             also gives the scale and can be used for many images of one size.
         size: (width, height) px of the result; by default the image's. Not with a `Framing`.
-        interpolation: "nearest", "linear", "cubic" or "lanczos".
+        interpolation: "nearest", "linear", "cubic" or "lanczos"; the last two have some seven digits,
+            whatever the dtype.
         border: fill outside of the image: "constant", "replicate" or "reflect".
         border_value: for "constant": one number, or one per channel. With any `border` it also fills pixels
             without a counterpart because the lens folds.
@@ -228,7 +235,7 @@ def border_values(value: float | int | Sequence[float | int], channels: int, dty
             f"Argument border_value must be one number, or one for each of the {channels} channels, "
             f"but it is {value!r}."
         )
-    if dtype.kind in "iu" and ((given < np.iinfo(dtype).min) | (given > np.iinfo(dtype).max)).any():
+    if dtype.kind in "iu" and not ((given >= np.iinfo(dtype).min) & (given <= np.iinfo(dtype).max)).all():
         raise ValueError(f"Argument border_value must be a value of {dtype}, but it is {value!r}.")
     return np.broadcast_to(given, channels).copy()
 
@@ -281,7 +288,10 @@ def check_image(image) -> None:
             "Argument image must be a NumPy array (height, width[, channels]) with pixels, but it is "
             f"{shape}. cv2.imread gives None where it cannot read a file."
         )
+    if isinstance(image, np.ma.MaskedArray):
+        raise ValueError("Argument image is a masked array, and masks are not kept: give its data alone.")
     check_channels_last(image.shape)
+    check_one_image(image.shape, "one call for each")
     if image.dtype.name not in (*_KNOWN, *_WORKING):
         raise ValueError(
             "Argument image must be boolean, integer of up to 32 bits or floating, but its dtype is "

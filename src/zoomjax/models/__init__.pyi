@@ -1,5 +1,6 @@
 # The public names of this room: read by type checkers, and by lazy_loader at run time.
 
+from . import camera as camera
 from ._bernstein import Pieces as Pieces
 from .about import About as About
 from .brown_conrady import BrownConrady as BrownConrady

@@ -18,6 +18,7 @@ def as_points(points: Any) -> Any:
         ValueError: they are not real numbers, or of another shape.
     """
     if not isinstance(points, jax.Array):
+        refuse_masked("points", points)
         try:
             points = np.asarray(points)
         except (TypeError, ValueError) as error:
@@ -29,6 +30,33 @@ def as_points(points: Any) -> Any:
     if jnp.issubdtype(points.dtype, jnp.integer):
         return points.astype(float)
     return points.astype(np.float32) if points.dtype.itemsize < 4 else points
+
+
+def as_focal(focal: Any) -> Any:
+    """Focal lengths as an array of floats.
+
+    Raises:
+        ValueError: they are not numbers.
+    """
+    if isinstance(focal, jax.Array):
+        return focal
+    refuse_masked("focal", focal)
+    try:
+        array = np.asarray(focal)
+        if array.dtype.kind in "iufO":
+            return array.astype(float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"Argument focal must be a number or an array, but it is {focal!r}.") from error
+    raise ValueError(f"Argument focal must be a number or an array, but it is {focal!r}.")
+
+
+def refuse_masked(name: str, values: Any) -> None:
+    """Raise ValueError for an array of NumPy that has a mask, which would be lost."""
+    if isinstance(values, np.ma.MaskedArray):
+        raise ValueError(
+            f"Argument {name} is a masked array, and masks are not kept: give an array with NaN in place "
+            f"of what is masked, {name}.filled(np.nan)."
+        )
 
 
 def check_broadcast(points: tuple[Any, ...], focal: tuple[Any, ...]) -> None:

@@ -89,7 +89,10 @@ class Camera(eqx.Module):
         corrected = self.lens.undistort(pixels, focal, focus)
         xp = namespace(corrected)
         corrected, principal, length = self._aligned(corrected, focal)
-        flat = (corrected - principal) / length[..., None]
+        # A NaN in a difference or a quotient would be one in all derivatives.
+        known = xp.isfinite(corrected[..., :1])
+        flat = (xp.where(known, corrected, 0) - principal) / length[..., None]
+        flat = xp.where(known, flat, np.nan)
         return xp.concatenate([flat, xp.ones_like(flat[..., :1])], axis=-1), finite(flat[..., 0])
 
     def project(
@@ -123,6 +126,8 @@ class Camera(eqx.Module):
 
     def _aligned(self, points: Any, focal: Any) -> list[Any]:
         """Points, the principal point and focal lengths in px, ready to broadcast."""
+        if isinstance(focal, Tracer):  # a NaN gives NaN by the lens, and would be one in all derivatives
+            focal = jnp.where(jnp.isfinite(focal), focal, jnp.asarray(self.lens.focal_range)[..., 1])
         principal = self.principal
         if principal is None:
             moves = self.lens.shift is not None

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._core.arrays import aligned, finite, interleaved, namespace, once, together
+from .._core.arrays import aligned, apart, finite, interleaved, namespace, once, together
 from .._core.fields import host_numbers
 from .._core.spread import spread
 from .._core.types import AnyArray, Elements, Points, traced
@@ -83,8 +83,8 @@ class Distortion(eqx.Module):
         """Correct distorted `points` (eq. 1).
 
         Beyond `monotone_radius` the result is NaN: the formula folds the plane over there, and two points
-        would have the same corrected position. `certify` proves that a lens has no such points in its
-        images.
+        would have the same corrected position. Derivatives are zero there. `certify` proves that a lens
+        has no such points in its images.
         """
         return self._mapped("undistort", points)
 
@@ -135,7 +135,7 @@ def mapped(method: str, family: AbstractFamily, points: Any, k: Any, centre: Any
             leaves = ((points, 1), (np.asarray(k), 1), (np.asarray(centre), 1), (np.asarray(scale), 0))
             points, *distortion = (leaf[None] for leaf in aligned(*leaves))
             if method == "undistort":
-                return _undistorted(points, family, *distortion, spreading=False)[0]
+                return _undistorted(points, family, *distortion)[0]
             at = _normal(_apart(points), *distortion, spreading=False)
             return together(*at.in_pixels(family.distort(at.z, at.k, family.limit(at.k))))[0]
     return compiled(method, _given, jnp.asarray(points), (family, k, centre, scale))
@@ -210,34 +210,66 @@ def _apart(points):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _corrected(distortion_of, points, operands):
-    """Corrected points, with the same derivatives as what is written: they are computed another way."""
-    return _undistorted(points, *distortion_of(operands), spreading=False)
+    """Corrected points; NaN, with derivatives of zero, beyond the limit."""
+    return _undistorted(points, *distortion_of(operands))
 
 
 @_corrected.defjvp
 def _corrected_jvp(distortion_of, primals, tangents):
-    """The value is that of the same function: under vmap it must have its batch axis at the same place."""
-    _, moved = jax.jvp(
-        lambda points, operands: _undistorted(points, *distortion_of(operands)), primals, tangents
-    )
+    """Of c + s F(z), s z = x - c.
+
+    Where there is no value slopes are those at the centre: a NaN, times a cotangent of zero, is NaN.
+    The value is that of the same function: under vmap it must have its batch axis at the same place.
+    """
+    family = distortion_of(primals[1])[0]
+
+    def normal(points, operands):
+        at = _normal(_apart(points), *distortion_of(operands)[1:])
+        return at.z, at.k, at.centre, at.scale
+
+    (z, k, _, scale), (_, k_dot, centre_dot, scale_dot) = jax.jvp(normal, primals, tangents)
+    at = _normal(_apart(primals[0]), *distortion_of(primals[1])[1:], spreading=False)
+    squared, own = _constant(z[0] * z[0] + z[1] * z[1]), _constant(at.own)
+    within = family.within(squared, own, digits=4) & (squared < np.inf)
+    for coefficient in apart(own):
+        within = within & jnp.isfinite(coefficient)
+    x, y = (jnp.where(within, side, 0) for side in z)
+    squared = x * x + y * y
+    away = tuple(tangents[0][..., i] - centre_dot[i] for i in (0, 1))
+    if isinstance(family, AbstractRadial):
+        along = jnp.where(within, x * away[0] + y * away[1] - squared * scale_dot, 0)
+        factor, bent = jax.jvp(family.factor, (squared, k), (2 * along, scale[None] * k_dot))
+        within = within & (factor >= 0)
+        factor = jnp.where(within, factor, 0)
+        moved = factor * away[0] + x * bent, factor * away[1] + y * bent
+    else:
+        z_dot = (jnp.where(within, away[i] - (x, y)[i] * scale_dot, 0) for i in (0, 1))
+        new, bent = jax.jvp(
+            lambda x, y, k: family.correct((x, y), x * x + y * y, k),
+            (x, y, k),
+            (*z_dot, scale[None] * k_dot),
+        )
+        within = within & (x * new[0] + y * new[1] >= 0)
+        moved = tuple(jnp.where(within, scale_dot * new[i] + bent[i], 0) for i in (0, 1))
+    here = within.astype(x.dtype)
+    moved = together(here * centre_dot[0] + moved[0], here * centre_dot[1] + moved[1])
     return _corrected(distortion_of, *primals), moved
 
 
-def _undistorted(points, family, k, centre, scale, *, spreading=True):
+def _undistorted(points, family, k, centre, scale):
     """Corrected points; NaN beyond the limit."""
-    at = _normal(_apart(points), k, centre, scale, spreading=spreading)
+    at = _normal(_apart(points), k, centre, scale, spreading=False)
     xp, (x, y) = namespace(at.k), at.z
-    joined = together if spreading else interleaved
     squared = x * x + y * y
-    within = family.within(_constant(squared), _constant(at.own), digits=4)
+    within = family.within(squared, at.own, digits=4)
     if isinstance(family, AbstractRadial):
         factor = family.factor(squared, at.k)
         factor = once(xp.where(within & (factor >= 0), factor, np.nan))
-        return joined(*at.in_pixels((x * factor, y * factor)))
+        return interleaved(*at.in_pixels((x * factor, y * factor)))
     new_x, new_y = family.correct(at.z, squared, at.k)
     # An invertible correction is monotone, and never goes to the other side; at a pole rounding does.
     within = within & (x * new_x + y * new_y >= 0)
-    return joined(*at.in_pixels((xp.where(within, new_x, np.nan), xp.where(within, new_y, np.nan))))
+    return interleaved(*at.in_pixels((xp.where(within, new_x, np.nan), xp.where(within, new_y, np.nan))))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -308,9 +340,12 @@ def _distorted_jvp(distortion_of, primals, tangents):
     # dF/dz dz = dy - dF/dk dk.
     by_k = jax.jvp(lambda k: family.correct(z, squared, k), (k,), (k_dot,))[1]
     moved, determinant = _solved(family, z, squared, k, (y_dot[0] - by_k[0], y_dot[1] - by_k[1]))
-    weight = jnp.where(exists, 1 / jnp.maximum(determinant, jnp.finfo(w.dtype).eps), 0)
+    weight = 1 / jnp.maximum(determinant, jnp.finfo(w.dtype).eps)
     return w, together(
-        *(centre_dot[i] + scale_dot * z[i] + scale * weight * moved[i] for i in (0, 1)),
+        *(
+            jnp.where(exists, centre_dot[i] + scale_dot * z[i] + scale * weight * moved[i], 0)
+            for i in (0, 1)
+        ),
     )
 
 

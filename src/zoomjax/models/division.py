@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .._core.arrays import namespace
 from .._core.types import AnyArray, Elements
-from .family import AbstractRadial, radial_factor, radial_orders, radial_slope, times
+from .family import AbstractRadial, radial_factor, radial_orders, radial_rest, times
 
 
 class Division(AbstractRadial):
@@ -51,10 +51,10 @@ class Division(AbstractRadial):
         return numerator / radial_factor(squared, k) ** 2
 
     def equation(self, r: Any, squared: Any, rho: Any, k: Elements) -> tuple[Any, Any]:
-        """``r - rho (1 + k1 t + ...)``, which has no pole."""
-        divisor = radial_factor(squared, k)
-        growth = radial_slope(squared, k) - divisor  # by r, times r
-        return r - rho * divisor, 1 - rho / (r + (r == 0)) * growth
+        """``r - rho (1 + k1 t + ...)``, without a pole; as r - rho, exact near the root, and the rest."""
+        rest = radial_rest(squared, k)
+        growth = radial_rest(squared, times(2 * radial_orders(len(k)) + 1, k)) - rest  # by r, times r
+        return (r - rho) - rho * rest, 1 - rho / (r + (r == 0)) * growth
 
     def conditions(self, size: int) -> np.ndarray:
         """The numerator of the slope, and the divisor."""

@@ -41,10 +41,17 @@ def radial_factor(
 
     The same code for NumPy and JAX, as all of a radial family's formulas.
     """
-    factor = 0 * squared_radius
+    return 1 + radial_rest(squared_radius, k)
+
+
+def radial_rest(
+    squared_radius: Float[AnyArray, "..."], k: Elements | Sequence[Any]
+) -> Float[AnyArray, "..."]:
+    """``L(t) - 1``, with its own digits: where L is near 1, it has more of them than L."""
+    rest = 0 * squared_radius
     for number, coefficient in enumerate(reversed(apart(k))):
-        factor = ((factor + coefficient) if number else coefficient) * squared_radius
-    return 1 + factor
+        rest = ((rest + coefficient) if number else coefficient) * squared_radius
+    return rest
 
 
 def radial_slope(squared_radius: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:

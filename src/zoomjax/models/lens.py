@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import eval_context
 from jaxtyping import Float, Num, ScalarLike
 
 from .._core.arguments import check_kind, kinds_checked
@@ -20,7 +21,8 @@ from .._core.checks import checked_size, checked_unit
 from .._core.fields import check_finite, check_positive, check_range, check_shapes, numbers
 from .._core.files import whole_file
 from .._core.types import AnyArray, FocalLike, Point, Points, traced
-from ._arguments import as_points, check_broadcast, check_terms
+from ._arguments import as_focal, as_points, check_broadcast, check_terms
+from ._known_sizes import with_known_size
 from .about import About, checked_about, checked_pitch
 from .distortion import Distortion, compiled, mapped
 from .family import AbstractFamily
@@ -127,9 +129,10 @@ class ZoomLens(eqx.Module):
         """
         focal = self._checked(focal, stacklevel=4)
         if traced((self, focal, focus)):
-            return self._distortion(focal, focus, within=traced((self, focal)))
-        with jax.ensure_compile_time_eval():  # what is known stays known inside of ``jit``
-            return self._distortion(focal, focus)
+            d = self._distortion(focal, focus, within=traced((self, focal)))
+            return with_known_size(d, self.image_size)
+        with eval_context():  # what is known stays known inside of ``jit``
+            return with_known_size(self._distortion(focal, focus), self.image_size)
 
     def undistort(
         self,
@@ -179,13 +182,7 @@ class ZoomLens(eqx.Module):
 
     def _checked(self, focal, stacklevel):
         """Focal lengths as an array, looked at where they are known."""
-        if not isinstance(focal, jax.Array):
-            try:
-                focal = np.asarray(focal, float)
-            except (TypeError, ValueError) as error:
-                raise ValueError(
-                    f"Argument focal must be a number or an array, but it is {focal!r}."
-                ) from error
+        focal = as_focal(focal)
         self.check_range(focal, stacklevel=stacklevel)
         return focal
 

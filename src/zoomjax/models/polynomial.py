@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.types import AnyArray, Elements
-from .family import AbstractRadial, radial_factor, radial_orders, radial_slope
+from .family import AbstractRadial, radial_factor, radial_orders, radial_rest, radial_slope
 
 
 class RadialPolynomial(AbstractRadial):
@@ -27,8 +27,8 @@ class RadialPolynomial(AbstractRadial):
         return radial_slope(squared, k)
 
     def equation(self, r: Any, squared: Any, rho: Any, k: Elements) -> tuple[Any, Any]:
-        """``r L(t) - rho``."""
-        return r * radial_factor(squared, k) - rho, radial_slope(squared, k)
+        """``r L(t) - rho``, as r - rho, which is exact near the root, and the rest."""
+        return (r - rho) + r * radial_rest(squared, k), radial_slope(squared, k)
 
     def conditions(self, size: int) -> np.ndarray:
         """One: the slope."""

@@ -5,6 +5,7 @@ these are near the middle of the image, and half its diagonal, which reveals an 
 """
 
 import dataclasses
+import inspect
 import math
 import warnings
 from typing import Any
@@ -16,8 +17,12 @@ import numpy as np
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_size
 from .._core.types import traced
+from ._known_sizes import known_size
 from .distortion import Distortion
 from .lens import ZoomLens
+
+_FEW = 16
+"""Channels, or images, that are more likely than an image of so few rows or columns."""
 
 _SAME_SCALE = 0.01
 """By which a scale may differ from half the image's diagonal and count as that."""
@@ -51,10 +56,9 @@ def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
         return lens
     check_aspect(size, lens.image_size)
     (width, height), (old_width, old_height) = size, lens.image_size
-    warnings.warn(
+    _warn_caller(
         f"The lens is for images of {old_width} x {old_height} px, and this one has {width} x {height}: "
-        "its distortion is scaled to them.",
-        stacklevel=2,
+        "its distortion is scaled to them."
     )
     centre = jnp.asarray(lens.centre)
     ratio = jnp.asarray([width / old_width, height / old_height], centre.dtype)
@@ -62,6 +66,18 @@ def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
     return dataclasses.replace(
         lens, centre=(centre + 0.5) * ratio - 0.5, image_size=size, pixel_pitch=pitch
     )
+
+
+def _warn_caller(message: str) -> None:
+    """A warning that names the line that called this package, by whichever of its functions."""
+    level, frame = 1, inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] in _INNER:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, stacklevel=level)
+
+
+_INNER = (__name__.split(".")[0], "contextlib", "functools", "jaxtyping", "beartype")
+"""Where frames between a caller and a warning are from: the package, and what wraps its functions."""
 
 
 def check_aspect(image_size: tuple[int, int], lens_size: tuple[int, int]) -> None:
@@ -101,16 +117,22 @@ def check_image_size(distortion: Distortion, image_size: tuple[int, int]) -> Non
 
     This is so if another image size explains centre and scale and this one does not: the centre is the
     middle of that size, and the scale half its diagonal; or that size is the same view scaled or turned,
-    and its middle is much nearer to the centre than the middle of this image. Nothing is checked under
-    ``jit`` or ``vmap``.
+    and its middle is much nearer to the centre than the middle of this image. Where centre and scale are
+    traced, those that the lens's image size makes likely stand in for them, of what ``lens(focal)``
+    returned; else nothing is checked.
 
     Raises:
         ValueError: the distortion is for another size; the message gives the sizes.
     """
     known = all(isinstance(side, int | np.integer) for side in image_size)  # or symbolic, for `jax.export`
-    if not known or traced((distortion.centre, distortion.scale)):
+    if not known:
         return
-    centre, scale = np.asarray(distortion.centre, float), float(distortion.scale)
+    if not traced((distortion.centre, distortion.scale)):
+        centre, scale = np.asarray(distortion.centre, float), float(distortion.scale)
+    elif (size := known_size(distortion)) is not None:
+        centre, scale = (np.array(size) - 1) / 2, math.hypot(*size) / 2
+    else:
+        return
     width, height = image_size
     half = math.hypot(width, height) / 2
     ratio = scale / half
@@ -144,6 +166,26 @@ def _off_middle(centre: np.ndarray, width: float | int, height: float | int) -> 
         * math.hypot(centre[0] - (width - 1) / 2, centre[1] - (height - 1) / 2)
         / math.hypot(width, height)
     )
+
+
+def check_one_image(shape: tuple[int, ...], instead: str) -> None:
+    """Refuse several images in one array, which would be taken for one with very many channels.
+
+    Args:
+        shape: of the array.
+        instead: what to do with them.
+
+    Raises:
+        ValueError: the shape is (images, rows, columns, 1, 3 or 4), or with channels before rows.
+    """
+    if len(shape) != 4 or not all(isinstance(side, int) for side in shape):
+        return
+    first, second, third, last = shape
+    if (last in (1, 3, 4) and third > max(first, _FEW)) or (second in (1, 3, 4) and third > _FEW < last):
+        raise ValueError(
+            f"Argument image must be one image, (height, width, channels), but its shape is {shape}, as "
+            f"that of several: {instead}."
+        )
 
 
 def check_channels_last(shape: tuple[int, ...]) -> None:
