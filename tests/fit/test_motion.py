@@ -142,8 +142,17 @@ def test_a_frame_without_tracks_does_not_matter(noisy, fit):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"focal": np.array([1.0, 2.0])}, "one number for each"),
-        ({"focal": np.full(FRAMES, -5.0)}, "must be positive"),
+        ({"focal": np.array([1.0, 2.0]), "focal_std": 1.0}, "a number for each"),
+        ({"focal": np.full(FRAMES, 900.0), "focal_std": np.ones(3)}, "a number for each|focal_std"),
+        ({"focal": np.full(FRAMES, -5.0), "focal_std": 1.0}, "must be positive"),
+        ({"focal": np.full(FRAMES, np.inf), "focal_std": 1.0}, "focal finite or NaN"),
+        ({"focal": np.full(FRAMES, 900.0), "focal_std": np.nan}, "must be positive"),
+        ({"focal": np.full(FRAMES, 900.0)}, "give both, or neither"),
+        ({"focal_std": 1.0}, "give both, or neither"),
+        ({"readout": -3.0}, "from -1 to 1"),
+        ({"readout": np.nan}, "from -1 to 1"),
+        ({"readout": "x"}, "from -1 to 1|readout"),
+        ({"readout": np.zeros(2)}, "from -1 to 1|readout"),
         ({"tracks": "clip.mp4"}, "tracks"),
     ],
 )
@@ -160,6 +169,26 @@ def lines(lens, path):
 @pytest.fixture(scope="module")
 def with_lines(noisy, lines):
     return fit_motion(noisy.tracks, lines=lines)
+
+
+def test_lines_of_no_weight_are_as_if_they_were_not_there(lens, noisy, lines, with_lines):
+    other = eqx.tree_at(lambda lens: lens.zoom.parameters, lens, -3 * lens.zoom.parameters)
+    wrong = motion_lines(other, np.asarray(lines.focal), noise=0.2, seed=2)
+    number = len(lines.frame)
+    points = [line for some in (lines, wrong) for line in some.to_ragged()]
+    both = Lines.from_ragged(
+        points,
+        np.concatenate([lines.frame, wrong.frame]),
+        lines.focal,
+        image_size=lines.image_size,
+        focal_unit="px",
+    )
+    weight = np.where(np.arange(len(points)) < number, 7.0, 0.0)
+    fit = fit_motion(noisy.tracks, lines=both.weighted(weight))
+    np.testing.assert_allclose(fit.focal, with_lines.focal, rtol=1e-6)
+    assert float(fit.line_noise) == pytest.approx(float(with_lines.line_noise), rel=1e-6)
+    ignored = fit_motion(noisy.tracks, lines=both, throw=False)
+    assert abs(np.asarray(ignored.focal) / np.asarray(with_lines.focal) - 1).max() > 1e-3
 
 
 def test_lines_of_the_same_frames_make_the_lens_better(lens, path, fit, with_lines):
@@ -215,6 +244,9 @@ def test_lines_of_something_else_are_refused(noisy, lines, path):
         fit_motion(noisy.tracks, lines=compress_any_centre(lines.about(np.array([100.0, 100.0]))))
     with pytest.raises(ValueError, match="compressed for 2 terms, but 3"):
         fit_motion(noisy.tracks, lines=compress_any_centre(lines.about((np.array(SIZE) - 1) / 2)), terms=3)
+    for wrong in (np.array([0.5]), np.array([0, 1]), np.array([FRAMES]), np.array([-1])):
+        with pytest.raises((ValueError, TypeError), match="line_frames"):
+            fit_motion(noisy.tracks, lines=few, line_frames=wrong)
     with pytest.raises(ValueError, match="line_frames is for argument lines"):
         fit_motion(noisy.tracks, line_frames=np.arange(FRAMES))
     with pytest.raises(ValueError, match="BrownConrady is not"):
@@ -259,7 +291,7 @@ def test_a_camera_that_stands_still_tells_nothing_of_its_shutter(lens, path):
 def test_derivatives_are_those_of_the_minimum(noisy, lines):
     """Newton's method from the fit gives the minimum for other points, with the noise held."""
     asked = Asked(PolynomialZoom(), RadialPolynomial(), 2, PolynomialZoom(degree=1), None)
-    given = Given(noisy.tracks, lines, None, None, np.inf)
+    given = Given(noisy.tracks, lines, None, None, None)
     _, model, noise = _fitted(given, asked, True)
     data = problem_of(given, asked).data
     rng = np.random.default_rng(0)

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse.csgraph
@@ -33,7 +34,7 @@ class Given(NamedTuple):
     lines: Lines | AnyCentreLines | None
     line_frames: Int[AnyArray, "some"] | None
     focal: Float[AnyArray, "frame"] | None
-    focal_std: float | int | Float[AnyArray, "frame"]
+    focal_std: float | int | Float[AnyArray, "frame"] | None
 
 
 class Asked(NamedTuple):
@@ -92,7 +93,7 @@ def problem_of(given: Given, asked: Asked) -> Problem:
         log_std=jnp.pad(std / focal, (0, more), constant_values=np.inf),
         unknowns=jnp.asarray(4.0 * np.sum(shot >= 0) + 2 * structure.tracks),
         neighbours=jnp.asarray(_neighbours(np.pad(shot, (0, more), constant_values=-1))),
-        readout=jnp.asarray(_READOUT if asked.readout is None else (asked.readout, _TOLD)),
+        readout=jnp.asarray(_known_readout(asked.readout)),
         lines=lines,
         moments=None if lines is None else lines.second_moments(2 * lines.terms),
         scale=tracks.scale,
@@ -103,17 +104,41 @@ def problem_of(given: Given, asked: Asked) -> Problem:
 
 def _known_focal(focal, focal_std, frames):
     """Known focal lengths and standard deviations of all frames; 1 and infinity where there is none."""
-    values = jnp.full(frames, jnp.nan) if focal is None else jnp.asarray(focal, float)
-    if values.shape != (frames,):
+    if (focal is None) != (focal_std is None):
         raise ValueError(
-            f"Argument focal must have one number for each of the {frames} frames, NaN where it is not "
-            f"known, but its shape is {values.shape}."
+            "Arguments focal and focal_std belong together, the focal lengths known beforehand and their "
+            "standard deviations, px: give both, or neither."
         )
-    if not traced((focal, focal_std)) and (np.any(values <= 0) or not np.all(np.asarray(focal_std) > 0)):
-        raise ValueError("Arguments focal and focal_std must be positive.")
+    if focal is None:
+        return jnp.ones(frames), jnp.full(frames, jnp.inf)
+    values, std = jnp.asarray(focal, float), jnp.asarray(focal_std, float)
+    if values.shape != (frames,) or std.shape not in ((), (frames,)):
+        raise ValueError(
+            f"Arguments focal and focal_std must have a number for each of the {frames} frames, focal NaN "
+            f"where it is not known and focal_std or one for all, but their shapes are {values.shape} and "
+            f"{std.shape}."
+        )
+    if not traced((focal, focal_std)) and (
+        np.any(values <= 0) or np.any(np.isinf(values)) or not np.all(np.asarray(std) > 0)
+    ):
+        raise ValueError("Arguments focal and focal_std must be positive, and focal finite or NaN.")
     there = jnp.isfinite(values)
-    std = jnp.where(there, jnp.broadcast_to(jnp.asarray(focal_std, float), frames), jnp.inf)
-    return jnp.where(there, values, 1.0), std
+    return jnp.where(there, values, 1.0), jnp.where(there, std, jnp.inf)
+
+
+def _known_readout(readout):
+    """What is known of the readout, and its standard deviation, frames."""
+    if readout is None:
+        return _READOUT
+    numeric = (
+        isinstance(readout, float | int | np.ndarray | np.number | jax.Array) and np.ndim(readout) == 0
+    )
+    if not traced(readout) and not (numeric and abs(readout) <= 1):
+        raise ValueError(
+            "Argument readout must be the time from the first row to the last, in frames: a number from -1 "
+            f"to 1, 0 for a global shutter, but it is {readout}."
+        )
+    return readout, _TOLD
 
 
 def _ready_lines(given, family, size):
@@ -133,7 +158,8 @@ def _ready_lines(given, family, size):
             f"{tracks.image_size} px."
         )
     frames = np.arange(tracks.frames) if line_frames is None else np.asarray(line_frames)
-    if len(frames) != len(lines.focal) or frames.min() < 0 or frames.max() >= tracks.frames:
+    whole = frames.dtype.kind in "iu" and frames.shape == lines.focal.shape
+    if not whole or frames.min() < 0 or frames.max() >= tracks.frames:
         raise ValueError(
             f"Argument line_frames must say which of the {tracks.frames} frames of the tracks each of the "
             f"{len(lines.focal)} frames of the lines is, and it does not."
@@ -152,6 +178,7 @@ def _ready_lines(given, family, size):
     more = bucket(len(frame)) - len(frame)
     frame = np.pad(frame, (0, more))
     triangle = jnp.pad(small.triangle.astype(float), ((0, more), (0, 0), (0, 0)))
+    weight = jnp.pad(_relative_weights(small), (0, more))
     ones = jnp.ones(1)  # nothing here depends on focal lengths
     ready = AnyCentreLines(
         triangle=triangle,
@@ -160,8 +187,19 @@ def _ready_lines(given, family, size):
         centre=small.centre,
         image_size=small.image_size,
         focal_unit=small.focal_unit,
+        weight=weight,
     )
     return ready, frame
+
+
+def _relative_weights(lines):
+    """Weights of lines, 1 in the mean over those of a frame that count."""
+    if lines.weight is None:
+        return jnp.ones(len(lines.frame))
+    both = jnp.stack([lines.weight, 1.0 * (lines.weight > 0)], axis=1)
+    sums = jax.ops.segment_sum(both, lines.frame, len(lines.focal))
+    mean = (sums[:, 0] / jnp.maximum(sums[:, 1], 1))[lines.frame]
+    return lines.weight / jnp.where(mean > 0, mean, 1)
 
 
 def _neighbours(shot):

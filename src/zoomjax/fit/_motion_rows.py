@@ -311,10 +311,7 @@ def _product(matrix, vector):
 
 
 def line_residuals_of(data: Data, model: Model) -> Float[Array, "line row"]:
-    """Distances of lines' corrected points to them, taken back into the image, px.
-
-    Or rows that have the same sum of squares. No rows where there are no lines.
-    """
+    """Distances of lines' corrected points to them, in the image, px, or rows with their sum of squares."""
     lines = data.lines
     if lines is None:
         return jnp.zeros((0, 1))
@@ -330,11 +327,17 @@ def line_residuals_of(data: Data, model: Model) -> Float[Array, "line row"]:
 
 
 def line_squares_of(data: Data, distances: Float[Array, "line row"]) -> Float[Array, "line"]:
-    """Mean square of each line's distances, px^2; NaN where there is no line."""
+    """Mean square of each line's distances, px^2; NaN where there is no line, or one of weight 0."""
     if data.lines is None:
         return jnp.zeros(0)
-    free = data.lines.counts - 2  # a line takes two
+    free = jnp.where(data.lines.weight == 0, 0, data.lines.counts - 2)  # a line takes two
     return jnp.where(free > 0, jnp.sum(distances**2, axis=1) / jnp.maximum(free, 1), jnp.nan)
+
+
+def weighed(data: Data, rows: Float[Array, "line row"]) -> Float[Array, "line row"]:
+    """Each line's rows times the root of its weight."""
+    weight = None if data.lines is None else data.lines.weight
+    return rows if weight is None else jnp.sqrt(weight)[:, None] * rows
 
 
 def averaged(data: Data, model: Model) -> Float[Array, "track 3"]:
@@ -364,7 +367,7 @@ def rows_of(unknowns: Unknowns, args: tuple[Data, Model, Noise, Stage]) -> Rows:
     of_lines = jnp.nan_to_num(line_squares_of(data, lines)) / (noise.lines * WRONG_LINE) ** 2
     return Rows(
         views * _flattened(squared)[:, None],
-        lines / noise.lines * _flattened(of_lines)[:, None],
+        weighed(data, lines / noise.lines * _flattened(of_lines)[:, None]),
         about_frames(data, there.path, unknowns, steps, stage),
         about_lens(data, there, unknowns, stage),
     )

@@ -29,6 +29,7 @@ from ._motion_rows import (
     rows_of,
     speed_of,
     units_of,
+    weighed,
 )
 from ._motion_start import STARTS
 from ._schur import Rows, Schur, Unknowns, covariances, reduced
@@ -172,7 +173,7 @@ def _described(data, model, noise, stage, result, steps):
         lines = line_residuals_of(data, there) / noise.lines
         return Rows(
             jnp.where(inlier[:, None], views, 0),
-            jnp.where(good[:, None], lines, 0),
+            weighed(data, jnp.where(good[:, None], lines, 0)),
             about_frames(data, there.path, unknowns, steps, stage),
             about_lens(data, there, unknowns, stage),
         )

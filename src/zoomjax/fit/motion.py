@@ -109,7 +109,7 @@ def fit_motion(
     line_frames: Int[AnyArray, "some"] | None = None,
     readout: float | int | None = None,
     focal: Float[AnyArray, "frame"] | None = None,
-    focal_std: float | Float[AnyArray, "frame"] = np.inf,
+    focal_std: float | int | Float[AnyArray, "frame"] | None = None,
     throw: bool = True,
 ) -> MotionFit:
     """Fit focal lengths, rotations and a zoom lens to tracks of points that are far away or do not move.
@@ -125,11 +125,13 @@ def fit_motion(
         shift: zoom model of the offset of the centre of distortion from the centre of the image: linear
             in 1/f by default; None if there is none.
         lines: straight lines that are seen in the same frames, which weigh by their own noise; or these
-            compressed about the centre of the image. Their focal lengths do not count.
+            compressed about the centre of the image. Their focal lengths do not count, their weights do,
+            beside other lines of the frame.
         line_frames: which of the tracks' frames each frame of the lines is; by default they are the same.
-        readout: time from the first row to the last, in frames: 0 for a global shutter. Fitted by default.
+        readout: time from the first row to the last, in frames, -1 to 1: 0 for a global shutter. Fitted by
+            default.
         focal: focal lengths that are known beforehand, px; NaN where not.
-        focal_std: their standard deviations, px.
+        focal_std: their standard deviations, px, above 0; needed if `focal` is given.
         throw: whether to raise if the fit fails. Otherwise see `ZoomFit.result`. `undetermined` and
             `folded` never raise.
 
