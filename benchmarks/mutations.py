@@ -467,5 +467,5 @@ READERS = {
     "TIFF": Reader(".tif", _photo_files(".tif"), _read_photo, sound_photo),
     "BMP": Reader(".bmp", _photo_files(".bmp"), _read_photo, sound_photo),
     "video": Reader(".mp4", _video_files, _read_video, sound_frames),
-    **{fmt.name: _foreign(fmt.name, fmt.suffixes[0]) for fmt in zj.interop.formats() if fmt.reads},
+    **{fmt.name: _foreign(fmt.name, fmt.suffixes[0]) for fmt in zj.interop.formats()},
 }

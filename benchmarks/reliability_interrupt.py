@@ -26,12 +26,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import av
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import psutil
 
@@ -121,15 +122,40 @@ def _video(folder: Path) -> Command:
     scenes.nikkor_18_200((320, 214)).save(folder / "lens.json")
     rng = np.random.default_rng(0)
     image = cv2.GaussianBlur(rng.uniform(0, 255, (214, 320, 3)).astype(np.float32), (0, 0), 2)
-    with av.open(str(folder / "clip.mp4"), "w") as out:
-        video: Any = out.add_stream("libx264", rate=30)
-        video.width, video.height, video.pix_fmt = 320, 214, "yuv420p"
-        for number in range(60):
-            frame = av.VideoFrame.from_ndarray(np.roll(image, number, 1).astype(np.uint8), "bgr24")
-            out.mux(video.encode(frame.reformat(format="yuv420p")))
-        out.mux(video.encode(None))
+    _write_clip(folder / "clip.mp4", (np.roll(image, number, 1).astype(np.uint8) for number in range(60)))
     arguments = ["undistort", "lens.json", "clip.mp4", "-o", "out/corrected.mp4", "--focal", "24"]
     return Command("undistort, video", arguments, folder, again=False, same=False)
+
+
+def _write_clip(path: Path, images: Iterable[np.ndarray]) -> None:
+    with av.open(str(path), "w") as out:
+        video: Any = None
+        for image in images:
+            if video is None:
+                video = out.add_stream("libx264", rate=30)
+                video.height, video.width = image.shape[:2]
+                video.pix_fmt = "yuv420p"
+            frame = av.VideoFrame.from_ndarray(image, "bgr24")
+            out.mux(video.encode(frame.reformat(format="yuv420p")))
+        out.mux(video.encode(None))
+
+
+def _clip(folder: Path) -> Command:
+    coeffs = jnp.array([[0.02, 0.0], [-0.05, 0.01], [-0.1, 0.03]])
+    zoom = zj.PolynomialZoom(2, coeffs, jnp.array(500.0))
+    lens = zj.ZoomLens(zoom, jnp.array([322.0, 178.0]), jnp.array([500.0, 1200.0]), (640, 360), "px")
+    path = scenes.pan_and_zoom(lens, 36, pan=20, tilt=5)
+    _write_clip(folder / "clip.mp4", scenes.motion_clip(lens, *path, noise=2).frames())
+    arguments = ["calibrate", "clip.mp4", "-o", "out", "--focal", "motion", "--degree", "1"]
+    return Command("calibrate, clip", arguments, folder, same=False)
+
+
+def _demo(folder: Path) -> Command:
+    return Command("demo", ["demo", "-o", "out", "--photos", "3"], folder, same=False)
+
+
+def _lens(folder: Path) -> Command:
+    return Command("lens", ["lens", "nikkor 18-200 ii", "-o", "out"], folder, again=False, same=False)
 
 
 def _export(folder: Path) -> Command:
@@ -155,11 +181,14 @@ def _import(folder: Path) -> Command:
 COMMANDS = {
     "lines": _lines,
     "photos": _photos,
+    "clip": _clip,
+    "demo": _demo,
     "undistort": _undistort,
     "video": _video,
     "export": _export,
     "stmap": _stmap,
     "import": _import,
+    "lens": _lens,
 }
 """What makes each command, with its files, in an empty folder."""
 

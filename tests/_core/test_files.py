@@ -4,7 +4,15 @@ import os
 
 import pytest
 
-from zoomjax._core.files import refuse_existing, remove_left, whole_file
+from zoomjax._core.files import (
+    refuse_existing,
+    refuse_inputs,
+    refuse_links,
+    remove_left,
+    settled,
+    whole_file,
+    whole_folder,
+)
 
 
 def test_what_is_there_is_not_replaced_unless_that_is_given(tmp_path):
@@ -75,3 +83,36 @@ def test_parts_that_no_process_uses_are_removed(tmp_path):
     names = {theirs.name, folder.name, link.name, ".zoomjax-0pipe__0.part", "video.mp4"}
     assert {path.name for path in tmp_path.iterdir()} == names
     remove_left(tmp_path / "nowhere")
+
+
+def test_a_folder_that_is_not_there_hides_nothing(tmp_path, monkeypatch):
+    """``new/../a`` is not found while ``new`` is missing, and is ``a`` once somebody makes it."""
+    (tmp_path / "a").write_text("mine")
+    (tmp_path / "there").mkdir()
+    hidden = tmp_path / "new" / ".." / "a"
+    assert not hidden.exists()
+    assert settled(hidden).samefile(tmp_path / "a")
+    assert settled(tmp_path / "new" / "..").samefile(tmp_path)
+    assert settled(tmp_path / "new" / "deep" / ".." / ".." / "b").parent.samefile(tmp_path)
+    for plain in ("a", "new/b", "there/../a"):
+        assert settled(tmp_path / plain) == tmp_path / plain
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileExistsError, match="already exists"):
+        refuse_existing([hidden], overwrite=False)
+    with pytest.raises(ValueError, match="is the input"):
+        refuse_inputs([hidden], [tmp_path / "a"])
+    with pytest.raises(ValueError, match="is not in the folder"):
+        refuse_links(tmp_path / "out", [tmp_path / "out" / "b", tmp_path / "out" / ".." / "a"])
+
+
+def test_a_folder_in_place_of_a_file_is_told_before_any_is_replaced(tmp_path):
+    (tmp_path / "out" / "b").mkdir(parents=True)
+    (tmp_path / "out" / "a").write_text("mine")
+
+    def fill(part):
+        for name in ("a", "b"):
+            (part / name).write_text("new")
+
+    with pytest.raises(IsADirectoryError, match="folder"), whole_folder(tmp_path / "out") as part:
+        fill(part)
+    assert (tmp_path / "out" / "a").read_text() == "mine"

@@ -5,6 +5,7 @@ import importlib.metadata
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app.arguments import centre_of
+from zoomjax.app.arguments import centre_of, read_lines
 from zoomjax.app.demo import write_photos
 from zoomjax.lines.csv import write_lines_csv
 
@@ -159,6 +160,52 @@ def test_calibrate_allows_for_uncertain_focal_lengths(calibrated, tmp_path):
 
 
 @pytest.mark.slow
+def test_lines_are_fitted_again_where_they_are(calibrated, tmp_path):
+    """A folder of results stands for its lines, which stay as they are; overlays of the fit before go."""
+    folder = tmp_path / "mylens"
+    shutil.copytree(calibrated[0], folder)
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    done = zoomjax(
+        "calibrate", folder, "-o", folder, "--exclude", "0,7", "--degree", 1, "--centre", "image"
+    )
+    assert done.returncode == 0, done.stderr
+    after = {file.name: file.read_bytes() for file in folder.iterdir()}
+    assert set(after) == set(before)
+    assert after["lines.npz"] == before["lines.npz"]
+    assert after["lens.json"] != before["lens.json"]
+    old, new = (json.loads(content["summary.json"]) for content in (before, after))
+    assert new["rms_none"] != old["rms_none"]  # without two lines
+    assert len(new["parameters"]) < len(old["parameters"])
+    again = zoomjax("calibrate", "lines.npz", "-o", ".", "--dry-run", cwd=folder)
+    assert again.returncode == 0, again.stderr
+    other = zoomjax("calibrate", folder, "-o", tmp_path / "new", *FORCED)
+    assert other.returncode == 0, other.stderr
+    assert json.loads((tmp_path / "new" / "summary.json").read_text())["parameters"] == old["parameters"]
+
+
+def test_files_of_lines_are_read_one_after_the_other(few_lines, tmp_path):
+    ragged, frame = few_lines.to_ragged(), np.asarray(few_lines.frame)
+    for name, frames in (("a", [0, 1]), ("b", [2, 3, 4])):
+        some = np.flatnonzero(np.isin(frame, frames))
+        zj.Lines.from_ragged(
+            [ragged[n] for n in some],
+            frame[some] - frames[0],
+            few_lines.focal[np.array(frames)],
+            image_size=few_lines.image_size,
+        ).save(tmp_path / f"{name}.npz")
+    both = read_lines([tmp_path / "a.npz", tmp_path / "b.npz"], None, None, None)
+    np.testing.assert_array_equal(both.focal, few_lines.focal)
+    np.testing.assert_array_equal(both.frame, few_lines.frame)
+    np.testing.assert_array_equal(np.concatenate(both.to_ragged()), np.concatenate(ragged))
+    line = np.stack([np.arange(9.0), np.full(9, 3.0)], axis=-1)
+    zj.Lines.from_ragged([line], [0], [24.0], image_size=(640, 480)).save(tmp_path / "c.npz")
+    with pytest.raises(
+        ValueError, match=r"The files of lines must hold .* size of .*a\.npz is .*c\.npz is"
+    ):
+        read_lines([tmp_path / "a.npz", tmp_path / "b.npz", tmp_path / "c.npz"], None, None, None)
+
+
+@pytest.mark.slow
 def test_calibrate_reads_csv(calibrated, few_lines, tmp_path):
     write_lines_csv(few_lines, tmp_path / "lines.csv")
     size = ("--image-size", "4288x2848")
@@ -293,7 +340,7 @@ WRONG = {
     "a line that is none": (["lines.npz", "--exclude", "1,x"], "--exclude must be numbers of lines"),
     "a line that is not there": (["lines.npz", "--exclude", "9999"], "There is no line 9999"),
     "lines of images": (["a.jpg", "--exclude", "3"], "--exclude is for a file of lines"),
-    "two files": (["lines.npz", "lines.npz"], "one file"),
+    "two files": (["lines.npz", "./lines.npz"], "lines.npz is given twice"),
     "options for another kind": (["lines.npz", "--image-size", "640x480"], "for CSV files"),
     "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),
     "a degree of another model": (["lines.npz", "--model", "spline", "--degree", "1"], "for polynomials"),
@@ -346,7 +393,8 @@ def test_an_option_without_effect_is_refused(options, sentence, wrong_files):
 
 def test_calibrate_does_not_replace_its_input(wrong_files):
     before = (wrong_files / "lines.npz").read_bytes()
-    done = zoomjax("calibrate", "lines.npz", "-o", ".", cwd=wrong_files)
+    (wrong_files / "lines.csv").write_text("frame,line,x,y,focal\n")
+    done = zoomjax("calibrate", "lines.npz", "lines.csv", "-o", ".", "--overwrite", cwd=wrong_files)
     assert done.returncode == 2
     assert "is the input" in done.stderr
     assert (wrong_files / "lines.npz").read_bytes() == before

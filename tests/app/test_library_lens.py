@@ -1,6 +1,7 @@
 """``zoomjax undistort --lens`` and ``zoomjax lens``: photos with EXIF data, corrected by the library."""
 
 import json
+import shlex
 import subprocess
 import sys
 
@@ -10,9 +11,11 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 import zoomjax as zj
+from zoomjax.app.commands_lens import app
 from zoomjax.app.library_lens import rows, undistort_by_library, write_lens
 from zoomjax.app.undistort_files import Job
 from zoomjax.io import read_photo
+from zoomjax.lenses.database import one_named
 
 from .._commands import SEVERAL
 from ..io.test_equipment import block
@@ -98,7 +101,9 @@ def test_the_commands_list_write_and_say_what_to_give(tmp_path):
         ["lens", NIKKOR, "-o", "lens.json", "--image-size", "300x200"],
         ["lens", "nikkor 18-200", "-o", "other.json"],
         ["undistort", "a.jpg", "-o", "out"],
+        ["lens", NIKKOR, "-o", "new/../mine.json"],
     ]
+    (tmp_path / "mine.json").write_text("mine")
     done = subprocess.run(
         [sys.executable, "-c", SEVERAL],
         input=json.dumps([(str(tmp_path), ["zoomjax", *words]) for words in jobs]),
@@ -107,10 +112,13 @@ def test_the_commands_list_write_and_say_what_to_give(tmp_path):
         timeout=300,
     )
     assert done.returncode == 0, done.stderr
-    (listed, table), (made, said), (asked, question), (refused, hint) = json.loads(
+    (listed, table), (made, said), (asked, question), (refused, hint), (kept, exists) = json.loads(
         done.stdout.splitlines()[-1]
     )
-    assert (listed, made, asked, refused) == (0, 0, 2, 2)
+    assert (listed, made, asked, refused, kept) == (0, 0, 2, 2, 2)
+    assert "mine.json already exists" in exists
+    assert (tmp_path / "mine.json").read_text() == "mine"
+    assert not (tmp_path / "new").exists()
     assert table.count("AF-S") == 2
     assert said.startswith(NIKKOR)
     assert zj.load_lens(tmp_path / "lens.json").image_size == SIZE
@@ -125,3 +133,26 @@ def test_without_lensfunpy_the_command_says_what_to_install():
     assert done.stderr == (
         'Error: The library of lenses needs the extra "lensfun": pip install "zoomjax[lensfun]"\n'
     )
+
+
+def test_the_example_of_the_help_finds_one_lens():
+    [command] = [c for c in app.registered_commands if c.callback and c.callback.__name__ == "lens"]
+    example = shlex.split(command.epilog.split("`")[1])
+    assert example[:2] == ["zoomjax", "lens"]
+    assert one_named(example[2])[0].name == f"{NIKKOR} II"
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_no_input_of_another_lens_is_replaced(resume, tmp_path):
+    """Each size is a group of its own: the target of one was the input of another."""
+    (tmp_path / "in").mkdir()
+    (tmp_path / "out" / "in").mkdir(parents=True)
+    first = photo(tmp_path / "in" / "x.png")
+    second = tmp_path / "out" / "in" / "x.png"
+    Image.fromarray(np.zeros((300, 200, 3), np.uint8)).save(
+        second, exif=block(of=D300, FocalLength=IFDRational(18, 1), LensModel=NIKKOR)
+    )
+    before = second.read_bytes()
+    with pytest.raises(ValueError, match="is the input"):
+        undistort_by_library(job(tmp_path, first, second, overwrite=True, resume=resume), NIKKOR)
+    assert second.read_bytes() == before

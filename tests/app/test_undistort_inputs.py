@@ -166,6 +166,7 @@ def test_several_videos_each_with_its_own_track(folder):
         undistort_files(job(folder, "*.mp4", focal=str(folder / "tracks/a.csv"), out="other"))
     again = undistort_files(job(folder, "*.mp4", focal=str(folder / "tracks"), resume=True))
     assert again.sentence.startswith("0 of 2 videos corrected now, 2 earlier")
+    assert "a.mp4 and 1 more. Such files hold no mark" in again.notes[-1]
     (folder / "c.mp4").write_bytes(b"no video")
     (folder / "tracks/c.csv").write_text("frame,focal\n0,20\n")
     skipping = dataclasses.replace(job(folder, "b.mp4", "c.mp4", out="new"), focal=str(folder / "tracks"))
@@ -200,3 +201,47 @@ def test_a_dead_link_and_an_empty_folder_cost_themselves(folder):
         source.name for source in find_photos([folder / name for name in ("in", "dead.jpg", "empty.jpg")])
     ]
     assert {"dead.jpg", "empty.jpg"} < {name.rsplit("/", 1)[-1] for name in photos}
+
+
+def test_dots_in_a_pattern_lead_nowhere(folder):
+    """Names below the fixed part of a pattern may begin with ``..``, and led out of the output folder."""
+    before = (folder / "in/a.jpg").read_bytes()
+    (folder / "far/deep").mkdir(parents=True)
+    done = undistort_files(job(folder, "far/*/../../in/a*.jpg", out="new/out"))
+    assert done.written == 1
+    assert (folder / "in/a.jpg").read_bytes() == before
+    assert files(folder / "new") == ["out/in/a.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [
+        ("in/new/../a.jpg", r"is the input"),
+        ("in/new/..", r"is the input"),
+        ("in/new/../other.jpg", r"already exists"),
+    ],
+)
+def test_dots_after_a_folder_that_is_not_there_hide_no_file(out, message, folder):
+    (folder / "in/other.jpg").write_text("precious")
+    before = {name: (folder / "in" / name).read_bytes() for name in files(folder / "in")}
+    with pytest.raises((ValueError, FileExistsError), match=message):
+        undistort_files(job(folder, "in/a.jpg", out=out))
+    assert {name: (folder / "in" / name).read_bytes() for name in files(folder / "in")} == before
+
+
+def test_what_is_no_result_is_not_counted_as_one(folder):
+    Image.fromarray(picture(0)).save(folder / "in/b.bmp")
+    Image.fromarray(picture(0)).save(folder / "in/c.bmp")
+    (folder / "out").mkdir()
+    (folder / "out/b.bmp").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"b\.bmp already exists"):
+        undistort_files(job(folder, "in/b.bmp", "in/c.bmp", focal="24", resume=True))
+    (folder / "out/b.bmp").unlink()
+    undistort_files(job(folder, "in/b.bmp", focal="24", out="out/b.bmp"))
+    done = undistort_files(job(folder, "in/b.bmp", "in/c.bmp", focal="24", resume=True))
+    assert done.sentence.startswith("1 of 2 photos corrected now, 1 earlier")
+    assert [note for note in done.notes if "out/b.bmp. Such files hold no mark" in note]
+    write_clip(folder / "c.mp4")
+    (folder / "out/c.mp4").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"c\.mp4 already exists"):
+        undistort_files(job(folder, "c.mp4", focal="24", resume=True))

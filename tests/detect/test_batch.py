@@ -1,7 +1,9 @@
 """Lines of many images: the same over processes and from the cache, and bad images in between."""
 
+import importlib.util
 import io
 import multiprocessing
+import sys
 
 import cv2
 import numpy as np
@@ -99,9 +101,83 @@ def test_another_detector_or_program_looks_again(photos, marker, tmp_path, monke
     list(detect(photos[:1], marker, cache=cache))
     list(detect(photos[:1], Marker(str(tmp_path / "other.txt")), cache=cache))
     assert len(list(cache.iterdir())) == 2
-    monkeypatch.setattr(module, "_code", lambda: b"changed")
+    monkeypatch.setattr(module, "_code", lambda kind: b"changed")
     list(detect(photos[:1], marker, cache=cache))
     assert looks(marker) == 2
+
+
+class Filled(zj.detect.AbstractDetector):
+    """Finds one line, at the height that its setting says."""
+
+    height: np.ndarray
+
+    def __call__(self, image):
+        return [np.stack([np.arange(20.0), np.full(20, float(self.height[0]))], -1)]
+
+
+def test_images_of_other_shapes_and_detectors_of_other_arrays_are_others(tmp_path, marker):
+    pixels = np.zeros(64 * 96, np.uint8)
+    pixels[:96] = 255
+    for shape in ((64, 96), (96, 64)):
+        [found] = detect([Source("a", None, pixels.reshape(shape))], marker, cache=tmp_path / "cache")
+        assert found.image_size == shape[::-1]
+        assert len(found.lines) == 1
+        assert np.ptp(found.lines[0][:, 0]) > shape[1] - 8
+    for height in (1.0, 33.0):
+        [found] = detect(
+            [Source("a", None, pixels.reshape(64, 96))],
+            Filled(np.array([height, 2.0])),
+            cache=tmp_path / "cache",
+        )
+        assert found.lines[0][0, 1] == height
+
+
+def test_a_detector_whose_file_has_changed_looks_again(tmp_path):
+    image = np.zeros((64, 96), np.uint8)
+    for height in (1, 5):
+        file = tmp_path / "own_detector.py"
+        file.write_text(OWN.format(height))
+        spec = importlib.util.spec_from_file_location("own_detector", file)
+        own = importlib.util.module_from_spec(spec)
+        sys.modules["own_detector"] = own
+        spec.loader.exec_module(own)
+        [found] = detect([Source("a", None, image)], own.Own(), cache=tmp_path / "cache")
+        assert found.lines[0][0, 1] == height
+
+
+OWN = """
+import numpy as np, zoomjax as zj
+class Own(zj.detect.AbstractDetector):
+    def __call__(self, image):
+        return [np.stack([np.arange(20.0), np.full(20, {})], -1)]
+"""
+
+
+class Poor(zj.detect.AbstractDetector):
+    """Finds nothing that is a line."""
+
+    def __call__(self, image):
+        return [np.array([[0.3, 0.3], [0.30001, 0.3], [0.30002, 0.3]]), np.zeros((0, 2))]
+
+
+def test_points_of_one_place_and_none_are_no_lines():
+    [found] = detect([Source("a", None, np.zeros((64, 96), np.uint8))], Poor())
+    assert found.lines == ()
+    assert "no lines" in found.problem
+
+
+@pytest.mark.parametrize(
+    "call", [zj.detect.find_checkerboard, zj.detect.find_dots, zj.detect.GridDetector()]
+)
+def test_a_list_is_no_image(call):
+    with pytest.raises((ValueError, TypeError), match="image"):
+        call([[0, 255], [255, 0]])
+
+
+def test_a_source_is_a_file_or_pixels():
+    for wrong in ({}, {"path": "a.jpg", "image": np.zeros((32, 32), np.uint8)}, {"image": [[0]]}):
+        with pytest.raises((ValueError, TypeError), match="image"):
+            Source("a", **wrong)
 
 
 def _rezipped(content, **changed):

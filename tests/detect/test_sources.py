@@ -1,5 +1,6 @@
 """Photographs of every kind, folders, patterns, and the frames of a video."""
 
+import contextlib
 import warnings
 
 import av
@@ -9,6 +10,7 @@ import pytest
 
 from zoomjax.detect.sources import as_bytes, find_photos, video_frames
 from zoomjax.io.focal_track import FocalTrack
+from zoomjax.io.video_reader import decode_video
 
 from .._clips import FRAMES, cut_off, focal, picture, write_clip
 from .._exif import exif
@@ -211,6 +213,17 @@ def test_a_video_that_ends_early_gives_the_frames_before_that(clip, tmp_path):
     with pytest.warns(UserWarning, match=rf"ends early, after \d+ of {FRAMES} frames"):
         found = list(video_frames(cut, 30.0, FRAMES))
     assert 3 < len(found) < FRAMES
+
+
+def test_a_video_of_which_no_wanted_frame_is_there_is_an_error(clip, monkeypatch):
+    @contextlib.contextmanager
+    def announced(path):
+        with decode_video(path) as (_, frames):
+            yield 10_000, (frame for frame in frames if frame[0] > 0)
+
+    monkeypatch.setattr("zoomjax.io.video_reader.decode_video", announced)
+    with pytest.raises(ValueError, match="of 10000 frames none of the 5 wanted can be decoded"):
+        list(video_frames(clip, 30.0, 5))
 
 
 def test_a_whole_video_gives_no_warning(clip):

@@ -1,5 +1,7 @@
 """Line primitives as CSV: what is read back, and what is refused with which words."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -107,3 +109,17 @@ def test_focal_lengths_in_the_file_and_beside_it_are_refused(tmp_path):
     ):
         read_lines_csv(path, image_size=SIZE, focal={0: 50.0})
     assert read_lines_csv(path, image_size=SIZE).focal.tolist() == [24]
+
+
+@pytest.mark.parametrize(
+    ("changed", "what"),
+    [
+        (lambda lines: lines.weighted(np.ones(len(lines.frame))), "weights"),
+        (lambda lines: dataclasses.replace(lines, centre=np.array([5.0, 5.0])), "another centre"),
+        (lambda lines: dataclasses.replace(lines, focus=np.zeros(len(lines.focal))), "a focus"),
+    ],
+)
+def test_what_has_no_column_is_refused(changed, what, tmp_path):
+    with pytest.raises(ValueError, match=rf"has {what}.*save the lines as \.npz"):
+        write_lines_csv(changed(lines_of(np.float64)), tmp_path / "lines.csv")
+    assert not (tmp_path / "lines.csv").exists()

@@ -83,6 +83,34 @@ def test_file_keeps_every_digit(dtype, ragged, tmp_path):
     assert_same(zj.load_lines(tmp_path / "lines.npz"), lines)
 
 
+@pytest.mark.parametrize("points", [(ROW, ROW[:2], ROW + 1, 0.9 * ROW), (ROW, ROW[:2], ROW + 1, ROW)])
+def test_file_keeps_numbers_of_lines(points, tmp_path):
+    with pytest.warns(UserWarning, match="Dropped 1 of 4"):
+        lines = make(points=points, frame=(0, 0, 1, 1))
+    np.testing.assert_array_equal(lines.number, [0, 2, 3])
+    lines.weighted(np.array([1.0, 2.0, 3.0])).save(tmp_path / "lines.npz")
+    loaded = zj.load_lines(tmp_path / "lines.npz")
+    np.testing.assert_array_equal(loaded.number, [0, 2, 3])
+    np.testing.assert_array_equal(loaded.weight, [1, 2, 3])
+
+
+def test_file_keeps_fields_of_other_dtypes(tmp_path):
+    lines = make(points=(ROW.astype(np.float32), ROW.astype(np.float32) + 1))
+    given = dataclasses.replace(lines, focal=np.array([24.1, 70.3]), centre=np.array([2.1, 1.7]))
+    given.save(tmp_path / "lines.npz")
+    assert_same(zj.load_lines(tmp_path / "lines.npz"), given)
+
+
+def test_what_could_not_be_read_is_not_saved(tmp_path):
+    lines = make()
+    short = dataclasses.replace(
+        lines, mask=np.asarray(lines.mask) & ([[True], [False]] | (np.arange(5) < 2))
+    )
+    with pytest.raises(ValueError, match="1 of 2 frames have no line of three points"):
+        short.save(tmp_path / "lines.npz")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_file_keeps_weights(tmp_path):
     make().weighted([0.5, 0.0]).save(tmp_path / "lines.npz")
     np.testing.assert_array_equal(zj.load_lines(tmp_path / "lines.npz").weight, [0.5, 0])

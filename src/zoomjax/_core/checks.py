@@ -20,6 +20,32 @@ def checked_integer(name: str, value: Any, least: int) -> int:
     return number
 
 
+def check_above(limit: float | int, **values: Any) -> None:
+    """Each value a finite number above the limit, which is excluded."""
+    for name, value in values.items():
+        if not (_is_finite(value) and value > limit):
+            raise ValueError(
+                f"Argument {name} must be a finite number above {limit:g}, but it is {value!r}."
+            )
+
+
+def check_between(low: float | int, high: float | int, **values: Any) -> None:
+    """Each value a finite number from low to high, which are included."""
+    for name, value in values.items():
+        if not (_is_finite(value) and low <= value <= high):
+            most = f" to {high:g}" if high < math.inf else " or more"
+            raise ValueError(
+                f"Argument {name} must be a finite number of {low:g}{most}, but it is {value!r}."
+            )
+
+
+def _is_finite(value: Any) -> bool:
+    try:
+        return not isinstance(value, str | bytes) and math.isfinite(value)
+    except TypeError:
+        return False
+
+
 def checked_terms(terms: Any, most: int | None = None) -> int:
     """The number N of distortion coefficients, at most those that a distortion model takes."""
     number = checked_integer("terms", terms, 1)

@@ -126,9 +126,27 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
                 yield part
             path.mkdir(exist_ok=True)
             for file in sorted(part.iterdir()):
+                if (path / file.name).is_dir():
+                    raise IsADirectoryError(
+                        errno.EISDIR, "cannot write a file where there is a folder", str(path / file.name)
+                    )
+            for file in sorted(part.iterdir()):
                 file.replace(path / file.name)
         finally:
             shutil.rmtree(part, ignore_errors=True)
+
+
+def settled(path: Path) -> Path:
+    """The path, without what changes its meaning as folders are made.
+
+    While ``new`` is not there, nothing is found at ``new/../a``; once it is made, that is ``a``.
+    """
+    last_is_name = path.name != ".."
+    folder = path.parent if last_is_name else path
+    if ".." not in folder.parts or folder.exists():
+        return path
+    folder = Path(os.path.realpath(folder))
+    return folder / path.name if last_is_name else folder
 
 
 def refuse_existing(targets: Iterable[Path], *, overwrite: bool) -> None:
@@ -139,7 +157,7 @@ def refuse_existing(targets: Iterable[Path], *, overwrite: bool) -> None:
     Raises:
         FileExistsError: one of `targets` exists, and `overwrite` is False.
     """
-    there = [] if overwrite else [path for path in dict.fromkeys(targets) if os.path.lexists(path)]
+    there = [] if overwrite else [path for path in dict.fromkeys(targets) if os.path.lexists(settled(path))]
     if there:
         raise FileExistsError(
             f"{_several(there)} and would be replaced: choose another place, or give argument overwrite."
@@ -159,20 +177,24 @@ def refuse_inputs(targets: Iterable[Path], inputs: Iterable[str | os.PathLike[st
             read[about.st_dev, about.st_ino] = path
     for target in targets:
         with contextlib.suppress(OSError):
-            about = os.stat(target)
+            about = os.stat(settled(target))
             if (same := read.get((about.st_dev, about.st_ino))) is not None:
                 what = "" if os.fspath(same) == str(target) else f" {os.fspath(same)}"
                 raise ValueError(f"The output {target} is the input{what}. Choose another place.")
 
 
 def refuse_links(folder: Path, targets: Iterable[Path]) -> None:
-    """Refuse to write through a link within a folder of results: it may lead out of it.
+    """Refuse to write through a link or ``..`` within a folder of results: it may lead out of it.
 
     The folder itself may be a link, as may be what it lies in.
 
     Raises:
-        ValueError: a folder between `folder` and one of `targets` is a link.
+        ValueError: a folder between `folder` and one of `targets` is a link, or ``..``.
     """
+    targets = list(targets)
+    for target in targets:
+        if folder in target.parents and ".." in target.relative_to(folder).parts:
+            raise ValueError(f"The output {target} is not in the folder {folder}. Choose another place.")
     between = {parent for target in targets for parent in target.parents if folder in parent.parents}
     for parent in sorted(between):
         if parent.is_symlink():

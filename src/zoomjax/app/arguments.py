@@ -57,10 +57,38 @@ Centre = Annotated[
 def read_lines(
     inputs: list[Path], focal: str | None, image_size: str | None, focal_unit: str | None
 ) -> "Lines":
-    """Read the one file of lines that is given."""
-    if len(inputs) > 1:
-        raise ValueError(f"Give one file of lines; there are {len(inputs)}.")
-    [path] = inputs
+    """Read files of lines, the frames of each after those of the files before it."""
+    for index, path in enumerate(inputs):
+        if path.resolve() in [other.resolve() for other in inputs[:index]]:
+            raise ValueError(f"{path} is given twice: its lines would count twice.")
+    parts = [_read_lines(path, focal, image_size, focal_unit) for path in inputs]
+    if len(parts) == 1:
+        return parts[0]
+    from ..fit.concatenation import concatenate
+
+    try:
+        return concatenate(parts)
+    except ValueError as error:
+        told = str(error).replace("Argument parts", "The files of lines")
+        for index, path in reversed([*enumerate(inputs)]):
+            told = told.replace(f"parts[{index}]", str(path))
+        raise ValueError(told) from error
+
+
+def results_of(path: str) -> Path | None:
+    """The lines of a folder of results; None if it is something else."""
+    lines = Path(path) / "lines.npz"
+    return lines if lines.is_file() and (Path(path) / "lens.json").is_file() else None
+
+
+def refits(inputs: list[Path], target: Path) -> bool:
+    """Whether a result is the one input: lines that are fitted again where they are, and stay there."""
+    return (
+        len(inputs) == 1 and target.name == "lines.npz" and target.exists() and inputs[0].samefile(target)
+    )
+
+
+def _read_lines(path: Path, focal: str | None, image_size: str | None, focal_unit: str | None) -> "Lines":
     if path.suffix == ".npz":
         if (focal, image_size, focal_unit) != (None, None, None):
             raise ValueError(

@@ -272,13 +272,16 @@ class Calibration:
         folder: str | os.PathLike[str],
         about: dict[str, Any] | None = None,
         pages: Mapping[str, str] | None = None,
+        *,
+        lines: bool = True,
     ) -> None:
-        """Write the files of `write` into an empty folder, such as that of a `results_folder`."""
+        """Write the files of `write`, with or without the lines, into an empty `results_folder`."""
         from .plot import plot_model  # so that `calibrate` does not need Matplotlib
 
         folder = Path(folder)
         self.zoom.lens.save(folder / "lens.json")
-        self.lines.save(folder / "lines.npz")
+        if lines:
+            self.lines.save(folder / "lines.npz")
         (folder / "summary.json").write_text(json.dumps(self.summary() | (about or {}), indent=2) + "\n")
         plot_model(self.zoom, self.each, self.lines).savefig(folder / "model.png", dpi=150)
         for name, text in (pages or {}).items():

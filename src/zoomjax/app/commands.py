@@ -26,7 +26,9 @@ from .arguments import (
     centre_of,
     number_of_cores,
     read_lines,
+    refits,
     refuse_to_replace,
+    results_of,
     split_lens,
     unit_of,
 )
@@ -45,14 +47,17 @@ from .options import (
     Distance,
     DryRun,
     Exclude,
+    FileOrFolder,
     FocalUnit,
     Frames,
     Overlays,
     Pitch,
     Pixel,
     Quiet,
+    ResultsFolder,
     Strict,
     WithLines,
+    detector_for,
     excluded,
     refuse_idle,
 )
@@ -85,9 +90,7 @@ def options(
 
 @app.command(epilog="Example: `zoomjax demo -o demo`")
 def demo(
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder for the results.", file_okay=False)
-    ] = Path("zoomjax-demo"),
+    output: ResultsFolder = Path("zoomjax-demo"),
     photos: Annotated[
         int, typer.Option(min=3, help="Number of photos, each at its own focal length.")
     ] = 12,
@@ -134,13 +137,12 @@ def calibrate(
         list[str],
         typer.Argument(
             metavar="INPUT...",
-            help="Photos, folders or patterns such as shots/*.jpg; or one video; or a file of lines: "
-            "lines.npz, or a CSV file with the columns frame,line,x,y[,focal].",
+            help="Photos, folders or patterns such as shots/*.jpg; or one video; or files of lines: "
+            "lines.npz, or CSV files with the columns frame,line,x,y[,focal]; or a folder of results, "
+            "whose lines are fitted again.",
         ),
     ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.", file_okay=False)
-    ],
+    output: ResultsFolder,
     model: ModelName = None,
     degree: Degree = None,
     terms: Terms = None,
@@ -167,9 +169,9 @@ def calibrate(
         typer.Option(
             help="Source of the focal lengths: a CSV file (columns image,focal; for a video time,focal or "
             "frame,focal; for CSV lines frame,focal), a number, exif, board (parallel to the sensor), "
-            "plane (oblique views of a flat grid), or for a video motion (how the image moves as the "
-            "camera turns and zooms). Default for photos: board if --pitch is given, else exif, else "
-            "plane; for a video: motion.",
+            "plane (oblique views of a flat grid), pitch (football markings), or for a video motion (as "
+            "the camera turns and zooms). Default for photos: board if --pitch is given, else exif, else "
+            "plane (with --detector pitch: pitch); for a video: motion.",
             rich_help_panel=FOCAL,
         ),
     ] = None,
@@ -183,8 +185,8 @@ def calibrate(
         str | None,
         typer.Option(
             help="Standard deviation of the focal lengths, in their unit or per cent, e.g. 0.3 or 1%. "
-            "Standard deviations of the results include it. Default: the estimate of plane or board, the "
-            "CSV column sigma, or else 0.",
+            "Standard deviations of the results include it. Default: what plane, board or pitch estimate, "
+            "the CSV column sigma, or else 0.",
             rich_help_panel=FOCAL,
         ),
     ] = None,
@@ -231,20 +233,22 @@ def calibrate(
     from .model_choice import WantedModel
 
     wanted = WantedModel(model or "auto", degree, terms)
+    inputs = [str(results_of(path) or path) for path in inputs]
     if any(path.lower().endswith((".npz", ".csv")) for path in inputs):
         refuse_idle(context, IDLE_FOR_LINES, f"for {inputs[0]}, which contains lines")
         from .calibration import CLEARS, FILES
         from .results_folder import results_folder
 
-        refuse_inputs([output / name for name in FILES], inputs)
-        results = results_folder(output, [*FILES, REPORT], clears=CLEARS, overwrite=overwrite)
+        files = [Path(path) for path in inputs]
+        names = [name for name in FILES if not refits(files, output / name)]
+        refuse_inputs([output / name for name in names], inputs)
+        results = results_folder(output, [*names, REPORT], clears=CLEARS, overwrite=overwrite)
         if dry_run:
-            lines = read_lines([Path(path) for path in inputs], focal, image_size, focal_unit)
+            lines = read_lines(files, focal, image_size, focal_unit)
             return tell_plan(lines_plan(lines, excluded(exclude)), output)
         with results as folder, stages(quiet=quiet) as stage:
             stage("Reading the lines")
-            lines = read_lines([Path(path) for path in inputs], focal, image_size, focal_unit)
-            lines = without(lines, excluded(exclude))
+            lines = without(read_lines(files, focal, image_size, focal_unit), excluded(exclude))
             calibration = calibrate_lines(
                 lines,
                 folder,
@@ -254,6 +258,7 @@ def calibrate(
                 focal_sigma=focal_sigma,
                 robust=robust,
                 title=title_of(inputs),
+                names=names,
             )
         return show.lines(calibration, output, robust=robust)
     if image_size is not None:
@@ -284,7 +289,7 @@ def calibrate(
     refuse_idle(context, ("with_lines",), "without --focal motion: all else is calibrated from lines")
     job = ImageJob(
         tuple(inputs),
-        detector=detector,
+        detector=detector_for(context, detector, focal),
         focal=focal,
         focal_unit=unit_of(focal_unit),
         focal_sigma=focal_sigma,
@@ -317,12 +322,7 @@ def undistort(
             "of them, or patterns.",
         ),
     ],
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", metavar="OUT", help="Output file for a single input, else a folder."
-        ),
-    ],
+    output: FileOrFolder,
     lens: Annotated[
         str | None,
         typer.Option(

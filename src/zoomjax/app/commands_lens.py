@@ -9,9 +9,10 @@ from .._core.text import plain
 from ._compiled import set_up_jax
 from .arguments import size_of
 from .commands import app
+from .options import place
 
 
-@app.command(epilog='Example: `zoomjax lens "nikkor 18-200" -o lens.json`')
+@app.command(epilog='Example: `zoomjax lens "nikkor 18-200 ii" -o lens.json`')
 def lens(
     search: Annotated[
         str, typer.Argument(metavar="SEARCH", help='Words of the name, such as "nikkor 18-200".')
@@ -19,7 +20,11 @@ def lens(
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", metavar="OUT", help="Write the one lens found: lens.json, or a folder for it."
+            "-o",
+            "--output",
+            metavar="OUT",
+            help="Write the one lens found: lens.json, or a folder for it.",
+            callback=place,
         ),
     ] = None,
     image_size: Annotated[

@@ -1,22 +1,16 @@
 """The command ``zoomjax reproduce``."""
 
-from pathlib import Path
-from typing import Annotated
-
-import typer
-
 from .._core.text import plain
 from ._compiled import set_up_jax
 from .arguments import Overwrite
 from .commands import app
 from .console import stages
+from .options import ResultsFolder
 
 
 @app.command(epilog="Example: `zoomjax reproduce -o paper`")
 def reproduce(
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.", file_okay=False)
-    ],
+    output: ResultsFolder,
     overwrite: Overwrite = False,
 ) -> None:
     """Repeat the two experiments of Alvarez et al. (2012) on synthetic scenes.

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from .._core.files import refuse_existing
+from .._core.files import refuse_existing, refuse_inputs
 from ..correct.framing import check_keep
 from ..correct.image import check_sampling
 from ..io.equipment import read_equipment
@@ -121,6 +121,7 @@ def undistort_by_library(
         )
     photos = [path for path, _ in found.photos]
     targets = targets_of(found.photos, job.output, job.inputs)
+    refuse_inputs(targets, photos)  # of all groups: one's target may be an input of another
     if not job.resume:
         to_do(job, photos, targets)  # complains of targets that exist before any work
     groups, skipped = _by_lens(photos, None if name == AUTO else name)

@@ -44,9 +44,11 @@ def _focal_lengths(job: "ImageJob", photos: Sequence[Path]) -> Callable[[Path], 
     from ..io.focal_table import read_focal_table
     from ..io.photo import read_focal
     from ..io.text_table import plain_number
+    from .focal_sources import MEASURED
 
-    if job.board is not None or job.focal in ("board", "plane"):
-        return lambda photo: f"f from the {'grid' if job.focal == 'plane' else 'board'} in it"
+    if job.board is not None or job.focal in MEASURED:
+        seen = {"plane": "grid", "pitch": "pitch"}.get(job.focal or "", "board")
+        return lambda photo: f"f from the {seen} in it"
     if job.focal is None or job.focal == "exif":
         none = "no f in EXIF data" + (", f from a grid in it" if job.focal is None else "")
         return lambda photo: none if (focal := read_focal(photo)) is None else f"{focal:g} mm"

@@ -5,7 +5,7 @@ import datetime
 import os
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,8 +30,9 @@ def calibrate_lines(
     focal_sigma: str | None,
     robust: bool,
     title: str,
+    names: Collection[str],
 ) -> "Calibration":
-    """Calibrate from lines, and write the results into the folder."""
+    """Calibrate from lines, and write those results into the folder that have such names."""
     from .calibration import calibrate, focal_sigmas
     from .report import report
 
@@ -40,7 +41,8 @@ def calibrate_lines(
         lines, model=model, centre=centre, focal_sigma=sigma, robust=robust, stage=stage
     )
     stage("Writing the results")
-    calibration.make(folder, pages={REPORT: report(calibration, run=what_is_run(title))})
+    pages = {REPORT: report(calibration, run=what_is_run(title))}
+    calibration.make(folder, pages=pages, lines="lines.npz" in names)
     return calibration
 
 

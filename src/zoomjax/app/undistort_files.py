@@ -127,7 +127,7 @@ def _videos(
     from .undistort_videos import tracks_of, undistort_videos
 
     tracks = tracks_of(job.focal, sources, hold=job.hold)
-    todo = to_do(job, sources, targets, lambda path: True)
+    todo = to_do(job, sources, targets, _is_video)
     correct = functools.partial(
         undistort_videos,
         lens=lens,
@@ -149,6 +149,7 @@ def _videos(
     else:
         sentence = f"{_counted(written, len(sources), earlier, job, 'video')}, {frames} frames"
     notes = [note for target, video in done.items() for note in _kept(target, video, len(sources))]
+    notes += _unmarked([path for path in targets if path not in {target for _, target in todo}])
     bad = {str(path): _reason(error) for path, error in skipped.items()}
     return Outcome(sentence, bad, written + earlier, tuple(notes))
 
@@ -193,9 +194,11 @@ def undistort_photos(
     earlier = len(sources) - len(todo)
     bad = {str(source): _reason(skipped[source]) for source, _ in todo if source in skipped}
     written = len(todo) - len(bad)
-    return Outcome(
-        _counted(written, len(sources), earlier, job, "photo"), bad, written + earlier, _losses(lost)
-    )
+    unmarked = [
+        path for path in targets if path not in {target for _, target in todo} and _holds_none(path)
+    ]
+    notes = (*_losses(lost), *_unmarked(unmarked))
+    return Outcome(_counted(written, len(sources), earlier, job, "photo"), bad, written + earlier, notes)
 
 
 def _reason(error: Exception) -> str:
@@ -223,10 +226,37 @@ def _losses(lost: Counter[tuple[str, str]]) -> tuple[str, ...]:
     )
 
 
+def _unmarked(left: Sequence[Path]) -> list[str]:
+    """That files were left of which nobody can tell what they are results of."""
+    if not left:
+        return []
+    more = f" and {len(left) - 1} more" if len(left) > 1 else ""
+    return [
+        f"Left as before: {left[0]}{more}. Such files hold no mark of the work that made them: if another "
+        "lens, focal length or option made them, remove them first."
+    ]
+
+
 def _is_marked(path: Path, geometry: str) -> bool:
-    """Whether a photo is a result of the same work; a format that holds no mark counts as one."""
+    """Whether a photo is a result of the same work; any is, of a format that holds no mark."""
     try:
-        return path.suffix.lower() == ".bmp" or geometry_of(read_metadata(path)) == geometry
+        metadata = read_metadata(path)
+        return _holds_none(path) or geometry_of(metadata) == geometry
+    except _BAD_FILE:
+        return False
+
+
+def _holds_none(path: Path) -> bool:
+    return path.suffix.lower() == ".bmp"
+
+
+def _is_video(path: Path) -> bool:
+    """Whether a file may be the result of an earlier run."""
+    from ..io.video_reader import opened_video
+
+    try:
+        with opened_video(path):
+            return True
     except _BAD_FILE:
         return False
 

@@ -75,7 +75,12 @@ def _expanded(given: Path, output: Path) -> list[tuple[Path, Path]]:
     if not files:
         raise FileNotFoundError(f"No photo or video fits the pattern {given}.")
     fixed = Path(*_until_magic(given.parts))
-    return [(path, path.relative_to(fixed)) for path in files]
+    return [(path, _without_dots(path.relative_to(fixed))) for path in files]
+
+
+def _without_dots(name: Path) -> Path:
+    """A name that leads nowhere else: ``a/../../b/x`` is ``b/x``."""
+    return Path(*(part for part in Path(os.path.normpath(name)).parts if part != ".."))
 
 
 def _until_magic(parts: Sequence[str]) -> list[str]:
@@ -118,7 +123,7 @@ def _distinct(named: Sequence[tuple[Path, Path]]) -> tuple[tuple[Path, Path], ..
     """
     targets = [(path, _target(name)) for path, name in named]
     if len({_folded(name) for _, name in targets}) < len(targets):
-        absolute = [path.absolute() for path, _ in named]
+        absolute = [Path(os.path.normpath(path.absolute())) for path, _ in named]
         shared = os.path.commonpath([path.parent for path in absolute])
         targets = [
             (path, _target(whole.relative_to(shared)))

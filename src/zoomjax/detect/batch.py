@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import inspect
 import io
 import math
 from collections.abc import Generator, Iterable
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import cv2
+import jax
 import numpy as np
 
 from .._core.files import whole_file
@@ -87,14 +89,16 @@ def detect(
             images, those "without focal length", or "none".
         workers: number of processes. An image that crashes a process, or takes longer than five minutes, is
             reported as a problem. 0: detect in this process, without this protection.
-        cache: folder of cached detections by the same detector; None: no cache.
+        cache: folder of cached detections by the same detector; None: no cache. A detector of one's own is
+            the same while its settings and the file that defines it are.
     """
     task = functools.partial(_detected, detector=detector, grid=grid)
+    code = _code(type(detector))
     with contextlib.ExitStack() as stack:
         submit = stack.enter_context(Workers(task, workers, _SECONDS)).submit if workers else task
         pending: collections.deque[tuple[_Entries | None, Source, Future | Detection]] = collections.deque()
         for source in sources:
-            entries = None if cache is None else _Entries.of(cache, source, detector)
+            entries = _Entries.of(cache, source, detector) if cache and code else None
             known, missing = (None, True) if entries is None else _known(entries, source, detector, grid)
             if known is None or missing:
                 pending.append((entries, source, submit(_Task(source, known))))
@@ -154,9 +158,9 @@ def _lines(
     """The thinned lines, and the share of edges that they leave unexplained."""
     if isinstance(detector, EdgeDetector):
         edges = detector.find(image)
-        return tuple(map(_thinned, edges.lines)), edges.unexplained
+        return _thinned(edges.lines), edges.unexplained
     lines = detector.lines(nodes) if isinstance(detector, GridDetector) else detector(image)
-    return tuple(map(_thinned, lines)), None
+    return _thinned(lines), None
 
 
 def _sentence(error: Exception) -> str:
@@ -176,13 +180,15 @@ _NO_LINES = (
 )
 
 
-def _thinned(line: np.ndarray) -> np.ndarray:
-    """Points of a line, in order, `_SPACING` px apart or more, to whole steps."""
-    if len(line) < 3:
-        return line
-    length = float(np.hypot(*(line[-1] - line[0])))
-    some = line[:: math.ceil(_SPACING * (len(line) - 1) / max(length, 1e-9))]
-    return np.rint(some / STEP) * STEP
+def _thinned(lines: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Points of each line in order, `_SPACING` px apart or more, to whole steps; three or more."""
+
+    def thinned(line: np.ndarray) -> np.ndarray:
+        length = float(np.hypot(*(line[-1] - line[0])))
+        some = line[:: math.ceil(_SPACING * (len(line) - 1) / max(length, 1e-9))]
+        return np.rint(some / STEP) * STEP
+
+    return tuple(line for line in map(thinned, filter(len, lines)) if len(line) > 2)
 
 
 def _finished(
@@ -221,19 +227,30 @@ class _Entries(NamedTuple):
             shown = source.digest()
         except (OSError, ValueError) as error:  # reported when it is read
             shown = repr(error).encode()
-        code = _code() + cv2.__version__.encode()
         ways = ("lines", detector), ("grid", _grid_detector(detector))
-        return cls(
-            *(cache / f"{hashlib.sha256(code + repr(w).encode() + shown).hexdigest()}.npz" for w in ways)
-        )
+        return cls(*(cache / f"{hashlib.sha256(_way(*way) + shown).hexdigest()}.npz" for way in ways))
+
+
+def _way(what: str, detector: AbstractDetector) -> bytes:
+    """What is searched for, and how: code, settings and version."""
+    numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(detector)]  # as repr leaves out arrays
+    return _code(type(detector)) + f"{cv2.__version__} {what} {detector!r} {numbers}".encode()
 
 
 @functools.cache
-def _code() -> bytes:
-    """Digest of the detection code: cached detections are invalid once it has changed."""
+def _code(kind: type[AbstractDetector]) -> bytes:
+    """Digest of the code by which this kind of detector works; empty if it is not in a file.
+
+    Cached detections are invalid once it has changed.
+    """
     folder = Path(__file__).parent
     files = [*sorted(folder.glob("*.py")), *sorted(folder.with_name("io").glob("*.py"))]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).digest()
+    try:
+        defined = inspect.getsourcefile(kind)
+        files.append(Path(defined or ""))
+        return hashlib.sha256(b"".join(path.read_bytes() for path in files)).digest()
+    except (OSError, TypeError):  # typed in
+        return b""
 
 
 def _save(detection: Detection, file: Path) -> None:

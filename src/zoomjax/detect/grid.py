@@ -159,6 +159,11 @@ def find_dots(
 
 def _grey(image: np.ndarray) -> np.ndarray:
     """One channel of bytes."""
+    if not isinstance(image, np.ndarray):
+        raise ValueError(
+            f"Argument image must be an array of bytes (uint8), but it is {type(image).__name__}. "
+            "cv2.imread gives None where it cannot read a file."
+        )
     colour = image.ndim == 3 and image.shape[2] == 3
     if image.dtype != np.uint8 or not (image.ndim == 2 or colour) or image.size == 0:
         raise ValueError(

@@ -39,6 +39,13 @@ class Source:
     image: UInt8[np.ndarray, "height width *channels"] | None = None
     focal: float | None = None
 
+    def __post_init__(self):
+        """Check that there is one of both."""
+        if (self.path is None) == (self.image is None):
+            raise ValueError("Either argument path or image must be given, the file or its pixels.")
+        if self.image is not None and not isinstance(self.image, np.ndarray):
+            raise ValueError(f"Argument image must be an array, but it is {type(self.image).__name__}.")
+
     @property
     def file(self) -> str:
         """The path, or the name of what has none."""
@@ -53,8 +60,8 @@ class Source:
         if self.path is not None:
             with open_photo(self.path) as file:
                 return hashlib.file_digest(file, "sha256").digest()
-        assert self.image is not None
-        return hashlib.sha256(np.ascontiguousarray(self.image).data).digest()
+        image = np.ascontiguousarray(self.image)
+        return hashlib.sha256(f"{image.shape} {image.dtype}".encode() + image.tobytes()).digest()
 
     def read(self) -> tuple[UInt8[np.ndarray, "height width *channels"], float | None]:
         """The pixels as stored, whatever the orientation tag says, in bytes; the focal length in EXIF data.
@@ -200,14 +207,20 @@ def video_frames(
     with decode_video(path) as (announced, frames):
         # From the first to the last; where not even the length is known, the first ones.
         wanted = set(np.linspace(0, (announced or number) - 1, number).round().astype(int).tolist())
-        last = -1
+        last, some = -1, False
         for last, time, image in frames:
             if last not in wanted:
                 continue
             at = focal.at(last, time) if isinstance(focal, FocalTrack) else float(focal)
+            some = True
             yield Source(f"{stem}-{last:06d}.jpg", None, image(), at)
         if last < 0:
             raise ValueError(f"Cannot read {os.fspath(path)}: none of its frames can be decoded.")
+        if not some:
+            raise ValueError(
+                f"Cannot read {os.fspath(path)}: of {announced} frames none of the {len(wanted)} wanted "
+                "can be decoded. It is cut off or damaged."
+            )
         if last + 1 < 0.98 * announced - 2:  # lengths are rounded
             warnings.warn(
                 f"{os.fspath(path)} ends early, after {last + 1} of {announced} frames: it is cut off or "

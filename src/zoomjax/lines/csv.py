@@ -87,7 +87,23 @@ def read_lines_csv(
 
 @kinds_checked
 def write_lines_csv(lines: Lines, path: str | os.PathLike[str]) -> None:
-    """Write lines as ``frame,line,x,y,focal``, with all the digits of their dtype."""
+    """Write lines as ``frame,line,x,y,focal``, with all the digits of their dtype.
+
+    Raises:
+        ValueError: the lines have weights, a focus, or another centre than the image's, for which there is
+            no column.
+    """
+    centre = (np.array(lines.image_size) - 1) / 2
+    beside = {
+        "weights": lines.weight is not None,
+        "a focus": lines.focus is not None,
+        "another centre than the image's": not np.allclose(lines.centre, centre, rtol=0, atol=1e-3),
+    }
+    if lost := [name for name, there in beside.items() if there]:
+        raise ValueError(
+            f"Argument lines has {' and '.join(lost)}, and a CSV file has no column for that: save the "
+            "lines as .npz, lines.save(path)."
+        )
     frame, focal = np.asarray(lines.frame), np.asarray(lines.focal)
     with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

@@ -213,9 +213,20 @@ class Lines(AbstractLines):
         """Write all fields, in their dtypes, to a ``.npz`` file that `load_lines` reads.
 
         Points that are whole steps of 1/1024 px, as detectors give them, take a tenth of the space.
+
+        Raises:
+            OSError: the file cannot be written; nothing is left of it.
+            ValueError: a frame has no line of three points, without which the file could not be read.
         """
         check_kind("path", path, (str, os.PathLike))
-        optional: dict[str, Any] = {"weight": self.weight, "focus": self.focus}
+        there = np.zeros(len(self.focal), bool)
+        there[np.asarray(self.frame)[np.asarray(self.mask).sum(1) > 2]] = True
+        if not (there.size and there.all()):
+            raise ValueError(
+                f"{np.sum(~there)} of {there.size} frames have no line of three points or more: leave them "
+                "out before the lines are saved."
+            )
+        optional: dict[str, Any] = {"weight": self.weight, "focus": self.focus, "number": self.number}
         fields: dict[str, Any] = {
             name: np.asarray(value) for name, value in optional.items() if value is not None
         }

@@ -1,7 +1,9 @@
 """Lines read from the ``.npz`` files that `Lines.save` writes."""
 
+import operator
 import os
 
+import equinox as eqx
 import numpy as np
 
 from .._core.archive import checked_counts, read_archive
@@ -33,8 +35,13 @@ def _lines(stored: dict[str, np.ndarray]) -> Lines:
         centre=stored["centre"],
         focus=stored.get("focus"),
     )
-    if "weight" not in stored:
-        return lines
-    if stored["weight"].shape != counts.shape:
-        raise ValueError("its weights and counts disagree")
-    return lines.weighted(stored["weight"][lines.number])
+    for name in ("focal", "centre"):  # of the points' dtype so far
+        if stored[name].dtype.kind == "f" and stored[name].dtype != getattr(lines, name).dtype:
+            lines = eqx.tree_at(operator.attrgetter(name), lines, stored[name])
+    of_lines = {name: stored[name] for name in ("weight", "number") if name in stored}
+    if any(values.shape != counts.shape or values.dtype.kind not in "fiu" for values in of_lines.values()):
+        raise ValueError("its weights or numbers, and its counts, disagree")
+    of_lines = {name: values[lines.number] for name, values in of_lines.items()}  # of those of three points
+    if "number" in of_lines:
+        lines = eqx.tree_at(lambda lines: lines.number, lines, of_lines["number"])
+    return lines.weighted(of_lines["weight"]) if "weight" in of_lines else lines

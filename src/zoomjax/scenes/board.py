@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, ScalarLike, UInt8
 
+from .._core.checks import check_above, check_between, checked_focal, checked_integer
 from .._core.types import AnyArray
 from ..lines.lines import Lines
 from ..models.distortion import Distortion
@@ -85,6 +86,8 @@ def focal_sweep(
     number: int = 50, shortest: float | int = 20.56, longest: float | int = 127.36
 ) -> np.ndarray:
     """Focal lengths spread evenly in 1/f, increasing; by default those of the paper's experiment."""
+    checked_integer("number", number, 1)
+    check_above(0, shortest=shortest, longest=longest)
     return 1 / np.linspace(1 / shortest, 1 / longest, number)
 
 
@@ -114,6 +117,9 @@ def board_lines(
     Returns:
         All edges at least a tenth of the image's height long.
     """
+    focal = checked_focal(focal).astype(np.asarray(focal).dtype)
+    check_above(0, spacing=spacing)
+    check_between(0, math.inf, noise=noise, imperfection=imperfection)
     board = StripedBoard.before(lens) if board is None else board
     rng = np.random.default_rng(seed)
     own = np.random.default_rng((seed, 1))  # so that bends leave the noise as it is
@@ -254,6 +260,9 @@ def board_photo(
             "Argument lens must be a radial polynomial to be photographed with, but it is "
             f"{type(lens.family).__name__}."
         )
+    check_above(0, focal=focal)
+    check_between(0, math.inf, blur=blur, noise=noise)
+    check_between(0, 1, vignetting=vignetting)
     board = StripedBoard.before(lens) if board is None else board
     dtype = lens.centre.dtype
     photo = np.asarray(

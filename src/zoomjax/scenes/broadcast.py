@@ -7,10 +7,13 @@ the pitch at 45 mm, and the areas before one goal at 157 mm. The camera's place 
 chosen for markings near the borders of the image, where lenses distort.
 """
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .._core.checks import check_above, check_between, checked_focal
 from .._core.types import AnyArray
 from ..focal.pitch import PITCH_LINES
 from ..lines.lines import Lines
@@ -64,6 +67,9 @@ def broadcast_lines(
     Returns:
         All markings at least a tenth of the image's height long.
     """
+    focal = checked_focal(focal)
+    check_above(0, spacing=spacing)
+    check_between(0, math.inf, noise=noise)
     rng = np.random.default_rng(seed)
     dtype = np.asarray(lens.centre).dtype
     points: list[np.ndarray] = []

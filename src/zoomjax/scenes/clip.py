@@ -9,6 +9,7 @@ Once a clip: the texture and its smaller copies. Once a frame: the samples' plac
 """
 
 import dataclasses
+import math
 from collections.abc import Iterator
 
 import equinox as eqx
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from .._core.checks import check_between, checked_focal, checked_integer
 from ..correct.image import remap
 from ..models.lens import ZoomLens
 from .motion import camera_between
@@ -166,6 +168,11 @@ def motion_clip(
     Returns:
         What renders the frames, one after the other, and tells where they show what.
     """
+    checked_focal(focal)
+    checked_integer("samples", samples, 1)
+    check_between(0, math.inf, noise=noise)
+    check_between(0, 0.6, moving=moving)
+    check_between(-1, 1, shutter=shutter)
     texture = leaves(seed=seed) if texture is None else texture
     density = float(np.max(focal)) if density is None else float(density)
     return MotionClip(

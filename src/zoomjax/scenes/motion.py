@@ -1,5 +1,6 @@
 """Tracks with exact truth: a camera on a tripod that pans, tilts and zooms, and points that it sees."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -8,6 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from .._core.checks import check_above, check_between, checked_focal, checked_integer
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..tracks.tracks import Tracks
@@ -47,6 +49,8 @@ def pan_and_zoom(
         pan, tilt: angles from end to end, degrees.
         seed: of where the camera begins its to and fro; by default always the same.
     """
+    checked_integer("frames", frames, 1)
+    check_between(-math.inf, math.inf, pan=pan, tilt=tilt)
     t = np.linspace(0, 1, frames)
     begins = np.array([0.0, 0.0, 0.7])
     if seed is not None:
@@ -91,6 +95,12 @@ def motion_tracks(
         distance: of the scene's points, m.
         seed: of everything random.
     """
+    checked_focal(focal)
+    checked_integer("views", views, 1)
+    check_between(1, math.inf, life=life)
+    check_between(0, math.inf, noise=noise, drift=drift)
+    check_between(0, 1, moving=moving)
+    check_between(-1, 1, shutter=shutter)
     rng = np.random.default_rng(seed)
     corner = np.array(lens.image_size) - 1
     seen_at = _Seen(lens, camera_between(focal, rotation), float(pupil), float(shutter))
@@ -150,6 +160,10 @@ def motion_lines(
         noise: standard deviation of each coordinate of each point, px.
         seed: of everything random.
     """
+    focal = checked_focal(focal)
+    checked_integer("number", number, 1)
+    check_above(0, spacing=spacing)
+    check_between(0, math.inf, noise=noise)
     rng = np.random.default_rng(seed)
     corner = np.array(lens.image_size) - 1
     points: list[np.ndarray] = []
