@@ -1,5 +1,7 @@
 """One formula for NumPy and JAX: the namespace to take operations from, and ranks made equal."""
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -70,3 +72,45 @@ def once(values: Any) -> Any:
     For what is expensive and used for both coordinates of a point.
     """
     return jax.lax.optimization_barrier(values) if namespace(*jax.tree.leaves(values)) is jnp else values
+
+
+_BLOCK = 2**16
+"""Elements: few enough for a processor's cache, and enough for all of its cores."""
+
+
+def in_blocks(function: Callable[..., Any], values: Any, *others: Any) -> Any:
+    """``function(values, *others)`` element by element, one block of the elements after another on a CPU.
+
+    Memory is then needed for the loops of one block, and each block's loops end when its own elements are
+    done.
+
+    Args:
+        function: of arrays that broadcast; its result has the shape and dtype of the first.
+        values: the elements.
+        others: arrays whose last axes broadcast with those of the elements; they may have more before.
+    """
+    shape = values.shape
+    number = math.prod(shape) if all(isinstance(length, int) for length in shape) else 0
+    if number <= _BLOCK:
+        return function(values, *others)
+
+    def flat(array):
+        own = array.shape[: max(array.ndim - len(shape), 0)]
+        alike = all(length == 1 for length in array.shape[len(own) :])
+        wanted = (1,) * len(shape) if alike else shape
+        return jnp.broadcast_to(array, (*own, *wanted)).reshape(*own, -1)
+
+    def blocks():
+        cut = jax.lax.dynamic_slice_in_dim
+        operands = [flat(array) for array in (values, *others)]
+
+        def one(index, done):
+            start = jnp.minimum(index * _BLOCK, number - _BLOCK)
+            parts = (
+                cut(array, start, _BLOCK, axis=-1) if array.shape[-1] > 1 else array for array in operands
+            )
+            return jax.lax.dynamic_update_slice_in_dim(done, function(*parts), start, axis=-1)
+
+        return jax.lax.fori_loop(0, -(-number // _BLOCK), one, 0 * operands[0]).reshape(shape)
+
+    return jax.lax.platform_dependent(cpu=blocks, default=lambda: function(values, *others))

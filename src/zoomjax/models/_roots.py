@@ -179,7 +179,7 @@ def newton_root(
     for _ in range(_NEWTON_STEPS):
         q = q - error / xp.where(slope > 0, slope, 1)
         error, slope = equation(q)
-    return once((q, (abs(error) <= rounding(q, slope)) & (q >= 0) & (slope >= 0) & within(q)))
+    return q, (abs(error) <= rounding(q, slope)) & (q >= 0) & (slope >= 0) & within(q)
 
 
 def increasing_root(
@@ -202,7 +202,7 @@ def increasing_root(
         size: of the numbers that the function is a difference of.
     """
     xp = namespace(start)
-    q, arrived = newton_root(equation, start, within, size)
+    q, arrived = once(newton_root(equation, start, within, size))
     if xp is np and arrived.all():
         return q, arrived
     end = high()
@@ -225,10 +225,6 @@ def _in_bracket(xp, equation, rounding, q, high):
         # Comparisons with NaN are False, so that it ends, too.
         return (abs(error) > rounding(q, slope)) & (high - low > 2 * eps * high)
 
-    def widened(state):
-        q, error, slope, low, high, least = state
-        return q, error, slope, low, 2 * high, least
-
     def step(state):
         q, error, slope, low, high, least = state
         low, high = xp.where(error < 0, q, low), xp.where(error > 0, q, high)
@@ -237,15 +233,15 @@ def _in_bracket(xp, equation, rounding, q, high):
         new = xp.where(good, newton, (low + high) / 2)
         return new, *equation(new), low, high, xp.minimum(least, abs(error))
 
-    endless = xp.isinf(high)
-    bounded = xp.where(endless, xp.maximum(q, 1), high)
-    state = (q, *equation(q), 0 * q, bounded, 0 * q + np.inf)
-    state = until(
+    error, slope = equation(q)
+    open_end = xp.isinf(high) & (abs(error) > rounding(q, slope))
+    high = until(
         xp,
-        lambda state: endless & unfinished(state) & (equation(state[4])[0] < 0) & xp.isfinite(state[4]),
-        widened,
-        state,
+        lambda high: open_end & (equation(high)[0] < 0) & xp.isfinite(high),
+        lambda high: 2 * high,
+        xp.where(xp.isinf(high), xp.maximum(q, 1), high),
         2000,
     )
+    state = (q, error, slope, 0 * q, high, 0 * q + np.inf)
     q, error, slope, *_ = until(xp, unfinished, step, state, _MOST_STEPS)
     return q, abs(error) <= 8 * rounding(q, slope)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._core.arrays import aligned, apart, finite, interleaved, namespace, once, together
+from .._core.arrays import aligned, apart, finite, in_blocks, interleaved, namespace, once, together
 from .._core.fields import host_numbers
 from .._core.spread import spread
 from .._core.types import AnyArray, Elements, Points, traced
@@ -291,9 +291,9 @@ def _distorted(distortion_of, points, operands):
 def _ratio(distortion_of, points, operands):
     """The distorted radii over the corrected ones; NaN where there is no inverse.
 
-    Newton's steps alone nearly always arrive. The rest is in branches, and not in loops that are left at
-    once, as the state of a loop would be written to memory. Under vmap all branches are taken, and the
-    loops in the last one end at once where all have arrived.
+    Newton's steps alone nearly always arrive. The rest is in a branch, and in blocks: what a program may
+    need is taken from the system in each call where it is more than some 30 MB, whether it is used or not.
+    Under vmap all branches are taken, and the loops in them end at once where all have arrived.
     """
 
     def normal():
@@ -303,18 +303,24 @@ def _ratio(distortion_of, points, operands):
 
     def certain():
         family, squared, k = normal()
-        q, found = family.ratio(squared, k, family.limit(k))
-        return jnp.where(found, q, jnp.nan)
-
-    def doubtful():
-        family, squared, k = normal()
-        settled = arrived | ~family.reaches(squared, k, family.limit(k))
-        return jax.lax.cond(jnp.all(settled), lambda: quick, certain)
+        return in_blocks(partial(_settled, family), quick, squared, k)
 
     family, squared, k = normal()
     quick, arrived = family.quick_ratio(squared, k)
-    quick = jnp.where(arrived, quick, jnp.nan)
-    return jax.lax.cond(jnp.all(arrived), lambda: quick, doubtful)
+    quick = once(jnp.where(arrived, quick, jnp.nan))
+    return jax.lax.cond(jnp.any(jnp.isnan(quick)), certain, lambda: quick)
+
+
+def _settled(family, quick, squared, k):
+    """Ratios of which those that are NaN are found for certain, if there are such."""
+
+    def certain():
+        q, found = family.ratio(squared, k, limit)
+        return jnp.where(found, q, jnp.nan)
+
+    limit = family.limit(k)
+    settled = ~jnp.isnan(quick) | ~family.reaches(squared, k, limit)
+    return jax.lax.cond(jnp.all(settled), lambda: quick, certain)
 
 
 @_distorted.defjvp

@@ -1,0 +1,44 @@
+"""Elements in blocks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax._core import arrays
+from zoomjax._core.arrays import in_blocks
+
+
+@pytest.mark.parametrize("shape", [(), (5,), (7,), (14,), (23,), (3, 9), (2, 4, 5)])
+def test_blocks_give_what_the_whole_gives(shape, monkeypatch, rng):
+    monkeypatch.setattr(arrays, "_BLOCK", 7)
+    values = jnp.asarray(rng.normal(size=shape))
+    one_for_all = jnp.asarray(rng.normal(size=(2, *[1] * len(shape))))
+    own = jnp.asarray(rng.normal(size=(2, *shape)))
+    last = jnp.asarray(rng.normal(size=shape[-1:]).reshape([1] * max(len(shape) - 1, 0) + [*shape[-1:]]))
+
+    def function(values, *others):
+        (a, b), (c, d), e = others
+        return a * values + b + c * values**2 + d * e
+
+    blocks = jax.jit(lambda *parts: in_blocks(function, *parts))(values, one_for_all, own, last)
+    np.testing.assert_allclose(blocks, function(values, one_for_all, own, last), rtol=1e-14)
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_points_beyond_the_fold_are_in_any_block(batched, rng):
+    """More points than a block has; the first, a middle and the last one have no inverse."""
+    number = 2 * arrays._BLOCK + 17
+    d = zj.Distortion(jnp.array([-0.3, 0.02]), jnp.zeros(2), jnp.ones(()))
+    points = rng.uniform(-0.3, 0.3, (number, 2))
+    beyond = [0, arrays._BLOCK, number // 2, number - 1]
+    points[beyond] = [2.0, 2.0]
+    near_fold = [5, arrays._BLOCK - 1, number - 2]
+    radius = float(d.monotone_radius)
+    points[near_fold] = d.undistort(np.array([0.999999 * radius, 0.0]))
+    compiled = jax.jit(jax.vmap(lambda p: d.distort(p)) if batched else lambda p: d.distort(p))
+    found = np.asarray(compiled(jnp.asarray(points)[None])[0] if batched else compiled(jnp.asarray(points)))
+    assert np.flatnonzero(np.isnan(found[:, 0])).tolist() == beyond
+    np.testing.assert_allclose(found[near_fold], [[0.999999 * radius, 0.0]] * 3, atol=1e-9)
+    np.testing.assert_allclose(found, d.distort(points), atol=1e-9)
