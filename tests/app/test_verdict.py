@@ -1,7 +1,11 @@
 """What photos say against one lens having taken them."""
 
+import dataclasses
+
 from PIL import ExifTags, Image
 
+from zoomjax.app.calibration import calibrate
+from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.verdict import findings_of_photos
 
 
@@ -25,8 +29,22 @@ def test_two_lenses_and_bodies_are_doubtful(tmp_path):
     photos = [photo(tmp_path / f"{n}.jpg", f"D{n // 3}", f"lens {n % 2}") for n in range(5)]
     lenses, cameras = findings_of_photos(photos)
     assert (lenses.verdict, cameras.verdict) == ("doubtful", "doubtful")
+    assert lenses.cause
+    assert cameras.cause
     assert lenses.found == (
         "the photos were taken with 2 different lenses, by their EXIF data: lens 0 (3 photos), lens 1 "
         "(2 photos)."
     )
     assert "D0 (3 photos), D1 (2 photos)" in cameras.found
+
+
+def test_two_lenses_are_to_be_parted_before_another_photo_is_taken(noisy, tmp_path):
+    done = calibrate(noisy, model=WantedModel("polynomial"), centre=None)
+    photos = [photo(tmp_path / f"{n}.jpg", lens=f"lens {n % 2}") for n in range(4)]
+    mixed = dataclasses.replace(done, assessment=done.assessment.joined_by(findings_of_photos(photos)))
+    assert mixed.assessment.sentence.startswith("Doubtful: the photos were taken with 2 different lenses")
+    assert mixed.advice() == (
+        "A further photo does not help here. Calibrate the photos of each lens and camera by themselves."
+    )
+    assert done.advice() != mixed.advice()
+    assert not mixed.summary()["next_photo"]["enough"]

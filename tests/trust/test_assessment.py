@@ -159,6 +159,15 @@ def test_the_worst_finding_comes_first(lines):
     assert joined.sentence == "Not determined: not determined."
 
 
+def test_a_cause_comes_before_its_consequences(lines):
+    cause = Finding("c", "doubtful", "two lenses.", "Part them.", cause=True)
+    worse = Finding("w", "not determined", "uncertain.", "Add photos.")
+    for findings in ([cause, worse], [worse, cause]):
+        joined = assessed(lines).joined_by(findings)
+        assert joined.findings[:2] == (cause, worse)
+        assert joined.sentence == "Not determined: two lenses."
+
+
 @pytest.mark.slow
 def test_the_real_zoom_camera_is_doubtful(data):
     """Its board is paper that is not flat: zooms differ by more than lines explain, which bands include."""

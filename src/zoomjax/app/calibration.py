@@ -112,7 +112,10 @@ class Calibration:
         return self.assessment.verdict == "good" and self.next.before < visible
 
     def advice(self) -> str:
-        """What to photograph next, or that there is enough."""
+        """What to photograph next, or that there is enough, or that something else comes first."""
+        causes = [finding.advice for finding in self.assessment.findings if finding.cause]
+        if causes:
+            return f"A further photo does not help here. {causes[0]}"
         if not self.enough():
             return self.next.sentence
         return (

@@ -33,6 +33,7 @@ def _mixed(what: str, names: Counter[str]) -> Iterable[Finding]:
         "doubtful",
         f"the photos were taken with {len(names)} different {what}, by their EXIF data: {listed}{more}.",
         "Calibrate the photos of each lens and camera by themselves.",
+        cause=True,
     )
 
 

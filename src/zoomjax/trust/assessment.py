@@ -45,12 +45,14 @@ class Finding:
         verdict: the best verdict that it allows; "good" for a remark.
         found: a sentence with figures.
         advice: a sentence on what to do.
+        cause: whether it says what is wrong with the photos, where others say what came of it.
     """
 
     about: str
     verdict: Verdict
     found: str
     advice: str
+    cause: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +60,7 @@ class Assessment:
     """The verdict on a fit.
 
     Attributes:
-        findings: what was found, the worst first.
+        findings: what was found: causes first, then the worst.
         evidence: what it was found in.
     """
 
@@ -82,7 +84,9 @@ class Assessment:
 
     def joined_by(self, findings: Sequence[Finding]) -> "Assessment":
         """The assessment with further findings."""
-        ranked = sorted([*self.findings, *findings], key=lambda of: -VERDICTS.index(of.verdict))
+        ranked = sorted(
+            [*self.findings, *findings], key=lambda of: (not of.cause, -VERDICTS.index(of.verdict))
+        )
         return dataclasses.replace(self, findings=tuple(ranked))
 
     def summary(self) -> dict[str, Any]:
