@@ -37,7 +37,6 @@ from .console import REPORT, progress_bar, show_calibration, show_images, stages
 from .options import (
     CALIBRATE_EXAMPLES,
     FIT,
-    FOCAL,
     IDLE_FOR_LINES,
     IDLE_FOR_MOTION,
     INPUT,
@@ -48,7 +47,9 @@ from .options import (
     DryRun,
     Exclude,
     FileOrFolder,
-    FocalUnit,
+    Focal,
+    FocalSigma,
+    FocalUnits,
     Frames,
     Overlays,
     Pitch,
@@ -164,32 +165,9 @@ def calibrate(
             rich_help_panel=INPUT,
         ),
     ] = "edges",
-    focal: Annotated[
-        str | None,
-        typer.Option(
-            help="Source of the focal lengths: a CSV file (columns image,focal; for a video time,focal or "
-            "frame,focal; for CSV lines frame,focal), a number, exif, board (parallel to the sensor), "
-            "plane (oblique views of a flat grid), pitch (football markings), or for a video motion (as "
-            "the camera turns and zooms). Default for photos: board if --pitch is given, else exif, else "
-            "plane (with --detector pitch: pitch); for a video: motion.",
-            rich_help_panel=FOCAL,
-        ),
-    ] = None,
-    focal_unit: Annotated[
-        FocalUnit | None,
-        typer.Option(
-            help="Unit of focal lengths in a CSV file or number. Default: mm.", rich_help_panel=FOCAL
-        ),
-    ] = None,
-    focal_sigma: Annotated[
-        str | None,
-        typer.Option(
-            help="Standard deviation of the focal lengths, in their unit or per cent, e.g. 0.3 or 1%. "
-            "Standard deviations of the results include it. Default: what plane, board or pitch estimate, "
-            "the CSV column sigma, or else 0.",
-            rich_help_panel=FOCAL,
-        ),
-    ] = None,
+    focal: Focal = None,
+    focal_unit: FocalUnits = None,
+    focal_sigma: FocalSigma = None,
     pitch: Pitch = None,
     distance: Distance = None,
     pixel: Pixel = None,

@@ -90,6 +90,30 @@ Exclude = Annotated[
     ),
 ]
 
+Focal = Annotated[
+    str | None,
+    typer.Option(
+        help="Source of the focal lengths: a CSV file (columns image,focal; for a video time,focal or "
+        "frame,focal; for CSV lines frame,focal), a number, exif, board (parallel to the sensor), "
+        "plane (oblique views of a flat grid), pitch (football markings), or for a video motion (as "
+        "the camera turns and zooms). Default for photos: board if --pitch is given, else exif, else "
+        "plane (with --detector pitch: pitch); for a video: motion.",
+        rich_help_panel=FOCAL,
+    ),
+]
+FocalUnits = Annotated[
+    FocalUnit | None,
+    typer.Option(help="Unit of focal lengths in a CSV file or number. Default: mm.", rich_help_panel=FOCAL),
+]
+FocalSigma = Annotated[
+    str | None,
+    typer.Option(
+        help="Standard deviation of the focal lengths, in their unit or per cent, e.g. 0.3 or 1%. "
+        "Standard deviations of the results include it. Default: what plane, board or pitch estimate, "
+        "the CSV column sigma, or else 0.",
+        rich_help_panel=FOCAL,
+    ),
+]
 Pitch = Annotated[
     str | None,
     typer.Option(
