@@ -11,7 +11,7 @@ from .options import FIT, OUTPUT
 if TYPE_CHECKING:
     from ..lines.lines import Lines
     from .focal_sources import Board
-    from .image_calibration import ImageJob
+    from .image_job import ImageJob
 
 
 Overwrite = Annotated[

@@ -109,7 +109,7 @@ def demo(
     from ..scenes.board import StripedBoard, nikkor_18_200
     from . import demo
     from .calibration import CLEARS, FILES
-    from .image_calibration import ImageJob
+    from .image_job import ImageJob
     from .results_folder import results_folder
 
     board = StripedBoard.before(truth := nikkor_18_200(demo.IMAGE_SIZE))
@@ -244,7 +244,7 @@ def calibrate(
     if exclude:
         raise ValueError("--exclude is for a file of lines: give the lines.npz of the calibration.")
     from .calibration import CLEARS
-    from .image_calibration import ImageJob
+    from .image_job import ImageJob
     from .results_folder import results_folder
 
     if wants_motion(inputs, focal, pitch):
