@@ -18,7 +18,7 @@ FLAGS = {
             "focal_sigma",
         ),
         *("focal_unit", "hold", "image_size", "interpolation", "keep", "lens", "model", "name"),
-        *("overwrite", "pixel_pitch", "terms", "tolerance"),
+        *("overwrite", "pixel_pitch", "shared_focal", "terms", "tolerance"),
     )
 } | {"format": "--to", "track": "--focal"}
 """Options of the command line by the names of the library's arguments."""

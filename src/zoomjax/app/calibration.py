@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._core.types import AnyArray
 from ..fit.algebraic import algebraic_zoom
@@ -295,6 +295,7 @@ def calibrate(
     centre: CentreArgument | None = "fit",
     robust: bool = False,
     focal_sigma: float | Float[np.ndarray, "frame"] = 0.0,
+    shared: Int[np.ndarray, "frame"] | None = None,
     stage: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
     """Fit the zoom model, and the models it is compared with.
@@ -308,6 +309,7 @@ def calibrate(
         robust: whether to reject lines that are not straight in the scene. All figures are then computed
             from the remaining lines.
         focal_sigma: standard deviation of the focal lengths: a number, or one per frame; 0 where exact.
+        shared: for each frame a number: frames of one number share a focal length and its error.
         stage: called with a description before each step that takes time.
 
     Raises:
@@ -318,7 +320,9 @@ def calibrate(
     exact, small, terms, chosen = used.zoom, used.lines, used.model.terms, used.model.zoom
     assert isinstance(chosen, AbstractLinearZoom)  # `WantedModel` has no other
     sigma = np.broadcast_to(focal_sigma, lines.focal.shape)
-    zoom = with_focal_sigma(exact, small, focal_sigma=sigma) if sigma.any() else exact
+    zoom = exact
+    if sigma.any():
+        zoom = with_focal_sigma(exact, small, focal_sigma=sigma, shared=shared)
     zoom = with_misfit(zoom, small)
     stage("Checking the fit on lines left out")
     held_out, each_held_out = np.full(len(sigma), np.nan), held_out_frames(small, terms=terms)

@@ -22,11 +22,15 @@ from .equipment import with_equipment
 from .focal_sources import MEASURED, Focals, choose_focals, lines_of
 from .image_job import ImageJob, overlay_name
 from .overlay import draw_lines
+from .plane_focals import Sharing
 from .results_folder import results_folder
 from .verdict import findings_of_photos
 
 MOST_OVERLAYS = 200
 """Images drawn with their lines, unless all are asked for."""
+
+_MOST_GROUPS = 20
+"""Groups of photos with one focal length that are listed."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of images done and their total."""
@@ -76,9 +80,19 @@ class ImageCalibration:
         return {
             "detector": self.job.detector,
             "focal_source": self.focals.origin,
+            "focal_groups": [dataclasses.asdict(group) for group in self.focals.groups],
             "images": images,
             "unused": self.unused,
         }
+
+    def shared(self) -> list[str]:
+        """Which images share a focal length, in sentences; none where that was not asked for."""
+        if self.job.shared_focal is None:
+            return []
+        groups = [group.sentence(self.focals.unit) for group in self.focals.groups]
+        rest = len(groups) - _MOST_GROUPS
+        more = [f"And {rest} groups more, in summary.json."] if rest > 0 else []
+        return [*groups[:_MOST_GROUPS], *more] or ["No two photos share a focal length."]
 
     def warnings(self) -> list[str]:
         """User-facing warnings: images that were not used, and those of the calibration."""
@@ -203,11 +217,11 @@ def calibrate_images(
         way = "board"
     if way is None and job.detector == "pitch" and not job.board and not any(d.focal for d in usable):
         way = "pitch"
-    focals = choose_focals(usable, way, unit=job.focal_unit, board=job.board)
+    focals = choose_focals(usable, way, unit=job.focal_unit, board=job.board, sharing=_sharing(job))
     unused |= {d.name: focals.absent for d in usable if d.name not in focals.focal}
     if job.focal_sigma is not None:
         sigma = focal_sigmas(job.focal_sigma, np.array(list(focals.focal.values())))
-        focals = dataclasses.replace(focals, deviation=dict(zip(focals.focal, sigma.tolist(), strict=True)))
+        focals = focals.deviating_by(dict(zip(focals.focal, sigma.tolist(), strict=True)))
     used = tuple(d for d in usable if d.name in focals.focal)
     while True:
         lines = lines_of(used, np.array([focals.focal[d.name] for d in used]), focals.unit)
@@ -218,6 +232,7 @@ def calibrate_images(
             centre=job.centre,
             robust=True,
             focal_sigma=sigma,
+            shared=_shared(used, focals),
             stage=stage,
         )
         done = ImageCalibration(job, calibration, used, focals, tuple(d.name for d in detections), unused)
@@ -226,6 +241,23 @@ def calibrate_images(
             return _with_findings(_with_equipment(done))
         unused = unused | dict.fromkeys(sorted(hopeless), _NONE_AGREES)
         used = tuple(d for d in used if d.name not in hopeless)
+
+
+def _sharing(job: ImageJob) -> Sharing | None:
+    """Which images share a focal length."""
+    if job.shared_focal is None:
+        return None
+    text = job.focal_sigma
+    return Sharing(job.shared_focal, None if text is None else lambda focal: focal_sigmas(text, focal))
+
+
+def _shared(used: Sequence[Detection], focals: Focals) -> np.ndarray | None:
+    """For each image a number, the same for those that share a focal length; None if none do."""
+    if not focals.groups:
+        return None
+    own = np.arange(len(used))
+    group = np.array([focals.number_of_group(detection.name) for detection in used])
+    return np.where(group >= 0, len(used) + group, own)
 
 
 def _with_equipment(done: ImageCalibration) -> ImageCalibration:

@@ -12,10 +12,12 @@ from ..detect.batch import DETECTORS
 from ..detect.sources import VIDEO_SUFFIXES, Source, find_photos, video_frames
 from ..fit.zoom import CentreArgument
 from ..io.focal_track import FocalTrack, read_focal_track
+from ..io.photo import read_focal
 from ..io.text_table import plain_number
 from .calibration import FILES, focal_sigmas
 from .focal_sources import MEASURED, Board, check_way
 from .model_choice import WantedModel
+from .plane_focals import SHARED_BY
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +32,8 @@ class ImageJob:
         focal_sigma: standard deviation of the focal lengths: a number in their unit, or a percentage such
             as "1%"; None for the standard deviation given by their source.
         board: the board, for ``focal="board"``.
+        shared_focal: for ``focal="plane"``, which images share a focal length: those of one EXIF focal
+            length ("exif"), of one "folder", or of focal lengths that agree ("similarity"); None: none.
         model: the zoom model.
         centre: centre of distortion: "fit", "image" or its coordinates, px.
         frames: maximum number of frames used from a video.
@@ -45,6 +49,7 @@ class ImageJob:
     focal_unit: str = "mm"
     focal_sigma: str | None = None
     board: Board | None = None
+    shared_focal: str | None = None
     model: WantedModel = WantedModel()  # noqa: RUF009, it is frozen
     centre: CentreArgument = "fit"
     frames: int = 60
@@ -71,6 +76,30 @@ class ImageJob:
                 'Argument focal "pitch" needs the markings of a pitch: give argument detector "pitch", too.'
             )
         focal_sigmas(self.focal_sigma or "0", np.ones(1))
+        if self.shared_focal is not None:
+            self._check_sharing(self.shared_focal)
+
+    def _check_sharing(self, how: str) -> None:
+        """Refuse shared focal lengths that have no effect."""
+        if how not in SHARED_BY:
+            raise ValueError(
+                f"Argument shared_focal must be one of {', '.join(SHARED_BY)}, but it is {how!r}."
+            )
+        if self.focal != "plane":
+            raise ValueError(
+                "Argument shared_focal is for focal lengths that are measured from a flat grid in the "
+                'images: give argument focal "plane", too, or leave it out.'
+            )
+        if self.video is not None and how != "similarity":
+            raise ValueError(
+                f'Argument shared_focal "{how}" is for photos: frames of a video can share a focal length '
+                'by "similarity".'
+            )
+        if how == "exif" and not any(map(_has_focal, self.sources()[0])):
+            raise ValueError(
+                'Argument shared_focal "exif" needs focal lengths in the EXIF data, but no photo has one: '
+                'photos of one zoom can share a focal length by "folder" or "similarity".'
+            )
 
     @property
     def video(self) -> Path | None:
@@ -106,6 +135,14 @@ class ImageJob:
             return 1.0
         number = plain_number(self.focal)
         return read_focal_track(self.focal) if number is None else number
+
+
+def _has_focal(photo: Source) -> bool:
+    """Whether the EXIF data of a photo have a focal length."""
+    try:
+        return read_focal(photo.file) is not None
+    except (OSError, ValueError):
+        return False
 
 
 def overlay_name(number: int, name: str) -> str:

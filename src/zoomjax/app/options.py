@@ -13,6 +13,7 @@ FIT, FOCAL, INPUT, OUTPUT = "Lens", "Focal lengths", "Images and lines", "Output
 
 Detector = Literal["edges", "grid", "pitch"]
 FocalUnit = Literal["mm", "px"]
+SharedBy = Literal["exif", "folder", "similarity"]
 OverlaysOf = Literal["some", "all", "none"]
 
 Strict = Annotated[
@@ -114,6 +115,15 @@ FocalSigma = Annotated[
         rich_help_panel=FOCAL,
     ),
 ]
+SharedFocal = Annotated[
+    SharedBy | None,
+    typer.Option(
+        help="With --focal plane: photos of one zoom share one focal length, estimated from all of them "
+        "together. Of one zoom are photos of one EXIF focal length (exif), of one folder (folder), or "
+        "whose focal lengths agree within their standard deviations (similarity).",
+        rich_help_panel=FOCAL,
+    ),
+]
 Pitch = Annotated[
     str | None,
     typer.Option(
@@ -137,10 +147,13 @@ Pixel = Annotated[
 
 IDLE_FOR_LINES = (
     *("pitch", "distance", "pixel", "jobs", "detector", "frames", "cache", "overlays", "with_lines"),
+    "shared_focal",
 )
 """Parameters of calibrate that say nothing about a file of lines."""
 
-IDLE_FOR_MOTION = ("focal_sigma", "focal_unit", "pitch", "distance", "pixel", "robust", "overlays")
+IDLE_FOR_MOTION = (
+    *("focal_sigma", "focal_unit", "pitch", "distance", "pixel", "robust", "overlays", "shared_focal"),
+)
 """And about a clip whose motion gives its focal lengths."""
 
 CALIBRATE_EXAMPLES = """\
@@ -149,6 +162,8 @@ Examples:
   zoomjax calibrate photos/ -o mylens
 
   zoomjax calibrate photos/*.jpg --focal focal.csv -o mylens
+
+  zoomjax calibrate zoom/*mm/ --focal plane --shared-focal folder -o mylens
 
   zoomjax calibrate zoom.mp4 --focal track.csv -o mylens
 
