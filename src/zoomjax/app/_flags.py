@@ -13,6 +13,7 @@ FLAGS = {
             "crop",
             "degree",
             "detector",
+            "family",
             "direction",
             "focal",
             "focal_sigma",

@@ -19,6 +19,7 @@ from ._flags import with_flags
 from .arguments import (
     Centre,
     Degree,
+    Family,
     ModelName,
     Overwrite,
     Terms,
@@ -148,7 +149,8 @@ def calibrate(
     model: ModelName = None,
     degree: Degree = None,
     terms: Terms = None,
-    centre: Centre = "fit",
+    family: Family = "radial",
+    centre: Centre = None,
     robust: Annotated[
         bool,
         typer.Option(
@@ -212,7 +214,9 @@ def calibrate(
     show = Shown(strict, quiet, as_json)
     from .model_choice import WantedModel
 
-    wanted = WantedModel(model or "auto", degree, terms)
+    wanted = WantedModel(model or "auto", degree, terms, family)
+    about = wanted.usual_centre if centre is None else centre_of(centre)
+    wanted.check_centre(about)
     inputs = [str(results_of(path) or path) for path in inputs]
     if any(path.lower().endswith((".npz", ".csv")) for path in inputs):
         refuse_idle(context, IDLE_FOR_LINES, f"for {inputs[0]}, which contains lines")
@@ -234,7 +238,7 @@ def calibrate(
                 folder,
                 stage,
                 model=wanted,
-                centre=centre_of(centre),
+                centre=about,
                 focal_sigma=focal_sigma,
                 robust=robust,
                 title=title_of(inputs),
@@ -257,7 +261,7 @@ def calibrate(
             inputs,
             output,
             wanted,
-            centre_of(centre),
+            about,
             lines=with_lines,
             detector=detector,
             frames=frames,
@@ -276,7 +280,7 @@ def calibrate(
         board=board_of(pitch, distance, pixel),
         shared_focal=shared_focal,
         model=wanted,
-        centre=centre_of(centre),
+        centre=about,
         frames=frames,
         workers=jobs or number_of_cores(),
         cache=cache_folder("detections") if cache else None,

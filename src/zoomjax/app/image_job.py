@@ -76,6 +76,7 @@ class ImageJob:
                 'Argument focal "pitch" needs the markings of a pitch: give argument detector "pitch", too.'
             )
         focal_sigmas(self.focal_sigma or "0", np.ones(1))
+        self.model.check_centre(self.centre)
         if self.shared_focal is not None:
             self._check_sharing(self.shared_focal)
 

@@ -153,6 +153,7 @@ IDLE_FOR_LINES = (
 
 IDLE_FOR_MOTION = (
     *("focal_sigma", "focal_unit", "pitch", "distance", "pixel", "robust", "overlays", "shared_focal"),
+    "family",
 )
 """And about a clip whose motion gives its focal lengths."""
 
@@ -166,6 +167,8 @@ Examples:
   zoomjax calibrate zoom/*mm/ --focal plane --shared-focal folder -o mylens
 
   zoomjax calibrate zoom.mp4 --focal track.csv -o mylens
+
+  zoomjax calibrate fisheye/ --family division -o mylens
 
   zoomjax calibrate mylens --exclude 15,17 -o mylens
 """
