@@ -349,7 +349,7 @@ WRONG = {
     "no such family": (["lines.npz", "--family", "fisheye"], "'radial', 'division', 'brown-conrady'"),
     "a centre of decentering": (
         ["lines.npz", "--family", "brown-conrady", "--centre", "fit"],
-        '--centre cannot be "fit" with argument family brown-conrady',
+        '--centre cannot be "fit" with --family brown-conrady',
     ),
     "a prior of another family": (
         ["lines.npz", "--family", "division", "--model", "smooth"],
