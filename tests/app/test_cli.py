@@ -346,6 +346,19 @@ WRONG = {
     "a degree of another model": (["lines.npz", "--model", "spline", "--degree", "1"], "for polynomials"),
     "no such model": (["lines.npz", "--model", "best"], "--model must be one of auto, polynomial"),
     "a centre that is none": (["lines.npz", "--centre", "middle"], "--centre must be fit, image, or X,Y"),
+    "no such family": (["lines.npz", "--family", "fisheye"], "'radial', 'division', 'brown-conrady'"),
+    "a centre of decentering": (
+        ["lines.npz", "--family", "brown-conrady", "--centre", "fit"],
+        '--centre cannot be "fit" with --family brown-conrady',
+    ),
+    "a prior of another family": (
+        ["lines.npz", "--family", "division", "--model", "smooth"],
+        "--model smooth has a prior for the radial polynomial",
+    ),
+    "focal lengths that are not measured": (
+        ["a.jpg", "--shared-focal", "folder"],
+        "--shared-focal is for focal lengths that are measured from a flat grid",
+    ),
     "csv without image size": (["lines.csv"], "--image-size"),
     "csv with a bad image size": (["lines.csv", "--image-size", "big"], "1920x1080"),
     "csv without focal lengths": (["bare.csv", "--image-size", "640x480"], "frame,focal"),
@@ -381,6 +394,8 @@ def test_a_mistake_is_one_sentence_and_status_2(case, wrong_files):
         (["lines.npz", "--detector", "grid"], "--detector has no effect for lines.npz"),
         (["lines.npz", "--overlays", "all", "--frames", "3"], "--frames and --overlays have no effect"),
         (["a.png", "--frames", "3"], "--frames has no effect for photos"),
+        (["lines.npz", "--shared-focal", "exif"], "--shared-focal has no effect for lines.npz"),
+        (["a.mp4", "--family", "division"], "--family has no effect with --focal motion"),
     ],
 )
 def test_an_option_without_effect_is_refused(options, sentence, wrong_files):

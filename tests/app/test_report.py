@@ -144,6 +144,7 @@ def test_names_are_escaped_and_lead_to_their_pictures(calibration):
         overlays=lambda: [f"{name}.jpg" for name in names],
         warnings=lambda: ["<b>two</b>\n  lines & more"],
         focals=SimpleNamespace(origin='"here" <there>'),
+        shared=lambda: ["<i>3</i> photos share f"],
     )
     page = Page(report(calibration, images))
     assert sum(tag == "script" for tag, _ in page.elements) == 2  # its own

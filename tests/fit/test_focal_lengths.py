@@ -66,6 +66,27 @@ def test_covariance_grows_by_the_response(sweep):
     np.testing.assert_allclose(same.covariance, fit.covariance, rtol=1e-9)
 
 
+def test_frames_that_share_an_error_add_up(sweep):
+    fit = zj.fit_zoom(sweep)
+
+    def more(**shared):
+        wide = zj.fit.with_focal_sigma(fit, sweep, focal_sigma=0.3, **shared)
+        return np.asarray(wide.covariance - fit.covariance)
+
+    own = more()
+    np.testing.assert_allclose(more(shared=np.arange(10)), own, rtol=1e-6, atol=1e-9 * own.max())
+    response = np.asarray(_response(sweep, fit.lens.zoom)) * (0.3 / np.asarray(sweep.focal))
+    one = response.sum(axis=1)  # all errors in step
+    size = np.sqrt(np.diag(response @ response.T))
+    excess = (
+        np.outer(one, one) / size / size[:, None] - more(shared=np.zeros(10, int)) / size / size[:, None]
+    )
+    assert np.linalg.eigvalsh(excess).min() > -1e-6
+    assert np.trace(excess) < 0.2 * np.sum((one / size) ** 2)
+    with pytest.raises(ValueError, match="shared must hold a number for each of the 10 frames"):
+        more(shared=np.arange(3))
+
+
 def test_undetermined_stays_infinite(sweep):
     fit = zj.fit_zoom(sweep)
     own = fit.covariance[0, 0]

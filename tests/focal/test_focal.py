@@ -173,6 +173,36 @@ def test_together_views_know_more_than_each(rng):
     assert abs(together.focal - 1200) < 4 * together.std
 
 
+def test_views_of_other_points_are_used_together(rng):
+    """As photos in which other parts of a board are seen; one with none changes nothing."""
+    seen = views(1200.0, (*TILTS, (0.0, 0.3, 0.0)))
+    noisy = seen + 0.1 * rng.standard_normal(seen.shape)
+    mask = np.ones(seen.shape[:2], bool)
+    mask[0, 30:] = mask[1, :20] = mask[-1] = False
+    noisy[~mask] = 1e4
+    planes = np.stack([PLANE + shift for shift in range(len(seen))])
+    together, each = zj.focal.focal_from_planes(noisy, planes, principal=PRINCIPAL, mask=mask)
+    assert float(together.focal) == pytest.approx(1200, abs=4 * float(together.std))
+    assert float(together.std) < 12
+    without, _ = zj.focal.focal_from_planes(noisy[:-1], planes[:-1], principal=PRINCIPAL, mask=mask[:-1])
+    assert float(without.focal) == pytest.approx(float(together.focal), rel=1e-9)
+    assert float(without.std) == pytest.approx(float(together.std), rel=1e-9)
+    assert np.isnan(each.focal[-1])
+    alone, _ = zj.focal.focal_from_planes(noisy[:1, :30], PLANE[:30], principal=PRINCIPAL)
+    assert float(alone.focal) == pytest.approx(float(each.focal[0]), rel=1e-9)
+    assert float(alone.std) == pytest.approx(float(each.std[0]), rel=1e-9)
+
+
+def test_masks_that_do_not_fit_raise(unchecked):
+    seen = views(1200.0)
+    with pytest.raises(ValueError, match="mask must have shape"):
+        zj.focal.focal_from_planes(seen, PLANE, principal=PRINCIPAL, mask=np.ones(len(PLANE), bool))
+    mask = np.ones(seen.shape[:2], bool)
+    mask[0, 4:] = False
+    with pytest.raises(ValueError, match="at least 5 valid points, or none, but one has 4"):
+        zj.focal.focal_from_planes(seen, PLANE, principal=PRINCIPAL, mask=mask)
+
+
 def test_unit_place_and_turn_of_the_plane_do_not_matter(rng):
     noisy = views(1200.0) + 0.3 * rng.standard_normal((3, len(PLANE), 2))
     known = zj.focal.focal_from_planes(noisy, PLANE, principal=PRINCIPAL)

@@ -4,5 +4,5 @@ from . import plot as plot
 from .calibration import Calibration as Calibration
 from .calibration import calibrate as calibrate
 from .image_calibration import ImageCalibration as ImageCalibration
-from .image_calibration import ImageJob as ImageJob
 from .image_calibration import calibrate_images as calibrate_images
+from .image_job import ImageJob as ImageJob

@@ -13,12 +13,13 @@ FLAGS = {
             "crop",
             "degree",
             "detector",
+            "family",
             "direction",
             "focal",
             "focal_sigma",
         ),
         *("focal_unit", "hold", "image_size", "interpolation", "keep", "lens", "model", "name"),
-        *("overwrite", "pixel_pitch", "terms", "tolerance"),
+        *("overwrite", "pixel_pitch", "shared_focal", "terms", "tolerance"),
     )
 } | {"format": "--to", "track": "--focal"}
 """Options of the command line by the names of the library's arguments."""

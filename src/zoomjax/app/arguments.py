@@ -11,7 +11,7 @@ from .options import FIT, OUTPUT
 if TYPE_CHECKING:
     from ..lines.lines import Lines
     from .focal_sources import Board
-    from .image_calibration import ImageJob
+    from .image_job import ImageJob
 
 
 Overwrite = Annotated[
@@ -43,12 +43,20 @@ Terms = Annotated[
         rich_help_panel=FIT,
     ),
 ]
+Family = Annotated[
+    Literal["radial", "division", "brown-conrady", "auto"],
+    typer.Option(
+        help="Distortion model: radial (polynomial), division (strong barrel distortion), brown-conrady "
+        "(the polynomial with decentering) or auto (of least cross-validation error).",
+        rich_help_panel=FIT,
+    ),
+]
 Centre = Annotated[
-    str,
+    str | None,
     typer.Option(
         metavar="fit|image|X,Y",
         help="Centre of distortion: fit (where the lines determine it, else the image's), image, or its "
-        "coordinates in px.",
+        "coordinates in px. Default: fit, but image with --family brown-conrady.",
         rich_help_panel=FIT,
     ),
 ]

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._core.types import AnyArray
 from ..fit.algebraic import algebraic_zoom
@@ -21,8 +21,10 @@ from ..fit.focal_lengths import with_focal_sigma
 from ..fit.result import RESULTS, FrameFits, ZoomFit
 from ..fit.straightness import frame_rms
 from ..fit.zoom import CentreArgument
+from ..lines.compressed import CompressedLines
 from ..lines.lines import Lines
 from ..models.invertibility import Certificate
+from ..models.registry import family_name
 from ..models.zoom import AbstractLinearZoom, PolynomialZoom
 from ..trust.assessment import NEGLIGIBLE, Assessment, assess
 from ..trust.bands import displacement_std
@@ -53,7 +55,8 @@ class Calibration:
         lines: the lines.
         zoom: the zoom model's fit.
         each: separate fits of the frames.
-        none, algebraic: each frame's RMS, px, without correction and with the algebraic estimate.
+        none, algebraic: each frame's RMS, px, without correction and with the algebraic estimate, which
+            is None for another distortion model than the radial polynomial.
         rejected: which lines have weight 0: left out by hand, or not straight in the scene.
         line_rms: RMS of each line under the zoom model, px, rejected lines included.
         next: the photo that would reduce the uncertainty most.
@@ -69,7 +72,7 @@ class Calibration:
     zoom: ZoomFit
     each: FrameFits
     none: np.ndarray
-    algebraic: np.ndarray
+    algebraic: np.ndarray | None
     rejected: np.ndarray
     line_rms: np.ndarray
     next: Suggestion
@@ -128,7 +131,7 @@ class Calibration:
         return [
             ("no correction", self.none),
             ("frame by frame", np.asarray(self.each.frame_rms)),
-            (f"{self.kind} (algebraic)", self.algebraic),
+            *([] if self.algebraic is None else [(f"{self.kind} (algebraic)", self.algebraic)]),
             (self.kind, np.asarray(self.zoom.frame_rms)),
         ]
 
@@ -180,7 +183,7 @@ class Calibration:
             self.assessment.summary()
             | {
                 "rms_none": rms_over_frames(self.none),
-                "rms_algebraic": rms_over_frames(self.algebraic),
+                "rms_algebraic": None if self.algebraic is None else rms_over_frames(self.algebraic),
                 "rms_frames": float(self.each.rms),
                 "rms_zoom": float(self.zoom.rms),
                 "rms_held_out": _finite([rms_over_frames(self.held_out)])[0],
@@ -202,6 +205,7 @@ class Calibration:
                 "frames_without_a_model": sum(map(bool, self.each.messages())),
                 "warnings": self.warnings(),
                 "model": type(lens.zoom).__name__,
+                "family": family_name(lens.family),
                 "centre": self.centre.summary(),
                 "pixel_polynomials": self.pixel_polynomials().tolist(),
                 "coefficients": self.coefficient_rows(),
@@ -230,7 +234,7 @@ class Calibration:
         )
 
     def pixel_polynomials(self) -> np.ndarray:
-        """Coefficients of ``f^(-j)`` (rows) of k1, ..., kN (columns) in px, as printed in the paper.
+        """Coefficients of ``f^(-j)`` (rows) of each coefficient (columns) in px, as printed in the paper.
 
         None, of shape (0, 0), for another model.
         """
@@ -238,7 +242,15 @@ class Calibration:
         if not isinstance(model, PolynomialZoom):
             return np.zeros((0, 0))
         normalised = np.asarray(model.in_inverse_focal())
-        return normalised / self.zoom.lens.scale ** (2 * np.arange(1, normalised.shape[1] + 1))
+        return normalised / self.zoom.lens.scale ** self.zoom.lens.family.orders(normalised.shape[1])
+
+    def coefficient_names(self) -> dict[str, int]:
+        """Names of the coefficients, k1, ..., kN and p1, p2, and the powers of 1/px in their units."""
+        family = self.zoom.lens.family
+        size = np.asarray(self.zoom.lens(self.zoom.lens.focal_range[0]).coefficients).size
+        radial, orders = size - family.size(0), family.orders(size).tolist()
+        names = [f"k{i + 1}" if i < radial else f"p{i + 1 - radial}" for i in range(size)]
+        return dict(zip(names, orders, strict=True))
 
     def coefficient_rows(self) -> list[list[float]]:
         """Focal length and k1, ..., kN, px, at some focal lengths over the range, evenly in 1/f."""
@@ -298,6 +310,7 @@ def calibrate(
     centre: CentreArgument | None = "fit",
     robust: bool = False,
     focal_sigma: float | Float[np.ndarray, "frame"] = 0.0,
+    shared: Int[np.ndarray, "frame"] | None = None,
     stage: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
     """Fit the zoom model, and the models it is compared with.
@@ -311,6 +324,7 @@ def calibrate(
         robust: whether to reject lines that are not straight in the scene. All figures are then computed
             from the remaining lines.
         focal_sigma: standard deviation of the focal lengths: a number, or one per frame; 0 where exact.
+        shared: for each frame a number: frames of one number share a focal length and its error.
         stage: called with a description before each step that takes time.
 
     Raises:
@@ -321,8 +335,13 @@ def calibrate(
     exact, small, terms, chosen = used.zoom, used.lines, used.model.terms, used.model.zoom
     assert isinstance(chosen, AbstractLinearZoom)  # `WantedModel` has no other
     sigma = np.broadcast_to(focal_sigma, lines.focal.shape)
-    zoom = with_focal_sigma(exact, small, focal_sigma=sigma) if sigma.any() else exact
-    zoom = with_misfit(zoom, small)
+    zoom = exact
+    if sigma.any():
+        zoom = with_focal_sigma(exact, small, focal_sigma=sigma, shared=shared)
+    algebraic = None
+    if isinstance(small, CompressedLines):  # not of another distortion model than the polynomial
+        zoom = with_misfit(zoom, small)
+        algebraic = np.asarray(frame_rms(small, algebraic_zoom(small, zoom=chosen, terms=terms)))
     stage("Checking the fit on lines left out")
     held_out, each_held_out = np.full(len(sigma), np.nan), held_out_frames(small, terms=terms)
     if len(sigma) > 1:
@@ -333,7 +352,7 @@ def calibrate(
         zoom=zoom,
         each=used.each,
         none=np.asarray(frame_rms(small, None)),
-        algebraic=np.asarray(frame_rms(small, algebraic_zoom(small, zoom=chosen, terms=terms))),
+        algebraic=algebraic,
         rejected=np.asarray(lines.weight) == 0
         if lines.weight is not None
         else np.zeros(len(lines.frame), bool),

@@ -54,7 +54,7 @@ class ClipJob:
         Raises:
             ValueError: there is not one video, or an option has no effect here.
         """
-        from .image_calibration import is_video
+        from .image_job import is_video
 
         if len(self.inputs) != 1 or not is_video(self.inputs[0]):
             raise ValueError("--focal motion is for one video: its motion tells the focal lengths.")
@@ -64,7 +64,7 @@ class ClipJob:
 
 def wants_motion(inputs: Sequence[str], focal: str | None, pitch: str | None) -> bool:
     """Whether focal lengths are to come from motion: asked for, or a video alone."""
-    from .image_calibration import is_video
+    from .image_job import is_video
 
     alone = focal is None and pitch is None and len(inputs) == 1 and is_video(inputs[0])
     return focal == "motion" or alone

@@ -19,6 +19,7 @@ from ._flags import with_flags
 from .arguments import (
     Centre,
     Degree,
+    Family,
     ModelName,
     Overwrite,
     Terms,
@@ -37,7 +38,6 @@ from .console import REPORT, progress_bar, show_calibration, show_images, stages
 from .options import (
     CALIBRATE_EXAMPLES,
     FIT,
-    FOCAL,
     IDLE_FOR_LINES,
     IDLE_FOR_MOTION,
     INPUT,
@@ -48,13 +48,16 @@ from .options import (
     DryRun,
     Exclude,
     FileOrFolder,
-    FocalUnit,
+    Focal,
+    FocalSigma,
+    FocalUnits,
     Frames,
     Overlays,
     Pitch,
     Pixel,
     Quiet,
     ResultsFolder,
+    SharedFocal,
     Strict,
     WithLines,
     detector_for,
@@ -108,7 +111,7 @@ def demo(
     from ..scenes.board import StripedBoard, nikkor_18_200
     from . import demo
     from .calibration import CLEARS, FILES
-    from .image_calibration import ImageJob
+    from .image_job import ImageJob
     from .results_folder import results_folder
 
     board = StripedBoard.before(truth := nikkor_18_200(demo.IMAGE_SIZE))
@@ -146,7 +149,8 @@ def calibrate(
     model: ModelName = None,
     degree: Degree = None,
     terms: Terms = None,
-    centre: Centre = "fit",
+    family: Family = "radial",
+    centre: Centre = None,
     robust: Annotated[
         bool,
         typer.Option(
@@ -164,32 +168,10 @@ def calibrate(
             rich_help_panel=INPUT,
         ),
     ] = "edges",
-    focal: Annotated[
-        str | None,
-        typer.Option(
-            help="Source of the focal lengths: a CSV file (columns image,focal; for a video time,focal or "
-            "frame,focal; for CSV lines frame,focal), a number, exif, board (parallel to the sensor), "
-            "plane (oblique views of a flat grid), pitch (football markings), or for a video motion (as "
-            "the camera turns and zooms). Default for photos: board if --pitch is given, else exif, else "
-            "plane (with --detector pitch: pitch); for a video: motion.",
-            rich_help_panel=FOCAL,
-        ),
-    ] = None,
-    focal_unit: Annotated[
-        FocalUnit | None,
-        typer.Option(
-            help="Unit of focal lengths in a CSV file or number. Default: mm.", rich_help_panel=FOCAL
-        ),
-    ] = None,
-    focal_sigma: Annotated[
-        str | None,
-        typer.Option(
-            help="Standard deviation of the focal lengths, in their unit or per cent, e.g. 0.3 or 1%. "
-            "Standard deviations of the results include it. Default: what plane, board or pitch estimate, "
-            "the CSV column sigma, or else 0.",
-            rich_help_panel=FOCAL,
-        ),
-    ] = None,
+    focal: Focal = None,
+    focal_unit: FocalUnits = None,
+    focal_sigma: FocalSigma = None,
+    shared_focal: SharedFocal = None,
     pitch: Pitch = None,
     distance: Distance = None,
     pixel: Pixel = None,
@@ -232,7 +214,9 @@ def calibrate(
     show = Shown(strict, quiet, as_json)
     from .model_choice import WantedModel
 
-    wanted = WantedModel(model or "auto", degree, terms)
+    wanted = WantedModel(model or "auto", degree, terms, family)
+    about = wanted.usual_centre if centre is None else centre_of(centre)
+    wanted.check_centre(about)
     inputs = [str(results_of(path) or path) for path in inputs]
     if any(path.lower().endswith((".npz", ".csv")) for path in inputs):
         refuse_idle(context, IDLE_FOR_LINES, f"for {inputs[0]}, which contains lines")
@@ -254,7 +238,7 @@ def calibrate(
                 folder,
                 stage,
                 model=wanted,
-                centre=centre_of(centre),
+                centre=about,
                 focal_sigma=focal_sigma,
                 robust=robust,
                 title=title_of(inputs),
@@ -266,7 +250,7 @@ def calibrate(
     if exclude:
         raise ValueError("--exclude is for a file of lines: give the lines.npz of the calibration.")
     from .calibration import CLEARS
-    from .image_calibration import ImageJob
+    from .image_job import ImageJob
     from .results_folder import results_folder
 
     if wants_motion(inputs, focal, pitch):
@@ -277,7 +261,7 @@ def calibrate(
             inputs,
             output,
             wanted,
-            centre_of(centre),
+            about,
             lines=with_lines,
             detector=detector,
             frames=frames,
@@ -294,8 +278,9 @@ def calibrate(
         focal_unit=unit_of(focal_unit),
         focal_sigma=focal_sigma,
         board=board_of(pitch, distance, pixel),
+        shared_focal=shared_focal,
         model=wanted,
-        centre=centre_of(centre),
+        centre=about,
         frames=frames,
         workers=jobs or number_of_cores(),
         cache=cache_folder("detections") if cache else None,

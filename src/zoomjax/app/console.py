@@ -177,11 +177,13 @@ def show_calibration(
     console.print()
     if calibration.selection:
         print(calibration.selection, end="\n\n")
+    if summary["family"] != "RadialPolynomial":
+        console.print(f"Distortion model: {summary['family']}", highlight=False)
     polynomials = calibration.pixel_polynomials()
-    for i, column in enumerate(polynomials.T, start=1):
+    for (name, order), column in zip(calibration.coefficient_names().items(), polynomials.T, strict=False):
         powers = ["", *(f" /f{'' if j == 1 else f'^{j}'}" for j in range(1, len(column)))]
         terms = " ".join(f"{value:+.4e}{power}" for value, power in zip(column, powers, strict=True))
-        console.print(f"k{i}(f) = {terms}   px^-{2 * i}", highlight=False)
+        console.print(f"{name}(f) = {terms}   px^-{order}", highlight=False)
     if not polynomials.size:
         console.print(_coefficients(calibration))
     console.print(f"\n{calibration.centre.sentence}", highlight=False)
@@ -199,8 +201,8 @@ def _coefficients(calibration: "Calibration") -> "Table":
     rows = calibration.coefficient_rows()
     table = Table(box=None)
     table.add_column(f"f, {calibration.zoom.lens.focal_unit}", justify="right")
-    for i in range(1, len(rows[0])):
-        table.add_column(f"k{i}, px^-{2 * i}", justify="right")
+    for name, order in calibration.coefficient_names().items():
+        table.add_column(f"{name}, px^-{order}", justify="right")
     for focal, *values in rows:
         table.add_row(f"{focal:.4g}", *(f"{value:+.4e}" for value in values))
     return table
@@ -217,6 +219,8 @@ def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()
     deviation = sorted(s / done.focals.focal[name] for name, s in done.focals.deviation.items())
     if deviation:
         print(f"Their standard deviations: {deviation[0]:.2%} to {deviation[-1]:.2%}.")
+    for sentence in done.shared():
+        print(sentence)
     tell(done.warnings())
     print(f"\nCheck the detected lines, drawn over each image, in {plain(str(folder / 'lines'))}.")
     tell_written(folder, ["lines/", *also])

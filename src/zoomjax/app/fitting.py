@@ -1,5 +1,6 @@
 """The fits of a calibration: which lines, model and centre, and then the zoom lens and the frames."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..fit.centre import fit_centre
+from ..fit.family_lines import FamilyLines, compress_family
 from ..fit.frames import fit_frames
 from ..fit.result import FrameFits, ZoomFit
 from ..fit.robust import reweighted
@@ -15,6 +17,7 @@ from ..fit.zoom import CentreArgument, about_centre, fit_zoom
 from ..lines.compressed import CompressedLines, compress
 from ..lines.free_centre import AnyCentreLines, compress_any_centre
 from ..lines.lines import Lines
+from ..models.polynomial import RadialPolynomial
 from ..trust.centre_choice import choose_centre
 from ..trust.selection import Candidate, Selection
 from .model_choice import CentreFound, WantedModel
@@ -34,7 +37,7 @@ class Fitted(NamedTuple):
 
     zoom: ZoomFit
     each: FrameFits
-    lines: CompressedLines
+    lines: CompressedLines | FamilyLines
     model: Candidate
     centre: CentreFound
     selection: Selection | None
@@ -51,12 +54,76 @@ def fitted(
     """The fits of a calibration; see `calibrate`.
 
     The model is chosen about the given centre, the centre fitted with it, and the model then chosen again:
-    mostly it is the same, and one fit, which takes its time to compile, has been enough.
+    mostly it is the same, and one fit, which takes its time to compile, has been enough. Another distortion
+    model than the radial polynomial is fitted about the centre found with that.
     """
-    model = wanted.base(lines.focal)
+    wanted.check_centre(centre)
+    radial = dataclasses.replace(wanted, family="radial")
+    model = radial.base(lines.focal)
     model.zoom.prepare(
         lines.focal, model.terms
     )  # raises if there are too few focal lengths, before any work
+    found = _about_centre(lines, radial, centre, robust, wanted.family in ("radial", "auto"), stage)
+    small, model, selection, zoom = found.lines, found.model, found.selection, found.zoom
+    if wanted.family != "radial":
+        placed = _widest(lines).about(small.centre)
+        if wanted.family == "auto":
+            stage("Choosing the distortion model")
+            if small.weight is not None:
+                placed = placed.weighted(np.asarray(small.weight))
+            compared = [v.candidate for v in selection.verdicts] if selection else [model]
+            selection = wanted.choose_family(placed, model, compared)
+            model = selection.chosen
+        else:
+            model = wanted.base(lines.focal)
+            if robust:
+                stage("Rejecting lines that are not straight")
+                form = compress_family(placed, model.family, terms=model.terms)
+                placed = placed.weighted(np.asarray(reweighted(form, model.zoom, model.terms)[0].weight))
+            if wanted.automatic:
+                stage("Choosing the model")
+                selection = wanted.choose_in_family(placed)
+                model = selection.chosen
+        if not isinstance(model.family, RadialPolynomial):
+            small = compress_family(placed, model.family, terms=model.terms)
+        if model.name != found.model.name:
+            zoom = None
+    stage("Fitting the zoom model")
+    if zoom is None:
+        zoom = fit_zoom(small, zoom=model.zoom, terms=model.terms)
+    stage("Fitting each frame separately")
+    each = fit_frames(small, terms=model.terms, throw=False)
+    return Fitted(zoom, each, small, model, found.centre, selection)
+
+
+class _Centred(NamedTuple):
+    """Lines about the centre of distortion, and the model under the radial polynomial.
+
+    Attributes:
+        lines, model, centre, selection: as of `Fitted`.
+        zoom: the fit, where the centre was fitted with it.
+    """
+
+    lines: CompressedLines
+    model: Candidate
+    centre: CentreFound
+    selection: Selection | None
+    zoom: ZoomFit | None
+
+
+def _about_centre(
+    lines: Lines,
+    wanted: WantedModel,
+    centre: CentreArgument | None,
+    robust: bool,
+    choose: bool,
+    stage: Callable[[str], None],
+) -> _Centred:
+    """Find the centre of distortion, under the radial polynomial, and the model where it is to be chosen.
+
+    The centre is that of the lens, whatever function of the radius describes it.
+    """
+    model, choose = wanted.base(lines.focal), choose and wanted.automatic
     stage("Compressing the lines")
     held = _compressed(lines, centre, wanted.most_terms(lines))
     small = held.about(held.centre)
@@ -65,7 +132,7 @@ def fitted(
         small = reweighted(small, model.zoom, model.terms)[0]
         held = held.weighted(np.asarray(small.weight))
     selection = None
-    if wanted.automatic:
+    if choose:
         stage("Choosing the model")
         selection = wanted.choose(small)
         model = selection.chosen
@@ -80,25 +147,25 @@ def fitted(
                 found = fit_centre(held, zoom=again.chosen.zoom, terms=again.chosen.terms)
             if found.determined:
                 selection, model = again, again.chosen
-    stage("Fitting the zoom model")
-    if found is not None and found.determined:
-        zoom = found.fit
-        small = held.about(zoom.lens.centre)
-    else:
-        zoom = fit_zoom(small, zoom=model.zoom, terms=model.terms)
-    stage("Fitting each frame separately")
-    each = fit_frames(small, terms=model.terms, throw=False)
-    return Fitted(zoom, each, small, model, CentreFound.of(held, choice, found), selection)
+    how = CentreFound.of(held, choice, found)
+    if found is None or not found.determined:
+        return _Centred(small, model, how, selection, None)
+    return _Centred(held.about(found.fit.lens.centre), model, how, selection, found.fit)
+
+
+def _widest(lines: Lines) -> Lines:
+    """The lines in the widest numbers."""
+    widest = jnp.result_type(float)
+    return jax.tree.map(
+        lambda a: jnp.asarray(a, widest) if jnp.issubdtype(a.dtype, jnp.floating) else a, lines
+    )
 
 
 def _compressed(
     lines: Lines, centre: CentreArgument | None, terms: int
 ) -> CompressedLines | AnyCentreLines:
     """The lines in the widest numbers, compressed about their centre, or for any if it is to be fitted."""
-    widest = jnp.result_type(float)
-    data = jax.tree.map(
-        lambda a: jnp.asarray(a, widest) if jnp.issubdtype(a.dtype, jnp.floating) else a, lines
-    )
+    data = _widest(lines)
     if not (isinstance(centre, str) and centre == "fit"):
         about: Any = about_centre(data, centre)
         return compress(about, terms)

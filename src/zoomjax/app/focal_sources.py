@@ -8,10 +8,10 @@ the zoom model fitted with the focal lengths found.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -21,7 +21,6 @@ from ..fit.robust import fit_robust
 from ..focal.board import focal_from_board
 from ..focal.estimate import FocalEstimate
 from ..focal.pitch import focal_from_pitch, name_pitch_lines
-from ..focal.plane import focal_from_planes
 from ..io.focal_table import read_focal_table
 from ..io.focal_track import read_focal_track
 from ..io.text_table import plain_number
@@ -29,6 +28,7 @@ from ..lines.compressed import compress
 from ..lines.lines import Lines
 from ..models.distortion import Distortion
 from ..models.zoom import PolynomialZoom
+from .plane_focals import MOST_UNCERTAIN, FocalGroup, Found, Sharing, focals_from_grids, nodes
 
 WAYS = (
     'a CSV file with the columns "image,focal" (--focal focal.csv); EXIF data in the photos '
@@ -43,9 +43,6 @@ _VIDEO_WAYS = (
 
 MEASURED = ("plane", "board", "pitch")
 """Sources that are the images themselves."""
-
-_MOST_UNCERTAIN = 0.2
-"""Largest standard deviation, relative to the focal length, of an estimate that is used."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +71,7 @@ class Focals:
         origin: the source of the focal lengths, in words.
         absent: why an image may have no focal length.
         deviation: standard deviations by name, where known: estimated from images, or given.
+        groups: the images that share a focal length.
     """
 
     focal: dict[str, float]
@@ -81,6 +79,16 @@ class Focals:
     origin: str
     absent: str
     deviation: dict[str, float] = dataclasses.field(default_factory=dict)
+    groups: tuple[FocalGroup, ...] = ()
+
+    def deviating_by(self, deviation: dict[str, float]) -> "Focals":
+        """The same with other standard deviations."""
+        groups = (dataclasses.replace(group, std=deviation[group.names[0]]) for group in self.groups)
+        return dataclasses.replace(self, deviation=deviation, groups=tuple(groups))
+
+    def number_of_group(self, name: str) -> int:
+        """Of an image: the number of its group, from 0; -1 where it has a focal length of its own."""
+        return next((n for n, group in enumerate(self.groups) if name in group.names), -1)
 
 
 def check_way(way: str | None, board: Board | None, *, video: bool) -> None:
@@ -113,6 +121,7 @@ def choose_focals(
     *,
     unit: str = "mm",
     board: Board | None = None,
+    sharing: Sharing | None = None,
 ) -> Focals:
     """Find the focal length of each image.
 
@@ -122,6 +131,7 @@ def choose_focals(
             available one: the `board` if it is given, else EXIF data, else an oblique grid.
         unit: unit of a number or of the focal lengths in a CSV file.
         board: the board, for "board".
+        sharing: which images share a focal length, for "plane".
 
     Raises:
         FileNotFoundError: there is no such CSV file.
@@ -137,12 +147,21 @@ def choose_focals(
         if board is None:
             raise ValueError(_NO_BOARD)
         found = _estimated(
-            detections, "mm", "the board's pitch (eq. 14)", _NOT_THE_BOARD, _from_board(board)
+            detections, "mm", "the board's pitch (eq. 14)", _NOT_THE_BOARD, _each(_from_board(board))
         )
     elif way == "plane":
-        found = _estimated(detections, "px", "homographies of the grid", _NO_PLANE, _from_plane)
+        found = _estimated(
+            detections,
+            "px",
+            "homographies of the grid",
+            _NO_PLANE,
+            functools.partial(focals_from_grids, sharing=sharing),
+            zooms=sharing.known(detections) if sharing else None,
+        )
     elif way == "pitch":
-        found = _estimated(detections, "px", "the markings of the pitch", _NO_PITCH, _from_pitch, few=True)
+        found = _estimated(
+            detections, "px", "the markings of the pitch", _NO_PITCH, _each(_from_pitch), few=True
+        )
     elif (number := _number(way)) is not None:
         found = Focals({d.name: number for d in detections}, unit, "--focal", "")
     else:
@@ -196,6 +215,7 @@ def _number(text: str) -> float | None:
 
 
 Estimator = Callable[[Detection, Distortion], FocalEstimate | None]
+Estimators = Callable[[Sequence[Detection], Sequence[Distortion]], Found]
 
 
 def _estimated(
@@ -203,84 +223,73 @@ def _estimated(
     unit: str,
     origin: str,
     absent: str,
-    estimate: Estimator,
+    estimate: Estimators,
     *,
     few: bool = False,
+    zooms: np.ndarray | None = None,
 ) -> Focals:
     """Focal lengths from corrected points. The correction is done twice, see the module.
 
     Where images have `few` lines, the corrections have one coefficient, at first the same in all of them.
+    Images of one number in `zooms` are corrected alike; by default each has a number of its own.
     """
-    without = compress(lines_of(detections, np.ones(len(detections)), unit))
+    zooms = np.arange(len(detections)) if zooms is None else zooms
+    without = compress(lines_of(detections, np.ones(zooms.max() + 1), unit, zooms))
     if few:
         one = fit_robust(without, zoom=PolynomialZoom(degree=0), terms=1, throw=False).fit.lens
         corrections = [one(1.0)] * len(detections)
     else:
         each = fit_frames(without, throw=False)
-        corrections = [each.distortion(frame) for frame in range(len(detections))]
-    found = _all(detections, corrections, estimate)
-    usable = [d for d in detections if d.name in found]
+        corrections = [each.distortion(zoom) for zoom in zooms.tolist()]
+    found = estimate(detections, corrections)
+    usable = [d for d in detections if d.name in found.focal]
     if len(usable) > 2:
-        focal = np.array([float(found[d.name].focal) for d in usable])
+        focal = np.array([float(found.focal[d.name].focal) for d in usable])
         lines = compress(lines_of(usable, focal, unit))
         degree = min(2, np.unique(focal).size - 1)
         lens = fit_robust(
             lines, zoom=PolynomialZoom(degree=degree), terms=1 if few else 2, throw=False
         ).fit.lens
-        found = _all(usable, [lens(float(f)) for f in focal], estimate) or found
+        again = estimate(usable, [lens(float(f)) for f in focal])
+        found = again if again.focal else found
     return Focals(
-        {name: float(f.focal) for name, f in found.items()},
+        {name: float(f.focal) for name, f in found.focal.items()},
         unit,
         origin,
         absent,
-        {name: float(f.std) for name, f in found.items()},
+        {name: float(f.std) for name, f in found.focal.items()},
+        found.groups,
     )
 
 
-def _all(
-    detections: Sequence[Detection], corrections: Sequence[Distortion], estimate: Estimator
-) -> dict[str, FocalEstimate]:
-    """The estimates that are precise enough, by the names of the images."""
-    found = {}
-    for detection, correction in zip(detections, corrections, strict=True):
-        if not np.isfinite(np.asarray(correction.coefficients)).all():
-            continue
-        value = estimate(detection, correction)
-        if value is not None and float(value.std) < _MOST_UNCERTAIN * float(value.focal):
-            found[detection.name] = value
-    return found
+def _each(estimator: Estimator) -> Estimators:
+    """Estimates of images by themselves, where they are precise enough."""
+
+    def estimate(detections: Sequence[Detection], corrections: Sequence[Distortion]) -> Found:
+        found = {}
+        for detection, correction in zip(detections, corrections, strict=True):
+            if not np.isfinite(np.asarray(correction.coefficients)).all():
+                continue
+            value = estimator(detection, correction)
+            if value is not None and float(value.std) < MOST_UNCERTAIN * float(value.focal):
+                found[detection.name] = value
+        return Found(found)
+
+    return estimate
 
 
-def lines_of(detections: Sequence[Detection], focal: np.ndarray, unit: str) -> Lines:
-    """The lines of all images, one frame per image."""
+def lines_of(
+    detections: Sequence[Detection], focal: np.ndarray, unit: str, frame: np.ndarray | None = None
+) -> Lines:
+    """The lines of all images: of each the number of its frame, by default a frame of its own."""
+    frame = np.arange(len(detections)) if frame is None else frame
     return Lines.from_ragged(
         [line for detection in detections for line in detection.lines],
-        np.repeat(np.arange(len(detections)), [len(detection.lines) for detection in detections]),
+        np.repeat(frame, [len(detection.lines) for detection in detections]),
         jnp.asarray(focal, float),
         image_size=detections[0].image_size,
         focal_unit=unit,
     )
-
-
-def _nodes(detection: Detection, correction: Distortion) -> tuple[np.ndarray, np.ndarray] | None:
-    """Corrected nodes, px, and their positions in the grid, steps; None if there are too few."""
-    if detection.nodes is None:
-        return None
-    seen = np.isfinite(detection.nodes[..., 0])
-    row, column = np.nonzero(seen)
-    if np.unique(row).size < 3 or np.unique(column).size < 3:
-        return None
-    corrected = correction.undistort(jnp.asarray(detection.nodes[seen]))
-    return np.asarray(corrected), np.stack([column, row], axis=-1).astype(float)
-
-
-def _from_plane(detection: Detection, correction: Distortion) -> FocalEstimate | None:
-    known = _nodes(detection, correction)
-    if known is None:
-        return None
-    points, places = known
-    _, each = focal_from_planes(points[None], places, principal=np.asarray(correction.centre))
-    return jax.tree.map(lambda a: a[0], each)
 
 
 def _from_pitch(detection: Detection, correction: Distortion) -> FocalEstimate | None:
@@ -293,7 +302,7 @@ def _from_pitch(detection: Detection, correction: Distortion) -> FocalEstimate |
 def _from_board(board: Board) -> Estimator:
     def estimate(detection: Detection, correction: Distortion) -> FocalEstimate | None:
         pitch = np.array(board.pitch)
-        known = _nodes(detection, correction)
+        known = nodes(detection, correction)
         if known is not None:
             points, places = known
             parts = [(points, pitch * places)]

@@ -5,121 +5,35 @@ import contextlib
 import dataclasses
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from .._core.text import numbered_name, plain
+from .._core.text import plain
 from ..detect.batch import DETECTORS, Detection, detect
-from ..detect.sources import VIDEO_SUFFIXES, Source, find_photos, video_frames
-from ..fit.zoom import CentreArgument
-from ..io.focal_track import FocalTrack, read_focal_track
-from ..io.text_table import plain_number
+from ..detect.sources import Source
 from ._flags import with_flags
-from .calibration import CLEARS, FILES, Calibration, calibrate, focal_sigmas
+from .calibration import CLEARS, Calibration, calibrate, focal_sigmas
 from .choice import chosen_frames, colour_limit
 from .equipment import with_equipment
-from .focal_sources import MEASURED, Board, Focals, check_way, choose_focals, lines_of
-from .model_choice import WantedModel
+from .focal_sources import MEASURED, Focals, choose_focals, lines_of
+from .image_job import ImageJob, overlay_name
 from .overlay import draw_lines
+from .plane_focals import Sharing
 from .results_folder import results_folder
 from .verdict import findings_of_photos
 
 MOST_OVERLAYS = 200
 """Images drawn with their lines, unless all are asked for."""
 
+_MOST_GROUPS = 20
+"""Groups of photos with one focal length that are listed."""
+
 Progress = Callable[[int, int], None]
 """Called with the number of images done and their total."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ImageJob:
-    """Settings of a calibration from images.
-
-    Attributes:
-        inputs: photos, folders or patterns; or one video.
-        detector: "edges", "grid" or "pitch".
-        focal: source of the focal lengths, as for `choose_focals`; for a video also a track.
-        focal_unit: unit of the focal lengths in a number, a table or a track.
-        focal_sigma: standard deviation of the focal lengths: a number in their unit, or a percentage such
-            as "1%"; None for the standard deviation given by their source.
-        board: the board, for ``focal="board"``.
-        model: the zoom model.
-        centre: centre of distortion: "fit", "image" or its coordinates, px.
-        frames: maximum number of frames used from a video.
-        workers: number of processes.
-        cache: folder for cached detections; None: no cache.
-        overlays: which images are drawn with their lines: "some" (all up to 200, beyond that the worst and
-            others over the zoom), "all" or "none".
-    """
-
-    inputs: tuple[str | os.PathLike[str], ...]
-    detector: str = "edges"
-    focal: str | None = None
-    focal_unit: str = "mm"
-    focal_sigma: str | None = None
-    board: Board | None = None
-    model: WantedModel = WantedModel()  # noqa: RUF009, it is frozen
-    centre: CentreArgument = "fit"
-    frames: int = 60
-    workers: int = 1
-    cache: Path | None = None
-    overlays: str = "some"
-
-    def __post_init__(self):
-        """Check the settings before any work.
-
-        Raises:
-            FileNotFoundError: there is no such CSV file.
-            ValueError: a name is unknown, or a file has the wrong type.
-        """
-        if self.detector not in DETECTORS:
-            raise ValueError(
-                f"Argument detector must be one of {', '.join(DETECTORS)}, but it is {self.detector!r}."
-            )
-        if len(self.inputs) > 1 and any(map(is_video, self.inputs)):
-            raise ValueError("Give photos, or one video.")
-        check_way(self.focal, self.board, video=self.video is not None)
-        if self.focal == "pitch" and self.detector != "pitch":
-            raise ValueError(
-                'Argument focal "pitch" needs the markings of a pitch: give argument detector "pitch", too.'
-            )
-        focal_sigmas(self.focal_sigma or "0", np.ones(1))
-
-    @property
-    def video(self) -> Path | None:
-        """The video, if the input is one."""
-        return Path(self.inputs[0]) if is_video(self.inputs[0]) else None
-
-    @property
-    def grid(self) -> str:
-        """In which images to search for a grid for the focal length: `detect`'s argument ``grid``."""
-        if self.focal == "plane" or (self.focal == "board" and self.detector == "grid"):
-            return "all"
-        needed = self.focal is None and self.board is None and self.detector != "pitch"
-        return "without focal length" if needed else "none"
-
-    def sources(self) -> tuple[Iterable[Source], int]:
-        """The images and their number."""
-        if self.video is None:
-            photos = find_photos(self.inputs)
-            return photos, len(photos)
-        return video_frames(self.video, self._track(), self.frames), self.frames
-
-    def results(self) -> list[str]:
-        """Names of the files that `ImageCalibration.write` writes, as far as known in advance."""
-        photos = self.sources()[0] if self.video is None else ()
-        return [*FILES, *(f"lines/{_overlay(n, photo.name)}" for n, photo in enumerate(photos, start=1))]
-
-    def _track(self) -> FocalTrack | float:
-        """The focal track of a video; 1 where focal lengths are estimated from its frames."""
-        if self.focal in (None, *MEASURED):
-            return 1.0
-        number = plain_number(self.focal)
-        return read_focal_track(self.focal) if number is None else number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,9 +80,19 @@ class ImageCalibration:
         return {
             "detector": self.job.detector,
             "focal_source": self.focals.origin,
+            "focal_groups": [dataclasses.asdict(group) for group in self.focals.groups],
             "images": images,
             "unused": self.unused,
         }
+
+    def shared(self) -> list[str]:
+        """Which images share a focal length, in sentences; none where that was not asked for."""
+        if self.job.shared_focal is None:
+            return []
+        groups = [group.sentence(self.focals.unit) for group in self.focals.groups]
+        rest = len(groups) - _MOST_GROUPS
+        more = [f"And {rest} groups more, in summary.json."] if rest > 0 else []
+        return [*groups[:_MOST_GROUPS], *more] or ["No two photos share a focal length."]
 
     def warnings(self) -> list[str]:
         """User-facing warnings: images that were not used, and those of the calibration."""
@@ -188,7 +112,7 @@ class ImageCalibration:
         most = {"some": MOST_OVERLAYS, "all": len(self.used), "none": 0}[self.job.overlays]
         drawn = set(chosen_frames(self.calibration, most)) if most else set()
         return [
-            _overlay(numbers[detection.name], detection.name) if frame in drawn else ""
+            overlay_name(numbers[detection.name], detection.name) if frame in drawn else ""
             for frame, detection in enumerate(self.used)
         ]
 
@@ -293,11 +217,11 @@ def calibrate_images(
         way = "board"
     if way is None and job.detector == "pitch" and not job.board and not any(d.focal for d in usable):
         way = "pitch"
-    focals = choose_focals(usable, way, unit=job.focal_unit, board=job.board)
+    focals = choose_focals(usable, way, unit=job.focal_unit, board=job.board, sharing=_sharing(job))
     unused |= {d.name: focals.absent for d in usable if d.name not in focals.focal}
     if job.focal_sigma is not None:
         sigma = focal_sigmas(job.focal_sigma, np.array(list(focals.focal.values())))
-        focals = dataclasses.replace(focals, deviation=dict(zip(focals.focal, sigma.tolist(), strict=True)))
+        focals = focals.deviating_by(dict(zip(focals.focal, sigma.tolist(), strict=True)))
     used = tuple(d for d in usable if d.name in focals.focal)
     while True:
         lines = lines_of(used, np.array([focals.focal[d.name] for d in used]), focals.unit)
@@ -308,6 +232,7 @@ def calibrate_images(
             centre=job.centre,
             robust=True,
             focal_sigma=sigma,
+            shared=_shared(used, focals),
             stage=stage,
         )
         done = ImageCalibration(job, calibration, used, focals, tuple(d.name for d in detections), unused)
@@ -316,6 +241,23 @@ def calibrate_images(
             return _with_findings(_with_equipment(done))
         unused = unused | dict.fromkeys(sorted(hopeless), _NONE_AGREES)
         used = tuple(d for d in used if d.name not in hopeless)
+
+
+def _sharing(job: ImageJob) -> Sharing | None:
+    """Which images share a focal length."""
+    if job.shared_focal is None:
+        return None
+    text = job.focal_sigma
+    return Sharing(job.shared_focal, None if text is None else lambda focal: focal_sigmas(text, focal))
+
+
+def _shared(used: Sequence[Detection], focals: Focals) -> np.ndarray | None:
+    """For each image a number, the same for those that share a focal length; None if none do."""
+    if not focals.groups:
+        return None
+    own = np.arange(len(used))
+    group = np.array([focals.number_of_group(detection.name) for detection in used])
+    return np.where(group >= 0, len(used) + group, own)
 
 
 def _with_equipment(done: ImageCalibration) -> ImageCalibration:
@@ -342,16 +284,6 @@ def _with_findings(done: ImageCalibration) -> ImageCalibration:
 _NONE_AGREES = (
     "none of its lines is straight under the model fitted to the other images. Check its focal length"
 )
-
-
-def _overlay(number: int, name: str) -> str:
-    """File name of the picture with an image's detected lines, safe for any image name."""
-    return numbered_name(number, name, ".jpg")
-
-
-def is_video(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is a video, by its name."""
-    return Path(path).suffix.lower() in VIDEO_SUFFIXES
 
 
 def _of_one_size(detections: Sequence[Detection]) -> tuple[list[Detection], dict[str, str]]:

@@ -1,27 +1,41 @@
 """Which zoom model and which centre of distortion `zoomjax calibrate` fits, and why."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ..fit.centre import CentreFit
+from ..fit.zoom import CentreArgument
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
 from ..lines.lines import Lines
+from ..models.brown_conrady import BrownConrady
+from ..models.division import Division
+from ..models.family import AbstractFamily, AbstractRadial
+from ..models.polynomial import RadialPolynomial
 from ..models.smooth import SmoothZoom
 from ..models.spline import SplineZoom
 from ..models.zoom import AbstractZoom, PolynomialZoom
 from ..trust.centre_choice import CentreChoice
-from ..trust.selection import Candidate, Selection
+from ..trust.selection import Candidate, Selection, select_model
 from ..trust.staged_selection import select_in_stages
 
 MODELS = ("auto", "polynomial", "smooth", "spline")
 """Zoom models by the names that `calibrate` takes; "auto" chooses."""
 
+FAMILIES: dict[str, AbstractFamily] = {
+    "radial": RadialPolynomial(),
+    "division": Division(),
+    "brown-conrady": BrownConrady(),
+}
+"""Distortion models by the names that `calibrate` takes, besides "auto", which chooses."""
+
 _DEGREE, _TERMS = 2, 2
 _MOST_DEGREE = 3
 _KNOTS = (4, 6, 8)
+_FOLDS = 10
 _MANY_LINES = 300
 """From so many lines on three coefficients compete."""
 
@@ -34,11 +48,14 @@ class WantedModel:
         model: one of `MODELS`.
         degree: of the polynomials; None for the default.
         terms: number of coefficients; None for the default, or for a choice.
+        family: the distortion model: one of `FAMILIES`, or "auto" for the one of least cross-validation
+            error.
     """
 
     model: str = "auto"
     degree: int | None = None
     terms: int | None = None
+    family: str = "radial"
 
     def __post_init__(self):
         """Check that the settings go together.
@@ -51,19 +68,48 @@ class WantedModel:
             raise ValueError(f"Argument model must be one of {names}, but it is {self.model!r}.")
         if self.degree is not None and self.model not in ("auto", "polynomial"):
             raise ValueError(f"Argument degree is for polynomials: leave it out for model {self.model}.")
+        if self.family not in ("auto", *FAMILIES):
+            names = ", ".join(["auto", *FAMILIES])
+            raise ValueError(f"Argument family must be one of {names}, but it is {self.family!r}.")
+        if self.family != "radial" and self.model == "smooth":
+            raise ValueError(
+                "Argument model smooth has a prior for the radial polynomial: leave out argument family."
+            )
+
+    @property
+    def distortion(self) -> AbstractFamily:
+        """The distortion model, or, where it is to be chosen, the first one."""
+        return FAMILIES.get(self.family, RadialPolynomial())
+
+    @property
+    def usual_centre(self) -> CentreArgument:
+        """The centre of distortion where none is asked for."""
+        return "fit" if isinstance(self.distortion, AbstractRadial) else "image"
+
+    def check_centre(self, centre: CentreArgument | None) -> None:
+        """Refuse to fit the centre of a model that is not radial: (p1, p2) do nearly the same.
+
+        Raises:
+            ValueError: it is to be fitted nevertheless.
+        """
+        if isinstance(centre, str) and centre == "fit" and self.usual_centre != "fit":
+            raise ValueError(
+                f'Argument centre cannot be "fit" with argument family {self.family}, whose decentering '
+                'does nearly the same: give "image" or coordinates.'
+            )
 
     def base(self, focal: Any) -> Candidate:
         """The model itself, or, where it is to be chosen, what lines are rejected and centred with."""
         distinct = np.unique(np.asarray(focal)).size
         terms = _TERMS if self.terms is None else self.terms
         if self.automatic:
-            return Candidate(PolynomialZoom(degree=min(_DEGREE, distinct - 1)), terms)
+            return Candidate(PolynomialZoom(degree=min(_DEGREE, distinct - 1)), terms, self.distortion)
         models: dict[str, AbstractZoom] = {
             "smooth": SmoothZoom(),
             "spline": SplineZoom(number=min(_KNOTS[1], distinct)),
         }
         polynomial = PolynomialZoom(degree=_DEGREE if self.degree is None else self.degree)
-        return Candidate(models.get(self.model, polynomial), terms)
+        return Candidate(models.get(self.model, polynomial), terms, self.distortion)
 
     @property
     def automatic(self) -> bool:
@@ -89,11 +135,49 @@ class WantedModel:
         zooms += [SmoothZoom()] if distinct > 1 and terms[0] == _TERMS else []
         return select_in_stages(lines, zooms, terms)
 
+    def choose_in_family(self, lines: Lines) -> Selection:
+        """The model of least cross-validation error under another distortion model than the polynomial.
+
+        Each part that is left out takes a fit, so that few compete: polynomials with two coefficients, and
+        with other numbers of them the one of degree 2, or of the highest degree that there is.
+        """
+        distinct, terms = np.unique(np.asarray(lines.focal)).size, self._terms(lines)
+        degrees = range(min(_MOST_DEGREE + 1, distinct))
+        pairs = [(degree, terms[0]) for degree in degrees]
+        pairs += [(min(_DEGREE, distinct - 1), number) for number in terms[1:]]
+        return _selected(lines, [Candidate(PolynomialZoom(degree=d), n, self.distortion) for d, n in pairs])
+
+    def choose_family(self, lines: Lines, chosen: Candidate, compared: Sequence[Candidate]) -> Selection:
+        """The distortion model of least cross-validation error.
+
+        Args:
+            lines: the lines, about their centre and with their weights.
+            chosen: the model chosen under the radial polynomial.
+            compared: what it was chosen from.
+        """
+        zoom = chosen.zoom
+        if isinstance(zoom, SmoothZoom):  # its prior is for the radial polynomial
+            zoom = PolynomialZoom(degree=min(_DEGREE, np.unique(np.asarray(lines.focal)).size - 1))
+        numbers = dict.fromkeys([chosen.terms, *self._terms(lines)])
+        others = [
+            Candidate(zoom, number, family) for family in list(FAMILIES.values())[1:] for number in numbers
+        ]
+        return _selected(lines, [*compared, *others])
+
     def _terms(self, lines: Any) -> list[int]:
         """Numbers of coefficients, the first of which the zoom models are compared with."""
         if self.terms is not None or not self.automatic:
             return [_TERMS if self.terms is None else self.terms]
         return [_TERMS, 1, *([3] if len(lines.frame) >= _MANY_LINES else [])]
+
+
+def _selected(lines: Lines, candidates: Sequence[Candidate]) -> Selection:
+    """The candidate of least error, over focal lengths left out, or lines where there are few."""
+    distinct = np.unique(np.asarray(lines.focal)).size
+    folds = min(_FOLDS, distinct - 2) if distinct > 3 else _FOLDS
+    if lines.weight is None:
+        lines = lines.weighted(np.ones(lines.frame.shape))  # as in every fold: one compiled program
+    return select_model(lines, candidates, folds=folds, rule="least")
 
 
 @dataclasses.dataclass(frozen=True)

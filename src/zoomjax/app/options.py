@@ -13,6 +13,7 @@ FIT, FOCAL, INPUT, OUTPUT = "Lens", "Focal lengths", "Images and lines", "Output
 
 Detector = Literal["edges", "grid", "pitch"]
 FocalUnit = Literal["mm", "px"]
+SharedBy = Literal["exif", "folder", "similarity"]
 OverlaysOf = Literal["some", "all", "none"]
 
 Strict = Annotated[
@@ -90,6 +91,39 @@ Exclude = Annotated[
     ),
 ]
 
+Focal = Annotated[
+    str | None,
+    typer.Option(
+        help="Source of the focal lengths: a CSV file (columns image,focal; for a video time,focal or "
+        "frame,focal; for CSV lines frame,focal), a number, exif, board (parallel to the sensor), "
+        "plane (oblique views of a flat grid), pitch (football markings), or for a video motion (as "
+        "the camera turns and zooms). Default for photos: board if --pitch is given, else exif, else "
+        "plane (with --detector pitch: pitch); for a video: motion.",
+        rich_help_panel=FOCAL,
+    ),
+]
+FocalUnits = Annotated[
+    FocalUnit | None,
+    typer.Option(help="Unit of focal lengths in a CSV file or number. Default: mm.", rich_help_panel=FOCAL),
+]
+FocalSigma = Annotated[
+    str | None,
+    typer.Option(
+        help="Standard deviation of the focal lengths, in their unit or per cent, e.g. 0.3 or 1%. "
+        "Standard deviations of the results include it. Default: what plane, board or pitch estimate, "
+        "the CSV column sigma, or else 0.",
+        rich_help_panel=FOCAL,
+    ),
+]
+SharedFocal = Annotated[
+    SharedBy | None,
+    typer.Option(
+        help="With --focal plane: photos of one zoom share one focal length, estimated from all of them "
+        "together. Of one zoom are photos of one EXIF focal length (exif), of one folder (folder), or "
+        "whose focal lengths agree within their standard deviations (similarity).",
+        rich_help_panel=FOCAL,
+    ),
+]
 Pitch = Annotated[
     str | None,
     typer.Option(
@@ -113,10 +147,14 @@ Pixel = Annotated[
 
 IDLE_FOR_LINES = (
     *("pitch", "distance", "pixel", "jobs", "detector", "frames", "cache", "overlays", "with_lines"),
+    "shared_focal",
 )
 """Parameters of calibrate that say nothing about a file of lines."""
 
-IDLE_FOR_MOTION = ("focal_sigma", "focal_unit", "pitch", "distance", "pixel", "robust", "overlays")
+IDLE_FOR_MOTION = (
+    *("focal_sigma", "focal_unit", "pitch", "distance", "pixel", "robust", "overlays", "shared_focal"),
+    "family",
+)
 """And about a clip whose motion gives its focal lengths."""
 
 CALIBRATE_EXAMPLES = """\
@@ -126,7 +164,11 @@ Examples:
 
   zoomjax calibrate photos/*.jpg --focal focal.csv -o mylens
 
+  zoomjax calibrate zoom/*mm/ --focal plane --shared-focal folder -o mylens
+
   zoomjax calibrate zoom.mp4 --focal track.csv -o mylens
+
+  zoomjax calibrate fisheye/ --family division -o mylens
 
   zoomjax calibrate mylens --exclude 15,17 -o mylens
 """

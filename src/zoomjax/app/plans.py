@@ -10,7 +10,7 @@ from .._core.text import plain, span
 
 if TYPE_CHECKING:
     from ..lines.lines import Lines
-    from .image_calibration import ImageJob
+    from .image_job import ImageJob
 
 _LISTED = 20
 

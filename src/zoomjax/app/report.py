@@ -23,6 +23,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from .._core.text import plain, span
+from ..models.registry import family_name
 from ..trust.selection import COLUMNS
 from .calibration import Calibration, rms_over_frames
 from .choice import colour_limit
@@ -227,14 +228,18 @@ def _straightness(calibration: Calibration) -> dict[str, Any]:
 
 def _lens(calibration: Calibration) -> dict[str, Any]:
     x, y = (float(value) for value in np.asarray(calibration.zoom.lens.centre))
+    names = calibration.coefficient_names()
     return {
         "unit": calibration.zoom.lens.focal_unit,
         "centre": f"{x:.6g}, {y:.6g}",
         "centre_found": calibration.centre.sentence,
         "coefficients": _coefficients(calibration),
+        "family": family_name(calibration.zoom.lens.family),
+        "formula": calibration.zoom.lens.family.formula,
+        "names": list(names),
         "polynomials": [
-            [_term(value, power) for power, value in enumerate(column)]
-            for column in calibration.pixel_polynomials().T
+            (name[0], name[1:], order, [_term(value, power) for power, value in enumerate(column)])
+            for (name, order), column in zip(names.items(), calibration.pixel_polynomials().T, strict=False)
         ],
         "certificate": _certificate(calibration),
         "plot": _plot(

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from ..fit.zoom import CentreArgument
     from ..lines.lines import Lines
     from .calibration import Calibration
-    from .image_calibration import ImageCalibration, ImageJob
+    from .image_calibration import ImageCalibration
+    from .image_job import ImageJob
     from .model_choice import WantedModel
     from .report import Run
 

@@ -196,6 +196,14 @@ def line_squares(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "line
     return _line_squares(lines, coefficients_by(zoom, lines))
 
 
+@eqx.filter_jit
+def line_squares_by_frame(
+    lines: AbstractLines, coefficients: Float[AnyArray, "frame terms"]
+) -> Float[Array, "line"]:
+    """The same under coefficients of each frame."""
+    return _line_squares(lines, jnp.asarray(coefficients))
+
+
 def _line_squares(lines, coefficients):
     distances = jax.vmap(line_residuals)(lines.corrected(coefficients[lines.frame]))
     return jnp.sum(distances**2, axis=1) / jnp.maximum(lines.counts, 1)

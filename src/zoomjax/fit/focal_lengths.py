@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Num, ScalarLike
+from jaxtyping import Array, Bool, Float, Int, Num, ScalarLike
 
 from .._core.arguments import kinds_checked
 from .._core.types import AnyArray, Focal, traced
@@ -48,7 +48,9 @@ _LEAST_NOISE = 1e-3
 
 
 @kinds_checked
-def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma) -> ZoomFit:
+def with_focal_sigma(
+    fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma, shared: Int[AnyArray, "frame"] | None = None
+) -> ZoomFit:
     """Add the uncertainty of the focal lengths to a fit's covariance, and so to all bands.
 
     Args:
@@ -56,14 +58,16 @@ def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma) 
         lines: the lines that it was fitted to, with their weights; measured in the image, if they were.
         focal_sigma: standard deviation of the focal lengths, in the lines' unit: a number, or one per
             frame; 0 where they are exact. For focal lengths rounded to whole mm it is 0.29, 1/sqrt(12).
-            Errors of frames are assumed to be independent.
+            Errors of frames are assumed to be independent, unless they are `shared`.
+        shared: for each frame a number: frames of the same one share an error, as photos at one setting of
+            the zoom whose focal length was measured once.
 
     Returns:
         The fit with `covariance` larger, to first order in the errors.
 
     Raises:
-        ValueError: `focal_sigma` does not hold finite numbers of at least 0, one or one a frame; or the
-            lens has a centre that moves along the zoom.
+        ValueError: `focal_sigma` does not hold finite numbers of at least 0, one or one a frame; `shared`
+            is not one number a frame; or the lens has a centre that moves along the zoom.
 
     Example:
         >>> from zoomjax import compress, displacement_std, fit_zoom, scenes
@@ -85,7 +89,17 @@ def with_focal_sigma(fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma) 
             "Argument fit must have a lens with a fixed centre, but its centre moves along the zoom."
         )
     lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
-    return widened(fit, lines, jnp.diag(sigma / jnp.asarray(lines.focal)) ** 2)
+    relative = sigma / jnp.asarray(lines.focal)
+    if shared is None:
+        return widened(fit, lines, jnp.diag(relative) ** 2)
+    shared = jnp.asarray(shared)
+    if shared.shape != relative.shape:
+        raise ValueError(
+            f"Argument shared must hold a number for each of the {len(relative)} frames, but its shape is "
+            f"{shared.shape}."
+        )
+    together = shared[:, None] == shared[None]
+    return widened(fit, lines, jnp.where(together, relative[:, None] * relative[None], 0))
 
 
 UNKNOWN = (

@@ -65,16 +65,22 @@ def _homogeneous(points):
     return jnp.concatenate([points, jnp.ones_like(points[..., :1])], axis=-1)
 
 
-def homography(image, plane):
-    """Eight entries (the last is 1), a root S of their covariance S Sᵀ for unit noise, and the squares."""
+def homography(image, plane, present):
+    """Eight entries (the last is 1), a root S of their covariance S Sᵀ for unit noise, and the squares.
+
+    `present` is 1 for the points that count and 0 for others.
+    """
     x, y = plane[:, 0], plane[:, 1]
     row = jnp.stack([x, y, jnp.ones_like(x)], axis=-1)
     none = jnp.zeros_like(row)
-    table = jnp.concatenate(
-        [
-            jnp.concatenate([row, none, -image[:, :1] * row], axis=1),
-            jnp.concatenate([none, row, -image[:, 1:] * row], axis=1),
-        ]
+    table = (
+        jnp.concatenate(
+            [
+                jnp.concatenate([row, none, -image[:, :1] * row], axis=1),
+                jnp.concatenate([none, row, -image[:, 1:] * row], axis=1),
+            ]
+        )
+        * jnp.tile(present, 2)[:, None]
     )
     vector = jnp.linalg.svd(table, full_matrices=False)[2][-1]
     # The last entry is the depth of the middle of the plane, which is in front of the camera.
@@ -82,7 +88,7 @@ def homography(image, plane):
 
     def residual(entries):
         mapped = row @ matrix_of(entries).T
-        return (mapped[:, :2] / mapped[:, 2:] - image).ravel()
+        return (present[:, None] * (mapped[:, :2] / mapped[:, 2:] - image)).ravel()
 
     return _refined(residual, start)
 

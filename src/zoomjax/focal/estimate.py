@@ -30,15 +30,17 @@ class FocalEstimate(eqx.Module):
     rms: Float[Array, "*view"]
 
 
-def estimate_of(entries, root, squares, number, coordinates, length):
+def estimate_of(entries, root, squares, number, coordinates, length, counted=None):
     """From the homographies of views, with the sum of squares of all their points' distances.
 
     Each of the points has one or two coordinates that the homographies, of 8 unknowns each, should give.
-    Lengths in the image are in units of length px.
+    Lengths in the image are in units of length px. Views that are not `counted` have no part in it.
     """
-    w, information, misfit = _inverse_square(entries, root)
+    if counted is None:
+        counted = jnp.ones(len(entries), bool)
+    w, information, misfit = _inverse_square(entries, root, counted)
     # What one camera can see of the plane has 6 unknowns a view, and f.
-    variance = (squares + misfit) / (coordinates * number - 6 * len(entries) - 1)
+    variance = (squares + misfit) / (coordinates * number - 6 * jnp.sum(counted) - 1)
     known = (w > 0) & (information > 0)
     w = jnp.where(known, w, 1)
     focal = length / jnp.sqrt(w)
@@ -62,11 +64,12 @@ def _equations(entries):
     return factor / size, jnp.stack([h1[2] * h2[2], h1[2] ** 2 - h2[2] ** 2]) / size
 
 
-def _inverse_square(entries, root):
+def _inverse_square(entries, root, counted):
     """The generalised least-squares w of several views, for unit noise the inverse of its variance, and by
     how much the sum of squares would be larger if the homographies obeyed the equations exactly.
     """
     factor, constant = jax.vmap(_equations)(entries)  # (view, 2)
+    factor, constant = (jnp.where(counted[:, None], of, 0) for of in (factor, constant))
     slopes = jax.vmap(jax.jacfwd(_equations))(entries)
 
     def solve(w):

@@ -21,27 +21,32 @@ them. The homography is fitted to the points' distances from the images of their
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Num
 
 from .._core.products import exact_products
-from .._core.types import AnyArray
+from .._core.types import AnyArray, traced
 from ._homography import homography, homography_from_lines
 from .estimate import FocalEstimate, as_points_of, check_pairs, estimate_of
 
 
 def focal_from_planes(
     points: Num[AnyArray, "view point 2"] | list,
-    plane: Num[AnyArray, "point 2"] | list,
+    plane: Num[AnyArray, "point 2"] | Num[AnyArray, "view point 2"] | list,
     *,
     principal: Num[AnyArray, "2"] | list | tuple,
+    mask: Bool[AnyArray, "view point"] | None = None,
 ) -> tuple[FocalEstimate, FocalEstimate]:
     """Estimate the focal length from oblique views of a known plane, by Zhang's two constraints.
 
     Args:
         points: corrected positions in the images, px, one or more views, all at the same zoom, of at
             least 5 points, no 3 of 4 of them on a line. One view is enough if it is oblique.
-        plane: the same points on the plane, in any unit: its size and place do not matter.
+        plane: the same points on the plane, in any unit: its size and place do not matter. (point, 2), or
+            (view, point, 2) if views show other points, of one plane or of several.
         principal: the principal point, px; the centre of distortion is the usual choice.
+        mask: which points are valid; by default all. Views without valid points have no part in the
+            result; all others need at least 5.
 
     Returns:
         The estimate from all views together, and those from each view alone, in px. A view that does not
@@ -49,7 +54,7 @@ def focal_from_planes(
         an infinite standard deviation.
 
     Raises:
-        ValueError: shapes differ, or there are fewer than 5 points.
+        ValueError: shapes differ, or a view has fewer than 5 points.
 
     References:
         Z. Zhang, "A flexible new technique for camera calibration", IEEE PAMI 22 (2000), section 3.1.
@@ -69,8 +74,25 @@ def focal_from_planes(
             "Argument points must have shape (view, point, 2), with a view at least, but its shape is "
             f"{points.shape}."
         )
-    check_pairs(points[0], plane, fewest=5)
-    return _focal_from_planes(points, plane, as_points_of("principal", principal))
+    if plane.ndim == 3 and len(plane) == len(points):
+        check_pairs(points[0], plane[0], fewest=5)
+    else:
+        check_pairs(points[0], plane, fewest=5)
+        plane = jnp.broadcast_to(plane, points.shape)
+    mask = jnp.ones(points.shape[:2], bool) if mask is None else jnp.asarray(mask)
+    if mask.shape != points.shape[:2]:
+        raise ValueError(
+            f"Argument mask must have shape (view, point), here {points.shape[:2]}, but its shape is "
+            f"{mask.shape}."
+        )
+    if not traced(mask):
+        counts = np.sum(mask, axis=1)
+        few = counts[(counts > 0) & (counts < 5)]
+        if few.size:
+            raise ValueError(
+                f"Views in argument mask must have at least 5 valid points, or none, but one has {few[0]}."
+            )
+    return _focal_from_planes(points, plane, mask, as_points_of("principal", principal))
 
 
 def focal_from_lines(
@@ -125,20 +147,43 @@ def focal_from_lines(
 
 @eqx.filter_jit
 @exact_products
-def _focal_from_planes(points, plane, principal):
-    image = points - principal[None, None]
-    plane = plane - jnp.mean(plane, axis=0, keepdims=True)
+def _focal_from_planes(points, plane, mask, principal):
+    counted = jnp.any(mask, axis=1)
+    # Views without points see what any camera can: a circle, so that their homographies are harmless.
+    angle = 2 * jnp.pi * jnp.arange(points.shape[1], dtype=points.dtype) / points.shape[1]
+    circle = jnp.broadcast_to(jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1), points.shape)
+    present = mask.astype(points.dtype)
+
+    def centred(points):
+        """About the mean of each view's valid points, and 0 in place of the others."""
+        points = jnp.where(mask[..., None], points, 0)
+        number = jnp.maximum(jnp.sum(present, axis=1), 1)[:, None, None]
+        mean = jnp.sum(points, axis=1, keepdims=True) / number
+        return jnp.where(mask[..., None], points - mean, 0)
+
+    def size(centred, axes):
+        number = jnp.sum(present, axis=axes, keepdims=True)[..., None]
+        squares = jnp.sum(centred**2, axis=(*axes, 2), keepdims=True)
+        return jnp.sqrt(jnp.where(squares > 0, squares, 1) / jnp.maximum(number, 1))
+
     # One length for all views: then w and the equations are of the order of 1 in each.
-    length = jnp.sqrt(jnp.mean(jnp.sum((points - jnp.mean(points, axis=1, keepdims=True)) ** 2, axis=-1)))
-    plane = plane / jnp.sqrt(jnp.mean(jnp.sum(plane**2, axis=-1)))
-    entries, root, squares = jax.vmap(homography, in_axes=(0, None))(image / length, plane)
-    number = points.shape[1]
+    length = size(centred(points), (0, 1))
+    image = jnp.where(mask[..., None], (points - principal[None, None]) / length, 0)
+    length = length[0, 0, 0]
+    plane = centred(plane)
+    plane = plane / size(plane, (1,))
+    image, plane = (jnp.where(counted[:, None, None], of, circle) for of in (image, plane))
+    present = jnp.where(counted[:, None], present, 1)
+    entries, root, squares = jax.vmap(homography)(image, plane, present)
+    squares = jnp.where(counted, squares, 0)
+    number = jnp.sum(mask, axis=1)
 
-    def estimate(entries, root, squares):
-        return estimate_of(entries, root, jnp.sum(squares), squares.size * number, 2, length)
+    def estimate(entries, root, squares, number, counted):
+        return estimate_of(entries, root, jnp.sum(squares), jnp.sum(number), 2, length, counted)
 
-    each = jax.vmap(estimate)(entries[:, None], root[:, None], squares[:, None])
-    return estimate(entries, root, squares), each
+    views = (entries, root, squares, number, counted)
+    each = jax.vmap(estimate)(*(of[:, None] for of in views))
+    return estimate(*views), each
 
 
 @eqx.filter_jit

@@ -12,8 +12,9 @@ from jaxtyping import Float
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_terms
 from .._core.types import of_known_values
-from ..fit.energy import line_squares, settings
+from ..fit.energy import line_squares, line_squares_by_frame, settings
 from ..fit.family_lines import FamilyLines
+from ..fit.frames import fit_frames
 from ..fit.result import RESULTS
 from ..fit.zoom import fit_zoom
 from ..lines.base import AbstractLines
@@ -41,7 +42,8 @@ def held_out_zoom(
     has it.
 
     Args:
-        lines: the lines, or, much faster, ``compress(lines)``.
+        lines: the lines, or, much faster, ``compress(lines)``; or ``compress_family(lines, family)``, with
+            a separate fit for each part.
         zoom, terms: as for `fit_zoom`.
         hold_out, folds, seed: as for `select_model`.
 
@@ -63,7 +65,7 @@ def held_out_zoom(
     zoom = PolynomialZoom() if zoom is None else zoom
     focal, *focus = settings(zoom, lines)
     zoom.prepare(focal, terms, *focus)  # complains of too few focal lengths
-    small = small_lines(lines, terms)
+    small = lines.compressed(terms) if isinstance(lines, FamilyLines) else small_lines(lines, terms)
     parts = folds_of(small, hold_out, folds, seed)
     judged = judge(small, zoom, terms, parts)
     return _by_frame(small, np.where(parts.fold >= 0, judged.unseen, np.nan))
@@ -89,6 +91,8 @@ def held_out_frames(
         fewer than two lines.
     """
     terms = checked_terms(terms)
+    if isinstance(lines, FamilyLines):
+        return _frames_by_fits(lines.compressed(terms), terms, folds, seed)
     small = small_lines(lines, terms)
     parts = folds_of(small, "line", folds, seed)
     lanes = lanes_of(small, parts.fold, terms)
@@ -133,6 +137,19 @@ def _by_frame(lines, of_line):
         for values in (share, share * of_line)
     )
     return np.sqrt(squares / np.where(total > 0, total, np.nan))
+
+
+def _frames_by_fits(lines, terms, folds, seed):
+    """`held_out_frames` of another distortion model, by fits of all frames for each part of their lines."""
+    own, parts = own_weights(lines), folds_of(lines, "line", folds, seed)
+    unseen = np.full(own.shape, np.nan)
+    for fold in range(parts.number):
+        out = parts.fold == fold
+        fits = fit_frames(lines.weighted(own * ~out), terms=terms, invertible=False, throw=False)
+        unseen[out] = np.asarray(line_squares_by_frame(lines, fits.coefficients))[out]
+    alone = np.bincount(np.asarray(lines.frame)[own > 0], minlength=len(lines.focal)) < 2
+    unseen[alone[np.asarray(lines.frame)]] = np.nan
+    return _by_frame(lines, unseen)
 
 
 def _judge_by_fits(lines, zoom, terms, parts):

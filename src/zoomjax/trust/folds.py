@@ -77,7 +77,9 @@ def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
     return small
 
 
-def folds_of(lines: CompressedLines, hold_out: HoldOut, folds: int | None, seed: int) -> Folds:
+def folds_of(
+    lines: CompressedLines | FamilyLines, hold_out: HoldOut, folds: int | None, seed: int
+) -> Folds:
     """The parts of the lines that are left out in turn; see `select_model`.
 
     Raises:
@@ -114,7 +116,7 @@ def folds_of(lines: CompressedLines, hold_out: HoldOut, folds: int | None, seed:
     return Folds(np.where(group >= 0, fold[group], -1), group, parts)
 
 
-def shares(lines: CompressedLines) -> Float[np.ndarray, "line"]:
+def shares(lines: CompressedLines | FamilyLines) -> Float[np.ndarray, "line"]:
     """The part of each line in the energy of eq. 13: every frame that counts weighs the same."""
     frame, own = np.asarray(lines.frame), own_weights(lines)
     total = np.bincount(frame, own, minlength=len(lines.focal))

@@ -1,0 +1,116 @@
+"""Calibration with other distortion models than the radial polynomial, to the end."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax import scenes
+from zoomjax.app.calibration import calibrate
+from zoomjax.app.model_choice import FAMILIES, WantedModel
+from zoomjax.app.report import report
+from zoomjax.lines.csv import read_lines_csv, write_lines_csv
+from zoomjax.models import registry
+
+FOCAL = np.array([20.0, 25.0, 33.0, 48.0, 80.0])
+SIZE = (1072, 712)
+
+
+@pytest.fixture(scope="module")
+def barrel():
+    """A strong barrel that the division model describes by one number at each focal length."""
+    zoom = zj.PolynomialZoom(1, jnp.array([[0.02], [-0.35]]), jnp.asarray(20.0))
+    centre = jnp.array([(SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2])
+    return zj.ZoomLens(zoom, centre, jnp.array([20.0, 80.0]), SIZE, family=zj.models.Division())
+
+
+@pytest.fixture(scope="module")
+def lines(barrel, tmp_path_factory):
+    """Its lines, by way of a CSV file."""
+    path = tmp_path_factory.mktemp("families") / "lines.csv"
+    write_lines_csv(scenes.board_lines(barrel, FOCAL, spacing=150, noise=0.1), path)
+    return read_lines_csv(path, image_size=SIZE)
+
+
+def wanted(family, terms=1):
+    return WantedModel("polynomial", degree=1, terms=terms, family=family)
+
+
+def farthest(lens, truth):
+    """The largest error of corrected points over image and zoom, px."""
+    x, y = (np.linspace(0, side - 1, 9) for side in SIZE)
+    points = jnp.array(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
+    off = [np.asarray(lens(f).undistort(points) - truth(f).undistort(points)) for f in FOCAL]
+    return float(np.max(np.linalg.norm(off, axis=-1)))
+
+
+def test_the_families_are_those_of_the_registry():
+    built_in = {zj.models.RadialPolynomial, zj.models.Division, zj.models.BrownConrady}
+    assert {type(family) for family in FAMILIES.values()} == built_in
+    assert [registry.family_named(registry.family_name(f)) for f in FAMILIES.values()] == [
+        *FAMILIES.values()
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", ["division", "brown-conrady"])
+def test_the_whole_job_runs_with_each_family(family, lines, barrel, tmp_path):
+    done = calibrate(lines, model=wanted(family), centre="image", robust=True, focal_sigma=0.05)
+    page = report(done)
+    done.write(tmp_path)
+    lens = zj.load_lens(tmp_path / "lens.json")
+    name = registry.family_name(FAMILIES[family])
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["family"], summary["rms_algebraic"]) == (name, None)
+    assert type(lens.family).__name__ == name
+    assert name in page
+    assert list(done.coefficient_names().items()) == (
+        [("k1", 2)] if family == "division" else [("k1", 2), ("p1", 1), ("p2", 1)]
+    )
+    assert np.isfinite(done.held_out).all()
+    assert np.isfinite(done.each_held_out).all()
+    image = np.full((SIZE[1], SIZE[0]), 200, np.uint8)
+    assert zj.undistort_image(image, lens(33.0)).shape == image.shape
+    if family == "division":
+        assert done.assessment.verdict == "good"
+        assert farthest(lens, barrel) < 1.0
+        assert np.sqrt(np.mean(done.held_out**2)) == pytest.approx(0.1, rel=0.2)
+
+
+@pytest.mark.slow
+def test_the_right_family_straightens_lines_that_another_leaves_bent(lines, barrel):
+    division, radial = (
+        calibrate(lines, model=wanted(family), centre="image") for family in ("division", "radial")
+    )
+    assert division.zoom.rms < radial.zoom.rms / 2
+    assert farthest(division.zoom.lens, barrel) < farthest(radial.zoom.lens, barrel) / 5
+
+
+@pytest.mark.slow
+def test_auto_takes_the_family_of_least_error_and_says_so(lines):
+    done = calibrate(lines, model=wanted("auto"), centre="image")
+    assert isinstance(done.zoom.lens.family, zj.models.Division)
+    assert done.selection.chosen.name == "Division, degree 1, 1 term"
+    names = [verdict.candidate.name for verdict in done.selection.verdicts]
+    assert names == ["degree 1, 1 term", "Division, degree 1, 1 term", "BrownConrady, degree 1, 1 term"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"family": "fisheye"}, "family must be one of auto, radial, division, brown-conrady"),
+        ({"family": "division", "model": "smooth"}, "prior for the radial polynomial"),
+    ],
+)
+def test_what_a_family_cannot_do_is_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        WantedModel(**settings)
+
+
+def test_the_centre_of_a_decentred_model_is_not_fitted(lines):
+    assert WantedModel(family="brown-conrady").usual_centre == "image"
+    assert WantedModel(family="division").usual_centre == "fit"
+    with pytest.raises(ValueError, match="brown-conrady, whose decentering does nearly the same"):
+        calibrate(lines, model=wanted("brown-conrady"), centre="fit")
