@@ -9,7 +9,8 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app.calibration import calibrate, focal_sigmas, rms_over_frames
+from zoomjax.app.calibration import calibrate, rms_over_frames
+from zoomjax.app.focal_sources import focal_sigmas
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.report import report
 

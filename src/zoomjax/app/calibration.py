@@ -367,22 +367,6 @@ def calibrate(
     )
 
 
-def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray, "frame"]:
-    """Parse standard deviations: a number in the unit of f, or a percentage of f such as "1%".
-
-    Raises:
-        ValueError: the text is neither, or negative.
-    """
-    number, percent, rest = text.strip().partition("%")
-    try:
-        value = float(number)
-    except ValueError:
-        value = np.nan
-    if rest or not 0 <= value < np.inf:
-        raise ValueError(f"Argument focal_sigma must be a number such as 0.3, or 1%, but it is {text!r}.")
-    return value / 100 * np.asarray(focal) if percent else np.full(np.shape(focal), value)
-
-
 def rms_over_frames(frame_rms: Float[AnyArray, "frame"]) -> float:
     """Root of the mean of the frames' squared RMS: eq. 13 from eq. 3. NaN frames are ignored."""
     known = np.asarray(frame_rms)[~np.isnan(frame_rms)]

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..fit.centre import fit_centre
-from ..fit.family_lines import FamilyLines, compress_family
+from ..fit.family_lines import compress_family
 from ..fit.frames import fit_frames
 from ..fit.result import FrameFits, ZoomFit
 from ..fit.robust import reweighted
 from ..fit.zoom import CentreArgument, about_centre, fit_zoom
+from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines, compress
 from ..lines.free_centre import AnyCentreLines, compress_any_centre
 from ..lines.lines import Lines
@@ -37,7 +38,7 @@ class Fitted(NamedTuple):
 
     zoom: ZoomFit
     each: FrameFits
-    lines: CompressedLines | FamilyLines
+    lines: AbstractLines
     model: Candidate
     centre: CentreFound
     selection: Selection | None
@@ -64,30 +65,11 @@ def fitted(
         lines.focal, model.terms
     )  # raises if there are too few focal lengths, before any work
     found = _about_centre(lines, radial, centre, robust, wanted.family in ("radial", "auto"), stage)
-    small, model, selection, zoom = found.lines, found.model, found.selection, found.zoom
+    small: AbstractLines = found.lines
+    model, selection, zoom = found.model, found.selection, found.zoom
     if wanted.family != "radial":
-        placed = _widest(lines).about(small.centre)
-        if wanted.family == "auto":
-            stage("Choosing the distortion model")
-            if small.weight is not None:
-                placed = placed.weighted(np.asarray(small.weight))
-            compared = [v.candidate for v in selection.verdicts] if selection else [model]
-            selection = wanted.choose_family(placed, model, compared)
-            model = selection.chosen
-        else:
-            model = wanted.base(lines.focal)
-            if robust:
-                stage("Rejecting lines that are not straight")
-                form = compress_family(placed, model.family, terms=model.terms)
-                placed = placed.weighted(np.asarray(reweighted(form, model.zoom, model.terms)[0].weight))
-            if wanted.automatic:
-                stage("Choosing the model")
-                selection = wanted.choose_in_family(placed)
-                model = selection.chosen
-        if not isinstance(model.family, RadialPolynomial):
-            small = compress_family(placed, model.family, terms=model.terms)
-        if model.name != found.model.name:
-            zoom = None
+        small, model, selection = _under_family(lines, wanted, found, robust, stage)
+        zoom = None
     stage("Fitting the zoom model")
     if zoom is None:
         zoom = fit_zoom(small, zoom=model.zoom, terms=model.terms)
@@ -151,6 +133,37 @@ def _about_centre(
     if found is None or not found.determined:
         return _Centred(small, model, how, selection, None)
     return _Centred(held.about(found.fit.lens.centre), model, how, selection, found.fit)
+
+
+def _under_family(
+    lines: Lines, wanted: WantedModel, found: _Centred, robust: bool, stage: Callable[[str], None]
+) -> tuple[AbstractLines, Candidate, Selection | None]:
+    """The lines, the model and its choice under another distortion model, or the best of all of them.
+
+    About the centre that was found. Weights are those under the distortion model itself where it is given.
+    """
+    model, selection = found.model, found.selection
+    placed = _widest(lines).about(found.lines.centre)
+    if wanted.family == "auto":
+        stage("Choosing the distortion model")
+        if found.lines.weight is not None:
+            placed = placed.weighted(np.asarray(found.lines.weight))
+        compared = [v.candidate for v in selection.verdicts] if selection else [model]
+        selection = wanted.choose_family(placed, model, compared)
+        model = selection.chosen
+    else:
+        model = wanted.base(lines.focal)
+        if robust:
+            stage("Rejecting lines that are not straight")
+            form = compress_family(placed, model.family, terms=model.terms)
+            placed = placed.weighted(np.asarray(reweighted(form, model.zoom, model.terms)[0].weight))
+        if wanted.automatic:
+            stage("Choosing the model")
+            selection = wanted.choose_in_family(placed)
+            model = selection.chosen
+    if isinstance(model.family, RadialPolynomial):
+        return found.lines, model, selection
+    return compress_family(placed, model.family, terms=model.terms), model, selection
 
 
 def _widest(lines: Lines) -> Lines:

@@ -14,7 +14,9 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
+from .._core.types import AnyArray
 from ..detect.batch import Detection
 from ..fit.frames import fit_frames
 from ..fit.robust import fit_robust
@@ -372,3 +374,19 @@ def _counted(position: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
             step = float(np.polyfit(index[: number + 1], position[: number + 1], 1)[0])
     rest = position - np.polyval(np.polyfit(index, position, 1), index)
     return (position, index) if np.sqrt(np.mean(rest**2)) < _EVEN * step else None
+
+
+def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray, "frame"]:
+    """Parse standard deviations: a number in the unit of f, or a percentage of f such as "1%".
+
+    Raises:
+        ValueError: the text is neither, or negative.
+    """
+    number, percent, rest = text.strip().partition("%")
+    try:
+        value = float(number)
+    except ValueError:
+        value = np.nan
+    if rest or not 0 <= value < np.inf:
+        raise ValueError(f"Argument focal_sigma must be a number such as 0.3, or 1%, but it is {text!r}.")
+    return value / 100 * np.asarray(focal) if percent else np.full(np.shape(focal), value)

@@ -16,10 +16,10 @@ from .._core.text import plain
 from ..detect.batch import DETECTORS, Detection, detect
 from ..detect.sources import Source
 from ._flags import with_flags
-from .calibration import CLEARS, Calibration, calibrate, focal_sigmas
+from .calibration import CLEARS, Calibration, calibrate
 from .choice import chosen_frames, colour_limit
 from .equipment import with_equipment
-from .focal_sources import MEASURED, Focals, choose_focals, lines_of
+from .focal_sources import MEASURED, Focals, choose_focals, focal_sigmas, lines_of
 from .image_job import ImageJob, overlay_name
 from .overlay import draw_lines
 from .plane_focals import Sharing

@@ -14,8 +14,8 @@ from ..fit.zoom import CentreArgument
 from ..io.focal_track import FocalTrack, read_focal_track
 from ..io.photo import read_focal
 from ..io.text_table import plain_number
-from .calibration import FILES, focal_sigmas
-from .focal_sources import MEASURED, Board, check_way
+from .calibration import FILES
+from .focal_sources import MEASURED, Board, check_way, focal_sigmas
 from .model_choice import WantedModel
 from .plane_focals import SHARED_BY
 

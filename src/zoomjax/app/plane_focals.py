@@ -136,7 +136,7 @@ def focals_from_grids(
         free = max(len(own) - 1, 1)
         wider = float(together.std) * math.sqrt(max(squares / free, 1.0))
         together = FocalEstimate(together.focal, jnp.asarray(wider), together.rms)
-        names = tuple(detections[i].name for i in group)
+        names = tuple(detections[i].name for i in group.tolist())
         found |= dict.fromkeys(names, together)
         groups.append(
             FocalGroup(

@@ -34,7 +34,8 @@ def calibrate_lines(
     names: Collection[str],
 ) -> "Calibration":
     """Calibrate from lines, and write those results into the folder that have such names."""
-    from .calibration import calibrate, focal_sigmas
+    from .calibration import calibrate
+    from .focal_sources import focal_sigmas
     from .report import report
 
     sigma = focal_sigmas(focal_sigma or "0", lines.focal)
