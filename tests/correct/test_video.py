@@ -171,6 +171,13 @@ def test_short_track_leaves_nothing(clip, tmp_path):
     assert undistort_video(clip, tmp_path / "out.mp4", lens=lens(), focal=held).frames == FRAMES
 
 
+@pytest.mark.parametrize("correct", [undistort_video, zj.correct.redistort_video])
+def test_a_track_that_goes_on_after_the_video_is_said(clip, tmp_path, correct):
+    longer = zj.io.FocalTrack(np.array([0.0, 48.0]), np.array([20.0, 80.0]), by_time=False)
+    with pytest.warns(UserWarning, match=r"goes on to 48 frames, and the video ends at 23: is it"):
+        assert correct(clip, tmp_path / "out.mp4", lens=lens(), focal=longer).frames == FRAMES
+
+
 def test_interruption_leaves_no_file_and_no_thread(clip, tmp_path):
     threads = threading.active_count()
 

@@ -87,7 +87,8 @@ def undistort_video(
 
         Warns:
         UserWarning: frames cannot be decoded, or are interlaced; focal lengths are outside of the fitted
-            range; the lens is for another size, or folds within the frames.
+            range; the track goes on after the video's end; the lens is for another size, or folds within
+            the frames.
     """
     return _convert(
         source,
@@ -180,6 +181,8 @@ def _convert(
             f"be decoded ({report.error or 'the file ends early'}): {report.written} were written.",
             stacklevel=3,
         )
+    else:
+        track.warn_if_longer(*report.last, stacklevel=3)
     return CorrectedVideo(
         report.written, lost, float(framing.scale), tuple(writer.kept), tuple(writer.not_kept)
     )
@@ -247,6 +250,7 @@ def _warped(
             if isinstance(item, av.VideoFrame):
                 if report.first is None:
                     report.first = first_frame(item)
+                report.last = (number, time)
                 yield warper(item, track.at(number, time))
             else:
                 yield item

@@ -5,6 +5,7 @@ Between two samples 1/f is taken as linear, because that is the variable in whic
 
 import dataclasses
 import os
+import warnings
 
 import numpy as np
 
@@ -75,6 +76,22 @@ class FocalTrack:
             )
         return 1 / float(np.interp(position, self.position, 1 / self.focal))
 
+    def warn_if_longer(self, frame: int, time: float, *, stacklevel: int = 2) -> None:
+        """Warn if this is hardly the track of a video with this last frame, as it goes on after it.
+
+        A track of one focal length is right for any video. Tracks in seconds may be a little longer.
+        """
+        last, end = float(self.position[-1]), time if self.by_time else float(frame)
+        slack = max(_LONGER * end, 1.0) if self.by_time else 0.0
+        if last > end + slack and np.ptp(self.focal) > 0:
+            unit = "s" if self.by_time else "frames"
+            base = "Times are in seconds" if self.by_time else "Frames count from 0"
+            warnings.warn(
+                f"The focal track goes on to {last:g} {unit}, and the video ends at {end:g}: is it the "
+                f"track of this video? {base}.",
+                stacklevel=stacklevel + 1,
+            )
+
 
 def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> FocalTrack:
     """Read a track from a CSV file with a header, ``time,focal`` (seconds) or ``frame,focal`` (from 0).
@@ -106,6 +123,9 @@ def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> Foc
     table.check(header, later, "greater than in the row before: sort the track, and give each moment once")
     return FocalTrack(position, focal, by_time=by_time, hold=hold)
 
+
+_LONGER = 0.05
+"""Of a video's length, by which a track in seconds may be longer."""
 
 _BY_TIME = {"time": True, "frame": False, "time_or_frame": None}
 """Columns of positions: whether they are seconds."""

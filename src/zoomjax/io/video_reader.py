@@ -57,6 +57,7 @@ class Report:
     failed: int = 0
     error: str = ""
     first: Any = None
+    last: tuple[int, float] = (-1, math.nan)
 
 
 def opened_video(source: str | os.PathLike[str]) -> Any:
