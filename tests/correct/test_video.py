@@ -256,6 +256,21 @@ def test_cut_off_mp4_is_named(clip, tmp_path):
     assert only(tmp_path, "cut.mp4")
 
 
+@pytest.mark.parametrize("sound", [False, True])
+def test_a_cut_off_matroska_file_is_said(tmp_path, sound):
+    """It tells its length in seconds, and no number of frames."""
+    source = write_clip(tmp_path / "in.mkv", encoder="ffv1", sound=sound)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=TRACK).lost == 0
+    content = source.read_bytes()
+    source.write_bytes(content[: len(content) // 2])
+    with pytest.warns(UserWarning, match=r"\d+ of 2\d frames of .*in\.mkv cannot be decoded .*ends early"):
+        done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=TRACK)
+    assert 20 <= done.frames + done.lost <= 28
+    assert done.lost >= 8
+
+
 def test_last_frames_that_do_not_decode_are_counted(tmp_path):
     """The data of the last third of an MP4 with its index in front are overwritten."""
     source = write_clip(tmp_path / "in.mp4", encoder="mpeg4", sound=False)

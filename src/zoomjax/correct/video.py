@@ -18,7 +18,7 @@ import numpy as np
 from .._core.files import refuse_inputs, whole_file
 from ..io.focal_track import FocalTrack
 from ..io.pyav import av
-from ..io.video_reader import Report, decoded_items, numbered, opened_video
+from ..io.video_reader import Report, decoded_items, frames_cut_off, numbered, opened_video
 from ..io.video_streams import CONTAINER, Carried, carried
 from ..io.video_writer import FrameWriter, first_frame
 from ..models.lens import ZoomLens
@@ -174,6 +174,8 @@ def _convert(
             writer = _write(items, part, target, input_, video, encoder, options, along, report, progress)
         finally:
             items.close()
+        if missing := frames_cut_off(input_, video, report):
+            report.announced = report.written + missing
     lost = max(report.corrupt, report.announced - report.written if report.announced else 0)
     if lost:
         warnings.warn(
