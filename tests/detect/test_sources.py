@@ -237,3 +237,9 @@ def test_a_track_of_a_longer_video_is_said(tmp_path):
     longer = FocalTrack(np.array([0.0, 99.0]), np.array([20.0, 80.0]), by_time=False)
     with pytest.warns(UserWarning, match=r"goes on to 99 frames, and the video ends at 23"):
         assert len(list(video_frames(clip, longer, 6))) == 6
+
+
+def test_results_of_a_clip_are_no_photographs(tmp_path):
+    for name in ("lens.json", "motion.png", "panorama.jpg", "a.jpg"):
+        (tmp_path / name).touch()
+    assert [source.name for source in find_photos([str(tmp_path)])] == ["a.jpg"]

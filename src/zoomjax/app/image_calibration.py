@@ -19,13 +19,13 @@ from ..fit.zoom import CentreArgument
 from ..io.focal_track import FocalTrack, read_focal_track
 from ..io.text_table import plain_number
 from ._flags import with_flags
-from .calibration import CLEARS, FILES, Calibration, calibrate, focal_sigmas
+from .calibration import FILES, Calibration, calibrate, focal_sigmas
 from .choice import chosen_frames, colour_limit
 from .equipment import with_equipment
 from .focal_sources import MEASURED, Board, Focals, check_way, choose_focals, lines_of
 from .model_choice import WantedModel
 from .overlay import draw_lines
-from .results_folder import results_folder
+from .results_folder import OF_A_LENS, results_folder
 from .verdict import findings_of_photos
 
 MOST_OVERLAYS = 200
@@ -202,7 +202,7 @@ class ImageCalibration:
     ) -> None:
         """Write the files of `Calibration.write`, and each image with its detected lines in ``lines/``."""
         names = [*self.job.results(), *(pages or {})]
-        with results_folder(folder, names, clears=CLEARS, overwrite=overwrite) as part:
+        with results_folder(folder, names, clears=OF_A_LENS, overwrite=overwrite) as part:
             self.make(part, progress, pages)
 
     def make(

@@ -19,7 +19,7 @@ from ..io.raw import RAW_SUFFIXES
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".m2ts", ".mpg", ".mxf", ".ts")
 """Of files that count as videos."""
 
-RESULTS = ("lines", "model.png", "before-after.jpg")
+RESULTS = ("lines", "model.png", "before-after.jpg", "motion.png", "panorama.jpg")
 """What a calibration puts beside its ``lens.json`` that might be taken for photographs."""
 
 
