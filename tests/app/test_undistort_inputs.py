@@ -195,6 +195,12 @@ def test_videos_of_one_name_do_not_share_a_track(folder):
         undistort_files(job(folder, "clips/one", focal=str(folder / "tracks"), out="other"))
 
 
+def test_again_is_for_photos(folder):
+    write_clip(folder / "a.mp4", 2, sound=False)
+    with pytest.raises(ValueError, match=r"Argument again is for photos, .*: leave it out"):
+        undistort_files(job(folder, "a.mp4", focal="30", again=True))
+
+
 def test_photos_of_one_name_do_not_share_a_row(folder):
     for place in ("one", "two"):
         (folder / "pictures" / place).mkdir(parents=True)

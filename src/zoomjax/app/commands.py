@@ -94,7 +94,7 @@ def demo(
     photos: Annotated[
         int, typer.Option(min=3, help="Number of photos, each at its own focal length.")
     ] = 12,
-    seed: Annotated[int, typer.Option(help="Random seed of the image noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the image noise.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
     """Run a complete example: render photos of a board with a known lens, then calibrate from them.

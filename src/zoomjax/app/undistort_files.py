@@ -131,6 +131,11 @@ def _videos(
 ) -> Outcome:
     from .undistort_videos import tracks_of, undistort_videos
 
+    if job.again:
+        raise ValueError(
+            "Argument again is for photos, which say that they are corrected, and the inputs are videos: "
+            "leave it out."
+        )
     tracks = tracks_of(job.focal, names, hold=job.hold)
     todo = to_do(job, sources, targets, _is_video)
     correct = functools.partial(
