@@ -178,6 +178,14 @@ def test_a_track_that_goes_on_after_the_video_is_said(clip, tmp_path, correct):
         assert correct(clip, tmp_path / "out.mp4", lens=lens(), focal=longer).frames == FRAMES
 
 
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("focal", ["30", "track.csv", [30.0] * 24, np.full(24, 30.0), None, True])
+def test_what_is_neither_a_focal_length_nor_a_track_is_refused(clip, tmp_path, focal):
+    with pytest.raises(TypeError, match=r"focal must be one focal length or a FocalTrack, .*read_focal"):
+        undistort_video(clip, tmp_path / "out.mp4", lens=lens(), focal=focal)
+    assert only(tmp_path)
+
+
 def test_interruption_leaves_no_file_and_no_thread(clip, tmp_path):
     threads = threading.active_count()
 

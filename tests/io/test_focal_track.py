@@ -100,3 +100,11 @@ def test_a_track_of_a_longer_video_warns(by_time, position, focal, warns):
         warnings.simplefilter("always")
         track.warn_if_longer(23, 0.767)
     assert [f"goes on to {position[1]}" in str(each.message) for each in caught] == [True] * warns
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_samples_may_be_lists_and_must_be_numbers():
+    assert zj.io.FocalTrack([0, 1], [20, 30], by_time=False).at(1, 0.0) == pytest.approx(30)
+    for samples in ((["0", "1"], [20, 30]), ([0, 1], "track.csv"), (None, [20, 30])):
+        with pytest.raises(ValueError, match=r"Arguments? (position|focal)"):
+            zj.io.FocalTrack(*samples)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from .._core.checks import real_numbers
 from .._core.files import refuse_inputs, whole_file
 from ..io.focal_track import FocalTrack
 from ..io.pyav import av
@@ -160,7 +161,7 @@ def _convert(
     if not isinstance(keep, Framing):
         check_keep(keep)
     refuse_inputs([target], [source])
-    track = focal if isinstance(focal, FocalTrack) else _constant(float(focal))
+    track = focal if isinstance(focal, FocalTrack) else _constant(focal)
     with opened_video(source) as input_, whole_file(target) as part:
         video = input_.streams.best("video")
         size = (video.codec_context.width, video.codec_context.height)
@@ -209,8 +210,14 @@ def _geometry(
     return lens, framing
 
 
-def _constant(focal: float) -> FocalTrack:
-    return FocalTrack(np.zeros(1), np.array([focal]), hold=True)
+def _constant(focal: Any) -> FocalTrack:
+    if (number := real_numbers(focal)) is None or number.ndim:
+        raise TypeError(
+            "Argument focal must be one focal length or a FocalTrack, but its type is "
+            f"{type(focal).__name__}: read_focal_track(path) reads a file, and FocalTrack(np.arange(n), f, "
+            "by_time=False) is of n frames."
+        )
+    return FocalTrack(np.zeros(1), number[None], hold=True)
 
 
 def _check_length(track: FocalTrack, video: Any) -> None:

@@ -9,6 +9,7 @@ import warnings
 
 import numpy as np
 
+from .._core.checks import real_numbers
 from .text_table import read_text_table
 
 
@@ -33,7 +34,11 @@ class FocalTrack:
     hold: bool = False
 
     def __post_init__(self):
-        """Check the samples."""
+        """Check the samples, which may be lists."""
+        for name in ("position", "focal"):
+            if (values := real_numbers(getattr(self, name))) is None:
+                raise ValueError(f"Argument {name} must hold numbers, but it is {getattr(self, name)!r}.")
+            object.__setattr__(self, name, values.astype(np.float64))
         if self.position.ndim != 1 or self.position.shape != self.focal.shape or not self.position.size:
             raise ValueError(
                 "Arguments position and focal must hold one number a sample, at least one, but their "
