@@ -150,7 +150,7 @@ def frames_cut_off(input_: Any, video: Any, report: Report) -> int:
         length = (input_.duration or 0) / av.time_base if len(input_.streams) == 1 else 0.0
     rate = float(video.average_rate or video.guessed_rate or 25)
     missing = length - report.end
-    return round(missing * rate) if missing > 0.02 * length + 2 / rate else 0
+    return round(missing * rate) if missing > 0.02 * length + 1 / rate else 0
 
 
 def numbered(
