@@ -2,6 +2,8 @@
 
 import sys
 
+from zoomjax.app.results_folder import results_folder
+
 COMMAND = [sys.executable, "-c", "from zoomjax.app.cli import main; main()"]
 
 # As in a terminal: what runs in the background of a shell inherits that Ctrl-C is ignored.
@@ -11,6 +13,27 @@ INTERRUPTIBLE = [
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     "from zoomjax.app.cli import main; main()",
 ]
+
+DATA = {"lines.npz", "tracks.npz", "track.csv"}
+ABOUT = {
+    *("summary.json", "report.html", "model.png", "lines/0001-a.jpg", "before-after.jpg"),
+    *("motion.png", "panorama.jpg", "import.json"),
+}
+
+
+def write_earlier(folder):
+    """Results of commands of all kinds, one after the other: of which none is about the next lens."""
+    with results_folder(folder) as part:
+        (part / "lines").mkdir()
+        for name in ("lens.json", *DATA, *ABOUT):
+            (part / name).write_text("earlier")
+
+
+def still_earlier(folder):
+    """Which of them are left."""
+    found = [path for path in folder.rglob("*") if path.is_file() and path.read_bytes() == b"earlier"]
+    return {path.relative_to(folder).as_posix() for path in found}
+
 
 SEVERAL = """
 import contextlib, io, json, os, sys

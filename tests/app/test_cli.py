@@ -22,7 +22,7 @@ from zoomjax.app.arguments import centre_of, read_lines
 from zoomjax.app.demo import write_photos
 from zoomjax.lines.csv import write_lines_csv
 
-from .._commands import COMMAND, INTERRUPTIBLE
+from .._commands import COMMAND, INTERRUPTIBLE, still_earlier, write_earlier
 
 
 def zoomjax(*arguments, cwd=None):
@@ -47,6 +47,22 @@ def calibrated(few_lines, tmp_path_factory):
     done = zoomjax("calibrate", folder / "lines.npz", "-o", folder / "out", *FORCED)
     assert done.returncode == 0, done.stderr
     return folder / "out", done
+
+
+def test_nothing_about_an_earlier_lens_stays_beside_a_new_one(calibrated, tmp_path):
+    """A report, or a panorama, of another lens would be taken for that of this one."""
+    folder, _ = calibrated
+    for name in ("again", "out"):
+        write_earlier(tmp_path / name)
+    done = zoomjax("calibrate", folder / "lines.npz", "-o", tmp_path / "again", *FORCED)
+    assert done.returncode == 0, done.stderr
+    assert still_earlier(tmp_path / "again") == {"tracks.npz", "track.csv"}
+    options = ("--to", "lensfun", "--pixel-pitch", 0.005)
+    assert zoomjax("export", folder / "lens.json", *options, "-o", tmp_path / "a.xml").returncode == 0
+    size = "x".join(str(side) for side in zj.load_lens(folder / "lens.json").image_size)
+    done = zoomjax("import", tmp_path / "a.xml", "--image-size", size, "-o", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert still_earlier(tmp_path / "out") == {"lines.npz", "tracks.npz", "track.csv"}
 
 
 def test_help_does_not_wait_for_jax():

@@ -17,7 +17,7 @@ from zoomjax.app.motion_calibration import FILES
 from zoomjax.fit.motion import fit_motion
 from zoomjax.scenes import motion_clip, motion_tracks, pan_and_zoom
 
-from .._commands import COMMAND
+from .._commands import COMMAND, still_earlier, write_earlier
 
 SIZE, FRAMES = (640, 360), 36
 
@@ -57,6 +57,7 @@ def clip(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def calibrated(clip):
+    write_earlier(clip.parent / "out")
     done = zoomjax("calibrate", clip.name, "-o", "out", cwd=clip.parent)
     assert done.returncode == 0, done.stderr
     return clip.parent / "out", done
@@ -87,6 +88,10 @@ def test_a_clip_alone_gives_its_focal_lengths_and_its_lens(calibrated):
         missed = np.asarray(made(f).undistort(points)) - np.asarray(true(f).undistort(points))
         assert np.hypot(*(missed - missed.mean(axis=0)).T).max() < 0.4
     assert np.asarray(made(510.0).centre) == pytest.approx(np.array([322, 178]), abs=1)
+
+
+def test_nothing_about_an_earlier_lens_stays(calibrated):
+    assert still_earlier(calibrated[0]) == {"lines.npz"}
 
 
 def test_its_summary_says_what_it_found(calibrated):

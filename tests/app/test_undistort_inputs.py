@@ -176,6 +176,44 @@ def test_several_videos_each_with_its_own_track(folder):
     assert luma(folder / "new/b.mp4")[0].shape[:0:-1] == SIZE
 
 
+def test_videos_of_one_name_do_not_share_a_track(folder):
+    for place in ("one", "two"):
+        (folder / "clips" / place).mkdir(parents=True)
+        (folder / "tracks" / place).mkdir(parents=True)
+        write_clip(folder / "clips" / place / "c.mp4", 2, sound=False)
+    (folder / "tracks/c.csv").write_text("frame,focal\n0,20\n1,20\n")
+    both = job(folder, "clips", focal=str(folder / "tracks"))
+    with pytest.raises(ValueError, match=r"c\.csv is for one video, .*such as .*two/c\.csv"):
+        undistort_files(both)
+    (folder / "tracks/two/c.csv").write_text("frame,focal\n0,80\n1,80\n")
+    undistort_files(both)
+    for place, f in (("one", 20.0), ("two", 80.0)):
+        expected = zj.undistort_image(luma(folder / "clips" / place / "c.mp4")[0][-1], lens()(f))
+        assert np.median(abs(luma(folder / "out" / place / "c.mp4")[0][-1].astype(int) - expected)) <= 2
+    (folder / "clips/one/c.mov").write_bytes((folder / "clips/one/c.mp4").read_bytes())
+    with pytest.raises(ValueError, match="both have its name: correct one after the other"):
+        undistort_files(job(folder, "clips/one", focal=str(folder / "tracks"), out="other"))
+
+
+def test_again_is_for_photos(folder):
+    write_clip(folder / "a.mp4", 2, sound=False)
+    with pytest.raises(ValueError, match=r"Argument again is for photos, .*: leave it out"):
+        undistort_files(job(folder, "a.mp4", focal="30", again=True))
+
+
+def test_photos_of_one_name_do_not_share_a_row(folder):
+    for place in ("one", "two"):
+        (folder / "pictures" / place).mkdir(parents=True)
+        cv2.imwrite(str(folder / "pictures" / place / "p.png"), np.zeros(SIZE[::-1], np.uint8))
+    table = folder / "focal.csv"
+    table.write_text("image,focal\np.png,30\n")
+    with pytest.raises(ValueError, match=r"one row p\.png for two images.*write the folder before"):
+        undistort_files(job(folder, "pictures", focal=str(table)))
+    assert not (folder / "out").exists()
+    table.write_text("image,focal\none/p.png,30\ntwo/p.png,60\n")
+    assert undistort_files(job(folder, "pictures", focal=str(table))).written == 2
+
+
 def test_nothing_is_written_through_a_link_in_the_output_folder(folder, tmp_path):
     (tmp_path / "outside").mkdir()
     (folder / "out").mkdir()

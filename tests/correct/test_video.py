@@ -171,6 +171,21 @@ def test_short_track_leaves_nothing(clip, tmp_path):
     assert undistort_video(clip, tmp_path / "out.mp4", lens=lens(), focal=held).frames == FRAMES
 
 
+@pytest.mark.parametrize("correct", [undistort_video, zj.correct.redistort_video])
+def test_a_track_that_goes_on_after_the_video_is_said(clip, tmp_path, correct):
+    longer = zj.io.FocalTrack(np.array([0.0, 48.0]), np.array([20.0, 80.0]), by_time=False)
+    with pytest.warns(UserWarning, match=r"goes on to 48 frames, and the video ends at 23: is it"):
+        assert correct(clip, tmp_path / "out.mp4", lens=lens(), focal=longer).frames == FRAMES
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("focal", ["30", "track.csv", [30.0] * 24, np.full(24, 30.0), None, True])
+def test_what_is_neither_a_focal_length_nor_a_track_is_refused(clip, tmp_path, focal):
+    with pytest.raises(TypeError, match=r"focal must be one focal length or a FocalTrack, .*read_focal"):
+        undistort_video(clip, tmp_path / "out.mp4", lens=lens(), focal=focal)
+    assert only(tmp_path)
+
+
 def test_interruption_leaves_no_file_and_no_thread(clip, tmp_path):
     threads = threading.active_count()
 
@@ -247,6 +262,21 @@ def test_cut_off_mp4_is_named(clip, tmp_path):
     with pytest.raises(ValueError, match=r"cut\.mp4.*damaged, cut off"):
         undistort_video(tmp_path / "cut.mp4", tmp_path / "out.mp4", lens=lens(), focal=30.0)
     assert only(tmp_path, "cut.mp4")
+
+
+@pytest.mark.parametrize("sound", [False, True])
+def test_a_cut_off_matroska_file_is_said(tmp_path, sound):
+    """It tells its length in seconds, and no number of frames."""
+    source = write_clip(tmp_path / "in.mkv", encoder="ffv1", sound=sound)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=TRACK).lost == 0
+    content = source.read_bytes()
+    source.write_bytes(content[: len(content) // 2])
+    with pytest.warns(UserWarning, match=r"\d+ of 2\d frames of .*in\.mkv cannot be decoded .*ends early"):
+        done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=TRACK)
+    assert 20 <= done.frames + done.lost <= 28
+    assert done.lost >= 8
 
 
 def test_last_frames_that_do_not_decode_are_counted(tmp_path):

@@ -230,3 +230,16 @@ def test_a_whole_video_gives_no_warning(clip):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         list(video_frames(clip, 30.0, 3))
+
+
+def test_a_track_of_a_longer_video_is_said(tmp_path):
+    clip = write_clip(tmp_path / "a.mp4", sound=False)
+    longer = FocalTrack(np.array([0.0, 99.0]), np.array([20.0, 80.0]), by_time=False)
+    with pytest.warns(UserWarning, match=r"goes on to 99 frames, and the video ends at 23"):
+        assert len(list(video_frames(clip, longer, 6))) == 6
+
+
+def test_results_of_a_clip_are_no_photographs(tmp_path):
+    for name in ("lens.json", "motion.png", "panorama.jpg", "a.jpg"):
+        (tmp_path / name).touch()
+    assert [source.name for source in find_photos([str(tmp_path)])] == ["a.jpg"]

@@ -5,6 +5,7 @@ import re
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 
 import zoomjax as zj
@@ -213,9 +214,54 @@ def test_maps_are_read_in_both_directions_and_three_conventions(convention, dire
     two, more = np.split(np.asarray(back.lens(24.0).coefficients), [2])
     assert two == pytest.approx(np.asarray(lens(24.0).coefficients), abs=1e-4)
     assert more == pytest.approx(0, abs=1e-4)
+    told = zj.interop.read(path)
+    assert np.asarray(told.lens.centre) == pytest.approx(np.asarray(back.lens.centre))
+    forget(path)
     if convention == "gyroflow":
         moved = np.asarray(zj.interop.read(path).lens.centre - back.lens.centre)
         assert np.abs(moved).max() > 0.1  # which shows that the convention matters
+
+
+def forget(path):
+    """Make a map of our own one of another program's, which tells its focal length alone."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        kept = {key: value for key, value in file.header().items() if key not in TOLD}
+        pixels = {name: channel.pixels.copy() for name, channel in file.channels().items()}
+    with OpenEXR.File(kept, pixels) as file:
+        file.write(str(path))
+
+
+TOLD = ("zoomjaxDirection", "zoomjaxConvention", "channels")
+
+
+@pytest.mark.parametrize("foreign", [False, True])
+def test_an_argument_that_contradicts_a_map_is_refused(foreign, tmp_path):
+    lens = LENSES["portrait"]()
+    zj.interop.write(lens, tmp_path / "m", format="stmap", focal=24)
+    path = tmp_path / "m" / "redistort.24.exr"
+    if foreign:
+        forget(path)
+    with pytest.raises(ValueError, match="its direction is redistort: leave out argument direction"):
+        zj.interop.read(path, direction="undistort")
+    with pytest.raises(ValueError, match="its focal is 24: leave out argument focal, which is 55"):
+        zj.interop.read(path, focal=55)
+    assert zj.interop.read(path, focal=24, direction="redistort").report.focal == (24,)
+    if not foreign:
+        with pytest.raises(ValueError, match="its convention is centres: leave out argument convention"):
+            zj.interop.read(path, convention="gyroflow")
+        path = path.rename(tmp_path / "undistort.exr")
+        assert zj.interop.read(path).lens(24.0).coefficients[0] == pytest.approx(
+            float(lens(24.0).coefficients[0]), abs=1e-4
+        )
+
+
+def test_maps_of_two_directions_are_of_the_same_focal_lengths(tmp_path):
+    zj.interop.write(LENSES["portrait"](), tmp_path / "m", format="stmap", focal=[24, 35])
+    (tmp_path / "m/redistort.24.exr").unlink()
+    (tmp_path / "m/undistort.35.exr").unlink()
+    with pytest.raises(ValueError, match="not of the same focal lengths: give argument direction"):
+        zj.interop.read(tmp_path / "m")
+    assert zj.interop.read(tmp_path / "m", direction="undistort").report.focal == (24,)
 
 
 @pytest.mark.parametrize("focal", [[24], [18, 50, 200]])

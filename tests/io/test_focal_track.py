@@ -1,5 +1,7 @@
 """Focal tracks: interpolation in 1/f, their ends, and files that are none."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -78,3 +80,31 @@ def test_frames_without_times_have_no_place_in_seconds(hold):
     with pytest.raises(ValueError, match="frames of the video have no times"):
         zj.io.FocalTrack(*samples, hold=hold).at(1, np.nan)
     assert zj.io.FocalTrack(*samples, by_time=False, hold=hold).at(2, np.nan) == 40
+
+
+@pytest.mark.parametrize(
+    ("by_time", "position", "focal", "warns"),
+    [
+        (False, (0, 23), (20, 80), False),
+        (False, (1, 24), (20, 80), True),  # counted from 1
+        (False, (0, 99), (20, 80), True),
+        (False, (0, 99), (30, 30), False),
+        (True, (0, 0.8), (20, 80), False),
+        (True, (0, 1.7), (20, 80), False),
+        (True, (0, 23), (20, 80), True),  # frames, called seconds
+    ],
+)
+def test_a_track_of_a_longer_video_warns(by_time, position, focal, warns):
+    track = zj.io.FocalTrack(np.array(position, float), np.array(focal, float), by_time=by_time, hold=True)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        track.warn_if_longer(23, 0.767)
+    assert [f"goes on to {position[1]}" in str(each.message) for each in caught] == [True] * warns
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_samples_may_be_lists_and_must_be_numbers():
+    assert zj.io.FocalTrack([0, 1], [20, 30], by_time=False).at(1, 0.0) == pytest.approx(30)
+    for samples in ((["0", "1"], [20, 30]), ([0, 1], "track.csv"), (None, [20, 30])):
+        with pytest.raises(ValueError, match=r"Arguments? (position|focal)"):
+            zj.io.FocalTrack(*samples)

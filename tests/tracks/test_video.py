@@ -238,3 +238,19 @@ def test_a_zooming_broadcast_with_moving_things_and_captions(tmp_path):
     scene = error[(age > 0) & ~moving]
     assert 1.48 * np.median(np.abs(scene)) < 0.08
     assert np.mean(np.abs(scene).max(axis=1) < 0.5) > 0.94  # at the borders of moving things
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("frame", "what"),
+    [
+        (np.zeros((64, 64)), r"\(64, 64\), float64"),
+        (np.zeros((64, 64), np.uint16), "uint16"),
+        (np.zeros((3, 64, 64), np.uint8), r"\(3, 64, 64\)"),
+        ([[1, 2], [3, 4]], "list"),
+        ("clip.mp4", "str"),
+    ],
+)
+def test_what_is_no_image_is_refused(frame, what):
+    with pytest.raises(ValueError, match=rf"frames must hold images .* of uint8, .* but one is .*{what}"):
+        track_frames([frame, frame])

@@ -191,7 +191,7 @@ def _has_three_distinct(line: np.ndarray) -> bool:
     return bool((from_first & (line != second).any(axis=1)).any())
 
 
-def real_numbers(values: ArrayLike) -> np.ndarray | None:
+def real_numbers(values: Any) -> np.ndarray | None:
     """Real numbers as an array, half precision widened; None if they are something else."""
     try:
         array = np.asarray(values)

@@ -35,13 +35,10 @@ from ..trust.selection import Selection
 from .fitting import fitted
 from .model_choice import CentreFound, WantedModel
 from .outward import outward
-from .results_folder import results_folder
+from .results_folder import OF_A_LENS, results_folder
 
 FILES = ("lens.json", "lines.npz", "summary.json", "model.png")
 """What `Calibration.write` writes."""
-
-CLEARS = ("lines/*",)
-"""Files of an earlier calibration that `Calibration.write` removes: pictures of its lines."""
 
 _ENOUGH = NEGLIGIBLE / 5
 """Standard deviation of the displacement, in diagonals, below which no further photo is needed."""
@@ -279,7 +276,7 @@ class Calibration:
             OSError: the folder cannot be written, or it has such a file and `overwrite` is False.
         """
         names = [*FILES, *(pages or {})]
-        with results_folder(folder, names, clears=CLEARS, overwrite=overwrite) as part:
+        with results_folder(folder, names, clears=OF_A_LENS, overwrite=overwrite) as part:
             self.make(part, about, pages)
 
     def make(

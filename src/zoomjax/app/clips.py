@@ -73,14 +73,14 @@ def wants_motion(inputs: Sequence[str], focal: str | None, pitch: str | None) ->
 def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
     """Calibrate from a clip, write the results and show them."""
     from .motion_calibration import FILES, calibrate_motion
-    from .results_folder import results_folder
+    from .results_folder import OF_A_LENS, results_folder
 
     clip = Path(job.inputs[0])
     if dry_run:
         besides = f", and from lines in up to {job.frames} frames" * job.lines
         tell_plan([f"Focal lengths and lens from how {plain(str(clip))} moves{besides}."], job.output)
         return
-    with results_folder(job.output, FILES, overwrite=job.overwrite) as folder:
+    with results_folder(job.output, FILES, clears=OF_A_LENS, overwrite=job.overwrite) as folder:
         with progress_bar("Following points", quiet=show.quiet) as progress:
             from ..tracks.video import track_video
 

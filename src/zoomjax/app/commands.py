@@ -97,7 +97,7 @@ def demo(
     photos: Annotated[
         int, typer.Option(min=3, help="Number of photos, each at its own focal length.")
     ] = 12,
-    seed: Annotated[int, typer.Option(help="Random seed of the image noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the image noise.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
     """Run a complete example: render photos of a board with a known lens, then calibrate from them.
@@ -110,13 +110,13 @@ def demo(
     set_up_jax()
     from ..scenes.board import StripedBoard, nikkor_18_200
     from . import demo
-    from .calibration import CLEARS, FILES
+    from .calibration import FILES
     from .image_job import ImageJob
-    from .results_folder import results_folder
+    from .results_folder import OF_A_LENS, results_folder
 
     board = StripedBoard.before(truth := nikkor_18_200(demo.IMAGE_SIZE))
     names = [*FILES, REPORT, "before-after.jpg", *(f"photos/{name}" for name in demo.photo_names(photos))]
-    with results_folder(output, names, clears=[*CLEARS, "photos/*"], overwrite=overwrite) as folder:
+    with results_folder(output, names, clears=[*OF_A_LENS, "photos/*"], overwrite=overwrite) as folder:
         with progress_bar("Rendering photos of the board") as progress:
             made = demo.write_photos(folder / "photos", number=photos, seed=seed, progress=progress)
         job = ImageJob(tuple(made), workers=number_of_cores())
@@ -208,7 +208,8 @@ def calibrate(
     images it also writes lines/: each image with its detected lines. From a
     video without focal lengths it writes track.csv, the focal length of each
     frame, and panorama.jpg in their place. Results of an earlier run in the
-    same folder are replaced.
+    same folder are replaced or removed; its lines.npz, tracks.npz and
+    track.csv stay until they are written again.
     """
     set_up_jax()
     show = Shown(strict, quiet, as_json)
@@ -220,13 +221,13 @@ def calibrate(
     inputs = [str(results_of(path) or path) for path in inputs]
     if any(path.lower().endswith((".npz", ".csv")) for path in inputs):
         refuse_idle(context, IDLE_FOR_LINES, f"for {inputs[0]}, which contains lines")
-        from .calibration import CLEARS, FILES
-        from .results_folder import results_folder
+        from .calibration import FILES
+        from .results_folder import OF_A_LENS, results_folder
 
         files = [Path(path) for path in inputs]
         names = [name for name in FILES if not refits(files, output / name)]
         refuse_inputs([output / name for name in names], inputs)
-        results = results_folder(output, [*names, REPORT], clears=CLEARS, overwrite=overwrite)
+        results = results_folder(output, [*names, REPORT], clears=OF_A_LENS, overwrite=overwrite)
         if dry_run:
             lines = read_lines(files, focal, image_size, focal_unit)
             return tell_plan(lines_plan(lines, excluded(exclude)), output)
@@ -249,9 +250,8 @@ def calibrate(
         raise ValueError("--image-size is for a CSV of lines: images have their own.")
     if exclude:
         raise ValueError("--exclude is for a file of lines: give the lines.npz of the calibration.")
-    from .calibration import CLEARS
     from .image_job import ImageJob
-    from .results_folder import results_folder
+    from .results_folder import OF_A_LENS, results_folder
 
     if wants_motion(inputs, focal, pitch):
         refuse_idle(context, IDLE_FOR_MOTION, "with --focal motion")
@@ -292,7 +292,7 @@ def calibrate(
     if dry_run:
         return tell_plan(images_plan(job), output)
     names = [*job.results(), REPORT]
-    with results_folder(output, names, clears=CLEARS, overwrite=overwrite) as folder:
+    with results_folder(output, names, clears=OF_A_LENS, overwrite=overwrite) as folder:
         done = calibrate_images(job, folder, title=title_of(inputs), quiet=quiet)
     return show.images(done, output)
 

@@ -149,7 +149,7 @@ def import_(
     set_up_jax()
     from ..interop.registry import read
     from ..models.tables import TableZoom
-    from .results_folder import results_folder
+    from .results_folder import OF_A_LENS, results_folder
 
     inputs = list(source.iterdir()) if source.is_dir() else [source]
     refuse_inputs([output / name for name in RESULTS], inputs)
@@ -164,7 +164,7 @@ def import_(
         convention=convention,
         zoom=TableZoom() if table else None,
     )
-    with results_folder(output, RESULTS, overwrite=overwrite) as folder:
+    with results_folder(output, RESULTS, clears=OF_A_LENS, overwrite=overwrite) as folder:
         found.lens.save(folder / RESULTS[0])
         content = dataclasses.asdict(found.report) | {"files": [str(file) for file in found.report.files]}
         (folder / RESULTS[1]).write_text(json.dumps(content, indent=2) + "\n")

@@ -16,14 +16,14 @@ from .._core.text import plain
 from ..detect.batch import DETECTORS, Detection, detect
 from ..detect.sources import Source
 from ._flags import with_flags
-from .calibration import CLEARS, Calibration, calibrate
+from .calibration import Calibration, calibrate
 from .choice import chosen_frames, colour_limit
 from .equipment import with_equipment
 from .focal_sources import MEASURED, Focals, choose_focals, focal_sigmas, lines_of
 from .image_job import ImageJob, overlay_name
 from .overlay import draw_lines
 from .plane_focals import Sharing
-from .results_folder import results_folder
+from .results_folder import OF_A_LENS, results_folder
 from .verdict import findings_of_photos
 
 MOST_OVERLAYS = 200
@@ -126,7 +126,7 @@ class ImageCalibration:
     ) -> None:
         """Write the files of `Calibration.write`, and each image with its detected lines in ``lines/``."""
         names = [*self.job.results(), *(pages or {})]
-        with results_folder(folder, names, clears=CLEARS, overwrite=overwrite) as part:
+        with results_folder(folder, names, clears=OF_A_LENS, overwrite=overwrite) as part:
             self.make(part, progress, pages)
 
     def make(

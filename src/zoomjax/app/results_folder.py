@@ -26,6 +26,15 @@ from .._core.files import TEMPORARY, locked, remove_left, unfinished
 LIST = ".zoomjax.json"
 """The name of the list."""
 
+OF_A_LENS = (
+    *("summary.json", "report.html", "model.png", "lines/*", "before-after.jpg"),
+    *("motion.png", "panorama.jpg", "import.json"),
+)
+"""What commands write about their ``lens.json``: the next one that writes a lens there removes it.
+
+What was measured, lines, tracks and focal lengths, stays.
+"""
+
 _LARGEST_LIST = 100_000_000  # bytes
 
 _Prints = list[tuple[int, str]]

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -94,7 +94,7 @@ def undistort_files(job: Job, progress: Progress = lambda done, total: None) -> 
         raise ValueError("Argument lens must be the file of a lens.")
     lens = load_lens(job.lens)
     found = photos_or_videos(job)
-    work = _videos if found.videos else undistort_photos
+    work = functools.partial(_videos, dict(found.videos)) if found.videos else undistort_photos
     files = found.videos or found.photos
     targets = targets_of(files, job.output, job.inputs)
     return with_refused(work(job, lens, [path for path, _ in files], targets, progress), found)
@@ -122,11 +122,21 @@ def with_refused(done: Outcome, found: Found) -> Outcome:
 
 
 def _videos(
-    job: Job, lens: ZoomLens, sources: Sequence[Path], targets: Sequence[Path], progress: Progress
+    names: Mapping[Path, Path],
+    job: Job,
+    lens: ZoomLens,
+    sources: Sequence[Path],
+    targets: Sequence[Path],
+    progress: Progress,
 ) -> Outcome:
     from .undistort_videos import tracks_of, undistort_videos
 
-    tracks = tracks_of(job.focal, sources, hold=job.hold)
+    if job.again:
+        raise ValueError(
+            "Argument again is for photos, which say that they are corrected, and the inputs are videos: "
+            "leave it out."
+        )
+    tracks = tracks_of(job.focal, names, hold=job.hold)
     todo = to_do(job, sources, targets, _is_video)
     correct = functools.partial(
         undistort_videos,
@@ -173,7 +183,7 @@ def undistort_photos(
         lens, lambda size: job.keep, job.interpolation, job.border, job.redistort, job.again
     )
     todo = to_do(job, sources, targets, lambda path: _is_marked(path, correction.geometry))
-    focal_of = _photo_focals(job, lens)
+    focal_of = _photo_focals(job, lens, sources)
     skipped: dict[Path, Exception] = {}
     correction = dataclasses.replace(correction, keep=_common_keep(job, lens, sources, focal_of, skipped))
     lost: Counter[tuple[str, str]] = Counter()
@@ -320,11 +330,17 @@ def _common_keep(
     return keep
 
 
-def _photo_focals(job: Job, lens: ZoomLens) -> Callable[[Path], float]:
-    """A function giving a photo's focal length: from the table, the number or its EXIF data."""
+def _photo_focals(job: Job, lens: ZoomLens, sources: Sequence[Path]) -> Callable[[Path], float]:
+    """A function giving a photo's focal length: from the table, the number or its EXIF data.
+
+    Raises:
+        OSError, ValueError: the table is missing or wrong, or one row of it is for two photos.
+    """
     if job.focal is None:
         return functools.cache(lambda path: photo_focal(path, lens))
     number = focal_number(job.focal)
     if number is not None:
         return lambda path: number
-    return read_focal_table(job.focal).need
+    table = read_focal_table(job.focal)
+    table.of(map(str, sources))  # which refuses a row for two photos
+    return table.need

@@ -1,6 +1,6 @@
 """Correction of several videos one after the other, each with its own focal lengths."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ..correct.video import CorrectedVideo, redistort_video, undistort_video
@@ -11,17 +11,20 @@ from .undistort_inputs import focal_number
 Focal = float | FocalTrack
 
 
-def tracks_of(focal: str | None, videos: Sequence[Path], *, hold: bool) -> dict[Path, Focal]:
+def tracks_of(focal: str | None, names: Mapping[Path, Path], *, hold: bool) -> dict[Path, Focal]:
     """The focal lengths of each video.
 
     Args:
-        focal: a number, a CSV file for one video, or a folder of CSV files named as the videos are.
-        videos: the videos.
+        focal: a number, a CSV file for one video, or a folder of CSV files named as the videos are, with or
+            without the folders of the names.
+        names: for each video the name of its result within the output folder.
         hold: whether a track's first and last focal lengths are used beyond its ends.
 
     Raises:
-        OSError, ValueError: a track is missing or wrong, or the options do not fit each other.
+        OSError, ValueError: a track is missing or wrong, or that of two videos; or the options do not fit
+            each other.
     """
+    videos = list(names)
     if focal is None:
         raise ValueError(
             "A video needs argument focal: one focal length, a CSV file with time,focal or frame,focal, or "
@@ -41,7 +44,22 @@ def tracks_of(focal: str | None, videos: Sequence[Path], *, hold: bool) -> dict[
                 f"folder with a track for each, such as {videos[0].stem}.csv."
             )
         return dict.fromkeys(videos, read_focal_track(focal, hold=hold))
-    return {video: read_focal_track(Path(focal) / f"{video.stem}.csv", hold=hold) for video in videos}
+    files = {video: _track_file(Path(focal), video, name) for video, name in names.items()}
+    first: dict[Path, Path] = {}
+    for video, file in files.items():
+        if (other := first.setdefault(file, video)) is not video:
+            own = Path(focal) / names[video].with_suffix(".csv")
+            raise ValueError(
+                f"The track {file} is for one video, and {other} and {video} both have its name: "
+                + (f"give each its own, such as {own}." if own != file else "correct one after the other.")
+            )
+    return {video: read_focal_track(file, hold=hold) for video, file in files.items()}
+
+
+def _track_file(folder: Path, video: Path, name: Path) -> Path:
+    """The track of a video: named with its folders, if there is such a file, else without."""
+    whole = folder / name.with_suffix(".csv")
+    return whole if whole.is_file() else folder / f"{video.stem}.csv"
 
 
 def undistort_videos(

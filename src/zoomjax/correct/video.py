@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from .._core.checks import real_numbers
 from .._core.files import refuse_inputs, whole_file
 from ..io.focal_track import FocalTrack
 from ..io.pyav import av
-from ..io.video_reader import Report, decoded_items, numbered, opened_video
+from ..io.video_reader import Report, decoded_items, frames_cut_off, numbered, opened_video
 from ..io.video_streams import CONTAINER, Carried, carried
 from ..io.video_writer import FrameWriter, first_frame
 from ..models.lens import ZoomLens
@@ -87,7 +88,8 @@ def undistort_video(
 
         Warns:
         UserWarning: frames cannot be decoded, or are interlaced; focal lengths are outside of the fitted
-            range; the lens is for another size, or folds within the frames.
+            range; the track goes on after the video's end; the lens is for another size, or folds within
+            the frames.
     """
     return _convert(
         source,
@@ -159,7 +161,7 @@ def _convert(
     if not isinstance(keep, Framing):
         check_keep(keep)
     refuse_inputs([target], [source])
-    track = focal if isinstance(focal, FocalTrack) else _constant(float(focal))
+    track = focal if isinstance(focal, FocalTrack) else _constant(focal)
     with opened_video(source) as input_, whole_file(target) as part:
         video = input_.streams.best("video")
         size = (video.codec_context.width, video.codec_context.height)
@@ -173,6 +175,8 @@ def _convert(
             writer = _write(items, part, target, input_, video, encoder, options, along, report, progress)
         finally:
             items.close()
+        if missing := frames_cut_off(input_, video, report):
+            report.announced = report.written + missing
     lost = max(report.corrupt, report.announced - report.written if report.announced else 0)
     if lost:
         warnings.warn(
@@ -180,6 +184,8 @@ def _convert(
             f"be decoded ({report.error or 'the file ends early'}): {report.written} were written.",
             stacklevel=3,
         )
+    else:
+        track.warn_if_longer(*report.last, stacklevel=3)
     return CorrectedVideo(
         report.written, lost, float(framing.scale), tuple(writer.kept), tuple(writer.not_kept)
     )
@@ -204,8 +210,14 @@ def _geometry(
     return lens, framing
 
 
-def _constant(focal: float) -> FocalTrack:
-    return FocalTrack(np.zeros(1), np.array([focal]), hold=True)
+def _constant(focal: Any) -> FocalTrack:
+    if (number := real_numbers(focal)) is None or number.ndim:
+        raise TypeError(
+            "Argument focal must be one focal length or a FocalTrack, but its type is "
+            f"{type(focal).__name__}: read_focal_track(path) reads a file, and FocalTrack(np.arange(n), f, "
+            "by_time=False) is of n frames."
+        )
+    return FocalTrack(np.zeros(1), number[None], hold=True)
 
 
 def _check_length(track: FocalTrack, video: Any) -> None:
@@ -247,6 +259,7 @@ def _warped(
             if isinstance(item, av.VideoFrame):
                 if report.first is None:
                     report.first = first_frame(item)
+                report.last = (number, time)
                 yield warper(item, track.at(number, time))
             else:
                 yield item

@@ -19,7 +19,7 @@ from ..io.raw import RAW_SUFFIXES
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".m2ts", ".mpg", ".mxf", ".ts")
 """Of files that count as videos."""
 
-RESULTS = ("lines", "model.png", "before-after.jpg")
+RESULTS = ("lines", "model.png", "before-after.jpg", "motion.png", "panorama.jpg")
 """What a calibration puts beside its ``lens.json`` that might be taken for photographs."""
 
 
@@ -199,7 +199,8 @@ def video_frames(
         ValueError: it cannot be read, or the track does not reach over it.
 
     Warns:
-        UserWarning: the video ends early, being cut off or damaged; the frames before that are used.
+        UserWarning: the video ends early, being cut off or damaged; the frames before that are used. Or the
+            track goes on after the video's end.
     """
     from ..io.video_reader import decode_video
 
@@ -207,7 +208,7 @@ def video_frames(
     with decode_video(path) as (announced, frames):
         # From the first to the last; where not even the length is known, the first ones.
         wanted = set(np.linspace(0, (announced or number) - 1, number).round().astype(int).tolist())
-        last, some = -1, False
+        last, time, some = -1, 0.0, False
         for last, time, image in frames:
             if last not in wanted:
                 continue
@@ -227,6 +228,8 @@ def video_frames(
                 "damaged. The frames before that are used.",
                 stacklevel=2,
             )
+        elif isinstance(focal, FocalTrack):
+            focal.warn_if_longer(last, time)
 
 
 def shrunk(image: np.ndarray, longest: int) -> tuple[np.ndarray, float]:

@@ -158,7 +158,7 @@ class Import:
         crop: crop factor of the camera, for lensfun.
         name: of the lens, in files of several; a part of it will do.
         direction: of an STMap: "undistort" or "redistort".
-        convention: of pixel positions, for STMaps.
+        convention: of pixel positions, for STMaps; None if it is not given.
     """
 
     path: Path
@@ -168,7 +168,7 @@ class Import:
     crop: float | None = None
     name: str | None = None
     direction: str | None = None
-    convention: str = CONVENTION
+    convention: str | None = None
 
     def size(self, found: tuple[int, int] | None = None) -> tuple[int, int]:
         """The image size, found in the file or given; ValueError if neither, or both and unlike."""

@@ -197,8 +197,9 @@ def read(
             (9 before 18); or those of the entries of a file. By default those that are in them.
         crop: for lensfun: crop factor of the camera; by default that of the calibration.
         name: of the lens, for files of several; a part of it will do.
-        direction: for STMaps: "undistort" or "redistort"; by default the file name says it.
-        convention: for STMaps: "centres" (Nuke, the default), "gyroflow" or "alicevision".
+        direction: for STMaps: "undistort" or "redistort"; by default the file or its name says it.
+        convention: for STMaps: "centres" (Nuke), "gyroflow" or "alicevision"; by default that which zoomjax
+            wrote into the file, else "centres".
         zoom: the zoom model, linear in its parameters. By default `SmoothZoom`; `TableZoom` for tangential
             distortion and the division model, and to keep what the file says at its focal lengths.
         terms: number of radial coefficients; by default 2 for `SmoothZoom`, else those of a file with our
@@ -227,7 +228,7 @@ def read(
         None if crop is None else positive("crop", crop),
         name,
         direction,
-        convention or CONVENTION,
+        convention,
     )
     try:
         contents = fmt.read(job)

@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 from ..models.distortion import Distortion
 from ..models.family import AbstractRadial
 from ._samples import border, distortions
-from .base import Contents, Export, FolderFormat, Import, Sampled, one_size
+from .base import CONVENTION, Contents, Export, FolderFormat, Import, Sampled, one_size
 
 _ROWS = 128
 """Of a map that are computed at once."""
@@ -34,7 +34,8 @@ _LEAST = 0.05
 """Share of a map's pixels that must lie within the image."""
 
 _FOCAL, _UNIT = "zoomjaxFocal", "zoomjaxFocalUnit"
-"""Attributes of the header."""
+_DIRECTION, _CONVENTION = "zoomjaxDirection", "zoomjaxConvention"
+"""Attributes of the header, of maps that zoomjax wrote."""
 
 CONVENTIONS = {"centres": (0.5, 0), "gyroflow": (0.0, 0), "alicevision": (0.0, -1)}
 """What is added to pixel positions, and to the size."""
@@ -65,8 +66,10 @@ class STMap(FolderFormat):
         size, worst = job.lens.image_size, 0.0
         window = _union([_corrected_window(d, size) for d in each])
         for f, distortion in zip(focal, each, strict=True):
-            header = {_FOCAL: float(f), _UNIT: job.lens.focal_unit}
-            for method, box in (("distort", window), ("undistort", (0, 0, size[0] - 1, size[1] - 1))):
+            header = {_FOCAL: float(f), _UNIT: job.lens.focal_unit, _CONVENTION: job.convention}
+            boxes = (window, (0, 0, size[0] - 1, size[1] - 1))
+            for method, box, direction in zip(("distort", "undistort"), boxes, DIRECTIONS, strict=True):
+                header[_DIRECTION] = direction
                 found, error = _quick(distortion, method, box)
                 rounding = _write_map(folder / next(names), found, box, size, job.convention, header)
                 worst = max(worst, error + rounding)
@@ -85,10 +88,11 @@ class STMap(FolderFormat):
         for number, path in enumerate(paths):
             header, red, green = _open(path)
             sizes.append(size := job.size(_window_size(header["displayWindow"])))
-            focal = header.get(_FOCAL) if job.focal is None else job.focal[number]
-            if focal is None:
+            given = None if job.focal is None else job.focal[number]
+            if (focal := _told("focal", header, _FOCAL, given)) is None:
                 raise ValueError("it does not say its focal length: give argument focal, one for each file")
-            nodes.append(Sampled(float(focal), *_pairs(header, red, green, size, wanted, job.convention)))
+            convention = _told("convention", header, _CONVENTION, job.convention) or CONVENTION
+            nodes.append(Sampled(float(focal), *_pairs(header, red, green, size, wanted, convention)))
             units.add(str(header.get(_UNIT, "mm")))
         return Contents(tuple(nodes), one_size(sizes), "px" if units == {"px"} else "mm")
 
@@ -197,6 +201,11 @@ def open_exr() -> Any:
     return OpenEXR
 
 
+def _header(path: Path) -> dict[str, Any]:
+    with open_exr().File(str(path), header_only=True) as file:
+        return dict(file.header())
+
+
 def _open(path: Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
     """Header, red and green of a map."""
     with open_exr().File(str(path), separate_channels=True) as file:
@@ -211,15 +220,39 @@ def _window_size(window: Any) -> tuple[int, int]:
     return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
 
 
+def _told(argument: str, header: dict[str, Any], attribute: str, given: Any) -> Any:
+    """What is given, or the header of our own maps tells; ValueError if they are not the same."""
+    told = header.get(attribute)
+    if told is None or given is None:
+        return given if told is None else told
+    here, there = (f"{v:.6g}" if isinstance(v, float) else str(v) for v in (told, given))
+    if here != there:
+        raise ValueError(f"its {argument} is {here}: leave out argument {argument}, which is {there}")
+    return given
+
+
 def _of_one_direction(job: Import) -> tuple[str, list[Path]]:
-    """The direction that is read, and its files: those whose names tell it, else all."""
-    told = [next((way for way in DIRECTIONS if way in path.name.lower()), None) for path in job.paths]
+    """The direction that is read, and its files: those that tell it, by themselves or by name, else all."""
+    headers = [_header(path) for path in job.paths]
+    told = [
+        header.get(_DIRECTION) or next((way for way in DIRECTIONS if way in path.name.lower()), None)
+        for path, header in zip(job.paths, headers, strict=True)
+    ]
     wanted = job.direction or told[0]
     if wanted is None:
         raise ValueError(
             'its name does not tell its direction: give argument direction, "undistort" or "redistort"'
         )
-    return wanted, [p for p, way in zip(job.paths, told, strict=True) if way == wanted] or list(job.paths)
+    found = [path for path, way in zip(job.paths, told, strict=True) if way == wanted]
+    if not found and None not in told:
+        raise ValueError(f"its direction is {told[0]}: leave out argument direction, which is {wanted}")
+    focal = {way: [h.get(_FOCAL) for h, w in zip(headers, told, strict=True) if w == way] for way in told}
+    if job.direction is None and any(set(of) != set(focal[wanted]) for of in focal.values()):
+        raise ValueError(
+            "its maps of the two directions are not of the same focal lengths: give argument direction, "
+            '"undistort" or "redistort"'
+        )
+    return wanted, found or list(job.paths)
 
 
 def _pairs(

@@ -5,9 +5,11 @@ Between two samples 1/f is taken as linear, because that is the variable in whic
 
 import dataclasses
 import os
+import warnings
 
 import numpy as np
 
+from .._core.checks import real_numbers
 from .text_table import read_text_table
 
 
@@ -32,7 +34,11 @@ class FocalTrack:
     hold: bool = False
 
     def __post_init__(self):
-        """Check the samples."""
+        """Check the samples, which may be lists."""
+        for name in ("position", "focal"):
+            if (values := real_numbers(getattr(self, name))) is None:
+                raise ValueError(f"Argument {name} must hold numbers, but it is {getattr(self, name)!r}.")
+            object.__setattr__(self, name, values.astype(np.float64))
         if self.position.ndim != 1 or self.position.shape != self.focal.shape or not self.position.size:
             raise ValueError(
                 "Arguments position and focal must hold one number a sample, at least one, but their "
@@ -75,6 +81,22 @@ class FocalTrack:
             )
         return 1 / float(np.interp(position, self.position, 1 / self.focal))
 
+    def warn_if_longer(self, frame: int, time: float, *, stacklevel: int = 2) -> None:
+        """Warn if this is hardly the track of a video with this last frame, as it goes on after it.
+
+        A track of one focal length is right for any video. Tracks in seconds may be a little longer.
+        """
+        last, end = float(self.position[-1]), time if self.by_time else float(frame)
+        slack = max(_LONGER * end, 1.0) if self.by_time else 0.0
+        if last > end + slack and np.ptp(self.focal) > 0:
+            unit = "s" if self.by_time else "frames"
+            base = "Times are in seconds" if self.by_time else "Frames count from 0"
+            warnings.warn(
+                f"The focal track goes on to {last:g} {unit}, and the video ends at {end:g}: is it the "
+                f"track of this video? {base}.",
+                stacklevel=stacklevel + 1,
+            )
+
 
 def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> FocalTrack:
     """Read a track from a CSV file with a header, ``time,focal`` (seconds) or ``frame,focal`` (from 0).
@@ -106,6 +128,9 @@ def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> Foc
     table.check(header, later, "greater than in the row before: sort the track, and give each moment once")
     return FocalTrack(position, focal, by_time=by_time, hold=hold)
 
+
+_LONGER = 0.05
+"""Of a video's length, by which a track in seconds may be longer."""
 
 _BY_TIME = {"time": True, "frame": False, "time_or_frame": None}
 """Columns of positions: whether they are seconds."""

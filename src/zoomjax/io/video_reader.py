@@ -57,6 +57,8 @@ class Report:
     failed: int = 0
     error: str = ""
     first: Any = None
+    last: tuple[int, float] = (-1, math.nan)
+    end: float = 0.0
 
 
 def opened_video(source: str | os.PathLike[str]) -> Any:
@@ -114,6 +116,9 @@ def decoded_items(
             packet = next(packets, None)
             if packet is None:
                 return
+            if packet.pts is not None:
+                end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
+                report.end = max(report.end, end)
             if packet.stream is not video:
                 if packet.dts is not None:
                     yield packet
@@ -127,6 +132,25 @@ def decoded_items(
         for frame in frames:
             report.corrupt += bool(frame.is_corrupt)
             yield frame
+
+
+def frames_cut_off(input_: Any, video: Any, report: Report) -> int:
+    """About how many frames the end of a file lacks that tells its length in seconds alone, as Matroska
+    does.
+
+    0 if all are there, as far as can be told: the length is that of the longest stream.
+    """
+    if video.frames or input_.format.name != "matroska,webm":
+        return 0
+    told = video.metadata.get("DURATION")
+    try:
+        hours, minutes, seconds = (float(part) for part in told.split(":"))
+        length = 3600 * hours + 60 * minutes + seconds
+    except (AttributeError, ValueError):
+        length = (input_.duration or 0) / av.time_base if len(input_.streams) == 1 else 0.0
+    rate = float(video.average_rate or video.guessed_rate or 25)
+    missing = length - report.end
+    return round(missing * rate) if missing > 0.02 * length + 1 / rate else 0
 
 
 def numbered(

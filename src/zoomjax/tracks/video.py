@@ -76,12 +76,13 @@ def track_frames(
         life: the most frames that a track is followed.
 
     Raises:
-        ValueError: there are fewer than two frames, they differ in size, or nothing can be followed.
+        ValueError: there are fewer than two frames, one is no such image, they differ in size, or nothing
+            can be followed.
     """
     most, life = checked_integer("most", most, 1), checked_integer("life", life, 2)
     follower = None
     for image in frames:
-        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+        grey = _grey(image)
         size = (grey.shape[1], grey.shape[0])
         follower = Follower(size, most=most, life=life) if follower is None else follower
         if size != follower.size:
@@ -96,3 +97,18 @@ def track_frames(
             "Nothing in it can be followed: it shows no corners, or nothing but what stays in its place."
         )
     return Tracks.from_arrays(track, frame, points, image_size=follower.size, frames=number)
+
+
+def _grey(image: np.ndarray) -> np.ndarray:
+    """A frame as (height, width) bytes; ValueError if it is no image of 8 bits."""
+    shape = np.shape(image)
+    flat = len(shape) == 2 or shape[2:] in ((1,), (3,), (4,))
+    if getattr(image, "dtype", None) != np.uint8 or not flat:
+        what = f"{shape}, {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(
+            "Argument frames must hold images (height, width) or (height, width, 3) of uint8, blue, green, "
+            f"red, but one is {what}."
+        )
+    if len(shape) == 2:
+        return image
+    return image[..., 0] if shape[2] == 1 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
