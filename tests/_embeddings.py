@@ -507,12 +507,17 @@ def tolerance(dtype):
 def far(cell, most):
     """Where a cell is not what it should be: the largest error, a share of the largest number; or None.
 
-    The largest of each array, but at least the rounding of the largest of all.
+    The largest of each array, but at least so much that ten roundings of the largest of all are allowed.
     """
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(cell.expected)]
     largest = max((np.max(np.abs(leaf[np.isfinite(leaf)]), initial=0) for leaf in leaves), default=0)
     least = max(
-        (1e4 * np.finfo(leaf.dtype).eps * largest for leaf in leaves if leaf.dtype.kind == "f"), default=0
+        (
+            max(1e4, 10 / most) * np.finfo(leaf.dtype).eps * largest
+            for leaf in leaves
+            if leaf.dtype.kind == "f"
+        ),
+        default=0,
     )
     for got, expected in zip(*map(jax.tree.leaves, cell), strict=True):
         got, expected = np.asarray(got), np.asarray(expected)

@@ -14,6 +14,7 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 from sybil import Sybil
 from sybil.parsers.markdown import CodeBlockParser, PythonCodeBlockParser
 
@@ -23,6 +24,7 @@ from zoomjax import scenes
 from zoomjax.app.calibration import calibrate
 from zoomjax.app.demo import write_photos
 from zoomjax.app.model_choice import WantedModel
+from zoomjax.app.undistort_files import Job, undistort_files
 
 from ._commands import SEVERAL
 
@@ -72,6 +74,15 @@ def given(tmp_path_factory):
     write_clip(folder / "clip.mp4", [cv2.imread(str(photo))[..., ::-1] for photo in photos])
     table(folder / "track.csv", "frame,focal", enumerate(FOCAL))
     write_clip(folder / "match.mp4", pitch_frames())
+    (folder / "match").mkdir()
+    for number, frame in enumerate(pitch_frames()):
+        cv2.imwrite(str(folder / "match" / f"{number}.png"), frame[..., ::-1])
+    for place, name in (("clips", "clip.mp4"), ("tracks", "track.csv")):
+        (folder / place).mkdir()
+        shutil.copy(folder / name, (folder / place / "clip").with_suffix(Path(name).suffix))
+    shutil.copytree(folder / "photos", folder / "shoot" / "day1")
+    with Image.open(photos[0]) as photo:
+        photo.save(folder / "plate.tif", exif=photo.getexif())
     write_clip(folder / "turning.mp4", turning_frames())
     (folder / "views").mkdir()
     for number, view in enumerate(grid_views()):
@@ -80,6 +91,10 @@ def given(tmp_path_factory):
     straight_lines_bent(folder / "lines.csv")
     table(folder / "frames.csv", "frame,focal", enumerate((24, 50, 80, 105)))
     calibrate(board(), model=WantedModel("polynomial"), centre=None).write(folder / "mylens")
+    overscan = Job(
+        folder / "mylens" / "lens.json", (folder / "plate.tif",), folder / "render.tif", keep="grow"
+    )
+    undistort_files(overscan)
     table(folder / "mylens" / "track.csv", "frame,focal", enumerate(np.geomspace(24, 105, TURNING)))
     lens = scenes.nikkor_18_200((4288, 2848))
     zj.interop.write(lens, folder / "zoom.xml", format="lensfun", pixel_pitch=0.0055)

@@ -47,6 +47,13 @@ def test_a_folder_keeps_its_structure(folder):
     np.testing.assert_array_equal(after, zj.undistort_image(before, lens()(40.0)))
 
 
+def test_what_is_not_there_is_said_so(folder):
+    """And not taken for a video, which needs focal lengths."""
+    for name in ("shoot", "shoot/day.v2"):
+        with pytest.raises(FileNotFoundError, match=r"There is no file or folder .*shoot"):
+            undistort_files(job(folder, "in", name))
+
+
 def test_a_pattern_keeps_the_structure_below_its_fixed_part(folder):
     undistort_files(job(folder, "in/**/*.jpg"))
     assert files(folder / "out") == ["a.jpg", "day/a.jpg"]

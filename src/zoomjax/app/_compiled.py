@@ -23,6 +23,7 @@ def set_up_jax() -> None:
     jax.config.update("jax_enable_x64", True)
     folder = cache_folder("compiled")
     if folder and "JAX_COMPILATION_CACHE_DIR" not in os.environ and _can_write(folder):
+        _remove_torn(folder)
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_compilation_cache_max_size", _MOST_COMPILED)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.03)
@@ -33,6 +34,16 @@ def _can_write(folder: Path) -> bool:
     with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
     return folder.is_dir() and os.access(folder, os.W_OK)
+
+
+def _remove_torn(folder: Path) -> None:
+    """Remove programs without the file that says when they were used: beside one, JAX keeps no other."""
+    with contextlib.suppress(OSError):
+        names = set(os.listdir(folder))
+        programs = {name.removesuffix("-cache") for name in names if name.endswith("-cache")}
+        for program in programs:
+            if f"{program}-atime" not in names or (folder / f"{program}-cache").is_dir():
+                forget_compiled(program)
 
 
 UNKEPT = re.compile(r"Error (?:reading|writing) persistent compilation cache entry for '([^']*)'")

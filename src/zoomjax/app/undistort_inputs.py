@@ -47,7 +47,7 @@ def find_inputs(inputs: Sequence[Path], output: Path) -> Found:
     names of the results, and what lies in `output` is left out.
 
     Raises:
-        FileNotFoundError: no file fits a pattern.
+        FileNotFoundError: no file fits a pattern, or there is no file or folder of a name.
         ValueError: a folder has neither photos nor videos.
     """
     given = [pair for path in inputs for pair in _expanded(path, output)]
@@ -65,6 +65,8 @@ def _expanded(given: Path, output: Path) -> list[tuple[Path, Path]]:
     named = given.suffix.lower() in (*SUFFIXES, *VIDEO_SUFFIXES)
     if given.is_dir() and not (named and not any(given.iterdir())):  # which is reported with the others
         return [(path, path.relative_to(given)) for path in _within(given, output)]
+    if not os.path.lexists(given) and not named and not glob.has_magic(str(given)):
+        raise FileNotFoundError(f"There is no file or folder {given}.")
     if os.path.lexists(given) or not glob.has_magic(str(given)):
         return [(given, Path(given.name))]
     found = [Path(name) for name in sorted(glob.glob(str(given), recursive=True))]
