@@ -85,8 +85,12 @@ def given(tmp_path_factory):
         photo.save(folder / "plate.tif", exif=photo.getexif())
     write_clip(folder / "turning.mp4", turning_frames())
     (folder / "views").mkdir()
-    for number, view in enumerate(grid_views()):
-        cv2.imwrite(str(folder / "views" / f"{number}.png"), view)
+    for f, *views in zip(FOCAL, grid_views(), grid_views(0.5), strict=True):
+        cv2.imwrite(str(folder / "views" / f"{FOCAL.index(f)}.png"), views[0])
+        zoom = folder / "zoom" / f"{f:.0f}mm"
+        zoom.mkdir(parents=True)
+        for number, view in enumerate(views):
+            cv2.imwrite(str(zoom / f"{number}.png"), view)
     table(folder / "views.csv", "image,focal", ((f"{n}.png", f) for n, f in enumerate(FOCAL)))
     straight_lines_bent(folder / "lines.csv")
     table(folder / "frames.csv", "frame,focal", enumerate((24, 50, 80, 105)))
@@ -152,12 +156,12 @@ def turning_frames():
     return [frame[..., ::-1] for frame in clip.frames()]
 
 
-def grid_views():
-    """A checkerboard seen obliquely, at five focal lengths."""
+def grid_views(least=0.35):
+    """A checkerboard seen obliquely, at five focal lengths, turned by so many radians at least."""
     squares = np.kron(np.indices((9, 12)).sum(0) % 2, np.ones((40, 40))).astype(np.uint8) * 200 + 30
     corners = np.array([[0, 0], [480, 0], [480, 360], [0, 360]], np.float32)
     for number, f in enumerate(FOCAL):
-        angle = 0.35 + 0.05 * number
+        angle = least + 0.05 * number
         x, y = ((corners - [240, 180]) / 100).T
         depth = 8 + np.sin(angle) * (x + 0.6 * y)
         seen = 150 * f**0.5 * np.stack([np.cos(angle) * x, np.cos(0.6 * angle) * y]).T / depth[:, None]

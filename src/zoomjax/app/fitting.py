@@ -140,7 +140,9 @@ def _under_family(
 ) -> tuple[AbstractLines, Candidate, Selection | None]:
     """The lines, the model and its choice under another distortion model, or the best of all of them.
 
-    About the centre that was found. Weights are those under the distortion model itself where it is given.
+    About the centre that was found. Weights are those under the distortion model itself where it is given:
+    lines that one zoom model cannot follow may be straight under another, so that they are judged again by
+    the one chosen.
     """
     model, selection = found.model, found.selection
     placed = _widest(lines).about(found.lines.centre)
@@ -152,18 +154,26 @@ def _under_family(
         selection = wanted.choose_family(placed, model, compared)
         model = selection.chosen
     else:
-        model = wanted.base(lines.focal)
+        whole, model = placed, wanted.base(lines.focal)
         if robust:
             stage("Rejecting lines that are not straight")
-            form = compress_family(placed, model.family, terms=model.terms)
-            placed = placed.weighted(np.asarray(reweighted(form, model.zoom, model.terms)[0].weight))
+            placed = _straight(whole, model)
         if wanted.automatic:
             stage("Choosing the model")
             selection = wanted.choose_in_family(placed)
+            if robust and selection.chosen.name != model.name:
+                stage("Rejecting lines that are not straight")
+                placed = _straight(whole, selection.chosen)
             model = selection.chosen
     if isinstance(model.family, RadialPolynomial):
         return found.lines, model, selection
     return compress_family(placed, model.family, terms=model.terms), model, selection
+
+
+def _straight(lines: Lines, model: Candidate) -> Lines:
+    """The lines with the weights that the model gives them."""
+    form = compress_family(lines, model.family, terms=model.terms)
+    return lines.weighted(np.asarray(reweighted(form, model.zoom, model.terms)[0].weight))
 
 
 def _widest(lines: Lines) -> Lines:

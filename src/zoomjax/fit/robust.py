@@ -115,18 +115,29 @@ def fit_robust(
 def reweighted(
     lines: SomeLines, zoom: AbstractZoom | None = None, terms: int | None = None
 ) -> tuple[SomeLines, AbstractZoom]:
-    """The lines with the weights of `fit_robust`, and the model of its last turn."""
+    """The lines with the weights of `fit_robust`, and the model of its last turn.
+
+    The first turn starts from the algebraic estimate; under another distortion model, which has none, from
+    the fit to all lines: far from it, whole frames would seem not to be straight.
+    """
     start, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
-    new = zoom is None or zoom.parameters is None
-    if new and isinstance(start, AbstractLinearZoom) and isinstance(lines.family, RadialPolynomial):
-        start = algebraic_zoom(lines, zoom=start, terms=terms).zoom
+    if zoom is None or zoom.parameters is None:
+        if not isinstance(lines.family, RadialPolynomial):
+            weighted = lines.weighted(_own_weights(lines))
+            start = fit_zoom(weighted, zoom=start, invertible=False, throw=False).lens.zoom
+        elif isinstance(start, AbstractLinearZoom):
+            start = algebraic_zoom(lines, zoom=start, terms=terms).zoom
     return _reweighted(lines, start)
+
+
+def _own_weights(lines):
+    return jnp.ones_like(lines.counts) if lines.weight is None else lines.weight
 
 
 @eqx.filter_jit
 def _reweighted(lines, start):
     """The lines with their weights, and the model that goes with them: a Gauss-Newton step a turn."""
-    own = jnp.ones_like(lines.counts) if lines.weight is None else lines.weight
+    own = _own_weights(lines)
 
     def turn(model, cut):
         weighted = lines.weighted(own * _weights(lines, model, cut))
