@@ -414,7 +414,6 @@ def _foreign(name: str, suffix: str) -> Reader:
     """Of lenses in another tool's format. Each is fitted anew, which takes a tenth of a second."""
     size, focal = (96, 64), (24, 35, 60)
     told: dict[str, Any] = {
-        "stmap": {"direction": "undistort"},
         "lensfun": {"image_size": size},
         "nuke": {"image_size": size, "focal": focal},
         "pftrack": {"focal": focal},
