@@ -26,6 +26,20 @@ def test_blocks_give_what_the_whole_gives(shape, monkeypatch, rng):
     np.testing.assert_allclose(blocks, function(values, one_for_all, own, last), rtol=1e-14)
 
 
+def test_arrays_that_may_be_sharded_stay_whole(monkeypatch):
+    """Slices of what lies on several devices would have to be gathered."""
+    monkeypatch.setattr(arrays, "_BLOCK", 7)
+
+    def program():
+        return str(
+            jax.make_jaxpr(lambda values: in_blocks(lambda values: 2 * values, values))(jnp.zeros(20))
+        )
+
+    assert "dynamic_slice" in program()
+    monkeypatch.setattr(jax, "device_count", lambda: 4)
+    assert "dynamic_slice" not in program()
+
+
 @pytest.mark.parametrize("batched", [False, True])
 def test_points_beyond_the_fold_are_in_any_block(batched, rng):
     """More points than a block has; the first, a middle and the last one have no inverse."""

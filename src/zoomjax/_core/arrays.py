@@ -82,7 +82,7 @@ def in_blocks(function: Callable[..., Any], values: Any, *others: Any) -> Any:
     """``function(values, *others)`` element by element, one block of the elements after another on a CPU.
 
     Memory is then needed for the loops of one block, and each block's loops end when its own elements are
-    done.
+    done. Not where there are several devices: arrays that are sharded would be gathered.
 
     Args:
         function: of arrays that broadcast; its result has the shape and dtype of the first.
@@ -91,7 +91,7 @@ def in_blocks(function: Callable[..., Any], values: Any, *others: Any) -> Any:
     """
     shape = values.shape
     number = math.prod(shape) if all(isinstance(length, int) for length in shape) else 0
-    if number <= _BLOCK:
+    if number <= _BLOCK or jax.device_count() > 1:
         return function(values, *others)
 
     def flat(array):
