@@ -1,6 +1,7 @@
 """What goes along with the pictures, in files of FFmpeg's encoders: copied where it can be, else said."""
 
 import struct
+import warnings
 from fractions import Fraction
 
 import av
@@ -9,6 +10,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax.correct.video import redistort_video, undistort_video
+from zoomjax.io.video_reader import decode_video
 
 from .._clips import FRAMES, SIZE, lens, luma, picture, write_clip
 
@@ -192,6 +194,29 @@ def test_frames_of_equal_times_are_moved_by_a_tick(tmp_path, encoder):
     assert "times of 1 frames, which others had before them" in done.not_kept
 
 
+@pytest.mark.parametrize("encoder", ["libx264", "mpeg4"])
+@pytest.mark.parametrize(("first", "between"), [(0, "3"), (0, "0"), (3, "0")])
+def test_frames_of_avi_files_have_the_times_at_which_they_are_shown(tmp_path, encoder, first, between):
+    """Such files tell the order of decoding alone. A later beginning fills them after the first frame."""
+    options = {"bf": between} | ({"x264-params": "log-level=error"} if encoder == "libx264" else {})
+    source = clip(tmp_path / "in.avi", encoder=encoder, stamps=range(first, first + 24), options=options)
+    expected = np.array([0, *range(first + 1, first + 24)]) / 25
+    with decode_video(source) as (announced, frames):
+        found = [(number, time, image()) for number, time, image in frames]
+    assert announced >= len(found) == 24
+    np.testing.assert_allclose([time for _, time, _ in found], expected, atol=1e-6)
+    for number, (counted, _, image) in enumerate(found):
+        assert counted == number
+        assert np.median(np.abs(image[..., 0].astype(int) - picture(first + number))) < 12
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # "the file ends early"
+        done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=20.0)
+    assert (done.frames, done.lost) == (24, 0)
+    assert not any("times" in name for name in done.not_kept)
+    times = luma(tmp_path / "out.mkv")[1]
+    np.testing.assert_allclose(times - times[0], expected, atol=1e-6)
+
+
 @pytest.mark.parametrize(("encoder", "expected"), [("libx264", "h264"), ("prores_ks", "prores")])
 def test_mxf_is_written(tmp_path, encoder, expected):
     pixels = "yuv420p" if encoder == "libx264" else "yuv422p10le"
@@ -248,3 +273,24 @@ def test_back_is_where_it_began(tmp_path):
     assert difference.mean() < 0.5
     with pytest.raises(ValueError, match="with which it was corrected"):
         redistort_video(source, tmp_path / "no.mkv", **arguments)
+
+
+@pytest.mark.parametrize("encoder", ["libx264", "libx265", "libvpx-vp9", "prores_ks", "ffv1"])
+@pytest.mark.parametrize("correct", [undistort_video, redistort_video])
+def test_options_that_an_encoder_does_not_know_are_refused(tmp_path, encoder, correct):
+    """FFmpeg passes over them: of a misspelled quality nobody would hear."""
+    source = clip(tmp_path / "in.mkv")
+    for options in ({"nonsense": "1"}, {"crff": "20", "threads": "1"}, {"movflags": "faststart"}):
+        with pytest.raises(ValueError, match=f"of the encoder {encoder}.*'{next(iter(options))}'"):
+            correct(source, tmp_path / "out.mkv", lens=lens(), focal=20.0, encoder=encoder, options=options)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.mkv"]
+    done = correct(
+        source, tmp_path / "out.mkv", lens=lens(), focal=20.0, encoder=encoder, options={"threads": "1"}
+    )
+    assert done.frames == 4
+
+
+@pytest.mark.parametrize("options", [{"crf": 20}, {20: "crf"}, ["crf", "20"], "crf=20"])
+def test_options_are_texts_by_names(tmp_path, options, unchecked):
+    with pytest.raises(TypeError, match="options must be texts by names"):
+        undistort_video("in.mkv", tmp_path / "out.mkv", lens=lens(), focal=20.0, options=options)

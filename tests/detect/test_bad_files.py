@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
-from zoomjax.app.image_calibration import ImageJob, calibrate_images
+from zoomjax.app.image_calibration import calibrate_images
+from zoomjax.app.image_job import ImageJob
 from zoomjax.detect import batch as module
 from zoomjax.detect.batch import detect
 from zoomjax.detect.sources import Source, find_photos

@@ -10,7 +10,9 @@ from PIL.TiffImagePlugin import IFDRational
 
 import zoomjax as zj
 from zoomjax.detect.sources import find_photos
+from zoomjax.io.exif import exif_with_orientation
 from zoomjax.io.headers import announced_size
+from zoomjax.io.heic import heic_metadata
 from zoomjax.io.photo import read_focal, read_photo
 
 pillow_heif = pytest.importorskip("pillow_heif")
@@ -45,6 +47,39 @@ def test_pixels_are_those_that_were_stored(tmp_path, orientation):
     assert read_focal(path) == 35.0
     assert metadata.exif
     assert not metadata.xmp + metadata.icc
+
+
+@pytest.mark.parametrize("told", [1, 3, 6, 7])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pixels_do_not_depend_on_what_the_exif_data_say(tmp_path, orientation, told):
+    path = write(tmp_path / "a.heic", gradient(), orientation)
+    content = path.read_bytes()
+    at = content.index(b"MM\0*") if b"MM\0*" in content else content.index(b"II*\0")
+    block = content[at:]  # as an editor changes it, and nothing else
+    path.write_bytes(content[:at] + exif_with_orientation(block, told))
+    image, metadata = read_photo(path)
+    assert np.abs(image.astype(int) - gradient()).max() <= 4
+    assert heic_metadata(path.read_bytes()) == metadata
+    exif = Image.Exif()
+    exif.load(metadata.exif)
+    assert exif[ExifTags.Base.Orientation] == orientation  # which other formats' viewers follow
+    assert read_focal(path) == 35.0
+
+
+def test_a_file_without_exif_data_gets_the_orientation(tmp_path):
+    path = tmp_path / "a.heic"
+    file = pillow_heif.from_bytes("BGR", SIZE, gradient().tobytes())
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    file.save(path, quality=-1, exif=exif.tobytes())
+    content = path.read_bytes().replace(b"Exif\0\0MM\0*", b"Exif\0\0XXXX")  # damaged
+    assert content != path.read_bytes()
+    path.write_bytes(content)
+    image, metadata = read_photo(path)
+    assert np.abs(image.astype(int) - gradient()).max() <= 4
+    exif = Image.Exif()
+    exif.load(metadata.exif)
+    assert dict(exif) == {ExifTags.Base.Orientation: 6}
 
 
 def test_more_than_eight_bits_are_kept(tmp_path):

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
-from PIL import ExifTags, Image, PngImagePlugin
+from PIL import ExifTags, Image, IptcImagePlugin, PngImagePlugin
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-from zoomjax.io.metadata import Metadata, geometry_of, marked
+from zoomjax.io.metadata import Metadata, geometry_of, marked, work_of
 from zoomjax.io.photo import read_focal, read_metadata, read_pages, read_photo
 from zoomjax.io.photo_writer import encoded_photo
 
@@ -241,6 +241,15 @@ def test_the_mark_leaves_the_packet_as_it_is():
     assert geometry_of(marked(Metadata(xmp=b"no packet"), "undistorted")) == "undistorted"
 
 
+def test_the_mark_tells_the_work():
+    once = marked(Metadata(xmp=XMP), "undistorted", "12ab")
+    assert work_of(once) == "12ab"
+    assert work_of(marked(once, "distorted", "34cd")) == "34cd"
+    assert work_of(marked(once, "distorted")) == ""
+    assert work_of(Metadata(xmp=XMP)) is None
+    assert geometry_of(once) == "undistorted"
+
+
 def test_notes_of_the_maker_are_left_out_of_tiff_files_and_named(tmp_path, image):
     given = Image.Exif()
     given[ExifTags.IFD.Exif] = {
@@ -257,3 +266,18 @@ def test_notes_of_the_maker_are_left_out_of_tiff_files_and_named(tmp_path, image
     with tifffile.TiffFile(tmp_path / "b.tif") as file:
         assert "MakerNote" in file.pages[0].tags["ExifTag"].value
     assert "the camera maker's notes" in read_pages(tmp_path / "b.tif").others
+
+
+@pytest.mark.parametrize("kind", [1, 4, 7])
+def test_iptc_data_of_any_type_are_kept_without_a_word(tmp_path, image, kind):
+    """Adobe's programs and exiftool call the bytes whole numbers of 32 bits (4)."""
+    block = IIM + bytes(-len(IIM) % 4)
+    values = struct.unpack(f"<{len(block) // 4}I", block) if kind == 4 else block
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, image, extratags=[(33723, kind, len(values), values, True)], metadata=None)
+    [(_, found)] = read_pages(path).pages
+    assert IIM in found.iptc
+    assert read_metadata(path).iptc == found.iptc
+    write(tmp_path / "b.jpg", image, found)
+    with Image.open(tmp_path / "b.jpg") as opened:
+        assert IptcImagePlugin.getiptcinfo(opened)[2, 120] == b"ruler"

@@ -36,6 +36,13 @@ def aligned(*parts: tuple[Any, int]) -> list[Any]:
     ]
 
 
+def held_as_given(array: np.ndarray) -> Any:
+    """A JAX array, unless that would change the values' dtype."""
+    if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
+        return jnp.asarray(array)
+    return array
+
+
 def finite(values: Any) -> Any:
     """Whether each of the values is finite, as an array even of one."""
     xp = namespace(values)

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .fields import refuse_masked
+
 
 def checked_integer(name: str, value: Any, least: int) -> int:
     """An integer of at least `least`, NumPy's kinds included, as Python's."""
@@ -88,6 +90,7 @@ def checked_points(line: ArrayLike, index: int) -> np.ndarray:
     if array is not None and array.size == 0:
         return np.zeros((0, 2), np.float32)
     if array is None or array.ndim != 2 or array.shape[1] != 2:
+        refuse_masked(f"points[{index}]", line)
         what = np.asarray(line) if array is None else array
         raise ValueError(
             f"Argument points must hold (n, 2) arrays of real numbers, but line {index} has shape "
@@ -129,6 +132,7 @@ def checked_focus(focus: ArrayLike, frames: int) -> np.ndarray:
 
 def checked_frames(frame: ArrayLike, lines: int, frames: int) -> np.ndarray:
     """For each of the lines the index of its frame."""
+    refuse_masked("frame", frame)
     index = np.asarray(frame)
     if lines == 0:
         raise ValueError("No usable line: argument points is empty.")
@@ -192,7 +196,9 @@ def _has_three_distinct(line: np.ndarray) -> bool:
 
 
 def real_numbers(values: Any) -> np.ndarray | None:
-    """Real numbers as an array, half precision widened; None if they are something else."""
+    """Real numbers as an array, half precision widened; None if they are something else, or masked."""
+    if isinstance(values, np.ma.MaskedArray):
+        return None
     try:
         array = np.asarray(values)
     except ValueError:  # rows of different lengths

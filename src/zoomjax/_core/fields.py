@@ -22,6 +22,12 @@ Axes = tuple[str | int, ...]
 _KINDS = {"real numbers": jnp.floating, "integers": jnp.integer, "booleans": jnp.bool_}
 
 
+def refuse_masked(name: str, values: Any, instead: str = "leave out what is masked") -> None:
+    """Raise ValueError for an array of NumPy that has a mask, which would be lost."""
+    if isinstance(values, np.ma.MaskedArray):
+        raise ValueError(f"Argument {name} is a masked array, and masks are not kept: {instead}.")
+
+
 def numbers(name: str) -> Callable[[Any], Any]:
     """A converter for a field of real numbers: lists and integers become arrays of floats."""
     return _converter(name, "real numbers")
@@ -46,6 +52,7 @@ def _converter(name: str, kind: str, make: Callable[[Any], Any] = jnp.array) -> 
     def convert(value: Any) -> Any:
         if value is None or isinstance(value, bool) or type(value) is object:
             return value
+        refuse_masked(name, value)
         array = value
         if not hasattr(value, "dtype"):
             array = _array(value, make) if isinstance(value, int | float | list | tuple) else None

@@ -2,8 +2,12 @@
 
 import re
 import unicodedata
+from collections.abc import Iterable
 
 _LONGEST = 80
+
+_OPENCV_NO_MEMORY = -4
+"""``cv2.Error.StsNoMem``."""
 
 
 def plain(text: str) -> str:
@@ -17,6 +21,15 @@ def plain(text: str) -> str:
     return "".join(c if _is_harmless(c) else c.encode("unicode_escape").decode() for c in text)
 
 
+def reason(error: Exception) -> str:
+    """The message of an error about one file, on one line, without the operating system's error numbers."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    if isinstance(error, MemoryError) or getattr(error, "code", 0) == _OPENCV_NO_MEMORY:
+        return "there is not enough memory for it"
+    return " ".join(str(error).split())
+
+
 def _is_harmless(character: str) -> bool:
     # Cc control, Cf direction, joiners and marks, Cs halves of pairs, Zl and Zp breaks of lines
     return (
@@ -28,6 +41,13 @@ def span(low: float, high: float, unit: str) -> str:
     """Two ends in their unit, or the one value that both are."""
     ends = [f"{value:.5g}" for value in (low, high)]
     return f"{' to '.join(dict.fromkeys(ends))} {unit}"
+
+
+def listed(names: Iterable[str], most: int, between: str = ", ") -> str:
+    """The first names, and how many more there are."""
+    first = list(names)
+    rest = len(first) - most
+    return between.join(first[:most]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def numbered_name(number: int, name: str, suffix: str) -> str:

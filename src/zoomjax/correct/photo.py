@@ -7,17 +7,20 @@ packet tells that a photo is corrected, so that it is not corrected twice.
 
 import contextlib
 import dataclasses
+import hashlib
 import os
 import warnings
 from collections.abc import Callable, Generator
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from .._core.files import refuse_inputs, whole_file
 from ..io.metadata import geometry_of, marked
-from ..io.photo import FORMATS, Photo, metadata_focal, read_focal, read_pages
+from ..io.photo import FORMATS, Photo, metadata_focal, open_photo, read_focal, read_pages
 from ..io.photo_writer import check_written, encoded_photo
+from ..models.about import UNKNOWN
 from ..models.lens import ZoomLens
 from .framing import Framing, framing_for_size
 from .image import undistort_image
@@ -33,7 +36,8 @@ class Correction:
         keep: what to show, given a photo's size.
         interpolation, border: as for `undistort_image`.
         back: whether corrected photos are given, and distortion is applied.
-        again: whether photos are accepted that carry the mark of the same work.
+        again: whether photos are accepted that carry the mark of the same geometry.
+        shown: what `keep` depends on besides the lens and a photo's size, as text.
     """
 
     lens: ZoomLens
@@ -42,6 +46,24 @@ class Correction:
     border: str = "constant"
     back: bool = False
     again: bool = False
+    shown: str = ""
+
+    def work(self, source: str | os.PathLike[str], focal: float | int) -> str:
+        """What the result for a photo at a focal length depends on, as hexadecimal digits.
+
+        Raises:
+            OSError, ValueError: the photo cannot be read, as `open_photo` says.
+        """
+        lens = self.lens
+        kinds = [type(of).__qualname__ for of in (lens, lens.zoom, lens.family)]
+        options = (self.geometry, self.shown, self.interpolation, self.border, float(focal))
+        digest = hashlib.sha256(repr((kinds, lens.image_size, lens.focal_unit, options)).encode())
+        for leaf in jax.tree.leaves(lens):
+            array = np.asarray(leaf)
+            digest.update(f"{array.dtype} {array.shape}".encode() + array.tobytes())
+        with open_photo(Path(source)) as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+        return digest.hexdigest()[:32]
 
     @property
     def geometry(self) -> str:
@@ -90,7 +112,8 @@ def undistort_photo(
         Warns:
         UserWarning: as `undistort_image` and `ZoomLens` do; or metadata are lost, as IPTC data in PNG.
     """
-    _convert(source, target, focal, Correction(lens, _scaled(keep), interpolation, border, again=again))
+    correction = Correction(lens, _scaled(keep), interpolation, border, again=again, shown=repr(keep))
+    _convert(source, target, focal, correction)
 
 
 def redistort_photo(
@@ -108,7 +131,8 @@ def redistort_photo(
 
     Arguments and errors are those of `undistort_photo`; `keep` tells how the photo was corrected.
     """
-    _convert(source, target, focal, Correction(lens, _scaled(keep), interpolation, border, True, again))
+    correction = Correction(lens, _scaled(keep), interpolation, border, True, again, shown=repr(keep))
+    _convert(source, target, focal, correction)
 
 
 def _scaled(keep: str | Framing) -> Callable[[tuple[int, int]], str | Framing]:
@@ -165,8 +189,10 @@ def corrected_photo(
     if focal is None:
         known = metadata_focal(photo.pages[0][1]) if correction.lens.focal_unit == "mm" else None
         focal = _known(known, source, correction.lens)
+    work = correction.work(source, focal)
     pages = [
-        (correction(image, focal), marked(metadata, correction.geometry)) for image, metadata in photo.pages
+        (correction(image, focal), marked(metadata, correction.geometry, work))
+        for image, metadata in photo.pages
     ]
     with _blamed(source):
         content, lost = encoded_photo(pages, suffix)
@@ -201,6 +227,8 @@ def _blamed(source: str | os.PathLike[str]) -> Generator[None, None, None]:
 def photo_focal(source: str | os.PathLike[str], lens: ZoomLens) -> float:
     """The focal length in a photograph's EXIF data, for a lens in mm. No pixel is decoded.
 
+    For a lens whose own focal length is not known, as `ZoomLens.about` says, the number that stands for it.
+
     Raises:
         FileNotFoundError: there is no such photograph.
         ValueError: it cannot be read or tells none, or the lens is in px.
@@ -209,6 +237,8 @@ def photo_focal(source: str | os.PathLike[str], lens: ZoomLens) -> float:
 
 
 def _known(focal: float | None, source: str | os.PathLike[str], lens: ZoomLens) -> float:
+    if lens.about.get("focal") == UNKNOWN:
+        return float(lens.focal_range[0])
     if focal is None:
         raise ValueError(
             f"The focal length of {os.fspath(source)} is not known: its EXIF data have none in "

@@ -9,9 +9,9 @@ import dataclasses
 import itertools
 import os
 import warnings
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from .._core.checks import real_numbers
 from .._core.files import refuse_inputs, whole_file
 from ..io.focal_track import FocalTrack
 from ..io.pyav import av
-from ..io.video_reader import Report, decoded_items, frames_cut_off, numbered, opened_video
+from ..io.video_reader import Report, decoded_items, frames_expected, numbered, opened_video
 from ..io.video_streams import CONTAINER, Carried, carried
 from ..io.video_writer import FrameWriter, first_frame
 from ..models.lens import ZoomLens
@@ -75,7 +75,8 @@ def undistort_video(
             `Framing`, which for frames of another size is scaled as the lens is.
         interpolation, border: as for `undistort_image`; a constant border is black.
         encoder: FFmpeg's name of the encoder; by default one for the source's own format, or for H.264.
-        options: options of the encoder; by default for visually lossless quality.
+        options: options of the encoder, texts by FFmpeg's names; by default for visually lossless quality.
+            Those of the container (movflags) are none.
         progress: called after each frame with the number of frames done and announced (0 if unknown).
 
     Raises:
@@ -83,27 +84,16 @@ def undistort_video(
         OSError: the target cannot be written; nothing is left of it.
         ValueError: the source is not a video, or none of its frames can be decoded; the track is shorter;
         the
-            lens is for another aspect ratio; or the target is the source, or its suffix or the encoder is
-            unknown, or not suitable for these frames.
+            lens is for another aspect ratio; or the target is the source, or its suffix, the encoder or an
+            option of it is unknown, or not suitable for these frames.
 
         Warns:
         UserWarning: frames cannot be decoded, or are interlaced; focal lengths are outside of the fitted
             range; the track goes on after the video's end; the lens is for another size, or folds within
             the frames.
     """
-    return _convert(
-        source,
-        target,
-        lens=lens,
-        focal=focal,
-        keep=keep,
-        interpolation=interpolation,
-        border=border,
-        encoder=encoder,
-        options=options,
-        progress=progress,
-        back=False,
-    )
+    how = _Work(lens, keep, interpolation, border, encoder, options, back=False)
+    return _convert(source, target, focal, how, progress)
 
 
 def redistort_video(
@@ -123,60 +113,58 @@ def redistort_video(
 
     Arguments, result and errors are those of `undistort_video`; `keep` tells how the video was corrected.
     """
-    return _convert(
-        source,
-        target,
-        lens=lens,
-        focal=focal,
-        keep=keep,
-        interpolation=interpolation,
-        border=border,
-        encoder=encoder,
-        options=options,
-        progress=progress,
-        back=True,
-    )
+    how = _Work(lens, keep, interpolation, border, encoder, options, back=True)
+    return _convert(source, target, focal, how, progress)
+
+
+class _Work(NamedTuple):
+    """What is done to a video: arguments of `undistort_video`, and whether distortion is applied."""
+
+    lens: ZoomLens
+    keep: str | Framing
+    interpolation: str
+    border: str
+    encoder: str | None
+    options: dict[str, str] | None
+    back: bool
 
 
 def _convert(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
-    *,
-    lens: ZoomLens,
     focal: float | int | FocalTrack,
-    keep: str | Framing,
-    interpolation: str,
-    border: str,
-    encoder: str | None,
-    options: dict[str, str] | None,
+    how: _Work,
     progress: Callable[[int, int], None],
-    back: bool,
 ) -> CorrectedVideo:
     target = Path(target)
     if target.suffix.lower() not in CONTAINER:
         raise ValueError(
             f"Argument target must end in one of {', '.join(CONTAINER)}, but it is {target.name!r}."
         )
-    check_sampling(interpolation, border)
-    if not isinstance(keep, Framing):
-        check_keep(keep)
+    check_sampling(how.interpolation, how.border)
+    if not isinstance(how.keep, Framing):
+        check_keep(how.keep)
+    _check_options(how.options)
     refuse_inputs([target], [source])
     track = focal if isinstance(focal, FocalTrack) else _constant(focal)
     with opened_video(source) as input_, whole_file(target) as part:
         video = input_.streams.best("video")
         size = (video.codec_context.width, video.codec_context.height)
         _check_length(track, video)
-        lens, framing = _geometry(lens, track, keep, size, back)
-        warper = FrameWarper(lens, framing, interpolation=interpolation, border=border, back=back)
+        lens, framing = _geometry(how.lens, track, how.keep, size, how.back)
+        warper = FrameWarper(
+            lens, framing, interpolation=how.interpolation, border=how.border, back=how.back
+        )
         report, along = Report(video.frames), carried(input_, video, target)
         decoded = ahead(decoded_items(input_, video, report, along.streams))
         items = ahead(_warped(decoded, warper, track, report, source))
         try:
-            writer = _write(items, part, target, input_, video, encoder, options, along, report, progress)
+            writer = _write(
+                items, part, target, input_, video, how.encoder, how.options, along, report, progress
+            )
         finally:
             items.close()
-        if missing := frames_cut_off(input_, video, report):
-            report.announced = report.written + missing
+        report.announced = frames_expected(input_, video, report)
     lost = max(report.corrupt, report.announced - report.written if report.announced else 0)
     if lost:
         warnings.warn(
@@ -189,6 +177,18 @@ def _convert(
     return CorrectedVideo(
         report.written, lost, float(framing.scale), tuple(writer.kept), tuple(writer.not_kept)
     )
+
+
+def _check_options(options: Any) -> None:
+    """Refuse options of an encoder that are not texts, which FFmpeg does not take."""
+    if options is None:
+        return
+    if not isinstance(options, Mapping) or not all(
+        isinstance(part, str) for pair in options.items() for part in pair
+    ):
+        raise TypeError(
+            f'Argument options must be texts by names, such as {{"crf": "20"}}, but it is {options!r}.'
+        )
 
 
 def _geometry(

@@ -19,6 +19,7 @@ File = io.BytesIO | io.BufferedReader
 _PREFIX = b"Exif\0\0"
 _FINENESS = 10_000  # parts of a mm
 _UNKNOWN = 2**32 - 1  # as numerator
+_SHORT = 3  # the type of whole numbers of 16 bits
 
 
 def exif_focal(block: bytes) -> float | None:
@@ -36,6 +37,38 @@ def exif_with_focal(focal: float) -> bytes:
     fraction = IFDRational(round(focal * _FINENESS), _FINENESS)
     exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLength: fraction}
     return exif.tobytes().removeprefix(_PREFIX)
+
+
+def exif_with_orientation(block: bytes, orientation: int) -> bytes:
+    """EXIF data with this orientation, 1 to 8, in the place of their own; all else stays byte for byte.
+
+    Data without an orientation are written anew with it, unless it is 1.
+    """
+    if place := _orientation_place(block):
+        at, order = place
+        return block[:at] + struct.pack(f"{order}H", orientation) + block[at + 2 :]
+    if orientation == 1:
+        return block
+    exif = parse_exif(io.BytesIO(block)) or Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    return exif.tobytes().removeprefix(_PREFIX)
+
+
+def _orientation_place(block: bytes) -> tuple[int, str] | None:
+    """Where the orientation of EXIF data is, and in which order of bytes; None if they have none."""
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(block[:4])
+    if order is None:
+        return None
+    try:
+        [folder] = struct.unpack_from(f"{order}I", block, 4)
+        [number] = struct.unpack_from(f"{order}H", block, folder)
+        for at in range(folder + 2, folder + 2 + 12 * number, 12):
+            if struct.unpack_from(f"{order}HHI", block, at) == (ExifTags.Base.Orientation, _SHORT, 1):
+                struct.unpack_from(f"{order}H", block, at + 8)
+                return at + 8, order
+    except struct.error:  # damaged or cut off
+        return None
+    return None
 
 
 def parse_exif(file: File, offset: int | None = None) -> Image.Exif | None:

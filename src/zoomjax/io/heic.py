@@ -1,9 +1,11 @@
 """HEIC photographs, as phones take them, by pillow-heif: the extra ``heic``.
 
-The decoder turns them upright. They are turned back by the orientation in their EXIF data, which cameras
-write beside the one that the decoder follows.
+The decoder turns them upright, as properties of the file say, whatever orientation their EXIF data have.
+So pictures are turned back by those properties, and the EXIF data get the orientation that these mean: in
+files of other formats it is what viewers follow.
 """
 
+import dataclasses
 import io
 from collections.abc import Mapping
 from types import ModuleType
@@ -11,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .exif import parse_exif
+from .exif import exif_with_orientation, parse_exif
 from .metadata import Metadata
 from .tiff import as_stored, orientation_of
 
@@ -33,7 +35,7 @@ def heic_metadata(content: bytes) -> Metadata:
     Raises:
         ValueError: as `heic_size`.
     """
-    return metadata_in(_opened(content).info)
+    return _told_truly(metadata_in(_opened(content).info), orientation_in(content))
 
 
 def metadata_in(info: Mapping[Any, Any]) -> Metadata:
@@ -54,8 +56,44 @@ def decode_heic(content: bytes) -> tuple[np.ndarray, Metadata]:
         image = np.array(picture)  # a copy: the memory goes with the picture
     except Exception as error:  # of whatever kind libheif's are
         raise ValueError("the file is damaged or cut off") from error
+    return as_stored(image, _orientation(metadata)), metadata
+
+
+def orientation_in(content: bytes) -> int | None:
+    """The orientation, 1 to 8, of which the properties of a file tell; None if they tell of several.
+
+    They are all in one box (ISO/IEC 23008-12, 6.5.10 and 6.5.12). Turns come before reflections (MIAF).
+    """
+    at = content.find(b"ipco")
+    end = at - 4 + int.from_bytes(content[at - 4 : at]) if at >= 4 else 0
+    turns, mirrors = set[int](), set[int]()
+    at += 4
+    while at + 8 < end <= len(content):
+        size, name, first = int.from_bytes(content[at : at + 4]), content[at + 4 : at + 8], content[at + 8]
+        if name == b"irot":
+            turns.add(first & 3)
+        elif name == b"imir":
+            mirrors.add(first & 1)
+        at += max(size, 8)
+    if len(turns) > 1 or len(mirrors) > 1:
+        return None
+    return _ORIENTATIONS[next(iter(turns), 0)][next(iter(mirrors), -1) + 1]
+
+
+_ORIENTATIONS = ((1, 4, 2), (8, 5, 7), (3, 2, 4), (6, 7, 5))
+"""By quarter turns against the clock, and reflections after them: none, up and down, left and right."""
+
+
+def _told_truly(metadata: Metadata, orientation: int | None) -> Metadata:
+    """Metadata with the orientation by which the decoder has turned the picture."""
+    if orientation is None or orientation == _orientation(metadata):
+        return metadata
+    return dataclasses.replace(metadata, exif=exif_with_orientation(metadata.exif, orientation))
+
+
+def _orientation(metadata: Metadata) -> int:
     parsed = parse_exif(io.BytesIO(metadata.exif))
-    return as_stored(image, 1 if parsed is None else orientation_of(parsed)), metadata
+    return 1 if parsed is None else orientation_of(parsed)
 
 
 def _opened(content: bytes):

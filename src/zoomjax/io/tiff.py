@@ -97,7 +97,7 @@ def _number(file: tifffile.TiffFile) -> int:
 def _page(content: bytes, file: tifffile.TiffFile, number: int) -> TiffPage:
     try:
         page: Any = file.pages[number]
-        metadata, orientation = tiff_metadata(content, page.offset)
+        metadata, orientation = tiff_metadata(content, page)
         image = _plain(page)
         separate = page.planarconfig == 2 and page.samplesperpixel > 1
         cmyk = getattr(page.photometric, "name", "") == "SEPARATED"
@@ -149,13 +149,13 @@ def _by_opencv(content: bytes, number: int) -> np.ndarray:
     return np.asarray(found[0])
 
 
-def tiff_metadata(content: bytes, offset: int | None = None) -> tuple[Metadata, int]:
-    """The metadata of the page at an offset, else of the first, and its orientation, 1 to 8."""
-    exif = parse_exif(io.BytesIO(content), offset)
+def tiff_metadata(content: bytes, page: Any = None) -> tuple[Metadata, int]:
+    """The metadata of one of tifffile's pages, else of the first, and its orientation, 1 to 8."""
+    exif = parse_exif(io.BytesIO(content), None if page is None else page.offset)
     if exif is None:
         return Metadata(), 1
     fields = {name: exif.get(tag) for name, tag, _ in _OTHERS}
-    iptc = exif.get(_IPTC)
+    iptc = _content_of(_IPTC, content, page) if _IPTC in exif and not fields["iptc"] else b""
     dpi = _dpi(exif)
     for tag in set(exif) - set(_DESCRIBING):
         del exif[tag]
@@ -163,12 +163,23 @@ def tiff_metadata(content: bytes, offset: int | None = None) -> tuple[Metadata, 
         exif[tag] = _bytes(exif[tag])  # else Pillow writes ASCII alone
     orientation = orientation_of(exif)
     fields["exif"] = exif.tobytes().removeprefix(b"Exif\0\0") if len(exif) else b""
-    if isinstance(iptc, bytes) and not fields["iptc"]:
+    if iptc:
         fields["iptc"] = _resource(iptc)
     known: dict[str, Any] = {
         k: v for k, v in fields.items() if isinstance(v, bytes) and len(v) < _MOST_BYTES
     }
     return Metadata(**known, dpi=dpi), orientation
+
+
+def _content_of(tag: int, content: bytes, page: Any) -> bytes:
+    """The bytes of a tag, whatever its type: those of IPTC data are said to be whole numbers, often."""
+    try:
+        with _opened(content) as file:
+            first: Any = file.pages[0]
+            found = (first if page is None else page).tags[tag]
+            return content[found.valueoffset :][: found.valuebytecount]
+    except Exception:  # as in `_opened`
+        return b""
 
 
 def _dpi(exif: Image.Exif) -> tuple[float, float] | None:

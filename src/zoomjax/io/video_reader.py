@@ -6,6 +6,7 @@ import functools
 import math
 import os
 import warnings
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,7 @@ def decode_video(
 
 @dataclasses.dataclass
 class Report:
-    """What happened on the way, in threads."""
+    """What happened on the way, in threads: counts of frames, and where packets end, s."""
 
     announced: int
     written: int = 0
@@ -59,6 +60,7 @@ class Report:
     first: Any = None
     last: tuple[int, float] = (-1, math.nan)
     end: float = 0.0
+    reached: float = 0.0
 
 
 def opened_video(source: str | os.PathLike[str]) -> Any:
@@ -100,17 +102,23 @@ def _frame_numbers(source: str | os.PathLike[str]) -> dict[int, int]:
     """The numbers of all frames by their time stamps, also of those that do not decode: by reading."""
     stamps = set()
     with opened_video(source) as input_, contextlib.suppress(av.error.FFmpegError):
+        avi = _is_avi(input_)
         for packet in input_.demux(input_.streams.best("video")):
-            if packet.pts is not None and not packet.is_discard:
-                stamps.add(packet.pts)
+            stamp = packet.dts if avi else packet.pts
+            if stamp is not None and not packet.is_discard:
+                stamps.add(stamp)
     return {stamp: number for number, stamp in enumerate(sorted(stamps))}
 
 
 def decoded_items(
     input_: Any, video: Any, report: Report, others: Sequence[Any] = ()
 ) -> Generator[Any, None, None]:
-    """Frames and packets of other streams, in the file's order; damaged ones are counted and left out."""
-    packets = input_.demux([video, *others])
+    """Frames and packets of other streams, in the file's order; damaged ones are counted and left out.
+
+    AVI files tell the order of decoding alone, a packet a step. Decoded frames come in the order in which
+    they are shown, so the times of packets, in their order, are those of frames.
+    """
+    packets, avi, steps = input_.demux([video, *others]), _is_avi(input_), deque[int]()
     while report.corrupt < _MOST_ERRORS:
         try:
             packet = next(packets, None)
@@ -119,28 +127,44 @@ def decoded_items(
             if packet.pts is not None:
                 end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
                 report.end = max(report.end, end)
+                if packet.stream is video:
+                    report.reached = max(report.reached, end)
             if packet.stream is not video:
                 if packet.dts is not None:
                     yield packet
                 continue
+            if avi and packet.dts is not None:
+                steps.append(packet.dts)
             frames = packet.decode()
         except av.error.FFmpegError as error:
             report.corrupt += 1
             report.failed += 1
             report.error = error.strerror or str(error)
+            if steps:
+                steps.pop()
             continue
         for frame in frames:
+            if steps:
+                frame.pts = steps.popleft()
             report.corrupt += bool(frame.is_corrupt)
             yield frame
 
 
-def frames_cut_off(input_: Any, video: Any, report: Report) -> int:
-    """About how many frames the end of a file lacks that tells its length in seconds alone, as Matroska
-    does.
+def _is_avi(input_: Any) -> bool:
+    return input_.format.name == "avi"
 
-    0 if all are there, as far as can be told: the length is that of the longest stream.
+
+def frames_expected(input_: Any, video: Any, report: Report) -> int:
+    """How many frames a file that was read to its end should hold, as far as it tells; 0 if it does not.
+
+    AVI also counts chunks without content, which show the last frame again. Matroska tells its length in
+    seconds alone, and the length of all is that of the longest stream.
     """
-    if video.frames or input_.format.name != "matroska,webm":
+    rate = float(video.average_rate or video.guessed_rate or 25)
+    if video.frames:
+        whole = _is_avi(input_) and round(report.reached * rate) >= video.frames
+        return report.written if whole else video.frames
+    if input_.format.name != "matroska,webm":
         return 0
     told = video.metadata.get("DURATION")
     try:
@@ -148,9 +172,9 @@ def frames_cut_off(input_: Any, video: Any, report: Report) -> int:
         length = 3600 * hours + 60 * minutes + seconds
     except (AttributeError, ValueError):
         length = (input_.duration or 0) / av.time_base if len(input_.streams) == 1 else 0.0
-    rate = float(video.average_rate or video.guessed_rate or 25)
     missing = length - report.end
-    return round(missing * rate) if missing > 0.02 * length + 1 / rate else 0
+    cut_off = missing > 0.02 * length + 1 / rate
+    return report.written + round(missing * rate) if cut_off else 0
 
 
 def numbered(

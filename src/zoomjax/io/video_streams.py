@@ -57,8 +57,9 @@ def carried(input_: Any, video: Any, named: Path) -> Carried:
     """What of an open file, beside one stream of pictures, goes over to a file of a name."""
     container = CONTAINER[named.suffix.lower()]
     streams, attachments, kept, lost = [], [], [], []
+    chapters = input_.chapters()
     for stream in input_.streams:
-        if stream is video:
+        if stream is video or _is_of_chapters(stream, input_, len(chapters)):
             continue
         if stream.type == "audio" or _holds(container, stream):
             streams.append(stream)
@@ -70,11 +71,16 @@ def carried(input_: Any, video: Any, named: Path) -> Carried:
             kept.append(f"the time code {stream.metadata['timecode']}")  # written from the tag
         else:
             lost.append(_name(stream))
-    chapters = input_.chapters()
     if chapters:
         (kept if container in _CHAPTERS else lost).append(f"chapters ({len(chapters)})")
     held = tuple(chapters) if container in _CHAPTERS else ()
     return Carried(tuple(streams), held, tuple(attachments), tuple(kept), tuple(lost))
+
+
+def _is_of_chapters(stream: Any, input_: Any, number: int) -> bool:
+    """Whether a stream holds the titles of the chapters, as QuickTime has them: a text for each."""
+    quicktime = input_.format.name.startswith("mov,")
+    return quicktime and stream.type == "data" and stream.name == "bin_data" and 0 < stream.frames == number
 
 
 def _holds(container: str, stream: Any) -> bool:

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import re
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +81,7 @@ class FrameWriter(contextlib.AbstractContextManager):
         kept, not_kept: names of what went over beside the pictures, and of what did not.
 
     Raises:
-        ValueError: the container takes no such encoder or sound, or the encoder no such frames.
+        ValueError: the container takes no such encoder or sound, or the encoder no such frames or options.
     """
 
     def __init__(
@@ -111,6 +111,7 @@ class FrameWriter(contextlib.AbstractContextManager):
             self._stream.set_display_matrix(like.orientation)
             with _blamed(name):
                 self._stream.codec_context.open(strict=False)
+            _refuse_unused(name, options, self._stream.codec_context.options)
             self._copies = put(self._output, along, named)
             starts(self._output, named, along.streams)
         except BaseException:
@@ -191,6 +192,15 @@ class FrameWriter(contextlib.AbstractContextManager):
             context.codec_tag = "hvc1"  # the tag that Apple's players ask for
         stream.metadata.update({k: v for k, v in source.metadata.items() if k.lower() not in _OWN_TAGS})
         return stream
+
+
+def _refuse_unused(encoder: str, options: dict[str, str] | None, left: Mapping[str, str]) -> None:
+    """Refuse options that an open encoder has left: FFmpeg passes over those that it does not know."""
+    if unused := [name for name in options or () if name in left]:
+        raise ValueError(
+            f"Argument options must be those of the encoder {encoder}, which does not know "
+            f"{', '.join(map(repr, unused))}: leave it out."
+        )
 
 
 def _options(name: str, source: Any) -> dict[str, str]:
