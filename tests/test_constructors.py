@@ -314,3 +314,38 @@ def test_many_values_of_jax_are_not_waited_for():
     gone = jnp.zeros(3)
     gone.delete()
     assert _fields.known(gone) is None
+
+
+def _masked(*shape):
+    """Of which something is masked: whoever looks at the numbers alone takes it for the rest."""
+    values = np.ma.masked_array(np.arange(1.0, 1 + np.prod(shape)).reshape(shape))
+    values[..., -1] = np.ma.masked
+    return values
+
+
+def _line():
+    return np.stack([np.arange(5.0), np.arange(5.0)], axis=-1)
+
+
+TAKERS = {
+    "points of lines": lambda: zj.Lines.from_ragged([_masked(5, 2)], [0], [24.0], image_size=SIZE),
+    "frames of lines": lambda: zj.Lines.from_ragged([_line()] * 2, _masked(2), [24.0], image_size=SIZE),
+    "focal lengths of lines": lambda: zj.Lines.from_ragged([_line()], [0], _masked(1), image_size=SIZE),
+    "a centre": lambda: zj.Lines.from_ragged([_line()], [0], [24.0], image_size=SIZE, centre=_masked(2)),
+    "focus": lambda: zj.Lines.from_ragged([_line()], [0], [24.0], image_size=SIZE, focus=_masked(1)),
+    "fields of lines": lambda: zj.Lines(**lines_fields() | {"points": _masked(2, 5, 2)}),
+    "weights": lambda: zj.Lines(**lines_fields()).weighted(_masked(2)),
+    "deviations": lambda: zj.fit.fit_focal(zj.Lines(**lines_fields()), _masked(2)),
+    "tracks": lambda: zj.tracks.Tracks.from_arrays([0, 0], [0, 1], _masked(2, 2), image_size=SIZE),
+    "focal tracks": lambda: zj.io.FocalTrack(_masked(2), [20.0, 60.0]),
+    "zoom models": lambda: zj.PolynomialZoom(1, _masked(2, 2), 20.0),
+    "lenses": lambda: zj.ZoomLens(**lens_fields() | {"centre": _masked(2)}),
+    "distortions": lambda: zj.Distortion(_masked(2), np.zeros(2), np.array(1.0)),
+}
+
+
+@pytest.mark.parametrize("take", TAKERS.values(), ids=TAKERS)
+@pytest.mark.usefixtures("unchecked")
+def test_masks_of_arrays_are_not_lost(take):
+    with pytest.raises(ValueError, match="mask"):
+        take()

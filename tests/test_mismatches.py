@@ -1,11 +1,13 @@
 """Things that do not belong together are refused, not combined into nonsense."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import zoomjax as zj
+from zoomjax import scenes
 
 
 @pytest.mark.parametrize("field", ["focal", "centre"])
@@ -30,3 +32,127 @@ def test_a_lens_in_millimetres_is_not_asked_for_pixels(noisy, fit):
     )
     with pytest.raises(ValueError, match="in mm"):
         zj.frame_rms(pixels, fit.lens)
+
+
+USES = {
+    "residuals": lambda fit, lines: np.sum(np.asarray(zj.fit.residuals(lines, _by(fit, lines))) ** 2),
+    "frame_energy": lambda fit, lines: zj.fit.frame_energy(lines, _by(fit, lines)),
+    "global_energy": lambda fit, lines: zj.fit.global_energy(lines, _by(fit, lines)),
+    "frame_rms": lambda fit, lines: zj.frame_rms(lines, fit.lens),
+    "algebraic_zoom": lambda fit, lines: zj.fit.algebraic_zoom(lines).zoom.parameters,
+    "algebraic_frames": lambda fit, lines: zj.fit.algebraic_frames(lines),
+    "fit_zoom": lambda fit, lines: zj.fit_zoom(lines).lens.zoom.parameters,
+    "in_image": lambda fit, lines: zj.fit_zoom(zj.fit.in_image(lines)).lens.zoom.parameters,
+    "fit_frames": lambda fit, lines: zj.fit_frames(lines).coefficients,
+    "fit_robust": lambda fit, lines: zj.fit_robust(lines).line_rms,
+    "fit_robust, from a model": lambda fit, lines: zj.fit_robust(lines, zoom=fit.lens.zoom).line_rms,
+    "fit_focal": lambda fit, lines: zj.fit.fit_focal(lines, 0.3).focal,
+    "with_focal_sigma": lambda fit, lines: _std(zj.fit.with_focal_sigma(fit, lines, focal_sigma=0.3)),
+    "with_misfit": lambda fit, lines: zj.trust.with_misfit(fit, lines).misfit,
+    "suggest_next": lambda fit, lines: zj.suggest_next(fit, lines).table,
+    "held_out_zoom": lambda fit, lines: zj.trust.held_out_zoom(lines),
+    "held_out_frames": lambda fit, lines: zj.trust.held_out_frames(lines),
+    "select_model": lambda fit, lines: zj.select_model(lines, [zj.PolynomialZoom()]).fit.rms,
+}
+"""What takes lines in any form."""
+
+
+def _by(fit, lines):
+    return jax.vmap(fit.lens.zoom)(jnp.asarray(lines.focal))
+
+
+def _std(fit):
+    return zj.displacement_std(fit, np.zeros(2), focal=50.0)
+
+
+@pytest.fixture(scope="module")
+def photos(truth):
+    """Nine photos with noise, and their fit."""
+    lines = scenes.board_lines(truth, scenes.focal_sweep(9), spacing=260.0, noise=0.3, seed=1)
+    return lines, zj.fit_zoom(zj.compress(lines))
+
+
+@pytest.mark.parametrize("use", USES.values(), ids=USES.keys())
+def test_lines_for_any_centre_are_those_about_their_own(use, photos):
+    lines, fit = photos
+    expected, found = use(fit, zj.compress(lines)), use(fit, zj.lines.compress_any_centre(lines))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-9)
+
+
+def _other(lines, other):
+    """The lines as those of another camera, or fewer frames of them."""
+    points, frame, focal = lines.to_ragged(), np.asarray(lines.frame), np.asarray(lines.focal)
+    size, unit = lines.image_size, "mm"
+    if other == "frames":
+        points, focal = [line for line, m in zip(points, frame, strict=True) if m < 8], focal[:8]
+        frame = frame[frame < 8]
+    elif other == "size":
+        size = (size[0] + 800, size[1] + 600)
+    else:
+        unit = "px"
+    return zj.Lines.from_ragged(points, frame, focal, image_size=size, focal_unit=unit)
+
+
+OF_A_FIT = {
+    "with_focal_sigma": lambda fit, lines: zj.fit.with_focal_sigma(fit, lines, focal_sigma=0.3),
+    "with_misfit": zj.trust.with_misfit,
+    "suggest_next": zj.suggest_next,
+    "evidence": lambda fit, lines: zj.trust.evidence(lines, fit),
+    "assess": lambda fit, lines: zj.trust.assess(lines, fit),
+}
+OF_A_LENS = {
+    "frame_rms": lambda fit, lines: zj.frame_rms(lines, fit.lens),
+    "cramer_rao": lambda fit, lines: zj.trust.cramer_rao(fit.lens, lines, std=0.3),
+    "displacement_bound": lambda fit, lines: zj.trust.displacement_bound(fit.lens, lines, std=0.3),
+}
+
+
+@pytest.mark.parametrize(
+    ("other", "message"), [("size", "size"), ("unit", "in mm"), ("frames", "9 frames.*are of 8")]
+)
+@pytest.mark.parametrize("use", [*OF_A_FIT, *OF_A_LENS])
+def test_lines_of_another_camera_are_refused(use, other, message, photos):
+    lines, fit = photos
+    if use in OF_A_LENS and other == "frames":
+        return  # a lens is for any lines
+    with pytest.raises(ValueError, match=message):
+        (OF_A_FIT | OF_A_LENS)[use](fit, _other(lines, other))
+
+
+def test_evidence_takes_the_same_lines_compressed_however_and_no_others(photos):
+    lines, fit = photos
+    expected = zj.trust.evidence(lines, fit)
+    found = zj.trust.evidence(lines, fit, compressed=zj.lines.compress_any_centre(lines))
+    assert [half.parting for half in found.halves] == [half.parting for half in expected.halves]
+    for half, other in zip(found.halves, expected.halves, strict=True):
+        np.testing.assert_allclose(half.apart, other.apart, rtol=1e-4)
+    for other in ("size", "frames"):
+        with pytest.raises(ValueError, match="compressed must be the same lines"):
+            zj.trust.evidence(lines, fit, compressed=zj.compress(_other(lines, other)))
+
+
+@pytest.mark.parametrize("given", [(np.ones(3), np.ones(9)), (np.ones(9), None), (None, np.ones(9))])
+def test_held_out_errors_are_one_a_frame_and_both(given, photos, unchecked):
+    held_out, each = given
+    with pytest.raises(ValueError, match="held_out"):
+        zj.trust.assess(*photos, held_out=held_out, each_held_out=each)
+
+
+def test_a_model_with_parameters_tells_the_number_of_coefficients(photos):
+    lines, _ = photos
+    small = zj.compress(lines, terms=3)
+    model = zj.fit_zoom(small, terms=3).lens.zoom
+    expected = zj.trust.held_out_zoom(small, terms=3)
+    np.testing.assert_array_equal(zj.trust.held_out_zoom(small, zoom=model), expected)
+    assert zj.fit.algebraic_zoom(small, zoom=model).zoom.parameters.shape == (3, 3)
+    assert zj.fit.fit_centre(lines, zoom=model).fit.lens.zoom.parameters.shape == (3, 3)
+    uses = (
+        lambda: zj.trust.held_out_zoom(small, zoom=model, terms=2),
+        lambda: zj.fit.algebraic_zoom(small, zoom=model, terms=2),
+        lambda: zj.fit.fit_centre(lines, zoom=model, terms=2),
+        lambda: zj.trust.Candidate(model, 2),
+        lambda: zj.select_model(small, [model]),
+    )
+    for use in uses:
+        with pytest.raises(ValueError, match="the parameters of zoom are for 3"):
+            use()

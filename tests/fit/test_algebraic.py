@@ -5,6 +5,7 @@ import pytest
 
 import zoomjax as zj
 
+from .._own_models import Halved
 from .._reference import largest_difference
 from ..conftest import RAGGED_FRAMES
 
@@ -78,3 +79,31 @@ def test_lines_through_the_centre_give_no_distortion():
 def test_too_few_focal_lengths_raise(ragged):
     with pytest.raises(ValueError, match="distinct focal lengths"):
         zj.fit.algebraic_zoom(ragged, zoom=zj.PolynomialZoom(3))
+
+
+@pytest.mark.parametrize("family", [zj.models.BrownConrady(), Halved()])
+def test_other_distortion_models_are_estimated_too(family, clean, truth):
+    """Both hold the polynomial: the estimate is its own, of half the coefficients, or next to it."""
+    small = zj.fit.compress_family(clean, family)
+    found = np.asarray(zj.fit.algebraic_zoom(small).zoom.parameters)
+    radial = np.asarray(zj.fit.algebraic_zoom(clean).zoom.parameters)
+    if family == Halved():
+        np.testing.assert_allclose(found / 2, radial, rtol=1e-6)
+        frames = zj.fit.algebraic_frames(small) / 2
+        np.testing.assert_allclose(frames, zj.fit.algebraic_frames(clean), rtol=1e-6)
+    else:
+        lens = zj.fit.algebraic_zoom(small)
+        assert largest_difference(lens, truth, clean.focal) < 0.05 * largest_difference(
+            eqx.tree_at(lambda lens: lens.zoom.parameters, truth, jnp.zeros((3, 2))), truth, clean.focal
+        )
+        assert (np.abs(found[:, 2:]) < 1e-3).all()
+
+
+def test_of_the_division_model_to_first_order(clean):
+    """Its k1 is minus the polynomial's, where distortion is weak."""
+    weak = zj.Distortion(jnp.array([1e-4]), clean.centre, jnp.asarray(clean.scale))
+    straight = np.linspace([200.0, 300.0], [3500.0, 700.0], 50)
+    seen = [weak.distort(straight + np.array([0, step])) for step in range(0, 2000, 300)]
+    lines = zj.Lines.from_ragged(seen, [0] * len(seen), [50.0], image_size=clean.image_size)
+    small = zj.fit.compress_family(lines, zj.models.Division(), terms=1)
+    np.testing.assert_allclose(zj.fit.algebraic_frames(small, terms=1), [[-1e-4]], rtol=1e-3)

@@ -12,11 +12,14 @@ from zoomjax import scenes
 K = jnp.array([[0.1, -0.05], [0.02, 0.03], [-0.1, 0.01]])
 
 
-def stretch(lines, k, index):
+DECENTRED = jnp.concatenate([K, jnp.array([[0.01, -0.004], [0.0, 0.006], [-0.01, 0.002]])], axis=1)
+
+
+def stretch(lines, k, index, family=zj.models.RadialPolynomial()):  # noqa: B008, it has no state
     """Root of the mean of ``|J^T n|^2`` of one line, from the Jacobian at each of its points."""
     points = np.asarray(lines.points[index])[np.asarray(lines.mask[index])]
     coefficients = k[int(lines.frame[index])]
-    d = zj.Distortion(coefficients, jnp.asarray(lines.centre), jnp.asarray(lines.scale))
+    d = zj.Distortion(coefficients, jnp.asarray(lines.centre), jnp.asarray(lines.scale), family)
     corrected = np.asarray(d.undistort(points))
     normal = np.linalg.svd(corrected - corrected.mean(axis=0))[2][1]
     across = [normal @ np.asarray(jax.jacfwd(d.undistort)(jnp.asarray(point))) for point in points]
@@ -29,6 +32,20 @@ def test_stretch_is_that_of_the_jacobian(ragged):
     expected = [stretch(ragged, K, index) for index in range(len(ragged.frame))]
     np.testing.assert_allclose(ratio, expected, rtol=1e-9)
     assert np.ptp(expected) > 0.02
+
+
+def test_the_stretch_of_a_model_that_is_not_radial_too(ragged):
+    family = zj.models.BrownConrady()
+    expected = [stretch(ragged, DECENTRED, index, family) for index in range(len(ragged.frame))]
+    radial = [stretch(ragged, K, index) for index in range(len(ragged.frame))]
+    assert np.abs(np.array(expected) - radial).max() > 1e-3
+    paper = zj.fit.with_family(ragged, family)
+    for lines in (zj.fit.in_image(paper), zj.fit.in_image(zj.fit.compress_family(ragged, family))):
+        ratio = [
+            np.linalg.norm(np.asarray(zj.fit.residuals(of, DECENTRED)), axis=1)
+            for of in (lines.as_weighted(), lines)
+        ]
+        np.testing.assert_allclose(ratio[0] / ratio[1], expected, rtol=1e-9)
 
 
 def test_compressed_lines_are_measured_alike(ragged):

@@ -249,7 +249,7 @@ def test_lines_of_something_else_are_refused(noisy, lines, path):
             fit_motion(noisy.tracks, lines=few, line_frames=wrong)
     with pytest.raises(ValueError, match="line_frames is for argument lines"):
         fit_motion(noisy.tracks, line_frames=np.arange(FRAMES))
-    with pytest.raises(ValueError, match="BrownConrady is not"):
+    with pytest.raises(ValueError, match="given a BrownConrady"):
         fit_motion(noisy.tracks, lines=lines, family=BrownConrady())
 
 

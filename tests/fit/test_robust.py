@@ -118,6 +118,26 @@ def test_own_weights_are_kept_as_factors(board):
     assert np.median(np.asarray(robust.weight)[own == 0.5]) == pytest.approx(0.5, rel=0.1)
 
 
+def test_lines_of_no_weight_do_not_tell_what_is_usual(truth):
+    """Many, and crooked: as the median they would have all arcs that are left believed."""
+    lines = scenes.board_lines(truth, scenes.focal_sweep(4), spacing=100, noise=0.5, seed=3)
+    arcs, which = with_arcs(lines, 0.7, sagitta=(20, 60), outward=False)
+    own = np.ones(len(lines.frame))
+    own[which[: -len(which) // 10]] = 0
+    robust = zj.fit_robust(zj.compress(arcs).weighted(own))
+    alone = [line for line, there in zip(arcs.to_ragged(), own, strict=True) if there]
+    expected = zj.fit_robust(
+        zj.compress(
+            zj.Lines.from_ragged(
+                alone, np.asarray(lines.frame)[own > 0], lines.focal, image_size=lines.image_size
+            )
+        )
+    )
+    np.testing.assert_allclose(robust.scale, expected.scale, rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(robust.weight)[own > 0], expected.weight, atol=1e-6)
+    assert (np.asarray(robust.weight)[which] == 0).all()
+
+
 @pytest.mark.slow
 def test_solver_and_steps_are_those_of_the_last_fit(small):
     robust = zj.fit_robust(small)

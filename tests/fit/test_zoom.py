@@ -13,6 +13,7 @@ import scipy.optimize
 
 import zoomjax as zj
 from zoomjax import RESULTS
+from zoomjax.fit.zoom import about_centre
 
 from .._reference import assert_derivatives_agree, frame_energies, image_grid, largest_difference
 from ..conftest import NOISE, moved
@@ -548,3 +549,12 @@ def test_frame_rms_tells_of_frames_outside_of_the_range(noisy, fit):
     narrow = eqx.tree_at(lambda lens: lens.focal_range, fit.lens, fit.lens.focal_range[:1].repeat(2))
     with pytest.warns(UserWarning, match="Focal lengths from 20.56 to 127.36 mm are not all within"):
         zj.frame_rms(noisy, narrow)
+
+
+@pytest.mark.parametrize("centre", [(1e9, 1e9), (-5000.0, 1e4), (95955.0, 539.0)])
+def test_a_centre_outside_of_the_image_is_said(small, noisy, centre):
+    """About which lines are the straighter the farther it is: a slip of the keyboard would look good."""
+    with pytest.warns(UserWarning, match="is outside of the image of 4288 x 2848 px"):
+        about_centre(noisy, centre)
+    inside = np.asarray(noisy.centre)
+    assert about_centre(small, inside) is small

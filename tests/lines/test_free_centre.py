@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
+from zoomjax.fit.energy import energy_by_frame, weighted_distances
 
 from ..conftest import SEED
 
@@ -17,6 +18,11 @@ K = jnp.array([[0.1, -0.05], [0.02, 0.03], [-0.1, 0.01]])
 @pytest.fixture(scope="module")
 def small(ragged):
     return zj.lines.compress_any_centre(ragged)
+
+
+def with_offset(lines, k):
+    """The errors of frames by coefficients that end with the centre's offset."""
+    return energy_by_frame(lines, weighted_distances(lines, k))
 
 
 def about(lines, centre):
@@ -49,15 +55,30 @@ def test_each_frame_may_have_its_own_centre(ragged, small, kind):
 
 def test_the_offset_of_the_centre_comes_after_the_coefficients(ragged, small):
     offset = (CENTRES - np.asarray(small.centre)) / small.scale
-    with_offset = zj.fit.frame_energy(small, jnp.concatenate([K, offset], axis=1))
-    np.testing.assert_allclose(with_offset, zj.fit.frame_energy(ragged.about(CENTRES), K), rtol=1e-12)
+    found = with_offset(small, jnp.concatenate([K, offset], axis=1))
+    np.testing.assert_allclose(found, zj.fit.frame_energy(ragged.about(CENTRES), K), rtol=1e-12)
+
+
+DECENTRED = jnp.concatenate([K, jnp.array([[0.01, -0.004], [0.0, 0.006], [-0.01, 0.002]])], axis=1)
+
+
+@pytest.mark.parametrize("centre", [CENTRES[0], CENTRES], ids=["one", "each"])
+def test_all_monomials_may_be_moved_to_another_centre(ragged, centre):
+    """As a model needs that is not radial: the energy is that of the points about that centre."""
+    family = zj.models.BrownConrady()
+    lines = zj.fit.compress_family(ragged, family).about(centre)
+    expected = zj.fit.frame_energy(zj.fit.with_family(ragged.about(centre), family), DECENTRED)
+    np.testing.assert_allclose(zj.fit.frame_energy(lines, DECENTRED), expected, rtol=1e-11)
+    jitted = jax.jit(lambda lines, k: zj.fit.frame_energy(lines.about(centre), k))
+    again = jitted(zj.fit.compress_family(ragged, family), DECENTRED)
+    np.testing.assert_allclose(again, expected, rtol=1e-11)
 
 
 def test_derivatives_by_the_centre_are_those_of_the_points(ragged, small):
     def energy(offset, lines):
         offsets = jnp.broadcast_to(offset, (3, 2))
         if lines is small:
-            return jnp.sum(zj.fit.frame_energy(lines, jnp.concatenate([K, offsets], axis=1)))
+            return jnp.sum(with_offset(lines, jnp.concatenate([K, offsets], axis=1)))
         return jnp.sum(zj.fit.frame_energy(lines.about(lines.centre + lines.scale * offset), K))
 
     offset = jnp.array([0.02, -0.03])
@@ -76,7 +97,7 @@ def test_a_frame_of_them_is_that_frame(ragged, small):
     chosen, present = small.by_frame()
     frame = small.take(jnp.asarray(chosen[1]), jnp.asarray(present[1]))
     np.testing.assert_allclose(
-        zj.fit.frame_energy(frame, jnp.concatenate([K[1:2], jnp.zeros((1, 2))], axis=1)),
+        with_offset(frame, jnp.concatenate([K[1:2], jnp.zeros((1, 2))], axis=1)),
         zj.fit.frame_energy(ragged, K)[1:2],
         rtol=1e-12,
     )
@@ -92,7 +113,7 @@ def test_float32_keeps_its_floor():
     )
     small = zj.lines.compress_any_centre(lines)
     assert small.triangle.dtype == np.float32
-    rms = np.sqrt(zj.fit.frame_energy(small, jnp.zeros((2, 4), jnp.float32)))
+    rms = np.sqrt(with_offset(small, jnp.zeros((2, 4), jnp.float32)))
     assert (rms < 2e-3).all()
 
 

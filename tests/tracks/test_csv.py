@@ -1,11 +1,12 @@
 """Tracks as CSV: what is read back, and what is refused with which words."""
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zoomjax.tracks import Tracks, read_tracks_csv, write_tracks_csv
+from zoomjax.tracks import Tracks, load_tracks, read_tracks_csv, write_tracks_csv
 
 SIZE = (64, 48)
 
@@ -84,3 +85,24 @@ def test_tracks_of_one_view_are_dropped(tmp_path):
     path = write(tmp_path / "t.csv", f"{HEAD}0,0,1,1\n0,1,1,1\n8,1,1,1\n")
     with pytest.warns(UserWarning, match="Dropped 1 of 2 tracks"):
         assert read_tracks_csv(path, image_size=SIZE).number.tolist() == [0]
+
+
+def test_digits_are_kept_where_jax_has_none(tmp_path, rng):
+    """A file that is read and written would lose what float32 does not hold."""
+    places = rng.uniform(0, 600, (10, 2))
+    rows = [
+        f"{track},{frame},{x!r},{y!r}"
+        for (track, frame), (x, y) in zip(
+            [(track, frame) for track in (0, 1) for frame in range(5)], places.tolist(), strict=True
+        )
+    ]
+    (tmp_path / "a.csv").write_text("\n".join(["track,frame,x,y", *rows]))
+    with jax.enable_x64(False):
+        tracks = read_tracks_csv(tmp_path / "a.csv", image_size=(640, 640))
+        write_tracks_csv(tracks, tmp_path / "b.csv")
+        tracks.save(tmp_path / "c.npz")
+        loaded = load_tracks(tmp_path / "c.npz")
+    assert (tmp_path / "b.csv").read_text().split() == (tmp_path / "a.csv").read_text().split()
+    for each in (tracks, loaded):
+        assert each.points.dtype == np.float64
+        np.testing.assert_array_equal(each.views()[2], places)

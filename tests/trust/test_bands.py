@@ -232,6 +232,12 @@ def test_focal_lengths_that_are_none_are_refused(fit, focal):
         assert np.isnan(jax.jit(call)(jnp.asarray(focal))).any()
 
 
+@pytest.mark.parametrize("level", [0, 1, 1.5, -0.5, 95, np.nan, [0.9, 0.95]])
+def test_levels_that_are_none_are_refused(fit, level, unchecked):
+    with pytest.raises(ValueError, match="level must be a number between 0 and 1"):
+        zj.displacement_band(fit, np.zeros(2), focal=50.0, level=level)
+
+
 def test_a_band_is_about_the_centre_at_its_focal_length(fit):
     """Which moves along the zoom where the lens has a shift: 3 % of the scale, 77 px, at the short end."""
     shift = zj.PolynomialZoom(1, [[0.0, 0.0], [0.03, -0.02]], FOCAL[0])

@@ -6,6 +6,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.trust import misfit
 
 FOCAL = scenes.focal_sweep(12)
 
@@ -39,8 +40,39 @@ def test_few_frames_have_no_estimate(truth):
     assert zj.trust.with_misfit(fit, few).misfit is None
 
 
-def test_another_distortion_model_is_refused(truth):
-    lines = scenes.board_lines(truth, FOCAL[:3], spacing=300.0, noise=0.3)
-    fit = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=0), terms=1, family=zj.models.Division())
-    with pytest.raises(ValueError, match="radial polynomial"):
-        zj.trust.with_misfit(fit, lines)
+def size_of(fit):
+    return np.sqrt(np.diag(fit.misfit))
+
+
+@pytest.mark.slow
+def test_by_residuals_it_is_what_it_is_by_moments(lines):
+    fit = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=1))
+    quickly, by_residuals = (
+        of(lines, np.asarray(jax.vmap(fit.lens.zoom)(lines.focal)), fit.lens.family)
+        for of in (misfit._quickly, misfit._by_residuals)
+    )
+    for one, other in zip(quickly, by_residuals, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * np.abs(one).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", [zj.models.Division(), zj.models.BrownConrady()])
+def test_other_distortion_models_have_one_too(truth, family):
+    """The scene is a polynomial's: what degree 1 misses of k1 is the same, up to Division's sign."""
+    seen = scenes.board_lines(truth, FOCAL, spacing=200.0, noise=0.3, seed=3)
+    small = zj.fit.compress_family(seen, family)
+    fit = zj.fit_zoom(small, zoom=zj.PolynomialZoom(degree=1))
+    own = zj.fit_zoom(zj.compress(seen), zoom=zj.PolynomialZoom(degree=1))
+    found = size_of(zj.trust.with_misfit(fit, small))
+    expected = size_of(zj.trust.with_misfit(own, zj.compress(seen)))
+    assert found[0] == pytest.approx(expected[0], rel=0.4)
+    if len(found) == 4:
+        assert (found[2:] < 0.02 * found[0]).all()
+
+
+@pytest.mark.slow
+def test_nor_does_the_metric_matter(lines):
+    fit = zj.fit_zoom(zj.fit.in_image(lines), zoom=zj.PolynomialZoom(degree=1))
+    paper = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=1))
+    found = size_of(zj.trust.with_misfit(fit, zj.fit.in_image(lines)))
+    np.testing.assert_allclose(found, size_of(zj.trust.with_misfit(paper, lines)), rtol=0.2)

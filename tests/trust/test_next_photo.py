@@ -133,7 +133,8 @@ def test_where_nothing_is_determined_something_is_suggested_all_the_same(lens):
     assert suggestion.sentence.endswith("would determine the lens best.")
 
 
-@pytest.mark.parametrize("bad", [(0.0, 50.0), (50.0, 20.0), (20.0, np.inf)])
+@pytest.mark.parametrize("bad", [(0.0, 50.0), (50.0, 20.0), (20.0, np.inf), (20.0,), "20,30"])
+@pytest.mark.usefixtures("unchecked")
 def test_a_range_that_is_none_raises(bad, central):
     with pytest.raises(ValueError, match="focal_range must be two positive numbers"):
         zj.suggest_next(*fitted(central), focal_range=bad)

@@ -11,9 +11,9 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.trust.cross_validation import held_out_frames, held_out_zoom, judge
-from zoomjax.trust.folds import HoldOut, Judged, folds_of, shares
-from zoomjax.trust.selection import compare, compare_judged, default_candidates
+from zoomjax.trust.cross_validation import errors_of, held_out_frames, held_out_zoom
+from zoomjax.trust.folds import HoldOut, LineErrors, folds_of, shares
+from zoomjax.trust.selection import compare, compare_errors, default_candidates
 
 FOCALS = 7
 POLYNOMIALS = [
@@ -83,7 +83,7 @@ def test_a_frame_left_out_is_corrected_by_the_fit_of_the_others(zoom, terms, lin
         model = zoom.prepare(np.delete(lines.focal, frame), terms)
         fit = zj.fit_zoom(counting_nothing(lines, frame), zoom=model, invertible=False)
         np.testing.assert_allclose(held_out[frame], rms_of(lines, fit.lens.zoom)[frame], rtol=1e-6)
-    judged = judge(lines, zoom, terms, folds_of(lines, "frame", 2, 0))
+    judged = errors_of(lines, zoom, terms, folds_of(lines, "frame", 2, 0))
     model = zoom.prepare(lines.focal, terms)
     fit = zj.fit_zoom(lines.weighted(np.ones(lines.frame.shape)), zoom=model, invertible=False)
     frame = np.asarray(lines.frame)
@@ -98,7 +98,7 @@ def test_a_fold_is_a_plain_fit_of_a_subset_of_the_lines(lines):
 
 def test_lines_left_out_are_measured_by_the_fit_of_the_others(lines):
     parts = folds_of(lines, "line", 4, 0)
-    judged = judge(lines, zj.PolynomialZoom(degree=2), 2, parts)
+    judged = errors_of(lines, zj.PolynomialZoom(degree=2), 2, parts)
     frame = np.asarray(lines.frame)
     for fold in (0, 3):
         own = (parts.fold == fold).astype(float)
@@ -170,11 +170,11 @@ def test_least_error_is_a_rule_of_its_own(worse, chosen, lines, rng):
     scatter = 1 + 0.3 * (-1.0) ** parts.unit
     scatter = scatter / np.average(scatter[parts.fold >= 0], weights=shares(lines)[parts.fold >= 0])
     errors = [
-        Judged(np.ones(len(square)), square * scatter * worse**2, 2.0, ""),
-        Judged(np.ones(len(square)), square, 4.0, ""),
+        LineErrors(np.ones(len(square)), square * scatter * worse**2, 2.0, ""),
+        LineErrors(np.ones(len(square)), square, 4.0, ""),
     ]
     rules = ("one standard error", "least")
-    found = [compare_judged(lines, candidates, errors, parts, rule)[1:] for rule in rules]
+    found = [compare_errors(lines, candidates, errors, parts, rule)[1:] for rule in rules]
     assert [candidates.index(simplest) for _, simplest in found] == list(chosen)
     assert [candidates.index(best) for best, _ in found] == [1, 1]
 
@@ -186,7 +186,8 @@ def test_paired_errors_are_those_of_the_differences_of_two_roots(lines):
     verdict, *_ = (v for v in compared(lines, [a, b], "frame")[0] if v.difference > 0)
     frame = np.asarray(lines.frame)
     squares = [
-        np.bincount(frame, judge(lines, c.zoom, c.terms, parts).unseen) / np.bincount(frame) for c in (a, b)
+        np.bincount(frame, errors_of(lines, c.zoom, c.terms, parts).unseen) / np.bincount(frame)
+        for c in (a, b)
     ]
     leave_out = 1 - np.eye(FOCALS)
     differences = np.subtract(*(np.sqrt(leave_out @ e / (FOCALS - 1)) for e in squares))
@@ -309,6 +310,8 @@ def test_default_candidates_are_what_the_lines_serve_and_few_focal_lengths_leave
         ({"folds": 1}, "at least 2"),
         ({"candidates": []}, "is empty"),
         ({"rule": "best"}, '"one standard error" or "least"'),
+        ({"seed": None}, "seed must be an integer of at least 0"),
+        ({"seed": -1}, "seed must be an integer of at least 0"),
         ({"candidates": [zj.PolynomialZoom(degree=9)]}, "No candidate can be compared"),
     ],
 )
@@ -321,10 +324,14 @@ def test_bad_arguments_are_told(options, message, lines):
 def test_other_types_are_told(lines):
     with pytest.raises(TypeError, match="must be Lines"):
         zj.select_model(np.zeros(3))  # pyright: ignore[reportArgumentType]
-    with pytest.raises(TypeError, match="without in_image"):
-        zj.select_model(zj.fit.in_image(lines))
+    with pytest.raises(TypeError, match="without with_family"):
+        zj.select_model(zj.fit.with_family(lines, zj.models.Division()))
     with pytest.raises(TypeError, match="zoom model"):
         zj.select_model(lines, ["quadratic"])  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="must be a list of zoom models"):
+        zj.select_model(lines, zj.PolynomialZoom())  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="such as Division"):
+        zj.trust.Candidate(zj.PolynomialZoom(), 2, zj.models.Division)  # pyright: ignore[reportArgumentType]
 
 
 def test_too_few_focal_lengths_to_leave_one_out_are_told(lines):
@@ -378,3 +385,15 @@ def with_a_point_that_is_nan(lines):
 def test_lines_that_say_nothing_are_refused(measure, spoiled, lines):
     with pytest.raises(ValueError, match="Argument lines must"):
         measure(spoiled(lines))
+
+
+@pytest.mark.slow
+def test_in_the_image_the_same_model_is_selected(lines):
+    """Every fold is fitted by itself then; with as little noise the metric makes no difference."""
+    candidates = [zj.PolynomialZoom(degree=degree) for degree in (1, 2)]
+    paper, image = (
+        zj.select_model(of, candidates, hold_out="line", folds=3) for of in (lines, zj.fit.in_image(lines))
+    )
+    assert image.chosen == paper.chosen
+    for one, other in zip(image.verdicts, paper.verdicts, strict=True):
+        assert one.held_out == pytest.approx(other.held_out, rel=0.1)

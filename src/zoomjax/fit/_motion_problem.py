@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 from .._core.types import AnyArray, traced
 from ..lines.free_centre import AnyCentreLines, compress_any_centre
 from ..lines.lines import Lines
-from ..models.family import AbstractFamily, AbstractRadial
+from ..models.family import AbstractFamily
+from ..models.requirements import check
 from ..models.zoom import AbstractZoom
 from ..tracks.tracks import Tracks
 from ._motion_rows import Data
@@ -148,10 +149,7 @@ def _ready_lines(given, family, size):
         if line_frames is not None:
             raise ValueError("Argument line_frames is for argument lines, which is not given.")
         return None, np.zeros(0, int)
-    if not isinstance(family, AbstractRadial):
-        raise ValueError(
-            f"Lines are fitted together with tracks for radial families: {type(family).__name__} is not."
-        )
+    check("fit_motion with lines", family=family)
     if lines.image_size != tracks.image_size:
         raise ValueError(
             f"Argument lines is of images of {lines.image_size} px, but the tracks are of "

@@ -22,13 +22,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from ..lines.free_centre import AnyCentreLines
+from ..lines.stretch import radial_stretch
 from ..models.family import AbstractFamily
 from ..models.zoom import AbstractPriorZoom, AbstractZoom, with_parameters
 from ._motion_start import Path, rotation_vector, shrunk_ray, turned
 from ._schur import Rows, Unknowns
 from ._structure import Structure
 from .energy import line_normal
-from .image_metric import squared_stretch
 
 CAUCHY = 2.3849
 """Of the noise: where the loss begins to flatten; of normal errors it wastes a twentieth."""
@@ -312,8 +312,8 @@ def _product(matrix, vector):
 
 def line_residuals_of(data: Data, model: Model) -> Float[Array, "line row"]:
     """Distances of lines' corrected points to them, in the image, px, or rows with their sum of squares."""
-    lines = data.lines
-    if lines is None:
+    lines, moments = data.lines, data.moments
+    if lines is None or moments is None:
         return jnp.zeros((0, 1))
     rows, frame = _rows_of_frames(data, model), data.structure.line_frame
     far = (jnp.asarray(data.size) - 1) / 2 / data.scale
@@ -321,7 +321,7 @@ def line_residuals_of(data: Data, model: Model) -> Float[Array, "line row"]:
     powers = expand(rows.coefficients[0])[frame]
     corrected = lines.corrected(jnp.concatenate([powers, rows.offset[frame]], axis=1))
     normal = jax.vmap(line_normal)(corrected)
-    squared = jax.vmap(squared_stretch)(powers, normal, data.moments, lines.counts)
+    squared = jax.vmap(radial_stretch)(powers, normal, moments, lines.counts)
     distances = jnp.einsum("lrc,lc->lr", corrected, normal)
     return distances / jnp.sqrt(jnp.maximum(squared, 0.01))[:, None]
 

@@ -6,8 +6,11 @@ sum of squares, of the areas ``x_p y_q - x_q y_p`` spanned by pairs of points ab
 order each area is linear in the coefficients, and the minimiser is a linear least-squares solution.
 Divided by the line's length squared the determinant is the squared distance to the line, so that the
 weights of eq. 13 apply. It is computed on compressed lines, whose D - 1 rows have the same determinant
-as the thousands of points.
+as the thousands of points. Under a distortion model that is not linear in its coefficients the rows, too,
+are taken to first order in them.
 """
+
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,11 +24,14 @@ from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines, compress
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
-from ..models.zoom import AbstractLinearZoom, PolynomialZoom, with_parameters
+from ..models.zoom import AbstractLinearZoom, PolynomialZoom, terms_of, with_parameters
 from ._linear import least_squares
+from .defaults import zoom_or_default
 from .energy import line_weights, prior_jacobian, settings
-from .image_metric import ImageLines
+from .family_lines import FamilyLines
+from .image_metric import in_corrected
 from .result import lens_of
+from .wrapper import about_own_centre
 
 
 def compressed(lines: AbstractLines, terms: int) -> CompressedLines:
@@ -33,78 +39,102 @@ def compressed(lines: AbstractLines, terms: int) -> CompressedLines:
 
     For lines measured in the image (`in_image`), the lines underneath.
     """
-    if isinstance(lines, ImageLines):
-        lines = lines.as_weighted()
+    lines = about_own_centre(in_corrected(lines))
     if isinstance(lines, CompressedLines):
         lines.check_terms(terms)
         return lines
     if isinstance(lines, Lines):
         return compress(lines, terms)
     raise TypeError(
-        f"Lines of type {type(lines).__name__} cannot be used here: pass Lines or compress(lines); after "
-        "compress_any_centre(lines), pass .about(centre)."
+        f"Lines of type {type(lines).__name__} cannot be used here: pass Lines or compress(lines)."
     )
 
 
 def algebraic_parameters(
-    lines: CompressedLines, zoom: AbstractLinearZoom, terms: int
-) -> Float[Array, "basis terms"]:
+    lines: AbstractLines, zoom: AbstractLinearZoom, terms: int
+) -> Float[Array, "basis size"]:
     """The parameters of a prepared linear zoom model that the algebraic estimate gives."""
-    areas = jax.vmap(_areas, in_axes=(0, None))(lines.triangle, terms)  # (line, area, 1 + terms)
+    size = lines.family.size(terms)
+    rows = _triangle_rows(lines, terms) if isinstance(lines, CompressedLines) else _rows(lines, size)
+    areas = jax.vmap(_areas)(*rows)  # (line, area, 1 + size)
     areas = lines.scale * jnp.sqrt(line_weights(lines))[:, None, None] * areas
     basis = jax.vmap(zoom.basis)(*settings(zoom, lines))[lines.frame]  # (line, basis)
     columns = jnp.einsum("lat,lb->labt", areas[..., 1:], basis)
-    unknowns = basis.shape[1] * terms
-    prior = prior_jacobian(lines, with_parameters(zoom, jnp.zeros((basis.shape[1], terms), basis.dtype)))
+    unknowns = basis.shape[1] * size
+    prior = prior_jacobian(lines, with_parameters(zoom, jnp.zeros((basis.shape[1], size), basis.dtype)))
     matrix = jnp.concatenate([columns.reshape(-1, unknowns), prior])
     right = jnp.concatenate([-areas[..., 0].reshape(-1), jnp.zeros(prior.shape[0], basis.dtype)])
     # Lines through the centre do not change the areas, px, whatever the coefficients: those stay zero.
     solution = least_squares(matrix, right, floor=lines.scale)
-    return solution.reshape(basis.shape[1], terms)
+    return solution.reshape(basis.shape[1], size)
 
 
-def _areas(triangle, terms):
+def _triangle_rows(lines, terms):
+    """x and y of each line's rows, (line, row, 1 + terms): without distortion, and what k1, ..., kN add."""
+    rows = lines.triangle[:, 1:, 1 : 3 + 2 * terms]
+    rows = rows.reshape(*rows.shape[:2], terms + 1, 2)
+    return rows[..., 0], rows[..., 1]
+
+
+def _rows(lines, size):
+    """The same of any distortion model, to first order in its coefficients."""
+    none = jnp.zeros((lines.frame.shape[0], size), jnp.asarray(lines.focal).dtype)
+
+    def along(direction):
+        return jax.jvp(lines.corrected, (none,), (jnp.broadcast_to(direction[None], none.shape),))
+
+    straight, added = jax.vmap(along, out_axes=(None, -1))(jnp.eye(size, dtype=none.dtype))
+    rows = jnp.concatenate([straight[..., None], added], axis=-1) / lines.scale
+    return rows[:, :, 0], rows[:, :, 1]
+
+
+def _areas(x, y):
     """For one line the area of each pair of rows, constant and linear in k, over the line's length."""
-    rows = triangle[1:, 1 : 3 + 2 * terms].reshape(-1, terms + 1, 2)
-    x, y = rows[..., 0], rows[..., 1]
-    first, second = np.triu_indices(triangle.shape[0] - 1, 1)
+    first, second = np.triu_indices(x.shape[0], 1)
     # Order 0 with order j, both ways round: the derivative of the area with respect to k_j.
     linear = (
         x[first, :1] * y[second] - x[second, :1] * y[first]
         + x[first] * y[second, :1] - x[second] * y[first, :1]
     )  # fmt: skip
     areas = jnp.concatenate([linear[:, :1] / 2, linear[:, 1:]], axis=1)
-    squared_length = jnp.sum(rows[:, 0] ** 2)
+    squared_length = jnp.sum(x[:, 0] ** 2 + y[:, 0] ** 2)
     return areas / jnp.sqrt(jnp.where(squared_length > 0, squared_length, 1))
 
 
 @kinds_checked
 def algebraic_zoom(
-    lines: AbstractLines, *, zoom: AbstractLinearZoom | None = None, terms: int = 2
+    lines: AbstractLines, *, zoom: AbstractLinearZoom | None = None, terms: int | None = None
 ) -> ZoomLens:
     """Estimate a zoom lens algebraically, without iterations.
 
     Args:
-        lines: the lines, or their compressed form.
-        zoom: a model that is linear in its parameters; `PolynomialZoom` of degree 2 by default.
-        terms: the number N of coefficients.
+        lines: the lines, or their compressed form; for another distortion model `compress_family` makes it.
+        zoom: a model that is linear in its parameters; `PolynomialZoom` of degree 2 by default. It is made
+            ready anew: of a fitted one only the settings and the number of coefficients count.
+        terms: the number N of coefficients: by default 2, or as many as a `zoom` with parameters has.
 
     References:
         L. Alvarez, L. Gómez, J. R. Sendra, "An algebraic approach to lens distortion by line
         rectification", J. Math. Imaging Vis. 35 (2009): [9] of the paper.
     """
-    model = PolynomialZoom() if zoom is None else zoom
-    terms = checked_terms(terms, lines.family.most_terms)
+    model: Any = zoom_or_default(zoom)
+    terms = terms_of(model, terms, lines.family)
     focal, *focus = settings(model, lines)
-    prepared = model.prepare(focal, terms, *focus)
-    return _solve_zoom(compressed(lines, terms), prepared, terms)
+    prepared = model.prepare(focal, lines.family.size(terms), *focus)
+    return _solve_zoom(small_of(lines, terms), prepared, terms)
 
 
 @kinds_checked
 def algebraic_frames(lines: AbstractLines, *, terms: int = 2) -> Float[Array, "frame terms"]:
-    """Estimate the normalised coefficients of each frame separately, without iterations."""
+    """Estimate the normalised coefficients of each frame separately; lines as of `algebraic_zoom`."""
     terms = checked_terms(terms, lines.family.most_terms)
-    return _solve_frames(compressed(lines, terms), *lines.by_frame(), terms)
+    return _solve_frames(small_of(lines, terms), *lines.by_frame(), terms)
+
+
+def small_of(lines, terms):
+    """The lines compressed, under their own distortion model; the metric is the paper's."""
+    plain = in_corrected(lines)
+    return plain.compressed(terms) if isinstance(plain, FamilyLines) else compressed(plain, terms)
 
 
 @eqx.filter_jit
@@ -117,7 +147,7 @@ def _solve_zoom(lines, zoom, terms):
 def _solve_frames(lines, chosen, present, terms):
     def solve(chosen, present):
         frame = lines.take(chosen, present)
-        constant = PolynomialZoom(degree=0).prepare(frame.focal, terms)
+        constant = PolynomialZoom(degree=0).prepare(frame.focal, frame.family.size(terms))
         return algebraic_parameters(frame, constant, terms)[0]
 
     return jax.vmap(solve)(chosen, present)

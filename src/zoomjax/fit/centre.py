@@ -21,16 +21,24 @@ from jaxtyping import Array, Bool, Float, PyTree, ScalarLike
 
 from .._core.arguments import kinds_checked
 from .._core.types import Coefficients, Focal
-from ..lines.free_centre import AnyCentreLines, compress_any_centre
+from ..lines.base import AbstractLines
+from ..lines.free_centre import AnyCentreLines
 from ..lines.lines import Lines
+from ..models.family import AbstractFamily
 from ..models.invertibility import certify
 from ..models.lens import ZoomLens
-from ..models.zoom import AbstractZoom, PolynomialZoom, with_parameters
+from ..models.requirements import check
+from ..models.zoom import AbstractZoom, PolynomialZoom, terms_of, with_parameters
 from ._least_squares import Solver, default_solver
 from .covariance import parameter_covariance
+from .defaults import zoom_or_default
 from .energy import AbstractJointZoom, linearised
+from .family_lines import with_family
 from .minimise import fit_about, minimise
+from .moved_centre import for_any_centre
+from .prepare import compressed_as_measured, ready_model
 from .result import RESULTS, FrameFits, ZoomFit, collected
+from .wrapper import points_of
 
 _MOST_UNCERTAIN = 0.05
 """Largest standard deviation of a centre, in half diagonals, with which it is accepted."""
@@ -114,9 +122,10 @@ def _both(zoom: AbstractZoom, centre: AbstractZoom) -> _CentredZoom:
 
 @kinds_checked
 def fit_centre(
-    lines: Lines | AnyCentreLines,
+    lines: AbstractLines,
     *,
     zoom: AbstractZoom | None = None,
+    family: AbstractFamily | None = None,
     centre: AbstractZoom | None = None,
     terms: int | None = None,
     solver: Solver | None = None,
@@ -128,9 +137,15 @@ def fit_centre(
     Args:
         lines: the lines, or, with the same result, ``compress_any_centre(lines)``, which can be reused for
             several fits. Their `centre` is the start, and is kept if the lines do not determine another.
-        zoom, terms, solver, max_steps, throw: as for `fit_zoom`, whose errors also apply.
+        zoom, family, terms, solver, max_steps, throw: as for `fit_zoom`, whose errors also apply. The
+            distortion model must be radial; under another one than the radial polynomial every step of the
+            search goes over the points, unless the lines are compressed for any centre.
         centre: how the centre depends on the focal length, as any zoom model: by default
             ``PolynomialZoom(degree=0)``, one centre for all frames.
+
+    Raises:
+        ValueError: the distortion model is not radial, the zoom model depends on the focus, or the lines
+            are compressed about one centre.
 
     Example:
         >>> import numpy as np
@@ -146,17 +161,18 @@ def fit_centre(
         >>> found.fit.lens.centre.round(1).tolist()
         [310.0, 250.0]
     """
-    if not isinstance(lines, AnyCentreLines):
-        lines = compress_any_centre(lines, 2 if terms is None else terms)
+    lines = lines if family is None else with_family(lines, family)
+    check("fit_centre", zoom=zoom)
+    lines = for_any_centre(lines, terms_of(zoom_or_default(zoom), terms, lines.family))
     options = {"max_steps": max_steps, "throw": throw}
-    fixed = fit_about(lines.about(lines.centre), zoom, terms, solver=solver, **options)
+    fixed = fit_about(_about(lines, lines.centre, zoom, terms), zoom, terms, solver=solver, **options)
     model = (PolynomialZoom(degree=0) if centre is None else centre).prepare(lines.focal, 2)
     start = _both(fixed.lens.zoom, model)
     found, covariance, std, determined = _search(lines, start, solver or default_solver(lines), max_steps)
     _, moved = found.parts()
     each = lines.centre[None] + lines.scale * jax.vmap(moved)(lines.focal)
     # Once more about these centres, for all else that is to know of a fit: the same compiled program.
-    fit = fit_about(lines.about(each), zoom, terms, solver=solver, **options)
+    fit = fit_about(_about(lines, each, zoom, terms), zoom, terms, solver=solver, **options)
     own = fit.covariance.shape[0]
     joint = jnp.where(determined, covariance, jnp.zeros_like(covariance).at[:own, :own].set(fit.covariance))
     lens = _lens(lines, fit.lens, moved, each)
@@ -178,6 +194,15 @@ def fit_centre(
     return CentreFit(fit, each, std, determined, fixed.rms, covariance)
 
 
+def _about(lines, centre, zoom, terms):
+    """The lines about a centre, compressed."""
+    placed = lines.about(centre)
+    if isinstance(points_of(placed), Lines):
+        _, terms = ready_model(placed, zoom, terms)
+        placed = compressed_as_measured(placed, terms)
+    return placed
+
+
 def refit_centre(lines: AnyCentreLines, found: CentreFit) -> AbstractZoom:
     """Coefficients and centre of least energy for other weights of the lines, started from a fit.
 
@@ -193,15 +218,19 @@ def refit_centre(lines: AnyCentreLines, found: CentreFit) -> AbstractZoom:
 
 @kinds_checked
 def fit_frame_centres(
-    lines: Lines | AnyCentreLines, *, terms: int = 2, solver: Solver | None = None, max_steps: int = 256
+    lines: AbstractLines,
+    *,
+    family: AbstractFamily | None = None,
+    terms: int = 2,
+    solver: Solver | None = None,
+    max_steps: int = 256,
 ) -> FrameCentres:
     """Fit distortion and centre of distortion of each frame separately (the paper's Figure 7).
 
     Args:
-        lines, terms, solver, max_steps: as for `fit_centre`.
+        lines, family, terms, solver, max_steps: as for `fit_centre`.
     """
-    if not isinstance(lines, AnyCentreLines):
-        lines = compress_any_centre(lines, terms)
+    lines = for_any_centre(lines if family is None else with_family(lines, family), terms)
     return _fit_frame_centres(lines, *lines.by_frame(), terms, solver, max_steps)
 
 
@@ -217,7 +246,8 @@ def _fit_frame_centres(lines, chosen, present, terms, solver, max_steps):
             throw=False,
         )
 
-    found = jax.lax.map(one, (chosen, present), batch_size=chosen.shape[0])
+    batch = 1 if isinstance(points_of(lines), Lines) else len(chosen)  # as in `fit_frames`
+    found = jax.lax.map(one, (chosen, present), batch_size=batch)
     each = eqx.tree_at(lambda fits: fits.centre, collected(lines, found.fit), found.centre[:, 0])
     return FrameCentres(each, found.std[:, 0], found.determined, found.rms_fixed)
 
@@ -245,7 +275,7 @@ def _search(lines, start, solver, max_steps):
 
 
 def _lens(
-    lines: AnyCentreLines, lens: ZoomLens, centre: AbstractZoom, each: Float[Array, "frame 2"]
+    lines: AbstractLines, lens: ZoomLens, centre: AbstractZoom, each: Float[Array, "frame 2"]
 ) -> ZoomLens:
     """The lens with its centre: a point if it is one for all focal lengths."""
     if isinstance(centre, PolynomialZoom) and centre.degree == 0:

@@ -28,6 +28,7 @@ from ..models.zoom import (
     AbstractZoom,
     with_parameters,
 )
+from .wrapper import about_own_centre
 
 # The angle of a line, ½ atan2, jumps by half a turn at one direction: harmless to derivatives, but the
 # residuals change sign there and finite differences across it are wrong. Left alone the jump sits at
@@ -100,6 +101,13 @@ def residuals(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -
         lines: the lines, or their compressed form.
         coefficients: normalised (k1, ..., kN) of each frame.
     """
+    return weighted_distances(about_own_centre(lines), coefficients)
+
+
+def weighted_distances(
+    lines: AbstractLines, coefficients: Float[Array, "frame terms"]
+) -> Float[Array, "line rows"]:
+    """The same; of lines for any centre by coefficients that end with the centre's offset."""
     if coefficients.shape[0] != lines.focal.shape[0]:
         raise ValueError(
             f"Argument coefficients must have a row for each of the {lines.focal.shape[0]} frames, but its "
@@ -225,7 +233,29 @@ def linearised(lines, zoom):
 
     def function(flat):
         k = coefficients_by(with_parameters(zoom, unravel(flat)), lines)
-        return (weighted := residuals(lines, k)), weighted
+        return (weighted := weighted_distances(lines, k)), weighted
 
     jacobian, weighted = jax.jacfwd(function, has_aux=True)(flat)
     return weighted, jacobian
+
+
+@eqx.filter_jit
+def frame_normal_equations(
+    lines: AbstractLines, coefficients: Float[Array, "frame size"]
+) -> tuple[Float[Array, "frame size"], Float[Array, "frame size size"]]:
+    """Half the gradient of each frame's error (eq. 3) by its own coefficients, and the Gauss-Newton matrix.
+
+    A frame's residuals depend on its own coefficients alone: one direction serves all frames at once.
+    """
+
+    def along(direction):
+        every = jnp.broadcast_to(direction[None], coefficients.shape)
+        return jax.jvp(lambda k: residuals(lines, k), (coefficients,), (every,))
+
+    directions = jnp.eye(coefficients.shape[1], dtype=coefficients.dtype)
+    weighted, jacobian = jax.vmap(along, out_axes=(None, -1))(directions)
+    number = number_counted(counted_frames(lines)).astype(coefficients.dtype)
+    gradient = number * jnp.einsum("lr,lri->li", weighted, jacobian)
+    matrix = number * jnp.einsum("lri,lrj->lij", jacobian, jacobian)
+    sums = [jax.ops.segment_sum(of, lines.frame, coefficients.shape[0]) for of in (gradient, matrix)]
+    return sums[0], sums[1]

@@ -6,23 +6,29 @@ the coefficients of `BrownConrady`, by the triangles for any centre, which hold 
 `Division` become the 8 of a polynomial, as good as exact (`Division.expansion`).
 """
 
+from typing import Any
+
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_terms
-from .._core.types import Centres, Focal, Focus, FrameIndex, LineWeight, Point, traced
-from ..lines.base import AbstractLines, with_fields_of
+from .._core.types import Centres, traced
+from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines, compress
 from ..lines.free_centre import AnyCentreLines, compress_any_centre
 from ..lines.lines import Lines, corrected_points
+from ..lines.stretch import stretch_of_points
 from ..models.family import AbstractFamily, AbstractRadial
 from ..models.polynomial import RadialPolynomial
 from .image_metric import ImageLines, in_image
+from .wrapper import AbstractWrapper, wrapped
 
 
-class FamilyLines(AbstractLines):
+class FamilyLines(AbstractWrapper):
     """Lines that are corrected by a distortion model: made by `with_family` and `compress_family`.
 
     Attributes:
@@ -31,25 +37,12 @@ class FamilyLines(AbstractLines):
         frame, focal, focus, centre, image_size, focal_unit, weight: those of the lines.
     """
 
-    lines: AbstractLines
     corrected_by: AbstractFamily
-    frame: FrameIndex
-    focal: Focal
-    focus: Focus | None
-    centre: Point
-    image_size: tuple[int, int] = eqx.field(static=True)
-    focal_unit: str = eqx.field(static=True)
-    weight: LineWeight | None
 
     @property
     def family(self) -> AbstractFamily:
         """What the coefficients mean."""
         return self.corrected_by
-
-    @property
-    def counts(self) -> Float[Array, "line"]:
-        """Number of points of each line."""
-        return self.lines.counts
 
     def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
         """Corrected points of each line about their mean, px, or rows with the same scatter.
@@ -90,28 +83,31 @@ class FamilyLines(AbstractLines):
         small = reduce(self.lines, self.family.expansion_terms(size))
         return eqx.tree_at(lambda lines: lines.lines, self, small)
 
-    def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
-        """``sum_p r_p^(2i) z_p z_p^T`` of the points as they were seen."""
-        return self.lines.second_moments(order)
+    def squared_stretch(
+        self, coefficients: Float[Array, "line size"], normals: Float[Array, "line 2"]
+    ) -> Float[Array, "line"]:
+        """The mean of ``|J^T n|^2`` over each line's points."""
+        if isinstance(self.family, AbstractRadial):
+            return super().squared_stretch(coefficients, normals)
+        if isinstance(self.lines, Lines):
+            z = (jnp.asarray(self.lines.points) - self.centre[None, None]) / self.scale
+            of_line = jax.vmap(stretch_of_points, in_axes=(0, 0, 0, 0, None))
+            return of_line(z, jnp.asarray(self.lines.mask), coefficients, normals, self.family)
+        self._check(coefficients.shape[1])
+        assert isinstance(self.lines, AnyCentreLines)
+        return self.lines.decentred_stretch(*self.expansion(coefficients), normals)
 
     def about(self, centre: Centres) -> "FamilyLines":
         """The same lines about another centre of distortion; see `AbstractLines.about`."""
-        if isinstance(self.lines, AnyCentreLines):
-            if traced((self.centre, centre)) or np.allclose(self.centre, centre, rtol=0, atol=1e-3):
-                return self
-            raise ValueError(
-                "Lines compressed with all monomials for a family that is not radial have one centre, but "
-                "another is requested. Compress the lines about that centre, or pass the lines themselves."
-            )
+        if isinstance(self.lines, AnyCentreLines) and not isinstance(self.family, AbstractRadial):
+            same = not traced((self.centre, centre)) and np.array_equal(self.centre, centre)
+            inside: Any = self.as_weighted()
+            return self if same else _wrapped(inside.moved(centre), self.family)
         return _wrapped(self.as_weighted().about(centre), self.family)
 
     def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "FamilyLines":
         """The chosen lines as a data set of one frame."""
         return _wrapped(self.as_weighted().take(lines, present), self.family)
-
-    def as_weighted(self) -> AbstractLines:
-        """The lines with the weights and focal lengths that these have been given."""
-        return with_fields_of(self.lines, self)
 
 
 @kinds_checked
@@ -121,9 +117,6 @@ def with_family(lines: AbstractLines, family: AbstractFamily) -> AbstractLines:
     Args:
         lines: the lines, their compressed form, or either measured in the image.
         family: the distortion model.
-
-    Raises:
-        ValueError: the lines are measured in the image, and the model is not radial.
 
     Example:
         >>> import jax.numpy as jnp, numpy as np
@@ -169,22 +162,5 @@ def compress_family(lines: Lines, family: AbstractFamily, *, terms: int = 2) -> 
     )
 
 
-def points_of(lines: AbstractLines) -> AbstractLines:
-    """The lines without their wrappers."""
-    while isinstance(lines, ImageLines | FamilyLines):
-        lines = lines.lines
-    return lines
-
-
 def _wrapped(lines, family):
-    return FamilyLines(
-        lines=lines,
-        corrected_by=family,
-        frame=lines.frame,
-        focal=lines.focal,
-        focus=lines.focus,
-        centre=lines.centre,
-        image_size=lines.image_size,
-        focal_unit=lines.focal_unit,
-        weight=lines.weight,
-    )
+    return wrapped(FamilyLines, lines, corrected_by=family)

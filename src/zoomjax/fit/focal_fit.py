@@ -25,6 +25,7 @@ from .focal_lengths import (
     widened,
 )
 from .result import ZoomFit
+from .wrapper import about_own_centre
 from .zoom import fit_zoom
 
 
@@ -92,6 +93,7 @@ def fit_focal(
         True
         >>> jax.config.update("jax_enable_x64", False)
     """
+    lines = about_own_centre(lines)
     sigma = checked_sigma(focal_sigma, lines.focal)
     given = jnp.asarray(lines.focal)
     if given.dtype != jnp.float64:

@@ -30,13 +30,16 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Num, ScalarLike
 
 from .._core.arguments import kinds_checked
+from .._core.fields import refuse_masked
 from .._core.types import AnyArray, Focal, traced
 from ..lines.base import AbstractLines
+from ..models.requirements import check
 from ..models.zoom import AbstractPriorZoom, with_parameters
 from .covariance import parameter_covariance
 from .energy import coefficients_by, line_weights, linearised, prior_error, prior_residuals, residuals
 from .family_lines import with_family
 from .result import ZoomFit
+from .same_camera import check_lines_of
 
 Sigma = ScalarLike | Num[AnyArray, "frame"]
 
@@ -67,7 +70,8 @@ def with_focal_sigma(
 
     Raises:
         ValueError: `focal_sigma` does not hold finite numbers of at least 0, one or one a frame; `shared`
-            is not one number a frame; or the lens has a centre that moves along the zoom.
+            is not one number a frame; the lens has a centre that moves along the zoom; or the lines are
+            not those of the fit: of another image size, unit or number of frames.
 
     Example:
         >>> from zoomjax import compress, displacement_std, fit_zoom, scenes
@@ -79,15 +83,13 @@ def with_focal_sigma(
         >>> bool(wide[0] < wide[1])
         True
     """
+    check_lines_of(fit, lines)
     sigma = checked_sigma(focal_sigma, lines.focal)
     if not traced(sigma) and not np.isfinite(sigma).all():
         raise ValueError(
             f"Argument focal_sigma must hold finite numbers, but it is {focal_sigma}. {UNKNOWN}"
         )
-    if fit.lens.shift is not None:
-        raise ValueError(
-            "Argument fit must have a lens with a fixed centre, but its centre moves along the zoom."
-        )
+    check("with_focal_sigma", shift=fit.lens.shift)
     lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
     relative = sigma / jnp.asarray(lines.focal)
     if shared is None:
@@ -115,6 +117,7 @@ def checked_sigma(focal_sigma: Any, focal: Focal) -> Float[Array, "frame"]:
     focal = jnp.asarray(focal)
     if focal_sigma is None:
         raise ValueError(f"Argument focal_sigma must be a number or one a frame, but it is None. {UNKNOWN}")
+    refuse_masked("focal_sigma", focal_sigma)
     sigma = jnp.asarray(focal_sigma, focal.dtype)
     if sigma.shape not in ((), focal.shape):
         raise ValueError(

@@ -16,10 +16,11 @@ from ..models.family import AbstractFamily
 from ..models.zoom import PolynomialZoom, with_parameters
 from ._least_squares import Solver, default_solver
 from .constrained import or_else, refit_zoom
-from .family_lines import points_of, with_family
+from .family_lines import with_family
 from .minimise import fit_prepared
 from .prepare import algebraic_start, compressed_as_measured
 from .result import FrameFits, collected, described_fit, is_invertible, outcome_of, thrown
+from .wrapper import about_own_centre, points_of
 
 
 @kinds_checked
@@ -41,7 +42,7 @@ def fit_frames(
     Raises:
         RuntimeError: the solver failed on some frame, and `throw` is set.
     """
-    lines = lines if family is None else with_family(lines, family)
+    lines = about_own_centre(lines if family is None else with_family(lines, family))
     terms = checked_terms(terms, lines.family.most_terms)
     chosen, present = lines.by_frame()
     solver = default_solver(lines) if solver is None else solver

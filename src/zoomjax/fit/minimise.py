@@ -8,18 +8,18 @@ import equinox as eqx
 import jax
 import optimistix as optx
 
-from ..models.zoom import AbstractLinearZoom, PolynomialZoom, with_parameters
+from ..models.zoom import AbstractLinearZoom, with_parameters
 from ._least_squares import default_solver
 from .algebraic import algebraic_parameters
 from .constrained import or_else, refit_zoom
-from .energy import coefficients_by, prior_residuals, residuals
+from .energy import coefficients_by, prior_residuals, weighted_distances
 from .prepare import algebraic_start, compressed_as_measured, ready_model
 from .result import described_fit, outcome_of, thrown
 
 
 def fit_about(lines, zoom=None, terms=None, *, solver=None, max_steps=256, invertible=True, throw=True):
     """`fit_zoom` about the centre of the lines, under their own distortion model."""
-    model, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
+    model, terms = ready_model(lines, zoom, terms)
     start = None
     if isinstance(model, AbstractLinearZoom) and (zoom is None or zoom.parameters is None):
         start = algebraic_start(lines, terms)
@@ -46,7 +46,7 @@ def minimise(lines, zoom, solver, max_steps):
     def function(parameters, args):
         lines, zoom = args
         zoom = with_parameters(zoom, parameters)
-        return residuals(lines, coefficients_by(zoom, lines)), prior_residuals(lines, zoom)
+        return weighted_distances(lines, coefficients_by(zoom, lines)), prior_residuals(lines, zoom)
 
     start = jax.tree.map(jax.lax.stop_gradient, zoom.parameters)
     solution = optx.least_squares(

@@ -22,8 +22,8 @@ from ..lines.lines import Lines
 from ..models.family import AbstractFamily
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
+from ..models.requirements import check
 from ..models.zoom import (
-    AbstractFocusZoom,
     AbstractZoom,
     PolynomialZoom,
 )
@@ -33,6 +33,7 @@ from ._motion_problem import Asked, Given, Problem, problem_of
 from ._motion_rows import Model, Noise, scaled
 from ._motion_stages import in_stages
 from ._motion_start import starts_of, views_by_frame
+from .defaults import zoom_or_default
 from .result import RESULTS, ZoomFit, failed
 
 _FAILED = "The fit failed: turn and zoom farther, or fit fewer coefficients about the image's centre."
@@ -153,9 +154,8 @@ def fit_motion(
             "fit_motion needs float64, and it is not enabled: call "
             'jax.config.update("jax_enable_x64", True) first.'
         )
-    zoom = PolynomialZoom() if zoom is None else zoom
-    if isinstance(zoom, AbstractFocusZoom):
-        raise ValueError("Argument zoom depends on the focus, which tracks do not have.")
+    zoom = zoom_or_default(zoom)
+    check("fit_motion", zoom=zoom)
     family = RadialPolynomial() if family is None else family
     terms = checked_terms(terms, family.most_terms)
     given = Given(tracks, lines, line_frames, focal, focal_std)

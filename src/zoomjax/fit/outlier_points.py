@@ -23,10 +23,12 @@ from jaxtyping import Bool, Float
 
 from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
-from ..lines.compressed import compress
 from ..lines.lines import Lines
-from ..models.zoom import AbstractZoom, PolynomialZoom
+from ..models.family import AbstractFamily
+from ..models.polynomial import RadialPolynomial
+from ..models.zoom import AbstractZoom
 from .energy import coefficients_by, line_normal
+from .family_lines import compress_family, with_family
 from .prepare import ready_model
 from .robust import RobustFit, fit_robust
 
@@ -65,7 +67,12 @@ class PointRejection(NamedTuple):
 @kinds_checked
 @of_known_values
 def reject_points(
-    lines: Lines, *, zoom: AbstractZoom | None = None, terms: int | None = None, throw: bool = True
+    lines: Lines,
+    *,
+    zoom: AbstractZoom | None = None,
+    family: AbstractFamily | None = None,
+    terms: int | None = None,
+    throw: bool = True,
 ) -> PointRejection:
     """Remove single outlier points from lines, together with a robust fit of the zoom model.
 
@@ -73,7 +80,7 @@ def reject_points(
 
     Args:
         lines: the lines, not compressed.
-        zoom, terms, throw: as for `fit_robust`, which is used in every turn.
+        zoom, family, terms, throw: as for `fit_robust`, which is used in every turn.
 
     Raises:
         TypeError: `lines` are not `Lines`.
@@ -88,12 +95,13 @@ def reject_points(
         >>> np.argwhere(reject_points(lines, zoom=PolynomialZoom(degree=0), terms=1).rejected).tolist()
         [[3, 7]]
     """
-    _, number = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
+    model = RadialPolynomial() if family is None else family
+    _, number = ready_model(with_family(lines, model), zoom, terms)
     everything, kept, seen = np.asarray(lines.mask), lines, set[bytes]()
     few = everything.sum(axis=1, keepdims=True) < _FEWEST
     while True:
-        fit = fit_robust(compress(kept, number), zoom=zoom, terms=terms, throw=throw)
-        distance, spread = map(np.asarray, _distances(lines, fit.fit.lens.zoom))
+        fit = fit_robust(compress_family(kept, model, terms=number), zoom=zoom, terms=terms, throw=throw)
+        distance, spread = map(np.asarray, _distances(lines, model, fit.fit.lens.zoom))
         good = everything & (few | (np.abs(distance) <= _CUT * spread[:, None]))
         seen.add(np.asarray(kept.mask).tobytes())
         if good.tobytes() in seen:  # settled, or a doubtful point comes and goes
@@ -102,9 +110,9 @@ def reject_points(
 
 
 @eqx.filter_jit
-def _distances(lines, zoom):
+def _distances(lines, family, zoom):
     """Signed distance of each corrected point from the line that most agree on, and each line's spread."""
-    corrected = lines.corrected(coefficients_by(zoom, lines)[lines.frame])
+    corrected = with_family(lines, family).corrected(coefficients_by(zoom, lines)[lines.frame])
     distance, spread = jax.vmap(_from_most)(corrected, lines.mask)
     counts = lines.counts
     typical = jnp.nanmedian(jnp.where(counts >= _FEWEST, spread, jnp.nan))

@@ -27,7 +27,7 @@ from .._core.arguments import kinds_checked
 from ..lines.base import AbstractLines, SomeLines
 from ..models.family import AbstractFamily
 from ..models.polynomial import RadialPolynomial
-from ..models.zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom, with_parameters
+from ..models.zoom import AbstractLinearZoom, AbstractZoom, with_parameters
 from ._least_squares import Solver
 from ._linear import least_squares
 from .algebraic import algebraic_zoom
@@ -35,6 +35,7 @@ from .energy import coefficients_by, line_residuals, linearised, prior_jacobian
 from .family_lines import with_family
 from .prepare import ready_model
 from .result import ZoomFit
+from .wrapper import about_own_centre
 from .zoom import fit_zoom
 
 _CUT = 6.0  # standard deviations of r among good lines, were they normal
@@ -50,7 +51,7 @@ class RobustFit(eqx.Module):
         weight: of each line, from 0 (rejected) to 1, or to the weight it had before.
         line_rms: RMS distance of each line's n corrected points to their line, px, with a divisor of n - 2
             so that short lines do not look better than they are; of rejected ones too.
-        scale: the typical `line_rms`, px: the median.
+        scale: the typical `line_rms`, px: the median over the lines that had a weight above 0 before.
     """
 
     fit: ZoomFit
@@ -103,7 +104,7 @@ def fit_robust(
         >>> fit_robust(compress(lines), zoom=PolynomialZoom(degree=0), terms=1).rejected.tolist()
         [10]
     """
-    lines = lines if family is None else with_family(lines, family)
+    lines = about_own_centre(lines if family is None else with_family(lines, family))
     weighted, model = reweighted(lines, zoom, terms)
     fit = fit_zoom(
         weighted, zoom=model, solver=solver, max_steps=max_steps, invertible=invertible, throw=throw
@@ -120,7 +121,7 @@ def reweighted(
     The first turn starts from the algebraic estimate; under another distortion model, which has none, from
     the fit to all lines: far from it, whole frames would seem not to be straight.
     """
-    start, terms = ready_model(lines, PolynomialZoom() if zoom is None else zoom, terms)
+    start, terms = ready_model(lines, zoom, terms)
     if zoom is None or zoom.parameters is None:
         if not isinstance(lines.family, RadialPolynomial):
             weighted = lines.weighted(_own_weights(lines))
@@ -156,7 +157,7 @@ def _reweighted(lines, start):
 def _weights(lines, model, cut):
     """Tukey's weight of each line under a model; 0 for lines that are not there."""
     line_rms, median = _line_rms(lines, model)
-    better = (line_rms <= median) & (lines.counts > 2)
+    better = (line_rms <= median) & _counted(lines)
     spread = 1.4826 * _median(median - line_rms, better)
     chance = median / jnp.sqrt(2 * jnp.maximum(lines.counts - 2, 1))
     spread = jnp.sqrt(jnp.maximum(spread, _LEAST_SPREAD * median) ** 2 + chance**2)
@@ -171,7 +172,12 @@ def _line_rms(lines, model):
     corrected = lines.corrected(coefficients_by(model, lines)[lines.frame])
     squares = jnp.sum(jax.vmap(line_residuals)(corrected) ** 2, axis=1)
     line_rms = jnp.sqrt(squares / jnp.maximum(lines.counts - 2, 1))
-    return line_rms, _median(line_rms, lines.counts > 2)
+    return line_rms, _median(line_rms, _counted(lines))
+
+
+def _counted(lines):
+    """The lines that tell what is usual: three points or more, and, before the fit, a weight above 0."""
+    return (lines.counts > 2) & (_own_weights(lines) > 0)
 
 
 def _median(values, counted):

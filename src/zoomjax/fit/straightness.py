@@ -8,10 +8,11 @@ from jaxtyping import Array, Float
 from .._core.arguments import kinds_checked
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines
-from ..lines.free_centre import AnyCentreLines
 from ..models.lens import ZoomLens
 from .energy import coefficients_by, frame_energy
 from .family_lines import with_family
+from .same_camera import check_camera
+from .wrapper import about_own_centre
 
 
 @kinds_checked
@@ -37,16 +38,7 @@ def frame_rms(
     If the lens folds, points beyond the fold are corrected by the formula.
     """
     if isinstance(lens, ZoomLens):
-        if lens.image_size != lines.image_size:
-            raise ValueError(
-                f"The lens is for images of size {lens.image_size}, but the lines are from images of size "
-                f"{lines.image_size}."
-            )
-        if lens.focal_unit != lines.focal_unit:
-            raise ValueError(
-                f"The lens takes focal lengths in {lens.focal_unit}, but those of the lines are in "
-                f"{lines.focal_unit}."
-            )
+        check_camera(lens, lines)
         lens.check_range(lines.focal)
         lines = with_family(lines, lens.family)
         lines = lines.about(lens.centre if lens.shift is None else jax.vmap(lens)(lines.focal).centre)
@@ -55,9 +47,7 @@ def frame_rms(
             "Argument lens must be a ZoomLens (fit.lens, not the fit), coefficients of each frame or None, "
             f"but its type is {type(lens).__name__}."
         )
-    elif isinstance(lines, AnyCentreLines):
-        lines = lines.about(lines.centre)  # or the last two coefficients would be taken for a centre
-    return _frame_rms(lines, lens)
+    return _frame_rms(about_own_centre(lines), lens)
 
 
 @eqx.filter_jit

@@ -7,6 +7,7 @@ refitted under that constraint (`constrained`). The work is in `minimise` and, f
 `centre`.
 """
 
+import warnings
 from typing import Any, Literal
 
 import numpy as np
@@ -16,8 +17,6 @@ from .._core.arguments import kinds_checked
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines, SomeLines
 from ..lines.compressed import CompressedLines
-from ..lines.free_centre import AnyCentreLines
-from ..lines.lines import Lines
 from ..models.family import AbstractFamily
 from ..models.zoom import AbstractZoom
 from ._least_squares import Solver
@@ -25,6 +24,7 @@ from .centre import fit_centre
 from .family_lines import with_family
 from .minimise import fit_about
 from .result import ZoomFit
+from .wrapper import about_own_centre
 
 CentreArgument = Literal["fit", "image"] | tuple[float, float] | Float[AnyArray, "2"]
 """The centre of distortion: fitted, the image's, or its coordinates, px."""
@@ -77,6 +77,9 @@ def fit_zoom(
         TypeError: an argument has the wrong type, such as the class PolynomialZoom instead of an instance.
         RuntimeError: the solver failed (see `throw`).
 
+    Warns:
+        UserWarning: the centre given is outside of the image.
+
     Example:
         >>> import jax.numpy as jnp, numpy as np
         >>> from zoomjax import Lines, PolynomialZoom, compress
@@ -90,20 +93,18 @@ def fit_zoom(
     lines = lines if family is None else with_family(lines, family)
     options: Any = {"solver": solver, "max_steps": max_steps, "throw": throw}
     if isinstance(centre, str) and centre == "fit":
-        if not isinstance(lines, Lines | AnyCentreLines) or not invertible:
-            raise ValueError(
-                'Argument centre is "fit", which needs lines that are not compressed about one centre, '
-                "under the radial polynomial and with invertible=True: pass the lines themselves, or "
-                "compress_any_centre(lines)."
-            )
+        if not invertible:
+            raise ValueError('Argument centre is "fit", which needs invertible=True.')
         return fit_centre(lines, zoom=zoom, terms=terms, **options).fit
     return fit_about(about_centre(lines, centre), zoom, terms, invertible=invertible, **options)
 
 
 def about_centre(lines: SomeLines, centre: CentreArgument | None) -> SomeLines | CompressedLines:
     """The lines about the centre of distortion that an argument names; None: their own."""
+    found: Any
     if centre is None:
-        return lines.about(lines.centre) if isinstance(lines, AnyCentreLines) else lines
+        found = about_own_centre(lines)
+        return found
     if isinstance(centre, str):
         if centre != "image":
             raise ValueError(
@@ -115,5 +116,12 @@ def about_centre(lines: SomeLines, centre: CentreArgument | None) -> SomeLines |
         raise ValueError(
             f'Argument centre must be "fit", "image" or two coordinates in px, but it is {centre}.'
         )
-    found: Any = lines.about(centre)
+    if ((centre < -0.5) | (centre > np.array(lines.image_size) - 0.5)).any():
+        width, height = lines.image_size
+        warnings.warn(
+            f"The centre of distortion, ({centre[0]:g}, {centre[1]:g}) px, is outside of the image of "
+            f"{width} x {height} px. That is right for a crop of a larger image alone.",
+            stacklevel=4,
+        )
+    found = lines.about(centre)
     return found

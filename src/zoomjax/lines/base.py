@@ -6,7 +6,7 @@ or rows that are exactly equivalent.
 
 import abc
 import math
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -25,6 +25,7 @@ from .._core.fields import (
     check_not_negative,
     check_positive,
     check_shapes,
+    refuse_masked,
 )
 from .._core.types import (
     AnyArray,
@@ -38,6 +39,7 @@ from .._core.types import (
 )
 from ..models.family import AbstractFamily
 from ..models.polynomial import RadialPolynomial
+from .stretch import radial_stretch
 
 SomeLines = TypeVar("SomeLines", bound="AbstractLines")
 
@@ -113,6 +115,17 @@ class AbstractLines(eqx.Module):
         traces = jnp.trace(self.second_moments(order), axis1=2, axis2=3)
         return jnp.concatenate([self.counts[:, None].astype(traces.dtype), traces], axis=1)
 
+    def squared_stretch(
+        self, coefficients: Float[Array, "line size"], normals: Float[Array, "line 2"]
+    ) -> Float[Array, "line"]:
+        """The mean of ``|J^T n|^2`` over each line's points: see `zoomjax.fit.in_image`.
+
+        J is the derivative of the correction by a line's own coefficients. By moments: for radial models.
+        """
+        powers, _ = self.expansion(coefficients)
+        moments = self.second_moments(2 * powers.shape[1])
+        return jax.vmap(radial_stretch)(powers, normals, moments, self.counts)
+
     @abc.abstractmethod
     def about(self, centre: Centres) -> "AbstractLines":
         """The same lines about another centre of distortion, px: that of all frames, or of each frame.
@@ -131,6 +144,7 @@ class AbstractLines(eqx.Module):
         Raises:
             ValueError: `weight` does not hold one finite number of at least 0 for each line.
         """
+        refuse_masked("weight", weight)
         weight = jnp.asarray(weight, jnp.asarray(self.focal).dtype)
         if weight.shape != self.frame.shape:
             raise ValueError(
@@ -160,20 +174,20 @@ class AbstractLines(eqx.Module):
         return chosen, slot < size[:, None]
 
 
-def with_fields_of(lines: SomeLines, other: AbstractLines) -> SomeLines:
-    """The lines with the focal lengths, focus and weights of a wrapper of them."""
-    return eqx.tree_at(
-        lambda lines: (lines.focal, lines.focus, lines.weight),
-        lines,
-        (other.focal, other.focus, other.weight),
-        is_leaf=lambda leaf: leaf is None,
-    )
+def header_of(lines: AbstractLines) -> dict[str, Any]:
+    """All that lines are beside their points: what another form of the same lines takes over."""
+    names = ("frame", "focal", "centre", "image_size", "focal_unit", "number", "weight", "focus")
+    return {name: getattr(lines, name) for name in names}
 
 
-def focus_of(
+def one_frame(
     lines: AbstractLines, chosen: Int[Array, "some"], present: Bool[Array, "some"]
-) -> Float[Array, "1"] | None:
-    """The focus of the one frame that the chosen lines are seen in."""
-    if lines.focus is None:
-        return None
-    return jnp.asarray(lines.focus)[lines.frame[chosen[jnp.argmax(present)]]][None]
+) -> dict[str, Any]:
+    """The header of the chosen lines as a data set of one frame."""
+    header, frame = header_of(lines), lines.frame[chosen[jnp.argmax(present)]]
+    of_lines = {name: None if (of := header[name]) is None else of[chosen] for name in ("number", "weight")}
+    of_frame = {
+        name: None if (of := header[name]) is None else jnp.asarray(of)[frame][None]
+        for name in ("focal", "focus")
+    }
+    return header | of_lines | of_frame | {"frame": jnp.zeros_like(chosen, jnp.int32)}

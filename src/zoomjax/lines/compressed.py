@@ -30,16 +30,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from .._core.arguments import kinds_checked
-from .._core.checks import checked_size, checked_terms
-from .._core.fields import check_shapes, integers, numbers
+from .._core.checks import checked_terms
 from .._core.products import EXACT
-from .._core.types import Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Point, traced
+from .._core.types import Centres, traced
 from ._triangle import triangle
-from .base import AbstractLines, focus_of
+from .base import header_of
 from .lines import Lines
+from .triangles import AbstractTriangles
 
 _AT_ONCE = 2**22
 """Points of lines that a GPU reduces side by side: their columns, some hundred MB, are in its memory."""
@@ -47,7 +47,7 @@ _AT_ONCE = 2**22
 _COMPILED: set[tuple] = set()  # shapes that have been reduced in this process
 
 
-class CompressedLines(AbstractLines):
+class CompressedLines(AbstractTriangles):
     """Lines reduced to triangles, for a fixed centre of distortion and up to `terms` coefficients.
 
     Attributes:
@@ -55,25 +55,8 @@ class CompressedLines(AbstractLines):
         frame, focal, centre, image_size, focal_unit, number, weight, focus: as in `Lines`.
     """
 
-    triangle: Float[Array, "line rows rows"] = eqx.field(converter=numbers("triangle"))
-    frame: FrameIndex = eqx.field(converter=integers("frame"))
-    focal: Focal = eqx.field(converter=numbers("focal"))
-    centre: Point = eqx.field(converter=numbers("centre"))
-    image_size: tuple[int, int] = eqx.field(static=True, converter=checked_size)
-    focal_unit: str = eqx.field(static=True)
-    number: LineNumber | None = eqx.field(default=None, converter=integers("number"))
-    weight: LineWeight | None = eqx.field(default=None, converter=numbers("weight"))
-    focus: Focus | None = eqx.field(default=None, converter=numbers("focus"))
-
     def __check_init__(self):
-        """Check that the shapes agree."""
-        check_shapes(
-            {
-                "triangle": (self.triangle, ("line", "rows", "rows")),
-                "frame": (self.frame, ("line",)),
-                "number": (self.number, ("line",)),
-            }
-        )
+        """Check that the triangles have the rows of some number of terms."""
         rows = self.triangle.shape[-1] if hasattr(self.triangle, "shape") else 5
         if rows < 5 or rows % 2 == 0:
             raise ValueError(
@@ -85,11 +68,6 @@ class CompressedLines(AbstractLines):
     def terms(self) -> int:
         """The largest number of coefficients N for which these triangles are valid."""
         return (self.triangle.shape[-1] - 3) // 2
-
-    @property
-    def counts(self) -> Float[Array, "line"]:
-        """Number of points of each line."""
-        return jnp.round(self.triangle[:, 0, 0] ** 2)
 
     def check_terms(self, terms: int) -> None:
         """Raise ValueError if the lines were compressed for fewer coefficients."""
@@ -129,20 +107,6 @@ class CompressedLines(AbstractLines):
             )
         return self
 
-    def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "CompressedLines":
-        """The chosen lines as a data set of one frame."""
-        return CompressedLines(
-            triangle=jnp.where(present[:, None, None], self.triangle[lines], 0),
-            frame=jnp.zeros_like(lines, jnp.int32),
-            focal=jnp.asarray(self.focal)[self.frame[lines[jnp.argmax(present)]]][None],
-            centre=self.centre,
-            image_size=self.image_size,
-            focal_unit=self.focal_unit,
-            number=None if self.number is None else self.number[lines],
-            weight=None if self.weight is None else self.weight[lines],
-            focus=focus_of(self, lines, present),
-        )
-
 
 def _combine(triangle, k):
     """The corrected points' rows from one line's triangle: linear in (1, k1, ..., kN)."""
@@ -173,14 +137,7 @@ def compress(lines: Lines, terms: int = 2) -> CompressedLines:
     """
     return CompressedLines(
         triangle=triangles_of(lines, _columns, checked_terms(terms)),
-        frame=lines.frame,
-        focal=lines.focal,
-        centre=lines.centre,
-        image_size=lines.image_size,
-        focal_unit=lines.focal_unit,
-        number=lines.number,
-        weight=lines.weight,
-        focus=lines.focus,
+        **header_of(lines),
     )
 
 

@@ -11,24 +11,27 @@ fit then costs 20 rows a line. `AnyCentreLines.about` makes the small triangles 
 without the points.
 """
 
+import math
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from .._core.arguments import kinds_checked
-from .._core.checks import checked_size, checked_terms
-from .._core.fields import check_shapes, integers, numbers
+from .._core.checks import checked_terms
 from .._core.products import EXACT
-from .._core.types import Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Point, traced
+from .._core.types import Centres, traced
 from ._triangle import triangle
-from .base import AbstractLines, focus_of
+from .base import header_of
 from .compressed import CompressedLines, triangles_of
 from .lines import Lines
+from .triangles import AbstractTriangles
 
 
-class AnyCentreLines(AbstractLines):
+class AnyCentreLines(AbstractTriangles):
     """Lines reduced to triangles that are valid for every centre of distortion and up to `terms`
     coefficients.
 
@@ -37,25 +40,8 @@ class AnyCentreLines(AbstractLines):
         frame, focal, centre, image_size, focal_unit, number, weight, focus: as in `Lines`.
     """
 
-    triangle: Float[Array, "line rows rows"] = eqx.field(converter=numbers("triangle"))
-    frame: FrameIndex = eqx.field(converter=integers("frame"))
-    focal: Focal = eqx.field(converter=numbers("focal"))
-    centre: Point = eqx.field(converter=numbers("centre"))
-    image_size: tuple[int, int] = eqx.field(static=True, converter=checked_size)
-    focal_unit: str = eqx.field(static=True)
-    number: LineNumber | None = eqx.field(default=None, converter=integers("number"))
-    weight: LineWeight | None = eqx.field(default=None, converter=numbers("weight"))
-    focus: Focus | None = eqx.field(default=None, converter=numbers("focus"))
-
     def __check_init__(self):
-        """Check that the shapes agree."""
-        check_shapes(
-            {
-                "triangle": (self.triangle, ("line", "rows", "rows")),
-                "frame": (self.frame, ("line",)),
-                "number": (self.number, ("line",)),
-            }
-        )
+        """Check that the triangles have the rows of some number of terms."""
         if hasattr(self.triangle, "shape"):
             terms = self.terms
             if terms < 1 or self.triangle.shape[-1] != (2 * terms + 2) * (2 * terms + 3) // 2:
@@ -68,11 +54,6 @@ class AnyCentreLines(AbstractLines):
     def terms(self) -> int:
         """The largest number of coefficients N for which these triangles are valid."""
         return (round((8 * self.triangle.shape[-1] + 1) ** 0.5) - 5) // 4
-
-    @property
-    def counts(self) -> Float[Array, "line"]:
-        """Number of points of each line."""
-        return jnp.round(self.triangle[:, 0, 0] ** 2)
 
     def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
         """Rows, px, with the scatter of the corrected points about their mean.
@@ -92,33 +73,37 @@ class AnyCentreLines(AbstractLines):
         """Such rows about `centre`, of the radial polynomial and the coefficients (p1, p2) of each line."""
 
         def combine(r, k, p):
-            none = jnp.zeros_like(p)
-            # The rows of R after the first hold the points about their mean; columns 3-5 are x^2, xy, y^2.
-            squares = jnp.stack(
-                [jnp.stack([3 * p[1], 2 * p[0], p[1]]), jnp.stack([p[0], 2 * p[1], 3 * p[0]])]
-            )
-            radial = _corrected_point(self.terms, k, none)
-            return jnp.matmul(r[1:], radial.at[:, 3:6].add(squares).T, precision=EXACT)
+            # The rows of R after the first hold the points about their mean.
+            return jnp.matmul(r[1:], _decentred_point(self.terms, k, p).T, precision=EXACT)
 
         return self.scale * jax.vmap(combine)(self.triangle, k, tangential)
+
+    def squared_stretch(
+        self, coefficients: Float[Array, "line size"], normals: Float[Array, "line 2"]
+    ) -> Float[Array, "line"]:
+        """The mean of ``|J^T n|^2`` over each line's points, of the corrections of `corrected`."""
+
+        def of_line(r, k, normal):
+            return _stretch(self.terms, r, normal @ _corrected_point(self.terms, k[:-2], k[-2:]))
+
+        return jax.vmap(of_line)(self.triangle, coefficients, normals)
+
+    def decentred_stretch(
+        self,
+        k: Float[Array, "line terms"],
+        tangential: Float[Array, "line 2"],
+        normals: Float[Array, "line 2"],
+    ) -> Float[Array, "line"]:
+        """The same of the corrections of `decentred`."""
+
+        def of_line(r, k, p, normal):
+            return _stretch(self.terms, r, normal @ _decentred_point(self.terms, k, p))
+
+        return jax.vmap(of_line)(self.triangle, k, tangential, normals)
 
     def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
         """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1, at most 2 N + 1, z from `centre`."""
         return self.about(self.centre).second_moments(order)
-
-    def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "AnyCentreLines":
-        """The chosen lines as a data set of one frame."""
-        return AnyCentreLines(
-            triangle=jnp.where(present[:, None, None], self.triangle[lines], 0),
-            frame=jnp.zeros_like(lines, jnp.int32),
-            focal=jnp.asarray(self.focal)[self.frame[lines[jnp.argmax(present)]]][None],
-            centre=self.centre,
-            image_size=self.image_size,
-            focal_unit=self.focal_unit,
-            number=None if self.number is None else self.number[lines],
-            weight=None if self.weight is None else self.weight[lines],
-            focus=focus_of(self, lines, present),
-        )
 
     def about(self, centre: Centres) -> CompressedLines:
         """The lines compressed about a fixed centre, px: that of all frames, or of each frame.
@@ -127,18 +112,21 @@ class AnyCentreLines(AbstractLines):
         """
         centre = jnp.asarray(centre, self.triangle.dtype)
         each = jnp.broadcast_to(centre, (self.focal.shape[0], 2))
-        return CompressedLines(
-            triangle=_about(
-                self.terms, self.triangle, ((each - self.centre[None]) / self.scale)[self.frame]
-            ),
-            frame=self.frame,
-            focal=self.focal,
-            centre=jnp.mean(each, axis=0),
-            image_size=self.image_size,
-            focal_unit=self.focal_unit,
-            number=self.number,
-            weight=self.weight,
-            focus=self.focus,
+        header: dict[str, Any] = header_of(self) | {"centre": jnp.mean(each, axis=0)}
+        offset = ((each - self.centre[None]) / self.scale)[self.frame]
+        return CompressedLines(triangle=_about(self.terms, self.triangle, offset), **header)
+
+    def moved(self, centre: Centres) -> "AnyCentreLines":
+        """The same lines with their monomials about another centre, px: that of all frames, or of each.
+
+        In the latter case the result's `centre` is the mean.
+        """
+        each = jnp.broadcast_to(jnp.asarray(centre, self.triangle.dtype), (self.focal.shape[0], 2))
+        offset = ((each - self.centre[None]) / self.scale)[self.frame]
+        return eqx.tree_at(
+            lambda lines: (lines.triangle, lines.centre),
+            self,
+            (_moved(self.terms, self.triangle, offset), jnp.mean(each, axis=0)),
         )
 
 
@@ -160,14 +148,7 @@ def compress_any_centre(lines: Lines, terms: int = 2) -> AnyCentreLines:
     """
     return AnyCentreLines(
         triangle=_triangles(lines, checked_terms(terms)),
-        frame=lines.frame,
-        focal=lines.focal,
-        centre=lines.centre,
-        image_size=lines.image_size,
-        focal_unit=lines.focal_unit,
-        number=lines.number,
-        weight=lines.weight,
-        focus=lines.focus,
+        **header_of(lines),
     )
 
 
@@ -226,6 +207,51 @@ def _corrected_point(terms, k, offset):
     columns = _radial_columns(terms, offset)[1:].reshape(terms + 1, 2, -1)
     kappa = jnp.concatenate([jnp.ones(1, k.dtype), k, jnp.zeros(terms - k.shape[0], k.dtype)])
     return jnp.einsum("j,jcm->cm", kappa, columns, precision=EXACT)
+
+
+def _decentred_point(terms, k, p):
+    """The same about the centre itself, with decentering; monomials 3 to 5 are x^2, xy and y^2."""
+    squares = jnp.stack([jnp.stack([3 * p[1], 2 * p[0], p[1]]), jnp.stack([p[0], 2 * p[1], 3 * p[0]])])
+    return _corrected_point(terms, k, jnp.zeros_like(p)).at[:, 3:6].add(squares)
+
+
+def _stretch(terms, r, across):
+    """The mean of ``|J^T n|^2``: J^T n is the gradient of n.x, the polynomial `across` in the monomials."""
+    gradient = jnp.asarray(_derivatives(terms), across.dtype) @ across
+    values = jnp.matmul(r, gradient.T, precision=EXACT)
+    count = r[0, 0] ** 2
+    return jnp.where(count > 0, jnp.sum(values**2) / jnp.maximum(count, 1), 1)
+
+
+def _derivatives(terms):
+    """What makes of a polynomial in the monomials its derivatives by x and y: (2, monomial, monomial)."""
+    a, b = _powers(terms)
+    place = {pair: index for index, pair in enumerate(zip(a.tolist(), b.tolist(), strict=True))}
+    by_xy = np.zeros((2, len(a), len(a)))
+    for (x, y), index in place.items():
+        if x:
+            by_xy[0, place[x - 1, y], index] = x
+        if y:
+            by_xy[1, place[x, y - 1], index] = y
+    return by_xy
+
+
+@eqx.filter_jit
+def _moved(terms, triangles, offset):
+    """R of the monomials of ``z - offset``, which are sums of those of z: (x - a)^i is by binomials."""
+    a, b = _powers(terms)
+    binomials = np.array([[math.comb(i, j) for i in range(2 * terms + 2)] for j in range(2 * terms + 2)])
+
+    def one(r, offset):
+        powers = jnp.stack([(-offset) ** power for power in range(2 * terms + 2)], axis=1)
+
+        def of(axis, lower, upper):  # what of lower^ there is in (x - offset)^upper
+            rest = np.maximum(upper[None] - lower[:, None], 0)
+            return jnp.asarray(binomials[lower[:, None], upper[None]], r.dtype) * powers[axis][rest]
+
+        return triangle(jnp.matmul(r, of(0, a, a) * of(1, b, b), precision=EXACT).T)
+
+    return jax.vmap(one)(triangles, offset)
 
 
 @eqx.filter_jit

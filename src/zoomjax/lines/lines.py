@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from .._core.arguments import check_kind
+from .._core.arrays import held_as_given
 from .._core.checks import (
     checked_centre,
     checked_focal,
@@ -34,7 +35,7 @@ from .._core.products import EXACT
 from .._core.steps import packed
 from .._core.types import AnyArray, Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Mask, Point
 from ..models.family import AbstractFamily
-from .base import AbstractLines, focus_of
+from .base import AbstractLines, one_frame
 
 FORMAT, VERSION = "zoomjax.lines", 2
 
@@ -150,17 +151,15 @@ class Lines(AbstractLines):
         mask = np.arange(max(counts)) < counts[:, None]
         warn_of_points_outside(padded, mask, size)
         return cls(
-            points=_held_as_given(padded),
+            points=held_as_given(padded),
             mask=jnp.asarray(mask),
             frame=jnp.asarray(frames, jnp.int32),
-            focal=_held_as_given(focals.astype(dtype)),
-            centre=_held_as_given(checked_centre(centre, size).astype(dtype)),
+            focal=held_as_given(focals.astype(dtype)),
+            centre=held_as_given(checked_centre(centre, size).astype(dtype)),
             image_size=size,
             focal_unit=unit,
             number=jnp.asarray(number, jnp.int32),
-            focus=None
-            if focus is None
-            else _held_as_given(checked_focus(focus, focals.size).astype(dtype)),
+            focus=None if focus is None else held_as_given(checked_focus(focus, focals.size).astype(dtype)),
         )
 
     @classmethod
@@ -281,14 +280,7 @@ class Lines(AbstractLines):
         return Lines(
             points=jnp.asarray(self.points)[lines],
             mask=jnp.asarray(self.mask)[lines] & present[:, None],
-            frame=jnp.zeros_like(lines, jnp.int32),
-            focal=jnp.asarray(self.focal)[self.frame[lines[jnp.argmax(present)]]][None],
-            centre=self.centre,
-            image_size=self.image_size,
-            focal_unit=self.focal_unit,
-            number=None if self.number is None else self.number[lines],
-            weight=None if self.weight is None else self.weight[lines],
-            focus=focus_of(self, lines, present),
+            **one_frame(self, lines, present),
         )
 
 
@@ -307,10 +299,3 @@ def _correct_line(points, mask, k, centre, scale, family):
     corrected = jnp.stack(family.correct((z[:, 0], z[:, 1]), jnp.sum(z * z, axis=1), k), axis=1)
     mean = jnp.sum(corrected, axis=0) / jnp.maximum(jnp.sum(mask), 1)
     return jnp.where(mask[:, None], scale * (corrected - mean[None]), 0)
-
-
-def _held_as_given(array: np.ndarray) -> AnyArray:
-    """A JAX array, unless that would change the values' dtype."""
-    if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
-        return jnp.asarray(array)
-    return array

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._core.arguments import check_kind
-from .._core.fields import check_finite, check_positive
+from .._core.fields import check_finite, check_positive, refuse_masked
 from .family import AbstractFamily
+
+_NAN = "give an array with NaN in place of what is masked, .filled(np.nan)"
 
 
 def as_points(points: Any) -> Any:
@@ -18,7 +20,7 @@ def as_points(points: Any) -> Any:
         ValueError: they are not real numbers, or of another shape.
     """
     if not isinstance(points, jax.Array):
-        refuse_masked("points", points)
+        refuse_masked("points", points, _NAN)
         try:
             points = np.asarray(points)
         except (TypeError, ValueError) as error:
@@ -40,7 +42,7 @@ def as_focal(focal: Any) -> Any:
     """
     if isinstance(focal, jax.Array):
         return focal
-    refuse_masked("focal", focal)
+    refuse_masked("focal", focal, _NAN)
     try:
         array = np.asarray(focal)
         if array.dtype.kind in "iufO":
@@ -48,15 +50,6 @@ def as_focal(focal: Any) -> Any:
     except (TypeError, ValueError) as error:
         raise ValueError(f"Argument focal must be a number or an array, but it is {focal!r}.") from error
     raise ValueError(f"Argument focal must be a number or an array, but it is {focal!r}.")
-
-
-def refuse_masked(name: str, values: Any) -> None:
-    """Raise ValueError for an array of NumPy that has a mask, which would be lost."""
-    if isinstance(values, np.ma.MaskedArray):
-        raise ValueError(
-            f"Argument {name} is a masked array, and masks are not kept: give an array with NaN in place "
-            f"of what is masked, {name}.filled(np.nan)."
-        )
 
 
 def check_broadcast(points: tuple[Any, ...], focal: tuple[Any, ...]) -> None:

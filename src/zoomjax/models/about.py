@@ -4,8 +4,11 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-USUAL = ("camera", "lens", "crop_factor", "source")
+USUAL = ("camera", "lens", "crop_factor", "source", "focal")
 """Names that zoomjax itself writes."""
+
+UNKNOWN = "not known"
+"""What ``about["focal"]`` says of a lens of one focal length that nobody knows: its number is arbitrary."""
 
 
 class About(Mapping[str, str | float]):

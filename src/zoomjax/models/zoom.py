@@ -10,14 +10,16 @@ import abc
 from typing import ClassVar, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, ScalarLike
 
-from .._core.checks import checked_integer
+from .._core.checks import checked_integer, checked_terms
 from .._core.fields import check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Coefficients, Focal, Focus, Scalar, traced
 from ._bernstein import Pieces, power_controls
+from .family import AbstractFamily
 
 SomeZoom = TypeVar("SomeZoom", bound="AbstractZoom")
 
@@ -248,6 +250,26 @@ def inverse_powers(focal_ref: ScalarLike, focal_range: Float[AnyArray, "2"], deg
 def with_parameters(zoom: SomeZoom, parameters: PyTree) -> SomeZoom:
     """The same model with other parameters."""
     return eqx.tree_at(lambda model: model.parameters, zoom, parameters, is_leaf=lambda leaf: leaf is None)
+
+
+def terms_of(zoom: AbstractZoom, terms: int | None, family: AbstractFamily) -> int:
+    """The number N of radial coefficients that is asked for; by default the model's own, or else 2.
+
+    Raises:
+        ValueError: it is none, or the parameters of the model are for another number.
+    """
+    own, besides = None, family.size(0)
+    if zoom.parameters is not None:
+        given = (1.0, 1.0) if isinstance(zoom, AbstractFocusZoom) else (1.0,)
+        own = jax.eval_shape(zoom, *given).shape[0] - besides
+    terms = (2 if own is None else own) if terms is None else terms
+    terms = checked_terms(terms, family.most_terms)
+    if own not in (None, terms):
+        raise ValueError(
+            f"Argument terms is {terms}, but the parameters of zoom are for {own}: give that number, or "
+            "start from a model without parameters."
+        )
+    return terms
 
 
 def check_distinct(what: str, focal: Focal, least: int) -> None:

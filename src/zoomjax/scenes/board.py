@@ -21,9 +21,9 @@ from .._core.checks import check_above, check_between, checked_focal, checked_in
 from .._core.types import AnyArray
 from ..lines.lines import Lines
 from ..models.distortion import Distortion
-from ..models.family import radial_factor, radial_slope
+from ..models.family import AbstractRadial
 from ..models.lens import ZoomLens
-from ..models.polynomial import RadialPolynomial
+from ..models.requirements import check
 from ..models.zoom import PolynomialZoom
 
 _NIKKOR_PIXELS = np.array(  # section 5.1: rows are powers of 1/f, columns k1 (px^-2) and k2 (px^-4)
@@ -253,13 +253,9 @@ def board_photo(
         seed: of the noise.
 
     Raises:
-        ValueError: the lens has another distortion model than the radial polynomial.
+        ValueError: its distortion model is not radial.
     """
-    if not isinstance(lens.family, RadialPolynomial):
-        raise ValueError(
-            "Argument lens must be a radial polynomial to be photographed with, but it is "
-            f"{type(lens.family).__name__}."
-        )
+    check("board_photo", zoom=lens.zoom, family=lens.family)
     check_above(0, focal=focal)
     check_between(0, math.inf, blur=blur, noise=noise)
     check_between(0, 1, vignetting=vignetting)
@@ -291,7 +287,8 @@ def _expose(
     image_size: tuple[int, int],
 ) -> Float[Array, "height width"]:
     """Light on each pixel, grey levels: coverage by white, and vignetting."""
-    k, scale = distortion.coefficients, distortion.scale
+    k, scale, family = distortion.coefficients, distortion.scale, distortion.family
+    assert isinstance(family, AbstractRadial)
     x, y = (
         (jnp.arange(side) - centre) / scale
         for side, centre in zip(image_size, distortion.centre, strict=True)
@@ -304,9 +301,9 @@ def _expose(
 
         def at(along):
             squared = across**2 + along**2
-            factor = radial_factor(squared, k)
+            factor = family.factor(squared, k)
             # d(z L)/dz across, by L's derivative: (slope - L) / (2 t) per unit of t.
-            growth = (radial_slope(squared, k) - factor) / jnp.where(squared > 0, squared, 1)
+            growth = (family.slope(squared, k) - factor) / jnp.where(squared > 0, squared, 1)
             span = (factor + across**2 * growth) / magnification
             return _coverage(across * factor * scale / magnification, span, blur, edges)
 

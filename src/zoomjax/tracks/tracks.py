@@ -12,8 +12,17 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from .._core.arguments import check_kind
+from .._core.arrays import held_as_given
 from .._core.checks import checked_integer, checked_size, real_numbers, warn_of_points_outside
-from .._core.fields import booleans, check_indices, check_shapes, integers, known, numbers
+from .._core.fields import (
+    booleans,
+    check_indices,
+    check_shapes,
+    integers,
+    known,
+    numbers,
+    refuse_masked,
+)
 from .._core.files import whole_file
 from .._core.types import AnyArray
 
@@ -22,6 +31,8 @@ FORMAT, VERSION = "zoomjax.tracks", 1
 
 class Tracks(eqx.Module):
     """Points of a scene as a clip shows them, as padded tensors; `Tracks.from_arrays` makes them.
+
+    As in `Lines`, points that JAX cannot hold in their dtype (float64 while x64 is off) stay NumPy arrays.
 
     Attributes:
         points: ``(x, y)`` px of each view of each track; (0, 0) is the centre of the top-left pixel.
@@ -124,7 +135,7 @@ class Tracks(eqx.Module):
         entry = np.where(mask, first[:, None] + view, first[:, None])  # padding repeats the first view
         warn_of_points_outside(places[entry], mask, size)
         return cls(
-            points=jnp.asarray(places[entry]),
+            points=held_as_given(places[entry]),
             frame=jnp.asarray(moments[entry], jnp.int32),
             mask=jnp.asarray(mask),
             image_size=size,
@@ -165,6 +176,8 @@ class Tracks(eqx.Module):
 
 def _views(track, frame, points):
     """Each view's track, frame and point as arrays, checked."""
+    for name, values in {"track": track, "frame": frame, "points": points}.items():
+        refuse_masked(name, values)
     names, moments = (np.asarray(values) for values in (track, frame))
     places = real_numbers(points)
     if places is None:

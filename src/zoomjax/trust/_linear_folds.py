@@ -23,12 +23,12 @@ from ..models.zoom import (
     AbstractPriorZoom,
     with_parameters,
 )
-from .folds import Judged, counts_of, own_weights
+from .folds import LineErrors, counts_of, own_weights
 
 _MOST_STEPS = 40  # of Gauss-Newton: from the fit of all lines it takes 1 to 3, from zero 4 to 8
 
 
-def judge_linear(lines, zoom, terms, parts):
+def linear_errors(lines, zoom, terms, parts):
     lanes = lanes_of(lines, parts.fold, terms)
     known: dict[bytes, Design | str] = {}
     designs, problem = [], ""
@@ -46,7 +46,7 @@ def judge_linear(lines, zoom, terms, parts):
         problem = problem or f"{bad} of {parts.number} folds do not converge"
     matrix = everything.matrix
     share = np.linalg.pinv(matrix, hermitian=True) @ (matrix - designs[0].precision)
-    return Judged(as_given(lines, seen), as_given(lines, unseen), float(np.trace(share)), problem)
+    return LineErrors(as_given(lines, seen), as_given(lines, unseen), float(np.trace(share)), problem)
 
 
 def as_given(lines, values):

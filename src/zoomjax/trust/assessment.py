@@ -123,7 +123,7 @@ def assess(
         held_out, each_held_out: from `held_out_zoom` and `held_out_frames`, if they are to be judged.
 
     Raises:
-        ValueError: no line is usable.
+        ValueError: as `evidence`; or there is not one number a frame in these two, or one of them alone.
 
     Example:
         >>> from zoomjax import compress, fit_zoom, scenes
@@ -132,10 +132,19 @@ def assess(
         >>> assess(lines, fit_zoom(compress(lines))).verdict
         'good'
     """
+    for name, values in {"held_out": held_out, "each_held_out": each_held_out}.items():
+        if values is not None and np.shape(values) != np.shape(lines.focal):
+            raise ValueError(
+                f"Argument {name} must hold one number for each of the {len(lines.focal)} frames, but its "
+                f"shape is {np.shape(values)}."
+            )
+    if (held_out is None) != (each_held_out is None):
+        raise ValueError("Arguments held_out and each_held_out are compared: give both, or neither.")
     found = evidence(lines, fit, compressed=compressed)
     findings = [*_of_bands(found, fit), *_of_halves(found), *_of_lines(found)]
     if held_out is not None and each_held_out is not None:
-        findings += _of_frames(found, np.asarray(lines.focal), held_out, each_held_out)
+        both = (np.asarray(values, float) for values in (held_out, each_held_out))
+        findings += _of_frames(found, np.asarray(lines.focal), *both)
     return Assessment((), found).joined_by(findings)
 
 

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Num, PyTree, ScalarLike
 
 from .._core.arguments import kinds_checked
 from .._core.fields import check_positive
-from .._core.types import AnyArray, Coefficients, Focal, Points
+from .._core.types import AnyArray, Coefficients, Focal, Points, traced
 from ..fit.result import ZoomFit
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
@@ -37,13 +37,17 @@ Result = TypeVar("Result")
 
 
 def _focal_checked(function: Callable[Given, Result]) -> Callable[Given, Result]:
-    """Refuse focal lengths that are none, where they are known: the function itself is compiled."""
+    """Refuse focal lengths and levels that are none, where they are known: the function is compiled."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
     def checked(*args: Given.args, **kwargs: Given.kwargs) -> Result:
-        focal = signature.bind(*args, **kwargs).arguments.get("focal")
+        given = signature.bind(*args, **kwargs).arguments
+        focal = given.get("focal")
         check_positive("focal", focal if isinstance(focal, jax.Array) else np.asarray(focal, float))
+        level = given.get("level", 0.5)
+        if not traced(level) and not (np.ndim(level) == 0 and 0 < level < 1):
+            raise ValueError(f"Argument level must be a number between 0 and 1, but it is {level!r}.")
         return function(*args, **kwargs)
 
     return checked
@@ -221,7 +225,7 @@ def displacement_band(
 
     Args:
         fit, points, focal: as for `displacement_covariance`.
-        level: the confidence level, between 0 and 1.
+        level: the confidence level, between 0 and 1, which are excluded: a share, not per cent.
 
     Returns:
         The lower and the upper end for each point.

@@ -9,7 +9,7 @@ from ..fit.centre import CentreFit, fit_centre, refit_centre
 from ..fit.energy import line_squares
 from ..lines.free_centre import AnyCentreLines
 from ..models.zoom import AbstractZoom, with_parameters
-from .cross_validation import judge
+from .cross_validation import errors_of
 from .folds import folds_of, own_weights, shares
 
 _FOLDS = 5
@@ -54,7 +54,7 @@ def choose_centre(lines: AnyCentreLines, *, zoom: AbstractZoom, terms: int = 2) 
     found = fit_centre(lines, zoom=zoom, terms=terms)
     small = lines.about(lines.centre)
     parts = folds_of(small, "frame" if len(lines.focal) >= _FOLDS else "line", _FOLDS, 0)
-    given = judge(small, with_parameters(zoom, None), terms, parts).unseen
+    given = errors_of(small, with_parameters(zoom, None), terms, parts).unseen
     own, fitted = own_weights(small), np.full(given.shape, np.nan)
     for fold in range(parts.number) if found.determined else ():
         out = parts.fold == fold

@@ -27,8 +27,10 @@ from jaxtyping import Array, Float, ScalarLike
 from .._core.arguments import kinds_checked
 from .._core.types import AnyArray, traced
 from ..fit.energy import line_normal
+from ..fit.same_camera import check_camera
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
+from ..models.requirements import check
 from ..models.sizes import at_focal
 from ..models.zoom import with_parameters
 
@@ -53,7 +55,8 @@ def cramer_rao(
         infinite if the lines do not determine them, or the lens folds at one of their points.
 
     Raises:
-        ValueError: `std` is not positive and finite, or not one number or one a line.
+        ValueError: `std` is not positive and finite, or not one number or one a line; or the lines are from
+            images of another size, or have focal lengths in another unit.
 
     Example:
         >>> from zoomjax import scenes
@@ -61,6 +64,8 @@ def cramer_rao(
         >>> cramer_rao(lens, scenes.board_lines(lens, focal, spacing=99.0), std=0.5).shape
         (6, 6)
     """
+    check_camera(lens, lines)
+    check("cramer_rao", zoom=lens.zoom)
     return _cramer_rao(lens, lines, _checked_std(std, lines))
 
 
@@ -106,6 +111,8 @@ def displacement_bound(
         >>> bool(displacement_bound(lens, lines, std=0.5) < 0.3)
         True
     """
+    check_camera(lens, lines)
+    check("cramer_rao", zoom=lens.zoom)
     return _displacement_bound(lens, lines, _checked_std(std, lines))
 
 

@@ -12,16 +12,18 @@ from jaxtyping import Float
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_terms
 from .._core.types import of_known_values
+from ..fit.defaults import zoom_or_default
 from ..fit.energy import line_squares, line_squares_by_frame, settings
-from ..fit.family_lines import FamilyLines
 from ..fit.frames import fit_frames
+from ..fit.prepare import compressed_as_measured
 from ..fit.result import RESULTS
+from ..fit.wrapper import AbstractWrapper
 from ..fit.zoom import fit_zoom
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
-from ..models.zoom import AbstractLinearZoom, AbstractZoom, PolynomialZoom
-from ._linear_folds import Design, Lanes, as_given, cross_validated, judge_linear, lanes_of
-from .folds import Folds, HoldOut, Judged, folds_of, own_weights, shares, small_lines
+from ..models.zoom import AbstractLinearZoom, AbstractZoom, terms_of, with_parameters
+from ._linear_folds import Design, Lanes, as_given, cross_validated, lanes_of, linear_errors
+from .folds import Folds, HoldOut, LineErrors, folds_of, own_weights, shares, small_lines
 
 
 @kinds_checked
@@ -30,7 +32,7 @@ def held_out_zoom(
     lines: AbstractLines,
     *,
     zoom: AbstractZoom | None = None,
-    terms: int = 2,
+    terms: int | None = None,
     hold_out: HoldOut = "frame",
     folds: int | None = None,
     seed: int = 0,
@@ -42,9 +44,10 @@ def held_out_zoom(
     has it.
 
     Args:
-        lines: the lines, or, much faster, ``compress(lines)``; or ``compress_family(lines, family)``, with
-            a separate fit for each part.
-        zoom, terms: as for `fit_zoom`.
+        lines: the lines, or, much faster, ``compress(lines)``; or ``compress_family(lines, family)`` or
+            ``in_image(lines)``, with a separate fit for each part.
+        zoom, terms: as for `fit_zoom`. The model is made ready anew for each part: of a fitted one only the
+            settings and the number of coefficients count.
         hold_out, folds, seed: as for `select_model`.
 
     Returns:
@@ -61,14 +64,15 @@ def held_out_zoom(
         >>> bool((held_out_zoom(lines) ** 2).mean() > fit_zoom(lines).rms ** 2)
         True
     """
-    terms = checked_terms(terms)
-    zoom = PolynomialZoom() if zoom is None else zoom
+    zoom = zoom_or_default(zoom)
+    terms = terms_of(zoom, terms, lines.family)
+    zoom = with_parameters(zoom, None)
     focal, *focus = settings(zoom, lines)
     zoom.prepare(focal, terms, *focus)  # complains of too few focal lengths
-    small = lines.compressed(terms) if isinstance(lines, FamilyLines) else small_lines(lines, terms)
+    small = _small(lines, terms)
     parts = folds_of(small, hold_out, folds, seed)
-    judged = judge(small, zoom, terms, parts)
-    return _by_frame(small, np.where(parts.fold >= 0, judged.unseen, np.nan))
+    found = errors_of(small, zoom, terms, parts)
+    return _by_frame(small, np.where(parts.fold >= 0, found.unseen, np.nan))
 
 
 @kinds_checked
@@ -91,9 +95,9 @@ def held_out_frames(
         fewer than two lines.
     """
     terms = checked_terms(terms)
-    if isinstance(lines, FamilyLines):
-        return _frames_by_fits(lines.compressed(terms), terms, folds, seed)
-    small = small_lines(lines, terms)
+    small = _small(lines, terms)
+    if not isinstance(small, CompressedLines):
+        return _frames_by_fits(small, terms, folds, seed)
     parts = folds_of(small, "line", folds, seed)
     lanes = lanes_of(small, parts.fold, terms)
     unseen = np.full(lanes.fold.shape, np.nan)
@@ -114,18 +118,24 @@ def held_out_frames(
     return _by_frame(small, as_given(small, unseen))
 
 
-def judge(lines: CompressedLines | FamilyLines, zoom: AbstractZoom, terms: int, parts: Folds) -> Judged:
+def _small(lines, terms):
+    """The lines compressed, under their own distortion model and in their own metric."""
+    wrapped = isinstance(lines, AbstractWrapper)
+    return compressed_as_measured(lines, terms) if wrapped else small_lines(lines, terms)
+
+
+def errors_of(lines: AbstractLines, zoom: AbstractZoom, terms: int, parts: Folds) -> LineErrors:
     """A model's errors on the lines of the fit, and on lines left out.
 
     Args:
-        lines: from `small_lines`, or those lines with another family.
+        lines: from `small_lines`, or those lines with another distortion model or metric.
         zoom: a model without parameters.
         terms: its number of coefficients.
         parts: the folds.
     """
     if isinstance(zoom, AbstractLinearZoom) and isinstance(lines, CompressedLines):
-        return judge_linear(lines, zoom, terms, parts)
-    return _judge_by_fits(lines, zoom, terms, parts)
+        return linear_errors(lines, zoom, terms, parts)
+    return _errors_by_fits(lines, zoom, terms, parts)
 
 
 def _by_frame(lines, of_line):
@@ -152,7 +162,7 @@ def _frames_by_fits(lines, terms, folds, seed):
     return _by_frame(lines, unseen)
 
 
-def _judge_by_fits(lines, zoom, terms, parts):
+def _errors_by_fits(lines, zoom, terms, parts):
     """By a fit of its own for each fold, starting from that of all lines."""
     own = own_weights(lines)
     everything = fit_zoom(lines, zoom=zoom, terms=terms, invertible=False, throw=False)
@@ -177,4 +187,4 @@ def _judge_by_fits(lines, zoom, terms, parts):
             failed += 1
     if failed:
         problem = problem or f"{failed} of {parts.number} folds do not converge"
-    return Judged(seen, unseen, float(ravel_pytree(everything.lens.zoom.parameters)[0].size), problem)
+    return LineErrors(seen, unseen, float(ravel_pytree(everything.lens.zoom.parameters)[0].size), problem)

@@ -33,11 +33,14 @@ from ..fit.energy import (
 )
 from ..fit.family_lines import compress_family, with_family
 from ..fit.result import ZoomFit
+from ..fit.same_camera import check_lines_of
+from ..fit.wrapper import about_own_centre
 from ..lines.base import AbstractLines
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
 from ..models.zoom import AbstractZoom, with_parameters
+from .bands import displacement_std
 from .folds import own_weights
 
 _CURVE = 5
@@ -81,7 +84,8 @@ class Evidence:
         rms, rms_uncorrected: RMS distance to straight lines, with and without the correction.
         noise: RMS distance of points to smooth curves through their lines; NaN where they have few points.
         displacement: how far the correction moves points, RMS over the image, where that is largest.
-        std: standard deviation of the displacement, averaged likewise, where that is largest.
+        std: standard deviation of the displacement, as in the bands, averaged likewise, where that is
+            largest.
         halves: the agreement of halves of the lines, as far as halves determine a lens.
         diagonal: of the image.
     """
@@ -115,7 +119,8 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
         compressed: the same lines compressed for the fit's distortion model, if they are at hand.
 
     Raises:
-        ValueError: no line is usable.
+        ValueError: no line is usable; the lines are not those of the fit, being of another image size, unit
+            or number of frames; or `compressed` are others.
 
     Example:
         >>> from zoomjax import compress, fit_zoom, scenes
@@ -124,12 +129,14 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
         >>> bool(0.4 < evidence(lines, fit_zoom(compress(lines))).noise < 0.6)
         True
     """
+    check_lines_of(fit, lines)
     lens = fit.lens
     centre = lens.centre if lens.shift is None else jax.vmap(lens)(jnp.asarray(lines.focal)).centre
     placed = lines.about(centre)
     if compressed is None:
         terms = np.asarray(lens.zoom(lens.focal_range[0])).size
         compressed = compress_family(placed, lens.family, terms=terms)
+    compressed = _same_lines(lines, compressed)
     weight = own_weights(compressed)
     if not weight.any():
         raise ValueError(
@@ -139,9 +146,9 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     dtype = fit.covariance.dtype
     low, high = (float(f) for f in lens.focal_range)
     focals = 1 / np.linspace(1 / low, 1 / high, _FOCALS)
-    moved, rows = map(
-        np.asarray, _derivatives(lens, jnp.asarray(_raster(lens), dtype), jnp.asarray(focals, dtype))
-    )
+    raster = jnp.asarray(_raster(lens), dtype)
+    moved, rows = map(np.asarray, _derivatives(lens, raster, jnp.asarray(focals, dtype)))
+    std = np.asarray(displacement_std(fit, raster[None], focal=focals[:, None]))
     zero = jnp.zeros((len(lines.focal), np.size(lens.zoom(lens.focal_range[0]))), dtype)
     before = np.asarray(frame_energy(compressed, zero))
     return Evidence(
@@ -153,10 +160,30 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
         rms_uncorrected=float(np.sqrt(np.nanmean(before))),
         noise=_noise(with_family(placed, lens.family), lens, np.flatnonzero(weight)),
         displacement=float(np.max(_over_image(np.linalg.norm(moved, axis=-1)))),
-        std=float(np.max(_spread(rows, np.asarray(fit.covariance)))),
+        std=float(np.max(_over_image(std))),
         halves=tuple(_halves(compressed, fit, weight, rows)),
         diagonal=2 * lens.scale,
     )
+
+
+def _same_lines(lines: Lines, compressed: AbstractLines) -> AbstractLines:
+    """The compressed lines about their centre.
+
+    Raises:
+        ValueError: they are not the lines.
+    """
+    same = (
+        compressed.image_size == lines.image_size
+        and compressed.focal_unit == lines.focal_unit
+        and np.array_equal(compressed.frame, lines.frame)
+        and np.array_equal(compressed.counts, lines.counts)
+    )
+    if not same:
+        raise ValueError(
+            "Argument compressed must be the same lines, compressed, but images, frames or numbers of "
+            "points differ: leave it out."
+        )
+    return about_own_centre(compressed)
 
 
 def _noise(lines: AbstractLines, lens: ZoomLens, counted: np.ndarray) -> float:

@@ -7,8 +7,7 @@ from jaxtyping import Float
 
 from .._core.checks import checked_integer
 from ..fit.algebraic import compressed
-from ..fit.family_lines import FamilyLines
-from ..fit.image_metric import ImageLines
+from ..fit.wrapper import AbstractWrapper
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
 
@@ -32,8 +31,8 @@ class Folds(NamedTuple):
     number: int
 
 
-class Judged(NamedTuple):
-    """A model on the lines of `Folds`.
+class LineErrors(NamedTuple):
+    """The errors of a model on the lines of `Folds`.
 
     Attributes:
         seen: mean squared distance of each line, px^2, under the fit of all lines.
@@ -53,14 +52,13 @@ def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
     """The lines compressed, for so many terms.
 
     Raises:
-        TypeError: they are no lines, or measured in another way than eq. 3.
+        TypeError: they are no lines, or have a distortion model or a metric of their own.
         ValueError: they are compressed already, for fewer terms; a point is not finite; or no line counts.
     """
-    if isinstance(lines, ImageLines | FamilyLines):
+    if isinstance(lines, AbstractWrapper):
         raise TypeError(
-            "Cross-validation measures distances in the corrected image, under the radial polynomial: pass "
-            "the lines without in_image or with_family. (To compare families, give select_model "
-            "Candidate(zoom, terms, family).)"
+            "Argument lines has a distortion model of its own, and here each candidate has one: pass the "
+            "lines without with_family, and Candidate(zoom, terms, family)."
         )
     if not isinstance(lines, AbstractLines):
         raise TypeError(
@@ -77,9 +75,7 @@ def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
     return small
 
 
-def folds_of(
-    lines: CompressedLines | FamilyLines, hold_out: HoldOut, folds: int | None, seed: int
-) -> Folds:
+def folds_of(lines: AbstractLines, hold_out: HoldOut, folds: int | None, seed: int) -> Folds:
     """The parts of the lines that are left out in turn; see `select_model`.
 
     Raises:
@@ -88,7 +84,7 @@ def folds_of(
     if hold_out not in get_args(HoldOut):
         raise ValueError(f'Argument hold_out must be "focal", "frame" or "line", but it is {hold_out!r}.')
     frame, focal = np.asarray(lines.frame), np.asarray(lines.focal)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(checked_integer("seed", seed, 0))
     most = _LINE_FOLDS if hold_out == "line" else _MOST_FOLDS
     most = most if folds is None else checked_integer("folds", folds, 2)
     if hold_out == "line":
@@ -116,7 +112,7 @@ def folds_of(
     return Folds(np.where(group >= 0, fold[group], -1), group, parts)
 
 
-def shares(lines: CompressedLines | FamilyLines) -> Float[np.ndarray, "line"]:
+def shares(lines: AbstractLines) -> Float[np.ndarray, "line"]:
     """The part of each line in the energy of eq. 13: every frame that counts weighs the same."""
     frame, own = np.asarray(lines.frame), own_weights(lines)
     total = np.bincount(frame, own, minlength=len(lines.focal))

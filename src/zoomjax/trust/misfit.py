@@ -12,6 +12,8 @@ s^2 that is left. So the mean of ``d d^T`` over the frames, times ``1 - q s^2 / 
 (James and Stein 1961), is the covariance of the misfit; next to none remains when the model is right.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -20,12 +22,17 @@ from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
+from ..fit.energy import frame_normal_equations
+from ..fit.family_lines import with_family
+from ..fit.image_metric import ImageLines
+from ..fit.prepare import compressed_as_measured
 from ..fit.result import ZoomFit
+from ..fit.same_camera import check_lines_of
 from ..lines.base import AbstractLines
 from ..models.polynomial import RadialPolynomial
-from ..models.zoom import AbstractFocusZoom
+from ..models.requirements import check
 from ._linear_folds import lanes_of, passed
-from .folds import small_lines
+from .folds import own_weights, small_lines
 
 _FEWEST = 8
 """Frames: with fewer, the misfit cannot be told from errors of single photos, and counts as these."""
@@ -43,15 +50,16 @@ def with_misfit(fit: ZoomFit, lines: AbstractLines) -> ZoomFit:
     misfit is estimated from what all frames have in common that the model does not follow.
 
     Args:
-        fit: the fit, with the radial polynomial and a model of the focal length alone.
-        lines: the lines that it was fitted to, with their weights.
+        fit: the fit, with a zoom model of the focal length alone.
+        lines: the lines that it was fitted to, with their weights and in their metric.
 
     Returns:
         The fit with `misfit`: a covariance of the normalised coefficients, zero where none is found. None,
         as before, where fewer than 8 frames have lines.
 
     Raises:
-        ValueError: the lens has another distortion model, or depends on the focus.
+        ValueError: the lens depends on the focus; or the lines are not those of the fit: of another image
+            size, unit or number of frames.
 
     Example:
         >>> from zoomjax import PolynomialZoom, compress, fit_zoom, scenes
@@ -64,34 +72,59 @@ def with_misfit(fit: ZoomFit, lines: AbstractLines) -> ZoomFit:
         >>> bool(one > 20 * two)
         True
     """
+    check_lines_of(fit, lines)
     lens = fit.lens
-    if not isinstance(lens.family, RadialPolynomial) or isinstance(lens.zoom, AbstractFocusZoom):
-        raise ValueError(
-            "Argument fit must have the radial polynomial and a zoom model of the focal length alone: the "
-            "misfit of others is not estimated."
-        )
+    check("with_misfit", zoom=lens.zoom)
     centre = lens.centre if lens.shift is None else jax.vmap(lens)(jnp.asarray(lines.focal)).centre
     k = np.asarray(jax.vmap(lens.zoom)(jnp.asarray(lines.focal)), float)
-    small = small_lines(lines.about(centre), k.shape[1])
-    lanes = lanes_of(small, np.zeros(len(small.frame), int), k.shape[1])
-    total = lanes.total(lanes.weight)
-    used = np.flatnonzero(total > 0)
-    if len(used) < _FEWEST:
+    placed = with_family(lines, lens.family).about(centre)
+    by_moments = isinstance(lens.family, RadialPolynomial) and not isinstance(placed, ImageLines)
+    score, matrix, number, focal = (_quickly if by_moments else _by_residuals)(placed, k, lens.family)
+    if len(focal) < _FEWEST:
         return fit
-    lines_at = passed(lanes, k)
-    score, matrix = (
-        np.moveaxis(lanes.total(lanes.weight / lanes.counts * of) / np.where(total > 0, total, 1), -1, 0)
-        for of in (lines_at.gradient, lines_at.matrix)
-    )
-    focal = np.asarray(small.focal)[lanes.frame[lanes.starts]][used]
-    number = lanes.total((lanes.weight > 0).astype(float))[used]
-    misfit = _common(score[used], matrix[used], number, focal)
+    misfit = _common(score, matrix, number, focal)
     return eqx.tree_at(
         lambda fit: fit.misfit,
         fit,
         jnp.asarray(misfit, fit.covariance.dtype),
         is_leaf=lambda leaf: leaf is None,
     )
+
+
+class _Frames(NamedTuple):
+    """The frames that have lines: score and matrix of each, its number of lines and its focal length."""
+
+    score: Float[np.ndarray, "frame terms"]
+    matrix: Float[np.ndarray, "frame terms terms"]
+    number: Float[np.ndarray, "frame"]
+    focal: Float[np.ndarray, "frame"]
+
+
+def _quickly(lines, k, family):
+    """Of the radial polynomial in the paper's metric, in NumPy: without compiling anything."""
+    del family
+    small = small_lines(lines, k.shape[1])
+    lanes = lanes_of(small, np.zeros(len(small.frame), int), k.shape[1])
+    total = lanes.total(lanes.weight)
+    used = np.flatnonzero(total > 0)
+    lines_at = passed(lanes, k)
+    score, matrix = (
+        np.moveaxis(lanes.total(lanes.weight / lanes.counts * of) / np.where(total > 0, total, 1), -1, 0)
+        for of in (lines_at.gradient, lines_at.matrix)
+    )
+    number = lanes.total((lanes.weight > 0).astype(float))
+    focal = np.asarray(small.focal)[lanes.frame[lanes.starts]]
+    return _Frames(score[used], matrix[used], number[used], focal[used])
+
+
+def _by_residuals(lines, k, family):
+    """Of any distortion model and metric."""
+    small = compressed_as_measured(lines, k.shape[1] - family.size(0))
+    dtype = jnp.asarray(small.focal).dtype
+    score, matrix = map(np.asarray, frame_normal_equations(small, jnp.asarray(k, dtype)))
+    number = np.bincount(np.asarray(small.frame), own_weights(small) > 0, minlength=len(k))
+    used = np.flatnonzero(number > 0)
+    return _Frames(score[used], matrix[used], number[used], np.asarray(small.focal)[used])
 
 
 def _common(

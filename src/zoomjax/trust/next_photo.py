@@ -24,9 +24,11 @@ from .._core.types import of_known_values
 from ..fit.energy import counted_frames, line_residuals, line_weights, linearised, number_counted
 from ..fit.family_lines import with_family
 from ..fit.result import ZoomFit
+from ..fit.same_camera import check_lines_of
 from ..lines.base import AbstractLines
+from ..models.requirements import check
 from ..models.sizes import at_focal
-from ..models.zoom import AbstractFocusZoom, with_parameters
+from ..models.zoom import with_parameters
 from .bands import displacement_std
 
 _FOCALS = 5  # over the range, evenly in 1/f
@@ -58,7 +60,7 @@ class Suggestion:
         focals: the candidates' focal lengths.
         regions: their parts of the image, in words.
         table: `after` of each candidate: of each focal length, region and direction.
-        focal_unit: "mm" or "px".
+        focal_unit: "mm" or "px"; empty where the one focal length is not known.
     """
 
     focal: float
@@ -74,10 +76,8 @@ class Suggestion:
     @property
     def sentence(self) -> str:
         """The suggestion in words."""
-        photo = (
-            f"Next, photograph {self.direction} lines through {self.region} of the image at f = "
-            f"{self.focal:.4g} {self.focal_unit}"
-        )
+        zoom = f"at f = {self.focal:.4g} {self.focal_unit}" if self.focal_unit else "with the same zoom"
+        photo = f"Next, photograph {self.direction} lines through {self.region} of the image {zoom}"
         if not np.isfinite(self.before):
             return f"{photo}: of all candidates, this one would determine the lens best."
         return (
@@ -103,7 +103,8 @@ def suggest_next(
         The best candidate, and the values of all candidates.
 
     Raises:
-        ValueError: `focal_range` is not two positive numbers in order, or no line is usable.
+        ValueError: `focal_range` is not two positive numbers in order, no line is usable, or the lines
+            are not those of the fit: of another image size, unit or number of frames.
 
     Example:
         >>> from zoomjax import compress, fit_zoom, scenes
@@ -112,17 +113,17 @@ def suggest_next(
         >>> suggest_next(fit_zoom(lines), lines).sentence
         'Next, photograph ...
     """
-    low, high = (float(f) for f in (fit.lens.focal_range if focal_range is None else focal_range))
+    check_lines_of(fit, lines)
+    try:
+        low, high = (float(f) for f in (fit.lens.focal_range if focal_range is None else focal_range))
+    except (TypeError, ValueError):
+        low = high = np.nan
     if not 0 < low <= high < np.inf:
         raise ValueError(
             "Argument focal_range must be two positive numbers, the shorter first, but it is "
             f"{focal_range!r}."
         )
-    if isinstance(fit.lens.zoom, AbstractFocusZoom) or fit.lens.shift is not None:
-        raise ValueError(
-            "Argument fit must have a lens that depends on the focal length alone and has one centre of "
-            "distortion, but it depends on the focus, or its centre moves along the zoom."
-        )
+    check("suggest_next", zoom=fit.lens.zoom, shift=fit.lens.shift)
     lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
     if not np.any(counted_frames(lines)):
         raise ValueError(

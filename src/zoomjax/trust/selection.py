@@ -18,12 +18,13 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from .._core.arguments import kinds_checked
-from .._core.checks import checked_terms
+from .._core.arguments import check_kind, kinds_checked
 from .._core.types import of_known_values
 from ..fit.energy import settings
 from ..fit.family_lines import compress_family, with_family
+from ..fit.image_metric import in_corrected, measured_as
 from ..fit.result import ZoomFit
+from ..fit.wrapper import about_own_centre
 from ..fit.zoom import fit_zoom
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
@@ -31,9 +32,9 @@ from ..lines.lines import Lines
 from ..models.family import AbstractFamily
 from ..models.polynomial import RadialPolynomial
 from ..models.smooth import SmoothZoom
-from ..models.zoom import AbstractZoom, PolynomialZoom, with_parameters
-from .cross_validation import judge
-from .folds import Folds, HoldOut, Judged, folds_of, shares, small_lines
+from ..models.zoom import AbstractZoom, PolynomialZoom, terms_of, with_parameters
+from .cross_validation import errors_of
+from .folds import Folds, HoldOut, LineErrors, folds_of, shares, small_lines
 
 _TERMS = 3  # of the default candidates, at most
 _DEGREES = 4
@@ -50,7 +51,7 @@ class Candidate:
 
     Attributes:
         zoom: such as ``PolynomialZoom(degree=2)``.
-        terms: N, of eq. 2.
+        terms: N, of eq. 2; of a zoom model with parameters theirs.
         family: the distortion model, such as ``Division()``.
     """
 
@@ -64,7 +65,8 @@ class Candidate:
             raise TypeError(
                 f"A candidate must be a zoom model, as PolynomialZoom(degree=2) is, not {self.zoom!r}."
             )
-        checked_terms(self.terms, AbstractFamily.most_terms)
+        check_kind("family", self.family, (AbstractFamily,))
+        terms_of(self.zoom, self.terms, self.family)
 
     @property
     def name(self) -> str:
@@ -199,7 +201,8 @@ def select_model(
     is chosen, and fitted to all lines.
 
     Args:
-        lines: the lines, or ``compress(lines, terms=3)``.
+        lines: the lines, or ``compress(lines, terms=3)``; measured in the image (`in_image`), every fold is
+            fitted by itself.
         candidates: zoom models, or `Candidate` for other `terms` than 2 or another distortion model. By
             default polynomials in 1/f of degree 0 to 3 with 1 to 3 coefficients (or as many as the lines
             are compressed for), and `SmoothZoom`.
@@ -241,8 +244,14 @@ def select_model(
         >>> select_model(compress(scene, terms=2)).chosen.name
         'degree 2, 2 terms'
     """
+    lines = about_own_centre(lines)
+    if isinstance(candidates, AbstractZoom | Candidate):
+        raise TypeError(
+            "Argument candidates must be a list of zoom models, [first, second], not one of them."
+        )
+    plain = in_corrected(lines)
     if candidates is None:
-        most = min(_TERMS, lines.terms) if isinstance(lines, CompressedLines) else _TERMS
+        most = min(_TERMS, plain.terms) if isinstance(plain, CompressedLines) else _TERMS
         compared = default_candidates(most)
     else:
         compared = tuple(c if isinstance(c, Candidate) else Candidate(c) for c in candidates)
@@ -250,9 +259,9 @@ def select_model(
         raise ValueError(f'Argument rule must be "one standard error" or "least", but it is {rule!r}.')
     if not compared:
         raise ValueError("Argument candidates must hold one or more zoom models, but it is empty.")
-    own = lines.terms if isinstance(lines, CompressedLines) else max(c.terms for c in compared)
-    small = small_lines(lines, own)
-    forms = {c.family: _in_family(lines, small, c.family, own) for c in compared}
+    own = plain.terms if isinstance(plain, CompressedLines) else max(c.terms for c in compared)
+    small = small_lines(plain, own)
+    forms = {c.family: measured_as(_in_family(plain, small, c.family, own), lines) for c in compared}
     if hold_out is None:
         hold_out = "focal" if np.unique(np.asarray(small.focal)).size > 3 else "line"
     parts = folds_of(small, hold_out, folds, seed)
@@ -282,7 +291,7 @@ def _in_family(lines, small, family, terms):
     )
 
 
-def judged_candidate(lines, candidate, parts):
+def candidate_errors(lines, candidate, parts):
     """The errors, or why there are none."""
     zoom = with_parameters(candidate.zoom, None)
     try:
@@ -290,7 +299,7 @@ def judged_candidate(lines, candidate, parts):
             lines.check_terms(candidate.terms)
         focal, *focus = settings(zoom, lines)
         zoom.prepare(np.asarray(focal), candidate.terms, *focus)
-        return judge(lines, zoom, candidate.terms, parts)
+        return errors_of(lines, zoom, candidate.terms, parts)
     except ValueError as error:
         return str(error)
 
@@ -306,11 +315,11 @@ def compare(
 
     `forms` are the same lines for other families than the radial polynomial.
     """
-    errors = [judged_candidate((forms or {}).get(c.family, lines), c, parts) for c in candidates]
-    return compare_judged(lines, candidates, errors, parts, rule)
+    errors = [candidate_errors((forms or {}).get(c.family, lines), c, parts) for c in candidates]
+    return compare_errors(lines, candidates, errors, parts, rule)
 
 
-def compare_judged(lines, candidates, errors, parts, rule):
+def compare_errors(lines, candidates, errors, parts, rule):
     """The same of candidates whose errors, or why there are none, are known."""
     share = shares(lines)
     counted = (parts.unit >= 0) & (share > 0)
@@ -322,7 +331,7 @@ def compare_judged(lines, candidates, errors, parts, rule):
 
     unseen = {}
     for i, judged in enumerate(errors):
-        if isinstance(judged, Judged) and not judged.problem:
+        if isinstance(judged, LineErrors) and not judged.problem:
             unseen[i] = by_unit(judged.unseen)
     if not unseen:
         reasons = {e if isinstance(e, str) else e.problem for e in errors}

@@ -9,7 +9,7 @@ from ..lines.compressed import CompressedLines
 from ..models.smooth import SmoothZoom
 from ..models.zoom import AbstractZoom
 from .folds import HoldOut, folds_of
-from .selection import Candidate, Selection, compare_judged, judged_candidate
+from .selection import Candidate, Selection, candidate_errors, compare_errors
 
 
 def select_in_stages(
@@ -34,13 +34,13 @@ def select_in_stages(
     most = min(folds, np.unique(np.asarray(lines.focal)).size - 2) if many else folds
     parts = folds_of(lines, hold_out, most, 0)
     candidates = [Candidate(zoom, terms[0]) for zoom in zooms]
-    errors = [judged_candidate(lines, candidate, parts) for candidate in candidates]
-    _, best, chosen = compare_judged(lines, candidates, errors, parts, "least")
+    errors = [candidate_errors(lines, candidate, parts) for candidate in candidates]
+    _, best, chosen = compare_errors(lines, candidates, errors, parts, "least")
     more = [
         Candidate(chosen.zoom, number) for number in terms[1:] if not isinstance(chosen.zoom, SmoothZoom)
     ]
-    errors += [judged_candidate(lines, candidate, parts) for candidate in more]
+    errors += [candidate_errors(lines, candidate, parts) for candidate in more]
     candidates += more
-    verdicts, best, chosen = compare_judged(lines, candidates, errors, parts, "least")
+    verdicts, best, chosen = compare_errors(lines, candidates, errors, parts, "least")
     fit = fit_zoom(lines, zoom=chosen.zoom, terms=chosen.terms)
     return Selection(chosen, best, fit, verdicts, hold_out, parts.number)
