@@ -17,6 +17,13 @@ def inputs_in(folder):
     return [folder / name for name in ("lens.json", "track.csv", "in/lens.json")]
 
 
+def cut_map(folder):
+    """Half of a map, of which OpenEXR itself complains in three lines."""
+    zj.interop.write(LENSES["landscape"](), folder / "maps", format="stmap", focal=18)
+    whole = (folder / "maps" / "undistort.18.exr").read_bytes()
+    return whole[: len(whole) // 2]
+
+
 @pytest.fixture(scope="module")
 def told(tmp_path_factory):
     """What commands said, each with its status: run in one process, after each other."""
@@ -24,6 +31,9 @@ def told(tmp_path_factory):
     LENSES["landscape"]().save(folder / "lens.json")
     (folder / "track.csv").write_text("frame,focal\n1,20\n3,40\n")
     (folder / "bad.json").write_text('{"fisheye_params": 1}')
+    (folder / "cut-undistort.exr").write_bytes(cut_map(folder))
+    few = {"format": "gyroflow", "focal": [18, 40, 200], "pixel_pitch": PITCH}
+    zj.interop.write(LENSES["landscape"](), folder / "few.json", **few)
     (folder / "in").mkdir()
     lens = LENSES["landscape"]()
     zj.interop.write(lens, folder / "in" / "lens.json", format="gyroflow", pixel_pitch=PITCH)
@@ -38,6 +48,11 @@ def told(tmp_path_factory):
         "no focal": "export lens.json --to pftrack -o b.pfb",
         "no format": "export lens.json --to that -o b.pfb",
         "import": "import a.xml --image-size 640x480 -o back",
+        "import division": "import a.pfb --focal 20,30,40 --family division --terms 1 -o division",
+        "smooth": "import few.json -o smooth",
+        "table": "import few.json --table -o table",
+        "terms": "import a.xml --image-size 640x480 --terms 9 -o never",
+        "cut map": "import cut-undistort.exr -o never",
         "no size": "import a.xml -o never",
         "damaged": "import bad.json -o never",
         "no effect": "export lens.json --to opencv --focal 24 --pixel-pitch 0.0367 --tolerance 1 -o b.yaml",
@@ -64,7 +79,11 @@ def told(tmp_path_factory):
 def test_formats_are_listed(told):
     status, text = told[1]["formats"]
     assert status == 0
-    assert len(text.splitlines()) == len(zj.interop.formats())
+    head, *lines = text.splitlines()
+    assert head.split() == ["format", "direction", "formula", "zoom", "tools"]
+    assert [line.split()[0] for line in lines] == [fmt.name for fmt in zj.interop.formats()]
+    [colmap] = [line for line in lines if line.startswith("colmap")]
+    assert "refitted, exact for division" in colmap
 
 
 def test_a_lens_goes_out_and_comes_back(told):
@@ -80,6 +99,18 @@ def test_a_lens_goes_out_and_comes_back(told):
     assert json.loads((folder / "back" / "import.json").read_text())["format"] == "lensfun"
 
 
+def test_the_model_of_an_import_can_be_chosen(told):
+    folder, said = told
+    assert said["import division"][0] == 0, said["import division"][1]
+    lens = zj.load_lens(folder / "division" / "lens.json")
+    assert isinstance(lens.family, zj.models.Division)
+    assert lens(20.0).coefficients.shape == (1,)
+    assert "interpolation: --table keeps to that." in said["smooth"][1]
+    assert "--table" not in said["table"][1]
+    told_of = [json.loads((folder / name / "import.json").read_text()) for name in ("smooth", "table")]
+    assert told_of[1]["between"] < 0.1 < told_of[0]["between"]
+
+
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
@@ -87,6 +118,8 @@ def test_a_lens_goes_out_and_comes_back(told):
         ("no pitch", "Error: --pixel-pitch, mm from one pixel to the next"),
         ("no focal", "Error: --focal must be given, one focal length or several"),
         ("no format", "Error: --to must be one of stmap, nuke"),
+        ("terms", "Error: --terms must be at most 4, but it is 9."),
+        ("cut map", "from cut-undistort.exr: it is no EXR file, or it is damaged or cut off."),
         ("no size", "it holds no image size: give --image-size"),
         ("no effect", "Error: --tolerance has no effect on the format opencv: leave it out."),
         ("no convention", "Error: --convention has no effect on the format nuke: leave it out."),

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..models.brown_conrady import BrownConrady
+from ..models.distortion import Distortion
 from ..models.division import Division
 from ..models.family import AbstractFamily
 from ..models.lens import ZoomLens
@@ -26,8 +27,10 @@ from ..models.tables import TableZoom
 from ..models.zoom import AbstractLinearZoom, AbstractPriorZoom, PolynomialZoom, with_parameters
 from ._centre import centre_and_family
 from ._forms import Form
-from ._samples import distortions, pairs_of
-from .base import Contents, Node, Sampled
+from ._samples import Pairs, distortions
+from ._seen import Seen, inside, seen_of
+from .base import TOLERANCE, Contents, Node, Sampled
+from .radial_table import RadialTable, zoom_of_table
 
 _MUCH = 0.5
 """px at the nodes from which a user is told of tables."""
@@ -35,12 +38,38 @@ _MUCH = 0.5
 _TERMS, _KEPT = 2, AbstractFamily.most_terms
 """Coefficients of a `SmoothZoom`, whose prior is for two, and of models that keep a file's values."""
 
+_MOVED = 0.05
+"""px by which the file's centres must differ for the lens's centre to move."""
+
+_NOT_SQUARE = 1e-6
+"""Share by which pixels must differ from squares to be told of."""
+
+_SHARES = tuple(tuple(i / parts for i in range(1, parts)) for parts in (1, 2, 4, 8, 16))
+"""Where a table has entries of the tool's own interpolation, in each interval, until it follows that."""
+
+_CHECKED = (0.2, 0.45, 0.8)
+"""Where that is looked at."""
+
 
 class UnsuitedError(ValueError):
     """The zoom model that was asked for does not suit the contents of a file that is sound."""
 
 
-Pairs = tuple[np.ndarray, np.ndarray]
+@dataclasses.dataclass(frozen=True)
+class Made:
+    """A lens of a file's contents.
+
+    Attributes:
+        lens: the lens.
+        at_nodes: its greatest error at the nodes, px (see `Report`).
+        between: its greatest error between them; None where the tool does not interpolate.
+        notes: what the user should know.
+    """
+
+    lens: ZoomLens
+    at_nodes: float
+    between: float | None
+    notes: tuple[str, ...]
 
 
 def lens_of(
@@ -48,7 +77,7 @@ def lens_of(
     zoom: AbstractLinearZoom | None,
     terms: int | None,
     family: AbstractFamily | None = None,
-) -> tuple[ZoomLens, float, tuple[str, ...]]:
+) -> Made:
     """The zoom lens of a file's contents.
 
     Args:
@@ -57,71 +86,145 @@ def lens_of(
         terms: number of radial coefficients; None for two of a `SmoothZoom`, else for those of the file
             where its formula is ours, or four.
         family: the distortion model; None for that which holds the file's values, or is nearest to them.
-
-    Returns:
-        The lens, its greatest error at the nodes, px of the corrected image, and notes.
     """
+    if terms is None and family is None and (zoom is None or _keeps_all(zoom)):
+        made = None if contents.table is None else _of_table(contents, contents.table, zoom is None)
+        if made is not None:
+            return made
     nodes = sorted(_averaged(contents.nodes), key=lambda node: node.focal)
-    focal = np.array([node.focal for node in nodes])
     size, notes = contents.image_size, list(contents.notes)
     if sampled := [node for node in nodes if isinstance(node, Sampled)]:
         centre, family = centre_and_family(sampled, size, family)
         nodes = [dataclasses.replace(node, centre=centre) for node in nodes]
-    scale, centres = math.hypot(*size) / 2, [_centre(node, size) for node in nodes]
-    centre = np.mean(centres, axis=0)
-    found = [_pairs(node, size) for node in nodes]
-    if short := [f"{node.focal:g}" for node, (_, _, whole) in zip(nodes, found, strict=True) if not whole]:
+    own, exact = _family(nodes, terms)
+    family, exact = (own, exact) if family is None or type(family) is type(own) else (family, False)
+    if zoom is None:
+        zoom = _default_zoom(family, len(nodes), terms)
+    count = terms or (_TERMS if isinstance(zoom, SmoothZoom) else _terms(nodes, exact))
+    seen = [seen_of(node, size) for node in nodes]
+    if short := [f"{each.node.focal:g}" for each in seen if not each.whole]:
         notes.append(
             f"The file's distortion turns back before the border of the image at {', '.join(short)} "
             f"{contents.focal_unit}: the lens is not validated beyond."
         )
-    points = [
-        (d + (c - centre) / scale, u + (c - centre) / scale)
-        for (d, u, _), c in zip(found, centres, strict=True)
-    ]
-    any_scale = [isinstance(node, Node) and node.form.any_scale for node in nodes]
-    own, exact = _family(nodes, terms)
-    family, exact = (own, exact) if family is None or type(family) is type(own) else (family, False)
-    if zoom is None:
-        zoom = _default_zoom(family, len(focal), terms)
-    count = terms or (_TERMS if isinstance(zoom, SmoothZoom) else _terms(nodes, exact))
-    model = _fitted(zoom, focal, points, any_scale, family, count)
-    spread = np.ptp(centres, axis=0).max()
-    if spread > 0.5:
+    lens, at_nodes, between, note = _following(contents, seen, zoom, family, count)
+    stretched = [abs(n.stretch[0] / n.stretch[1] - 1) for n in nodes if isinstance(n, Node)]
+    if (most := max(stretched, default=0.0)) > _NOT_SQUARE:
+        notes.append(f"The file's pixels are up to {100 * most:.2g} % from square: the lens's are square.")
+    if at_nodes > _MUCH and len(nodes) > 1 and not isinstance(zoom, TableZoom):
+        notes.append("The zoom model smooths the file's values: a table, TableZoom(), keeps them.")
+    elif between is not None and between > _MUCH and not isinstance(zoom, TableZoom):
         notes.append(
-            f"The file's centres differ by up to {spread:.2g} px: their mean is the lens's centre."
+            f"Between the file's focal lengths the lens is smooth, up to {between:.2g} px from the tool's "
+            "own interpolation: a table, TableZoom(), keeps to that."
         )
+    return Made(lens, at_nodes, between, (*notes, *note))
+
+
+def _following(
+    contents: Contents, seen: list[Seen], zoom: AbstractLinearZoom, family: AbstractFamily, terms: int
+) -> tuple[ZoomLens, float, float | None, tuple[str, ...]]:
+    """The lens through nodes, its errors at and between them, and notes.
+
+    A table gets entries of the tool's own interpolation, more and more, until it follows that.
+    """
+    between, size = contents.between, contents.image_size
+    if between is None or len(seen) == 1:
+        lens, notes = _lens(contents, seen, zoom, family, terms)
+        return lens, _error(lens, seen), None, notes
+    nodes = [each.node for each in seen]
+    checked = inside(between, nodes, _CHECKED, size)
+    levels = _SHARES if _keeps_all(zoom) else _SHARES[:1]
+    for shares in levels:
+        more = inside(between, nodes, shares, size)
+        told = sorted([*seen, *more], key=lambda each: each.node.focal)
+        lens, notes = _lens(contents, told, zoom, family, terms)
+        at_nodes, error = _error(lens, seen), _error(lens, checked)
+        if error <= max(TOLERANCE, at_nodes) or shares is levels[-1]:
+            return lens, at_nodes, error, notes
+    raise AssertionError
+
+
+def _keeps_all(zoom: AbstractLinearZoom) -> bool:
+    """Whether it is a table with entries wherever there are values."""
+    return isinstance(zoom, TableZoom) and zoom.number is None and zoom.parameters is None
+
+
+def _of_table(contents: Contents, table: RadialTable, auto: bool) -> Made | None:
+    """The lens of a tool's table of radial polynomials, as in the library of lenses; None if it folds."""
+    [centre] = {tuple(np.asarray(node.centre, float).tolist()) for node in contents.nodes}
+    size, model = contents.image_size, "auto" if auto else "table"
+    found = zoom_of_table(table, centre=np.array(centre), image_size=size, model=model)
+    if found is None:
+        return None
+    notes = list(contents.notes)
+    if found.short:
+        where = ", ".join(f"{focal:g}" for focal in found.short)
+        notes.append(
+            f"The file's distortion turns back before the border of the image at {where} "
+            f"{contents.focal_unit}: the lens is not validated beyond."
+        )
+    lens = ZoomLens(
+        found.zoom,
+        jnp.asarray(centre),
+        jnp.asarray([table.focal[0], table.focal[-1]]),
+        size,
+        focal_unit=contents.focal_unit,
+        pixel_pitch=contents.pixel_pitch,
+        about=contents.about,
+    )
+    return Made(lens, found.at_nodes, found.between if len(table.focal) > 1 else None, tuple(notes))
+
+
+def _lens(
+    contents: Contents, seen: list[Seen], zoom: AbstractLinearZoom, family: AbstractFamily, terms: int
+) -> tuple[ZoomLens, tuple[str, ...]]:
+    """The lens of least squares through nodes, and what is to be said of its centre."""
+    size = contents.image_size
+    scale, focal = math.hypot(*size) / 2, np.array([each.node.focal for each in seen])
+    own = np.array([each.node.centre for each in seen], float)
+    centre, shift, notes = np.mean(own, axis=0), None, ()
+    if np.ptp(own, axis=0).max() > _MOVED and len(seen) > 1:
+        shift = TableZoom() if _keeps_all(zoom) else PolynomialZoom(1)
+        shift, moved = _through(shift, focal, (own - centre) / scale)
+        off = np.hypot(*(own - centre - scale * moved).T).max()
+        notes = (
+            f"The lens's centre moves along the zoom, as the file's do, by up to "
+            f"{np.ptp(own, axis=0).max():.2g} px"
+            + (f"; they scatter by up to {off:.2g} px about it." if off > _MOVED else "."),
+        )
+    else:
+        moved = np.zeros_like(own)
+    points = [each.about(centre + scale * by, scale) for each, by in zip(seen, moved, strict=True)]
+    model = _fitted(zoom, focal, points, [each.any_scale for each in seen], family, terms)
     lens = ZoomLens(
         model,
         jnp.asarray(centre),
         jnp.asarray([focal[0], focal[-1]]),
         size,
         focal_unit=contents.focal_unit,
+        shift=shift,
         family=family,
+        pixel_pitch=contents.pixel_pitch,
+        about=contents.about,
     )
-    worst = _worst(lens, focal, points, any_scale)
-    stretched = [abs(node.stretch[0] / node.stretch[1] - 1) for node in nodes if isinstance(node, Node)]
-    if (most := max(stretched, default=0.0)) > 0:
-        notes.append(f"The file's pixels are up to {100 * most:.2g} % from square: the lens's are square.")
-    if worst > _MUCH and len(focal) > 1 and not isinstance(model, TableZoom):
-        notes.append("The zoom model smooths the file's values: a table, TableZoom(), keeps them.")
-    return lens, worst, tuple(notes)
+    return lens, notes
+
+
+def _through(
+    zoom: AbstractLinearZoom, focal: np.ndarray, values: np.ndarray
+) -> tuple[AbstractLinearZoom, np.ndarray]:
+    """A zoom model of least squares through values at focal lengths, and what it is there."""
+    prepared = zoom.prepare(jnp.asarray(focal), values.shape[1])
+    assert isinstance(prepared, AbstractLinearZoom)
+    basis = np.asarray(jax.vmap(prepared.basis)(jnp.asarray(focal)), float)
+    parameters = np.linalg.lstsq(basis, values, rcond=None)[0]
+    return with_parameters(prepared, jnp.asarray(parameters)), basis @ parameters
 
 
 def _averaged(nodes: tuple[Node | Sampled, ...]) -> list[Node | Sampled]:
     """One node for each focal length: of several, as in a track that stands still, the first."""
     return list({node.focal: node for node in reversed(nodes)}.values())
-
-
-def _centre(node: Node | Sampled, size: tuple[int, int]) -> np.ndarray:
-    return (np.array(size) - 1) / 2 if node.centre is None else np.asarray(node.centre, float)
-
-
-def _pairs(node: Node | Sampled, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, bool]:
-    if not isinstance(node, Sampled):
-        return pairs_of(node, size)
-    centre, scale = _centre(node, size), math.hypot(*size) / 2
-    return (node.distorted - centre) / scale, (node.corrected - centre) / scale, True
 
 
 def _family(nodes: list[Node | Sampled], terms: int | None) -> tuple[AbstractFamily, bool]:
@@ -173,14 +276,16 @@ def _fitted(
         raise UnsuitedError(str(error)) from error
     assert isinstance(prepared, AbstractLinearZoom)
     basis = np.asarray(jax.vmap(prepared.basis)(jnp.asarray(focal)), float)  # (node, basis)
+    equations = [
+        _scaled_equations(family, *pair, terms, scaled)
+        for pair, scaled in zip(points, any_scale, strict=True)
+    ]
+    if _keeps_all(zoom):  # each node by itself
+        rows = np.array([np.linalg.lstsq(*pair, rcond=None)[0] for pair in equations])
+        return with_parameters(prepared, jnp.asarray(basis.T @ rows))  # a permutation
     rows, right = [], []
-    for phi, (distorted, corrected), scaled in zip(basis, points, any_scale, strict=True):
-        matrix, change = _equations(family, distorted, corrected, terms)
-        if scaled:  # the scale is one more unknown, which drops out
-            outwards = corrected.ravel() / np.linalg.norm(corrected)
-            matrix = matrix - np.outer(outwards, outwards @ matrix)
-            change = change - outwards * (outwards @ change)
-        share = 1 / math.sqrt(len(distorted))
+    for phi, (matrix, change) in zip(basis, equations, strict=True):
+        share = math.sqrt(2 / len(change))  # of one point
         rows.append(np.einsum("b,rk->rbk", phi, matrix).reshape(len(matrix), -1) * share)
         right.append(change * share)
     if isinstance(prepared, AbstractPriorZoom):
@@ -189,6 +294,18 @@ def _fitted(
         right.append(np.zeros(len(prior)))
     a = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
     return with_parameters(prepared, jnp.asarray(a.reshape(basis.shape[1], size)))
+
+
+def _scaled_equations(
+    family: AbstractFamily, distorted: np.ndarray, corrected: np.ndarray, terms: int, any_scale: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Those of `_equations`, without the unknown scale of corrected points, if they have one."""
+    matrix, change = _equations(family, distorted, corrected, terms)
+    if any_scale:  # it is one more unknown, which drops out
+        outwards = corrected.ravel() / np.linalg.norm(corrected)
+        matrix = matrix - np.outer(outwards, outwards @ matrix)
+        change = change - outwards * (outwards @ change)
+    return matrix, change
 
 
 def _equations(
@@ -216,15 +333,25 @@ def _prior(zoom: AbstractPriorZoom, number: int) -> np.ndarray:
     return float(zoom.error) * np.asarray(jax.vmap(row, out_axes=1)(jnp.eye(number)), float)
 
 
-def _worst(lens: ZoomLens, focal: np.ndarray, points: list[Pairs], any_scale: list[bool]) -> float:
-    """The greatest distance of corrected points to those of the file, px."""
-    worst, centre = 0.0, np.asarray(lens.centre)
-    for distortion, (distorted, corrected), scaled in zip(
-        distortions(lens, focal), points, any_scale, strict=True
-    ):
-        found = (np.asarray(distortion.undistort(distorted * lens.scale + centre)) - centre) / lens.scale
-        if scaled:
-            corrected = corrected * np.sum(found * corrected) / np.sum(corrected * corrected)
-        distance = np.hypot(*(found - corrected).T)
-        worst = max(worst, float(distance.max()) if np.isfinite(distance).all() else np.inf)
-    return worst * lens.scale
+def _error(lens: ZoomLens, seen: list[Seen]) -> float:
+    """The greatest distance of the lens from nodes, px."""
+    each = distortions(lens, np.array([one.node.focal for one in seen]))
+    return max(_distance(*pair, lens.scale) for pair in zip(each, seen, strict=True))
+
+
+def _distance(distortion: Distortion, seen: Seen, scale: float) -> float:
+    """The greatest distance from a node, px, in the image into which the file maps.
+
+    Where the lens does not reach, it is that in the other image.
+    """
+    centre = np.asarray(distortion.centre, float)
+    distorted, corrected = seen.about(centre, scale)
+    found = (np.asarray(distortion.undistort(distorted * scale + centre)) - centre) / scale
+    if seen.any_scale:
+        corrected = corrected * np.sum(found * corrected) / np.sum(corrected * corrected)
+    distance = np.hypot(*(found - corrected).T)
+    if not seen.corrects:
+        back = (np.asarray(distortion.distort(corrected * scale + centre)) - centre) / scale
+        other = np.hypot(*(back - distorted).T)
+        distance = np.where(np.isfinite(other), other, distance)
+    return float(distance.max() * scale) if np.isfinite(distance).all() else np.inf

@@ -21,6 +21,9 @@ from .base import Contents, Export, Import, InterpolatedFormat, Node, read_text
 _SQUARE = 0.01
 """Share by which fx and fy may differ."""
 
+_SAME = 0.01
+"""Share by which pixel pitches of several focal lengths may differ: labels on lenses are rounded."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Pinhole:
@@ -115,13 +118,38 @@ def focal_px(fx: Any, fy: Any) -> tuple[float, tuple[float, float]]:
     return f, (fx / f, fy / f)
 
 
-def contents(nodes: list[Node], size: tuple[int, int], job: Import) -> Contents:
-    """Of cameras whose focal lengths are in px, unless other ones are given in mm."""
+def contents(
+    nodes: list[Node],
+    size: tuple[int, int],
+    job: Import,
+    *,
+    px: list[float] | None = None,
+    mm: bool = False,
+) -> Contents:
+    """Of cameras with focal lengths in px, or in mm if the file or argument focal has such.
+
+    Args:
+        nodes: the cameras.
+        size: (width, height) px.
+        job: what is given.
+        px: focal length of each in px; by default that of the node, as for a file in px.
+        mm: whether the nodes' own focal lengths are in mm.
+    """
+    px = [node.focal for node in nodes] if px is None and not mm else px
     if job.focal is not None:
         if len(job.focal) != len(nodes):
             raise ValueError(f"argument focal must hold {len(nodes)} focal lengths, one for each camera")
         nodes = [dataclasses.replace(n, focal=f) for n, f in zip(nodes, job.focal, strict=True)]
-    return Contents(tuple(nodes), size, "px" if job.focal is None else "mm")
+    mm = mm or job.focal is not None
+    pitch = pitch_of([node.focal for node in nodes], px) if mm and px is not None else None
+    return Contents(tuple(nodes), size, "mm" if mm else "px", pixel_pitch=pitch)
+
+
+def pitch_of(mm: list[float], px: list[float]) -> float | None:
+    """The pixel pitch of focal lengths in mm and in px; None where it is not the same for all."""
+    found = np.array(mm) / np.array(px)
+    mean = float(found.mean()) if found.size else math.nan
+    return mean if np.ptp(found) <= _SAME * mean else None
 
 
 def matrix_rows(camera: Pinhole) -> list[list[float]]:

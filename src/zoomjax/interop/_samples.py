@@ -9,6 +9,7 @@ from .._core.text import plain
 from ..models.distortion import Distortion
 from ..models.family import AbstractRadial
 from ..models.lens import ZoomLens
+from ..models.tables import TableZoom
 from .base import Node
 
 _RAYS, _RADII = 16, 24
@@ -17,12 +18,19 @@ _RAYS, _RADII = 16, 24
 _AT_ONCE = 16
 """Focal lengths that a lens is asked for at once: JAX compiles for each number of them."""
 
+Pairs = tuple[np.ndarray, np.ndarray]
+"""Distorted and corrected points, or what a formula maps and what to, each (point, 2)."""
+
 _BEYOND, _STEPS = 4.0, 800
 """How far the corrected radius is followed, in units of the corner's, and in how many steps."""
 
 
 def distortions(lens: ZoomLens, focal: Float[np.ndarray, "focal"]) -> list[Distortion]:
     """The distortion at each focal length, of NumPy arrays in float64."""
+    if isinstance(lens.zoom, TableZoom) and lens.shift is None:  # each of which JAX would compile anew
+        lens.check_range(focal, stacklevel=3)
+        k, centre = _of_table(lens.zoom, np.asarray(focal, float)), np.asarray(lens.centre, float)
+        return [Distortion(row, centre, np.float64(lens.scale), lens.family) for row in k]
     found = []
     for first in range(0, len(focal), _AT_ONCE):
         part = np.asarray(focal[first : first + _AT_ONCE], float)
@@ -35,10 +43,17 @@ def distortions(lens: ZoomLens, focal: Float[np.ndarray, "focal"]) -> list[Disto
     return found
 
 
+def _of_table(zoom: TableZoom, focal: np.ndarray) -> np.ndarray:
+    """The coefficients of a table, by NumPy."""
+    knots, values = np.asarray(zoom.knots, float), np.asarray(zoom.parameters, float)
+    x = 1 / focal if zoom.inverse else focal
+    return np.stack([np.interp(x, knots, column) for column in values.T], axis=-1)
+
+
 def pairs(
-    distortion: Distortion, size: tuple[int, int], focal: float, *, all_rays: bool = False
-) -> tuple[Float[np.ndarray, "point 2"], Float[np.ndarray, "point 2"]]:
-    """Distorted and corrected points of an image, in half diagonals from the centre.
+    each: list[Distortion], size: tuple[int, int], focal: Float[np.ndarray, "focal"], *, all_rays: bool
+) -> list[Pairs]:
+    """Distorted and corrected points of an image at focal lengths, in half diagonals from the centre.
 
     A radial distortion is the same in all directions: one ray, to the farthest corner, tells it all unless
     `all_rays` are asked for.
@@ -46,20 +61,26 @@ def pairs(
     Raises:
         ValueError: the image folds over.
     """
-    centre, scale = np.asarray(distortion.centre), float(distortion.scale)
-    ends = border(size, centre)
-    if isinstance(distortion.family, AbstractRadial) and not all_rays:
-        ends = ends[[np.argmax(np.hypot(*ends.T))]]
+    first = each[0]
+    centres, scale = np.array([one.centre for one in each], float), float(first.scale)
+    ends = np.array([border(size, centre) for centre in centres])
+    if isinstance(first.family, AbstractRadial) and not all_rays:
+        farthest = np.argmax(np.hypot(ends[..., 0], ends[..., 1]), axis=1)
+        ends = ends[np.arange(len(ends)), farthest][:, None]
     part = np.sin(np.linspace(0, np.pi / 2, _RADII + 1)[1:])
-    distorted = (part[:, None, None] * ends).reshape(-1, 2)
-    corrected = (np.asarray(distortion.undistort(distorted + centre)) - centre) / scale
-    if not np.isfinite(corrected).all():
+    distorted = (part[:, None, None] * ends[:, None]).reshape(len(each), -1, 2)
+    k = np.array([one.coefficients for one in each], float)
+    together = Distortion(k, centres, np.full(len(each), scale), first.family)
+    corrected = np.asarray(together.undistort(distorted + centres[:, None])) - centres[:, None]
+    whole = np.isfinite(corrected).all(axis=(1, 2))
+    if not whole.all():
+        where = f"{focal[np.argmin(whole)]:g}"
         raise ValueError(
-            f"The lens folds over within the image at the focal length {focal:g}, and has no corrected "
+            f"The lens folds over within the image at the focal length {where}, and has no corrected "
             "points there: zj.models.certify says where. Fit it again with fewer terms, or export focal "
             "lengths at which it does not."
         )
-    return distorted / scale, corrected
+    return list(zip(distorted / scale, corrected / scale, strict=True))
 
 
 def border(size: tuple[int, int], centre: np.ndarray) -> Float[np.ndarray, "ray 2"]:

@@ -8,6 +8,7 @@ written is read again: the error that is reported is that of the file.
 
 import dataclasses
 import itertools
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,11 @@ import numpy as np
 from ..models.brown_conrady import BrownConrady
 from ..models.distortion import Distortion
 from ..models.division import Division
+from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
+from ..models.tables import TableZoom
 from ._forms import AbstractForm, Form
-from ._samples import distortions, pairs
+from ._samples import Pairs, distortions, pairs
 from .base import Export, Format, Import, InterpolatedFormat, Node, NodeFormat
 
 _FEW = 5
@@ -28,6 +31,12 @@ _NUMBERS = (2, 3, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97, 129)
 
 _BETWEEN = (0.2, 0.5, 0.8)
 """Where errors are looked at, between two focal lengths."""
+
+_IDLE, _GAIN, _ENOUGH = 2, 0.95, 17
+"""The search ends where so many tries have not brought the error below that share, with enough nodes."""
+
+_APART = 1.001
+"""Ratio of focal lengths that are told apart."""
 
 _NEAR = 1.05
 """Beyond the tolerance, errors between focal lengths are not worth more nodes at this ratio to theirs."""
@@ -58,11 +67,34 @@ def solve(fmt: NodeFormat, job: Export) -> Solution:
         return Solution(*maker.nodes(focal), None)
     if job.focal is not None:
         return _checked(fmt, *maker.nodes(focal), job)
-    for number in _NUMBERS:
-        found = _checked(fmt, *maker.nodes(fmt.spread(low, high, number)), job)
-        if (found.between or 0.0) <= max(job.tolerance, _NEAR * found.at_nodes) or number == _NUMBERS[-1]:
+    tried: list[Solution] = []
+    for focal in _places(fmt, job.lens, low, high):
+        found = _checked(fmt, *maker.nodes(focal), job)
+        if found.worst <= job.tolerance:
             return found
-    raise AssertionError
+        tried.append(found)
+        if (found.between or 0.0) <= _NEAR * found.at_nodes:
+            break
+        worst = [solution.worst for solution in tried]
+        idle = len(tried) > _IDLE and min(worst[-_IDLE:]) > _GAIN * min(worst[:-_IDLE])
+        if idle and len(focal) >= _ENOUGH:
+            break
+    least = min(solution.worst for solution in tried)
+    return next(solution for solution in tried if solution.worst <= least / _GAIN)
+
+
+def _places(fmt: InterpolatedFormat, lens: ZoomLens, low: float, high: float) -> Iterator[np.ndarray]:
+    """Focal lengths of the nodes, more and more: the lens's own, where it is a table, else spread out."""
+    most, zoom = _NUMBERS[-1], lens.zoom
+    if isinstance(zoom, TableZoom) and zoom.knots is not None:
+        own = np.asarray(zoom.knots, float)
+        own = 1 / own if zoom.inverse else own
+        own = np.unique([low, *own[(own > low * _APART) & (own < high / _APART)], high])
+        while len(own) <= most:
+            yield own
+            own = np.sort(np.concatenate([own, (own[1:] + own[:-1]) / 2]))
+    for number in _NUMBERS:
+        yield fmt.spread(low, high, number)
 
 
 def _makers(fmt: NodeFormat, focal: np.ndarray, job: Export) -> list[tuple["_Maker", float]]:
@@ -86,29 +118,29 @@ class _Maker:
         """A node at each focal length, and the greatest error at one, px."""
         missing = np.array(sorted({float(f) for f in focal} - set(self.made)))
         if missing.size:
-            for f, distortion in zip(missing, distortions(self.job.lens, missing), strict=True):
-                self.made[float(f)] = self._node(float(f), distortion)
+            each = distortions(self.job.lens, missing)
+            ends = _from_to(self.form, each, missing, self.job)
+            for f, distortion, pair in zip(missing, each, ends, strict=True):
+                self.made[float(f)] = self._node(float(f), distortion, *pair)
         nodes, errors = zip(*(self.made[float(f)] for f in focal), strict=True)
         frames = self.job.frames or [None] * len(nodes)
         nodes = [dataclasses.replace(n, frame=frame) for n, frame in zip(nodes, frames, strict=True)]
         return nodes, max(errors)
 
-    def _node(self, focal: float, distortion: Distortion) -> tuple[Node, float]:
-        job, centre = self.job, np.asarray(distortion.centre)
-        start, end = _from_to(self.form, distortion, focal, job)
+    def _node(
+        self, focal: float, distortion: Distortion, start: np.ndarray, end: np.ndarray
+    ) -> tuple[Node, float]:
+        centre = np.asarray(distortion.centre)
         theta = same(self.form, distortion)
         theta = self.form.fit(start, end) if theta is None else theta
         node = Node(focal, self.form, theta, centre)
-        return node, _error(node, centre, start, end, job)
+        return node, _error(node, centre, start, end, self.job)
 
 
-def _from_to(
-    form: AbstractForm, distortion: Distortion, focal: float, job: Export
-) -> tuple[np.ndarray, np.ndarray]:
+def _from_to(form: AbstractForm, each: list[Distortion], focal: np.ndarray, job: Export) -> list[Pairs]:
     """The points that a formula maps, and what to, in half diagonals from the centre."""
-    all_rays = job.lens.shift is not None
-    distorted, corrected = pairs(distortion, job.lens.image_size, focal, all_rays=all_rays)
-    return (distorted, corrected) if form.corrects else (corrected, distorted)
+    found = pairs(each, job.lens.image_size, focal, all_rays=job.lens.shift is not None)
+    return found if form.corrects else [(corrected, distorted) for distorted, corrected in found]
 
 
 def _checked(fmt: InterpolatedFormat, nodes: list[Node], at_nodes: float, job: Export) -> Solution:
@@ -119,11 +151,12 @@ def _checked(fmt: InterpolatedFormat, nodes: list[Node], at_nodes: float, job: E
     inside = np.concatenate([a + (b - a) * np.array(_BETWEEN) for a, b in itertools.pairwise(focal)])
     worst = {True: at_nodes, False: 0.0}
     tried = np.concatenate([focal, inside])
-    for place, (f, distortion) in enumerate(zip(tried, distortions(job.lens, tried), strict=True)):
+    each = distortions(job.lens, tried)
+    ends = _from_to(nodes[0].form, each, tried, job)
+    for place, (f, distortion, pair) in enumerate(zip(tried, each, ends, strict=True)):
         read = fmt.native(fmt.interpolate(focal, numbers, float(f)), float(f), nodes[0], job)
-        start, end = _from_to(nodes[0].form, distortion, float(f), job)
         at_node = place < len(focal)
-        error = _error(read, np.asarray(distortion.centre), start, end, job)
+        error = _error(read, np.asarray(distortion.centre), *pair, job)
         worst[at_node] = max(worst[at_node], error)
     return Solution(nodes, worst[True], worst[False] if len(focal) > 1 else None)
 
@@ -147,14 +180,17 @@ def error_written(fmt: Format, nodes: list[Node], job: Export, files: list[Path]
     parts = [nodes] if len(files) == 1 else [[node] for node in nodes]
     focal = sorted({node.focal for node in nodes})
     exact = dict(zip(focal, distortions(job.lens, np.array(focal)), strict=True))
+    ends: dict[AbstractForm, dict[float, Pairs]] = {}
     worst = 0.0
     for file, part in zip(files, parts, strict=True):
         told = tuple(node.focal for node in part)
         found = fmt.read(Import(file, (file,), job.lens.image_size, told)).nodes
         for node, f in zip(found, told, strict=True):
             assert isinstance(node, Node)
-            start, end = _from_to(node.form, exact[f], f, job)
-            worst = max(worst, _error(node, np.asarray(exact[f].centre), start, end, job))
+            if node.form not in ends:
+                all_of_them = _from_to(node.form, list(exact.values()), np.array(focal), job)
+                ends[node.form] = dict(zip(focal, all_of_them, strict=True))
+            worst = max(worst, _error(node, np.asarray(exact[f].centre), *ends[node.form][f], job))
     return worst
 
 

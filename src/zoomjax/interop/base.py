@@ -8,6 +8,7 @@ how the tool interpolates between focal lengths. Which focal lengths and coeffic
 
 import abc
 import dataclasses
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from ..models.lens import ZoomLens
 from ._forms import AbstractForm
+from .radial_table import RadialTable
 
 TOLERANCE, CONVENTION = 0.1, "centres"
 """What is taken if it is not given."""
@@ -56,12 +58,14 @@ class Sampled:
         focal: focal length in the lens's unit.
         distorted, corrected: the pairs, (point, 2).
         centre: centre of distortion, px; None if not known.
+        corrects: whether the file maps distorted to corrected points.
     """
 
     focal: float
     distorted: np.ndarray
     corrected: np.ndarray
     centre: np.ndarray | None = None
+    corrects: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +78,7 @@ class Report:
         at_nodes: the greatest error at the nodes, px, over the whole image. A file that maps corrected to
             distorted points is judged in the distorted image, others in the corrected one.
         between: the greatest error between the nodes, where the tool interpolates, px; None where it does
-            not.
+            not. Of a file that was read: against the tool's own interpolation.
         notes: what the user should know: how the file is to be used, and where the format cannot do better.
         files: the files written, or read.
     """
@@ -189,12 +193,21 @@ class Contents:
         image_size: (width, height) px.
         focal_unit: "mm" or "px".
         notes: what the user should know.
+        pixel_pitch: mm from one pixel to the next; None if the file does not say it.
+        about: words and numbers for `ZoomLens.about`.
+        between: where the tool interpolates, what it makes of the interval after the node of a number, in
+            the order of focal lengths, at a share of the way; None where it does not.
+        table: the nodes as the tool's table of radial polynomials, where it is one.
     """
 
     nodes: tuple[Node | Sampled, ...]
     image_size: tuple[int, int]
     focal_unit: str
     notes: tuple[str, ...] = ()
+    pixel_pitch: float | None = None
+    about: Mapping[str, str | float] = dataclasses.field(default_factory=dict)
+    between: Callable[[int, float], Node] | None = None
+    table: RadialTable | None = None
 
 
 def one_size(sizes: list[tuple[int, int]]) -> tuple[int, int]:
@@ -221,6 +234,7 @@ class Format(abc.ABC):
         tools: who reads it.
         suffixes: of its files; the first is that of files written.
         exact: whether the tool's formula is ours, so that radial polynomials lose nothing but digits.
+        exact_for: a distortion model that is exact in a format that is not; None if there is none.
         zoom: what the format knows of zooming: "one" focal length a file, a "list" of independent ones, or
             "interpolated" between its nodes.
         writes: whether it is written, too.
@@ -233,6 +247,7 @@ class Format(abc.ABC):
     tools: ClassVar[str]
     suffixes: ClassVar[tuple[str, ...]]
     exact: ClassVar[bool] = False
+    exact_for: ClassVar[str | None] = None
     zoom: ClassVar[str] = "one"
     writes: ClassVar[bool] = True
     note: ClassVar[str | None] = None

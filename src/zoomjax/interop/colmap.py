@@ -30,6 +30,7 @@ class COLMAP(NodeFormat):
 
     name, tools, suffixes = "colmap", "COLMAP, GLOMAP, gsplat", (".txt",)
     zoom = "list"
+    exact_for = "division"
 
     def forms(self, lens: ZoomLens):
         """One term of division, which is ours, or rational, three over three."""

@@ -5,12 +5,17 @@ takes camera matrix and coefficients, which are for radii in focal lengths, as l
 ends.
 """
 
+import dataclasses
 import json
+from collections.abc import Callable
 
 import numpy as np
 
 from ._pinhole import Pinholes, contents, formula, from_opencv, matrix_rows, pinhole
 from .base import Contents, Export, Import, Node, one_size, read_text
+
+_MOST = 8
+"""Coefficients that are read."""
 
 
 class Gyroflow(Pinholes):
@@ -44,8 +49,8 @@ class Gyroflow(Pinholes):
             "note": "",
             "calibrated_by": "zoomjax",
             "camera_brand": "",
-            "camera_model": "",
-            "lens_model": "zoomjax",
+            "camera_model": str(job.lens.about.get("camera", "")),
+            "lens_model": str(job.lens.about.get("lens", "zoomjax")),
             "calibrator_version": "zoomjax",
             "focal_length": first["focal_length"],
             "fisheye_params": {key: first[key] for key in ("camera_matrix", "distortion_coeffs")},
@@ -67,7 +72,7 @@ class Gyroflow(Pinholes):
         model = table.get("distortion_model", "opencv_fisheye")
         if model != "opencv_standard":
             raise ValueError(f"its distortion model {model!r} is not opencv_standard")
-        nodes, sizes = [], []
+        nodes, sizes, numbers = [], [], []
         entries = table.get("interpolations") or {}
         mm = bool(entries) or bool(table.get("focal_length"))
         for key, own in (entries or {table.get("focal_length"): {}}).items():
@@ -77,8 +82,23 @@ class Gyroflow(Pinholes):
             matrix = np.array(parameters["camera_matrix"], float)
             if not table.get("asymmetrical"):
                 matrix[:2, 2] = np.array(size) / 2
-            k = parameters["distortion_coeffs"]
+            k = np.asarray(parameters["distortion_coeffs"], float).ravel()
             nodes.append(from_opencv(float(key) if mm else None, matrix, k, size))
+            numbers.append(np.concatenate([matrix.ravel(), k[:_MOST], np.zeros(max(0, _MOST - len(k)))]))
             sizes.append(size)
-        found = contents(nodes, one_size(sizes), job)
-        return Contents(found.nodes, found.image_size, "mm" if mm else found.focal_unit)
+        size = one_size(sizes)
+        found = contents(nodes, size, job, px=[float(row[0]) for row in numbers], mm=mm)
+        at = {node.focal: row for node, row in zip(found.nodes[::-1], numbers[::-1], strict=True)}
+        return dataclasses.replace(found, between=_linear(at, size) if entries else None)
+
+
+def _linear(numbers: dict[float, np.ndarray], size: tuple[int, int]) -> Callable[[int, float], Node]:
+    """Gyroflow's own interpolation: camera matrix and coefficients are linear in f."""
+    focal = sorted(numbers)
+
+    def between(i: int, share: float) -> Node:
+        low, high = focal[i : i + 2]
+        values = (1 - share) * numbers[low] + share * numbers[high]
+        return from_opencv((1 - share) * low + share * high, values[:9], values[9:], size)
+
+    return between

@@ -2,8 +2,9 @@
 
 Radial coefficients 1 to 3 are OpenCV's k1, k2, k3, for radii in focal lengths; ``FocalLengthX`` is the
 focal length as a share of the image's longer side, ``FocalLengthY`` the same for y, and the centre a share
-of its width and height. Of entries at one focal length, that of the farthest focus counts. Whether centres
-count from pixel centres or corners is not documented: here from corners.
+of its width and height. Between entries all are linear in log f. Of entries at one focal length, that of
+the farthest focus counts. Whether centres count from pixel centres or corners is not documented: here from
+corners.
 """
 
 import math
@@ -12,7 +13,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ._pinhole import Pinhole, focal_px, node_of
+from ..io.equipment import FILM
+from ._pinhole import Pinhole, focal_px, node_of, pitch_of
 from .base import Contents, Format, Import, Node, one_size
 
 _CAMERA = "{http://ns.adobe.com/photoshop/1.0/camera-profile}"
@@ -22,6 +24,7 @@ class LCP(Format):
     """Adobe's lens profiles."""
 
     name, tools, suffixes = "lcp", "Adobe Camera Raw, Lightroom, RawTherapee", (".lcp",)
+    zoom = "interpolated"
     writes = False
 
     def recognises(self, head: str) -> bool:
@@ -30,7 +33,7 @@ class LCP(Format):
 
     def read(self, job: Import) -> Contents:
         """All entries with a perspective model."""
-        found: dict[float, tuple[float, Node]] = {}
+        found: dict[float, tuple[float, np.ndarray]] = {}
         sizes = []
         for profile, model in _profiles(ET.parse(job.paths[0]).getroot()):
             stated = (
@@ -42,10 +45,24 @@ class LCP(Format):
             focal = float(profile["FocalLength"])
             far = float(profile.get("FocusDistance", "inf"))
             if focal not in found or far > found[focal][0]:
-                found[focal] = far, _node(focal, model, size)
+                found[focal] = far, _numbers(focal, model, size)
         if not found:
             raise ValueError("it has no perspective model with a focal length")
-        return Contents(tuple(node for _, node in found.values()), one_size(sizes), "mm")
+        size, focal = one_size(sizes), sorted(found)
+        rows = [found[f][1] for f in focal]
+
+        def between(i: int, share: float) -> Node:
+            at = (1 - share) * focal[i] + share * focal[i + 1]
+            t = math.log(at / focal[i]) / math.log(focal[i + 1] / focal[i])
+            return _node(at, (1 - t) * rows[i] + t * rows[i + 1], size)
+
+        return Contents(
+            tuple(_node(f, row, size) for f, row in zip(focal, rows, strict=True)),
+            size,
+            "mm",
+            pixel_pitch=pitch_of(focal, [float(row[0]) * max(size) for row in rows]),
+            between=between,
+        )
 
 
 def _profiles(root: ET.Element) -> Iterator[tuple[dict[str, str], dict[str, str]]]:
@@ -69,11 +86,16 @@ def _values(element: ET.Element) -> dict[str, str]:
     return {name.removeprefix(_CAMERA): value for name, value in pairs if name.startswith(_CAMERA)}
 
 
-def _node(focal: float, model: dict[str, str], size: tuple[int, int]) -> Node:
-    usual = focal / math.hypot(36, 24) * math.hypot(*size) / max(size)
+def _numbers(focal: float, model: dict[str, str], size: tuple[int, int]) -> np.ndarray:
+    """Focal lengths and centre as shares of sides, three radial and two tangential coefficients."""
+    usual = focal / FILM * math.hypot(*size) / max(size)
     share = float(model.get("FocalLengthX", 0)) or usual
-    f, stretch = focal_px(share * max(size), (float(model.get("FocalLengthY", 0)) or share) * max(size))
     place = [float(model.get(name, 0.5)) for name in ("ImageXCenter", "ImageYCenter")]
-    k = np.array([float(model.get(f"RadialDistortParam{i}", 0)) for i in (1, 2, 3)])
-    p = np.array([float(model.get(f"TangentialDistortParam{i}", 0)) for i in (1, 2)])
-    return node_of(Pinhole(focal, f, np.array(place) * size - 0.5, k, p, stretch), size)
+    k = [float(model.get(f"RadialDistortParam{i}", 0)) for i in (1, 2, 3)]
+    p = [float(model.get(f"TangentialDistortParam{i}", 0)) for i in (1, 2)]
+    return np.array([share, float(model.get("FocalLengthY", 0)) or share, *place, *k, *p])
+
+
+def _node(focal: float, numbers: np.ndarray, size: tuple[int, int]) -> Node:
+    f, stretch = focal_px(*(numbers[:2] * max(size)))
+    return node_of(Pinhole(focal, f, numbers[2:4] * size - 0.5, numbers[4:7], numbers[7:], stretch), size)

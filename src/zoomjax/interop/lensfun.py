@@ -17,17 +17,18 @@ the nearest. Files are of version 1, which lensfun 0.3 and later read, in the pi
 import dataclasses
 import math
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from fractions import Fraction
 from typing import ClassVar
+from xml.sax.saxutils import escape
 
 import numpy as np
 
 from .._core.text import plain
+from ..io.equipment import FILM
 from ._forms import AbstractForm, Form, minimax
 from .base import Contents, Export, Import, InterpolatedFormat, Node
-
-DIAGONAL = math.hypot(36, 24)
-"""mm, of crop factor 1."""
+from .radial_table import SPARE, RadialTable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +101,7 @@ class Lensfun(InterpolatedFormat):
 
     def native(self, numbers: np.ndarray, focal: float, like: Node, job: Export) -> Node:
         """What lensfun makes of terms."""
-        return dataclasses.replace(like, focal=focal, theta=_theta(numbers, like.form, job))
+        return dataclasses.replace(like, focal=focal, theta=_theta(numbers, job))
 
     def interpolate(self, focal: np.ndarray, numbers: np.ndarray, at: float) -> np.ndarray:
         """Cubic Hermite polynomials of f times the terms."""
@@ -126,6 +127,7 @@ class Lensfun(InterpolatedFormat):
         offset = nodes[0].centre - (np.array(size) - 1) / 2
         x, y = offset / ((min(size) - 1) / 2)
         model, names = ("poly5", "k1 k2") if isinstance(nodes[0].form, Form) else ("ptlens", "a b c")
+        model_name = str(job.lens.about.get("lens", f"zoomjax {low:.4g}-{high:.4g}mm"))
         entries = []
         for node in nodes:
             terms = zip(names.split(), self.foreign(node, job), strict=True)
@@ -137,8 +139,8 @@ class Lensfun(InterpolatedFormat):
             [
                 '<lensdatabase version="1">',
                 " <lens>",
-                "  <maker>zoomjax</maker>",
-                f"  <model>zoomjax {low:.4g}-{high:.4g}mm</model>",
+                f"  <maker>{escape(str(job.lens.about.get('maker', 'zoomjax')))}</maker>",
+                f"  <model>{escape(model_name)}</model>",
                 "  <mount>Generic</mount>",
                 f"  <cropfactor>{_crop(size, job.pitch):.9g}</cropfactor>",
                 f"  <aspect-ratio>{max(size)}:{min(size)}</aspect-ratio>",
@@ -168,6 +170,8 @@ class Lensfun(InterpolatedFormat):
         lens = _chosen(job)
         size = job.size()
         crop = float(lens.findtext("cropfactor", "1"))
+        if not 0 < crop < math.inf:
+            raise ValueError("its crop factor is not a positive number")
         aspect = float(Fraction(*map(float_fraction, lens.findtext("aspect-ratio", "3:2").split(":"))))
         unit = (
             math.hypot(*(side - 1 for side in size)) / 2 * (job.crop or crop) / crop / math.hypot(aspect, 1)
@@ -176,18 +180,51 @@ class Lensfun(InterpolatedFormat):
         place = lens.find("center")
         offset = [0.0, 0.0] if place is None else [float(place.get(axis, "0")) for axis in "xy"]
         centre = middle + np.array(offset) * (min(size) - 1) / 2
-        entries = lens.findall("calibration/distortion")
-        models = {entry.attrib["model"] for entry in entries} - {"none"}
-        if len(models) > 1:
-            entries = [entry for entry in entries if entry.attrib["model"] == entries[0].attrib["model"]]
+        entries = [e for e in lens.findall("calibration/distortion") if e.attrib["model"] != "none"]
+        if not entries:
+            return Contents((), size, "mm")
+        kinds = dict.fromkeys(entry.attrib["model"] for entry in entries)
+        entries = [entry for entry in entries if entry.attrib["model"] == next(iter(kinds))]
+        found = {float(entry.attrib["focal"]): _read_terms(entry.attrib) for entry in reversed(entries)}
+        focal = np.array(sorted(found))
+        terms = np.array([found[f] for f in focal]).reshape(len(focal), -1)
         ratio = math.hypot(*size) / 2 / unit
-        nodes = [
-            Node(float(entry.attrib["focal"]), *_read_terms(entry.attrib, ratio), centre)
-            for entry in entries
-            if entry.attrib["model"] != "none"
-        ]
+
+        def between(number: int, share: float) -> Node:
+            at = float(focal[number] + share * (focal[number + 1] - focal[number]))
+            return Node(at, *_formula(self.interpolate(focal, terms, at), ratio), centre)
+
+        def polynomial(at: float) -> np.ndarray:
+            return _polynomial(self.interpolate(focal, terms, at))
+
+        nodes = tuple(
+            Node(float(f), *_formula(row, ratio), centre) for f, row in zip(focal, terms, strict=True)
+        )
         scaled = any(node.form.any_scale for node in nodes)
-        return Contents(tuple(nodes), size, "mm", (_SCALED,) * scaled)
+        low, high = float(focal[0]) / SPARE, float(focal[-1]) * SPARE
+        return Contents(
+            nodes,
+            size,
+            "mm",
+            (*_others(kinds), *(_SCALED,) * scaled),
+            pixel_pitch=FILM / ((job.crop or crop) * math.hypot(*size)),
+            about={
+                "lens": plain(lens.findtext("model", "")),
+                "maker": plain(lens.findtext("maker", "")),
+                "crop_factor": job.crop or crop,
+            },
+            between=between,
+            table=RadialTable(tuple(focal.tolist()), (low, high), polynomial, ratio, scaled),
+        )
+
+
+def _others(kinds: Iterable[str]) -> tuple[str, ...]:
+    """What is said of entries of other models than the first, which lensfun leaves out."""
+    first, *others = kinds or ("",)
+    if not others:
+        return ()
+    names = plain(", ".join(others))
+    return (f"Entries of the model {names} are left out, as by lensfun: the first is {plain(first)}.",)
 
 
 def float_fraction(text: str) -> Fraction:
@@ -220,20 +257,33 @@ def _title(lens: ET.Element) -> str:
     return f"{lens.findtext('maker', '')} {lens.findtext('model', '')}".strip()
 
 
-def _read_terms(words: dict[str, str], ratio: float) -> tuple[AbstractForm, np.ndarray]:
-    """The formula of an entry and its coefficients for radii in half diagonals, `ratio` units each."""
+def _read_terms(words: dict[str, str]) -> list[float]:
+    """The terms of an entry: k1, k2 of poly5, or a, b, c."""
     model = words["model"]
     if model == "poly5":
-        form = Form(2)
-        return form, form.rescaled(np.array([float(words.get(name, 0)) for name in ("k1", "k2")]), ratio)
+        return [float(words.get(name, 0)) for name in ("k1", "k2")]
     if model == "poly3":
-        c, b, a = 0.0, float(words.get("k1", 0)), 0.0
-    elif model == "ptlens":
-        a, b, c = (float(words.get(name, 0)) for name in "abc")
-    else:
-        raise ValueError(f"its distortion model {plain(model)!r} is not poly3, poly5 or ptlens")
+        return [0.0, float(words.get("k1", 0)), 0.0]
+    if model == "ptlens":
+        return [float(words.get(name, 0)) for name in "abc"]
+    raise ValueError(f"its distortion model {plain(model)!r} is not poly3, poly5 or ptlens")
+
+
+def _formula(terms: np.ndarray, ratio: float) -> tuple[AbstractForm, np.ndarray]:
+    """The formula of terms and its coefficients for radii in half diagonals, `ratio` units each."""
+    if len(terms) == 2:
+        form = Form(2)
+        return form, form.rescaled(terms, ratio)
     form = PtLens()
-    return form, form.rescaled(_of_unit_slope(np.array([1 - a - b - c, c, b, a])), ratio)
+    return form, form.rescaled(_of_unit_slope(_polynomial(terms)[:4]), ratio)
+
+
+def _polynomial(terms: np.ndarray) -> np.ndarray:
+    """Distorted over corrected radius, by powers of the corrected one."""
+    if len(terms) == 2:
+        return np.array([1.0, 0.0, terms[0], 0.0, terms[1]])
+    a, b, c = terms
+    return np.array([1 - a - b - c, c, b, a, 0.0])
 
 
 def _of_unit_slope(g: np.ndarray) -> np.ndarray:
@@ -243,12 +293,8 @@ def _of_unit_slope(g: np.ndarray) -> np.ndarray:
     return g / g[0] ** np.arange(1, 5)
 
 
-def _theta(terms: np.ndarray, form: AbstractForm, job: Export) -> np.ndarray:
-    ratio = job.lens.scale / _unit(job.lens.image_size)
-    if isinstance(form, Form):
-        return form.rescaled(terms, ratio)
-    a, b, c = terms
-    return form.rescaled(_of_unit_slope(np.array([1 - a - b - c, c, b, a])), ratio)
+def _theta(terms: np.ndarray, job: Export) -> np.ndarray:
+    return _formula(terms, job.lens.scale / _unit(job.lens.image_size))[1]
 
 
 def _one(g: np.ndarray) -> float:
@@ -266,4 +312,4 @@ def _unit(size: tuple[int, int]) -> float:
 
 
 def _crop(size: tuple[int, int], pitch: float) -> float:
-    return DIAGONAL / (math.hypot(*size) * pitch)
+    return FILM / (math.hypot(*size) * pitch)

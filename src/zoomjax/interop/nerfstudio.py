@@ -52,7 +52,7 @@ class Nerfstudio(NodeFormat):
         if (model := table.get("camera_model", "OPENCV")) not in _MODELS:
             raise ValueError(f"its camera model {model!r} is none of {', '.join(_MODELS)}")
         common = {key: table[key] for key in (*_KEYS, "k4") if key in table}
-        nodes, sizes, units = [], [], set()
+        nodes, sizes, px, units = [], [], [], set()
         for frame in table["frames"] or [{}]:
             values = {**frame, **common}
             size = job.size((int(values["w"]), int(values["h"])))
@@ -66,6 +66,8 @@ class Nerfstudio(NodeFormat):
             centre = np.array([values["cx"], values["cy"]]) - 0.5
             nodes.append(node_of(Pinhole(focal, f, centre, k, p, stretch), size))
             sizes.append(size)
+            px.append(f)
             units.add(mm)
-        found = contents(nodes, one_size(sizes), job)
-        return Contents(found.nodes, found.image_size, "mm" if units == {True} else found.focal_unit)
+        if len(units) > 1 and job.focal is None:
+            raise ValueError("some of its focal lengths are in mm and some in px: give argument focal")
+        return contents(nodes, one_size(sizes), job, px=px, mm=units == {True})

@@ -76,7 +76,8 @@ class Nuke(NodeFormat):
         else:
             raise ValueError(f"it holds no focal lengths: give argument focal, {len(frames)} of them")
         nodes = [Node(f, form, row[:-2], row[-2:]) for f, row in zip(told, values, strict=True)]
-        return Contents(tuple(nodes), size, "mm")
+        pitch = 10 * float(knobs["tde4_filmback_width_cm"]) / size[0] if kind == _NODE else None
+        return Contents(tuple(nodes), size, "mm", pixel_pitch=pitch)
 
 
 Keys = dict[int, float]

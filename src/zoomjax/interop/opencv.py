@@ -4,6 +4,8 @@ The rational model with eight coefficients, which follows an inverse polynomial 
 and `cv2.initUndistortRectifyMap` then do as the lens; `cv2.undistortPoints` stops after five iterations.
 """
 
+import numpy as np
+
 from ._pinhole import (
     contents,
     data_of,
@@ -50,7 +52,7 @@ class OpenCV(NodeFormat):
 
     def read(self, job: Import) -> Contents:
         """One file or several; focal lengths in px, or in the unit that zoomjax wrote beside them."""
-        nodes, sizes, units = [], [], set()
+        nodes, sizes, px, units = [], [], [], set()
         for path in job.paths:
             table = load_yaml(path)
             size = job.size(
@@ -59,11 +61,14 @@ class OpenCV(NodeFormat):
             mm = table.get("focal_unit") == "mm"
             coefficients = table.get("distortion_coefficients", table.get("dist_coeffs"))
             focal = float(table["focal_length"]) if mm else None
-            nodes.append(from_opencv(focal, data_of(table["camera_matrix"]), data_of(coefficients), size))
+            matrix = data_of(table["camera_matrix"])
+            nodes.append(from_opencv(focal, matrix, data_of(coefficients), size))
+            px.append(float(np.ravel(matrix)[0]))
             sizes.append(size)
             units.add("mm" if mm else "px")
-        found = contents(nodes, one_size(sizes), job)
-        return Contents(found.nodes, found.image_size, "mm" if units == {"mm"} else found.focal_unit)
+        if len(units) > 1 and job.focal is None:
+            raise ValueError("some of its focal lengths are in mm and some in px: give argument focal")
+        return contents(nodes, one_size(sizes), job, px=px, mm=units == {"mm"})
 
 
 def _matrix(name: str, rows: int, columns: int, values: object) -> list[str]:

@@ -79,7 +79,7 @@ class OpenTrackIO(NodeFormat):
 
     def read(self, job: Import) -> Contents:
         """Samples, one a line, in an array, or one alone; what is static may be in the first of them."""
-        nodes, camera, sizes = [], {}, []
+        nodes, camera, sizes, pitches = [], {}, [], []
         for sample in _samples(read_text(job.paths[0])):
             camera = {**camera, **sample.get("static", {}).get("camera", {})}
             resolution = camera.get("activeSensorResolution")
@@ -87,7 +87,9 @@ class OpenTrackIO(NodeFormat):
             sizes.append(size := job.size(found))
             pitch = float(camera["activeSensorPhysicalDimensions"]["width"]) / size[0]
             nodes.append(_node(sample["lens"], pitch, size))
-        return Contents(tuple(nodes), one_size(sizes), "mm")
+            pitches.append(pitch)
+        pitch = pitches[0] if len(set(pitches)) == 1 else None
+        return Contents(tuple(nodes), one_size(sizes), "mm", pixel_pitch=pitch)
 
 
 def _samples(text: str) -> list[dict]:

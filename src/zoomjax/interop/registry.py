@@ -16,7 +16,8 @@ from .._core.files import refuse_existing, whole_file, whole_folder
 from ..io.focal_track import FocalTrack
 from ..models.family import AbstractFamily
 from ..models.lens import ZoomLens
-from ..models.zoom import AbstractFocusZoom, AbstractLinearZoom
+from ..models.requirements import check
+from ..models.zoom import AbstractLinearZoom
 from ._lens import UnsuitedError, lens_of
 from ._options import check_model, check_options, focal_lengths, positive, positives
 from ._solve import Solution, error_written, solve
@@ -121,8 +122,7 @@ def write(
     path = Path(path)
     fmt = _format_to_write(format, path)
     check_options(fmt, {"tolerance": tolerance, "convention": convention})
-    if isinstance(lens.zoom, AbstractFocusZoom):
-        raise ValueError("Argument lens depends on the focus: choose one first, lens.at_focus(focus).")
+    check("interop.write", zoom=lens.zoom)
     job = Export(
         lens,
         *focal_lengths(fmt, lens, focal, track),
@@ -239,14 +239,15 @@ def read(
                 raise ValueError(f"its focal length {node.focal} is not a positive number")
             if isinstance(node, Node) and not np.isfinite([*node.theta, *node.centre]).all():
                 raise ValueError(f"its coefficients or centre at {node.focal:g} are not finite numbers")
-        lens, worst, notes = lens_of(contents, zoom, terms, family)
+        made = lens_of(contents, zoom, terms, family)
     except (FileNotFoundError, UnsuitedError):
         raise
     except _DAMAGED as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
         raise ValueError(f"Cannot read a {fmt.name} lens from {path}: {reason}.") from error
     nodes = tuple(sorted({node.focal for node in contents.nodes}))
-    return Reading(lens, Report(fmt.name, nodes, worst, None, notes, tuple(paths)))
+    report = Report(fmt.name, nodes, made.at_nodes, made.between, made.notes, tuple(paths))
+    return Reading(made.lens, report)
 
 
 _DAMAGED = (

@@ -9,13 +9,15 @@ Two writers put positions elsewhere, `convention`: "gyroflow" has x/w and 1 - y/
 and 1 - y/(h - 1).
 """
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from .._core.quiet import silent
 from ..models.distortion import Distortion
 from ..models.family import AbstractRadial
 from ._samples import border, distortions
@@ -92,7 +94,8 @@ class STMap(FolderFormat):
             if (focal := _told("focal", header, _FOCAL, given)) is None:
                 raise ValueError("it does not say its focal length: give argument focal, one for each file")
             convention = _told("convention", header, _CONVENTION, job.convention) or CONVENTION
-            nodes.append(Sampled(float(focal), *_pairs(header, red, green, size, wanted, convention)))
+            points = _pairs(header, red, green, size, wanted, convention)
+            nodes.append(Sampled(float(focal), *points, corrects=wanted == "redistort"))
             units.add(str(header.get(_UNIT, "mm")))
         return Contents(tuple(nodes), one_size(sizes), "px" if units == {"px"} else "mm")
 
@@ -201,18 +204,36 @@ def open_exr() -> Any:
     return OpenEXR
 
 
+_DAMAGED = "it is no EXR file, or it is damaged or cut off"
+
+
 def _header(path: Path) -> dict[str, Any]:
-    with open_exr().File(str(path), header_only=True) as file:
+    with _opened(path, header_only=True) as file:
         return dict(file.header())
 
 
 def _open(path: Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
     """Header, red and green of a map."""
-    with open_exr().File(str(path), separate_channels=True) as file:
+    with _opened(path, separate_channels=True) as file:
+        if not file.parts:
+            raise ValueError(_DAMAGED)
         channels, header = file.channels(), dict(file.header())
         if not {"R", "G"} <= set(channels):
             raise ValueError(f"it has no channels R and G, but {', '.join(channels)}")
         return header, np.array(channels["R"].pixels, float), np.array(channels["G"].pixels, float)
+
+
+@contextlib.contextmanager
+def _opened(path: Path, **how: bool) -> Iterator[Any]:
+    """An EXR file; OpenEXR's own complaints about a damaged one are not printed."""
+    module = open_exr()
+    try:
+        with silent():
+            file = module.File(str(path), **how)
+    except RuntimeError as error:
+        raise ValueError(_DAMAGED) from error
+    with file:
+        yield file
 
 
 def _window_size(window: Any) -> tuple[int, int]:

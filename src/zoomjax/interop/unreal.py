@@ -5,6 +5,7 @@ height. Zoom is the focal length in the lens's unit, focus one entry. Unreal tak
 between entries, but eases the first and last interval: those are made short.
 """
 
+import dataclasses
 import json
 
 import numpy as np
@@ -98,15 +99,39 @@ class Unreal(Pinholes):
         tables = {entry["parameterName"]: _rows(entry) for entry in table["cameraParameterTables"]}
         if len({row["FocusEncoder"] for row in tables["DistortionTable"]}) > 1:
             raise ValueError("it has entries at more than one focus, and zoomjax reads files of one")
-        nodes = []
-        for row in tables["DistortionTable"]:
-            zoom = row["ZoomEncoder"]
-            focal, middle = (_at(tables[name], zoom) for name in ("FocalLengthTable", "ImageCenterTable"))
-            f, stretch = focal_px(focal["Fx"] * size[0], focal["Fy"] * size[1])
-            centre = np.array([middle["Cx"] * size[0], middle["Cy"] * size[1]]) - 0.5
-            k, p = (np.array([row[name] for name in names]) for names in (("K1", "K2", "K3"), ("P1", "P2")))
-            nodes.append(node_of(Pinhole(f, f, centre, k, p, stretch), size))
-        return contents(nodes, size, job)
+        rows = {row["ZoomEncoder"]: _numbers(tables, row) for row in reversed(tables["DistortionTable"])}
+        zooms = np.array(sorted(rows))
+        numbers = np.array([rows[zoom] for zoom in zooms])
+        width = _width_mm(table.get("sensorDimensions", {}))
+        mm = width is not None and job.focal is None
+
+        def node(row: np.ndarray) -> Node:
+            f, stretch = focal_px(row[0] * size[0], row[1] * size[1])
+            focal = float(row[0] * width) if mm and width is not None else f
+            return node_of(Pinhole(focal, f, row[2:4] * size - 0.5, row[4:7], row[7:], stretch), size)
+
+        def between(i: int, share: float) -> Node:
+            at = (1 - share) * zooms[i] + share * zooms[i + 1]
+            return node(self.interpolate(zooms, numbers, float(at)))
+
+        found = contents([node(row) for row in numbers], size, job, mm=mm)
+        if mm and width is not None:
+            found = dataclasses.replace(found, pixel_pitch=width / size[0])
+        return found if job.focal is not None else dataclasses.replace(found, between=between)
+
+
+def _numbers(tables: dict[str, list[dict[str, float]]], row: dict[str, float]) -> list[float]:
+    """Fx, Fy, Cx, Cy, K1 to K3, P1 and P2 at the zoom of a row of the distortions."""
+    names = ("FocalLengthTable", "ImageCenterTable")
+    focal, middle = (_at(tables[name], row["ZoomEncoder"]) for name in names)
+    own = [row[name] for name in ("K1", "K2", "K3", "P1", "P2")]
+    return [focal["Fx"], focal["Fy"], middle["Cx"], middle["Cy"], *own]
+
+
+def _width_mm(sensor: dict) -> float | None:
+    """The width of the sensor; None if it is not there, or not in mm."""
+    width = float(sensor.get("width", 0))
+    return width if sensor.get("units") == "Millimeters" and width > 0 else None
 
 
 def _data(nodes: list[Node], rows: list[list[float]]) -> str:

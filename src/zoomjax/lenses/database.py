@@ -56,6 +56,11 @@ class LensTable:
         """Whether it is calibrated at several focal lengths."""
         return len(self.focal) > 1
 
+    @property
+    def kind(self) -> str:
+        """Of its polynomials: "PTLENS", "POLY3" or "POLY5"."""
+        return self.source.calib_distortion[0].model.name
+
     @functools.cached_property
     def aspect_ratio(self) -> float:
         """Of the sensor it was calibrated on: the one with which lensfun's corrections come out.

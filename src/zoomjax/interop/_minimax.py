@@ -1,10 +1,11 @@
 """Fits of the radial polynomial to a table: least largest distance, by least squares with changing weights.
 
 A table gives the corrected radius u of each distorted radius d, at some focal lengths. The polynomial is to
-give ``m u = d (1 + k1 d^2 + ... + kN d^2N)``: the magnification m of each focal length is free, because it
-leaves straight lines straight, and lensfun's own versions differ in it. All is linear in the k and in m,
-which is eliminated. Weights grow where the distance is large (Lawson's iteration), so that the largest
-distance falls. Lengths are halves of the image's diagonal, errors are distances in the distorted image.
+give ``m u = d (1 + k1 d^2 + ... + kN d^2N)``: the magnification m of each focal length is free where it is
+the tool's own choice, because it leaves straight lines straight, and lensfun's own versions differ in it.
+All is linear in the k and in m, which is eliminated. Weights grow where the distance is large (Lawson's
+iteration), so that the largest distance falls. Lengths are halves of the image's diagonal, errors are
+distances in the distorted image.
 
 All is NumPy, for many fits at once: there is nothing to compile.
 """
@@ -36,10 +37,12 @@ class Targets(NamedTuple):
     Attributes:
         corrected: the corrected radius of each of `RADII`.
         slope: the derivative of the distorted by the corrected radius; 0 beyond where the table folds.
+        scaled: whether the magnification of each focal length is free; else it is 1.
     """
 
     corrected: Float[np.ndarray, "focal radius"]
     slope: Float[np.ndarray, "focal radius"]
+    scaled: bool = True
 
     @property
     def seen(self) -> Bool[np.ndarray, "focal radius"]:
@@ -48,15 +51,16 @@ class Targets(NamedTuple):
 
     def at(self, index: Any) -> "Targets":
         """Those of an index of NumPy."""
-        return Targets(self.corrected[index], self.slope[index])
+        return Targets(self.corrected[index], self.slope[index], self.scaled)
 
 
-def targets(polynomials: Float[np.ndarray, "focal power"], unit: float) -> Targets:
+def targets(polynomials: Float[np.ndarray, "focal power"], unit: float, *, scaled: bool = True) -> Targets:
     """Solve a table's polynomials from corrected to distorted radii at `RADII`.
 
     Args:
         polynomials: distorted over corrected radius, by powers of the corrected one, in the table's unit.
         unit: half of the image's diagonal in that unit.
+        scaled: whether the magnification of each focal length is free.
     """
     distorted = RADII * unit
     radius = distorted / polynomials[:, :1]
@@ -69,7 +73,8 @@ def targets(polynomials: Float[np.ndarray, "focal power"], unit: float) -> Targe
             break
     value, slope = _value(polynomials, radius)
     good = (abs(value - distorted) < 1e-9 * unit) & (slope > _LEAST_SLOPE)
-    return _continued(radius / unit, np.where(np.cumprod(good, axis=1), slope, 0))
+    slope = np.where(np.cumprod(good, axis=1), slope, 0)
+    return Targets(_continued(radius / unit, slope), slope, scaled)
 
 
 _NEWTON = 30
@@ -92,7 +97,7 @@ def _continued(corrected, slope):
     last = np.maximum(seen.sum(axis=1, keepdims=True) - 1, 0)
     end, rate = (np.take_along_axis(values, last, axis=1) for values in (corrected, slope))
     beyond = end + (RADII - RADII[last]) / np.maximum(rate, _LEAST_SLOPE)
-    return Targets(np.where(seen, corrected, beyond), slope)
+    return np.where(seen, corrected, beyond)
 
 
 def fit(
@@ -112,9 +117,9 @@ def fit(
     best = np.zeros(scale.shape)
     for _ in range(_STEPS):
         root = np.sqrt(lawson)
-        parameters = _solved(rows * root[..., None], right * root, own * root)
+        parameters = _solved(rows * root[..., None], right * root, own * root, wanted.scaled)
         along = (rows @ parameters[:, None, :, None])[..., 0] + right
-        distance = _distance(along, own, lawson)
+        distance = _distance(along, own, lawson, wanted.scaled)
         largest = distance.max(axis=(1, 2))
         best = np.where((largest < least)[:, None], parameters, best)
         least = np.minimum(largest, least)
@@ -128,14 +133,14 @@ def largest_distance(
 ) -> Float[np.ndarray, "focal"]:
     """How far from the table polynomials put a point of the distorted image, at most, where the table sees.
 
-    In half diagonals, and at the magnification of each focal length that is best for it.
+    In half diagonals, and at the magnification of each focal length that is best for it, if that is free.
     """
     weight = np.where(wanted.seen, _in_image(wanted), 0)
     along = (RADII + coefficients @ powers(coefficients.shape[1]).T) * weight
     own = wanted.corrected * weight
     lawson, least = np.ones_like(along), np.full(len(along), np.inf)
     for _ in range(_STEPS):
-        distance = _distance(along, own, lawson)
+        distance = _distance(along, own, lawson, wanted.scaled)
         largest = distance.max(axis=1)
         least = np.minimum(largest, least)
         lawson = lawson * (distance / np.maximum(largest, 1e-15)[:, None] + _FLOOR)
@@ -152,11 +157,14 @@ def _in_image(wanted: Targets) -> Float[np.ndarray, "... radius"]:
     return np.maximum(wanted.slope, _LEAST_SLOPE)
 
 
-def _solved(rows, right, own):
+def _solved(rows, right, own, scaled):
     """Weighted least squares, the magnifications eliminated."""
-    own = own / np.linalg.norm(own, axis=-1, keepdims=True)
-    rows = rows - own[..., None] * (own[..., None, :] @ rows)
-    right = right - own * np.einsum("gfr,gfr->gf", own, right)[..., None]
+    if scaled:
+        own = own / np.linalg.norm(own, axis=-1, keepdims=True)
+        rows = rows - own[..., None] * (own[..., None, :] @ rows)
+        right = right - own * np.einsum("gfr,gfr->gf", own, right)[..., None]
+    else:
+        right = right - own
     flat = rows.reshape(len(rows), -1, rows.shape[-1])
     matrix = np.swapaxes(flat, 1, 2) @ flat + _RIDGE * np.eye(rows.shape[-1])
     return -np.linalg.solve(
@@ -164,7 +172,9 @@ def _solved(rows, right, own):
     )[..., 0]
 
 
-def _distance(along, own, weight):
-    """Distances at the magnifications that are best in least squares."""
+def _distance(along, own, weight, scaled):
+    """Distances at the magnifications that are best in least squares, or at 1."""
+    if not scaled:
+        return abs(along - own)
     magnification = (weight * along * own).sum(-1) / (weight * own * own).sum(-1)
     return abs(along - magnification[..., None] * own)
