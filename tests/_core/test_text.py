@@ -1,12 +1,13 @@
-"""Names that somebody else chose."""
+"""Names that somebody else chose, and messages of errors."""
 
 import unicodedata
 
+import cv2
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zoomjax._core.text import numbered_name, plain, span
+from zoomjax._core.text import listed, numbered_name, plain, reason, span
 
 names = st.text(max_size=300) | st.text(
     st.sampled_from("./\\:*?<>|\"' -=~a\x1b\n\udcff\u202e"), max_size=300
@@ -63,3 +64,28 @@ def test_a_span_of_one_value_is_that_value():
     assert span(20.56, 127.36, "mm") == "20.56 to 127.36 mm"
     assert span(28.0, 28.0, "mm") == "28 mm"
     assert span(1000.01, 1000.02, "px") == "1000 px"
+
+
+def test_lists_end_by_how_much_is_left_out():
+    assert listed("abc", 3) == "a, b, c"
+    assert listed(iter("abcde"), 3, "; ") == "a; b; c and 2 more"
+    assert listed([], 2) == ""
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (FileNotFoundError(2, "No such file or directory", "a.png"), "No such file or directory"),
+        (MemoryError("Unable to allocate"), "there is not enough memory for it"),
+        (ValueError("It is\n  two lines."), "It is two lines."),
+        (OSError("without a number"), "without a number"),
+    ],
+)
+def test_the_reason_of_an_error_is_one_line(error, told):
+    assert reason(error) == told
+
+
+def test_opencv_without_memory_is_an_error_of_memory():
+    error = cv2.error("Failed to allocate")
+    error.code = cv2.Error.StsNoMem
+    assert reason(error) == reason(MemoryError())

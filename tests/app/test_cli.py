@@ -375,6 +375,22 @@ WRONG = {
         ["a.jpg", "--shared-focal", "folder"],
         "--shared-focal is for focal lengths that are measured from a flat grid",
     ),
+    "a board at infinity": (
+        ["a.jpg", "--pitch", "20", "--distance", "inf", "--pixel", "0.005"],
+        "Missing or wrong: --distance",
+    ),
+    "digits of another kind": (["a.jpg", "--focal", "35", "--focal-sigma", "1_0"], "such as 0.3, or 1%"),
+    "no digits": (["lines.npz", "--focal-sigma", ""], "such as 0.3, or 1%"),
+    "too many coefficients": (["a.jpg", "--terms", "9"], "--terms must be at most 4"),
+    "more coefficients than the prior": (
+        ["a.jpg", "--model", "smooth", "--terms", "3"],
+        "leave out --terms",
+    ),
+    "one focal length of csv": (
+        ["lines.csv", "--image-size", "640x480", "--focal", "35"],
+        "--focal must be a CSV file with the columns frame,focal",
+    ),
+    "a size in other digits": (["lines.csv", "--image-size", "²x3"], "--image-size must be like"),
     "csv without image size": (["lines.csv"], "--image-size"),
     "csv with a bad image size": (["lines.csv", "--image-size", "big"], "1920x1080"),
     "csv without focal lengths": (["bare.csv", "--image-size", "640x480"], "frame,focal"),
@@ -403,6 +419,9 @@ def test_a_mistake_is_one_sentence_and_status_2(case, wrong_files):
     assert not (wrong_files / "out").exists()
 
 
+_BOARD = ("--pitch", "30", "--distance", "1185", "--pixel", "0.0055")
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
@@ -412,6 +431,15 @@ def test_a_mistake_is_one_sentence_and_status_2(case, wrong_files):
         (["a.png", "--frames", "3"], "--frames has no effect for photos"),
         (["lines.npz", "--shared-focal", "exif"], "--shared-focal has no effect for lines.npz"),
         (["a.mp4", "--family", "division"], "--family has no effect with --focal motion"),
+        (["a.png", "--focal-unit", "px"], "--focal-unit has no effect without --focal"),
+        (
+            ["a.png", "--focal", "exif", "--focal-unit", "px"],
+            "--focal-unit has no effect with --focal exif",
+        ),
+        (["a.png", "--focal", "plane", "--focal-unit", "mm"], "--focal-unit has no effect with --focal pl"),
+        (["a.png", "--focal", "35", *_BOARD], "--pitch and --distance and --pixel have no effect with --f"),
+        (["a.png", "--focal", "exif", *_BOARD], "have no effect with --focal exif"),
+        (["lines.npz", "--model", "auto", "--degree", "2"], "--model auto has no effect with --degree"),
     ],
 )
 def test_an_option_without_effect_is_refused(options, sentence, wrong_files):

@@ -8,7 +8,7 @@ import pytest
 import typer
 
 import zoomjax
-from zoomjax.app._flags import FLAGS, with_flags
+from zoomjax.app._flags import FLAGS, options_of, with_flags
 from zoomjax.app.cli import app
 
 ROOT = Path(zoomjax.__file__).parent
@@ -58,3 +58,24 @@ def test_every_flag_is_an_option():
 )
 def test_arguments_have_the_command_lines_names(message, told):
     assert with_flags(message) == told
+
+
+LONGER = "Give a track as long as the video, or hold its ends (argument hold). Now."
+
+
+@pytest.mark.parametrize(
+    ("message", "words", "told"),
+    [
+        (
+            LONGER,
+            ["undistort", "lens.json"],
+            "Give a track as long as the video, or hold its ends (--hold). Now.",
+        ),
+        (LONGER, ["calibrate", "a.mp4"], "Give a track as long as the video. Now."),
+        (LONGER, ["--help"], "Give a track as long as the video, or hold its ends (--hold). Now."),
+        ("Give this or that (argument lens).", ["calibrate"], "Give this."),
+        ("Give it (argument focal).", ["calibrate"], "Give it (--focal)."),
+    ],
+)
+def test_a_command_speaks_of_its_own_options_alone(message, words, told):
+    assert with_flags(message, options_of(typer.main.get_command(app), words)) == told

@@ -8,8 +8,9 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app.focal_sources import Board, check_way, choose_focals
-from zoomjax.app.image_calibration import ImageJob
+from zoomjax.app.board_focals import Board
+from zoomjax.app.focal_sources import check_way, choose_focals
+from zoomjax.app.image_job import ImageJob
 from zoomjax.detect.batch import Detection, detect
 from zoomjax.detect.sources import Source
 

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import re
+import shutil
 import unicodedata
 import warnings
 from pathlib import Path
@@ -10,14 +12,18 @@ import cv2
 import numpy as np
 import pytest
 
+import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app import demo
 from zoomjax.app.console import show_images
-from zoomjax.app.image_calibration import ImageJob, calibrate_images
+from zoomjax.app.image_calibration import calibrate_images
+from zoomjax.app.image_job import ImageJob
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.pictures import pictures
 from zoomjax.app.report import report
+from zoomjax.app.undistort_files import Job, undistort_files
 from zoomjax.io.exif import exif_with_focal
+from zoomjax.io.video_reader import decode_video
 
 from .. import _clips as clips
 
@@ -175,6 +181,52 @@ def test_an_image_none_of_whose_lines_agrees_is_not_used(folder, tmp_path):
     assert list(done.unused) == ["bent.png"]
     assert "none of its lines is straight" in done.unused["bent.png"]
     assert len(done.used) == 5
+
+
+@pytest.mark.slow
+def test_one_photo_needs_no_focal_length(folder, tmp_path):
+    path = tmp_path / "no-exif.png"
+    shutil.copy(folder / "no-exif.png", path)
+    done = calibrate_images(ImageJob((path,), overlays="none"))
+    lens, truth = done.calibration.zoom.lens, scenes.nikkor_18_200(SIZE)(20.56)
+    corner = np.array([10.0, 10.0])
+    np.testing.assert_allclose(lens(1.0).undistort(corner), truth.undistort(corner), atol=0.3)
+    assert lens.about["focal"] == "not known"
+    with pytest.raises(ValueError, match="pixel_pitch"):
+        zj.Camera(lens)
+    page = report(done.calibration, done)
+    assert "focal length not known" in page
+    assert "against 1/f" not in page  # plots of one point
+    for text in (page, done.calibration.advice(), str(done.calibration.summary()["next_photo"])):
+        assert not re.search(r"\b1 mm\b(?! stands)", text)
+    done.calibration.zoom.lens.save(tmp_path / "lens.json")
+    expected = zj.undistort_image(cv2.imread(str(path)), lens(1.0))
+    image = cv2.imread(str(path))
+    cv2.imwrite(str(tmp_path / "later.tif"), image)  # and it knows no more
+    write_exif(tmp_path / "zoomed.png", image, 70.0)  # another than 1 mm, but nobody knows that either
+    clips.write_frames(tmp_path / "clip.mkv", [image] * 3, encoder="ffv1")
+    files = tuple(tmp_path / name for name in ("later.tif", "zoomed.png"))
+    undistort_files(Job(tmp_path / "lens.json", files, tmp_path / "out"))
+    for file in files:
+        np.testing.assert_array_equal(cv2.imread(str(tmp_path / "out" / file.name)), expected)
+    undistort_files(Job(tmp_path / "lens.json", (tmp_path / "clip.mkv",), tmp_path / "out.mkv"))
+    with decode_video(tmp_path / "out.mkv") as (number, frames):
+        shown = [image() for *_, image in frames]
+    assert number == len(shown) == 3
+    assert np.abs(shown[1].astype(int) - expected).mean() < 3
+
+
+def write_exif(path, image, focal):
+    exif = np.frombuffer(exif_with_focal(focal), np.uint8)
+    _, content = cv2.imencodeWithMetadata(".png", image, [cv2.IMAGE_METADATA_EXIF], [exif])
+    path.write_bytes(content.tobytes())
+
+
+def test_several_photos_need_focal_lengths(folder, tmp_path):
+    for name in "ab":
+        shutil.copy(folder / "no-exif.png", tmp_path / f"{name}.png")
+    with pytest.raises(ValueError, match=r"No focal length found .*one focal length for all"):
+        calibrate_images(ImageJob((tmp_path,)))
 
 
 @pytest.mark.slow

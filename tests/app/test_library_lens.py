@@ -13,6 +13,7 @@ from PIL.TiffImagePlugin import IFDRational
 import zoomjax as zj
 from zoomjax.app.commands_lens import app
 from zoomjax.app.library_lens import rows, undistort_by_library, write_lens
+from zoomjax.app.results_folder import results_folder
 from zoomjax.app.undistort_files import Job
 from zoomjax.io import read_photo
 from zoomjax.lenses.database import one_named
@@ -75,6 +76,28 @@ def test_photos_of_one_name_keep_their_folders(tmp_path):
     }
 
 
+def test_a_lens_of_ones_own_is_not_taken_for_a_video(tmp_path):
+    first = photo(tmp_path / "a.png")
+    (tmp_path / "lens.json").write_text("{}")
+    done = undistort_by_library(job(tmp_path, tmp_path / "lens.json", first), NIKKOR)
+    assert done.written == 1
+    assert "without argument lens" in done.skipped[str(tmp_path / "lens.json")]
+
+
+def test_photos_of_two_lenses_do_not_share_a_row_of_focal_lengths(tmp_path):
+    canon = {"Make": "Canon", "Model": "Canon EOS 600D"}
+    (tmp_path / "more").mkdir()
+    first = photo(tmp_path / "a.png")
+    second = photo(tmp_path / "more" / "a.png", canon, "EF-S18-55mm f/3.5-5.6 IS II")
+    (tmp_path / "focal.csv").write_text("image,focal\na.png,24\n")
+    with pytest.raises(ValueError, match=r"one row a\.png for two images"):
+        undistort_by_library(job(tmp_path, first, second, focal=str(tmp_path / "focal.csv")), "auto")
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "focal.csv").write_text("image,focal\na.png,24\nmore/a.png,30\n")
+    done = undistort_by_library(job(tmp_path, first, second, focal=str(tmp_path / "focal.csv")), "auto")
+    assert done.written == 2
+
+
 def test_targets_that_exist_are_refused_before_any_work(tmp_path):
     both = photo(tmp_path / "a.png"), photo(tmp_path / "b.png")
     (tmp_path / "out").mkdir()
@@ -93,6 +116,17 @@ def test_a_search_shows_what_lenses_become_and_writes_the_one(tmp_path):
     assert zj.load_lens(tmp_path / "lens" / "lens.json").about["lens"] == NIKKOR
     with pytest.raises(FileExistsError, match="would be replaced"):
         write_lens(NIKKOR, tmp_path / "lens", size=SIZE, crop=None, overwrite=False)
+
+
+def test_what_an_earlier_run_wrote_about_another_lens_is_removed(tmp_path):
+    with results_folder(tmp_path) as made:
+        for name in ("lens.json", "report.html", "summary.json", "lines.npz"):
+            (made / name).write_text("of another lens")
+    (tmp_path / "model.png").write_text("the user's own")
+    write_lens(NIKKOR, tmp_path, size=SIZE, crop=None, overwrite=True)
+    kept = {path.name for path in tmp_path.iterdir() if not path.name.startswith(".")}
+    assert kept == {"lens.json", "lines.npz", "model.png"}
+    assert zj.load_lens(tmp_path / "lens.json").about["lens"] == NIKKOR
 
 
 def test_the_commands_list_write_and_say_what_to_give(tmp_path):

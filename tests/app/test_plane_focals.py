@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import cv2
 import jax.numpy as jnp
@@ -13,7 +14,9 @@ from zoomjax.app.console import show_images
 from zoomjax.app.focal_sources import choose_focals
 from zoomjax.app.image_calibration import calibrate_images
 from zoomjax.app.image_job import ImageJob
+from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.plane_focals import FocalGroup, Sharing, similar
+from zoomjax.app.plans import images_plan
 from zoomjax.app.report import report
 from zoomjax.detect.batch import detect
 from zoomjax.detect.sources import find_photos
@@ -163,6 +166,43 @@ def test_groups_are_told_in_terminal_report_and_summary(folder, tmp_path, capsys
     for group, focal in zip(groups, ZOOMS.values(), strict=True):
         assert group["focal"] == pytest.approx(focal, rel=0.02)
         assert group["std"] > 0
+
+
+@pytest.mark.slow
+def test_a_folder_of_two_zooms_is_doubtful(folder, tmp_path):
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    for photo in [*(folder / "24mm").iterdir(), *(folder / "50mm").iterdir()]:
+        shutil.copy(photo, mixed / f"{photo.parent.name}-{photo.name}")
+    job = ImageJob(
+        (str(mixed), str(folder / "35mm")),
+        detector="grid",
+        focal="plane",
+        shared_focal="folder",
+        centre="image",
+        model=WantedModel("polynomial", degree=1),
+    )
+    done = calibrate_images(job).calibration
+    assert done.assessment.verdict != "good"
+    first = done.assessment.findings[0]
+    assert first.about == "shared focal lengths"
+    assert "10 photos share f = " in first.found
+    assert "one zoom" in done.advice()
+
+
+def test_a_dry_run_shows_which_photos_would_share(folder):
+    def planned(how):
+        return images_plan(ImageJob(inputs(folder), detector="grid", focal="plane", shared_focal=how))
+
+    alone = planned(None)
+    assert planned("similarity") == [*alone, "Photos whose focal lengths agree would share one."]
+    head = "Photos that would share a focal length:"
+    for how, called in (("folder", str(folder) + "/{:g}mm"), ("exif", "{:g} mm in EXIF data")):
+        told = planned(how)
+        assert told[: len(alone) + 1] == [*alone, head]
+        said = [line.partition(": ")[0] for line in told[len(alone) + 1 :]]
+        assert said == [f"  {called.format(mm)}" for mm in ZOOMS]
+        assert all(line.count(".png") == len(TILTS) for line in told[len(alone) + 1 :])
 
 
 @pytest.mark.parametrize(

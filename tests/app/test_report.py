@@ -17,7 +17,8 @@ import zoomjax.app.report
 from zoomjax import RESULTS
 from zoomjax.app.calibration import calibrate
 from zoomjax.app.model_choice import WantedModel
-from zoomjax.app.report import Run, report
+from zoomjax.app.page import Run
+from zoomjax.app.report import report
 
 from .._browser import opened
 
@@ -133,7 +134,7 @@ def test_worst_lines_are_those_of_the_lens(page, calibration):
 @pytest.fixture
 def undrawn(monkeypatch):
     nothing = dict.fromkeys(("source", "label", "class", "width", "height"), "")
-    monkeypatch.setattr(zoomjax.app.report, "_plot", lambda *_, **__: nothing)
+    monkeypatch.setattr(zoomjax.app.report, "embedded_plot", lambda *_, **__: nothing)
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -1,8 +1,10 @@
 """What ``zoomjax undistort`` makes of folders, patterns, links, marks and files of all kinds."""
 
 import dataclasses
+import re
 
 import cv2
+import equinox as eqx
 import numpy as np
 import pytest
 from PIL import Image
@@ -11,7 +13,8 @@ import zoomjax as zj
 from zoomjax.app.undistort_files import Job, undistort_files
 from zoomjax.detect.sources import find_photos
 from zoomjax.io.metadata import geometry_of
-from zoomjax.io.photo import read_metadata
+from zoomjax.io.photo import read_metadata, read_photo
+from zoomjax.io.photo_writer import encoded_photo
 
 from .._clips import FRAMES, SIZE, focal, lens, luma, picture, write_clip
 from .._exif import exif
@@ -100,6 +103,74 @@ def test_a_run_is_resumed(folder):
     (folder / "out/b.png").write_bytes((folder / "in/day/b.png").read_bytes())  # of somebody else
     with pytest.raises(FileExistsError, match=r"b\.png already exists"):
         undistort_files(job(folder, "in/day", resume=True))
+
+
+def _other_lens(folder):
+    other = lens()
+    eqx.tree_at(lambda of: of.zoom.parameters, other, 0.9 * other.zoom.parameters).save(
+        folder / "lens.json"
+    )
+    return {}
+
+
+def _other_photo(folder):
+    image = cv2.cvtColor(picture(5), cv2.COLOR_GRAY2BGR)
+    test_photo.write(folder / "in/day/b.png", image, exif((40, 1), orientation=1))
+    return {}
+
+
+def _photo_of_an_old_version(folder):
+    image, metadata = read_photo(folder / "out/b.png")
+    old = dataclasses.replace(metadata, xmp=re.sub(rb' zoomjax:Work="[^"]*"', b"", metadata.xmp))
+    assert old != metadata
+    (folder / "out/b.png").write_bytes(encoded_photo([(image, old)], ".png")[0])
+    return {}
+
+
+OTHER_WORK = {
+    "lens": _other_lens,
+    "focal length": lambda folder: {"focal": "41"},
+    "photo": _other_photo,
+    "old version": _photo_of_an_old_version,
+    "interpolation": lambda folder: {"interpolation": "cubic"},
+    "border": lambda folder: {"border": "reflect"},
+    "keep": lambda folder: {"keep": "valid"},
+}
+
+
+@pytest.mark.parametrize("other", OTHER_WORK)
+def test_a_resumed_run_leaves_results_of_the_same_work_alone(other, folder):
+    """Or a folder would be half of one lens, half of another, without a word."""
+    undistort_files(job(folder, "in/day"))
+    before = {name: (folder / "out" / name).read_bytes() for name in ("a.jpg", "b.png")}
+    same = undistort_files(job(folder, "in/day", resume=True))
+    assert same.sentence.startswith("0 of 2 photos corrected now, 2 earlier")
+    settings = OTHER_WORK[other](folder)
+    made = {name: (folder / "out" / name).read_bytes() for name in before}
+    with pytest.raises(FileExistsError, match=r"was not made from .* with this lens, focal length"):
+        undistort_files(job(folder, "in/day", resume=True, **settings))
+    assert {name: (folder / "out" / name).read_bytes() for name in before} == made
+    done = undistort_files(job(folder, "in/day", resume=True, overwrite=True, **settings))
+    assert done.written == 2
+    assert (folder / "out/b.png").read_bytes() != made["b.png"]
+    undistort_files(job(folder, "in/day", out="whole", **settings))
+    for name in before:
+        assert (folder / "out" / name).read_bytes() == (folder / "whole" / name).read_bytes()
+
+
+def test_paths_may_be_texts(folder):
+    zj.undistort_photo(str(folder / "in/a.jpg"), str(folder / "a.png"), lens=lens())
+    assert geometry_of(read_metadata(folder / "a.png")) == "undistorted"
+
+
+def test_a_framing_of_other_photos_is_other_work(folder):
+    test_photo.write(
+        folder / "in/wide.png", cv2.cvtColor(picture(0), cv2.COLOR_GRAY2BGR), exif((20, 1), orientation=1)
+    )
+    undistort_files(job(folder, "in/day", keep="valid"))
+    assert undistort_files(job(folder, "in/day", keep="valid", resume=True)).written == 2
+    with pytest.raises(FileExistsError, match="was not made from"):
+        undistort_files(job(folder, "in/day/b.png", "in/wide.png", keep="valid", resume=True))
 
 
 def test_bad_files_of_every_kind_are_named_and_skipped(folder):

@@ -6,7 +6,8 @@ from PIL import ExifTags, Image
 
 from zoomjax.app.calibration import calibrate
 from zoomjax.app.model_choice import WantedModel
-from zoomjax.app.verdict import findings_of_photos
+from zoomjax.app.plane_focals import FocalGroup
+from zoomjax.app.verdict import findings_of_focals, findings_of_photos
 
 
 def photo(path, model=None, lens=None):
@@ -48,3 +49,16 @@ def test_two_lenses_are_to_be_parted_before_another_photo_is_taken(noisy, tmp_pa
     )
     assert done.advice() != mixed.advice()
     assert not mixed.summary()["next_photo"]["enough"]
+
+
+def test_photos_that_disagree_about_a_shared_focal_length_are_doubtful():
+    agree = FocalGroup(("a", "b"), 1000.0, 10.0, (990.0, 1010.0))
+    near = FocalGroup(("c", "d"), 2000.0, 90.0, (1800.0, 2100.0), agree=False)
+    far = FocalGroup(("e", "f", "g"), 3000.0, 400.0, (1500.0, 4000.0), agree=False)
+    assert findings_of_focals([agree, FocalGroup(("h", "i"), 1.0, 0.1)], "px") == []
+    [one] = findings_of_focals([agree, near], "px")
+    assert (one.verdict, one.cause) == ("doubtful", True)
+    assert one.found == near.sentence("px")
+    assert "1,800 to 2,100 px" in one.found
+    [both] = findings_of_focals([agree, near, far], "px")
+    assert both.found == far.sentence("px") + " Another group disagrees, too."

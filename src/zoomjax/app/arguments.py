@@ -1,5 +1,6 @@
 """Arguments of the command line: checks, and conversion to arguments of the library."""
 
+import math
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,7 +11,7 @@ from .options import FIT, OUTPUT
 
 if TYPE_CHECKING:
     from ..lines.lines import Lines
-    from .focal_sources import Board
+    from .board_focals import Board
     from .image_job import ImageJob
 
 
@@ -97,7 +98,8 @@ def refits(inputs: list[Path], target: Path) -> bool:
 
 
 def _read_lines(path: Path, focal: str | None, image_size: str | None, focal_unit: str | None) -> "Lines":
-    if path.suffix == ".npz":
+    kind = path.suffix.lower()
+    if kind == ".npz":
         if (focal, image_size, focal_unit) != (None, None, None):
             raise ValueError(
                 f"{path} contains focal lengths and image size: leave out --focal, --image-size and "
@@ -106,11 +108,15 @@ def _read_lines(path: Path, focal: str | None, image_size: str | None, focal_uni
         from ..lines.npz import load_lines
 
         return load_lines(path)
-    if path.suffix == ".csv":
+    if kind == ".csv":
         from ..lines.csv import read_focal_csv, read_lines_csv
 
         if (size := size_of(image_size)) is None:
             raise ValueError(f"The image size of {path} is not known: give --image-size, e.g. 1920x1080.")
+        if focal is not None and not focal.lower().endswith(".csv"):
+            raise ValueError(
+                f"--focal must be a CSV file with the columns frame,focal for {path}, but it is {focal!r}."
+            )
         return read_lines_csv(
             path,
             image_size=size,
@@ -150,7 +156,7 @@ def size_of(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     width, _, height = text.lower().partition("x")
-    if not (width.isdigit() and height.isdigit()):
+    if not all(side.isascii() and side.isdigit() for side in (width, height)):
         raise ValueError(f"--image-size must be like 1920x1080, but it is {text!r}.")
     return int(width), int(height)
 
@@ -170,12 +176,16 @@ def unit_of(given: str | None) -> str:
 
 def board_of(pitch: str | None, distance: float | None, pixel: float | None) -> "Board | None":
     """The board, if one is given."""
-    from .focal_sources import Board
+    from .board_focals import Board
 
     if pitch is distance is pixel is None:
         return None
     pitches = [_positive(part) for part in (pitch or "").lower().split("x")]
-    given = {"--pitch": all(pitches), "--distance": (distance or 0) > 0, "--pixel": (pixel or 0) > 0}
+    given = {
+        "--pitch": all(pitches),
+        "--distance": 0 < (distance or 0) < math.inf,
+        "--pixel": 0 < (pixel or 0) < math.inf,
+    }
     bad = [name for name, good in given.items() if not good]
     if bad or len(pitches) > 2 or distance is None or pixel is None:
         raise ValueError(

@@ -8,12 +8,14 @@ import importlib.metadata
 import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from .._core.text import span
 from .._core.types import AnyArray
 from ..fit.algebraic import algebraic_zoom
 from ..fit.energy import coefficients_by, line_rms
@@ -23,6 +25,7 @@ from ..fit.straightness import frame_rms
 from ..fit.zoom import CentreArgument
 from ..lines.compressed import CompressedLines
 from ..lines.lines import Lines
+from ..models.about import UNKNOWN
 from ..models.invertibility import Certificate
 from ..models.registry import family_name
 from ..models.zoom import AbstractLinearZoom, PolynomialZoom
@@ -96,6 +99,18 @@ class Calibration:
         std = np.asarray(displacement_std(self.zoom, corner, focal=np.array(focal)))
         return list(zip(focal, outward(lens, corner, focal).tolist(), std.tolist(), strict=True))
 
+    @property
+    def focal_known(self) -> bool:
+        """Whether f is known: of one photo alone, a number may stand for it."""
+        return self.zoom.lens.about.get("focal") != UNKNOWN
+
+    def focal_text(self) -> str:
+        """The range of focal lengths in words."""
+        low, high = (float(f) for f in self.zoom.lens.focal_range)
+        if not self.focal_known:
+            return "focal length not known"
+        return f"f = {span(low, high, self.zoom.lens.focal_unit)}"
+
     def allowed_for(self) -> str:
         """A sentence on the uncertainty of focal lengths in the bands; empty if they are exact."""
         share = self.focal_sigma / np.asarray(self.lines.focal)
@@ -117,7 +132,7 @@ class Calibration:
         if causes:
             return f"A further photo does not help here. {causes[0]}"
         if not self.enough():
-            return self.next.sentence
+            return self.next.sentence if self.focal_known else replace(self.next, focal_unit="").sentence
         return (
             f"Enough: the standard deviation of the displacement is {self.next.before:.2g} px, averaged "
             f"over image and focal range, and would be {self.next.after:.2g} px with the best next photo."
@@ -335,9 +350,9 @@ def calibrate(
     zoom = exact
     if sigma.any():
         zoom = with_focal_sigma(exact, small, focal_sigma=sigma, shared=shared)
+    zoom = with_misfit(zoom, small)
     algebraic = None
-    if isinstance(small, CompressedLines):  # not of another distortion model than the polynomial
-        zoom = with_misfit(zoom, small)
+    if isinstance(small, CompressedLines):  # others are estimated to first order alone: far off, if strong
         algebraic = np.asarray(frame_rms(small, algebraic_zoom(small, zoom=chosen, terms=terms)))
     stage("Checking the fit on lines left out")
     held_out, each_held_out = np.full(len(sigma), np.nan), held_out_frames(small, terms=terms)

@@ -21,7 +21,7 @@ except ModuleNotFoundError:
 from .._core.text import plain
 from . import commands_interop, commands_lens, commands_reproduce  # noqa: F401, they add their commands
 from ._compiled import UNKEPT, forget_compiled
-from ._flags import with_flags
+from ._flags import options_of, with_flags
 from ._interrupts import INTERRUPTED, LAST_WORDS, end_run, leave, swallowed
 from .commands import app
 
@@ -74,7 +74,12 @@ def _sentence(error: BaseException) -> str:
         text = f"There is not enough memory. {text}".strip()
     elif isinstance(error, OSError) and error.strerror:
         text = error.strerror + (f": {os.fspath(error.filename)}" if error.filename is not None else ".")
-    return plain(with_flags(text))
+    return plain(with_flags(text, _options()))
+
+
+def _options() -> set[str] | None:
+    """The options of the command that runs."""
+    return options_of(typer.main.get_command(app), sys.argv[1:])
 
 
 def _print_warning(message, category, filename, lineno, file=None, line=None) -> None:
@@ -82,4 +87,4 @@ def _print_warning(message, category, filename, lineno, file=None, line=None) ->
     if unkept and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         forget_compiled(unkept[1])
         return
-    print(f"Warning: {plain(with_flags(str(message)))}", file=sys.stderr)
+    print(f"Warning: {plain(with_flags(str(message), _options()))}", file=sys.stderr)

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import typer
 
 from .._core.text import plain
-from .console import progress_bar, stages
+from .console import REPORT, print_verdict, progress_bar, stages
 from .plans import tell_plan
+from .runs import what_is_run
 from .shown import NOT_GOOD, Shown
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ def wants_motion(inputs: Sequence[str], focal: str | None, pitch: str | None) ->
 
 def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
     """Calibrate from a clip, write the results and show them."""
+    from .clip_report import clip_report
     from .motion_calibration import FILES, calibrate_motion
     from .results_folder import OF_A_LENS, results_folder
 
@@ -80,7 +82,7 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
         besides = f", and from lines in up to {job.frames} frames" * job.lines
         tell_plan([f"Focal lengths and lens from how {plain(str(clip))} moves{besides}."], job.output)
         return
-    with results_folder(job.output, FILES, clears=OF_A_LENS, overwrite=job.overwrite) as folder:
+    with results_folder(job.output, [*FILES, REPORT], clears=OF_A_LENS, overwrite=job.overwrite) as folder:
         with progress_bar("Following points", quiet=show.quiet) as progress:
             from ..tracks.video import track_video
 
@@ -91,6 +93,9 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
                 clip, tracks, found=found, model=job.model, centre=job.centre, stage=stage
             )
             done.make(folder, stage)
+            stage("Making the report")
+            page = clip_report(done, folder / "panorama.jpg", run=what_is_run(clip.name))
+            (folder / REPORT).write_text(page, encoding="utf-8")
     _show(done, job, show)
     if show.strict and done.verdict != "good":
         raise typer.Exit(NOT_GOOD)
@@ -118,23 +123,19 @@ def _lines(job: ClipJob, show: Shown) -> "Sequence[Detection]":
 def _show(done: "MotionCalibration", job: ClipJob, show: Shown) -> None:
     """Print what was found: as JSON, the verdict alone, or all."""
     from rich.console import Console
-    from rich.text import Text
 
     if show.as_json:
         print(json.dumps(json.loads((job.output / "summary.json").read_text()), indent=2))
         return
-    console = Console()
-    colour = {"good": "green", "doubtful": "yellow"}.get(done.verdict, "red")
-    console.print(Text.assemble((f"{done.verdict.capitalize()}:", f"bold {colour}"), " ", done.sentence()))
-    for finding in done.findings():
-        console.print(Text(f"  - {finding}"))
+    print_verdict(done.verdict, done.sentence, done.findings)
     if show.quiet:
         return
+    console = Console()
     for line in done.figures():
         console.print(line, highlight=False)
     from .motion_calibration import FILES
 
-    print(f"\nWritten to {plain(str(job.output))}: {', '.join(FILES)}")
+    print(f"\nWritten to {plain(str(job.output))}: {', '.join([REPORT, *FILES])}")
     lens, track = job.output / "lens.json", job.output / "track.csv"
     print(
         f"Correct the clip with zoomjax undistort {plain(str(lens))} {plain(job.inputs[0])} "

@@ -62,7 +62,9 @@ from .options import (
     WithLines,
     detector_for,
     excluded,
+    refuse_auto,
     refuse_idle,
+    refuse_idle_sources,
 )
 from .plans import images_plan, lines_plan, tell_plan, without
 from .runs import calibrate_images, calibrate_lines, title_of
@@ -215,6 +217,7 @@ def calibrate(
     show = Shown(strict, quiet, as_json)
     from .model_choice import WantedModel
 
+    refuse_auto(model, degree)
     wanted = WantedModel(model or "auto", degree, terms, family)
     about = wanted.usual_centre if centre is None else centre_of(centre)
     wanted.check_centre(about)
@@ -271,6 +274,7 @@ def calibrate(
         )
         return calibrate_clip(clip, show, dry_run=dry_run)
     refuse_idle(context, ("with_lines",), "without --focal motion: all else is calibrated from lines")
+    refuse_idle_sources(context, focal)
     job = ImageJob(
         tuple(inputs),
         detector=detector_for(context, detector, focal),

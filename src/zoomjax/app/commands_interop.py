@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -132,11 +132,26 @@ def import_(
         str | None,
         typer.Option(help="Of STMaps: centres (Nuke), gyroflow or alicevision. Default: centres."),
     ] = None,
+    family: Annotated[
+        Literal["radial", "division", "brown-conrady"] | None,
+        typer.Option(
+            help="Distortion model: radial (polynomial), division or brown-conrady (with decentering). "
+            "Default: that which holds the file's coefficients, or is nearest to its maps."
+        ),
+    ] = None,
+    terms: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Number of radial coefficients. Default: 2, or those that keep the file's values.",
+        ),
+    ] = None,
     table: Annotated[
         bool,
         typer.Option(
             "--table",
-            help="Keep the file's own values at its focal lengths, and interpolate linearly in 1/f.",
+            help="Keep the file's own values at its focal lengths, and the tool's own interpolation "
+            "between; linear in 1/f where it has none.",
         ),
     ] = False,
     overwrite: Overwrite = False,
@@ -149,6 +164,7 @@ def import_(
     set_up_jax()
     from ..interop.registry import read
     from ..models.tables import TableZoom
+    from .model_choice import FAMILIES
     from .results_folder import OF_A_LENS, results_folder
 
     inputs = list(source.iterdir()) if source.is_dir() else [source]
@@ -163,6 +179,8 @@ def import_(
         direction=direction,
         convention=convention,
         zoom=TableZoom() if table else None,
+        terms=terms,
+        family=None if family is None else FAMILIES[family],
     )
     with results_folder(output, RESULTS, clears=OF_A_LENS, overwrite=overwrite) as folder:
         found.lens.save(folder / RESULTS[0])
@@ -174,13 +192,24 @@ def import_(
 
 @app.command("formats")
 def formats() -> None:
-    """List the formats of other tools: what can be done, how well, zooming, and who reads them."""
+    """List the formats of other tools.
+
+    Exact formats have our formula: a radial polynomial loses nothing but
+    digits, up to the number of coefficients of the format. In others the
+    tool's formula is refitted, and the error is reported.
+    """
     from ..interop.registry import FORMATS
 
+    rows = [("format", "direction", "formula", "zoom", "tools")]
     for fmt in FORMATS:
         ways = "export, import" if fmt.writes else "import"
-        exact = "exact" if fmt.exact else "refitted"
-        print(f"{fmt.name:<12}{ways:<16}{exact:<10}{_ZOOM[fmt.zoom]:<26}{fmt.tools}")
+        formula = "exact" if fmt.exact else "refitted"
+        if fmt.exact_for is not None:
+            formula += f", exact for {fmt.exact_for}"
+        rows.append((fmt.name, ways, formula, _ZOOM[fmt.zoom], fmt.tools))
+    widths = [max(map(len, column)) + 2 for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("".join(f"{word:<{width}}" for word, width in zip(row, widths, strict=True)).rstrip())
 
 
 _ZOOM = {
@@ -193,7 +222,7 @@ _ZOOM = {
 
 def _show(report: "Report") -> None:
     for line in str(report).splitlines():
-        print(plain(line))
+        print(plain(line.replace("a table, TableZoom(), keeps", "--table keeps")))
 
 
 def _numbers(text: str) -> list[float]:

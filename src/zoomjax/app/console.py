@@ -8,13 +8,14 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .._core.text import plain, span
+from .._core.text import plain
 from ._interrupts import go_on
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from ..trust.assessment import Finding
     from .calibration import Calibration
     from .image_calibration import ImageCalibration
 
@@ -120,15 +121,20 @@ def _ticking(tell: Callable[[], object]) -> Iterator[None]:
 
 def show_verdict(calibration: "Calibration") -> None:
     """Print the verdict, and for each finding what to do."""
+    found = calibration.assessment
+    print_verdict(found.verdict, found.sentence, found.findings)
+
+
+def print_verdict(verdict: str, sentence: str, findings: "Sequence[Finding]") -> None:
+    """Print the sentence of a verdict, and for each finding what to do."""
     from rich.console import Console
     from rich.text import Text
 
-    found, console = calibration.assessment, Console()
-    verdict, _, reason = found.sentence.partition(":")
-    colour = {"good": "green", "doubtful": "yellow"}.get(found.verdict, "red")
-    console.print(Text.assemble((f"{verdict}:", f"bold {colour}"), reason))
-    for place, finding in enumerate(found.findings):
-        known = place == 0 and found.verdict != "good"  # from the line above
+    console, (word, _, reason) = Console(), sentence.partition(":")
+    colour = {"good": "green", "doubtful": "yellow"}.get(verdict, "red")
+    console.print(Text.assemble((f"{word}:", f"bold {colour}"), reason))
+    for place, finding in enumerate(findings):
+        known = place == 0 and verdict != "good"  # from the line above
         console.print(Text(f"  - {'' if known else _capital(finding.found) + ' '}{finding.advice}"))
 
 
@@ -148,12 +154,11 @@ def show_calibration(
     console = Console()
     summary = calibration.summary()
     unit = summary["focal_unit"]
-    low, high = summary["focal_range"]
     show_verdict(calibration)
     console.print(
         f"\n{summary['points']:,} points on {summary['lines']:,} lines in "
         f"{summary['frames']} frame{'s' * (summary['frames'] > 1)}, "
-        f"f = {span(low, high, unit)}\n",
+        f"{calibration.focal_text()}\n",
         highlight=False,
     )
     table = Table(
@@ -187,7 +192,10 @@ def show_calibration(
     if not polynomials.size:
         console.print(_coefficients(calibration))
     console.print(f"\n{calibration.centre.sentence}", highlight=False)
-    corner = [f"{moved:+.2f} ± {std:.2g} px at {f:.4g} {unit}" for f, moved, std in calibration.corner()]
+    corner = [
+        f"{moved:+.2f} ± {std:.2g} px" + f" at {f:.4g} {unit}" * calibration.focal_known
+        for f, moved, std in calibration.corner()
+    ]
     console.print(f"\nThe correction moves a corner by {', '.join(corner)}.", highlight=False)
     if allowed_for := calibration.allowed_for():
         console.print(allowed_for, highlight=False)
@@ -213,7 +221,7 @@ def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()
     found = sum(len(detection.lines) for detection in done.used)
     rejected = int(done.calibration.rejected.sum())
     print(
-        f"\n{found} lines found in {len(done.used)} images; {rejected} of them are not straight in the "
+        f"\n{found} lines found in {_images(len(done.used))}; {rejected} of them are not straight in the "
         f"scene and were rejected.\nFocal lengths: {plain(done.focals.origin)}."
     )
     deviation = sorted(s / done.focals.focal[name] for name, s in done.focals.deviation.items())
@@ -224,6 +232,10 @@ def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()
     tell(done.warnings())
     print(f"\nCheck the detected lines, drawn over each image, in {plain(str(folder / 'lines'))}.")
     tell_written(folder, ["lines/", *also])
+
+
+def _images(number: int) -> str:
+    return f"{number} image{'s' * (number > 1)}"
 
 
 def tell(warnings: Sequence[str]) -> None:

@@ -1,14 +1,12 @@
 """Plots of where lines lie, in the image and over the zoom, and of how residuals depend on the radius."""
 
 import numpy as np
-from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
+from .colours import FRAMES, MODEL, SHADES
 
-_INK, _LINES = "#c2410c", "#1e3a5f"
-_SHADES = LinearSegmentedColormap.from_list("coverage", ["#ffffff", "#1e3a5f"])
 _CELLS, _RINGS = 16, 12
 _MOST_POINTS = 200_000  # are enough to average over
 
@@ -31,14 +29,14 @@ def plot_coverage(lines: Lines, weight: np.ndarray) -> Figure:
     passed = np.unique((line * rows + y) * columns + x) % (rows * columns)
     number = np.bincount(passed, minlength=rows * columns).reshape(rows, columns)
     extent = (0, columns * cell, rows * cell, 0)
-    shown = left.imshow(number, cmap=_SHADES, extent=extent, vmin=0, interpolation="nearest")
+    shown = left.imshow(number, cmap=SHADES, extent=extent, vmin=0, interpolation="nearest")
     left.set(xlim=(0, width), ylim=(height, 0), xlabel="$x$  (px)", ylabel="$y$  (px)")
     left.set_title("lines through each part of the image", fontsize=10)
     figure.colorbar(shown, ax=left, shrink=0.8)
     focal = np.asarray(lines.focal)
     per_frame = np.bincount(np.asarray(lines.frame)[weight > 0], minlength=len(focal))
-    right.vlines(focal, 0, per_frame, color=_LINES, linewidth=1)
-    right.plot(focal, per_frame, "o", color=_LINES, markersize=4)
+    right.vlines(focal, 0, per_frame, color=FRAMES, linewidth=1)
+    right.plot(focal, per_frame, "o", color=FRAMES, markersize=4)
     right.set(ylim=(0, None), xlabel=f"$f$  ({lines.focal_unit})", ylabel="lines")
     if focal.max() > 2 * focal.min():
         right.set_xscale("log")
@@ -70,7 +68,7 @@ def plot_radius(lines: Lines, lens: ZoomLens, weight: np.ndarray) -> Figure:
     axes = figure.subplots()
     middle = (edges[1:] + edges[:-1]) / 2
     rms = np.sqrt(squares[known] / number[known])
-    axes.plot(middle[known], rms, "o", color=_INK, markersize=5)
+    axes.plot(middle[known], rms, "o", color=MODEL, markersize=5)
     axes.set(ylim=(0, 1.15 * rms.max() or 1), xlim=(0, edges[-1]))
     axes.set_xlabel("distance from the centre of distortion  (px)")
     axes.set_ylabel("RMS residual  (px)")

@@ -20,7 +20,6 @@ from .._core.types import AnyArray
 from ..detect.batch import Detection
 from ..fit.frames import fit_frames
 from ..fit.robust import fit_robust
-from ..focal.board import focal_from_board
 from ..focal.estimate import FocalEstimate
 from ..focal.pitch import focal_from_pitch, name_pitch_lines
 from ..io.focal_table import read_focal_table
@@ -30,37 +29,23 @@ from ..lines.compressed import compress
 from ..lines.lines import Lines
 from ..models.distortion import Distortion
 from ..models.zoom import PolynomialZoom
-from .plane_focals import MOST_UNCERTAIN, FocalGroup, Found, Sharing, focals_from_grids, nodes
+from .board_focals import NOT_THE_BOARD, Board, focal_of_board
+from .plane_focals import MOST_UNCERTAIN, FocalGroup, Found, Sharing, focals_from_grids
 
 WAYS = (
-    'a CSV file with the columns "image,focal" (--focal focal.csv); EXIF data in the photos '
-    "(--focal exif); a board parallel to the sensor (--focal board --pitch MM --distance MM --pixel MM); "
-    "oblique photos of a flat checkerboard or dot grid (--focal plane); or markings of a football pitch "
-    "(--focal pitch)"
+    "one focal length for all (--focal 24); a CSV file with the columns image,focal (--focal focal.csv); "
+    "EXIF data in the photos (--focal exif); a board parallel to the sensor (--focal board --pitch MM "
+    "--distance MM --pixel MM); oblique photos of a flat checkerboard or dot grid (--focal plane); or "
+    "markings of a football pitch (--focal pitch)"
 )
 
 _VIDEO_WAYS = (
-    "one focal length, a CSV file with time,focal or frame,focal, or plane, board or pitch as for photos"
+    "one focal length, a CSV file with time,focal or frame,focal, motion, or plane, board or pitch as for "
+    "photos"
 )
 
 MEASURED = ("plane", "board", "pitch")
 """Sources that are the images themselves."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Board:
-    """A board parallel to the sensor.
-
-    Attributes:
-        pitch: mm between neighbouring lines on it, across and down: from one edge of a stripe to the next
-            one, or from corner to corner, or from dot to dot.
-        distance: mm from the camera's projection plane to it.
-        pixel: mm, side of a pixel on the sensor.
-    """
-
-    pitch: tuple[float, float]
-    distance: float
-    pixel: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +59,7 @@ class Focals:
         absent: why an image may have no focal length.
         deviation: standard deviations by name, where known: estimated from images, or given.
         groups: the images that share a focal length.
+        known: whether they are: of one image alone, one millimetre may stand for what nobody knows.
     """
 
     focal: dict[str, float]
@@ -82,6 +68,7 @@ class Focals:
     absent: str
     deviation: dict[str, float] = dataclasses.field(default_factory=dict)
     groups: tuple[FocalGroup, ...] = ()
+    known: bool = True
 
     def deviating_by(self, deviation: dict[str, float]) -> "Focals":
         """The same with other standard deviations."""
@@ -130,7 +117,8 @@ def choose_focals(
     Args:
         detections: detections of images of one size, all with lines.
         way: the source: "exif", "board", "plane", "pitch", a number or a CSV file. None for the best
-            available one: the `board` if it is given, else EXIF data, else an oblique grid.
+            available one: the `board` if it is given, else EXIF data, else an oblique grid; else, of one
+            image alone, none: one millimetre stands for its focal length.
         unit: unit of a number or of the focal lengths in a CSV file.
         board: the board, for "board".
         sharing: which images share a focal length, for "plane".
@@ -139,6 +127,7 @@ def choose_focals(
         FileNotFoundError: there is no such CSV file.
         ValueError: no focal length was found; the message lists the other sources.
     """
+    whole = way
     if way is None:
         way = "board" if board else "exif" if any(d.focal for d in detections) else "plane"
     if way == "exif":
@@ -149,7 +138,11 @@ def choose_focals(
         if board is None:
             raise ValueError(_NO_BOARD)
         found = _estimated(
-            detections, "mm", "the board's pitch (eq. 14)", _NOT_THE_BOARD, _each(_from_board(board))
+            detections,
+            "mm",
+            "the board's pitch (eq. 14)",
+            NOT_THE_BOARD,
+            _each(functools.partial(focal_of_board, board)),
         )
     elif way == "plane":
         found = _estimated(
@@ -177,6 +170,8 @@ def choose_focals(
             f"{Path(way).name} has no row for it",
             {name: value for name, value in sigma.items() if value is not None},
         )
+    if not found.focal and whole is None and board is None and len(detections) == 1:
+        return Focals({detections[0].name: 1.0}, "mm", _UNKNOWN, "", known=False)
     if not found.focal:
         raise ValueError(
             f"No focal length found for any image. Source: {found.origin}; problem: {found.absent}. Give "
@@ -186,6 +181,9 @@ def choose_focals(
     return found
 
 
+_UNKNOWN = "not known, and not needed for one photo: 1 mm stands for it"
+
+
 _NO_PLANE = "no flat grid was found in it, or the view is too frontal to determine a focal length"
 
 
@@ -193,16 +191,6 @@ _NO_PITCH = (
     "its lines cannot be told to be the markings of a football pitch, of which at least four must be seen, "
     "two along and two across it, or they do not determine a focal length"
 )
-
-_NOT_THE_BOARD = (
-    "no evenly spaced lines of a board were found in it, or their pitch differs between the two directions "
-    "(then give both: --pitch ACROSSxDOWN)"
-)
-_EVEN = 0.1
-"""Largest RMS distance of lines of a board from even spacing, in steps."""
-
-_DISAGREE = 3e-3
-"""Relative difference allowed between a board's two directions, if more than three deviations."""
 
 
 def _own(detections: Sequence[Detection]) -> dict[str, float]:
@@ -301,81 +289,6 @@ def _from_pitch(detection: Detection, correction: Distortion) -> FocalEstimate |
     return focal_from_pitch(named, principal=principal) if named else None
 
 
-def _from_board(board: Board) -> Estimator:
-    def estimate(detection: Detection, correction: Distortion) -> FocalEstimate | None:
-        pitch = np.array(board.pitch)
-        known = nodes(detection, correction)
-        if known is not None:
-            points, places = known
-            parts = [(points, pitch * places)]
-        else:
-            corrected = [np.asarray(correction.undistort(jnp.asarray(line))) for line in detection.lines]
-            parts = [(points, pitch * places) for points, places in _parallels(corrected)]
-        found = [
-            focal_from_board(points, places, distance=board.distance, pixel=board.pixel)
-            for points, places in parts
-        ]
-        return _combined(found)
-
-    return estimate
-
-
-def _combined(found: Sequence[FocalEstimate]) -> FocalEstimate | None:
-    """The weighted mean of estimates; None if there are none, or if they disagree."""
-    if not found:
-        return None
-    focal, std, rms = (
-        np.array([float(getattr(f, name)) for f in found]) for name in ("focal", "std", "rms")
-    )
-    weight = 1 / np.maximum(std, 1e-12) ** 2
-    mean = weight @ focal / weight.sum()
-    if np.any(abs(focal - mean) > np.maximum(3 * std, _DISAGREE * mean)):
-        return None
-    return FocalEstimate(jnp.asarray(mean), jnp.asarray(weight.sum() ** -0.5), jnp.asarray(rms.max()))
-
-
-def _parallels(lines: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For each direction of a board, the positions of its lines, px, and their numbers on the board.
-
-    Both are (n, 2), on the x axis for vertical and on the y axis for horizontal lines, as
-    `focal_from_board` takes them. A direction whose lines are not evenly spaced is left out.
-    """
-    middle = np.array([line.mean(axis=0) for line in lines])
-    along = np.array([line[-1] - line[0] for line in lines])
-    twice = 2 * np.arctan2(along[:, 1], along[:, 0])
-    # Multiplying the angle by 4 in all makes both directions of a board one.
-    main = np.angle(np.sum(np.hypot(*along.T) * np.exp(2j * twice))) / 4
-    result = []
-    for direction in (main, main + np.pi / 2):
-        chosen = np.cos(twice - 2 * direction) > 0.9
-        normal = np.array([-np.sin(direction), np.cos(direction)])
-        counted = _counted(np.sort(middle[chosen] @ normal))
-        if counted is not None:
-            axis = np.eye(2)[int(np.argmax(abs(normal)))]
-            result.append(tuple(values[:, None] * axis for values in counted))
-    return result
-
-
-def _counted(position: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Positions of evenly spaced lines, in order, and their numbers; None if they are not evenly spaced.
-
-    Some lines may be missing, and some may be in two pieces.
-    """
-    if len(position) < 3:
-        return None
-    usual = float(np.median(np.diff(position)))
-    position = position[np.append(True, np.diff(position) > 0.2 * usual)]
-    if len(position) < 3 or usual < 1:
-        return None
-    step, index = float(np.median(np.diff(position))), np.zeros(len(position))
-    for number in range(1, len(position)):  # the estimate of the step improves with each line
-        index[number] = index[number - 1] + np.rint((position[number] - position[number - 1]) / step)
-        if number > 3:
-            step = float(np.polyfit(index[: number + 1], position[: number + 1], 1)[0])
-    rest = position - np.polyval(np.polyfit(index, position, 1), index)
-    return (position, index) if np.sqrt(np.mean(rest**2)) < _EVEN * step else None
-
-
 def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray, "frame"]:
     """Parse standard deviations: a number in the unit of f, or a percentage of f such as "1%".
 
@@ -383,10 +296,7 @@ def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray
         ValueError: the text is neither, or negative.
     """
     number, percent, rest = text.strip().partition("%")
-    try:
-        value = float(number)
-    except ValueError:
-        value = np.nan
-    if rest or not 0 <= value < np.inf:
+    value = plain_number(number)
+    if rest or value is None or value < 0:
         raise ValueError(f"Argument focal_sigma must be a number such as 0.3, or 1%, but it is {text!r}.")
     return value / 100 * np.asarray(focal) if percent else np.full(np.shape(focal), value)

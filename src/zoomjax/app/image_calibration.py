@@ -15,6 +15,7 @@ import numpy as np
 from .._core.text import plain
 from ..detect.batch import DETECTORS, Detection, detect
 from ..detect.sources import Source
+from ..models.about import UNKNOWN
 from ._flags import with_flags
 from .calibration import Calibration, calibrate
 from .choice import chosen_frames, colour_limit
@@ -24,7 +25,7 @@ from .image_job import ImageJob, overlay_name
 from .overlay import draw_lines
 from .plane_focals import Sharing
 from .results_folder import OF_A_LENS, results_folder
-from .verdict import findings_of_photos
+from .verdict import findings_of_focals, findings_of_photos
 
 MOST_OVERLAYS = 200
 """Images drawn with their lines, unless all are asked for."""
@@ -261,20 +262,23 @@ def _shared(used: Sequence[Detection], focals: Focals) -> np.ndarray | None:
 
 
 def _with_equipment(done: ImageCalibration) -> ImageCalibration:
-    """The same with camera and lens in the lens, as the photos used tell."""
+    """The same with camera and lens in the lens, as the photos used tell, and whether f is known."""
     if done.job.video is not None:
         return done
     photos = [Path(detection.file) for detection in done.used]
     zoom = done.calibration.zoom
-    zoom = dataclasses.replace(zoom, lens=with_equipment(zoom.lens, photos))
+    lens = with_equipment(zoom.lens, photos)
+    if not done.focals.known:
+        lens = dataclasses.replace(lens, pixel_pitch=None, about={**lens.about, "focal": UNKNOWN})
+    zoom = dataclasses.replace(zoom, lens=lens)
     return dataclasses.replace(done, calibration=dataclasses.replace(done.calibration, zoom=zoom))
 
 
 def _with_findings(done: ImageCalibration) -> ImageCalibration:
-    """The same with what the photos say about themselves in the verdict."""
-    if done.job.video is not None:
-        return done
-    found = findings_of_photos(Path(detection.file) for detection in done.used)
+    """The same with what the photos and their focal lengths say about themselves in the verdict."""
+    found = findings_of_focals(done.focals.groups, done.focals.unit)
+    if done.job.video is None:
+        found += findings_of_photos(Path(detection.file) for detection in done.used)
     assessment = done.calibration.assessment.joined_by(found)
     return dataclasses.replace(
         done, calibration=dataclasses.replace(done.calibration, assessment=assessment)

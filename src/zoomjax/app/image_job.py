@@ -14,8 +14,9 @@ from ..fit.zoom import CentreArgument
 from ..io.focal_track import FocalTrack, read_focal_track
 from ..io.photo import read_focal
 from ..io.text_table import plain_number
+from .board_focals import Board
 from .calibration import FILES
-from .focal_sources import MEASURED, Board, check_way, focal_sigmas
+from .focal_sources import MEASURED, check_way, focal_sigmas
 from .model_choice import WantedModel
 from .plane_focals import SHARED_BY
 
@@ -75,7 +76,7 @@ class ImageJob:
             raise ValueError(
                 'Argument focal "pitch" needs the markings of a pitch: give argument detector "pitch", too.'
             )
-        focal_sigmas(self.focal_sigma or "0", np.ones(1))
+        focal_sigmas("0" if self.focal_sigma is None else self.focal_sigma, np.ones(1))
         self.model.check_centre(self.centre)
         if self.shared_focal is not None:
             self._check_sharing(self.shared_focal)

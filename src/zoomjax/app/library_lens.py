@@ -9,11 +9,13 @@ from .._core.files import refuse_existing, refuse_inputs
 from ..correct.framing import check_keep
 from ..correct.image import check_sampling
 from ..io.equipment import read_equipment
+from ..io.focal_table import read_focal_table
 from ..io.photo import read_size
 from ..lenses.database import LensTable, find, one_named
 from ..lenses.library import load, table_for
 from ..lenses.matching import match
 from ..models.lens import ZoomLens
+from .results_folder import OF_A_LENS, results_folder
 from .undistort_files import (
     Job,
     Outcome,
@@ -22,9 +24,12 @@ from .undistort_files import (
     undistort_photos,
     with_refused,
 )
-from .undistort_inputs import targets_of
+from .undistort_inputs import focal_number, targets_of
 
 AUTO = "auto"
+
+_FILE = "lens.json"
+"""The lens in a folder."""
 
 _MOST_SHOWN = 60
 """Lenses listed with their errors."""
@@ -77,18 +82,24 @@ def _row(table: LensTable, size: tuple[int, int] | None) -> Row:
 def write_lens(
     name: str, output: Path, *, size: tuple[int, int] | None, crop: float | None, overwrite: bool
 ) -> ZoomLens:
-    """Write a lens of the library to a file, or as ``lens.json`` into a folder.
+    """Write a lens of the library to a file, or as ``lens.json`` into a folder of results.
+
+    In a folder, what an earlier run wrote about its lens is removed.
 
     Raises:
         OSError: the file exists, or cannot be written.
         ValueError: no lens has this name, or several have; or as `load`.
     """
-    target = output if output.suffix.lower() == ".json" else output / "lens.json"
+    target = output if output.suffix.lower() == ".json" else output / _FILE
     refuse_existing([target], overwrite=overwrite)
     table = table_for(one_named(name), crop)
     lens = load(table, image_size=size or _size_of(table), crop=crop)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    lens.save(target)
+    if target == output:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        lens.save(target)
+    else:
+        with results_folder(output, [_FILE], clears=OF_A_LENS, overwrite=overwrite) as folder:
+            lens.save(folder / _FILE)
     return lens
 
 
@@ -122,6 +133,8 @@ def undistort_by_library(
     photos = [path for path, _ in found.photos]
     targets = targets_of(found.photos, job.output, job.inputs)
     refuse_inputs(targets, photos)  # of all groups: one's target may be an input of another
+    if job.focal is not None and focal_number(job.focal) is None:
+        read_focal_table(job.focal).of(map(str, photos))  # and one's row that of another
     if not job.resume:
         to_do(job, photos, targets)  # complains of targets that exist before any work
     groups, skipped = _by_lens(photos, None if name == AUTO else name)

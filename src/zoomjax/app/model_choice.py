@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from .._core.checks import checked_terms
 from ..fit.centre import CentreFit
 from ..fit.zoom import CentreArgument
 from ..lines.base import AbstractLines
@@ -13,8 +14,9 @@ from ..lines.compressed import CompressedLines
 from ..lines.lines import Lines
 from ..models.brown_conrady import BrownConrady
 from ..models.division import Division
-from ..models.family import AbstractFamily, AbstractRadial
+from ..models.family import AbstractFamily
 from ..models.polynomial import RadialPolynomial
+from ..models.requirements import refusal
 from ..models.smooth import SmoothZoom
 from ..models.spline import SplineZoom
 from ..models.zoom import AbstractZoom, PolynomialZoom
@@ -61,7 +63,8 @@ class WantedModel:
         """Check that the settings go together.
 
         Raises:
-            ValueError: the model is unknown, or a degree is given for another one than the polynomial.
+            ValueError: the model is unknown; a degree is given for another one than the polynomial; or the
+                distortion model, or the prior of the zoom model, does not have so many terms.
         """
         if self.model not in MODELS:
             names = ", ".join(MODELS)
@@ -71,6 +74,12 @@ class WantedModel:
         if self.family not in ("auto", *FAMILIES):
             names = ", ".join(["auto", *FAMILIES])
             raise ValueError(f"Argument family must be one of {names}, but it is {self.family!r}.")
+        if self.terms is not None:
+            checked_terms(self.terms, self.distortion.most_terms)
+        if self.model == "smooth" and self.terms not in (None, _TERMS):
+            raise ValueError(
+                f"Argument model smooth has a prior for {_TERMS} coefficients: leave out argument terms."
+            )
         if self.family != "radial" and self.model == "smooth":
             raise ValueError(
                 "Argument model smooth has a prior for the radial polynomial: leave out argument family."
@@ -84,18 +93,18 @@ class WantedModel:
     @property
     def usual_centre(self) -> CentreArgument:
         """The centre of distortion where none is asked for."""
-        return "fit" if isinstance(self.distortion, AbstractRadial) else "image"
+        return "image" if refusal("fit_centre", family=self.distortion) else "fit"
 
     def check_centre(self, centre: CentreArgument | None) -> None:
-        """Refuse to fit the centre of a model that is not radial: (p1, p2) do nearly the same.
+        """Refuse to fit the centre of a model that has none of its own.
 
         Raises:
             ValueError: it is to be fitted nevertheless.
         """
         if isinstance(centre, str) and centre == "fit" and self.usual_centre != "fit":
             raise ValueError(
-                f'Argument centre cannot be "fit" with argument family {self.family}, whose decentering '
-                'does nearly the same: give "image" or coordinates.'
+                f'Argument centre cannot be "fit" with argument family {self.family}: give "image" or '
+                f"coordinates. ({refusal('fit_centre', family=self.distortion)})"
             )
 
     def base(self, focal: Any) -> Candidate:

@@ -4,7 +4,7 @@ import csv
 import dataclasses
 import importlib.metadata
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from ..io.video_reader import decode_video
 from ..lines.lines import Lines
 from ..models.zoom import PolynomialZoom
 from ..tracks.tracks import Tracks
+from ..trust.assessment import VERDICTS, Finding, Verdict
 from ..trust.bands import displacement_std
 from .model_choice import WantedModel
 from .outward import outward
@@ -76,64 +77,94 @@ class MotionCalibration:
         """Standard deviation of the factor common to all focal lengths, relative."""
         return float(np.sqrt(self.fit.covariance[-1, -1]))
 
-    def findings(self) -> list[str]:
-        """What the clip cannot tell, in sentences with what to do about it; empty if all is good."""
-        fit, told = self.fit, []
-        if fit.fit.result == RESULTS.undetermined:
-            told.append(
-                "The camera hardly turns, so the scale of the focal lengths is not determined: only their "
-                "ratios are. The lens straightens lines all the same. Film again and turn the camera by "
-                "some 10 degrees or more while it zooms."
+    @property
+    def findings(self) -> list[Finding]:
+        """What the clip cannot tell, with what to do about it: the worst first; empty if all is good."""
+        found = [*self._of_turning(), *self._of_zooming(), *self._of_points(), *self._of_frames()]
+        return sorted(found, key=lambda of: -VERDICTS.index(of.verdict))
+
+    def _of_turning(self) -> Iterator[Finding]:
+        if self.fit.fit.result == RESULTS.undetermined:
+            yield Finding(
+                "turning",
+                "not determined",
+                "the camera hardly turns, so the scale of the focal lengths is not determined: only their "
+                "ratios are. The lens straightens lines all the same.",
+                "Film again and turn the camera by some 10 degrees or more while it zooms.",
             )
-        elif fit.fit.result != RESULTS.successful:
-            told.append(RESULTS[fit.fit.result])
+        elif self.fit.fit.result != RESULTS.successful:
+            message = RESULTS[self.fit.fit.result]
+            again = "Film again, slowly, before a scene at rest."
+            yield Finding("fit", "not determined", message[:1].lower() + message[1:], again)
         elif self.scale_std() > _LOOSE_SCALE:
-            told.append(
-                f"All focal lengths have a common factor that is known to {self.scale_std():.1%} only. "
-                "Turn the camera farther while it zooms."
+            yield Finding(
+                "scale",
+                "doubtful",
+                f"all focal lengths have a common factor that is known to {self.scale_std():.1%} only.",
+                "Turn the camera farther while it zooms.",
             )
-        low, high = (float(f) for f in fit.lens.focal_range)
+
+    def _of_zooming(self) -> Iterator[Finding]:
+        low, high = (float(f) for f in self.fit.lens.focal_range)
         if high < _LEAST_ZOOM * low:
-            told.append(
-                f"The focal length hardly changes, {low:.0f} to {high:.0f} px: this is one zoom only."
+            yield Finding(
+                "zoom",
+                "good",
+                f"the focal length hardly changes, {low:.0f} to {high:.0f} px: this is one zoom only.",
+                "Zoom while you film, if the lens is to be known at other focal lengths.",
             )
+
+    def _of_points(self) -> Iterator[Finding]:
         if (share := self.following()) < _FEW:
-            told.append(
-                f"Only {share:.0%} of the tracked points move as a camera that turns makes them: much in "
-                "the clip moves by itself, or the camera does not stand still. Use a tripod."
+            yield Finding(
+                "moving things",
+                "not determined",
+                f"only {share:.0%} of the tracked points move as a camera that turns makes them: much in "
+                "the clip moves by itself, or the camera does not stand still.",
+                "Use a tripod, and film a scene at rest.",
             )
-        if float(fit.noise) > _ROUGH:
-            told.append(
-                f"Points are off the model by {float(fit.noise):.2f} px: the clip is blurred, much in it "
-                "moves by itself, or things near the camera shift as it turns. Turn more slowly, "
-                "before a scene at rest."
+        if (noise := float(self.fit.noise)) > _ROUGH:
+            yield Finding(
+                "noise",
+                "doubtful" if noise <= _WRONG else "not determined",
+                f"points are off the model by {noise:.2f} px: the clip is blurred, much in it moves by "
+                "itself, or things near the camera shift as it turns.",
+                "Turn more slowly, before a scene at rest.",
             )
-        shots = int(np.max(np.asarray(fit.shot))) + 1
+
+    def _of_frames(self) -> Iterator[Finding]:
+        shots = int(np.max(np.asarray(self.fit.shot))) + 1
         if shots > 1:
-            told.append(
-                f"The clip has {shots - 1} cut{'s' * (shots > 2)}. The shots share one lens; the panorama "
-                "is of the longest."
+            yield Finding(
+                "cuts",
+                "good",
+                f"the clip has {shots - 1} cut{'s' * (shots > 2)}. The shots share one lens; the panorama "
+                "is of the longest.",
+                "Check that all of them were filmed with the same lens.",
             )
-        if missing := int(np.sum(~np.isfinite(np.asarray(fit.focal)))):
-            told.append(f"{missing} frames show nothing that can be followed: their f is interpolated.")
-        return told
+        if missing := int(np.sum(~np.isfinite(np.asarray(self.fit.focal)))):
+            yield Finding(
+                "frames without points",
+                "good",
+                f"{missing} frames show nothing that can be followed: their f is interpolated.",
+                "Look at these frames in the corrected clip.",
+            )
 
     @property
-    def verdict(self) -> str:
-        """`poor` if the fit failed, is undetermined or misses points, `doubtful` if rough, else `good`."""
-        missed = self.following() < _FEW or float(self.fit.noise) > _WRONG
-        if self.fit.fit.result != RESULTS.successful or missed:
-            return "poor"
-        rough = float(self.fit.noise) > _ROUGH or self.scale_std() > _LOOSE_SCALE
-        return "doubtful" if rough else "good"
+    def verdict(self) -> Verdict:
+        """The worst of the findings' verdicts; "good" if there are none."""
+        return VERDICTS[max((VERDICTS.index(of.verdict) for of in self.findings), default=0)]
 
+    @property
     def sentence(self) -> str:
-        """The verdict's reason, in words."""
+        """The verdict and its main reason."""
+        if self.verdict != "good":
+            return f"{self.verdict.capitalize()}: {self.findings[0].found}"
         low, high = (float(f) for f in self.fit.lens.focal_range)
         pan, tilt = np.ptp(np.asarray(self.fit.pan_and_tilt), axis=0)
         return (
-            f"{self.following():.0%} of the tracked points follow a camera that turns by {pan:.1f} by "
-            f"{tilt:.1f} degrees and zooms from {low:.0f} to {high:.0f} px, within "
+            f"Good: {self.following():.0%} of the tracked points follow a camera that turns by {pan:.1f} "
+            f"by {tilt:.1f} degrees and zooms from {low:.0f} to {high:.0f} px, within "
             f"{float(self.fit.noise):.2f} px."
         )
 
@@ -171,7 +202,8 @@ class MotionCalibration:
         fit, lens = self.fit, self.fit.lens
         return {
             "verdict": self.verdict,
-            "findings": self.findings(),
+            "verdict_sentence": self.sentence,
+            "findings": [dataclasses.asdict(finding) for finding in self.findings],
             "clip": self.clip.name,
             "frames": self.tracks.frames,
             "tracks": len(self.tracks.number),

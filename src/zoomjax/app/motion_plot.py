@@ -6,9 +6,9 @@ from matplotlib.figure import Figure
 
 from ..fit.motion import MotionFit
 from ..trust.bands import displacement_std
+from .colours import FRAMES, MODEL, PALE
 from .outward import outward
 
-_MODEL, _FRAMES, _PALE = "#c2410c", "#1e3a5f", "#7da3c8"
 _BAND = 1.96  # standard deviations of a 95 % band
 
 
@@ -26,8 +26,8 @@ def plot_motion(fit: MotionFit) -> Figure:
 def _focal(axes: Axes, fit: MotionFit) -> None:
     focal, std = np.asarray(fit.focal), np.asarray(fit.focal_std)
     frame = np.arange(len(focal))
-    axes.fill_between(frame, focal - _BAND * std, focal + _BAND * std, color=_MODEL, alpha=0.25, lw=0)
-    axes.plot(frame, focal, color=_MODEL)
+    axes.fill_between(frame, focal - _BAND * std, focal + _BAND * std, color=MODEL, alpha=0.25, lw=0)
+    axes.plot(frame, focal, color=MODEL)
     axes.set(xlabel="frame", ylabel="focal length, px", title="How the camera zoomed")
     axes.margins(x=0)
 
@@ -36,8 +36,8 @@ def _direction(axes: Axes, fit: MotionFit) -> None:
     angles, shot = np.asarray(fit.pan_and_tilt), np.asarray(fit.shot)
     for number in range(shot.max() + 1):
         of_shot = angles[shot == number]
-        axes.plot(of_shot[:, 0], of_shot[:, 1], color=_FRAMES, lw=1)
-        axes.plot(*of_shot[0], "o", color=_MODEL, ms=5)
+        axes.plot(of_shot[:, 0], of_shot[:, 1], color=FRAMES, lw=1)
+        axes.plot(*of_shot[0], "o", color=MODEL, ms=5)
     axes.set(
         xlabel="to the right, degrees", ylabel="up, degrees", title="Where it looked (a dot: the beginning)"
     )
@@ -51,8 +51,8 @@ def _corner(axes: Axes, fit: MotionFit) -> None:
     corner = np.zeros(2)
     moved = outward(lens, corner, focal)
     std = np.asarray(displacement_std(fit.fit, corner, focal=focal))
-    axes.fill_between(focal, moved - _BAND * std, moved + _BAND * std, color=_MODEL, alpha=0.25, lw=0)
-    axes.plot(focal, moved, color=_MODEL)
+    axes.fill_between(focal, moved - _BAND * std, moved + _BAND * std, color=MODEL, alpha=0.25, lw=0)
+    axes.plot(focal, moved, color=MODEL)
     axes.axhline(0, color="0.7", lw=0.8, zorder=0)
     axes.set(
         xlabel="focal length, px",
@@ -66,10 +66,10 @@ def _residuals(axes: Axes, fit: MotionFit) -> None:
     residual = np.asarray(fit.residual)
     residual = np.sort(residual[np.isfinite(residual)])  # others pad
     share = np.arange(1, len(residual) + 1) / len(residual)
-    axes.plot(residual, share, color=_FRAMES)
+    axes.plot(residual, share, color=FRAMES)
     noise = float(fit.noise)
     sizes = np.geomspace(noise / 10, max(noise * 10, residual[-1]), 200)
-    axes.plot(sizes, 1 - np.exp(-((sizes / noise) ** 2) / 2), color=_PALE, ls="--", zorder=0)
+    axes.plot(sizes, 1 - np.exp(-((sizes / noise) ** 2) / 2), color=PALE, ls="--", zorder=0)
     axes.set_xscale("log")
     axes.set(
         xlabel="distance of a tracked point from the model, px",

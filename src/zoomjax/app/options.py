@@ -203,6 +203,25 @@ def refuse_idle(context: typer.Context, names: Iterable[str], where: str) -> Non
         raise ValueError(f"{' and '.join(given)} {has} no effect {where}: leave {them} out.")
 
 
+_OF_A_UNIT = (None, "exif", "board", "plane", "pitch")
+"""Sources of focal lengths that tell their unit."""
+
+
+def refuse_idle_sources(context: typer.Context, focal: str | None) -> None:
+    """Refuse options about another source of focal lengths of photos than the one that is used."""
+    if focal in _OF_A_UNIT:
+        source = f"with --focal {focal}" if focal else "without --focal"
+        refuse_idle(context, ("focal_unit",), f"{source}, for it is the unit of a number or a CSV file")
+    if focal not in (None, "board"):
+        refuse_idle(context, ("pitch", "distance", "pixel"), f"with --focal {focal}")
+
+
+def refuse_auto(model: str | None, degree: int | None) -> None:
+    """Refuse a model that is to be chosen and is given."""
+    if model == "auto" and degree is not None:
+        raise ValueError("--model auto has no effect with --degree, which gives the model: leave out one.")
+
+
 def _is_given(context: typer.Context, name: str) -> bool:
     source = context.get_parameter_source(name)
     return source is not None and source.name != "DEFAULT"

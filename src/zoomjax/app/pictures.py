@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from ..correct.framing import frame_output
+from ..correct.framing import Framing, frame_output
 from ..correct.image import undistort_image
 from ..detect.sources import shrunk
 from ..models.distortion import Distortion
@@ -67,10 +67,7 @@ def _pictures(images: "ImageCalibration", frame: int, image: UInt8[np.ndarray, "
     look = {"rejected": rejected.tolist(), "rms": rms, "labels": labels, "limit": colour_limit(calibration)}
     before = draw_lines(small, [_at(line, scale) for line in lines], **look)
     distortion = _resized(calibration.zoom.lens(float(calibration.lines.focal[frame])), image, small)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of folds, which the report states
-        framing = frame_output(distortion, (small.shape[1], small.shape[0]), keep="all")
-        corrected = undistort_image(small, distortion, keep=framing, border_value=128)
+    corrected, framing = _corrected(small, distortion)
     origin, enlarged = np.asarray(framing.origin), float(framing.scale)
     joined = np.asarray(distortion.undistort(_at(np.concatenate(lines), scale)))  # all lines at once
     ends = np.cumsum([len(line) for line in lines])[:-1]
@@ -79,6 +76,20 @@ def _pictures(images: "ImageCalibration", frame: int, image: UInt8[np.ndarray, "
     after = draw_lines(corrected, known, **look)
     crops = {int(line): _crop(image, lines[place]) for line, place in zip(named, labels, strict=True)}
     return Pictures(frame, _jpeg(before), _jpeg(after), crops)
+
+
+def before_after(image: UInt8[np.ndarray, "..."], distortion: Distortion) -> tuple[bytes, bytes]:
+    """A small picture of an image, and one of its correction, as JPEG."""
+    small, _ = shrunk(image, _WIDE)
+    return _jpeg(small), _jpeg(_corrected(small, _resized(distortion, image, small))[0])
+
+
+def _corrected(small: np.ndarray, distortion: Distortion) -> tuple[np.ndarray, Framing]:
+    """All of a picture, corrected, and how it is framed."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of folds, which the report states
+        framing = frame_output(distortion, (small.shape[1], small.shape[0]), keep="all")
+        return undistort_image(small, distortion, keep=framing, border_value=128), framing
 
 
 def _crop(image: np.ndarray, line: np.ndarray) -> bytes:

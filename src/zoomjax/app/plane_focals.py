@@ -56,6 +56,10 @@ class FocalGroup:
     alone: tuple[float, float] | None = None
     agree: bool = True
 
+    def spread(self) -> float:
+        """How many times the shortest focal length of a single photo the longest is."""
+        return 1.0 if self.alone is None else self.alone[1] / self.alone[0]
+
     def sentence(self, unit: str) -> str:
         """The group in words."""
         digits = max(0, -math.floor(math.log10(self.std))) if 0 < self.std < 1 else 0

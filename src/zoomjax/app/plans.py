@@ -6,18 +6,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._core.text import plain, span
+from .._core.text import listed, plain, span
 
 if TYPE_CHECKING:
+    from ..detect.sources import Source
     from ..lines.lines import Lines
     from .image_job import ImageJob
 
-_LISTED = 20
+_LISTED, _NAMED = 20, 6
 
 
 def lines_plan(lines: "Lines", exclude: Sequence[int]) -> list[str]:
     """What would be fitted, in lines of text."""
     left, focal = len(lines.frame) - len(exclude), np.asarray(without(lines, exclude).focal)
+    if not left:
+        raise ValueError("No line is left: give fewer to be excluded.")
     return [
         f"{left:,} of {len(lines.frame):,} lines in {len(focal)} frames, "
         f"f = {span(float(focal.min()), float(focal.max()), lines.focal_unit)}."
@@ -36,7 +39,38 @@ def images_plan(job: "ImageJob") -> list[str]:
             told.append(f"  {plain(source.name)}: {focal_of(source.path or Path())}")
         except (OSError, ValueError) as error:
             told.append(f"  {plain(source.name)}: {plain(str(error))}")
-    return [*told, *([f"  and {len(sources) - _LISTED} more"] if len(sources) > _LISTED else [])]
+    more = [f"  and {len(sources) - _LISTED} more"] if len(sources) > _LISTED else []
+    return [*told, *more, *_zooms(job, sources)]
+
+
+def _zooms(job: "ImageJob", photos: Sequence["Source"]) -> list[str]:
+    """Which photos would share a focal length, as far as that is known before they are looked at."""
+    if job.shared_focal is None:
+        return []
+    if job.shared_focal == "similarity":
+        return ["Photos whose focal lengths agree would share one."]
+    members: dict[str, list[str]] = {}
+    for photo in photos:
+        members.setdefault(_zoom(job.shared_focal, photo.path or Path()), []).append(plain(photo.name))
+    shared = [
+        f"  {zoom}: {listed(names, _NAMED)}" for zoom, names in members.items() if zoom and len(names) > 1
+    ]
+    return (
+        ["Photos that would share a focal length:", *shared] if shared else ["No two photos share a zoom."]
+    )
+
+
+def _zoom(how: str, photo: Path) -> str:
+    """What names the zoom of a photo; empty if it has a focal length of its own."""
+    from ..io.photo import read_focal
+
+    if how == "folder":
+        return plain(str(photo.parent))
+    try:
+        focal = read_focal(photo)
+    except (OSError, ValueError):  # said above
+        return ""
+    return "" if focal is None else f"{focal:g} mm in EXIF data"
 
 
 def _focal_lengths(job: "ImageJob", photos: Sequence[Path]) -> Callable[[Path], str]:

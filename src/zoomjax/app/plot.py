@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
@@ -19,9 +18,8 @@ from ..lines.base import AbstractLines
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..trust.bands import coefficient_std, displacement_std
+from .colours import DEPTHS, FRAMES, MODEL
 
-_MODEL, _FRAMES = "#c2410c", "#1e3a5f"
-_DEPTHS = LinearSegmentedColormap.from_list("zoomjax", ["#ffffff", "#7da3c8"])
 _EXAGGERATIONS = np.outer(10.0 ** np.arange(7), (1, 2, 5)).ravel()
 _VISIBLE = 0.03  # of the image's longer side: how far the drawn grid is bent at least
 _STEP = 7  # from one arrow to the next, in points at which the field is known
@@ -67,19 +65,17 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
         known = np.isfinite(sigma[:, i])
         x, unit = 1 / focal[known], f"px$^{{-{orders[i]}}}$"
         above.plot(
-            x, frames[known, i], "o", markersize=3.5, color=_FRAMES, label="separate fit of each frame"
+            x, frames[known, i], "o", markersize=3.5, color=FRAMES, label="separate fit of each frame"
         )
-        above.plot(grid, curve[:, i], color=_MODEL, linewidth=1.8, label="zoom model")
+        above.plot(grid, curve[:, i], color=MODEL, linewidth=1.8, label="zoom model")
         _shade(above, grid, curve[:, i], spread[:, i])
         name = f"k_{i + 1}" if orders[i] > 1 else f"p_{i + 1 - np.sum(orders > 1)}"
         _label(above, f"${name}$", unit, curve[:, i])
         difference = frames[known, i] - expected[known, i]
-        below.errorbar(
-            x, difference, sigma[known, i], fmt="o", markersize=2.5, linewidth=0.9, color=_FRAMES
-        )
+        below.errorbar(x, difference, sigma[known, i], fmt="o", markersize=2.5, linewidth=0.9, color=FRAMES)
         _shade(below, grid, 0.0, spread[:, i])
         _label(below, "frame − model", unit, np.append(difference, sigma[known, i]))
-        below.axhline(0, color=_MODEL, linewidth=1.2, zorder=0)
+        below.axhline(0, color=MODEL, linewidth=1.2, zorder=0)
         below.set_xlabel(f"$1/f$  (1/{lens.focal_unit})")
         below.locator_params(axis="x", nbins=6)  # labels of focal lengths in px are long
         _show_focal_lengths(above, focal, lens.focal_unit)
@@ -108,9 +104,9 @@ def plot_residues(
     size = 4 if len(focal) < 100 else 2.5
     axes.plot(1 / focal, none, "x", color="0.55", markersize=size + 1, label="no correction")
     axes.plot(
-        1 / focal, each, "o", color=_FRAMES, markersize=size + 2, fillstyle="none", label="frame by frame"
+        1 / focal, each, "o", color=FRAMES, markersize=size + 2, fillstyle="none", label="frame by frame"
     )
-    axes.plot(1 / focal, zoom, "o", color=_MODEL, markersize=size, label="zoom model")
+    axes.plot(1 / focal, zoom, "o", color=MODEL, markersize=size, label="zoom model")
     axes.set_ylim(0)
     axes.set_ylabel(f"RMS distance to the lines  ({unit})")
     axes.set_xlabel(f"$1/f$  (1/{lines.focal_unit})")
@@ -143,8 +139,8 @@ def plot_primitives(lines: Lines, lens: ZoomLens, frames: Sequence[int]) -> Figu
         points = np.asarray(lines.points)[chosen][mask[chosen]].astype(float)
         distortion = lens(focal)
         for axes, mapped in zip(row, (np.asarray, distortion.undistort), strict=True):
-            axes.plot(*np.asarray(mapped(points)).T, ".", markersize=0.5, color=_FRAMES, rasterized=True)
-            axes.plot(*np.asarray(mapped(border)).T, color=_MODEL, linewidth=1)
+            axes.plot(*np.asarray(mapped(points)).T, ".", markersize=0.5, color=FRAMES, rasterized=True)
+            axes.plot(*np.asarray(mapped(border)).T, color=MODEL, linewidth=1)
             axes.set_aspect("equal")
             axes.invert_yaxis()
             axes.set_axis_off()
@@ -167,14 +163,14 @@ def plot_centres(centres: FrameCentres, lines: AbstractLines) -> Figure:
     std = np.asarray(centres.std)[known]
     left.errorbar(*away.T, xerr=std[:, 0], yerr=std[:, 1], fmt="none", ecolor="0.85", elinewidth=0.8)
     dots = left.scatter(*away.T, c=1 / focal[known], s=16, cmap="viridis", zorder=2)
-    left.plot(0, 0, "+", color=_MODEL, markersize=12, label="the image's centre")
+    left.plot(0, 0, "+", color=MODEL, markersize=12, label="the image's centre")
     figure.colorbar(dots, label=f"$1/f$  (1/{lines.focal_unit})", shrink=0.85)
     left.set_aspect("equal", adjustable="datalim")
     left.set_xlabel("centre of distortion, $x$  (px from the image's)")
     left.set_ylabel("$y$  (px)")
     left.invert_yaxis()
     left.legend(frameon=False)
-    right.plot(1 / focal[known], gain, "o", markersize=3.5, color=_FRAMES)
+    right.plot(1 / focal[known], gain, "o", markersize=3.5, color=FRAMES)
     right.axhline(0, color="0.85", linewidth=0.8, zorder=0)
     right.set_ylabel("RMS lower by  (%)")
     right.set_xlabel(f"$1/f$  (1/{lines.focal_unit})")
@@ -232,13 +228,13 @@ def _draw_grid(axes: Axes, lens: ZoomLens, focal: float, exaggeration: float | N
     bent = np.split(points + exaggeration * off, np.cumsum([len(line) for line in straight])[:-1])
     for line, seen in zip(straight, bent, strict=True):
         axes.plot(*line.T, color="0.75", linewidth=0.8, zorder=1)
-        axes.plot(*seen.T, color=_MODEL, linewidth=1.1, zorder=2)
+        axes.plot(*seen.T, color=MODEL, linewidth=1.1, zorder=2)
     axes.set_title(f"$f$ = {focal:.4g} {lens.focal_unit}: a straight grid, distorted", fontsize=9)
     more = "" if exaggeration == 1 else f", distortion × {exaggeration:g}"
     _explain(
         axes,
         Line2D([], [], color="0.75", label="straight"),
-        Line2D([], [], color=_MODEL, label=f"distorted by the lens{more}"),
+        Line2D([], [], color=MODEL, label=f"distorted by the lens{more}"),
     )
     axes.spines[:].set_visible(False)
 
@@ -251,7 +247,7 @@ def _draw_field(figure: Figure, axes: Axes, lens: ZoomLens, fit: ZoomFit | None,
     distance[distance < _ROUNDING * lens.scale] = 0
     levels = MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]).tick_values(0, float(distance.filled(0).max()) or 1)
     axes.patch.set(hatch="////", edgecolor="0.75")  # what shows beyond a fold
-    filled = axes.contourf(*np.moveaxis(points, -1, 0), distance, levels, cmap=_DEPTHS)
+    filled = axes.contourf(*np.moveaxis(points, -1, 0), distance, levels, cmap=DEPTHS)
     bar = figure.colorbar(filled, ax=axes, shrink=0.8)
     bar.set_label("displacement  (px)", fontsize=8)
     bar.ax.tick_params(labelsize=8)
@@ -263,7 +259,7 @@ def _draw_field(figure: Figure, axes: Axes, lens: ZoomLens, fit: ZoomFit | None,
         axes.quiver(
             *np.moveaxis(at, -1, 0),
             *np.moveaxis(arrows, -1, 0),
-            color=_FRAMES,
+            color=FRAMES,
             angles="xy",
             scale_units="xy",
             scale=scale,
@@ -285,10 +281,10 @@ def _draw_std(axes: Axes, points: np.ndarray, std: np.ma.MaskedArray) -> None:
         return
     levels = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(0, largest)[1:-1]
     drawn = axes.contour(
-        *np.moveaxis(points, -1, 0), std, levels, colors=_MODEL, linestyles="--", linewidths=1.1
+        *np.moveaxis(points, -1, 0), std, levels, colors=MODEL, linestyles="--", linewidths=1.1
     )
     axes.clabel(drawn, fmt="%g", fontsize=7)
-    _explain(axes, Line2D([], [], color=_MODEL, linestyle="--", label="standard deviation  (px)"))
+    _explain(axes, Line2D([], [], color=MODEL, linestyle="--", label="standard deviation  (px)"))
 
 
 def _explain(axes: Axes, *handles: Line2D) -> None:
@@ -323,7 +319,7 @@ def _shade(axes: Axes, x: np.ndarray, middle: np.ndarray | float, std: np.ndarra
             x,
             middle - times * std,
             middle + times * std,
-            color=_MODEL,
+            color=MODEL,
             alpha=0.16,
             linewidth=0,
             label=label,

@@ -1,33 +1,21 @@
-"""report.html: a calibration on one page.
+"""report.html: a calibration from lines on one page.
 
-The page is self-contained: style, script, plots and pictures are embedded, and nothing is loaded. Its text
-is in ``templates/report.html``, its colours are in ``report.css`` beside it, and its slider is drawn by
-``report.js``; this module computes the values. Plots are drawn for a light background; browsers in dark
-mode invert them.
-
-Runs once per calibration; most of the time is plotting.
+Its text is in ``templates/report.html``; this module computes the values. Runs once per calibration; most
+of the time is plotting.
 """
 
-import base64
-import dataclasses
-import functools
-import io
-import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import jinja2
-import markupsafe
-import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
 
-from .._core.text import plain, span
+from .._core.text import span
 from ..models.registry import family_name
 from ..trust.selection import COLUMNS
 from .calibration import Calibration, rms_over_frames
 from .choice import colour_limit
 from .coverage import plot_coverage, plot_radius
+from .page import Run, counted, data_url, embedded_data, embedded_plot, rendered, short
 from .pictures import Pictures
 from .plot import plot_distortion, plot_model, plot_primitives, plot_residues
 from .slider import slider
@@ -43,19 +31,6 @@ _COLUMNS = ("zoom", "left out", "alone", "none", "lines", "worst lines")
 
 _WORST, _WORST_REJECTED = 3, 2
 """How many lines of a frame are listed: of those that count, and of the rejected ones."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """What was run, for the report.
-
-    Attributes:
-        title: what was calibrated, such as the folder's name.
-        rows: names and values: command, folder, date, camera.
-    """
-
-    title: str = ""
-    rows: tuple[tuple[str, str], ...] = ()
 
 
 def report(
@@ -75,48 +50,36 @@ def report(
         run: what was run.
     """
     lens = calibration.zoom.lens
-    low, high = (float(f) for f in lens.focal_range)
     versions = calibration.summary()["versions"]
     run, moving = run or Run(), slider(calibration.zoom)
-    return (
-        _templates()
-        .get_template("report.html")
-        .render(
-            title=run.title,
-            about=[
-                f"f = {span(low, high, lens.focal_unit)}",
-                f"{lens.image_size[0]} × {lens.image_size[1]} px",
-                _number(len(calibration.none), "photo" if images else "frame"),
-                _number(len(calibration.rejected), "line"),
-                _number(int(np.sum(np.asarray(calibration.lines.mask))), "point"),
-            ],
-            verdict=calibration.assessment,
-            cards=_cards(calibration),
-            warnings=images.warnings() if images else calibration.warnings(),
-            slider=_embedded(moving),
-            slider_times=f"{moving['times']:g}" if moving and moving["times"] > 1 else None,
-            limit=f"{colour_limit(calibration):.2g}" if pictures and images else None,
-            photos=[_photo(calibration, images, one) for one in pictures] if images else [],
-            straightness=_straightness(calibration),
-            coverage=_coverage(calibration),
-            lens=_lens(calibration),
-            distortion=_distortion(calibration),
-            next=calibration.advice(),
-            frames=_frames(calibration, images),
-            images=images,
-            run=run.rows,
-            files=["lens.json", "summary.json", "lines.npz", "model.png"],
-            versions=", ".join(f"{name} {of}" for name, of in versions.items()),
-        )
-    )
-
-
-def _embedded(data: dict[str, Any] | None) -> markupsafe.Markup | None:
-    """Numbers as JSON within a page: nothing in it can end the script."""
-    if data is None:
-        return None
-    return markupsafe.Markup(
-        json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    return rendered(
+        "report.html",
+        title=run.title,
+        about=[
+            calibration.focal_text(),
+            f"{lens.image_size[0]} × {lens.image_size[1]} px",
+            counted(len(calibration.none), "photo" if images else "frame"),
+            counted(len(calibration.rejected), "line"),
+            counted(int(np.sum(np.asarray(calibration.lines.mask))), "point"),
+        ],
+        several=len(calibration.none) > 1,
+        verdict=calibration.assessment,
+        cards=_cards(calibration),
+        warnings=images.warnings() if images else calibration.warnings(),
+        slider=embedded_data(moving),
+        slider_times=f"{moving['times']:g}" if moving and moving["times"] > 1 else None,
+        limit=f"{colour_limit(calibration):.2g}" if pictures and images else None,
+        photos=[_photo(calibration, images, one) for one in pictures] if images else [],
+        straightness=_straightness(calibration),
+        coverage=_coverage(calibration),
+        lens=_lens(calibration),
+        distortion=_distortion(calibration),
+        next=calibration.advice(),
+        frames=_frames(calibration, images),
+        images=images,
+        run=run.rows,
+        files=["lens.json", "summary.json", "lines.npz", "model.png"],
+        versions=", ".join(f"{name} {of}" for name, of in versions.items()),
     )
 
 
@@ -127,39 +90,15 @@ def _photo(calibration: Calibration, images: "ImageCalibration", one: Pictures) 
     return {
         "name": images.used[one.frame].name,
         "focal": f"{focal:.5g}",
-        "unit": calibration.lines.focal_unit,
+        "unit": calibration.lines.focal_unit if calibration.focal_known else "",
         "rms": [f"{float(value):.2g}" if np.isfinite(value) else "–" for value in rms],
-        "before": _data(one.before, "jpeg"),
-        "after": _data(one.after, "jpeg"),
+        "before": data_url(one.before, "jpeg"),
+        "after": data_url(one.after, "jpeg"),
         "crops": [
-            {"line": line, "rms": f"{calibration.line_rms[line]:.2g}", "source": _data(crop, "jpeg")}
+            {"line": line, "rms": f"{calibration.line_rms[line]:.2g}", "source": data_url(crop, "jpeg")}
             for line, crop in one.crops.items()
         ],
     }
-
-
-def _data(content: bytes, kind: str) -> str:
-    """A picture as a data URL."""
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-
-
-@functools.cache
-def _templates() -> jinja2.Environment:
-    """The Jinja templates. All text is escaped and free of control characters."""
-    return jinja2.Environment(
-        loader=jinja2.PackageLoader("zoomjax.app"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        finalize=lambda value: _shown(value) if type(value) is str else value,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-
-
-def _shown(text: str) -> str:
-    """Text without control characters, except line breaks."""
-    return "\n".join(map(plain, text.split("\n")))
 
 
 def _cards(calibration: Calibration) -> list[tuple[str, str]]:
@@ -170,35 +109,32 @@ def _cards(calibration: Calibration) -> list[tuple[str, str]]:
     after = left_out if np.isfinite(left_out) else zoom
     cards = [
         (
-            f"{_short(none)} → {_short(after)} px",
+            f"{short(none)} → {short(after)} px",
             "from straight: lines before → after correction",
         ),
         (f"{none / after:.3g} times" if after > 0 else "∞", "straighter"),
         (
-            f"{_short(found.displacement)} px",
+            f"{short(found.displacement)} px",
             "average shift of pixels by the correction",
         ),
-        (f"± {_short(found.std)} px" if np.isfinite(found.std) else "unknown", "uncertainty of that shift"),
+        (f"± {short(found.std)} px" if np.isfinite(found.std) else "unknown", "uncertainty of that shift"),
     ]
     if np.isfinite(left_out) and np.isfinite(own):
         cards[0] = (cards[0][0], cards[0][1] + ", in photos left out of the fit")
-        cards.append((f"{_short(own)} px", "the same with a correction for each photo alone"))
+        cards.append((f"{short(own)} px", "the same with a correction for each photo alone"))
     return cards
-
-
-def _short(value: float) -> str:
-    """Two digits of a length, or all before the decimal point."""
-    return f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}"
 
 
 def _coverage(calibration: Calibration) -> list[dict[str, Any]]:
     weight = (~calibration.rejected).astype(float)
     lens = calibration.zoom.lens
     plots = [
-        _plot(plot_coverage(calibration.lines, weight), "Coverage of the image and of the zoom by lines")
+        embedded_plot(
+            plot_coverage(calibration.lines, weight), "Coverage of the image and of the zoom by lines"
+        )
     ]
     label = "Residuals against the distance from the centre"
-    return [*plots, _plot(plot_radius(calibration.lines, lens, weight), label, class_="box plot")]
+    return [*plots, embedded_plot(plot_radius(calibration.lines, lens, weight), label, class_="box plot")]
 
 
 def _straightness(calibration: Calibration) -> dict[str, Any]:
@@ -222,7 +158,7 @@ def _straightness(calibration: Calibration) -> dict[str, Any]:
             for name, value in ((name, rms_over_frames(frames)) for name, frames in calibration.rows())
         ],
         "choice": chosen and {"title": chosen.title, "columns": COLUMNS, "rows": chosen.rows()},
-        "plot": _plot(figure, "Residual RMS of each frame against 1/f", class_="box plot"),
+        "plot": embedded_plot(figure, "Residual RMS of each frame against 1/f", class_="box plot"),
     }
 
 
@@ -242,7 +178,7 @@ def _lens(calibration: Calibration) -> dict[str, Any]:
             for (name, order), column in zip(names.items(), calibration.pixel_polynomials().T, strict=False)
         ],
         "certificate": _certificate(calibration),
-        "plot": _plot(
+        "plot": embedded_plot(
             plot_model(calibration.zoom, calibration.each, calibration.lines),
             "Distortion coefficients against 1/f: separate fits of the frames, and the zoom model",
             kind="svg" if len(calibration.none) <= _MOST_FRAMES else "png",
@@ -261,15 +197,14 @@ def _coefficients(calibration: Calibration) -> list[tuple[str, ...]]:
 def _certificate(calibration: Calibration) -> str:
     lens, proof = calibration.zoom.lens, calibration.zoom.certificate
     low, high = (float(f) for f in lens.focal_range)
-    found = (
-        f"{float(proof.slope):.3g}, at f = {float(proof.focal):.4g} {lens.focal_unit}, "
-        f"{float(proof.radius):.0f} px from the centre"
-    )
+    known = calibration.focal_known
+    at = f"at f = {float(proof.focal):.4g} {lens.focal_unit}, " * known
+    where = f" at {'any focal length from ' * (low < high)}{span(low, high, lens.focal_unit)}" * known
+    found = f"{float(proof.slope):.3g}, {at}{float(proof.radius):.0f} px from the centre"
     if proof.certified:
         return (
-            "The lens is proved to be invertible: the corrected image does not fold over at "
-            f"{'any focal length from ' * (low < high)}{span(low, high, lens.focal_unit)}. The slope of "
-            "the corrected radius (1 without distortion, 0 at a fold) is at least "
+            f"The lens is proved to be invertible: the corrected image does not fold over{where}. The "
+            "slope of the corrected radius (1 without distortion, 0 at a fold) is at least "
             f"{float(proof.least):.3g}; the smallest slope found is {found}."
         )
     if proof.folded:
@@ -285,19 +220,24 @@ def _certificate(calibration: Calibration) -> str:
 
 def _distortion(calibration: Calibration) -> dict[str, Any]:
     lens, focal = calibration.zoom.lens, np.asarray(calibration.lines.focal)
+    known = calibration.focal_known
     ends = sorted({float(focal.min()), float(focal.max())})
     frames = sorted({int(np.argmin(focal)), int(np.argmax(focal))}, key=lambda frame: focal[frame])
     return {
         "rows": [
-            (f"{f:.4g} {lens.focal_unit}", f"{moved:+.2f}".replace("-", "−"), _uncertainty(std))
+            (
+                f"{f:.4g} {lens.focal_unit}" if known else "any",
+                f"{moved:+.2f}".replace("-", "−"),
+                _uncertainty(std),
+            )
             for f, moved, std in calibration.corner()
         ],
         "allowed_for": calibration.allowed_for(),
-        "grid": _plot(
+        "grid": embedded_plot(
             plot_distortion(calibration.zoom, focal=ends),
             "A straight grid, distorted, and the displacement of pixels, at both ends of the zoom",
         ),
-        "points": _plot(
+        "points": embedded_plot(
             plot_primitives(calibration.lines, lens, frames),
             "Points before and after correction",
             kind="png",
@@ -375,19 +315,3 @@ def _excess(value: float, reference: float) -> str:
 
 def _uncertainty(std: float) -> str:
     return f"{std:.2g}" if np.isfinite(std) else "not determined"
-
-
-def _number(count: int, noun: str) -> str:
-    return f"{count:,} {noun}" + ("" if count == 1 else "s")
-
-
-def _plot(
-    figure: Figure, label: str, *, class_: str = "box wide plot", kind: str = "svg"
-) -> dict[str, str | int]:
-    """A plot, embedded as a data URL, with its natural size so that text stays readable."""
-    file = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "zoomjax"}):
-        figure.savefig(file, format=kind, dpi=150, metadata={"Date": None} if kind == "svg" else {})
-    width, height = (f"{96 * side:.0f}" for side in figure.get_size_inches())
-    source = _data(file.getvalue(), kind.replace("svg", "svg+xml"))
-    return {"source": source, "label": label, "class": class_, "width": width, "height": height}

@@ -5,10 +5,12 @@ import datetime
 import os
 import shlex
 import sys
-from collections.abc import Callable, Collection
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .._core.text import listed
 from .console import REPORT, progress_bar, stages
 
 if TYPE_CHECKING:
@@ -18,7 +20,10 @@ if TYPE_CHECKING:
     from .image_calibration import ImageCalibration
     from .image_job import ImageJob
     from .model_choice import WantedModel
-    from .report import Run
+    from .page import Run
+
+_MOST = 4
+"""Folders and cameras named in the report."""
 
 
 def calibrate_lines(
@@ -38,7 +43,7 @@ def calibrate_lines(
     from .focal_sources import focal_sigmas
     from .report import report
 
-    sigma = focal_sigmas(focal_sigma or "0", lines.focal)
+    sigma = focal_sigmas("0" if focal_sigma is None else focal_sigma, lines.focal)
     calibration = calibrate(
         lines, model=model, centre=centre, focal_sigma=sigma, robust=robust, stage=stage
     )
@@ -77,8 +82,7 @@ def calibrate_images(
 
 def what_is_run(title: str, images: "ImageCalibration | None" = None) -> "Run":
     """For the report: the command, its folder, the date and the camera."""
-    from .equipment import equipment_of
-    from .report import Run
+    from .page import Run
 
     now = datetime.datetime.now().astimezone()
     rows = [
@@ -87,16 +91,32 @@ def what_is_run(title: str, images: "ImageCalibration | None" = None) -> "Run":
         ("Date", now.strftime("%Y-%m-%d %H:%M %Z")),
     ]
     if images is not None and not images.job.video:
-        found = equipment_of(Path(images.used[0].file))
-        if names := ", ".join(filter(None, (found.camera, found.lens))):
-            rows.append(("Camera", names))
+        rows += _cameras(Path(detection.file) for detection in images.used)
     return Run(title, tuple(rows))
 
 
+def _cameras(photos: Iterable[Path]) -> list[tuple[str, str]]:
+    """What the photos were taken with, where it is known: a row for all."""
+    from .equipment import equipment_of
+
+    found = map(equipment_of, photos)
+    names = Counter(name for one in found if (name := ", ".join(filter(None, (one.camera, one.lens)))))
+    if len(names) < 2:
+        return [("Camera", name) for name in names]
+    return [
+        ("Cameras", listed((f"{name} ({number})" for name, number in names.most_common()), _MOST, "; "))
+    ]
+
+
 def title_of(inputs: list[str]) -> str:
-    """What is calibrated, in a word: the folder, or the file, that is named first."""
-    first = Path(inputs[0])
-    name = first.name if first.is_dir() or not first.parent.name else first.parent.name
-    if len(inputs) == 1 and first.is_file():
-        name = first.name
-    return name if name not in ("", ".", "..") else first.resolve().name
+    """What is calibrated, in words: the folders that are named, or those of the files; or the one file."""
+    if len(inputs) == 1 and Path(inputs[0]).is_file():
+        return Path(inputs[0]).name
+    return listed(dict.fromkeys(map(_folder_name, inputs)), _MOST)
+
+
+def _folder_name(path: str) -> str:
+    """The name of a folder, or of that which a file or a pattern is in."""
+    here = Path(path)
+    name = here.name if here.is_dir() or not here.parent.name else here.parent.name
+    return name if name not in ("", ".", "..") else here.resolve().name

@@ -12,13 +12,15 @@ import cv2
 import numpy as np
 
 from .._core.files import refuse_existing, refuse_inputs, refuse_links, whole_file
+from .._core.text import reason
 from ..correct.framing import Framing, check_keep, frame_output
 from ..correct.image import check_sampling
 from ..correct.photo import Correction, corrected_photo, photo_focal
 from ..correct.redistort import check_framed
 from ..io.focal_table import read_focal_table
-from ..io.metadata import geometry_of
+from ..io.metadata import geometry_of, work_of
 from ..io.photo import read_metadata
+from ..models.about import UNKNOWN
 from ..models.lens import ZoomLens, load_lens
 from ..models.sizes import at_focal, lens_for_size
 from .undistort_inputs import Found, find_inputs, focal_number, targets_of
@@ -136,8 +138,9 @@ def _videos(
             "Argument again is for photos, which say that they are corrected, and the inputs are videos: "
             "leave it out."
         )
-    tracks = tracks_of(job.focal, names, hold=job.hold)
-    todo = to_do(job, sources, targets, _is_video)
+    unknown = job.focal is None and lens.about.get("focal") == UNKNOWN
+    tracks = tracks_of(str(float(lens.focal_range[0])) if unknown else job.focal, names, hold=job.hold)
+    todo = to_do(job, sources, targets, lambda _, target: _is_video(target))
     correct = functools.partial(
         undistort_videos,
         lens=lens,
@@ -160,7 +163,7 @@ def _videos(
         sentence = f"{_counted(written, len(sources), earlier, job, 'video')}, {frames} frames"
     notes = [note for target, video in done.items() for note in _kept(target, video, len(sources))]
     notes += _unmarked([path for path in targets if path not in {target for _, target in todo}])
-    bad = {str(path): _reason(error) for path, error in skipped.items()}
+    bad = {str(path): reason(error) for path, error in skipped.items()}
     return Outcome(sentence, bad, written + earlier, tuple(notes))
 
 
@@ -182,10 +185,11 @@ def undistort_photos(
     correction = Correction(
         lens, lambda size: job.keep, job.interpolation, job.border, job.redistort, job.again
     )
-    todo = to_do(job, sources, targets, lambda path: _is_marked(path, correction.geometry))
     focal_of = _photo_focals(job, lens, sources)
     skipped: dict[Path, Exception] = {}
-    correction = dataclasses.replace(correction, keep=_common_keep(job, lens, sources, focal_of, skipped))
+    keep, shown = _common_keep(job, lens, sources, focal_of, skipped)
+    correction = dataclasses.replace(correction, keep=keep, shown=shown)
+    todo = to_do(job, sources, targets, functools.partial(_is_result, job, correction, focal_of))
     lost: Counter[tuple[str, str]] = Counter()
     for number, (source, target) in enumerate(todo, start=1):
         if source not in skipped:
@@ -202,18 +206,13 @@ def undistort_photos(
     if len(sources) == 1 and skipped:
         raise next(iter(skipped.values()))
     earlier = len(sources) - len(todo)
-    bad = {str(source): _reason(skipped[source]) for source, _ in todo if source in skipped}
+    bad = {str(source): reason(skipped[source]) for source, _ in todo if source in skipped}
     written = len(todo) - len(bad)
     unmarked = [
         path for path in targets if path not in {target for _, target in todo} and _holds_none(path)
     ]
     notes = (*_losses(lost), *_unmarked(unmarked))
     return Outcome(_counted(written, len(sources), earlier, job, "photo"), bad, written + earlier, notes)
-
-
-def _reason(error: Exception) -> str:
-    """Of an error of one file, without the error numbers of the operating system."""
-    return (isinstance(error, OSError) and error.strerror) or str(error)
 
 
 def _counted(written: int, number: int, earlier: int, job: Job, what: str) -> str:
@@ -247,13 +246,30 @@ def _unmarked(left: Sequence[Path]) -> list[str]:
     ]
 
 
-def _is_marked(path: Path, geometry: str) -> bool:
-    """Whether a photo is a result of the same work; any is, of a format that holds no mark."""
+def _is_result(
+    job: Job, correction: Correction, focal_of: Callable[[Path], float], source: Path, target: Path
+) -> bool:
+    """Whether a photo is what the same work makes of a source; any is, of a format that holds no mark.
+
+    Raises:
+        FileExistsError: it was made by other work, and must not be replaced.
+    """
     try:
-        metadata = read_metadata(path)
-        return _holds_none(path) or geometry_of(metadata) == geometry
+        metadata = read_metadata(target)
+        if _holds_none(target):
+            return True
+        if geometry_of(metadata) != correction.geometry:
+            return False
+        if work_of(metadata) == correction.work(source, focal_of(source)):
+            return True
     except _BAD_FILE:
         return False
+    if job.overwrite:
+        return False
+    raise FileExistsError(
+        f"{target} was not made from {source} with this lens, focal length and options, or by an earlier "
+        "version: give another output, or argument overwrite to make it again."
+    )
 
 
 def _holds_none(path: Path) -> bool:
@@ -275,7 +291,7 @@ def to_do(
     job: Job,
     sources: Sequence[Path],
     targets: Sequence[Path],
-    is_result: Callable[[Path], bool] = lambda path: False,
+    is_result: Callable[[Path, Path], bool] = lambda source, target: False,
 ) -> list[tuple[Path, Path]]:
     """Sources and targets that are to be done: with `resume`, those without a result.
 
@@ -288,7 +304,7 @@ def to_do(
     refuse_links(job.output, targets)
     pairs = list(zip(sources, targets, strict=True))
     if job.resume:
-        pairs = [pair for pair in pairs if not (os.path.lexists(pair[1]) and is_result(pair[1]))]
+        pairs = [pair for pair in pairs if not (os.path.lexists(pair[1]) and is_result(*pair))]
     refuse_existing([target for _, target in pairs], overwrite=job.overwrite)
     return pairs
 
@@ -299,13 +315,13 @@ def _common_keep(
     sources: Sequence[Path],
     focal_of: Callable[[Path], float],
     skipped: dict[Path, Exception],
-) -> Callable[[tuple[int, int]], str | Framing]:
-    """The framing for each image size, common to all focal lengths of the photos.
+) -> tuple[Callable[[tuple[int, int]], str | Framing], str]:
+    """The framing for each image size, common to all focal lengths of the photos; what it depends on.
 
     Photos without a focal length are added to `skipped`.
     """
     if job.keep == "same":
-        return lambda size: job.keep
+        return lambda size: job.keep, job.keep
     focals = []
     for source in sources:
         try:
@@ -313,7 +329,7 @@ def _common_keep(
         except _BAD_FILE as error:
             skipped[source] = error
     if not focals:
-        return lambda size: job.keep
+        return lambda size: job.keep, job.keep
     low, high = min(focals), max(focals)
     dtype = np.asarray(lens.centre).dtype
     spread = (1 / np.linspace(1 / low, 1 / high, 65 if low < high else 1)).astype(dtype)
@@ -327,7 +343,7 @@ def _common_keep(
             check_framed(framing, size)
         return framing
 
-    return keep
+    return keep, f"{job.keep} from {low!r} to {high!r}"
 
 
 def _photo_focals(job: Job, lens: ZoomLens, sources: Sequence[Path]) -> Callable[[Path], float]:

@@ -111,6 +111,8 @@ def _why_not(path: Path) -> str | None:
         return f"it is a {kind} photo whose name does not say so: give it the suffix of one"
     if (why := unknown(begins)).startswith("it is a") and "video" not in why:
         return why
+    if path.suffix.lower() == ".json":
+        return "it is not a photo or video: a lens of your own comes first, without argument lens"
     kind = mimetypes.guess_type(path.name)[0] or ""
     if kind.startswith(("image/", "text/", "audio/")):
         return f"it is not a photo: names of photos end in {', '.join(SUFFIXES)}"

@@ -4,11 +4,12 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
-from .._core.text import plain
+from .._core.text import listed, plain
 from ..trust.assessment import Finding
 from .equipment import equipment_of
+from .plane_focals import FocalGroup
 
-_LISTED = 4
+_MOST = 4
 
 
 def findings_of_photos(photos: Iterable[Path]) -> list[Finding]:
@@ -23,15 +24,33 @@ def findings_of_photos(photos: Iterable[Path]) -> list[Finding]:
     return [*_mixed("lenses", lenses), *_mixed("cameras", bodies)]
 
 
+def findings_of_focals(groups: Iterable[FocalGroup], unit: str) -> list[Finding]:
+    """What speaks against photos sharing focal lengths: what they give alone, if that is too far apart."""
+    apart = [group for group in groups if not group.agree]
+    if not apart:
+        return []
+    worst = max(apart, key=FocalGroup.spread)
+    others = {1: "", 2: " Another group disagrees, too."}
+    more = others.get(len(apart), f" {len(apart) - 1} other groups disagree, too.")
+    return [
+        Finding(
+            "shared focal lengths",
+            "doubtful",
+            worst.sentence(unit) + more,
+            "Check that the photos of a group were taken at one zoom, and that the board is flat.",
+            cause=True,
+        )
+    ]
+
+
 def _mixed(what: str, names: Counter[str]) -> Iterable[Finding]:
     if len(names) < 2:
         return
-    listed = ", ".join(f"{plain(name)} ({_photos(number)})" for name, number in names.most_common(_LISTED))
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    first = listed((f"{plain(name)} ({_photos(number)})" for name, number in names.most_common()), _MOST)
     yield Finding(
         f"different {what}",
         "doubtful",
-        f"the photos were taken with {len(names)} different {what}, by their EXIF data: {listed}{more}.",
+        f"the photos were taken with {len(names)} different {what}, by their EXIF data: {first}.",
         "Calibrate the photos of each lens and camera by themselves.",
         cause=True,
     )
