@@ -1,12 +1,13 @@
 """Focal lengths and the lens from how a clip moves: errors beside the Cramér-Rao bound, and times.
 
-    python -m benchmarks.motion [--sections NAME ...] [--clips N] [--data FOLDER] [--output FILE]
+    python -m benchmarks.motion [--sections NAME ...] [--only TEXT] [--clips N] [--data FOLDER]
 
 `simulated`: tracks with exact truth, of random lenses on random paths; everything is started from nothing.
 f is the RMS over the clips of the error of all focal lengths, relative. The lens's error is the RMS
 distance of corrected points over the image, without a shift common to all of them, which turns the camera.
 The bound of each is what the covariance of the fit says, without what the robust loss loses. A clip
 diverged if its focal lengths are off by more than 3 times the bound and 1 %, and the fit says nothing.
+Errors are those of clips of which the fit does not say that it failed.
 
 `real`: focal lengths, principal points and lenses of the shared broadcast clips, every fourth frame; the
 camera stands where it stood, and what it looks at wanders over the pitch, as the data does not tell that.
@@ -15,7 +16,7 @@ before it; and with the pitch's lines in every fifth frame, a point each 20 px, 
 
 `time`: seconds of a second fit in the process, tracking apart, and the memory of the process.
 
-Results go to benchmarks/results/motion.md and motion.json.
+Results go to benchmarks/results/motion.md and motion.json after each row. With --only, other rows stay.
 """
 
 import argparse
@@ -23,6 +24,7 @@ import json
 import os
 import resource
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -129,11 +131,15 @@ def wide(lens: ZoomLens) -> ZoomLens:
     )
 
 
-def simulated(clips: int) -> dict:
+Rows = Iterator[tuple[str, dict]]
+
+
+def simulated(clips: int, only: str) -> Rows:
     """Errors and bounds of each kind of clip."""
-    rows = {}
     for kind, (path, tracks) in KINDS.items():
         found = []
+        if only not in kind:
+            continue
         for seed in range(clips):
             lens, scene = random_scene(seed, path, tracks)
             begin = time.perf_counter()
@@ -156,19 +162,22 @@ def simulated(clips: int) -> dict:
                     "seconds": seconds,
                 }
             )
+        accepted = [clip for clip in found if clip["good"]] or found
         mean = {
-            name: float(np.sqrt(np.mean([clip[name] ** 2 for clip in found])))
+            name: float(np.sqrt(np.mean([clip[name] ** 2 for clip in accepted])))
             for name in ("f", "f_bound", "lens", "lens_bound")
         }
-        rows[kind] = mean | {
-            "clips": clips,
-            "diverged": sum(clip["diverged"] for clip in found),
-            "told": sum(not clip["good"] for clip in found),
-            "seconds": float(np.median([clip["seconds"] for clip in found])),
-            "found": found,
-        }
-        print(kind, {k: v for k, v in rows[kind].items() if k != "found"}, flush=True)
-    return rows
+        yield (
+            kind,
+            mean
+            | {
+                "clips": clips,
+                "diverged": sum(clip["diverged"] for clip in found),
+                "told": sum(not clip["good"] for clip in found),
+                "seconds": float(np.median([clip["seconds"] for clip in found])),
+                "found": found,
+            },
+        )
 
 
 class FrameLenses:
@@ -217,9 +226,8 @@ def real_scene(
     return lenses, scene, lines, some[used]
 
 
-def real(folder: Path) -> dict:
+def real(folder: Path, only: str) -> Rows:
     """Errors of each clip: as it is, with the pupil before the axis, and with the pitch's lines."""
-    rows = {}
     for path in sorted((folder / "broadcast_cameras").glob("*.npz")):
         clip = read_clip(path)
         for kind, pupil, with_lines in (
@@ -227,6 +235,8 @@ def real(folder: Path) -> dict:
             (", pupil 0.2 m", 0.2, False),
             (", lines", 0, True),
         ):
+            if only not in clip.name + kind:
+                continue
             lenses, scene, lines, line_frames = real_scene(clip, pupil)
             more = {"lines": lines, "line_frames": line_frames} if with_lines else {}
             begin = time.perf_counter()
@@ -238,22 +248,24 @@ def real(folder: Path) -> dict:
                 pair = (wide(fit.lens)(float(own[frame])), lenses(float(scene.focal[frame])))
                 a, b = (np.asarray(distortion.undistort(_SHOWN)) for distortion in pair)
                 missed.append((a - a.mean(axis=0)) - (b - b.mean(axis=0)))
-            rows[clip.name + kind] = {
-                "frames": len(own),
-                "f": float(np.sqrt(np.mean((own / scene.focal - 1) ** 2))),
-                "f_bound": float(np.sqrt(np.mean((np.asarray(fit.focal_std) / own) ** 2))),
-                "lens": float(np.sqrt(np.mean(np.sum(np.square(missed), axis=-1)))),
-                "good": bool(fit.fit.result == RESULTS.successful),
-                "seconds": seconds,
-            }
-            print(clip.name + kind, rows[clip.name + kind], flush=True)
-    return rows
+            yield (
+                clip.name + kind,
+                {
+                    "frames": len(own),
+                    "f": float(np.sqrt(np.mean((own / scene.focal - 1) ** 2))),
+                    "f_bound": float(np.sqrt(np.mean((np.asarray(fit.focal_std) / own) ** 2))),
+                    "lens": float(np.sqrt(np.mean(np.sum(np.square(missed), axis=-1)))),
+                    "good": bool(fit.fit.result == RESULTS.successful),
+                    "seconds": seconds,
+                },
+            )
 
 
-def timed(lengths: tuple[int, ...] = (150, 1500, 10_000)) -> dict:
+def timed(only: str) -> Rows:
     """Seconds of a fit, the second in the process, and the most memory that the process has had."""
-    rows = {}
-    for frames in lengths:
+    for frames in (150, 1500, 10_000):
+        if only not in f"{frames:,}":
+            continue
         lens, scene = random_scene(0, {}, {}, frames)
         begin = time.perf_counter()
         fit_motion(scene.tracks, throw=False)
@@ -264,15 +276,16 @@ def timed(lengths: tuple[int, ...] = (150, 1500, 10_000)) -> dict:
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
         shown = np.arange(0, frames, max(frames // 10, 1))
         own = errors(wide(lens), scene, fit, shown)
-        rows[f"{frames:,}"] = {
-            "first": seconds[0],
-            "second": seconds[1],
-            "GB": memory,
-            "f": own[0],
-            "lens": own[1],
-        }
-        print(frames, rows[f"{frames:,}"], flush=True)
-    return rows
+        yield (
+            f"{frames:,}",
+            {
+                "first": seconds[0],
+                "second": seconds[1],
+                "GB": memory,
+                "f": own[0],
+                "lens": own[1],
+            },
+        )
 
 
 def page(results: dict) -> str:
@@ -357,6 +370,7 @@ def main():
     )
     names = ("simulated", "real", "time")
     parser.add_argument("--sections", nargs="+", choices=names, default=list(names))
+    parser.add_argument("--only", default="", help="rows whose names have this text")
     parser.add_argument("--clips", type=int, default=20, help="of each kind")
     parser.add_argument("--data", type=Path, default=os.environ.get("ZOOMJAX_DATA"), help="shared data")
     parser.add_argument("--output", type=Path, default=FOLDER / "motion.md")
@@ -367,10 +381,20 @@ def main():
     for name in options.sections:
         if name == "real" and options.data is None:
             parser.error("--data or ZOOMJAX_DATA must name the folder of the shared data")
-        make = {"simulated": lambda: simulated(options.clips), "real": lambda: real(options.data)}
-        rows = make.get(name, timed)()
-        results[name] = {"rows": rows, "machine": machine()}
-        write(options.output, page(results), results)
+        rows = {
+            "simulated": lambda: simulated(options.clips, options.only),
+            "real": lambda: real(options.data, options.only),
+            "time": lambda: timed(options.only),
+        }[name]()
+        if not options.only:
+            results.pop(name, None)
+        section = results.setdefault(name, {"rows": {}})
+        section["machine"] = machine()
+        for key, row in rows:
+            section["rows"][key] = row
+            print(key, {k: v for k, v in row.items() if k != "found"}, flush=True)
+            write(options.output, page(results), results, quiet=True)
+    print(page(results))
 
 
 if __name__ == "__main__":

@@ -51,12 +51,13 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
     ]
 
 
-def write(output: Path, page: str, results: dict) -> None:
+def write(output: Path, page: str, results: dict, *, quiet: bool = False) -> None:
     """Print a page, and write it with its results beside it as JSON."""
     output.parent.mkdir(parents=True, exist_ok=True)
     output.write_text(page)
     output.with_suffix(".json").write_text(json.dumps(results, indent=2) + "\n")
-    print(page)
+    if not quiet:
+        print(page)
 
 
 def real_data(parser: argparse.ArgumentParser) -> Path:
