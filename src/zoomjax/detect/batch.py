@@ -24,6 +24,7 @@ import numpy as np
 
 from .._core.files import whole_file
 from .._core.steps import STEP
+from .._core.text import reason
 from ._workers import LostError, Workers
 from .base import AbstractDetector
 from .edges import EdgeDetector
@@ -128,7 +129,7 @@ def _detected(task: _Task, *, detector: AbstractDetector, grid: str) -> Detectio
     try:
         image, focal = source.read()
     except Exception as error:  # any error concerns this image only
-        return found(problem=_sentence(error))
+        return found(problem=reason(error).rstrip("."))
     size = (image.shape[1], image.shape[0])
     if min(size) < _SMALLEST:
         return found(problem=f"it is {size[0]}x{size[1]} px: at least {_SMALLEST} px a side are needed")
@@ -144,7 +145,9 @@ def _detected(task: _Task, *, detector: AbstractDetector, grid: str) -> Detectio
             return dataclasses.replace(known, nodes=nodes)
         lines, unexplained = _lines(detector, image, nodes)
     except Exception as error:
-        return found(size, problem=f"the detector failed: {type(error).__name__}: {_sentence(error)}")
+        return found(
+            size, problem=f"the detector failed: {type(error).__name__}: {reason(error).rstrip('.')}"
+        )
     return found(size, lines, focal, nodes, "" if lines else _NO_LINES, unexplained)
 
 
@@ -161,15 +164,6 @@ def _lines(
         return _thinned(edges.lines), edges.unexplained
     lines = detector.lines(nodes) if isinstance(detector, GridDetector) else detector(image)
     return _thinned(lines), None
-
-
-def _sentence(error: Exception) -> str:
-    """The message of an error, without the error numbers of the operating system and a full stop."""
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    if isinstance(error, MemoryError) or getattr(error, "code", 0) == cv2.Error.StsNoMem:
-        return "there is not enough memory for it"
-    return " ".join(str(error).split()).rstrip(".")
 
 
 _ANOTHER = "Try another detector, such as edges (argument detector)"
