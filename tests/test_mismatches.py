@@ -150,7 +150,7 @@ def test_a_model_with_parameters_tells_the_number_of_coefficients(photos):
         lambda: zj.trust.held_out_zoom(small, zoom=model, terms=2),
         lambda: zj.fit.algebraic_zoom(small, zoom=model, terms=2),
         lambda: zj.fit.fit_centre(lines, zoom=model, terms=2),
-        lambda: zj.trust.Candidate(model, 2),
+        lambda: zj.models.Model(model, 2),
         lambda: zj.select_model(small, [model]),
     )
     for use in uses:

@@ -235,7 +235,7 @@ def test_robust_fit(name):
 def test_cross_validation(name):
     """Lines left out are straight too, and less so than those fitted."""
     row = ROWS[name]
-    candidate = zj.trust.Candidate(row.zoom, row.terms, row.distortion)
+    candidate = zj.models.Model(row.zoom, row.terms, row.distortion)
     if name == "FocusSplineZoom":
         focal = zj.trust.held_out_zoom(zj.compress(lines_of(name)), zoom=row.zoom)
         assert np.nanmax(focal) < 1

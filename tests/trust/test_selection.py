@@ -17,7 +17,7 @@ from zoomjax.trust.selection import compare, compare_errors, default_candidates
 
 FOCALS = 7
 POLYNOMIALS = [
-    zj.trust.Candidate(zj.PolynomialZoom(degree=d), terms) for terms in (1, 2) for d in (0, 1, 2, 3)
+    zj.models.Model(zj.PolynomialZoom(degree=d), terms) for terms in (1, 2) for d in (0, 1, 2, 3)
 ]
 MODELS = {
     "polynomial": (zj.PolynomialZoom(degree=2), 2),
@@ -83,7 +83,7 @@ def test_a_frame_left_out_is_corrected_by_the_fit_of_the_others(zoom, terms, lin
         model = zoom.prepare(np.delete(lines.focal, frame), terms)
         fit = zj.fit_zoom(counting_nothing(lines, frame), zoom=model, invertible=False)
         np.testing.assert_allclose(held_out[frame], rms_of(lines, fit.lens.zoom)[frame], rtol=1e-6)
-    judged = errors_of(lines, zoom, terms, folds_of(lines, "frame", 2, 0))
+    judged = errors_of(lines, zj.models.Model(zoom, terms), folds_of(lines, "frame", 2, 0))
     model = zoom.prepare(lines.focal, terms)
     fit = zj.fit_zoom(lines.weighted(np.ones(lines.frame.shape)), zoom=model, invertible=False)
     frame = np.asarray(lines.frame)
@@ -98,7 +98,7 @@ def test_a_fold_is_a_plain_fit_of_a_subset_of_the_lines(lines):
 
 def test_lines_left_out_are_measured_by_the_fit_of_the_others(lines):
     parts = folds_of(lines, "line", 4, 0)
-    judged = errors_of(lines, zj.PolynomialZoom(degree=2), 2, parts)
+    judged = errors_of(lines, zj.models.Model(zj.PolynomialZoom(degree=2)), parts)
     frame = np.asarray(lines.frame)
     for fold in (0, 3):
         own = (parts.fold == fold).astype(float)
@@ -164,7 +164,7 @@ def test_the_simplest_within_one_standard_error_is_chosen(selection):
 @pytest.mark.parametrize(("worse", "chosen"), [(1.02, (0, 1)), (1.0003, (0, 0))])
 def test_least_error_is_a_rule_of_its_own(worse, chosen, lines, rng):
     """The one with fewer numbers is worse on average, though not on every focal length."""
-    candidates = [zj.trust.Candidate(zj.PolynomialZoom(degree=degree)) for degree in (0, 1)]
+    candidates = [zj.models.Model(zj.PolynomialZoom(degree=degree)) for degree in (0, 1)]
     parts = folds_of(lines, "focal", None, 0)
     square = np.where(parts.fold >= 0, 1.0, np.nan)
     scatter = 1 + 0.3 * (-1.0) ** parts.unit
@@ -185,10 +185,7 @@ def test_paired_errors_are_those_of_the_differences_of_two_roots(lines):
     a, b = POLYNOMIALS[5], POLYNOMIALS[6]
     verdict, *_ = (v for v in compared(lines, [a, b], "frame")[0] if v.difference > 0)
     frame = np.asarray(lines.frame)
-    squares = [
-        np.bincount(frame, errors_of(lines, c.zoom, c.terms, parts).unseen) / np.bincount(frame)
-        for c in (a, b)
-    ]
+    squares = [np.bincount(frame, errors_of(lines, c, parts).unseen) / np.bincount(frame) for c in (a, b)]
     leave_out = 1 - np.eye(FOCALS)
     differences = np.subtract(*(np.sqrt(leave_out @ e / (FOCALS - 1)) for e in squares))
     jackknife = np.sqrt((FOCALS - 1) * np.var(differences))
@@ -254,7 +251,7 @@ def test_the_summary_is_json(selection):
 
 
 def test_a_prior_makes_parameters_fewer(lines):
-    verdict, *_ = compared(lines, [zj.trust.Candidate(zj.SmoothZoom())])[0]
+    verdict, *_ = compared(lines, [zj.models.Model(zj.SmoothZoom())])[0]
     assert 4 < verdict.parameters < 14
 
 
@@ -262,7 +259,7 @@ def test_what_cannot_be_fitted_is_in_the_table_with_the_reason(lines):
     many, left, terms = (
         zj.PolynomialZoom(degree=7),
         zj.PolynomialZoom(degree=6),
-        zj.trust.Candidate(zj.PolynomialZoom(degree=1), 4),
+        zj.models.Model(zj.PolynomialZoom(degree=1), 4),
     )
     selection = zj.select_model(lines, [many, left, terms, zj.PolynomialZoom(degree=2)])
     problems = [v.problem for v in selection.verdicts]
@@ -331,7 +328,7 @@ def test_other_types_are_told(lines):
     with pytest.raises(TypeError, match="must be a list of zoom models"):
         zj.select_model(lines, zj.PolynomialZoom())  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="such as Division"):
-        zj.trust.Candidate(zj.PolynomialZoom(), 2, zj.models.Division)  # pyright: ignore[reportArgumentType]
+        zj.models.Model(zj.PolynomialZoom(), 2, zj.models.Division)  # pyright: ignore[reportArgumentType]
 
 
 def test_too_few_focal_lengths_to_leave_one_out_are_told(lines):
@@ -356,7 +353,7 @@ def test_families_are_compared(scene):
     focal = np.array([20.0, 28.0, 45.0, 80.0])
     bent = scenes.board_lines(lens, focal, spacing=150, noise=0.05)
     candidates = [
-        zj.trust.Candidate(zj.PolynomialZoom(degree=1), 1, family)
+        zj.models.Model(zj.PolynomialZoom(degree=1), 1, family)
         for family in (zj.models.RadialPolynomial(), zj.models.Division())
     ]
     selection = zj.select_model(bent, candidates, hold_out="line", folds=3)
@@ -367,7 +364,7 @@ def test_families_are_compared(scene):
 
 
 def test_a_family_that_the_triangles_do_not_serve_says_so(lines):
-    candidates = [zj.PolynomialZoom(), zj.trust.Candidate(zj.PolynomialZoom(), 1, zj.models.Division())]
+    candidates = [zj.PolynomialZoom(), zj.models.Model(zj.PolynomialZoom(), 1, zj.models.Division())]
     _, verdict = zj.select_model(lines, candidates, hold_out="line", folds=2).verdicts
     assert "compress(lines, terms=8)" in verdict.problem
 

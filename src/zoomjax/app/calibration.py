@@ -357,7 +357,7 @@ def calibrate(
     stage("Checking the fit on lines left out")
     held_out, each_held_out = np.full(len(sigma), np.nan), held_out_frames(small, terms=terms)
     if len(sigma) > 1:
-        held_out = held_out_zoom(small, zoom=chosen, terms=terms)
+        held_out = held_out_zoom(small, zoom=used.model)
     lines = (lines.weighted(np.asarray(small.weight)) if robust else lines).about(np.asarray(small.centre))
     return Calibration(
         lines=lines,

@@ -11,6 +11,7 @@ import numpy as np
 from ..fit.centre import fit_centre
 from ..fit.family_lines import compress_family
 from ..fit.frames import fit_frames
+from ..fit.prepare import ready_model
 from ..fit.result import FrameFits, ZoomFit
 from ..fit.robust import reweighted
 from ..fit.zoom import CentreArgument, about_centre, fit_zoom
@@ -18,9 +19,10 @@ from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines, compress
 from ..lines.free_centre import AnyCentreLines, compress_any_centre
 from ..lines.lines import Lines
+from ..models.model import Model
 from ..models.polynomial import RadialPolynomial
 from ..trust.centre_choice import choose_centre
-from ..trust.selection import Candidate, Selection
+from ..trust.selection import Selection
 from .model_choice import CentreFound, WantedModel
 
 
@@ -39,7 +41,7 @@ class Fitted(NamedTuple):
     zoom: ZoomFit
     each: FrameFits
     lines: AbstractLines
-    model: Candidate
+    model: Model
     centre: CentreFound
     selection: Selection | None
 
@@ -61,9 +63,7 @@ def fitted(
     wanted.check_centre(centre)
     radial = dataclasses.replace(wanted, family="radial")
     model = radial.base(lines.focal)
-    model.zoom.prepare(
-        lines.focal, model.terms
-    )  # raises if there are too few focal lengths, before any work
+    ready_model(lines, model)  # raises if there are too few focal lengths, before any work
     found = _about_centre(lines, radial, centre, robust, wanted.family in ("radial", "auto"), stage)
     small: AbstractLines = found.lines
     model, selection, zoom = found.model, found.selection, found.zoom
@@ -72,7 +72,7 @@ def fitted(
         zoom = None
     stage("Fitting the zoom model")
     if zoom is None:
-        zoom = fit_zoom(small, zoom=model.zoom, terms=model.terms)
+        zoom = fit_zoom(small, zoom=model)
     stage("Fitting each frame separately")
     each = fit_frames(small, terms=model.terms, throw=False)
     return Fitted(zoom, each, small, model, found.centre, selection)
@@ -87,7 +87,7 @@ class _Centred(NamedTuple):
     """
 
     lines: CompressedLines
-    model: Candidate
+    model: Model
     centre: CentreFound
     selection: Selection | None
     zoom: ZoomFit | None
@@ -111,7 +111,7 @@ def _about_centre(
     small = held.about(held.centre)
     if robust:
         stage("Rejecting lines that are not straight")
-        small = reweighted(small, model.zoom, model.terms)[0]
+        small = reweighted(small, model)[0]
         held = held.weighted(np.asarray(small.weight))
     selection = None
     if choose:
@@ -121,12 +121,12 @@ def _about_centre(
     choice = found = None
     if isinstance(held, AnyCentreLines):
         stage("Fitting the centre of distortion")
-        choice = choose_centre(held, zoom=model.zoom, terms=model.terms)
+        choice = choose_centre(held, model)
         found = choice.found if choice.better else None
         if found is not None and selection is not None:
             again = wanted.choose(held.about(found.fit.lens.centre))
             if again.chosen.name != model.name:
-                found = fit_centre(held, zoom=again.chosen.zoom, terms=again.chosen.terms)
+                found = fit_centre(held, zoom=again.chosen)
             if found.determined:
                 selection, model = again, again.chosen
     how = CentreFound.of(held, choice, found)
@@ -137,7 +137,7 @@ def _about_centre(
 
 def _under_family(
     lines: Lines, wanted: WantedModel, found: _Centred, robust: bool, stage: Callable[[str], None]
-) -> tuple[AbstractLines, Candidate, Selection | None]:
+) -> tuple[AbstractLines, Model, Selection | None]:
     """The lines, the model and its choice under another distortion model, or the best of all of them.
 
     About the centre that was found. Weights are those under the distortion model itself where it is given:
@@ -170,10 +170,10 @@ def _under_family(
     return compress_family(placed, model.family, terms=model.terms), model, selection
 
 
-def _straight(lines: Lines, model: Candidate) -> Lines:
+def _straight(lines: Lines, model: Model) -> Lines:
     """The lines with the weights that the model gives them."""
     form = compress_family(lines, model.family, terms=model.terms)
-    return lines.weighted(np.asarray(reweighted(form, model.zoom, model.terms)[0].weight))
+    return lines.weighted(np.asarray(reweighted(form, model)[0].weight))
 
 
 def _widest(lines: Lines) -> Lines:

@@ -15,13 +15,14 @@ from ..lines.lines import Lines
 from ..models.brown_conrady import BrownConrady
 from ..models.division import Division
 from ..models.family import AbstractFamily
+from ..models.model import Model
 from ..models.polynomial import RadialPolynomial
 from ..models.requirements import refusal
 from ..models.smooth import SmoothZoom
 from ..models.spline import SplineZoom
 from ..models.zoom import AbstractZoom, PolynomialZoom
 from ..trust.centre_choice import CentreChoice
-from ..trust.selection import Candidate, Selection, select_model
+from ..trust.selection import Selection, select_model
 from ..trust.staged_selection import select_in_stages
 
 MODELS = ("auto", "polynomial", "smooth", "spline")
@@ -107,18 +108,18 @@ class WantedModel:
                 f"coordinates. ({refusal('fit_centre', family=self.distortion)})"
             )
 
-    def base(self, focal: Any) -> Candidate:
+    def base(self, focal: Any) -> Model:
         """The model itself, or, where it is to be chosen, what lines are rejected and centred with."""
         distinct = np.unique(np.asarray(focal)).size
         terms = _TERMS if self.terms is None else self.terms
         if self.automatic:
-            return Candidate(PolynomialZoom(degree=min(_DEGREE, distinct - 1)), terms, self.distortion)
+            return Model(PolynomialZoom(degree=min(_DEGREE, distinct - 1)), terms, self.distortion)
         models: dict[str, AbstractZoom] = {
             "smooth": SmoothZoom(),
             "spline": SplineZoom(number=min(_KNOTS[1], distinct)),
         }
         polynomial = PolynomialZoom(degree=_DEGREE if self.degree is None else self.degree)
-        return Candidate(models.get(self.model, polynomial), terms, self.distortion)
+        return Model(models.get(self.model, polynomial), terms, self.distortion)
 
     @property
     def automatic(self) -> bool:
@@ -154,9 +155,9 @@ class WantedModel:
         degrees = range(min(_MOST_DEGREE + 1, distinct))
         pairs = [(degree, terms[0]) for degree in degrees]
         pairs += [(min(_DEGREE, distinct - 1), number) for number in terms[1:]]
-        return _selected(lines, [Candidate(PolynomialZoom(degree=d), n, self.distortion) for d, n in pairs])
+        return _selected(lines, [Model(PolynomialZoom(degree=d), n, self.distortion) for d, n in pairs])
 
-    def choose_family(self, lines: Lines, chosen: Candidate, compared: Sequence[Candidate]) -> Selection:
+    def choose_family(self, lines: Lines, chosen: Model, compared: Sequence[Model]) -> Selection:
         """The distortion model of least cross-validation error.
 
         Args:
@@ -169,7 +170,7 @@ class WantedModel:
             zoom = PolynomialZoom(degree=min(_DEGREE, np.unique(np.asarray(lines.focal)).size - 1))
         numbers = dict.fromkeys([chosen.terms, *self._terms(lines)])
         others = [
-            Candidate(zoom, number, family) for family in list(FAMILIES.values())[1:] for number in numbers
+            Model(zoom, number, family) for family in list(FAMILIES.values())[1:] for number in numbers
         ]
         return _selected(lines, [*compared, *others])
 
@@ -180,7 +181,7 @@ class WantedModel:
         return [_TERMS, 1, *([3] if len(lines.frame) >= _MANY_LINES else [])]
 
 
-def _selected(lines: Lines, candidates: Sequence[Candidate]) -> Selection:
+def _selected(lines: Lines, candidates: Sequence[Model]) -> Selection:
     """The candidate of least error, over focal lengths left out, or lines where there are few."""
     distinct = np.unique(np.asarray(lines.focal)).size
     folds = min(_FOLDS, distinct - 2) if distinct > 3 else _FOLDS

@@ -19,42 +19,30 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.arguments import kinds_checked
-from .._core.checks import checked_terms
 from ..lines.base import AbstractLines
-from ..lines.compressed import CompressedLines, compress
-from ..lines.lines import Lines
+from ..lines.compressed import CompressedLines
 from ..models.lens import ZoomLens
-from ..models.zoom import AbstractLinearZoom, PolynomialZoom, terms_of, with_parameters
+from ..models.model import Model
+from ..models.polynomial import RadialPolynomial
+from ..models.zoom import AbstractLinearZoom, PolynomialZoom, with_parameters
 from ._linear import least_squares
-from .defaults import zoom_or_default
+from .compression import compressed, small_of
 from .energy import line_weights, prior_jacobian, settings
-from .family_lines import FamilyLines
-from .image_metric import in_corrected
+from .prepare import asked_for, ready_model
 from .result import lens_of
-from .wrapper import about_own_centre
 
 
-def compressed(lines: AbstractLines, terms: int) -> CompressedLines:
-    """The lines, compressed unless they are already.
-
-    For lines measured in the image (`in_image`), the lines underneath.
-    """
-    lines = about_own_centre(in_corrected(lines))
-    if isinstance(lines, CompressedLines):
-        lines.check_terms(terms)
-        return lines
-    if isinstance(lines, Lines):
-        return compress(lines, terms)
-    raise TypeError(
-        f"Lines of type {type(lines).__name__} cannot be used here: pass Lines or compress(lines)."
-    )
+def algebraic_start(lines: AbstractLines, model: Model) -> CompressedLines | None:
+    """What the algebraic estimate is made from; None for a model that has none."""
+    if not (isinstance(model.zoom, AbstractLinearZoom) and isinstance(model.family, RadialPolynomial)):
+        return None
+    return compressed(lines, model.terms)
 
 
-def algebraic_parameters(
-    lines: AbstractLines, zoom: AbstractLinearZoom, terms: int
-) -> Float[Array, "basis size"]:
-    """The parameters of a prepared linear zoom model that the algebraic estimate gives."""
-    size = lines.family.size(terms)
+def algebraic_parameters(lines: AbstractLines, model: Model) -> Float[Array, "basis size"]:
+    """The parameters of a prepared model, linear in them, that the algebraic estimate gives."""
+    zoom: Any = model.zoom
+    terms, size = model.terms, model.size
     rows = _triangle_rows(lines, terms) if isinstance(lines, CompressedLines) else _rows(lines, size)
     areas = jax.vmap(_areas)(*rows)  # (line, area, 1 + size)
     areas = lines.scale * jnp.sqrt(line_weights(lines))[:, None, None] * areas
@@ -117,37 +105,27 @@ def algebraic_zoom(
         L. Alvarez, L. Gómez, J. R. Sendra, "An algebraic approach to lens distortion by line
         rectification", J. Math. Imaging Vis. 35 (2009): [9] of the paper.
     """
-    model: Any = zoom_or_default(zoom)
-    terms = terms_of(model, terms, lines.family)
-    focal, *focus = settings(model, lines)
-    prepared = model.prepare(focal, lines.family.size(terms), *focus)
-    return _solve_zoom(small_of(lines, terms), prepared, terms)
+    _, asked = asked_for(lines, zoom, terms)
+    model = ready_model(lines, asked.with_parameters(None))
+    return _solve_zoom(small_of(lines, model.terms), model)
 
 
 @kinds_checked
 def algebraic_frames(lines: AbstractLines, *, terms: int = 2) -> Float[Array, "frame terms"]:
     """Estimate the normalised coefficients of each frame separately; lines as of `algebraic_zoom`."""
-    terms = checked_terms(terms, lines.family.most_terms)
-    return _solve_frames(small_of(lines, terms), *lines.by_frame(), terms)
-
-
-def small_of(lines, terms):
-    """The lines compressed, under their own distortion model; the metric is the paper's."""
-    plain = in_corrected(lines)
-    return plain.compressed(terms) if isinstance(plain, FamilyLines) else compressed(plain, terms)
+    model = Model(PolynomialZoom(degree=0), terms, lines.family)
+    return _solve_frames(small_of(lines, model.terms), *lines.by_frame(), model)
 
 
 @eqx.filter_jit
-def _solve_zoom(lines, zoom, terms):
-    parameters = algebraic_parameters(lines, zoom, terms)
-    return lens_of(lines, with_parameters(zoom, parameters))
+def _solve_zoom(lines, model):
+    return lens_of(lines, with_parameters(model.zoom, algebraic_parameters(lines, model)))
 
 
 @eqx.filter_jit
-def _solve_frames(lines, chosen, present, terms):
+def _solve_frames(lines, chosen, present, model):
     def solve(chosen, present):
         frame = lines.take(chosen, present)
-        constant = PolynomialZoom(degree=0).prepare(frame.focal, frame.family.size(terms))
-        return algebraic_parameters(frame, constant, terms)[0]
+        return algebraic_parameters(frame, ready_model(frame, model))[0]
 
     return jax.vmap(solve)(chosen, present)

@@ -27,16 +27,16 @@ from ..lines.lines import Lines
 from ..models.family import AbstractFamily
 from ..models.invertibility import certify
 from ..models.lens import ZoomLens
+from ..models.model import Model
 from ..models.requirements import check
-from ..models.zoom import AbstractZoom, PolynomialZoom, terms_of, with_parameters
+from ..models.zoom import AbstractZoom, PolynomialZoom, with_parameters
 from ._least_squares import Solver, default_solver
+from .compression import compressed_as_measured
 from .covariance import parameter_covariance
-from .defaults import zoom_or_default
 from .energy import AbstractJointZoom, linearised
-from .family_lines import with_family
 from .minimise import fit_about, minimise
 from .moved_centre import for_any_centre
-from .prepare import compressed_as_measured, ready_model
+from .prepare import asked_for
 from .result import RESULTS, FrameFits, ZoomFit, collected
 from .wrapper import points_of
 
@@ -124,7 +124,7 @@ def _both(zoom: AbstractZoom, centre: AbstractZoom) -> _CentredZoom:
 def fit_centre(
     lines: AbstractLines,
     *,
-    zoom: AbstractZoom | None = None,
+    zoom: AbstractZoom | Model | None = None,
     family: AbstractFamily | None = None,
     centre: AbstractZoom | None = None,
     terms: int | None = None,
@@ -161,18 +161,18 @@ def fit_centre(
         >>> found.fit.lens.centre.round(1).tolist()
         [310.0, 250.0]
     """
-    lines = lines if family is None else with_family(lines, family)
-    check("fit_centre", zoom=zoom)
-    lines = for_any_centre(lines, terms_of(zoom_or_default(zoom), terms, lines.family))
-    options = {"max_steps": max_steps, "throw": throw}
-    fixed = fit_about(_about(lines, lines.centre, zoom, terms), zoom, terms, solver=solver, **options)
-    model = (PolynomialZoom(degree=0) if centre is None else centre).prepare(lines.focal, 2)
-    start = _both(fixed.lens.zoom, model)
+    lines, model = asked_for(lines, zoom, terms, family)
+    check("fit_centre", zoom=model.zoom)
+    lines = for_any_centre(lines, model.terms)
+    options = {"solver": solver, "max_steps": max_steps, "throw": throw}
+    fixed = fit_about(_about(lines, lines.centre, model), model, **options)
+    offset = (PolynomialZoom(degree=0) if centre is None else centre).prepare(lines.focal, 2)
+    start = _both(fixed.lens.zoom, offset)
     found, covariance, std, determined = _search(lines, start, solver or default_solver(lines), max_steps)
     _, moved = found.parts()
     each = lines.centre[None] + lines.scale * jax.vmap(moved)(lines.focal)
     # Once more about these centres, for all else that is to know of a fit: the same compiled program.
-    fit = fit_about(_about(lines, each, zoom, terms), zoom, terms, solver=solver, **options)
+    fit = fit_about(_about(lines, each, model), model, **options)
     own = fit.covariance.shape[0]
     joint = jnp.where(determined, covariance, jnp.zeros_like(covariance).at[:own, :own].set(fit.covariance))
     lens = _lens(lines, fit.lens, moved, each)
@@ -194,13 +194,11 @@ def fit_centre(
     return CentreFit(fit, each, std, determined, fixed.rms, covariance)
 
 
-def _about(lines, centre, zoom, terms):
+def _about(lines, centre, model):
     """The lines about a centre, compressed."""
     placed = lines.about(centre)
-    if isinstance(points_of(placed), Lines):
-        _, terms = ready_model(placed, zoom, terms)
-        placed = compressed_as_measured(placed, terms)
-    return placed
+    points = isinstance(points_of(placed), Lines)
+    return compressed_as_measured(placed, model.terms) if points else placed
 
 
 def refit_centre(lines: AnyCentreLines, found: CentreFit) -> AbstractZoom:
@@ -230,21 +228,17 @@ def fit_frame_centres(
     Args:
         lines, family, terms, solver, max_steps: as for `fit_centre`.
     """
-    lines = for_any_centre(lines if family is None else with_family(lines, family), terms)
-    return _fit_frame_centres(lines, *lines.by_frame(), terms, solver, max_steps)
+    lines, model = asked_for(lines, PolynomialZoom(degree=0), terms, family)
+    lines = for_any_centre(lines, model.terms)
+    return _fit_frame_centres(lines, *lines.by_frame(), model, solver, max_steps)
 
 
 @eqx.filter_jit
-def _fit_frame_centres(lines, chosen, present, terms, solver, max_steps):
+def _fit_frame_centres(lines, chosen, present, model, solver, max_steps):
+    options = {"terms": model.terms, "solver": solver, "max_steps": max_steps, "throw": False}
+
     def one(frame):
-        return fit_centre(
-            lines.take(*frame),
-            zoom=PolynomialZoom(degree=0),
-            terms=terms,
-            solver=solver,
-            max_steps=max_steps,
-            throw=False,
-        )
+        return fit_centre(lines.take(*frame), zoom=model.zoom, **options)
 
     batch = 1 if isinstance(points_of(lines), Lines) else len(chosen)  # as in `fit_frames`
     found = jax.lax.map(one, (chosen, present), batch_size=batch)

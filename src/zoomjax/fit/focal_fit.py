@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from .._core.arguments import kinds_checked
 from .._core.types import traced
 from ..lines.base import AbstractLines
+from ..models.model import Model
 from ..models.zoom import AbstractZoom
 from .focal_lengths import (
     MOST_STEPS,
@@ -24,6 +25,7 @@ from .focal_lengths import (
     refined,
     widened,
 )
+from .prepare import asked_for
 from .result import ZoomFit
 from .wrapper import about_own_centre
 from .zoom import fit_zoom
@@ -56,7 +58,7 @@ def fit_focal(
     lines: AbstractLines,
     focal_sigma: Sigma,
     *,
-    zoom: AbstractZoom | None = None,
+    zoom: AbstractZoom | Model | None = None,
     terms: int | None = None,
     invertible: bool = True,
     throw: bool = True,
@@ -93,7 +95,8 @@ def fit_focal(
         True
         >>> jax.config.update("jax_enable_x64", False)
     """
-    lines = about_own_centre(lines)
+    placed, model = asked_for(lines, zoom, terms)
+    lines = about_own_centre(placed)
     sigma = checked_sigma(focal_sigma, lines.focal)
     given = jnp.asarray(lines.focal)
     if given.dtype != jnp.float64:
@@ -106,8 +109,8 @@ def fit_focal(
             "Argument focal_sigma must be finite for frames at two different focal lengths or more, but it "
             f"is {focal_sigma}. {UNKNOWN}"
         )
-    start = fit_zoom(lines, zoom=zoom, terms=terms, invertible=False, throw=throw)
-    t, model, steps, reached = refined(lines, start.lens.zoom, sigma / given)
+    start = fit_zoom(lines, zoom=model, invertible=False, throw=throw)
+    t, refitted, steps, reached = refined(lines, start.lens.zoom, sigma / given)
     if throw and not traced(reached) and not reached:
         raise RuntimeError(
             f"The focal lengths did not converge in {MOST_STEPS} steps: the lines hardly determine those "
@@ -115,7 +118,7 @@ def fit_focal(
         )
     focal = given * jnp.exp(t)
     moved = at_focal_lengths(lines, focal)
-    fit = fit_zoom(moved, zoom=model, invertible=invertible, throw=throw)
+    fit = fit_zoom(moved, zoom=refitted, invertible=invertible, throw=throw)
     covariance = posterior(moved, fit.lens.zoom, sigma / given)
     return FocalFit(
         fit=widened(fit, moved, covariance),

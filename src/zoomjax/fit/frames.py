@@ -9,16 +9,16 @@ import jax
 import jax.numpy as jnp
 
 from .._core.arguments import kinds_checked
-from .._core.checks import checked_terms
 from ..lines.base import AbstractLines
 from ..lines.lines import Lines
 from ..models.family import AbstractFamily
-from ..models.zoom import PolynomialZoom, with_parameters
+from ..models.zoom import PolynomialZoom
 from ._least_squares import Solver, default_solver
+from .algebraic import algebraic_start
+from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
-from .family_lines import with_family
 from .minimise import fit_prepared
-from .prepare import algebraic_start, compressed_as_measured
+from .prepare import asked_for, ready_model
 from .result import FrameFits, collected, described_fit, is_invertible, outcome_of, thrown
 from .wrapper import about_own_centre, points_of
 
@@ -42,25 +42,24 @@ def fit_frames(
     Raises:
         RuntimeError: the solver failed on some frame, and `throw` is set.
     """
-    lines = about_own_centre(lines if family is None else with_family(lines, family))
-    terms = checked_terms(terms, lines.family.most_terms)
+    placed, model = asked_for(lines, PolynomialZoom(degree=0), terms, family)
+    lines = about_own_centre(placed)
     chosen, present = lines.by_frame()
     solver = default_solver(lines) if solver is None else solver
-    start = algebraic_start(lines, terms)
-    fits, outcome = _fit_frames(lines, start, chosen, present, terms, solver, max_steps)
+    start = algebraic_start(lines, model)
+    fits, outcome = _fit_frames(lines, start, chosen, present, model, solver, max_steps)
     if invertible:
-        small = compressed_as_measured(lines, terms)
-        fits, outcome = or_else(fits, outcome, lambda: _refit_frames(small, chosen, present, terms, fits))
+        small = compressed_as_measured(lines, model.terms)
+        fits, outcome = or_else(fits, outcome, lambda: _refit_frames(small, chosen, present, model, fits))
     return thrown(fits, outcome, throw)
 
 
 @eqx.filter_jit
-def _fit_frames(lines, start, chosen, present, terms, solver, max_steps):
+def _fit_frames(lines, start, chosen, present, model, solver, max_steps):
     def fit(chosen, present):
         frame = lines.take(chosen, present)
-        constant = PolynomialZoom(degree=0).prepare(frame.focal, lines.family.size(terms))
         own = None if start is None else start.take(chosen, present)
-        return fit_prepared(frame, own, constant, terms, solver, max_steps)[0]
+        return fit_prepared(frame, own, ready_model(frame, model), solver, max_steps)[0]
 
     # Small compressed frames are solved side by side; the points themselves one frame at a time, for
     # side by side they would all be in memory at once, padded to the fullest frame.
@@ -71,13 +70,13 @@ def _fit_frames(lines, start, chosen, present, terms, solver, max_steps):
 
 
 @eqx.filter_jit
-def _refit_frames(lines, chosen, present, terms, free):
+def _refit_frames(lines, chosen, present, model, free):
     """Each frame's fit, refitted to be invertible where it is not."""
 
     def fit(chosen, present, result, coefficients):
         frame = lines.take(chosen, present)
-        constant = PolynomialZoom(degree=0).prepare(frame.focal, lines.family.size(terms))
-        own = described_fit(frame, with_parameters(constant, coefficients[None]), result, jnp.asarray(0))
+        constant = ready_model(frame, model).with_parameters(coefficients[None])
+        own = described_fit(frame, constant.zoom, result, jnp.asarray(0))
         other, _ = refit_zoom(frame, own)
         keep = is_invertible(own)
         return jax.tree.map(lambda own, other: jnp.where(keep, own, other), own, other)

@@ -4,38 +4,40 @@ Compiled once for a shape of the lines; once per fit an algebraic start and, aft
 the certificate; per iteration one Jacobian of the residuals.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import optimistix as optx
 
-from ..models.zoom import AbstractLinearZoom, with_parameters
+from ..models.zoom import with_parameters
 from ._least_squares import default_solver
-from .algebraic import algebraic_parameters
+from .algebraic import algebraic_parameters, algebraic_start
+from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
 from .energy import coefficients_by, prior_residuals, weighted_distances
-from .prepare import algebraic_start, compressed_as_measured, ready_model
+from .prepare import ready_model
 from .result import described_fit, outcome_of, thrown
 
 
-def fit_about(lines, zoom=None, terms=None, *, solver=None, max_steps=256, invertible=True, throw=True):
-    """`fit_zoom` about the centre of the lines, under their own distortion model."""
-    model, terms = ready_model(lines, zoom, terms)
-    start = None
-    if isinstance(model, AbstractLinearZoom) and (zoom is None or zoom.parameters is None):
-        start = algebraic_start(lines, terms)
+def fit_about(lines, asked, *, solver=None, max_steps=256, invertible=True, throw=True):
+    """`fit_zoom` of a model about the centre of the lines, which are under its distortion model."""
+    model = ready_model(lines, asked)
+    start = algebraic_start(lines, model) if asked.zoom.parameters is None else None
     solver = default_solver(lines) if solver is None else solver
-    fit, outcome = fit_prepared(lines, start, model, terms, solver, max_steps)
+    fit, outcome = fit_prepared(lines, start, model, solver, max_steps)
     if invertible:
-        fit, outcome = or_else(fit, outcome, lambda: refit_zoom(compressed_as_measured(lines, terms), fit))
+        small = functools.partial(compressed_as_measured, lines, model.terms)
+        fit, outcome = or_else(fit, outcome, lambda: refit_zoom(small(), fit))
     return thrown(fit, outcome, throw)
 
 
 @eqx.filter_jit
-def fit_prepared(lines, start, zoom, terms, solver, max_steps):
+def fit_prepared(lines, start, model, solver, max_steps):
     """The fit of a prepared model, and its outcome."""
     if start is not None:
-        zoom = with_parameters(zoom, algebraic_parameters(start, zoom, terms))
-    zoom, result, steps = minimise(lines, zoom, solver, max_steps)
+        model = model.with_parameters(algebraic_parameters(start, model))
+    zoom, result, steps = minimise(lines, model.zoom, solver, max_steps)
     fit = described_fit(lines, zoom, result, steps)
     return fit, outcome_of(fit)
 

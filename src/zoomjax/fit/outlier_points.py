@@ -25,11 +25,11 @@ from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
 from ..lines.lines import Lines
 from ..models.family import AbstractFamily
-from ..models.polynomial import RadialPolynomial
+from ..models.model import Model
 from ..models.zoom import AbstractZoom
 from .energy import coefficients_by, line_normal
 from .family_lines import compress_family, with_family
-from .prepare import ready_model
+from .prepare import asked_for, ready_model
 from .robust import RobustFit, fit_robust
 
 _CUT = 4.0
@@ -69,7 +69,7 @@ class PointRejection(NamedTuple):
 def reject_points(
     lines: Lines,
     *,
-    zoom: AbstractZoom | None = None,
+    zoom: AbstractZoom | Model | None = None,
     family: AbstractFamily | None = None,
     terms: int | None = None,
     throw: bool = True,
@@ -95,13 +95,13 @@ def reject_points(
         >>> np.argwhere(reject_points(lines, zoom=PolynomialZoom(degree=0), terms=1).rejected).tolist()
         [[3, 7]]
     """
-    model = RadialPolynomial() if family is None else family
-    _, number = ready_model(with_family(lines, model), zoom, terms)
+    _, model = asked_for(lines, zoom, terms, family)
+    ready_model(lines, model)  # complains of too few focal lengths
     everything, kept, seen = np.asarray(lines.mask), lines, set[bytes]()
     few = everything.sum(axis=1, keepdims=True) < _FEWEST
     while True:
-        fit = fit_robust(compress_family(kept, model, terms=number), zoom=zoom, terms=terms, throw=throw)
-        distance, spread = map(np.asarray, _distances(lines, model, fit.fit.lens.zoom))
+        fit = fit_robust(compress_family(kept, model.family, terms=model.terms), zoom=model, throw=throw)
+        distance, spread = map(np.asarray, _distances(lines, model.family, fit.fit.lens.zoom))
         good = everything & (few | (np.abs(distance) <= _CUT * spread[:, None]))
         seen.add(np.asarray(kept.mask).tobytes())
         if good.tobytes() in seen:  # settled, or a doubtful point comes and goes

@@ -1,38 +1,50 @@
-"""Preparation of a fit: the model, the compressed lines and the algebraic start."""
+"""Preparation of a fit: the model that is asked for, made ready for the lines."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..lines.base import AbstractLines
-from ..lines.compressed import CompressedLines
-from ..models.polynomial import RadialPolynomial
-from ..models.zoom import terms_of
-from .algebraic import compressed, small_of
-from .defaults import zoom_or_default
+from ..lines.base import AbstractLines, SomeLines
+from ..models.family import AbstractFamily
+from ..models.model import Model
+from ..models.zoom import AbstractZoom
+from .defaults import DEFAULT_ZOOM
 from .energy import settings
-from .image_metric import measured_as
+from .family_lines import with_family
 
 
-def ready_model(lines, zoom, terms):
-    """The model ready to be fitted to these lines, in their dtype, and its number of radial terms."""
-    zoom = zoom_or_default(zoom)
-    terms = terms_of(zoom, terms, lines.family)
-    focal, *focus = settings(zoom, lines)
-    size = lines.family.size(terms)
-    prepared = zoom.prepare(focal, size, *focus)  # complains of too few focal lengths
-    if zoom.parameters is None:
-        return prepared, terms
+def asked_for(
+    lines: SomeLines,
+    zoom: AbstractZoom | Model | None,
+    terms: int | None = None,
+    family: AbstractFamily | None = None,
+) -> tuple[SomeLines, Model]:
+    """The lines under the distortion model asked for, and the model: by default that of the paper.
+
+    Raises:
+        ValueError: `zoom` is a `Model`, and `terms` or `family` is given besides.
+    """
+    if isinstance(zoom, Model):
+        if terms is not None or family is not None:
+            raise ValueError(
+                "Argument zoom is a Model, which has a number of terms and a distortion model of its own: "
+                "leave out the arguments terms and family."
+            )
+        zoom, terms, family = zoom.zoom, zoom.terms, zoom.family
+    placed = lines if family is None else with_family(lines, family)
+    return placed, Model(DEFAULT_ZOOM if zoom is None else zoom, terms, placed.family)
+
+
+def ready_model(lines: AbstractLines, model: Model) -> Model:
+    """The model ready to be fitted to these lines, in their dtype.
+
+    Raises:
+        ValueError: the zoom model needs more focal lengths, or the focus, which the lines do not have.
+    """
+    focal, *focus = settings(model.zoom, lines)
+    prepared = model.zoom.prepare(focal, model.size, *focus)  # complains of too few focal lengths
+    if model.zoom.parameters is None:
+        return model.with_zoom(prepared)
     dtype = jnp.asarray(lines.focal).dtype
-    arrays, rest = eqx.partition(zoom, eqx.is_inexact_array)
-    return eqx.combine(jax.tree.map(lambda array: array.astype(dtype), arrays), rest), terms
-
-
-def compressed_as_measured(lines, terms):
-    """The lines compressed, measured as they were."""
-    return measured_as(small_of(lines, terms), lines)
-
-
-def algebraic_start(lines: AbstractLines, terms: int) -> CompressedLines | None:
-    """What the algebraic estimate is made from; None for a family that it does not know."""
-    return compressed(lines, terms) if isinstance(lines.family, RadialPolynomial) else None
+    arrays, rest = eqx.partition(model.zoom, eqx.is_inexact_array)
+    return model.with_zoom(eqx.combine(jax.tree.map(lambda array: array.astype(dtype), arrays), rest))

@@ -26,14 +26,14 @@ from jaxtyping import Array, Float, Int
 from .._core.arguments import kinds_checked
 from ..lines.base import AbstractLines, SomeLines
 from ..models.family import AbstractFamily
+from ..models.model import Model
 from ..models.polynomial import RadialPolynomial
 from ..models.zoom import AbstractLinearZoom, AbstractZoom, with_parameters
 from ._least_squares import Solver
 from ._linear import least_squares
 from .algebraic import algebraic_zoom
 from .energy import coefficients_by, line_residuals, linearised, prior_jacobian
-from .family_lines import with_family
-from .prepare import ready_model
+from .prepare import asked_for, ready_model
 from .result import ZoomFit
 from .wrapper import about_own_centre
 from .zoom import fit_zoom
@@ -74,7 +74,7 @@ class RobustFit(eqx.Module):
 def fit_robust(
     lines: AbstractLines,
     *,
-    zoom: AbstractZoom | None = None,
+    zoom: AbstractZoom | Model | None = None,
     family: AbstractFamily | None = None,
     terms: int | None = None,
     solver: Solver | None = None,
@@ -104,8 +104,9 @@ def fit_robust(
         >>> fit_robust(compress(lines), zoom=PolynomialZoom(degree=0), terms=1).rejected.tolist()
         [10]
     """
-    lines = about_own_centre(lines if family is None else with_family(lines, family))
-    weighted, model = reweighted(lines, zoom, terms)
+    placed, asked = asked_for(lines, zoom, terms, family)
+    lines = about_own_centre(placed)
+    weighted, model = reweighted(lines, asked)
     fit = fit_zoom(
         weighted, zoom=model, solver=solver, max_steps=max_steps, invertible=invertible, throw=throw
     )
@@ -113,22 +114,21 @@ def fit_robust(
     return RobustFit(fit=fit, weight=jnp.asarray(weighted.weight), line_rms=line_rms, scale=median)
 
 
-def reweighted(
-    lines: SomeLines, zoom: AbstractZoom | None = None, terms: int | None = None
-) -> tuple[SomeLines, AbstractZoom]:
+def reweighted(lines: SomeLines, asked: Model) -> tuple[SomeLines, Model]:
     """The lines with the weights of `fit_robust`, and the model of its last turn.
 
     The first turn starts from the algebraic estimate; under another distortion model, which has none, from
     the fit to all lines: far from it, whole frames would seem not to be straight.
     """
-    start, terms = ready_model(lines, zoom, terms)
-    if zoom is None or zoom.parameters is None:
-        if not isinstance(lines.family, RadialPolynomial):
+    model = ready_model(lines, asked)
+    if asked.zoom.parameters is None:
+        if not isinstance(model.family, RadialPolynomial):
             weighted = lines.weighted(_own_weights(lines))
-            start = fit_zoom(weighted, zoom=start, invertible=False, throw=False).lens.zoom
-        elif isinstance(start, AbstractLinearZoom):
-            start = algebraic_zoom(lines, zoom=start, terms=terms).zoom
-    return _reweighted(lines, start)
+            model = model.with_zoom(fit_zoom(weighted, zoom=model, invertible=False, throw=False).lens.zoom)
+        elif isinstance(model.zoom, AbstractLinearZoom):
+            model = model.with_zoom(algebraic_zoom(lines, zoom=asked.zoom, terms=asked.terms).zoom)
+    weighted, zoom = _reweighted(lines, model.zoom)
+    return weighted, model.with_zoom(zoom)
 
 
 def _own_weights(lines):

@@ -18,11 +18,12 @@ from .._core.types import AnyArray
 from ..lines.base import AbstractLines, SomeLines
 from ..lines.compressed import CompressedLines
 from ..models.family import AbstractFamily
+from ..models.model import Model
 from ..models.zoom import AbstractZoom
 from ._least_squares import Solver
 from .centre import fit_centre
-from .family_lines import with_family
 from .minimise import fit_about
+from .prepare import asked_for
 from .result import ZoomFit
 from .wrapper import about_own_centre
 
@@ -34,7 +35,7 @@ CentreArgument = Literal["fit", "image"] | tuple[float, float] | Float[AnyArray,
 def fit_zoom(
     lines: AbstractLines,
     *,
-    zoom: AbstractZoom | None = None,
+    zoom: AbstractZoom | Model | None = None,
     family: AbstractFamily | None = None,
     terms: int | None = None,
     centre: CentreArgument | None = None,
@@ -47,9 +48,10 @@ def fit_zoom(
 
     Args:
         lines: the lines, or, much faster and with the same result, ``compress(lines)``.
-        zoom: the zoom model; `PolynomialZoom` of degree 2 by default. If it has parameters, the solver
-            starts there. Otherwise it starts from the algebraic estimate if the model is linear and the
-            distortion model is the radial polynomial, else from no distortion.
+        zoom: the zoom model; `PolynomialZoom` of degree 2 by default. Or a `Model`, which has `family` and
+            `terms`, too. If it has parameters, the solver starts there. Otherwise it starts from the
+            algebraic estimate if the model is linear and the distortion model is the radial polynomial,
+            else from no distortion.
         family: the distortion model: `RadialPolynomial` (eq. 2) unless the lines have another one
             (`compress_family`); or `Division`, or `BrownConrady`, which has two additional coefficients.
         terms: the number N of radial distortion coefficients (eq. 2): by default 2, or as many as a `zoom`
@@ -90,13 +92,13 @@ def fit_zoom(
         >>> bool(fit.rms < 1)
         True
     """
-    lines = lines if family is None else with_family(lines, family)
+    lines, model = asked_for(lines, zoom, terms, family)
     options: Any = {"solver": solver, "max_steps": max_steps, "throw": throw}
     if isinstance(centre, str) and centre == "fit":
         if not invertible:
             raise ValueError('Argument centre is "fit", which needs invertible=True.')
-        return fit_centre(lines, zoom=zoom, terms=terms, **options).fit
-    return fit_about(about_centre(lines, centre), zoom, terms, invertible=invertible, **options)
+        return fit_centre(lines, zoom=model, **options).fit
+    return fit_about(about_centre(lines, centre), model, invertible=invertible, **options)
 
 
 def about_centre(lines: SomeLines, centre: CentreArgument | None) -> SomeLines | CompressedLines:

@@ -14,6 +14,7 @@ from .invertibility import Certificate as Certificate
 from .invertibility import certify as certify
 from .lens import ZoomLens as ZoomLens
 from .lens import load_lens as load_lens
+from .model import Model as Model
 from .polynomial import RadialPolynomial as RadialPolynomial
 from .power import PowerZoom as PowerZoom
 from .registry import register_model as register_model

@@ -26,6 +26,7 @@ from ._known_sizes import with_known_size
 from .about import About, checked_about, checked_pitch
 from .distortion import Distortion, compiled, mapped
 from .family import AbstractFamily
+from .model import Model
 from .polynomial import RadialPolynomial
 from .registry import array_of, coefficients_shape, described, family_name, family_named, zoom_from
 from .zoom import AbstractFocusZoom, AbstractLinearZoom, AbstractZoom
@@ -108,6 +109,11 @@ class ZoomLens(eqx.Module):
         """The length in px that is radius 1: half the image diagonal."""
         return math.hypot(*self.image_size) / 2
 
+    @property
+    def model(self) -> Model:
+        """Zoom model, number of coefficients and distortion model, as fits of other lines take them."""
+        return Model(self.zoom, None, self.family)
+
     def __call__(self, focal: FocalLike, focus: FocalLike | None = None) -> Distortion:
         """The distortion at a focal length in `focal_unit`, or at several.
 
@@ -124,8 +130,7 @@ class ZoomLens(eqx.Module):
 
         Raises:
             ValueError: `focal` is not positive and finite, or the zoom model depends on the focus and
-            `focus` is
-                missing.
+                `focus` is missing.
         """
         focal = self._checked(focal, stacklevel=4)
         if traced((self, focal, focus)):

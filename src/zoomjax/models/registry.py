@@ -27,7 +27,7 @@ from .tables import TableZoom
 from .two_region import TwoRegionZoom
 from .zoom import AbstractFocusZoom, AbstractZoom, PolynomialZoom
 
-Model = TypeVar("Model", bound=AbstractZoom | AbstractFamily)
+SomeModel = TypeVar("SomeModel", bound=AbstractZoom | AbstractFamily)
 
 _ZOOMS: dict[str, type[AbstractZoom]] = {}
 _FAMILIES: dict[str, type[AbstractFamily]] = {}
@@ -37,13 +37,13 @@ _RESERVED = {"model", "formula"}
 
 
 @overload
-def register_model(cls: type[Model], *, name: str | None = None) -> type[Model]: ...
+def register_model(cls: type[SomeModel], *, name: str | None = None) -> type[SomeModel]: ...
 
 
 @overload
 def register_model(
     cls: None = None, *, name: str | None = None
-) -> Callable[[type[Model]], type[Model]]: ...
+) -> Callable[[type[SomeModel]], type[SomeModel]]: ...
 
 
 def register_model(cls: Any = None, *, name: str | None = None) -> Any:

@@ -18,7 +18,6 @@ from .evidence import evidence as evidence
 from .misfit import with_misfit as with_misfit
 from .next_photo import Suggestion as Suggestion
 from .next_photo import suggest_next as suggest_next
-from .selection import Candidate as Candidate
 from .selection import Selection as Selection
 from .selection import Verdict as Verdict
 from .selection import select_model as select_model

@@ -28,15 +28,15 @@ from .folds import LineErrors, counts_of, own_weights
 _MOST_STEPS = 40  # of Gauss-Newton: from the fit of all lines it takes 1 to 3, from zero 4 to 8
 
 
-def linear_errors(lines, zoom, terms, parts):
-    lanes = lanes_of(lines, parts.fold, terms)
+def linear_errors(lines, model, parts):
+    lanes = lanes_of(lines, parts.fold, model.terms)
     known: dict[bytes, Design | str] = {}
     designs, problem = [], ""
     for fold in range(-1, parts.number):
         left = np.zeros(len(lines.focal), bool)
         left[lanes.frame[(lanes.weight > 0) & ((lanes.fold != fold) | (fold < 0))]] = True
         if (key := left.tobytes()) not in known:
-            known[key] = _design(lines, zoom, left, terms)
+            known[key] = _design(lines, model, left)
         design = known[key]
         if isinstance(design, str):
             problem, design = problem or design, None
@@ -64,18 +64,18 @@ class Design(NamedTuple):
     precision: np.ndarray  # (parameter, parameter): of the prior, in the unit of eq. 13
 
 
-def _design(lines, zoom, left, terms):
+def _design(lines, model, left):
     """The model as made ready for the frames that are left, or why it cannot be."""
     try:
-        focal, *focus = map(np.asarray, settings(zoom, lines))
-        model = zoom.prepare(focal[left], terms, *(values[left] for values in focus))
+        focal, *focus = map(np.asarray, settings(model.zoom, lines))
+        zoom = model.zoom.prepare(focal[left], model.terms, *(values[left] for values in focus))
     except ValueError as error:
         return str(error)
-    values = np.asarray(_basis_of(with_parameters(model, None), focal, *focus), float)
+    values = np.asarray(_basis_of(with_parameters(zoom, None), focal, *focus), float)
     size = values.shape[1]
-    precision = np.zeros((size * terms, size * terms))
-    if isinstance(model, AbstractPriorZoom):
-        whitener = np.asarray(_whitener(lines, model), float)
+    precision = np.zeros((size * model.terms, size * model.terms))
+    if isinstance(zoom, AbstractPriorZoom):
+        whitener = np.asarray(_whitener(lines, zoom), float)
         precision = whitener.T @ whitener
     project = np.zeros((size, len(focal)))
     project[:, left] = np.linalg.pinv(values[left])

@@ -8,7 +8,7 @@ import numpy as np
 from ..fit.centre import CentreFit, fit_centre, refit_centre
 from ..fit.energy import line_squares
 from ..lines.free_centre import AnyCentreLines
-from ..models.zoom import AbstractZoom, with_parameters
+from ..models.model import Model
 from .cross_validation import errors_of
 from .folds import folds_of, own_weights, shares
 
@@ -36,25 +36,24 @@ class CentreChoice:
         return bool(self.found.determined) and self.fitted <= self.given
 
 
-def choose_centre(lines: AnyCentreLines, *, zoom: AbstractZoom, terms: int = 2) -> CentreChoice:
+def choose_centre(lines: AnyCentreLines, model: Model) -> CentreChoice:
     """Fit the centre of distortion, one for all focal lengths, and cross-validate it.
 
     A fifth of the frames is left out at a time, or, with fewer than five, of the lines of each frame.
 
     Args:
         lines: the lines, compressed for any centre.
-        zoom: the zoom model, without parameters.
-        terms: its number of coefficients.
+        model: the zoom model, without parameters, and its number of coefficients.
 
     Raises:
         ValueError, RuntimeError: as for `fit_centre`.
     """
     if lines.weight is None:
         lines = lines.weighted(np.ones(lines.frame.shape))  # as in every fold: one compiled program
-    found = fit_centre(lines, zoom=zoom, terms=terms)
+    found = fit_centre(lines, zoom=model)
     small = lines.about(lines.centre)
     parts = folds_of(small, "frame" if len(lines.focal) >= _FOLDS else "line", _FOLDS, 0)
-    given = errors_of(small, with_parameters(zoom, None), terms, parts).unseen
+    given = errors_of(small, model.with_parameters(None), parts).unseen
     own, fitted = own_weights(small), np.full(given.shape, np.nan)
     for fold in range(parts.number) if found.determined else ():
         out = parts.fold == fold

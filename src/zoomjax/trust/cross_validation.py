@@ -12,16 +12,17 @@ from jaxtyping import Float
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_terms
 from .._core.types import of_known_values
-from ..fit.defaults import zoom_or_default
+from ..fit.compression import compressed_as_measured
 from ..fit.energy import line_squares, line_squares_by_frame, settings
 from ..fit.frames import fit_frames
-from ..fit.prepare import compressed_as_measured
+from ..fit.prepare import asked_for, ready_model
 from ..fit.result import RESULTS
 from ..fit.wrapper import AbstractWrapper
 from ..fit.zoom import fit_zoom
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
-from ..models.zoom import AbstractLinearZoom, AbstractZoom, terms_of, with_parameters
+from ..models.model import Model
+from ..models.zoom import AbstractLinearZoom, AbstractZoom
 from ._linear_folds import Design, Lanes, as_given, cross_validated, lanes_of, linear_errors
 from .folds import Folds, HoldOut, LineErrors, folds_of, own_weights, shares, small_lines
 
@@ -31,7 +32,7 @@ from .folds import Folds, HoldOut, LineErrors, folds_of, own_weights, shares, sm
 def held_out_zoom(
     lines: AbstractLines,
     *,
-    zoom: AbstractZoom | None = None,
+    zoom: AbstractZoom | Model | None = None,
     terms: int | None = None,
     hold_out: HoldOut = "frame",
     folds: int | None = None,
@@ -64,14 +65,12 @@ def held_out_zoom(
         >>> bool((held_out_zoom(lines) ** 2).mean() > fit_zoom(lines).rms ** 2)
         True
     """
-    zoom = zoom_or_default(zoom)
-    terms = terms_of(zoom, terms, lines.family)
-    zoom = with_parameters(zoom, None)
-    focal, *focus = settings(zoom, lines)
-    zoom.prepare(focal, terms, *focus)  # complains of too few focal lengths
-    small = _small(lines, terms)
+    lines, asked = asked_for(lines, zoom, terms)
+    model = asked.with_parameters(None)
+    ready_model(lines, model)  # complains of too few focal lengths
+    small = _small(lines, model.terms)
     parts = folds_of(small, hold_out, folds, seed)
-    found = errors_of(small, zoom, terms, parts)
+    found = errors_of(small, model, parts)
     return _by_frame(small, np.where(parts.fold >= 0, found.unseen, np.nan))
 
 
@@ -124,18 +123,17 @@ def _small(lines, terms):
     return compressed_as_measured(lines, terms) if wrapped else small_lines(lines, terms)
 
 
-def errors_of(lines: AbstractLines, zoom: AbstractZoom, terms: int, parts: Folds) -> LineErrors:
+def errors_of(lines: AbstractLines, model: Model, parts: Folds) -> LineErrors:
     """A model's errors on the lines of the fit, and on lines left out.
 
     Args:
         lines: from `small_lines`, or those lines with another distortion model or metric.
-        zoom: a model without parameters.
-        terms: its number of coefficients.
+        model: a model without parameters.
         parts: the folds.
     """
-    if isinstance(zoom, AbstractLinearZoom) and isinstance(lines, CompressedLines):
-        return linear_errors(lines, zoom, terms, parts)
-    return _errors_by_fits(lines, zoom, terms, parts)
+    if isinstance(model.zoom, AbstractLinearZoom) and isinstance(lines, CompressedLines):
+        return linear_errors(lines, model, parts)
+    return _errors_by_fits(lines, model, parts)
 
 
 def _by_frame(lines, of_line):
@@ -162,10 +160,10 @@ def _frames_by_fits(lines, terms, folds, seed):
     return _by_frame(lines, unseen)
 
 
-def _errors_by_fits(lines, zoom, terms, parts):
+def _errors_by_fits(lines, model, parts):
     """By a fit of its own for each fold, starting from that of all lines."""
     own = own_weights(lines)
-    everything = fit_zoom(lines, zoom=zoom, terms=terms, invertible=False, throw=False)
+    everything = fit_zoom(lines, zoom=model, invertible=False, throw=False)
     seen = np.asarray(line_squares(lines, everything.lens.zoom))
     unseen, failed = np.full(seen.shape, np.nan), 0
     problem = ""
@@ -173,8 +171,8 @@ def _errors_by_fits(lines, zoom, terms, parts):
         kept = own * (parts.fold != fold)
         left = np.unique(np.asarray(lines.frame)[kept > 0])
         try:
-            focal, *focus = (np.asarray(values)[left] for values in settings(zoom, lines))
-            zoom.prepare(focal, terms, *focus)
+            focal, *focus = (np.asarray(values)[left] for values in settings(model.zoom, lines))
+            model.zoom.prepare(focal, model.size, *focus)
         except ValueError as error:
             problem = problem or str(error)
             continue

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.checks import checked_integer
-from ..fit.algebraic import compressed
+from ..fit.compression import compressed
 from ..fit.wrapper import AbstractWrapper
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
@@ -58,7 +58,7 @@ def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
     if isinstance(lines, AbstractWrapper):
         raise TypeError(
             "Argument lines has a distortion model of its own, and here each candidate has one: pass the "
-            "lines without with_family, and Candidate(zoom, terms, family)."
+            "lines without with_family, and Model(zoom, terms, family)."
         )
     if not isinstance(lines, AbstractLines):
         raise TypeError(

@@ -22,10 +22,10 @@ from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
+from ..fit.compression import compressed_as_measured
 from ..fit.energy import frame_normal_equations
 from ..fit.family_lines import with_family
 from ..fit.image_metric import ImageLines
-from ..fit.prepare import compressed_as_measured
 from ..fit.result import ZoomFit
 from ..fit.same_camera import check_lines_of
 from ..lines.base import AbstractLines

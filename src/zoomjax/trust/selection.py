@@ -18,11 +18,11 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from .._core.arguments import check_kind, kinds_checked
+from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
-from ..fit.energy import settings
 from ..fit.family_lines import compress_family, with_family
 from ..fit.image_metric import in_corrected, measured_as
+from ..fit.prepare import ready_model
 from ..fit.result import ZoomFit
 from ..fit.wrapper import about_own_centre
 from ..fit.zoom import fit_zoom
@@ -30,9 +30,10 @@ from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
 from ..lines.lines import Lines
 from ..models.family import AbstractFamily
+from ..models.model import Model
 from ..models.polynomial import RadialPolynomial
 from ..models.smooth import SmoothZoom
-from ..models.zoom import AbstractZoom, PolynomialZoom, terms_of, with_parameters
+from ..models.zoom import AbstractZoom, PolynomialZoom
 from .cross_validation import errors_of
 from .folds import Folds, HoldOut, LineErrors, folds_of, shares, small_lines
 
@@ -43,43 +44,6 @@ Rule = Literal["one standard error", "least"]
 
 _TIE = 5e-4
 """Part of the error: candidates that differ by less are as good as each other, under the rule "least"."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Candidate:
-    """A model to compare: a zoom model, specified but not fitted, and its number of coefficients.
-
-    Attributes:
-        zoom: such as ``PolynomialZoom(degree=2)``.
-        terms: N, of eq. 2; of a zoom model with parameters theirs.
-        family: the distortion model, such as ``Division()``.
-    """
-
-    zoom: AbstractZoom
-    terms: int = 2
-    family: AbstractFamily = RadialPolynomial()  # noqa: RUF009, it has no state
-
-    def __post_init__(self):
-        """Check what it is made of."""
-        if not isinstance(self.zoom, AbstractZoom):
-            raise TypeError(
-                f"A candidate must be a zoom model, as PolynomialZoom(degree=2) is, not {self.zoom!r}."
-            )
-        check_kind("family", self.family, (AbstractFamily,))
-        terms_of(self.zoom, self.terms, self.family)
-
-    @property
-    def name(self) -> str:
-        """What it is called: "degree 2, 2 terms" if it is a polynomial in 1/f; others with their kind."""
-        settings = [
-            f"{field.name} {value}"
-            for field in dataclasses.fields(self.zoom)
-            if field.metadata.get("static") and (value := getattr(self.zoom, field.name)) is not None
-        ]
-        other = [self.zoom] * (not isinstance(self.zoom, PolynomialZoom))
-        other += [self.family] * (not isinstance(self.family, RadialPolynomial))
-        kind = [type(model).__name__ for model in other]
-        return ", ".join([*kind, *settings, f"{self.terms} term{'s' * (self.terms > 1)}"])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +61,7 @@ class Verdict:
         problem: why it was not compared, in a sentence; empty if it was.
     """
 
-    candidate: Candidate
+    candidate: Model
     parameters: float = np.nan
     rms: float = np.nan
     held_out: float = np.nan
@@ -121,8 +85,8 @@ class Selection:
         folds: number of folds.
     """
 
-    chosen: Candidate
-    best: Candidate
+    chosen: Model
+    best: Model
     fit: ZoomFit
     verdicts: tuple[Verdict, ...]
     hold_out: HoldOut
@@ -187,7 +151,7 @@ COLUMNS = ("candidate", "parameters", "fitted", "held out", "to the best", "")
 @of_known_values
 def select_model(
     lines: AbstractLines,
-    candidates: Sequence[AbstractZoom | Candidate] | None = None,
+    candidates: Sequence[AbstractZoom | Model] | None = None,
     *,
     hold_out: HoldOut | None = None,
     folds: int | None = None,
@@ -203,7 +167,7 @@ def select_model(
     Args:
         lines: the lines, or ``compress(lines, terms=3)``; measured in the image (`in_image`), every fold is
             fitted by itself.
-        candidates: zoom models, or `Candidate` for other `terms` than 2 or another distortion model. By
+        candidates: zoom models, or `Model` for other `terms` than 2 or another distortion model. By
             default polynomials in 1/f of degree 0 to 3 with 1 to 3 coefficients (or as many as the lines
             are compressed for), and `SmoothZoom`.
         hold_out: what is left out. "focal": focal lengths with all of their frames, but never the shortest
@@ -245,7 +209,7 @@ def select_model(
         'degree 2, 2 terms'
     """
     lines = about_own_centre(lines)
-    if isinstance(candidates, AbstractZoom | Candidate):
+    if isinstance(candidates, AbstractZoom | Model):
         raise TypeError(
             "Argument candidates must be a list of zoom models, [first, second], not one of them."
         )
@@ -254,7 +218,7 @@ def select_model(
         most = min(_TERMS, plain.terms) if isinstance(plain, CompressedLines) else _TERMS
         compared = default_candidates(most)
     else:
-        compared = tuple(c if isinstance(c, Candidate) else Candidate(c) for c in candidates)
+        compared = tuple(c if isinstance(c, Model) else Model(c) for c in candidates)
     if rule not in get_args(Rule):
         raise ValueError(f'Argument rule must be "one standard error" or "least", but it is {rule!r}.')
     if not compared:
@@ -266,18 +230,18 @@ def select_model(
         hold_out = "focal" if np.unique(np.asarray(small.focal)).size > 3 else "line"
     parts = folds_of(small, hold_out, folds, seed)
     verdicts, best, chosen = compare(small, compared, parts, forms, rule)
-    fit = fit_zoom(forms[chosen.family], zoom=chosen.zoom, terms=chosen.terms)
+    fit = fit_zoom(forms[chosen.family], zoom=chosen)
     return Selection(chosen, best, fit, verdicts, hold_out, parts.number)
 
 
-def default_candidates(terms: int = _TERMS) -> tuple[Candidate, ...]:
+def default_candidates(terms: int = _TERMS) -> tuple[Model, ...]:
     """Polynomials of degree 0 to 3 with up to so many coefficients, and `SmoothZoom`."""
     polynomials = [
-        Candidate(PolynomialZoom(degree=degree), number)
+        Model(PolynomialZoom(degree=degree), number)
         for number in range(1, terms + 1)
         for degree in range(_DEGREES)
     ]
-    return (*polynomials, *([Candidate(SmoothZoom(), 2)] if terms > 1 else []))
+    return (*polynomials, *([Model(SmoothZoom(), 2)] if terms > 1 else []))
 
 
 def _in_family(lines, small, family, terms):
@@ -293,24 +257,23 @@ def _in_family(lines, small, family, terms):
 
 def candidate_errors(lines, candidate, parts):
     """The errors, or why there are none."""
-    zoom = with_parameters(candidate.zoom, None)
+    model = candidate.with_parameters(None)
     try:
         if isinstance(lines, CompressedLines):
-            lines.check_terms(candidate.terms)
-        focal, *focus = settings(zoom, lines)
-        zoom.prepare(np.asarray(focal), candidate.terms, *focus)
-        return errors_of(lines, zoom, candidate.terms, parts)
+            lines.check_terms(model.terms)
+        ready_model(lines, model)  # complains of too few focal lengths
+        return errors_of(lines, model, parts)
     except ValueError as error:
         return str(error)
 
 
 def compare(
     lines: CompressedLines,
-    candidates: Sequence[Candidate],
+    candidates: Sequence[Model],
     parts: Folds,
     forms: Mapping[AbstractFamily, AbstractLines] | None = None,
     rule: Rule = "one standard error",
-) -> tuple[tuple[Verdict, ...], Candidate, Candidate]:
+) -> tuple[tuple[Verdict, ...], Model, Model]:
     """The verdicts, the best candidate and the chosen one; see `select_model`.
 
     `forms` are the same lines for other families than the radial polynomial.

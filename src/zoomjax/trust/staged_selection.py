@@ -6,10 +6,11 @@ import numpy as np
 
 from ..fit.zoom import fit_zoom
 from ..lines.compressed import CompressedLines
+from ..models.model import Model
 from ..models.smooth import SmoothZoom
 from ..models.zoom import AbstractZoom
 from .folds import HoldOut, folds_of
-from .selection import Candidate, Selection, candidate_errors, compare_errors
+from .selection import Selection, candidate_errors, compare_errors
 
 
 def select_in_stages(
@@ -33,14 +34,12 @@ def select_in_stages(
     hold_out: HoldOut = "focal" if many else "line"
     most = min(folds, np.unique(np.asarray(lines.focal)).size - 2) if many else folds
     parts = folds_of(lines, hold_out, most, 0)
-    candidates = [Candidate(zoom, terms[0]) for zoom in zooms]
+    candidates = [Model(zoom, terms[0]) for zoom in zooms]
     errors = [candidate_errors(lines, candidate, parts) for candidate in candidates]
     _, best, chosen = compare_errors(lines, candidates, errors, parts, "least")
-    more = [
-        Candidate(chosen.zoom, number) for number in terms[1:] if not isinstance(chosen.zoom, SmoothZoom)
-    ]
+    more = [Model(chosen.zoom, number) for number in terms[1:] if not isinstance(chosen.zoom, SmoothZoom)]
     errors += [candidate_errors(lines, candidate, parts) for candidate in more]
     candidates += more
     verdicts, best, chosen = compare_errors(lines, candidates, errors, parts, "least")
-    fit = fit_zoom(lines, zoom=chosen.zoom, terms=chosen.terms)
+    fit = fit_zoom(lines, zoom=chosen)
     return Selection(chosen, best, fit, verdicts, hold_out, parts.number)
