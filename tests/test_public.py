@@ -1,10 +1,13 @@
 """The public names: they exist, say what they do, and are the ones agreed on."""
 
+import ast
 import importlib
 import importlib.metadata
 import inspect
+import itertools
 import subprocess
 import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
@@ -164,3 +167,24 @@ def test_the_design_in_ten_lines(noisy, tmp_path):
     points = jnp.array([[0.0, 0.0], [4287.0, 2847.0]])
     assert jnp.allclose(d.distort(d.undistort(points)), points, rtol=0, atol=1e-9)
     assert (zj.frame_rms(lines, fit.lens) < zj.frame_rms(lines, None)).all()
+
+
+SECTIONS = ("Args:", "Returns:", "Raises:", "Warns:", "Attributes:")
+
+
+@pytest.mark.parametrize("path", sorted(Path(zj.__file__).parent.rglob("*.py")), ids=lambda path: path.stem)
+def test_sections_of_docstrings_hold_what_is_under_them(path):
+    """The documentation's pages would show a head, and its content as running text."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module) and (
+            doc := ast.get_docstring(node)
+        ):
+            lines = doc.splitlines()
+            for head, below in itertools.pairwise(lines):
+                if head.strip() in SECTIONS:
+                    assert not head.startswith(" "), (
+                        f"{path.name}: {head.strip()} of {getattr(node, 'name', '')}"
+                    )
+                    assert below.startswith("    "), (
+                        f"{path.name}: below {head} of {getattr(node, 'name', '')}"
+                    )

@@ -60,7 +60,7 @@ def undistort(
         A tensor of the points' dtype and device; NaN beyond the lens's focal range (see
         `ZoomLens.extended`). First derivatives exist; for second ones use JAX.
 
-        Raises:
+    Raises:
         TypeError: the points are not a tensor of float32 or float64, or the lens has the wrong type.
         ValueError: a lens is given without a focal length, or a distortion with one.
     """

@@ -45,7 +45,7 @@ def test_two_lenses_are_to_be_parted_before_another_photo_is_taken(noisy, tmp_pa
     mixed = dataclasses.replace(done, assessment=done.assessment.joined_by(findings_of_photos(photos)))
     assert mixed.assessment.sentence.startswith("Doubtful: the photos were taken with 2 different lenses")
     assert mixed.advice() == (
-        "A further photo does not help here. Calibrate the photos of each lens and camera by themselves."
+        "Calibrate the photos of each lens and camera by themselves. That comes before another photo."
     )
     assert done.advice() != mixed.advice()
     assert not mixed.summary()["next_photo"]["enough"]

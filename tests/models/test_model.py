@@ -46,7 +46,7 @@ def test_held_out_lines_of_a_model(lines):
 @pytest.mark.parametrize("more", [{"terms": 1}, {"family": Division()}], ids=["terms", "family"])
 @pytest.mark.parametrize("fit", [zj.fit_zoom, zj.fit_robust, zj.fit.fit_centre, zj.fit.reject_points])
 def test_what_a_model_says_is_not_said_again(lines, fit, more):
-    with pytest.raises(ValueError, match="Argument zoom is a Model, .*leave out"):
+    with pytest.raises(ValueError, match=r"Argument zoom is a Model, .*leave out"):
         fit(lines, zoom=ASKED, **more)
 
 

@@ -130,7 +130,7 @@ class Calibration:
         """What to photograph next, or that there is enough, or that something else comes first."""
         causes = [finding.advice for finding in self.assessment.findings if finding.cause]
         if causes:
-            return f"A further photo does not help here. {causes[0]}"
+            return f"{causes[0]} That comes before another photo."
         if not self.enough():
             return self.next.sentence if self.focal_known else replace(self.next, focal_unit="").sentence
         return (

@@ -83,7 +83,7 @@ def frame_output(
         ValueError: a size or `keep` is not valid, there is no distortion, one is for images of another size
             or aspect ratio, or ("valid") the images have no common part.
 
-        Warns:
+    Warns:
         UserWarning: the lens is for images of another size, so it was scaled.
 
     Example:

@@ -83,10 +83,9 @@ def undistort_image(
             or the framing, or by its centre and scale the distortion, is for images of another size. With a
             user-defined `Framing` the distortion is not checked.
 
-        Warns:
+    Warns:
         UserWarning: the lens folds within the image, and the part beyond the fold cannot be corrected; or
-        the
-            lens is for images of another size, so it was scaled.
+            the lens is for images of another size, so it was scaled.
 
     Example:
         >>> import numpy as np

@@ -109,7 +109,7 @@ def undistort_photo(
             corrected already, or has another aspect ratio than the lens; or the target is the photo itself,
             its suffix is unknown, or its format cannot store such pixels or several pages.
 
-        Warns:
+    Warns:
         UserWarning: as `undistort_image` and `ZoomLens` do; or metadata are lost, as IPTC data in PNG.
     """
     correction = Correction(lens, _scaled(keep), interpolation, border, again=again, shown=repr(keep))

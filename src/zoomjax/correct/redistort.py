@@ -50,7 +50,7 @@ def redistort_image(
     Raises:
         ValueError: an argument is not one of the above, or the image does not have the framing's size.
 
-        Warns:
+    Warns:
         UserWarning: the lens folds within the image, and the part beyond the fold cannot be made.
 
     Example:

@@ -83,11 +83,10 @@ def undistort_video(
         FileNotFoundError: there is no such video.
         OSError: the target cannot be written; nothing is left of it.
         ValueError: the source is not a video, or none of its frames can be decoded; the track is shorter;
-        the
-            lens is for another aspect ratio; or the target is the source, or its suffix, the encoder or an
-            option of it is unknown, or not suitable for these frames.
+            the lens is for another aspect ratio; or the target is the source, or its suffix, the encoder
+            or an option of it is unknown, or not suitable for these frames.
 
-        Warns:
+    Warns:
         UserWarning: frames cannot be decoded, or are interlaced; focal lengths are outside of the fitted
             range; the track goes on after the video's end; the lens is for another size, or folds within
             the frames.

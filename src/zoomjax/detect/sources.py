@@ -101,7 +101,7 @@ def find_photos(inputs: Iterable[str | os.PathLike[str]]) -> list[Source]:
         FileNotFoundError: an input does not exist, or no file fits a pattern.
         ValueError: an input is not a photo, or a folder has none.
 
-        Warns:
+    Warns:
         UserWarning: a photo is given twice, perhaps through a link; it is used once.
     """
     paths: list[Path] = []

@@ -35,7 +35,7 @@ def focal_from_board(
         The focal length in mm. Residuals are treated as independent errors of the points' coordinates.
         Errors of distance, pixel and board are not included: f changes by as many per cent as the distance.
 
-        Raises:
+    Raises:
         ValueError: shapes differ, there are fewer than 3 points, or a length is not positive.
         RuntimeError: a length that was not known is not positive, or all points of the board coincide.
 

@@ -43,7 +43,7 @@ def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
     Raises:
         ValueError: the images have another aspect ratio, so they cannot show the same view.
 
-        Warns:
+    Warns:
         UserWarning: the size differs, so the lens was scaled.
 
     Example:

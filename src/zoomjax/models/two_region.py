@@ -101,10 +101,10 @@ def barrel_crossover(focal: Focal, k1: Float[AnyArray, "frame"]) -> float:
         focal: focal length of each frame.
         k1: first coefficient of the separate fit of each frame, ``fit_frames(lines).coefficients[:, 0]``.
 
-        Returns:
+    Returns:
         The zero of k1, interpolated linearly in 1/f; the one of shortest focal length if there are several.
 
-        Raises:
+    Raises:
         ValueError: k1 does not change its sign.
     """
     order = np.argsort(1 / np.asarray(focal))[::-1]

@@ -187,15 +187,14 @@ def select_model(
         The selection. Candidates that cannot be fitted, to all lines or to a fold's, or of which a fold
         does not converge, are in its table with the reason.
 
-        Raises:
-        ValueError: no candidate can be compared, nothing can be left out, or an argument is not one of
-        those
-            above.
-        TypeError: `lines` or a candidate has the wrong type.
-
         The fits of folds are not made invertible; the final fit is, by `fit_zoom`. Candidates that are
         linear in their parameters are cross-validated at hundreds of fits a second; others, and those of
         another distortion model, with a separate fit for each fold.
+
+    Raises:
+        ValueError: no candidate can be compared, nothing can be left out, or an argument is not one of
+            those above.
+        TypeError: `lines` or a candidate has the wrong type.
 
     References:
         L. Breiman, J. Friedman, R. Olshen, C. Stone, "Classification and regression trees" (1984), 3.4.3.
