@@ -294,3 +294,30 @@ def test_options_that_an_encoder_does_not_know_are_refused(tmp_path, encoder, co
 def test_options_are_texts_by_names(tmp_path, options, unchecked):
     with pytest.raises(TypeError, match="options must be texts by names"):
         undistort_video("in.mkv", tmp_path / "out.mkv", lens=lens(), focal=20.0, options=options)
+
+
+@pytest.mark.parametrize(
+    ("encoder", "options", "word"),
+    [
+        ("libx264", {"x264-params": "keynit=10:crf=18"}, "keynit"),
+        ("libx265", {"x265-params": "keynit=10:log-level=error"}, "keynit"),
+    ],
+    ids=["x264", "x265"],
+)
+def test_words_within_an_option_that_an_encoder_does_not_know_are_refused(tmp_path, encoder, options, word):
+    source = clip(tmp_path / "in.mp4")
+    target = tmp_path / "out.mp4"
+    with pytest.raises(ValueError, match=f"options must be those of the encoder {encoder}, .*{word}"):
+        undistort_video(source, target, lens=lens(), focal=20.0, encoder=encoder, options=options)
+    assert not target.exists()
+
+
+def test_options_within_an_option_reach_the_encoder(tmp_path):
+    source = clip(tmp_path / "in.mp4", stamps=range(24))
+    sizes = []
+    for crf in ("1", "51"):
+        target = tmp_path / f"{crf}.mp4"
+        options = {"x264-params": f"crf={crf}"}
+        undistort_video(source, target, lens=lens(), focal=20.0, encoder="libx264", options=options)
+        sizes.append(target.stat().st_size)
+    assert sizes[0] > 1.2 * sizes[1]

@@ -109,9 +109,10 @@ class FrameWriter(contextlib.AbstractContextManager):
             name = encoder or self._encoder(video.codec_context.name, named)
             self._stream = self._pictures(name, video, first, like, options, free=encoder is None)
             self._stream.set_display_matrix(like.orientation)
-            with _blamed(name):
+            with _blamed(name), _warnings() as warned:
                 self._stream.codec_context.open(strict=False)
-            _refuse_unused(name, options, self._stream.codec_context.options)
+            if options is not None:
+                _refuse_unknown(name, options, self._stream.codec_context.options, warned)
             self._copies = put(self._output, along, named)
             starts(self._output, named, along.streams)
         except BaseException:
@@ -194,13 +195,32 @@ class FrameWriter(contextlib.AbstractContextManager):
         return stream
 
 
-def _refuse_unused(encoder: str, options: dict[str, str] | None, left: Mapping[str, str]) -> None:
-    """Refuse options that an open encoder has left: FFmpeg passes over those that it does not know."""
-    if unused := [name for name in options or () if name in left]:
+def _refuse_unknown(
+    encoder: str, options: dict[str, str], left: Mapping[str, str], warned: list[tuple[int, str, str]]
+) -> None:
+    """Refuse options that an open encoder has left, as FFmpeg passes over those that it does not know.
+
+    What is within one option, as in ``x264-params``, the encoder reads itself; it warns, and goes on.
+    """
+    unused = ", ".join(repr(name) for name in options if name in left)
+    within = [text.strip().rstrip(".") for _, _, text in warned if "option" in text.lower()]
+    if unused or within:
+        problem = f"which does not know {unused}" if unused else f"which says: {within[0]}"
         raise ValueError(
-            f"Argument options must be those of the encoder {encoder}, which does not know "
-            f"{', '.join(map(repr, unused))}: leave it out."
+            f"Argument options must be those of the encoder {encoder}, {problem}: leave it out."
         )
+
+
+@contextlib.contextmanager
+def _warnings() -> Generator[list[tuple[int, str, str]], None, None]:
+    """What FFmpeg warns of in this thread."""
+    level = av.logging.get_level()
+    av.logging.set_level(av.logging.WARNING)
+    try:
+        with av.logging.Capture() as warned:
+            yield warned
+    finally:
+        av.logging.set_level(level)
 
 
 def _options(name: str, source: Any) -> dict[str, str]:
