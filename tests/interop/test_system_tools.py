@@ -4,13 +4,10 @@ On Debian: ``apt install python3-mrcal hugin-tools``. What mrcal gave is in
 benchmarks/results/interop_mrcal.md.
 """
 
-import functools
 import json
-import os
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +16,7 @@ from scipy.optimize import minimize_scalar
 import zoomjax as zj
 
 from ._lenses import LENSES, PITCH, STRONG, polynomial
+from ._pythons import python_with, run
 from .test_write import MARGIN, shown
 
 PROJECT = """
@@ -39,25 +37,12 @@ model.write(path)
 """
 
 
-@functools.cache
-def python() -> str:
-    """A Python that has mrcal."""
-    for folder in os.get_exec_path():
-        found = Path(folder) / "python3"
-        if (
-            found.exists()
-            and not subprocess.run([found, "-c", "import mrcal"], capture_output=True).returncode
-        ):
-            return str(found)
-    pytest.skip("Needs mrcal (apt install python3-mrcal) for a python3 on the path.")
+def python():
+    return python_with("mrcal", "apt install python3-mrcal")
 
 
 def mrcal(program, *given):
-    done = subprocess.run(
-        [python(), "-c", program], input=json.dumps(given), capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return run(python(), program, *given)
 
 
 @pytest.mark.parametrize("name", LENSES)

@@ -141,8 +141,8 @@ def write(
     refuse_existing(list(files), overwrite=overwrite)
     if isinstance(fmt, FolderFormat):
         with whole_folder(path) as part:
-            worst = fmt.write_all(job, part)
-        return Report(fmt.name, job.focal or (), worst, None, files=files)
+            worst, notes = fmt.write_all(job, part)
+        return Report(fmt.name, job.focal or (), worst, None, notes, files)
     assert isinstance(fmt, NodeFormat)
     found = solve(fmt, job)
     if several:
