@@ -193,8 +193,8 @@ def test_maps_cover_the_corrected_image(tmp_path):
     assert (low < 0).all()
     width, height = high - low + 1
     assert report.notes == (
-        f"Corrected images are {width}x{height} px: the photo's frame begins {-low[0]} px from the left and "
-        f"{-low[1]} px from the top.",
+        f"Corrected images are {width}x{height} px: the photo's frame begins {-low[0]} px from the left "
+        f"and {-low[1]} px from the top.",
     )
 
 
