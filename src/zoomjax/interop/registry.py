@@ -25,6 +25,7 @@ from .base import CONVENTION, TOLERANCE, Export, FolderFormat, Format, Import, N
 from .colmap import COLMAP
 from .discorpy import Discorpy
 from .gyroflow import Gyroflow
+from .hugin import Hugin
 from .kalibr import Kalibr
 from .lcp import LCP
 from .lensfun import Lensfun
@@ -40,7 +41,7 @@ from .unreal import Unreal
 
 FORMATS: tuple[Format, ...] = (
     *(STMap(), Nuke(), OpenTrackIO(), PFTrack()),
-    *(Lensfun(), Gyroflow(), Unreal()),
+    *(Lensfun(), Hugin(), Gyroflow(), Unreal()),
     *(OpenCV(), ROS(), Kalibr(), Mrcal(), COLMAP(), Nerfstudio(), Discorpy(), LCP()),
 )
 """In the order of `formats` and of the documentation."""
