@@ -53,7 +53,7 @@ _OUTSIDE = -1.0
 class STMap(FolderFormat):
     """Pairs of EXR maps, one pair for each focal length or frame."""
 
-    name, tools, suffixes = "stmap", "Nuke, Natron, Fusion, Flame, After Effects", (".exr",)
+    name, tools, suffixes = "stmap", "Nuke, Natron, Fusion, Flame, Blender, After Effects", (".exr",)
     exact = True
     options = ("convention", "direction", "focal")
 
