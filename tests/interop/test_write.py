@@ -31,17 +31,17 @@ def shown(lens):
     return np.stack(np.meshgrid(np.linspace(0, w - 1, 7), np.linspace(0, h - 1, 6)), -1).reshape(-1, 2)
 
 
-def error(name, path, lens, focal, index=0):
+def error(name, path, lens, focal, index=0, pitch=PITCH):
     """The greatest distance of what the tool does to what the lens does, px."""
     distorted = shown(lens)
     corrected = np.asarray(lens(focal).undistort(distorted))
     start, end = (distorted, corrected) if name in CORRECTS else (corrected, distorted)
-    mm = focal if lens.focal_unit == "mm" else focal * PITCH
+    mm, px = (focal, focal / pitch) if lens.focal_unit == "mm" else (focal * pitch, focal)
     centre = np.asarray(lens.centre_at(focal))
 
     def at(scale):
         points = centre + scale * (start - centre)
-        found = READERS[name](path, focal, points, index=index, size=lens.image_size, mm=mm)
+        found = READERS[name](path, focal, points, index=index, size=lens.image_size, mm=mm, px=px)
         return np.hypot(*(found - end).T).max()
 
     if name == "lensfun" and "ptlens" in path.read_text():  # which leaves the scale free
@@ -120,17 +120,20 @@ def test_samples_of_opentrackio_are_of_its_schema(lens, tmp_path):
         jsonschema.validate(json.loads(line), schema)
 
 
-@pytest.mark.parametrize("name", ["landscape", "portrait", "decentred", "moving centre"])
+@pytest.mark.parametrize(
+    "name", ["landscape", "portrait", "wide, three terms", "px", "decentred", "moving centre"]
+)
 def test_maps_say_where_to_sample(name, tmp_path):
     lens = LENSES[name]()
     w, h = lens.image_size
-    report = zj.interop.write(lens, tmp_path / "maps", format="stmap", focal=[18, 200])
+    ends = np.asarray(lens.focal_range).tolist()
+    report = zj.interop.write(lens, tmp_path / "maps", format="stmap", focal=ends)
     assert report.worst < 1e-3
-    for focal in (18, 200):
-        distortion = lens(float(focal))
+    for focal in ends:
+        distortion = lens(focal)
         for kind, exact in (("undistort", distortion.distort), ("redistort", distortion.undistort)):
             with OpenEXR.File(
-                str(tmp_path / "maps" / f"{kind}.{focal}.exr"), separate_channels=True
+                str(tmp_path / "maps" / f"{kind}.{focal:.10g}.exr"), separate_channels=True
             ) as file:
                 header = dict(file.header())
                 red, green, blue = (np.array(file.channels()[c].pixels) for c in "RGB")
