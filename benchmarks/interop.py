@@ -118,7 +118,7 @@ def page(results: dict) -> str:
         ]
         for name, row in results["formats"].items()
     ]
-    head = ["", "direction", "formula", "focal lengths", "error at them, px", "between, px", "read again, px"]
+    head = ["", "direction", "formula", "focal lengths", "error at them, px", "between, px"]
     found = results["database"]
     errors = [
         [
@@ -145,7 +145,7 @@ def page(results: dict) -> str:
             "0.1 px. Read again, the error is that of the zoom model through the file's focal lengths. "
             f"Times are of a first call, with compiling. Read only: {unwritten}.",
             "",
-            *table([*head, "writing, s", "reading, s"], rows),
+            *table([*head, "read again, px", "writing, s", "reading, s"], rows),
             "",
             "## The lensfun database",
             "",

@@ -91,7 +91,7 @@ def lens_of(
         made = None if contents.table is None else _of_table(contents, contents.table, zoom is None)
         if made is not None:
             return made
-    nodes = sorted(_averaged(contents.nodes), key=lambda node: node.focal)
+    nodes: list[Node | Sampled] = sorted(_averaged(contents.nodes), key=lambda node: node.focal)
     size, notes = contents.image_size, list(contents.notes)
     if sampled := [node for node in nodes if isinstance(node, Sampled)]:
         centres, family = centres_and_family(sampled, size, family)
