@@ -102,9 +102,12 @@ def measure_database(lenses: list[ET.Element], folder: Path) -> dict:
 
 def page(results: dict) -> str:
     """The results as a page."""
+    ways = {fmt.name: "out, in" if fmt.writes else "in" for fmt in zj.interop.formats()}
+    unwritten = ", ".join(name for name, way in ways.items() if way == "in")
     rows = [
         [
             name,
+            ways[name],
             "exact" if row["exact"] else "refitted",
             str(row["focal"]),
             f"{row['at_nodes']:.2g}",
@@ -115,7 +118,7 @@ def page(results: dict) -> str:
         ]
         for name, row in results["formats"].items()
     ]
-    head = ["", "formula", "focal lengths", "error at them, px", "between, px", "read again, px"]
+    head = ["", "direction", "formula", "focal lengths", "error at them, px", "between, px"]
     found = results["database"]
     errors = [
         [
@@ -140,9 +143,9 @@ def page(results: dict) -> str:
             "",
             f"18 to 200 mm at {SIZE[0]} x {SIZE[1]} px (maps: {MAP_SIZE[0]} x {MAP_SIZE[1]} px), tolerance "
             "0.1 px. Read again, the error is that of the zoom model through the file's focal lengths. "
-            "Times are of a first call, with compiling.",
+            f"Times are of a first call, with compiling. Read only: {unwritten}.",
             "",
-            *table([*head, "writing, s", "reading, s"], rows),
+            *table([*head, "read again, px", "writing, s", "reading, s"], rows),
             "",
             "## The lensfun database",
             "",

@@ -120,6 +120,19 @@ def lensfun(path, focal, points, *, size, mm, **_):
     return np.array(at)
 
 
+def hugin(path, focal, points, *, index, size, px, **_):
+    """A panorama of another focal length than the photo, which Hugin scales."""
+    line = [line for line in path.read_text().splitlines() if line.startswith("i ")][index]
+    words = dict(re.findall(r" ([a-z])([-\d.e]+)", line))
+    v, a, b, c, d, e = (float(words[name]) for name in "vabcde")
+    assert (int(words["w"]), int(words["h"])) == tuple(size)
+    middle, half = (np.array(size) - 1) / 2, min(size) / 2
+    ahead = size[0] / 2 / np.tan(np.radians(v) / 2) / px
+    z = (points - middle - [d, e]) * ahead / half
+    r = np.hypot(*z.T)[:, None]
+    return middle + [d, e] + half * z * (a * r**3 + b * r**2 + c * r + 1 - a - b - c)
+
+
 def opentrackio(path, focal, points, *, index, size, **_):
     sample = json.loads(path.read_text().splitlines()[index])
     sensor = sample["static"]["camera"]["activeSensorPhysicalDimensions"]
@@ -217,6 +230,6 @@ READERS = {
     reader.__name__: reader
     for reader in (
         *(opencv, ros, kalibr, mrcal, colmap, nerfstudio, discorpy),
-        *(gyroflow, unreal, lensfun, opentrackio, nuke, pftrack),
+        *(gyroflow, unreal, lensfun, hugin, opentrackio, nuke, pftrack),
     )
 }

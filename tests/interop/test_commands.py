@@ -31,6 +31,8 @@ def told(tmp_path_factory):
     LENSES["landscape"]().save(folder / "lens.json")
     (folder / "track.csv").write_text("frame,focal\n1,20\n3,40\n")
     (folder / "bad.json").write_text('{"fisheye_params": 1}')
+    (folder / "photo.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)))
+    (folder / "photo.xml").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)))
     (folder / "cut-undistort.exr").write_bytes(cut_map(folder))
     few = {"format": "gyroflow", "focal": [18, 40, 200], "pixel_pitch": PITCH}
     zj.interop.write(LENSES["landscape"](), folder / "few.json", **few)
@@ -55,6 +57,8 @@ def told(tmp_path_factory):
         "cut map": "import cut-undistort.exr -o never",
         "no size": "import a.xml -o never",
         "damaged": "import bad.json -o never",
+        "foreign": "import photo.png -o never",
+        "foreign by its name": "import photo.xml --from lensfun -o never",
         "no effect": "export lens.json --to opencv --focal 24 --pixel-pitch 0.0367 --tolerance 1 -o b.yaml",
         "no convention": "export lens.json --to nuke --focal 24 --convention nonsense -o b.nk",
         "no crop": "import a.pfb --focal 20,26,40 --crop 1.5 -o never",
@@ -120,6 +124,8 @@ def test_the_model_of_an_import_can_be_chosen(told):
         ("no format", "Error: --to must be one of stmap, nuke"),
         ("terms", "Error: --terms must be at most 4, but it is 9."),
         ("cut map", "from cut-undistort.exr: it is no EXR file, or it is damaged or cut off."),
+        ("foreign", "Error: photo.png is of no format that is known: stmap, nuke"),
+        ("foreign by its name", "Error: Cannot read a lensfun lens from photo.xml: "),
         ("no size", "it holds no image size: give --image-size"),
         ("no effect", "Error: --tolerance has no effect on the format opencv: leave it out."),
         ("no convention", "Error: --convention has no effect on the format nuke: leave it out."),

@@ -56,6 +56,44 @@ def test_centres_that_scatter_are_smoothed_and_that_is_said(tmp_path):
     assert zj.interop.read(tmp_path / "cameras.txt", zoom=TableZoom()).report.at_nodes < 0.1
 
 
+def test_values_that_no_smooth_model_follows_are_smoothed_and_that_is_said(tmp_path):
+    rows = "1 SIMPLE_RADIAL 640 480 {} 320 240 {}\n"
+    focal, jumps = (500, 700, 1000, 1400, 2000, 3000), (-0.1, 0.1, -0.2, 0.4, -0.8, 1.6)
+    (tmp_path / "cameras.txt").write_text("".join(map(rows.format, focal, jumps)))
+    back, table = (zj.interop.read(tmp_path / "cameras.txt", zoom=zoom) for zoom in (None, TableZoom()))
+    [note] = back.report.notes
+    assert note == (
+        f"The zoom model smooths the file's values, by up to {back.report.at_nodes:.2g} px: a table, "
+        "TableZoom(), keeps them."
+    )
+    assert table.report.at_nodes < 0.05 < 0.5 < back.report.at_nodes
+    assert not table.report.notes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("direction", "focal"), [("undistort", [18, 200]), ("redistort", [18, 35, 200])])
+@pytest.mark.parametrize("kind", [name for name in LENSES if name.startswith("moving")])
+def test_maps_show_a_centre_that_moves(kind, focal, direction, tmp_path):
+    """Which they do not say; about one for all they would be pixels off."""
+    lens = LENSES[kind]()
+    zj.interop.write(lens, tmp_path / "m", format="stmap", focal=focal)
+    back = zj.interop.read(tmp_path / "m", direction=direction, zoom=TableZoom())
+    assert type(back.lens.family) is type(lens.family)
+    assert back.report.worst < 1e-3
+    assert any("centre moves along the zoom" in note for note in back.report.notes)
+    for f in map(float, focal):
+        assert np.asarray(back.lens.centre_at(f)) == pytest.approx(np.asarray(lens.centre_at(f)), abs=0.01)
+        moved = back.lens(f).undistort(shown(lens)) - lens(f).undistort(shown(lens))
+        assert np.abs(moved).max() < 1e-3
+
+
+def test_maps_of_one_centre_give_a_lens_of_one_centre(tmp_path):
+    zj.interop.write(LENSES["division"](), tmp_path / "m", format="stmap", focal=[18, 50, 200])
+    back = zj.interop.read(tmp_path / "m")
+    assert back.lens.shift is None
+    assert not back.report.notes
+
+
 @pytest.mark.parametrize("name", PITCHED)
 def test_the_size_of_pixels_comes_back(name, tmp_path):
     """And so a lens that was read can be written again."""

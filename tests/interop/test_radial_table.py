@@ -55,7 +55,11 @@ def test_a_file_of_the_database_is_the_lens_of_the_library(name, smaller, tmp_pa
         radii = [np.hypot(*(points[np.hypot(*ours.T) > 1].T)) for points in (ours, theirs)]
         scale = np.median(radii[1] / radii[0])
         again = np.asarray(wanted(focal).distort(middle + scale * ours))
-        assert np.hypot(*(again - grid).T).max() < max(0.5, found.report.worst)
+        seen = np.isfinite(again).all(
+            -1
+        )  # a corner where the table turns back may be just beyond the other
+        assert seen.all() or (seen.mean() > 0.9 and "turns back" in str(found.report))
+        assert np.hypot(*(again - grid)[seen].T).max() < max(0.5, found.report.worst)
 
 
 def test_a_table_that_turns_back_says_where(tmp_path):

@@ -31,17 +31,17 @@ def shown(lens):
     return np.stack(np.meshgrid(np.linspace(0, w - 1, 7), np.linspace(0, h - 1, 6)), -1).reshape(-1, 2)
 
 
-def error(name, path, lens, focal, index=0):
+def error(name, path, lens, focal, index=0, pitch=PITCH):
     """The greatest distance of what the tool does to what the lens does, px."""
     distorted = shown(lens)
     corrected = np.asarray(lens(focal).undistort(distorted))
     start, end = (distorted, corrected) if name in CORRECTS else (corrected, distorted)
-    mm = focal if lens.focal_unit == "mm" else focal * PITCH
+    mm, px = (focal, focal / pitch) if lens.focal_unit == "mm" else (focal * pitch, focal)
     centre = np.asarray(lens.centre_at(focal))
 
     def at(scale):
         points = centre + scale * (start - centre)
-        found = READERS[name](path, focal, points, index=index, size=lens.image_size, mm=mm)
+        found = READERS[name](path, focal, points, index=index, size=lens.image_size, mm=mm, px=px)
         return np.hypot(*(found - end).T).max()
 
     if name == "lensfun" and "ptlens" in path.read_text():  # which leaves the scale free
@@ -120,21 +120,25 @@ def test_samples_of_opentrackio_are_of_its_schema(lens, tmp_path):
         jsonschema.validate(json.loads(line), schema)
 
 
-@pytest.mark.parametrize("name", ["landscape", "portrait", "decentred", "moving centre"])
+@pytest.mark.parametrize(
+    "name", ["landscape", "portrait", "wide, three terms", "px", "decentred", "moving centre"]
+)
 def test_maps_say_where_to_sample(name, tmp_path):
     lens = LENSES[name]()
     w, h = lens.image_size
-    report = zj.interop.write(lens, tmp_path / "maps", format="stmap", focal=[18, 200])
+    ends = np.asarray(lens.focal_range).tolist()
+    report = zj.interop.write(lens, tmp_path / "maps", format="stmap", focal=ends)
     assert report.worst < 1e-3
-    for focal in (18, 200):
-        distortion = lens(float(focal))
+    for focal in ends:
+        distortion = lens(focal)
         for kind, exact in (("undistort", distortion.distort), ("redistort", distortion.undistort)):
             with OpenEXR.File(
-                str(tmp_path / "maps" / f"{kind}.{focal}.exr"), separate_channels=True
+                str(tmp_path / "maps" / f"{kind}.{focal:.10g}.exr"), separate_channels=True
             ) as file:
                 header = dict(file.header())
-                red, green = (np.array(file.channels()[c].pixels) for c in "RG")
+                red, green, blue = (np.array(file.channels()[c].pixels) for c in "RGB")
             assert red.dtype == np.float32
+            assert (blue == 1).all()  # Blender takes it for the opacity
             assert np.asarray(header["displayWindow"]).tolist() == [[0, 0], [w - 1, h - 1]]
             left, top = np.asarray(header["dataWindow"])[0]
             y, x = (v.ravel() for v in np.mgrid[0 : red.shape[0] : 37, 0 : red.shape[1] : 41])
@@ -182,7 +186,7 @@ def test_discorpy_corrects_images(name, tmp_path):
 def test_maps_cover_the_corrected_image(tmp_path):
     """What the camera saw at its corners is in the map, beyond the display window."""
     lens = LENSES["landscape"]()
-    zj.interop.write(lens, tmp_path / "maps", format="stmap", focal=18)
+    report = zj.interop.write(lens, tmp_path / "maps", format="stmap", focal=18)
     corners = np.array([[0, 0], [639, 0], [639, 479], [0, 479.0]])
     corrected = np.asarray(lens(18.0).undistort(corners))
     with OpenEXR.File(str(tmp_path / "maps" / "undistort.18.exr")) as file:
@@ -190,6 +194,16 @@ def test_maps_cover_the_corrected_image(tmp_path):
     assert (low <= corrected.min(0)).all()
     assert (high >= corrected.max(0)).all()
     assert (low < 0).all()
+    width, height = high - low + 1
+    assert report.notes == (
+        f"Corrected images are {width}x{height} px: the photo's frame begins {-low[0]} px from the left "
+        f"and {-low[1]} px from the top.",
+    )
+
+
+def test_maps_without_overscan_say_nothing_of_it(tmp_path):
+    lens = polynomial([[-0.01]], (640, 480), (319.5, 239.5))
+    assert not zj.interop.write(lens, tmp_path / "maps", format="stmap", focal=18).notes
 
 
 def test_a_track_is_an_entry_for_each_frame(tmp_path):

@@ -1,10 +1,13 @@
 """The centre of distortion of maps, which do not say it: that about which a formula comes nearest to them.
 
-Radial polynomials about one centre for all maps are tried first, then the same with decentering (Brown and
-Conrady). The coefficients of each map are linear least squares for each centre that is tried.
+Radial polynomials about one centre for all maps are tried first, then about a centre that moves along the
+zoom, linear in 1/f, then both with decentering (Brown and Conrady). The coefficients of each map are linear
+least squares for each centre that is tried.
 """
 
+import itertools
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -21,45 +24,68 @@ _FAR = 0.5
 """Half diagonals from the middle of the image, beyond which a centre is not believed."""
 
 _LESS = 0.5
-"""Share of the radial formula's error below which decentering is worth two coefficients more."""
+"""Share of the error of a simpler formula below which one with more coefficients is worth them."""
 
 _WELL = 0.01
-"""px, below which the radial formula is good enough."""
+"""px, below which a formula is good enough."""
 
 
-def centre_and_family(
+class _Found(NamedTuple):
+    """Centres of maps, px, (map, 2); the greatest error of the formula about them, px; the formula."""
+
+    centres: np.ndarray
+    worst: float
+    family: AbstractFamily
+
+
+def centres_and_family(
     nodes: list[Sampled], size: tuple[int, int], family: AbstractFamily | None
 ) -> tuple[np.ndarray, AbstractFamily]:
-    """The centre of maps, px, and the distortion model; that which is nearer to them if it is None."""
+    """The centre of each map, px, and the distortion model; that which is nearest to them if it is None."""
+    formulas = [RadialPolynomial(), BrownConrady()]
     if family is not None:
-        return _centre(nodes, size, isinstance(family, BrownConrady))[0], family
-    centre, worst = _centre(nodes, size, False)
-    if worst > _WELL:
-        other, least = _centre(nodes, size, True)
-        if least < _LESS * worst:
-            return other, BrownConrady()
-    return centre, RadialPolynomial()
+        formulas = [BrownConrady() if isinstance(family, BrownConrady) else RadialPolynomial()]
+    best = _about(nodes, size, formulas[0], moves=False)
+    for formula, moves in list(itertools.product(formulas, (False, True)))[1:]:
+        if best.worst <= _WELL:
+            break
+        if moves and len(nodes) == 1:
+            continue
+        found = _about(nodes, size, formula, moves=moves)
+        best = found if found.worst < _LESS * best.worst else best
+    return best.centres, family or best.family
 
 
-def _centre(nodes: list[Sampled], size: tuple[int, int], tangential: bool) -> tuple[np.ndarray, float]:
-    """The centre, px, and the greatest error of the formula about it, px."""
+def _about(nodes: list[Sampled], size: tuple[int, int], formula: AbstractFamily, *, moves: bool) -> _Found:
+    """The centres about which a formula is nearest to maps: one for all, or linear in 1/f."""
     middle, scale = (np.array(size) - 1) / 2, math.hypot(*size) / 2
     each = [((n.distorted - middle) / scale, (n.corrected - middle) / scale) for n in nodes]
+    x = 1 / np.array([node.focal for node in nodes])
+    basis = np.stack([np.ones_like(x), x / x.max()], -1)[:, : 1 + moves]
 
-    def residuals(shift: np.ndarray) -> np.ndarray:
-        parts = []
-        for distorted, corrected in each:
-            z = distorted - shift
-            t = np.sum(z * z, -1, keepdims=True)
-            columns = [z * t ** (i + 1) for i in range(_TERMS)]
-            if tangential:
-                columns += [t * q + 2 * (z @ q)[:, None] * z for q in np.eye(2)]
-            matrix = np.stack([column.ravel() for column in columns], -1)
-            change = (corrected - distorted).ravel()
-            parts.append(matrix @ np.linalg.lstsq(matrix, change, rcond=None)[0] - change)
-        return np.concatenate(parts)
+    def residuals(flat: np.ndarray) -> np.ndarray:
+        shifts = basis @ flat.reshape(-1, 2)
+        return np.concatenate(
+            [_residuals(*pair, by, formula) for pair, by in zip(each, shifts, strict=True)]
+        )
 
-    found = least_squares(residuals, np.zeros(2), x_scale=0.01, diff_step=1e-6, xtol=1e-12, ftol=1e-12)
-    shift = found.x if np.abs(found.x).max() < _FAR else np.zeros(2)
-    worst = np.hypot(*residuals(shift).reshape(-1, 2).T).max()
-    return middle + scale * shift, scale * float(worst)
+    start = np.zeros(2 * basis.shape[1])
+    found = least_squares(residuals, start, x_scale=0.01, diff_step=1e-6, xtol=1e-12, ftol=1e-12).x
+    if np.abs(basis @ found.reshape(-1, 2)).max() > _FAR:
+        found = start
+    worst = np.hypot(*residuals(found).reshape(-1, 2).T).max()
+    return _Found(middle + scale * basis @ found.reshape(-1, 2), scale * float(worst), formula)
+
+
+def _residuals(
+    distorted: np.ndarray, corrected: np.ndarray, shift: np.ndarray, formula: AbstractFamily
+) -> np.ndarray:
+    """What a formula leaves of a map, about a centre that is shifted from that of its points."""
+    z = distorted - shift
+    t = np.sum(z * z, -1, keepdims=True)
+    columns = [z * t ** (i + 1) for i in range(_TERMS)]
+    if isinstance(formula, BrownConrady):
+        columns += [t * q + 2 * (z @ q)[:, None] * z for q in np.eye(2)]
+    matrix = np.stack([column.ravel() for column in columns], -1)
+    change = (corrected - distorted).ravel()
+    return matrix @ np.linalg.lstsq(matrix, change, rcond=None)[0] - change

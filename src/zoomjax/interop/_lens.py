@@ -25,7 +25,7 @@ from ..models.polynomial import RadialPolynomial
 from ..models.smooth import SmoothZoom
 from ..models.tables import TableZoom
 from ..models.zoom import AbstractLinearZoom, AbstractPriorZoom, PolynomialZoom, with_parameters
-from ._centre import centre_and_family
+from ._centre import centres_and_family
 from ._forms import Form
 from ._samples import Pairs, distortions
 from ._seen import Seen, inside, seen_of
@@ -91,11 +91,11 @@ def lens_of(
         made = None if contents.table is None else _of_table(contents, contents.table, zoom is None)
         if made is not None:
             return made
-    nodes = sorted(_averaged(contents.nodes), key=lambda node: node.focal)
+    nodes: list[Node | Sampled] = sorted(_averaged(contents.nodes), key=lambda node: node.focal)
     size, notes = contents.image_size, list(contents.notes)
     if sampled := [node for node in nodes if isinstance(node, Sampled)]:
-        centre, family = centre_and_family(sampled, size, family)
-        nodes = [dataclasses.replace(node, centre=centre) for node in nodes]
+        centres, family = centres_and_family(sampled, size, family)
+        nodes = [dataclasses.replace(n, centre=c) for n, c in zip(sampled, centres, strict=True)]
     own, exact = _family(nodes, terms)
     family, exact = (own, exact) if family is None or type(family) is type(own) else (family, False)
     if zoom is None:
@@ -112,7 +112,10 @@ def lens_of(
     if (most := max(stretched, default=0.0)) > _NOT_SQUARE:
         notes.append(f"The file's pixels are up to {100 * most:.2g} % from square: the lens's are square.")
     if at_nodes > _MUCH and len(nodes) > 1 and not isinstance(zoom, TableZoom):
-        notes.append("The zoom model smooths the file's values: a table, TableZoom(), keeps them.")
+        notes.append(
+            f"The zoom model smooths the file's values, by up to {at_nodes:.2g} px: a table, TableZoom(), "
+            "keeps them."
+        )
     elif between is not None and between > _MUCH and not isinstance(zoom, TableZoom):
         notes.append(
             f"Between the file's focal lengths the lens is smooth, up to {between:.2g} px from the tool's "

@@ -315,5 +315,5 @@ class FolderFormat(Format):
     """A format that is always a folder of files, made of the lens itself and of no formula."""
 
     @abc.abstractmethod
-    def write_all(self, job: Export, folder: Path) -> float:
-        """Write the files; return the greatest error that writing itself made, px."""
+    def write_all(self, job: Export, folder: Path) -> tuple[float, tuple[str, ...]]:
+        """Write the files; return the greatest error that writing itself made, px, and notes."""

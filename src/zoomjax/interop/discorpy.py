@@ -94,4 +94,4 @@ class Discorpy(NodeFormat):
             form = Powers(terms)
             theta = form.rescaled(numbers[2:], math.hypot(*size) / 2)
             nodes.append(Node(focal, form, theta, numbers[:2]))
-        return contents(nodes, size, job)
+        return contents(nodes, size, job, mm=True)

@@ -1,4 +1,4 @@
-"""lensfun's XML, which darktable, Hugin, RawTherapee and digiKam read.
+"""lensfun's XML, which darktable, RawTherapee and digiKam read.
 
     poly5    r_d = r (1 + k1 r² + k2 r⁴)
     ptlens   r_d = r (a r³ + b r² + c r + 1 - a - b - c)
@@ -77,7 +77,7 @@ _SCALED = "lensfun scales the corrected image here: positions agree up to that."
 class Lensfun(InterpolatedFormat):
     """A lens of the lensfun database: poly5 or ptlens at several focal lengths."""
 
-    name, tools, suffixes = "lensfun", "darktable, Hugin, RawTherapee, digiKam", (".xml",)
+    name, tools, suffixes = "lensfun", "darktable, RawTherapee, digiKam", (".xml",)
     options = ("tolerance", "crop", "name")
 
     def forms(self, lens):
@@ -96,7 +96,7 @@ class Lensfun(InterpolatedFormat):
         if isinstance(node.form, Form):
             return node.form.rescaled(node.theta, ratio)
         g = node.form.rescaled(node.theta, ratio)
-        m = 1 / _one(g)
+        m = 1 / radius_of_one(g)
         return np.array([g[3] / m**4, g[2] / m**3, g[1] / m**2])
 
     def native(self, numbers: np.ndarray, focal: float, like: Node, job: Export) -> Node:
@@ -275,7 +275,7 @@ def _formula(terms: np.ndarray, ratio: float) -> tuple[AbstractForm, np.ndarray]
         form = Form(2)
         return form, form.rescaled(terms, ratio)
     form = PtLens()
-    return form, form.rescaled(_of_unit_slope(_polynomial(terms)[:4]), ratio)
+    return form, form.rescaled(of_unit_slope(_polynomial(terms)[:4]), ratio)
 
 
 def _polynomial(terms: np.ndarray) -> np.ndarray:
@@ -286,7 +286,7 @@ def _polynomial(terms: np.ndarray) -> np.ndarray:
     return np.array([1 - a - b - c, c, b, a, 0.0])
 
 
-def _of_unit_slope(g: np.ndarray) -> np.ndarray:
+def of_unit_slope(g: np.ndarray) -> np.ndarray:
     """The same curve for corrected radii so scaled that the factor is 1 at the centre."""
     if not g[0] > 0:
         raise ValueError("its distortion is no map: the factor at the centre is not positive")
@@ -297,12 +297,12 @@ def _theta(terms: np.ndarray, job: Export) -> np.ndarray:
     return _formula(terms, job.lens.scale / _unit(job.lens.image_size))[1]
 
 
-def _one(g: np.ndarray) -> float:
+def radius_of_one(g: np.ndarray) -> float:
     """The corrected radius whose distorted one is 1."""
     roots = np.roots([*g[::-1], -1.0])
     real = roots[(abs(roots.imag) < 1e-9) & (roots.real > 0)].real
     if not real.size:
-        raise ValueError("The lens is too strong for the model ptlens of lensfun.")
+        raise ValueError("The lens is too strong for ptlens, the polynomial of lensfun and Hugin.")
     return float(real.min())
 
 

@@ -25,6 +25,7 @@ from .base import CONVENTION, TOLERANCE, Export, FolderFormat, Format, Import, N
 from .colmap import COLMAP
 from .discorpy import Discorpy
 from .gyroflow import Gyroflow
+from .hugin import Hugin
 from .kalibr import Kalibr
 from .lcp import LCP
 from .lensfun import Lensfun
@@ -40,7 +41,7 @@ from .unreal import Unreal
 
 FORMATS: tuple[Format, ...] = (
     *(STMap(), Nuke(), OpenTrackIO(), PFTrack()),
-    *(Lensfun(), Gyroflow(), Unreal()),
+    *(Lensfun(), Hugin(), Gyroflow(), Unreal()),
     *(OpenCV(), ROS(), Kalibr(), Mrcal(), COLMAP(), Nerfstudio(), Discorpy(), LCP()),
 )
 """In the order of `formats` and of the documentation."""
@@ -141,8 +142,8 @@ def write(
     refuse_existing(list(files), overwrite=overwrite)
     if isinstance(fmt, FolderFormat):
         with whole_folder(path) as part:
-            worst = fmt.write_all(job, part)
-        return Report(fmt.name, job.focal or (), worst, None, files=files)
+            worst, notes = fmt.write_all(job, part)
+        return Report(fmt.name, job.focal or (), worst, None, notes, files)
     assert isinstance(fmt, NodeFormat)
     found = solve(fmt, job)
     if several:

@@ -2,7 +2,8 @@
 
 Two for each focal length: ``undistort`` says for a pixel of the corrected image where it is in the
 distorted one, ``redistort`` the other way round. Red is ``(x + 0.5)/w``, green ``1 - (y + 0.5)/h``, from
-the bottom left corner; 32-bit float. The corrected image of a barrel lens is larger than the photo: the
+the bottom left corner; 32-bit float. Blue is 1 where there is something to sample, else 0: Blender takes it
+for the opacity, others leave it out. The corrected image of a barrel lens is larger than the photo: the
 data window of ``undistort`` is its bounding box (overscan), the display window that of the photo.
 
 Two writers put positions elsewhere, `convention`: "gyroflow" has x/w and 1 - y/h, "alicevision" x/(w - 1)
@@ -52,7 +53,7 @@ _OUTSIDE = -1.0
 class STMap(FolderFormat):
     """Pairs of EXR maps, one pair for each focal length or frame."""
 
-    name, tools, suffixes = "stmap", "Nuke, Natron, Fusion, Flame, After Effects", (".exr",)
+    name, tools, suffixes = "stmap", "Nuke, Natron, Fusion, Flame, Blender, After Effects", (".exr",)
     exact = True
     options = ("convention", "direction", "focal")
 
@@ -60,7 +61,7 @@ class STMap(FolderFormat):
         """Two for each node."""
         return [f"{kind}.{stem}.exr" for stem in job.stems for kind in DIRECTIONS]
 
-    def write_all(self, job: Export, folder: Path) -> float:
+    def write_all(self, job: Export, folder: Path) -> tuple[float, tuple[str, ...]]:
         """The maps; returns the greatest error of rounding and of what is quicker than the lens, px."""
         names = iter(self.file_names(job))
         focal = job.focal or ()
@@ -75,7 +76,7 @@ class STMap(FolderFormat):
                 found, error = _quick(distortion, method, box)
                 rounding = _write_map(folder / next(names), found, box, size, job.convention, header)
                 worst = max(worst, error + rounding)
-        return worst
+        return worst, _overscan(window, size)
 
     def recognises(self, head: str) -> bool:
         """By EXR's magic number."""
@@ -133,6 +134,17 @@ def _union(windows: list[tuple[int, int, int, int]]) -> tuple[int, int, int, int
     return (*(int(v) for v in table[:, :2].min(0)), *(int(v) for v in table[:, 2:].max(0)))  # pyright: ignore[reportReturnType]
 
 
+def _overscan(window: tuple[int, int, int, int], size: tuple[int, int]) -> tuple[str, ...]:
+    """What those should know whose tool has no data windows."""
+    width, height = window[2] - window[0] + 1, window[3] - window[1] + 1
+    if (width, height) == size:
+        return ()
+    return (
+        f"Corrected images are {width}x{height} px: the photo's frame begins {-window[0]} px from the left "
+        f"and {-window[1]} px from the top.",
+    )
+
+
 def _quick(
     distortion: Distortion, method: str, window: tuple[int, int, int, int]
 ) -> tuple[Callable[[np.ndarray], Any], float]:
@@ -179,9 +191,10 @@ def _write_map(
         grid = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)
         found = to_map(np.asarray(map_of(grid)), size, convention)
         exists = np.isfinite(found)
-        rows = pixels[first : first + len(y), :, :2]
-        rows[:] = np.where(exists, found, _OUTSIDE)
-        rounding = np.where(exists, abs(rows - found), 0) * np.array(size)
+        rows = pixels[first : first + len(y)]
+        rows[..., :2] = np.where(exists, found, _OUTSIDE)
+        rows[..., 2] = exists.all(axis=-1)
+        rounding = np.where(exists, abs(rows[..., :2] - found), 0) * np.array(size)
         worst = max(worst, float(np.hypot(*np.moveaxis(rounding, -1, 0)).max()))
     about = {
         "compression": OpenEXR.ZIP_COMPRESSION,
