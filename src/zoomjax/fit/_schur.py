@@ -197,17 +197,19 @@ def _frame_blocks(own, halves, extra, structure):
     diagonal = jnp.zeros((blocks, size, 4, size, 4), own.dtype)
     diagonal = diagonal.at[:, place, :, place].set(each.swapaxes(0, 1)).reshape(blocks, n, n)
     within = structure.frame - structure.begin * size
+    reach = size if blocks == 1 else 2 * size
 
     def of_block(number):
         here = jnp.where(structure.begin == number, structure.place, structure.most)  # or dropped
-        rows = (
-            jnp.zeros((structure.most, 2 * size, 4, 2), own.dtype).at[here, within].set(halves, mode="drop")
-        )
-        rows = rows.transpose(1, 2, 0, 3).reshape(2 * n, -1)
+        rows = jnp.zeros((structure.most, reach, 4, 2), own.dtype)
+        rows = rows.at[here, within].set(halves, mode="drop")
+        rows = rows.transpose(1, 2, 0, 3).reshape(4 * reach, -1)
         return rows @ rows.T
 
     coupled = jax.lax.map(of_block, jnp.arange(blocks))
     diagonal = diagonal - coupled[:, :n, :n]
+    if blocks == 1:
+        return diagonal, 0 * diagonal  # no constant, which XLA would fold for seconds
     diagonal = diagonal.at[1:].add(-coupled[:-1, n:, n:])
     return diagonal, -coupled[:, :n, n:]
 
