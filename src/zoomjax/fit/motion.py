@@ -74,7 +74,7 @@ class MotionFit(eqx.Module):
             scene: its standard deviation from point to point, which tracks tell. What all points have in
             common looks like a lens, and nobody can tell; it is likely a few times as large, and so is the
             relative error of f that it makes. 0 if none is seen, NaN with few tracks.
-        parallax_score: its square in standard deviations of chance: above 4 or so it is seen.
+        parallax_score: its square in standard deviations of chance: above 3 or so it is seen.
     """
 
     fit: ZoomFit
