@@ -17,6 +17,9 @@ before it; and with the pitch's lines in every fifth frame, a point each 20 px, 
 `rendered`: clips of 1080p and 150 frames, rendered from photographs and encoded as H.264, through the
 command line alone, `zoomjax calibrate clip.mp4`.
 
+`broadcast`: the real frames of a broadcast in the shared data, beside the focal lengths that the pitch
+tells; --panorama FILE writes what they look like put together.
+
 `rivals`: OpenCV's and Hugin's own estimates, on the same simulated tracks.
 
 `time`: seconds of a second fit in the process, tracking apart, and the memory of the process.
@@ -33,6 +36,7 @@ from typing import NamedTuple
 
 import jax
 
+from .motion_broadcast import broadcast
 from .motion_cameras import real
 from .motion_clips import rendered
 from .motion_rivals import rivals
@@ -83,6 +87,15 @@ SECTIONS = {
             *(f"{r['noise']:.2f}", f"{100 * r['follow']:.0f}", f"{r['seconds']:.0f}"),
         ],
     ),
+    "broadcast": Section(
+        "Frames of a broadcast",
+        ("frames", "turned, °", "f, px", "sd", "from the pitch, px", "sd", "frames with it", "in bands, %"),
+        lambda r: [
+            *(str(r["frames"]), f"{r['turned']:.1f}", f"{r['f']:.0f}", f"{r['f_std']:.0f}"),
+            *(f"{r['pitch']:.0f}", f"{r['pitch_std']:.0f}", str(r["pitch_frames"])),
+            f"{100 * r['within']:.0f}",
+        ],
+    ),
     "rivals": Section(
         "Rivals",
         ("f, %", "common factor off, %", "rest, %", "lens, px", "seconds"),
@@ -128,18 +141,20 @@ def main():
     parser.add_argument("--only", default="", help="rows whose names have this text")
     parser.add_argument("--clips", type=int, default=20, help="of each kind")
     parser.add_argument("--data", type=Path, default=os.environ.get("ZOOMJAX_DATA"), help="shared data")
+    parser.add_argument("--panorama", type=Path, help="where to write panoramas of the broadcast")
     parser.add_argument("--output", type=Path, default=FOLDER / "motion.md")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     stored = options.output.with_suffix(".json")
     results = json.loads(stored.read_text()) if stored.exists() else {}
     for name in options.sections:
-        if name == "real" and options.data is None:
+        if name in ("real", "broadcast") and options.data is None:
             parser.error("--data or ZOOMJAX_DATA must name the folder of the shared data")
         rows = {
             "simulated": lambda: simulated(options.clips, options.only),
             "real": lambda: real(options.data, options.only),
             "rendered": lambda: rendered(options.only),
+            "broadcast": lambda: broadcast(options.data, options.only, options.panorama),
             "rivals": lambda: rivals(options.only),
             "time": lambda: timed(options.only),
         }[name]()

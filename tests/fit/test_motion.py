@@ -116,7 +116,11 @@ def test_known_focal_lengths_give_the_scale(lens, path):
     fit = fit_motion(
         tracked(lens, still, noise=0.3).tracks, focal=known, focal_std=1e-3 * focal, throw=False
     )
-    assert abs(np.asarray(fit.focal) / focal - 1).max() < 0.01
+    assert fit.fit.result == RESULTS.successful
+    off, std = np.asarray(fit.focal) / focal - 1, np.asarray(fit.focal_std) / focal
+    assert abs(off).max() < 0.01
+    assert std[3] == pytest.approx(1e-3, rel=0.2)
+    assert (abs(off) < 4 * std).all()
 
 
 def test_a_frame_without_tracks_does_not_matter(noisy, fit):

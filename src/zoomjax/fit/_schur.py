@@ -41,7 +41,7 @@ class Rows(NamedTuple):
     Attributes:
         views: of each view; they depend on its frame, its ray and the lens.
         lines: of each line; they depend on its frame and the lens.
-        frames: of each frame, a number for each of its own.
+        frames: of each frame, a number for each of its own; each depends on that one and the lens.
         lens: of the lens alone.
     """
 
@@ -103,20 +103,22 @@ def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, dam
     line_right = _line_products(by_frame.lines, rows.lines[..., None])[..., 0]
     own = _products(by_frame.views, by_frame.views)
     diagonal, above = _frame_blocks(own, _times(coupling, _root(inverse)[by_track]), extra, structure)
-    corner = jnp.einsum("vri,vrj->ij", by_lens.views, by_lens.views) + by_lens.lens.T @ by_lens.lens
-    corner = corner + jnp.einsum("lri,lrj->ij", by_lens.lines, by_lens.lines)
-    corner = corner - jnp.einsum("tik,tkj->ij", to_lens, lens_solved) + damping * jnp.eye(len(corner))
-    right_lens = jnp.einsum("vri,vr->i", by_lens.views, rows.views) + by_lens.lens.T @ rows.lens
-    right_lens = right_lens - jnp.einsum("tij,tj->i", to_lens, solved[..., 0])
-    right_lens = right_lens + jnp.einsum("lri,lr->i", by_lens.lines, rows.lines)
+    corner = by_lens.lens.T @ by_lens.lens + damping * jnp.eye(by_lens.lens.shape[1])
+    for part in (by_lens.views, by_lens.lines, by_lens.frames):
+        corner = corner + jnp.einsum("vri,vrj->ij", part, part)
+    corner = corner - jnp.einsum("tik,tkj->ij", to_lens, lens_solved)
+    right_lens = by_lens.lens.T @ rows.lens - jnp.einsum("tij,tj->i", to_lens, solved[..., 0])
+    for part, of in zip((by_lens.views, by_lens.lines, by_lens.frames), rows[:3], strict=True):
+        right_lens = right_lens + jnp.einsum("vri,vr->i", part, of)
     right = _by_block(right, structure.frame, structure)
     right = right + _by_block(line_right, structure.line_frame, structure)
     own_right = right + _padded(by_frame.frames * rows.frames, structure)
     border = _by_block(border, structure.frame, structure)
+    known = _padded(by_frame.frames[..., None] * by_lens.frames, structure)
     return Reduced(
         diagonal,
         above,
-        border + _by_block(line_border, structure.line_frame, structure),
+        border + _by_block(line_border, structure.line_frame, structure) + known,
         corner,
         own_right,
         right_lens,
@@ -223,8 +225,8 @@ def _by_block(values, frame, structure):
 
 def _padded(values, structure):
     """Numbers of frames, by blocks."""
-    frames = structure.block * structure.blocks
-    return jnp.zeros((frames, 4), values.dtype).at[: len(values)].set(values).reshape(structure.blocks, -1)
+    more = ((0, structure.block * structure.blocks - len(values)), *((0, 0),) * (values.ndim - 1))
+    return jnp.pad(values, more).reshape(structure.blocks, 4 * structure.block, *values.shape[2:])
 
 
 def _factored(matrix):
