@@ -81,10 +81,10 @@ SECTIONS = {
     ),
     "rendered": Section(
         "Rendered clips",
-        ("frames", "f, %", "its sd", "lens, px", "noise, px", "follow, %", "seconds"),
+        ("frames", "f, %", "its sd", "lens, px", "noise, px", "follow, %"),
         lambda r: [
             *(str(r["frames"]), _percent(r["f"]), _percent(r["f_bound"]), f"{r['lens']:.3f}"),
-            *(f"{r['noise']:.2f}", f"{100 * r['follow']:.0f}", f"{r['seconds']:.0f}"),
+            *(f"{r['noise']:.2f}", f"{100 * r['follow']:.0f}"),
         ],
     ),
     "broadcast": Section(
@@ -98,11 +98,8 @@ SECTIONS = {
     ),
     "rivals": Section(
         "Rivals",
-        ("f, %", "common factor off, %", "rest, %", "lens, px", "seconds"),
-        lambda r: [
-            *(_percent(r["f"]), _percent(r["factor"]), _percent(r["rest"])),
-            *(f"{r['lens']:.3f}", f"{r['seconds']:.0f}"),
-        ],
+        ("f, %", "common factor off, %", "rest, %", "lens, px"),
+        lambda r: [_percent(r["f"]), _percent(r["factor"]), _percent(r["rest"]), f"{r['lens']:.3f}"],
     ),
     "time": Section(
         "Time",
