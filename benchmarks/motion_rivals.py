@@ -112,11 +112,11 @@ def _opencv(tracks: Tracks, images: np.ndarray) -> Found:
         image.img_idx, image.img_size = place, SIZE
         image.keypoints = [cv2.KeyPoint(float(x), float(y), 1.0) for x, y in np.concatenate(points)]
         features.append(image)
-    done, cameras = cv2.detail_HomographyBasedEstimator().apply(features, matches, None)
+    done, cameras = cv2.detail.HomographyBasedEstimator().apply(features, matches, None)
     assert done
     for camera in cameras:
         camera.R = camera.R.astype(np.float32)
-    adjuster = cv2.detail_BundleAdjusterRay()
+    adjuster = cv2.detail.BundleAdjusterRay()
     adjuster.setConfThresh(1.0)
     done, cameras = adjuster.apply(features, matches, cameras)
     assert done

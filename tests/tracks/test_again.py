@@ -45,7 +45,7 @@ def carried(clip, off=0.0):
 
 
 def test_points_are_found_again_where_the_camera_comes_back(clip, video, tracks):
-    more = find_again(video, tracks, carried(clip, 1.0), every=2)
+    more = find_again(video, tracks, carry=carried(clip, 1.0), every=2)
     number, frame, points = more.views()
     first = np.searchsorted(number, number)
     gained = len(number) - len(tracks.views()[0])
@@ -65,7 +65,7 @@ def test_points_are_found_again_where_the_camera_comes_back(clip, video, tracks)
 def test_every_says_in_which_frames(clip, video, tracks):
     number, frame, _ = tracks.views()
     known = set(zip(number.tolist(), frame.tolist(), strict=True))
-    number, frame, _ = find_again(video, tracks, carried(clip), every=5).views()
+    number, frame, _ = find_again(video, tracks, carry=carried(clip), every=5).views()
     new = {pair for pair in zip(number.tolist(), frame.tolist(), strict=True) if pair not in known}
     assert new
     assert all(moment % 5 == 0 for _, moment in new)
@@ -73,12 +73,12 @@ def test_every_says_in_which_frames(clip, video, tracks):
 
 def test_what_is_not_there_is_not_found(clip, video, tracks):
     count = len(tracks.views()[0])
-    wrong = find_again(video, tracks, carried(clip, 40.0))
+    wrong = find_again(video, tracks, carry=carried(clip, 40.0))
     assert len(wrong.views()[0]) < 1.02 * count
-    nowhere = find_again(video, tracks, lambda frame, points, other: np.full_like(points, np.nan))
+    nowhere = find_again(video, tracks, carry=lambda frame, points, other: np.full_like(points, np.nan))
     assert len(nowhere.views()[0]) == count
 
 
 def test_every_is_a_number_of_frames(clip, video, tracks):
     with pytest.raises(ValueError, match="every"):
-        find_again(video, tracks, carried(clip), every=0)
+        find_again(video, tracks, carry=carried(clip), every=0)

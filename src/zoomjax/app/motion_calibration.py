@@ -318,7 +318,7 @@ def calibrate_motion(
     fit = fitted(tracks)
     if tracks.frames <= LOOPS and fit.fit.result == RESULTS.successful:
         stage("Finding points again where the camera comes back")
-        more = find_again(clip, tracks, fit.carried)
+        more = find_again(clip, tracks, carry=fit.carried)
         if np.sum(more.mask) > (1 + _WORTH) * np.sum(tracks.mask):
             stage("Fitting the path that is closed")
             tracks, fit = more, fitted(more)

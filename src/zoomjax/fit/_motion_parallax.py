@@ -49,7 +49,8 @@ def parallax_of(
     basis = _smooth(data, model, inlier)
 
     def variance(pattern):
-        slopes = _slopes(*(jnp.where(there, of, 0) for of in (missed, pattern, *own)), noise, track, tracks)
+        views = [jnp.where(there, of, 0) for of in (missed, pattern, *own)]
+        slopes = _slopes(views, noise, track, tracks)
         slopes = _rough(slopes, basis)
         usual = (slopes.weight > 0) & (slopes.value**2 < _WILD**2)
         weight = jnp.where(usual, slopes.weight**2, 0)
@@ -76,8 +77,9 @@ def _by_rays(data, model, noise):
     return [jax.jvp(seen, (still.rays,), (direction,))[1] for direction in along]
 
 
-def _slopes(missed, pattern, first, second, noise, track, tracks):
+def _slopes(views, noise, track, tracks):
     """Of residuals along a pattern, where rays are free: a Gauss-Newton step of each track."""
+    missed, pattern, first, second = views
 
     def dot(one, other):
         return jax.ops.segment_sum(jnp.sum(one * other, axis=1), track, tracks)

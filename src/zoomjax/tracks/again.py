@@ -46,7 +46,7 @@ class _Kept(NamedTuple):
 
 
 def find_again(
-    clip: str | os.PathLike[str], tracks: Tracks, carry: Carry, *, every: int = 5, seed: int = 0
+    clip: str | os.PathLike[str], tracks: Tracks, *, carry: Carry, every: int = 5, seed: int = 0
 ) -> Tracks:
     """Tracks with more views, in frames to which their points have come back.
 
