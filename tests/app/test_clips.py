@@ -246,7 +246,7 @@ def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
     if kind == "one zoom":
         focal = np.full(FRAMES, 600.0)
     if kind == "little turning":
-        focal, rotation = pan_and_zoom(lens(), FRAMES, pan=1, tilt=0)
+        focal, rotation = pan_and_zoom(lens(), FRAMES, pan=4, tilt=0)
     more = {"moving": {"moving": 0.8}, "pupil": {"pupil": 0.5}, "little turning": {"noise": 0.5}}.get(
         kind, {}
     )
