@@ -420,7 +420,14 @@ LEFT_OUT = {
     **dict.fromkeys(
         (
             *("load_lens", "load_lines", "read_focal_csv", "read_focal_track", "read_lines_csv"),
-            *("load_tracks", "read_tracks_csv", "write_tracks_csv", "track_video", "track_frames"),
+            *(
+                "load_tracks",
+                "read_tracks_csv",
+                "write_tracks_csv",
+                "track_video",
+                "track_frames",
+                "find_again",
+            ),
             *("write_lines_csv", "undistort_image", "undistort_photo", "undistort_video"),
             *("redistort_image", "redistort_photo", "redistort_video", "read", "write", "formats"),
             *("find", "load", "match", "names"),

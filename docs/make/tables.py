@@ -312,10 +312,14 @@ def vision() -> str:
     return markdown(heads, list(rows.values()))
 
 
-def motion() -> str:
-    """Focal lengths and lenses from motion, beside the bound."""
-    heads, rows = table_of("motion.md", "Simulated tracks")
-    return markdown(["", *heads[1:]], list(rows.values()))
+def motion(section: str) -> Callable[[], str]:
+    """What makes a table of focal lengths and lenses from motion."""
+
+    def make() -> str:
+        heads, rows = table_of("motion.md", section)
+        return markdown(["", *heads[1:]], list(rows.values()))
+
+    return make
 
 
 TABLES: dict[str, Callable[[], str]] = {
@@ -337,6 +341,10 @@ TABLES: dict[str, Callable[[], str]] = {
     "lensfun-forms": lensfun_forms,
     "board-focal": board_focal,
     "vision": vision,
-    "motion": motion,
+    "motion": motion("Simulated tracks"),
+    "motion-real": motion("Real lenses"),
+    "motion-rendered": motion("Rendered clips"),
+    "motion-broadcast": motion("Frames of a broadcast"),
+    "motion-rivals": motion("Rivals"),
 }
 """What makes each table, by the name in its marker."""

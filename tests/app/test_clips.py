@@ -231,6 +231,9 @@ def test_motion_is_tried_where_nothing_else_is_given():
         ("one zoom", "good", "hardly changes"),
         ("moving", "not determined", "moves by itself"),
         ("cut", "good", "1 cut"),
+        ("pupil", "doubtful", "its entrance pupil is off the axis"),
+        ("little turning", "doubtful", "have a common factor that is known to"),
+        ("dark", "good", "3 frames show nothing"),
     ],
 )
 def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
@@ -242,8 +245,17 @@ def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
         rotation = np.broadcast_to(rotation[0], rotation.shape)
     if kind == "one zoom":
         focal = np.full(FRAMES, 600.0)
-    moving = 0.8 if kind == "moving" else 0
-    tracks = motion_tracks(lens(), focal, rotation, views=80, life=15, noise=0.1, moving=moving).tracks
+    if kind == "little turning":
+        focal, rotation = pan_and_zoom(lens(), FRAMES, pan=4, tilt=0)
+    more = {"moving": {"moving": 0.8}, "pupil": {"pupil": 0.5}, "little turning": {"noise": 0.5}}.get(
+        kind, {}
+    )
+    options = {"views": 80, "life": 15, "noise": 0.1} | more
+    tracks = motion_tracks(lens(), focal, rotation, **options).tracks
+    if kind == "dark":
+        track, frame, points = tracks.views()
+        seen = (frame < 20) | (frame > 22)
+        tracks = Tracks.from_arrays(track[seen], frame[seen], points[seen], image_size=SIZE, frames=FRAMES)
     if kind == "cut":
         track, frame, points = tracks.views()
         tracks = Tracks.from_arrays(

@@ -116,7 +116,11 @@ def test_known_focal_lengths_give_the_scale(lens, path):
     fit = fit_motion(
         tracked(lens, still, noise=0.3).tracks, focal=known, focal_std=1e-3 * focal, throw=False
     )
-    assert abs(np.asarray(fit.focal) / focal - 1).max() < 0.01
+    assert fit.fit.result == RESULTS.successful
+    off, std = np.asarray(fit.focal) / focal - 1, np.asarray(fit.focal_std) / focal
+    assert abs(off).max() < 0.01
+    assert std[3] == pytest.approx(1e-3, rel=0.2)
+    assert (abs(off) < 4 * std).all()
 
 
 def test_a_frame_without_tracks_does_not_matter(noisy, fit):
@@ -285,6 +289,51 @@ def test_a_camera_that_stands_still_tells_nothing_of_its_shutter(lens, path):
     focal, rotation = path[0][:1].repeat(8), path[1][:1].repeat(8, axis=0)
     fit = fit_motion(tracked(lens, (focal, rotation), noise=0.3).tracks, throw=False)
     assert fit.readout_std > 0.4
+
+
+def test_a_pupil_off_the_axis_is_seen_and_drift_is_none(lens, path, fit):
+    seen = fit_motion(tracked(lens, path, noise=0.3, pupil=0.3).tracks)
+    true = np.std(0.3 / np.linalg.norm(tracked(lens, path, pupil=0.3).points, axis=1))
+    assert seen.parallax_score > 3
+    assert seen.parallax == pytest.approx(true, rel=0.4)
+    assert fit.parallax_score < 3
+    assert fit_motion(tracked(lens, path, noise=0.3, drift=0.1).tracks).parallax_score < 3
+
+
+def test_few_tracks_tell_no_parallax(lens, path):
+    few = motion_tracks(lens, *path, views=5, life=60, noise=0.3)
+    assert np.isnan(fit_motion(few.tracks, throw=False).parallax)
+
+
+def test_points_are_carried_to_where_other_frames_show_them(lens, path, noisy, fit):
+    track, view = np.nonzero(np.asarray(noisy.tracks.mask))
+    frame, points = (np.asarray(of)[track, view] for of in (noisy.tracks.frame, noisy.tracks.points))
+    first = np.searchsorted(track, track)
+    there = frame == 9
+    carried = fit.carried(frame[first][there], points[first][there], 9)
+    missed = np.linalg.norm(carried - points[there], axis=1)
+    assert len(missed) > 30
+    assert np.median(missed) < 1.0
+    behind = fit.carried(np.array([0]), np.array([[-1e6, 0.0]]), FRAMES - 1)
+    assert behind.shape == (1, 2)
+
+
+def test_nothing_is_carried_across_a_cut(fit):
+    cut = eqx.tree_at(lambda fit: fit.shot, fit, (jnp.arange(FRAMES) > 11).astype(jnp.int32))
+    assert np.isnan(cut.carried(np.array([3]), np.array([[640.0, 360.0]]), 12)).all()
+    assert np.isfinite(cut.carried(np.array([3]), np.array([[640.0, 360.0]]), 4)).all()
+
+
+@pytest.mark.parametrize(("frames", "life", "whole"), [(60, 60, True), (60, 20, False), (300, 100, False)])
+def test_tracks_of_short_clips_stay_whole_and_of_long_ones_do_not(frames, life, whole):
+    track, frame = np.repeat([0, 1, 2], life), np.tile(np.arange(life), 3)
+    frame[-life:] += frames - life
+    points = np.random.default_rng(0).uniform(0, 700, (3 * life, 2))
+    tracks = Tracks.from_arrays(track, frame, points, image_size=SIZE, frames=frames)
+    asked = Asked(PolynomialZoom(), RadialPolynomial(), 2, None, None)
+    problem = problem_of(Given(tracks, None, None, None, None), asked)
+    assert (problem.data.structure.blocks == 1) == whole
+    assert len(np.unique(problem.piece)) == (3 if life <= 48 or whole else 9)
 
 
 @pytest.mark.slow

@@ -21,13 +21,13 @@ def problem(rng, frames, tracks, longest):
     structure = structure_of(track, frame, frames, line_frame=line_frame)
     line_of_frame, line_of_lens = (rng.normal(size=(12, 5, n)) for n in (4, 3))
     of_frame, of_ray, of_lens = (rng.normal(size=(len(track), 2, n)) for n in (4, 2, 3))
-    about = rng.uniform(0.5, 2, (frames, 4))
+    about, with_lens = rng.uniform(0.5, 2, (frames, 4)), rng.normal(size=(frames, 4, 3))
 
     def jacobian(x):
         views = jnp.einsum("vij,vj->vi", of_frame, x.frames[frame])
         views += jnp.einsum("vij,vj->vi", of_ray, x.rays[track]) + of_lens @ x.lens[0]
         lines = jnp.einsum("lij,lj->li", line_of_frame, x.frames[line_frame]) + line_of_lens @ x.lens[0]
-        return Rows(views, lines, about * x.frames, x.lens[0] / 3)
+        return Rows(views, lines, about * x.frames + with_lens @ x.lens[0], x.lens[0] / 3)
 
     like = Unknowns(jnp.zeros((frames, 4)), jnp.zeros((tracks, 2)), (jnp.zeros(3), None))
     rows = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), jacobian(like))

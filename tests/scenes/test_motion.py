@@ -51,3 +51,18 @@ def test_rows_of_a_rolling_shutter_are_seen_one_after_the_other(lens):
         straight = 800 * np.array([np.tan(pan), down / depth / np.cos(pan)])
         there = np.asarray(distortion.undistort(point)) - np.asarray(distortion.centre)
         np.testing.assert_allclose(there, straight, atol=1e-3)
+
+
+def test_points_of_a_map_are_the_same_track_when_they_come_back(lens):
+    focal, rotation = pan_and_zoom(lens, 40, pan=60)
+    once, kept = (motion_tracks(lens, focal, rotation, views=20, life=5, returns=r) for r in (False, True))
+    assert len(kept.points) < 0.5 * len(once.points)
+    frame, mask = np.asarray(kept.tracks.frame), np.asarray(kept.tracks.mask)
+    gaps = (np.diff(frame, axis=1) > 1) & mask[:, 1:]
+    assert gaps.any()
+    assert np.bincount(frame[mask]).max() <= 20
+    for track, moment, point in views(kept):
+        ahead = rotation[moment] @ kept.points[track]
+        distortion = lens(float(focal[moment]))
+        straight = np.asarray(distortion.centre) + focal[moment] * ahead[:2] / ahead[2]
+        np.testing.assert_allclose(distortion.undistort(point), straight, atol=1e-8)

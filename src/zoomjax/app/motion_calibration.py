@@ -12,12 +12,13 @@ import jax
 import numpy as np
 
 from ..detect.batch import Detection
-from ..fit.motion import MotionFit, fit_motion
+from ..fit.motion import LOOPS, MotionFit, fit_motion
 from ..fit.result import RESULTS
 from ..fit.zoom import CentreArgument
 from ..io.video_reader import decode_video
 from ..lines.lines import Lines
 from ..models.zoom import PolynomialZoom
+from ..tracks.again import find_again
 from ..tracks.tracks import Tracks
 from ..trust.assessment import VERDICTS, Finding, Verdict
 from ..trust.bands import displacement_std
@@ -38,6 +39,9 @@ _WRONG = 2.0  # px, of the noise of points: what is seen is no camera that turns
 _MISSED = 9.0  # times the noise, squared: views beyond do not follow the model
 _FEW = 0.5  # of the views that do follow it
 _MANY = 9.0  # focal lengths, more than any model needs
+_SURE = 3.0  # times chance: of a parallax
+_NEARLY_NONE, _HARMLESS = 1e-4, 5e-4  # of the pupil's offset over distances: its standard deviation
+_WORTH = 0.03  # share of more views for which it is fitted again
 _LEAST_ZOOM = 1.2  # between the ends of the focal lengths
 
 
@@ -123,6 +127,7 @@ class MotionCalibration:
                 "the clip moves by itself, or the camera does not stand still.",
                 "Use a tripod, and film a scene at rest.",
             )
+        yield from self._of_parallax()
         if (noise := float(self.fit.noise)) > _ROUGH:
             yield Finding(
                 "noise",
@@ -130,6 +135,18 @@ class MotionCalibration:
                 f"points are off the model by {noise:.2f} px: the clip is blurred, much in it moves by "
                 "itself, or things near the camera shift as it turns.",
                 "Turn more slowly, before a scene at rest.",
+            )
+
+    def _of_parallax(self) -> Iterator[Finding]:
+        size, score = float(self.fit.parallax), float(self.fit.parallax_score)
+        if score > _SURE and size > _NEARLY_NONE:
+            yield Finding(
+                "parallax",
+                "doubtful" if size > _HARMLESS else "good",
+                "near points move otherwise than far ones as the camera turns, by a share of "
+                f"{size:.2%}: its entrance pupil is off the axis of rotation. Focal lengths may be off by "
+                "a few times that, and the lens with them.",
+                "Turn the camera about its entrance pupil, or film what is farther away.",
             )
 
     def _of_frames(self) -> Iterator[Finding]:
@@ -286,15 +303,25 @@ def calibrate_motion(
     candidate = model.base(np.arange(1.0, _MANY))
     shift = PolynomialZoom(degree=1) if centre == "fit" else None
     lines, line_frames = _lines_of(found, times)
-    fit = fit_motion(
-        tracks,
-        zoom=candidate.zoom,
-        terms=candidate.terms,
-        shift=shift,
-        lines=lines,
-        line_frames=line_frames,
-    )
-    jax.block_until_ready(fit.focal)
+
+    def fitted(tracks):
+        fit = fit_motion(
+            tracks,
+            zoom=candidate.zoom,
+            terms=candidate.terms,
+            shift=shift,
+            lines=lines,
+            line_frames=line_frames,
+        )
+        return jax.block_until_ready(fit)
+
+    fit = fitted(tracks)
+    if tracks.frames <= LOOPS and fit.fit.result == RESULTS.successful:
+        stage("Finding points again where the camera comes back")
+        more = find_again(clip, tracks, carry=fit.carried)
+        if np.sum(more.mask) > (1 + _WORTH) * np.sum(tracks.mask):
+            stage("Fitting the path that is closed")
+            tracks, fit = more, fitted(more)
     return MotionCalibration(clip, tracks, fit, times, lines)
 
 

@@ -24,8 +24,12 @@ _READOUT = (0.0, 0.5)
 _TOLD = 1e-4  # standard deviation of a readout that is given
 
 _LONGEST = 48
-"""Frames of a track that share a ray. Longer ones are cut, so that only frames near each other are coupled:
-that they show the same point says little more, and a cubic cost is saved."""
+"""Frames of a track that share a ray in a long clip. Longer tracks are cut, so that only frames near each
+other are coupled: time is then linear in the frames."""
+
+LONGEST_LOOP = 256
+"""Frames of a clip whose tracks stay whole if there are longer ones: a camera that comes back to where it
+looked before then closes a loop. The frames' matrix is full, and its cost of little account."""
 
 
 class Given(NamedTuple):
@@ -77,8 +81,9 @@ def problem_of(given: Given, asked: Asked) -> Problem:
     frames = bucket(tracks.frames)
     more = frames - tracks.frames
     lines, line_frame = _ready_lines(given, asked.family, asked.family.size(asked.terms))
-    piece = _pieces(track, moment)
-    structure = structure_of(piece, moment, frames, min(_LONGEST, frames), line_frame=line_frame)
+    block = _block(track, moment, frames)
+    piece = _pieces(track, moment, block)
+    structure = structure_of(piece, moment, frames, block, line_frame=line_frame)
     wide = padded(structure)
     points = jnp.asarray(tracks.points, float)[track, view] - (np.array([tracks.image_size]) - 1) / 2
     views = len(wide.track) - len(points)
@@ -221,8 +226,15 @@ def _shots(track, moment, frames):
     return shot
 
 
-def _pieces(track, moment):
-    """Names of the tracks' pieces, each at most `_LONGEST` frames long, for each view."""
+def _block(track, moment, frames):
+    """Frames that are coupled with one another: all of a short clip that has long tracks, or some."""
     _, first, number = np.unique(track, return_index=True, return_inverse=True)
-    part = (moment - moment[first][number]) // _LONGEST
+    longest = int(np.max(moment - moment[first][number])) + 1
+    return frames if frames <= LONGEST_LOOP and longest > _LONGEST else min(_LONGEST, frames)
+
+
+def _pieces(track, moment, block):
+    """Names of the tracks' pieces, each at most as long as a block, for each view."""
+    _, first, number = np.unique(track, return_index=True, return_inverse=True)
+    part = (moment - moment[first][number]) // block
     return np.unique(np.stack([track, part]), axis=1, return_inverse=True)[1].ravel()

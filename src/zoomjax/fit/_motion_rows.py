@@ -283,22 +283,22 @@ def _rows_of_frames(data, model):
     return _Rows(model, coefficients, offset, data.size[1] - 1.0)
 
 
-def residuals_of(data: Data, model: Model) -> Float[Array, "view 2"]:
-    """Residuals of all views, px."""
+def residuals_of(
+    data: Data, model: Model, lever: Float[Array, "track"] | None = None
+) -> Float[Array, "view 2"]:
+    """Residuals of all views, px.
+
+    `lever` is how far the entrance pupil is before the axis of rotation, over each point's distance.
+    """
     rows = _rows_of_frames(data, model)
+    lever = jnp.zeros(data.structure.tracks) if lever is None else lever
 
     def view(point, frame, track):
         log_focal, coefficients, turning = rows.at(frame, point)
         ahead = turned(_product(model.path.rotation[frame], model.path.rays[track]), turning)
-        return _view(
-            point,
-            jnp.exp(log_focal),
-            coefficients,
-            rows.offset[frame],
-            ahead,
-            model.family,
-            data.scale,
-        )
+        ahead = ahead.at[2].add(-lever[track])
+        camera = jnp.exp(log_focal), coefficients, rows.offset[frame]
+        return _view(point, *camera, ahead, model.family, data.scale)
 
     views = jax.vmap(view)(data.points, data.structure.frame, data.structure.track)
     return jnp.where(data.there[:, None], views, 0)

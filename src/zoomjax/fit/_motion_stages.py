@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
 from ._least_squares import RoundingTrustRegion
+from ._motion_parallax import parallax_of
 from ._motion_rows import (
     CAUCHY,
     WRONG_LINE,
@@ -225,6 +226,7 @@ def _described(data, model, noise, stage, result, steps):
         rms_unconstrained=rms,
         joint=None if model.shift is None else joint,
     )
+    parallax, parallax_std = parallax_of(data, model, noise, inlier)
     parts = {
         "fit": fit,
         "focal": jnp.where(unseen, jnp.nan, focal),
@@ -235,5 +237,7 @@ def _described(data, model, noise, stage, result, steps):
         "line_noise": noise.lines if len(good) else jnp.asarray(jnp.nan),
         "readout": model.readout,
         "readout_std": jnp.sqrt(lens[-2, -2] * inflation),
+        "parallax": jnp.sqrt(jnp.maximum(parallax, 0)),
+        "parallax_score": parallax / parallax_std,
     }
     return parts, jnp.linalg.norm(missed, axis=-1)

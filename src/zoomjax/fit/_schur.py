@@ -41,7 +41,7 @@ class Rows(NamedTuple):
     Attributes:
         views: of each view; they depend on its frame, its ray and the lens.
         lines: of each line; they depend on its frame and the lens.
-        frames: of each frame, a number for each of its own.
+        frames: of each frame, a number for each of its own; each depends on that one and the lens.
         lens: of the lens alone.
     """
 
@@ -103,20 +103,22 @@ def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, dam
     line_right = _line_products(by_frame.lines, rows.lines[..., None])[..., 0]
     own = _products(by_frame.views, by_frame.views)
     diagonal, above = _frame_blocks(own, _times(coupling, _root(inverse)[by_track]), extra, structure)
-    corner = jnp.einsum("vri,vrj->ij", by_lens.views, by_lens.views) + by_lens.lens.T @ by_lens.lens
-    corner = corner + jnp.einsum("lri,lrj->ij", by_lens.lines, by_lens.lines)
-    corner = corner - jnp.einsum("tik,tkj->ij", to_lens, lens_solved) + damping * jnp.eye(len(corner))
-    right_lens = jnp.einsum("vri,vr->i", by_lens.views, rows.views) + by_lens.lens.T @ rows.lens
-    right_lens = right_lens - jnp.einsum("tij,tj->i", to_lens, solved[..., 0])
-    right_lens = right_lens + jnp.einsum("lri,lr->i", by_lens.lines, rows.lines)
+    corner = by_lens.lens.T @ by_lens.lens + damping * jnp.eye(by_lens.lens.shape[1])
+    for part in (by_lens.views, by_lens.lines, by_lens.frames):
+        corner = corner + jnp.einsum("vri,vrj->ij", part, part)
+    corner = corner - jnp.einsum("tik,tkj->ij", to_lens, lens_solved)
+    right_lens = by_lens.lens.T @ rows.lens - jnp.einsum("tij,tj->i", to_lens, solved[..., 0])
+    for part, of in zip((by_lens.views, by_lens.lines, by_lens.frames), rows[:3], strict=True):
+        right_lens = right_lens + jnp.einsum("vri,vr->i", part, of)
     right = _by_block(right, structure.frame, structure)
     right = right + _by_block(line_right, structure.line_frame, structure)
     own_right = right + _padded(by_frame.frames * rows.frames, structure)
     border = _by_block(border, structure.frame, structure)
+    known = _padded(by_frame.frames[..., None] * by_lens.frames, structure)
     return Reduced(
         diagonal,
         above,
-        border + _by_block(line_border, structure.line_frame, structure),
+        border + _by_block(line_border, structure.line_frame, structure) + known,
         corner,
         own_right,
         right_lens,
@@ -197,17 +199,19 @@ def _frame_blocks(own, halves, extra, structure):
     diagonal = jnp.zeros((blocks, size, 4, size, 4), own.dtype)
     diagonal = diagonal.at[:, place, :, place].set(each.swapaxes(0, 1)).reshape(blocks, n, n)
     within = structure.frame - structure.begin * size
+    reach = size if blocks == 1 else 2 * size
 
     def of_block(number):
         here = jnp.where(structure.begin == number, structure.place, structure.most)  # or dropped
-        rows = (
-            jnp.zeros((structure.most, 2 * size, 4, 2), own.dtype).at[here, within].set(halves, mode="drop")
-        )
-        rows = rows.transpose(1, 2, 0, 3).reshape(2 * n, -1)
+        rows = jnp.zeros((structure.most, reach, 4, 2), own.dtype)
+        rows = rows.at[here, within].set(halves, mode="drop")
+        rows = rows.transpose(1, 2, 0, 3).reshape(4 * reach, -1)
         return rows @ rows.T
 
     coupled = jax.lax.map(of_block, jnp.arange(blocks))
     diagonal = diagonal - coupled[:, :n, :n]
+    if blocks == 1:
+        return diagonal, 0 * diagonal  # no constant, which XLA would fold for seconds
     diagonal = diagonal.at[1:].add(-coupled[:-1, n:, n:])
     return diagonal, -coupled[:, :n, n:]
 
@@ -221,8 +225,8 @@ def _by_block(values, frame, structure):
 
 def _padded(values, structure):
     """Numbers of frames, by blocks."""
-    frames = structure.block * structure.blocks
-    return jnp.zeros((frames, 4), values.dtype).at[: len(values)].set(values).reshape(structure.blocks, -1)
+    more = ((0, structure.block * structure.blocks - len(values)), *((0, 0),) * (values.ndim - 1))
+    return jnp.pad(values, more).reshape(structure.blocks, 4 * structure.block, *values.shape[2:])
 
 
 def _factored(matrix):

@@ -29,12 +29,15 @@ from ..models.zoom import (
 )
 from ..tracks.tracks import Tracks
 from ._motion_gradient import sensitive
-from ._motion_problem import Asked, Given, Problem, problem_of
+from ._motion_problem import LONGEST_LOOP, Asked, Given, Problem, problem_of
 from ._motion_rows import Model, Noise, scaled
 from ._motion_stages import in_stages
 from ._motion_start import starts_of, views_by_frame
 from .defaults import zoom_or_default
 from .result import RESULTS, ZoomFit, failed
+
+LOOPS = LONGEST_LOOP
+"""The most frames of a clip in which a camera that comes back closes a loop: tracks stay whole."""
 
 _FAILED = "The fit failed: turn and zoom farther, or fit fewer coefficients about the image's centre."
 
@@ -67,6 +70,11 @@ class MotionFit(eqx.Module):
         readout: time that a rolling shutter takes from the first row to the last, in frames.
         readout_std: its standard deviation. A large one says that nothing is known: the camera was too slow
             to tell, and it does no harm.
+        parallax: distance of the entrance pupil before the axis of rotation, over that of a point of the
+            scene: its standard deviation from point to point, which tracks tell. What all points have in
+            common looks like a lens, and nobody can tell; it is likely a few times as large, and so is the
+            relative error of f that it makes. 0 if none is seen, NaN with few tracks.
+        parallax_score: its square in standard deviations of chance: above 3 or so it is seen.
     """
 
     fit: ZoomFit
@@ -81,6 +89,8 @@ class MotionFit(eqx.Module):
     line_noise: Float[Array, ""]
     readout: Float[Array, ""]
     readout_std: Float[Array, ""]
+    parallax: Float[Array, ""]
+    parallax_score: Float[Array, ""]
 
     @property
     def lens(self) -> ZoomLens:
@@ -93,9 +103,41 @@ class MotionFit(eqx.Module):
         x, y, z = self.rotation[:, 2].T
         return jnp.degrees(jnp.stack([jnp.arctan2(x, z), -jnp.arcsin(jnp.clip(y, -1, 1))], axis=1))
 
+    def carried(
+        self, frame: Int[AnyArray, "point"], points: Float[AnyArray, "point 2"], other: int
+    ) -> Float[np.ndarray, "point 2"]:
+        """Where a frame shows what others show, px; NaN behind the camera, and beyond a cut.
+
+        Args:
+            frame: for each point the number of the frame that it is in.
+            points: the points, px.
+            other: the number of the frame in which they are looked for.
+        """
+        known = np.nan_to_num(np.asarray(self.focal), nan=float(self.lens.focal_range[0]))
+        turn = np.asarray(self.rotation)
+        frame = np.asarray(frame)
+        seen = _carried(
+            self.lens, known[frame], turn[frame], jnp.asarray(points), known[other], turn[other]
+        )
+        same = np.asarray(self.shot)[frame] == np.asarray(self.shot)[other]
+        return np.where(same[:, None], np.asarray(seen), np.nan)
+
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
         """Raise TypeError: call the lens of the fit instead."""
         raise TypeError("A MotionFit is not a lens: use fit.lens, as in fit.lens(2400.0).")
+
+
+@eqx.filter_jit
+def _carried(lens, focal, rotation, points, other_focal, other_rotation):
+    """Points of frames in another one, px, without what a rolling shutter does to them."""
+
+    def one(f, turn, point):
+        flat = (lens(f).undistort(point) - lens.centre_at(f)) / f
+        ahead = other_rotation @ (turn.T @ jnp.append(flat, 1))
+        straight = lens.centre_at(other_focal) + other_focal * ahead[:2] / jnp.maximum(ahead[2], 1e-3)
+        return jnp.where(ahead[2] > 1e-3, lens(other_focal).distort(straight), jnp.nan)
+
+    return jax.vmap(one)(focal, rotation, points)
 
 
 @kinds_checked

@@ -72,6 +72,7 @@ def motion_tracks(
     *,
     views: int = 200,
     life: float | int = 40,
+    returns: bool = False,
     noise: float | int = 0,
     drift: float | int = 0,
     moving: float | int = 0,
@@ -87,6 +88,8 @@ def motion_tracks(
         focal, rotation: of each frame: `pan_and_zoom`, or of a real camera.
         views: tracks seen at a time.
         life: mean number of frames that a track lives.
+        returns: whether a point is the same track whenever it comes back into the image, as points of a map
+            are; `life` then has no effect.
         noise: standard deviation of each coordinate of each point, px.
         drift: of a track, px a frame: a random walk's steps.
         moving: share of tracks on things that move, some 2 px a frame.
@@ -108,9 +111,11 @@ def motion_tracks(
     first, alive = np.zeros(0, int), np.zeros(0, int)
     entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for frame, (f, turn) in enumerate(zip(focal, rotation, strict=True)):
-        alive = alive[last[alive] > frame]
+        before, alive = alive, np.arange(len(scene)) if returns else alive[last[alive] > frame]
         walk[alive] += drift * rng.standard_normal((len(alive), 2))
         alive, seen = seen_at.inside(frame, scene, alive, speed * (frame - first)[:, None] + walk)
+        kept = np.argsort(~np.isin(alive, before), kind="stable")[:views]  # first those just seen
+        alive, seen = alive[kept], seen[kept]
         new = max(views - len(alive), 0)
         distortion = lens(float(f))
         ahead = np.asarray(distortion.undistort(rng.uniform(0, corner, (new, 2))))

@@ -1,5 +1,6 @@
 # The public names of this room: read by type checkers, and by lazy_loader at run time.
 
+from .again import find_again as find_again
 from .csv import read_tracks_csv as read_tracks_csv
 from .csv import write_tracks_csv as write_tracks_csv
 from .npz import load_tracks as load_tracks

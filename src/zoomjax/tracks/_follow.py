@@ -22,10 +22,10 @@ _BACK = 0.4
 _NEAR = 2.0
 """px: how far the match may be from where the flow leads."""
 
-_ALIKE = 0.85
+ALIKE = 0.85
 """Least correlation with the patch of the anchor."""
 
-_GROWTH = 1.4
+GROWTH = 1.4
 """Change of scale after which a track ends: patches are bent, and the error hardly grows up to there."""
 
 _WEAKEST = 3.0
@@ -148,8 +148,8 @@ class Follower:
         active.strayed = np.maximum(active.strayed, np.linalg.norm(points - active.anchor, axis=1))
         away = np.linalg.norm(active.carried - active.anchor, axis=1)
         active.expected = np.maximum(active.expected, away)
-        good = (likeness > _ALIKE) & (np.linalg.norm(points - flow, axis=1) < _NEAR)
-        good &= (growth < _GROWTH) & (growth > 1 / _GROWTH) & (active.until > self.frame)
+        good = (likeness > ALIKE) & (np.linalg.norm(points - flow, axis=1) < _NEAR)
+        good &= (growth < GROWTH) & (growth > 1 / GROWTH) & (active.until > self.frame)
         good &= self._inside(points) & ~active.is_still
         self._end(active[~good])
         self._active = active[good]

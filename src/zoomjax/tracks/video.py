@@ -82,7 +82,7 @@ def track_frames(
     most, life = checked_integer("most", most, 1), checked_integer("life", life, 2)
     follower = None
     for image in frames:
-        grey = _grey(image)
+        grey = grey_frame(image)
         size = (grey.shape[1], grey.shape[0])
         follower = Follower(size, most=most, life=life) if follower is None else follower
         if size != follower.size:
@@ -99,7 +99,7 @@ def track_frames(
     return Tracks.from_arrays(track, frame, points, image_size=follower.size, frames=number)
 
 
-def _grey(image: np.ndarray) -> np.ndarray:
+def grey_frame(image: np.ndarray) -> np.ndarray:
     """A frame as (height, width) bytes; ValueError if it is no image of 8 bits."""
     shape = np.shape(image)
     flat = len(shape) == 2 or shape[2:] in ((1,), (3,), (4,))

@@ -1,0 +1,95 @@
+"""Lenses of real broadcast cameras for `benchmarks/motion.py`: tracks and pitch lines seen through them."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from zoomjax import Distortion, Lines
+from zoomjax.fit import RESULTS, fit_motion
+from zoomjax.scenes import MotionScene, motion_tracks
+
+from .motion_simulated import SHOWN, SIZE, Rows, wide
+from .real.study_broadcast import SCALE, Clip, looking_at, pitch_lines, read_clip
+
+
+class FrameLenses:
+    """The lenses of a clip's frames, by focal length: a radial polynomial that inverts OpenCV's."""
+
+    def __init__(self, clip: Clip, frames: np.ndarray):
+        self.image_size, self.focal = SIZE, clip.focal[frames] * (1 + 1e-9 * np.arange(len(frames)))
+        self.centre = clip.principal[frames]
+        self.k = [_inverse(f, k) for f, k in zip(clip.focal[frames], clip.k[frames], strict=True)]
+
+    def __call__(self, focal: float) -> Distortion:
+        """The lens of the frame with this focal length."""
+        frame = int(np.argmin(abs(self.focal - focal)))
+        return Distortion(self.k[frame], self.centre[frame], np.array(SCALE))
+
+
+def _inverse(focal: float, k: np.ndarray) -> np.ndarray:
+    """Four coefficients that correct what OpenCV's distort, over the image."""
+    r = np.linspace(0, 1.1, 200)[1:]
+    bent = r * SCALE * (1 + (r * SCALE / focal) ** 2 * (k[0] + (r * SCALE / focal) ** 2 * k[1])) / SCALE
+    powers = bent[:, None] ** (2 * np.arange(1, 5) + 1)
+    found = np.linalg.lstsq(powers, r - bent)[0]
+    assert abs(powers @ found - (r - bent)).max() * SCALE < 0.02
+    return found
+
+
+def real_scene(
+    clip: Clip, pupil: float, seed: int = 0
+) -> tuple[FrameLenses, MotionScene, Lines, np.ndarray]:
+    """Tracks and pitch lines of a clip; the frames of the lines."""
+    frames = np.arange(0, len(clip.focal), 4)
+    lenses: Any = FrameLenses(clip, frames)
+    time = np.linspace(0, 2 * np.pi * len(frames) / 150, len(frames))
+    aims = np.column_stack([30 * np.sin(1.3 * time), 5 + 10 * np.sin(2.1 * time), 0 * time])
+    turns = np.stack([looking_at(clip.position, aim) for aim in aims])
+    scene = motion_tracks(lenses, lenses.focal, turns, noise=0.5, pupil=pupil, seed=seed)
+    rng = np.random.default_rng(seed)
+    some = np.arange(0, len(frames), 5)
+    seen = [pitch_lines(clip, frames[place], turns[place]) for place in some]
+    points = [line[::5] + rng.normal(0, 0.5, line[::5].shape) for lines in seen for line in lines]
+    number = np.repeat(np.arange(len(some)), [len(lines) for lines in seen])
+    long = [len(line) >= 5 for line in points]
+    points = [np.clip(line, 0, np.array(SIZE) - 1) for line, use in zip(points, long, strict=True) if use]
+    used, place = np.unique(number[long], return_inverse=True)
+    lines = Lines.from_ragged(points, place, np.ones(len(used)), image_size=SIZE, focal_unit="px")
+    return lenses, scene, lines, some[used]
+
+
+def real(folder: Path, only: str) -> Rows:
+    """Errors of each clip: as it is, with the pupil before the axis, and with the pitch's lines."""
+    for path in sorted((folder / "broadcast_cameras").glob("*.npz")):
+        clip = read_clip(path)
+        for kind, pupil, with_lines in (
+            ("", 0, False),
+            (", pupil 0.2 m", 0.2, False),
+            (", lines", 0, True),
+        ):
+            if only not in clip.name + kind:
+                continue
+            lenses, scene, lines, line_frames = real_scene(clip, pupil)
+            more = {"lines": lines, "line_frames": line_frames} if with_lines else {}
+            begin = time.perf_counter()
+            fit = fit_motion(scene.tracks, throw=False, **more)
+            seconds = time.perf_counter() - begin
+            own, shown = np.asarray(fit.focal), np.arange(0, len(scene.focal), 15)
+            missed = []
+            for frame in shown:
+                pair = (wide(fit.lens)(float(own[frame])), lenses(float(scene.focal[frame])))
+                a, b = (np.asarray(distortion.undistort(SHOWN)) for distortion in pair)
+                missed.append((a - a.mean(axis=0)) - (b - b.mean(axis=0)))
+            yield (
+                clip.name + kind,
+                {
+                    "frames": len(own),
+                    "f": float(np.sqrt(np.mean((own / scene.focal - 1) ** 2))),
+                    "f_bound": float(np.sqrt(np.mean((np.asarray(fit.focal_std) / own) ** 2))),
+                    "lens": float(np.sqrt(np.mean(np.sum(np.square(missed), axis=-1)))),
+                    "good": bool(fit.fit.result == RESULTS.successful),
+                    "seconds": seconds,
+                },
+            )

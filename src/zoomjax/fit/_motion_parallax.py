@@ -1,0 +1,121 @@
+"""Whether near points move otherwise than far ones: the entrance pupil off the axis of rotation.
+
+A pupil at e before the axis sees a point at the distance D as if the camera were nearer by e: the point is
+``e/D / cos`` of its distance from the centre farther out. Of that, what is the same for all points looks
+like a lens, and no track tells it. The rest differs from track to track. So the slope of each track's
+residuals along that pattern is taken, freed of the track's own ray and of what depends smoothly on where
+in the image and in the zoom the track lies, as a wrong lens would. Its variance beyond that of noise is
+that of e/D. The same pattern turned by 90 degrees is of no pupil: things that move and points that drift
+give both alike, and what it has is subtracted.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ._motion_rows import Data, Model, Noise, moved, residuals_of, units_of
+from ._schur import Unknowns
+
+_WILD = 5.0  # standard deviations, of a slope that is no chance: of a thing that moves
+_FEWEST = 20  # tracks
+
+
+class _Slopes(NamedTuple):
+    """Of each track."""
+
+    value: Float[Array, "track"]  # in its standard deviations by noise
+    weight: Float[Array, "track"]  # 1 over that standard deviation
+
+
+def parallax_of(
+    data: Data, model: Model, noise: Noise, inlier: Bool[Array, "view"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Variance over the tracks of e/D, and the standard deviation of that; NaN with few tracks.
+
+    Args:
+        data: the tracks.
+        model: fitted to them.
+        noise: of the residuals.
+        inlier: views that count.
+    """
+    tracks, track = data.structure.tracks, data.structure.track
+    none = jnp.zeros(tracks)
+    missed, pattern = jax.jvp(lambda lever: residuals_of(data, model, lever), (none,), (none + 1,))
+    turned = jnp.stack([-pattern[:, 1], pattern[:, 0]], axis=1)
+    own = _by_rays(data, model, noise)
+    there = inlier[:, None]
+    basis = _smooth(data, model, inlier)
+
+    def variance(pattern):
+        views = [jnp.where(there, of, 0) for of in (missed, pattern, *own)]
+        slopes = _slopes(views, noise, track, tracks)
+        slopes = _rough(slopes, basis)
+        usual = (slopes.weight > 0) & (slopes.value**2 < _WILD**2)
+        weight = jnp.where(usual, slopes.weight**2, 0)
+        total, more = jnp.sum(weight**2), jnp.where(usual, slopes.value**2 - 1, 0)
+        excess = jnp.sum(weight * more) / total
+        scatter = jnp.sum((weight * (more - excess * weight)) ** 2) / total**2
+        return excess, scatter, jnp.sum(usual)
+
+    (along, one, count), (across, two, _) = variance(pattern), variance(turned)
+    few = count < _FEWEST
+    found, std = along - jnp.maximum(across, 0), jnp.sqrt(one + two)
+    return jnp.where(few, jnp.nan, found), jnp.where(few, jnp.nan, std)
+
+
+def _by_rays(data, model, noise):
+    """How views move with the two numbers of their rays."""
+    units = units_of(data, model, noise)
+    still = jax.tree.map(jnp.zeros_like, units)
+
+    def seen(rays):
+        return residuals_of(data, moved(model, Unknowns(still.frames, rays, still.lens)))
+
+    along = [jnp.zeros_like(units.rays).at[:, axis].set(units.rays[:, axis]) for axis in (0, 1)]
+    return [jax.jvp(seen, (still.rays,), (direction,))[1] for direction in along]
+
+
+def _slopes(views, noise, track, tracks):
+    """Of residuals along a pattern, where rays are free: a Gauss-Newton step of each track."""
+    missed, pattern, first, second = views
+
+    def dot(one, other):
+        return jax.ops.segment_sum(jnp.sum(one * other, axis=1), track, tracks)
+
+    def without(of, length, ray):
+        factor = jnp.where(length > 0, dot(of, ray) / jnp.where(length > 0, length, 1), 0)
+        return of - factor[track][:, None] * ray
+
+    second = without(second, dot(first, first), first)
+    for ray in (first, second):
+        pattern = without(pattern, dot(ray, ray), ray)
+        missed = without(missed, dot(ray, ray), ray)
+    weight = jnp.sqrt(dot(pattern, pattern)) / noise.points
+    value = -dot(pattern, missed) / jnp.where(weight > 0, weight, 1) / noise.points**2
+    return _Slopes(jnp.where(weight > 0, value, 0), weight)
+
+
+def _smooth(data, model, inlier):
+    """Functions of where in the image and in the zoom a track lies, (track, function)."""
+    track, tracks = data.structure.track, data.structure.tracks
+
+    def mean(of):
+        count = jax.ops.segment_sum(1.0 * inlier, track, tracks)
+        return jax.ops.segment_sum(jnp.where(inlier, of, 0), track, tracks) / jnp.maximum(count, 1)
+
+    radius = mean(jnp.sum((data.points / data.scale) ** 2, axis=1))
+    focal = jnp.exp(model.path.log_focal)[data.structure.frame]
+    u = mean(jnp.min(focal, where=inlier, initial=jnp.inf) / focal)
+    return jnp.stack([radius**i * u**j for i in range(3) for j in range(3)], axis=1)
+
+
+def _rough(slopes, basis):
+    """Slopes without what the functions explain."""
+    usual = jnp.where(slopes.value**2 < _WILD**2, slopes.weight, 0)
+    rows = usual[:, None] * basis
+    normal = rows.T @ rows
+    right = rows.T @ jnp.where(usual > 0, slopes.value, 0)
+    found = jnp.linalg.solve(normal + 1e-9 * jnp.trace(normal) * jnp.eye(len(normal)), right)
+    return slopes._replace(value=slopes.value - slopes.weight * (basis @ found))
