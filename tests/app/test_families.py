@@ -100,6 +100,24 @@ def test_auto_takes_the_family_of_least_error_and_says_so(lines):
     assert names == ["degree 1, 1 term", "Division, degree 1, 1 term", "BrownConrady, degree 1, 1 term"]
 
 
+@pytest.mark.slow
+def test_without_a_word_the_division_model_competes_for_strong_lenses_alone(lines, barrel):
+    """It has its own centre, and its own judgement of lines."""
+    done = calibrate(lines, model=wanted(None), centre="fit", robust=True)
+    names = [verdict.candidate.name for verdict in done.selection.verdicts]
+    assert names == ["degree 1, 1 term", "Division, degree 1, 1 term"]
+    assert done.selection.chosen.name == names[1]
+    assert done.centre.how == "fitted"
+    assert done.rejected.mean() < 0.1
+    assert farthest(done.zoom.lens, barrel) < 1.0
+
+    focal = np.array([21.0, 25.0, 33.0, 48.0, 80.0])
+    weak = scenes.board_lines(scenes.nikkor_18_200(SIZE), focal, spacing=150, noise=0.1)
+    plain = calibrate(weak, model=wanted(None), centre="image")
+    assert plain.selection is None
+    assert isinstance(plain.zoom.lens.family, zj.models.RadialPolynomial)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -1,10 +1,11 @@
 """Detection of flat grids, checkerboards and dots, of unknown numbers of rows and columns.
 
 Checkerboards: a board grows from the corners that are there (`_saddles`), whatever part of it is outside of
-the image. Where all of it is seen, OpenCV's sector-based search for a board of its size places the corners.
-Where much of it is missing, or no board has grown, that search also lets a board grow from a small start
-while whole rows and columns are found; how far it gets depends on the scale of the image, so that it runs at
-several, and the largest board counts. What is found must be dark and bright in turn, or else it is no board.
+the image. Where all of it is seen, OpenCV's sector-based search for a board of its size places the
+corners. Where much of it is missing, or no board has grown, that search also lets a board grow from a small
+start while whole rows and columns are found; how far it gets depends on the scale of the image, so that it
+runs at several, and the largest board counts. What is found must be dark and bright in turn, or else it is
+no board.
 
 Dots: the image less its background is cut at Otsu's threshold into spots. From one spot the grid grows,
 neighbour by neighbour (`_growth`). A spot's position is the centroid of its contrast.
