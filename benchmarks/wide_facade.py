@@ -1,8 +1,8 @@
 """The facade on which the paper's authors show their program: what is found by everything automatic.
 
-The edges of the facade are labelled by hand in wide_labels.json, looked at one by one in an enlarged picture:
-each has points along it, px, and some are doubtful (the foot of the wall, where stains and dirt are as long as
-the edge). A line found is right if all of its points are near one labelled edge.
+The edges of the facade are labelled by hand in wide_labels.json, looked at one by one in an enlarged
+picture: each has points along it, px, and some are doubtful (the foot of the wall, where stains and dirt
+are as long as the edge). A line found is right if all of its points are near one labelled edge.
 """
 
 import json
@@ -19,16 +19,23 @@ import numpy as np
 
 import zoomjax as zj
 from zoomjax.app.calibration import calibrate
-from zoomjax.detect.batch import _thinned
+from zoomjax.detect.batch import detect
 from zoomjax.detect.edges import EdgeDetector
+from zoomjax.detect.sources import find_photos
 from zoomjax.models.division import Division
 
 RADII = np.array([0.2, 0.4, 0.6, 0.8, 0.9, 1.0])
 """Of the way to the corner."""
 
 _LABELS = Path(__file__).with_name("wide_labels.json")
+_SIZE = (1072, 712)
+"""Of the photo, px."""
+
 _NEAR = 3.0
 """px from a labelled edge."""
+
+_SETTINGS = ("0.8", "0.0", "3.0", "3.0", "10.0")
+"""Of the authors' program: Canny's high threshold, the range of distortion, and two tolerances."""
 
 
 def facade(folder: Path, program: Path | None) -> dict:
@@ -43,8 +50,8 @@ def facade(folder: Path, program: Path | None) -> dict:
         start = time.process_time()
         edges = detector.find(image)
         times.append(time.process_time() - start)
-    theirs = primitives(folder / "primitives.txt")
-    own = list(_thinned(edges.lines))
+    theirs = primitives(folder / "primitives.txt", size[1])
+    own = list(next(detect(find_photos([path]), detector)).lines)
     best = {who: _by_default(lines, size) for who, lines in (("theirs", theirs), ("own", own))}
     result: dict[str, Any] = {
         "lines": len(edges.lines),
@@ -122,9 +129,8 @@ def straightness(lines: Sequence[np.ndarray], distortion: Any) -> float:
 
 
 def _figures(distortion: Any, theirs: Sequence[np.ndarray]) -> dict[str, Any]:
-    size = (1072, 712)
     return {
-        "displacement_px": displacements(distortion, size).tolist(),
+        "displacement_px": displacements(distortion, _SIZE).tolist(),
         "straightness_px": straightness(theirs, distortion),
     }
 
@@ -155,13 +161,14 @@ def _distance(points: np.ndarray, polyline: np.ndarray) -> np.ndarray:
     return np.linalg.norm(offset - share[..., None] * step, axis=-1).min(axis=1)
 
 
-def primitives(path: Path) -> list[np.ndarray]:
-    """The points of the lines in an output file of the authors' program."""
+def primitives(path: Path, height: int) -> list[np.ndarray]:
+    """The points of the lines in an output file of the authors' program, which counts rows from below."""
     lines = []
     for block in path.read_text().split("line points :")[1:]:
         values = block.split()
         number = int(values[0])
-        lines.append(np.array(values[1 : 1 + 2 * number], float).reshape(number, 2))
+        points = np.array(values[1 : 1 + 2 * number], float).reshape(number, 2)
+        lines.append(np.stack([points[:, 0], height - 1 - points[:, 1]], axis=-1))
     return lines
 
 
@@ -171,14 +178,7 @@ def run_program(program: Path, image: Path, model: str, theirs: Sequence[np.ndar
         (inputs := Path(folder, "in")).mkdir()
         (outputs := Path(folder, "out")).mkdir()
         (inputs / image.name).symlink_to(image)
-        command = [
-            str(program),
-            f"{inputs}/",
-            f"{outputs}/",
-            *"0.8 0.0 3.0 3.0 10.0".split(),
-            model,
-            "True",
-        ]
+        command = [str(program), f"{inputs}/", f"{outputs}/", *_SETTINGS, model, "True"]
         before = _child_time()
         subprocess.run(command, check=True, capture_output=True)
         spent = _child_time() - before
@@ -186,6 +186,7 @@ def run_program(program: Path, image: Path, model: str, theirs: Sequence[np.ndar
     numbers = re.findall(r"= *\(?([-+.\deE]+)(?: +([-+.\deE]+)\))?", text.split("NUMBER OF LINES")[0])
     centre = np.array(numbers[0], float)
     k = np.array([first for first, _ in numbers[3:]], float)
+    centre[1] = _SIZE[1] - 1 - centre[1]
     lens = _Theirs(centre, k, division=model == "div")
     lines = int(re.search(r"NUMBER OF LINES = (\d+)", text)[1])  # pyright: ignore[reportOptionalSubscript]
     return _figures(lens, theirs) | {"lines": lines, "cpu_s": spent, "centre_px": centre.tolist()}

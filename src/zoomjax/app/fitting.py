@@ -24,6 +24,9 @@ from ..trust.centre_choice import choose_centre
 from ..trust.selection import Candidate, Selection
 from .model_choice import STRONG, CentreFound, WantedModel
 
+_TURNS = 2
+"""How often centre and weights of the lines are found in turn, at most."""
+
 
 class Fitted(NamedTuple):
     """The fits of a calibration, and what they are made from.
@@ -110,8 +113,8 @@ def _about_centre(
     small = held.about(held.centre)
     if robust:
         stage("Rejecting lines that are not straight")
-        small = reweighted(small, model.zoom, model.terms)[0]
-        held = held.weighted(np.asarray(small.weight))
+        weight = _weights(held, model)
+        small, held = small.weighted(weight), held.weighted(weight)
     selection = None
     if choose:
         stage("Choosing the model")
@@ -132,6 +135,25 @@ def _about_centre(
     if found is None or not found.determined:
         return _Centred(small, model, how, selection, None)
     return _Centred(held.about(found.fit.lens.centre), model, how, selection, found.fit)
+
+
+def _weights(held: CompressedLines | AnyCentreLines, model: Candidate) -> np.ndarray:
+    """The weights of the lines about their centre, or about one fitted to them, whichever keeps more.
+
+    About a centre that is far from the lens's, straight lines look bent, the longest ones most.
+    """
+
+    def about(centre: Any) -> np.ndarray:
+        return np.asarray(reweighted(held.about(centre), model.zoom, model.terms)[0].weight)
+
+    best, tried = about(held.centre), held
+    for _ in range(_TURNS if isinstance(held, AnyCentreLines) and not best.all() else 0):
+        found = fit_centre(tried, zoom=model.zoom, terms=model.terms, throw=False)
+        other = about(found.fit.lens.centre)
+        if not found.determined or other.sum() <= best.sum():
+            break
+        best, tried = other, held.weighted(other)
+    return best
 
 
 def _is_strong(wanted: WantedModel, found: _Centred, stage: Callable[[str], None]) -> bool:
