@@ -237,8 +237,8 @@ def _board_page(plate: dict) -> list[str]:
         f"have {', '.join(map(str, plate['corners']))} corners. {plate['lines']['edges']} lines from edges "
         f"and {plate['lines']['grids']} rows and columns from grids, of which {plate['rejected']['edges']} "
         f"and {plate['rejected']['grids']} are rejected; RMS {plate['rms_px']['edges']:.2f} and "
-        f"{plate['rms_px']['grids']:.2f} px. The centre is fitted: {middle['edges']} and {middle['grids']} px, "
-        f"that of `cv2.calibrateCamera` on the whole boards is ({x:.1f}, {y:.1f}) px. Between the "
+        f"{plate['rms_px']['grids']:.2f} px. The centre is fitted: {middle['edges']} and {middle['grids']} "
+        f"px, that of `cv2.calibrateCamera` on the whole boards is ({x:.1f}, {y:.1f}) px. Between the "
         "corrections are, px, up to a homography, on the corners of the whole boards and on all that are "
         "seen:",
         "",

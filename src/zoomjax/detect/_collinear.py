@@ -47,9 +47,9 @@ _TURN = 0.02
 _GAP = 2.5
 """Longest gap, in lengths of what is visible of the shorter side of it."""
 
-_LONG_GAP = 0.06
-"""Of the image's shorter side: by no more a gap exceeds what is visible. Farther off, edges of other things
-are on the same line by chance: that of a window, and that of a pier below it."""
+_LONG_GAP = (0.06, 40.0)
+"""Of the image's shorter side, and px; the larger counts: by no more a gap exceeds what is visible. Farther
+off, edges of other things are on the same line by chance: that of a window, and that of a pier below it."""
 
 _CORNER = 4.0
 """px that an edge loses at each end where it meets another: near corners there are no edge points."""
@@ -117,10 +117,11 @@ def collinear(pieces: Fragments, model: OneFrame, sigma: float) -> np.ndarray:
     straight = np.flatnonzero(roughness < max(2 * sigma, _ROUGH))
     units = _Units(*(getattr(units, field.name)[straight] for field in dataclasses.fields(_Units)))
     group = np.arange(len(straight))
+    long = max(_LONG_GAP[0] * min(model.image_size), _LONG_GAP[1])
     for nearest in _ROUNDS:
         whole = _merged(units, group)
         pairs = _neighbours(whole, nearest) if nearest else _aligned(whole, sigma)
-        group = _joined(whole, *_ordered(whole, *pairs), sigma, _LONG_GAP * min(model.image_size))[group]
+        group = _joined(whole, *_ordered(whole, *pairs), sigma, long)[group]
     label = np.full(len(pieces.count), -1)
     label[straight] = _checked(units, group, sigma)
     alone = label < 0
