@@ -39,6 +39,9 @@ NUMBERS = (16, 24, 32, 48, 64)
 POINTS = 64
 """Points of each of them."""
 
+TOGETHER = 60
+"""Scenes after which compiled programs are forgotten: a process can hold so many of them."""
+
 SIZE = (1280, 720)
 
 
@@ -289,6 +292,8 @@ def measure(name: str, given: argparse.Namespace, data: Path, measured: dict) ->
             rows[seed] = rendered(seed)
             print(rows[seed], flush=True)
             keep(sorted(rows.values(), key=lambda row: row["seed"]))
+            if seed % TOGETHER == TOGETHER - 1:
+                jax.clear_caches()
 
 
 if __name__ == "__main__":

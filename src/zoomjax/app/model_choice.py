@@ -190,8 +190,8 @@ class WantedModel:
     def is_beyond(self, fit: ZoomFit) -> bool:
         """Whether a fit of the radial polynomial is to compete with the division model.
 
-        It is where it moves a corner outwards by more than `_STRONG` of the way, or folds: a polynomial
-        follows such lenses with many terms only.
+        It is where it moves a corner by more than `_STRONG` of the way, or folds: a polynomial follows such
+        lenses with many terms only.
         """
         if self.family is not None or self.model == "smooth":
             return False
@@ -200,7 +200,7 @@ class WantedModel:
         last = np.array(lens.image_size) - 1
         corner = np.where(centre > last / 2, 0.0, last)
         moved = outward(lens, corner, [float(f) for f in lens.focal_range])
-        return not bool(np.max(moved) < _STRONG * np.hypot(*(corner - centre)))
+        return not bool(np.max(abs(moved)) < _STRONG * np.hypot(*(corner - centre)))
 
     def _terms(self, lines: Any) -> list[int]:
         """Numbers of coefficients, the first of which the zoom models are compared with."""
