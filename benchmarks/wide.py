@@ -267,8 +267,9 @@ def _rendered_page(rows: list[dict]) -> list[str]:
         f"5 %, calibrated as by `zoomjax calibrate` without options: the lens is within {WITHIN} px RMS of "
         f"the image of the true one, up to a homography, in {of['within']} of {of['scenes']} "
         f"({of['within'] / of['scenes']:.1%}); median {of['median_px']:.2f} px. {said} False alarms: "
-        f"{of['alarms']} of {of['within']}. The true lens is of the division model with one term, which is "
-        "one of those that are compared; real lenses are of none exactly. Of each scene's lines the longest "
+        f"{of['alarms']} of {of['within']}. The true lens is of the "
+        "division model with one term, which is one of those that are compared; real lenses are of none "
+        "exactly. Of each scene's lines the longest "
         f"{', '.join(map(str, NUMBERS[:-1]))} or {NUMBERS[-1]} are fitted.",
         "",
         *table(
