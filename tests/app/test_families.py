@@ -100,6 +100,40 @@ def test_auto_takes_the_family_of_least_error_and_says_so(lines):
     assert names == ["degree 1, 1 term", "Division, degree 1, 1 term", "BrownConrady, degree 1, 1 term"]
 
 
+@pytest.mark.slow
+def test_lines_are_judged_about_a_centre_that_they_determine(barrel):
+    """About the image's, which is far from the lens's, the longest of them look bent."""
+    off = zj.ZoomLens(
+        barrel.zoom,
+        barrel.centre + jnp.array([25.0, -45.0]),
+        barrel.focal_range,
+        SIZE,
+        family=barrel.family,
+    )
+    some = scenes.board_lines(off, FOCAL, spacing=150, noise=0.02)
+    done = calibrate(some, model=wanted(None), centre="fit", robust=True)
+    assert done.rejected.mean() < 0.05
+    np.testing.assert_allclose(done.centre.centre, off.centre, atol=1.0)
+
+
+@pytest.mark.slow
+def test_without_a_word_the_division_model_competes_for_strong_lenses_alone(lines, barrel):
+    """It has its own centre, and its own judgement of lines."""
+    done = calibrate(lines, model=wanted(None), centre="fit", robust=True)
+    names = [verdict.candidate.name for verdict in done.selection.verdicts]
+    assert names == ["degree 1, 1 term", "Division, degree 1, 1 term"]
+    assert done.selection.chosen.name == names[1]
+    assert done.centre.how == "fitted"
+    assert done.rejected.mean() < 0.1
+    assert farthest(done.zoom.lens, barrel) < 1.0
+
+    focal = np.array([21.0, 25.0, 33.0, 48.0, 80.0])
+    weak = scenes.board_lines(scenes.nikkor_18_200(SIZE), focal, spacing=150, noise=0.1)
+    plain = calibrate(weak, model=wanted(None), centre="image")
+    assert plain.selection is None
+    assert isinstance(plain.zoom.lens.family, zj.models.RadialPolynomial)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -7,7 +7,8 @@ from PIL import ExifTags, Image
 from zoomjax.app.calibration import calibrate
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.plane_focals import FocalGroup
-from zoomjax.app.verdict import findings_of_focals, findings_of_photos
+from zoomjax.app.verdict import findings_of_edges, findings_of_focals, findings_of_photos
+from zoomjax.detect.batch import Detection
 
 
 def photo(path, model=None, lens=None):
@@ -62,3 +63,14 @@ def test_photos_that_disagree_about_a_shared_focal_length_are_doubtful():
     assert "1,800 to 2,100 px" in one.found
     [both] = findings_of_focals([agree, near, far], "px")
     assert both.found == far.sentence("px") + " Another group disagrees, too."
+
+
+def test_photos_whose_strong_edges_are_on_no_line_are_remarked_on():
+    """Not those of a detector that does not look at all edges, and not a few among many."""
+    photos = [Detection(f"{n}.jpg", unexplained=share) for n, share in enumerate((0.2, 0.7, 0.9))]
+    (found,) = findings_of_edges(photos)
+    assert (found.about, found.verdict) == ("edges without lines", "good")
+    assert "2 of 3 photos" in found.found
+    assert "90% in 2.jpg" in found.found
+    assert findings_of_edges([*photos[:2], Detection("a.jpg", unexplained=0.1)]) == []
+    assert findings_of_edges([Detection("grid.jpg")]) == []

@@ -82,6 +82,97 @@ def test_corners_of_a_board_are_found_where_they_are(pose, k):
     assert rms(found - seen(pose, k, nodes())) < 0.05
 
 
+PARTLY = {
+    "left": np.array([[30.0, 0, -50], [2, 30, 41.5], [0, 0, 1]]),
+    "corner": np.array([[40.0, 3, 150], [-2, 40, 120.5], [0, 0, 1]]),
+    "turned": np.array([[36.0, 30, -60], [-30, 36, 130.5], [0, 0, 1]]),
+    "oblique": np.array([[40.0, -4, -60], [5, 40, -50], [0.012, 0.008, 1]]),
+}
+
+
+def matched(found, truth):
+    """The true corner nearest to each one found."""
+    offset = np.linalg.norm(found[:, None] - truth[None], axis=-1)
+    assert len(set(offset.argmin(axis=1).tolist())) == len(found)
+    return truth[offset.argmin(axis=1)]
+
+
+@lenses
+@pytest.mark.parametrize("pose", PARTLY.values(), ids=PARTLY)
+def test_a_board_partly_outside_of_the_image_is_found_as_far_as_it_is_seen(pose, k):
+    """Every corner well within the image, where it is, and rows and columns that are those of the board."""
+    image = rendered(squares, pose, k)
+    grid = find_checkerboard(image)
+    assert grid is not None
+    truth = np.nan_to_num(seen(pose, k, nodes()).reshape(-1, 2), nan=-1e6)  # beyond the lens's fold
+    depth = np.minimum(truth, np.subtract(SIZE, 1) - truth).min(axis=1)
+    found = grid[np.isfinite(grid[..., 0])]
+    assert (depth > 8).sum() <= len(found) <= (depth > 0).sum() < ROWS * COLUMNS
+    assert rms(found - matched(found, truth)) < 0.1
+    place = {tuple(corner): divmod(index, COLUMNS) for index, corner in enumerate(truth.tolist())}
+    for axis in (0, 1):
+        for line in grid.swapaxes(0, axis):
+            points = line[np.isfinite(line[:, 0])]
+            there = (
+                np.array([place[tuple(p)] for p in matched(points, truth).tolist()]) if len(points) else []
+            )
+            assert len(points) < 2 or 0 in np.ptp(there, axis=0)
+
+
+def charuco(ratio):
+    """Like `squares`, with a marker of so much of its side in each white square."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
+    board = cv2.aruco.CharucoBoard((COLUMNS + 1, ROWS + 1), 1.0, ratio, dictionary)
+    side = 120  # pixels of a square: each bit of a marker has whole ones
+    image = board.generateImage(((COLUMNS + 1) * side, (ROWS + 1) * side), marginSize=0)
+
+    def pattern(places):
+        i, j = np.moveaxis(np.floor((places + 1) * side).astype(int), -1, 0)
+        inside = (i >= 0) & (j >= 0) & (i < image.shape[1]) & (j < image.shape[0])
+        shown = image[np.clip(j, 0, image.shape[0] - 1), np.clip(i, 0, image.shape[1] - 1)] / 255
+        return np.where(inside, shown, 1.0)
+
+    return pattern
+
+
+@pytest.mark.parametrize("ratio", [0.5, 0.75])
+@lenses
+@pytest.mark.parametrize("pose", [OBLIQUE, PARTLY["corner"]], ids=["whole", "partly"])
+def test_boards_with_markers_are_found_without_their_dictionary(pose, k, ratio):
+    """ChArUco boards: corners of squares, and none of markers."""
+    grid = find_checkerboard(rendered(charuco(ratio), pose, k))
+    assert grid is not None
+    truth = np.nan_to_num(seen(pose, k, nodes()).reshape(-1, 2), nan=-1e6)
+    depth = np.minimum(truth, np.subtract(SIZE, 1) - truth).min(axis=1)
+    found = grid[np.isfinite(grid[..., 0])]
+    assert len(found) >= 0.9 * (depth > 8).sum()
+    assert rms(found - matched(found, truth)) < 0.15
+
+
+def test_hidden_corners_are_nan_and_the_board_grows_around_them():
+    image = rendered(squares, OBLIQUE)
+    truth = mapped(OBLIQUE, nodes())
+    hidden = truth[2:5, 4:6].reshape(-1, 2)
+    middle = tuple(np.rint(hidden.mean(axis=0)).astype(int).tolist())
+    covered = cv2.circle(image, middle, 50, 128, -1)
+    grid = find_checkerboard(covered)
+    assert grid.shape == (ROWS, COLUMNS, 2)
+    far = np.linalg.norm(truth - middle, axis=-1)
+    assert np.isnan(grid[far < 48]).all()
+    assert np.isfinite(grid[far > 60]).all()
+    assert rms((grid - truth)[far > 60]) < 0.1
+
+
+def test_no_corner_is_passed_over(data):
+    """A board of which OpenCV's search skips columns, and one whose last row is outside in part."""
+    for name, least in (("calibration1", 47), ("calibration5", 53)):
+        grid = find_checkerboard(cv2.imread(str(data / "wide" / "board" / f"{name}.jpg")))
+        assert grid.shape == (6, 9, 2)
+        assert np.isfinite(grid[..., 0]).sum() >= least
+        for rest in (np.diff(grid, n=2, axis=0), np.diff(grid, n=2, axis=1)):
+            assert np.nanmax(abs(rest)) < 20  # px: steps are 80 to 130, and change slowly
+
+
 @pytest.mark.parametrize("bright", [False, True])
 @lenses
 @poses
@@ -163,6 +254,7 @@ def test_dots_cut_by_the_images_edge_do_not_count():
 def test_corners_found_only_in_a_smaller_image_are_where_they_are(monkeypatch):
     search = module._search
     monkeypatch.setattr(module, "_SCALES", (0.75,))
+    monkeypatch.setattr(module, "grown_board", lambda grey: None)
     monkeypatch.setattr(
         module, "_search", lambda grey, size, flags: search(grey, size, flags) if flags else None
     )
@@ -175,6 +267,7 @@ def test_corners_found_only_in_a_smaller_image_are_where_they_are(monkeypatch):
 def test_corners_found_in_a_smaller_image_are_sharpened_in_the_full_one(monkeypatch):
     full = find_checkerboard(rendered(squares, OBLIQUE))
     monkeypatch.setattr(module, "_SCALES", (0.75,))
+    monkeypatch.setattr(module, "grown_board", lambda grey: None)
     np.testing.assert_allclose(find_checkerboard(rendered(squares, OBLIQUE)), full, atol=1e-3)
 
 

@@ -45,10 +45,11 @@ Terms = Annotated[
     ),
 ]
 Family = Annotated[
-    Literal["radial", "division", "brown-conrady", "auto"],
+    Literal["radial", "division", "brown-conrady", "auto"] | None,
     typer.Option(
         help="Distortion model: radial (polynomial), division (strong barrel distortion), brown-conrady "
-        "(the polynomial with decentering) or auto (of least cross-validation error).",
+        "(the polynomial with decentering) or auto (of least cross-validation error). Default: radial; of "
+        "a strong lens, that of radial and division.",
         rich_help_panel=FIT,
     ),
 ]

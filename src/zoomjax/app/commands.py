@@ -151,7 +151,7 @@ def calibrate(
     model: ModelName = None,
     degree: Degree = None,
     terms: Terms = None,
-    family: Family = "radial",
+    family: Family = None,
     centre: Centre = None,
     robust: Annotated[
         bool,
@@ -165,8 +165,8 @@ def calibrate(
     detector: Annotated[
         Detector,
         typer.Option(
-            help="What to detect in images: edges (any straight edges), grid (checkerboards and dot grids) "
-            "or pitch (markings of a sports pitch).",
+            help="What to detect in images: edges (any straight edges), grid (checkerboards, ChArUco "
+            "boards, dot grids) or pitch (markings of a sports pitch).",
             rich_help_panel=INPUT,
         ),
     ] = "edges",

@@ -19,11 +19,15 @@ from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines, compress
 from ..lines.free_centre import AnyCentreLines, compress_any_centre
 from ..lines.lines import Lines
+from ..models.family import AbstractRadial
 from ..models.model import Model
 from ..models.polynomial import RadialPolynomial
 from ..trust.centre_choice import choose_centre
 from ..trust.selection import Selection
-from .model_choice import CentreFound, WantedModel
+from .model_choice import STRONG, CentreFound, WantedModel
+
+_TURNS = 2
+"""How often centre and weights of the lines are found in turn, at most."""
 
 
 class Fitted(NamedTuple):
@@ -58,35 +62,33 @@ def fitted(
 
     The model is chosen about the given centre, the centre fitted with it, and the model then chosen again:
     mostly it is the same, and one fit, which takes its time to compile, has been enough. Another distortion
-    model than the radial polynomial is fitted about the centre found with that.
+    model than the radial polynomial starts from there, and has its own centre and weights of lines.
     """
     wanted.check_centre(centre)
     radial = dataclasses.replace(wanted, family="radial")
     model = radial.base(lines.focal)
     ready_model(lines, model)  # raises if there are too few focal lengths, before any work
-    found = _about_centre(lines, radial, centre, robust, wanted.family in ("radial", "auto"), stage)
-    small: AbstractLines = found.lines
-    model, selection, zoom = found.model, found.selection, found.zoom
-    if wanted.family != "radial":
-        small, model, selection = _under_family(lines, wanted, found, robust, stage)
-        zoom = None
+    found = _about_centre(lines, radial, centre, robust, wanted.family in (None, "radial", "auto"), stage)
+    if wanted.family not in (None, "radial") or _is_strong(wanted, found, stage):
+        found = _under_family(lines, wanted, found, centre, robust, stage)
+    small, model, zoom = found.lines, found.model, found.zoom
     stage("Fitting the zoom model")
     if zoom is None:
         zoom = fit_zoom(small, zoom=model)
     stage("Fitting each frame separately")
     each = fit_frames(small, terms=model.terms, throw=False)
-    return Fitted(zoom, each, small, model, found.centre, selection)
+    return Fitted(zoom, each, small, model, found.centre, found.selection)
 
 
 class _Centred(NamedTuple):
-    """Lines about the centre of distortion, and the model under the radial polynomial.
+    """Lines about the centre of distortion, and the model.
 
     Attributes:
         lines, model, centre, selection: as of `Fitted`.
-        zoom: the fit, where the centre was fitted with it.
+        zoom: the fit, where there is one.
     """
 
-    lines: CompressedLines
+    lines: AbstractLines
     model: Model
     centre: CentreFound
     selection: Selection | None
@@ -111,8 +113,8 @@ def _about_centre(
     small = held.about(held.centre)
     if robust:
         stage("Rejecting lines that are not straight")
-        small = reweighted(small, model)[0]
-        held = held.weighted(np.asarray(small.weight))
+        weight = _weights(held, model)
+        small, held = small.weighted(weight), held.weighted(weight)
     selection = None
     if choose:
         stage("Choosing the model")
@@ -135,39 +137,89 @@ def _about_centre(
     return _Centred(held.about(found.fit.lens.centre), model, how, selection, found.fit)
 
 
-def _under_family(
-    lines: Lines, wanted: WantedModel, found: _Centred, robust: bool, stage: Callable[[str], None]
-) -> tuple[AbstractLines, Model, Selection | None]:
-    """The lines, the model and its choice under another distortion model, or the best of all of them.
+def _weights(held: CompressedLines | AnyCentreLines, model: Model) -> np.ndarray:
+    """The weights of the lines about their centre, or about one fitted to them, whichever keeps more.
 
-    About the centre that was found. Weights are those under the distortion model itself where it is given:
-    lines that one zoom model cannot follow may be straight under another, so that they are judged again by
-    the one chosen.
+    About a centre that is far from the lens's, straight lines look bent, the longest ones most.
+    """
+
+    def about(centre: Any) -> np.ndarray:
+        return np.asarray(reweighted(held.about(centre), model)[0].weight)
+
+    best, tried = about(held.centre), held
+    for _ in range(_TURNS if isinstance(held, AnyCentreLines) and not best.all() else 0):
+        found = fit_centre(tried, zoom=model, throw=False)
+        other = about(found.fit.lens.centre)
+        if not found.determined or other.sum() <= best.sum():
+            break
+        best, tried = other, held.weighted(other)
+    return best
+
+
+def _is_strong(wanted: WantedModel, found: _Centred, stage: Callable[[str], None]) -> bool:
+    """Whether the polynomial is to compete with the division model."""
+    if wanted.family is not None:
+        return False
+    zoom = found.zoom
+    if zoom is None:
+        stage("Fitting the zoom model")
+        zoom = fit_zoom(found.lines, zoom=found.model, throw=False)
+    return wanted.is_beyond(zoom)
+
+
+def _under_family(
+    lines: Lines,
+    wanted: WantedModel,
+    found: _Centred,
+    centre: CentreArgument | None,
+    robust: bool,
+    stage: Callable[[str], None],
+) -> _Centred:
+    """The same under another distortion model, or under the best of them.
+
+    Lines that one model cannot follow may be straight under another: those that either keeps are compared,
+    and the model chosen judges them by itself.
     """
     model, selection = found.model, found.selection
-    placed = _widest(lines).about(found.lines.centre)
-    if wanted.family == "auto":
+    placed = whole = _widest(lines).about(found.lines.centre)
+    judge = None
+    if wanted.family in (None, "auto"):
         stage("Choosing the distortion model")
-        if found.lines.weight is not None:
-            placed = placed.weighted(np.asarray(found.lines.weight))
         compared = [v.candidate for v in selection.verdicts] if selection else [model]
-        selection = wanted.choose_family(placed, model, compared)
+        selection = wanted.choose_family(_kept_by_either(whole, wanted, found, robust), model, compared)
         model = selection.chosen
+        if isinstance(model.family, RadialPolynomial):
+            return found._replace(model=model, selection=selection, zoom=None)
     else:
-        whole, model = placed, wanted.base(lines.focal)
-        if robust:
-            stage("Rejecting lines that are not straight")
-            placed = _straight(whole, model)
+        model = wanted.base(lines.focal)
         if wanted.automatic:
+            if robust:
+                stage("Rejecting lines that are not straight")
+                placed, judge = _straight(whole, model), model
             stage("Choosing the model")
             selection = wanted.choose_in_family(placed)
-            if robust and selection.chosen.name != model.name:
-                stage("Rejecting lines that are not straight")
-                placed = _straight(whole, selection.chosen)
             model = selection.chosen
-    if isinstance(model.family, RadialPolynomial):
-        return found.lines, model, selection
-    return compress_family(placed, model.family, terms=model.terms), model, selection
+    if robust and (judge is None or judge.name != model.name):
+        stage("Rejecting lines that are not straight")
+        placed = _straight(whole, model)
+    how = found.centre
+    if isinstance(centre, str) and centre == "fit" and isinstance(model.family, AbstractRadial):
+        stage("Fitting the centre of distortion")
+        own = fit_centre(placed, zoom=model, throw=False)
+        if own.determined:
+            how = CentreFound.of(lines, None, own)
+            placed = placed.about(own.fit.lens.centre)
+            placed = _straight(placed, model) if robust else placed
+    return _Centred(compress_family(placed, model.family, terms=model.terms), model, how, selection, None)
+
+
+def _kept_by_either(lines: Lines, wanted: WantedModel, found: _Centred, robust: bool) -> Lines:
+    """The lines, each with the larger of its weights under the polynomial and the division model."""
+    if not robust or found.lines.weight is None:
+        return lines
+    model = wanted.base(lines.focal)
+    other = _straight(lines, dataclasses.replace(model, family=STRONG))
+    return lines.weighted(np.maximum(np.asarray(other.weight), np.asarray(found.lines.weight)))
 
 
 def _straight(lines: Lines, model: Model) -> Lines:

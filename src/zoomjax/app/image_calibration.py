@@ -25,7 +25,7 @@ from .image_job import ImageJob, overlay_name
 from .overlay import draw_lines
 from .plane_focals import Sharing
 from .results_folder import OF_A_LENS, results_folder
-from .verdict import findings_of_focals, findings_of_photos
+from .verdict import findings_of_edges, findings_of_focals, findings_of_photos
 
 MOST_OVERLAYS = 200
 """Images drawn with their lines, unless all are asked for."""
@@ -75,6 +75,7 @@ class ImageCalibration:
                 "focal_sigma": self.focals.deviation.get(detection.name),
                 "lines": len(detection.lines),
                 "rejected": int(rejected.sum()),
+                "unexplained": detection.unexplained,
             }
             for detection, rejected in zip(self.used, self.rejected(), strict=True)
         ]
@@ -276,7 +277,7 @@ def _with_equipment(done: ImageCalibration) -> ImageCalibration:
 
 def _with_findings(done: ImageCalibration) -> ImageCalibration:
     """The same with what the photos and their focal lengths say about themselves in the verdict."""
-    found = findings_of_focals(done.focals.groups, done.focals.unit)
+    found = findings_of_focals(done.focals.groups, done.focals.unit) + findings_of_edges(done.used)
     if done.job.video is None:
         found += findings_of_photos(Path(detection.file) for detection in done.used)
     assessment = done.calibration.assessment.joined_by(found)

@@ -8,6 +8,7 @@ import numpy as np
 
 from .._core.checks import checked_terms
 from ..fit.centre import CentreFit
+from ..fit.result import ZoomFit
 from ..fit.zoom import CentreArgument
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
@@ -24,6 +25,7 @@ from ..models.zoom import AbstractZoom, PolynomialZoom
 from ..trust.centre_choice import CentreChoice
 from ..trust.selection import Selection, select_model
 from ..trust.staged_selection import select_in_stages
+from .outward import outward
 
 MODELS = ("auto", "polynomial", "smooth", "spline")
 """Zoom models by the names that `calibrate` takes; "auto" chooses."""
@@ -34,6 +36,13 @@ FAMILIES: dict[str, AbstractFamily] = {
     "brown-conrady": BrownConrady(),
 }
 """Distortion models by the names that `calibrate` takes, besides "auto", which chooses."""
+
+STRONG: AbstractFamily = Division()
+"""The distortion model that competes with the polynomial for strong lenses."""
+
+_STRONG = 0.15
+"""Displacement of a corner, in radii. Below it a polynomial with two terms and the division model with one
+are nearly the same."""
 
 _DEGREE, _TERMS = 2, 2
 _MOST_DEGREE = 3
@@ -52,13 +61,14 @@ class WantedModel:
         degree: of the polynomials; None for the default.
         terms: number of coefficients; None for the default, or for a choice.
         family: the distortion model: one of `FAMILIES`, or "auto" for the one of least cross-validation
-            error.
+            error. None: the radial polynomial; where the lens turns out to be a strong one, it competes
+            with the division model.
     """
 
     model: str = "auto"
     degree: int | None = None
     terms: int | None = None
-    family: str = "radial"
+    family: str | None = None
 
     def __post_init__(self):
         """Check that the settings go together.
@@ -72,7 +82,7 @@ class WantedModel:
             raise ValueError(f"Argument model must be one of {names}, but it is {self.model!r}.")
         if self.degree is not None and self.model not in ("auto", "polynomial"):
             raise ValueError(f"Argument degree is for polynomials: leave it out for model {self.model}.")
-        if self.family not in ("auto", *FAMILIES):
+        if self.family not in (None, "auto", *FAMILIES):
             names = ", ".join(["auto", *FAMILIES])
             raise ValueError(f"Argument family must be one of {names}, but it is {self.family!r}.")
         if self.terms is not None:
@@ -81,7 +91,7 @@ class WantedModel:
             raise ValueError(
                 f"Argument model smooth has a prior for {_TERMS} coefficients: leave out argument terms."
             )
-        if self.family != "radial" and self.model == "smooth":
+        if self.family not in (None, "radial") and self.model == "smooth":
             raise ValueError(
                 "Argument model smooth has a prior for the radial polynomial: leave out argument family."
             )
@@ -89,7 +99,7 @@ class WantedModel:
     @property
     def distortion(self) -> AbstractFamily:
         """The distortion model, or, where it is to be chosen, the first one."""
-        return FAMILIES.get(self.family, RadialPolynomial())
+        return FAMILIES.get(self.family or "radial", RadialPolynomial())
 
     @property
     def usual_centre(self) -> CentreArgument:
@@ -158,7 +168,7 @@ class WantedModel:
         return _selected(lines, [Model(PolynomialZoom(degree=d), n, self.distortion) for d, n in pairs])
 
     def choose_family(self, lines: Lines, chosen: Model, compared: Sequence[Model]) -> Selection:
-        """The distortion model of least cross-validation error.
+        """The distortion model of least cross-validation error: of all, or of two for a strong lens.
 
         Args:
             lines: the lines, about their centre and with their weights.
@@ -169,10 +179,29 @@ class WantedModel:
         if isinstance(zoom, SmoothZoom):  # its prior is for the radial polynomial
             zoom = PolynomialZoom(degree=min(_DEGREE, np.unique(np.asarray(lines.focal)).size - 1))
         numbers = dict.fromkeys([chosen.terms, *self._terms(lines)])
+        families = list(FAMILIES.values())[1:] if self.family == "auto" else [STRONG]
         others = [
-            Model(zoom, number, family) for family in list(FAMILIES.values())[1:] for number in numbers
+            Model(zoom, number, family)
+            for family in families
+            for number in numbers
+            if number <= family.most_terms
         ]
         return _selected(lines, [*compared, *others])
+
+    def is_beyond(self, fit: ZoomFit) -> bool:
+        """Whether a fit of the radial polynomial is to compete with the division model.
+
+        It is where it moves a corner by more than `_STRONG` of the way, or folds: a polynomial follows such
+        lenses with many terms only.
+        """
+        if self.family is not None or self.model == "smooth":
+            return False
+        lens = fit.lens
+        centre = np.asarray(lens.centre)
+        last = np.array(lens.image_size) - 1
+        corner = np.where(centre > last / 2, 0.0, last)
+        moved = outward(lens, corner, [float(f) for f in lens.focal_range])
+        return not bool(np.max(abs(moved)) < _STRONG * np.hypot(*(corner - centre)))
 
     def _terms(self, lines: Any) -> list[int]:
         """Numbers of coefficients, the first of which the zoom models are compared with."""
@@ -214,7 +243,7 @@ class CentreFound:
 
         Args:
             lines: about the centre that was given.
-            choice: its comparison with a fitted one; None where that was not asked for.
+            choice: its comparison with a fitted one; None where there is none.
             found: the fitted one, if that is better.
         """
         x, y = (float(value) for value in np.asarray(lines.centre))
@@ -222,19 +251,16 @@ class CentreFound:
         how, place = (
             ("image", f"the middle of the image, {_place(x, y)}") if middle else ("given", _place(x, y))
         )
+        if choice is None and found is not None and found.determined:
+            return cls._fitted(found, ".")
         if choice is None:
             return cls((x, y), None, how, f"The centre of distortion is taken as given: {place}.")
         if found is not None and found.determined:
-            u, v = (float(value) for value in np.asarray(found.fit.lens.centre))
-            std = (float(found.std[0, 0]), float(found.std[0, 1]))
-            return cls(
-                (u, v),
-                std,
-                "fitted",
-                f"The centre of distortion was fitted: {_place(u, v)}, \u00b1 {std[0]:.2g} and \u00b1 "
-                f"{std[1]:.2g} px. Lines that were not fitted are {choice.fitted:.4f} px off straight "
-                f"about it, and {choice.given:.4f} px about {place}.",
+            more = (
+                f". Lines that were not fitted are {choice.fitted:.4f} px off straight about it, and "
+                f"{choice.given:.4f} px about {place}."
             )
+            return cls._fitted(found, more)
         why = "the lines do not determine another one"
         if found is None and choice.found.determined:
             why = (
@@ -242,6 +268,15 @@ class CentreFound:
                 f"and {choice.given:.4f} px about this"
             )
         return cls((x, y), None, how, f"The centre of distortion was kept at {place}: {why}.")
+
+    @classmethod
+    def _fitted(cls, found: CentreFit, more: str) -> "CentreFound":
+        """A fitted centre, and what else there is to say of it."""
+        u, v = (float(value) for value in np.asarray(found.fit.lens.centre))
+        std = (float(found.std[0, 0]), float(found.std[0, 1]))
+        spread = f"\u00b1 {std[0]:.2g} and \u00b1 {std[1]:.2g} px"
+        told = f"The centre of distortion was fitted: {_place(u, v)}, {spread}{more}"
+        return cls((u, v), std, "fitted", told)
 
     def summary(self) -> dict[str, Any]:
         """The same for JSON."""

@@ -5,11 +5,14 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from .._core.text import listed, plain
+from ..detect.batch import Detection
 from ..trust.assessment import Finding
 from .equipment import equipment_of
 from .plane_focals import FocalGroup
 
 _MOST = 4
+_UNEXPLAINED = 0.5
+"""Of the length of a photo's long smooth edges: lines that hold less are little of what there is."""
 
 
 def findings_of_photos(photos: Iterable[Path]) -> list[Finding]:
@@ -39,6 +42,28 @@ def findings_of_focals(groups: Iterable[FocalGroup], unit: str) -> list[Finding]
             worst.sentence(unit) + more,
             "Check that the photos of a group were taken at one zoom, and that the board is flat.",
             cause=True,
+        )
+    ]
+
+
+def findings_of_edges(detections: Iterable[Detection]) -> list[Finding]:
+    """What speaks against the lines being those of the scene: strong long edges that are on none of them.
+
+    A remark: foliage and round things have such edges, too.
+    """
+    shares = {d.name: d.unexplained for d in detections if d.unexplained is not None}
+    many = {name: share for name, share in shares.items() if share > _UNEXPLAINED}
+    if not many or 2 * len(many) < len(shares):
+        return []
+    worst = max(many, key=lambda name: many[name])
+    of = "" if len(shares) == 1 else f" of {len(many)} of {_photos(len(shares))}"
+    share = f"{many[worst]:.0%} in {plain(worst)}"
+    return [
+        Finding(
+            "edges without lines",
+            "good",
+            f"more than half of the long smooth edges{of} are on no line: {share}.",
+            "Look at the drawn lines: if straight edges have none, photograph a scene with fewer curves.",
         )
     ]
 

@@ -6,7 +6,8 @@ All pieces are corrected. Two of them join, end to end, when
   uncertainty allow;
 - the same side is brighter, with like contrast; or the brighter side flips, as at the corners of a
   checkerboard, and they touch, or each has flipped before;
-- the gap is explained: no longer than some times the visible part of the shorter one, or outside the image;
+- the gap is explained: no longer than some times the visible part of the shorter one, and, where it is
+  long, than little more than that part; or it is outside the image;
 - they do not run beside each other: the two edges of a thin bar stay two lines;
 - each is the nearest such neighbour of the other.
 
@@ -45,6 +46,10 @@ _TURN = 0.02
 
 _GAP = 2.5
 """Longest gap, in lengths of what is visible of the shorter side of it."""
+
+_LONG_GAP = (0.06, 40.0)
+"""Of the image's shorter side, and px; the larger counts: by no more a gap exceeds what is visible. Farther
+off, edges of other things are on the same line by chance: that of a window, and that of a pier below it."""
 
 _CORNER = 4.0
 """px that an edge loses at each end where it meets another: near corners there are no edge points."""
@@ -112,10 +117,11 @@ def collinear(pieces: Fragments, model: OneFrame, sigma: float) -> np.ndarray:
     straight = np.flatnonzero(roughness < max(2 * sigma, _ROUGH))
     units = _Units(*(getattr(units, field.name)[straight] for field in dataclasses.fields(_Units)))
     group = np.arange(len(straight))
+    long = max(_LONG_GAP[0] * min(model.image_size), _LONG_GAP[1])
     for nearest in _ROUNDS:
         whole = _merged(units, group)
         pairs = _neighbours(whole, nearest) if nearest else _aligned(whole, sigma)
-        group = _joined(whole, *_ordered(whole, *pairs), sigma)[group]
+        group = _joined(whole, *_ordered(whole, *pairs), sigma, long)[group]
     label = np.full(len(pieces.count), -1)
     label[straight] = _checked(units, group, sigma)
     alone = label < 0
@@ -241,7 +247,9 @@ def _ordered(units: _Units, first: np.ndarray, second: np.ndarray) -> tuple[np.n
     return pair // len(size), pair % len(size)
 
 
-def _joined(units: _Units, longer: np.ndarray, shorter: np.ndarray, sigma: float) -> np.ndarray:
+def _joined(
+    units: _Units, longer: np.ndarray, shorter: np.ndarray, sigma: float, long_gap: float
+) -> np.ndarray:
     """(u,), the number of the line of each unit, after the pairs that may join have done so."""
     number = len(units.length)
     middle, normal, _ = _line(units.sums)
@@ -263,7 +271,7 @@ def _joined(units: _Units, longer: np.ndarray, shorter: np.ndarray, sigma: float
     same |= units.flips[longer] & units.flips[shorter]
     visible = np.minimum(units.sums[longer, 6], units.sums[shorter, 6])
     outside = units.leaves[longer, meet] & units.leaves[shorter, met]
-    explained = np.maximum(_GAP * visible + 2 * _CORNER, _TOUCH)
+    explained = np.maximum(np.minimum(_GAP * visible + 2 * _CORNER, long_gap + visible), _TOUCH)
     most = np.where(same, np.where(outside, np.inf, explained), _TOUCH)
     fits = (passed * scale < _OVERLAP) & (gap <= most)
     fits &= abs(units.contrast[longer, meet] - units.contrast[shorter, met]) < np.log(_CONTRAST)

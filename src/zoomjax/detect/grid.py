@@ -1,22 +1,23 @@
 """Detection of flat grids, checkerboards and dots, of unknown numbers of rows and columns.
 
-Checkerboards: OpenCV's sector-based search lets a board grow from a small start while corners are found.
-How far it gets depends on the scale of the image, so it runs at several and the largest board counts; its
-corners are those found in the full image where that is possible. What is found must be dark and bright in
-turn, or else it is no board.
+Checkerboards: a board grows from the corners that are there (`_saddles`), whatever part of it is outside of
+the image. Where all of it is seen, OpenCV's sector-based search for a board of its size places the
+corners. Where much of it is missing, or no board has grown, that search also lets a board grow from a small
+start while whole rows and columns are found; how far it gets depends on the scale of the image, so that it
+runs at several, and the largest board counts. What is found must be dark and bright in turn, or else it is
+no board.
 
 Dots: the image less its background is cut at Otsu's threshold into spots. From one spot the grid grows,
-neighbour by neighbour, each expected one step of the grid further; steps follow those found last, so that
-they bend with the lens and shrink with perspective. A spot's position is the centroid of its contrast.
+neighbour by neighbour (`_growth`). A spot's position is the centroid of its contrast.
 """
-
-from collections import deque
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from .._core.checks import checked_integer
+from ._growth import as_grid, largest_grid, nearest_of
+from ._saddles import grown_board
 from .base import AbstractDetector
 from .sources import shrunk
 
@@ -39,13 +40,14 @@ _ALTERNATE = 0.95
 """Of neighbouring squares so many must be dark and bright in turn. Boards have all of them so; what the
 search takes for a board in dots, lawns or noise has up to 0.9, by chance more only where it is 3 x 3."""
 
+_WHOLE = 0.8
+"""Of a grown board's places, the share from which on it holds all that is seen of the board: some corners
+may be hidden, or outside of the image."""
+
 _FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 
 _FEWEST_PIXELS = 6
 """Spots of fewer pixels are noise."""
-
-_NEAR = 0.3
-"""How far, in steps of the grid, a dot may be from where it is expected."""
 
 _SEEDS = 9
 """How many dots, from the middle of all outwards, a grid is grown from before the largest one counts."""
@@ -93,7 +95,7 @@ class GridDetector(AbstractDetector):
     ) -> Float[np.ndarray, "row column 2"] | None:
         """The nodes of the grid, px, or None if there is none.
 
-        Rows run to the right, columns downwards. Dots that are not seen are NaN.
+        Rows run to the right, columns downwards. Corners and dots that are not seen are NaN.
         """
         grey = _grey(image)
         grids = [grid for grid in (find_checkerboard(grey), find_dots(grey)) if grid is not None]
@@ -111,24 +113,12 @@ def find_checkerboard(
         image: grey or blue, green, red.
 
     Returns:
-        At least 3 x 3 corners; rows run to the right, columns downwards.
+        At least 3 x 3 corners; rows run to the right, columns downwards. NaN where no corner is seen: a
+        part of the board may be hidden, or outside of the image.
     """
     grey, reduced = shrunk(_grey(image), _LONGEST)
-    best, best_scale = None, 1.0
-    for scale in _SCALES + ((_LARGER,) if min(grey.shape) < _SMALL else ()):
-        found = _search(_resized(grey, scale), (_START, _START), cv2.CALIB_CB_LARGER)
-        if found is not None and (best is None or found.size > best.size):
-            best, best_scale = (found + 0.5) / scale - 0.5, scale
-    if best is None:
-        return None
-    if best_scale < 1:
-        rows, columns = best.shape[:2]
-        for size in ((columns, rows), (rows, columns)):
-            sharp = _search(grey, size, 0)
-            if sharp is not None:
-                best = sharp
-                break
-    return _upright((best + 0.5) / reduced - 0.5)
+    best = _board(grey)
+    return None if best is None else _upright((best + 0.5) / reduced - 0.5)
 
 
 def find_dots(
@@ -149,9 +139,9 @@ def find_dots(
         centres, labels = _spots(tone)
         if len(centres) < _START**2:
             continue
-        place = _grown(centres, labels)
+        place = largest_grid(centres, labels, _seeds(centres))
         if 2 * len(place) >= len(centres) and len(place) > most:
-            best, most = _as_grid(centres, place), len(place)
+            best, most = as_grid(centres, place), len(place)
     if best is None or min(best.shape[:2]) < _START or 2 * most < best[..., 0].size:
         return None
     return _upright((best + 0.5) / reduced - 0.5)
@@ -179,6 +169,58 @@ def _resized(grey: np.ndarray, scale: float) -> np.ndarray:
         return grey
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     return cv2.resize(grey, None, fx=scale, fy=scale, interpolation=way)
+
+
+def _board(grey: np.ndarray) -> np.ndarray | None:
+    """Corners of the largest checkerboard: grown from those that are there, or searched for as a whole."""
+    grown = _grown(grey)
+    if grown is not None and np.isfinite(grown[..., 0]).mean() >= _WHOLE:
+        sharp = _sharp(grey, grown)
+        return grown if sharp is None else sharp
+    found = _searched(grey)
+    if grown is None or (found is not None and found[..., 0].size > np.isfinite(grown[..., 0]).sum()):
+        return found
+    return grown
+
+
+def _grown(grey: np.ndarray) -> np.ndarray | None:
+    """Corners of a board of which a part may be seen; of a blurred one, from a smaller image."""
+    grown = grown_board(grey)
+    if grown is None and min(grey.shape) > _SMALL:
+        grown = grown_board(_resized(grey, 0.5))
+        grown = None if grown is None else (grown + 0.5) / 0.5 - 0.5
+    return grown
+
+
+def _sharp(grey: np.ndarray, board: np.ndarray) -> np.ndarray | None:
+    """The same board, searched for by its numbers of rows and columns; None unless it is found there."""
+    rows, columns = board.shape[:2]
+    for size in ((columns, rows), (rows, columns)):
+        sharp = _search(grey, size, 0)
+        if sharp is not None and _as_far(sharp, board):
+            return sharp
+    return None
+
+
+def _as_far(sharp: np.ndarray, board: np.ndarray) -> bool:
+    """Whether each corner of the one is near one of the other, as far as that is seen."""
+    seen = board[np.isfinite(board[..., 0])]
+    distance = np.linalg.norm(seen[:, None] - sharp.reshape(-1, 2), axis=-1).min(axis=1)
+    step = np.median(np.linalg.norm(np.diff(sharp, axis=1), axis=-1))
+    return bool(distance.max() < step / 4)
+
+
+def _searched(grey: np.ndarray) -> np.ndarray | None:
+    """Corners of a board of complete rows and columns, searched for at several scales."""
+    best, best_scale = None, 1.0
+    for scale in _SCALES + ((_LARGER,) if min(grey.shape) < _SMALL else ()):
+        found = _search(_resized(grey, scale), (_START, _START), cv2.CALIB_CB_LARGER)
+        if found is not None and (best is None or found.size > best.size):
+            best, best_scale = (found + 0.5) / scale - 0.5, scale
+    if best is not None and best_scale < 1:
+        sharp = _sharp(grey, best)
+        best = best if sharp is None else sharp
+    return best
 
 
 def _search(grey: np.ndarray, size: tuple[int, int], flags: int) -> np.ndarray | None:
@@ -234,7 +276,13 @@ def _spots(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     fits &= (area > usual / 5) & (area < 5 * usual)
     new = np.where(fits, np.cumsum(fits), 0)
     centres = _centroids(grey, new[np.asarray(label, np.intp)], int(fits.sum()), float(np.sqrt(usual)))
-    return centres, _nearest(centres, (height, width))
+    return centres, nearest_of(centres, (height, width))
+
+
+def _seeds(centres: np.ndarray) -> list[int]:
+    """Some spots, from the middle of all outwards."""
+    order = np.argsort(np.hypot(*(centres - centres.mean(axis=0)).T))
+    return order[np.linspace(0, len(order) - 1, _SEEDS).astype(int)].tolist()
 
 
 def _centroids(grey: np.ndarray, label: np.ndarray, number: int, across: float) -> np.ndarray:
@@ -255,82 +303,3 @@ def _centroids(grey: np.ndarray, label: np.ndarray, number: int, across: float) 
     total = np.maximum(np.bincount(own, weight, number + 1), 1e-9)
     sums = [np.bincount(own, weight * axis, number + 1) for axis in (x, y)]
     return np.stack(sums, axis=-1)[1:] / total[1:, None]
-
-
-def _nearest(centres: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """For each pixel the index of the centre nearest to it."""
-    apart = np.ones(shape, np.uint8)
-    x, y = np.rint(centres).astype(int).T
-    apart[y, x] = 0
-    _, label = cv2.distanceTransformWithLabels(
-        apart, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    label = np.asarray(label, np.intp)
-    index = np.zeros(label.max() + 1, np.int32)
-    index[label[y, x]] = np.arange(len(centres))
-    return index[label]
-
-
-def _grown(centres: np.ndarray, nearest: np.ndarray) -> dict[int, tuple[int, int]]:
-    """Row and column of each spot of the largest grid that grows from one of some spots."""
-    order = np.argsort(np.hypot(*(centres - centres.mean(axis=0)).T))
-    best: dict[int, tuple[int, int]] = {}
-    for seed in order[np.linspace(0, len(order) - 1, _SEEDS).astype(int)]:
-        place = _grown_from(int(seed), centres, nearest)
-        if len(place) > len(best):
-            best = place
-        if 2 * len(best) > len(centres):
-            break
-    return best
-
-
-def _grown_from(seed: int, centres: np.ndarray, nearest: np.ndarray) -> dict[int, tuple[int, int]]:
-    """Row and column of each spot that is reached from one spot, step by step."""
-    steps = _first_steps(seed, centres)
-    if steps is None:
-        return {}
-    place, taken = {seed: (0, 0)}, {(0, 0): seed}
-    queue = deque([(seed, *steps)])
-    while queue:
-        spot, across, down = queue.popleft()
-        row, column = place[spot]
-        for i, j in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-            there = (row + i, column + j)
-            if there in taken:
-                continue
-            step = i * down + j * across
-            other = _spot_at(centres[spot] + step, nearest)
-            if other is None or other in place:
-                continue
-            found = centres[other] - centres[spot]
-            if np.hypot(*(found - step)) > _NEAR * min(np.hypot(*across), np.hypot(*down)):
-                continue
-            place[other], taken[there] = there, other
-            queue.append((other, j * found if j else across, i * found if i else down))
-    return place
-
-
-def _first_steps(seed: int, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """From a spot to the nearest other one, and to the nearest in a clearly other direction."""
-    offsets = centres - centres[seed]
-    near = offsets[np.argsort(np.hypot(*offsets.T))[1:13]]
-    first = near[0]
-    sine = abs(first[0] * near[:, 1] - first[1] * near[:, 0])
-    other = near[sine > 0.6 * np.hypot(*first) * np.hypot(*near.T)]
-    return (first, other[0]) if len(other) else None
-
-
-def _spot_at(position: np.ndarray, nearest: np.ndarray) -> int | None:
-    """The spot nearest to a position, px, that is within the image."""
-    x, y = round(position[0]), round(position[1])
-    inside = 0 <= y < nearest.shape[0] and 0 <= x < nearest.shape[1]
-    return int(nearest[y, x]) if inside else None
-
-
-def _as_grid(centres: np.ndarray, place: dict[int, tuple[int, int]]) -> np.ndarray:
-    """Centres by row and column, NaN where there is none."""
-    index = np.array(list(place.values()))
-    index -= index.min(axis=0)
-    grid = np.full((*(index.max(axis=0) + 1), 2), np.nan)
-    grid[index[:, 0], index[:, 1]] = centres[list(place)]
-    return grid

@@ -1,5 +1,7 @@
 """Preparation of a fit: the model that is asked for, made ready for the lines."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -31,7 +33,7 @@ def asked_for(
                 "leave out the arguments terms and family."
             )
         zoom, terms, family = zoom.zoom, zoom.terms, zoom.family
-    placed = lines if family is None else with_family(lines, family)
+    placed: Any = lines if family is None else with_family(lines, family)
     return placed, Model(DEFAULT_ZOOM if zoom is None else zoom, terms, placed.family)
 
 

@@ -125,7 +125,7 @@ def reweighted(lines: SomeLines, asked: Model) -> tuple[SomeLines, Model]:
         if not isinstance(model.family, RadialPolynomial):
             weighted = lines.weighted(_own_weights(lines))
             model = model.with_zoom(fit_zoom(weighted, zoom=model, invertible=False, throw=False).lens.zoom)
-        elif isinstance(model.zoom, AbstractLinearZoom):
+        elif isinstance(asked.zoom, AbstractLinearZoom):
             model = model.with_zoom(algebraic_zoom(lines, zoom=asked.zoom, terms=asked.terms).zoom)
     weighted, zoom = _reweighted(lines, model.zoom)
     return weighted, model.with_zoom(zoom)

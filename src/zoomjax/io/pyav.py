@@ -6,6 +6,7 @@ if TYPE_CHECKING:
     import av
     import av.codec.codec
     import av.error
+    import av.logging
     import av.sidedata.sidedata
 else:
 
