@@ -39,7 +39,7 @@ def aligned(*parts: tuple[Any, int]) -> list[Any]:
 def held_as_given(array: np.ndarray) -> Any:
     """A JAX array, unless that would change the values' dtype."""
     if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
-        return jnp.asarray(array)
+        return jax.device_put(array)  # without a program, as jnp.asarray would compile for each shape
     return array
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from .._core.text import span
 from .._core.types import AnyArray
 from ..fit.algebraic import algebraic_zoom
-from ..fit.energy import coefficients_by, line_rms
+from ..fit.energy import line_squares
 from ..fit.focal_lengths import with_focal_sigma
 from ..fit.result import RESULTS, FrameFits, ZoomFit
 from ..fit.straightness import frame_rms
@@ -368,7 +368,7 @@ def calibrate(
         rejected=np.asarray(lines.weight) == 0
         if lines.weight is not None
         else np.zeros(len(lines.frame), bool),
-        line_rms=np.asarray(line_rms(small, coefficients_by(zoom.lens.zoom, small))),
+        line_rms=np.sqrt(line_squares(small, zoom.lens.zoom)),
         next=suggest_next(exact, small),  # from the noise alone, without focal_sigma
         focal_sigma=sigma,
         held_out=held_out,

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from .._core.arguments import kinds_checked
 from ..lines.base import AbstractLines
+from ..lines.buckets import bucketed, bucketed_frames, of_frames
 from ..lines.compressed import CompressedLines
 from ..models.lens import ZoomLens
 from ..models.model import Model
@@ -107,14 +108,20 @@ def algebraic_zoom(
     """
     _, asked = asked_for(lines, zoom, terms)
     model = ready_model(lines, asked.with_parameters(None))
-    return _solve_zoom(small_of(lines, model.terms), model)
+    return _solve_zoom(small_of(bucketed(lines), model.terms), model)
+
+
+def algebraic_model(lines: AbstractLines, model: Model) -> Model:
+    """A prepared model, linear in its parameters, with those of the algebraic estimate."""
+    return model.with_zoom(_solve_zoom(small_of(lines, model.terms), model).zoom)
 
 
 @kinds_checked
 def algebraic_frames(lines: AbstractLines, *, terms: int = 2) -> Float[Array, "frame terms"]:
     """Estimate the normalised coefficients of each frame separately; lines as of `algebraic_zoom`."""
     model = Model(PolynomialZoom(degree=0), terms, lines.family)
-    return _solve_frames(small_of(lines, model.terms), *lines.by_frame(), model)
+    padded, frames = bucketed_frames(lines)
+    return of_frames(_solve_frames(small_of(padded, model.terms), frames, model), lines)
 
 
 @eqx.filter_jit
@@ -123,9 +130,9 @@ def _solve_zoom(lines, model):
 
 
 @eqx.filter_jit
-def _solve_frames(lines, chosen, present, model):
+def _solve_frames(lines, frames, model):
     def solve(chosen, present):
         frame = lines.take(chosen, present)
         return algebraic_parameters(frame, ready_model(frame, model))[0]
 
-    return jax.vmap(solve)(chosen, present)
+    return jax.vmap(solve)(frames.chosen, frames.present)

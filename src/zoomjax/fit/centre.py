@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, PyTree, ScalarLike
 from .._core.arguments import kinds_checked
 from .._core.types import Coefficients, Focal
 from ..lines.base import AbstractLines
+from ..lines.buckets import bucketed, bucketed_frames, of_frames
 from ..lines.free_centre import AnyCentreLines
 from ..lines.lines import Lines
 from ..models.family import AbstractFamily
@@ -36,8 +37,8 @@ from .covariance import parameter_covariance
 from .energy import AbstractJointZoom, linearised
 from .minimise import fit_about, minimise
 from .moved_centre import for_any_centre
-from .prepare import asked_for
-from .result import RESULTS, FrameFits, ZoomFit, collected
+from .prepare import asked_for, ready_model
+from .result import RESULTS, FrameFits, ZoomFit, collected, each_of_given, of_given
 from .wrapper import points_of
 
 _MOST_UNCERTAIN = 0.05
@@ -163,16 +164,18 @@ def fit_centre(
     """
     lines, model = asked_for(lines, zoom, terms, family)
     check("fit_centre", zoom=model.zoom)
-    lines = for_any_centre(lines, model.terms)
-    options = {"solver": solver, "max_steps": max_steps, "throw": throw}
-    fixed = fit_about(_about(lines, lines.centre, model), model, **options)
+    ready, given = ready_model(lines, model), lines
+    lines = for_any_centre(bucketed(lines), model.terms)
+    unfitted = model.zoom.parameters is None
+    options = {"algebraic": unfitted, "solver": solver, "max_steps": max_steps, "throw": throw}
+    fixed = fit_about(_about(lines, lines.centre, model), ready, **options)
     offset = (PolynomialZoom(degree=0) if centre is None else centre).prepare(lines.focal, 2)
     start = _both(fixed.lens.zoom, offset)
     found, covariance, std, determined = _search(lines, start, solver or default_solver(lines), max_steps)
     _, moved = found.parts()
     each = lines.centre[None] + lines.scale * jax.vmap(moved)(lines.focal)
     # Once more about these centres, for all else that is to know of a fit: the same compiled program.
-    fit = fit_about(_about(lines, each, model), model, **options)
+    fit = fit_about(_about(lines, each, model), ready, **options)
     own = fit.covariance.shape[0]
     joint = jnp.where(determined, covariance, jnp.zeros_like(covariance).at[:own, :own].set(fit.covariance))
     lens = _lens(lines, fit.lens, moved, each)
@@ -191,7 +194,8 @@ def fit_centre(
         ),
         is_leaf=lambda leaf: leaf is None,
     )
-    return CentreFit(fit, each, std, determined, fixed.rms, covariance)
+    each, std = of_frames(each, given), of_frames(std, given)
+    return CentreFit(of_given(fit, given), each, std, determined, fixed.rms, covariance)
 
 
 def _about(lines, centre, model):
@@ -210,7 +214,7 @@ def refit_centre(lines: AnyCentreLines, found: CentreFit) -> AbstractZoom:
     if centre is None:
         offset = (lens.centre - jnp.asarray(lines.centre))[None] / lens.scale
         centre = with_parameters(PolynomialZoom(degree=0).prepare(lines.focal, 2), offset)
-    joint, *_ = _search(lines, _both(lens.zoom, centre), default_solver(lines), 256)
+    joint, *_ = _search(bucketed(lines), _both(lens.zoom, centre), default_solver(lines), 256)
     return joint
 
 
@@ -229,20 +233,24 @@ def fit_frame_centres(
         lines, family, terms, solver, max_steps: as for `fit_centre`.
     """
     lines, model = asked_for(lines, PolynomialZoom(degree=0), terms, family)
-    lines = for_any_centre(lines, model.terms)
-    return _fit_frame_centres(lines, *lines.by_frame(), model, solver, max_steps)
+    padded, frames = bucketed_frames(for_any_centre(lines, model.terms))
+    found = _fit_frame_centres(padded, frames, model, solver, max_steps)
+    each, std, determined, fixed = found.each, found.std, found.determined, found.rms_fixed
+    std, determined, fixed = (of_frames(values, lines) for values in (std, determined, fixed))
+    return FrameCentres(each_of_given(each, lines), std, determined, fixed)
 
 
 @eqx.filter_jit
-def _fit_frame_centres(lines, chosen, present, model, solver, max_steps):
+def _fit_frame_centres(lines, frames, model, solver, max_steps):
     options = {"terms": model.terms, "solver": solver, "max_steps": max_steps, "throw": False}
 
     def one(frame):
         return fit_centre(lines.take(*frame), zoom=model.zoom, **options)
 
-    batch = 1 if isinstance(points_of(lines), Lines) else len(chosen)  # as in `fit_frames`
-    found = jax.lax.map(one, (chosen, present), batch_size=batch)
-    each = eqx.tree_at(lambda fits: fits.centre, collected(lines, found.fit), found.centre[:, 0])
+    batch = 1 if isinstance(points_of(lines), Lines) else len(frames.chosen)  # as in `fit_frames`
+    found = jax.lax.map(one, (frames.chosen, frames.present), batch_size=batch)
+    each = collected(lines, found.fit, frames.there)
+    each = eqx.tree_at(lambda fits: fits.centre, each, found.centre[:, 0])
     return FrameCentres(each, found.std[:, 0], found.determined, found.rms_fixed)
 
 

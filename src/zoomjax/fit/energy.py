@@ -22,6 +22,7 @@ from .._core.fields import numbers
 from .._core.products import exact_products
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines
+from ..lines.buckets import bucketed_jit, of_frames, of_lines
 from ..models.zoom import (
     AbstractFocusZoom,
     AbstractPriorZoom,
@@ -141,6 +142,12 @@ def coefficients_by(zoom: AbstractZoom, lines: AbstractLines) -> Float[Array, "f
     return jnp.asarray(jax.vmap(zoom)(*settings(zoom, lines)))
 
 
+@bucketed_jit(returns=of_frames)
+def frame_coefficients(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "frame terms"]:
+    """The same, compiled."""
+    return coefficients_by(zoom, lines)
+
+
 def prior_residuals(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "row"] | None:
     """Residuals of the prior of a zoom model, px; None for a model without a prior."""
     prior = prior_of(zoom)
@@ -176,7 +183,7 @@ def prior_jacobian(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "ro
 
 
 @kinds_checked
-@eqx.filter_jit
+@bucketed_jit(frames=["coefficients"], returns=of_frames)
 def frame_energy(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "frame"]:
     """The error of each frame, px^2: mean over its lines of the mean squared distance (eq. 3).
 
@@ -192,19 +199,19 @@ def energy_by_frame(lines: AbstractLines, weighted: Float[Array, "line rows"]) -
     return jnp.where(counted, number_counted(counted).astype(squares.dtype) * squares, jnp.nan)
 
 
-@eqx.filter_jit
+@bucketed_jit(frames=["coefficients"], returns=of_lines)
 def line_rms(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "line"]:
     """Root of the mean squared distance of each line's corrected points to it, px, whatever its weight."""
     return jnp.sqrt(_line_squares(lines, coefficients))
 
 
-@eqx.filter_jit
+@bucketed_jit(returns=of_lines)
 def line_squares(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "line"]:
     """Mean squared distance of each line's corrected points to it, px^2, under a zoom model."""
     return _line_squares(lines, coefficients_by(zoom, lines))
 
 
-@eqx.filter_jit
+@bucketed_jit(frames=["coefficients"], returns=of_lines)
 def line_squares_by_frame(
     lines: AbstractLines, coefficients: Float[AnyArray, "frame terms"]
 ) -> Float[Array, "line"]:
@@ -239,7 +246,7 @@ def linearised(lines, zoom):
     return weighted, jacobian
 
 
-@eqx.filter_jit
+@bucketed_jit(frames=["coefficients"], returns=[of_frames, of_frames])
 def frame_normal_equations(
     lines: AbstractLines, coefficients: Float[Array, "frame size"]
 ) -> tuple[Float[Array, "frame size"], Float[Array, "frame size size"]]:

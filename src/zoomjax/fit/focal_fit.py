@@ -23,7 +23,7 @@ from .focal_lengths import (
     checked_sigma,
     posterior,
     refined,
-    widened,
+    with_covariance,
 )
 from .prepare import asked_for
 from .result import ZoomFit
@@ -104,26 +104,25 @@ def fit_focal(
             "Focal lengths are refined in float64 only: "
             f'jax.config.update("jax_enable_x64", True), and not lines in {given.dtype}.'
         )
-    if not traced((sigma, given)) and np.unique(given[np.isfinite(sigma)]).size < 2:
+    if not traced((sigma, given)) and np.unique(np.asarray(given)[np.isfinite(sigma)]).size < 2:
         raise ValueError(
             "Argument focal_sigma must be finite for frames at two different focal lengths or more, but it "
             f"is {focal_sigma}. {UNKNOWN}"
         )
     start = fit_zoom(lines, zoom=model, invertible=False, throw=throw)
-    t, refitted, steps, reached = refined(lines, start.lens.zoom, sigma / given)
+    focal, refitted, steps, reached = refined(lines, start.lens.zoom, sigma)
     if throw and not traced(reached) and not reached:
         raise RuntimeError(
             f"The focal lengths did not converge in {MOST_STEPS} steps: the lines hardly determine those "
             "with a large focal_sigma. Leave these frames out, or measure their focal lengths."
         )
-    focal = given * jnp.exp(t)
     moved = at_focal_lengths(lines, focal)
     fit = fit_zoom(moved, zoom=refitted, invertible=invertible, throw=throw)
-    covariance = posterior(moved, fit.lens.zoom, sigma / given)
+    std, *wider = posterior(moved, fit.lens.zoom, fit.covariance, fit.joint, sigma, given)
     return FocalFit(
-        fit=widened(fit, moved, covariance),
+        fit=with_covariance(fit, *wider),
         focal=focal,
-        std=focal * jnp.sqrt(jnp.diagonal(covariance)),
+        std=std,
         given=given,
         steps=steps,
     )

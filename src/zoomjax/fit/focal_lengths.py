@@ -33,6 +33,7 @@ from .._core.arguments import kinds_checked
 from .._core.fields import refuse_masked
 from .._core.types import AnyArray, Focal, traced
 from ..lines.base import AbstractLines
+from ..lines.buckets import bucketed_jit, of_frames
 from ..models.requirements import check
 from ..models.zoom import AbstractPriorZoom, with_parameters
 from .covariance import parameter_covariance
@@ -90,18 +91,31 @@ def with_focal_sigma(
             f"Argument focal_sigma must hold finite numbers, but it is {focal_sigma}. {UNKNOWN}"
         )
     check("with_focal_sigma", shift=fit.lens.shift)
-    lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
-    relative = sigma / jnp.asarray(lines.focal)
-    if shared is None:
-        return widened(fit, lines, jnp.diag(relative) ** 2)
-    shared = jnp.asarray(shared)
-    if shared.shape != relative.shape:
+    number = lines.focal.shape[0]
+    if shared is not None and jnp.shape(shared) != (number,):
         raise ValueError(
-            f"Argument shared must hold a number for each of the {len(relative)} frames, but its shape is "
-            f"{shared.shape}."
+            f"Argument shared must hold a number for each of the {number} frames, but its shape is "
+            f"{jnp.shape(shared)}."
         )
+    shared = np.arange(number) if shared is None else shared
+    lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
+    own = (fit.lens.zoom, fit.covariance, fit.joint)
+    return with_covariance(fit, *_widened_by(lines, *own, sigma, shared))
+
+
+def with_covariance(fit, covariance, joint):
+    """A fit with other covariances: of the parameters, and of these with the centre."""
+    return eqx.tree_at(
+        lambda fit: (fit.covariance, fit.joint), fit, (covariance, joint), is_leaf=lambda leaf: leaf is None
+    )
+
+
+@bucketed_jit(frames=["sigma", "shared"], returns=[None, None])
+def _widened_by(lines, zoom, own, joint, sigma, shared):
+    """`_widened` by standard deviations of the focal lengths, of which some are wrong together."""
+    relative = sigma / jnp.asarray(lines.focal)
     together = shared[:, None] == shared[None]
-    return widened(fit, lines, jnp.where(together, relative[:, None] * relative[None], 0))
+    return _widened(lines, zoom, own, joint, jnp.where(together, relative[:, None] * relative[None], 0))
 
 
 UNKNOWN = (
@@ -112,7 +126,7 @@ UNKNOWN = (
 )
 
 
-def checked_sigma(focal_sigma: Any, focal: Focal) -> Float[Array, "frame"]:
+def checked_sigma(focal_sigma: Any, focal: Focal) -> Float[AnyArray, "frame"]:
     """The standard deviation of each frame's focal length."""
     focal = jnp.asarray(focal)
     if focal_sigma is None:
@@ -129,7 +143,7 @@ def checked_sigma(focal_sigma: Any, focal: Focal) -> Float[Array, "frame"]:
             raise ValueError(f"Argument focal_sigma must hold numbers, but it is {focal_sigma}. {UNKNOWN}")
         if (np.asarray(sigma) < 0).any():
             raise ValueError(f"Argument focal_sigma must be at least 0, but it is {focal_sigma}.")
-    return jnp.broadcast_to(sigma, focal.shape)
+    return jnp.broadcast_to(sigma, focal.shape) if traced(sigma) else np.broadcast_to(sigma, focal.shape)
 
 
 class _NearEnergy(NamedTuple):
@@ -180,33 +194,29 @@ def _inverse(matrix):
     return jnp.linalg.pinv(matrix / size[:, None] / size[None], hermitian=True) / size[:, None] / size[None]
 
 
-@eqx.filter_jit
-def widened(fit, lines, covariance):
-    """The fit with its covariance enlarged by that of the logarithms of the focal lengths.
+def _widened(lines, zoom, covariance, joint, of_focal):
+    """The covariance, and that with the centre, enlarged by that of the logarithms of the focal lengths.
 
     Wrong focal lengths also show as errors that the lines of a photo share, for which the covariance allows
     already: only what goes beyond that is added. A fitted centre is held where it is.
     """
-    zoom = fit.lens.zoom
     response = _response(lines, zoom)
     weighted, jacobian = linearised(lines, zoom)
     by_line, _ = parameter_covariance(lines, zoom, weighted, jacobian, photos=False)
-    infinite = jnp.isinf(jnp.diagonal(fit.covariance)) | jnp.isinf(jnp.diagonal(by_line))
+    infinite = jnp.isinf(jnp.diagonal(covariance)) | jnp.isinf(jnp.diagonal(by_line))
     known = ~(infinite[:, None] | infinite[None])
-    own, by_line = (jnp.where(known, matrix, 0) for matrix in (fit.covariance, by_line))
+    own, by_line = (jnp.where(known, matrix, 0) for matrix in (covariance, by_line))
     size = jnp.sqrt(jnp.maximum(jnp.diagonal(own), 0))
     unit = jnp.where(size > 0, size, 1)
     both = unit[:, None] * unit[None]
     shared = _positive_part((own - by_line) / both)
-    of_focal = jnp.where(known, response @ covariance @ response.T, 0) / both
+    of_focal = jnp.where(known, response @ of_focal @ response.T, 0) / both
     more = _positive_part(of_focal - shared) * both
-    wider = jnp.where(known, fit.covariance + more, fit.covariance)
-    fit = eqx.tree_at(lambda fit: fit.covariance, fit, wider)
-    if fit.joint is None:
-        return fit
+    wider = jnp.where(known, covariance + more, covariance)
+    if joint is None:
+        return wider, None
     number = wider.shape[0]
-    joint = fit.joint.at[:number, :number].add(jnp.where(known, more, 0))
-    return eqx.tree_at(lambda fit: fit.joint, fit, joint)
+    return wider, joint.at[:number, :number].add(jnp.where(known, more, 0))
 
 
 def _positive_part(matrix):
@@ -281,9 +291,13 @@ def _prior_noise(lines, zoom):
     return prior_error(lines, zoom) ** 2 if isinstance(zoom, AbstractPriorZoom) else 0.0
 
 
-@eqx.filter_jit
-def refined(lines, zoom, relative):
-    """log f relative to the given ones, and the zoom model with them, by damped Gauss-Newton steps."""
+@bucketed_jit(frames=["sigma"], returns=[of_frames, None, None, None])
+def refined(lines, zoom, sigma):
+    """The focal lengths, and the zoom model with them, by damped Gauss-Newton steps.
+
+    And the number of steps, and whether the end is reached.
+    """
+    relative = sigma / jnp.asarray(lines.focal)
     known = jnp.isfinite(relative)
     relative = jnp.where(known, relative, 1)
     flat, unravel = ravel_pytree(zoom.parameters)
@@ -330,16 +344,22 @@ def refined(lines, zoom, relative):
     start = (flat, zero, jnp.zeros_like(inf), inf, jnp.asarray(0))
     flat, t, _, change, steps = jax.lax.while_loop(goes_on, turn, start)
     reached: Bool[Array, ""] = change <= tolerance
-    return relative * t, model(flat), steps, reached
+    return _focal_of(lines, relative, t), model(flat), steps, reached
 
 
-@eqx.filter_jit
-def posterior(lines, zoom, relative):
-    """Covariance of the logarithms of the focal lengths, given the lines and the prior, at the minimum."""
+@bucketed_jit(frames=["sigma", "given"], returns=[of_frames, None, None])
+def posterior(lines, zoom, covariance, joint, sigma, given):
+    """Standard deviations of the focal lengths, given the lines and the prior, at the minimum.
+
+    And the covariance of the parameters, and that with the centre, enlarged by it.
+    """
+    relative = sigma / given
     known = jnp.isfinite(relative)
     relative = jnp.where(known, relative, 1)
     tau = _prior_weights(lines, zoom)
-    joint = _joint(lines, zoom, relative, known, tau, jnp.zeros_like(relative))
-    inverse = _inverse(joint.gauss_newton)
-    both = (inverse @ joint.middle @ inverse)[-relative.shape[0] :, -relative.shape[0] :]
-    return relative[:, None] * both * relative[None]
+    near = _joint(lines, zoom, relative, known, tau, jnp.zeros_like(relative))
+    inverse = _inverse(near.gauss_newton)
+    both = (inverse @ near.middle @ inverse)[-relative.shape[0] :, -relative.shape[0] :]
+    of_focal = relative[:, None] * both * relative[None]
+    std = jnp.asarray(lines.focal) * jnp.sqrt(jnp.diagonal(of_focal))
+    return std, *_widened(lines, zoom, covariance, joint, of_focal)

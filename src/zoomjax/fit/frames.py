@@ -10,16 +10,17 @@ import jax.numpy as jnp
 
 from .._core.arguments import kinds_checked
 from ..lines.base import AbstractLines
+from ..lines.buckets import bucketed_frames
 from ..lines.lines import Lines
 from ..models.family import AbstractFamily
 from ..models.zoom import PolynomialZoom
 from ._least_squares import Solver, default_solver
-from .algebraic import algebraic_start
+from .algebraic import algebraic_parameters, algebraic_start
 from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
 from .minimise import fit_prepared
 from .prepare import asked_for, ready_model
-from .result import FrameFits, collected, described_fit, is_invertible, outcome_of, thrown
+from .result import FrameFits, collected, described_fit, each_of_given, is_invertible, outcome_of, thrown
 from .wrapper import about_own_centre, points_of
 
 
@@ -44,33 +45,35 @@ def fit_frames(
     """
     placed, model = asked_for(lines, PolynomialZoom(degree=0), terms, family)
     lines = about_own_centre(placed)
-    chosen, present = lines.by_frame()
+    padded, frames = bucketed_frames(lines)
     solver = default_solver(lines) if solver is None else solver
-    start = algebraic_start(lines, model)
-    fits, outcome = _fit_frames(lines, start, chosen, present, model, solver, max_steps)
+    start = algebraic_start(padded, model)
+    fits, outcome = _fit_frames(padded, start, frames, model, solver, max_steps)
     if invertible:
-        small = compressed_as_measured(lines, model.terms)
-        fits, outcome = or_else(fits, outcome, lambda: _refit_frames(small, chosen, present, model, fits))
-    return thrown(fits, outcome, throw)
+        small = compressed_as_measured(padded, model.terms)
+        fits, outcome = or_else(fits, outcome, lambda: _refit_frames(small, frames, model, fits))
+    return each_of_given(thrown(fits, outcome, throw), lines)
 
 
 @eqx.filter_jit
-def _fit_frames(lines, start, chosen, present, model, solver, max_steps):
+def _fit_frames(lines, start, frames, model, solver, max_steps):
     def fit(chosen, present):
         frame = lines.take(chosen, present)
-        own = None if start is None else start.take(chosen, present)
-        return fit_prepared(frame, own, ready_model(frame, model), solver, max_steps)[0]
+        ready = ready_model(frame, model)
+        if start is not None:
+            ready = ready.with_parameters(algebraic_parameters(start.take(chosen, present), ready))
+        return fit_prepared(frame, ready, solver, max_steps)[0]
 
     # Small compressed frames are solved side by side; the points themselves one frame at a time, for
     # side by side they would all be in memory at once, padded to the fullest frame.
-    batch = 1 if isinstance(points_of(lines), Lines) else len(chosen)
-    fits = jax.lax.map(lambda frame: fit(*frame), (chosen, present), batch_size=batch)
-    each = collected(lines, fits)
+    batch = 1 if isinstance(points_of(lines), Lines) else len(frames.chosen)
+    fits = jax.lax.map(lambda frame: fit(*frame), (frames.chosen, frames.present), batch_size=batch)
+    each = collected(lines, fits, frames.there)
     return each, outcome_of(each)
 
 
 @eqx.filter_jit
-def _refit_frames(lines, chosen, present, model, free):
+def _refit_frames(lines, frames, model, free):
     """Each frame's fit, refitted to be invertible where it is not."""
 
     def fit(chosen, present, result, coefficients):
@@ -81,5 +84,6 @@ def _refit_frames(lines, chosen, present, model, free):
         keep = is_invertible(own)
         return jax.tree.map(lambda own, other: jnp.where(keep, own, other), own, other)
 
-    each = collected(lines, jax.vmap(fit)(chosen, present, free.result, free.coefficients))
+    fits = jax.vmap(fit)(frames.chosen, frames.present, free.result, free.coefficients)
+    each = collected(lines, fits, frames.there)
     return each, outcome_of(each)

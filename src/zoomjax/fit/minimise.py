@@ -12,20 +12,22 @@ import optimistix as optx
 
 from ..models.zoom import with_parameters
 from ._least_squares import default_solver
-from .algebraic import algebraic_parameters, algebraic_start
+from .algebraic import algebraic_model, algebraic_start
 from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
 from .energy import coefficients_by, prior_residuals, weighted_distances
-from .prepare import ready_model
 from .result import described_fit, outcome_of, thrown
 
 
-def fit_about(lines, asked, *, solver=None, max_steps=256, invertible=True, throw=True):
-    """`fit_zoom` of a model about the centre of the lines, which are under its distortion model."""
-    model = ready_model(lines, asked)
-    start = algebraic_start(lines, model) if asked.zoom.parameters is None else None
+def fit_about(lines, model, *, algebraic, solver=None, max_steps=256, invertible=True, throw=True):
+    """`fit_zoom` of a prepared model about the centre of the lines, which are under its distortion model.
+
+    It starts from the algebraic estimate, if it is to and there is one, or else from its parameters.
+    """
+    if algebraic and (start := algebraic_start(lines, model)) is not None:
+        model = algebraic_model(start, model)
     solver = default_solver(lines) if solver is None else solver
-    fit, outcome = fit_prepared(lines, start, model, solver, max_steps)
+    fit, outcome = fit_prepared(lines, model, solver, max_steps)
     if invertible:
         small = functools.partial(compressed_as_measured, lines, model.terms)
         fit, outcome = or_else(fit, outcome, lambda: refit_zoom(small(), fit))
@@ -33,10 +35,8 @@ def fit_about(lines, asked, *, solver=None, max_steps=256, invertible=True, thro
 
 
 @eqx.filter_jit
-def fit_prepared(lines, start, model, solver, max_steps):
-    """The fit of a prepared model, and its outcome."""
-    if start is not None:
-        model = model.with_parameters(algebraic_parameters(start, model))
+def fit_prepared(lines, model, solver, max_steps):
+    """The fit of a prepared model from its own parameters, and its outcome."""
     zoom, result, steps = minimise(lines, model.zoom, solver, max_steps)
     fit = described_fit(lines, zoom, result, steps)
     return fit, outcome_of(fit)

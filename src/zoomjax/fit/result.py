@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.types import Centres, traced
 from ..lines.base import AbstractLines
+from ..lines.buckets import of_frames
 from ..models.distortion import Distortion
 from ..models.family import AbstractFamily
 from ..models.invertibility import Certificate, certificate_of
@@ -182,16 +183,36 @@ def described_fit(lines, zoom, result, steps):
     )
 
 
-def collected(lines, fits):
-    """Fits of one frame each, stacked, as one; about the centre of the lines."""
+def of_given(fit: ZoomFit, lines: AbstractLines) -> ZoomFit:
+    """A fit of padded lines as one of the lines themselves."""
+    return eqx.tree_at(lambda fit: fit.frame_rms, fit, of_frames(fit.frame_rms, lines))
+
+
+def each_of_given(fits: FrameFits, lines: AbstractLines) -> FrameFits:
+    """Fits of padded frames as those of the frames that there are."""
+    own_centres = fits.centre.ndim == 2
+
+    def by_frame(fits):
+        each = (fits.coefficients, fits.frame_rms, fits.covariance, fits.result, fits.certificate)
+        return jax.tree.leaves((each, fits.centre if own_centres else None))
+
+    return eqx.tree_at(by_frame, fits, [of_frames(leaf, lines) for leaf in by_frame(fits)])
+
+
+def collected(lines, fits, there=True):
+    """Fits of one frame each, stacked, as one; about the centre of the lines.
+
+    Frames that are not `there` are left out of the means.
+    """
+    squares, free = (jnp.where(there, rms, jnp.nan) ** 2 for rms in (fits.rms, fits.rms_unconstrained))
     return FrameFits(
         coefficients=fits.lens.zoom.parameters[:, 0],
-        rms=jnp.sqrt(jnp.nanmean(fits.rms**2)),
+        rms=jnp.sqrt(jnp.nanmean(squares)),
         frame_rms=fits.rms,
         covariance=fits.covariance,
         result=fits.result,
         certificate=fits.certificate,
-        rms_unconstrained=jnp.sqrt(jnp.nanmean(fits.rms_unconstrained**2)),
+        rms_unconstrained=jnp.sqrt(jnp.nanmean(free)),
         centre=jnp.asarray(lines.centre),
         scale=lines.scale,
         family=lines.family,

@@ -25,16 +25,17 @@ from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
 from ..lines.base import AbstractLines, SomeLines
+from ..lines.buckets import bucketed, of_lines
 from ..models.family import AbstractFamily
 from ..models.model import Model
 from ..models.polynomial import RadialPolynomial
 from ..models.zoom import AbstractLinearZoom, AbstractZoom, with_parameters
 from ._least_squares import Solver
 from ._linear import least_squares
-from .algebraic import algebraic_zoom
+from .algebraic import algebraic_model
 from .energy import coefficients_by, line_residuals, linearised, prior_jacobian
 from .prepare import asked_for, ready_model
-from .result import ZoomFit
+from .result import ZoomFit, of_given
 from .wrapper import about_own_centre
 from .zoom import fit_zoom
 
@@ -104,14 +105,16 @@ def fit_robust(
         >>> fit_robust(compress(lines), zoom=PolynomialZoom(degree=0), terms=1).rejected.tolist()
         [10]
     """
-    placed, asked = asked_for(lines, zoom, terms, family)
-    lines = about_own_centre(placed)
-    weighted, model = reweighted(lines, asked)
+    given, asked = asked_for(lines, zoom, terms, family)
+    model = ready_model(given, asked)
+    padded = about_own_centre(bucketed(given))
+    weighted, model = _turns(padded, model, asked.zoom.parameters is None)
     fit = fit_zoom(
         weighted, zoom=model, solver=solver, max_steps=max_steps, invertible=invertible, throw=throw
     )
-    line_rms, median = _line_rms(lines, fit.lens.zoom)
-    return RobustFit(fit=fit, weight=jnp.asarray(weighted.weight), line_rms=line_rms, scale=median)
+    line_rms, median = _line_rms(padded, fit.lens.zoom)
+    weight = of_lines(jnp.asarray(weighted.weight), given)
+    return RobustFit(of_given(fit, given), weight, of_lines(line_rms, given), median)
 
 
 def reweighted(lines: SomeLines, asked: Model) -> tuple[SomeLines, Model]:
@@ -120,13 +123,19 @@ def reweighted(lines: SomeLines, asked: Model) -> tuple[SomeLines, Model]:
     The first turn starts from the algebraic estimate; under another distortion model, which has none, from
     the fit to all lines: far from it, whole frames would seem not to be straight.
     """
-    model = ready_model(lines, asked)
-    if asked.zoom.parameters is None:
+    padded = bucketed(lines)
+    weighted, model = _turns(padded, ready_model(lines, asked), asked.zoom.parameters is None)
+    return lines.weighted(of_lines(jnp.asarray(weighted.weight), lines)), model
+
+
+def _turns(lines, model, unfitted):
+    """The lines with their weights, and the model of the last turn, of a prepared model."""
+    if unfitted:
         if not isinstance(model.family, RadialPolynomial):
             weighted = lines.weighted(_own_weights(lines))
             model = model.with_zoom(fit_zoom(weighted, zoom=model, invertible=False, throw=False).lens.zoom)
-        elif isinstance(asked.zoom, AbstractLinearZoom):
-            model = model.with_zoom(algebraic_zoom(lines, zoom=asked.zoom, terms=asked.terms).zoom)
+        elif isinstance(model.zoom, AbstractLinearZoom):
+            model = algebraic_model(lines, model)
     weighted, zoom = _reweighted(lines, model.zoom)
     return weighted, model.with_zoom(zoom)
 

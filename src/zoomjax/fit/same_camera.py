@@ -1,7 +1,14 @@
-"""Checks that lines are those of a lens or of a fit: of the same images, frames and unit."""
+"""Lines and the lens or fit that they are those of: of the same images, frames and unit."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
 
 from ..lines.base import AbstractLines
+from ..lines.buckets import bucketed_jit, of_frames
 from ..models.lens import ZoomLens
+from .family_lines import with_family
 from .result import ZoomFit
 
 
@@ -35,3 +42,14 @@ def check_lines_of(fit: ZoomFit, lines: AbstractLines) -> None:
         raise ValueError(
             f"The fit is of {own} frames, but the lines are of {given}: pass the lines that were fitted."
         )
+
+
+def placed_as(lens: ZoomLens, lines: AbstractLines) -> AbstractLines:
+    """The lines under the distortion model of a lens and about its centre, at each frame's focal length."""
+    moved: Any = with_family(lines, lens.family)
+    return moved.about(lens.centre if lens.shift is None else _centres(lines, lens))
+
+
+@bucketed_jit(returns=of_frames)
+def _centres(lines, lens):
+    return jax.vmap(lens.centre_at)(jnp.asarray(lines.focal))

@@ -1,17 +1,17 @@
 """Straightness of lines corrected by a lens: the error of eq. 3, px."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.arguments import kinds_checked
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines
+from ..lines.buckets import bucketed_jit, of_frames
 from ..models.lens import ZoomLens
 from .energy import coefficients_by, frame_energy
-from .family_lines import with_family
-from .same_camera import check_camera
+from .same_camera import check_camera, placed_as
 from .wrapper import about_own_centre
 
 
@@ -40,23 +40,22 @@ def frame_rms(
     if isinstance(lens, ZoomLens):
         check_camera(lens, lines)
         lens.check_range(lines.focal)
-        lines = with_family(lines, lens.family)
-        lines = lines.about(lens.centre if lens.shift is None else jax.vmap(lens)(lines.focal).centre)
+        lines = placed_as(lens, lines)
     elif not (lens is None or eqx.is_array_like(lens)):
         raise TypeError(
             "Argument lens must be a ZoomLens (fit.lens, not the fit), coefficients of each frame or None, "
             f"but its type is {type(lens).__name__}."
         )
-    return _frame_rms(about_own_centre(lines), lens)
-
-
-@eqx.filter_jit
-def _frame_rms(lines, lens):
-    focal = jnp.asarray(lines.focal)
+    lines = about_own_centre(lines)
+    if isinstance(lens, ZoomLens):
+        return _frame_rms(lines, lens.zoom, None)
     if lens is None:
-        coefficients = jnp.zeros((focal.shape[0], lines.family.size(1)), focal.dtype)
-    elif isinstance(lens, ZoomLens):
-        coefficients = coefficients_by(lens.zoom, lines)
-    else:
-        coefficients = lens
-    return jnp.sqrt(frame_energy(lines, jnp.asarray(coefficients)))
+        lens = np.zeros((lines.focal.shape[0], lines.family.size(1)), lines.focal.dtype)
+    return _frame_rms(lines, None, jnp.asarray(lens))
+
+
+@bucketed_jit(frames=["coefficients"], returns=of_frames)
+def _frame_rms(lines, zoom, coefficients):
+    """By a zoom model, or, without, by coefficients of each frame."""
+    coefficients = coefficients if zoom is None else coefficients_by(zoom, lines)
+    return jnp.sqrt(frame_energy(lines, coefficients))

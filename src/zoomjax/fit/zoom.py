@@ -16,6 +16,7 @@ from jaxtyping import Float
 from .._core.arguments import kinds_checked
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines, SomeLines
+from ..lines.buckets import bucketed
 from ..lines.compressed import CompressedLines
 from ..models.family import AbstractFamily
 from ..models.model import Model
@@ -23,8 +24,8 @@ from ..models.zoom import AbstractZoom
 from ._least_squares import Solver
 from .centre import fit_centre
 from .minimise import fit_about
-from .prepare import asked_for
-from .result import ZoomFit
+from .prepare import asked_for, ready_model
+from .result import ZoomFit, of_given
 from .wrapper import about_own_centre
 
 CentreArgument = Literal["fit", "image"] | tuple[float, float] | Float[AnyArray, "2"]
@@ -98,7 +99,9 @@ def fit_zoom(
         if not invertible:
             raise ValueError('Argument centre is "fit", which needs invertible=True.')
         return fit_centre(lines, zoom=model, **options).fit
-    return fit_about(about_centre(lines, centre), model, invertible=invertible, **options)
+    ready, unfitted = ready_model(lines, model), model.zoom.parameters is None
+    placed = about_centre(bucketed(lines), centre)
+    return of_given(fit_about(placed, ready, algebraic=unfitted, invertible=invertible, **options), lines)
 
 
 def about_centre(lines: SomeLines, centre: CentreArgument | None) -> SomeLines | CompressedLines:

@@ -145,15 +145,19 @@ class AbstractLines(eqx.Module):
             ValueError: `weight` does not hold one finite number of at least 0 for each line.
         """
         refuse_masked("weight", weight)
-        weight = jnp.asarray(weight, jnp.asarray(self.focal).dtype)
-        if weight.shape != self.frame.shape:
+        dtype = jax.dtypes.canonicalize_dtype(self.focal.dtype)
+        if isinstance(weight, jax.Array) or traced(weight):
+            values = jnp.asarray(weight, dtype)
+        else:
+            values = jax.device_put(np.asarray(weight, dtype))  # unlike jnp.asarray this compiles nothing
+        if values.shape != self.frame.shape:
             raise ValueError(
                 f"Argument weight must hold one number for each of the {self.frame.shape[0]} lines, but "
-                f"its shape is {weight.shape}."
+                f"its shape is {values.shape}."
             )
-        if not traced(weight) and not (np.isfinite(weight) & (np.asarray(weight) >= 0)).all():
+        if not traced(values) and not (np.isfinite(values) & (np.asarray(values) >= 0)).all():
             raise ValueError("Argument weight must hold finite numbers of at least 0, but it does not.")
-        return eqx.tree_at(lambda lines: lines.weight, self, weight, is_leaf=lambda leaf: leaf is None)
+        return eqx.tree_at(lambda lines: lines.weight, self, values, is_leaf=lambda leaf: leaf is None)
 
     def by_frame(self) -> tuple[Int[AnyArray, "frame some"], Bool[AnyArray, "frame some"]]:
         """For each frame the indices of its lines, padded to the largest frame, and a mask of real entries.

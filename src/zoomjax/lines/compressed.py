@@ -38,6 +38,7 @@ from .._core.products import EXACT
 from .._core.types import Centres, traced
 from ._triangle import triangle
 from .base import header_of
+from .buckets import bucketed
 from .lines import Lines
 from .triangles import AbstractTriangles
 
@@ -188,7 +189,7 @@ def triangles_of(lines: Lines, columns: Callable[..., Array], terms: int) -> Flo
         return _reduce_sharded(lines, sharding, columns, terms)
     if traced(lines) or jax.default_backend() != "cpu":
         return _reduce_run(lines, np.asarray(0), lines.points.shape[0], columns, terms)
-    return _reduce_in_threads(lines, columns, terms)
+    return jax.device_put(_reduce_in_threads(bucketed(lines), columns, terms)[: lines.points.shape[0]])
 
 
 def _sharding_of_lines(lines):
@@ -246,7 +247,8 @@ def _reduce_in_threads(lines, columns, terms):
         triangles += pool.map(reduce_from, starts[alone:])
         _COMPILED.add(signature)
     overlaps = [part * size - start for part, start in enumerate(starts)]
-    return jnp.concatenate([run[overlap:] for run, overlap in zip(triangles, overlaps, strict=True)])
+    runs = [np.asarray(run)[overlap:] for run, overlap in zip(triangles, overlaps, strict=True)]
+    return np.concatenate(runs)
 
 
 @eqx.filter_jit

@@ -26,6 +26,7 @@ from .._core.products import EXACT
 from .._core.types import Centres, traced
 from ._triangle import triangle
 from .base import header_of
+from .buckets import bucketed_jit, of_lines
 from .compressed import CompressedLines, triangles_of
 from .lines import Lines
 from .triangles import AbstractTriangles
@@ -110,24 +111,24 @@ class AnyCentreLines(AbstractTriangles):
 
         In the latter case the result's `centre` is the mean.
         """
-        centre = jnp.asarray(centre, self.triangle.dtype)
-        each = jnp.broadcast_to(centre, (self.focal.shape[0], 2))
-        header: dict[str, Any] = header_of(self) | {"centre": jnp.mean(each, axis=0)}
-        offset = ((each - self.centre[None]) / self.scale)[self.frame]
-        return CompressedLines(triangle=_about(self.terms, self.triangle, offset), **header)
+        each, mean = self._centres(centre)
+        return CompressedLines(triangle=_about(self, each), **header_of(self) | {"centre": mean})
 
     def moved(self, centre: Centres) -> "AnyCentreLines":
         """The same lines with their monomials about another centre, px: that of all frames, or of each.
 
         In the latter case the result's `centre` is the mean.
         """
-        each = jnp.broadcast_to(jnp.asarray(centre, self.triangle.dtype), (self.focal.shape[0], 2))
-        offset = ((each - self.centre[None]) / self.scale)[self.frame]
-        return eqx.tree_at(
-            lambda lines: (lines.triangle, lines.centre),
-            self,
-            (_moved(self.terms, self.triangle, offset), jnp.mean(each, axis=0)),
-        )
+        each, mean = self._centres(centre)
+        new = (_moved(self, each), mean)
+        return eqx.tree_at(lambda lines: (lines.triangle, lines.centre), self, new)
+
+    def _centres(self, centre: Centres) -> tuple[Any, Any]:
+        """The centre of each frame, and their mean; in NumPy where they are known."""
+        xp: Any = jnp if traced(centre) else np
+        centre = xp.asarray(centre, self.triangle.dtype)
+        each = xp.broadcast_to(centre, (self.focal.shape[0], 2))
+        return each, jnp.asarray(centre if centre.ndim == 1 else xp.mean(each, axis=0))
 
 
 @kinds_checked
@@ -236,9 +237,10 @@ def _derivatives(terms):
     return by_xy
 
 
-@eqx.filter_jit
-def _moved(terms, triangles, offset):
+@bucketed_jit(frames=["centres"], returns=of_lines)
+def _moved(lines, centres):
     """R of the monomials of ``z - offset``, which are sums of those of z: (x - a)^i is by binomials."""
+    terms = lines.terms
     a, b = _powers(terms)
     binomials = np.array([[math.comb(i, j) for i in range(2 * terms + 2)] for j in range(2 * terms + 2)])
 
@@ -251,12 +253,17 @@ def _moved(terms, triangles, offset):
 
         return triangle(jnp.matmul(r, of(0, a, a) * of(1, b, b), precision=EXACT).T)
 
-    return jax.vmap(one)(triangles, offset)
+    return jax.vmap(one)(lines.triangle, _offsets(lines, centres))
 
 
-@eqx.filter_jit
-def _about(terms, triangles, offset):
+@bucketed_jit(frames=["centres"], returns=of_lines)
+def _about(lines, centres):
     def one(r, offset):
-        return triangle(jnp.matmul(_radial_columns(terms, offset), r.T, precision=EXACT))
+        return triangle(jnp.matmul(_radial_columns(lines.terms, offset), r.T, precision=EXACT))
 
-    return jax.vmap(one)(triangles, offset)
+    return jax.vmap(one)(lines.triangle, _offsets(lines, centres))
+
+
+def _offsets(lines, centres):
+    """Of each line's centre from that of the monomials, normalised."""
+    return ((centres - lines.centre[None]) / lines.scale)[lines.frame]

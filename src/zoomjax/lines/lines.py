@@ -152,13 +152,13 @@ class Lines(AbstractLines):
         warn_of_points_outside(padded, mask, size)
         return cls(
             points=held_as_given(padded),
-            mask=jnp.asarray(mask),
-            frame=jnp.asarray(frames, jnp.int32),
+            mask=held_as_given(mask),
+            frame=held_as_given(frames.astype(np.int32)),
             focal=held_as_given(focals.astype(dtype)),
             centre=held_as_given(checked_centre(centre, size).astype(dtype)),
             image_size=size,
             focal_unit=unit,
-            number=jnp.asarray(number, jnp.int32),
+            number=held_as_given(number.astype(np.int32)),
             focus=None if focus is None else held_as_given(checked_focus(focus, focals.size).astype(dtype)),
         )
 

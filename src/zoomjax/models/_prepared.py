@@ -22,6 +22,11 @@ def zero_parameters(rows: int, terms: int, dtype: np.dtype) -> Float[Array, "row
     return jnp.asarray(np.zeros((rows, terms), dtype))
 
 
+def shortest(focal: Focal) -> Float[Array, ""]:
+    """The shortest focal length: where they are known by NumPy, which compiles nothing."""
+    return jnp.min(focal) if traced(focal) else jnp.asarray(np.asarray(focal).min())
+
+
 def prepared(value):
     if value is None:
         raise ValueError(UNFITTED)

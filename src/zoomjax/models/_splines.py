@@ -7,9 +7,16 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core.types import AnyArray, traced
 
 
-def spread(values: Float[AnyArray, "value"], number: int | None) -> Float[AnyArray, "knot"]:
-    """`number` of the distinct values, or all, increasing and spread evenly over their ranks."""
-    ordered = jnp.sort(values) if traced(values) else np.unique(np.asarray(values))
+def spread(
+    values: Float[AnyArray, "value"], number: int | None, *, inverse: bool = False
+) -> Float[AnyArray, "knot"]:
+    """`number` of the distinct values, or all, increasing and spread evenly over their ranks.
+
+    Or of their `inverse`; in NumPy where they are known, which compiles nothing.
+    """
+    values = values if traced(values) else np.asarray(values)
+    values = 1 / values if inverse else values
+    ordered = jnp.sort(values) if traced(values) else np.unique(values)
     if number is None:
         return ordered
     return ordered[np.round(np.linspace(0, ordered.shape[0] - 1, number)).astype(int)]

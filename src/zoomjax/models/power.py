@@ -9,7 +9,7 @@ from jaxtyping import Float, ScalarLike
 from .._core.fields import check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Coefficients, Focal, Scalar, traced
 from ._bernstein import Pieces
-from ._prepared import prepared, zero_parameters
+from ._prepared import prepared, shortest, zero_parameters
 from .zoom import AbstractZoom, check_distinct, one_focal
 
 _POWER_PIECES = 128
@@ -50,7 +50,7 @@ class PowerZoom(AbstractZoom):
             check_distinct("A power law", focal, 3)
         focal = jnp.asarray(focal)
         start = zero_parameters(3, terms, focal.dtype).at[2].set(-2)
-        return PowerZoom(parameters=start, focal_ref=jnp.min(focal))
+        return PowerZoom(parameters=start, focal_ref=shortest(focal))
 
     def __call__(self, focal: ScalarLike) -> Coefficients:
         """The coefficients at one focal length."""

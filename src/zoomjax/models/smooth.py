@@ -13,6 +13,7 @@ import math
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
@@ -22,6 +23,7 @@ from .._core.checks import checked_integer
 from .._core.fields import check_finite, check_not_negative, check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Focal, Scalar
 from ._bernstein import Pieces
+from ._prepared import shortest, zero_parameters
 from .zoom import UNFITTED, AbstractPriorZoom, inverse_powers
 
 _ERROR = 9.21e-5
@@ -108,14 +110,14 @@ class SmoothZoom(AbstractPriorZoom):
                 f"The prior of this SmoothZoom is for {self.beyond.shape[0]} terms, but {terms} are asked "
                 "for: give it the arguments quadratic and beyond for them, or choose a PolynomialZoom."
             )
-        focal = jnp.asarray(focal)
+        dtype = jax.dtypes.canonicalize_dtype(focal.dtype)
         return SmoothZoom(
             degree=self.degree,
-            parameters=jnp.zeros((self.degree + 1, terms), focal.dtype),
-            focal_ref=jnp.min(focal),
-            error=self.error.astype(focal.dtype),
-            quadratic=self.quadratic.astype(focal.dtype),
-            beyond=self.beyond.astype(focal.dtype),
+            parameters=zero_parameters(self.degree + 1, terms, dtype),
+            focal_ref=shortest(focal),
+            error=self.error.astype(dtype),
+            quadratic=self.quadratic.astype(dtype),
+            beyond=self.beyond.astype(dtype),
         )
 
     def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:

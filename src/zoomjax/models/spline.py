@@ -57,7 +57,7 @@ class SplineZoom(AbstractLinearZoom):
     def prepare(self, focal: Focal, terms: int) -> "SplineZoom":
         """A spline of zeros, its knots at focal lengths that are there."""
         check_knots("A spline", focal, self.number)
-        knots = spread(1 / focal, self.number)
+        knots = spread(focal, self.number, inverse=True)
         zeros = zero_parameters(knots.shape[0], terms, knots.dtype)
         curvature = natural_curvature(knots)
         return SplineZoom(number=self.number, parameters=zeros, knots=knots, curvature=curvature)

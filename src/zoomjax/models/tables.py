@@ -60,7 +60,7 @@ class TableZoom(AbstractLinearZoom):
     def prepare(self, focal: Focal, terms: int) -> "TableZoom":
         """A table of zeros, its entries at focal lengths that are there."""
         check_knots("A table", focal, self.number)
-        knots = spread(1 / focal if self.inverse else focal, self.number)
+        knots = spread(focal, self.number, inverse=self.inverse)
         zeros = zero_parameters(knots.shape[0], terms, knots.dtype)
         return TableZoom(number=self.number, inverse=self.inverse, parameters=zeros, knots=knots)
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, ScalarLike
 from .._core.fields import check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Focal, Scalar, of_known_values, traced
 from ._bernstein import Pieces
-from ._prepared import prepared, zero_parameters
+from ._prepared import prepared, shortest, zero_parameters
 from .zoom import AbstractLinearZoom, check_distinct, inverse_powers
 
 
@@ -68,7 +68,7 @@ class TwoRegionZoom(AbstractLinearZoom):
         return TwoRegionZoom(
             crossover=self.crossover.astype(focal.dtype),
             parameters=zero_parameters(6, terms, focal.dtype),
-            focal_ref=jnp.min(focal),
+            focal_ref=shortest(focal),
         )
 
     def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:

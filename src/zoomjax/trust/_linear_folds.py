@@ -19,6 +19,7 @@ import jax
 import numpy as np
 
 from ..fit.energy import prior_jacobian, settings
+from ..lines.buckets import bucketed_jit, padded_frames
 from ..models.zoom import (
     AbstractPriorZoom,
     with_parameters,
@@ -71,7 +72,8 @@ def _design(lines, model, left):
         zoom = model.zoom.prepare(focal[left], model.terms, *(values[left] for values in focus))
     except ValueError as error:
         return str(error)
-    values = np.asarray(_basis_of(with_parameters(zoom, None), focal, *focus), float)
+    every = map(padded_frames, (focal, *focus))
+    values = np.asarray(_basis_of(with_parameters(zoom, None), *every), float)[: len(focal)]
     size = values.shape[1]
     precision = np.zeros((size * model.terms, size * model.terms))
     if isinstance(zoom, AbstractPriorZoom):
@@ -86,7 +88,7 @@ _basis_of = eqx.filter_jit(lambda model, *settings: jax.vmap(model.basis)(*setti
 """Of a model without its parameters: one compiled program for any number of terms."""
 
 
-@eqx.filter_jit
+@bucketed_jit()
 def _whitener(lines, model):
     """What makes of the flattened parameters what their prior adds to the residuals, px."""
     return prior_jacobian(lines, model)

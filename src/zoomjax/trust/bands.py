@@ -36,19 +36,23 @@ Given = ParamSpec("Given")
 Result = TypeVar("Result")
 
 
-def _focal_checked(function: Callable[Given, Result]) -> Callable[Given, Result]:
-    """Refuse focal lengths and levels that are none, where they are known: the function is compiled."""
-    signature = inspect.signature(function)
+def _compiled(function: Callable[Given, Result]) -> Callable[Given, Result]:
+    """Compile a function of a fit; refuse focal lengths and levels that are none, where they are known.
+
+    It does not see the errors of the frames, so that their number is no matter.
+    """
+    program, signature = eqx.filter_jit(function), inspect.signature(function)
 
     @functools.wraps(function)
     def checked(*args: Given.args, **kwargs: Given.kwargs) -> Result:
-        given = signature.bind(*args, **kwargs).arguments
+        given: dict[str, Any] = signature.bind(*args, **kwargs).arguments
         focal = given.get("focal")
         check_positive("focal", focal if isinstance(focal, jax.Array) else np.asarray(focal, float))
         level = given.get("level", 0.5)
         if not traced(level) and not (np.ndim(level) == 0 and 0 < level < 1):
             raise ValueError(f"Argument level must be a number between 0 and 1, but it is {level!r}.")
-        return function(*args, **kwargs)
+        given["fit"] = eqx.tree_at(lambda fit: fit.frame_rms, given["fit"], None)
+        return program(**given)  # pyright: ignore[reportCallIssue]
 
     return checked
 
@@ -137,8 +141,7 @@ def _uncertain(fit):
 
 
 @kinds_checked
-@_focal_checked
-@eqx.filter_jit
+@_compiled
 def coefficient_std(fit: ZoomFit, focal: Focals) -> Float[Array, "*focal terms"]:
     """Standard deviations of the normalised coefficients k1(f), ..., kN(f).
 
@@ -162,8 +165,7 @@ def coefficient_std(fit: ZoomFit, focal: Focals) -> Float[Array, "*focal terms"]
 
 
 @kinds_checked
-@_focal_checked
-@eqx.filter_jit
+@_compiled
 def displacement_covariance(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Array, "*both 2 2"]:
     """Covariance of corrected points, and so of displacements, px^2.
 
@@ -188,8 +190,7 @@ def displacement_covariance(fit: ZoomFit, points: Points, *, focal: Focals) -> F
 
 
 @kinds_checked
-@_focal_checked
-@eqx.filter_jit
+@_compiled
 def displacement_std(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Array, "*both"]:
     """Standard deviation of corrected points, px: the root of the mean squared distance.
 
@@ -213,8 +214,7 @@ def displacement_std(fit: ZoomFit, points: Points, *, focal: Focals) -> Float[Ar
 
 
 @kinds_checked
-@_focal_checked
-@eqx.filter_jit
+@_compiled
 def displacement_band(
     fit: ZoomFit, points: Points, *, focal: Focals, level: ScalarLike = 0.95
 ) -> tuple[Float[Array, "*both"], Float[Array, "*both"]]:

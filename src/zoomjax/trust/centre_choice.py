@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..fit.centre import CentreFit, fit_centre, refit_centre
@@ -57,7 +56,7 @@ def choose_centre(lines: AnyCentreLines, model: Model) -> CentreChoice:
     own, fitted = own_weights(small), np.full(given.shape, np.nan)
     for fold in range(parts.number) if found.determined else ():
         out = parts.fold == fold
-        kept = lines.weighted(jnp.asarray(own * ~out))
+        kept = lines.weighted(own * ~out)
         fitted[out] = np.asarray(line_squares(lines, refit_centre(kept, found)))[out]
     share = np.where(np.isfinite(given) & np.isfinite(fitted), shares(small), 0)
     if not share.any():

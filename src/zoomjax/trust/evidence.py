@@ -14,6 +14,7 @@ Once per fit: a pass over the points of at most `_MOST_LINES` lines, and a Jacob
 
 import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -31,17 +32,18 @@ from ..fit.energy import (
     prior_jacobian,
     prior_residuals,
 )
-from ..fit.family_lines import compress_family, with_family
+from ..fit.family_lines import compress_family
 from ..fit.result import ZoomFit
-from ..fit.same_camera import check_lines_of
+from ..fit.same_camera import check_lines_of, placed_as
 from ..fit.wrapper import about_own_centre
 from ..lines.base import AbstractLines
+from ..lines.buckets import bucketed, bucketed_jit, of_lines
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
 from ..models.zoom import AbstractZoom, with_parameters
 from .bands import displacement_std
-from .folds import own_weights
+from .folds import counts_of, own_weights
 
 _CURVE = 5
 _FOCALS = 3  # over the range, evenly in 1/f
@@ -131,11 +133,11 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     """
     check_lines_of(fit, lines)
     lens = fit.lens
-    centre = lens.centre if lens.shift is None else jax.vmap(lens)(jnp.asarray(lines.focal)).centre
-    placed = lines.about(centre)
+    placed: Any = placed_as(lens, lines)
     if compressed is None:
         terms = np.asarray(lens.zoom(lens.focal_range[0])).size
-        compressed = compress_family(placed, lens.family, terms=terms)
+        points: Any = placed if isinstance(placed, Lines) else placed.as_weighted()
+        compressed = compress_family(points, lens.family, terms=terms)
     compressed = _same_lines(lines, compressed)
     weight = own_weights(compressed)
     if not weight.any():
@@ -149,7 +151,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     raster = jnp.asarray(_raster(lens), dtype)
     moved, rows = map(np.asarray, _derivatives(lens, raster, jnp.asarray(focals, dtype)))
     std = np.asarray(displacement_std(fit, raster[None], focal=focals[:, None]))
-    zero = jnp.zeros((len(lines.focal), np.size(lens.zoom(lens.focal_range[0]))), dtype)
+    zero = jax.device_put(np.zeros((len(lines.focal), np.size(lens.zoom(lens.focal_range[0]))), dtype))
     before = np.asarray(frame_energy(compressed, zero))
     return Evidence(
         lines=int((weight > 0).sum()),
@@ -158,7 +160,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
         focals=np.unique(np.asarray(lines.focal)[frames]).size,
         rms=float(fit.rms),
         rms_uncorrected=float(np.sqrt(np.nanmean(before))),
-        noise=_noise(with_family(placed, lens.family), lens, np.flatnonzero(weight)),
+        noise=_noise(placed, lens, np.flatnonzero(weight)),
         displacement=float(np.max(_over_image(np.linalg.norm(moved, axis=-1)))),
         std=float(np.max(_over_image(std))),
         halves=tuple(_halves(compressed, fit, weight, rows)),
@@ -176,7 +178,7 @@ def _same_lines(lines: Lines, compressed: AbstractLines) -> AbstractLines:
         compressed.image_size == lines.image_size
         and compressed.focal_unit == lines.focal_unit
         and np.array_equal(compressed.frame, lines.frame)
-        and np.array_equal(compressed.counts, lines.counts)
+        and np.array_equal(counts_of(compressed), counts_of(lines))
     )
     if not same:
         raise ValueError(
@@ -189,20 +191,19 @@ def _same_lines(lines: Lines, compressed: AbstractLines) -> AbstractLines:
 def _noise(lines: AbstractLines, lens: ZoomLens, counted: np.ndarray) -> float:
     """RMS distance, px, of corrected points to smooth curves through their lines."""
     chosen = counted[np.unique(np.linspace(0, len(counted) - 1, _MOST_LINES).astype(int))]
-    counts, coefficients = np.asarray(lines.counts), coefficients_by(lens.zoom, lines)
+    counts, lines = counts_of(lines), bucketed(lines)
     squares = []
     for part in np.array_split(chosen, -(-len(chosen) // _LINES_AT_ONCE)):
-        index = jnp.asarray(np.resize(part, min(_LINES_AT_ONCE, len(chosen))))
-        rows = np.asarray(_corrected(lines, index, coefficients))
+        rows = np.asarray(_corrected(lines, np.resize(part, _LINES_AT_ONCE), lens.zoom))
         pairs = zip(rows[: len(part)], counts[part].astype(int), strict=True)
         squares += [_roughness(points[:count]) for points, count in pairs if count >= _LEAST_POINTS]
     return float(np.sqrt(np.mean(squares))) if squares else np.nan
 
 
 @eqx.filter_jit
-def _corrected(lines, index, coefficients):
+def _corrected(lines, index, zoom):
     some = lines.take(index, jnp.ones(len(index), bool))
-    return some.corrected(coefficients[lines.frame[index]])
+    return some.corrected(coefficients_by(zoom, lines)[lines.frame[index]])
 
 
 def _roughness(points: np.ndarray) -> float:
@@ -259,7 +260,7 @@ def _normal_terms(
     return prior.T @ prior, (gram, gradient)
 
 
-@eqx.filter_jit
+@bucketed_jit(returns=[of_lines, of_lines, None, None])
 def _linearised(lines, zoom):
     weighted, jacobian = linearised(lines, zoom)
     prior = prior_jacobian(lines, zoom)
@@ -279,11 +280,18 @@ def _partings(lines: AbstractLines, fit: ZoomFit, weight: np.ndarray) -> dict[st
     rank = np.empty(len(focal), int)
     rank[np.argsort(focal, kind="stable")] = np.arange(len(focal))
     parted = {"lines": evenly, "frames": rank[frame] % 2 == 0}
-    rows = np.asarray(lines.corrected(coefficients_by(fit.lens.zoom, lines)[frame]))
-    steep = (rows[..., 1] ** 2).sum(axis=1) > (rows[..., 0] ** 2).sum(axis=1)
+    across, down = np.asarray(_extent(lines, fit.lens.zoom)).T
+    steep = down > across
     if _LEAST_SHARE <= steep[counted].mean() <= 1 - _LEAST_SHARE:
         parted["directions"] = steep
     return parted
+
+
+@bucketed_jit(returns=of_lines)
+def _extent(lines, zoom):
+    """How far each corrected line reaches, squared: across the image and down."""
+    rows = lines.corrected(coefficients_by(zoom, lines)[lines.frame])
+    return jnp.sum(rows**2, axis=1)
 
 
 def _raster(lens: ZoomLens) -> np.ndarray:

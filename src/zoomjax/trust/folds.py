@@ -10,6 +10,8 @@ from ..fit.compression import compressed
 from ..fit.wrapper import AbstractWrapper
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
+from ..lines.lines import Lines
+from ..lines.triangles import AbstractTriangles
 
 HoldOut = Literal["focal", "frame", "line"]
 
@@ -126,7 +128,11 @@ def own_weights(lines):
 
 
 def counts_of(lines):
-    """Numbers of points; of `CompressedLines` in NumPy: of what JAX does once, most is compiling."""
-    if not isinstance(lines, CompressedLines):
+    """Numbers of points, in NumPy where it can be: of what JAX does once, most is compiling."""
+    while isinstance(lines, AbstractWrapper):
+        lines = lines.lines
+    if isinstance(lines, Lines):
+        return np.asarray(lines.mask).sum(axis=1).astype(float)
+    if not isinstance(lines, AbstractTriangles):
         return np.asarray(lines.counts)
     return np.round(np.asarray(lines.triangle)[:, 0, 0].astype(float) ** 2)

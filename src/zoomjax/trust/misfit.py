@@ -15,7 +15,6 @@ s^2 that is left. So the mean of ``d d^T`` over the frames, times ``1 - q s^2 / 
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -23,11 +22,10 @@ from jaxtyping import Float
 from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
 from ..fit.compression import compressed_as_measured
-from ..fit.energy import frame_normal_equations
-from ..fit.family_lines import with_family
+from ..fit.energy import frame_coefficients, frame_normal_equations
 from ..fit.image_metric import ImageLines
 from ..fit.result import ZoomFit
-from ..fit.same_camera import check_lines_of
+from ..fit.same_camera import check_lines_of, placed_as
 from ..lines.base import AbstractLines
 from ..models.polynomial import RadialPolynomial
 from ..models.requirements import check
@@ -75,9 +73,8 @@ def with_misfit(fit: ZoomFit, lines: AbstractLines) -> ZoomFit:
     check_lines_of(fit, lines)
     lens = fit.lens
     check("with_misfit", zoom=lens.zoom)
-    centre = lens.centre if lens.shift is None else jax.vmap(lens)(jnp.asarray(lines.focal)).centre
-    k = np.asarray(jax.vmap(lens.zoom)(jnp.asarray(lines.focal)), float)
-    placed = with_family(lines, lens.family).about(centre)
+    placed = placed_as(lens, lines)
+    k = np.asarray(frame_coefficients(placed, lens.zoom), float)
     by_moments = isinstance(lens.family, RadialPolynomial) and not isinstance(placed, ImageLines)
     score, matrix, number, focal = (_quickly if by_moments else _by_residuals)(placed, k, lens.family)
     if len(focal) < _FEWEST:

@@ -26,10 +26,12 @@ from ..fit.family_lines import with_family
 from ..fit.result import ZoomFit
 from ..fit.same_camera import check_lines_of
 from ..lines.base import AbstractLines
+from ..lines.buckets import bucketed_jit, of_lines
 from ..models.requirements import check
 from ..models.sizes import at_focal
 from ..models.zoom import with_parameters
 from .bands import displacement_std
+from .folds import own_weights
 
 _FOCALS = 5  # over the range, evenly in 1/f
 _DIRECTIONS = ("horizontal", "vertical")
@@ -125,7 +127,7 @@ def suggest_next(
         )
     check("suggest_next", zoom=fit.lens.zoom, shift=fit.lens.shift)
     lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
-    if not np.any(counted_frames(lines)):
+    if not own_weights(lines).any():
         raise ValueError(
             "Argument lines must have a usable line, but all have a weight of 0 or too few points."
         )
@@ -134,7 +136,7 @@ def suggest_next(
     dtype = fit.covariance.dtype
     candidates = jnp.asarray(candidate_lines(fit.lens.image_size, length), dtype)
     grid = jnp.asarray(focals, dtype)
-    now, table = _bands(fit, lines, candidates, grid, jnp.asarray(number), jnp.asarray(counts))
+    now, table = _bands(lines, fit.lens, candidates, grid, jnp.asarray(number), jnp.asarray(counts))
     before = float(_average(displacement_std(fit, _image_grid(fit.lens.image_size)[:, None], focal=grid)))
     # What was measured of the noise is in `before`; how a photo changes it is the ratio.
     table = np.nan_to_num(np.asarray(table, np.float64), nan=np.inf)  # what rounding alone is left of
@@ -177,7 +179,7 @@ def _typical(lines):
     return tuple(float(np.median(values)) for values in (per_frame[per_frame > 0], length, counts[there]))
 
 
-@eqx.filter_jit
+@bucketed_jit(returns=[of_lines] * 3)
 def _sizes(lines):
     unchanged = lines.corrected(jnp.zeros((lines.frame.shape[0], lines.family.size(1)), lines.focal.dtype))
     return line_weights(lines), lines.counts, jnp.sum(unchanged**2, axis=(1, 2))
@@ -205,20 +207,20 @@ def candidate_lines(
     return lines
 
 
-@eqx.filter_jit
-def _bands(fit, lines, candidates, focals, number, counts):
+@bucketed_jit(returns=[None, None])
+def _bands(lines, lens, candidates, focals, number, counts):
     """The mean standard deviation of the displacement now, and with each candidate.
 
     For independent points, and candidates with so many lines of so many points.
     """
-    zoom = fit.lens.zoom
+    zoom = lens.zoom
     flat, unravel = ravel_pytree(zoom.parameters)
     weights, frames = line_weights(lines), number_counted(counted_frames(lines)).astype(flat.dtype)
     weighted, jacobian = linearised(lines, zoom)
     information = jnp.einsum("lri,lrj->ij", jacobian, jacobian)
     noise = jnp.einsum("l,lri,lrj->ij", weights, jacobian, jacobian)
     variance = jnp.sum(weighted**2) / _positive(jnp.sum(weights * (lines.counts - 2)))
-    rows = _displacement_rows(fit, flat, unravel, focals)
+    rows = _displacement_rows(lens, flat, unravel, focals)
 
     def typical(information, noise):
         """Of the estimate with the prior: a variance of 1 for each parameter, weighed as a point is."""
@@ -236,8 +238,8 @@ def _bands(fit, lines, candidates, focals, number, counts):
         """Mean over a line's points of the squared derivatives of their residuals."""
 
         def residuals(flat):
-            lens = eqx.tree_at(lambda lens: lens.zoom, fit.lens, with_parameters(zoom, unravel(flat)))
-            corrected = at_focal(lens, focal).undistort(points)
+            other = eqx.tree_at(lambda lens: lens.zoom, lens, with_parameters(zoom, unravel(flat)))
+            corrected = at_focal(other, focal).undistort(points)
             return line_residuals(corrected - jnp.mean(corrected, axis=0)[None])
 
         derivative = jax.jacfwd(residuals)(flat)
@@ -254,13 +256,13 @@ def _bands(fit, lines, candidates, focals, number, counts):
     return typical(information, noise), over(candidates, focals)
 
 
-def _displacement_rows(fit, flat, unravel, focals):
+def _displacement_rows(lens, flat, unravel, focals):
     """Derivatives by the parameters of where points all over the image go, at all focal lengths."""
-    points = _image_grid(fit.lens.image_size).astype(flat.dtype)
+    points = _image_grid(lens.image_size).astype(flat.dtype)
 
     def corrected(flat, focal):
-        zoom = with_parameters(fit.lens.zoom, unravel(flat))
-        return at_focal(eqx.tree_at(lambda lens: lens.zoom, fit.lens, zoom), focal).undistort(points)
+        zoom = with_parameters(lens.zoom, unravel(flat))
+        return at_focal(eqx.tree_at(lambda lens: lens.zoom, lens, zoom), focal).undistort(points)
 
     rows = jax.vmap(jax.jacfwd(corrected), (None, 0))(flat, focals)
     return rows.reshape(-1, 2, flat.size)
