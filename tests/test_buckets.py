@@ -24,6 +24,7 @@ from zoomjax.fit import (
     fit_focal,
     fit_frame_centres,
     frame_energy,
+    global_energy,
     in_image,
     with_focal_sigma,
 )
@@ -214,10 +215,20 @@ def test_other_sizes_compile_nothing(compilations):
 
 def test_other_lines_and_frames_compile_nothing(compilations):
     fit = functools.partial(zj.fit_zoom, zoom=zj.PolynomialZoom(degree=0), terms=1)
+    other = scene(5, 14, 33)
+    compilations()
     fit(zj.compress(LINES))
     assert compilations() > 1
-    fit(zj.compress(scene(5, 14, 33)))
+    fit(zj.compress(other))
     assert compilations() == 0
+
+
+@pytest.mark.parametrize("number", [1, 6, 8])
+def test_rows_of_other_frames_are_refused_before_they_are_padded(number, unchecked):
+    lines = zj.compress(LINES)
+    for function in (frame_energy, global_energy, lambda lines, k: zj.frame_rms(lines, k)):
+        with pytest.raises(ValueError, match="a row for each of the 7 frames"):
+            function(lines, jax.numpy.zeros((number, 2)))
 
 
 def _used() -> tuple[int, int]:

@@ -12,7 +12,7 @@ from ..fit.centre import fit_centre
 from ..fit.family_lines import compress_family
 from ..fit.frames import fit_frames
 from ..fit.prepare import ready_model
-from ..fit.result import FrameFits, ZoomFit
+from ..fit.result import FrameFits, ZoomFit, failed
 from ..fit.robust import reweighted
 from ..fit.zoom import CentreArgument, about_centre, fit_zoom
 from ..lines.base import AbstractLines
@@ -69,12 +69,16 @@ def fitted(
     model = radial.base(lines.focal)
     ready_model(lines, model)  # raises if there are too few focal lengths, before any work
     found = _about_centre(lines, radial, centre, robust, wanted.family in (None, "radial", "auto"), stage)
-    if wanted.family not in (None, "radial") or _is_strong(wanted, found, stage):
+    if wanted.family is None and found.zoom is None:
+        stage("Fitting the zoom model")
+        found = found._replace(zoom=fit_zoom(found.lines, zoom=found.model, throw=False))
+    strong = found.zoom is not None and wanted.is_beyond(found.zoom)
+    if strong or wanted.family not in (None, "radial"):
         found = _under_family(lines, wanted, found, centre, robust, stage)
     small, model, zoom = found.lines, found.model, found.zoom
-    stage("Fitting the zoom model")
-    if zoom is None:
-        zoom = fit_zoom(small, zoom=model)
+    if zoom is None or failed(zoom.result):
+        stage("Fitting the zoom model")
+        zoom = fit_zoom(small, zoom=model)  # or says why not
     stage("Fitting each frame separately")
     each = fit_frames(small, terms=model.terms, throw=False)
     return Fitted(zoom, each, small, model, found.centre, found.selection)
@@ -154,17 +158,6 @@ def _weights(held: CompressedLines | AnyCentreLines, model: Model) -> np.ndarray
             break
         best, tried = other, held.weighted(other)
     return best
-
-
-def _is_strong(wanted: WantedModel, found: _Centred, stage: Callable[[str], None]) -> bool:
-    """Whether the polynomial is to compete with the division model."""
-    if wanted.family is not None:
-        return False
-    zoom = found.zoom
-    if zoom is None:
-        stage("Fitting the zoom model")
-        zoom = fit_zoom(found.lines, zoom=found.model, throw=False)
-    return wanted.is_beyond(zoom)
 
 
 def _under_family(

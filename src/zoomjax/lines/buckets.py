@@ -128,6 +128,8 @@ def bucketed_jit(
             by_frame = {name: given[name] for name in frames if given[name] is not None}
             if traced(by_frame) or (padded := bucketed(lines)) is lines:
                 return program(*args, **kwargs)
+            if any(np.shape(of)[:1] != lines.focal.shape for of in by_frame.values()):
+                return program(*args, **kwargs)  # it says so; padding would make it look right
             given |= {name: padded_to(of, len(padded.focal)) for name, of in by_frame.items()}
             found: Any = program(**given | {first: padded})  # pyright: ignore[reportCallIssue]
             if returns is None or callable(returns):

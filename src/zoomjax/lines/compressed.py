@@ -231,9 +231,11 @@ def _reduce_in_threads(lines, columns, terms):
     number = lines.points.shape[0]
     widest = jnp.result_type(float)
     with ThreadPoolExecutor() as pool:
-        # JAX's context managers, such as that for float64, hold in their own thread alone.
-        same_context = pool.submit(lambda: jnp.result_type(float) == widest).result()
-        parts = min(os.cpu_count() or 1, number) if same_context else 1
+        # JAX's context managers, such as that for float64, hold in their own thread alone. So does `jit`:
+        # lines that are known are reduced at once, inside of it, too.
+        if not pool.submit(lambda: jnp.result_type(float) == widest).result():
+            return _reduce_run(lines, np.asarray(0), number, columns, terms)
+        parts = min(os.cpu_count() or 1, number)
         size = -(-number // parts)
         starts = [min(part * size, number - size) for part in range(parts)]
 
@@ -242,8 +244,8 @@ def _reduce_in_threads(lines, columns, terms):
             return jax.block_until_ready(_reduce_run(lines, np.asarray(start), size, columns, terms))
 
         signature = (lines.points.shape, str(lines.points.dtype), size, columns, terms, str(widest))
-        alone = 0 if signature in _COMPILED and same_context else 1
-        triangles = [reduce_from(start) for start in starts[:alone]]
+        alone = 0 if signature in _COMPILED else 1
+        triangles = [pool.submit(reduce_from, start).result() for start in starts[:alone]]
         triangles += pool.map(reduce_from, starts[alone:])
         _COMPILED.add(signature)
     overlaps = [part * size - start for part, start in enumerate(starts)]
