@@ -112,7 +112,7 @@ def _opencv(tracks: Tracks, images: np.ndarray) -> Found:
         image.img_idx, image.img_size = place, SIZE
         image.keypoints = [cv2.KeyPoint(float(x), float(y), 1.0) for x, y in np.concatenate(points)]
         features.append(image)
-    done, cameras = cv2.detail.HomographyBasedEstimator().apply(features, matches, None)
+    done, cameras = cv2.detail.HomographyBasedEstimator().apply(features, matches, [])
     assert done
     for camera in cameras:
         camera.R = camera.R.astype(np.float32)

@@ -47,6 +47,7 @@ def write_many(folder: Path, number: int) -> None:
         target = folder / f"{path.stem}-{index:05d}.jpg"
         if target.exists():
             continue
+        assert image is not None  # written above
         image = image.copy()
         image[-2:] = rng.integers(0, 40, image[-2:].shape, dtype=np.uint8)
         exif = np.frombuffer(exif_with_focal(focal or 1.0), np.uint8)

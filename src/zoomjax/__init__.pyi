@@ -23,6 +23,7 @@ from .detect import EdgeDetector as EdgeDetector
 from .fit import RESULTS as RESULTS
 from .fit import FrameFits as FrameFits
 from .fit import ZoomFit as ZoomFit
+from .fit import cache_compiled as cache_compiled
 from .fit import fit_frames as fit_frames
 from .fit import fit_robust as fit_robust
 from .fit import fit_zoom as fit_zoom

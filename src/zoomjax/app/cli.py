@@ -19,8 +19,8 @@ except ModuleNotFoundError:
     sys.exit('The command line needs the extra "app": pip install "zoomjax[app]"')
 
 from .._core.text import plain
+from ..fit.compiled import UNKEPT, forget_compiled
 from . import commands_interop, commands_lens, commands_reproduce  # noqa: F401, they add their commands
-from ._compiled import UNKEPT, forget_compiled
 from ._flags import options_of, with_flags
 from ._interrupts import INTERRUPTED, LAST_WORDS, end_run, leave, swallowed
 from .commands import app

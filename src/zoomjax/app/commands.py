@@ -14,8 +14,8 @@ import typer
 
 from .._core.files import cache_folder, refuse_inputs
 from .._core.text import plain
-from ._compiled import set_up_jax
 from ._flags import with_flags
+from ._jax import set_up_jax
 from .arguments import (
     Centre,
     Degree,

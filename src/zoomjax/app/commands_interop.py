@@ -9,7 +9,7 @@ import typer
 
 from .._core.files import refuse_inputs
 from .._core.text import plain
-from ._compiled import set_up_jax
+from ._jax import set_up_jax
 from .arguments import Overwrite, size_of
 from .commands import app
 from .options import ResultsFolder, place

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from .._core.text import plain
-from ._compiled import set_up_jax
+from ._jax import set_up_jax
 from .arguments import size_of
 from .commands import app
 from .options import place

@@ -1,7 +1,7 @@
 """The command ``zoomjax reproduce``."""
 
 from .._core.text import plain
-from ._compiled import set_up_jax
+from ._jax import set_up_jax
 from .arguments import Overwrite
 from .commands import app
 from .console import stages

@@ -6,6 +6,7 @@ from .centre import CentreFit as CentreFit
 from .centre import FrameCentres as FrameCentres
 from .centre import fit_centre as fit_centre
 from .centre import fit_frame_centres as fit_frame_centres
+from .compiled import cache_compiled as cache_compiled
 from .concatenation import concatenate as concatenate
 from .energy import frame_energy as frame_energy
 from .energy import global_energy as global_energy
