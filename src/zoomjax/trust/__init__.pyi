@@ -21,3 +21,5 @@ from .next_photo import suggest_next as suggest_next
 from .selection import Selection as Selection
 from .selection import Verdict as Verdict
 from .selection import select_model as select_model
+from .vanishing import VanishingPoints as VanishingPoints
+from .vanishing import vanishing_points as vanishing_points

@@ -3,7 +3,8 @@
 A lens is good if its correction is right to within a small part of itself. Three errors are compared with
 the displacement (RMS over the image, at its largest): that of the noise (the bands), half the distance
 between lenses fitted to halves of the lines where it exceeds what noise explains, and the error of frames
-left out beyond that of their own fits. An error below `NEGLIGIBLE` of the image's diagonal does no harm,
+left out beyond that of their own fits. Vanishing points that ask for another correction make it doubtful.
+An error below `NEGLIGIBLE` of the image's diagonal does no harm,
 however small the displacement.
 """
 
@@ -34,6 +35,7 @@ _BEYOND_NOISE = 3.0  # how many times farther apart halves are than by chance
 _UNPREDICTED = 1.5  # how many times the RMS of frames left out may exceed that of their own fits
 _REJECTED = 1 / 3  # of the lines
 _FEW_LINES = 5  # per frame
+_UNPARALLEL, _SURE = 0.25, 4.0  # a factor's distance from 1 that counts: at least, and in deviations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,17 +93,21 @@ class Assessment:
 
     def summary(self) -> dict[str, Any]:
         """The verdict, its findings and figures as plain values; None for what is not known."""
-        figures = dataclasses.asdict(self.evidence)
-        known = {
-            name: value if not isinstance(value, float) or np.isfinite(value) else None
-            for name, value in figures.items()
-        }
+        figures = dataclasses.asdict(self.evidence, dict_factory=_known)
         return {
             "verdict": self.verdict,
             "verdict_sentence": self.sentence,
             "findings": [dataclasses.asdict(finding) for finding in self.findings],
-            "evidence": known,
+            "evidence": figures,
         }
+
+
+def _known(figures: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Figures by name; None for what is not finite."""
+    return {
+        name: None if isinstance(value, float) and not np.isfinite(value) else value
+        for name, value in figures
+    }
 
 
 @kinds_checked
@@ -141,7 +147,7 @@ def assess(
     if (held_out is None) != (each_held_out is None):
         raise ValueError("Arguments held_out and each_held_out are compared: give both, or neither.")
     found = evidence(lines, fit, compressed=compressed)
-    findings = [*_of_bands(found, fit), *_of_halves(found), *_of_lines(found)]
+    findings = [*_of_bands(found, fit), *_of_halves(found), *_of_lines(found), *_of_vanishing(found)]
     if held_out is not None and each_held_out is not None:
         both = (np.asarray(values, float) for values in (held_out, each_held_out))
         findings += _of_frames(found, np.asarray(lines.focal), *both)
@@ -235,6 +241,23 @@ def _of_lines(of: Evidence) -> Iterator[Finding]:
         "doubtful" if hardly else "good",
         found[:-1] + (f"; uncorrected, by {_px(of.rms_uncorrected)} px." if hardly else "."),
         "Check that the photographed lines are straight and the board is flat; else choose a larger model.",
+    )
+
+
+def _of_vanishing(of: Evidence) -> Iterator[Finding]:
+    """Vanishing points that ask for another correction by far: things are parallel only roughly."""
+    other = of.vanishing
+    if not abs(other.factor - 1) > max(_UNPARALLEL, _SURE * other.std):
+        return
+    if _judged(abs(other.factor - 1) * of.displacement, of) == "good":
+        return
+    yield Finding(
+        "vanishing points",
+        "doubtful",
+        f"{other.lines} lines meet in {other.points} vanishing points, but best with {other.factor:.2f} "
+        f"\u00b1 {other.std:.2g} times the correction.",
+        "Look at the drawn lines: lines of different things may have become one. Add long lines near the "
+        "edges of the image.",
     )
 
 

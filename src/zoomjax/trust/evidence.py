@@ -8,6 +8,7 @@
   fit of all. Noise makes the two lenses differ by what the bands predict; whatever else bends lines (a
   curved board, two lenses in one data set) makes them differ by more. The lines are parted in three ways:
   evenly, by direction, by frame.
+- *Vanishing points* of corrected lines, which no fit asks for: see `vanishing_points`.
 
 Once per fit: a pass over the points of at most `_MOST_LINES` lines, and a Jacobian of the compressed ones.
 """
@@ -44,6 +45,7 @@ from ..models.sizes import at_focal
 from ..models.zoom import AbstractZoom, with_parameters
 from .bands import displacement_std
 from .folds import counts_of, own_weights
+from .vanishing import VanishingPoints, vanishing_points
 
 _CURVE = 5
 _FOCALS = 3  # over the range, evenly in 1/f
@@ -90,6 +92,7 @@ class Evidence:
             largest.
         halves: the agreement of halves of the lines, as far as halves determine a lens.
         diagonal: of the image.
+        vanishing: whether lines that are parallel in the scene meet.
     """
 
     lines: int
@@ -103,6 +106,7 @@ class Evidence:
     std: float
     halves: tuple[Halves, ...]
     diagonal: float
+    vanishing: VanishingPoints
 
     @property
     def crooked(self) -> bool:
@@ -165,6 +169,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
         std=float(np.max(_over_image(std))),
         halves=tuple(_halves(compressed, fit, weight, rows)),
         diagonal=2 * lens.scale,
+        vanishing=vanishing_points(lines, lens),
     )
 
 
