@@ -202,6 +202,20 @@ def test_the_crossover_is_where_k1_is_zero():
         zj.models.barrel_crossover(FOCAL, inverse)
 
 
+@pytest.mark.parametrize(
+    ("k1", "crossover"),
+    [([-0.1, 0.0, 0.1], 40.0), ([0.0, -0.1, 0.1], 160 / 3), ([-1e-200, 1e-200, 0.1], 80 / 3)],
+)
+def test_a_crossover_beside_zeros_and_tiny_coefficients(k1, crossover):
+    found = zj.models.barrel_crossover(np.array([20.0, 40.0, 80.0]), np.array(k1))
+    assert found == pytest.approx(crossover, rel=1e-12)
+
+
+def test_zeros_are_no_crossover():
+    with pytest.raises(ValueError, match="one sign"):
+        zj.models.barrel_crossover(np.array([20.0, 40.0, 80.0]), np.array([0.0, 0.1, 0.1]))
+
+
 def test_two_regions_without_a_crossover_say_where_to_get_it():
     with pytest.raises(ValueError, match="barrel_crossover"):
         zj.models.TwoRegionZoom().prepare(FOCAL, 1)

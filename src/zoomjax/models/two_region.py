@@ -109,9 +109,12 @@ def barrel_crossover(focal: Focal, k1: Float[AnyArray, "frame"]) -> float:
     """
     order = np.argsort(1 / np.asarray(focal))[::-1]
     inverse, value = 1 / np.asarray(focal)[order], np.asarray(k1)[order]
-    changes = np.flatnonzero(value[:-1] * value[1:] < 0)
+    signed = np.flatnonzero(value)  # beside zeros
+    changes = np.flatnonzero(np.diff(np.sign(value[signed])))
     if not changes.size:
         raise ValueError("k1 has one sign throughout: one region is enough, PolynomialZoom(degree=2).")
-    i = changes[0]
-    share = value[i] / (value[i] - value[i + 1])
-    return float(1 / (inverse[i] + share * (inverse[i + 1] - inverse[i])))
+    before, after = signed[changes[0]], signed[changes[0] + 1]
+    if after > before + 1:
+        return float(1 / inverse[before + 1])  # exactly zero there
+    share = value[before] / (value[before] - value[after])
+    return float(1 / (inverse[before] + share * (inverse[after] - inverse[before])))
