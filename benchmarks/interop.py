@@ -176,10 +176,7 @@ def page(results: dict) -> str:
             "",
             *table(["", "median", "90 %", "worst"], errors),
             "",
-            *(
-                f"Worst {way}: {_worst(found, key)}."
-                for way, key in (("read", "read"), ("written", "written"))
-            ),
+            *(f"Worst {way}: {_worst(found, way)}." for way in ("read", "written")),
             "",
             machine_line(results["machine"]),
             "",

@@ -107,6 +107,7 @@ def pairs_of(node: Node, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray,
     """
     scale = math.hypot(*size) / 2
     ends = border(size, node.centre) / scale
+    ends = ends[np.any(ends != 0, axis=1)]  # the centre may be a corner
     length = np.hypot(*ends.T)
     part = np.sin(np.linspace(0, np.pi / 2, _RADII + 1)[1:])
     if node.form.corrects:
