@@ -1,11 +1,14 @@
 """The camera and lens of a calibration's photos in the lens."""
 
+import sys
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from zoomjax import scenes
 from zoomjax.app.equipment import with_equipment
+from zoomjax.io.equipment import FILM
 
 from ..io.test_equipment import CROP, FOCAL, PITCH, SIZE, block, plane
 
@@ -37,6 +40,27 @@ def test_what_photos_do_not_agree_on_is_left_out(lens, tmp_path):
     found = with_equipment(lens, [photo(tmp_path / "a.jpg"), other])
     assert found.about == {"lens": "18-200"}
     assert found.pixel_pitch is None
+
+
+def bare(path):
+    """A photo whose EXIF data name the body, and nothing of its sensor."""
+    block_of_it = block(of={"Make": "NIKON CORPORATION", "Model": "NIKON D300"})
+    Image.fromarray(np.zeros((8, 12, 3), np.uint8)).save(path, exif=block_of_it)
+    return path
+
+
+def test_the_database_tells_the_sensor_of_a_body_whose_photos_do_not(lens, tmp_path):
+    found = with_equipment(lens, [bare(tmp_path / "a.jpg")])
+    assert found.about["crop_factor"] == 1.523
+    assert found.pixel_pitch == pytest.approx(FILM / 1.523 / np.hypot(*SIZE))
+
+
+def test_without_the_database_the_sensor_is_not_known(lens, tmp_path, monkeypatch):
+    from zoomjax.lenses import database
+
+    database.database.cache_clear()
+    monkeypatch.setitem(sys.modules, "lensfunpy", None)
+    assert with_equipment(lens, [bare(tmp_path / "a.jpg")]).pixel_pitch is None
 
 
 def test_the_maker_is_named_once(lens, tmp_path):

@@ -136,7 +136,12 @@ def test_the_commands_list_write_and_say_what_to_give(tmp_path):
         ["lens", "nikkor 18-200", "-o", "other.json"],
         ["undistort", "a.jpg", "-o", "out"],
         ["lens", NIKKOR, "-o", "new/../mine.json"],
+        ["undistort", "--lens", "auto", "nikon.png", "canon.png", "-o", "corrected"],
     ]
+    photo(tmp_path / "nikon.png")
+    photo(
+        tmp_path / "canon.png", {"Make": "Canon", "Model": "Canon EOS 600D"}, "EF-S18-55mm f/3.5-5.6 IS II"
+    )
     (tmp_path / "mine.json").write_text("mine")
     done = subprocess.run(
         [sys.executable, "-c", SEVERAL],
@@ -146,9 +151,14 @@ def test_the_commands_list_write_and_say_what_to_give(tmp_path):
         timeout=300,
     )
     assert done.returncode == 0, done.stderr
-    (listed, table), (made, said), (asked, question), (refused, hint), (kept, exists) = json.loads(
-        done.stdout.splitlines()[-1]
+    (listed, table), (made, said), (asked, question), (refused, hint), (kept, exists), (both, each) = (
+        json.loads(done.stdout.splitlines()[-1])
     )
+    assert both == 0
+    assert [line.split(",")[0] for line in each.splitlines() if "its table" in line] == [
+        NIKKOR,
+        "Canon EF-S 18-55mm f/3.5-5.6 IS II",
+    ]
     assert (listed, made, asked, refused, kept) == (0, 0, 2, 2, 2)
     assert "mine.json already exists" in exists
     assert (tmp_path / "mine.json").read_text() == "mine"

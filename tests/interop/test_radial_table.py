@@ -6,6 +6,7 @@ from pathlib import Path
 import lensfunpy
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 import zoomjax as zj
 from zoomjax.interop.radial_table import RadialTable, zoom_of_table
@@ -60,6 +61,56 @@ def test_a_file_of_the_database_is_the_lens_of_the_library(name, smaller, tmp_pa
         )  # a corner where the table turns back may be just beyond the other
         assert seen.all() or (seen.mean() > 0.9 and "turns back" in str(found.report))
         assert np.hypot(*(again - grid)[seen].T).max() < max(0.5, found.report.worst)
+
+
+OFF_CENTRE = (
+    '<lensdatabase version="1"><lens><maker>M</maker><model>A</model><mount>X</mount>'
+    '<cropfactor>1</cropfactor><center x="0.2" y="-0.15"/><calibration>'
+    '<distortion model="ptlens" focal="18" a="0.02" b="-0.08" c="0.03"/>'
+    '<distortion model="ptlens" focal="35" a="0.01" b="-0.02" c="0.01"/>'
+    '<distortion model="ptlens" focal="70" a="0.002" b="0.003" c="0.001"/>'
+    "</calibration></lens></lensdatabase>"
+)
+
+
+def off_centre(folder):
+    """A lens whose farthest corner is 1.2 half diagonals from its centre."""
+    (folder / "a.xml").write_text(OFF_CENTRE)
+    return folder / "a.xml"
+
+
+def rippled(folder):
+    """A lens that seven coefficients follow worst in a narrow ring."""
+    return entry("Canon RF-S 18-150mm F3.5-6.3 IS STM", folder)
+
+
+@pytest.mark.parametrize("made", [off_centre, rippled])
+def test_the_error_that_is_said_is_the_greatest_of_all_radii(made, tmp_path):
+    """Of many points on the way to the farthest corner, at the magnification that is best for them."""
+    path = made(tmp_path)
+    found = zj.interop.read(path, image_size=SIZE)
+    [source] = lensfunpy.Database(xml=path.read_text(), load_common=False, load_bundled=False).lenses
+    centre = np.asarray(found.lens.centre)
+    far = np.where(centre > (np.array(SIZE) - 1) / 2, 0, np.array(SIZE) - 1)
+    way = centre + np.linspace(0.01, 1.1, 300)[:, None] * (far - centre)
+    nodes = np.array(found.report.focal)
+    worst = 0.0
+    for focal in [*nodes, *np.sqrt(nodes[1:] * nodes[:-1])]:
+        modifier = lensfunpy.Modifier(source, source.crop_factor, *SIZE)
+        flags = lensfunpy.ModifyFlags.DISTORTION
+        modifier.initialize(float(focal), 4.0, 1000.0, scale=1.0, flags=flags)
+        apart = [np.ravel(modifier.apply_geometry_distortion(*map(float, point), 1, 1)) for point in way]
+        theirs = np.array(apart, float)
+        inside = ((theirs >= 0) & (theirs <= np.array(SIZE) - 1)).all(axis=1)
+
+        def error(scale, focal=focal, theirs=theirs, inside=inside):
+            ours = np.asarray(found.lens(focal).distort(centre + scale * (way[inside] - centre)))
+            return np.hypot(*(ours - theirs[inside]).T).max()
+
+        best = minimize_scalar(error, bounds=(0.95, 1.05), method="bounded", options={"xatol": 1e-7})
+        worst = max(worst, best.fun)
+    assert 0.8 * worst <= found.report.worst
+    assert worst <= found.report.worst + 0.02
 
 
 def test_a_table_that_turns_back_says_where(tmp_path):

@@ -525,3 +525,32 @@ def test_a_coefficient_that_is_no_finite_number_is_refused_at_once(tmp_path, rec
     with pytest.raises(ValueError, match="coefficients or centre at 18 are not finite numbers"):
         zj.interop.read(path, image_size=LENSES["landscape"]().image_size)
     assert not recwarn.list
+
+
+def cameras(path, *rows):
+    """Cameras of a focal length and k1 each, for COLMAP."""
+    lines = [f"{i} RADIAL 640 480 {f} 320 240 {k} 0\n" for i, (f, k) in enumerate(rows, start=1)]
+    path.write_text("".join(lines))
+    return path
+
+
+def test_a_smooth_zoom_that_folds_over_gives_way_to_a_table(tmp_path):
+    rows = (500, 0.3), (700, -0.2), (1000, 40.0)
+    found = zj.interop.read(cameras(tmp_path / "c.txt", *rows))
+    assert isinstance(found.lens.zoom, TableZoom)
+    assert np.isfinite(found.report.worst)
+
+
+@pytest.mark.parametrize("rows", [[(500, 50.0)], [(500, -0.3), (700, 40.0), (1000, -0.3)]])
+def test_a_lens_that_folds_over_is_refused(rows, tmp_path):
+    with pytest.raises(
+        ValueError, match=r"the lens that is nearest to it folds over within the image as a "
+    ):
+        zj.interop.read(cameras(tmp_path / "c.txt", *rows))
+
+
+def test_the_centre_may_be_a_corner(tmp_path):
+    (tmp_path / "c.txt").write_text("1 RADIAL 640 480 900 0.5 0.5 -0.1 0\n")
+    found = zj.interop.read(tmp_path / "c.txt")
+    assert np.asarray(found.lens.centre).tolist() == [0, 0]
+    assert np.isfinite(found.report.worst)

@@ -31,9 +31,9 @@ def shown(lens):
     return np.stack(np.meshgrid(np.linspace(0, w - 1, 7), np.linspace(0, h - 1, 6)), -1).reshape(-1, 2)
 
 
-def error(name, path, lens, focal, index=0, pitch=PITCH):
+def error(name, path, lens, focal, index=0, pitch=PITCH, distorted=None):
     """The greatest distance of what the tool does to what the lens does, px."""
-    distorted = shown(lens)
+    distorted = shown(lens) if distorted is None else distorted
     corrected = np.asarray(lens(focal).undistort(distorted))
     start, end = (distorted, corrected) if name in CORRECTS else (corrected, distorted)
     mm, px = (focal, focal / pitch) if lens.focal_unit == "mm" else (focal * pitch, focal)
@@ -90,6 +90,20 @@ def test_between_its_focal_lengths_a_file_does_as_reported(name, kind, tmp_path)
     assert report.worst <= 0.1 or any("cannot follow" in note for note in report.notes)
 
 
+@pytest.mark.parametrize("name", ["discorpy", "hugin", "opentrackio", "nuke", "opencv"])
+def test_the_error_that_is_said_is_the_greatest_of_all_points(name, tmp_path):
+    """Refitted are seven coefficients, which leave narrow rings."""
+    lens = zj.lenses.load(
+        "Nikon AF-S DX VR Zoom-Nikkor 18-200mm f/3.5-5.6G IF-ED II", image_size=(4288, 2848)
+    )
+    [low, _] = np.asarray(lens.focal_range).tolist()
+    path = tmp_path / f"lens{WRITTEN[name].suffixes[0]}"
+    report = zj.interop.write(lens, path, format=name, focal=low)
+    grid = np.stack(np.meshgrid(np.linspace(0, 4287, 61), np.linspace(0, 2847, 41)), -1).reshape(-1, 2)
+    worst = error(name, path, lens, low, pitch=lens.pixel_pitch, distorted=grid)
+    assert 0.9 * report.worst <= worst <= report.worst + MARGIN
+
+
 def test_more_focal_lengths_are_written_for_a_lower_tolerance(tmp_path):
     lens = LENSES["landscape"]()
     reports = [
@@ -106,6 +120,39 @@ def test_what_a_format_cannot_do_is_said(tmp_path):
     report = zj.interop.write(lens, tmp_path / "k.yaml", format="kalibr", focal=50, pixel_pitch=PITCH)
     assert 0.5 < report.worst < 2
     assert any("cannot follow this lens within 0.1 px" in note for note in report.notes)
+
+
+def said(lens, folder, **how):
+    report = zj.interop.write(lens, folder / "a", overwrite=True, pixel_pitch=PITCH, **how)
+    return report, str(report)
+
+
+FLOOR = "cannot follow this lens within"
+BETWEEN = "Between the focal lengths the error exceeds the tolerance of 0.1 px"
+
+
+def test_it_is_said_whether_the_formula_or_the_focal_lengths_are_what_is_wrong(tmp_path):
+    mild = LENSES["landscape"]()
+    report, text = said(mild, tmp_path, format="gyroflow", focal=[18, 200])
+    assert f"{BETWEEN}: give more of them, or none to have them chosen." in text
+    assert FLOOR not in text
+    strong = polynomial([[0.25, -0.05], [0.01, 0.0]], (4288, 2848), (2143.5, 1423.5))
+    report, text = said(strong, tmp_path, format="lensfun")  # a smooth one
+    assert report.at_nodes > 0.1
+    assert FLOOR in text
+    assert BETWEEN not in text
+    assert report.between <= report.at_nodes + 0.1
+    report, text = said(strong, tmp_path, format="unreal", focal=[18, 200])
+    assert FLOOR in text
+    assert BETWEEN in text
+
+
+def test_opentrackio_is_named_for_unreal_where_it_takes_the_lens(tmp_path):
+    better = "Unreal's reader of OpenTrackIO takes the lens without a refit."
+    assert better in said(LENSES["landscape"](), tmp_path, format="unreal", focal=[18, 200])[1]
+    seven = zj.lenses.load("Canon EF 24-70mm f/2.8L II USM", image_size=(600, 400), model="table")
+    assert seven(35.0).coefficients.shape[-1] > 3
+    assert better not in said(seven, tmp_path, format="unreal", focal=[24, 70])[1]
 
 
 def test_samples_of_opentrackio_are_of_its_schema(lens, tmp_path):

@@ -377,8 +377,8 @@ def undistort(
             from .library_lens import undistort_by_library
 
             done = undistort_by_library(job, lens, progress)
-    if done.sentence:
-        print(plain(done.sentence))
+    for sentence in done.sentence.splitlines():
+        print(plain(sentence))
     for note in done.notes:
         print(plain(note))
     for path, reason in done.skipped.items():

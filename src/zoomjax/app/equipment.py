@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..io.equipment import FILM, Equipment, read_equipment
+from ..lenses.matching import crop_factor
 from ..models.lens import ZoomLens
 
 _SAME = 0.01
@@ -14,10 +15,13 @@ _SAME = 0.01
 def with_equipment(lens: ZoomLens, photos: Iterable[Path]) -> ZoomLens:
     """The lens with the camera, lens, crop factor and pixel pitch that all its photos agree on.
 
+    Where EXIF data do not tell a crop factor, it is that of the body in the lensfun database, if there is
+    lensfunpy: a photo is taken to show the whole sensor.
+
     Photos without EXIF data, or of formats whose data cannot be read any more, say nothing.
     """
     found = [equipment_of(photo) for photo in photos]
-    crops = [crop for one in found if (crop := one.crop_factor(lens.image_size))]
+    crops = [crop for one in found if (crop := crop_factor(one, lens.image_size))]
     crop = crops[0] if crops and max(crops) - min(crops) <= _SAME * min(crops) else None
     pitch = None if crop is None else FILM / (crop * 2 * lens.scale)
     facts = {

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from .._core.files import refuse_existing, refuse_inputs
+from .._core.text import plain
 from ..correct.framing import check_keep
 from ..correct.image import check_sampling
 from ..io.equipment import read_equipment
@@ -154,7 +155,7 @@ def undistort_by_library(
                 raise
             outcome = Outcome("", {str(paths[0]): str(error)})
         else:
-            sentences.append(f"{_taken(lens)}: {outcome.sentence}")
+            sentences.append(plain(f"{_taken(lens)}: {outcome.sentence}"))
         skipped |= outcome.skipped
         notes += outcome.notes
         written, done = written + outcome.written, done + len(paths)

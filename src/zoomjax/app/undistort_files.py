@@ -65,7 +65,7 @@ class Outcome:
     """The result of a correction.
 
     Attributes:
-        sentence: a sentence on what was written.
+        sentence: a sentence on what was written; on a line of its own for each lens of the library.
         skipped: for each file that was not corrected, by path, the reason.
         written: the number of files that are corrected, now or earlier.
         notes: sentences on what was kept, what was not, and what was left out.

@@ -92,12 +92,13 @@ def lens_of(
         if made is not None:
             return made
     nodes: list[Node | Sampled] = sorted(_averaged(contents.nodes), key=lambda node: node.focal)
-    size, notes = contents.image_size, list(contents.notes)
+    size, notes, given = contents.image_size, list(contents.notes), family
     if sampled := [node for node in nodes if isinstance(node, Sampled)]:
         centres, family = centres_and_family(sampled, size, family)
         nodes = [dataclasses.replace(n, centre=c) for n, c in zip(sampled, centres, strict=True)]
     own, exact = _family(nodes, terms)
     family, exact = (own, exact) if family is None or type(family) is type(own) else (family, False)
+    chosen = zoom is None
     if zoom is None:
         zoom = _default_zoom(family, len(nodes), terms)
     count = terms or (_TERMS if isinstance(zoom, SmoothZoom) else _terms(nodes, exact))
@@ -108,6 +109,13 @@ def lens_of(
             f"{contents.focal_unit}: the lens is not validated beyond."
         )
     lens, at_nodes, between, note = _following(contents, seen, zoom, family, count)
+    if not math.isfinite(at_nodes):
+        if chosen and isinstance(zoom, SmoothZoom):
+            return lens_of(contents, TableZoom(), terms, given)
+        raise ValueError(
+            f"the lens that is nearest to it folds over within the image as a {type(zoom).__name__} of "
+            f"{type(family).__name__}"
+        )
     stretched = [abs(n.stretch[0] / n.stretch[1] - 1) for n in nodes if isinstance(n, Node)]
     if (most := max(stretched, default=0.0)) > _NOT_SQUARE:
         notes.append(f"The file's pixels are up to {100 * most:.2g} % from square: the lens's are square.")

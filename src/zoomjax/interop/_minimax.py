@@ -4,8 +4,8 @@ A table gives the corrected radius u of each distorted radius d, at some focal l
 give ``m u = d (1 + k1 d^2 + ... + kN d^2N)``: the magnification m of each focal length is free where it is
 the tool's own choice, because it leaves straight lines straight, and lensfun's own versions differ in it.
 All is linear in the k and in m, which is eliminated. Weights grow where the distance is large (Lawson's
-iteration), so that the largest distance falls. Lengths are halves of the image's diagonal, errors are
-distances in the distorted image.
+iteration), so that the largest distance falls. Radius 1 is the corner that is farthest from the centre;
+errors are distances in the distorted image.
 
 All is NumPy, for many fits at once: there is nothing to compile.
 """
@@ -24,8 +24,11 @@ _FLOOR = 1e-2
 _RIDGE = 1e-10
 """Of the normal equations, which are scaled."""
 
-RADII = np.sin(np.linspace(0, np.pi / 2, 25)[1:])
+RADII = np.sin(np.linspace(0, np.pi / 2, 97)[1:])
 """Distorted radii: close to each other towards the corner, where polynomials of high degree move."""
+
+_FITTED = slice(3, None, 4)
+"""Those of a fit. Distances are looked at between them, too, where they are up to a tenth larger."""
 
 _LEAST_SLOPE = 0.05
 """Of the table, distorted over corrected: where it is flatter, or folds, it is continued straight."""
@@ -59,7 +62,7 @@ def targets(polynomials: Float[np.ndarray, "focal power"], unit: float, *, scale
 
     Args:
         polynomials: distorted over corrected radius, by powers of the corrected one, in the table's unit.
-        unit: half of the image's diagonal in that unit.
+        unit: the radius of the farthest corner in that unit.
         scaled: whether the magnification of each focal length is free.
     """
     distorted = RADII * unit
@@ -79,7 +82,7 @@ def targets(polynomials: Float[np.ndarray, "focal power"], unit: float, *, scale
 
 _NEWTON = 30
 _LONGEST = 0.1
-"""Newton's steps, and the longest of them, in half diagonals: it starts near the root before any fold."""
+"""Newton's steps, and the longest of them, in such radii: it starts near the root before any fold."""
 
 
 def _value(polynomials, radius):
@@ -109,17 +112,18 @@ def fit(
         columns: of each parameter, ``u - d`` at each focal length and of `RADII`.
         wanted: the table, with an axis for the fits in front.
     """
+    scaled, columns, wanted = wanted.scaled, columns[..., _FITTED, :], wanted.at((..., _FITTED))
     weight = _in_image(wanted)
-    rows, right, own = columns * weight[..., None], RADII * weight, wanted.corrected * weight
+    rows, right, own = columns * weight[..., None], RADII[_FITTED] * weight, wanted.corrected * weight
     scale = np.sqrt(np.einsum("gfrp,gfrp->gp", rows, rows))
     rows = rows / scale[:, None, None]
     lawson, least = np.ones_like(right), np.full(len(right), np.inf)
     best = np.zeros(scale.shape)
     for _ in range(_STEPS):
         root = np.sqrt(lawson)
-        parameters = _solved(rows * root[..., None], right * root, own * root, wanted.scaled)
+        parameters = _solved(rows * root[..., None], right * root, own * root, scaled)
         along = (rows @ parameters[:, None, :, None])[..., 0] + right
-        distance = _distance(along, own, lawson, wanted.scaled)
+        distance = _distance(along, own, lawson, scaled)
         largest = distance.max(axis=(1, 2))
         best = np.where((largest < least)[:, None], parameters, best)
         least = np.minimum(largest, least)
@@ -133,7 +137,8 @@ def largest_distance(
 ) -> Float[np.ndarray, "focal"]:
     """How far from the table polynomials put a point of the distorted image, at most, where the table sees.
 
-    In half diagonals, and at the magnification of each focal length that is best for it, if that is free.
+    In radii of the farthest corner, and at the magnification of each focal length that is best for it, if
+    that is free.
     """
     weight = np.where(wanted.seen, _in_image(wanted), 0)
     along = (RADII + coefficients @ powers(coefficients.shape[1]).T) * weight

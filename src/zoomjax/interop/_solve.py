@@ -38,9 +38,6 @@ _IDLE, _GAIN, _ENOUGH = 2, 0.95, 17
 _APART = 1.001
 """Ratio of focal lengths that are told apart."""
 
-_NEAR = 1.05
-"""Beyond the tolerance, errors between focal lengths are not worth more nodes at this ratio to theirs."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Solution:
@@ -73,8 +70,8 @@ def solve(fmt: NodeFormat, job: Export) -> Solution:
         if found.worst <= job.tolerance:
             return found
         tried.append(found)
-        if (found.between or 0.0) <= _NEAR * found.at_nodes:
-            break
+        if found.at_nodes > job.tolerance and (found.between or 0.0) <= found.at_nodes + job.tolerance:
+            break  # the formula is what is wrong, not the number of nodes
         worst = [solution.worst for solution in tried]
         idle = len(tried) > _IDLE and min(worst[-_IDLE:]) > _GAIN * min(worst[:-_IDLE])
         if idle and len(focal) >= _ENOUGH:

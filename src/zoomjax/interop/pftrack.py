@@ -32,11 +32,9 @@ class PFTrack(NodeFormat):
         width, height = job.lens.image_size
         lines = [_HEADER, width, height, 1, width, height, "High Order", 1, len(nodes)]
         for number, node in enumerate(nodes, start=1):
-            x, y = (node.centre / np.array([width, height])).tolist()
-            keys = (_FORM.rescaled(node.theta, _UNIT)).tolist()
-            up = (height - 1 - node.centre[1]) / height
-            del y
-            lines += [number if node.frame is None else node.frame, *map(repr, [*keys, x, float(up)])]
+            keys = _FORM.rescaled(node.theta, _UNIT).tolist()
+            x, up = float(node.centre[0]) / width, float(height - 1 - node.centre[1]) / height
+            lines += [number if node.frame is None else node.frame, *map(repr, [*keys, x, up])]
         return "\n".join(map(str, [*lines, ""]))
 
     def recognises(self, head: str) -> bool:

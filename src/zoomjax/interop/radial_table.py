@@ -76,7 +76,8 @@ class TableFit(NamedTuple):
 
     Attributes:
         zoom: the model, invertible over the image.
-        at_nodes: largest distance from the table at its focal lengths, px of the distorted image.
+        at_nodes: largest distance from the table at its focal lengths, px of the distorted image, up to the
+            corner that is farthest from the centre.
         between: the same between them, and up to the ends of the range.
         short: focal lengths of the table at which it folds over within the image.
     """
@@ -104,12 +105,15 @@ def zoom_of_table(
         model: "smooth" for a `SmoothZoom`, "table" for a `TableZoom`, or "auto" for the first of these
             within a pixel of the table, and a `TableZoom` for a single focal length.
     """
-    samples, scale = _sampled(table), math.hypot(*image_size) / 2
+    scale = math.hypot(*image_size) / 2
+    away = abs(np.asarray(centre, float) - (np.array(image_size) - 1) / 2)
+    farthest = float(np.hypot(*(away + np.array(image_size) / 2)))
+    samples = _sampled(table, farthest / scale)
     if samples is None:
         return None
     models = "table" if model == "auto" and len(table.focal) == 1 else model
     for found in _candidates(samples, models, scale):
-        far = found.errors.max() * scale > _CLOSE
+        far = found.errors.max() * farthest > _CLOSE
         if model == "auto" and isinstance(found.zoom, SmoothZoom) and far:
             continue
         if _certified(found.zoom, centre, table.focal_range, image_size):
@@ -118,8 +122,8 @@ def zoom_of_table(
             seen = np.all(samples.wanted.seen, axis=1, keepdims=True)[at_nodes, 0][::-1]
             return TableFit(
                 found.zoom,
-                float(found.errors[at_nodes].max() * scale),
-                float(found.errors[~at_nodes].max() * scale),
+                float(found.errors[at_nodes].max() * farthest),
+                float(found.errors[~at_nodes].max() * farthest),
                 tuple(f for f, whole in zip(table.focal, seen.tolist(), strict=True) if not whole),
             )
     return None
@@ -131,21 +135,27 @@ class _Samples(NamedTuple):
     Attributes:
         x: 1/f, increasing: some beyond the last focal length of the table, then `_CELLS` for each interval
             between its focal lengths, and the end of the last, then some beyond the first.
-        wanted: the radii there.
+        wanted: the radii there, the farthest corner of the image from the centre being 1.
+        reach: how far that corner is, in half diagonals.
     """
 
     x: Float[np.ndarray, "focal"]
     wanted: Targets
+    reach: float
+
+    def in_half_diagonals(self, coefficients: Float[np.ndarray, "... terms"]) -> np.ndarray:
+        """Coefficients k1, k2, ... for radii in half diagonals."""
+        return coefficients / self.reach ** (2 * np.arange(1, coefficients.shape[-1] + 1))
 
 
 class _Candidate(NamedTuple):
-    """A zoom model, and its largest distance from the table at each focal length, in half diagonals."""
+    """A zoom model, and its largest distance from the table at each focal length, the corner being 1."""
 
     zoom: AbstractZoom
     errors: Float[np.ndarray, "focal"]
 
 
-def _sampled(table: RadialTable) -> _Samples | None:
+def _sampled(table: RadialTable, reach: float) -> _Samples | None:
     """What it is looked at; None where the tool has no map at all."""
     ends = 1 / np.array(table.focal)[::-1]
     between = [np.linspace(a, b, _CELLS + 1)[:-1] for a, b in itertools.pairwise(ends)]
@@ -156,17 +166,17 @@ def _sampled(table: RadialTable) -> _Samples | None:
     polynomials = np.stack([table.polynomial(1 / place) for place in x])
     if not (polynomials[:, 0] > 0).all():
         return None
-    wanted = targets(polynomials, table.unit, scaled=table.scaled)
-    return _Samples(x, wanted) if wanted.seen.any(axis=1).all() else None
+    wanted = targets(polynomials, table.unit * reach, scaled=table.scaled)
+    return _Samples(x, wanted, reach) if wanted.seen.any(axis=1).all() else None
 
 
 def _candidates(samples: _Samples, model: str, scale: float) -> Iterator[_Candidate]:
     """Zoom models for a table, in the order of choice."""
-    if model == "smooth" or (model == "auto" and _two_may_do(samples, _CLOSE / scale)):
+    if model == "smooth" or (model == "auto" and _two_may_do(samples, _CLOSE / (scale * samples.reach))):
         yield _smooth(samples)
     if model != "smooth":
         for terms in _TERMS:
-            yield _table(samples, terms, _BETWEEN / scale)
+            yield _table(samples, terms, _BETWEEN / (scale * samples.reach))
 
 
 @functools.cache
@@ -192,7 +202,9 @@ def _smooth(samples: _Samples) -> _Candidate:
     design = design.reshape(1, *design.shape[:2], -1)
     parameters = fit(design, samples.wanted.at(None))[0].reshape(basis.shape[1], -1)
     zoom = dataclasses.replace(
-        zoom, parameters=jnp.asarray(parameters), focal_ref=jnp.asarray(1 / samples.x[-1])
+        zoom,
+        parameters=jnp.asarray(samples.in_half_diagonals(parameters)),
+        focal_ref=jnp.asarray(1 / samples.x[-1]),
     )
     return _Candidate(zoom, largest_distance(basis @ parameters, samples.wanted))
 
@@ -210,7 +222,8 @@ def _table(samples: _Samples, terms: int, between: float) -> _Candidate:
         error = largest_distance(_interpolated(x, x[knots], each[knots]), wanted)
         far = np.flatnonzero(error > own.max() + between)
         knots[np.unique(far // stride) * stride + stride // 2] = True
-    zoom = TableZoom(parameters=jnp.asarray(each[knots]), knots=jnp.asarray(x[knots]))
+    own = samples.in_half_diagonals(each[knots])
+    zoom = TableZoom(parameters=jnp.asarray(own), knots=jnp.asarray(x[knots]))
     there = _interpolated(samples.x, x[knots], each[knots])
     return _Candidate(zoom, largest_distance(there, samples.wanted))
 

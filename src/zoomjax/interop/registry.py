@@ -100,7 +100,8 @@ def write(
             default the lens's own. Formats with focal lengths in px need it for lenses in mm, those with a
             sensor's size always.
         tolerance: for formats that interpolate: focal lengths are added until the error between them is
-            below this, px, or more of them gain nothing; 0.1 by default.
+            below this, px, or exceeds what the tool's formula leaves at each by no more, or more of them
+            gain nothing; 0.1 by default.
         convention: for STMaps: "centres" (Nuke, the default), "gyroflow" or "alicevision".
         overwrite: whether files that exist may be replaced.
 
@@ -321,14 +322,20 @@ def _by_value(path: Path) -> list[Any]:
 
 def _shortfall(fmt: Format, found: Solution, job: Export) -> tuple[str, ...]:
     """What is said where the tolerance is missed."""
-    if found.worst <= job.tolerance:
-        return ()
-    if found.between is not None and found.between > max(job.tolerance, 1.1 * found.at_nodes):
-        return (
-            f"Between the focal lengths the error exceeds the tolerance of {job.tolerance:g} px: more of "
-            "them would help.",
+    notes, floor = [], 0.0
+    if found.at_nodes > job.tolerance:
+        floor = found.at_nodes
+        notes.append(
+            f"The formula of {fmt.name} cannot follow this lens within {job.tolerance:g} px, however many "
+            "focal lengths are written."
         )
-    return (
-        f"The formula of {fmt.name} cannot follow this lens within {job.tolerance:g} px, however many "
-        "focal lengths are written.",
-    )
+    if (found.between or 0.0) > floor + job.tolerance:
+        way = (
+            f", and more than {len(found.nodes)} are not written."
+            if job.focal is None
+            else ": give more of them, or none to have them chosen."
+        )
+        notes.append(
+            f"Between the focal lengths the error exceeds the tolerance of {job.tolerance:g} px{way}"
+        )
+    return tuple(notes)

@@ -11,7 +11,10 @@ import json
 import numpy as np
 
 from ._pinhole import Pinhole, Pinholes, contents, focal_px, formula, node_of, pinhole
+from ._samples import distortions
+from ._solve import same
 from .base import Contents, Export, Import, Node, read_text
+from .opentrackio import OpenTrackIO
 
 _END = 0.01
 """Length of the first and last interval, as a share of their neighbours'."""
@@ -28,11 +31,17 @@ class Unreal(Pinholes):
     """Unreal's lens file exchange format."""
 
     name, tools, suffixes = "unreal", "Unreal Engine", (".ulens",)
-    note = "Unreal's reader of OpenTrackIO takes the lens without a refit."
 
     def forms(self, lens):
         """Three terms."""
         return (formula(lens, 3),)
+
+    def notes(self, nodes: list[Node], job: Export) -> tuple[str, ...]:
+        """The other way into Unreal, for lenses that it suits."""
+        [form] = OpenTrackIO().forms(job.lens)
+        if same(form, distortions(job.lens, np.asarray(job.lens.focal_range)[:1])[0]) is None:
+            return ()
+        return ("Unreal's reader of OpenTrackIO takes the lens without a refit.",)
 
     def interpolate(self, focal: np.ndarray, numbers: np.ndarray, at: float) -> np.ndarray:
         """Linear, but with a slope of 0 at both ends, as its automatic tangents have it."""

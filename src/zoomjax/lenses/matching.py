@@ -70,6 +70,19 @@ def match(equipment: Equipment, image_size: tuple[int, int], *, lens: str | None
     return Match(table_for(found, crop), crop)
 
 
+def crop_factor(equipment: Equipment, image_size: tuple[int, int]) -> float | None:
+    """The crop factor of a photo: by its EXIF data, else of its body in the database; None if not known.
+
+    Without lensfunpy it is that of the EXIF data.
+    """
+    if (told := equipment.crop_factor(image_size)) is not None:
+        return told
+    try:
+        return _crop(_body(equipment, image_size), equipment, image_size)
+    except ImportError:
+        return None
+
+
 def _fitting(body: Any, equipment: Equipment) -> list[LensTable]:
     """The tables of the one lens that fits.
 
