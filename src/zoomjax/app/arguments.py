@@ -27,6 +27,7 @@ ModelName = Annotated[
     str | None,
     typer.Option(
         "--model",
+        metavar="MODEL",
         help="Zoom model: auto (of least cross-validation error), polynomial (in 1/f), smooth (with a "
         "prior from real lenses) or spline. Default: auto, or polynomial with --degree.",
         rich_help_panel=FIT,
@@ -34,12 +35,18 @@ ModelName = Annotated[
 ]
 Degree = Annotated[
     int | None,
-    typer.Option(min=0, help="Degree of the polynomials in 1/f; default: chosen.", rich_help_panel=FIT),
+    typer.Option(
+        min=0,
+        metavar="N",
+        help="Degree of the polynomials in 1/f; default: chosen.",
+        rich_help_panel=FIT,
+    ),
 ]
 Terms = Annotated[
     int | None,
     typer.Option(
         min=1,
+        metavar="N",
         help="Number of distortion coefficients, k1 to kN; default: chosen.",
         rich_help_panel=FIT,
     ),
@@ -47,6 +54,7 @@ Terms = Annotated[
 Family = Annotated[
     Literal["radial", "division", "brown-conrady", "auto"] | None,
     typer.Option(
+        metavar="MODEL",
         help="Distortion model: radial (polynomial), division (strong barrel distortion), brown-conrady "
         "(the polynomial with decentering) or auto (of least cross-validation error). Default: radial; of "
         "a strong lens, that of radial and division.",

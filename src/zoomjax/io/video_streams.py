@@ -136,8 +136,8 @@ def _copied(output: Any, source: Any, named: Path) -> Any:
         stream = output.add_stream_from_template(source)
     except ValueError as error:
         raise ValueError(
-            f"Cannot keep the sound, {source.codec_context.codec.canonical_name}, in a {named.suffix} file. Choose the "
-            "suffix of the source, or .mkv."
+            f"Cannot keep the {_name(source)} in a {named.suffix} file. Choose the suffix of the source, "
+            "or .mkv."
         ) from error
     stream.metadata.update(source.metadata)
     if source.type != "data":
