@@ -61,6 +61,23 @@ def test_video(folder):
     assert max(bend(frame) for frame in luma(folder / "out.mp4")[0][::6]) <= 0.2
 
 
+def test_a_folder_of_results_stands_for_its_lens(folder, tmp_path):
+    (tmp_path / "mylens").mkdir()
+    lens().save(tmp_path / "mylens/lens.json")
+    photo, options = folder / "a.jpg", ["--to", "opencv", "--focal", "35", "--pixel-pitch", "0.005"]
+    for words in (
+        ["undistort", "mylens", photo, "-o", "a.jpg"],
+        ["export", "mylens", *options, "-o", "a.yaml"],
+    ):
+        done = subprocess.run([*COMMAND, *map(str, words)], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert (tmp_path / words[-1]).exists()
+    words = ["undistort", str(tmp_path), str(photo), "-o", "b.jpg"]
+    done = subprocess.run([*COMMAND, *words], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "has no lens.json: give that of zoomjax calibrate" in done.stderr
+
+
 def test_a_dry_run_says_what_would_be_written(folder):
     photos = ("a.jpg", "b.jpg", "picture.gif")
     done = run(folder, *photos, "--focal", "table.csv", "-o", "planned", "--dry-run")

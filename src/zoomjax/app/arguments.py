@@ -157,7 +157,22 @@ def split_lens(inputs: list[Path]) -> tuple[Path, tuple[Path, ...]]:
             "Give the lens and then what to correct: lens.json photos/*.jpg. Without a lens of your own, "
             "--lens auto takes that of the EXIF data."
         )
-    return inputs[0], tuple(inputs[1:])
+    return lens_file(inputs[0]), tuple(inputs[1:])
+
+
+def lens_file(given: Path) -> Path:
+    """The file of a lens, for which the folder of results that it is in stands, too.
+
+    Raises:
+        FileNotFoundError: there is none in the folder.
+    """
+    if not given.is_dir():
+        return given
+    if not (given / "lens.json").is_file():
+        raise FileNotFoundError(
+            f"The folder {given} has no lens.json: give that of zoomjax calibrate, or the file of a lens."
+        )
+    return given / "lens.json"
 
 
 def size_of(text: str | None) -> tuple[int, int] | None:

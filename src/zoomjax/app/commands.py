@@ -319,8 +319,8 @@ def undistort(
         list[Path],
         typer.Argument(
             metavar="[lens.json] INPUT...",
-            help="The lens written by zoomjax calibrate, unless --lens is given; photos or videos, folders "
-            "of them, or patterns.",
+            help="The lens written by zoomjax calibrate, or the folder of its results, unless --lens is "
+            "given; photos or videos, folders of them, or patterns.",
         ),
     ],
     output: FileOrFolder,

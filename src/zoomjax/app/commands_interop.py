@@ -10,7 +10,7 @@ import typer
 from .._core.files import refuse_inputs
 from .._core.text import plain
 from ._compiled import set_up_jax
-from .arguments import Overwrite, size_of
+from .arguments import Overwrite, lens_file, size_of
 from .commands import app
 from .options import ResultsFolder, place
 
@@ -24,7 +24,12 @@ RESULTS = ("lens.json", "import.json")
 @app.command("export")
 def export(
     lens: Annotated[
-        Path, typer.Argument(metavar="lens.json", help="The lens written by zoomjax calibrate.")
+        Path,
+        typer.Argument(
+            metavar="lens.json",
+            help="The lens written by zoomjax calibrate, or the folder of its results.",
+            callback=lens_file,
+        ),
     ],
     output: Annotated[
         Path,
