@@ -247,12 +247,18 @@ def show_frames(calibration: "Calibration", names: Sequence[str] = ()) -> None:
     ):
         table.add_column(name, justify="right", no_wrap=True)
     rejected = Counter(row["frame"] for row in summary["rejected"])
+    shown = dict(enumerate(names))
     for row in sorted(summary["per_frame"], key=lambda row: row["focal"]):
         values = (row[key] for key in ("rms_none", "rms_zoom", "rms_held_out", "rms_frames"))
         figures = ("–" if value is None else f"{value:.3f}" for value in values)
         frame = row["frame"]
-        name = plain(names[frame]) if names else str(frame)
-        table.add_row(name, f"{row['focal']:.5g}", *figures, str(row["lines"]), str(rejected[frame]))
+        table.add_row(
+            plain(shown.get(frame, str(frame))),
+            f"{row['focal']:.5g}",
+            *figures,
+            str(row["lines"]),
+            str(rejected[frame]),
+        )
     console.print()
     console.print(table)
     versions = ", ".join(f"{name} {of}" for name, of in summary["versions"].items())

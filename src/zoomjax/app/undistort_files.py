@@ -190,7 +190,7 @@ def _planned(todo: Sequence[tuple[Path, Path]], earlier: int, about: Callable[[P
             told.append(f"  {source} -> {target}{about(source)}")
         except _BAD_FILE as error:
             skipped[source] = error
-    files = _made(*zip(*todo, strict=True), skipped) if todo else ()
+    files = tuple((source, target) for source, target in todo if source not in skipped)
     bad = {str(source): reason(error) for source, error in skipped.items()}
     return Outcome(files_plan(told, earlier), bad, files=files)
 

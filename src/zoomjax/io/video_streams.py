@@ -113,7 +113,7 @@ def _name(stream: Any) -> str:
     context = getattr(stream, "codec_context", None)
     codec = getattr(stream, "name", None) if context is None else context.codec.canonical_name
     language = stream.metadata.get("language")
-    about = [_NAMES.get(codec, codec) or "of no known kind", None if language == "und" else language]
+    about = [_NAMES.get(codec or "", codec) or "of no known kind", None if language == "und" else language]
     return f"{_KINDS.get(stream.type, stream.type)} ({', '.join(filter(None, about))})"
 
 
