@@ -19,8 +19,11 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app.arguments import centre_of, read_lines
+from zoomjax.app.console import show_choice
 from zoomjax.app.demo import write_photos
 from zoomjax.lines.csv import write_lines_csv
+from zoomjax.models import BrownConrady, Model, PolynomialZoom, SmoothZoom, SplineZoom
+from zoomjax.trust.selection import Selection, Verdict
 
 from .._commands import COMMAND, INTERRUPTIBLE, still_earlier, write_earlier
 
@@ -336,7 +339,62 @@ def test_help_has_examples_and_fits_a_terminal():
         assert max(map(len, done.stdout.splitlines())) <= 80
 
 
+ALL_HELP = """
+import json, typer
+from typer.testing import CliRunner
+from zoomjax.app import cli
+names = typer.main.get_command(cli.app).commands
+print(json.dumps({name: CliRunner().invoke(cli.app, [name, "--help"]).output for name in names}))
+"""
+
+
+def test_help_tells_choices_and_no_python_types():
+    """All commands in one process, without the checks of types that tests add."""
+    env = os.environ | {"COLUMNS": "120"}
+    done = subprocess.run([sys.executable, "-c", ALL_HELP], capture_output=True, text=True, env=env)
+    assert done.returncode == 0, done.stderr
+    texts = json.loads(done.stdout)
+    assert len(texts) > 7
+    for name, text in texts.items():
+        assert "--help" in text, name
+        assert not re.search(r"<(list\[|str|bool|int|float|path|text|file|dir)", text, re.IGNORECASE), name
+        assert ("<edges|grid|pitch>" in text) == (name == "calibrate")
+
+
+def test_the_table_of_models_fits_a_terminal(capsys, monkeypatch):
+    """Also with the longest names, which are wrapped."""
+    monkeypatch.setenv("COLUMNS", "80")
+    names = [Model(PolynomialZoom(2), 2), Model(SmoothZoom(6), 2), Model(SplineZoom(4), 3, BrownConrady())]
+    figures = [Verdict(of, 8.3, 1.5924, 1.7458, 0.287, 1.73213 * n, 0.287) for n, of in enumerate(names)]
+    out = Verdict(names[2], problem="The fit failed. More.")
+    shown = {"chosen": names[1], "best": names[0], "verdicts": (*figures, out), "hold_out": "focal"}
+    selection = object.__new__(Selection)  # without the fit, which is not shown
+    for name, value in (shown | {"folds": 10}).items():
+        object.__setattr__(selection, name, value)
+    show_choice(selection)
+    told = capsys.readouterr().out
+    assert max(map(len, told.splitlines())) <= 80
+    assert re.search(r"^> SmoothZoom, degree 6, 2 terms +8\.3 +1\.7458 ± 0\.2870 +\+1\.7321", told, re.M)
+    assert re.search(r"^  degree 2, 2 terms .* best *$", told, re.M)
+    assert "not compared" in told
+
+
+@pytest.mark.slow
+def test_all_frames_are_told_if_that_is_asked_for(calibrated, tmp_path):
+    source = calibrated[0] / "lines.npz"
+    done = zoomjax("calibrate", source, "-o", tmp_path / "o", "--verbose", *FORCED)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "o" / "summary.json").read_text())["per_frame"]
+    for row in rows:
+        figures = [f"{row[key]:.3f}" for key in ("rms_none", "rms_zoom", "rms_held_out", "rms_frames")]
+        wanted = [str(row["frame"]), f"{row['focal']:.5g}", *figures, str(row["lines"]), "0"]
+        assert wanted in [line.split() for line in done.stdout.splitlines()]
+    assert "Versions: zoomjax" in done.stdout
+    assert all(len(line) <= 80 for line in done.stdout.splitlines() if str(tmp_path) not in line)
+
+
 WRONG = {
+    "much and little": (["lines.npz", "--verbose", "--quiet"], "--verbose has no effect with --quiet"),
     "no such file": (["missing.npz"], "missing.npz"),
     "not a lines file": (["foreign.npz"], "foreign.npz"),
     "truncated": (["truncated.npz"], "truncated.npz"),

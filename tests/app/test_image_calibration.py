@@ -80,6 +80,8 @@ def test_bad_images_are_reported_and_do_not_matter(done):
     [told, *_] = done.warnings()
     assert told.startswith("6 of 11 images are not used.")
     assert all(name in told for name in expected)
+    [sizes] = [found for found in done.calibration.assessment.findings if found.about == "other sizes"]
+    assert sizes.found.startswith("2 of 7 photos are of another size")
 
 
 def test_results_are_written_with_the_lines_over_each_image(done, tmp_path):

@@ -45,6 +45,18 @@ def test_numbers_are_written_and_a_legend_is_added():
     assert 170 < columns.mean() < 230
 
 
+def test_numbers_of_lines_beside_each_other_do_not_cover_each_other():
+    """Whichever lines are numbered: here the first and the fourth of those drawn."""
+    image = np.zeros((300, 400, 3), np.uint8)
+    lines = [np.stack([np.full(280, 200.0 + n), np.arange(10.0, 290)], axis=-1) for n in range(4)]
+    bare = draw_lines(image, lines, [False] * 4)
+    written = [
+        (draw_lines(image, lines, [False] * 4, labels=labels) != bare).any(axis=(1, 2)).sum()
+        for labels in ({0: "41"}, {0: "41", 3: "102"})
+    ]
+    assert written[1] >= 1.9 * written[0]
+
+
 @pytest.mark.parametrize("shape", [(3000, 4000), (4000, 3000, 3)])
 def test_large_images_are_made_smaller_with_their_lines(shape):
     image = np.zeros(shape, np.uint8)

@@ -256,6 +256,10 @@ onload = () => {{
         page.querySelector("#zoom-grid .bent").getAttribute("d") !== seen[1]];
     }})(),
     boxes: [...page.querySelectorAll(".box")].filter((box) => box.scrollWidth > box.clientWidth).length,
+    marked: [...page.querySelectorAll(".box")].every(
+      (box) => (box.scrollWidth > box.clientWidth + 1) === box.classList.contains("more-right")),
+    fades: [...page.querySelectorAll(".more-right")].every(
+      (box) => page.defaultView.getComputedStyle(box).maskImage.includes("gradient")),
   }});
 }};
 </script>"""
@@ -278,5 +282,7 @@ def test_in_a_browser(text, tmp_path, width):
     assert first.startswith("f = 20.56 mm: the corner moves by")
     assert last.startswith("f = 127.4 mm: the corner moves by")
     assert told == last
+    assert found["marked"]
+    assert found["fades"]
     if width == 360:
         assert found["boxes"] > 0

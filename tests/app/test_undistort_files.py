@@ -1,6 +1,7 @@
 """``zoomjax undistort``, as a user runs it: photos and videos, and mistakes in one sentence."""
 
 import dataclasses
+import json
 import re
 import signal
 import subprocess
@@ -58,6 +59,50 @@ def test_video(folder):
     assert done.stderr == ""
     assert done.stdout.startswith(f"{FRAMES} frames corrected, scale 1.0")
     assert max(bend(frame) for frame in luma(folder / "out.mp4")[0][::6]) <= 0.2
+
+
+def test_a_folder_of_results_stands_for_its_lens(folder, tmp_path):
+    (tmp_path / "mylens").mkdir()
+    lens().save(tmp_path / "mylens/lens.json")
+    photo, options = folder / "a.jpg", ["--to", "opencv", "--focal", "35", "--pixel-pitch", "0.005"]
+    for words in (
+        ["undistort", "mylens", photo, "-o", "a.jpg"],
+        ["export", "mylens", *options, "-o", "a.yaml"],
+    ):
+        done = subprocess.run([*COMMAND, *map(str, words)], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert (tmp_path / words[-1]).exists()
+    words = ["undistort", str(tmp_path), str(photo), "-o", "b.jpg"]
+    done = subprocess.run([*COMMAND, *words], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "has no lens.json: give that of zoomjax calibrate" in done.stderr
+
+
+def test_a_dry_run_says_what_would_be_written(folder):
+    photos = ("a.jpg", "b.jpg", "picture.gif")
+    done = run(folder, *photos, "--focal", "table.csv", "-o", "planned", "--dry-run")
+    assert done.returncode == 1
+    assert done.stdout.splitlines() == [
+        "1 file would be written. Nothing was written.",
+        "  b.jpg -> planned/b.jpg, f = 30 mm",
+    ]
+    assert "Skipped a.jpg: " in done.stderr
+    assert "Skipped picture.gif: it is a GIF" in done.stderr
+    done = run(folder, "zoom.mp4", "--focal", "track.csv", "-o", "planned.mp4", "--dry-run")
+    assert done.returncode == 0, done.stderr
+    assert "  zoom.mp4 -> planned.mp4" in done.stdout
+    assert not [*folder.glob("planned*")]
+
+
+def test_results_as_json_and_in_silence(folder):
+    done = run(folder, "a.jpg", "b.jpg", "picture.gif", "-o", "json", "--json")
+    assert done.returncode == 1
+    told = json.loads(done.stdout)
+    assert told["files"] == [{"source": f"{n}.jpg", "target": f"json/{n}.jpg"} for n in "ab"]
+    assert [*told["skipped"]] == ["picture.gif"]
+    again = run(folder, "a.jpg", "b.jpg", "picture.gif", "-o", "json", "--resume", "--quiet")
+    assert (again.returncode, again.stdout) == (1, "")
+    assert again.stderr.startswith("Skipped picture.gif: it is a GIF")
 
 
 def test_photos_at_their_own_focal_lengths(folder):

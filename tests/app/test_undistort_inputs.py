@@ -19,6 +19,7 @@ from zoomjax.io.photo_writer import encoded_photo
 from .._clips import FRAMES, SIZE, focal, lens, luma, picture, write_clip
 from .._exif import exif
 from ..correct import test_photo
+from ..correct.test_video_streams import clip
 
 
 @pytest.fixture
@@ -71,6 +72,17 @@ def test_results_in_the_folder_itself_are_no_inputs(folder):
     for _ in range(2):
         undistort_files(job(folder, "in", out="in/out", overwrite=True))
     assert files(folder / "in/out") == ["a.jpg", "day/a.jpg", "day/b.png"]
+
+
+def test_a_new_suffix_does_not_make_two_results_one(folder):
+    """The photo of a phone, which becomes a PNG file, beside a picture of that name."""
+    heif = pytest.importorskip("pillow_heif")
+    grey = Image.fromarray(cv2.cvtColor(picture(0), cv2.COLOR_GRAY2RGB))
+    heif.from_pillow(grey).save(folder / "in/day/b.heic", exif=exif((40, 1)), quality=95)
+    heif.from_pillow(grey).save(folder / "in/day/c.heic", exif=exif((40, 1)), quality=95)
+    done = undistort_files(job(folder, "in"))
+    assert not done.skipped
+    assert files(folder / "out") == ["a.jpg", "day/a.jpg", "day/b.heic.png", "day/b.png", "day/c.png"]
 
 
 def test_links_to_one_photo_are_corrected_once(folder):
@@ -235,7 +247,7 @@ def test_several_videos_each_with_its_own_track(folder):
         (folder / f"tracks/{name}.csv").write_text(f"frame,focal\n{text}")
     done = undistort_files(job(folder, "*.mp4", focal=str(folder / "tracks")))
     assert done.sentence == f"2 videos corrected: {folder / 'out'}, {2 * FRAMES} frames"
-    assert done.notes == ("Kept of a.mp4: sound (aac, und).",)
+    assert done.notes == ("Kept of a.mp4: sound (aac).",)
     for name, last in (("a", 80.0), ("b", 30.0)):
         expected = zj.undistort_image(luma(folder / f"{name}.mp4")[0][-1], lens()(last))
         assert np.median(abs(luma(folder / f"out/{name}.mp4")[0][-1].astype(int) - expected)) <= 2
@@ -252,6 +264,22 @@ def test_several_videos_each_with_its_own_track(folder):
     assert list(done.skipped) == [str(folder / "c.mp4")]
     assert files(folder / "new") == ["b.mp4"]
     assert luma(folder / "new/b.mp4")[0].shape[:0:-1] == SIZE
+
+
+def test_of_several_videos_warnings_name_theirs_and_videos_are_counted(folder):
+    write_clip(folder / "a.mp4", 3)
+    size = (SIZE[0] // 4 * 2, SIZE[1] // 4 * 2)
+    ended = clip(folder / "b.mkv", size=size, stamps=range(3))
+    clip(folder / "c.flv", stamps=range(3))
+    told = []
+    with pytest.warns(UserWarning, match=rf"^{re.escape(str(ended))}: The lens is for images of") as caught:
+        done = undistort_files(
+            job(folder, "a.mp4", "b.mkv", "c.flv", focal="40"), lambda *of: told.append(of)
+        )
+    assert len(caught) == 1
+    assert told == [(0, 3)] * 3 + [(1, 3)] * 3 + [(2, 3)] * 3
+    assert not done.skipped
+    assert files(folder / "out") == ["a.mp4", "b.mkv", "c.mkv"]
 
 
 def test_videos_of_one_name_do_not_share_a_track(folder):

@@ -7,16 +7,27 @@ from PIL import ExifTags, Image
 from zoomjax.app.calibration import calibrate
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.plane_focals import FocalGroup
-from zoomjax.app.verdict import findings_of_edges, findings_of_focals, findings_of_photos
+from zoomjax.app.verdict import (
+    findings_of_edges,
+    findings_of_focals,
+    findings_of_photos,
+    findings_of_sizes,
+)
 from zoomjax.detect.batch import Detection
 
 
-def photo(path, model=None, lens=None):
+def photo(path, model=None, lens=None, written=None):
     exif = Image.Exif()
     if model is not None:
         exif[ExifTags.Base.Model] = model
     if lens is not None:
         exif[ExifTags.IFD.Exif] = {ExifTags.Base.LensModel: lens}
+    if written is not None:
+        width, height = written
+        exif[ExifTags.IFD.Exif] = {
+            ExifTags.Base.ExifImageWidth: width,
+            ExifTags.Base.ExifImageHeight: height,
+        }
     Image.new("L", (40, 40)).save(path, exif=exif)
     return path
 
@@ -38,6 +49,25 @@ def test_two_lenses_and_bodies_are_doubtful(tmp_path):
         "(2 photos)."
     )
     assert "D0 (3 photos), D1 (2 photos)" in cameras.found
+
+
+def test_photos_cropped_from_other_shapes_are_doubtful(tmp_path):
+    """Not those made smaller, or taken upright."""
+    sizes = [(6000, 4000), (4000, 6000), (3001, 2000), (6000, 4000)]
+    photos = [photo(tmp_path / f"{n}.jpg", written=size) for n, size in enumerate(sizes)]
+    assert findings_of_photos(photos) == []
+    photos.append(photo(tmp_path / "other.jpg", written=(6000, 3376)))
+    (found,) = findings_of_photos(photos)
+    assert (found.verdict, found.cause) == ("doubtful", True)
+    assert "6000 x 4000 px (3 photos), 3001 x 2000 px (1 photo)" in found.found
+    assert "6000 x 3376 px (1 photo)" in found.found
+
+
+def test_photos_of_other_sizes_are_remarked_on():
+    assert findings_of_sizes(0, 9) == []
+    (found,) = findings_of_sizes(2, 9)
+    assert found.verdict == "good"
+    assert found.found == "2 of 11 photos are of another size than most and were left out."
 
 
 def test_two_lenses_are_to_be_parted_before_another_photo_is_taken(noisy, tmp_path):

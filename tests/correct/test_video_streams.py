@@ -217,6 +217,33 @@ def test_frames_of_avi_files_have_the_times_at_which_they_are_shown(tmp_path, en
     np.testing.assert_allclose(times - times[0], expected, atol=1e-6)
 
 
+@pytest.mark.parametrize(("encoder", "between"), [("libx264", 3), ("libx264", 0), ("mpeg2video", 2)])
+def test_frames_of_mxf_files_have_the_times_at_which_they_are_shown(tmp_path, encoder, between):
+    """Those of H.264 have no index of the order in which frames are shown."""
+    source = clip(tmp_path / "in.mxf", encoder=encoder, stamps=range(24), options={"bf": str(between)})
+    expected = np.arange(24) / 25
+    with decode_video(source) as (_, frames):
+        found = [(time, image()) for _, time, image in frames]
+    np.testing.assert_allclose([time for time, _ in found], expected, atol=1e-6)
+    for number, (_, image) in enumerate(found):
+        assert np.median(np.abs(image[..., 0].astype(int) - picture(number))) < 12
+    done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=20.0)
+    assert not any("times" in name for name in done.not_kept)
+    np.testing.assert_allclose(luma(tmp_path / "out.mkv")[1], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".webm"])
+def test_av1_stays_what_it_is_and_is_called_so(tmp_path, suffix):
+    """Whichever library decodes it."""
+    source = clip(tmp_path / "in.mkv", encoder="libsvtav1", stamps=range(3))
+    done = undistort_video(source, tmp_path / f"out{suffix}", lens=lens(), focal=20.0)
+    with av.open(str(tmp_path / f"out{suffix}")) as out:
+        assert out.streams.video[0].codec_context.codec.canonical_name == "av1"
+    assert done.not_kept == ()
+    done = undistort_video(source, tmp_path / "out.mov", lens=lens(), focal=20.0)
+    assert done.not_kept == ("the format av1, which became H.264 in a .mov file",)
+
+
 @pytest.mark.parametrize(("encoder", "expected"), [("libx264", "h264"), ("prores_ks", "prores")])
 def test_mxf_is_written(tmp_path, encoder, expected):
     pixels = "yuv420p" if encoder == "libx264" else "yuv422p10le"

@@ -10,6 +10,7 @@ import tifffile
 from PIL import ExifTags, Image, IptcImagePlugin, PngImagePlugin
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
+from zoomjax.io.equipment import read_equipment
 from zoomjax.io.metadata import Metadata, geometry_of, marked, work_of
 from zoomjax.io.photo import read_focal, read_metadata, read_pages, read_photo
 from zoomjax.io.photo_writer import encoded_photo
@@ -274,7 +275,9 @@ def test_iptc_data_of_any_type_are_kept_without_a_word(tmp_path, image, kind):
     block = IIM + bytes(-len(IIM) % 4)
     values = struct.unpack(f"<{len(block) // 4}I", block) if kind == 4 else block
     path = tmp_path / "a.tif"
-    tifffile.imwrite(path, image, extratags=[(33723, kind, len(values), values, True)], metadata=None)
+    tags = [(33723, kind, len(values), values, True), (ExifTags.Base.Make, 2, 0, "Nikon", True)]
+    tifffile.imwrite(path, image, extratags=tags, metadata=None)
+    assert read_equipment(path).maker == "Nikon"
     [(_, found)] = read_pages(path).pages
     assert IIM in found.iptc
     assert read_metadata(path).iptc == found.iptc

@@ -27,6 +27,7 @@ ModelName = Annotated[
     str | None,
     typer.Option(
         "--model",
+        metavar="MODEL",
         help="Zoom model: auto (of least cross-validation error), polynomial (in 1/f), smooth (with a "
         "prior from real lenses) or spline. Default: auto, or polynomial with --degree.",
         rich_help_panel=FIT,
@@ -34,12 +35,18 @@ ModelName = Annotated[
 ]
 Degree = Annotated[
     int | None,
-    typer.Option(min=0, help="Degree of the polynomials in 1/f; default: chosen.", rich_help_panel=FIT),
+    typer.Option(
+        min=0,
+        metavar="N",
+        help="Degree of the polynomials in 1/f; default: chosen.",
+        rich_help_panel=FIT,
+    ),
 ]
 Terms = Annotated[
     int | None,
     typer.Option(
         min=1,
+        metavar="N",
         help="Number of distortion coefficients, k1 to kN; default: chosen.",
         rich_help_panel=FIT,
     ),
@@ -47,6 +54,7 @@ Terms = Annotated[
 Family = Annotated[
     Literal["radial", "division", "brown-conrady", "auto"] | None,
     typer.Option(
+        metavar="MODEL",
         help="Distortion model: radial (polynomial), division (strong barrel distortion), brown-conrady "
         "(the polynomial with decentering) or auto (of least cross-validation error). Default: radial; of "
         "a strong lens, that of radial and division.",
@@ -149,7 +157,22 @@ def split_lens(inputs: list[Path]) -> tuple[Path, tuple[Path, ...]]:
             "Give the lens and then what to correct: lens.json photos/*.jpg. Without a lens of your own, "
             "--lens auto takes that of the EXIF data."
         )
-    return inputs[0], tuple(inputs[1:])
+    return lens_file(inputs[0]), tuple(inputs[1:])
+
+
+def lens_file(given: Path) -> Path:
+    """The file of a lens, for which the folder of results that it is in stands, too.
+
+    Raises:
+        FileNotFoundError: there is none in the folder.
+    """
+    if not given.is_dir():
+        return given
+    if not (given / "lens.json").is_file():
+        raise FileNotFoundError(
+            f"The folder {given} has no lens.json: give that of zoomjax calibrate, or the file of a lens."
+        )
+    return given / "lens.json"
 
 
 def size_of(text: str | None) -> tuple[int, int] | None:

@@ -22,8 +22,12 @@ from .._core.text import plain
 from ..fit.compiled import UNKEPT, forget_compiled
 from . import commands_interop, commands_lens, commands_reproduce  # noqa: F401, they add their commands
 from ._flags import options_of, with_flags
+from ._help import PlainCommand
 from ._interrupts import INTERRUPTED, LAST_WORDS, end_run, leave, swallowed
 from .commands import app
+
+for _command in app.registered_commands:
+    _command.cls = PlainCommand
 
 USAGE: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "UsageError")
 """What Typer raises for mistakes in the command line."""

@@ -6,15 +6,12 @@ float64.
 
 import dataclasses
 import importlib.metadata
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from .._core.files import cache_folder, refuse_inputs
-from .._core.text import plain
-from ._flags import with_flags
 from ._jax import set_up_jax
 from .arguments import (
     Centre,
@@ -42,23 +39,36 @@ from .options import (
     IDLE_FOR_MOTION,
     INPUT,
     UNDISTORT_EXAMPLES,
+    Again,
     AsJson,
+    Border,
     Detector,
     Distance,
     DryRun,
     Exclude,
     FileOrFolder,
     Focal,
+    FocalAtUse,
     FocalSigma,
     FocalUnits,
     Frames,
+    Hold,
+    Interpolation,
+    JsonOfWork,
+    Keep,
+    OtherLens,
     Overlays,
     Pitch,
     Pixel,
     Quiet,
+    QuietWork,
+    Redistort,
+    Replace,
     ResultsFolder,
+    Resume,
     SharedFocal,
     Strict,
+    Verbose,
     WithLines,
     detector_for,
     excluded,
@@ -68,7 +78,7 @@ from .options import (
 )
 from .plans import images_plan, lines_plan, tell_plan, without
 from .runs import calibrate_images, calibrate_lines, title_of
-from .shown import Shown
+from .shown import Shown, show_outcome
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -97,9 +107,9 @@ def options(
 def demo(
     output: ResultsFolder = Path("zoomjax-demo"),
     photos: Annotated[
-        int, typer.Option(min=3, help="Number of photos, each at its own focal length.")
+        int, typer.Option(min=3, metavar="N", help="Number of photos, each at its own focal length.")
     ] = 12,
-    seed: Annotated[int, typer.Option(min=0, help="Random seed of the image noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Random seed of the image noise.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
     """Run a complete example: render photos of a board with a known lens, then calibrate from them.
@@ -183,6 +193,7 @@ def calibrate(
         int | None,
         typer.Option(
             min=1,
+            metavar="N",
             help="Number of processes that detect lines; default: one per core.",
             rich_help_panel=INPUT,
         ),
@@ -200,6 +211,7 @@ def calibrate(
     overlays: Overlays = "some",
     strict: Strict = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     as_json: AsJson = False,
     dry_run: DryRun = False,
     overwrite: Overwrite = False,
@@ -214,7 +226,7 @@ def calibrate(
     track.csv stay until they are written again.
     """
     set_up_jax()
-    show = Shown(strict, quiet, as_json)
+    show = Shown(strict, quiet, as_json, verbose)
     from .model_choice import WantedModel
 
     refuse_auto(model, degree)
@@ -307,57 +319,24 @@ def undistort(
         list[Path],
         typer.Argument(
             metavar="[lens.json] INPUT...",
-            help="The lens written by zoomjax calibrate, unless --lens is given; photos or videos, folders "
-            "of them, or patterns.",
+            help="The lens written by zoomjax calibrate, or the folder of its results, unless --lens is "
+            "given; photos or videos, folders of them, or patterns.",
         ),
     ],
     output: FileOrFolder,
-    lens: Annotated[
-        str | None,
-        typer.Option(
-            metavar="auto|NAME",
-            help="In place of lens.json, a lens of the library (zoomjax lens): that of each photo's EXIF "
-            "data, or by its name.",
-        ),
-    ] = None,
-    focal: Annotated[
-        str | None,
-        typer.Option(
-            help="A focal length, or a CSV file: columns time,focal or frame,focal for a video, "
-            "image,focal for photos; for several videos a folder of such files with their names. Default "
-            "for photos: their EXIF data."
-        ),
-    ] = None,
-    keep: Annotated[
-        str,
-        typer.Option(
-            help="Framing of the corrected image: same (as the input), all (every input pixel), valid (no "
-            "empty borders) or grow (every input pixel at its size, on a larger canvas). The framing stays "
-            "constant while zooming."
-        ),
-    ] = "same",
-    interpolation: Annotated[
-        str, typer.Option(help="Interpolation: nearest, linear, cubic or lanczos.")
-    ] = "linear",
-    border: Annotated[
-        str, typer.Option(help="Fill outside of the input image: constant (black), replicate or reflect.")
-    ] = "constant",
-    hold: Annotated[
-        bool,
-        typer.Option("--hold", help="Use the first and last focal length of a track beyond its ends."),
-    ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace existing files, but never an input.")
-    ] = False,
-    redistort: Annotated[
-        bool, typer.Option("--redistort", help="Go back: apply the distortion to corrected images.")
-    ] = False,
-    again: Annotated[
-        bool, typer.Option("--again", help="Also accept photos that zoomjax has corrected already.")
-    ] = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Leave what an earlier run has written, and do the rest.")
-    ] = False,
+    lens: OtherLens = None,
+    focal: FocalAtUse = None,
+    hold: Hold = False,
+    keep: Keep = "same",
+    interpolation: Interpolation = "linear",
+    border: Border = "constant",
+    redistort: Redistort = False,
+    again: Again = False,
+    resume: Resume = False,
+    overwrite: Replace = False,
+    quiet: QuietWork = False,
+    as_json: JsonOfWork = False,
+    dry_run: DryRun = False,
 ) -> None:
     """Correct photos or videos, each image at its own focal length.
 
@@ -369,19 +348,14 @@ def undistort(
 
     file, files = split_lens(inputs) if lens is None else (None, tuple(inputs))
     job = Job(file, files, output, focal, keep, interpolation, border, hold, overwrite)
-    job = dataclasses.replace(job, redistort=redistort, again=again, resume=resume)
-    with progress_bar("Correcting", timed=False) as progress:
+    job = dataclasses.replace(job, redistort=redistort, again=again, resume=resume, dry_run=dry_run)
+    with progress_bar("Correcting", timed=False, quiet=quiet or dry_run) as progress:
         if lens is None:
             done = undistort_files(job, progress)
         else:
             from .library_lens import undistort_by_library
 
             done = undistort_by_library(job, lens, progress)
-    for sentence in done.sentence.splitlines():
-        print(plain(sentence))
-    for note in done.notes:
-        print(plain(note))
-    for path, reason in done.skipped.items():
-        print(plain(f"Skipped {path}: {with_flags(reason)}"), file=sys.stderr)
+    show_outcome(done, quiet=quiet, as_json=as_json)
     if done.skipped:
-        raise typer.Exit(1 if done.written else 2)
+        raise typer.Exit(1 if done.written or dry_run else 2)

@@ -10,7 +10,7 @@ import typer
 from .._core.files import refuse_inputs
 from .._core.text import plain
 from ._jax import set_up_jax
-from .arguments import Overwrite, size_of
+from .arguments import Overwrite, lens_file, size_of
 from .commands import app
 from .options import ResultsFolder, place
 
@@ -24,7 +24,12 @@ RESULTS = ("lens.json", "import.json")
 @app.command("export")
 def export(
     lens: Annotated[
-        Path, typer.Argument(metavar="lens.json", help="The lens written by zoomjax calibrate.")
+        Path,
+        typer.Argument(
+            metavar="lens.json",
+            help="The lens written by zoomjax calibrate, or the folder of its results.",
+            callback=lens_file,
+        ),
     ],
     output: Annotated[
         Path,
@@ -40,8 +45,9 @@ def export(
     focal: Annotated[
         str | None,
         typer.Option(
+            metavar="F,...|CSV",
             help="Focal lengths, separated by commas, or a CSV file with the columns frame,focal: an entry "
-            "for each frame. Formats that interpolate choose them by themselves."
+            "for each frame. Formats that interpolate choose them by themselves.",
         ),
     ] = None,
     pixel_pitch: Annotated[
@@ -62,7 +68,10 @@ def export(
     ] = None,
     convention: Annotated[
         str | None,
-        typer.Option(help="Of STMaps: centres (Nuke), gyroflow or alicevision. Default: centres."),
+        typer.Option(
+            metavar="CONVENTION",
+            help="Of STMaps: centres (Nuke), gyroflow or alicevision. Default: centres.",
+        ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
@@ -113,36 +122,51 @@ def import_(
     focal: Annotated[
         str | None,
         typer.Option(
-            help="Focal lengths of the files or entries, separated by commas, where these do not say them."
+            metavar="F,...",
+            help="Focal lengths of the files or entries, separated by commas, where these do not say them.",
         ),
     ] = None,
     crop: Annotated[
         float | None,
-        typer.Option(help="For lensfun: crop factor of the camera; default: that of the calibration."),
+        typer.Option(
+            metavar="FACTOR",
+            help="For lensfun: crop factor of the camera; default: that of the calibration.",
+        ),
     ] = None,
     name: Annotated[
         str | None,
-        typer.Option(help="For lensfun: name of the lens, or a part of it, for files of several."),
+        typer.Option(
+            metavar="NAME",
+            help="For lensfun: name of the lens, or a part of it, for files of several.",
+        ),
     ] = None,
     direction: Annotated[
         str | None,
-        typer.Option(help="Of STMaps: undistort or redistort; default: what the file name says."),
+        typer.Option(
+            metavar="DIRECTION",
+            help="Of STMaps: undistort or redistort; default: what the file name says.",
+        ),
     ] = None,
     convention: Annotated[
         str | None,
-        typer.Option(help="Of STMaps: centres (Nuke), gyroflow or alicevision. Default: centres."),
+        typer.Option(
+            metavar="CONVENTION",
+            help="Of STMaps: centres (Nuke), gyroflow or alicevision. Default: centres.",
+        ),
     ] = None,
     family: Annotated[
         Literal["radial", "division", "brown-conrady"] | None,
         typer.Option(
+            metavar="MODEL",
             help="Distortion model: radial (polynomial), division or brown-conrady (with decentering). "
-            "Default: that which holds the file's coefficients, or is nearest to its maps."
+            "Default: that which holds the file's coefficients, or is nearest to its maps.",
         ),
     ] = None,
     terms: Annotated[
         int | None,
         typer.Option(
             min=1,
+            metavar="N",
             help="Number of radial coefficients. Default: 2, or those that keep the file's values.",
         ),
     ] = None,

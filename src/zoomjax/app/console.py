@@ -2,8 +2,10 @@
 
 import contextlib
 import math
+import textwrap
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from ..trust.assessment import Finding
+    from ..trust.selection import Selection
     from .calibration import Calibration
     from .image_calibration import ImageCalibration
 
@@ -181,7 +184,7 @@ def show_calibration(
     console.print(table)
     console.print()
     if calibration.selection:
-        print(calibration.selection, end="\n\n")
+        show_choice(calibration.selection)
     if summary["family"] != "RadialPolynomial":
         console.print(f"Distortion model: {summary['family']}", highlight=False)
     polynomials = calibration.pixel_polynomials()
@@ -202,6 +205,66 @@ def show_calibration(
     console.print(calibration.advice(), highlight=False)
 
 
+def show_choice(selection: "Selection") -> None:
+    """Print what the models that were compared leave of lines left out, the chosen one marked by ">"."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=selection.title, title_justify="left", box=None, pad_edge=False)
+    table.add_column("")
+    for name in ("parameters", "px, held out", "to the best"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for of, row in zip(selection.verdicts, selection.rows(), strict=True):
+        mark = ">" if of.candidate is selection.chosen else " "
+        if of.problem:
+            table.add_row(f"{mark} {row[0]}", "", "not compared", "")
+            continue
+        best = f"{of.difference:+.4f} ± {of.difference_std:.4f}"
+        table.add_row(
+            f"{mark} {row[0]}", row[1], row[3], "best" if of.candidate is selection.best else best
+        )
+    console = Console()
+    console.print(table)
+    console.print()
+
+
+def show_frames(calibration: "Calibration", names: Sequence[str] = ()) -> None:
+    """Print each frame's focal length, straightness and lines, from the shortest f; and the versions."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console, summary = Console(), calibration.summary()
+    table = Table(title="Frames: RMS distance to straight lines, px", title_justify="left", box=None)
+    table.add_column("", overflow="fold")
+    for name in (
+        f"f, {summary['focal_unit']}",
+        "before",
+        "after",
+        "left out",
+        "alone",
+        "lines",
+        "rejected",
+    ):
+        table.add_column(name, justify="right", no_wrap=True)
+    rejected = Counter(row["frame"] for row in summary["rejected"])
+    shown = dict(enumerate(names))
+    for row in sorted(summary["per_frame"], key=lambda row: row["focal"]):
+        values = (row[key] for key in ("rms_none", "rms_zoom", "rms_held_out", "rms_frames"))
+        figures = ("–" if value is None else f"{value:.3f}" for value in values)
+        frame = row["frame"]
+        table.add_row(
+            plain(shown.get(frame, str(frame))),
+            f"{row['focal']:.5g}",
+            *figures,
+            str(row["lines"]),
+            str(rejected[frame]),
+        )
+    console.print()
+    console.print(table)
+    versions = ", ".join(f"{name} {of}" for name, of in summary["versions"].items())
+    console.print(f"\nVersions: {versions}", highlight=False)
+
+
 def _coefficients(calibration: "Calibration") -> "Table":
     """A table of the coefficients at some focal lengths."""
     from rich.table import Table
@@ -220,18 +283,28 @@ def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()
     """Print how many lines were found and rejected, warnings, and where the results are."""
     found = sum(len(detection.lines) for detection in done.used)
     rejected = int(done.calibration.rejected.sum())
-    print(
-        f"\n{found} lines found in {_images(len(done.used))}; {rejected} of them are not straight in the "
-        f"scene and were rejected.\nFocal lengths: {plain(done.focals.origin)}."
+    print()
+    say(
+        f"{found} lines found in {_images(len(done.used))}; {rejected} of them are not straight in the "
+        "scene and were rejected."
     )
+    say(f"Focal lengths: {plain(done.focals.origin)}.")
     deviation = sorted(s / done.focals.focal[name] for name, s in done.focals.deviation.items())
     if deviation:
-        print(f"Their standard deviations: {deviation[0]:.2%} to {deviation[-1]:.2%}.")
+        say(f"Their standard deviations: {deviation[0]:.2%} to {deviation[-1]:.2%}.")
     for sentence in done.shared():
-        print(sentence)
+        say(sentence)
     tell(done.warnings())
-    print(f"\nCheck the detected lines, drawn over each image, in {plain(str(folder / 'lines'))}.")
+    print()
+    say(f"Check the detected lines, drawn over each image, in {plain(str(folder / 'lines'))}.")
     tell_written(folder, ["lines/", *also])
+
+
+def say(text: str) -> None:
+    """Print text in lines as wide as the terminal, in which words stay whole, as paths must."""
+    from rich.console import Console
+
+    print(textwrap.fill(text, Console().width, break_long_words=False, break_on_hyphens=False))
 
 
 def _images(number: int) -> str:
@@ -250,4 +323,5 @@ def tell(warnings: Sequence[str]) -> None:
 def tell_written(folder: Path, also: Sequence[str] = ()) -> None:
     """Print where the results are."""
     files = [REPORT, "lens.json", "lines.npz", "summary.json", "model.png", *also]
-    print(f"\nWritten to {plain(str(folder))}: {', '.join(files)}")
+    print()
+    say(f"Written to {plain(str(folder))}: {', '.join(files)}")

@@ -25,7 +25,7 @@ from .image_job import ImageJob, overlay_name
 from .overlay import draw_lines
 from .plane_focals import Sharing
 from .results_folder import OF_A_LENS, results_folder
-from .verdict import findings_of_edges, findings_of_focals, findings_of_photos
+from .verdict import findings_of_edges, findings_of_focals, findings_of_photos, findings_of_sizes
 
 MOST_OVERLAYS = 200
 """Images drawn with their lines, unless all are asked for."""
@@ -280,6 +280,8 @@ def _with_findings(done: ImageCalibration) -> ImageCalibration:
     found = findings_of_focals(done.focals.groups, done.focals.unit) + findings_of_edges(done.used)
     if done.job.video is None:
         found += findings_of_photos(Path(detection.file) for detection in done.used)
+        others = sum(why.startswith(_OTHER_SIZE) for why in done.unused.values())
+        found += findings_of_sizes(others, len(done.used))
     assessment = done.calibration.assessment.joined_by(found)
     return dataclasses.replace(
         done, calibration=dataclasses.replace(done.calibration, assessment=assessment)
@@ -289,6 +291,9 @@ def _with_findings(done: ImageCalibration) -> ImageCalibration:
 _NONE_AGREES = (
     "none of its lines is straight under the model fitted to the other images. Check its focal length"
 )
+
+
+_OTHER_SIZE = "its size is"
 
 
 def _of_one_size(detections: Sequence[Detection]) -> tuple[list[Detection], dict[str, str]]:
@@ -301,7 +306,7 @@ def _of_one_size(detections: Sequence[Detection]) -> tuple[list[Detection], dict
         if detection.image_size == (width, height):
             continue
         own = "x".join(map(str, detection.image_size))
-        here = f"its size is {own} px, but most images have {width}x{height}"
+        here = f"{_OTHER_SIZE} {own} px, but most images have {width}x{height}"
         turned = detection.image_size == (height, width)
         others[detection.name] = here + (
             ": it was rotated, so rotate it back"

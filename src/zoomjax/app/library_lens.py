@@ -141,7 +141,7 @@ def undistort_by_library(
     groups, skipped = _by_lens(photos, None if name == AUTO else name)
     if not groups and len(photos) == 1:
         raise ValueError(skipped[str(photos[0])])
-    sentences, notes, written, done = [], [], 0, len(skipped)
+    sentences, notes, files, written, done = [], [], [], 0, len(skipped)
     for lens, paths in groups:
         own = [target for path, target in zip(photos, targets, strict=True) if path in paths]
 
@@ -158,8 +158,10 @@ def undistort_by_library(
             sentences.append(plain(f"{_taken(lens)}: {outcome.sentence}"))
         skipped |= outcome.skipped
         notes += outcome.notes
+        files += outcome.files
         written, done = written + outcome.written, done + len(paths)
-    return with_refused(Outcome("\n".join(sentences), skipped, written, tuple(notes)), found)
+    outcome = Outcome("\n".join(sentences), skipped, written, tuple(notes), tuple(files))
+    return with_refused(outcome, found)
 
 
 def _by_lens(photos: list[Path], name: str | None) -> tuple[list["_Group"], dict[str, str]]:

@@ -9,6 +9,7 @@ import typer
 from .._core.files import settled
 
 FIT, FOCAL, INPUT, OUTPUT = "Lens", "Focal lengths", "Images and lines", "Output"
+USE, PICTURE = "Lens and focal lengths", "Picture"
 """Panels of the help."""
 
 Detector = Literal["edges", "grid", "pitch"]
@@ -24,6 +25,15 @@ Quiet = Annotated[
     bool,
     typer.Option(
         "--quiet", "-q", help="Print the verdict, warnings and errors only.", rich_help_panel=OUTPUT
+    ),
+]
+Verbose = Annotated[
+    bool,
+    typer.Option(
+        "--verbose",
+        "-v",
+        help="Also print a table of all frames, and the versions of what was run.",
+        rich_help_panel=OUTPUT,
     ),
 ]
 AsJson = Annotated[
@@ -54,6 +64,7 @@ Frames = Annotated[
     int,
     typer.Option(
         min=1,
+        metavar="N",
         help="For a video: maximum number of frames in which lines are detected.",
         rich_help_panel=INPUT,
     ),
@@ -94,6 +105,7 @@ Exclude = Annotated[
 Focal = Annotated[
     str | None,
     typer.Option(
+        metavar="SOURCE",
         help="Source of the focal lengths: a CSV file (columns image,focal; for a video time,focal or "
         "frame,focal; for CSV lines frame,focal), a number, exif, board (parallel to the sensor), "
         "plane (oblique views of a flat grid), pitch (football markings), or for a video motion (as "
@@ -109,6 +121,7 @@ FocalUnits = Annotated[
 FocalSigma = Annotated[
     str | None,
     typer.Option(
+        metavar="STD",
         help="Standard deviation of the focal lengths, in their unit or per cent, e.g. 0.3 or 1%. "
         "Standard deviations of the results include it. Default: what plane, board or pitch estimate, "
         "the CSV column sigma, or else 0.",
@@ -145,6 +158,100 @@ Pixel = Annotated[
     typer.Option(metavar="MM", help="For --focal board: pixel size on the sensor.", rich_help_panel=FOCAL),
 ]
 
+OtherLens = Annotated[
+    str | None,
+    typer.Option(
+        metavar="auto|NAME",
+        help="In place of lens.json, a lens of the library (zoomjax lens): that of each photo's EXIF data, "
+        "or by its name.",
+        rich_help_panel=USE,
+    ),
+]
+FocalAtUse = Annotated[
+    str | None,
+    typer.Option(
+        metavar="F|CSV",
+        help="A focal length, or a CSV file: columns time,focal or frame,focal for a video, image,focal "
+        "for photos; for several videos a folder of such files with their names. Default for photos: "
+        "their EXIF data.",
+        rich_help_panel=USE,
+    ),
+]
+Hold = Annotated[
+    bool,
+    typer.Option(
+        "--hold",
+        help="Use the first and last focal length of a track beyond its ends.",
+        rich_help_panel=USE,
+    ),
+]
+Keep = Annotated[
+    str,
+    typer.Option(
+        metavar="same|all|valid|grow",
+        help="Framing of the corrected image: same (as the input), all (every input pixel), valid (no "
+        "empty borders) or grow (every input pixel at its size, on a larger canvas). The framing stays "
+        "constant while zooming.",
+        rich_help_panel=PICTURE,
+    ),
+]
+Interpolation = Annotated[
+    str,
+    typer.Option(
+        metavar="METHOD",
+        help="Interpolation: nearest, linear, cubic or lanczos.",
+        rich_help_panel=PICTURE,
+    ),
+]
+Border = Annotated[
+    str,
+    typer.Option(
+        metavar="FILL",
+        help="Fill outside of the input image: constant (black), replicate or reflect.",
+        rich_help_panel=PICTURE,
+    ),
+]
+Redistort = Annotated[
+    bool,
+    typer.Option(
+        "--redistort",
+        help="Go back: apply the distortion to corrected images.",
+        rich_help_panel=PICTURE,
+    ),
+]
+Again = Annotated[
+    bool,
+    typer.Option(
+        "--again",
+        help="Also accept photos that zoomjax has corrected already.",
+        rich_help_panel=OUTPUT,
+    ),
+]
+Resume = Annotated[
+    bool,
+    typer.Option(
+        "--resume",
+        help="Leave what an earlier run has written, and do the rest.",
+        rich_help_panel=OUTPUT,
+    ),
+]
+Replace = Annotated[
+    bool,
+    typer.Option("--overwrite", help="Replace existing files, but never an input.", rich_help_panel=OUTPUT),
+]
+QuietWork = Annotated[
+    bool,
+    typer.Option("--quiet", "-q", help="Print warnings and errors only.", rich_help_panel=OUTPUT),
+]
+JsonOfWork = Annotated[
+    bool,
+    typer.Option(
+        "--json",
+        help="Print what was written and skipped as JSON, in place of sentences.",
+        rich_help_panel=OUTPUT,
+    ),
+]
+
 IDLE_FOR_LINES = (
     *("pitch", "distance", "pixel", "jobs", "detector", "frames", "cache", "overlays", "with_lines"),
     "shared_focal",
@@ -153,7 +260,7 @@ IDLE_FOR_LINES = (
 
 IDLE_FOR_MOTION = (
     *("focal_sigma", "focal_unit", "pitch", "distance", "pixel", "robust", "overlays", "shared_focal"),
-    "family",
+    *("family", "verbose"),
 )
 """And about a clip whose motion gives its focal lengths."""
 
@@ -179,6 +286,10 @@ Examples:
   zoomjax undistort mylens/lens.json photo.jpg -o corrected.jpg
 
   zoomjax undistort mylens/lens.json clip.mp4 --focal track.csv -o corrected.mp4
+
+  zoomjax undistort mylens/lens.json shoot -o corrected --resume
+
+  zoomjax undistort mylens/lens.json plate.tif --keep grow -o overscan.tif
 """
 
 

@@ -38,7 +38,7 @@ def draw_lines(
         rejected: whether each line was rejected.
         rms: of each line, px; by default all have the first colour.
         limit: the RMS, px, from which on a line has the last colour.
-        labels: text near the middle of lines, by their places in `lines`; neighbours' are apart.
+        labels: text near the middle of lines, by their places in `lines`; three after another are apart.
         legend: whether to explain the colours below the picture.
         dim: brightness of the image.
 
@@ -57,8 +57,8 @@ def draw_lines(
                 _draw(picture, dash, _REJECTED, width + 1)
         else:
             _draw(picture, line, colour(rms[index] / limit if len(rms) and limit > 0 else 0.0), width)
-    for index, text in (labels or {}).items():
-        _write(picture, text, shown[index], (3 + index % 3) / 8)
+    for order, (index, text) in enumerate((labels or {}).items()):
+        _write(picture, text, shown[index], (3 + order % 3) / 8)
     return np.vstack([picture, _legend(picture.shape[1], limit)]) if legend else picture
 
 

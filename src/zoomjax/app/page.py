@@ -41,7 +41,7 @@ def rendered(template: str, **values: Any) -> str:
 @functools.cache
 def _templates() -> jinja2.Environment:
     """The Jinja templates. All text is escaped and free of control characters."""
-    return jinja2.Environment(
+    environment = jinja2.Environment(
         loader=jinja2.PackageLoader("zoomjax.app"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
@@ -50,6 +50,8 @@ def _templates() -> jinja2.Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    environment.filters["together"] = lambda text: text.replace(" ", "\u00a0")  # on one line of the page
+    return environment
 
 
 def _shown(text: str) -> str:

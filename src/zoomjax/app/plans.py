@@ -1,4 +1,4 @@
-"""What a calibration would do (``--dry-run``), and lines left out by hand (``--exclude``)."""
+"""What a command would do (``--dry-run``), and lines left out by hand (``--exclude``)."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -95,6 +95,14 @@ def _focal_lengths(job: "ImageJob", photos: Sequence[Path]) -> Callable[[Path], 
         if str(photo) in known
         else f"not used, as {name} has no row for it"
     )
+
+
+def files_plan(files: Sequence[str], earlier: int) -> str:
+    """Which files would be written, each in a line of text, and how many are there from an earlier run."""
+    more = [f"  and {len(files) - _LISTED} more"] if len(files) > _LISTED else []
+    before = f", {earlier} are there" if earlier else ""
+    head = f"{len(files)} file{'s' * (len(files) != 1)} would be written{before}. Nothing was written."
+    return "\n".join([head, *files[:_LISTED], *more])
 
 
 def tell_plan(told: Sequence[str], output: Path) -> None:

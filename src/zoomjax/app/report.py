@@ -121,7 +121,7 @@ def _cards(calibration: Calibration) -> list[tuple[str, str]]:
     ]
     if np.isfinite(left_out) and np.isfinite(own):
         cards[0] = (cards[0][0], cards[0][1] + ", in photos left out of the fit")
-        cards.append((f"{short(own)} px", "the same with a correction for each photo alone"))
+        cards.append((f"{short(own)} px", "from straight after a correction for each photo alone"))
     return cards
 
 

@@ -2,16 +2,20 @@
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
-from .console import show_calibration, show_images, show_verdict, tell, tell_written
+from .._core.text import plain
+from ._flags import with_flags
+from .console import show_calibration, show_frames, show_images, show_verdict, tell, tell_written
 
 if TYPE_CHECKING:
     from .calibration import Calibration
     from .image_calibration import ImageCalibration
+    from .undistort_files import Outcome
 
 NOT_GOOD = 3
 """Exit status of ``--strict`` where the verdict is not good."""
@@ -19,11 +23,17 @@ NOT_GOOD = 3
 
 @dataclasses.dataclass(frozen=True)
 class Shown:
-    """How results are shown: the options ``--strict``, ``--quiet`` and ``--json``."""
+    """How results are shown: the options ``--strict``, ``--quiet``, ``--json`` and ``--verbose``."""
 
     strict: bool = False
     quiet: bool = False
     as_json: bool = False
+    verbose: bool = False
+
+    def __post_init__(self):
+        """Check that they go together."""
+        if self.verbose and (self.quiet or self.as_json):
+            raise ValueError("--verbose has no effect with --quiet or --json: leave one of them out.")
 
     def lines(self, calibration: "Calibration", output: Path, *, robust: bool) -> None:
         """Show a calibration from lines, and end by its verdict."""
@@ -32,6 +42,8 @@ class Shown:
             if robust:
                 rejected = int(calibration.rejected.sum())
                 print(f"\n{rejected} lines are not straight in the scene and were rejected.")
+            if self.verbose:
+                show_frames(calibration)
         tell(calibration.warnings())
         if not (self.quiet or self.as_json):
             tell_written(output)
@@ -41,6 +53,8 @@ class Shown:
         """Show a calibration from images, and end by its verdict."""
         if self._all(done.calibration, output):
             show_calibration(done.calibration)
+            if self.verbose:
+                show_frames(done.calibration, [detection.name for detection in done.used])
             show_images(done, output)
         else:
             tell(done.warnings())
@@ -57,3 +71,16 @@ class Shown:
     def _end(self, calibration: "Calibration") -> None:
         if self.strict and calibration.assessment.verdict != "good":
             raise typer.Exit(NOT_GOOD)
+
+
+def show_outcome(done: "Outcome", *, quiet: bool, as_json: bool) -> None:
+    """Print what ``zoomjax undistort`` has done: on stdout results, on stderr what was skipped."""
+    skipped = {path: with_flags(reason) for path, reason in done.skipped.items()}
+    if as_json:
+        files = [{"source": str(source), "target": str(target)} for source, target in done.files]
+        print(json.dumps({"files": files, "skipped": skipped, "notes": done.notes}, indent=2))
+        return
+    for told in () if quiet else filter(None, (*done.sentence.split("\n"), *done.notes)):
+        print(plain(told))
+    for path, reason in skipped.items():
+        print(plain(f"Skipped {path}: {reason}"), file=sys.stderr)

@@ -23,6 +23,7 @@ from ..io.photo import read_metadata
 from ..models.about import UNKNOWN
 from ..models.lens import ZoomLens, load_lens
 from ..models.sizes import at_focal, lens_for_size
+from .plans import files_plan
 from .undistort_inputs import Found, find_inputs, focal_number, targets_of
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ class Job:
         redistort: whether corrected files are given, and distortion is applied.
         again: whether photos that are corrected already are corrected again.
         resume: whether what an earlier run has written is left as it is.
+        dry_run: whether only to say what would be written.
     """
 
     lens: Path | None
@@ -58,6 +60,7 @@ class Job:
     redistort: bool = False
     again: bool = False
     resume: bool = False
+    dry_run: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,12 +72,14 @@ class Outcome:
         skipped: for each file that was not corrected, by path, the reason.
         written: the number of files that are corrected, now or earlier.
         notes: sentences on what was kept, what was not, and what was left out.
+        files: sources and the files that are made of them, now or earlier.
     """
 
     sentence: str
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
     written: int = 0
     notes: tuple[str, ...] = ()
+    files: tuple[tuple[Path, Path], ...] = ()
 
 
 Progress = Callable[[int, int], None]
@@ -141,6 +146,8 @@ def _videos(
     unknown = job.focal is None and lens.about.get("focal") == UNKNOWN
     tracks = tracks_of(str(float(lens.focal_range[0])) if unknown else job.focal, names, hold=job.hold)
     todo = to_do(job, sources, targets, lambda _, target: _is_video(target))
+    if job.dry_run:
+        return _planned(todo, len(sources) - len(todo), lambda _: "")
     correct = functools.partial(
         undistort_videos,
         lens=lens,
@@ -164,7 +171,28 @@ def _videos(
     notes = [note for target, video in done.items() for note in _kept(target, video, len(sources))]
     notes += _unmarked([path for path in targets if path not in {target for _, target in todo}])
     bad = {str(path): reason(error) for path, error in skipped.items()}
-    return Outcome(sentence, bad, written + earlier, tuple(notes))
+    files = _made(sources, targets, skipped)
+    return Outcome(sentence, bad, written + earlier, tuple(notes), files)
+
+
+def _made(
+    sources: Sequence[Path], targets: Sequence[Path], skipped: Mapping[Path, Exception]
+) -> tuple[tuple[Path, Path], ...]:
+    pairs = zip(sources, targets, strict=True)
+    return tuple((source, target) for source, target in pairs if source not in skipped)
+
+
+def _planned(todo: Sequence[tuple[Path, Path]], earlier: int, about: Callable[[Path], str]) -> Outcome:
+    """What would be written, with what is known about each source."""
+    told, skipped = [], {}
+    for source, target in todo:
+        try:
+            told.append(f"  {source} -> {target}{about(source)}")
+        except _BAD_FILE as error:
+            skipped[source] = error
+    files = tuple((source, target) for source, target in todo if source not in skipped)
+    bad = {str(source): reason(error) for source, error in skipped.items()}
+    return Outcome(files_plan(told, earlier), bad, files=files)
 
 
 def _kept(target: Path, video: "CorrectedVideo", number: int) -> list[str]:
@@ -190,6 +218,10 @@ def undistort_photos(
     keep, shown = _common_keep(job, lens, sources, focal_of, skipped)
     correction = dataclasses.replace(correction, keep=keep, shown=shown)
     todo = to_do(job, sources, targets, functools.partial(_is_result, job, correction, focal_of))
+    if job.dry_run:
+        return _planned(
+            todo, len(sources) - len(todo), lambda source: f", f = {focal_of(source):g} {lens.focal_unit}"
+        )
     lost: Counter[tuple[str, str]] = Counter()
     for number, (source, target) in enumerate(todo, start=1):
         if source not in skipped:
@@ -212,7 +244,11 @@ def undistort_photos(
         path for path in targets if path not in {target for _, target in todo} and _holds_none(path)
     ]
     notes = (*_losses(lost), *_unmarked(unmarked))
-    return Outcome(_counted(written, len(sources), earlier, job, "photo"), bad, written + earlier, notes)
+    sentence, files = (
+        _counted(written, len(sources), earlier, job, "photo"),
+        _made(sources, targets, skipped),
+    )
+    return Outcome(sentence, bad, written + earlier, notes, files)
 
 
 def _counted(written: int, number: int, earlier: int, job: Job, what: str) -> str:

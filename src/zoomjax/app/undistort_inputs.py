@@ -19,7 +19,9 @@ from ..io.text_table import plain_number
 _TARGETS = {
     **dict.fromkeys(HEIC_SUFFIXES, ".png"),
     **dict.fromkeys(RAW_SUFFIXES, ".tif"),
-    **dict.fromkeys((".mts", ".m2ts", ".mpg"), ".ts"),
+    **dict.fromkeys((".mts", ".m2ts", ".mpg", ".mpeg"), ".ts"),
+    **dict.fromkeys((".flv", ".wmv", ".vob", ".ogv"), ".mkv"),
+    ".3gp": ".mp4",
 }
 """Suffixes of the results of files whose format can only be read."""
 
@@ -122,9 +124,14 @@ def _why_not(path: Path) -> str | None:
 def _distinct(named: Sequence[tuple[Path, Path]]) -> tuple[tuple[Path, Path], ...]:
     """Names of the results, with folders up to the one that all files share where two names are the same.
 
+    Of two that differ in their suffixes alone, and become one format, the one whose suffix changes keeps it
+    as well: ``a.heic.png`` beside ``a.png``.
+
     Raises:
         ValueError: they are the same even so.
     """
+    kept = {_folded(name) for _, name in named if _target(name) == name}
+    named = [(path, _beside(name) if _folded(_target(name)) in kept else name) for path, name in named]
     targets = [(path, _target(name)) for path, name in named]
     if len({_folded(name) for _, name in targets}) < len(targets):
         absolute = [Path(os.path.normpath(path.absolute())) for path, _ in named]
@@ -144,6 +151,12 @@ def _distinct(named: Sequence[tuple[Path, Path]]) -> tuple[tuple[Path, Path], ..
 
 def _target(name: Path) -> Path:
     return name.with_suffix(_TARGETS[name.suffix.lower()]) if name.suffix.lower() in _TARGETS else name
+
+
+def _beside(name: Path) -> Path:
+    """The name of a result beside that of another file: all of its own, and the new suffix."""
+    target = _target(name)
+    return name if target == name else name.with_name(name.name + target.suffix)
 
 
 def _folded(name: Path) -> str:

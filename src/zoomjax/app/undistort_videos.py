@@ -1,6 +1,9 @@
 """Correction of several videos one after the other, each with its own focal lengths."""
 
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+import os
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from ..correct.video import CorrectedVideo, redistort_video, undistort_video
@@ -72,22 +75,42 @@ def undistort_videos(
     back: bool,
     progress: Callable[[int, int], None],
 ) -> tuple[dict[Path, CorrectedVideo], dict[Path, Exception]]:
-    """Correct each source into its target; the results by target, and the errors of sources by source."""
+    """Correct each source into its target; the results by target, and the errors of sources by source.
+
+    Progress is counted in frames of one video, and in videos of several, whose warnings name them.
+    """
+    os.environ.setdefault("SVT_LOG", "1")  # the encoder of AV1 tells its settings without it
     done, skipped = {}, {}
     correct = redistort_video if back else undistort_video
-    for source, target, focal in work:
+    several = len(work) > 1
+    for number, (source, target, focal) in enumerate(work):
+
+        def told(frames: int, total: int, number: int = number) -> None:
+            progress(*((number, len(work)) if several else (frames, total)))
+
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
-            done[target] = correct(
-                source,
-                target,
-                lens=lens,
-                focal=focal,
-                keep=keep,
-                interpolation=interpolation,
-                border=border,
-                progress=progress,
-            )
+            with _warnings_named(source) if several else contextlib.nullcontext():
+                done[target] = correct(
+                    source,
+                    target,
+                    lens=lens,
+                    focal=focal,
+                    keep=keep,
+                    interpolation=interpolation,
+                    border=border,
+                    progress=told,
+                )
         except (ValueError, OSError) as error:
             skipped[source] = error
     return done, skipped
+
+
+@contextlib.contextmanager
+def _warnings_named(source: Path) -> Iterator[None]:
+    """Warnings within begin with the name of the file that they are about."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield
+    for message in dict.fromkeys(str(one.message) for one in caught):
+        warnings.warn(f"{source}: {message}", stacklevel=3)

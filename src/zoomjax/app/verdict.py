@@ -11,20 +11,39 @@ from .equipment import equipment_of
 from .plane_focals import FocalGroup
 
 _MOST = 4
+_SHAPE = 1.01
+"""Ratio of the shapes of images that differ by more than rounding."""
 _UNEXPLAINED = 0.5
 """Of the length of a photo's long smooth edges: lines that hold less are little of what there is."""
 
 
 def findings_of_photos(photos: Iterable[Path]) -> list[Finding]:
-    """What speaks against one lens having taken all photos: different bodies or lenses in their EXIF data.
+    """What speaks against one lens having taken all photos in one way, by their EXIF data.
 
-    Photos that name no camera or lens, or that cannot be read any more, say nothing.
+    That is different bodies or lenses, or sizes of other shapes, of which what is left was cropped. Photos
+    that name no camera or lens, or that cannot be read any more, say nothing.
     """
-    bodies, lenses = Counter[str](), Counter[str]()
+    bodies, lenses, sizes = Counter[str](), Counter[str](), Counter[tuple[int, int]]()
     for found in map(equipment_of, photos):
         bodies.update(filter(None, [found.camera]))
         lenses.update(filter(None, [found.lens]))
-    return [*_mixed("lenses", lenses), *_mixed("cameras", bodies)]
+        if found.written:
+            sizes[max(found.written), min(found.written)] += 1
+    return [*_mixed("lenses", lenses), *_mixed("cameras", bodies), *_reshaped(sizes)]
+
+
+def findings_of_sizes(left_out: int, used: int) -> list[Finding]:
+    """That photos were left out, being of another size than most: a remark, as they do no harm."""
+    if not left_out:
+        return []
+    return [
+        Finding(
+            "other sizes",
+            "good",
+            f"{left_out} of {_photos(left_out + used)} are of another size than most and were left out.",
+            "Use the photos as the camera stored them, and calibrate those of each size by themselves.",
+        )
+    ]
 
 
 def findings_of_focals(groups: Iterable[FocalGroup], unit: str) -> list[Finding]:
@@ -77,6 +96,21 @@ def _mixed(what: str, names: Counter[str]) -> Iterable[Finding]:
         "doubtful",
         f"the photos were taken with {len(names)} different {what}, by their EXIF data: {first}.",
         "Calibrate the photos of each lens and camera by themselves.",
+        cause=True,
+    )
+
+
+def _reshaped(sizes: Counter[tuple[int, int]]) -> Iterable[Finding]:
+    """Photos, now of one size, that the camera wrote in sizes of different shapes: some were cropped."""
+    shapes = [width / height for width, height in sizes]
+    if not shapes or max(shapes) < _SHAPE * min(shapes):
+        return
+    told = listed((f"{w} x {h} px ({_photos(number)})" for (w, h), number in sizes.most_common()), _MOST)
+    yield Finding(
+        "cropped photos",
+        "doubtful",
+        f"the camera wrote these photos in different shapes, by their EXIF data: {told}.",
+        "Use the photos as the camera stored them: where a photo is cropped, the lens's centre moves.",
         cause=True,
     )
 

@@ -16,7 +16,10 @@ from ..io.focal_track import FocalTrack
 from ..io.photo import SUFFIXES, metadata_focal, open_photo, read_photo
 from ..io.raw import RAW_SUFFIXES
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".m2ts", ".mpg", ".mxf", ".ts")
+VIDEO_SUFFIXES = (
+    *(".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".mxf", ".ts"),
+    *(".3gp", ".flv", ".wmv", ".vob", ".ogv"),
+)
 """Of files that count as videos."""
 
 RESULTS = ("lines", "model.png", "before-after.jpg", "motion.png", "panorama.jpg")

@@ -105,8 +105,10 @@ def find_exif(file: File, kind: str) -> bytes | None:
             return JpegImageFile(file).info.get("exif")
         if kind == "PNG":
             return _find_chunk(file, 8, ">I4s", b"eXIf", lambda size: size + 4)  # and a checksum
-        if kind == "TIFF":
-            return None if (exif := parse_exif(file)) is None else exif.tobytes()
+        if kind == "TIFF" and (exif := parse_exif(file)) is not None:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of IPTC data in whole numbers, as exiftool writes them
+                return exif.tobytes()
         if kind == "WebP":
             return _find_chunk(file, 12, "<4sI", b"EXIF", lambda size: size + size % 2)
     except Exception:  # as above

@@ -3,10 +3,10 @@
 import contextlib
 import dataclasses
 import functools
+import heapq
 import math
 import os
 import warnings
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -115,11 +115,14 @@ def decoded_items(
 ) -> Generator[Any, None, None]:
     """Frames and packets of other streams, in the file's order; damaged ones are counted and left out.
 
-    AVI files tell the order of decoding alone, a packet a step. Decoded frames come in the order in which
-    they are shown, so the times of packets, in their order, are those of frames.
+    AVI files tell the order of decoding alone, a packet a step, and so do MXF files of H.264 that have no
+    index of the order in which frames are shown. Decoded frames come in that order, so the times of
+    packets, the earliest first, are those of frames.
     """
-    packets, avi, steps = input_.demux([video, *others]), _is_avi(input_), deque[int]()
+    packets, avi, steps = input_.demux([video, *others]), _is_avi(input_), list[int]()
+    ordered = avi or input_.format.name == "mxf"
     while report.corrupt < _MOST_ERRORS:
+        step = None
         try:
             packet = next(packets, None)
             if packet is None:
@@ -133,19 +136,21 @@ def decoded_items(
                 if packet.dts is not None:
                     yield packet
                 continue
-            if avi and packet.dts is not None:
-                steps.append(packet.dts)
+            step = (packet.dts if avi else packet.pts) if ordered else None
+            if step is not None:
+                heapq.heappush(steps, step)
             frames = packet.decode()
         except av.error.FFmpegError as error:
             report.corrupt += 1
             report.failed += 1
             report.error = error.strerror or str(error)
-            if steps:
-                steps.pop()
+            if step in steps:
+                steps.remove(step)
+                heapq.heapify(steps)
             continue
         for frame in frames:
             if steps:
-                frame.pts = steps.popleft()
+                frame.pts = heapq.heappop(steps)
             report.corrupt += bool(frame.is_corrupt)
             yield frame
 

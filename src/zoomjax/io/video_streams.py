@@ -102,13 +102,18 @@ def _holds(container: str, stream: Any) -> bool:
 _KINDS = {"audio": "sound", "subtitle": "subtitles", "data": "data", "video": "a further picture"}
 
 
+_NAMES = {"subrip": "srt"}
+"""Codecs that people know by another name than FFmpeg's."""
+
+
 def _name(stream: Any) -> str:
     """What messages call a stream: its kind, its codec and its language."""
     if stream.type == "attachment":
         return f"the attachment {stream.metadata.get('filename', stream.index)}"
     context = getattr(stream, "codec_context", None)
-    codec = getattr(stream, "name", None) if context is None else context.name
-    about = [codec or "of no known kind", stream.metadata.get("language")]
+    codec = getattr(stream, "name", None) if context is None else context.codec.canonical_name
+    language = stream.metadata.get("language")
+    about = [_NAMES.get(codec or "", codec) or "of no known kind", None if language == "und" else language]
     return f"{_KINDS.get(stream.type, stream.type)} ({', '.join(filter(None, about))})"
 
 
@@ -131,8 +136,8 @@ def _copied(output: Any, source: Any, named: Path) -> Any:
         stream = output.add_stream_from_template(source)
     except ValueError as error:
         raise ValueError(
-            f"Cannot keep the sound, {source.codec_context.name}, in a {named.suffix} file. Choose the "
-            "suffix of the source, or .mkv."
+            f"Cannot keep the {_name(source)} in a {named.suffix} file. Choose the suffix of the source, "
+            "or .mkv."
         ) from error
     stream.metadata.update(source.metadata)
     if source.type != "data":

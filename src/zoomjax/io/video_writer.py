@@ -106,7 +106,7 @@ class FrameWriter(contextlib.AbstractContextManager):
             self._output.metadata.update(
                 {key: value for key, value in input_.metadata.items() if key not in _OWN_TAGS}
             )
-            name = encoder or self._encoder(video.codec_context.name, named)
+            name = encoder or self._encoder(video.codec_context.codec.canonical_name, named)
             self._stream = self._pictures(name, video, first, like, options, free=encoder is None)
             self._stream.set_display_matrix(like.orientation)
             with _blamed(name), _warnings() as warned:

@@ -32,6 +32,12 @@
   const curve = part("zoom-curve"), box = { left: 52, right: 470, top: 12, bottom: 262 };
   const radii = data.radius, last = radii[radii.length - 1];
   const known = data.moved.flat().filter((value) => value !== null);
+  const most = 1.5 * Math.max(0, ...known.map(Math.abs));  // of bands, which may be far wider than the curves
+  data.moved.forEach((row, index) => row.forEach((value, at) => {
+    const std = data.std[index][at];
+    if (value === null || std === null) return;
+    for (const end of [value - 2 * std, value + 2 * std]) known.push(Math.min(most, Math.max(-most, end)));
+  }));
   let low = Math.min(0, ...known), high = Math.max(0, ...known);
   if (high - low < 1e-9) high = low + 1;
   const margin = 0.06 * (high - low);
@@ -71,7 +77,7 @@
     band.setAttribute("d", sure ? `${path([...upper, ...lower], x, y)}Z` : "");
     const moved = row[row.length - 1], digits = Math.abs(moved) < 10 ? 2 : 1;
     const text = moved === null ? "the image folds over in the corner"
-      : `the corner moves by ${moved > 0 ? "+" : ""}${moved.toFixed(digits)} px`.replace("-", "−");
+      : `the corner moves by ${Math.abs(moved).toFixed(digits)} px ${moved < 0 ? "inwards" : "outwards"}`;
     const label = `f = ${Number(f.toPrecision(4))} ${data.unit}: ${text}`;
     part("zoom-label").textContent = label;
     input.setAttribute("aria-valuetext", label);
