@@ -1,8 +1,8 @@
 """Work on any executor of `concurrent.futures`: handed over ahead, its results in the order of the work.
 
 A task runs where the executor puts it, perhaps on another machine. It computes in the precision that is set
-here, and its warnings are told here. Arrays go there and come back as NumPy's, for JAX would cut float64 as
-it unpacks them.
+here, and its warnings are told here. Arrays of JAX go there as NumPy's, for they are cut to float32 where
+they are unpacked without float64.
 """
 
 import collections
@@ -18,6 +18,7 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from typing import Any, Generic, TypeVar
 
 import jax
+import numpy as np
 
 from .text import reason
 
@@ -123,6 +124,26 @@ def _gave_up(error: Exception) -> RuntimeError:
         f"The executor gave up ({type(error).__name__}{': ' * bool(told)}{told}). Begin again with a new "
         "one. A cluster of Dask goes on when a worker dies; a process pool does not."
     )
+
+
+Tree = TypeVar("Tree")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sent:
+    """An array of JAX on its way."""
+
+    array: np.ndarray
+
+
+def sent(tree: Tree) -> Tree:
+    """A pytree for a task, in which it is `arrived` again."""
+    return jax.tree.map(lambda leaf: _Sent(np.asarray(leaf)) if isinstance(leaf, jax.Array) else leaf, tree)
+
+
+def arrived(tree: Tree) -> Tree:
+    """What was `sent`, with the arrays of JAX that it had."""
+    return jax.tree.map(lambda leaf: jax.device_put(leaf.array) if isinstance(leaf, _Sent) else leaf, tree)
 
 
 def is_away() -> bool:

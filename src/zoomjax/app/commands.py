@@ -43,6 +43,7 @@ from .options import (
     INPUT,
     UNDISTORT_EXAMPLES,
     AsJson,
+    Cluster,
     Detector,
     Distance,
     DryRun,
@@ -187,6 +188,7 @@ def calibrate(
             rich_help_panel=INPUT,
         ),
     ] = None,
+    cluster: Cluster = None,
     cache: Annotated[
         bool, typer.Option(help="Cache detections, and use cached ones.", rich_help_panel=INPUT)
     ] = True,
@@ -292,12 +294,14 @@ def calibrate(
     )
     if job.video is None:
         refuse_idle(context, ("frames",), "for photos")
+    if cluster is not None:
+        refuse_idle(context, ("jobs",), "with --cluster, whose workers detect lines")
     refuse_to_replace(job, output)
     if dry_run:
         return tell_plan(images_plan(job), output)
     names = [*job.results(), REPORT]
     with results_folder(output, names, clears=OF_A_LENS, overwrite=overwrite) as folder:
-        done = calibrate_images(job, folder, title=title_of(inputs), quiet=quiet)
+        done = calibrate_images(job, folder, title=title_of(inputs), quiet=quiet, cluster=cluster)
     return show.images(done, output)
 
 
@@ -358,6 +362,7 @@ def undistort(
     resume: Annotated[
         bool, typer.Option("--resume", help="Leave what an earlier run has written, and do the rest.")
     ] = False,
+    cluster: Cluster = None,
 ) -> None:
     """Correct photos or videos, each image at its own focal length.
 
@@ -365,18 +370,19 @@ def undistort(
     is then 1, or 2 if all were skipped.
     """
     set_up_jax()
+    from .cluster import cluster_executor
     from .undistort_files import Job, undistort_files
 
     file, files = split_lens(inputs) if lens is None else (None, tuple(inputs))
     job = Job(file, files, output, focal, keep, interpolation, border, hold, overwrite)
     job = dataclasses.replace(job, redistort=redistort, again=again, resume=resume)
-    with progress_bar("Correcting", timed=False) as progress:
+    with cluster_executor(cluster) as executor, progress_bar("Correcting", timed=False) as progress:
         if lens is None:
-            done = undistort_files(job, progress)
+            done = undistort_files(job, progress, executor)
         else:
             from .library_lens import undistort_by_library
 
-            done = undistort_by_library(job, lens, progress)
+            done = undistort_by_library(job, lens, progress, executor)
     if done.sentence:
         print(plain(done.sentence))
     for note in done.notes:

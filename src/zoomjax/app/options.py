@@ -60,6 +60,17 @@ Frames = Annotated[
 ]
 
 
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="tcp://HOST:PORT",
+        help="Work on a cluster of Dask, whose scheduler has this address: a photo, or a segment of a "
+        "video, is a task. Workers and this machine must find the files by the same paths.",
+        rich_help_panel=INPUT,
+    ),
+]
+
+
 def place(output: Path | None) -> Path | None:
     """Where results go, whatever folders are made on the way; for the options `--output`."""
     return None if output is None else settled(output)
@@ -147,13 +158,13 @@ Pixel = Annotated[
 
 IDLE_FOR_LINES = (
     *("pitch", "distance", "pixel", "jobs", "detector", "frames", "cache", "overlays", "with_lines"),
-    "shared_focal",
+    *("shared_focal", "cluster"),
 )
 """Parameters of calibrate that say nothing about a file of lines."""
 
 IDLE_FOR_MOTION = (
     *("focal_sigma", "focal_unit", "pitch", "distance", "pixel", "robust", "overlays", "shared_focal"),
-    "family",
+    *("family", "cluster"),
 )
 """And about a clip whose motion gives its focal lengths."""
 
@@ -179,6 +190,8 @@ Examples:
   zoomjax undistort mylens/lens.json photo.jpg -o corrected.jpg
 
   zoomjax undistort mylens/lens.json clip.mp4 --focal track.csv -o corrected.mp4
+
+  zoomjax undistort mylens/lens.json photos/ --cluster tcp://192.168.0.5:8786 -o corrected
 """
 
 

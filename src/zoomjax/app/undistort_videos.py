@@ -1,6 +1,7 @@
 """Correction of several videos one after the other, each with its own focal lengths."""
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 
 from ..correct.video import CorrectedVideo, redistort_video, undistort_video
@@ -71,6 +72,7 @@ def undistort_videos(
     border: str,
     back: bool,
     progress: Callable[[int, int], None],
+    executor: Executor | None = None,
 ) -> tuple[dict[Path, CorrectedVideo], dict[Path, Exception]]:
     """Correct each source into its target; the results by target, and the errors of sources by source."""
     done, skipped = {}, {}
@@ -87,6 +89,7 @@ def undistort_videos(
                 interpolation=interpolation,
                 border=border,
                 progress=progress,
+                executor=executor,
             )
         except (ValueError, OSError) as error:
             skipped[source] = error
