@@ -21,8 +21,8 @@ def part(lines: zj.Lines, some: slice) -> zj.Lines:
     return dataclasses.replace(lines, **own, number=None)
 
 
-def main(rank: int, port: int) -> None:
-    jax.distributed.initialize(f"127.0.0.1:{port}", num_processes=2, process_id=rank)
+def main(rank: int, number: int, address: str) -> None:
+    jax.distributed.initialize(address, num_processes=number, process_id=rank)
     assert (jax.process_count(), len(jax.devices())) == (2, 4)
     from ._sharded import FRAMES, K, scene
 
@@ -56,4 +56,4 @@ def main(rank: int, port: int) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    main(int(sys.argv[1]), int(sys.argv[2]), sys.argv[3])

@@ -3,6 +3,7 @@
 import functools
 import multiprocessing
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -16,22 +17,22 @@ import pytest
 import zoomjax as zj
 from zoomjax.lines import shard, stream
 
+ROOT = Path(__file__).parents[2]
 
-@pytest.mark.slow
-def test_two_processes_fit_the_lens_of_one():
-    """To 1e-12, each with some of the lines; they exchange sums by gloo."""
+
+def in_two_processes(command, *, devices, folder):
+    """Run a command twice, with 0 and 1 and the address of the first; what they print."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    devices = "--xla_force_host_platform_device_count=2 --xla_backend_optimization_level=0"
-    environment = {**os.environ, "XLA_FLAGS": devices, "JAX_PLATFORMS": "cpu"}
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    flags = f"--xla_force_host_platform_device_count={devices} --xla_backend_optimization_level=0"
+    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    root = Path(__file__).parents[2]
     ran = [
         subprocess.Popen(
-            [sys.executable, "-m", "tests._two_processes", str(rank), port],
+            [sys.executable, *command, str(rank), "2", address],
             env=environment,
-            cwd=root,
+            cwd=folder,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -44,7 +45,28 @@ def test_two_processes_fit_the_lens_of_one():
         for process in ran:
             process.kill()
     assert [process.returncode for process in ran] == [0, 0], "\n".join(told)
+    return told
+
+
+@pytest.mark.slow
+def test_two_processes_fit_the_lens_of_one():
+    """To 1e-12, each with some of the lines; they exchange sums by gloo."""
+    told = in_two_processes(["-m", "tests._two_processes"], devices=2, folder=ROOT)
     assert all("as in one process 4" in each for each in told)
+
+
+@pytest.mark.slow
+def test_the_program_of_the_page_runs_in_two_processes(tmp_path, noisy):
+    [program] = re.findall(r"```python processes\n(.*?)```", (ROOT / "docs/clusters.md").read_text(), re.S)
+    (tmp_path / "fit.py").write_text(program)
+    for rank in range(2):
+        own = noisy.to_ragged()[rank::2]
+        zj.Lines.from_ragged(
+            own, np.asarray(noisy.frame)[rank::2], noisy.focal, image_size=noisy.image_size
+        ).save(tmp_path / f"part-{rank}.npz")
+    in_two_processes(["fit.py"], devices=1, folder=tmp_path)
+    found, expected = zj.load_lens(tmp_path / "lens.json"), zj.fit_zoom(zj.compress(noisy)).lens
+    np.testing.assert_allclose(found.zoom.parameters, expected.zoom.parameters, rtol=1e-12, atol=1e-12)
 
 
 def test_one_device_takes_all(lines):
