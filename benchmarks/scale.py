@@ -4,10 +4,10 @@
 
 Clusters of Dask on this machine with 1, 2 and 4 workers, a process of one thread each: lines found in
 rendered photographs of the paper's board, and files of points compressed by `zj.lines.stream`. The rate,
-higher is better, stands beside the ideal, that of one worker times the workers or cores, whichever are fewer.
-The cost of a task is that of tasks that do nothing, for client, scheduler and workers on the same cores: an
-upper bound. What a thousand workers would do is on paper and a simulation, with their assumptions beside
-them; nobody has run it. Results go to benchmarks/results/scale.md and scale.json.
+higher is better, stands beside the ideal, that of one worker times the workers or cores, whichever are
+fewer. The cost of a task is that of tasks that do nothing, for client, scheduler and workers on the same
+cores: an upper bound. What a thousand workers would do is on paper and a simulation, with their assumptions
+beside them; nobody has run it. Results go to benchmarks/results/scale.md and scale.json.
 """
 
 import argparse

@@ -159,6 +159,28 @@ def test_a_track_that_is_too_short_is_refused_from_a_task_too(tmp_path, threads)
     assert not (tmp_path / "out.ts").exists()
 
 
+def test_a_segment_that_ends_its_workers_is_said_to_do_so(tmp_path):
+    """As Dask says of a task whose workers died one after the other."""
+
+    class KilledWorker(Exception):
+        pass
+
+    class Killing(ThreadPoolExecutor):
+        def submit(self, function, /, *given):
+            def killed(*given):
+                raise KilledWorker("attempted to run task on 4 workers")
+
+            return super().submit(killed)
+
+    source = keyed(tmp_path / "in.mp4")
+    with (
+        Killing(1) as pool,
+        pytest.raises(ValueError, match=r"in\.mp4: the task of a segment failed: KilledWorker: attempted"),
+    ):
+        undistort_video(source, tmp_path / "out.mp4", lens=lens(), focal=TRACK, executor=pool)
+    assert not (tmp_path / "out.mp4").exists()
+
+
 @pytest.mark.slow
 def test_processes_without_float64_compute_in_that_of_the_lens(tmp_path):
     source = keyed(tmp_path / "in.mp4")

@@ -44,6 +44,7 @@ from .options import (
     UNDISTORT_EXAMPLES,
     AsJson,
     Cluster,
+    ClusterToCorrect,
     Detector,
     Distance,
     DryRun,
@@ -362,7 +363,7 @@ def undistort(
     resume: Annotated[
         bool, typer.Option("--resume", help="Leave what an earlier run has written, and do the rest.")
     ] = False,
-    cluster: Cluster = None,
+    cluster: ClusterToCorrect = None,
 ) -> None:
     """Correct photos or videos, each image at its own focal length.
 

@@ -60,15 +60,13 @@ Frames = Annotated[
 ]
 
 
-Cluster = Annotated[
-    str | None,
-    typer.Option(
-        metavar="tcp://HOST:PORT",
-        help="Work on a cluster of Dask, whose scheduler has this address: a photo, or a segment of a "
-        "video, is a task. Workers and this machine must find the files by the same paths.",
-        rich_help_panel=INPUT,
-    ),
-]
+_CLUSTER: dict[str, Any] = {
+    "metavar": "tcp://HOST:PORT",
+    "help": "Work on a cluster of Dask, whose scheduler has this address: a photo, or a segment of a "
+    "video, is a task. Workers and this machine must find the files by the same paths.",
+}
+Cluster = Annotated[str | None, typer.Option(**_CLUSTER, rich_help_panel=INPUT)]
+ClusterToCorrect = Annotated[str | None, typer.Option(**_CLUSTER)]
 
 
 def place(output: Path | None) -> Path | None:

@@ -142,8 +142,12 @@ def encoded_segments(
         in_order(checked_executor(executor), task, segments, size=lambda one: one.size)
     ) as done:
         for one in done:
-            if one.error is not None:
+            if isinstance(one.error, ValueError | OSError):
                 raise one.error
+            if one.error is not None:  # the executor's own, such as that of a task that ends its workers
+                raise ValueError(
+                    f"Cannot correct {os.fspath(work.source)}: the task of a segment failed: {one.told()}."
+                ) from one.error
             assert one.result is not None
             yield one.result
 
