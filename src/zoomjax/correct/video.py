@@ -11,7 +11,7 @@ import dataclasses
 import itertools
 import os
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -349,7 +349,7 @@ def _write_segments(
     work = dataclasses.replace(work, like=report.first, zero=frame.time or 0.0)
     made = warper(frame, work.track.at(number, time))
 
-    def pictures() -> Iterator[Picture]:
+    def pictures() -> Generator[Picture, None, None]:
         for done in encoded_segments(executor, segments, work):
             report.written += done.report.written
             report.corrupt += done.report.corrupt

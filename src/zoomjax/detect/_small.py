@@ -1,6 +1,7 @@
 """Lines of one image as a few bytes, to be sent: whole steps, as files of lines hold them."""
 
 import io
+from typing import Any
 
 import numpy as np
 
@@ -11,9 +12,10 @@ def small(lines: tuple[np.ndarray, ...]) -> bytes:
     """The points of all lines, exactly."""
     points = np.concatenate(lines) if lines else np.zeros((0, 2))
     steps = packed(points)
+    held: dict[str, Any] = {"points": points} if steps is None else steps
     content = io.BytesIO()
     counts = np.array([len(line) for line in lines], np.int32)
-    np.savez_compressed(content, counts=counts, **({"points": points} if steps is None else steps))
+    np.savez_compressed(content, counts=counts, **held)
     return content.getvalue()
 
 
