@@ -47,6 +47,20 @@ def raw(folder: Path) -> None:
     assert "zoomjax[raw]" not in told, "the extra is not seen"
 
 
+def cluster(folder: Path) -> None:
+    """Lines of a photo, found by a worker of Dask."""
+    from distributed import Client
+
+    photo = np.full((120, 160), 40, np.uint8)
+    photo[60:] = 200
+    source = zj.detect.Source("step", image=photo)
+    with Client(n_workers=1, threads_per_worker=1, dashboard_address=None) as client:
+        executor = client.get_executor(pure=False)
+        [found] = zj.detect.detect([source], zj.detect.EdgeDetector(), executor=executor)
+    assert not found.problem, found.problem
+    assert len(found.lines) == 1
+
+
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as name:
-        {extra.__name__: extra for extra in (interop, lensfun, heic, raw)}[sys.argv[1]](Path(name))
+        {extra.__name__: extra for extra in (interop, lensfun, heic, raw, cluster)}[sys.argv[1]](Path(name))

@@ -29,7 +29,7 @@ TOP = {"torch": {"correct", "models"}, "__main__": {"app"}}
 """Modules beside the rooms, and what they import from."""
 
 LIBRARIES = {
-    "app": {"matplotlib", "typer", "rich", "cv2", "jinja2"},
+    "app": {"matplotlib", "typer", "rich", "cv2", "jinja2", "distributed"},
     "correct": {"cv2"},
     "detect": {"cv2"},
     "io": {"cv2", "av", "PIL", "pillow_heif", "rawpy", "tifffile"},

@@ -61,7 +61,9 @@ IN_CI = sorted(
     if line.startswith(("zoomjax undistort", "zoomjax calibrate lines.csv"))
 )
 """A calibration compiles for most of a minute; CI runs that of photos as `zoomjax demo`."""
-OTHERS = sorted(OURS - set(IN_CI))
+ON_A_CLUSTER = sorted(line for line in OURS if "--cluster" in line)
+OTHERS = sorted(OURS - set(IN_CI) - set(ON_A_CLUSTER))
+ADDRESS = "tcp://192.168.0.5:8786"  # of a scheduler, as pages have it
 
 
 @pytest.fixture(scope="module")
@@ -282,6 +284,24 @@ def others(given, tmp_path_factory):
     return ran(OTHERS, given, tmp_path_factory)
 
 
+@pytest.fixture(scope="module")
+def on_a_cluster(given, tmp_path_factory):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        own = [line.replace(ADDRESS, cluster.scheduler_address) for line in ON_A_CLUSTER]
+        return dict(zip(ON_A_CLUSTER, ran(own, given, tmp_path_factory).values(), strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # what Dask and Tornado warn of
+@pytest.mark.parametrize("line", ON_A_CLUSTER)
+def test_commands_run_on_a_cluster(line, on_a_cluster):
+    status, said, made = on_a_cluster[line]
+    assert status == 0, said
+    assert made.exists()
+    assert "2 workers" in said
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("line", IN_CI)
 def test_shell_commands_run(line, in_ci):
@@ -302,6 +322,7 @@ def test_other_commands_are_those_that_set_up_and_check():
     """They install packages and run all tests: .ci/run runs them itself."""
     first = ("python3 -m venv .venv", ".venv/bin/pip install", ".venv/bin/pre-commit install")
     first += (".venv/bin/python -m pytest", ".venv/bin/python -m docs.make", "pip install")
+    first += ("dask scheduler", "dask worker")
     others = {line for lines in COMMANDS.values() for line in lines} - OURS
     assert all(line.startswith(first) for line in others), others
     for line in others:

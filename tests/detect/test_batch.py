@@ -1,15 +1,19 @@
 """Lines of many images: the same over processes and from the cache, and bad images in between."""
 
+import functools
 import importlib.util
 import io
 import multiprocessing
+import os
 import sys
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
 import cv2
 import numpy as np
 import pytest
 
 import zoomjax as zj
+from zoomjax._core import executors
 from zoomjax.detect import batch as module
 from zoomjax.detect.batch import Detection, detect
 from zoomjax.detect.sources import Source, find_photos
@@ -330,3 +334,93 @@ def test_a_grid_is_looked_for_where_it_tells_the_focal_length(tmp_path):
     [again] = detect(sources[:1], zj.detect.GridDetector(), cache=tmp_path)
     np.testing.assert_array_equal(of_grid.nodes, again.nodes)
     assert of_grid.nodes.shape == (7, 9, 2)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    """Two processes, as of any executor."""
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+        yield pool
+
+
+@pytest.mark.slow
+def test_an_executor_finds_the_same_in_its_processes(photos, marker, pool, tmp_path):
+    """Bad images in between; workers look into the cache, and write to it."""
+    sources = [*photos, Source("pixels", image=cv2.imread(str(photos[1].path)), focal=31.0)]
+    cache = tmp_path / "cache"
+    for _ in range(2):
+        found = list(detect(sources, marker, executor=pool, cache=cache))
+        for one, other in zip(found, detect(sources, marker), strict=True):
+            same(one, other)
+        assert found[-1].focal == 31.0
+    assert looks(marker) == 5 + 5 + 5  # here twice, there once
+
+
+def test_an_executor_of_threads_serves_too(photos, marker):
+    with ThreadPoolExecutor(2) as pool:
+        for one, other in zip(detect(photos, marker, executor=pool), detect(photos, marker), strict=True):
+            same(one, other)
+
+
+def test_pixels_of_a_clip_are_handed_over_a_few_at_a_time(marker, monkeypatch):
+    image = np.zeros((40, 120), np.uint8)
+    image[7] = 255
+    taken = []
+
+    def frames():
+        for number in range(20):
+            taken.append(number)
+            yield Source(f"{number}", image=image)
+
+    monkeypatch.setattr(executors, "_MOST_BYTES", 3 * image.nbytes)
+    with ThreadPoolExecutor(1) as pool:
+        for number, _ in enumerate(detect(frames(), marker, executor=pool)):
+            assert len(taken) <= number + 4
+    assert len(taken) == 20
+
+
+class Deadly(zj.detect.AbstractDetector):
+    """Ends the process that runs it."""
+
+    def __call__(self, image):
+        os._exit(1)
+
+
+@pytest.mark.slow
+def test_a_pool_that_breaks_is_said_to_be_broken(photos):
+    with (
+        ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as broken,
+        pytest.raises(RuntimeError, match=r"The executor gave up \(BrokenProcessPool.*Begin again"),
+    ):
+        list(detect(photos, Deadly(), executor=broken))
+
+
+def test_what_fails_in_an_executor_is_a_problem_of_its_image(photos, marker):
+    class Failing(ThreadPoolExecutor):
+        def submit(self, function, /, source):
+            if source.name == "1.png":
+                function = functools.partial(int, "no number")
+            return super().submit(function, source)
+
+    with Failing(1) as pool:
+        found = list(detect(photos, marker, executor=pool))
+    assert found[1].problem.startswith("its task failed: TypeError")
+    assert [len(d.lines) for d in found] == [1, 0, 3, 0, 0]
+
+
+def test_executors_that_are_none_are_refused(photos, marker):
+    with pytest.raises(TypeError, match=r"client\.get_executor\(\), but its type is int"):
+        executors.checked_executor(4)
+    with (
+        ThreadPoolExecutor(1) as pool,
+        pytest.raises(ValueError, match="Argument workers is 2, and argument executor has its own"),
+    ):
+        next(detect(photos, marker, executor=pool, workers=2))
+
+
+def test_an_executor_is_told_to_stop_when_nobody_asks_any_more(photos, marker):
+    with ThreadPoolExecutor(1) as pool:
+        found = detect(photos * 50, marker, executor=pool)
+        next(found)
+        found.close()
+    assert looks(marker) < 50

@@ -11,6 +11,7 @@ FLAGS = {
             "again",
             "border",
             "centre",
+            "cluster",
             "convention",
             "crop",
             "degree",

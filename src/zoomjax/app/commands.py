@@ -42,6 +42,8 @@ from .options import (
     Again,
     AsJson,
     Border,
+    Cluster,
+    ClusterToCorrect,
     Detector,
     Distance,
     DryRun,
@@ -198,6 +200,7 @@ def calibrate(
             rich_help_panel=INPUT,
         ),
     ] = None,
+    cluster: Cluster = None,
     cache: Annotated[
         bool, typer.Option(help="Cache detections, and use cached ones.", rich_help_panel=INPUT)
     ] = True,
@@ -304,12 +307,14 @@ def calibrate(
     )
     if job.video is None:
         refuse_idle(context, ("frames",), "for photos")
+    if cluster is not None:
+        refuse_idle(context, ("jobs",), "with --cluster, whose workers detect lines")
     refuse_to_replace(job, output)
     if dry_run:
         return tell_plan(images_plan(job), output)
     names = [*job.results(), REPORT]
     with results_folder(output, names, clears=OF_A_LENS, overwrite=overwrite) as folder:
-        done = calibrate_images(job, folder, title=title_of(inputs), quiet=quiet)
+        done = calibrate_images(job, folder, title=title_of(inputs), quiet=quiet, cluster=cluster)
     return show.images(done, output)
 
 
@@ -337,6 +342,7 @@ def undistort(
     quiet: QuietWork = False,
     as_json: JsonOfWork = False,
     dry_run: DryRun = False,
+    cluster: ClusterToCorrect = None,
 ) -> None:
     """Correct photos or videos, each image at its own focal length.
 
@@ -344,18 +350,22 @@ def undistort(
     is then 1, or 2 if all were skipped.
     """
     set_up_jax()
+    from .cluster import cluster_executor
     from .undistort_files import Job, undistort_files
 
     file, files = split_lens(inputs) if lens is None else (None, tuple(inputs))
     job = Job(file, files, output, focal, keep, interpolation, border, hold, overwrite)
     job = dataclasses.replace(job, redistort=redistort, again=again, resume=resume, dry_run=dry_run)
-    with progress_bar("Correcting", timed=False, quiet=quiet or dry_run) as progress:
+    with (
+        cluster_executor(cluster, quiet=quiet) as executor,
+        progress_bar("Correcting", timed=False, quiet=quiet or dry_run) as progress,
+    ):
         if lens is None:
-            done = undistort_files(job, progress)
+            done = undistort_files(job, progress, executor)
         else:
             from .library_lens import undistort_by_library
 
-            done = undistort_by_library(job, lens, progress)
+            done = undistort_by_library(job, lens, progress, executor)
     show_outcome(done, quiet=quiet, as_json=as_json)
     if done.skipped:
         raise typer.Exit(1 if done.written or dry_run else 2)

@@ -6,6 +6,7 @@ import dataclasses
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
@@ -182,6 +183,7 @@ def calibrate_images(
     *,
     progress: Progress = lambda done, total: None,
     stage: Callable[[str], None] = lambda _: None,
+    executor: Executor | None = None,
 ) -> ImageCalibration:
     """Detect lines in images, find focal lengths, reject lines that are not straight, and fit the model.
 
@@ -189,6 +191,7 @@ def calibrate_images(
         job: the settings.
         progress: called after each image.
         stage: called with a description before each later step.
+        executor: where lines are detected, in place of the job's processes: see `zoomjax.detect.detect`.
 
     Raises:
         FileNotFoundError: an input does not exist.
@@ -201,8 +204,9 @@ def calibrate_images(
         sources,
         DETECTORS[job.detector](),
         grid=job.grid,
-        workers=job.workers,
+        workers=job.workers if executor is None else 0,
         cache=job.cache,
+        executor=executor,
     )
     with contextlib.closing(looked):  # ends the processes after an error, too
         for detection in looked:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -110,7 +111,10 @@ def _size_of(table: LensTable) -> tuple[int, int]:
 
 
 def undistort_by_library(
-    job: Job, name: str, progress: Callable[[int, int], None] = lambda done, total: None
+    job: Job,
+    name: str,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    executor: Executor | None = None,
 ) -> Outcome:
     """Correct photos by lenses of the library; `Job.lens` is None.
 
@@ -118,6 +122,7 @@ def undistort_by_library(
         job: as for `undistort_files`.
         name: name of the lens, or "auto" for that of each photo's EXIF data.
         progress: called after each photo.
+        executor: where photos are corrected, as for `undistort_files`.
 
     Raises:
         ValueError: as `undistort_files`; or no lens fits a single photo, or several do; or the inputs are
@@ -149,7 +154,7 @@ def undistort_by_library(
             progress(before + number, len(photos))
 
         try:
-            outcome = undistort_photos(job, lens, paths, own, count)
+            outcome = undistort_photos(job, lens, paths, own, count, executor)
         except (ValueError, OSError) as error:  # of a group of one photo
             if len(paths) > 1 or len(photos) == 1:
                 raise

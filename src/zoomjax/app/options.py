@@ -71,6 +71,15 @@ Frames = Annotated[
 ]
 
 
+_CLUSTER: dict[str, Any] = {
+    "metavar": "tcp://HOST:PORT",
+    "help": "Work on a cluster of Dask, whose scheduler has this address: a photo, or a segment of a "
+    "video, is a task. Workers and this machine must find the files by the same paths.",
+}
+Cluster = Annotated[str | None, typer.Option(**_CLUSTER, rich_help_panel=INPUT)]
+ClusterToCorrect = Annotated[str | None, typer.Option(**_CLUSTER)]
+
+
 def place(output: Path | None) -> Path | None:
     """Where results go, whatever folders are made on the way; for the options `--output`."""
     return None if output is None else settled(output)
@@ -254,13 +263,13 @@ JsonOfWork = Annotated[
 
 IDLE_FOR_LINES = (
     *("pitch", "distance", "pixel", "jobs", "detector", "frames", "cache", "overlays", "with_lines"),
-    "shared_focal",
+    *("shared_focal", "cluster"),
 )
 """Parameters of calibrate that say nothing about a file of lines."""
 
 IDLE_FOR_MOTION = (
     *("focal_sigma", "focal_unit", "pitch", "distance", "pixel", "robust", "overlays", "shared_focal"),
-    *("family", "verbose"),
+    *("family", "cluster", "verbose"),
 )
 """And about a clip whose motion gives its focal lengths."""
 
@@ -290,6 +299,8 @@ Examples:
   zoomjax undistort mylens/lens.json shoot -o corrected --resume
 
   zoomjax undistort mylens/lens.json plate.tif --keep grow -o overscan.tif
+
+  zoomjax undistort mylens/lens.json photos/ --cluster tcp://192.168.0.5:8786 -o corrected
 """
 
 

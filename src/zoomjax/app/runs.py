@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .._core.text import listed
+from .cluster import cluster_executor
 from .console import REPORT, progress_bar, stages
 
 if TYPE_CHECKING:
@@ -54,25 +55,26 @@ def calibrate_lines(
 
 
 def calibrate_images(
-    job: "ImageJob", folder: Path, *, title: str, quiet: bool = False
+    job: "ImageJob", folder: Path, *, title: str, quiet: bool = False, cluster: str | None = None
 ) -> "ImageCalibration":
-    """Calibrate from images, and write the results into the folder."""
+    """Calibrate from images, perhaps on a cluster of Dask, and write the results into the folder."""
     from .image_calibration import calibrate_images
     from .pictures import pictures
     from .report import report
 
     with contextlib.ExitStack() as shown:
+        executor = shown.enter_context(cluster_executor(cluster, quiet=quiet))
         progress = shown.enter_context(progress_bar("Detecting lines", quiet=quiet))
 
         def stage(name: str) -> None:
             nonlocal current
-            if current is None:  # replace the bar by the stages
+            if current is None:  # replace the bar by the stages; the cluster has done its part
                 shown.close()
                 current = shown.enter_context(stages(quiet=quiet))
             current(name)
 
         current: Callable[[str], None] | None = None
-        done = calibrate_images(job, progress=progress, stage=stage)
+        done = calibrate_images(job, progress=progress, stage=stage, executor=executor)
         stage("Making the report")
         page = report(done.calibration, done, pictures=pictures(done), run=what_is_run(title, done))
     with progress_bar("Drawing the lines and writing the results", quiet=quiet) as progress:

@@ -5,24 +5,21 @@ import functools
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
-import numpy as np
-
-from .._core.files import refuse_existing, refuse_inputs, refuse_links, whole_file
+from .._core.files import refuse_existing, refuse_inputs, refuse_links
 from .._core.text import reason
-from ..correct.framing import Framing, check_keep, frame_output
+from ..correct.framing import Framing, check_keep
 from ..correct.image import check_sampling
-from ..correct.photo import Correction, corrected_photo, photo_focal
-from ..correct.redistort import check_framed
+from ..correct.photo import Correction, photo_focal
 from ..io.focal_table import read_focal_table
 from ..io.metadata import geometry_of, work_of
 from ..io.photo import read_metadata
 from ..models.about import UNKNOWN
 from ..models.lens import ZoomLens, load_lens
-from ..models.sizes import at_focal, lens_for_size
+from ._photos import BAD_FILE, SAME, CommonFraming, corrected_photos
 from .plans import files_plan
 from .undistort_inputs import Found, find_inputs, focal_number, targets_of
 
@@ -83,12 +80,18 @@ class Outcome:
 
 
 Progress = Callable[[int, int], None]
-_BAD_FILE = (ValueError, OSError, RuntimeError, MemoryError, cv2.error)
-"""Errors of one file that do not stop the others."""
 
 
-def undistort_files(job: Job, progress: Progress = lambda done, total: None) -> Outcome:
+def undistort_files(
+    job: Job, progress: Progress = lambda done, total: None, executor: Executor | None = None
+) -> Outcome:
     """Correct photos or videos. Of several files, those that cannot be corrected are skipped.
+
+    Args:
+        job: the settings.
+        progress: called after each photo, or after frames of a video.
+        executor: where photos, or segments of a video, are corrected; None: here. Its workers read and
+            write photos by the same paths.
 
     Raises:
         OSError, ValueError: the options, the lens, the table of focal lengths or the targets are wrong,
@@ -104,7 +107,8 @@ def undistort_files(job: Job, progress: Progress = lambda done, total: None) -> 
     work = functools.partial(_videos, dict(found.videos)) if found.videos else undistort_photos
     files = found.videos or found.photos
     targets = targets_of(files, job.output, job.inputs)
-    return with_refused(work(job, lens, [path for path, _ in files], targets, progress), found)
+    done = work(job, lens, [path for path, _ in files], targets, progress, executor)
+    return with_refused(done, found)
 
 
 def photos_or_videos(job: Job) -> Found:
@@ -135,6 +139,7 @@ def _videos(
     sources: Sequence[Path],
     targets: Sequence[Path],
     progress: Progress,
+    executor: Executor | None,
 ) -> Outcome:
     from .undistort_videos import tracks_of, undistort_videos
 
@@ -155,6 +160,7 @@ def _videos(
         interpolation=job.interpolation,
         border=job.border,
         back=job.redistort,
+        executor=executor,
     )
     done, skipped = correct(
         [(source, target, tracks[source]) for source, target in todo], progress=progress
@@ -203,16 +209,19 @@ def _kept(target: Path, video: "CorrectedVideo", number: int) -> list[str]:
 
 
 def undistort_photos(
-    job: Job, lens: ZoomLens, sources: Sequence[Path], targets: Sequence[Path], progress: Progress
+    job: Job,
+    lens: ZoomLens,
+    sources: Sequence[Path],
+    targets: Sequence[Path],
+    progress: Progress,
+    executor: Executor | None = None,
 ) -> Outcome:
     """Correct photos by one lens, whatever the job's own; it raises as `undistort_files`."""
     if job.hold:
         raise ValueError(
             "Argument hold is for a video's track of focal lengths, and the inputs are photos."
         )
-    correction = Correction(
-        lens, lambda size: job.keep, job.interpolation, job.border, job.redistort, job.again
-    )
+    correction = Correction(lens, SAME, job.interpolation, job.border, job.redistort, job.again)
     focal_of = _photo_focals(job, lens, sources)
     skipped: dict[Path, Exception] = {}
     keep, shown = _common_keep(job, lens, sources, focal_of, skipped)
@@ -223,18 +232,15 @@ def undistort_photos(
             todo, len(sources) - len(todo), lambda source: f", f = {focal_of(source):g} {lens.focal_unit}"
         )
     lost: Counter[tuple[str, str]] = Counter()
-    for number, (source, target) in enumerate(todo, start=1):
-        if source not in skipped:
-            try:
-                content, missing = corrected_photo(source, target.suffix, correction, focal_of(source))
-            except _BAD_FILE as error:
-                skipped[source] = error
-            else:
-                lost.update((target.suffix.lower(), name) for name in missing)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                with whole_file(target) as part:
-                    part.write_bytes(content)
-        progress(number, len(todo))
+    wanted = [pair for pair in todo if pair[0] not in skipped]
+    known = None if job.focal is None and executor is not None else focal_of
+    done = corrected_photos(wanted, correction, known, executor)
+    for number, (source, target, missing) in enumerate(done, start=1):
+        if isinstance(missing, Exception):
+            skipped[source] = missing
+        else:
+            lost.update((target.suffix.lower(), name) for name in missing)
+        progress(len(todo) - len(wanted) + number, len(todo))
     if len(sources) == 1 and skipped:
         raise next(iter(skipped.values()))
     earlier = len(sources) - len(todo)
@@ -298,7 +304,7 @@ def _is_result(
             return False
         if work_of(metadata) == correction.work(source, focal_of(source)):
             return True
-    except _BAD_FILE:
+    except BAD_FILE:
         return False
     if job.overwrite:
         return False
@@ -319,7 +325,7 @@ def _is_video(path: Path) -> bool:
     try:
         with opened_video(path):
             return True
-    except _BAD_FILE:
+    except BAD_FILE:
         return False
 
 
@@ -357,28 +363,17 @@ def _common_keep(
     Photos without a focal length are added to `skipped`.
     """
     if job.keep == "same":
-        return lambda size: job.keep, job.keep
+        return SAME, job.keep
     focals = []
     for source in sources:
         try:
             focals.append(focal_of(source))
-        except _BAD_FILE as error:
+        except BAD_FILE as error:
             skipped[source] = error
     if not focals:
-        return lambda size: job.keep, job.keep
+        return SAME, job.keep
     low, high = min(focals), max(focals)
-    dtype = np.asarray(lens.centre).dtype
-    spread = (1 / np.linspace(1 / low, 1 / high, 65 if low < high else 1)).astype(dtype)
-
-    @functools.cache
-    def keep(size: tuple[int, int]) -> Framing:
-        original = lens.image_size if job.redistort and job.keep == "grow" else size
-        scaled = lens_for_size(lens, original)
-        framing = frame_output([at_focal(scaled, f) for f in spread], original, keep=job.keep)
-        if job.redistort:
-            check_framed(framing, size)
-        return framing
-
+    keep = CommonFraming(lens, job.keep, low, high, job.redistort)
     return keep, f"{job.keep} from {low!r} to {high!r}"
 
 

@@ -4,6 +4,7 @@ import contextlib
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 
 from ..correct.video import CorrectedVideo, redistort_video, undistort_video
@@ -74,6 +75,7 @@ def undistort_videos(
     border: str,
     back: bool,
     progress: Callable[[int, int], None],
+    executor: Executor | None = None,
 ) -> tuple[dict[Path, CorrectedVideo], dict[Path, Exception]]:
     """Correct each source into its target; the results by target, and the errors of sources by source.
 
@@ -100,6 +102,7 @@ def undistort_videos(
                     interpolation=interpolation,
                     border=border,
                     progress=told,
+                    executor=executor,
                 )
         except (ValueError, OSError) as error:
             skipped[source] = error

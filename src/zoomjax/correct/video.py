@@ -1,15 +1,18 @@
 """Correction of zooming video with PyAV, each frame at its own focal length.
 
+On an executor, segments of the video are corrected and encoded side by side (`_segments`).
 Decoding, warping (`_planes`) and encoding overlap in three threads with a few frames between them, so that
 memory use stays constant. Frame times, frame rate, colour description, orientation, tags, sound, and what
 else the container holds are copied unchanged; the result says what was kept and what was not.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import os
 import warnings
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,11 +24,12 @@ from ..io.focal_track import FocalTrack
 from ..io.pyav import av
 from ..io.video_reader import Report, decoded_items, frames_expected, numbered, opened_video
 from ..io.video_streams import CONTAINER, Carried, carried
-from ..io.video_writer import FrameWriter, first_frame
+from ..io.video_writer import FrameWriter, Picture, first_frame
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal, lens_for_size
 from ._planes import FrameWarper
 from ._prefetch import ahead
+from ._segments import Segment, Work, cut, encoded_segments, with_others
 from .framing import Framing, check_keep, frame_output, framing_for_size
 from .image import check_sampling, warn_of_fold
 from .redistort import check_framed
@@ -62,6 +66,7 @@ def undistort_video(
     encoder: str | None = None,
     options: dict[str, str] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    executor: Executor | None = None,
 ) -> CorrectedVideo:
     """Correct a video, each frame at its own focal length, and write it to a new file.
 
@@ -78,6 +83,9 @@ def undistort_video(
         options: options of the encoder, texts by FFmpeg's names; by default for visually lossless quality.
             Those of the container (movflags) are none.
         progress: called after each frame with the number of frames done and announced (0 if unknown).
+        executor: where segments of the video, from key frame to key frame, are corrected and encoded; None:
+            here. Its workers read the video by the same path; packets come back. A video whose frames have
+            no times, as in AVI files, is corrected here.
 
     Raises:
         FileNotFoundError: there is no such video.
@@ -92,7 +100,7 @@ def undistort_video(
             the frames.
     """
     how = _Work(lens, keep, interpolation, border, encoder, options, back=False)
-    return _convert(source, target, focal, how, progress)
+    return _convert(source, target, focal, how, progress, executor)
 
 
 def redistort_video(
@@ -107,13 +115,14 @@ def redistort_video(
     encoder: str | None = None,
     options: dict[str, str] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    executor: Executor | None = None,
 ) -> CorrectedVideo:
     """Apply distortion to a corrected video, as `redistort_image`, and write it to a new file.
 
     Arguments, result and errors are those of `undistort_video`; `keep` tells how the video was corrected.
     """
     how = _Work(lens, keep, interpolation, border, encoder, options, back=True)
-    return _convert(source, target, focal, how, progress)
+    return _convert(source, target, focal, how, progress, executor)
 
 
 class _Work(NamedTuple):
@@ -134,6 +143,7 @@ def _convert(
     focal: float | int | FocalTrack,
     how: _Work,
     progress: Callable[[int, int], None],
+    executor: Executor | None,
 ) -> CorrectedVideo:
     target = Path(target)
     if target.suffix.lower() not in CONTAINER:
@@ -155,14 +165,20 @@ def _convert(
             lens, framing, interpolation=how.interpolation, border=how.border, back=how.back
         )
         report, along = Report(video.frames), carried(input_, video, target)
-        decoded = ahead(decoded_items(input_, video, report, along.streams))
-        items = ahead(_warped(decoded, warper, track, report, source))
-        try:
-            writer = _write(
-                items, part, target, input_, video, how.encoder, how.options, along, report, progress
+        segments = [] if executor is None else _segments_of(source, target, video, along, report)
+        if executor is not None and segments:
+            there = Work(source, target.name, lens, framing, how.interpolation, how.border, how.back, track)
+            there = dataclasses.replace(there, encoder=how.encoder, options=how.options)
+            writer = _write_segments(
+                executor, segments, there, warper, part, target, input_, video, along, report, progress
             )
-        finally:
-            items.close()
+        else:
+            decoded = ahead(decoded_items(input_, video, report, along.streams))
+            items = ahead(_warped(decoded, warper, track, report, source))
+            with contextlib.closing(items):
+                writer = _write(
+                    items, part, target, input_, video, how.encoder, how.options, along, report, progress
+                )
         report.announced = frames_expected(input_, video, report)
     lost = max(report.corrupt, report.announced - report.written if report.announced else 0)
     if lost:
@@ -297,4 +313,58 @@ def _write(
             writer.encode(item)
             report.written += 1
             progress(report.written, report.announced)
+    return writer
+
+
+def _segments_of(
+    source: str | os.PathLike[str], target: Path, video: Any, along: Carried, report: Report
+) -> list[Segment]:
+    """The segments of a video; none if it cannot be cut, as one whose alpha VP9 keeps beside packets."""
+    has_alpha = (video.codec_context.pix_fmt or "").startswith("yuva")
+    if has_alpha and target.suffix.lower() in (".webm", ".mkv"):
+        return []
+    return cut(source, [stream.index for stream in along.streams], report)
+
+
+def _write_segments(
+    executor: Executor,
+    segments: Sequence[Segment],
+    work: Work,
+    warper: FrameWarper,
+    part: Path,
+    target: Path,
+    input_: Any,
+    video: Any,
+    along: Carried,
+    report: Report,
+    progress: Callable[[int, int], None],
+) -> FrameWriter:
+    """Copy packets as they come, and pictures from an executor's tasks; the writer, which is done."""
+    own = Report(0)
+    for frame, number, time in numbered(decoded_items(input_, video, own), own, work.source):  # noqa: B007
+        break
+    else:
+        raise ValueError(f"Cannot read a video from {input_.name}: none of its frames can be decoded.")
+    report.first = first_frame(frame)
+    work = dataclasses.replace(work, like=report.first, zero=frame.time or 0.0)
+    made = warper(frame, work.track.at(number, time))
+
+    def pictures() -> Generator[Picture, None, None]:
+        for done in encoded_segments(executor, segments, work):
+            report.written += done.report.written
+            report.corrupt += done.report.corrupt
+            report.error = report.error or done.report.error
+            report.last = max(report.last, done.report.last)
+            progress(report.written, report.announced)
+            yield from done.pictures
+
+    others = [stream.index for stream in along.streams]
+    with (
+        contextlib.closing(pictures()) as encoded,
+        FrameWriter(
+            part, target, input_, video, made, report.first, work.encoder, work.options, along
+        ) as writer,
+    ):
+        for item in with_others(work.source, others, encoded):
+            (writer.put if isinstance(item, Picture) else writer.copy)(item)
     return writer

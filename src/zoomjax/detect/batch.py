@@ -1,4 +1,4 @@
-"""Detection in many images: in several processes, with a cache. Bad images are reported and skipped.
+"""Detection in many images: in several processes or on an executor, with a cache. Bad images are skipped.
 
 Only points are kept, at most one every `_SPACING` px of a line: detectors smooth over some px, so that
 closer neighbours share their noise and add little information. They are rounded to steps of 1/1024 px, far
@@ -14,7 +14,7 @@ import inspect
 import io
 import math
 from collections.abc import Generator, Iterable
-from concurrent.futures import Future
+from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,9 +22,11 @@ import cv2
 import jax
 import numpy as np
 
+from .._core.executors import checked_executor, in_order, is_away
 from .._core.files import whole_file
 from .._core.steps import STEP
 from .._core.text import reason
+from ._small import of_small, small
 from ._workers import LostError, Workers
 from .base import AbstractDetector
 from .edges import EdgeDetector
@@ -80,8 +82,9 @@ def detect(
     grid: str = "none",
     workers: int = 0,
     cache: Path | None = None,
+    executor: Executor | None = None,
 ) -> Generator[Detection, None, None]:
-    """Detect lines in each image, in order.
+    """Detect lines in each image, in order. Bad images are reported, as `Detection.problem`, and skipped.
 
     Args:
         sources: the images.
@@ -92,7 +95,22 @@ def detect(
             reported as a problem. 0: detect in this process, without this protection.
         cache: folder of cached detections by the same detector; None: no cache. A detector of one's own is
             the same while its settings and the file that defines it are.
+        executor: in place of `workers`, any executor of `concurrent.futures`: a task an image. Its workers
+            read the images, and the cache, by the same paths; only lines come back. There is no limit of
+            time.
+
+    Raises:
+        TypeError: `executor` is none.
+        ValueError: there are both `executor` and `workers`.
+        RuntimeError: no process can be started, or the executor gave up.
     """
+    if executor is not None:
+        if workers:
+            raise ValueError(
+                f"Argument workers is {workers}, and argument executor has its own: leave out one of both."
+            )
+        yield from _by_executor(checked_executor(executor), sources, detector, grid, cache)
+        return
     task = functools.partial(_detected, detector=detector, grid=grid)
     code = _code(type(detector))
     with contextlib.ExitStack() as stack:
@@ -109,6 +127,42 @@ def detect(
                 yield _finished(*pending.popleft(), detector, grid)
         while pending:
             yield _finished(*pending.popleft(), detector, grid)
+
+
+def _by_executor(
+    executor: Executor,
+    sources: Iterable[Source],
+    detector: AbstractDetector,
+    grid: str,
+    cache: Path | None,
+) -> Generator[Detection, None, None]:
+    """The same on an executor: one task an image, with all reading in it."""
+    task = functools.partial(_sent, detector=detector, grid=grid, cache=cache)
+    with contextlib.closing(in_order(executor, task, sources, size=_pixels)) as done:
+        for one in done:
+            if one.result is None:
+                yield Detection(one.item.name, one.item.file, problem=f"its task failed: {one.told()}")
+            else:
+                detection, lines = one.result
+                yield dataclasses.replace(detection, lines=of_small(lines))
+
+
+def _pixels(source: Source) -> int:
+    return 0 if source.image is None else source.image.nbytes
+
+
+def _sent(
+    source: Source, *, detector: AbstractDetector, grid: str, cache: Path | None
+) -> tuple[Detection, bytes]:
+    """In a worker: a detection, from the cache or not, and its lines apart, small."""
+    if is_away():
+        cv2.setNumThreads(1)  # workers share a machine's cores
+    entries = _Entries.of(cache, source, detector) if cache and _code(type(detector)) else None
+    known, missing = (None, True) if entries is None else _known(entries, source, detector, grid)
+    if known is None or missing:
+        found = _detected(_Task(source, known), detector=detector, grid=grid)
+        known = _finished(entries, source, found, detector, grid)
+    return dataclasses.replace(known, lines=()), small(known.lines)
 
 
 class _Task(NamedTuple):

@@ -71,8 +71,11 @@ class GramSchmidt(lx.AbstractLinearSolver):
         del options
         structure = operator.in_structure()
         leaves = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), structure)
-        unravel = jax.tree_util.Partial(ravel_pytree(leaves)[1])
-        return *gram_schmidt(operator.as_matrix()), eqxi.Static(unravel.func)
+        flat, unravel = ravel_pytree(leaves)
+        unravel = jax.tree_util.Partial(unravel)
+        # Not as one matrix: the rows of lines on several devices, and those of the damping, stay apart.
+        along = jax.vmap(lambda direction: operator.mv(unravel(direction)), out_axes=-1)
+        return *gram_schmidt(along(jnp.eye(flat.size, dtype=flat.dtype))), eqxi.Static(unravel.func)
 
     def compute(
         self, state: Any, vector: PyTree[Array], options: dict[str, Any]
@@ -81,7 +84,7 @@ class GramSchmidt(lx.AbstractLinearSolver):
         del options
         orthogonal, triangle, unravel = state
         result: Any = lx.RESULTS.successful
-        return unravel.value(solved(orthogonal, triangle, ravel_pytree(vector)[0])), result, {}
+        return unravel.value(solved(orthogonal, triangle, vector)), result, {}
 
     def transpose(self, state: Any, options: dict[str, Any]) -> Any:
         """Not needed: steps of a solver are not differentiated."""

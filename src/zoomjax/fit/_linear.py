@@ -1,8 +1,10 @@
 """Linear least squares with many rows and few columns."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 
 def least_squares(
@@ -13,34 +15,48 @@ def least_squares(
     Rounding is counted from the largest singular value and `floor`, the size of what the rows were computed
     from. Solved with the small triangle of the whole table, so that the rows are read once.
     """
-    triangle = jnp.linalg.qr(jnp.concatenate([matrix, right[:, None]], axis=1), mode="r")
+    triangle = triangle_of(jnp.concatenate([matrix, right[:, None]], axis=1))
     left, size, rows = jnp.linalg.svd(triangle[:, :-1], full_matrices=False)
     known = size > 64 * jnp.finfo(size.dtype).eps * (size[0] + floor)
     inverse = jnp.where(known, 1 / jnp.where(known, size, 1), 0)
     return rows.T @ (inverse * (left.T @ triangle[:, -1]))
 
 
+def triangle_of(matrix: PyTree[Float[Array, "... column"]]) -> Float[Array, "column column"]:
+    """R of the QR of a matrix with more rows than columns; see `gram_schmidt`."""
+    return gram_schmidt(matrix)[1]
+
+
 def gram_schmidt(
-    matrix: Float[Array, "row column"],
-) -> tuple[Float[Array, "row column"], Float[Array, "column column"]]:
-    """Q and R of a matrix by modified Gram-Schmidt; rows of zeros in R for columns that are dependent."""
+    matrix: PyTree[Float[Array, "... column"]],
+) -> tuple[list[Float[Array, "column ..."]], Float[Array, "column column"]]:
+    """Q, a column after the other, and R of a matrix by modified Gram-Schmidt.
+
+    R has rows of zeros for columns that are dependent. Rows may be in several arrays, and along several
+    axes of each: where they are spread over devices, sums over them are all that is exchanged.
+    """
+    parts = jax.tree.leaves(matrix)
 
     def reduce(left, column):
-        own = left[:, column]
-        products = jnp.matmul(own, left, precision="highest")
+        own = [part[..., column] for part in left]
+        products = _total(
+            jnp.tensordot(o, p, o.ndim, precision="highest") for o, p in zip(own, left, strict=True)
+        )
         norm = jnp.sqrt(products[column])
         inverse = jnp.where(norm > 0, 1 / jnp.where(norm > 0, norm, 1), 0)
-        unit, row = own * inverse, products * inverse
-        return (left - jnp.outer(unit, row)).at[:, column].set(0), (unit, row)
+        units, row = [part * inverse for part in own], products * inverse
+        taken = [unit[..., None] * row.reshape((1,) * unit.ndim + (-1,)) for unit in units]
+        left = [(p - t).at[..., column].set(0) for p, t in zip(left, taken, strict=True)]
+        return left, (units, row)
 
-    _, (units, triangle) = jax.lax.scan(reduce, matrix, jnp.arange(matrix.shape[1]))
-    return units.T, triangle
+    _, (units, triangle) = jax.lax.scan(reduce, parts, jnp.arange(parts[0].shape[-1]))
+    return units, triangle
 
 
 def solved(
-    orthogonal: Float[Array, "row column"],
+    orthogonal: list[Float[Array, "column ..."]],
     triangle: Float[Array, "column column"],
-    right: Float[Array, "row"],
+    right: PyTree[Float[Array, "..."]],
 ) -> Float[Array, "column"]:
     """The x of least ``|Q R x - right|``, with Q and R of `gram_schmidt`.
 
@@ -48,11 +64,15 @@ def solved(
     (Björck 1967), though Q is orthogonal only as far as the condition allows.
     """
 
-    def take_off(left, unit):
-        part = jnp.vdot(unit, left, precision="highest")
-        return left - part * unit, part
+    def take_off(left, units):
+        along = _total(jnp.vdot(u, rest, precision="highest") for u, rest in zip(units, left, strict=True))
+        return [rest - along * unit for unit, rest in zip(units, left, strict=True)], along
 
-    parts = jax.lax.scan(take_off, right, orthogonal.T)[1]
+    along = jax.lax.scan(take_off, jax.tree.leaves(right), orthogonal)[1]
     missing = jnp.diagonal(triangle) == 0
     regular = triangle + jnp.diag(missing.astype(triangle.dtype))
-    return jax.scipy.linalg.solve_triangular(regular, parts)
+    return jax.scipy.linalg.solve_triangular(regular, along)
+
+
+def _total(terms):
+    return functools.reduce(jnp.add, terms)

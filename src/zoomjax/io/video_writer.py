@@ -4,8 +4,9 @@ import contextlib
 import dataclasses
 import re
 from collections.abc import Generator, Mapping
+from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -63,6 +64,23 @@ class FirstFrame:
     side: dict[str, bytes]
 
 
+class Picture(NamedTuple):
+    """An encoded packet, with times in units of `time_base`."""
+
+    content: bytes
+    pts: int | None
+    dts: int | None
+    duration: int
+    time_base: Fraction
+    key: bool
+
+    @classmethod
+    def of(cls, packet: Any) -> "Picture":
+        """A packet of an encoder's."""
+        times = (packet.pts, packet.dts, packet.duration or 0, packet.time_base)
+        return cls(bytes(packet), *times, bool(packet.is_keyframe))
+
+
 class FrameWriter(contextlib.AbstractContextManager):
     """A video file that is being written; within ``with``, which finishes it.
 
@@ -99,6 +117,7 @@ class FrameWriter(contextlib.AbstractContextManager):
         self.kept, self.not_kept = list(along.kept), list(along.not_kept)
         self._last: int | None = None
         self._moved = 0
+        self._encodes = False
         self._output = av.open(
             str(path), "w", format=CONTAINER[named.suffix.lower()], metadata_errors="surrogateescape"
         )
@@ -122,25 +141,48 @@ class FrameWriter(contextlib.AbstractContextManager):
 
     def encode(self, frame: Any) -> None:
         """Write a frame, at its own time, or just after one that has the same time."""
+        self._output.mux(self.encoded(frame))
+
+    def encoded(self, frame: Any) -> list[Any]:
+        """Packets that are ready once the encoder has a frame as well, or None at the end; not written."""
+        self._encodes = frame is not None
+        if frame is None:
+            return self._stream.encode(None)
         if frame.pts is not None:
             if self._last is not None and frame.pts <= self._last:
                 frame.pts = self._last + 1
                 self._moved += 1
             self._last = frame.pts
-        self._output.mux(self._stream.encode(frame))
+        return self._stream.encode(frame)
+
+    def put(self, picture: "Picture") -> None:
+        """Write what another writer, with the same arguments, has encoded, after all before it."""
+        packet = av.Packet(picture.content)
+        packet.pts, packet.duration, packet.time_base = picture.pts, picture.duration, picture.time_base
+        packet.dts = picture.dts
+        if picture.dts is not None and self._last is not None and picture.dts <= self._last:
+            packet.dts = self._last + 1  # before a cut an encoder looks less far back than after it
+        self._last = packet.dts
+        packet.is_keyframe, packet.stream = picture.key, self._stream
+        self._output.mux(packet)
 
     def copy(self, packet: Any) -> None:
         """Write a packet of another of the source's streams as it is."""
         packet.stream = self._copies[packet.stream.index]
         self._output.mux(packet)
 
+    def drop(self) -> None:
+        """Let go of the file, which nobody reads."""
+        with contextlib.suppress(Exception):
+            self._output.close()
+
     def __exit__(self, kind, error, trace) -> None:
         """Finish the file; after an error, only let go of it."""
         if self._moved:
             self.not_kept.append(f"times of {self._moved} frames, which others had before them")
         try:
-            if kind is None:
-                self._output.mux(self._stream.encode(None))
+            if kind is None and self._encodes:
+                self._output.mux(self.encoded(None))
         finally:
             with contextlib.nullcontext() if kind is None else contextlib.suppress(Exception):
                 self._output.close()

@@ -11,3 +11,5 @@ from .free_centre import AnyCentreLines as AnyCentreLines
 from .free_centre import compress_any_centre as compress_any_centre
 from .lines import Lines as Lines
 from .npz import load_lines as load_lines
+from .sharding import shard as shard
+from .streaming import stream as stream

@@ -1,5 +1,6 @@
 """Lines read from the ``.npz`` files that `Lines.save` writes."""
 
+import functools
 import operator
 import os
 
@@ -13,17 +14,23 @@ from .lines import FORMAT, VERSION, Lines
 
 
 @kinds_checked
-def load_lines(path: str | os.PathLike[str]) -> Lines:
+def load_lines(path: str | os.PathLike[str], *, chunk: bool = False) -> Lines:
     """Read lines that `Lines.save` wrote.
+
+    Args:
+        path: the file.
+        chunk: whether the file holds only some of the lines' points, as for `Lines.from_ragged`: then every
+            line is kept, to be compressed and merged with its other points.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: the file is truncated, of another kind, or of a later version; the message names it.
     """
-    return read_archive(path, "lines", _lines, format=(FORMAT, VERSION), writer="Lines.save")
+    make = functools.partial(_lines, chunk=chunk)
+    return read_archive(path, "lines", make, format=(FORMAT, VERSION), writer="Lines.save")
 
 
-def _lines(stored: dict[str, np.ndarray]) -> Lines:
+def _lines(stored: dict[str, np.ndarray], *, chunk: bool = False) -> Lines:
     points = unpacked(stored["steps"], stored["step"]) if "steps" in stored else stored["points"]
     counts = checked_counts(stored["counts"], points)
     lines = Lines.from_ragged(
@@ -34,6 +41,7 @@ def _lines(stored: dict[str, np.ndarray]) -> Lines:
         focal_unit=str(stored["focal_unit"]),
         centre=stored["centre"],
         focus=stored.get("focus"),
+        chunk=chunk,
     )
     for name in ("focal", "centre"):  # of the points' dtype so far
         if stored[name].dtype.kind == "f" and stored[name].dtype != getattr(lines, name).dtype:
