@@ -194,7 +194,7 @@ def _planned(todo: Sequence[tuple[Path, Path]], earlier: int, about: Callable[[P
     for source, target in todo:
         try:
             told.append(f"  {source} -> {target}{about(source)}")
-        except _BAD_FILE as error:
+        except BAD_FILE as error:
             skipped[source] = error
     files = tuple((source, target) for source, target in todo if source not in skipped)
     bad = {str(source): reason(error) for source, error in skipped.items()}
