@@ -75,7 +75,7 @@ def in_order(
         task: a function that can be pickled, as can items and results.
         items: taken as they are handed over, at most some thousands ahead.
         size: bytes that an item takes until it is done.
-        there: makes of an item what the task is given: workers are in other folders, so paths must be whole.
+        there: makes of an item what the task is given: whole paths, as workers are in other folders.
 
     Raises:
         RuntimeError: the executor gave up, as a process pool does when one of its processes dies.
