@@ -379,6 +379,15 @@ def test_pixels_of_a_clip_are_handed_over_a_few_at_a_time(marker, monkeypatch):
     assert len(taken) == 20
 
 
+@pytest.mark.slow
+def test_workers_in_another_folder_find_what_is_named_from_here(photos, marker, pool, monkeypatch):
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as elsewhere:
+        elsewhere.submit(os.chdir, "/").result()
+        monkeypatch.chdir(photos[0].path.parent)
+        found = list(detect(find_photos(["0.png", "1.png"]), marker, executor=elsewhere))
+    assert [(d.file, len(d.lines)) for d in found] == [("0.png", 1), ("1.png", 2)]
+
+
 class Deadly(zj.detect.AbstractDetector):
     """Ends the process that runs it."""
 

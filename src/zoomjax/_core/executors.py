@@ -66,6 +66,7 @@ def in_order(
     items: Iterable[Item],
     *,
     size: Callable[[Item], int] = lambda item: 0,
+    there: Callable[[Item], Item] = lambda item: item,
 ) -> Generator[Done[Item, Result], None, None]:
     """``task(item)`` of each item, in their order. Closing the generator cancels what has not begun.
 
@@ -74,6 +75,7 @@ def in_order(
         task: a function that can be pickled, as can items and results.
         items: taken as they are handed over, at most some thousands ahead.
         size: bytes that an item takes until it is done.
+        there: makes of an item what the task is given: whole paths, as workers are in other folders.
 
     Raises:
         RuntimeError: the executor gave up, as a process pool does when one of its processes dies.
@@ -104,7 +106,7 @@ def in_order(
             while pending and (len(pending) >= _MOST_AHEAD or held + size(item) > _MOST_BYTES):
                 yield first()
             try:
-                future = executor.submit(away, item)
+                future = executor.submit(away, there(item))
             except BrokenExecutor as error:
                 raise _gave_up(error) from error
             pending.append((item, future))

@@ -98,7 +98,7 @@ def corrected_photos(
             yield task.source, task.target, _corrected(task, correction)
         return
     work = functools.partial(_corrected_there, correction=_sent(correction))
-    with contextlib.closing(in_order(checked_executor(executor), work, tasks)) as done:
+    with contextlib.closing(in_order(checked_executor(executor), work, tasks, there=_absolute)) as done:
         for one in done:
             if isinstance(one.error, OSError):  # of the target
                 raise one.error
@@ -106,6 +106,11 @@ def corrected_photos(
                 yield one.item.source, one.item.target, RuntimeError(f"its task failed: {one.told()}")
             else:
                 yield one.item.source, one.item.target, one.result
+
+
+def _absolute(task: _Task) -> _Task:
+    """For a worker, which is in another folder."""
+    return task._replace(source=task.source.absolute(), target=task.target.absolute())
 
 
 def _known(focal_of: Callable[[Path], float] | None, source: Path) -> float | Exception | None:

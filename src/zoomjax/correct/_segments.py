@@ -137,7 +137,8 @@ def encoded_segments(
 ) -> Generator[Encoded, None, None]:
     """The segments, corrected and encoded by an executor's tasks, in order."""
     lens, framing = sent((work.lens, work.framing))
-    task = _Task(dataclasses.replace(work, lens=lens, framing=framing))
+    source = Path(work.source).absolute()  # workers are in other folders
+    task = _Task(dataclasses.replace(work, source=source, lens=lens, framing=framing))
     with contextlib.closing(
         in_order(checked_executor(executor), task, segments, size=lambda one: one.size)
     ) as done:

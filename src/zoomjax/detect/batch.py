@@ -137,18 +137,24 @@ def _by_executor(
     cache: Path | None,
 ) -> Generator[Detection, None, None]:
     """The same on an executor: one task an image, with all reading in it."""
-    task = functools.partial(_sent, detector=detector, grid=grid, cache=cache)
-    with contextlib.closing(in_order(executor, task, sources, size=_pixels)) as done:
+    place = None if cache is None else cache.absolute()
+    task = functools.partial(_sent, detector=detector, grid=grid, cache=place)
+    with contextlib.closing(in_order(executor, task, sources, size=_pixels, there=_absolute)) as done:
         for one in done:
             if one.result is None:
                 yield Detection(one.item.name, one.item.file, problem=f"its task failed: {one.told()}")
             else:
                 detection, lines = one.result
-                yield dataclasses.replace(detection, lines=of_small(lines))
+                yield dataclasses.replace(detection, file=one.item.file, lines=of_small(lines))
 
 
 def _pixels(source: Source) -> int:
     return 0 if source.image is None else source.image.nbytes
+
+
+def _absolute(source: Source) -> Source:
+    """For a worker, which is in another folder."""
+    return source if source.path is None else dataclasses.replace(source, path=source.path.absolute())
 
 
 def _sent(

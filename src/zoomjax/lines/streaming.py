@@ -5,7 +5,7 @@ import functools
 import os
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Executor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from .._core.executors import arrived, checked_executor, in_order, sent
 from .compressed import CompressedLines, compress
@@ -55,12 +55,19 @@ def stream(
             yield compress(read(path), terms)
         return
     task = functools.partial(_reduced, terms=terms, read=read)
-    with contextlib.closing(in_order(checked_executor(executor), task, paths)) as done:
+    with contextlib.closing(in_order(checked_executor(executor), task, paths, there=_absolute)) as done:
         for one in done:
             if one.error is not None:
                 raise one.error
             assert one.result is not None
             yield arrived(one.result)
+
+
+def _absolute(path: Any) -> Any:
+    """For a worker, which is in another folder; what is no file here may be an address."""
+    if not os.path.exists(path):
+        return path
+    return os.path.abspath(path) if isinstance(path, str) else type(path)(os.path.abspath(path))
 
 
 def _reduced(path: Path, *, terms: int, read: Callable[[Path], Lines]) -> CompressedLines:
