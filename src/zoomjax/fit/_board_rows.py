@@ -1,6 +1,6 @@
 """What `fit_boards` minimises: residuals of corners in the image, and what is known beforehand.
 
-The unknowns are the pose of each photo, the shape of the board (`_board_shape`), log f of each zoom, the
+The unknowns are the pose of each photo, the shape of each board (`_board_shape`), log f of each zoom, the
 zoom model, and the centre of distortion. Corner X is ahead of photo p as ``R_p X + t_p``; its residual is
 that of `_views`, in the image, with a Cauchy loss. Lengths are half the board's longer side.
 """
@@ -18,7 +18,11 @@ from ..models.zoom import AbstractPriorZoom, AbstractZoom, with_parameters
 from ._board_schur import Rows, Unknowns
 from ._board_shape import shape_of
 from ._motion_start import turned
-from ._views import CAUCHY, flattened, product, view_residual
+from ._views import flattened, product, view_residual
+
+LOSS = 7.0
+"""Of the noise: where the loss begins to flatten. Boards that bend a little from photo to photo leave more
+than the noise: a photo is not to lose its weight for that, and a corner that is mistaken is."""
 
 _PIN = 1e4
 """Weight of what is held: the log f of padding, and a centre that is given."""
@@ -30,7 +34,7 @@ class Data(eqx.Module):
     Attributes:
         points: about the centre that is given, or that of the image, px; 0 where there is none.
         there: which corners are seen.
-        zoom: of each photo, its zoom's number.
+        zoom, board: of each photo, the number of its zoom, and that of its board.
         places: of the corners on a flat board.
         basis: of its shape.
         smooth: rows of what makes log f a smooth curve in the label of the zooms, 0 without; and what they
@@ -43,6 +47,7 @@ class Data(eqx.Module):
     points: Float[Array, "photo corner 2"]
     there: Bool[Array, "photo corner"]
     zoom: Int[Array, "photo"]
+    board: Int[Array, "photo"]
     places: Float[Array, "corner 2"]
     basis: Float[Array, "corner 3 function"]
     smooth: Float[Array, "zoom zoom"]
@@ -56,7 +61,7 @@ class Model(eqx.Module):
 
     Attributes:
         rotation, position: of the board in each photo's camera.
-        shape: coefficients of the board's shape.
+        shape: coefficients of each board's shape.
         log_focal: of each zoom.
         zoom: the zoom model.
         offset: of the centre, half image diagonals.
@@ -65,7 +70,7 @@ class Model(eqx.Module):
 
     rotation: Float[Array, "photo 3 3"]
     position: Float[Array, "photo 3"]
-    shape: Float[Array, "function"]
+    shape: Float[Array, "board function"]
     log_focal: Float[Array, "zoom"]
     zoom: AbstractZoom
     offset: Float[Array, "2"]
@@ -106,8 +111,8 @@ def units_of(data: Data, model: Model, noise: Array) -> Unknowns:
     zoom = jax.tree.map(lambda leaf: jnp.full(leaf.shape, of_lens), model.zoom.parameters)
     of_focal = noise / (half * jnp.sqrt(jnp.maximum(in_zoom, 1)))
     lens = (of_focal, zoom, jnp.full(2, of_lens))
-    shape = jnp.full(len(model.shape), jnp.minimum(1, 100 * of_lens))
-    return Unknowns(poses, jnp.ones((len(data.places), 3)), shape, lens)
+    shape = jnp.full(model.shape.shape, jnp.minimum(1, 100 * of_lens))
+    return Unknowns(poses, jnp.ones((len(shape), len(data.places), 3)), shape, lens)
 
 
 def moved(model: Model, steps: Unknowns) -> Model:
@@ -130,23 +135,25 @@ def moved(model: Model, steps: Unknowns) -> Model:
 
 
 def residuals_of(
-    data: Data, model: Model, points: Float[Array, "corner 3"] | float = 0.0
+    data: Data, model: Model, points: Float[Array, "board corner 3"] | None = None
 ) -> Float[Array, "photo corner 2"]:
     """Residuals of all corners, px, with corners displaced by `points` from the board's shape."""
     focal = jnp.exp(model.log_focal)
     coefficients = jax.vmap(model.zoom)(focal)
-    board = shape_of(data.places, data.basis, model.shape) + points
+    boards = jax.vmap(shape_of, (None, None, 0))(data.places, data.basis, model.shape)
+    boards = boards if points is None else boards + points
 
-    def photo(seen, there, zoom, rotation, position):
+    def photo(seen, there, zoom, board, rotation, position):
         def corner(point, place):
             ahead = product(rotation, place) + position
             return view_residual(
                 point, focal[zoom], coefficients[zoom], model.offset, ahead, model.family, data.scale
             )
 
-        return jnp.where(there[:, None], jax.vmap(corner)(seen, board), 0)
+        return jnp.where(there[:, None], jax.vmap(corner)(seen, boards[board]), 0)
 
-    return jax.vmap(photo)(data.points, data.there, data.zoom, model.rotation, model.position)
+    numbers = (data.zoom, data.board)
+    return jax.vmap(photo)(data.points, data.there, *numbers, model.rotation, model.position)
 
 
 def rows_of(unknowns: Unknowns, args: tuple[Data, Model, Stage]) -> Rows:
@@ -155,7 +162,7 @@ def rows_of(unknowns: Unknowns, args: tuple[Data, Model, Stage]) -> Rows:
     steps = scaled_steps(unknowns, data, model, stage)
     there = moved(model, steps)
     views = residuals_of(data, there, steps.points) / stage.noise
-    squared = jnp.sum(views**2, axis=-1) / CAUCHY**2
+    squared = jnp.sum(views**2, axis=-1) / LOSS**2
     return Rows(views * flattened(squared)[..., None], *known_rows(data, there, stage))
 
 

@@ -1,10 +1,10 @@
-"""Linear least squares for many poses, one board and one lens, in time that is linear in the photos.
+"""Linear least squares for many poses, some boards and one lens, in time that is linear in the photos.
 
 Each row belongs to one corner of one photo: it depends on the six numbers of that photo's pose, on where
-the corner is on the board, and on the lens. Poses are eliminated photo by photo (Schur complement), which
-leaves a matrix of shape and lens alone. A corner is moved by the functions of the board's shape, linearly:
-its columns by three coordinates are multiplied by them after sums over the photos. So all columns come from
-9 products and one for each number of the lens.
+the corner is on the board, and on the lens. Poses are eliminated photo by photo (Schur complement), then
+the shape of each board. A corner is moved by the functions of its board's shape, linearly: its columns by
+three coordinates are multiplied by them after sums over the photos. So all columns come from 9 products and
+one for each number of the lens.
 
 Normal equations square the condition of the problem: float64 only.
 """
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import cho_solve
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from ._normal_solver import AbstractNormalSolver
 
@@ -27,55 +27,86 @@ class Unknowns(NamedTuple):
         poses: six numbers a photo.
         points: of each corner, its displacement from the board's shape. It stays 0: its columns are those
             from which the shape's are made.
-        shape: coefficients of the shape.
+        shape: coefficients of each board's shape.
         lens: a tree of arrays.
     """
 
     poses: Float[Array, "photo 6"]
-    points: Float[Array, "corner 3"]
-    shape: Float[Array, "function"]
+    points: Float[Array, "board corner 3"]
+    shape: Float[Array, "board function"]
     lens: PyTree
 
 
 class Rows(NamedTuple):
-    """Residuals: of the corners, and of what is known beforehand of shape and lens.
+    """Residuals: of the corners, and of what is known beforehand of shapes and lens.
 
     Attributes:
         views: of each corner in each photo.
-        shape: of the shape, a number for each of its own.
+        shape: of the shapes, a number for each of their own.
         lens: of the lens alone.
     """
 
     views: Float[Array, "photo corner 2"]
-    shape: Float[Array, "function"]
+    shape: Float[Array, "board function"]
     lens: Float[Array, "row"]
 
 
-class Reduced(NamedTuple):
-    """The normal equations: of the poses, and of shape and lens without the poses.
+class Structure(NamedTuple):
+    """How shapes move corners.
 
     Attributes:
-        matrix: of shape and lens, poses eliminated.
-        right: the right-hand side.
-        prior: what `Rows.shape` and `Rows.lens` contribute to the matrix.
-        of_photo: what each photo contributes to matrix and right-hand side.
-        poses: inverse blocks of the poses, what couples them to shape and lens, and their right-hand side.
+        basis: how each coefficient of a shape, in the units of the steps, displaces each corner.
+        board: of each photo.
     """
 
-    matrix: Float[Array, "common common"]
-    right: Float[Array, "common"]
-    prior: Float[Array, "common common"]
-    of_photo: tuple[Float[Array, "photo common common"] | None, Float[Array, "photo common"]]
-    poses: tuple[Array, Array, Array]
+    basis: Float[Array, "corner 3 function"]
+    board: Int[Array, "photo"]
+
+
+class Photos(NamedTuple):
+    """What photos contribute to the normal equations, each by itself.
+
+    Attributes:
+        point, lens: columns of the corners' rows, by coordinates of the corners and by the lens.
+        inverse: of the block of its pose.
+        border: of pose, and of its board's shape and lens; `solved` is the inverse's product with it.
+        right: right-hand side of the pose.
+        scores: right-hand side of its board's shape and the lens, without the pose.
+    """
+
+    point: Float[Array, "photo corner 2 3"]
+    lens: Float[Array, "photo corner 2 lens"]
+    inverse: Float[Array, "photo 6 6"]
+    border: Float[Array, "photo 6 both"]
+    solved: Float[Array, "photo 6 both"]
+    right: Float[Array, "photo 6"]
+    scores: Float[Array, "photo both"]
+
+
+class Reduced(NamedTuple):
+    """The normal equations of shapes and lens, without the poses.
+
+    Attributes:
+        shape: block of each board's shape.
+        mixed: of it and the lens.
+        lens: block of the lens.
+        right_shape, right_lens: the right-hand side.
+        prior_shape, prior_lens: what is known beforehand, in the blocks: a diagonal, and a matrix.
+        photos: what each photo contributes.
+    """
+
+    shape: Float[Array, "board function function"]
+    mixed: Float[Array, "board function lens"]
+    lens: Float[Array, "lens lens"]
+    right_shape: Float[Array, "board function"]
+    right_lens: Float[Array, "lens"]
+    prior_shape: Float[Array, "board function"]
+    prior_lens: Float[Array, "lens lens"]
+    photos: Photos
 
 
 def reduced(
-    jacobian: Any,
-    rows: Rows,
-    like: Unknowns,
-    basis: Float[Array, "corner 3 function"],
-    damping: Array,
-    by_photo: bool = False,
+    jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, damping: Float[Array, ""]
 ) -> Reduced:
     """The normal equations of ``jacobian x = rows``, with `damping` added to the diagonal.
 
@@ -83,55 +114,75 @@ def reduced(
         jacobian: maps `Unknowns` to `Rows`.
         rows: the right-hand side.
         like: the unknowns' shapes.
-        basis: how each coefficient of the shape displaces each corner.
+        structure: how shapes move corners.
         damping: added to each unknown's diagonal entry.
-        by_photo: whether to say what each photo contributes to the matrix.
     """
     by_pose, by_point, by_lens, own = _columns(jacobian, like)
-    pose, point, lens = by_pose.views, by_point.views, by_lens.views  # (photo, corner, 2, columns)
-    photos, functions = len(pose), basis.shape[2]
-    wide = basis.reshape(-1, functions)
+    photos = _photos(by_pose.views, by_point.views, by_lens.views, rows.views, structure, damping)
+    functions, boards = structure.basis.shape[2], len(like.shape)
 
-    def of_shape(values):  # (photo, corner, 3, some) to (photo, function, some)
-        return jnp.einsum("pks,kf->pfs", values.reshape(photos, len(wide), -1), wide)
+    def of_boards(values):
+        return jax.ops.segment_sum(values, structure.board, boards)
+
+    corner = of_boards(_products(photos.point, photos.point))
+    across = of_boards(_products(photos.point, photos.lens))
+    basis = structure.basis
+
+    def board(number):
+        here = (structure.board == number)[:, None, None]
+        border, solved = (jnp.where(here, of[:, :, :functions], 0) for of in (photos.border, photos.solved))
+        moved = jnp.einsum("nij,njg->nig", corner[number], basis)
+        block = _flat(basis).T @ _flat(moved) - _flat(border).T @ _flat(solved)
+        mixed = _flat(basis).T @ _flat(across[number])
+        return block, mixed - _flat(border).T @ _flat(photos.solved[:, :, functions:])
+
+    shape, mixed = jax.lax.map(board, jnp.arange(boards))
+    lens = jnp.einsum("pnri,pnrj->ij", photos.lens, photos.lens) + by_lens.lens.T @ by_lens.lens
+    lens = lens - _flat(photos.border[:, :, functions:]).T @ _flat(photos.solved[:, :, functions:])
+    return Reduced(
+        shape + jnp.eye(functions)[None] * (own**2 + damping)[:, :, None],
+        mixed,
+        lens + damping * jnp.eye(len(lens)),
+        of_boards(photos.scores[:, :functions]) + own * rows.shape,
+        jnp.sum(photos.scores[:, functions:], axis=0) + by_lens.lens.T @ rows.lens,
+        own**2,
+        by_lens.lens.T @ by_lens.lens,
+        photos,
+    )
+
+
+def _photos(pose, point, lens, views, structure, damping):
+    """The poses' blocks, and what is left of each photo without them."""
+    wide = _flat(structure.basis)
 
     def both(values):
-        """Columns by points and by lens, times others, summed over each photo's rows."""
-        by_shape = of_shape(jnp.einsum("pnri,pnrj->pnij", point, values))
+        """Columns by shape and by lens, times others, summed over each photo's rows."""
+        by_point = _products(point, values).reshape(len(point), len(wide), -1)
+        by_shape = jnp.einsum("pks,kf->pfs", by_point, wide)
         return jnp.concatenate([by_shape, jnp.einsum("pnri,pnrj->pij", lens, values)], axis=1)
 
     block = jnp.einsum("pnri,pnrj->pij", pose, pose)
     empty = jnp.trace(block, axis1=1, axis2=2) <= 0  # of photos that pad
-    block = block + (damping + empty)[:, None, None] * jnp.eye(6)[None]
-    inverse = jnp.linalg.inv(block)
-    border = both(pose).swapaxes(1, 2)  # (photo, 6, common)
+    inverse = jnp.linalg.inv(block + (damping + empty)[:, None, None] * jnp.eye(6)[None])
+    border = both(pose).swapaxes(1, 2)
     solved = inverse @ border
-    right_pose = jnp.einsum("pnri,pnr->pi", pose, rows.views)
-    scores = both(rows.views[..., None])[..., 0] - jnp.einsum("pic,pi->pc", solved, right_pose)
-
-    damped = damping * jnp.eye(border.shape[2])
-    prior = jax.scipy.linalg.block_diag(jnp.diag(own**2), by_lens.lens.T @ by_lens.lens)
-    of_prior = jnp.concatenate([own * rows.shape, by_lens.lens.T @ rows.lens])
-    each = None
-    if by_photo:
-        moved = jnp.concatenate([jnp.einsum("pnrk,nkf->pnrf", point, basis), lens], axis=3)
-        each = jnp.einsum("pnri,pnrj->pij", moved, moved) - jnp.einsum("pci,pcj->pij", border, solved)
-    matrix = _summed(point, lens, basis) - jnp.einsum("pci,pcj->ij", border, solved)
-    return Reduced(
-        matrix + prior + damped,
-        jnp.sum(scores, axis=0) + of_prior,
-        prior,
-        (each, scores),
-        (inverse, border, right_pose),
-    )
+    right = jnp.einsum("pnri,pnr->pi", pose, views)
+    scores = both(views[..., None])[..., 0] - jnp.einsum("pic,pi->pc", solved, right)
+    return Photos(point, lens, inverse, border, solved, right, scores)
 
 
-def _summed(point, lens, basis):
-    """The matrix of shape and lens, of all photos together, before poses are eliminated."""
-    corner = jnp.einsum("pnri,pnrj->nij", point, point)
-    shape = jnp.einsum("nif,nij,njg->fg", basis, corner, basis)
-    mixed = jnp.einsum("nif,nij->fj", basis, jnp.einsum("pnri,pnrj->nij", point, lens))
-    return jnp.block([[shape, mixed], [mixed.T, jnp.einsum("pnri,pnrj->ij", lens, lens)]])
+def _products(left, right):
+    """Of each corner in each photo, the sum over its two rows of the products of their columns.
+
+    As loops that XLA fuses: a product of matrices with two rows would be a call each.
+    """
+    x, y = (left[:, :, row, :, None] * right[:, :, row, None, :] for row in (0, 1))
+    return x + y
+
+
+def _flat(values):
+    """An array as a matrix of its last axis."""
+    return values.reshape(-1, values.shape[-1])
 
 
 def _columns(jacobian, like):
@@ -143,8 +194,8 @@ def _columns(jacobian, like):
     along = jnp.eye(10 + lens.size)
     directions = Unknowns(
         jnp.broadcast_to(along[:, None, :6], (len(along), *like.poses.shape)),
-        jnp.broadcast_to(along[:, None, 6:9], (len(along), *like.points.shape)),
-        jnp.broadcast_to(along[:, 9:10], (len(along), *like.shape.shape)),
+        jnp.broadcast_to(along[:, None, None, 6:9], (len(along), *like.points.shape)),
+        jnp.broadcast_to(along[:, None, 9:10], (len(along), *like.shape.shape)),
         jax.vmap(unravel)(along[:, 10:]),
     )
     out = jax.vmap(jacobian)(directions)  # at once: compiled once
@@ -155,25 +206,41 @@ def _columns(jacobian, like):
     return columns(slice(6)), columns(slice(6, 9)), columns(slice(10, None)), out.shape[9]
 
 
-def solution(matrix: Reduced, like: Unknowns) -> Unknowns:
+def solution(matrix: Reduced, like: Unknowns, structure: Structure) -> Unknowns:
     """The unknowns that solve the normal equations."""
-    common = cho_solve((jnp.linalg.cholesky(matrix.matrix), True), matrix.right)
-    inverse, border, right = matrix.poses
-    poses = jnp.einsum("pij,pj->pi", inverse, right - border @ common)
-    functions = len(like.shape)
-    lens = ravel_pytree(like.lens)[1](common[functions:])
-    return Unknowns(poses, like.points, common[:functions], lens)
+    sides = jnp.concatenate([matrix.right_shape[..., None], matrix.mixed], axis=2)
+    solved = solved_boards(matrix.shape, sides)
+    own, gain = solved[..., 0], solved[..., 1:]
+    corner = matrix.lens - jnp.einsum("bfi,bfj->ij", matrix.mixed, gain)
+    right = matrix.right_lens - jnp.einsum("bfi,bf->i", matrix.mixed, own)
+    lens = cho_solve((jnp.linalg.cholesky(corner), True), right)
+    shape = own - gain @ lens
+    both = jnp.concatenate(
+        [shape[structure.board], jnp.broadcast_to(lens, (len(structure.board), len(lens)))], 1
+    )
+    photos = matrix.photos
+    poses = jnp.einsum("pij,pj->pi", photos.inverse, photos.right) - jnp.einsum(
+        "pij,pj->pi", photos.solved, both
+    )
+    return Unknowns(poses, like.points, shape, ravel_pytree(like.lens)[1](lens))
+
+
+def solved_boards(
+    shape: Float[Array, "board function function"], sides: Float[Array, "board function side"]
+) -> Float[Array, "board function side"]:
+    """Solutions for each board's block, one after the other."""
+
+    def board(of):
+        return cho_solve((jnp.linalg.cholesky(of[0]), True), of[1])
+
+    return jax.lax.map(board, (shape, sides))
 
 
 class PoseSchur(AbstractNormalSolver):
-    """Steps of a damped Gauss-Newton method for `Unknowns` and `Rows`, by `reduced` and `solution`.
+    """Steps of a damped Gauss-Newton method for `Unknowns` and `Rows`, by `reduced` and `solution`."""
 
-    Attributes:
-        basis: how each coefficient of the shape, in the units of the steps, displaces each corner.
-    """
-
-    basis: Float[Array, "corner 3 function"]
+    structure: Structure
 
     def step(self, jacobian: Any, rows: Rows, like: Unknowns, damping: Array) -> Unknowns:
         """The unknowns of least squares."""
-        return solution(reduced(jacobian, rows, like, self.basis, damping), like)
+        return solution(reduced(jacobian, rows, like, self.structure, damping), like, self.structure)

@@ -2,8 +2,9 @@
 
 Corner (column, row) of the grid is at ``(x, y, 0) + sum_j b_j(x, y) c_j``, x and y about the middle of the
 board in units of half its longer side. The functions are products of Legendre polynomials of the two
-directions, out of the plane up to a total degree of 8, in the plane up to 5. A coefficient c_j is a priori
-normal, with a standard deviation that falls with the square of the degree; `SHAPE_STD` scales it.
+directions, up to a total degree (`OUT_OF_PLANE`, `IN_PLANE`), and to no more than corners can tell. A
+coefficient c_j is a priori normal, with a standard deviation that falls with the square of the degree;
+`SHAPE_STD` scales it.
 
 What poses can do is left out: the plane out of which the board bends (3 functions), and translation,
 rotation and scale in the plane (4). What is left in the plane to first order is another ratio of width to
@@ -16,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-OUT_OF_PLANE, IN_PLANE = 8, 5
+OUT_OF_PLANE, IN_PLANE = 12, 10
 """Largest total degrees."""
 
-SHAPE_STD = (0.05, 0.01)
+SHAPE_STD = (0.1, 0.03)
 """Standard deviation of a function of degree 2 out of the plane, and in it, half longer sides."""
 
 
@@ -37,13 +38,14 @@ def shape_basis(places: Float[np.ndarray, "corner 2"]) -> Float[np.ndarray, "cor
     u, v = (places / reach[None]).T
     degree = max(OUT_OF_PLANE, IN_PLANE)
     along, down = (np.polynomial.legendre.legvander(axis, degree) for axis in (u, v))
-    powers = list(itertools.product(range(degree + 1), repeat=2))
+    most = [min(np.unique(axis).size, degree + 1) for axis in (u, v)]
+    powers = list(itertools.product(range(most[0]), range(most[1])))
     columns = []
-    for axis, (std, most, least) in enumerate(
-        ((SHAPE_STD[1], IN_PLANE, 2), (SHAPE_STD[1], IN_PLANE, 2), (SHAPE_STD[0], OUT_OF_PLANE, 2))
+    for axis, (std, highest) in enumerate(
+        ((SHAPE_STD[1], IN_PLANE), (SHAPE_STD[1], IN_PLANE), (SHAPE_STD[0], OUT_OF_PLANE))
     ):
         for a, b in powers:
-            if least <= a + b <= most:
+            if 2 <= a + b <= highest:
                 displaced = np.zeros((len(places), 3))
                 displaced[:, axis] = std * (2 / (a + b)) ** 2 * along[:, a] * down[:, b]
                 columns.append(displaced)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from ..models.invertibility import Certificate, certificate_of
 from ._board_rows import (
+    LOSS,
     Data,
     Model,
     Stage,
@@ -21,27 +22,25 @@ from ._board_rows import (
     scaled_steps,
     units_of,
 )
-from ._board_schur import PoseSchur, Rows, Unknowns, reduced
+from ._board_schur import PoseSchur, Rows, Structure, Unknowns, reduced, solved_boards
 from ._board_shape import shape_of
 from ._normal_solver import damped_solver
-from ._views import CAUCHY, EXACT, MEDIAN_OF_SIZE
+from ._views import EXACT, MEDIAN_OF_SIZE
 from .covariance import of_clusters
 from .result import RESULTS
 
 _STAGES = (
-    (1e-3, 4.0, Stage(0.0, 0.1, 1.0, change=3.0, damping=1e-3)),
+    (1e-3, 2.0, Stage(0.0, 0.1, 1.0, change=3.0, damping=1e-3)),
     *((0.0, 1.0, Stage(0.0, 1.0, 1.0, change=0.3, damping=1e-6)),) * 5,
 )
 """Stages, with the least noise in half image diagonals of the first one's loss, and by how much the loss is
 wider than the noise before it. The first one hardly bends the board."""
 
-_SAME = 0.97  # of the noise before a stage: one that leaves less was not the last
+_SAME = 0.7  # of the noise before a stage: one that leaves less was not the last
 
 _FLAT = 1e-9  # standard deviation of the shape's coefficients of a board that is flat
 
 _MOST_STEPS = 40  # of a stage
-
-_INFLATION = 1 / 0.95  # of variances, by what the loss loses
 
 
 class Described(NamedTuple):
@@ -59,8 +58,8 @@ class Described(NamedTuple):
     """
 
     covariance: Float[Array, "lens lens"]
-    shape_std: Float[Array, "corner 3"]
-    shape: Float[Array, "corner 3"]
+    shape_std: Float[Array, "board corner 3"]
+    shape: Float[Array, "board corner 3"]
     missed: Float[Array, "photo corner 2"]
     inlier: Array
     noise: Float[Array, ""]
@@ -120,7 +119,7 @@ def _noise_of(data, missed):
 def _solved(data, model, stage):
     """Poses, board and lens of least energy, the noise, the solver's status and its steps."""
     units = units_of(data, model, stage.noise)
-    steps = PoseSchur(data.basis * units.shape)
+    steps = PoseSchur(_structure(data, units))
     solution = optx.least_squares(
         rows_of,
         damped_solver(steps, Unknowns, stage.change, stage.damping),
@@ -142,33 +141,31 @@ def described(
     units = units_of(data, model, stage.noise)
     zeros = jax.tree.map(jnp.zeros_like, units)
     missed = residuals_of(data, model)
-    squared = jnp.sum(missed**2, axis=-1) / (stage.noise * CAUCHY) ** 2
+    squared = jnp.sum(missed**2, axis=-1) / (stage.noise * LOSS) ** 2
     weight = 1 / (1 + squared)  # the derivative of the loss is this times the residual
 
     def linear(unknowns):
-        there = moved(model, scaled_steps(unknowns, data, model, stage))
-        views = residuals_of(data, there, scaled_steps(unknowns, data, model, stage).points) / stage.noise
+        steps = scaled_steps(unknowns, data, model, stage)
+        there = moved(model, steps)
+        views = residuals_of(data, there, steps.points) / stage.noise
         return Rows(weight[..., None] * views, *known_rows(data, there, stage))
 
     rows, jacobian = jax.linearize(linear, zeros)
     # (w J)^T r is the gradient, and w^2 J^T J the mean of its derivative over the directions of residuals.
     rows = rows._replace(views=missed / stage.noise)
-    normal = reduced(jacobian, rows, zeros, data.basis * units.shape, jnp.asarray(0.0), by_photo=True)
-    unit = jnp.concatenate([units.shape, ravel_pytree(units.lens)[0]])
-    functions = len(model.shape)
-    inverse = jnp.linalg.inv(normal.matrix)
-    lens, of_board = _of_photos(normal, inverse, functions)
-    own = unit[functions:]
-    shape_inverse = of_board * jnp.outer(units.shape, units.shape)
-    variance = jnp.einsum("nkf,fg,nkg->nk", data.basis, shape_inverse, data.basis)
+    structure = _structure(data, units)
+    normal = reduced(jacobian, rows, zeros, structure, jnp.asarray(0.0))
+    lens, of_boards = _of_photos(normal, structure)
+    own = ravel_pytree(units.lens)[0]
+    variance = jnp.einsum("nkf,bfg,nkg->bnk", structure.basis, of_boards, structure.basis)
     inlier = data.there & (squared < 9)  # beyond, the loss nearly ignores a corner
     count = 2 * jnp.sum(inlier)
-    unknowns = 6 * jnp.sum(jnp.any(data.there, axis=1)) + data.zooms + functions
+    unknowns = 6 * jnp.sum(jnp.any(data.there, axis=1)) + data.zooms + model.shape.size
     free = count / jnp.maximum(count - unknowns, 1)
     return Described(
         covariance=lens * jnp.outer(own, own),
         shape_std=jnp.sqrt(jnp.maximum(variance, 0)),
-        shape=shape_of(data.places, data.basis, model.shape),
+        shape=jax.vmap(shape_of, (None, None, 0))(data.places, data.basis, model.shape),
         missed=missed,
         inlier=inlier,
         noise=stage.noise * jnp.sqrt(free),
@@ -176,24 +173,38 @@ def described(
     )
 
 
-def _of_photos(normal, inverse, functions):
-    """Covariances of the lens and of the shape: photos err each by itself, their corners together.
+def _structure(data, units):
+    return Structure(data.basis * units.shape[0], data.board)
 
-    The shape is eliminated from the matrix and from each photo's score; both are then in parameters in
-    which the matrix is the identity, as `of_clusters` takes them.
+
+def _of_photos(normal, structure):
+    """Covariances of the lens and of the shapes: photos err each by itself, their corners together.
+
+    Shapes are eliminated from the matrix and from each photo's score; both are then in parameters in which
+    the matrix is the identity, as `of_clusters` takes them.
     """
-    matrix, (each, scores) = normal.matrix, normal.of_photo
-    gain = jnp.linalg.solve(matrix[:functions, :functions], matrix[:functions, functions:])
-    along = jnp.concatenate([-gain, jnp.eye(gain.shape[1])])  # of the lens, the shape following it
-    own = along.T @ matrix @ along
-    factor = jnp.linalg.cholesky(own)
-    white = along @ jnp.linalg.inv(factor).T
-    score = scores @ white
-    leverage = white.T @ each @ white
-    numbers = 2.0 * white.shape[1] * jnp.sum(jnp.any(scores != 0, axis=1))
-    covariance = of_clusters(score, leverage, leverage * _INFLATION, numbers - white.shape[1])
-    size = jnp.maximum(jnp.trace(covariance) / jnp.maximum(jnp.trace(jnp.sum(leverage, axis=0)), 1e-9), 1)
-    prior = white.T @ normal.prior @ white  # draws to its mean: by how much, in the mean
-    back = jnp.linalg.inv(factor)
-    shape = inverse[:functions, :functions] * size
-    return back.T @ (covariance + prior) @ back, shape
+    photos, functions = normal.photos, structure.basis.shape[2]
+    gain = solved_boards(normal.shape, normal.mixed)  # shapes follow the lens by its negative
+    matrix = normal.lens - jnp.einsum("bfi,bfj->ij", normal.mixed, gain)
+    back = jnp.linalg.inv(jnp.linalg.cholesky(matrix))
+    along = gain[structure.board]
+    score = photos.scores[:, functions:] - jnp.einsum("pfi,pf->pi", along, photos.scores[:, :functions])
+    moved = jnp.einsum("nkf,pfi->pnki", structure.basis, along)
+    moved = (photos.lens - jnp.einsum("pnrk,pnki->pnri", photos.point, moved)) @ back.T
+
+    def white(border):
+        return (border[:, :, functions:] - border[:, :, :functions] @ along) @ back.T
+
+    leverage = jnp.einsum("pnri,pnrj->pij", moved, moved)
+    leverage = leverage - jnp.einsum("pci,pcj->pij", white(photos.border), white(photos.solved))
+    score = score @ back.T
+    numbers = 2.0 * len(matrix) * jnp.sum(jnp.any(score != 0, axis=1))
+    covariance = of_clusters(score, leverage, leverage, numbers - len(matrix))
+    independent = jnp.trace(jnp.sum(leverage, axis=0))
+    size = jnp.maximum(jnp.trace(covariance) / jnp.where(independent > 0, independent, 1), 1)
+    # What is known beforehand draws to its mean: by how much, in the mean.
+    prior = normal.prior_lens + jnp.einsum("bfi,bf,bfj->ij", gain, normal.prior_shape, gain)
+    lens = back.T @ (covariance + back @ prior @ back.T) @ back
+    identity = jnp.broadcast_to(jnp.eye(functions), normal.shape.shape)
+    shape = solved_boards(normal.shape, identity) * size + gain @ lens[None] @ gain.swapaxes(1, 2)
+    return lens, shape

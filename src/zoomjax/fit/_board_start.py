@@ -1,4 +1,4 @@
-"""A start for `fit_boards`: distortion from straightness, then focal lengths and poses from homographies."""
+"""A start for `fit_boards`: distortion from straightness, then f and poses from homographies."""
 
 import equinox as eqx
 import jax
@@ -94,7 +94,7 @@ def homographies(
 
 
 def filled(focal: np.ndarray, std: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """Focal lengths where some are not known: on a line through the others, in logarithms, or usual ones."""
+    """Focal lengths where some are unknown: on a line through the others, in logarithms, or usual ones."""
     known = np.isfinite(focal) & (std < _UNCERTAIN * np.nan_to_num(focal))
     if not known.any():
         return np.full(len(focal), 2.0) * label / label.min()  # of a field of view of 53 degrees

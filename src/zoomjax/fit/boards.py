@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_size, checked_terms
@@ -77,8 +77,9 @@ class BoardFit(eqx.Module):
         covariance: of log f of each zoom, of the zoom model's parameters, and of the centre, half image
             diagonals: photos are taken to err each by itself. Focal length and distance stand in for each
             other where the board is seen squarely: the variances of log f say so.
-        shape: where each corner is, steps of the grid, about the board's middle: x along rows, y along
-            columns, z away from the camera.
+        board: for each photo the number of its board.
+        shape: where each corner of each board is, steps of the grid, about its middle: x along rows, y
+            along columns, z away from the camera.
         shape_std: its standard deviation.
         coefficients: the shape as the fit has it, of its smooth functions.
         poses: of the board in each photo.
@@ -91,9 +92,10 @@ class BoardFit(eqx.Module):
     focal_std: Float[Array, "zoom"]
     frame_focal: Float[Array, "photo"]
     covariance: Float[Array, "all all"]
-    shape: Float[Array, "row column 3"]
-    shape_std: Float[Array, "row column 3"]
-    coefficients: Float[Array, "function"]
+    board: Int[Array, "photo"]
+    shape: Float[Array, "board row column 3"]
+    shape_std: Float[Array, "board row column 3"]
+    coefficients: Float[Array, "board function"]
     poses: BoardPoses
     noise: Float[Array, ""]
 
@@ -103,38 +105,50 @@ class BoardFit(eqx.Module):
         return self.fit.lens
 
     @property
-    def bend(self) -> float:
-        """How far the board reaches out of its plane, from its deepest to its highest corner, steps."""
+    def bend(self) -> Float[np.ndarray, "board"]:
+        """How far each board reaches out of its plane, from its deepest to its highest corner, steps."""
         height = np.asarray(self.shape[..., 2])
-        return float(height.max() - height.min())
+        return height.max(axis=(1, 2)) - height.min(axis=(1, 2))
 
     def locate(
-        self, grids: Sequence[Any] | np.ndarray, focal: Float[AnyArray, "photo"] | Sequence[float]
+        self,
+        grids: Sequence[Any] | np.ndarray,
+        focal: Float[AnyArray, "photo"] | Sequence[float],
+        *,
+        board: Int[AnyArray, "photo"] | Sequence[int] | None = None,
     ) -> BoardPoses:
-        """The poses of the same board in other photos, for the lens and the shape of this fit.
+        """The poses of the same boards in other photos, for the lens and the shapes of this fit.
 
         Args:
             grids: as for `fit_boards`.
             focal: the labels of their zooms, which are among those fitted.
+            board: their boards, by default the first.
 
         Raises:
-            ValueError: a grid has another size, or a label is not among those fitted.
+            ValueError: a grid has another size, or a label or a board is not among those fitted.
         """
-        rows, columns = self.shape.shape[:2]
-        given = _checked(grids, focal, self.lens.image_size, (rows, columns))
-        known = np.asarray(self.label)
+        given = _checked(grids, focal, board, self.lens.image_size, self.shape.shape[1:3])
+        known, lens = np.asarray(self.label), self.lens
         number = np.searchsorted(known, given.label).clip(0, len(known) - 1)
-        if (known[number] != given.label).any():
+        strange = known[number] != given.label
+        if strange.any():
             raise ValueError(
                 f"Argument focal must be among the labels fitted, {known.tolist()}, but it holds "
-                f"{given.label[known[number] != given.label][0]:g}."
+                f"{given.label[strange][0]:g}."
             )
-        lens, focal_px = self.lens, np.asarray(self.focal)
+        boards = len(self.shape)
+        if given.board.max() >= boards:
+            raise ValueError(
+                f"Argument board must be among the {boards} boards fitted, from 0, but it holds "
+                f"{given.board.max()}."
+            )
         data = _data(given, number, len(known), np.asarray(lens.centre), _HELD)
         coefficients = _padded(np.asarray(jax.vmap(lens.zoom)(self.focal)), len(data.smooth))
         matrices, *_ = _homographies(data, coefficients, lens.family)
-        start = _model(data, matrices, focal_px, lens.zoom, lens.family)
-        start = eqx.tree_at(lambda model: model.shape, start, self.coefficients)
+        start = _model(data, matrices, np.asarray(self.focal), lens.zoom, lens.family, bucket(boards))
+        start = eqx.tree_at(
+            lambda model: model.shape, start, _padded(np.asarray(self.coefficients), bucket(boards))
+        )
         return _poses(given, data, *located(data, start, self.noise))
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
@@ -152,6 +166,7 @@ def fit_boards(
     family: AbstractFamily | None = None,
     terms: int = 2,
     centre: CentreArgument = "fit",
+    board: Int[AnyArray, "photo"] | Sequence[int] | None = None,
     smooth: float | int | None = None,
     flat: bool = False,
     throw: bool = True,
@@ -163,16 +178,18 @@ def fit_boards(
 
     Args:
         grids: the corners of the board in each photo, px, (row, column, 2), NaN where none is seen:
-            `zoomjax.detect.GridDetector.find` gives them. The same corner of the board has the same place in
-            all, of at least 3 rows and 3 columns.
-        focal: for each photo the label of its zoom, above 0: photos of one label share a focal length, which
-            is fitted. Labels are in the order of the focal lengths, such as those of the zoom ring or of
-            EXIF data, and need not be exact.
+            `zoomjax.detect.GridDetector.find` gives them. The same corner of the board has the same place
+            in all, of at least 3 rows and 3 columns.
+        focal: for each photo the label of its zoom, above 0: photos of one label share a focal length,
+            which is fitted. Labels are in the order of the focal lengths, such as those of the zoom ring
+            or of EXIF data, and need not be exact.
         image_size: width and height of the photos, px.
         zoom: the zoom model; by default `PolynomialZoom` of degree 2, or less where there are fewer zooms.
         family: the distortion model; `RadialPolynomial` by default.
         terms: the number N of radial distortion coefficients.
         centre: of distortion, which is the principal point, too: "fit", "image", or two coordinates, px.
+        board: for each photo the number of its board, from 0, if there are several of one size, or if one
+            was bent otherwise in between, as paper is from day to day. By default all show the same.
         smooth: standard deviation of log f beside a parabola in the logarithm of the label: 0.01 if focal
             lengths lie on a smooth curve within a per cent. By default they are free.
         flat: whether the board is flat.
@@ -194,7 +211,7 @@ def fit_boards(
             "fit_boards needs float64, and it is not enabled: call "
             'jax.config.update("jax_enable_x64", True) first.'
         )
-    given = _checked(grids, focal, image_size)
+    given = _checked(grids, focal, board, image_size)
     label, number = np.unique(given.label, return_inverse=True)
     zoom = PolynomialZoom(degree=min(2, len(label) - 1)) if zoom is None else zoom
     check("fit_boards", zoom=zoom)
@@ -210,7 +227,8 @@ def fit_boards(
     focal_px = filled(found[: len(label)], std[: len(label)], label) * data.scale
     ready = zoom.prepare(focal_px, family.size(terms))
     ready = through(ready, _padded(focal_px, len(wide)), wide)
-    start = _model(data, matrices, focal_px, ready, family)
+    boards = int(given.board.max()) + 1
+    start = _model(data, matrices, focal_px, ready, family, bucket(boards))
     model, stage, result, steps = in_stages(data, start, flat=flat)
     fit = _described(given, data, (model, stage, result, steps), label, origin, fitted)
     return _thrown(fit) if throw else fit
@@ -219,10 +237,11 @@ def fit_boards(
 class _Given(NamedTuple):
     grids: np.ndarray
     label: np.ndarray
+    board: np.ndarray
     image_size: tuple[int, int]
 
 
-def _checked(grids, focal, image_size, shape=None):
+def _checked(grids, focal, board, image_size, shape=None):
     """The grids as one array, and their labels."""
     if traced((grids, focal)):
         raise ValueError("Arguments of fit_boards must have known values: call it outside of jit and vmap.")
@@ -246,6 +265,13 @@ def _checked(grids, focal, image_size, shape=None):
             f"Argument focal must have a positive label for each of the {len(arrays)} grids, the same for "
             f"photos of one zoom, but it is {np.array2string(label, threshold=8)}."
         )
+    number = np.zeros(len(arrays), int) if board is None else np.asarray(board)
+    whole = number.dtype.kind in "iu" and number.shape == (len(arrays),) and number.min() >= 0
+    if not whole or number.max() >= len(arrays):
+        raise ValueError(
+            f"Argument board must have a number for each of the {len(arrays)} grids, 0 for the first "
+            f"board, but it is {np.array2string(number, threshold=8)}."
+        )
     stack = np.stack(arrays)
     stack = np.where(np.isfinite(stack).all(axis=-1, keepdims=True), stack, np.nan)
     count = np.isfinite(stack[..., 0]).sum(axis=(1, 2))
@@ -254,7 +280,7 @@ def _checked(grids, focal, image_size, shape=None):
             f"Argument grids must have {LEAST_CORNERS} corners or more in each photo, but number "
             f"{int(count.argmin())} has {count.min()}: leave it out."
         )
-    return _Given(stack, label, checked_size(image_size))
+    return _Given(stack, label, number, checked_size(image_size))
 
 
 def _data(given, number, zooms, origin, centre_std, smooth=None, label=None):
@@ -277,6 +303,7 @@ def _data(given, number, zooms, origin, centre_std, smooth=None, label=None):
         points=jnp.asarray(about),
         there=jnp.asarray(there),
         zoom=jnp.asarray(np.pad(number, (0, wide - photos)), jnp.int32),
+        board=jnp.asarray(np.pad(given.board, (0, wide - photos)), jnp.int32),
         places=jnp.asarray(np.pad(places, extra, mode="wrap")),
         basis=jnp.asarray(np.pad(basis, (*extra, (0, 0)))),
         smooth=jnp.asarray(smoothness),
@@ -295,14 +322,14 @@ def _homographies(data, coefficients, family):
     return found[0], *(np.asarray(of) for of in found[1:])
 
 
-def _model(data, matrices, focal_px, zoom, family):
+def _model(data, matrices, focal_px, zoom, family, boards):
     """Poses from homographies, of a flat board."""
     focal = _padded(focal_px, len(data.smooth))
     rotation, position = poses_of(matrices, focal[data.zoom] / data.scale)
     return Model(
         rotation=rotation,
         position=position,
-        shape=jnp.zeros(data.basis.shape[2]),
+        shape=jnp.zeros((boards, data.basis.shape[2])),
         log_focal=jnp.log(focal),
         zoom=zoom,
         offset=jnp.zeros(2),
@@ -327,7 +354,8 @@ def _described(given, data, solved, label, origin, fitted):
     """The fit, of the photos and zooms there are, in steps of the grid."""
     model, stage, result, steps = solved
     photos, rows, columns = given.grids.shape[:3]
-    zooms, corners, unit = len(label), rows * columns, grid_places(rows, columns)[1]
+    zooms, boards, corners = len(label), int(given.board.max()) + 1, rows * columns
+    unit = grid_places(rows, columns)[1]
     focal = np.exp(np.asarray(model.log_focal[:zooms]))
     centre = jnp.asarray(origin) + (data.scale * model.offset if fitted else 0)
     focal_range = jnp.asarray([focal.min(), focal.max()])
@@ -369,9 +397,10 @@ def _described(given, data, solved, label, origin, fitted):
         focal_std=jnp.asarray(focal * log_std),
         frame_focal=jnp.asarray(focal[number]),
         covariance=jnp.asarray(covariance),
-        shape=unit * known.shape[:corners].reshape(rows, columns, 3),
-        shape_std=unit * known.shape_std[:corners].reshape(rows, columns, 3),
-        coefficients=model.shape,
+        board=jnp.asarray(given.board),
+        shape=unit * known.shape[:boards, :corners].reshape(boards, rows, columns, 3),
+        shape_std=unit * known.shape_std[:boards, :corners].reshape(boards, rows, columns, 3),
+        coefficients=model.shape[:boards],
         poses=_poses(given, data, model, known.missed),
         noise=known.noise,
     )

@@ -100,11 +100,12 @@ def parameter_covariance(
 def of_clusters(score, leverage, share, scores):
     """The covariance of parameters in which the fit's Gauss-Newton matrix is the identity.
 
-    Clusters of points, here called lines, err independently of each other. `share` is what each line would contribute were its points independent. Their sum, A, is compared with
-    the sum S of the squares of the scores. A line draws the fit to itself: its score is first divided by
-    ``sqrt(1 - h)``, h its leverage along the score (Bell and McCaffrey 2002 have a matrix there). The size
-    of S is kept, ``c = tr S / tr A``: n points of a line count as n/c independent ones. Its shape is shrunk
-    to that of A by the part of their difference that the scatter of the scores explains.
+    Clusters of points, here called lines, err each by itself. `share` is what each would contribute were
+    its points independent. Their sum, A, is compared with the sum S of the squares of the scores. A line
+    draws the fit to itself: its score is first divided by ``sqrt(1 - h)``, h its leverage along the score
+    (Bell and McCaffrey 2002 have a matrix there). The size of S is kept, ``c = tr S / tr A``: n points of a
+    line count as n/c independent ones. Its shape is shrunk to that of A by the part of their difference
+    that the scatter of the scores explains.
 
     c has nu degrees of freedom, few where a few long lines at the border decide all, and at most `scores`,
     the number of independent scores less the parameters. Its own uncertainty is added, ``2 max(c, 1)/nu``,
