@@ -11,6 +11,7 @@ from zoomjax import PolynomialZoom, ZoomLens
 from zoomjax.fit import RESULTS, fit_boards
 from zoomjax.fit import _board_rows as rows_module
 from zoomjax.fit import boards as boards_module
+from zoomjax.fit._board_problem import checked_grids, data_of
 from zoomjax.fit._board_rows import Stage, rows_of, units_of
 from zoomjax.fit._board_schur import PoseSchur, Structure, Unknowns
 from zoomjax.fit._board_shape import grid_places, shape_basis
@@ -22,23 +23,22 @@ FOCAL = np.repeat([1000.0, 1600.0, 2600.0], 6)
 LABEL = np.repeat([1.0, 2.0, 3.0], 6)
 
 
-def bent(height=0.25):
+def bent(height=0.1):
     """A board that is bent: a cylinder with a twist, half a step out of its plane, and 1 % too wide."""
     places, unit = grid_places(ROWS, COLUMNS)
     x, y = places.T
-    z = height * ((x**2 - np.mean(x**2)) + 0.8 * x * y) / unit
-    # The plane of the shape is that of no linear part: what is left of x^2 after 1, x and y.
+    z = height * (x**2 - 1 / 3 + 0.8 * x * y)  # its plane is where x^2 is 1/3 of the largest
     return np.stack([1.005 * x, y / 1.005, z], axis=1) * unit
 
 
 def seen_through(lens, board, focal):
-    """Corners of photos of a board from all sides, near enough to fill the image."""
+    """Corners of photos of a board from all sides, near enough to fill most of the image."""
     grids, poses = [], []
     for number, f in enumerate(focal):
         tilt = np.array([0.5 * np.cos(2.4 * number), 0.5 * np.sin(2.4 * number), 0.1 * np.sin(number)])
         rotation = np.asarray(jax.vmap(turned, (1, None), 1)(jnp.eye(3), jnp.asarray(tilt)))
-        distance = f * COLUMNS / (0.75 * SIZE[0])
-        shift = distance / f * 60 * np.array([np.cos(number), np.sin(number)])
+        distance = f * COLUMNS / (0.55 * SIZE[0])
+        shift = distance / f * 40 * np.array([np.cos(number), np.sin(number)])
         position = np.append(shift, distance)
         ahead = board @ rotation.T + position
         straight = np.asarray(lens.centre) + f * ahead[:, :2] / ahead[:, 2:]
@@ -72,17 +72,17 @@ def displaced(lens, fit, focal):
 def test_exact_corners_give_lens_focal_lengths_poses_and_shape(lens, exact):
     fit, _, poses = exact
     assert fit.fit.result == RESULTS.successful
-    np.testing.assert_allclose(fit.focal, [1000, 1600, 2600], rtol=1e-3)
-    assert displaced(lens, fit, [1000, 1600, 2600]) < 0.05
-    np.testing.assert_allclose(fit.lens.centre, lens.centre, atol=0.3)
-    assert fit.fit.rms < 0.02
-    np.testing.assert_allclose(fit.shape[0].reshape(-1, 3), bent(), atol=0.01)
-    assert abs(fit.bend[0] - np.ptp(bent()[:, 2])) < 0.01
+    np.testing.assert_allclose(fit.focal, [1000, 1600, 2600], rtol=1e-6)
+    assert displaced(lens, fit, [1000, 1600, 2600]) < 1e-3
+    np.testing.assert_allclose(fit.lens.centre, lens.centre, atol=1e-3)
+    assert fit.fit.rms < 1e-4
+    np.testing.assert_allclose(fit.shape[0].reshape(-1, 3), bent(), atol=1e-3)
+    np.testing.assert_allclose(fit.bend, np.ptp(bent()[:, 2]), atol=1e-3)
     for found, at, (rotation, position) in zip(
         np.asarray(fit.poses.rotation), np.asarray(fit.poses.position), poses, strict=True
     ):
-        np.testing.assert_allclose(found, rotation, atol=1e-3)
-        np.testing.assert_allclose(at, position, rtol=2e-3, atol=5e-3)
+        np.testing.assert_allclose(found, rotation, atol=1e-5)
+        np.testing.assert_allclose(at, position, rtol=1e-4, atol=1e-3)
 
 
 def test_flat_boards_are_worse_and_say_other_focal_lengths(lens, exact):
@@ -137,9 +137,9 @@ def test_padding_changes_nothing(exact, monkeypatch):
 
 def problem(grids, boards=2):
     """Two boards of other shapes, in a distortion model that is not linear."""
-    given = boards_module._checked(grids, LABEL, np.arange(len(grids)) % boards, SIZE)
+    given = checked_grids(grids, LABEL, np.arange(len(grids)) % boards, SIZE)
     number = np.unique(LABEL, return_inverse=True)[1]
-    data = boards_module._data(given, number, 3, np.array([639.5, 359.5]), 0.05)
+    data = data_of(given, number, 3, np.array([639.5, 359.5]), 0.05)
     focal = np.array([1000.0, 1600.0, 2600.0])
     zoom = PolynomialZoom(1).prepare(focal, 2)
     matrices, *_ = boards_module._homographies(data, jnp.zeros((3, 2)), Division())
@@ -203,7 +203,7 @@ def test_shapes_leave_to_poses_what_poses_can_do():
 
 
 def test_standard_deviations_are_the_scatter_of_fits_to_noise(exact):
-    """Within a factor: 8 draws tell a standard deviation to 25 %, and three focal lengths are correlated."""
+    """Within a factor: 8 draws tell a standard deviation to 25 %, and focal lengths are correlated."""
     _, grids, _ = exact
     rng = np.random.default_rng(4)
     fits = [
@@ -212,12 +212,12 @@ def test_standard_deviations_are_the_scatter_of_fits_to_noise(exact):
     focal = np.array([fit.focal for fit in fits])
     said = np.sqrt(np.mean([np.square(fit.focal_std) for fit in fits], axis=0))
     off = np.sqrt(np.mean((focal - [1000, 1600, 2600]) ** 2, axis=0))
-    assert (off / said > 0.5).all() and (off / said < 2).all()
+    assert abs(np.log(off / said)).max() < np.log(2)
     centres = np.array([fit.lens.centre for fit in fits])
     scale = np.hypot(*SIZE) / 2
     of_centre = scale * np.sqrt([np.diag(fit.fit.joint)[-2:] for fit in fits]).mean(axis=0)
     off = np.sqrt(np.mean((centres - [646, 355]) ** 2, axis=0))
-    assert (off / of_centre > 0.4).all() and (off / of_centre < 2).all()
+    assert abs(np.log(off / of_centre)).max() < np.log(2.5)
     shapes = np.array([fit.shape[0] for fit in fits])
     said = np.sqrt(np.mean([np.square(fit.shape_std[0]) for fit in fits]))
     assert 0.5 < np.sqrt(np.mean(np.var(shapes, axis=0, ddof=1))) / said < 2

@@ -174,7 +174,7 @@ def described(
 
 
 def _structure(data, units):
-    return Structure(data.basis * units.shape[0], data.board)
+    return Structure(data.basis * units.shape[0][None, None], data.board)
 
 
 def _of_photos(normal, structure):

@@ -121,7 +121,7 @@ def poses_of(
 
     rotation, position = jax.vmap(pose)(matrices, focal)
     bad = ~jnp.all(jnp.isfinite(position), axis=1)
-    rotation = jnp.where(bad[:, None, None], jnp.eye(3), rotation)
+    rotation = jnp.where(bad[:, None, None], jnp.eye(3)[None], rotation)
     ahead = jnp.stack([0 * focal, 0 * focal, 2 * focal], axis=1)
     return rotation, jnp.where(bad[:, None], ahead, position)
 

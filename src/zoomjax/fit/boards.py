@@ -18,23 +18,21 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
-from .._core.checks import checked_size, checked_terms
-from .._core.types import AnyArray, traced
+from .._core.checks import checked_terms
+from .._core.types import AnyArray
 from ..models.family import AbstractFamily
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ..models.requirements import check
 from ..models.zoom import AbstractZoom, PolynomialZoom
-from ._board_rows import Data, Model
-from ._board_shape import grid_places, shape_basis
+from ._board_problem import checked_grids, data_of, padded_to
+from ._board_rows import Model
+from ._board_shape import grid_places
 from ._board_stages import described, in_stages, located
 from ._board_start import coefficients_of, filled, homographies, poses_of, through
 from ._structure import bucket
 from .result import RESULTS, ZoomFit, failed, judged
 from .zoom import CentreArgument
-
-LEAST_CORNERS = 12
-"""Corners of a photo that count: fewer hardly tell its pose and something more."""
 
 _CENTRE_STD = 0.05
 """Standard deviation of a fitted centre, half image diagonals, before there is any data: poses can stand in
@@ -127,7 +125,7 @@ class BoardFit(eqx.Module):
         Raises:
             ValueError: a grid has another size, or a label or a board is not among those fitted.
         """
-        given = _checked(grids, focal, board, self.lens.image_size, self.shape.shape[1:3])
+        given = checked_grids(grids, focal, board, self.lens.image_size, self.shape.shape[1:3])
         known, lens = np.asarray(self.label), self.lens
         number = np.searchsorted(known, given.label).clip(0, len(known) - 1)
         strange = known[number] != given.label
@@ -142,12 +140,12 @@ class BoardFit(eqx.Module):
                 f"Argument board must be among the {boards} boards fitted, from 0, but it holds "
                 f"{given.board.max()}."
             )
-        data = _data(given, number, len(known), np.asarray(lens.centre), _HELD)
-        coefficients = _padded(np.asarray(jax.vmap(lens.zoom)(self.focal)), len(data.smooth))
+        data = data_of(given, number, len(known), np.asarray(lens.centre), _HELD)
+        coefficients = padded_to(np.asarray(jax.vmap(lens.zoom)(self.focal)), len(data.smooth))
         matrices, *_ = _homographies(data, coefficients, lens.family)
         start = _model(data, matrices, np.asarray(self.focal), lens.zoom, lens.family, bucket(boards))
         start = eqx.tree_at(
-            lambda model: model.shape, start, _padded(np.asarray(self.coefficients), bucket(boards))
+            lambda model: model.shape, start, padded_to(np.asarray(self.coefficients), bucket(boards))
         )
         return _poses(given, data, *located(data, start, self.noise))
 
@@ -211,7 +209,7 @@ def fit_boards(
             "fit_boards needs float64, and it is not enabled: call "
             'jax.config.update("jax_enable_x64", True) first.'
         )
-    given = _checked(grids, focal, board, image_size)
+    given = checked_grids(grids, focal, board, image_size)
     label, number = np.unique(given.label, return_inverse=True)
     zoom = PolynomialZoom(degree=min(2, len(label) - 1)) if zoom is None else zoom
     check("fit_boards", zoom=zoom)
@@ -220,101 +218,18 @@ def fit_boards(
     middle = (np.array(given.image_size) - 1) / 2
     fitted = isinstance(centre, str) and centre == "fit"
     origin = middle if isinstance(centre, str) else np.asarray(centre, float)
-    data = _data(given, number, len(label), origin, _CENTRE_STD if fitted else _HELD, smooth, label)
+    data = data_of(given, number, len(label), origin, _CENTRE_STD if fitted else _HELD, smooth, label)
     coefficients = coefficients_of(given.grids, number, given.image_size, origin, family, terms)
-    wide = _padded(coefficients, len(data.smooth))
+    wide = padded_to(coefficients, len(data.smooth))
     matrices, found, std = _homographies(data, wide, family)
     focal_px = filled(found[: len(label)], std[: len(label)], label) * data.scale
     ready = zoom.prepare(focal_px, family.size(terms))
-    ready = through(ready, _padded(focal_px, len(wide)), wide)
+    ready = through(ready, padded_to(focal_px, len(wide)), wide)
     boards = int(given.board.max()) + 1
     start = _model(data, matrices, focal_px, ready, family, bucket(boards))
     model, stage, result, steps = in_stages(data, start, flat=flat)
     fit = _described(given, data, (model, stage, result, steps), label, origin, fitted)
     return _thrown(fit) if throw else fit
-
-
-class _Given(NamedTuple):
-    grids: np.ndarray
-    label: np.ndarray
-    board: np.ndarray
-    image_size: tuple[int, int]
-
-
-def _checked(grids, focal, board, image_size, shape=None):
-    """The grids as one array, and their labels."""
-    if traced((grids, focal)):
-        raise ValueError("Arguments of fit_boards must have known values: call it outside of jit and vmap.")
-    arrays = [np.asarray(grid, float) for grid in grids]
-    if not arrays:
-        raise ValueError("Argument grids must hold the corners of one photo at least, but it is empty.")
-    wrong = [array.shape for array in arrays if array.ndim != 3 or array.shape[2] != 2]
-    if wrong:
-        raise ValueError(f"Argument grids must hold arrays (row, column, 2), but one is {wrong[0]}.")
-    sizes = sorted({array.shape[:2] for array in arrays} | ({shape} if shape else set()))
-    if len(sizes) > 1:
-        raise ValueError(
-            f"Argument grids must be of one board, but they have {sizes[0]} and {sizes[1]} corners: keep "
-            "those of one size, with NaN for corners that are not seen."
-        )
-    if min(sizes[0]) < 3:
-        raise ValueError(f"Argument grids must have 3 rows and 3 columns or more, but has {sizes[0]}.")
-    label = np.asarray(focal, float)
-    if label.shape != (len(arrays),) or not (np.isfinite(label) & (label > 0)).all():
-        raise ValueError(
-            f"Argument focal must have a positive label for each of the {len(arrays)} grids, the same for "
-            f"photos of one zoom, but it is {np.array2string(label, threshold=8)}."
-        )
-    number = np.zeros(len(arrays), int) if board is None else np.asarray(board)
-    whole = number.dtype.kind in "iu" and number.shape == (len(arrays),) and number.min() >= 0
-    if not whole or number.max() >= len(arrays):
-        raise ValueError(
-            f"Argument board must have a number for each of the {len(arrays)} grids, 0 for the first "
-            f"board, but it is {np.array2string(number, threshold=8)}."
-        )
-    stack = np.stack(arrays)
-    stack = np.where(np.isfinite(stack).all(axis=-1, keepdims=True), stack, np.nan)
-    count = np.isfinite(stack[..., 0]).sum(axis=(1, 2))
-    if count.min() < LEAST_CORNERS:
-        raise ValueError(
-            f"Argument grids must have {LEAST_CORNERS} corners or more in each photo, but number "
-            f"{int(count.argmin())} has {count.min()}: leave it out."
-        )
-    return _Given(stack, label, number, checked_size(image_size))
-
-
-def _data(given, number, zooms, origin, centre_std, smooth=None, label=None):
-    """The grids, padded to few numbers of photos, corners and zooms."""
-    photos, rows, columns = given.grids.shape[:3]
-    places, _ = grid_places(rows, columns)
-    corners, wide, more = bucket(rows * columns), bucket(photos), bucket(zooms)
-    points = given.grids.reshape(photos, -1, 2)
-    there = np.zeros((wide, corners), bool)
-    there[:photos, : rows * columns] = np.isfinite(points[..., 0])
-    about = np.zeros((wide, corners, 2))
-    about[:photos, : rows * columns] = np.nan_to_num(points - origin)
-    smoothness = np.zeros((more, more))
-    if smooth is not None and zooms > 3:
-        curve = np.linalg.qr(np.vander(np.log(label), 3))[0]
-        smoothness[:zooms, :zooms] = (np.eye(zooms) - curve @ curve.T) / smooth
-    basis = shape_basis(places)
-    extra = ((0, corners - len(places)), (0, 0))
-    return Data(
-        points=jnp.asarray(about),
-        there=jnp.asarray(there),
-        zoom=jnp.asarray(np.pad(number, (0, wide - photos)), jnp.int32),
-        board=jnp.asarray(np.pad(given.board, (0, wide - photos)), jnp.int32),
-        places=jnp.asarray(np.pad(places, extra, mode="wrap")),
-        basis=jnp.asarray(np.pad(basis, (*extra, (0, 0)))),
-        smooth=jnp.asarray(smoothness),
-        zooms=jnp.asarray(zooms),
-        centre_std=jnp.asarray(centre_std),
-        scale=float(np.hypot(*given.image_size) / 2),
-    )
-
-
-def _padded(values, size):
-    return jnp.asarray(np.concatenate([values, np.repeat(values[-1:], size - len(values), axis=0)]))
 
 
 def _homographies(data, coefficients, family):
@@ -324,7 +239,7 @@ def _homographies(data, coefficients, family):
 
 def _model(data, matrices, focal_px, zoom, family, boards):
     """Poses from homographies, of a flat board."""
-    focal = _padded(focal_px, len(data.smooth))
+    focal = padded_to(focal_px, len(data.smooth))
     rotation, position = poses_of(matrices, focal[data.zoom] / data.scale)
     return Model(
         rotation=rotation,
