@@ -15,6 +15,7 @@ import numpy as np
 from ..detect.batch import Detection
 from ..fit.boards import BoardFit, fit_boards
 from ..fit.result import RESULTS, failed
+from ..fit.zoom import CentreArgument
 from ..models.lens import ZoomLens
 from .focal_sources import Focals
 from .plane_focals import FocalGroup
@@ -53,14 +54,16 @@ class BoardBundle:
         focal, std = np.asarray(self.fit.focal), np.asarray(self.fit.focal_std)
         good = np.isfinite(std) & (std < _UNCERTAIN * focal)
         new, deviation, groups = dict(focals.focal), dict(focals.deviation), []
-        for group in focals.groups or [FocalGroup((name,), 0.0, 0.0) for name in focals.focal]:
+        alone = [FocalGroup((name,), 0.0, 0.0) for name in focals.focal]
+        for group in focals.groups or alone:
             numbers = {int(self.number[self.names.index(n)]) for n in group.names if n in self.names}
             zoom = next(iter(numbers)) if len(numbers) == 1 else -1
             if zoom >= 0 and good[zoom]:
                 f, s = float(focal[zoom]), float(std[zoom])
+                s = s if group.agree else max(s, group.std)  # they may be of two zooms
                 new |= {name: f for name in group.names if name in new}
                 deviation |= {name: s for name in group.names if name in new}
-                group = dataclasses.replace(group, focal=f, std=s, agree=True)
+                group = dataclasses.replace(group, focal=f, std=s)
             if focals.groups:
                 groups.append(group)
         origin = "bundle adjustment of the grid, which may be bent"
@@ -119,7 +122,9 @@ class BoardBundle:
         }
 
 
-def bundle_of(used: Sequence[Detection], focals: Focals) -> BoardBundle | None:
+def bundle_of(
+    used: Sequence[Detection], focals: Focals, centre: CentreArgument = "fit"
+) -> BoardBundle | None:
     """The bundle adjustment of the photos' grids; None if there are too few of them, or it fails."""
     grids = {d.name: d.nodes for d in used if d.nodes is not None}
     grids = {name: of for name, of in grids.items() if np.isfinite(of[..., 0]).sum() >= _CORNERS}

@@ -232,7 +232,7 @@ def calibrate_images(
     bundle = None
     if job.detector == "grid":
         stage("Fitting the shape of the board")
-        bundle = bundle_of(used, focals)
+        bundle = bundle_of(used, focals, job.centre)
         if bundle is not None and job.focal == "plane":
             focals = bundle.measured(focals)
     while True:

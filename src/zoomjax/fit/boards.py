@@ -110,7 +110,7 @@ class BoardFit(eqx.Module):
 
     def locate(
         self,
-        grids: Sequence[Any] | np.ndarray,
+        grids: Sequence[Any] | AnyArray,
         focal: Float[AnyArray, "photo"] | Sequence[float],
         *,
         board: Int[AnyArray, "photo"] | Sequence[int] | None = None,
@@ -156,7 +156,7 @@ class BoardFit(eqx.Module):
 
 @kinds_checked
 def fit_boards(
-    grids: Sequence[Any] | np.ndarray,
+    grids: Sequence[Any] | AnyArray,
     focal: Float[AnyArray, "photo"] | Sequence[float],
     *,
     image_size: Sequence[int],
