@@ -8,9 +8,13 @@ from jaxtyping import Array, Float, Int
 
 from .._core.checks import checked_size
 from .._core.types import traced
+from ..lines.buckets import bucket as bucket_of
 from ._board_rows import Data
 from ._board_shape import grid_places, shape_basis
 from ._structure import bucket
+
+_PHOTOS = (16, 32, 64, 96, 128)
+"""Numbers of photos that programs are compiled for; larger ones are four to each doubling."""
 
 LEAST_CORNERS = 12
 """Corners of a photo that count: fewer hardly tell its pose and something more."""
@@ -79,7 +83,7 @@ def data_of(
     """The grids, padded to few numbers of photos, corners and zooms."""
     photos, rows, columns = given.grids.shape[:3]
     places, _ = grid_places(rows, columns)
-    corners, wide, more = bucket(rows * columns), bucket(photos), bucket(zooms)
+    corners, wide, more = bucket(rows * columns), bucket_of(photos, _PHOTOS), bucket(zooms)
     points = given.grids.reshape(photos, -1, 2)
     there = np.zeros((wide, corners), bool)
     there[:photos, : rows * columns] = np.isfinite(points[..., 0])

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Num
 
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_terms
@@ -111,7 +111,7 @@ class BoardFit(eqx.Module):
     def locate(
         self,
         grids: Sequence[Any] | AnyArray,
-        focal: Float[AnyArray, "photo"] | Sequence[float],
+        focal: Num[AnyArray, "photo"] | Sequence[float | int],
         *,
         board: Int[AnyArray, "photo"] | Sequence[int] | None = None,
     ) -> BoardPoses:
@@ -157,7 +157,7 @@ class BoardFit(eqx.Module):
 @kinds_checked
 def fit_boards(
     grids: Sequence[Any] | AnyArray,
-    focal: Float[AnyArray, "photo"] | Sequence[float],
+    focal: Num[AnyArray, "photo"] | Sequence[float | int],
     *,
     image_size: Sequence[int],
     zoom: AbstractZoom | None = None,
