@@ -5,8 +5,7 @@
 116 photos of a checkerboard at five zooms (see zoomcam.py), split into random halves of each zoom's photos.
 All is fitted to one half and judged by the other: `fit_boards` with a shape for each zoom's photos, which
 are of one day, and a flat board; the straightness fit (`fit_zoom`, centre fitted); and, for the first pair
-of halves, OpenCV zoom by zoom (k1, k2): `calibrateCamera`. `calibrateCameraRO`, which fits the board's
-points, too, is run on a half of one zoom.
+of halves, OpenCV's `calibrateCamera` zoom by zoom (k1, k2).
 
 *Photos not seen*: RMS distance of corners from where the model puts them, with the pose alone refitted.
 *Scatter*: RMS difference, over all corners of a zoom, of where the lenses of both halves correct them to.
@@ -30,10 +29,7 @@ from .study import main, table
 from .zoomcam import read_corners, read_photos
 
 SIZE = (1280, 720)
-PAIRS = 2
-RO_STEPS = 5
-RELEASED = 5
-"""The zoom at which `calibrateCameraRO` is run."""
+PAIRS = 1
 TIMED = 120
 """Photos of the timing: all of them, and some again."""
 
@@ -64,8 +60,8 @@ def not_seen(fit: BoardFit, corners: np.ndarray, zoom: np.ndarray) -> np.ndarray
     return np.asarray(fit.locate(corners, zoom, board=board).residual)
 
 
-def opencv(corners: np.ndarray, others: np.ndarray, *, points: bool) -> dict:
-    """OpenCV's calibration of one zoom, with or without the board's points, and photos not seen."""
+def opencv(corners: np.ndarray, others: np.ndarray) -> dict:
+    """OpenCV's calibration of one zoom, and photos not seen."""
     rows, columns = corners.shape[1:3]
     y, x = np.indices((rows, columns)).reshape(2, -1)
     board = np.stack([x, y, 0 * x], axis=1).astype(np.float32)
@@ -73,17 +69,10 @@ def opencv(corners: np.ndarray, others: np.ndarray, *, points: bool) -> dict:
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
     start = np.array([[4000.0, 0, (SIZE[0] - 1) / 2], [0, 4000.0, (SIZE[1] - 1) / 2], [0, 0, 1]])
     flags |= cv2.CALIB_USE_INTRINSIC_GUESS
-    until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, RO_STEPS if points else 30, 1e-6)
-    if points:  # OpenCV 5 fails with an assertion otherwise
-        flags |= cv2.CALIB_DISABLE_SCHUR_COMPLEMENT
-        _, matrix, k, _, _, board = cv2.calibrateCameraRO(
-            [board] * len(seen), seen, SIZE, columns - 1, start, None, flags=flags, criteria=until
-        )
-        board = board.reshape(-1, 3)
-    else:
-        _, matrix, k, _, _ = cv2.calibrateCamera(
-            [board] * len(seen), seen, SIZE, start, None, flags=flags, criteria=until
-        )
+    until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 1e-6)
+    _, matrix, k, _, _ = cv2.calibrateCamera(
+        [board] * len(seen), seen, SIZE, start, None, flags=flags, criteria=until
+    )
     distances = []
     for grid in others:
         _, turn, shift = cv2.solvePnP(board, grid.reshape(-1, 1, 2), matrix, k)
@@ -172,7 +161,7 @@ def of_opencv(corners: np.ndarray, zoom: np.ndarray) -> dict:
     """OpenCV's `calibrateCamera` on the first pair of halves."""
     first, labels = halves(zoom, np.random.default_rng(0)), np.unique(zoom)
     both = [
-        [opencv(corners[m & (zoom == q)], corners[~m & (zoom == q)], points=False) for q in labels]
+        [opencv(corners[m & (zoom == q)], corners[~m & (zoom == q)]) for q in labels]
         for m in (first, ~first)
     ]
     missed = [np.concatenate([half[i]["missed"] for half in both]) for i in range(len(labels))]
@@ -194,22 +183,8 @@ def of_opencv(corners: np.ndarray, zoom: np.ndarray) -> dict:
     }
 
 
-def of_released(corners: np.ndarray, zoom: np.ndarray) -> dict:
-    """OpenCV's `calibrateCameraRO` on a half of one zoom: it takes minutes for it."""
-    first = halves(zoom, np.random.default_rng(0)) & (zoom == RELEASED)
-    start = time.process_time()
-    found = opencv(corners[first], corners[(zoom == RELEASED) & ~first], points=True)
-    return {
-        "photos": int(first.sum()),
-        "not_seen": rms(found["missed"]),
-        "focal": found["focal"],
-        "cpu_s": time.process_time() - start,
-    }
-
-
 def timed(fit: Callable[[], object]) -> tuple[float, float]:
-    """Seconds and seconds of processors of a call whose programs are compiled; the least of two."""
-    jax.block_until_ready(fit())
+    """Seconds, and seconds of processors, of the faster of two calls: the first may compile."""
     taken = []
     for _ in range(2):
         start, own = time.perf_counter(), time.process_time()
@@ -228,7 +203,6 @@ def run(data: Path) -> dict:
     return {
         "ours": of_pairs(corners, zoom, lines),
         "opencv": of_opencv(corners, zoom),
-        "released": of_released(corners, zoom),
         "whole": {
             "focal": np.asarray(whole.focal).tolist(),
             "focal_std": np.asarray(whole.focal_std).tolist(),
@@ -237,7 +211,6 @@ def run(data: Path) -> dict:
             "rms": float(whole.fit.rms),
         },
         "time_s": {
-            "one board": timed(lambda: fit_boards(corners[many], zoom[many], image_size=SIZE, throw=False)),
             "a board a zoom": timed(lambda: fitted(corners[many], zoom[many], flat=False)),
         },
     }
@@ -255,8 +228,8 @@ def page(r: dict) -> list[str]:
     return [
         "# Boards as what they are",
         "",
-        f"116 photos of a zoom camera, fitted half against half: {PAIRS} pairs of halves, for OpenCV the "
-        "first alone. Paper of the board was bent otherwise from day to day, so that each zoom has its own "
+        f"116 photos of a zoom camera, fitted half against half: {PAIRS} pair of halves. "
+        "Paper of the board was bent otherwise from day to day, so that each zoom has its own "
         "shape. Aims: 0.62 px for photos not seen, a scatter of 0.6 of that of straightness, focal lengths "
         "that repeat within 1 % and lie on a smooth curve within 1 %.",
         "",
@@ -275,10 +248,6 @@ def page(r: dict) -> list[str]:
         f"The median distance is {ours['bent']['median']:.3f} px with the shape and "
         f"{ours['flat']['median']:.3f} "
         "px without: some photos show the board bent otherwise than the others of their zoom.",
-        "",
-        f"`cv2.calibrateCameraRO` on {r['released']['photos']} photos of zoom {RELEASED}x: "
-        f"{r['released']['not_seen']:.3f} px on the others, f = {r['released']['focal']:.0f} px, in "
-        f"{r['released']['cpu_s']:.0f} s of a processor and {RO_STEPS} steps at most.",
         "",
         "## Lens, half against half",
         "",
