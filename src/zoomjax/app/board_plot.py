@@ -16,11 +16,13 @@ def plot_boards(fit: BoardFit) -> Figure:
     rows = 1 if len(height) <= 3 else 2
     axes = figure.subplots(rows, -(-len(height) // rows), squeeze=False).ravel()
     most = max(float(np.abs(height).max()), 1e-6)
+    drawn = None
     for number, (own, of) in enumerate(zip(axes, height, strict=False)):
         drawn = own.imshow(of, cmap="RdBu", vmin=-most, vmax=most, interpolation="bicubic")
         photos = int(np.sum(np.asarray(fit.board) == number))
         own.set(xticks=[], yticks=[], title=f"{photos} photos: {fit.bend[number]:.2f} steps")
     for own in axes[len(height) :]:
         own.remove()
+    assert drawn is not None  # there is one board at least
     figure.colorbar(drawn, ax=axes[: len(height)].tolist(), label="towards the camera, steps of the grid")
     return figure

@@ -90,7 +90,7 @@ def data_of(
     about = np.zeros((wide, corners, 2))
     about[:photos, : rows * columns] = np.nan_to_num(points - origin)
     smoothness = np.zeros((more, more))
-    if smooth is not None and zooms > 3:
+    if smooth is not None and label is not None and zooms > 3:
         curve = np.linalg.qr(np.vander(np.log(label), 3))[0]
         smoothness[:zooms, :zooms] = (np.eye(zooms) - curve @ curve.T) / smooth
     basis = shape_basis(places)

@@ -139,7 +139,7 @@ def residuals_of(
 ) -> Float[Array, "photo corner 2"]:
     """Residuals of all corners, px, with corners displaced by `points` from the board's shape."""
     focal = jnp.exp(model.log_focal)
-    coefficients = jax.vmap(model.zoom)(focal)
+    coefficients = jnp.asarray(jax.vmap(model.zoom)(focal))
     boards = jax.vmap(shape_of, (None, None, 0))(data.places, data.basis, model.shape)
     boards = boards if points is None else boards + points
 

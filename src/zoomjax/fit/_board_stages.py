@@ -66,7 +66,7 @@ class Described(NamedTuple):
     certificate: Certificate
 
 
-def in_stages(data: Data, model: Model, *, flat: bool = False) -> tuple[Model, Stage, RESULTS, int]:
+def in_stages(data: Data, model: Model, *, flat: bool = False) -> tuple[Model, Stage, Any, int]:
     """The fit, its last stage, the solver's status and its steps in all."""
     noise, total = _noise(data, model), 0
     result: Any = RESULTS.successful
@@ -138,7 +138,7 @@ def described(
     data: Data, model: Model, stage: Stage, centre: Array, size: tuple[int, int], focal_range: Array
 ) -> Described:
     """Residuals, covariance and certificate of a fit."""
-    units = units_of(data, model, stage.noise)
+    units = units_of(data, model, jnp.asarray(stage.noise))
     zeros = jax.tree.map(jnp.zeros_like, units)
     missed = residuals_of(data, model)
     squared = jnp.sum(missed**2, axis=-1) / (stage.noise * LOSS) ** 2

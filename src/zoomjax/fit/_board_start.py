@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.products import exact_products
@@ -131,7 +132,7 @@ def through(
     zoom: AbstractZoom, focal: Float[Array, "zoom"], coefficients: Float[Array, "zoom size"]
 ) -> AbstractZoom:
     """The zoom model through coefficients of each zoom, as well as it can."""
-    flat, unravel = jax.flatten_util.ravel_pytree(zoom.parameters)
+    flat, unravel = ravel_pytree(zoom.parameters)
 
     def missed(flat):
         return (jax.vmap(with_parameters(zoom, unravel(flat)))(focal) - coefficients).ravel()
