@@ -204,6 +204,19 @@ def test_shapes_leave_to_poses_what_poses_can_do():
     assert np.linalg.matrix_rank(wide) == wide.shape[1] <= 3 * len(x) + 7
 
 
+def test_smooth_focal_lengths_are_drawn_to_a_parabola_alone(exact):
+    label = np.array([1.0, 2.0, 4.0, 7.0, 9.0])
+    number = np.arange(5)
+    given = checked_grids(exact[1][:5], label, None, SIZE)
+    data = data_of(given, number, 5, np.array([639.5, 359.5]), 0.05, 0.01, label)
+    curve = np.pad(np.polyval([0.05, 0.8, 6.0], np.log(label)), (0, len(data.smooth) - 5))
+    np.testing.assert_allclose(np.asarray(data.smooth) @ curve, 0, atol=1e-9)
+    off = curve + 0.02 * (np.arange(len(curve)) == 2)
+    assert 0.5 < np.linalg.norm(np.asarray(data.smooth) @ off) < 2.0  # of 2 deviations, some is a parabola
+    free = data_of(given, number, 5, np.array([639.5, 359.5]), 0.05)
+    assert not np.asarray(free.smooth).any()
+
+
 def test_standard_deviations_are_the_scatter_of_fits_to_noise(exact):
     """Within a factor: 8 draws tell a standard deviation to 25 %, and focal lengths are correlated."""
     _, grids, _ = exact

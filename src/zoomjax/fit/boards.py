@@ -189,7 +189,8 @@ def fit_boards(
         board: for each photo the number of its board, from 0, if there are several of one size, or if one
             was bent otherwise in between, as paper is from day to day. By default all show the same.
         smooth: standard deviation of log f beside a parabola in the logarithm of the label: 0.01 if focal
-            lengths lie on a smooth curve within a per cent. By default they are free.
+            lengths lie on a smooth curve within a per cent; of no effect with three zooms or fewer. By
+            default they are free.
         flat: whether the board is flat.
         throw: whether to raise if the fit fails. Otherwise see `ZoomFit.result`. `undetermined` and
             `folded` never raise.
