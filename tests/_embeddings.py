@@ -417,6 +417,7 @@ LEFT_OUT = {
         BY_VALUES,
     ),
     "fit_motion": OUTSIDE_OF_JIT,
+    "fit_boards": BY_VALUES,
     **dict.fromkeys(
         (
             *("load_lens", "load_lines", "read_focal_csv", "read_focal_track", "read_lines_csv"),

@@ -19,7 +19,7 @@ import numpy as np
 
 import zoomjax as zj
 from zoomjax import interop, scenes
-from zoomjax.fit import _motion_problem, motion
+from zoomjax.fit import _motion_problem, boards, motion
 from zoomjax.models import requirements
 
 from . import test_models as models
@@ -155,6 +155,18 @@ def fit_motion_with_lines(name):
     return _motion_problem._ready_lines(given, row.distortion, row.distortion.size(row.terms))
 
 
+def fit_boards(name):
+    """As far as its arguments are looked at: it takes any model that it has accepted."""
+    row, places = ROWS[name], np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), axis=-1)
+    grids = [100 + 50 * places] * len(FOCAL)
+    options = {"zoom": row.zoom, "family": row.distortion, "terms": row.terms}
+    try:
+        with mock.patch.object(boards, "coefficients_of", side_effect=Accepted):
+            return zj.fit.fit_boards(grids, FOCAL, image_size=SIZE, **options)
+    except Accepted:
+        return "accepted"
+
+
 def one_lens(name):
     """The lens; of a model that depends on the focus, at one."""
     lens = models.lens_of(name)
@@ -205,6 +217,7 @@ TRIES = (
     Try("`with_focal_sigma`", with_focal_sigma),
     Try("`fit_motion`", fit_motion, ("fit_motion",)),
     Try("`fit_motion` with lines", fit_motion_with_lines, ("fit_motion", "fit_motion with lines")),
+    Try("`fit_boards`", fit_boards, ("fit_boards",)),
     Try("bands (`std_of`)", bands),
     Try("`with_misfit`", with_misfit, ("with_misfit",)),
     Try("`cramer_rao`", cramer_rao, ("cramer_rao",)),

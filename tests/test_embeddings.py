@@ -147,6 +147,7 @@ KNOWN = {
     "reject_points": lambda x: zj.fit.reject_points(traced_lines(x)),
     "suggest_next": lambda x: zj.suggest_next(table.fit(), traced_lines(x)),
     "fit_motion": lambda x: zj.fit.fit_motion(traced_tracks(x)),
+    "fit_boards": lambda x: zj.fit.fit_boards(x[None], [1.0], image_size=table.SIZE),
     "barrel_crossover": lambda x: zj.models.barrel_crossover(np.array([20.0, 30.0]), x[:2, 0]),
 }
 

@@ -22,7 +22,7 @@ def read_zoomcam(folder: Path) -> Lines:
     Args:
         folder: holds ``corners_22x15.npz`` and ``focal_px.csv``.
     """
-    corners, zoom, focal = _corners(folder)
+    corners, zoom, focal = read_corners(folder)
     zooms, frame = np.unique(zoom, return_inverse=True)
     return Lines.from_grids(
         corners, frame, [focal[z] for z in zooms.tolist()], image_size=(1280, 720), focal_unit="px"
@@ -31,7 +31,7 @@ def read_zoomcam(folder: Path) -> Lines:
 
 def read_photos(folder: Path) -> Lines:
     """The same lines, one frame a photo, in double precision."""
-    corners, zoom, focal = _corners(folder)
+    corners, zoom, focal = read_corners(folder)
     frames = np.arange(len(zoom))
     return Lines.from_grids(
         corners.astype(float),
@@ -42,7 +42,7 @@ def read_photos(folder: Path) -> Lines:
     )
 
 
-def _corners(folder: Path) -> tuple[np.ndarray, np.ndarray, dict[float, float]]:
+def read_corners(folder: Path) -> tuple[np.ndarray, np.ndarray, dict[float, float]]:
     """The corners of each photo, its zoom, and the focal length of each zoom."""
     with np.load(folder / "corners_22x15.npz") as stored:
         zoom, corners = stored["zoom"], stored["corners"]

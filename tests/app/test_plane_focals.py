@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
+from zoomjax.app.board_bundle import bundle_of
 from zoomjax.app.console import show_images
-from zoomjax.app.focal_sources import choose_focals
+from zoomjax.app.focal_sources import Focals, choose_focals
 from zoomjax.app.image_calibration import calibrate_images
 from zoomjax.app.image_job import ImageJob
 from zoomjax.app.model_choice import WantedModel
@@ -161,11 +162,31 @@ def test_groups_are_told_in_terminal_report_and_summary(folder, tmp_path, capsys
     assert all(sentence in out for sentence in told)
     assert all(sentence in report(done.calibration, done) for sentence in told)
     done.write(tmp_path / "out")
-    groups = json.loads((tmp_path / "out" / "summary.json").read_text())["focal_groups"]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    groups, board = summary["focal_groups"], summary["board"]
+    assert board["photos"] == 15
+    assert board["bend_steps"][0] < 0.1  # it is flat
+    assert [group["focal"] for group in groups] == pytest.approx(board["focal_px"])
+    assert [row[0] for row in done.bundle.compared(done.calibration.zoom.lens, board["focal_px"])] == [
+        f"{f:.4g}" for f in board["focal_px"]
+    ]
+    sentence = done.bundle.sentences()[0]
+    assert "bundle adjustment of 15 photos" in sentence
+    assert sentence in out
+    page = report(done.calibration, done)
+    assert sentence in page
+    assert "Straightness and bundle adjustment" in page
     assert [len(group["names"]) for group in groups] == [5, 5, 5]
     for group, focal in zip(groups, ZOOMS.values(), strict=True):
         assert group["focal"] == pytest.approx(focal, rel=0.02)
         assert group["std"] > 0
+
+
+def test_few_photos_make_no_bundle(detections):
+    focals = Focals({d.name: 1.0 for d in detections}, "px", "", "")
+    assert bundle_of(detections[:3], focals) is None
+    apart = Focals({d.name: 1.0 + i for i, d in enumerate(detections)}, "px", "", "")
+    assert bundle_of(detections, apart) is None  # each at a zoom of its own
 
 
 @pytest.mark.slow

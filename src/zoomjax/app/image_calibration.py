@@ -18,6 +18,7 @@ from ..detect.batch import DETECTORS, Detection, detect
 from ..detect.sources import Source
 from ..models.about import UNKNOWN
 from ._flags import with_flags
+from .board_bundle import BoardBundle, bundle_of
 from .calibration import Calibration, calibrate
 from .choice import chosen_frames, colour_limit
 from .equipment import with_equipment
@@ -49,6 +50,7 @@ class ImageCalibration:
         focals: the focal lengths of the used images.
         images: the names of all images, in order; overlays are numbered by their place in it, from 1.
         unused: for each image that was not used, the reason.
+        bundle: the bundle adjustment of the grids in them; None if there are too few.
     """
 
     job: ImageJob
@@ -57,6 +59,7 @@ class ImageCalibration:
     focals: Focals
     images: tuple[str, ...]
     unused: dict[str, str]
+    bundle: BoardBundle | None = None
 
     def members(self) -> list[np.ndarray]:
         """For each used image, the numbers of its lines among those of the calibration."""
@@ -83,6 +86,7 @@ class ImageCalibration:
         return {
             "detector": self.job.detector,
             "focal_source": self.focals.origin,
+            "board": self.bundle and self.bundle.about(),
             "focal_groups": [dataclasses.asdict(group) for group in self.focals.groups],
             "images": images,
             "unused": self.unused,
@@ -229,6 +233,12 @@ def calibrate_images(
         sigma = focal_sigmas(job.focal_sigma, np.array(list(focals.focal.values())))
         focals = focals.deviating_by(dict(zip(focals.focal, sigma.tolist(), strict=True)))
     used = tuple(d for d in usable if d.name in focals.focal)
+    bundle = None
+    if job.detector == "grid":
+        stage("Fitting the shape of the board")
+        bundle = bundle_of(used, focals, job.centre)
+        if bundle is not None and job.focal == "plane":
+            focals = bundle.measured(focals)
     while True:
         lines = lines_of(used, np.array([focals.focal[d.name] for d in used]), focals.unit)
         sigma = np.array([focals.deviation.get(d.name, 0.0) for d in used])
@@ -242,6 +252,7 @@ def calibrate_images(
             stage=stage,
         )
         done = ImageCalibration(job, calibration, used, focals, tuple(d.name for d in detections), unused)
+        done = dataclasses.replace(done, bundle=bundle)
         hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}
         if not hopeless:
             return _with_findings(_with_equipment(done))

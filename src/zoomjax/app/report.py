@@ -12,6 +12,7 @@ import numpy as np
 from .._core.text import span
 from ..models.registry import family_name
 from ..trust.selection import COLUMNS
+from .board_plot import plot_boards
 from .calibration import Calibration, rms_over_frames
 from .choice import colour_limit
 from .coverage import plot_coverage, plot_radius
@@ -74,6 +75,7 @@ def report(
         coverage=_coverage(calibration),
         lens=_lens(calibration),
         distortion=_distortion(calibration),
+        board=_board(calibration, images),
         next=calibration.advice(),
         frames=_frames(calibration, images),
         images=images,
@@ -242,6 +244,21 @@ def _distortion(calibration: Calibration) -> dict[str, Any]:
             "Points before and after correction",
             kind="png",
         ),
+    }
+
+
+def _board(calibration: Calibration, images: "ImageCalibration | None") -> dict[str, Any] | None:
+    """How bent the board is, and its bundle adjustment beside straightness."""
+    bundle = images.bundle if images else None
+    if images is None or bundle is None:
+        return None
+    place = [bundle.names[int(np.argmax(bundle.number == zoom))] for zoom in range(len(bundle.fit.focal))]
+    label = [images.focals.focal[name] for name in place]
+    return {
+        "sentences": bundle.sentences(),
+        "head": [f"f, {images.focals.unit}", "f, px", "straightness, px", "bundle, px", "difference, px"],
+        "rows": bundle.compared(calibration.zoom.lens, label),
+        "plot": embedded_plot(plot_boards(bundle.fit), "Height of the board's corners over its plane"),
     }
 
 

@@ -2,6 +2,9 @@
 
 from .algebraic import algebraic_frames as algebraic_frames
 from .algebraic import algebraic_zoom as algebraic_zoom
+from .boards import BoardFit as BoardFit
+from .boards import BoardPoses as BoardPoses
+from .boards import fit_boards as fit_boards
 from .centre import CentreFit as CentreFit
 from .centre import FrameCentres as FrameCentres
 from .centre import fit_centre as fit_centre

@@ -1,10 +1,8 @@
 """What `fit_motion` minimises: residuals of views in the image, and what is known beforehand.
 
 The unknowns are log f and the rotation of each frame, a ray of each track, the zoom model, the offset of
-the centre of distortion, and the time that the shutter takes from row to row. A ray X is seen in frame t at
-``p = f_t (y1, y2)/y3`` with ``y = R_t X``, and the point that was observed is corrected to c. The residual
-in the image is ``J^-1 (c - p)``, where J is the derivative of the correction at the observed point: one
-step of Newton's method for the inverse, exact to second order. Residuals have a Cauchy loss.
+the centre of distortion, and the time that the shutter takes from row to row. A ray X is ahead of frame t
+as ``R_t X``, and its residual that of `_views`, in the image, with a Cauchy loss.
 
 With a rolling shutter a row is seen before or after the middle of the image. f and R are then those of that
 time, by a parabola through the frame and its neighbours.
@@ -28,10 +26,8 @@ from ..models.zoom import AbstractPriorZoom, AbstractZoom, with_parameters
 from ._motion_start import Path, rotation_vector, shrunk_ray, turned
 from ._schur import Rows, Unknowns
 from ._structure import Structure
+from ._views import CAUCHY, corrected, flattened, product, view_residual
 from .energy import line_normal
-
-CAUCHY = 2.3849
-"""Of the noise: where the loss begins to flatten; of normal errors it wastes a twentieth."""
 
 WRONG_LINE = 3.0
 """Times the noise: the RMS of a line's distances where its loss begins to flatten."""
@@ -239,26 +235,6 @@ def _tangents(ray):
     return jnp.stack([first, jnp.cross(ray, first)])
 
 
-def _corrected(point, coefficients, offset, family, scale):
-    """A point corrected, px about the centre of distortion, which is the principal point, too."""
-    z = point / scale - offset
-    return scale * jnp.stack(family.correct((z[0], z[1]), z @ z, coefficients))
-
-
-def _view(point, focal, coefficients, offset, ahead, family, scale):
-    """The residual of one view, px of the image."""
-
-    def corrected(point):
-        return _corrected(point, coefficients, offset, family, scale)
-
-    depth = jnp.where(ahead[2] > 0.05, ahead[2], 0.05)
-    missed = corrected(point) - focal * ahead[:2] / depth
-    (a, b), (c, d) = jax.jacfwd(corrected)(point)
-    determinant = a * d - b * c
-    determinant = jnp.where(determinant > 0.05, determinant, 0.05)
-    return jnp.stack([d * missed[0] - b * missed[1], a * missed[1] - c * missed[0]]) / determinant
-
-
 class _Rows(NamedTuple):
     """The camera at the rows of frames: what each frame has, and how it changes in a frame's time."""
 
@@ -295,19 +271,13 @@ def residuals_of(
 
     def view(point, frame, track):
         log_focal, coefficients, turning = rows.at(frame, point)
-        ahead = turned(_product(model.path.rotation[frame], model.path.rays[track]), turning)
+        ahead = turned(product(model.path.rotation[frame], model.path.rays[track]), turning)
         ahead = ahead.at[2].add(-lever[track])
         camera = jnp.exp(log_focal), coefficients, rows.offset[frame]
-        return _view(point, *camera, ahead, model.family, data.scale)
+        return view_residual(point, *camera, ahead, model.family, data.scale)
 
     views = jax.vmap(view)(data.points, data.structure.frame, data.structure.track)
     return jnp.where(data.there[:, None], views, 0)
-
-
-def _product(matrix, vector):
-    """A matrix times a vector, as a sum that XLA fuses with what uses it."""
-    x, y, z = (matrix[:, column] * vector[column] for column in range(3))
-    return x + y + z
 
 
 def line_residuals_of(data: Data, model: Model) -> Float[Array, "line row"]:
@@ -346,9 +316,9 @@ def averaged(data: Data, model: Model) -> Float[Array, "track 3"]:
 
     def direction(point, frame):
         log_focal, coefficients, turning = rows.at(frame, point)
-        straight = _corrected(point, coefficients, rows.offset[frame], model.family, data.scale)
+        straight = corrected(point, coefficients, rows.offset[frame], model.family, data.scale)
         ahead = turned(jnp.concatenate([straight / jnp.exp(log_focal), jnp.ones(1)]), -turning)
-        return _product(model.path.rotation[frame].T, ahead) / jnp.linalg.norm(ahead)
+        return product(model.path.rotation[frame].T, ahead) / jnp.linalg.norm(ahead)
 
     seen = jax.vmap(direction)(data.points, data.structure.frame)
     rays = jax.ops.segment_sum(seen, data.structure.track, data.structure.tracks)
@@ -366,17 +336,11 @@ def rows_of(unknowns: Unknowns, args: tuple[Data, Model, Noise, Stage]) -> Rows:
     squared = jnp.sum(views**2, axis=-1) / CAUCHY**2
     of_lines = jnp.nan_to_num(line_squares_of(data, lines)) / (noise.lines * WRONG_LINE) ** 2
     return Rows(
-        views * _flattened(squared)[:, None],
-        weighed(data, lines / noise.lines * _flattened(of_lines)[:, None]),
+        views * flattened(squared)[:, None],
+        weighed(data, lines / noise.lines * flattened(of_lines)[:, None]),
         about_frames(data, there.path, unknowns, steps, stage),
         about_lens(data, there, unknowns, stage),
     )
-
-
-def _flattened(squared):
-    """The root of ``log(1 + s)/s``: what residuals of square s are multiplied by."""
-    safe = jnp.where(squared > 1e-8, squared, 1.0)
-    return jnp.where(squared > 1e-8, jnp.sqrt(jnp.log1p(safe) / safe), 1 - squared / 4)
 
 
 def about_frames(data, path, unknowns, steps, stage):

@@ -11,10 +11,8 @@ from jax.flatten_util import ravel_pytree
 
 from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
-from ._least_squares import RoundingTrustRegion
 from ._motion_parallax import parallax_of
 from ._motion_rows import (
-    CAUCHY,
     WRONG_LINE,
     Model,
     Noise,
@@ -33,11 +31,10 @@ from ._motion_rows import (
     weighed,
 )
 from ._motion_start import STARTS
+from ._normal_solver import damped_solver
 from ._schur import Rows, Schur, Unknowns, covariances, reduced
+from ._views import CAUCHY, EXACT, MEDIAN_OF_SIZE
 from .result import RESULTS, ZoomFit, judged
-
-_MEDIAN_OF_SIZE = 1.1774  # of the length of a vector of two normal numbers
-
 
 STAGES = (
     Stage(0.3, 0.01, 0.05, 4.0, change=1.0, damping=1e-3, own=0.05, fresh=1.0),
@@ -52,7 +49,6 @@ _SETTLED = 3.0
 """Change of the residuals over a whole stage, in all and in units of the noise, that is as good as none."""
 
 _MOST_STEPS = 30  # of a stage
-_EXACT = 1e-6  # px, noise of tracks and lines without noise
 
 _INFLATION = 1 / 0.95  # of variances, by what the loss loses
 
@@ -83,7 +79,7 @@ def in_stages(data, paths, spreads, zoom, shift, family, terms):
         nothing = Speed(*2 * (jnp.zeros((len(focal), 4)),))
         prepared_zoom = zoom.prepare(focal, family.size(terms))
         model = Model(path, prepared_zoom, prepared, data.readout[0], nothing, family)
-        noise = Noise(spread / _MEDIAN_OF_SIZE, jnp.asarray(jnp.nan)).wider(STAGES[0].wider)
+        noise = Noise(spread / MEDIAN_OF_SIZE, jnp.asarray(jnp.nan)).wider(STAGES[0].wider)
         tried.append(_solved(data, *_arrays((model, noise, STAGES[0]))))
     model, noise, result, steps = min(tried, key=lambda found: np.nan_to_num(found[1].points, nan=np.inf))
     weighted_by = noise
@@ -108,11 +104,6 @@ def _arrays(tree):
     )
 
 
-def _of_residuals(change):
-    """The size of a change of the residuals. Steps are not asked: along weak directions they say little."""
-    return jnp.zeros(()) if isinstance(change, Unknowns) else optx.two_norm(change)
-
-
 @eqx.filter_jit
 def _solved(data, model, noise, stage):
     """The path and the lens of least energy, the noise, the solver's status and its steps.
@@ -120,10 +111,7 @@ def _solved(data, model, noise, stage):
     A stage whose steps are spent is successful if all of them moved the residuals by less than their noise
     does: with heavy tails the last steps are many and small.
     """
-    solver = optx.LevenbergMarquardt(
-        rtol=0.0, atol=stage.change, norm=_of_residuals, linear_solver=Schur(data.structure)
-    )
-    solver = eqx.tree_at(lambda s: s.search, solver, RoundingTrustRegion(first_damping=stage.damping))
+    solver = damped_solver(Schur(data.structure), Unknowns, stage.change, stage.damping)
     model = eqx.tree_at(lambda m: m.speed, model, speed_of(model.path, data.neighbours))
     rays = jnp.where(stage.fresh > 0, averaged(data, model), model.path.rays)
     model = eqx.tree_at(lambda m: m.path.rays, model, rays)
@@ -144,10 +132,10 @@ def _solved(data, model, noise, stage):
     size = jnp.linalg.norm(views, axis=-1)
     near = (size < 3 * CAUCHY * noise.points)[:, None]
     settled = optx.two_norm(jnp.where(near, views - first, 0)) < _SETTLED * noise.points
-    points = jnp.nanmedian(jnp.where(data.there, size, jnp.nan)) / _MEDIAN_OF_SIZE
+    points = jnp.nanmedian(jnp.where(data.there, size, jnp.nan)) / MEDIAN_OF_SIZE
     rays = model.path.rays / jnp.linalg.norm(model.path.rays, axis=1, keepdims=True)
     model = eqx.tree_at(lambda m: m.path.rays, model, rays)
-    noise = Noise(jnp.maximum(points, _EXACT), _line_noise(data, model))
+    noise = Noise(jnp.maximum(points, EXACT), _line_noise(data, model))
     spent = solution.result == optx.RESULTS.nonlinear_max_steps_reached
     good: Any = RESULTS.successful
     result = RESULTS.where(settled & spent, good, RESULTS.promote(solution.result))
@@ -157,7 +145,7 @@ def _solved(data, model, noise, stage):
 def _line_noise(data, model):
     """The median of the RMS distances of lines, px; 1 where there are none."""
     squares = line_squares_of(data, line_residuals_of(data, model))
-    return jnp.maximum(jnp.sqrt(jnp.nanmedian(squares)), _EXACT) if len(squares) else jnp.ones(())
+    return jnp.maximum(jnp.sqrt(jnp.nanmedian(squares)), EXACT) if len(squares) else jnp.ones(())
 
 
 @eqx.filter_jit

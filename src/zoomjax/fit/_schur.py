@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import lineax as lx
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, PyTree
 
+from ._normal_solver import AbstractNormalSolver
 from ._structure import Structure
 
 
@@ -326,38 +326,11 @@ def covariances(
     return own, lens, -jnp.einsum("fij,jk->fik", by_lens, lens)
 
 
-class Schur(lx.AbstractLinearSolver):
+class Schur(AbstractNormalSolver):
     """Steps of a damped Gauss-Newton method for `Unknowns` and `Rows`, by `reduced` and `solution`."""
 
     structure: Structure
 
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
-        """The operator itself."""
-        del options
-        return operator
-
-    def compute(
-        self, state: Any, vector: PyTree[Array], options: dict[str, Any]
-    ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
-        """The unknowns: of rows, and of as many equations that damp each unknown."""
-        del options
-        rows, _ = vector
-        like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), state.in_structure())
-        _, damped = state.mv(like._replace(frames=jnp.ones_like(like.frames)))
-        matrix = reduced(
-            lambda x: state.mv(x)[0], rows, like, self.structure, damped.frames.ravel()[0] ** 2
-        )
-        result: Any = lx.RESULTS.successful
-        return solution(matrix, like, self.structure), result, {}
-
-    def transpose(self, state: Any, options: dict[str, Any]) -> Any:
-        """Not needed: steps of a solver are not differentiated."""
-        raise NotImplementedError("The steps of this solver have no transpose: pass another solver.")
-
-    def conj(self, state: Any, options: dict[str, Any]) -> Any:
-        """Real numbers stay what they are."""
-        return state, options
-
-    def assume_full_rank(self) -> bool:
-        """The damping of each step sees to it."""
-        return True
+    def step(self, jacobian: Any, rows: Rows, like: Unknowns, damping: Array) -> Unknowns:
+        """The unknowns of least squares."""
+        return solution(reduced(jacobian, rows, like, self.structure, damping), like, self.structure)

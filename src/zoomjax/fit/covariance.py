@@ -38,7 +38,7 @@ def parameter_covariance(
 
     Were points independent, with errors of one size, it would be the sandwich of the weights w of eq. 13,
     ``sigma^2 (J^T W J)^-1 (J^T W^2 J) (J^T W J)^-1``, with sigma from the residuals and their degrees of
-    freedom; `_of_whole_lines` puts lines for points. Both are made by way of the triangle of J: the
+    freedom; `of_clusters` puts lines for points. Both are made by way of the triangle of J: the
     normal equations would square the condition number, which float32 has no room for.
 
     A parameter is *undetermined* where moving it changes the residuals by less than twice what noise in
@@ -81,7 +81,7 @@ def parameter_covariance(
     terms = jax.eval_shape(coefficients_by, zoom, lines).shape[1]
     scores = terms * jnp.sum(weights > 0) - jnp.sum(good)
     score = jnp.einsum("lri,lr->li", jacobian, weighted)
-    covariance = _of_whole_lines(score, leverage, share, scores)
+    covariance = of_clusters(score, leverage, share, scores)
     if photos:
         frames = lines.focal.shape[0]
         of_photos = [jax.ops.segment_sum(of, lines.frame, frames) for of in (score, leverage, share)]
@@ -97,14 +97,15 @@ def parameter_covariance(
     return jnp.where(either, infinite, covariance), ~jnp.any(undetermined)
 
 
-def _of_whole_lines(score, leverage, share, scores):
+def of_clusters(score, leverage, share, scores):
     """The covariance of parameters in which the fit's Gauss-Newton matrix is the identity.
 
-    `share` is what each line would contribute were its points independent. Their sum, A, is compared with
-    the sum S of the squares of the scores. A line draws the fit to itself: its score is first divided by
-    ``sqrt(1 - h)``, h its leverage along the score (Bell and McCaffrey 2002 have a matrix there). The size
-    of S is kept, ``c = tr S / tr A``: n points of a line count as n/c independent ones. Its shape is shrunk
-    to that of A by the part of their difference that the scatter of the scores explains.
+    Clusters of points, here called lines, err each by itself. `share` is what each would contribute were
+    its points independent. Their sum, A, is compared with the sum S of the squares of the scores. A line
+    draws the fit to itself: its score is first divided by ``sqrt(1 - h)``, h its leverage along the score
+    (Bell and McCaffrey 2002 have a matrix there). The size of S is kept, ``c = tr S / tr A``: n points of a
+    line count as n/c independent ones. Its shape is shrunk to that of A by the part of their difference
+    that the scatter of the scores explains.
 
     c has nu degrees of freedom, few where a few long lines at the border decide all, and at most `scores`,
     the number of independent scores less the parameters. Its own uncertainty is added, ``2 max(c, 1)/nu``,
@@ -126,7 +127,7 @@ def _of_whole_lines(score, leverage, share, scores):
 
 
 def _of_whole_photos(of_photos, by_line, free, terms):
-    """The covariance where the lines of a photo may err together, in the parameters of `_of_whole_lines`.
+    """The covariance where the lines of a photo may err together, in the parameters of `of_clusters`.
 
     A bent board bends all lines of a photo alike, and a wrong focal length or a model that does not follow
     the lens does the same. Were the lines independent, with the covariance C = `by_line`, split into A_m

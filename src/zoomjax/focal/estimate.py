@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.fields import numbers
-from ._homography import matrix_of
+from .homography import matrix_of
 
 _WEIGHINGS = 5
 """How often the two equations are weighted anew: their weights depend on w. The first 2 matter."""

@@ -26,8 +26,8 @@ from jaxtyping import Bool, Num
 
 from .._core.products import exact_products
 from .._core.types import AnyArray, traced
-from ._homography import homography, homography_from_lines
 from .estimate import FocalEstimate, as_points_of, check_pairs, estimate_of
+from .homography import homography, homography_from_lines
 
 
 def focal_from_planes(

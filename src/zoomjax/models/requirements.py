@@ -40,6 +40,7 @@ STILL_CENTRE = Requirement(
 REQUIREMENTS: dict[str, dict[str, Requirement]] = {
     "fit_centre": {"zoom": FOCAL_ALONE._replace(instead=""), "family": RADIAL._replace(instead=_NO_CENTRE)},
     "fit_motion": {"zoom": FOCAL_ALONE._replace(instead="Tracks have no focus.")},
+    "fit_boards": {"zoom": FOCAL_ALONE._replace(instead="Photos of boards have no focus.")},
     "fit_motion with lines": {"family": RADIAL},
     "with_focal_sigma": {"shift": STILL_CENTRE},
     "with_misfit": {"zoom": FOCAL_ALONE._replace(instead="")},

@@ -136,4 +136,5 @@ def _refined(residual, start):
 
 
 def matrix_of(entries):
+    """The matrix of eight entries; the last is 1."""
     return jnp.append(entries, 1).reshape(3, 3)

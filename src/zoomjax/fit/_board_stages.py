@@ -1,0 +1,210 @@
+"""The stages of `fit_boards`: from a start to the fit, and what is known about it."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from ..models.invertibility import Certificate, certificate_of
+from ._board_rows import (
+    LOSS,
+    Data,
+    Model,
+    Stage,
+    known_rows,
+    moved,
+    residuals_of,
+    rows_of,
+    scaled_steps,
+    units_of,
+)
+from ._board_schur import PoseSchur, Rows, Structure, Unknowns, reduced, solved_boards
+from ._board_shape import shape_of
+from ._normal_solver import damped_solver
+from ._views import EXACT, MEDIAN_OF_SIZE
+from .covariance import of_clusters
+from .result import RESULTS
+
+_STAGES = (
+    (1e-3, 2.0, Stage(0.0, 0.1, 1.0, change=3.0, damping=1e-3)),
+    *((0.0, 1.0, Stage(0.0, 1.0, 1.0, change=0.3, damping=1e-6)),) * 5,
+)
+"""Stages, with the least noise in half image diagonals of the first one's loss, and by how much the loss is
+wider than the noise before it. The first one hardly bends the board."""
+
+_SAME = 0.7  # of the noise before a stage: one that leaves less was not the last
+
+_FLAT = 1e-9  # standard deviation of the shape's coefficients of a board that is flat
+
+_MOST_STEPS = 40  # of a stage
+
+
+class Described(NamedTuple):
+    """What is known of a fit.
+
+    Attributes:
+        covariance: of log f of each zoom, of the zoom model and of the centre.
+        shape_std: standard deviation of each corner's place, half longer sides.
+        shape: where the corners are.
+        missed: residuals, px.
+        inlier: which corners count.
+        noise: standard deviation of a coordinate, px.
+        determined: whether zoom model and centre are.
+        certificate: of the lens over the focal lengths.
+    """
+
+    covariance: Float[Array, "lens lens"]
+    shape_std: Float[Array, "board corner 3"]
+    shape: Float[Array, "board corner 3"]
+    missed: Float[Array, "photo corner 2"]
+    inlier: Array
+    noise: Float[Array, ""]
+    certificate: Certificate
+
+
+def in_stages(data: Data, model: Model, *, flat: bool = False) -> tuple[Model, Stage, Any, int]:
+    """The fit, its last stage, the solver's status and its steps in all."""
+    noise, total = _noise(data, model), 0
+    result: Any = RESULTS.successful
+    stage = _STAGES[0][2]
+    for number, (least, wider, stage) in enumerate(_STAGES):
+        own = jnp.maximum(wider * noise, least * data.scale)
+        stage = _arrays(stage._replace(noise=own, shape=_FLAT if flat else stage.shape))
+        before = noise
+        model, noise, result, steps = _solved(data, model, stage)
+        total += int(steps)
+        if number > 0 and result == RESULTS.successful and noise > _SAME * before:
+            break
+    return model, stage._replace(noise=noise), result, total
+
+
+def located(data: Data, model: Model, noise: Array) -> tuple[Model, Array]:
+    """The poses of photos, for a lens and a board that are held, and the residuals, px."""
+    noise = jnp.maximum(noise, _noise(data, model))
+    for _ in range(3):
+        stage = _arrays(Stage(noise, 1.0, 0.0, change=0.01, damping=1e-6))
+        before = noise
+        model, noise, _, _ = _solved(data, model, stage)
+        if noise > _SAME * before:
+            break
+    return model, _residuals(data, model)
+
+
+def _arrays(tree):
+    """Numbers that the compiled program takes, and is not compiled for, whatever they come from."""
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, jnp.float64) if eqx.is_inexact_array_like(leaf) else leaf, tree
+    )
+
+
+_residuals = eqx.filter_jit(residuals_of)
+
+
+@eqx.filter_jit
+def _noise(data, model):
+    return _noise_of(data, residuals_of(data, model))
+
+
+def _noise_of(data, missed):
+    """The noise from the median of the residuals."""
+    size = jnp.where(data.there, jnp.linalg.norm(missed, axis=-1), jnp.nan)
+    return jnp.maximum(jnp.nan_to_num(jnp.nanmedian(size)) / MEDIAN_OF_SIZE, EXACT)
+
+
+@eqx.filter_jit
+def _solved(data, model, stage):
+    """Poses, board and lens of least energy, the noise, the solver's status and its steps."""
+    units = units_of(data, model, stage.noise)
+    steps = PoseSchur(_structure(data, units))
+    solution = optx.least_squares(
+        rows_of,
+        damped_solver(steps, Unknowns, stage.change, stage.damping),
+        jax.tree.map(jnp.zeros_like, units),
+        args=(data, model, stage),
+        max_steps=_MOST_STEPS,
+        throw=False,
+    )
+    model = moved(model, scaled_steps(solution.value, data, model, stage))
+    noise = _noise_of(data, residuals_of(data, model))
+    return model, noise, RESULTS.promote(solution.result), solution.stats["num_steps"]
+
+
+@eqx.filter_jit
+def described(
+    data: Data, model: Model, stage: Stage, centre: Array, size: tuple[int, int], focal_range: Array
+) -> Described:
+    """Residuals, covariance and certificate of a fit."""
+    units = units_of(data, model, jnp.asarray(stage.noise))
+    zeros = jax.tree.map(jnp.zeros_like, units)
+    missed = residuals_of(data, model)
+    squared = jnp.sum(missed**2, axis=-1) / (stage.noise * LOSS) ** 2
+    weight = 1 / (1 + squared)  # the derivative of the loss is this times the residual
+
+    def linear(unknowns):
+        steps = scaled_steps(unknowns, data, model, stage)
+        there = moved(model, steps)
+        views = residuals_of(data, there, steps.points) / stage.noise
+        return Rows(weight[..., None] * views, *known_rows(data, there, stage))
+
+    rows, jacobian = jax.linearize(linear, zeros)
+    # (w J)^T r is the gradient, and w^2 J^T J the mean of its derivative over the directions of residuals.
+    rows = rows._replace(views=missed / stage.noise)
+    structure = _structure(data, units)
+    normal = reduced(jacobian, rows, zeros, structure, jnp.asarray(0.0))
+    lens, of_boards = _of_photos(normal, structure)
+    own = ravel_pytree(units.lens)[0]
+    variance = jnp.einsum("nkf,bfg,nkg->bnk", structure.basis, of_boards, structure.basis)
+    inlier = data.there & (squared < 9)  # beyond, the loss nearly ignores a corner
+    count = 2 * jnp.sum(inlier)
+    unknowns = 6 * jnp.sum(jnp.any(data.there, axis=1)) + data.zooms + model.shape.size
+    free = count / jnp.maximum(count - unknowns, 1)
+    return Described(
+        covariance=lens * jnp.outer(own, own),
+        shape_std=jnp.sqrt(jnp.maximum(variance, 0)),
+        shape=jax.vmap(shape_of, (None, None, 0))(data.places, data.basis, model.shape),
+        missed=missed,
+        inlier=inlier,
+        noise=stage.noise * jnp.sqrt(free),
+        certificate=certificate_of(model.zoom, centre, focal_range, size, family=model.family),
+    )
+
+
+def _structure(data, units):
+    return Structure(data.basis * units.shape[0][None, None], data.board)
+
+
+def _of_photos(normal, structure):
+    """Covariances of the lens and of the shapes: photos err each by itself, their corners together.
+
+    Shapes are eliminated from the matrix and from each photo's score; both are then in parameters in which
+    the matrix is the identity, as `of_clusters` takes them.
+    """
+    photos, functions = normal.photos, structure.basis.shape[2]
+    gain = solved_boards(normal.shape, normal.mixed)  # shapes follow the lens by its negative
+    matrix = normal.lens - jnp.einsum("bfi,bfj->ij", normal.mixed, gain)
+    back = jnp.linalg.inv(jnp.linalg.cholesky(matrix))
+    along = gain[structure.board]
+    score = photos.scores[:, functions:] - jnp.einsum("pfi,pf->pi", along, photos.scores[:, :functions])
+    moved = jnp.einsum("nkf,pfi->pnki", structure.basis, along)
+    moved = (photos.lens - jnp.einsum("pnrk,pnki->pnri", photos.point, moved)) @ back.T
+
+    def white(border):
+        return (border[:, :, functions:] - border[:, :, :functions] @ along) @ back.T
+
+    leverage = jnp.einsum("pnri,pnrj->pij", moved, moved)
+    leverage = leverage - jnp.einsum("pci,pcj->pij", white(photos.border), white(photos.solved))
+    score = score @ back.T
+    numbers = 2.0 * len(matrix) * jnp.sum(jnp.any(score != 0, axis=1))
+    covariance = of_clusters(score, leverage, leverage, numbers - len(matrix))
+    independent = jnp.trace(jnp.sum(leverage, axis=0))
+    size = jnp.maximum(jnp.trace(covariance) / jnp.where(independent > 0, independent, 1), 1)
+    # What is known beforehand draws to its mean: by how much, in the mean.
+    prior = normal.prior_lens + jnp.einsum("bfi,bf,bfj->ij", gain, normal.prior_shape, gain)
+    lens = back.T @ (covariance + back @ prior @ back.T) @ back
+    identity = jnp.broadcast_to(jnp.eye(functions), normal.shape.shape)
+    shape = solved_boards(normal.shape, identity) * size + gain @ lens[None] @ gain.swapaxes(1, 2)
+    return lens, shape

@@ -1,0 +1,74 @@
+"""Linear solvers of steps by normal equations of a known structure, for optimistix."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, PyTree
+
+from ._least_squares import RoundingTrustRegion
+
+
+class AbstractNormalSolver(lx.AbstractLinearSolver):
+    """Steps of a damped Gauss-Newton method.
+
+    The unknowns are a tree whose first leaf is damped as all others are.
+    """
+
+    @abc.abstractmethod
+    def step(self, jacobian: Any, rows: Any, like: Any, damping: Array) -> Any:
+        """The unknowns of least squares of ``jacobian x = rows``, with `damping` added to the diagonal."""
+
+    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
+        """The operator itself."""
+        del options
+        return operator
+
+    def compute(
+        self, state: Any, vector: PyTree[Array], options: dict[str, Any]
+    ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
+        """The unknowns: of rows, and of as many equations that damp each unknown."""
+        del options
+        rows, _ = vector
+        like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), state.in_structure())
+        leaves, shape = jax.tree.flatten(like)
+        _, damped = state.mv(jax.tree.unflatten(shape, [jnp.ones_like(leaves[0]), *leaves[1:]]))
+        damping = jax.tree.leaves(damped)[0].ravel()[0] ** 2
+        result: Any = lx.RESULTS.successful
+        return self.step(lambda x: state.mv(x)[0], rows, like, damping), result, {}
+
+    def transpose(self, state: Any, options: dict[str, Any]) -> Any:
+        """Not needed: steps of a solver are not differentiated."""
+        raise NotImplementedError("The steps of this solver have no transpose: pass another solver.")
+
+    def conj(self, state: Any, options: dict[str, Any]) -> Any:
+        """Real numbers stay what they are."""
+        return state, options
+
+    def assume_full_rank(self) -> bool:
+        """The damping of each step sees to it."""
+        return True
+
+
+def damped_solver(
+    steps: AbstractNormalSolver, unknowns: type, change: Any, damping: Any
+) -> optx.LevenbergMarquardt:
+    """Levenberg-Marquardt with these steps, which ends with a step that moves the residuals by less.
+
+    Args:
+        steps: the linear solver.
+        unknowns: the class of the unknowns, whose own changes are not asked: along weak directions they say
+            little.
+        change: of the residuals, in all.
+        damping: of the first step.
+    """
+
+    def of_residuals(moved):
+        return jnp.zeros(()) if isinstance(moved, unknowns) else optx.two_norm(moved)
+
+    solver = optx.LevenbergMarquardt(rtol=0.0, atol=change, norm=of_residuals, linear_solver=steps)
+    return eqx.tree_at(lambda s: s.search, solver, RoundingTrustRegion(first_damping=damping))

@@ -1,0 +1,67 @@
+"""Views of points of a scene: how far the image is from where a camera would see them, robustly.
+
+A point ahead of the camera, in its axes, is seen at ``p = f (x, y)/z``, and the point that was observed is
+corrected to c. The residual in the image is ``J^-1 (c - p)``, where J is the derivative of the correction
+at the observed point: one step of Newton's method for the inverse, exact to second order.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..models.family import AbstractFamily
+
+CAUCHY = 2.3849
+"""Of the noise: where the loss begins to flatten; of normal errors it wastes a twentieth."""
+
+MEDIAN_OF_SIZE = 1.1774
+"""Of the length of a vector of two normal numbers."""
+
+EXACT = 1e-6
+"""px: the least noise, of points without any."""
+
+
+def corrected(
+    point: Float[Array, "2"],
+    coefficients: Float[Array, "terms"],
+    offset: Float[Array, "2"],
+    family: AbstractFamily,
+    scale: float,
+) -> Float[Array, "2"]:
+    """A point corrected, px about the centre of distortion, which is the principal point, too."""
+    z = point / scale - offset
+    return scale * jnp.stack(family.correct((z[0], z[1]), z @ z, coefficients))
+
+
+def view_residual(
+    point: Float[Array, "2"],
+    focal: Float[Array, ""],
+    coefficients: Float[Array, "terms"],
+    offset: Float[Array, "2"],
+    ahead: Float[Array, "3"],
+    family: AbstractFamily,
+    scale: float,
+) -> Float[Array, "2"]:
+    """The residual of one view, px of the image."""
+
+    def straight(point):
+        return corrected(point, coefficients, offset, family, scale)
+
+    depth = jnp.where(ahead[2] > 0.05, ahead[2], 0.05)
+    missed = straight(point) - focal * ahead[:2] / depth
+    (a, b), (c, d) = jax.jacfwd(straight)(point)
+    determinant = a * d - b * c
+    determinant = jnp.where(determinant > 0.05, determinant, 0.05)
+    return jnp.stack([d * missed[0] - b * missed[1], a * missed[1] - c * missed[0]]) / determinant
+
+
+def product(matrix: Float[Array, "3 3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
+    """A matrix times a vector, as a sum that XLA fuses with what uses it."""
+    x, y, z = (matrix[:, column] * vector[column] for column in range(3))
+    return x + y + z
+
+
+def flattened(squared: Float[Array, "*some"]) -> Float[Array, "*some"]:
+    """The root of ``log(1 + s)/s``: what residuals of square s are multiplied by for a Cauchy loss."""
+    safe = jnp.where(squared > 1e-8, squared, 1.0)
+    return jnp.where(squared > 1e-8, jnp.sqrt(jnp.log1p(safe) / safe), 1 - squared / 4)

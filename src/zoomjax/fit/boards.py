@@ -1,0 +1,329 @@
+"""A zoom lens, focal lengths and the shape of a board from photos of it: bundle adjustment.
+
+A printed board is seldom flat. Rows and columns of one that is bent are not straight in the image, whatever
+the lens, and homographies of a flat board give wrong focal lengths. Seen from many sides its shape can be
+told from the lens: poses, shape, focal lengths, distortion and its centre are fitted together, to distances
+in the image. What is minimised says `_board_rows`; the solver is optimistix' Levenberg-Marquardt with
+poses eliminated (`_board_schur`); the start comes from straightness and homographies (`_board_start`).
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, NoReturn
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int, Num
+
+from .._core.arguments import kinds_checked
+from .._core.checks import checked_terms
+from .._core.types import AnyArray
+from ..models.family import AbstractFamily
+from ..models.lens import ZoomLens
+from ..models.polynomial import RadialPolynomial
+from ..models.requirements import check
+from ..models.zoom import AbstractZoom, PolynomialZoom
+from ._board_problem import checked_grids, data_of, padded_to
+from ._board_rows import Model
+from ._board_shape import grid_places
+from ._board_stages import described, in_stages, located
+from ._board_start import coefficients_of, filled, homographies, poses_of, through
+from ._structure import bucket
+from .result import RESULTS, ZoomFit, failed, judged
+from .zoom import CentreArgument
+
+_CENTRE_STD = 0.05
+"""Standard deviation of a fitted centre, half image diagonals, before there is any data: poses can stand in
+for it where the lens is long."""
+
+_HELD = 1e-9
+"""The same of what is held."""
+
+_UNKNOWN = 0.2
+"""Standard deviation of log f from which a focal length is not determined."""
+
+_FAILED = "The fit of the board failed: add photos of it, oblique and from several sides. "
+
+
+class BoardPoses(NamedTuple):
+    """Where a board is in photos.
+
+    Attributes:
+        rotation: from the board to the camera, whose axes are x right, y down and z forward.
+        position: of the board's middle in the camera, steps of its grid.
+        residual: distance between each corner and where the model puts it, px; NaN where none is seen.
+    """
+
+    rotation: Float[Array, "photo 3 3"]
+    position: Float[Array, "photo 3"]
+    residual: Float[Array, "photo row column"]
+
+
+class BoardFit(eqx.Module):
+    """A zoom lens with its focal lengths, and the board that it was fitted to.
+
+    Attributes:
+        fit: the lens, with focal lengths in px, and its uncertainty. `ZoomFit.rms` is of the distances
+            between corners and where the model puts them, px of the image, without outliers;
+            `ZoomFit.frame_rms` has one for each photo. `ZoomFit.joint` includes the centre, if it was
+            fitted. Its result is `undetermined` where a focal length is not.
+        label: the labels of the zooms, in order.
+        focal, focal_std: focal length of each and its standard deviation, px.
+        frame_focal: focal length of each photo, px.
+        covariance: of log f of each zoom, of the zoom model's parameters, and of the centre, half image
+            diagonals: photos are taken to err each by itself. Focal length and distance stand in for each
+            other where the board is seen squarely: the variances of log f say so.
+        board: for each photo the number of its board.
+        shape: where each corner of each board is, steps of the grid, about its middle: x along rows, y
+            along columns, z away from the camera.
+        shape_std: its standard deviation.
+        coefficients: the shape as the fit has it, of its smooth functions.
+        poses: of the board in each photo.
+        noise: standard deviation of a corner's coordinate, px.
+    """
+
+    fit: ZoomFit
+    label: Float[Array, "zoom"]
+    focal: Float[Array, "zoom"]
+    focal_std: Float[Array, "zoom"]
+    frame_focal: Float[Array, "photo"]
+    covariance: Float[Array, "all all"]
+    board: Int[Array, "photo"]
+    shape: Float[Array, "board row column 3"]
+    shape_std: Float[Array, "board row column 3"]
+    coefficients: Float[Array, "board function"]
+    poses: BoardPoses
+    noise: Float[Array, ""]
+
+    @property
+    def lens(self) -> ZoomLens:
+        """The zoom lens."""
+        return self.fit.lens
+
+    @property
+    def bend(self) -> Float[np.ndarray, "board"]:
+        """How far each board reaches out of its plane, from its deepest to its highest corner, steps."""
+        height = np.asarray(self.shape[..., 2])
+        return height.max(axis=(1, 2)) - height.min(axis=(1, 2))
+
+    def locate(
+        self,
+        grids: Sequence[Any] | AnyArray,
+        focal: Num[AnyArray, "photo"] | Sequence[float | int],
+        *,
+        board: Int[AnyArray, "photo"] | Sequence[int] | None = None,
+    ) -> BoardPoses:
+        """The poses of the same boards in other photos, for the lens and the shapes of this fit.
+
+        Args:
+            grids: as for `fit_boards`.
+            focal: the labels of their zooms, which are among those fitted.
+            board: their boards, by default the first.
+
+        Raises:
+            ValueError: a grid has another size, or a label or a board is not among those fitted.
+        """
+        given = checked_grids(grids, focal, board, self.lens.image_size, self.shape.shape[1:3])
+        known, lens = np.asarray(self.label), self.lens
+        number = np.searchsorted(known, given.label).clip(0, len(known) - 1)
+        strange = known[number] != given.label
+        if strange.any():
+            raise ValueError(
+                f"Argument focal must be among the labels fitted, {known.tolist()}, but it holds "
+                f"{given.label[strange][0]:g}."
+            )
+        boards = len(self.shape)
+        if given.board.max() >= boards:
+            raise ValueError(
+                f"Argument board must be among the {boards} boards fitted, from 0, but it holds "
+                f"{given.board.max()}."
+            )
+        data = data_of(given, number, len(known), np.asarray(lens.centre), _HELD)
+        coefficients = padded_to(np.asarray(jax.vmap(lens.zoom)(self.focal)), len(data.smooth))
+        matrices, *_ = _homographies(data, coefficients, lens.family)
+        start = _model(data, matrices, np.asarray(self.focal), lens.zoom, lens.family, bucket(boards))
+        start = eqx.tree_at(
+            lambda model: model.shape, start, padded_to(np.asarray(self.coefficients), bucket(boards))
+        )
+        return _poses(given, data, *located(data, start, self.noise))
+
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
+        """Raise TypeError: call the lens of the fit instead."""
+        raise TypeError("A BoardFit is not a lens: use fit.lens, as in fit.lens(2400.0).")
+
+
+@kinds_checked
+def fit_boards(
+    grids: Sequence[Any] | AnyArray,
+    focal: Num[AnyArray, "photo"] | Sequence[float | int],
+    *,
+    image_size: Sequence[int],
+    zoom: AbstractZoom | None = None,
+    family: AbstractFamily | None = None,
+    terms: int = 2,
+    centre: CentreArgument = "fit",
+    board: Int[AnyArray, "photo"] | Sequence[int] | None = None,
+    smooth: float | int | None = None,
+    flat: bool = False,
+    throw: bool = True,
+) -> BoardFit:
+    """Fit a zoom lens, focal lengths and the shape of a board to photos of it, all of one board.
+
+    Computed in float64, which has to be enabled. Sets of photos, corners and zooms are padded to a few
+    sizes, so that others do not compile again.
+
+    Args:
+        grids: the corners of the board in each photo, px, (row, column, 2), NaN where none is seen:
+            `zoomjax.detect.GridDetector.find` gives them. The same corner of the board has the same place
+            in all, of at least 3 rows and 3 columns.
+        focal: for each photo the label of its zoom, above 0: photos of one label share a focal length,
+            which is fitted. Labels are in the order of the focal lengths, such as those of the zoom ring
+            or of EXIF data, and need not be exact.
+        image_size: width and height of the photos, px.
+        zoom: the zoom model; by default `PolynomialZoom` of degree 2, or less where there are fewer zooms.
+        family: the distortion model; `RadialPolynomial` by default.
+        terms: the number N of radial distortion coefficients.
+        centre: of distortion, which is the principal point, too: "fit", "image", or two coordinates, px.
+        board: for each photo the number of its board, from 0, if there are several of one size, or if one
+            was bent otherwise in between, as paper is from day to day. By default all show the same.
+        smooth: standard deviation of log f beside a parabola in the logarithm of the label: 0.01 if focal
+            lengths lie on a smooth curve within a per cent; of no effect with three zooms or fewer. By
+            default they are free.
+        flat: whether the board is flat.
+        throw: whether to raise if the fit fails. Otherwise see `ZoomFit.result`. `undetermined` and
+            `folded` never raise.
+
+    Raises:
+        ValueError: float64 is not enabled; grids are of several sizes, or hold too few corners; or there is
+            not one positive label for each.
+        RuntimeError: the fit failed (see `throw`).
+
+    References:
+        K. H. Strobl, G. Hirzinger, "More accurate pinhole camera calibration with imperfect planar
+        target", ICCV Workshops 2011: the board's shape as unknowns.
+        B. Triggs et al., "Bundle adjustment: a modern synthesis", 2000.
+    """
+    if jnp.zeros(()).dtype != jnp.float64:
+        raise ValueError(
+            "fit_boards needs float64, and it is not enabled: call "
+            'jax.config.update("jax_enable_x64", True) first.'
+        )
+    given = checked_grids(grids, focal, board, image_size)
+    label, number = np.unique(given.label, return_inverse=True)
+    zoom = PolynomialZoom(degree=min(2, len(label) - 1)) if zoom is None else zoom
+    check("fit_boards", zoom=zoom)
+    family = RadialPolynomial() if family is None else family
+    terms = checked_terms(terms, family.most_terms)
+    middle = (np.array(given.image_size) - 1) / 2
+    fitted = isinstance(centre, str) and centre == "fit"
+    origin = middle if isinstance(centre, str) else np.asarray(centre, float)
+    data = data_of(given, number, len(label), origin, _CENTRE_STD if fitted else _HELD, smooth, label)
+    coefficients = coefficients_of(given.grids, number, given.image_size, origin, family, terms)
+    wide = padded_to(coefficients, len(data.smooth))
+    matrices, found, std = _homographies(data, wide, family)
+    focal_px = filled(found[: len(label)], std[: len(label)], label) * data.scale
+    ready = zoom.prepare(focal_px, family.size(terms))
+    ready = through(ready, padded_to(focal_px, len(wide)), wide)
+    boards = int(given.board.max()) + 1
+    start = _model(data, matrices, focal_px, ready, family, bucket(boards))
+    model, stage, result, steps = in_stages(data, start, flat=flat)
+    fit = _described(given, data, (model, stage, result, steps), label, origin, fitted)
+    return _thrown(fit) if throw else fit
+
+
+def _homographies(data, coefficients, family):
+    found = homographies(data.points, data.there, data.zoom, data.places, coefficients, family, data.scale)
+    return found[0], *(np.asarray(of) for of in found[1:])
+
+
+def _model(data, matrices, focal_px, zoom, family, boards):
+    """Poses from homographies, of a flat board."""
+    focal = padded_to(focal_px, len(data.smooth))
+    rotation, position = poses_of(matrices, focal[data.zoom] / data.scale)
+    return Model(
+        rotation=rotation,
+        position=position,
+        shape=jnp.zeros((boards, data.basis.shape[2])),
+        log_focal=jnp.log(focal),
+        zoom=zoom,
+        offset=jnp.zeros(2),
+        family=family,
+    )
+
+
+def _poses(given, data, model, missed):
+    """The poses of the photos there are."""
+    photos, rows, columns = given.grids.shape[:3]
+    unit = grid_places(rows, columns)[1]
+    distance = np.linalg.norm(np.asarray(missed), axis=-1)
+    distance = np.where(np.asarray(data.there), distance, np.nan)[:photos, : rows * columns]
+    return BoardPoses(
+        rotation=model.rotation[:photos],
+        position=model.position[:photos] * unit,
+        residual=jnp.asarray(distance.reshape(photos, rows, columns)),
+    )
+
+
+def _described(given, data, solved, label, origin, fitted):
+    """The fit, of the photos and zooms there are, in steps of the grid."""
+    model, stage, result, steps = solved
+    photos, rows, columns = given.grids.shape[:3]
+    zooms, boards, corners = len(label), int(given.board.max()) + 1, rows * columns
+    unit = grid_places(rows, columns)[1]
+    focal = np.exp(np.asarray(model.log_focal[:zooms]))
+    centre = jnp.asarray(origin) + (data.scale * model.offset if fitted else 0)
+    focal_range = jnp.asarray([focal.min(), focal.max()])
+    known = described(data, model, stage, centre, given.image_size, focal_range)
+    all_numbers = np.asarray(known.covariance)
+    kept = np.r_[:zooms, len(model.log_focal) : len(all_numbers)]
+    covariance = all_numbers[np.ix_(kept, kept)]
+    log_std = np.sqrt(np.diag(covariance)[:zooms])
+    size = ravel_pytree(model.zoom.parameters)[0].size
+    joint = covariance[zooms:, zooms:]
+    squares = np.where(np.asarray(known.inlier), np.sum(np.asarray(known.missed) ** 2, axis=-1), 0)[:photos]
+    counts = np.asarray(known.inlier).sum(axis=1)[:photos]
+    rms = jnp.asarray(np.sqrt(squares.sum() / max(counts.sum(), 1)))
+    lens = ZoomLens(
+        zoom=model.zoom,
+        centre=centre,
+        focal_range=focal_range,
+        image_size=given.image_size,
+        focal_unit="px",
+        family=model.family,
+    )
+    determined = bool(np.isfinite(covariance).all() and log_std.max() < _UNKNOWN)
+    fit = ZoomFit(
+        lens=lens,
+        rms=rms,
+        frame_rms=jnp.asarray(np.sqrt(squares.sum(axis=1) / np.maximum(counts, 1))),
+        covariance=jnp.asarray(joint[:size, :size]),
+        result=judged(model.zoom, result, jnp.asarray(determined), known.certificate),
+        steps=jnp.asarray(steps),
+        certificate=known.certificate,
+        rms_unconstrained=rms,
+        joint=jnp.asarray(joint) if fitted else None,
+    )
+    number = np.asarray(data.zoom)[:photos]
+    return BoardFit(
+        fit=fit,
+        label=jnp.asarray(label),
+        focal=jnp.asarray(focal),
+        focal_std=jnp.asarray(focal * log_std),
+        frame_focal=jnp.asarray(focal[number]),
+        covariance=jnp.asarray(covariance),
+        board=jnp.asarray(given.board),
+        shape=unit * known.shape[:boards, :corners].reshape(boards, rows, columns, 3),
+        shape_std=unit * known.shape_std[:boards, :corners].reshape(boards, rows, columns, 3),
+        coefficients=model.shape[:boards],
+        poses=_poses(given, data, model, known.missed),
+        noise=known.noise,
+    )
+
+
+def _thrown(fit):
+    """The fit, raising RuntimeError where its solver failed."""
+    if bool(failed(fit.fit.result)):
+        raise RuntimeError(_FAILED + RESULTS[fit.fit.result])
+    return fit
