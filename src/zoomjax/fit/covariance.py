@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..lines.base import AbstractLines
 from ..models.zoom import AbstractZoom, with_parameters
+from ._linear import triangle_of
 from .energy import coefficients_by, counted_frames, line_weights, prior_error, prior_jacobian, prior_of
 
 _ROUNDING = 64
@@ -55,7 +56,7 @@ def parameter_covariance(
     weights = line_weights(lines)
     prior = prior_jacobian(lines, zoom)
     rows = jnp.concatenate([jacobian.reshape(-1, jacobian.shape[-1]), prior])
-    triangle = jnp.linalg.qr(rows, mode="r")
+    triangle = triangle_of(rows)
     # Columns of unit length, so that one threshold serves parameters of any size.
     size = jnp.linalg.norm(triangle, axis=0)
     size = jnp.where(size > 0, size, 1)
