@@ -111,6 +111,11 @@ def fit() -> str:
     return markdown(["", "time", ""], [[shown, *rows[name][1:]] for name, shown in names.items()])
 
 
+def whole(name: str) -> Callable[[], str]:
+    """What makes the table of a page of results as it is."""
+    return lambda: markdown(*rows_of(name))
+
+
 def correct() -> str:
     """How long correcting takes, beside OpenCV and FFmpeg."""
     _, rows = table_of("correct.md")
@@ -325,6 +330,8 @@ def motion(section: str) -> Callable[[], str]:
 TABLES: dict[str, Callable[[], str]] = {
     "rooms": rooms.table,
     "fit": fit,
+    "compiling": whole("compiling.md"),
+    "many": whole("many.md"),
     "correct": correct,
     "pipeline": pipeline,
     "reproduced": reproduced,

@@ -23,7 +23,11 @@ def least_squares(
 
 
 def triangle_of(matrix: PyTree[Float[Array, "... column"]]) -> Float[Array, "column column"]:
-    """R of the QR of a matrix with more rows than columns; see `gram_schmidt`."""
+    """R of the QR of a matrix with more rows than columns; see `gram_schmidt`.
+
+    LAPACK starts threads on all cores for this, which takes many times as long. And its calls for several
+    matrices at once, as under ``vmap``, stop for ever where two of them fill the threads they wait for.
+    """
     return gram_schmidt(matrix)[1]
 
 

@@ -24,14 +24,19 @@ def fit_about(lines, model, *, algebraic, solver=None, max_steps=256, invertible
 
     It starts from the algebraic estimate, if it is to and there is one, or else from its parameters.
     """
-    if algebraic and (start := algebraic_start(lines, model)) is not None:
-        model = algebraic_model(start, model)
     solver = default_solver(lines) if solver is None else solver
-    fit, outcome = fit_prepared(lines, model, solver, max_steps)
+    fit, outcome = fit_freely(lines, model, algebraic, solver, max_steps)
     if invertible:
         small = functools.partial(compressed_as_measured, lines, model.terms)
         fit, outcome = or_else(fit, outcome, lambda: refit_zoom(small(), fit))
     return thrown(fit, outcome, throw)
+
+
+def fit_freely(lines, model, algebraic, solver, max_steps):
+    """The fit that `fit_about` begins with, whether invertible or not, and its outcome."""
+    if algebraic and (start := algebraic_start(lines, model)) is not None:
+        model = algebraic_model(start, model)
+    return fit_prepared(lines, model, solver, max_steps)
 
 
 @eqx.filter_jit

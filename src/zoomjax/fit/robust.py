@@ -34,6 +34,7 @@ from ._least_squares import Solver
 from ._linear import least_squares
 from .algebraic import algebraic_model
 from .energy import coefficients_by, line_residuals, linearised, prior_jacobian
+from .minimise import fit_prepared
 from .prepare import asked_for, ready_model
 from .result import ZoomFit, of_given
 from .wrapper import about_own_centre
@@ -113,8 +114,21 @@ def fit_robust(
         weighted, zoom=model, solver=solver, max_steps=max_steps, invertible=invertible, throw=throw
     )
     line_rms, median = _line_rms(padded, fit.lens.zoom)
-    weight = of_lines(jnp.asarray(weighted.weight), given)
-    return RobustFit(of_given(fit, given), weight, of_lines(line_rms, given), median)
+    return robust_of_given(RobustFit(fit, jnp.asarray(weighted.weight), line_rms, median), given)
+
+
+def fit_robust_freely(lines, model, algebraic, solver, max_steps):
+    """`fit_robust` of padded lines and a prepared model, whether invertible or not, and its outcome."""
+    weighted, model = _turns(lines, model, algebraic)
+    fit, outcome = fit_prepared(weighted, model, solver, max_steps)
+    line_rms, median = _line_rms(lines, fit.lens.zoom)
+    return RobustFit(fit, jnp.asarray(weighted.weight), line_rms, median), outcome
+
+
+def robust_of_given(robust: RobustFit, lines: AbstractLines) -> RobustFit:
+    """A robust fit of padded lines as one of the lines themselves."""
+    own = (of_given(robust.fit, lines), of_lines(robust.weight, lines), of_lines(robust.line_rms, lines))
+    return eqx.tree_at(lambda robust: (robust.fit, robust.weight, robust.line_rms), robust, own)
 
 
 def reweighted(lines: SomeLines, asked: Model) -> tuple[SomeLines, Model]:

@@ -52,14 +52,22 @@ def bucket(number: int, sizes: Sequence[int]) -> int:
     return -(-number // step) * step
 
 
-def bucketed(lines: SomeLines) -> SomeLines:
+def bucketed(lines: SomeLines, *, closely: bool = False) -> SomeLines:
     """The lines padded, their arrays by NumPy: see the module.
 
     The first lines and frames are those given; `of_lines` and `of_frames` cut results to them.
+
+    Args:
+        lines: the lines.
+        closely: whether to pad to the next power of two, for work in which each row costs.
     """
     if not _paddable(lines):
         return lines
-    number = bucket(lines.frame.shape[0], _LINES[:1] if _are_many(lines) else _LINES)
+    number = lines.frame.shape[0]
+    if closely:
+        number = max(_LINES[0], 1 << (number - 1).bit_length())
+    else:
+        number = bucket(number, _LINES[:1] if _are_many(lines) else _LINES)
     return _padded(lines, number, bucket(lines.focal.shape[0], _FRAMES))
 
 
