@@ -154,7 +154,7 @@ def problem(grids, boards=2):
 def test_steps_solve_the_least_squares_of_the_dense_jacobian(exact):
     problem_of_two = problem(exact[1])
     data, model, stage = problem_of_two
-    units = units_of(data, model, stage.noise)
+    units = units_of(data, model, jnp.asarray(stage.noise))
     zeros = jax.tree.map(jnp.zeros_like, units)
     rows, linear = jax.linearize(lambda x: rows_of(x, problem_of_two), zeros)
     structure = Structure(data.basis * units.shape[0, 0], data.board)
@@ -174,7 +174,7 @@ def test_steps_solve_the_least_squares_of_the_dense_jacobian(exact):
 
 def test_derivatives_are_those_of_finite_differences(exact):
     data, model, stage = problem(exact[1])
-    zeros = jax.tree.map(jnp.zeros_like, units_of(data, model, stage.noise))
+    zeros = jax.tree.map(jnp.zeros_like, units_of(data, model, jnp.asarray(stage.noise)))
     rng = np.random.default_rng(3)
     along = jax.tree.map(lambda leaf: jnp.asarray(rng.standard_normal(leaf.shape)), zeros)
     along = along._replace(points=zeros.points)
@@ -230,7 +230,7 @@ def test_standard_deviations_are_the_scatter_of_fits_to_noise(exact):
     assert abs(np.log(off / said)).max() < np.log(2)
     centres = np.array([fit.lens.centre for fit in fits])
     scale = np.hypot(*SIZE) / 2
-    of_centre = scale * np.sqrt([np.diag(fit.fit.joint)[-2:] for fit in fits]).mean(axis=0)
+    of_centre = scale * np.sqrt([np.diag(fit.covariance)[-2:] for fit in fits]).mean(axis=0)
     off = np.sqrt(np.mean((centres - [646, 355]) ** 2, axis=0))
     assert abs(np.log(off / of_centre)).max() < np.log(2.5)
     shapes = np.array([fit.shape[0] for fit in fits])
