@@ -294,6 +294,22 @@ def _three(figure: float) -> str:
     return f"{figure:.3f}"
 
 
+def lensfun_few() -> str:
+    """Six hundred lenses of which a few focal lengths are fitted."""
+    names = {
+        "SmoothZoom, other half's prior": "`SmoothZoom`, prior from other lenses",
+        "polynomial of degree 2, or the highest there is": "`PolynomialZoom`, degree 2 (of two: 1)",
+        "table in 1/f": "`TableZoom` in 1/f",
+    }
+    few = results("lensfun.json")["few"]
+    rows = [
+        [number, shown, *map(_three, few[name][number])]
+        for number in ("2", "3", "4")
+        for name, shown in names.items()
+    ]
+    return markdown(["fitted", "", "25 %", "median", "75 %", "90 %"], rows)
+
+
 def lensfun_forms() -> str:
     """Degrees of SmoothZoom."""
     found = re.findall(r"^(?:degree )?(.+): \[([\d. ]+)\]$", sections("lensfun-forms.md")[""], re.MULTILINE)
@@ -345,6 +361,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "broadcast": broadcast,
     "pitch": pitch,
     "lensfun": lensfun,
+    "lensfun-few": lensfun_few,
     "lensfun-forms": lensfun_forms,
     "board-focal": board_focal,
     "vision": vision,

@@ -18,6 +18,9 @@ import zoomjax as zj
 
 from .data import Frames
 
+FEW = (2, 3, 4)
+"""Numbers of focal lengths that are fitted where few are known."""
+
 
 def legendre(u, degree):
     """Legendre's polynomials of 2u - 1, (..., degree + 1)."""
@@ -98,9 +101,19 @@ def squared_error(frames, k):
     return frames.energy + jnp.einsum("...fi,...fij,...fj->...f", d, frames.second, d)
 
 
-def lens_error(frames, k):
-    """The mean energy of a lens's interior frames."""
-    chosen = inner(frames)
+def some_of(frames, number):
+    """A few of a lens's frames, from the first to the last, as evenly in 1/f as there are."""
+    u, there = positions(frames), frames.second[..., 0, 0] > 0
+    last = jnp.min(jnp.where(there, u, 1), axis=-1, keepdims=True)
+    wanted = 1 + (last - 1) * jnp.linspace(0, 1, number)
+    far = jnp.abs(jnp.where(there, u, jnp.inf)[..., None] - wanted[..., None, :])
+    nearest = jnp.argmin(far, axis=-2)
+    return jnp.any(jnp.arange(u.shape[-1])[:, None] == nearest[..., None, :], axis=-1)
+
+
+def lens_error(frames, k, chosen=None):
+    """The mean energy of a lens's interior frames, or of those chosen."""
+    chosen = inner(frames) if chosen is None else chosen
     return jnp.sum(jnp.where(chosen, squared_error(frames, k), 0), -1) / jnp.sum(chosen, -1)
 
 
@@ -231,7 +244,8 @@ def power_law(frames: Frames, asked: np.ndarray) -> np.ndarray:
 
 def two_regions(frames: Frames, asked: np.ndarray) -> np.ndarray | None:
     """TwoRegionZoom, where k1 changes its sign with three focal lengths or more on either side."""
-    if not (np.diff(np.sign(frames.k[:, 0])) != 0).any():
+    signs = np.sign(frames.k[:, 0][frames.k[:, 0] != 0])
+    if not np.diff(signs).any():
         return None
     crossover = zj.models.barrel_crossover(frames.focal, frames.k[:, 0])
     result = np.zeros((len(asked), 2))

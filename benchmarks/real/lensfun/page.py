@@ -19,6 +19,7 @@ def markdown(results: dict) -> str:
         _about(results),
         _left_out(results, order),
         _lens_by_lens(results, order),
+        _few(results),
         _in_sample(results, order),
         _floor(results),
         _check(results),
@@ -88,6 +89,23 @@ def _lens_by_lens(r: dict, order: list[str]) -> list[str]:
         "difference of the quantiles, px, with paired intervals.",
         "",
         *table(("against", "ratio", "interval", "better", "25 %", "median", "75 %", "90 %"), rows),
+    ]
+
+
+def _few(r: dict) -> list[str]:
+    rows = [
+        [name, number, *(f"{x:.3f}" for x in quantiles)]
+        for number in next(iter(r["few"].values()))
+        for name, of in r["few"].items()
+        for quantiles in (of[number],)
+    ]
+    return [
+        "## Few focal lengths",
+        "",
+        "Only so many are fitted: both ends of the zoom and, between them, those nearest to an even "
+        "spacing in 1/f. Errors at the other ones, by the quantiles over the lenses.",
+        "",
+        *table(("", "fitted", "25 %", "median", "75 %", "90 %"), rows),
     ]
 
 

@@ -29,16 +29,21 @@ from .data import (
     read,
 )
 from .models import (
+    FEW,
     all_lenses,
+    batches_of,
     fit_chosen_degree,
     fit_polynomials,
+    inner,
     interpolate,
+    lens_error,
     one_by_one,
     power_law,
+    some_of,
     two_regions,
 )
 from .page import OURS
-from .prior import fit_smooth, learn
+from .prior import few_errors, fit_smooth, learn
 
 DRAWS = 2000
 
@@ -146,6 +151,7 @@ def study() -> dict:
     rows = {name: quantiles_of(fit, errors, bootstrap) for name, fit in fits.items()}
     left_out = {name: errors.left_out(fit) for name, fit in fits.items()}
     paired = {name: compared(left_out[OURS], error, bootstrap) for name, error in left_out.items()}
+    few = few_focal_lengths(data, side, learned)
     pairs = twice_calibrated(lenses, data, np.split(np.asarray(triangle), errors.start[1:-1]))
     lap("true energies and intervals")
     study_time, processor = sum(times.values()), time.process_time()
@@ -161,6 +167,7 @@ def study() -> dict:
         **{name: np.quantile(values, QUANTILES).tolist() for name, values in errors.references().items()},
         "models": rows,
         "paired": paired,
+        "few": few,
         "twice": {"pairs": len(pairs), "rms": np.quantile(pairs, QUANTILES).tolist()},
         "check": check,
         "seconds": study_time,
@@ -207,6 +214,45 @@ def fit_all(data: list[Frames], side: np.ndarray, learned: list[zj.SmoothZoom]) 
     with ThreadPoolExecutor(2) as pool:
         running = {name: pool.submit(fit) for name, fit in every_fit.items()}
     return {name: future.result() for name, future in running.items()}
+
+
+def few_focal_lengths(
+    data: list[Frames], side: np.ndarray, learned: list[zj.SmoothZoom]
+) -> dict[str, dict[str, list[float]]]:
+    """Quantiles of the lenses' errors, px, at the interior focal lengths where only a few are fitted."""
+
+    def interpolated(frames: Frames, number: int) -> np.ndarray:
+        errors = []
+        for one in range(len(frames.focal)):
+            lens = Frames(*(np.asarray(values[one]) for values in frames))
+            known, there = np.asarray(some_of(lens, number)), lens.second[:, 0, 0] > 0
+            k = np.zeros_like(lens.k)
+            fitted = Frames(*(values[known] for values in lens))
+            k[there] = interpolate(fitted, lens.focal[there], "table in 1/f")
+            errors.append(lens_error(lens, jnp.asarray(k), inner(lens) & ~known))
+        return np.array(errors)
+
+    def polynomial(frames: Frames, number: int) -> Any:
+        seen = jnp.where(some_of(frames, number)[..., None, None], frames.second, 0)
+        k = fit_polynomials(frames._replace(second=seen), min(2, number - 1))[0]
+        return lens_error(frames, k, inner(frames) & ~some_of(frames, number))
+
+    found: dict[str, dict[str, list[float]]] = {}
+    for number in FEW:
+        parts: dict[str, list[np.ndarray]] = {}
+        for part, zoom in enumerate(learned):
+            for _, frames in batches_of(data, np.flatnonzero(side == part)):
+                errors = {
+                    OURS: few_errors(frames, number, zoom),
+                    "polynomial of degree 2, or the highest there is": polynomial(frames, number),
+                    "table in 1/f": interpolated(frames, number),
+                }
+                for name, of in errors.items():
+                    parts.setdefault(name, []).append(np.sqrt(np.asarray(of)))
+        for name, of in parts.items():
+            values = np.concatenate(of)
+            found.setdefault(name, {})[str(number)] = np.quantile(values, QUANTILES).tolist()
+    return found
 
 
 class Errors:
