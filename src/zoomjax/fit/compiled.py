@@ -16,8 +16,8 @@ _MOST = 100_000_000  # bytes; all that one calibration compiles takes some ten m
 def cache_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Keep what JAX compiles on disk, for all later processes: call it before the first fit.
 
-    Data sets of other sizes use the same programs, as they are padded to a few sizes. So after one
-    calibration later ones compile next to nothing. The command line does this by itself. The folder is kept
+    Data sets are padded to a few sizes, and those of one size share programs. So after some calibrations
+    later ones compile next to nothing. The command line does this by itself. The folder is kept
     below 100 MB where the package ``filelock`` is installed, without which JAX cannot tell.
 
     Args:
