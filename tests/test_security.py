@@ -27,6 +27,8 @@ MODULES |= {
 }
 MODULES |= {"subprocess", "pty", "webbrowser", "xmlrpc", "socketserver", "imaplib", "poplib", "runpy"}
 HARMLESS = {"urllib.parse"}
+ALLOWED = {"app/cluster.py": ["imports socket"]}
+"""A cluster is reached where the command line is given its address, and nothing else is."""
 CALLS = {"eval", "exec", "compile", "__import__"}
 METHODS = {
     "os": {"system", "popen", "fork", "forkpty", "startfile"},
@@ -68,7 +70,8 @@ def _of_call(node):
 
 @pytest.mark.parametrize("name", FILES)
 def test_no_pickle_no_network_no_shell(name):
-    assert not list(offences(FILES[name].read_text(encoding="utf-8")))
+    found = [offence.partition(": ")[2] for offence in offences(FILES[name].read_text(encoding="utf-8"))]
+    assert found == ALLOWED.get(name, [])
 
 
 @pytest.mark.parametrize(

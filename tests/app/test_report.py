@@ -146,6 +146,7 @@ def test_names_are_escaped_and_lead_to_their_pictures(calibration):
         warnings=lambda: ["<b>two</b>\n  lines & more"],
         focals=SimpleNamespace(origin='"here" <there>'),
         shared=lambda: ["<i>3</i> photos share f"],
+        bundle=None,
     )
     page = Page(report(calibration, images))
     assert sum(tag == "script" for tag, _ in page.elements) == 2  # its own

@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 import functools
 import os
-import socket
+import platform
 import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable
@@ -157,7 +157,7 @@ _own = threading.local()
 
 
 def _here() -> tuple[str, int]:
-    return socket.gethostname(), os.getpid()
+    return platform.node(), os.getpid()
 
 
 def _away(
