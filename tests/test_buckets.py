@@ -185,6 +185,7 @@ def everything(frames: int, lines: int, points: int) -> None:
     zj.fit_robust(small)
     zj.fit_zoom(weighted(small), zoom=TableZoom(number=3))
     zj.fit_zoom(in_image(small), zoom=SmoothZoom())
+    zj.fit_zoom(small, zoom=SmoothZoom())  # which is chosen below for some of the sets
     zj.fit_zoom(compress_family(given, Division(), terms=1))
     algebraic_zoom(small)
     algebraic_frames(small)
