@@ -40,6 +40,8 @@ def gram_schmidt(
     axes of each: where they are spread over devices, sums over them are all that is exchanged.
     """
     parts = jax.tree.leaves(matrix)
+    dtype = jnp.result_type(*parts)
+    parts = [part.astype(dtype) for part in parts]
 
     def reduce(left, column):
         own = [part[..., column] for part in left]
