@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from zoomjax import PolynomialZoom, ZoomLens
+from tests._boards import COLUMNS, FOCAL, LABEL, ROWS, SIZE, bent, displaced, seen_through, true_lens
+from zoomjax import PolynomialZoom
 from zoomjax.fit import RESULTS, fit_boards
 from zoomjax.fit import _board_rows as rows_module
 from zoomjax.fit import boards as boards_module
@@ -15,42 +16,12 @@ from zoomjax.fit._board_problem import checked_grids, data_of
 from zoomjax.fit._board_rows import Stage, rows_of, units_of
 from zoomjax.fit._board_schur import PoseSchur, Structure, Unknowns
 from zoomjax.fit._board_shape import grid_places, shape_basis
-from zoomjax.fit._motion_start import turned
 from zoomjax.models import Division
-
-SIZE, ROWS, COLUMNS = (1280, 720), 6, 8
-FOCAL = np.repeat([1000.0, 1600.0, 2600.0], 6)
-LABEL = np.repeat([1.0, 2.0, 3.0], 6)
-
-
-def bent(height=0.1):
-    """A board that is bent: a cylinder with a twist, half a step out of its plane, and 1 % too wide."""
-    places, unit = grid_places(ROWS, COLUMNS)
-    x, y = places.T
-    z = height * (x**2 - 1 / 3 + 0.8 * x * y)  # its plane is where x^2 is 1/3 of the largest
-    return np.stack([1.005 * x, y / 1.005, z], axis=1) * unit
-
-
-def seen_through(lens, board, focal):
-    """Corners of photos of a board from all sides, near enough to fill most of the image."""
-    grids, poses = [], []
-    for number, f in enumerate(focal):
-        tilt = np.array([0.5 * np.cos(2.4 * number), 0.5 * np.sin(2.4 * number), 0.1 * np.sin(number)])
-        rotation = np.asarray(jax.vmap(turned, (1, None), 1)(jnp.eye(3), jnp.asarray(tilt)))
-        distance = f * COLUMNS / (0.55 * SIZE[0])
-        shift = distance / f * 40 * np.array([np.cos(number), np.sin(number)])
-        position = np.append(shift, distance)
-        ahead = board @ rotation.T + position
-        straight = np.asarray(lens.centre) + f * ahead[:, :2] / ahead[:, 2:]
-        grids.append(np.asarray(lens(float(f)).distort(straight)).reshape(ROWS, COLUMNS, 2))
-        poses.append((rotation, position))
-    return np.stack(grids), poses
 
 
 @pytest.fixture(scope="module")
 def lens():
-    zoom = PolynomialZoom(2, jnp.array([[0.02, 0.0], [-0.05, 0.01], [-0.08, 0.03]]), jnp.array(1000.0))
-    return ZoomLens(zoom, jnp.array([646.0, 355.0]), jnp.array([1000.0, 2600.0]), SIZE, "px")
+    return true_lens()
 
 
 @pytest.fixture(scope="module")
@@ -59,21 +30,11 @@ def exact(lens):
     return fit_boards(grids, LABEL, image_size=SIZE), grids, poses
 
 
-def displaced(lens, fit, focal):
-    """RMS distance over the image of points corrected by the fitted lens and by the true one, px."""
-    grid = np.stack(np.meshgrid(*(np.linspace(0, n - 1, 9) for n in SIZE)), -1).reshape(-1, 2)
-    missed = [
-        np.asarray(fit.lens(float(own)).undistort(grid)) - np.asarray(lens(float(true)).undistort(grid))
-        for own, true in zip(np.asarray(fit.focal), focal, strict=True)
-    ]
-    return float(np.sqrt(np.mean(np.sum(np.square(missed), axis=-1))))
-
-
 def test_exact_corners_give_lens_focal_lengths_poses_and_shape(lens, exact):
     fit, _, poses = exact
     assert fit.fit.result == RESULTS.successful
     np.testing.assert_allclose(fit.focal, [1000, 1600, 2600], rtol=1e-6)
-    assert displaced(lens, fit, [1000, 1600, 2600]) < 1e-3
+    assert displaced(lens, fit.lens, fit.focal, [1000, 1600, 2600]) < 1e-3
     np.testing.assert_allclose(fit.lens.centre, lens.centre, atol=1e-3)
     assert fit.fit.rms < 1e-4
     np.testing.assert_allclose(fit.shape[0].reshape(-1, 3), bent(), atol=1e-3)
@@ -103,6 +64,56 @@ def test_the_same_photos_are_located_as_they_were_fitted(exact):
         fit.locate(grids[:1], [1.5])
     with pytest.raises(ValueError, match="boards fitted"):
         fit.locate(grids[:2], LABEL[:2], board=[0, 1])
+
+
+def test_a_board_that_bends_from_photo_to_photo(lens):
+    """Each photo has its own bend, which a rigid board has not; and so have photos that are located."""
+    rng = np.random.default_rng(5)
+    x, y = grid_places(ROWS, COLUMNS)[0].T
+    unit = grid_places(ROWS, COLUMNS)[1]
+    bends = (
+        0.01
+        * unit
+        * (rng.standard_normal((len(FOCAL), 1)) * x**2 + rng.standard_normal((len(FOCAL), 1)) * x * y)
+    )
+    boards = bent() + np.stack([0 * bends, 0 * bends, bends], axis=-1)
+    grids, _ = seen_through(lens, boards, FOCAL)
+    grids = grids + 0.05 * rng.standard_normal((len(FOCAL), ROWS, COLUMNS, 2))
+    fit = fit_boards(grids, LABEL, image_size=SIZE)
+    assert 0.05 < fit.fit.rms < 0.09
+    assert 0.002 < fit.bend_std < 0.02
+    out_of_plane = bends - bends.mean(axis=0)
+    found = np.asarray(fit.poses.bend).reshape(len(FOCAL), -1)
+    plane = np.stack([np.ones_like(x), x, y], axis=1)
+    for one, true in zip(found, out_of_plane, strict=True):  # but for what poses can do
+        missed = one - true
+        missed = missed - plane @ np.linalg.lstsq(plane, missed, rcond=None)[0]
+        assert np.sqrt(np.mean(missed**2)) < 0.3 * np.sqrt(np.mean(out_of_plane**2))
+    there = fit.locate(grids[:4], LABEL[:4])
+    np.testing.assert_allclose(there.bend, fit.poses.bend[:4], atol=0.01)
+    rigid = eqx.tree_at(lambda f: f.bend_std, fit, jnp.asarray(1e-9)).locate(grids[:4], LABEL[:4])
+    assert np.square(rigid.residual).mean() > 4 * np.square(there.residual).mean()
+
+
+def test_flattened_corners_are_seen_where_a_flat_board_has_them(lens, exact):
+    """Rows and columns are straight; plane, place and scale of the board are a matter of convention."""
+    fit, grids, _ = exact
+    moved = fit.flattening()
+    assert np.abs(moved).max() > 3
+    for grid, more, focal in zip(grids, moved, FOCAL.tolist(), strict=True):
+        for corners, most in ((grid + more, 0.01), (grid, np.inf)):
+            straight = np.asarray(lens(focal).undistort(corners))
+            lines = [*straight, *straight.swapaxes(0, 1)]
+            off = [np.linalg.svd(line - line.mean(axis=0))[1][1] for line in lines]
+            assert max(off) < most
+    assert max(off) > 1
+
+
+def test_a_rigid_board_is_found_to_be_rigid(exact):
+    grids = exact[1] + 0.1 * np.random.default_rng(6).standard_normal(exact[1].shape)
+    fit = fit_boards(grids, LABEL, image_size=SIZE)
+    assert fit.bend_std < 1.5e-3
+    assert np.sqrt(np.mean(np.square(fit.poses.bend))) < 0.01  # steps of the grid
 
 
 def test_outliers_and_missing_corners_do_little(exact):
@@ -147,7 +158,7 @@ def problem(grids, boards=2):
     matrices, *_ = boards_module._homographies(data, jnp.zeros((3, 2)), Division())
     model = boards_module._model(data, matrices, focal, zoom, Division(), boards)
     shape = 0.3 * jnp.asarray(np.random.default_rng(2).standard_normal(model.shape.shape))
-    stage = Stage(jnp.asarray(2.0), jnp.asarray(1.0), jnp.asarray(1.0), 0.1, 1e-3)
+    stage = Stage(jnp.asarray(2.0), jnp.asarray(1.0), jnp.asarray(0.01), jnp.asarray(1.0), 0.1, 1e-3)
     return data, eqx.tree_at(lambda model: model.shape, model, shape), stage
 
 
@@ -157,7 +168,8 @@ def test_steps_solve_the_least_squares_of_the_dense_jacobian(exact):
     units = units_of(data, model, jnp.asarray(stage.noise))
     zeros = jax.tree.map(jnp.zeros_like, units)
     rows, linear = jax.linearize(lambda x: rows_of(x, problem_of_two), zeros)
-    structure = Structure(data.basis * units.shape[0, 0], data.board)
+    bend = units.poses[:, None, 6:] * data.basis.own[None]
+    structure = Structure(data.basis.scaled(units.shape[0, 0]), bend, data.board, data.members)
     step = PoseSchur(structure).step(linear, rows, zeros, jnp.asarray(1e-2))
     unknown, unravel = ravel_pytree((zeros.poses, zeros.shape, zeros.lens))
 
@@ -191,6 +203,7 @@ def test_derivatives_are_those_of_finite_differences(exact):
 def test_shapes_leave_to_poses_what_poses_can_do():
     places, _ = grid_places(ROWS, COLUMNS)
     basis = shape_basis(places)
+    of = np.asarray(basis.moved(jnp.eye(basis.size)))
     x, y = places.T
     none = 0 * x
     poses = [
@@ -200,7 +213,7 @@ def test_shapes_leave_to_poses_what_poses_can_do():
         np.stack([-y, x, none], 1),
         np.stack([x, y, none], 1),
     ]
-    wide = np.concatenate([np.stack(poses, 2).reshape(-1, 7), basis.reshape(3 * len(x), -1)], axis=1)
+    wide = np.concatenate([np.stack(poses, 2).reshape(-1, 7), of.reshape(3 * len(x), -1)], axis=1)
     assert np.linalg.matrix_rank(wide) == wide.shape[1] <= 3 * len(x) + 7
 
 

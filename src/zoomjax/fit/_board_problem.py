@@ -79,8 +79,9 @@ def data_of(
     centre_std: float,
     smooth=None,
     label=None,
+    boards: int | None = None,
 ) -> Data:
-    """The grids, padded to few numbers of photos, corners and zooms."""
+    """The grids, padded to few numbers of photos, corners, zooms and boards."""
     photos, rows, columns = given.grids.shape[:3]
     places, _ = grid_places(rows, columns)
     corners, wide, more = bucket(rows * columns), bucket_of(photos, _PHOTOS), bucket(zooms)
@@ -93,20 +94,29 @@ def data_of(
     if smooth is not None and label is not None and zooms > 3:
         curve = np.linalg.qr(np.vander(np.log(label), 3))[0]
         smoothness[:zooms, :zooms] = (np.eye(zooms) - curve @ curve.T) / smooth
-    basis = shape_basis(places)
-    extra = ((0, corners - len(places)), (0, 0))
+    extra = corners - len(places)
     return Data(
         points=jnp.asarray(about),
         there=jnp.asarray(there),
         zoom=jnp.asarray(np.pad(number, (0, wide - photos)), jnp.int32),
         board=jnp.asarray(np.pad(given.board, (0, wide - photos)), jnp.int32),
-        places=jnp.asarray(np.pad(places, extra, mode="wrap")),
-        basis=jnp.asarray(np.pad(basis, (*extra, (0, 0)))),
+        members=jnp.asarray(_members(given.board, boards, wide), jnp.int32),
+        places=jnp.asarray(np.pad(places, ((0, extra), (0, 0)), mode="wrap")),
+        basis=shape_basis(places, extra),
         smooth=jnp.asarray(smoothness),
         zooms=jnp.asarray(zooms),
         centre_std=jnp.asarray(centre_std),
         scale=float(np.hypot(*given.image_size) / 2),
     )
+
+
+def _members(board, boards, wide):
+    """The photos of each board, padded to few numbers of them with one that there is not."""
+    counts = np.bincount(board, minlength=boards or 0)
+    out = np.full((bucket(len(counts)), bucket(int(counts.max()))), wide)
+    for number, count in enumerate(counts):
+        out[number, :count] = np.flatnonzero(board == number)
+    return out
 
 
 def padded_to(values: np.ndarray, size: int) -> Array:

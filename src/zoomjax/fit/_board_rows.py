@@ -1,8 +1,9 @@
 """What `fit_boards` minimises: residuals of corners in the image, and what is known beforehand.
 
-The unknowns are the pose of each photo, the shape of each board (`_board_shape`), log f of each zoom, the
-zoom model, and the centre of distortion. Corner X is ahead of photo p as ``R_p X + t_p``; its residual is
-that of `_views`, in the image, with a Cauchy loss. Lengths are half the board's longer side.
+The unknowns are the pose of each photo and how its board bends beside its shape, the shape of each board
+(`_board_shape`), log f of each zoom, the zoom model, and the centre of distortion. Corner X is ahead of
+photo p as ``R_p X + t_p``; its residual is that of `_views`, in the image, with a Cauchy loss. Lengths are
+half the board's longer side.
 """
 
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..models.family import AbstractFamily
 from ..models.zoom import AbstractPriorZoom, AbstractZoom, with_parameters
 from ._board_schur import Rows, Unknowns
-from ._board_shape import shape_of
+from ._board_shape import Basis, shape_of
 from ._motion_start import turned
 from ._views import flattened, product, view_residual
 
@@ -35,8 +36,9 @@ class Data(eqx.Module):
         points: about the centre that is given, or that of the image, px; 0 where there is none.
         there: which corners are seen.
         zoom, board: of each photo, the number of its zoom, and that of its board.
+        members: of each board, its photos; padded with numbers that no photo has.
         places: of the corners on a flat board.
-        basis: of its shape.
+        basis: of its shape, and of what photos have beside it.
         smooth: rows of what makes log f a smooth curve in the label of the zooms, 0 without; and what they
             are for a focal length a zoom that is not there.
         zooms: how many of them there are; others pad.
@@ -48,8 +50,9 @@ class Data(eqx.Module):
     there: Bool[Array, "photo corner"]
     zoom: Int[Array, "photo"]
     board: Int[Array, "photo"]
+    members: Int[Array, "board member"]
     places: Float[Array, "corner 2"]
-    basis: Float[Array, "corner 3 function"]
+    basis: Basis
     smooth: Float[Array, "zoom zoom"]
     zooms: Int[Array, ""]
     centre_std: Float[Array, ""]
@@ -61,6 +64,7 @@ class Model(eqx.Module):
 
     Attributes:
         rotation, position: of the board in each photo's camera.
+        bend: coefficients of how it bends in each photo beside its shape.
         shape: coefficients of each board's shape.
         log_focal: of each zoom.
         zoom: the zoom model.
@@ -70,6 +74,7 @@ class Model(eqx.Module):
 
     rotation: Float[Array, "photo 3 3"]
     position: Float[Array, "photo 3"]
+    bend: Float[Array, "photo own"]
     shape: Float[Array, "board function"]
     log_focal: Float[Array, "zoom"]
     zoom: AbstractZoom
@@ -83,6 +88,7 @@ class Stage(NamedTuple):
     Attributes:
         noise: standard deviation of a corner's coordinate, px.
         shape: standard deviation of the shape's coefficients before there is any data: 1, or less.
+        bend: the same of what photos have beside it, half longer sides.
         free: 1, or 0 where lens and shape are held.
         change: a step that moves the residuals by less, in all and in units of the noise, is the last.
         damping: of the first step.
@@ -90,6 +96,7 @@ class Stage(NamedTuple):
 
     noise: float | Array
     shape: float | Array
+    bend: float | Array
     free: float | Array
     change: float | Array
     damping: float | Array
@@ -106,12 +113,14 @@ def units_of(data: Data, model: Model, noise: Array) -> Unknowns:
     of_photo = noise / jnp.sqrt(in_photo)
     across, along = of_photo / focal, of_photo / half
     poses = jnp.stack([across, across, along, across, across, along], axis=1)
+    bends = jnp.broadcast_to((of_photo / half)[:, None], model.bend.shape)
     root = jnp.sqrt(jnp.maximum(jnp.sum(in_photo), 1))
     of_lens = noise / (half * root)
     zoom = jax.tree.map(lambda leaf: jnp.full(leaf.shape, of_lens), model.zoom.parameters)
     of_focal = noise / (half * jnp.sqrt(jnp.maximum(in_zoom, 1)))
     lens = (of_focal, zoom, jnp.full(2, of_lens))
     shape = jnp.full(model.shape.shape, jnp.minimum(1, 100 * of_lens))
+    poses = jnp.concatenate([poses, bends], axis=1)
     return Unknowns(poses, jnp.ones((len(shape), len(data.places), 3)), shape, lens)
 
 
@@ -125,7 +134,8 @@ def moved(model: Model, steps: Unknowns) -> Model:
     depth = model.position[:, 2:]
     return Model(
         rotation=jax.vmap(rotation)(model.rotation, steps.poses[:, :3]),
-        position=model.position + depth * steps.poses[:, 3:],
+        position=model.position + depth * steps.poses[:, 3:6],
+        bend=model.bend + steps.poses[:, 6:],
         shape=model.shape + steps.shape,
         log_focal=model.log_focal + log_focal,
         zoom=with_parameters(model.zoom, jax.tree.map(jnp.add, model.zoom.parameters, parameters)),
@@ -143,17 +153,19 @@ def residuals_of(
     boards = jax.vmap(shape_of, (None, None, 0))(data.places, data.basis, model.shape)
     boards = boards if points is None else boards + points
 
-    def photo(seen, there, zoom, board, rotation, position):
+    def photo(seen, there, zoom, board, rotation, position, bend):
+        places = boards[board].at[:, 2].add(data.basis.own @ bend)
+
         def corner(point, place):
             ahead = product(rotation, place) + position
             return view_residual(
                 point, focal[zoom], coefficients[zoom], model.offset, ahead, model.family, data.scale
             )
 
-        return jnp.where(there[:, None], jax.vmap(corner)(seen, boards[board]), 0)
+        return jnp.where(there[:, None], jax.vmap(corner)(seen, places), 0)
 
-    numbers = (data.zoom, data.board)
-    return jax.vmap(photo)(data.points, data.there, *numbers, model.rotation, model.position)
+    poses = (model.rotation, model.position, model.bend)
+    return jax.vmap(photo)(data.points, data.there, data.zoom, data.board, *poses)
 
 
 def rows_of(unknowns: Unknowns, args: tuple[Data, Model, Stage]) -> Rows:
@@ -169,12 +181,12 @@ def rows_of(unknowns: Unknowns, args: tuple[Data, Model, Stage]) -> Rows:
 def scaled_steps(unknowns: Unknowns, data: Data, model: Model, stage: Stage) -> Unknowns:
     """Steps from numbers in their `units_of`."""
     steps = jax.tree.map(jnp.multiply, unknowns, units_of(data, model, jnp.asarray(stage.noise)))
-    held = jax.tree.map(lambda leaf: stage.free * leaf, (steps.points, steps.shape, steps.lens))
-    return Unknowns(steps.poses, *held)
+    held = jax.tree.map(lambda leaf: stage.free * leaf, (steps.shape, steps.lens))
+    return Unknowns(steps.poses, steps.points, *held)
 
 
-def known_rows(data: Data, model: Model, stage: Stage) -> tuple[Array, Array]:
-    """What is known beforehand of the shape, and of the lens."""
+def known_rows(data: Data, model: Model, stage: Stage) -> tuple[Array, Array, Array]:
+    """What is known beforehand of photos' own bends, of the shape, and of the lens."""
     padding = jnp.arange(len(model.log_focal)) >= data.zooms
     rows = [
         data.smooth @ model.log_focal,
@@ -184,4 +196,4 @@ def known_rows(data: Data, model: Model, stage: Stage) -> tuple[Array, Array]:
     ]
     if isinstance(model.zoom, AbstractPriorZoom):
         rows.append(model.zoom.standardised())
-    return model.shape / stage.shape, jnp.concatenate(rows)
+    return model.bend / stage.bend, model.shape / stage.shape, jnp.concatenate(rows)

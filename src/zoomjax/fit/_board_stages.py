@@ -30,15 +30,19 @@ from .covariance import of_clusters
 from .result import RESULTS
 
 _STAGES = (
-    (1e-3, 2.0, Stage(0.0, 0.1, 1.0, change=3.0, damping=1e-3)),
-    *((0.0, 1.0, Stage(0.0, 1.0, 1.0, change=0.3, damping=1e-6)),) * 5,
+    (1e-3, 2.0, Stage(0.0, 0.1, 1e-5, 1.0, change=3.0, damping=1e-3)),
+    *((0.0, 1.0, Stage(0.0, 1.0, 3e-3, 1.0, change=0.3, damping=1e-6)),) * 5,
 )
 """Stages, with the least noise in half image diagonals of the first one's loss, and by how much the loss is
-wider than the noise before it. The first one hardly bends the board."""
+wider than the noise before it. The first one hardly bends the board, and not from photo to photo."""
+
+_LEAST_BEND = 1e-5
+"""Standard deviation of photos' own bends of a board that keeps its shape: 0.005 mm of 1 m."""
 
 _SAME = 0.7  # of the noise before a stage: one that leaves less was not the last
 
-_FLAT = 1e-9  # standard deviation of the shape's coefficients of a board that is flat
+_FLAT = 1e-9
+"""Standard deviation of the coefficients of shape and bends of a board that is flat."""
 
 _MOST_STEPS = 40  # of a stage
 
@@ -68,25 +72,29 @@ class Described(NamedTuple):
 
 def in_stages(data: Data, model: Model, *, flat: bool = False) -> tuple[Model, Stage, Any, int]:
     """The fit, its last stage, the solver's status and its steps in all."""
-    noise, total = _noise(data, model), 0
+    noise, total, bend = _noise(data, model), 0, None
     result: Any = RESULTS.successful
     stage = _STAGES[0][2]
     for number, (least, wider, stage) in enumerate(_STAGES):
         own = jnp.maximum(wider * noise, least * data.scale)
-        stage = _arrays(stage._replace(noise=own, shape=_FLAT if flat else stage.shape))
+        stage = stage._replace(noise=own, bend=stage.bend if bend is None else bend)
+        stage = _arrays(stage._replace(shape=_FLAT, bend=_FLAT) if flat else stage)
         before = noise
         model, noise, result, steps = _solved(data, model, stage)
         total += int(steps)
-        if number > 0 and result == RESULTS.successful and noise > _SAME * before:
-            break
-    return model, stage._replace(noise=noise), result, total
+        if number > 0:
+            bend = _bend_of(data, model)
+            if result == RESULTS.successful and noise > _SAME * before:
+                break
+    last = stage._replace(noise=noise, bend=stage.bend if flat or bend is None else bend)
+    return model, last, result, total
 
 
-def located(data: Data, model: Model, noise: Array) -> tuple[Model, Array]:
-    """The poses of photos, for a lens and a board that are held, and the residuals, px."""
+def located(data: Data, model: Model, noise: Array, bend: Array) -> tuple[Model, Array]:
+    """Poses and own bends of photos, for a lens and a shape that are held, and the residuals, px."""
     noise = jnp.maximum(noise, _noise(data, model))
     for _ in range(3):
-        stage = _arrays(Stage(noise, 1.0, 0.0, change=0.01, damping=1e-6))
+        stage = _arrays(Stage(noise, 1.0, bend, 0.0, change=0.01, damping=1e-6))
         before = noise
         model, noise, _, _ = _solved(data, model, stage)
         if noise > _SAME * before:
@@ -116,10 +124,18 @@ def _noise_of(data, missed):
 
 
 @eqx.filter_jit
+def _bend_of(data, model):
+    """The standard deviation of photos' own bends, from themselves."""
+    photos = jnp.any(data.there, axis=1)
+    squares = jnp.sum(jnp.where(photos[:, None], model.bend**2, 0))
+    return jnp.maximum(jnp.sqrt(squares / (jnp.sum(photos) * model.bend.shape[1])), _LEAST_BEND)
+
+
+@eqx.filter_jit
 def _solved(data, model, stage):
     """Poses, board and lens of least energy, the noise, the solver's status and its steps."""
     units = units_of(data, model, stage.noise)
-    steps = PoseSchur(_structure(data, units))
+    steps = PoseSchur(_structure(data, units, stage))
     solution = optx.least_squares(
         rows_of,
         damped_solver(steps, Unknowns, stage.change, stage.damping),
@@ -153,14 +169,15 @@ def described(
     rows, jacobian = jax.linearize(linear, zeros)
     # (w J)^T r is the gradient, and w^2 J^T J the mean of its derivative over the directions of residuals.
     rows = rows._replace(views=missed / stage.noise)
-    structure = _structure(data, units)
+    structure = _structure(data, units, stage)
     normal = reduced(jacobian, rows, zeros, structure, jnp.asarray(0.0))
     lens, of_boards = _of_photos(normal, structure)
     own = ravel_pytree(units.lens)[0]
-    variance = jnp.einsum("nkf,bfg,nkg->bnk", structure.basis, of_boards, structure.basis)
+    variance = jax.vmap(structure.basis.variance)(of_boards)
     inlier = data.there & (squared < 9)  # beyond, the loss nearly ignores a corner
     count = 2 * jnp.sum(inlier)
-    unknowns = 6 * jnp.sum(jnp.any(data.there, axis=1)) + data.zooms + model.shape.size
+    of_photos = units.poses.shape[1] * jnp.sum(jnp.any(data.there, axis=1))
+    unknowns = of_photos + data.zooms + model.shape.size
     free = count / jnp.maximum(count - unknowns, 1)
     return Described(
         covariance=lens * jnp.outer(own, own),
@@ -173,8 +190,9 @@ def described(
     )
 
 
-def _structure(data, units):
-    return Structure(data.basis * units.shape[0][None, None], data.board)
+def _structure(data, units, stage):
+    bend = units.poses[:, None, 6:] * data.basis.own[None]
+    return Structure(data.basis.scaled(stage.free * units.shape[0, 0]), bend, data.board, data.members)
 
 
 def _of_photos(normal, structure):
@@ -183,13 +201,13 @@ def _of_photos(normal, structure):
     Shapes are eliminated from the matrix and from each photo's score; both are then in parameters in which
     the matrix is the identity, as `of_clusters` takes them.
     """
-    photos, functions = normal.photos, structure.basis.shape[2]
+    photos, functions = normal.photos, structure.basis.size
     gain = solved_boards(normal.shape, normal.mixed)  # shapes follow the lens by its negative
     matrix = normal.lens - jnp.einsum("bfi,bfj->ij", normal.mixed, gain)
     back = jnp.linalg.inv(jnp.linalg.cholesky(matrix))
     along = gain[structure.board]
     score = photos.scores[:, functions:] - jnp.einsum("pfi,pf->pi", along, photos.scores[:, :functions])
-    moved = jnp.einsum("nkf,pfi->pnki", structure.basis, along)
+    moved = jax.vmap(structure.basis.moved)(along)
     moved = (photos.lens - jnp.einsum("pnrk,pnki->pnri", photos.point, moved)) @ back.T
 
     def white(border):

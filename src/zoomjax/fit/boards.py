@@ -53,11 +53,14 @@ class BoardPoses(NamedTuple):
     Attributes:
         rotation: from the board to the camera, whose axes are x right, y down and z forward.
         position: of the board's middle in the camera, steps of its grid.
+        bend: how far each corner is out of the board's shape in this photo, away from the camera, steps of
+            its grid: paper bends otherwise from photo to photo.
         residual: distance between each corner and where the model puts it, px; NaN where none is seen.
     """
 
     rotation: Float[Array, "photo 3 3"]
     position: Float[Array, "photo 3"]
+    bend: Float[Array, "photo row column"]
     residual: Float[Array, "photo row column"]
 
 
@@ -80,6 +83,7 @@ class BoardFit(eqx.Module):
             along columns, z away from the camera.
         shape_std: its standard deviation.
         coefficients: the shape as the fit has it, of its smooth functions.
+        bend_std: standard deviation of the functions that photos have beside it, half longer sides.
         poses: of the board in each photo.
         noise: standard deviation of a corner's coordinate, px.
     """
@@ -94,6 +98,7 @@ class BoardFit(eqx.Module):
     shape: Float[Array, "board row column 3"]
     shape_std: Float[Array, "board row column 3"]
     coefficients: Float[Array, "board function"]
+    bend_std: Float[Array, ""]
     poses: BoardPoses
     noise: Float[Array, ""]
 
@@ -116,6 +121,8 @@ class BoardFit(eqx.Module):
         board: Int[AnyArray, "photo"] | Sequence[int] | None = None,
     ) -> BoardPoses:
         """The poses of the same boards in other photos, for the lens and the shapes of this fit.
+
+        How the board bends in each photo beside its shape is fitted, too.
 
         Args:
             grids: as for `fit_boards`.
@@ -140,14 +147,37 @@ class BoardFit(eqx.Module):
                 f"Argument board must be among the {boards} boards fitted, from 0, but it holds "
                 f"{given.board.max()}."
             )
-        data = data_of(given, number, len(known), np.asarray(lens.centre), _HELD)
+        data = data_of(given, number, len(known), np.asarray(lens.centre), _HELD, boards=boards)
         coefficients = padded_to(np.asarray(jax.vmap(lens.zoom)(self.focal)), len(data.smooth))
         matrices, *_ = _homographies(data, coefficients, lens.family)
         start = _model(data, matrices, np.asarray(self.focal), lens.zoom, lens.family, bucket(boards))
         start = eqx.tree_at(
             lambda model: model.shape, start, padded_to(np.asarray(self.coefficients), bucket(boards))
         )
-        return _poses(given, data, *located(data, start, self.noise))
+        return _poses(given, data, *located(data, start, self.noise, self.bend_std))
+
+    def flattening(self) -> Float[np.ndarray, "photo row column 2"]:
+        """How much elsewhere each corner would be seen if the board were flat and even, px.
+
+        Added to the corners that were seen, it makes rows and columns straight in the scene. NaN where the
+        lens shows no such point.
+        """
+        rows, columns = self.shape.shape[1:3]
+        places, unit = grid_places(rows, columns)
+        flat = np.pad(places * unit, ((0, 0), (0, 1)))
+        shape = np.asarray(self.shape).reshape(len(self.shape), -1, 3)
+        bend = np.asarray(self.poses.bend).reshape(len(self.frame_focal), -1)
+        rotation, position = np.asarray(self.poses.rotation), np.asarray(self.poses.position)
+        moved = []
+        for photo, (focal, board) in enumerate(
+            zip(self.frame_focal.tolist(), self.board.tolist(), strict=True)
+        ):
+            bent = shape[board] + np.pad(bend[photo, :, None], ((0, 0), (2, 0)))
+            ahead = np.stack([flat, bent]) @ rotation[photo].T + position[photo]
+            straight = np.asarray(self.lens.centre) + focal * ahead[..., :2] / ahead[..., 2:]
+            seen = np.asarray(self.lens(focal).distort(straight))
+            moved.append((seen[0] - seen[1]).reshape(rows, columns, 2))
+        return np.stack(moved)
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
         """Raise TypeError: call the lens of the fit instead."""
@@ -245,7 +275,8 @@ def _model(data, matrices, focal_px, zoom, family, boards):
     return Model(
         rotation=rotation,
         position=position,
-        shape=jnp.zeros((boards, data.basis.shape[2])),
+        bend=jnp.zeros((len(data.points), data.basis.own.shape[1])),
+        shape=jnp.zeros((boards, data.basis.size)),
         log_focal=jnp.log(focal),
         zoom=zoom,
         offset=jnp.zeros(2),
@@ -257,11 +288,13 @@ def _poses(given, data, model, missed):
     """The poses of the photos there are."""
     photos, rows, columns = given.grids.shape[:3]
     unit = grid_places(rows, columns)[1]
+    bend = (model.bend[:photos] @ data.basis.own.T)[:, : rows * columns]
     distance = np.linalg.norm(np.asarray(missed), axis=-1)
     distance = np.where(np.asarray(data.there), distance, np.nan)[:photos, : rows * columns]
     return BoardPoses(
         rotation=model.rotation[:photos],
         position=model.position[:photos] * unit,
+        bend=unit * bend.reshape(photos, rows, columns),
         residual=jnp.asarray(distance.reshape(photos, rows, columns)),
     )
 
@@ -317,6 +350,7 @@ def _described(given, data, solved, label, origin, fitted):
         shape=unit * known.shape[:boards, :corners].reshape(boards, rows, columns, 3),
         shape_std=unit * known.shape_std[:boards, :corners].reshape(boards, rows, columns, 3),
         coefficients=model.shape[:boards],
+        bend_std=jnp.asarray(stage.bend),
         poses=_poses(given, data, model, known.missed),
         noise=known.noise,
     )
