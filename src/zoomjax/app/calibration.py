@@ -323,6 +323,7 @@ def calibrate(
     robust: bool = False,
     focal_sigma: float | Float[np.ndarray, "frame"] = 0.0,
     shared: Int[np.ndarray, "frame"] | None = None,
+    widened: Callable[[ZoomFit], ZoomFit] = lambda fit: fit,
     stage: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
     """Fit the zoom model, and the models it is compared with.
@@ -337,6 +338,7 @@ def calibrate(
             from the remaining lines.
         focal_sigma: standard deviation of the focal lengths: a number, or one per frame; 0 where exact.
         shared: for each frame a number: frames of one number share a focal length and its error.
+        widened: adds to the uncertainty of a fit what the lines do not show of it.
         stage: called with a description before each step that takes time.
 
     Raises:
@@ -350,7 +352,7 @@ def calibrate(
     zoom = exact
     if sigma.any():
         zoom = with_focal_sigma(exact, small, focal_sigma=sigma, shared=shared)
-    zoom = with_misfit(zoom, small)
+    zoom = widened(with_misfit(zoom, small))
     algebraic = None
     if isinstance(small, CompressedLines):  # others are estimated to first order alone: far off, if strong
         algebraic = np.asarray(frame_rms(small, algebraic_zoom(small, zoom=chosen, terms=terms)))
@@ -373,7 +375,7 @@ def calibrate(
         focal_sigma=sigma,
         held_out=held_out,
         each_held_out=each_held_out,
-        centre=used.centre,
+        centre=used.centre.as_uncertain_as(zoom),
         assessment=assess(lines, zoom, compressed=small, held_out=held_out, each_held_out=each_held_out),
         selection=used.selection,
     )

@@ -240,7 +240,8 @@ def calibrate_images(
         if bundle is not None and job.focal == "plane":
             focals = bundle.measured(focals)
     while True:
-        lines = lines_of(used, np.array([focals.focal[d.name] for d in used]), focals.unit)
+        shown = used if bundle is None else bundle.lines_used(used)
+        lines = lines_of(shown, np.array([focals.focal[d.name] for d in used]), focals.unit)
         sigma = np.array([focals.deviation.get(d.name, 0.0) for d in used])
         calibration = calibrate(
             lines,
@@ -249,6 +250,7 @@ def calibrate_images(
             robust=True,
             focal_sigma=sigma,
             shared=_shared(used, focals),
+            widened=(lambda fit: fit) if bundle is None else bundle.widened,
             stage=stage,
         )
         done = ImageCalibration(job, calibration, used, focals, tuple(d.name for d in detections), unused)

@@ -274,15 +274,28 @@ class CentreFound:
         """A fitted centre, and what else there is to say of it."""
         u, v = (float(value) for value in np.asarray(found.fit.lens.centre))
         std = (float(found.std[0, 0]), float(found.std[0, 1]))
-        spread = f"\u00b1 {std[0]:.2g} and \u00b1 {std[1]:.2g} px"
-        told = f"The centre of distortion was fitted: {_place(u, v)}, {spread}{more}"
+        told = f"The centre of distortion was fitted: {_place(u, v)}, {_spread(std)}{more}"
         return cls((u, v), std, "fitted", told)
+
+    def as_uncertain_as(self, fit: ZoomFit) -> "CentreFound":
+        """The same with the standard deviations that a fit gives it, where it was fitted."""
+        if self.std is None or fit.joint is None or fit.lens.shift is not None:
+            return self
+        x, y = fit.lens.scale * np.sqrt(np.diag(np.asarray(fit.joint))[-2:])
+        std = (float(x), float(y))
+        return dataclasses.replace(
+            self, std=std, sentence=self.sentence.replace(_spread(self.std), _spread(std))
+        )
 
     def summary(self) -> dict[str, Any]:
         """The same for JSON."""
         x, y = self.centre
         std = None if self.std is None else list(self.std)
         return {"x": x, "y": y, "std": std, "how": self.how, "sentence": self.sentence}
+
+
+def _spread(std: tuple[float, float]) -> str:
+    return f"\u00b1 {std[0]:.2g} and \u00b1 {std[1]:.2g} px"
 
 
 def _place(x: float, y: float) -> str:

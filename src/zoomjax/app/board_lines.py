@@ -1,0 +1,137 @@
+"""Rows and columns of a board that is bent, as a flat one would show them.
+
+A bent board bends its rows and columns, whatever the lens: a lens that makes them straight is wrong. Where
+the bundle adjustment finds them bent, they are moved to where a flat board in the same place would have
+them, and the lens is fitted to these. What is uncertain of the board's shape is then uncertain of the lens.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from ..detect.batch import Detection
+from ..detect.grid import GridDetector
+from ..fit.boards import BoardFit
+from ..fit.energy import line_squares
+from ..fit.result import RESULTS, ZoomFit, failed
+from ..fit.zoom import CentreArgument, fit_zoom
+from ..lines.free_centre import compress_any_centre
+from ..lines.lines import Lines
+from ..models.family import AbstractFamily
+from ..models.lens import ZoomLens
+from ..models.zoom import PolynomialZoom, with_parameters
+
+_STRAIGHTER = 0.9
+"""Deviation of lines of the flat board, in those of the bent one, below which they are taken."""
+
+_RADII = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class Straightness:
+    """How straight rows and columns are, each under the lens that fits them best.
+
+    Attributes:
+        seen: the lens of those that are seen.
+        rms_seen, rms_flat: their deviation, median over lines, px, and that of those of a flat board, as it
+            is expected without the numbers that were fitted to the board's shape.
+    """
+
+    seen: ZoomLens
+    rms_seen: float
+    rms_flat: float
+
+    @property
+    def bent(self) -> bool:
+        """Whether the board bends the lines by more than can be left to the lens."""
+        return self.rms_flat < _STRAIGHTER * self.rms_seen
+
+
+def flat_detections(fit: BoardFit, detections: Sequence[Detection]) -> list[Detection]:
+    """The detections that were fitted, in their order, with the lines of a flat board."""
+    flat = []
+    for detection, moved in zip(detections, fit.flattening(), strict=True):
+        assert detection.nodes is not None  # it has been fitted
+        nodes = detection.nodes + np.nan_to_num(moved)
+        flat.append(dataclasses.replace(detection, nodes=nodes, lines=tuple(GridDetector.lines(nodes))))
+    return flat
+
+
+def straightness(
+    fit: BoardFit, seen: Lines, flat: Lines, centre: CentreArgument | None
+) -> Straightness | None:
+    """How straight lines are, and those of a flat board; None if no lens can be fitted to them.
+
+    Only fits that determine the board's shape count.
+    """
+    if bool(failed(fit.fit.result)) or fit.fit.result == RESULTS.undetermined:
+        return None
+    degree = min(2, np.unique(np.asarray(seen.focal)).size - 1)
+    lenses, deviations = [], []
+    for lines in (seen, flat):
+        held = compress_any_centre(lines)
+        one = fit_zoom(held, zoom=PolynomialZoom(degree=degree), centre=centre, throw=False)
+        if bool(failed(one.result)):
+            return None
+        lenses.append(one.lens)
+        placed = held.about(one.lens.centre)
+        deviations.append(float(np.sqrt(np.median(line_squares(placed, one.lens.zoom)))))
+    return Straightness(lenses[0], deviations[0], deviations[1] * _of_freedom(fit))
+
+
+def _of_freedom(fit: BoardFit) -> float:
+    """By how much residuals are smaller for the numbers that were fitted."""
+    count = 2 * int(np.isfinite(np.asarray(fit.poses.residual)).sum())
+    fitted = 18 * len(fit.frame_focal) + fit.coefficients.size
+    return float(np.sqrt(count / max(count - fitted, count / 4)))
+
+
+def widened(fit: ZoomFit, board: BoardFit) -> ZoomFit:
+    """A fit to lines of the flat board with what is uncertain of the board's shape in its bands."""
+    common = coefficient_covariance(board, fit.lens.family, fit)
+    misfit = common if fit.misfit is None else fit.misfit + common
+    fit = eqx.tree_at(lambda f: f.misfit, fit, misfit, is_leaf=lambda leaf: leaf is None)
+    own = board.fit.joint
+    if fit.joint is None or own is None or fit.lens.shift is not None:
+        return fit
+    return eqx.tree_at(lambda f: f.joint, fit, fit.joint.at[-2:, -2:].add(own[-2:, -2:]))
+
+
+def coefficient_covariance(board: BoardFit, family: AbstractFamily, fit: ZoomFit) -> jax.Array:
+    """Covariance of a distortion model's coefficients that displaces as that of the bundle's lens.
+
+    In the mean over the zooms.
+    """
+    numbers = np.size(fit.lens.zoom(fit.lens.focal_range[0]))
+    low, high = (float(f) for f in fit.lens.focal_range)
+    share = (np.asarray(board.label) - board.label.min()) / max(float(np.ptp(board.label)), 1e-9)
+    total = np.zeros((numbers, numbers))
+    for focal, at in zip(np.asarray(board.focal), low + (high - low) * share, strict=True):
+        moved = np.asarray(_moved(board.lens.zoom, board.lens.family, jnp.asarray(focal)))
+        own = np.asarray(_columns(family, jnp.asarray(fit.lens.zoom(at)), jnp.linspace(0, 1, _RADII)))
+        gain = np.linalg.pinv(own) @ moved
+        total += gain @ np.asarray(board.fit.covariance) @ gain.T / len(board.focal)
+    return jnp.asarray(total)
+
+
+@eqx.filter_jit
+def _moved(zoom, family, focal):
+    """How each parameter of a zoom model moves points at some radii."""
+    flat, unravel = ravel_pytree(zoom.parameters)
+    by_parameter = jax.jacfwd(lambda flat: with_parameters(zoom, unravel(flat))(focal))(flat)
+    return _columns(family, zoom(focal), jnp.linspace(0, 1, _RADII)) @ by_parameter
+
+
+@eqx.filter_jit
+def _columns(family, k, radii):
+    """How each coefficient moves points at some radii along the image's x axis."""
+
+    def moved(k):
+        return jax.vmap(lambda r: family.correct((r, 0 * r), r * r, k)[0])(radii)
+
+    return jax.jacfwd(moved)(k)
