@@ -37,7 +37,7 @@ _STAGES = (
 wider than the noise before it. The first one hardly bends the board, and not from photo to photo."""
 
 _LEAST_BEND = 1e-5
-"""Standard deviation of photos' own bends of a board that keeps its shape: 0.005 mm of 1 m."""
+"""Standard deviation of photos' own bends from which a board keeps its shape, half longer sides."""
 
 _SAME = 0.7  # of the noise before a stage: one that leaves less was not the last
 
