@@ -12,7 +12,8 @@ _MOST = 6
 def plot_boards(fit: BoardFit) -> Figure:
     """Height of each board's corners over its plane, as the camera sees it: blue is nearer."""
     height = -np.asarray(fit.shape)[:_MOST, ..., 2]
-    figure = Figure(figsize=(11, 3 if len(height) <= 3 else 5.5), layout="constrained")
+    across = 1.2 + 3.3 * min(len(height), 3)
+    figure = Figure(figsize=(across, 3 if len(height) <= 3 else 5.5), layout="constrained")
     rows = 1 if len(height) <= 3 else 2
     axes = figure.subplots(rows, -(-len(height) // rows), squeeze=False).ravel()
     most = max(float(np.abs(height).max()), 1e-6)

@@ -256,7 +256,10 @@ def _board(calibration: Calibration, images: "ImageCalibration | None") -> dict[
     label = [images.focals.focal[name] for name in place]
     return {
         "sentences": bundle.sentences(),
-        "head": [f"f, {images.focals.unit}", "f, px", "as seen, px", "lens.json, px", "bundle, px"],
+        "head": [
+            f"f of the photos, {images.focals.unit}",
+            *("f of the bundle, px", "as seen, px", "lens.json, px", "bundle, px"),
+        ],
         "rows": bundle.compared(calibration.zoom.lens, label),
         "plot": embedded_plot(plot_boards(bundle.fit), "Height of the board's corners over its plane"),
     }
