@@ -150,15 +150,16 @@ class BoardBundle:
         centre = (np.array(lens.image_size) - 1) / 2
         outward = (corner - centre) / np.linalg.norm(corner - centre)
         seen = None if self.straightness is None else self.straightness.seen
-        for own, focal, std in zip(label, self.fit.focal, self.fit.focal_std, strict=True):
+        zooms = (self.fit.label.tolist(), label, self.fit.focal.tolist(), self.fit.focal_std.tolist())
+        for first, own, focal, std in zip(*zooms, strict=True):
             moved = [
                 (np.asarray(one(float(f)).undistort(corner)) - corner) @ outward if one else np.nan
-                for one, f in ((seen, own), (lens, own), (self.fit.lens, focal))
+                for one, f in ((seen, first), (lens, own), (self.fit.lens, focal))
             ]
             rows.append(
                 (
                     f"{own:.4g}",
-                    f"{float(focal):.0f} ± {float(std):.0f}",
+                    f"{focal:.0f} ± {std:.0f}",
                     *(f"{value:+.2f}" if np.isfinite(value) else "" for value in moved),
                 )
             )
