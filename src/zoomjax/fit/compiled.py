@@ -46,7 +46,7 @@ def cache_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     if place is None or not _can_write(place):
         return None
     _remove_torn(place)
-    if jax.config.jax_compilation_cache_dir not in (None, str(place)):
+    if getattr(jax.config, "jax_compilation_cache_dir", None) not in (None, str(place)):
         compilation_cache.reset_cache()  # or JAX goes on with the folder that it has opened
     jax.config.update("jax_compilation_cache_dir", str(place))
     if importlib.util.find_spec("filelock"):  # without it JAX warns, and keeps nothing
