@@ -98,6 +98,32 @@ def test_a_sentence_says_what_to_pass(call, message, things):
         eval(call, FUNCTIONS | {"zj": zj, "np": np, "optx": optx} | things)
 
 
+MASKED = {
+    "points, as many as JAX would not look at": "displacement_std(fit, big, focal=35.0)",
+    "points": "displacement_band(fit, hidden, focal=35.0)",
+    "focal lengths": "coefficient_std(fit, hidden)",
+    "coefficients": "frame_energy(small, hidden)",
+    "of each frame": "frame_rms(small, hidden)",
+    "of all": "global_energy(small, hidden)",
+    "sigma": "with_focal_sigma(fit, small, focal_sigma=hidden)",
+    "shared": "with_focal_sigma(fit, small, focal_sigma=0.3, shared=hidden)",
+    "sigma of a fit": "fit_focal(small, hidden)",
+    "std": "cramer_rao(lens, lines, std=hidden)",
+    "errors": "assess(lines, fit, held_out=hidden, each_held_out=hidden)",
+    "a centre": "fit_zoom(lines, centre=hidden)",
+    "focal lengths to write": "write(lens, 'never.jsonl', format='opentrackio', focal=hidden)",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("call", MASKED.values(), ids=MASKED)
+def test_a_mask_is_not_lost(call, things):
+    hidden = np.ma.masked_array([20.0, 30.0], [False, True])
+    big = np.ma.masked_array(np.zeros((9, 2)), True)
+    with pytest.raises(ValueError, match="is a masked array, and masks are not kept"):
+        eval(call, FUNCTIONS | {"np": np, "hidden": hidden, "big": big} | things)
+
+
 def test_all_fits_that_are_called_name_their_lens(small, noisy):
     robust = zj.fit_robust(small)
     with pytest.raises(TypeError, match=r"robust\.fit\.lens\(35\.0\)"):

@@ -53,6 +53,32 @@ def test_a_later_process_with_other_sizes_compiles_nothing(tmp_path, how):
     assert found > 3
 
 
+TWO_FOLDERS = """
+import os, sys
+import jax, numpy as np, zoomjax as zj
+os.chdir(sys.argv[1])
+for number, folder in enumerate(("first", sys.argv[1] + "/second"), 2):
+    zj.cache_compiled(folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    os.chdir("/")
+    jax.block_until_ready(jax.jit(lambda x, n=number: x @ x + n)(np.eye(number)))
+    print(len(os.listdir(sys.argv[1] + "/first")))
+"""
+
+
+@pytest.mark.slow
+def test_the_last_folder_counts_wherever_one_is_meanwhile(tmp_path):
+    """JAX opens a folder once, by the name that it is told."""
+    own = {**os.environ}
+    own.pop("JAX_COMPILATION_CACHE_DIR", None)
+    command = [sys.executable, "-W", "error", "-c", TWO_FOLDERS, str(tmp_path)]
+    done = subprocess.run(command, env=own, capture_output=True, text=True, timeout=600)
+    assert (done.returncode, done.stderr) == (0, "")
+    first, then = map(int, done.stdout.split())
+    assert first == then > 0
+    assert os.listdir(tmp_path / "second")
+
+
 @pytest.fixture
 def settings(monkeypatch):
     """What `cache_compiled` tells JAX, which does not hear it."""

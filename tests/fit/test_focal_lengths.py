@@ -8,6 +8,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.fit import focal_fit
 from zoomjax.fit.focal_lengths import _response
 
 ROUNDED = 1 / np.sqrt(12)
@@ -85,6 +86,13 @@ def test_frames_that_share_an_error_add_up(sweep):
     assert np.trace(excess) < 0.2 * np.sum((one / size) ** 2)
     with pytest.raises(ValueError, match="shared must hold a number for each of the 10 frames"):
         more(shared=np.arange(3))
+
+
+@pytest.mark.parametrize("shared", [np.full(10, np.nan), np.ones(10, bool), np.full(10, "a"), ["a"] * 10])
+def test_what_is_no_number_is_not_shared(sweep, shared, unchecked):
+    """NaN is like nothing, itself included: such frames would be taken as exact."""
+    with pytest.raises(ValueError, match="Argument shared must hold integers"):
+        zj.fit.with_focal_sigma(zj.fit_zoom(sweep), sweep, focal_sigma=0.3, shared=shared)
 
 
 def test_undetermined_stays_infinite(sweep):
@@ -200,6 +208,76 @@ def test_bands_with_rounded_focal_lengths_hold_the_truth_as_often_as_they_say():
     assert table["rounded, `fit_focal`"]["focal_rms"] < 0.8 * table["rounded, taken as exact"]["focal_rms"]
 
 
+# What nothing determines
+
+
+def weighing(lines, frames):
+    return lines.weighted(np.isin(np.asarray(lines.frame), frames).astype(float))
+
+
+def few(truth, number):
+    return zj.compress(scenes.board_lines(truth, scenes.focal_sweep(number), spacing=300.0, noise=0.3))
+
+
+@pytest.mark.parametrize(("sigma", "std"), [(0.3, 0.3), (0.0, 0.0), (np.inf, np.inf)])
+def test_a_frame_whose_lines_weigh_nothing_keeps_its_focal_length_and_sigma(sweep, sigma, std):
+    found = zj.fit.fit_focal(
+        weighing(sweep, [0, 1, 2, 4, 5, 6, 7, 8, 9]), np.where(np.arange(10) == 3, sigma, 0.3)
+    )
+    assert found.std[3] == pytest.approx(std)
+    assert found.focal[3] == pytest.approx(sweep.focal[3])
+    assert (np.delete(np.asarray(found.std), 3) > 0.05).all()
+    assert zj.RESULTS[found.fit.result] == ""
+
+
+def test_a_focal_length_of_no_effect_is_not_determined(sweep):
+    sigma = np.where(np.arange(10) == 3, np.inf, 0.3)
+    found = zj.fit.fit_focal(sweep, sigma, zoom=zj.PolynomialZoom(degree=0))
+    np.testing.assert_allclose(found.std, sigma, rtol=1e-6)
+    assert np.isfinite(found.fit.covariance).all()  # the lens is the same for all
+
+
+@pytest.mark.parametrize("number", [3, 4])
+def test_a_focal_length_that_goes_with_any_lens_is_not_determined(truth, number):
+    """With a model through every frame each focal length that is not known makes lines as straight."""
+    lines = few(truth, number)
+    sigma = np.where(np.arange(number) == 1, np.inf, 0.3)
+    found = zj.fit.fit_focal(lines, sigma, zoom=zj.PolynomialZoom(degree=number - 1))
+    assert np.isposinf(found.std).tolist() == (sigma == np.inf).tolist()
+    assert zj.RESULTS[found.fit.result] == zj.RESULTS[zj.RESULTS.undetermined]
+    assert np.isposinf(zj.displacement_std(found.fit, np.zeros(2), focal=float(lines.focal[1])))
+
+
+def test_known_focal_lengths_of_frames_that_weigh_nothing_do_not_set_the_scale(sweep):
+    sigma = np.where(np.isin(np.arange(10), [0, 5]), 0.3, np.inf)
+    with pytest.raises(ValueError, match="lines that weigh something"):
+        zj.fit.fit_focal(weighing(sweep, [0, 1, 2, 3]), sigma)
+
+
+def test_focal_lengths_that_do_not_converge_are_said(rounded, refined, monkeypatch):
+    whole = focal_fit.refined
+    monkeypatch.setattr(focal_fit, "refined", lambda *given: (*whole(*given)[:3], jnp.asarray(False)))
+    with pytest.raises(RuntimeError, match="did not converge"):
+        zj.fit.fit_focal(rounded, ROUNDED)
+    found = zj.fit.fit_focal(rounded, ROUNDED, throw=False)
+    np.testing.assert_allclose(found.focal, refined.focal)
+    assert zj.RESULTS[found.fit.result] == zj.RESULTS[zj.RESULTS.nonlinear_max_steps_reached]
+
+
+@pytest.mark.slow
+def test_the_order_of_frames_and_the_unit_do_not_matter(rounded, refined):
+    order = np.random.default_rng(0).permutation(10)
+    place = np.argsort(order)
+    turned = eqx.tree_at(
+        lambda lines: (lines.focal, lines.frame),
+        rounded,
+        (10 * jnp.asarray(rounded.focal)[order], jnp.asarray(place[np.asarray(rounded.frame)])),
+    )
+    found = zj.fit.fit_focal(turned, 10 * ROUNDED)
+    np.testing.assert_allclose(found.focal[place] / 10, refined.focal, rtol=1e-6)
+    np.testing.assert_allclose(found.std[place] / 10, refined.std, rtol=1e-5)
+
+
 # Errors
 
 
@@ -217,7 +295,14 @@ def test_focal_lengths_that_nobody_knows_raise_and_say_why(rounded, sigma, unche
 
 
 @pytest.mark.parametrize(
-    ("sigma", "message"), [(-0.1, "at least 0"), (np.ones(3), "each of the 10 frames")]
+    ("sigma", "message"),
+    [
+        (-0.1, "at least 0"),
+        (np.ones(3), "each of the 10 frames"),
+        ("0.3", "real numbers"),
+        (True, "real numbers"),
+        (np.ones(10, bool), "real numbers"),
+    ],
 )
 def test_sigma_that_is_none_raises(rounded, sigma, message, unchecked):
     with pytest.raises(ValueError, match=message):

@@ -73,6 +73,26 @@ def test_files_of_a_folder_are_in_the_order_of_the_numbers_in_their_names(tmp_pa
         assert np.abs(moved).max() < 0.1
 
 
+@pytest.mark.parametrize("name", ["opencv", "ros"])
+def test_frames_before_the_first_are_before_it(name, tmp_path):
+    """A track may begin before frame 0, and a name's dash is no sign where a word is before it."""
+    lens, focal = LENSES["landscape"](), np.array([24.0, 35.0, 50.0, 70.0])
+    track = zj.io.FocalTrack(np.arange(-2.0, 2.0), focal, by_time=False)
+    zj.interop.write(lens, tmp_path / "a", format=name, track=track, pixel_pitch=0.01)
+    back = zj.interop.read(tmp_path / "a", focal=focal)
+    names = [path.stem for path in back.report.files]
+    assert names == ["-00002", "-00001", "000000", "000001"]
+    points = shown(lens)
+    for f in focal:
+        moved = np.asarray(back.lens(f).undistort(points)) - np.asarray(lens(f).undistort(points))
+        assert np.abs(moved).max() < 0.5
+    for number, path in enumerate(sorted((tmp_path / "a").iterdir())):
+        path.rename(path.with_name(f"lens-{9 + number}.yaml"))
+    assert [path.stem for path in zj.interop.read(tmp_path / "a", focal=focal).report.files] == [
+        *("lens-9", "lens-10", "lens-11", "lens-12")
+    ]
+
+
 @pytest.mark.parametrize("name", ["nuke", "opentrackio", "pftrack"])
 def test_our_own_formula_comes_back_exactly(name, written):
     lens, found = written

@@ -270,6 +270,7 @@ def test_a_track_is_an_entry_for_each_frame(tmp_path):
 IN_FRAMES, IN_SECONDS = (
     zj.io.FocalTrack(np.arange(2.0), np.array([20.0, 30]), by_time=by_time) for by_time in (False, True)
 )
+NO_FRAME = zj.io.FocalTrack(np.array([0.5, 0.75]), np.array([20.0, 30]), by_time=False)
 MISTAKES = {
     "Argument pixel_pitch, mm from one pixel to the next": {"format": "opencv", "focal": 24},
     "Argument format must be one of": {"format": "nonsense"},
@@ -277,6 +278,10 @@ MISTAKES = {
     "The format lcp can be read only": {"format": "lcp"},
     "Argument focal must be given, one focal length or several": {"format": "opencv", "pixel_pitch": PITCH},
     "Argument focal must hold positive": {"format": "opencv", "focal": -1, "pixel_pitch": PITCH},
+    "Argument focal must hold positive numbers, but it is True": {"format": "opencv", "focal": True},
+    "Argument focal must hold positive numbers, but it is .'24'": {"format": "opencv", "focal": ["24"]},
+    "Argument pixel_pitch must be a positive": {"format": "opencv", "focal": 24, "pixel_pitch": True},
+    "Argument track must reach over a whole frame, but it": {"format": "nuke", "track": NO_FRAME},
     "Argument tolerance must be a positive": {"format": "lensfun", "tolerance": 0, "pixel_pitch": PITCH},
     "Argument convention must be one of": {"format": "stmap", "focal": 24, "convention": "x"},
     "Argument track must be left out: the format": {"format": "lensfun", "track": IN_FRAMES},
@@ -284,6 +289,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("message", MISTAKES)
 def test_a_mistake_is_one_sentence_and_nothing_is_written(message, tmp_path):
     with pytest.raises(ValueError, match=message):
@@ -298,6 +304,25 @@ def test_files_are_replaced_only_if_told(tmp_path):
         zj.interop.write(lens, tmp_path / "a.pfb", focal=24)
     zj.interop.write(lens, tmp_path / "a.pfb", focal=24, overwrite=True)
     assert (tmp_path / "a.pfb").read_text().startswith("#PFBarrel")
+
+
+@pytest.mark.parametrize("name", ["opencv", "stmap"])
+def test_files_of_a_longer_track_that_stay_are_named(name, tmp_path):
+    """They are of another lens: a program that reads the sequence would go on with it."""
+    lens = polynomial([[-0.01]], (64, 48), (31.5, 23.5))
+
+    def written(frames, **options):
+        track = zj.io.FocalTrack(np.arange(frames), np.full(frames, 18.0), by_time=False)
+        path = tmp_path / "maps"
+        return zj.interop.write(lens, path, format=name, track=track, pixel_pitch=PITCH, **options)
+
+    assert "other files" not in str(written(5).notes)
+    before = {file.name: file.read_bytes() for file in (tmp_path / "maps").iterdir()}
+    report = written(3, overwrite=True)
+    left = sorted(before.keys() - {file.name for file in report.files})
+    assert f"holds other files of this kind, {left[0]} and {len(left) - 1} more" in report.notes[-1]
+    assert {file.name for file in (tmp_path / "maps").iterdir()} == before.keys()
+    assert "other files" not in str(written(5, overwrite=True).notes)
 
 
 def test_a_lens_that_folds_is_refused(tmp_path):

@@ -142,3 +142,10 @@ def test_processes_give_the_same_triangles_in_float64(lines, tmp_path):
         for there, here in zip(stream(files, executor=pool), stream(files), strict=True):
             assert there.triangle.dtype == np.float64
             same(there, here)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("kind", [str, Path, os.fsencode])
+def test_one_path_is_not_a_list_of_its_letters(kind, tmp_path):
+    with pytest.raises(TypeError, match=r"paths must be a list of files, \[first, second\]"):
+        list(zj.lines.stream(kind(str(tmp_path / "lines.npz"))))

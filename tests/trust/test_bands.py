@@ -232,7 +232,13 @@ def test_focal_lengths_that_are_none_are_refused(fit, focal):
         assert np.isnan(jax.jit(call)(jnp.asarray(focal))).any()
 
 
-@pytest.mark.parametrize("level", [0, 1, 1.5, -0.5, 95, np.nan, [0.9, 0.95]])
+@pytest.mark.parametrize("focal", ["35", True, None, ["35"]])
+def test_focal_lengths_that_are_no_numbers_are_refused(fit, focal, unchecked):
+    with pytest.raises(ValueError, match="focal must hold real numbers"):
+        zj.trust.coefficient_std(fit, focal)
+
+
+@pytest.mark.parametrize("level", [0, 1, 1.5, -0.5, 95, np.nan, [0.9, 0.95], "0.9", True])
 def test_levels_that_are_none_are_refused(fit, level, unchecked):
     with pytest.raises(ValueError, match="level must be a number between 0 and 1"):
         zj.displacement_band(fit, np.zeros(2), focal=50.0, level=level)

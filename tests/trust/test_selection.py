@@ -96,6 +96,36 @@ def test_a_fold_is_a_plain_fit_of_a_subset_of_the_lines(lines):
     np.testing.assert_allclose(held_out_zoom(lines)[2], rms_of(lines, fit.lens.zoom)[2], rtol=1e-9)
 
 
+def alone_bent():
+    """Lines through the centre, which tell nothing, and one that is bent: what it says is of itself."""
+    t = np.linspace(-1, 1, 30)
+    through = [
+        np.array([319.5, 239.5]) + 200 * np.outer(t, [np.cos(a), np.sin(a)]) for a in np.linspace(0, 3, 6)
+    ]
+    bent = np.stack([300 * t + 319.5, 100 + 5 * t**2], axis=-1)
+    return zj.Lines.from_ragged([*through, bent], [0] * 7, [50.0], image_size=(640, 480))
+
+
+@pytest.mark.parametrize(
+    "measure",
+    [
+        lambda lines: held_out_zoom(
+            lines, zoom=zj.PolynomialZoom(degree=0), terms=1, hold_out="line", folds=7
+        ),
+        lambda lines: held_out_frames(lines, terms=1, folds=7),
+    ],
+    ids=["zoom", "frames"],
+)
+@pytest.mark.parametrize("kind", [zj.compress, lambda lines: zj.fit.in_image(zj.compress(lines))])
+def test_a_line_is_not_measured_by_what_it_said_itself(measure, kind):
+    """Where the others determine nothing, it is as bent as without a correction."""
+    lines = kind(alone_bent())
+    bent = float(zj.frame_rms(zj.compress(alone_bent()), None)[0])
+    fitted = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=0), terms=1)
+    assert fitted.rms < 0.02 * bent
+    np.testing.assert_allclose(measure(lines), bent, rtol=0.02)
+
+
 def test_lines_left_out_are_measured_by_the_fit_of_the_others(lines):
     parts = folds_of(lines, "line", 4, 0)
     judged = errors_of(lines, zj.models.Model(zj.PolynomialZoom(degree=2)), parts)

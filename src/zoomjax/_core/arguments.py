@@ -1,7 +1,7 @@
 """Type checks of arguments, with error messages that say what to pass.
 
 `kinds_checked` reads a function's annotations of our own classes, of solvers and of paths, and checks its
-arguments before anything else: one place for all functions.
+arguments before anything else, of which none may be a masked array: one place for all functions.
 """
 
 import functools
@@ -13,6 +13,8 @@ from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
+
+from .fields import refuse_masked
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -87,10 +89,11 @@ def check_kind(name: str, value: Any, kinds: tuple[type, ...]) -> None:
 
 
 def kinds_checked(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """The function, which looks at the kinds of its arguments first."""
+    """The function, which looks at the kinds of its arguments first, and refuses masked arrays."""
+    parameters = inspect.signature(function).parameters
     wanted = {
         name: (place, kinds, parameter.default)
-        for place, (name, parameter) in enumerate(inspect.signature(function).parameters.items())
+        for place, (name, parameter) in enumerate(parameters.items())
         if (kinds := _kinds(parameter.annotation))
     }
     assert wanted, f"{function} takes nothing to check"
@@ -101,6 +104,8 @@ def kinds_checked(function: Callable[Parameters, Result]) -> Callable[Parameters
             value = args[place] if place < len(args) else kwargs.get(name, default)
             if not isinstance(value, kinds) and value is not inspect.Parameter.empty:
                 check_kind(name, value, kinds)
+        for name, value in (*zip(parameters, args, strict=False), *kwargs.items()):
+            refuse_masked(name, value)
         return function(*args, **kwargs)
 
     return checked

@@ -33,6 +33,17 @@ def numbers(name: str) -> Callable[[Any], Any]:
     return _converter(name, "real numbers")
 
 
+def real_argument(name: str, value: Any) -> Any:
+    """Real numbers that a function is given, as an array: no words, booleans, None or masked array.
+
+    Raises:
+        ValueError: they are something else.
+    """
+    if value is None or isinstance(value, bool):
+        raise ValueError(f"Argument {name} must hold real numbers, but it is {value}.")
+    return numbers(name)(value)
+
+
 def host_numbers(name: str) -> Callable[[Any], Any]:
     """As `numbers`, but lists become NumPy arrays: what is computed from them needs no compilation."""
     return _converter(name, "real numbers", np.array)

@@ -173,7 +173,7 @@ class BoardBundle:
             "rms": float(fit.fit.rms),
             "noise": float(fit.noise),
             "focal_px": np.asarray(fit.focal).tolist(),
-            "focal_px_std": np.asarray(fit.focal_std).tolist(),
+            "focal_px_std": [s if np.isfinite(s) else None for s in np.asarray(fit.focal_std).tolist()],
             "centre": np.asarray(fit.lens.centre).tolist(),
             "bend_steps": fit.bend.tolist(),
             "bend_between_photos_steps": float(np.sqrt(np.mean(np.square(fit.poses.bend)))),

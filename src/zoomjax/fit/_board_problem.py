@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._core.checks import checked_size
+from .._core.fields import refuse_masked
 from .._core.types import traced
 from ..lines.buckets import bucket as bucket_of
 from ._board_rows import Data
@@ -18,6 +19,9 @@ _PHOTOS = (16, 32, 64, 96, 128)
 
 LEAST_CORNERS = 12
 """Corners of a photo that count: fewer hardly tell its pose and something more."""
+
+
+_NAN = "give arrays with NaN in place of what is masked"
 
 
 class Given(NamedTuple):
@@ -33,6 +37,9 @@ def checked_grids(grids, focal, board, image_size, shape: tuple[int, ...] | None
     """The grids as one array, and their labels."""
     if traced((grids, focal)):
         raise ValueError("Arguments of fit_boards must have known values: call it outside of jit and vmap.")
+    refuse_masked("grids", grids, _NAN)
+    for grid in grids:
+        refuse_masked("grids", grid, _NAN)
     arrays = [np.asarray(grid, float) for grid in grids]
     if not arrays:
         raise ValueError("Argument grids must hold the corners of one photo at least, but it is empty.")
@@ -55,10 +62,10 @@ def checked_grids(grids, focal, board, image_size, shape: tuple[int, ...] | None
         )
     number = np.zeros(len(arrays), int) if board is None else np.asarray(board)
     whole = number.dtype.kind in "iu" and number.shape == (len(arrays),) and number.min() >= 0
-    if not whole or number.max() >= len(arrays):
+    if not whole or (shape is None and np.unique(number).size <= number.max()):
         raise ValueError(
             f"Argument board must have a number for each of the {len(arrays)} grids, 0 for the first "
-            f"board, but it is {np.array2string(number, threshold=8)}."
+            f"board, with none left out, but it is {np.array2string(number, threshold=8)}."
         )
     stack = np.stack(arrays)
     stack = np.where(np.isfinite(stack).all(axis=-1, keepdims=True), stack, np.nan)

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, Num
 
 from .._core.arguments import kinds_checked
-from .._core.checks import checked_terms
+from .._core.checks import check_above, checked_terms
 from .._core.types import AnyArray
 from ..models.family import AbstractFamily
 from ..models.lens import ZoomLens
@@ -32,7 +32,7 @@ from ._board_stages import described, in_stages, located
 from ._board_start import coefficients_of, filled, homographies, poses_of, through
 from ._structure import bucket
 from .result import RESULTS, ZoomFit, failed, judged
-from .zoom import CentreArgument
+from .zoom import CentreArgument, given_centre
 
 _CENTRE_STD = 0.05
 """Standard deviation of a fitted centre, half image diagonals, before there is any data: poses can stand in
@@ -70,10 +70,12 @@ class BoardFit(eqx.Module):
     Attributes:
         fit: the lens, with focal lengths in px, and its uncertainty. `ZoomFit.rms` is of the distances
             between corners and where the model puts them, px of the image, without outliers;
-            `ZoomFit.frame_rms` has one for each photo. `ZoomFit.joint` includes the centre, if it was
-            fitted. Its result is `undetermined` where a focal length is not.
+            `ZoomFit.frame_rms` has one for each photo, NaN where most of its corners are outliers.
+            `ZoomFit.joint` includes the centre, if it was fitted. Its result is `undetermined` where a
+            focal length is not.
         label: the labels of the zooms, in order.
-        focal, focal_std: focal length of each and its standard deviation, px.
+        focal, focal_std: focal length of each and its standard deviation, px; infinite where most corners
+            of its photos are outliers.
         frame_focal: focal length of each photo, px.
         covariance: of log f of each zoom, of the zoom model's parameters, and of the centre, half image
             diagonals: photos are taken to err each by itself. Focal length and distance stand in for each
@@ -246,9 +248,10 @@ def fit_boards(
     check("fit_boards", zoom=zoom)
     family = RadialPolynomial() if family is None else family
     terms = checked_terms(terms, family.most_terms)
-    middle = (np.array(given.image_size) - 1) / 2
     fitted = isinstance(centre, str) and centre == "fit"
-    origin = middle if isinstance(centre, str) else np.asarray(centre, float)
+    origin = given_centre("image" if fitted else centre, given.image_size, stacklevel=4)
+    if smooth is not None:
+        check_above(0, smooth=smooth)
     data = data_of(given, number, len(label), origin, _CENTRE_STD if fitted else _HELD, smooth, label)
     coefficients = coefficients_of(given.grids, number, given.image_size, origin, family, terms)
     wide = padded_to(coefficients, len(data.smooth))
@@ -312,12 +315,17 @@ def _described(given, data, solved, label, origin, fitted):
     all_numbers = np.asarray(known.covariance)
     kept = np.r_[:zooms, len(model.log_focal) : len(all_numbers)]
     covariance = all_numbers[np.ix_(kept, kept)]
+    squares = np.where(np.asarray(known.inlier), np.sum(np.asarray(known.missed) ** 2, axis=-1), 0)[:photos]
+    counts, seen = (np.asarray(of).sum(axis=1)[:photos] for of in (known.inlier, data.there))
+    number = np.asarray(data.zoom)[:photos]
+    lost = np.flatnonzero(2 * np.bincount(number, counts) < np.bincount(number, seen))
+    covariance[lost] = covariance[:, lost] = 0
+    covariance[lost, lost] = np.inf  # what fits few of its corners says nothing of a zoom
     log_std = np.sqrt(np.diag(covariance)[:zooms])
     size = ravel_pytree(model.zoom.parameters)[0].size
     joint = covariance[zooms:, zooms:]
-    squares = np.where(np.asarray(known.inlier), np.sum(np.asarray(known.missed) ** 2, axis=-1), 0)[:photos]
-    counts = np.asarray(known.inlier).sum(axis=1)[:photos]
     rms = jnp.asarray(np.sqrt(squares.sum() / max(counts.sum(), 1)))
+    of_photos = np.sqrt(squares.sum(axis=1) / np.maximum(counts, 1))
     lens = ZoomLens(
         zoom=model.zoom,
         centre=centre,
@@ -330,7 +338,7 @@ def _described(given, data, solved, label, origin, fitted):
     fit = ZoomFit(
         lens=lens,
         rms=rms,
-        frame_rms=jnp.asarray(np.sqrt(squares.sum(axis=1) / np.maximum(counts, 1))),
+        frame_rms=jnp.asarray(np.where(2 * counts >= seen, of_photos, np.nan)),
         covariance=jnp.asarray(joint[:size, :size]),
         result=judged(model.zoom, result, jnp.asarray(determined), known.certificate),
         steps=jnp.asarray(steps),
@@ -338,7 +346,6 @@ def _described(given, data, solved, label, origin, fitted):
         rms_unconstrained=rms,
         joint=jnp.asarray(joint) if fitted else None,
     )
-    number = np.asarray(data.zoom)[:photos]
     return BoardFit(
         fit=fit,
         label=jnp.asarray(label),

@@ -22,6 +22,7 @@ def cache_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
 
     Args:
         folder: where to; by default ``compiled`` in the folder ``ZOOMJAX_CACHE``, or in the user's cache.
+            Of several calls the last one counts.
 
     Returns:
         The folder. None, and nothing is kept, if none can be written to. If JAX has been told of a folder
@@ -37,13 +38,16 @@ def cache_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
         >>> jax.config.update("jax_compilation_cache_dir", None)
     """
     import jax  # not needed to read this module, nor to remove a program
+    from jax.experimental.compilation_cache import compilation_cache
 
     if own := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return Path(own)
-    place = cache_folder("compiled") if folder is None else Path(folder)
+    place = cache_folder("compiled") if folder is None else Path(folder).absolute()
     if place is None or not _can_write(place):
         return None
     _remove_torn(place)
+    if getattr(jax.config, "jax_compilation_cache_dir", None) not in (None, str(place)):
+        compilation_cache.reset_cache()  # or JAX goes on with the folder that it has opened
     jax.config.update("jax_compilation_cache_dir", str(place))
     if importlib.util.find_spec("filelock"):  # without it JAX warns, and keeps nothing
         jax.config.update("jax_compilation_cache_max_size", _MOST)

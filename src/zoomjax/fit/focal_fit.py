@@ -13,8 +13,10 @@ from jaxtyping import Array, Float, Int
 from .._core.arguments import kinds_checked
 from .._core.types import traced
 from ..lines.base import AbstractLines
+from ..lines.buckets import bucketed
 from ..models.model import Model
 from ..models.zoom import AbstractZoom
+from .energy import counted_frames
 from .focal_lengths import (
     MOST_STEPS,
     UNKNOWN,
@@ -26,7 +28,7 @@ from .focal_lengths import (
     with_covariance,
 )
 from .prepare import asked_for
-from .result import ZoomFit
+from .result import RESULTS, ZoomFit, failed
 from .wrapper import about_own_centre
 from .zoom import fit_zoom
 
@@ -35,9 +37,11 @@ class FocalFit(eqx.Module):
     """A zoom lens fitted together with the focal lengths of its frames.
 
     Attributes:
-        fit: the fit at the estimated focal lengths; its covariance includes their remaining uncertainty.
+        fit: the fit at the estimated focal lengths; its covariance includes their remaining uncertainty,
+            and its result is `undetermined` where they leave a parameter open.
         focal: the estimated focal length of each frame.
         std: their standard deviations, same unit; at most about those given, and 0 where 0 was given.
+            Infinite where it is not determined; that given for a frame whose lines all weigh nothing.
         given: the focal lengths of the lines.
         steps: number of steps the joint solver took.
     """
@@ -104,11 +108,13 @@ def fit_focal(
             "Focal lengths are refined in float64 only: "
             f'jax.config.update("jax_enable_x64", True), and not lines in {given.dtype}.'
         )
-    if not traced((sigma, given)) and np.unique(np.asarray(given)[np.isfinite(sigma)]).size < 2:
-        raise ValueError(
-            "Argument focal_sigma must be finite for frames at two different focal lengths or more, but it "
-            f"is {focal_sigma}. {UNKNOWN}"
-        )
+    if not traced((sigma, lines)):
+        told = np.isfinite(sigma) & np.asarray(counted_frames(bucketed(lines)))[: given.shape[0]]
+        if np.unique(np.asarray(given)[told]).size < 2:
+            raise ValueError(
+                "Argument focal_sigma must be finite for frames at two different focal lengths or more, "
+                f"with lines that weigh something, but it is {focal_sigma}. {UNKNOWN}"
+            )
     start = fit_zoom(lines, zoom=model, invertible=False, throw=throw)
     focal, refitted, steps, reached = refined(lines, start.lens.zoom, sigma)
     if throw and not traced(reached) and not reached:
@@ -118,11 +124,23 @@ def fit_focal(
         )
     moved = at_focal_lengths(lines, focal)
     fit = fit_zoom(moved, zoom=refitted, invertible=invertible, throw=throw)
-    std, *wider = posterior(moved, fit.lens.zoom, fit.covariance, fit.joint, sigma, given)
+    std, covariance, joint, determined = posterior(
+        moved, fit.lens.zoom, fit.covariance, fit.joint, sigma, given
+    )
+    fit = with_covariance(_judged(fit, reached, determined), covariance, joint)
     return FocalFit(
-        fit=with_covariance(fit, *wider),
+        fit=fit.result.error_if(fit, failed(fit.result)) if throw and traced(reached) else fit,
         focal=focal,
         std=std,
         given=given,
         steps=steps,
     )
+
+
+def _judged(fit, reached, determined):
+    """The fit whose result says, too, how the focal lengths were found."""
+    unfinished: Any = RESULTS.nonlinear_max_steps_reached
+    undetermined: Any = RESULTS.undetermined
+    told = RESULTS.where(determined | failed(fit.result), fit.result, undetermined)
+    told = RESULTS.where(reached | failed(fit.result), told, unfinished)
+    return eqx.tree_at(lambda fit: fit.result, fit, told)

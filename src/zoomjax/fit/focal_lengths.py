@@ -30,14 +30,22 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Num, ScalarLike
 
 from .._core.arguments import kinds_checked
-from .._core.fields import refuse_masked
+from .._core.fields import integers, real_argument
 from .._core.types import AnyArray, Focal, traced
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_jit, of_frames
 from ..models.requirements import check
 from ..models.zoom import AbstractPriorZoom, with_parameters
 from .covariance import parameter_covariance
-from .energy import coefficients_by, line_weights, linearised, prior_error, prior_residuals, residuals
+from .energy import (
+    coefficients_by,
+    counted_frames,
+    line_weights,
+    linearised,
+    prior_error,
+    prior_residuals,
+    residuals,
+)
 from .family_lines import with_family
 from .result import ZoomFit
 from .same_camera import check_lines_of
@@ -92,15 +100,15 @@ def with_focal_sigma(
         )
     check("with_focal_sigma", shift=fit.lens.shift)
     number = lines.focal.shape[0]
-    if shared is not None and jnp.shape(shared) != (number,):
+    together: Any = np.arange(number) if shared is None else integers("shared")(shared)
+    if np.shape(together) != (number,):
         raise ValueError(
             f"Argument shared must hold a number for each of the {number} frames, but its shape is "
-            f"{jnp.shape(shared)}."
+            f"{np.shape(together)}."
         )
-    shared = np.arange(number) if shared is None else shared
     lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
     own = (fit.lens.zoom, fit.covariance, fit.joint)
-    return with_covariance(fit, *_widened_by(lines, *own, sigma, shared))
+    return with_covariance(fit, *_widened_by(lines, *own, sigma, together))
 
 
 def with_covariance(fit, covariance, joint):
@@ -131,8 +139,7 @@ def checked_sigma(focal_sigma: Any, focal: Focal) -> Float[AnyArray, "frame"]:
     focal = jnp.asarray(focal)
     if focal_sigma is None:
         raise ValueError(f"Argument focal_sigma must be a number or one a frame, but it is None. {UNKNOWN}")
-    refuse_masked("focal_sigma", focal_sigma)
-    sigma = jnp.asarray(focal_sigma, focal.dtype)
+    sigma = jnp.asarray(real_argument("focal_sigma", focal_sigma), focal.dtype)
     if sigma.shape not in ((), focal.shape):
         raise ValueError(
             f"Argument focal_sigma must hold one number, or one for each of the {focal.shape[0]} frames, "
@@ -347,19 +354,42 @@ def refined(lines, zoom, sigma):
     return _focal_of(lines, relative, t), model(flat), steps, reached
 
 
-@bucketed_jit(frames=["sigma", "given"], returns=[of_frames, None, None])
+@bucketed_jit(frames=["sigma", "given"], returns=[of_frames, None, None, None])
 def posterior(lines, zoom, covariance, joint, sigma, given):
     """Standard deviations of the focal lengths, given the lines and the prior, at the minimum.
 
-    And the covariance of the parameters, and that with the centre, enlarged by it.
+    And the covariance of the parameters, and that with the centre, enlarged by it; and whether the zoom
+    model is determined. Infinite is what neither lines nor prior determine: a focal length at which the
+    coefficients are those nearby, or one that goes with another model. Without lines the prior is left.
     """
     relative = sigma / given
     known = jnp.isfinite(relative)
-    relative = jnp.where(known, relative, 1)
+    spread = jnp.where(known, relative, 1)
     tau = _prior_weights(lines, zoom)
-    near = _joint(lines, zoom, relative, known, tau, jnp.zeros_like(relative))
-    inverse = _inverse(near.gauss_newton)
-    both = (inverse @ near.middle @ inverse)[-relative.shape[0] :, -relative.shape[0] :]
-    of_focal = relative[:, None] * both * relative[None]
-    std = jnp.asarray(lines.focal) * jnp.sqrt(jnp.diagonal(of_focal))
-    return std, *_widened(lines, zoom, covariance, joint, of_focal)
+    near = _joint(lines, zoom, spread, known, tau, jnp.zeros_like(spread))
+    inverse, free = _inverse(near.gauss_newton), _free(near.gauss_newton)
+    number = free.shape[0] - relative.shape[0]
+    both = (inverse @ near.middle @ inverse)[number:, number:]
+    of_focal = spread[:, None] * both * spread[None]
+    told = jnp.where(free[number:], jnp.inf, jnp.sqrt(jnp.diagonal(of_focal)))
+    std = jnp.asarray(lines.focal) * jnp.where(counted_frames(lines), told, relative)
+    covariance = _unknown(covariance, free[:number])
+    if joint is not None:
+        joint = _unknown(joint, jnp.pad(free[:number], (0, joint.shape[0] - number)))
+    return std, *_widened(lines, zoom, covariance, joint, of_focal), ~jnp.any(free[:number])
+
+
+def _free(matrix):
+    """Which unknowns a symmetric matrix does not determine: directions that `_inverse` leaves out."""
+    size = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0))
+    size = jnp.where(size > 0, size, 1)
+    values, vectors = jnp.linalg.eigh(matrix / size[:, None] / size[None])
+    eps = jnp.finfo(values.dtype).eps
+    null = values <= 10 * values.shape[0] * eps * jnp.max(jnp.abs(values))  # as `pinv` has it
+    return jnp.sum(jnp.where(null[None], vectors**2, 0), axis=1) > jnp.sqrt(eps)
+
+
+def _unknown(covariance, free):
+    """A covariance with infinite variances, and without covariances, of some of its unknowns."""
+    there = jnp.where(free[:, None] | free[None], 0, covariance)
+    return jnp.where(jnp.diag(free), jnp.inf, there)

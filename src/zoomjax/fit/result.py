@@ -19,26 +19,30 @@ from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ..models.zoom import AbstractFocusZoom, AbstractZoom
 from .covariance import parameter_covariance
-from .energy import energy_by_frame, linearised
+from .energy import counted_frames, energy_by_frame, linearised
 
 
 def lens_of(lines: AbstractLines, zoom: AbstractZoom) -> ZoomLens:
-    """The lens that a zoom model fitted to these lines makes."""
-    focal = jnp.asarray(lines.focal)
+    """The lens that a zoom model fitted to these lines makes, for the range of the frames that count."""
+    counted = counted_frames(lines)
+    fitted = counted | ~jnp.any(counted)
+    focus = lines.focus if isinstance(zoom, AbstractFocusZoom) else None
     return ZoomLens(
         zoom=zoom,
         centre=jnp.asarray(lines.centre),
-        focal_range=jnp.stack([jnp.min(focal), jnp.max(focal)]),
+        focal_range=_range(jnp.asarray(lines.focal), fitted),
         image_size=lines.image_size,
         focal_unit=lines.focal_unit,
-        focus_range=_focus_range(lines) if isinstance(zoom, AbstractFocusZoom) else None,
+        focus_range=None if focus is None else _range(jnp.asarray(focus), fitted),
         family=lines.family,
     )
 
 
-def _focus_range(lines):
-    focus = jnp.asarray(lines.focus)
-    return jnp.stack([jnp.min(focus), jnp.max(focus)])
+def _range(values, fitted):
+    """The least and the greatest of the values fitted."""
+    return jnp.stack(
+        [jnp.min(jnp.where(fitted, values, jnp.inf)), jnp.max(jnp.where(fitted, values, -jnp.inf))]
+    )
 
 
 class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]

@@ -52,7 +52,8 @@ class RobustFit(eqx.Module):
         fit: the zoom model fitted to the weighted lines; its RMS and covariance are theirs.
         weight: of each line, from 0 (rejected) to 1, or to the weight it had before.
         line_rms: RMS distance of each line's n corrected points to their line, px, with a divisor of n - 2
-            so that short lines do not look better than they are; of rejected ones too.
+            so that short lines do not look better than they are; of rejected ones too. NaN for lines of
+            fewer than three points, which count as none.
         scale: the typical `line_rms`, px: the median over the lines that had a weight above 0 before.
     """
 
@@ -68,7 +69,7 @@ class RobustFit(eqx.Module):
     @property
     def rejected(self) -> Int[np.ndarray, "rejected"]:
         """Indices of the rejected lines, the least straight first."""
-        lines = np.flatnonzero(np.asarray(self.weight) == 0)
+        lines = np.flatnonzero((np.asarray(self.weight) == 0) & ~np.isnan(np.asarray(self.line_rms)))
         return lines[np.argsort(-np.asarray(self.line_rms)[lines], kind="stable")]
 
 
@@ -113,16 +114,21 @@ def fit_robust(
     fit = fit_zoom(
         weighted, zoom=model, solver=solver, max_steps=max_steps, invertible=invertible, throw=throw
     )
-    line_rms, median = _line_rms(padded, fit.lens.zoom)
-    return robust_of_given(RobustFit(fit, jnp.asarray(weighted.weight), line_rms, median), given)
+    return robust_of_given(_described(padded, weighted, fit), given)
 
 
 def fit_robust_freely(lines, model, algebraic, solver, max_steps):
     """`fit_robust` of padded lines and a prepared model, whether invertible or not, and its outcome."""
     weighted, model = _turns(lines, model, algebraic)
     fit, outcome = fit_prepared(weighted, model, solver, max_steps)
+    return _described(lines, weighted, fit), outcome
+
+
+def _described(lines, weighted, fit):
+    """The fit with the weights and the errors of its lines."""
     line_rms, median = _line_rms(lines, fit.lens.zoom)
-    return RobustFit(fit, jnp.asarray(weighted.weight), line_rms, median), outcome
+    line_rms = jnp.where(lines.counts > 2, line_rms, jnp.nan)
+    return RobustFit(fit, jnp.asarray(weighted.weight), line_rms, median)
 
 
 def robust_of_given(robust: RobustFit, lines: AbstractLines) -> RobustFit:

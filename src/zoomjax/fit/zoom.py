@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
+from .._core.checks import real_numbers
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines, SomeLines
 from ..lines.buckets import bucketed
@@ -110,23 +111,30 @@ def about_centre(lines: SomeLines, centre: CentreArgument | None) -> SomeLines |
     if centre is None:
         found = about_own_centre(lines)
         return found
-    if isinstance(centre, str):
-        if centre != "image":
-            raise ValueError(
-                f'Argument centre must be "fit", "image" or two coordinates in px, but it is {centre!r}.'
-            )
-        centre = (np.array(lines.image_size) - 1) / 2
-    centre = np.asarray(centre, float)
-    if centre.shape != (2,) or not np.isfinite(centre).all():
-        raise ValueError(
-            f'Argument centre must be "fit", "image" or two coordinates in px, but it is {centre}.'
-        )
-    if ((centre < -0.5) | (centre > np.array(lines.image_size) - 0.5)).any():
-        width, height = lines.image_size
-        warnings.warn(
-            f"The centre of distortion, ({centre[0]:g}, {centre[1]:g}) px, is outside of the image of "
-            f"{width} x {height} px. That is right for a crop of a larger image alone.",
-            stacklevel=4,
-        )
-    found = lines.about(centre)
+    found = lines.about(given_centre(centre, lines.image_size, stacklevel=5))
     return found
+
+
+def given_centre(
+    centre: CentreArgument, image_size: tuple[int, int], *, stacklevel: int
+) -> Float[np.ndarray, "2"]:
+    """The centre of distortion, px, that an argument gives, other than "fit".
+
+    Raises:
+        ValueError: it is neither "image" nor two coordinates.
+    """
+    if isinstance(centre, str) and centre == "image":
+        return (np.array(image_size) - 1) / 2
+    told = real_numbers(centre)
+    if told is None or told.shape != (2,) or not np.isfinite(told).all():
+        raise ValueError(
+            f'Argument centre must be "fit", "image" or two coordinates in px, but it is {centre!r}.'
+        )
+    if ((told < -0.5) | (told > np.array(image_size) - 0.5)).any():
+        width, height = image_size
+        warnings.warn(
+            f"The centre of distortion, ({told[0]:g}, {told[1]:g}) px, is outside of the image of "
+            f"{width} x {height} px. That is right for a crop of a larger image alone.",
+            stacklevel=stacklevel,
+        )
+    return told.astype(float)

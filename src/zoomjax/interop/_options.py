@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .._core.checks import checked_terms
+from .._core.checks import checked_terms, real_numbers
 from ..io.focal_track import FocalTrack
 from ..models.brown_conrady import BrownConrady
 from ..models.division import Division
@@ -41,7 +41,7 @@ def check_options(fmt: Format, given: dict[str, Any]) -> None:
 
 def positive(name: str, value: Any) -> float:
     """A positive number."""
-    number = float(value) if isinstance(value, int | float | np.number) else math.nan
+    number = float(value) if real_numbers(value) is not None and np.ndim(value) == 0 else math.nan
     if not (math.isfinite(number) and number > 0):
         raise ValueError(f"Argument {name} must be a positive number, but it is {value!r}.")
     return number
@@ -58,10 +58,8 @@ def check_model(terms: Any, family: Any) -> None:
 
 def positives(name: str, values: Any) -> tuple[float, ...]:
     """One positive number or several."""
-    try:
-        found = np.atleast_1d(np.asarray(values, float))
-    except (TypeError, ValueError):
-        found = np.zeros(0)
+    numbers = real_numbers(values)
+    found = np.zeros(0) if numbers is None else np.atleast_1d(numbers)
     if found.ndim != 1 or not (np.isfinite(found) & (found > 0)).all() or not found.size:
         raise ValueError(f"Argument {name} must hold positive numbers, but it is {values!r}.")
     return tuple(found.tolist())
@@ -107,4 +105,9 @@ def _tracked(fmt: Format, track: FocalTrack, focal: Any) -> tuple[tuple[float, .
         raise ValueError("Argument track must be in frames (columns frame,focal), but it is in seconds.")
     first, last = math.ceil(track.position[0]), math.floor(track.position[-1])
     frames = range(first, last + 1)
+    if not frames:
+        raise ValueError(
+            f"Argument track must reach over a whole frame, but it is from {track.position[0]:g} to "
+            f"{track.position[-1]:g}."
+        )
     return tuple(track.at(frame, math.nan) for frame in frames), tuple(frames)

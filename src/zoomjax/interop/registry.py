@@ -141,10 +141,11 @@ def write(
         )
     files = tuple(path / name for name in fmt.file_names(job)) if several else (path,)
     refuse_existing(list(files), overwrite=overwrite)
+    others = _others(path, files) if several else ()
     if isinstance(fmt, FolderFormat):
         with whole_folder(path) as part:
             worst, notes = fmt.write_all(job, part)
-        return Report(fmt.name, job.focal or (), worst, None, notes, files)
+        return Report(fmt.name, job.focal or (), worst, None, (*notes, *others), files)
     assert isinstance(fmt, NodeFormat)
     found = solve(fmt, job)
     if several:
@@ -159,7 +160,7 @@ def write(
         tuple(node.focal for node in found.nodes),
         max(found.at_nodes, written),
         found.between,
-        (*fmt.notes(found.nodes, job), *_shortfall(fmt, found, job)),
+        (*fmt.notes(found.nodes, job), *_shortfall(fmt, found, job), *others),
         files,
     )
 
@@ -314,9 +315,26 @@ def _files(path: Path) -> list[Path]:
     return sorted(found, key=_by_value)
 
 
+def _others(folder: Path, files: Iterable[Path]) -> tuple[str, ...]:
+    """That a folder keeps files that look like those written, as those of an earlier and longer track."""
+    if not folder.is_dir():
+        return ()
+    names, suffixes = {file.name for file in files}, {file.suffix.lower() for file in files}
+    found = sorted(
+        name for name in os.listdir(folder) if name not in names and Path(name).suffix.lower() in suffixes
+    )
+    if not found:
+        return ()
+    more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+    return (
+        f"The folder {folder} holds other files of this kind, {found[0]}{more}, of an earlier export, say: "
+        "remove them, or programs that read all of them take another lens there.",
+    )
+
+
 def _by_value(path: Path) -> list[Any]:
-    """Words and numbers of a name in turn, so that 9 is before 18."""
-    parts = re.split(r"(\d+(?:\.\d+)?)", path.stem)
+    """Words and numbers of a name in turn, so that 9 is before 18, and the frame -1 before 0."""
+    parts = re.split(r"((?:(?<![^.])-)?\d+(?:\.\d+)?)", path.stem)
     return [float(part) if index % 2 else part for index, part in enumerate(parts)]
 
 

@@ -37,6 +37,7 @@ def stream(
 
     Raises:
         RuntimeError: the executor gave up.
+        TypeError: `paths` is one path, whose letters would be files.
         And what `read` and `compress` raise, of the first such file.
 
     Example:
@@ -50,6 +51,8 @@ def stream(
         >>> [float(small.focal[0]) for small in stream(sorted(folder.iterdir()))]
         [24.0, 70.0]
     """
+    if isinstance(paths, str | bytes | os.PathLike):
+        raise TypeError(f"Argument paths must be a list of files, [first, second], but it is {paths!r}.")
     if executor is None:
         for path in paths:
             yield compress(read(path), terms)

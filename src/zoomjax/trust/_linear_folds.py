@@ -134,12 +134,16 @@ class _Pass(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Some parameters, the energy there, half its gradient, and its Gauss-Newton matrix."""
+    """Some parameters, the energy there, half its gradient, and its Gauss-Newton matrix.
+
+    And how far a unit of each parameter moves the points, px^2, along their lines and across.
+    """
 
     parameters: np.ndarray
     energy: float
     gradient: np.ndarray
     matrix: np.ndarray
+    moved: np.ndarray
     lines: _Pass
 
 
@@ -172,8 +176,9 @@ def cross_validated(lanes, designs):
 def _minimised(lanes, weight, design, parameters, known=None):
     """The state of least energy near these parameters, and whether it is one.
 
-    Levenberg-Marquardt without damping, until a step fails. Directions that the lines do not determine stay
-    as they are. `known` is the pass over the lines at the start, if it has been made.
+    Levenberg-Marquardt without damping, until a step fails. Directions that the lines do not determine are
+    0 then, and not what lines that are left out have made of them. `known` is the pass over the lines at
+    the start, if it has been made.
     """
     in_frame = lanes.total(weight)
     share = np.zeros(lanes.frames)
@@ -189,7 +194,7 @@ def _minimised(lanes, weight, design, parameters, known=None):
         if there.energy <= at.energy * (1 + 128 * eps):  # rounding must not reject the last step
             at, damping = there, damping / 10
             if decrease <= 16 * eps * at.energy:
-                return at, True
+                return _without_undetermined(at, lanes, weights, design), True
         else:
             damping = max(10 * damping, 1e-3)
     return at, False
@@ -197,13 +202,35 @@ def _minimised(lanes, weight, design, parameters, known=None):
 
 def _move(at, damping):
     """The damped Gauss-Newton step, and by how much it should lower the energy."""
-    size = np.sqrt(np.maximum(np.diagonal(at.matrix), 0))  # rounding alone may be negative
-    size = np.where(size > 0, size, 1)
-    values, vectors = np.linalg.eigh(at.matrix / size[:, None] / size)
-    known = values > 64 * np.finfo(float).eps * values[-1]
+    size, values, vectors, known = _directions(at)
     inverse = np.where(known, 1 / np.where(known, values + damping, 1), 0)
     along = vectors.T @ (at.gradient / size)
     return -(vectors @ (inverse * along)) / size, np.sum(inverse * along**2)
+
+
+def _directions(at):
+    """The units of the parameters, eigenvalues and vectors of the matrix in them, and which are determined.
+
+    What Gram matrices of lines lose to rounding is a part of what the parameters move, also along the
+    lines: of lines through the centre the matrix holds nothing else.
+    """
+    eps = np.finfo(float).eps
+    size = np.sqrt(np.maximum(np.diagonal(at.matrix), 0))  # rounding alone may be negative
+    told = size**2 > 4 * eps * at.moved
+    size = np.where(told, size, 1)
+    values, vectors = np.linalg.eigh(np.where(told[:, None] & told, at.matrix, 0) / size[:, None] / size)
+    lost = 4 * eps * np.max(at.moved / size**2, where=told, initial=0)
+    return size, values, vectors, values > max(64 * eps * values[-1], lost)
+
+
+def _without_undetermined(at, lanes, weights, design):
+    """The state of which nothing is left along directions that the lines do not determine."""
+    size, _, vectors, known = _directions(at)
+    if known.all():
+        return at
+    along = vectors.T @ (size * at.parameters.reshape(-1))
+    left = vectors @ np.where(known, along, 0) / size
+    return _state(lanes, weights, design, left.reshape(at.parameters.shape))
 
 
 def _state(lanes, weights, design, parameters, known=None):
@@ -213,6 +240,7 @@ def _state(lanes, weights, design, parameters, known=None):
     rows, flat = design.basis[lanes.frame[lanes.starts]], parameters.reshape(-1)
     pulled = design.precision @ flat
     terms, size = len(gradient), rows.shape[1]
+    moved = lanes.total(weights * np.einsum("jjl->jl", lanes.gram[0] + lanes.gram[2])[1:])
     products = (rows[:, :, None] * rows[:, None]).reshape(len(rows), -1)
     blocks = (matrix.reshape(-1, len(rows)) @ products).reshape(terms, terms, size, size)
     return _State(
@@ -220,6 +248,7 @@ def _state(lanes, weights, design, parameters, known=None):
         weights @ lines.squares + flat @ pulled,
         (gradient @ rows).T.reshape(-1) + pulled,
         blocks.transpose(2, 0, 3, 1).reshape(flat.size, flat.size) + design.precision,
+        (moved @ rows**2).T.reshape(-1),
         lines,
     )
 

@@ -21,6 +21,7 @@ from ..fit.result import RESULTS, ZoomFit
 from ..lines.base import AbstractLines
 from ..lines.lines import Lines
 from .evidence import Evidence, evidence
+from .folds import focals_there
 
 Verdict = Literal["good", "doubtful", "not determined"]
 
@@ -150,7 +151,8 @@ def assess(
     findings = [*_of_bands(found, fit), *_of_halves(found), *_of_lines(found), *_of_vanishing(found)]
     if held_out is not None and each_held_out is not None:
         both = (np.asarray(values, float) for values in (held_out, each_held_out))
-        findings += _of_frames(found, np.asarray(lines.focal), *both)
+        focal = np.asarray(lines.focal, float)
+        findings += _of_frames(found, np.where(np.isin(focal, focals_there(lines)), focal, np.nan), *both)
     return Assessment((), found).joined_by(findings)
 
 
@@ -263,7 +265,7 @@ def _of_vanishing(of: Evidence) -> Iterator[Finding]:
 
 def _of_frames(of: Evidence, focal: np.ndarray, zoom: np.ndarray, each: np.ndarray) -> Iterator[Finding]:
     """Frames left out and their own fits, but not those at the ends of the zoom, which are extrapolated."""
-    inner = (focal > focal.min()) & (focal < focal.max()) & np.isfinite(zoom) & np.isfinite(each)
+    inner = (focal > np.nanmin(focal)) & (focal < np.nanmax(focal)) & np.isfinite(zoom) & np.isfinite(each)
     if inner.sum() < 2:
         return
     joint, own = (float(np.sqrt(np.mean(values[inner] ** 2))) for values in (zoom, each))

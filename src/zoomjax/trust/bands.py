@@ -25,7 +25,7 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float, Num, PyTree, ScalarLike
 
 from .._core.arguments import kinds_checked
-from .._core.fields import check_positive
+from .._core.fields import check_positive, real_argument
 from .._core.types import AnyArray, Coefficients, Focal, Points, traced
 from ..fit.result import ZoomFit
 from ..models.lens import ZoomLens
@@ -46,15 +46,20 @@ def _compiled(function: Callable[Given, Result]) -> Callable[Given, Result]:
     @functools.wraps(function)
     def checked(*args: Given.args, **kwargs: Given.kwargs) -> Result:
         given: dict[str, Any] = signature.bind(*args, **kwargs).arguments
-        focal = given.get("focal")
-        check_positive("focal", focal if isinstance(focal, jax.Array) else np.asarray(focal, float))
+        for name in given.keys() & {"points", "focal"}:
+            given[name] = real_argument(name, given[name])
+        check_positive("focal", given["focal"])
         level = given.get("level", 0.5)
-        if not traced(level) and not (np.ndim(level) == 0 and 0 < level < 1):
+        if not traced(level) and not (_is_number(level) and 0 < level < 1):
             raise ValueError(f"Argument level must be a number between 0 and 1, but it is {level!r}.")
         given["fit"] = eqx.tree_at(lambda fit: fit.frame_rms, given["fit"], None)
         return program(**given)  # pyright: ignore[reportCallIssue]
 
     return checked
+
+
+def _is_number(value: Any) -> bool:
+    return np.ndim(value) == 0 and np.issubdtype(np.asarray(value).dtype, np.floating)
 
 
 Focals = Num[AnyArray | ScalarLike, "*focal"]

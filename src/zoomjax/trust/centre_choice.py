@@ -51,9 +51,11 @@ def choose_centre(lines: AnyCentreLines, model: Model) -> CentreChoice:
         lines = lines.weighted(np.ones(lines.frame.shape))  # as in every fold: one compiled program
     found = fit_centre(lines, zoom=model)
     small = lines.about(lines.centre)
-    parts = folds_of(small, "frame" if len(lines.focal) >= _FOLDS else "line", _FOLDS, 0)
+    own = own_weights(small)
+    frames = np.unique(np.asarray(small.frame)[own > 0]).size
+    parts = folds_of(small, "frame" if frames >= _FOLDS else "line", _FOLDS, 0)
     given = errors_of(small, model.with_parameters(None), parts).unseen
-    own, fitted = own_weights(small), np.full(given.shape, np.nan)
+    fitted = np.full(given.shape, np.nan)
     for fold in range(parts.number) if found.determined else ():
         out = parts.fold == fold
         kept = lines.weighted(own * ~out)

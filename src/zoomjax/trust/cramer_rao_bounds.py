@@ -25,6 +25,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, ScalarLike
 
 from .._core.arguments import kinds_checked
+from .._core.fields import real_argument
 from .._core.types import AnyArray, traced
 from ..fit.energy import line_normal
 from ..fit.same_camera import check_camera
@@ -169,7 +170,7 @@ def _displacement_rms(lens, other):
 
 def _checked_std(std, lines):
     """Standard deviations of points, positive and finite."""
-    std = jnp.asarray(std)
+    std = jnp.asarray(real_argument("std", std))
     if std.shape not in ((), lines.frame.shape):
         raise ValueError(
             f"Argument std must hold one number, or one for each of the {lines.frame.shape[0]} lines, but "

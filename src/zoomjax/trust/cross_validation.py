@@ -161,7 +161,7 @@ def _frames_by_fits(lines, terms, folds, seed):
 
 
 def _errors_by_fits(lines, model, parts):
-    """By a fit of its own for each fold, starting from that of all lines."""
+    """By a fit of its own for each fold, from that of all lines, unless some of that would stay."""
     own = own_weights(lines)
     everything = fit_zoom(lines, zoom=model, invertible=False, throw=False)
     seen = np.asarray(line_squares(lines, everything.lens.zoom))
@@ -176,8 +176,9 @@ def _errors_by_fits(lines, model, parts):
         except ValueError as error:
             problem = problem or str(error)
             continue
-        start = everything.lens.zoom
-        fit = fit_zoom(lines.weighted(kept), zoom=start, invertible=False, throw=False)
+        fit = fit_zoom(lines.weighted(kept), zoom=everything.lens.zoom, invertible=False, throw=False)
+        if fit.result == RESULTS.undetermined:  # where the start stays, which has seen the lines left out
+            fit = fit_zoom(lines.weighted(kept), zoom=model, invertible=False, throw=False)
         if fit.result in (RESULTS.successful, RESULTS.undetermined, RESULTS.folded):
             out = parts.fold == fold
             unseen[out] = np.asarray(line_squares(lines, fit.lens.zoom))[out]

@@ -84,7 +84,7 @@ class Evidence:
 
     Attributes:
         lines, frames, focals: how many lines, frames and distinct focal lengths count.
-        rejected: how many lines have a weight of 0.
+        rejected: how many lines of three points or more have a weight of 0.
         rms, rms_uncorrected: RMS distance to straight lines, with and without the correction.
         noise: RMS distance of points to smooth curves through their lines; NaN where they have few points.
         displacement: how far the correction moves points, RMS over the image, where that is largest.
@@ -159,7 +159,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     before = np.asarray(frame_energy(compressed, zero))
     return Evidence(
         lines=int((weight > 0).sum()),
-        rejected=0 if lines.weight is None else int((np.asarray(lines.weight) == 0).sum()),
+        rejected=int(((counts_of(lines) > 2) & (weight == 0)).sum()),
         frames=len(frames),
         focals=np.unique(np.asarray(lines.focal)[frames]).size,
         rms=float(fit.rms),
@@ -282,8 +282,9 @@ def _partings(lines: AbstractLines, fit: ZoomFit, weight: np.ndarray) -> dict[st
     order = counted[np.lexsort([rng.random(len(counted)), frame[counted]])]
     evenly = np.zeros(len(frame), bool)
     evenly[order[::2]] = True
-    rank = np.empty(len(focal), int)
-    rank[np.argsort(focal, kind="stable")] = np.arange(len(focal))
+    there = np.unique(frame[counted])
+    rank = np.zeros(len(focal), int)
+    rank[there[np.argsort(focal[there], kind="stable")]] = np.arange(len(there))
     parted = {"lines": evenly, "frames": rank[frame] % 2 == 0}
     across, down = np.asarray(_extent(lines, fit.lens.zoom)).T
     steep = down > across

@@ -23,7 +23,7 @@ class Folds(NamedTuple):
     """What is left out together.
 
     Attributes:
-        fold: of each line, from 0; -1 for lines that are never left out.
+        fold: of each line, from 0; -1 for lines that are never left out, as those that weigh nothing.
         unit: of each line, the focal length, frame or line it stands for; -1 as before.
         number: of folds.
     """
@@ -85,25 +85,29 @@ def folds_of(lines: AbstractLines, hold_out: HoldOut, folds: int | None, seed: i
     """
     if hold_out not in get_args(HoldOut):
         raise ValueError(f'Argument hold_out must be "focal", "frame" or "line", but it is {hold_out!r}.')
-    frame, focal = np.asarray(lines.frame), np.asarray(lines.focal)
+    frame, focal, counted = np.asarray(lines.frame), np.asarray(lines.focal), own_weights(lines) > 0
     rng = np.random.default_rng(checked_integer("seed", seed, 0))
     most = _LINE_FOLDS if hold_out == "line" else _MOST_FOLDS
     most = most if folds is None else checked_integer("folds", folds, 2)
     if hold_out == "line":
         # Every frame's lines over all folds, as evenly as can be.
-        order = np.lexsort([rng.random(len(frame)), frame])
-        fold = np.empty(len(frame), int)
-        fold[order] = np.arange(len(frame)) % most
-        return Folds(fold, np.arange(len(frame)), most)
+        lines_there = np.flatnonzero(counted)
+        order = lines_there[np.lexsort([rng.random(len(lines_there)), frame[counted]])]
+        fold = np.full(len(frame), -1)
+        fold[order] = np.arange(len(order)) % most
+        return Folds(fold, np.where(counted, np.arange(len(frame)), -1), most)
+    there = np.unique(frame[counted])
     if hold_out == "frame":
-        group, number, needed = frame, len(focal), "two or more frames"
+        number, needed = len(there), "two or more frames"
+        place = np.searchsorted(there, frame)
     else:
-        distinct, place = np.unique(focal, return_inverse=True)
+        distinct = np.unique(focal[there])
         number, needed = (
             len(distinct) - 2,
             "4 or more distinct focal lengths, as both ends are never left out",
         )
-        group = np.where((place > 0) & (place <= number), place - 1, -1)[frame]
+        place = np.searchsorted(distinct, focal[frame]) - 1
+    group = np.where(counted & (place >= 0) & (place < number), place, -1)
     if number < 2:
         raise ValueError(
             f'Argument hold_out is "{hold_out}", which needs {needed}; there are fewer. Use '
@@ -119,6 +123,12 @@ def shares(lines: AbstractLines) -> Float[np.ndarray, "line"]:
     frame, own = np.asarray(lines.frame), own_weights(lines)
     total = np.bincount(frame, own, minlength=len(lines.focal))
     return own / (np.where(total > 0, total, 1) * max(np.sum(total > 0), 1))[frame]
+
+
+def focals_there(lines: AbstractLines) -> Float[np.ndarray, "some"]:
+    """The distinct focal lengths of frames of which a line counts."""
+    counted = own_weights(lines) > 0
+    return np.unique(np.asarray(lines.focal)[np.asarray(lines.frame)[counted]])
 
 
 def own_weights(lines):

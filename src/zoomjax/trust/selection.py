@@ -35,7 +35,7 @@ from ..models.polynomial import RadialPolynomial
 from ..models.smooth import SmoothZoom
 from ..models.zoom import AbstractZoom, PolynomialZoom
 from .cross_validation import errors_of
-from .folds import Folds, HoldOut, LineErrors, folds_of, shares, small_lines
+from .folds import Folds, HoldOut, LineErrors, focals_there, folds_of, shares, small_lines
 
 _TERMS = 3  # of the default candidates, at most
 _DEGREES = 4
@@ -226,7 +226,7 @@ def select_model(
     small = small_lines(plain, own)
     forms = {c.family: measured_as(_in_family(plain, small, c.family, own), lines) for c in compared}
     if hold_out is None:
-        hold_out = "focal" if np.unique(np.asarray(small.focal)).size > 3 else "line"
+        hold_out = "focal" if focals_there(small).size > 3 else "line"
     parts = folds_of(small, hold_out, folds, seed)
     verdicts, best, chosen = compare(small, compared, parts, forms, rule)
     fit = fit_zoom(forms[chosen.family], zoom=chosen)

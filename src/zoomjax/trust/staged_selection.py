@@ -2,14 +2,12 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from ..fit.zoom import fit_zoom
 from ..lines.compressed import CompressedLines
 from ..models.model import Model
 from ..models.smooth import SmoothZoom
 from ..models.zoom import AbstractZoom
-from .folds import HoldOut, folds_of
+from .folds import HoldOut, focals_there, folds_of
 from .selection import Selection, candidate_errors, compare_errors
 
 
@@ -30,9 +28,10 @@ def select_in_stages(
     Raises:
         ValueError: no candidate can be compared.
     """
-    many = np.unique(np.asarray(lines.focal)).size > 3
+    distinct = focals_there(lines).size
+    many = distinct > 3
     hold_out: HoldOut = "focal" if many else "line"
-    most = min(folds, np.unique(np.asarray(lines.focal)).size - 2) if many else folds
+    most = min(folds, distinct - 2) if many else folds
     parts = folds_of(lines, hold_out, most, 0)
     candidates = [Model(zoom, terms[0]) for zoom in zooms]
     errors = [candidate_errors(lines, candidate, parts) for candidate in candidates]

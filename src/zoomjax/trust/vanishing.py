@@ -23,6 +23,7 @@ from ..fit.same_camera import check_camera
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
+from .folds import own_weights
 
 _PHOTOS = 12  # evenly spread over the focal lengths
 _MOST_LINES = 100  # of a photo, the longest
@@ -84,10 +85,10 @@ def vanishing_points(lines: Lines, lens: ZoomLens) -> VanishingPoints:
         (True, True)
     """
     check_camera(lens, lines)
-    frame, weight = np.asarray(lines.frame), lines.weight
-    counted = np.ones(len(frame), bool) if weight is None else np.asarray(weight) > 0
+    frame, counted = np.asarray(lines.frame), own_weights(lines) > 0
     focal, points = np.asarray(lines.focal, float), lines.to_ragged()
-    order = np.argsort(focal, kind="stable")
+    there = np.unique(frame[counted])
+    order = there[np.argsort(focal[there], kind="stable")]
     looked_at = order[np.unique(np.linspace(0, len(order) - 1, min(_PHOTOS, len(order))).astype(int))]
     found = []
     for index in looked_at:
