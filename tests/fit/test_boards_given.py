@@ -3,17 +3,16 @@
 import numpy as np
 import pytest
 
+from tests._boards import LABEL, SIZE, bent, seen_through, true_lens
 from zoomjax.fit import RESULTS, fit_boards
-
-from .test_boards import LABEL, SIZE, bent, lens, seen_through
+from zoomjax.fit._board_start import ordered
 
 pytestmark = pytest.mark.usefixtures("unchecked")
-lens = lens  # the fixture
 
 
 @pytest.fixture(scope="module")
-def grids(lens):
-    return seen_through(lens, bent(), np.repeat([1000.0, 1600.0, 2600.0], 6))[0]
+def grids():
+    return seen_through(true_lens(), bent(), np.repeat([1000.0, 1600.0, 2600.0], 6))[0]
 
 
 def masked(grid):
@@ -72,19 +71,26 @@ def test_a_photo_of_something_else_does_not_look_the_best(grids):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-def test_a_zoom_of_which_nothing_fits_has_no_focal_length(grids, seed):
-    """One such photo spoils the start of its zoom: 87 ± 2 px for 1000, and all of its corners outliers."""
+def test_a_photo_of_something_else_does_little(grids, seed):
+    """It spoilt the start of its zoom: 87 ± 2 px for 1000, with all of its corners outliers."""
     fit = fit_boards(scrambled(grids, seed), LABEL, image_size=SIZE)
-    off = abs(np.asarray(fit.focal) - [1000, 1600, 2600])
-    assert (off < 5 * np.asarray(fit.focal_std)).all()
-    wrong = off > 100
-    assert np.isposinf(np.asarray(fit.focal_std)[wrong]).all()
-    undetermined = RESULTS[RESULTS.undetermined]
-    assert RESULTS[fit.fit.result] == (undetermined if wrong.any() else "")
+    assert fit.fit.result != RESULTS.undetermined
+    np.testing.assert_allclose(fit.focal, [1000, 1600, 2600], rtol=0.01)
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="the start of a zoom is not robust against one photo")
-def test_a_photo_of_something_else_does_little(grids):
-    fit = fit_boards(scrambled(grids, 0), LABEL, image_size=SIZE)
-    np.testing.assert_allclose(fit.focal, [1000, 1600, 2600], rtol=0.01)
+def test_a_zoom_of_which_nothing_fits_has_no_focal_length(grids):
+    """Where most of its photos show something else."""
+    noisy = grids.copy()
+    for photo in range(5):
+        noisy[photo] = scrambled(grids[photo : photo + 1].repeat(4, 0), photo)[3]
+    fit = fit_boards(noisy, LABEL, image_size=SIZE)
+    assert np.isposinf(np.asarray(fit.focal_std)[0])
+    assert RESULTS[fit.fit.result] == RESULTS[RESULTS.undetermined]
+
+
+def test_photos_that_show_a_grid(grids):
+    some = scrambled(grids, 0)[:6]
+    some[4, 2:] = np.nan
+    assert ordered(some).tolist() == [True, True, True, False, True, True]
+    assert ordered(some[3:4]).tolist() == [True]  # there is nothing better

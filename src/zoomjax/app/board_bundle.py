@@ -100,7 +100,7 @@ class BoardBundle:
         """Whether it explains the photos of a group by one focal length, as well as all others."""
         rms = np.asarray(self.fit.fit.frame_rms)
         own = [rms[self.names.index(name)] for name in group.names if name in self.names]
-        return bool(max(own) < _EXPLAINED * np.median(rms))
+        return bool(np.max(own) < _EXPLAINED * np.nanmedian(rms))  # NaN: most of its corners are outliers
 
     def sentences(self) -> list[str]:
         """How bent the board is, and how well the model fits, in sentences."""

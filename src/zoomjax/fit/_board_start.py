@@ -20,8 +20,29 @@ from .frames import fit_frames
 _UNCERTAIN = 0.3
 """Relative standard deviation of a focal length from which on it is none."""
 
+_NO_LINE = 0.1
+"""Width of a row's or column's points across it, in its length, from which on they are on no line: no lens
+bends lines so far, and corners in the wrong places scatter."""
+
 _STEPS = 4
 """Of Gauss and Newton's method for the zoom model: more than one for those that are not linear."""
+
+
+def ordered(grids: Float[np.ndarray, "photo row column 2"]) -> Bool[np.ndarray, "photo"]:
+    """Which photos show a grid: most of whose rows and columns are points along a line, if a bent one.
+
+    All, if none do.
+    """
+    found = np.zeros(len(grids), bool)
+    for photo, grid in enumerate(grids):
+        widths = []
+        for line in (*grid, *grid.swapaxes(0, 1)):
+            seen = line[np.isfinite(line[:, 0])]
+            if len(seen) >= 3:
+                along, across = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
+                widths.append(across / along if along > 0 else 1.0)
+        found[photo] = not widths or np.median(widths) < _NO_LINE
+    return found if found.any() else ~found
 
 
 def coefficients_of(
@@ -31,8 +52,9 @@ def coefficients_of(
     centre: Float[np.ndarray, "2"],
     family: AbstractFamily,
     terms: int,
+    zooms: int,
 ) -> Float[np.ndarray, "zoom size"]:
-    """The distortion of each zoom by itself, from the straightness of rows and columns."""
+    """The distortion of each zoom by itself, from the straightness of rows and columns; 0 without any."""
     lines, frame = [], []
     for grid, number in zip(grids, zoom.tolist(), strict=True):
         for line in (*grid, *grid.swapaxes(0, 1)):
@@ -40,10 +62,9 @@ def coefficients_of(
             if len(seen) >= 3:
                 lines.append(seen)
                 frame.append(number)
-    zooms = int(zoom.max()) + 1
     made = Lines.from_ragged(lines, frame, np.arange(1.0, zooms + 1), image_size=image_size)
     small = compress_family(made.about(centre), family, terms=terms)
-    return np.asarray(fit_frames(small, family=family, terms=terms, throw=False).coefficients)
+    return np.nan_to_num(fit_frames(small, family=family, terms=terms, throw=False).coefficients)
 
 
 @eqx.filter_jit
@@ -52,6 +73,7 @@ def homographies(
     points: Float[Array, "photo corner 2"],
     there: Bool[Array, "photo corner"],
     zoom: Int[Array, "photo"],
+    told: Bool[Array, "photo"],
     places: Float[Array, "corner 2"],
     coefficients: Float[Array, "zoom size"],
     family: AbstractFamily,
@@ -59,7 +81,7 @@ def homographies(
 ) -> tuple[Float[Array, "photo 3 3"], Float[Array, "zoom"], Float[Array, "zoom"]]:
     """The homography of each photo, corrected, in half image diagonals; f of each zoom there, and its std.
 
-    Infinite where homographies do not tell f.
+    Infinite where homographies do not tell f; those are asked that `told` names.
     """
 
     def straight(point, k):
@@ -80,7 +102,7 @@ def homographies(
         return (entries, root, squares), matrix_of(entries) @ shift
 
     (entries, root, squares), matrices = jax.vmap(photo)(points, there, coefficients[zoom])
-    good = jnp.isfinite(squares) & jnp.any(there, axis=1)
+    good = jnp.isfinite(squares) & jnp.any(there, axis=1) & told
     flat = jnp.where(good[:, None], entries, jnp.eye(3).ravel()[:8][None])
     root = jnp.where(good[:, None, None], root, jnp.eye(8)[None])
 

@@ -29,7 +29,7 @@ from ._board_problem import checked_grids, data_of, padded_to
 from ._board_rows import Model
 from ._board_shape import grid_places
 from ._board_stages import described, in_stages, located
-from ._board_start import coefficients_of, filled, homographies, poses_of, through
+from ._board_start import coefficients_of, filled, homographies, ordered, poses_of, through
 from ._structure import bucket
 from .result import RESULTS, ZoomFit, failed, judged
 from .zoom import CentreArgument, given_centre
@@ -253,9 +253,10 @@ def fit_boards(
     if smooth is not None:
         check_above(0, smooth=smooth)
     data = data_of(given, number, len(label), origin, _CENTRE_STD if fitted else _HELD, smooth, label)
-    coefficients = coefficients_of(given.grids, number, given.image_size, origin, family, terms)
-    wide = padded_to(coefficients, len(data.smooth))
-    matrices, found, std = _homographies(data, wide, family)
+    told = ordered(given.grids)
+    lens = (given.image_size, origin, family, terms, len(label))
+    wide = padded_to(coefficients_of(given.grids[told], number[told], *lens), len(data.smooth))
+    matrices, found, std = _homographies(data, wide, family, told)
     focal_px = filled(found[: len(label)], std[: len(label)], label) * data.scale
     ready = zoom.prepare(focal_px, family.size(terms))
     ready = through(ready, padded_to(focal_px, len(wide)), wide)
@@ -266,8 +267,12 @@ def fit_boards(
     return _thrown(fit) if throw else fit
 
 
-def _homographies(data, coefficients, family):
-    found = homographies(data.points, data.there, data.zoom, data.places, coefficients, family, data.scale)
+def _homographies(data, coefficients, family, told=True):
+    """Those of all photos, and focal lengths from those that are `told`."""
+    told = np.atleast_1d(told)
+    told = jnp.asarray(np.pad(told, (0, len(data.there) - len(told)), mode="edge"))
+    seen = (data.points, data.there, data.zoom, told)
+    found = homographies(*seen, data.places, coefficients, family, data.scale)
     return found[0], *(np.asarray(of) for of in found[1:])
 
 
