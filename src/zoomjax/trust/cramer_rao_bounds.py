@@ -25,6 +25,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, ScalarLike
 
 from .._core.arguments import kinds_checked
+from .._core.programs import light_program
 from .._core.types import AnyArray, traced
 from ..fit.energy import line_normal
 from ..fit.same_camera import check_camera
@@ -69,7 +70,7 @@ def cramer_rao(
     return _cramer_rao(lens, lines, _checked_std(std, lines))
 
 
-@eqx.filter_jit
+@light_program
 def _cramer_rao(lens, lines, std):
     std = jnp.broadcast_to(jnp.asarray(std, lens.centre.dtype), lines.frame.shape)
     std = jnp.where(std > 0, std, jnp.nan)  # where it could not be checked: nothing is known
@@ -116,7 +117,7 @@ def displacement_bound(
     return _displacement_bound(lens, lines, _checked_std(std, lines))
 
 
-@eqx.filter_jit
+@light_program
 def _displacement_bound(lens, lines, std):
     flat, unravel = ravel_pytree(lens.zoom.parameters)
     points, focal, weight = _field(lens)
@@ -158,7 +159,7 @@ def displacement_rms(lens: ZoomLens, other: ZoomLens) -> Float[Array, ""]:
     return _displacement_rms(lens, other)
 
 
-@eqx.filter_jit
+@light_program
 def _displacement_rms(lens, other):
     points, focal, weight = _field(lens)
     apart = jax.vmap(lambda f: at_focal(lens, f).undistort(points) - at_focal(other, f).undistort(points))(
