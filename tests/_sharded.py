@@ -62,7 +62,7 @@ def check_fits(lines: zj.Lines, plain: zj.lines.CompressedLines) -> None:
             fit.lens.zoom.parameters, one.lens.zoom.parameters, rtol=1e-12, atol=1e-12
         )
         model = ready_model(data, Model(one.lens.zoom, 2, data.family))
-        program = fit_prepared.lower(data, model, default_solver(data), 256).compile()
+        program = eqx.filter_jit(fit_prepared).lower(data, model, default_solver(data), 256).compile()
         found = exchanged(program)
         assert set(found) == {"all-reduce"}, found
         assert found["all-reduce"] <= 400, found  # sums of parameters and frames, of 12,800 points

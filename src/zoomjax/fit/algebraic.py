@@ -12,13 +12,13 @@ are taken to first order in them.
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.arguments import kinds_checked
+from .._core.programs import program
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed, bucketed_frames, of_frames
 from ..lines.compressed import CompressedLines
@@ -124,12 +124,12 @@ def algebraic_frames(lines: AbstractLines, *, terms: int = 2) -> Float[Array, "f
     return of_frames(_solve_frames(small_of(padded, model.terms), frames, model), lines)
 
 
-@eqx.filter_jit
+@program
 def _solve_zoom(lines, model):
     return lens_of(lines, with_parameters(model.zoom, algebraic_parameters(lines, model)))
 
 
-@eqx.filter_jit
+@program
 def _solve_frames(lines, frames, model):
     def solve(chosen, present):
         frame = lines.take(chosen, present)

@@ -20,6 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree, ScalarLike
 
 from .._core.arguments import kinds_checked
+from .._core.programs import light_program, program
 from .._core.types import Coefficients, Focal
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed, bucketed_frames, of_frames
@@ -35,7 +36,7 @@ from ._least_squares import Solver, default_solver
 from .compression import compressed_as_measured
 from .covariance import parameter_covariance
 from .energy import AbstractJointZoom, linearised
-from .minimise import fit_about, minimise
+from .minimise import fit_about, minimised
 from .moved_centre import for_any_centre
 from .prepare import asked_for, ready_model
 from .result import RESULTS, FrameFits, ZoomFit, collected, each_of_given, of_given
@@ -171,29 +172,12 @@ def fit_centre(
     fixed = fit_about(_about(lines, lines.centre, model), ready, **options)
     offset = (PolynomialZoom(degree=0) if centre is None else centre).prepare(lines.focal, 2)
     start = _both(fixed.lens.zoom, offset)
-    found, covariance, std, determined = _search(lines, start, solver or default_solver(lines), max_steps)
-    _, moved = found.parts()
-    each = lines.centre[None] + lines.scale * jax.vmap(moved)(lines.focal)
+    found, each, covariance, std, determined = _search(
+        lines, start, solver or default_solver(lines), max_steps
+    )
     # Once more about these centres, for all else that is to know of a fit: the same compiled program.
     fit = fit_about(_about(lines, each, model), ready, **options)
-    own = fit.covariance.shape[0]
-    joint = jnp.where(determined, covariance, jnp.zeros_like(covariance).at[:own, :own].set(fit.covariance))
-    lens = _lens(lines, fit.lens, moved, each)
-    certificate = fit.certificate if lens.shift is None else certify(lens)
-    good: Any = RESULTS.successful  # an inherited member, which pyright takes for another class's
-    folded = certificate.folded & (fit.result == good)
-    fit = eqx.tree_at(
-        lambda fit: (fit.lens, fit.covariance, fit.joint, fit.certificate, fit.result),
-        fit,
-        (
-            lens,
-            jnp.where(determined & jnp.isfinite(fit.covariance), covariance[:own, :own], fit.covariance),
-            joint,
-            certificate,
-            RESULTS.where(folded, RESULTS.folded, fit.result),
-        ),
-        is_leaf=lambda leaf: leaf is None,
-    )
+    fit = _about_centres(lines, fit, found, each, covariance, determined)
     each, std = of_frames(each, given), of_frames(std, given)
     return CentreFit(of_given(fit, given), each, std, determined, fixed.rms, covariance)
 
@@ -240,7 +224,7 @@ def fit_frame_centres(
     return FrameCentres(each_of_given(each, lines), std, determined, fixed)
 
 
-@eqx.filter_jit
+@program
 def _fit_frame_centres(lines, frames, model, solver, max_steps):
     options = {"terms": model.terms, "solver": solver, "max_steps": max_steps, "throw": False}
 
@@ -254,10 +238,15 @@ def _fit_frame_centres(lines, frames, model, solver, max_steps):
     return FrameCentres(each, found.std[:, 0], found.determined, found.rms_fixed)
 
 
-@eqx.filter_jit
 def _search(lines, start, solver, max_steps):
     """The joint minimum, or the start if the centre found is too uncertain."""
-    found, _, _ = minimise(lines, start, solver, max_steps)
+    found, _, _ = minimised(lines, start, solver, max_steps)
+    return _accepted(lines, start, found)
+
+
+@light_program
+def _accepted(lines, start, found):
+    """The model found, if its centre is certain enough, or else the start; its centres; and what tells."""
     covariance, _ = parameter_covariance(lines, found, *linearised(lines, found), extra=2)
 
     def offsets(parameters):
@@ -273,7 +262,32 @@ def _search(lines, start, solver, max_steps):
     parameters = jax.tree.map(
         lambda new, old: jnp.where(determined, new, old), found.parameters, start.parameters
     )
-    return with_parameters(found, parameters), covariance, lines.scale * std, determined
+    each = lines.centre[None] + lines.scale * offsets(parameters)
+    return with_parameters(found, parameters), each, covariance, lines.scale * std, determined
+
+
+@light_program
+def _about_centres(lines, fit, found, each, covariance, determined):
+    """The fit about the centres found, with its lens and covariance, and those of both."""
+    _, moved = found.parts()
+    own = fit.covariance.shape[0]
+    joint = jnp.where(determined, covariance, jnp.zeros_like(covariance).at[:own, :own].set(fit.covariance))
+    lens = _lens(lines, fit.lens, moved, each)
+    certificate = fit.certificate if lens.shift is None else certify(lens)
+    good: Any = RESULTS.successful  # an inherited member, which pyright takes for another class's
+    folded = certificate.folded & (fit.result == good)
+    return eqx.tree_at(
+        lambda fit: (fit.lens, fit.covariance, fit.joint, fit.certificate, fit.result),
+        fit,
+        (
+            lens,
+            jnp.where(determined & jnp.isfinite(fit.covariance), covariance[:own, :own], fit.covariance),
+            joint,
+            certificate,
+            RESULTS.where(folded, RESULTS.folded, fit.result),
+        ),
+        is_leaf=lambda leaf: leaf is None,
+    )
 
 
 def _lens(

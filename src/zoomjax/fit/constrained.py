@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from .._core.programs import program
 from .._core.types import traced
 from ..models.invertibility import slope_controls, stated_pieces
 from ..models.zoom import AbstractLinearZoom, with_parameters
@@ -28,7 +29,7 @@ _MOST_STEPS = 200
 """Of the interior-point method, which takes 10 to 20."""
 
 
-@eqx.filter_jit
+@program
 def refit_zoom(lines, free):
     """The best invertible model."""
     zoom = free.lens.zoom

@@ -11,7 +11,6 @@ and within it every line. The M frames are those that have a line of a weight ab
 import abc
 import math
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
@@ -20,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core.arguments import kinds_checked
 from .._core.fields import numbers
 from .._core.products import exact_products
+from .._core.programs import light_program
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_jit, of_frames, of_lines
@@ -225,7 +225,7 @@ def _line_squares(lines, coefficients):
 
 
 @kinds_checked
-@eqx.filter_jit
+@light_program
 def global_energy(
     lines: AbstractLines, coefficients: Float[AnyArray, "frame terms"] | list
 ) -> Float[Array, ""]:

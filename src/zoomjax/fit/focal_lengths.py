@@ -298,7 +298,7 @@ def _prior_noise(lines, zoom):
     return prior_error(lines, zoom) ** 2 if isinstance(zoom, AbstractPriorZoom) else 0.0
 
 
-@bucketed_jit(frames=["sigma"], returns=[of_frames, None, None, None])
+@bucketed_jit(frames=["sigma"], returns=[of_frames, None, None, None], light=False)
 def refined(lines, zoom, sigma):
     """The focal lengths, and the zoom model with them, by damped Gauss-Newton steps.
 

@@ -4,11 +4,11 @@ The fit of one frame is a zoom polynomial of degree 0 on the lines of that frame
 `zoom` is used, under `vmap` over the frames.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from .._core.arguments import kinds_checked
+from .._core.programs import light_program, program
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_frames
 from ..lines.lines import Lines
@@ -18,7 +18,7 @@ from ._least_squares import Solver, default_solver
 from .algebraic import algebraic_parameters, algebraic_start
 from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
-from .minimise import fit_prepared
+from .minimise import minimise
 from .prepare import asked_for, ready_model
 from .result import FrameFits, collected, described_fit, each_of_given, is_invertible, outcome_of, thrown
 from .wrapper import about_own_centre, points_of
@@ -55,24 +55,64 @@ def fit_frames(
     return each_of_given(thrown(fits, outcome, throw), lines)
 
 
-@eqx.filter_jit
 def _fit_frames(lines, start, frames, model, solver, max_steps):
-    def fit(chosen, present):
-        frame = lines.take(chosen, present)
-        ready = ready_model(frame, model)
-        if start is not None:
-            ready = ready.with_parameters(algebraic_parameters(start.take(chosen, present), ready))
-        return fit_prepared(frame, ready, solver, max_steps)[0]
+    """The fits of all frames, whether invertible or not, and their outcome."""
+    parameters = None if start is None else _starts(start, frames, model)
+    minima = _minima(lines, frames, model, parameters, solver, max_steps)
+    return _described(lines, frames, model, *minima)
 
-    # Small compressed frames are solved side by side; the points themselves one frame at a time, for
-    # side by side they would all be in memory at once, padded to the fullest frame.
-    batch = 1 if isinstance(points_of(lines), Lines) else len(frames.chosen)
-    fits = jax.lax.map(lambda frame: fit(*frame), (frames.chosen, frames.present), batch_size=batch)
+
+@light_program
+def _starts(lines, frames, model):
+    """The parameters that each frame's algebraic estimate gives."""
+
+    def start(chosen, present):
+        frame = lines.take(chosen, present)
+        return algebraic_parameters(frame, ready_model(frame, model))
+
+    return jax.vmap(start)(frames.chosen, frames.present)
+
+
+@program
+def _minima(lines, frames, model, parameters, solver, max_steps):
+    """The parameters of each frame at the minimum, how the solver ended, and after how many steps."""
+
+    def fit(frame, parameters):
+        ready = ready_model(frame, model)
+        ready = ready if parameters is None else ready.with_parameters(parameters)
+        zoom, result, steps = minimise(frame, ready.zoom, solver, max_steps)
+        return zoom.parameters, result, steps
+
+    return _over_frames(fit, lines, frames, parameters)
+
+
+@light_program
+def _described(lines, frames, model, parameters, result, steps):
+    def describe(frame, parameters, result, steps):
+        return described_fit(
+            frame, ready_model(frame, model).with_parameters(parameters).zoom, result, steps
+        )
+
+    fits = _over_frames(describe, lines, frames, parameters, result, steps)
     each = collected(lines, fits, frames.there)
     return each, outcome_of(each)
 
 
-@eqx.filter_jit
+def _over_frames(function, lines, frames, *rows):
+    """A function of the lines of a frame, and of what there is of it, for all frames.
+
+    Small compressed frames are taken side by side; the points themselves one frame at a time, for side by
+    side they would all be in memory at once, padded to the fullest frame.
+    """
+    batch = 1 if isinstance(points_of(lines), Lines) else len(frames.chosen)
+
+    def one(frame):
+        return function(lines.take(*frame[0]), *frame[1])
+
+    return jax.lax.map(one, ((frames.chosen, frames.present), rows), batch_size=batch)
+
+
+@program
 def _refit_frames(lines, frames, model, free):
     """Each frame's fit, refitted to be invertible where it is not."""
 

@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._core.programs import program
 from .._core.types import of_known_values
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed
@@ -222,7 +223,7 @@ def _in_stacks(jobs, fit, solver, max_steps):
                 yield from found
 
 
-@eqx.filter_jit
+@program
 def _fit_each(freely, stack, number, settings):
     """The fits of the first `number` data sets of a stack, and whether each is certified."""
     arrays, rest = eqx.partition(stack, eqx.is_array)

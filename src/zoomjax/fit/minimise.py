@@ -6,10 +6,10 @@ the certificate; per iteration one Jacobian of the residuals.
 
 import functools
 
-import equinox as eqx
 import jax
 import optimistix as optx
 
+from .._core.programs import light_program, program
 from ..models.zoom import with_parameters
 from ._least_squares import default_solver
 from .algebraic import algebraic_model, algebraic_start
@@ -39,10 +39,14 @@ def fit_freely(lines, model, algebraic, solver, max_steps):
     return fit_prepared(lines, model, solver, max_steps)
 
 
-@eqx.filter_jit
 def fit_prepared(lines, model, solver, max_steps):
     """The fit of a prepared model from its own parameters, and its outcome."""
-    zoom, result, steps = minimise(lines, model.zoom, solver, max_steps)
+    return described(lines, *minimised(lines, model.zoom, solver, max_steps))
+
+
+@light_program
+def described(lines, zoom, result, steps):
+    """The fit that ended so, and its outcome: once after the steps."""
     fit = described_fit(lines, zoom, result, steps)
     return fit, outcome_of(fit)
 
@@ -60,3 +64,7 @@ def minimise(lines, zoom, solver, max_steps):
         function, solver, start, args=(lines, zoom), max_steps=max_steps, throw=False
     )
     return with_parameters(zoom, solution.value), solution.result, solution.stats["num_steps"]
+
+
+minimised = program(minimise)
+"""`minimise`, compiled."""

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .._core.arguments import kinds_checked
+from .._core.programs import program
 from .._core.types import of_known_values
 from ..lines.lines import Lines
 from ..models.family import AbstractFamily
@@ -109,7 +110,7 @@ def reject_points(
         kept = eqx.tree_at(lambda lines: lines.mask, lines, jnp.asarray(good))
 
 
-@eqx.filter_jit
+@program
 def _distances(lines, family, zoom):
     """Signed distance of each corrected point from the line that most agree on, and each line's spread."""
     corrected = with_family(lines, family).corrected(coefficients_by(zoom, lines)[lines.frame])

@@ -24,6 +24,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
+from .._core.programs import light_program, program
 from ..lines.base import AbstractLines, SomeLines
 from ..lines.buckets import bucketed, of_lines
 from ..models.family import AbstractFamily
@@ -164,7 +165,7 @@ def _own_weights(lines):
     return jnp.ones_like(lines.counts) if lines.weight is None else lines.weight
 
 
-@eqx.filter_jit
+@program
 def _reweighted(lines, start):
     """The lines with their weights, and the model that goes with them: a Gauss-Newton step a turn."""
     own = _own_weights(lines)
@@ -195,7 +196,7 @@ def _weights(lines, model, cut):
     return jnp.where((excess < 1) & (lines.counts > 2), (1 - excess**2) ** 2, 0)
 
 
-@eqx.filter_jit
+@light_program
 def _line_rms(lines, model):
     """RMS distance of each line, px, over its degrees of freedom, and the median over lines."""
     corrected = lines.corrected(coefficients_by(model, lines)[lines.frame])

@@ -18,13 +18,13 @@ Lines of a plane, such as markings of a sports pitch, can be used without known 
 them. The homography is fitted to the points' distances from the images of their lines.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Num
 
 from .._core.products import exact_products
+from .._core.programs import light_program
 from .._core.types import AnyArray, traced
 from .estimate import FocalEstimate, as_points_of, check_pairs, estimate_of
 from .homography import homography, homography_from_lines
@@ -145,7 +145,7 @@ def focal_from_lines(
     return _focal_from_lines(points, jnp.asarray(mask), lines, as_points_of("principal", principal))
 
 
-@eqx.filter_jit
+@light_program
 @exact_products
 def _focal_from_planes(points, plane, mask, principal):
     counted = jnp.any(mask, axis=1)
@@ -186,7 +186,7 @@ def _focal_from_planes(points, plane, mask, principal):
     return estimate(*views), each
 
 
-@eqx.filter_jit
+@light_program
 @exact_products
 def _focal_from_lines(points, mask, lines, principal):
     extra = max(0, 9 - mask.size)  # with as many rows as the table below has columns, or more

@@ -20,6 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
+from .._core.programs import program
 from .._core.types import AnyArray, traced
 from .base import AbstractLines, SomeLines
 
@@ -116,18 +117,19 @@ def of_frames(values: Any, lines: AbstractLines) -> Any:
 
 
 def bucketed_jit(
-    *, frames: Sequence[str] = (), returns: Cut | Sequence[Cut] = None
+    *, frames: Sequence[str] = (), returns: Cut | Sequence[Cut] = None, light: bool = True
 ) -> Callable[[Callable[_Given, _Result]], Callable[_Given, _Result]]:
-    """As ``equinox.filter_jit`` of a function whose first argument are lines, which arrive padded.
+    """As `program` of a function whose first argument are lines, which arrive padded.
 
     Args:
         frames: names of other arguments that hold a row for each frame.
         returns: `of_lines`, `of_frames` or None, where nothing is to be cut: for the result, or for each of
             several.
+        light: whether the work is small for small arguments.
     """
 
     def decorate(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
-        program, signature = eqx.filter_jit(function), inspect.signature(function)
+        compiled, signature = program(function, light=light), inspect.signature(function)
 
         @functools.wraps(function)
         def call(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
@@ -135,11 +137,11 @@ def bucketed_jit(
             first, lines = next(iter(given.items()))
             by_frame = {name: given[name] for name in frames if given[name] is not None}
             if traced(by_frame) or (padded := bucketed(lines)) is lines:
-                return program(*args, **kwargs)
+                return compiled(*args, **kwargs)
             if any(np.shape(of)[:1] != lines.focal.shape for of in by_frame.values()):
-                return program(*args, **kwargs)  # it says so; padding would make it look right
+                return compiled(*args, **kwargs)  # it says so; padding would make it look right
             given |= {name: padded_to(of, len(padded.focal)) for name, of in by_frame.items()}
-            found: Any = program(**given | {first: padded})  # pyright: ignore[reportCallIssue]
+            found: Any = compiled(**given | {first: padded})  # pyright: ignore[reportCallIssue]
             if returns is None or callable(returns):
                 return found if returns is None else returns(found, lines)
             cut = (part if of is None else of(part, lines) for part, of in zip(found, returns, strict=True))

@@ -35,6 +35,7 @@ from jaxtyping import Array, Float
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_terms
 from .._core.products import EXACT
+from .._core.programs import program
 from .._core.types import Centres, traced
 from ._triangle import triangle
 from .base import header_of
@@ -253,7 +254,7 @@ def _reduce_in_threads(lines, columns, terms):
     return np.concatenate(runs)
 
 
-@eqx.filter_jit
+@program
 def _reduce_run(lines, start, size, columns, terms):
     """Triangles of `size` consecutive lines, one after the other so that each stays in the cache."""
 

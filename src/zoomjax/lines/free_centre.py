@@ -187,27 +187,41 @@ def _powers(terms):
     return tuple(np.array(pairs).T)
 
 
+def _products(terms):
+    """The columns as sums of products ``w_x^p w_y^q``: the powers of all, and how often each is in each."""
+    often = {(0, 0): (0, 1)}
+    for j, m in zip(*map(np.ndarray.tolist, np.tril_indices(terms + 1)), strict=True):
+        often[2 * m + 1, 2 * (j - m)] = (1 + 2 * j, math.comb(j, m))
+        often[2 * m, 2 * (j - m) + 1] = (2 + 2 * j, math.comb(j, m))
+    matrix = np.zeros((2 * terms + 3, len(often)))
+    for place, (column, number) in enumerate(often.values()):
+        matrix[column, place] = number
+    return np.array(list(often)).T, matrix
+
+
+def _expanded(terms, offset):
+    """Those products with ``w = z - offset``, by monomials of z: the powers of both are by binomials."""
+    powers = jnp.stack([(-offset) ** power for power in range(2 * terms + 2)], axis=1)
+    parts = []
+    for axis, upper, lower in zip((0, 1), _products(terms)[0], _powers(terms), strict=True):
+        often = np.array([[math.comb(p, a) for a in lower.tolist()] for p in upper.tolist()])
+        rest = np.maximum(upper[:, None] - lower[None], 0)
+        parts.append(often.astype(offset.dtype) * powers[axis][rest])
+    return parts[0] * parts[1]
+
+
 def _radial_columns(terms, offset):
-    """1, w, (w.w) w, ..., (w.w)^N w with ``w = z - offset``, as polynomials ``c[a, b] x^a y^b``."""
-
-    def times(polynomial, axis):
-        up = jnp.roll(polynomial, 1, axis)  # the highest power is never reached
-        return up - offset[axis] * polynomial
-
-    one = jnp.zeros((2 * terms + 2,) * 2, offset.dtype).at[0, 0].set(1)
-    columns, power = [one], one
-    for term in range(terms + 1):
-        columns += [times(power, 0), times(power, 1)]
-        if term < terms:
-            power = times(columns[-2], 0) + times(columns[-1], 1)
-    return jnp.stack(columns)[(slice(None), *_powers(terms))]
+    """1, w, (w.w) w, ..., (w.w)^N w with ``w = z - offset``, by monomials of z."""
+    matrix = _products(terms)[1].astype(offset.dtype)
+    return jnp.matmul(matrix, _expanded(terms, offset), precision=EXACT)
 
 
 def _corrected_point(terms, k, offset):
     """The corrected point of a line's points, x and y, by monomials."""
-    columns = _radial_columns(terms, offset)[1:].reshape(terms + 1, 2, -1)
+    matrix = _products(terms)[1][1:].reshape(terms + 1, 2, -1).astype(offset.dtype)
     kappa = jnp.concatenate([jnp.ones(1, k.dtype), k, jnp.zeros(terms - k.shape[0], k.dtype)])
-    return jnp.einsum("j,jcm->cm", kappa, columns, precision=EXACT)
+    weights = jnp.einsum("j,jcn->cn", kappa, matrix, precision=EXACT)
+    return jnp.matmul(weights, _expanded(terms, offset), precision=EXACT)
 
 
 def _decentred_point(terms, k, p):
@@ -237,7 +251,7 @@ def _derivatives(terms):
     return by_xy
 
 
-@bucketed_jit(frames=["centres"], returns=of_lines)
+@bucketed_jit(frames=["centres"], returns=of_lines, light=False)
 def _moved(lines, centres):
     """R of the monomials of ``z - offset``, which are sums of those of z: (x - a)^i is by binomials."""
     terms = lines.terms
@@ -256,7 +270,7 @@ def _moved(lines, centres):
     return jax.vmap(one)(lines.triangle, _offsets(lines, centres))
 
 
-@bucketed_jit(frames=["centres"], returns=of_lines)
+@bucketed_jit(frames=["centres"], returns=of_lines, light=False)
 def _about(lines, centres):
     def one(r, offset):
         return triangle(jnp.matmul(_radial_columns(lines.terms, offset), r.T, precision=EXACT))

@@ -1,5 +1,7 @@
 """Interpolation between knots, as weights of the values there: hats, and natural cubic splines."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -67,15 +69,17 @@ def natural_controls(
 
 def natural_curvature(knots: Float[AnyArray, "basis"]) -> Float[Array, "basis basis"]:
     """The matrix from values at the knots to the natural spline's second derivatives there."""
-    knots = jnp.asarray(knots)
-    size = knots.shape[0]
+    xp: Any = jnp if traced(knots) else np  # known ones compile nothing
+    knots = xp.asarray(knots)
+    size, width = knots.shape[0], xp.diff(knots)
     if size < 3:
-        return jnp.zeros((size, size), knots.dtype)
-    width = jnp.diff(knots)
-    inner = jnp.arange(size - 2)
-    bands = jnp.zeros((size - 2, size), knots.dtype)
-    system = bands.at[inner, inner].set(width[:-1] / 6).at[inner, inner + 2].set(width[1:] / 6)
-    system = system.at[inner, inner + 1].set((width[:-1] + width[1:]) / 3)
-    second = bands.at[inner, inner].set(1 / width[:-1]).at[inner, inner + 2].set(1 / width[1:])
-    second = second.at[inner, inner + 1].set(-1 / width[:-1] - 1 / width[1:])
-    return jnp.pad(jnp.linalg.solve(system[:, 1:-1], second), ((1, 1), (0, 0)))
+        return jnp.asarray(np.zeros((size, size), knots.dtype))
+
+    def banded(*diagonals):
+        one, two, three = (np.eye(size - 2, size, k, dtype=knots.dtype) for k in range(3))
+        return diagonals[0][:, None] * one + diagonals[1][:, None] * two + diagonals[2][:, None] * three
+
+    first, last = width[:-1], width[1:]
+    system = banded(first / 6, (first + last) / 3, last / 6)
+    second = banded(1 / first, -1 / first - 1 / last, 1 / last)
+    return jnp.asarray(xp.pad(xp.linalg.solve(system[:, 1:-1], second), ((1, 1), (0, 0))))

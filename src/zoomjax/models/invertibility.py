@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._core.arguments import kinds_checked
+from .._core.programs import light_program
 from .._core.types import AnyArray, Point, Scalar
 from ._bernstein import Pieces, cut, power_controls
 from .family import AbstractFamily
@@ -97,7 +98,7 @@ def certify(lens: ZoomLens) -> Certificate:
     )
 
 
-@eqx.filter_jit
+@light_program
 def certificate_of(
     zoom: AbstractZoom,
     centre: Point,

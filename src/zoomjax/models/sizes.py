@@ -10,12 +10,12 @@ import math
 import warnings
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_size
+from .._core.programs import light_program
 from .._core.types import traced
 from ._known_sizes import known_size
 from .distortion import Distortion
@@ -201,7 +201,7 @@ def check_channels_last(shape: tuple[int, ...]) -> None:
         )
 
 
-at_focal = eqx.filter_jit(lambda lens, focal: lens._distortion(focal, None))
+at_focal = light_program(lambda lens, focal: lens._distortion(focal, None))
 """``lens(focal)`` compiled, for videos.
 
 It extrapolates beyond the fitted range without a warning: for callers that have checked the range, or that

@@ -14,10 +14,10 @@ NumPy, float64 whatever the lines' dtype: with sums as small as these, compiling
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 
+from .._core.programs import light_program
 from ..fit.energy import prior_jacobian, settings
 from ..lines.buckets import bucketed_jit, padded_frames
 from ..models.zoom import (
@@ -84,7 +84,7 @@ def _design(lines, model, left):
     return Design(values, project, precision)
 
 
-_basis_of = eqx.filter_jit(lambda model, *settings: jax.vmap(model.basis)(*settings))
+_basis_of = light_program(lambda model, *settings: jax.vmap(model.basis)(*settings))
 """Of a model without its parameters: one compiled program for any number of terms."""
 
 

@@ -26,6 +26,7 @@ from jaxtyping import Array, Float, Num, PyTree, ScalarLike
 
 from .._core.arguments import kinds_checked
 from .._core.fields import check_positive, real_argument
+from .._core.programs import light_program
 from .._core.types import AnyArray, Coefficients, Focal, Points, traced
 from ..fit.result import ZoomFit
 from ..models.lens import ZoomLens
@@ -41,7 +42,7 @@ def _compiled(function: Callable[Given, Result]) -> Callable[Given, Result]:
 
     It does not see the errors of the frames, so that their number is no matter.
     """
-    program, signature = eqx.filter_jit(function), inspect.signature(function)
+    compiled, signature = light_program(function), inspect.signature(function)
 
     @functools.wraps(function)
     def checked(*args: Given.args, **kwargs: Given.kwargs) -> Result:
@@ -53,7 +54,7 @@ def _compiled(function: Callable[Given, Result]) -> Callable[Given, Result]:
         if not traced(level) and not (_is_number(level) and 0 < level < 1):
             raise ValueError(f"Argument level must be a number between 0 and 1, but it is {level!r}.")
         given["fit"] = eqx.tree_at(lambda fit: fit.frame_rms, given["fit"], None)
-        return program(**given)  # pyright: ignore[reportCallIssue]
+        return compiled(**given)  # pyright: ignore[reportCallIssue]
 
     return checked
 

@@ -26,6 +26,7 @@ from jaxtyping import Array, Float, ScalarLike
 
 from .._core.arguments import kinds_checked
 from .._core.fields import real_argument
+from .._core.programs import light_program
 from .._core.types import AnyArray, traced
 from ..fit.energy import line_normal
 from ..fit.same_camera import check_camera
@@ -70,7 +71,7 @@ def cramer_rao(
     return _cramer_rao(lens, lines, _checked_std(std, lines))
 
 
-@eqx.filter_jit
+@light_program
 def _cramer_rao(lens, lines, std):
     std = jnp.broadcast_to(jnp.asarray(std, lens.centre.dtype), lines.frame.shape)
     std = jnp.where(std > 0, std, jnp.nan)  # where it could not be checked: nothing is known
@@ -117,7 +118,7 @@ def displacement_bound(
     return _displacement_bound(lens, lines, _checked_std(std, lines))
 
 
-@eqx.filter_jit
+@light_program
 def _displacement_bound(lens, lines, std):
     flat, unravel = ravel_pytree(lens.zoom.parameters)
     points, focal, weight = _field(lens)
@@ -159,7 +160,7 @@ def displacement_rms(lens: ZoomLens, other: ZoomLens) -> Float[Array, ""]:
     return _displacement_rms(lens, other)
 
 
-@eqx.filter_jit
+@light_program
 def _displacement_rms(lens, other):
     points, focal, weight = _field(lens)
     apart = jax.vmap(lambda f: at_focal(lens, f).undistort(points) - at_focal(other, f).undistort(points))(

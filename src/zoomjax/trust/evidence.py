@@ -25,6 +25,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
+from .._core.programs import light_program
 from .._core.types import of_known_values
 from ..fit.energy import (
     coefficients_by,
@@ -205,7 +206,7 @@ def _noise(lines: AbstractLines, lens: ZoomLens, counted: np.ndarray) -> float:
     return float(np.sqrt(np.mean(squares))) if squares else np.nan
 
 
-@eqx.filter_jit
+@light_program
 def _corrected(lines, index, zoom):
     some = lines.take(index, jnp.ones(len(index), bool))
     return some.corrected(coefficients_by(zoom, lines)[lines.frame[index]])
@@ -306,7 +307,7 @@ def _raster(lens: ZoomLens) -> np.ndarray:
     return np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
 
 
-@eqx.filter_jit
+@light_program
 def _derivatives(lens, points, focals):
     """Displacements of points at focal lengths, and their derivatives by the parameters."""
     flat, unravel = ravel_pytree(lens.zoom.parameters)

@@ -11,6 +11,7 @@ be compared there too. The cost is one small Jacobian per candidate; nothing is 
 """
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -137,7 +138,10 @@ def suggest_next(
     candidates = jnp.asarray(candidate_lines(fit.lens.image_size, length), dtype)
     grid = jnp.asarray(focals, dtype)
     now, table = _bands(lines, fit.lens, candidates, grid, jnp.asarray(number), jnp.asarray(counts))
-    before = float(_average(displacement_std(fit, _image_grid(fit.lens.image_size)[:, None], focal=grid)))
+    points = _image_grid(fit.lens.image_size).astype(dtype)[:, None]
+    before = np.asarray(displacement_std(fit, points, focal=grid))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        before = float(_average(before, np))
     # What was measured of the noise is in `before`; how a photo changes it is the ratio.
     table = np.nan_to_num(np.asarray(table, np.float64), nan=np.inf)  # what rounding alone is left of
     if np.isfinite(before) and float(now) > 0:
@@ -268,19 +272,19 @@ def _displacement_rows(lens, flat, unravel, focals):
     return rows.reshape(-1, 2, flat.size)
 
 
-def _average(stds):
+def _average(stds, xp: Any = jnp):
     """The geometric mean.
 
     The largest, or the plain mean, is that of the worst focal length; a photo elsewhere then gains nothing,
     and one there as much wherever its lines are, for the next worst is left.
     """
-    return jnp.exp(jnp.mean(jnp.log(stds)))
+    return xp.exp(xp.mean(xp.log(stds)))
 
 
 def _image_grid(image_size):
     """Points all over the image, its corners among them, and not its centre, which is always certain."""
-    x, y = (jnp.linspace(0, side - 1, 6) for side in image_size)
-    return jnp.stack(jnp.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    x, y = (np.linspace(0, side - 1, 6) for side in image_size)
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def _positive(value):

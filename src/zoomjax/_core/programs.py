@@ -1,0 +1,106 @@
+"""Programs that XLA compiles quickly, where they run as fast, or where nobody would notice.
+
+The time of a first fit is that of the compiler. On processors two of its settings matter. The emitters of
+fusions by MLIR take half of the time, and what they emit for our programs is no faster: all but those that
+correct points and images are compiled without. Optimisation by LLVM takes two thirds of the rest, and makes
+a program some three times as fast: where the work is that of going over the arguments once or twice, and
+these are small, that saves a millisecond for a second.
+"""
+
+import functools
+import math
+import os
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.extend.core
+from jax.core import eval_context
+
+_PLAINLY = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_backend_optimization_level": 1,
+    "xla_cpu_prefer_vector_width": 128,  # which for our few columns are as fast, or faster
+    "xla_cpu_parallel_codegen_split_count": 4,  # parts that are compiled side by side; each costs
+}
+_UNOPTIMISED = {**_PLAINLY, "xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1}
+
+_ROWS, _NUMBERS = 1024, 3 * 2**19
+"""Of the arguments of a light program, up to which it is not optimised: the longest, and all in all."""
+
+# It moved from `jax.core` to where it is now.
+_trace_state: Any = getattr(jax.extend.core, "get_opaque_trace_state", None) or getattr(
+    jax.core, "get_opaque_trace_state", None
+)
+
+_Given = ParamSpec("_Given")
+_Result = TypeVar("_Result")
+
+
+def program(function: Callable[_Given, _Result], *, light: bool = False) -> Callable[_Given, _Result]:
+    """As ``equinox.filter_jit``, with settings of the compiler that save its time.
+
+    Inside of ``jit``, ``vmap`` and ``grad`` the function is a part of another program, with the settings of
+    that one. XLA's own hold on a GPU, and where ``XLA_FLAGS`` or the version of JAX says otherwise.
+
+    Args:
+        function: what to compile.
+        light: whether its work is small for small arguments.
+    """
+    plain = eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def call(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
+        if not _at_once() or not (settings := _settings(light and _few((args, kwargs)))):
+            return plain(*args, **kwargs)
+        try:
+            return _with_settings(function, settings)(*args, **kwargs)
+        except jax.errors.JaxRuntimeError as error:
+            unknown = {name for name, _ in settings if f"No such compile option: '{name}'" in str(error)}
+            if not unknown:
+                raise
+            _UNKNOWN.update(unknown)
+            _settings.cache_clear()
+            return call(*args, **kwargs)
+
+    return call
+
+
+def light_program(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
+    """`program` of a function whose work is small for small arguments."""
+    return program(function, light=True)
+
+
+_UNKNOWN: set[str] = set()  # settings that this version of XLA does not have
+
+
+@functools.cache
+def _settings(unoptimised: bool) -> tuple[tuple[str, Any], ...]:
+    """The compiler's settings that are not given by the environment; none but on a processor."""
+    if jax.default_backend() != "cpu":
+        return ()
+    given = os.environ.get("XLA_FLAGS", "")
+    wanted = _UNOPTIMISED if unoptimised else _PLAINLY
+    return tuple(of for of in wanted.items() if of[0] not in given and of[0] not in _UNKNOWN)
+
+
+@functools.cache
+def _with_settings(function, settings):
+    given: Any = {"compiler_options": dict(settings)}  # for `jax.jit`
+    return eqx.filter_jit(function, **given)
+
+
+def _few(arguments: Any) -> bool:
+    """Whether arrays are short, and hold few numbers in all."""
+    shapes = [leaf.shape for leaf in jax.tree.leaves(arguments) if eqx.is_array(leaf)]
+    longest = max((shape[0] for shape in shapes if shape), default=0)
+    return longest <= _ROWS and sum(map(math.prod, shapes)) <= _NUMBERS
+
+
+def _at_once() -> bool:
+    """Whether a program runs now, and is not made a part of another."""
+    with eval_context():
+        now = _trace_state(convention="flax")
+    return _trace_state(convention="flax") == now
