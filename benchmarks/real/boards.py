@@ -309,7 +309,7 @@ def page(r: dict) -> list[str]:
         "",
         "## Time",
         "",
-        f"{TIMED} photos of 330 corners, compiled: "
+        f"{TIMED} photos of 330 corners, compiled (the last figure to be taken, on an idle machine): "
         + "; ".join(
             f"{name} {wall:.1f} s ({own:.1f} s of processors)" for name, (wall, own) in r["time_s"].items()
         )

@@ -9,6 +9,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from .._core.programs import program
 from ..models.invertibility import Certificate, certificate_of
 from ._board_rows import (
     LOSS,
@@ -109,10 +110,10 @@ def _arrays(tree):
     )
 
 
-_residuals = eqx.filter_jit(residuals_of)
+_residuals = program(residuals_of)
 
 
-@eqx.filter_jit
+@program
 def _noise(data, model):
     return _noise_of(data, residuals_of(data, model))
 
@@ -123,7 +124,7 @@ def _noise_of(data, missed):
     return jnp.maximum(jnp.nan_to_num(jnp.nanmedian(size)) / MEDIAN_OF_SIZE, EXACT)
 
 
-@eqx.filter_jit
+@program
 def _bend_of(data, model):
     """The standard deviation of photos' own bends, from themselves."""
     photos = jnp.any(data.there, axis=1)
@@ -131,7 +132,7 @@ def _bend_of(data, model):
     return jnp.maximum(jnp.sqrt(squares / (jnp.sum(photos) * model.bend.shape[1])), _LEAST_BEND)
 
 
-@eqx.filter_jit
+@eqx.filter_jit  # whose steps XLA's own settings make a quarter faster
 def _solved(data, model, stage):
     """Poses, board and lens of least energy, the noise, the solver's status and its steps."""
     units = units_of(data, model, stage.noise)
@@ -149,7 +150,7 @@ def _solved(data, model, stage):
     return model, noise, RESULTS.promote(solution.result), solution.stats["num_steps"]
 
 
-@eqx.filter_jit
+@program
 def described(
     data: Data, model: Model, stage: Stage, centre: Array, size: tuple[int, int], focal_range: Array
 ) -> Described:

@@ -1,6 +1,5 @@
 """A start for `fit_boards`: distortion from straightness, then f and poses from homographies."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +7,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.products import exact_products
+from .._core.programs import program
 from ..focal.estimate import estimate_of
 from ..focal.homography import homography, matrix_of
 from ..lines.lines import Lines
@@ -67,7 +67,7 @@ def coefficients_of(
     return np.nan_to_num(fit_frames(small, family=family, terms=terms, throw=False).coefficients)
 
 
-@eqx.filter_jit
+@program
 @exact_products
 def homographies(
     points: Float[Array, "photo corner 2"],
@@ -128,7 +128,7 @@ def filled(focal: np.ndarray, std: np.ndarray, label: np.ndarray) -> np.ndarray:
     return np.where(known, focal, np.exp(np.polyval(slope, x)))
 
 
-@eqx.filter_jit
+@program
 def poses_of(
     matrices: Float[Array, "photo 3 3"], focal: Float[Array, "photo"]
 ) -> tuple[Float[Array, "photo 3 3"], Float[Array, "photo 3"]]:
@@ -149,7 +149,7 @@ def poses_of(
     return rotation, jnp.where(bad[:, None], ahead, position)
 
 
-@eqx.filter_jit
+@program
 def through(
     zoom: AbstractZoom, focal: Float[Array, "zoom"], coefficients: Float[Array, "zoom size"]
 ) -> AbstractZoom:
