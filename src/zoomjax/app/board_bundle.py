@@ -205,6 +205,6 @@ def bundle_of(
         return None
     of = [d for d in used if d.name in grids]
     flat = flat_detections(fit, of)
-    both = (lines_of(some, label, focals.unit) for some in (of, flat))
-    straight = straightness(fit, *both, centre)
+    seen, even = (lines_of(some, label, focals.unit) for some in (of, flat))
+    straight = straightness(fit, seen, even, centre)
     return BoardBundle(fit, tuple(grids), number, focals.unit, tuple(flat), straight)

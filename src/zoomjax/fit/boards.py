@@ -267,7 +267,7 @@ def fit_boards(
     return _thrown(fit) if throw else fit
 
 
-def _homographies(data, coefficients, family, told=True):
+def _homographies(data, coefficients, family, told: Any = True):
     """Those of all photos, and focal lengths from those that are `told`."""
     told = np.atleast_1d(told)
     told = jnp.asarray(np.pad(told, (0, len(data.there) - len(told)), mode="edge"))
