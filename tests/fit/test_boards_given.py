@@ -65,7 +65,9 @@ def test_a_photo_of_something_else_does_not_look_the_best(grids):
     fit = fit_boards(scrambled(grids, 3), LABEL, image_size=SIZE)
     assert RESULTS[fit.fit.result] == ""
     assert np.flatnonzero(np.isnan(fit.fit.frame_rms)).tolist() == [3]
-    assert np.median(np.asarray(fit.poses.residual)[3]) > 50
+    assert np.isnan(np.asarray(fit.poses.residual)[3]).all()
+    assert np.isnan(np.asarray(fit.poses.rotation)[3]).all()
+    assert np.isfinite(np.asarray(fit.poses.rotation)[4]).all()
     assert np.isfinite(fit.fit.rms)
 
 
@@ -80,9 +82,9 @@ def test_a_photo_of_something_else_does_little(grids, seed):
 
 @pytest.mark.slow
 def test_a_zoom_of_which_nothing_fits_has_no_focal_length(grids):
-    """Where most of its photos show something else."""
+    """Where all of its photos show something else."""
     noisy = grids.copy()
-    for photo in range(5):
+    for photo in range(6):
         noisy[photo] = scrambled(grids[photo : photo + 1].repeat(4, 0), photo)[3]
     fit = fit_boards(noisy, LABEL, image_size=SIZE)
     assert np.isposinf(np.asarray(fit.focal_std)[0])

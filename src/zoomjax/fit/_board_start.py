@@ -62,9 +62,12 @@ def coefficients_of(
             if len(seen) >= 3:
                 lines.append(seen)
                 frame.append(number)
-    made = Lines.from_ragged(lines, frame, np.arange(1.0, zooms + 1), image_size=image_size)
+    shown, frame = np.unique(frame, return_inverse=True)
+    made = Lines.from_ragged(lines, frame, np.arange(1.0, len(shown) + 1), image_size=image_size)
     small = compress_family(made.about(centre), family, terms=terms)
-    return np.nan_to_num(fit_frames(small, family=family, terms=terms, throw=False).coefficients)
+    coefficients = np.zeros((zooms, family.size(terms)))
+    coefficients[shown] = fit_frames(small, family=family, terms=terms, throw=False).coefficients
+    return coefficients
 
 
 @program
@@ -73,7 +76,6 @@ def homographies(
     points: Float[Array, "photo corner 2"],
     there: Bool[Array, "photo corner"],
     zoom: Int[Array, "photo"],
-    told: Bool[Array, "photo"],
     places: Float[Array, "corner 2"],
     coefficients: Float[Array, "zoom size"],
     family: AbstractFamily,
@@ -81,7 +83,7 @@ def homographies(
 ) -> tuple[Float[Array, "photo 3 3"], Float[Array, "zoom"], Float[Array, "zoom"]]:
     """The homography of each photo, corrected, in half image diagonals; f of each zoom there, and its std.
 
-    Infinite where homographies do not tell f; those are asked that `told` names.
+    Infinite where homographies do not tell f.
     """
 
     def straight(point, k):
@@ -102,7 +104,7 @@ def homographies(
         return (entries, root, squares), matrix_of(entries) @ shift
 
     (entries, root, squares), matrices = jax.vmap(photo)(points, there, coefficients[zoom])
-    good = jnp.isfinite(squares) & jnp.any(there, axis=1) & told
+    good = jnp.isfinite(squares) & jnp.any(there, axis=1)
     flat = jnp.where(good[:, None], entries, jnp.eye(3).ravel()[:8][None])
     root = jnp.where(good[:, None, None], root, jnp.eye(8)[None])
 

@@ -51,7 +51,8 @@ class BoardPoses(NamedTuple):
     """Where a board is in photos.
 
     Attributes:
-        rotation: from the board to the camera, whose axes are x right, y down and z forward.
+        rotation: from the board to the camera, whose axes are x right, y down and z forward. NaN, as all
+            of a photo, where it shows no grid: its corners are on no lines.
         position: of the board's middle in the camera, steps of its grid.
         bend: how far each corner is out of the board's shape in this photo, away from the camera, steps of
             its grid: paper bends otherwise from photo to photo.
@@ -70,7 +71,8 @@ class BoardFit(eqx.Module):
     Attributes:
         fit: the lens, with focal lengths in px, and its uncertainty. `ZoomFit.rms` is of the distances
             between corners and where the model puts them, px of the image, without outliers;
-            `ZoomFit.frame_rms` has one for each photo, NaN where most of its corners are outliers.
+            `ZoomFit.frame_rms` has one for each photo, NaN where most of its corners are outliers, or it
+            shows no grid.
             `ZoomFit.joint` includes the centre, if it was fitted. Its result is `undetermined` where a
             focal length is not.
         label: the labels of the zooms, in order.
@@ -243,6 +245,7 @@ def fit_boards(
             'jax.config.update("jax_enable_x64", True) first.'
         )
     given = checked_grids(grids, focal, board, image_size)
+    given = given._replace(grids=np.where(ordered(given.grids)[:, None, None, None], given.grids, np.nan))
     label, number = np.unique(given.label, return_inverse=True)
     zoom = PolynomialZoom(degree=min(2, len(label) - 1)) if zoom is None else zoom
     check("fit_boards", zoom=zoom)
@@ -253,10 +256,9 @@ def fit_boards(
     if smooth is not None:
         check_above(0, smooth=smooth)
     data = data_of(given, number, len(label), origin, _CENTRE_STD if fitted else _HELD, smooth, label)
-    told = ordered(given.grids)
     lens = (given.image_size, origin, family, terms, len(label))
-    wide = padded_to(coefficients_of(given.grids[told], number[told], *lens), len(data.smooth))
-    matrices, found, std = _homographies(data, wide, family, told)
+    wide = padded_to(coefficients_of(given.grids, number, *lens), len(data.smooth))
+    matrices, found, std = _homographies(data, wide, family)
     focal_px = filled(found[: len(label)], std[: len(label)], label) * data.scale
     ready = zoom.prepare(focal_px, family.size(terms))
     ready = through(ready, padded_to(focal_px, len(wide)), wide)
@@ -267,12 +269,8 @@ def fit_boards(
     return _thrown(fit) if throw else fit
 
 
-def _homographies(data, coefficients, family, told: Any = True):
-    """Those of all photos, and focal lengths from those that are `told`."""
-    told = np.atleast_1d(told)
-    told = jnp.asarray(np.pad(told, (0, len(data.there) - len(told)), mode="edge"))
-    seen = (data.points, data.there, data.zoom, told)
-    found = homographies(*seen, data.places, coefficients, family, data.scale)
+def _homographies(data, coefficients, family):
+    found = homographies(data.points, data.there, data.zoom, data.places, coefficients, family, data.scale)
     return found[0], *(np.asarray(of) for of in found[1:])
 
 
@@ -299,9 +297,10 @@ def _poses(given, data, model, missed):
     bend = (model.bend[:photos] @ data.basis.own.T)[:, : rows * columns]
     distance = np.linalg.norm(np.asarray(missed), axis=-1)
     distance = np.where(np.asarray(data.there), distance, np.nan)[:photos, : rows * columns]
+    known = np.isfinite(given.grids[..., 0]).any(axis=(1, 2))
     return BoardPoses(
-        rotation=model.rotation[:photos],
-        position=model.position[:photos] * unit,
+        rotation=jnp.where(known[:, None, None], model.rotation[:photos], jnp.nan),
+        position=jnp.where(known[:, None], model.position[:photos] * unit, jnp.nan),
         bend=unit * bend.reshape(photos, rows, columns),
         residual=jnp.asarray(distance.reshape(photos, rows, columns)),
     )
@@ -323,7 +322,8 @@ def _described(given, data, solved, label, origin, fitted):
     squares = np.where(np.asarray(known.inlier), np.sum(np.asarray(known.missed) ** 2, axis=-1), 0)[:photos]
     counts, seen = (np.asarray(of).sum(axis=1)[:photos] for of in (known.inlier, data.there))
     number = np.asarray(data.zoom)[:photos]
-    lost = np.flatnonzero(2 * np.bincount(number, counts) < np.bincount(number, seen))
+    fitted_there, seen_there = (np.bincount(number, of) for of in (counts, seen))
+    lost = np.flatnonzero((2 * fitted_there < seen_there) | (seen_there == 0))
     covariance[lost] = covariance[:, lost] = 0
     covariance[lost, lost] = np.inf  # what fits few of its corners says nothing of a zoom
     log_std = np.sqrt(np.diag(covariance)[:zooms])
@@ -343,7 +343,7 @@ def _described(given, data, solved, label, origin, fitted):
     fit = ZoomFit(
         lens=lens,
         rms=rms,
-        frame_rms=jnp.asarray(np.where(2 * counts >= seen, of_photos, np.nan)),
+        frame_rms=jnp.asarray(np.where((2 * counts >= seen) & (seen > 0), of_photos, np.nan)),
         covariance=jnp.asarray(joint[:size, :size]),
         result=judged(model.zoom, result, jnp.asarray(determined), known.certificate),
         steps=jnp.asarray(steps),
