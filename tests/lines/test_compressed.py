@@ -271,7 +271,7 @@ def test_second_derivatives_for_fits_are_those_through_all_points(scene, ragged,
 
 @pytest.mark.slow
 def test_lines_spread_over_devices_stay_where_they_are():
-    """The same triangles, bit by bit, without an exchange of points; energies exchange a sum a frame."""
+    """The same triangles, to rounding, without an exchange of points; energies exchange a sum a frame."""
     devices = "--xla_force_host_platform_device_count=4"
     ran = subprocess.run(
         [sys.executable, str(Path(__file__).parents[1] / "_sharded.py")],
