@@ -64,6 +64,11 @@ class BoardBundle:
         """Whether the lens is fitted to lines of a flat board: see `Straightness.bent`."""
         return self.straightness is not None and self.straightness.bent
 
+    @property
+    def bend_between_photos(self) -> float:
+        """How far corners are out of the board's shape in single photos, RMS, steps of the grid."""
+        return float(np.sqrt(np.mean(np.square(self.fit.poses.bend))))
+
     def lines_used(self, detections: Sequence[Detection]) -> list[Detection]:
         """The detections with the lines that the lens is fitted to."""
         flat = {d.name: d for d in self.flat} if self.bent else {}
@@ -137,7 +142,7 @@ class BoardBundle:
 
     def _between(self) -> str:
         """How it bends from photo to photo, if more than can be told from nothing."""
-        bend = float(np.sqrt(np.mean(np.square(self.fit.poses.bend))))
+        bend = self.bend_between_photos
         return f", and bends by {bend:.2g} steps from photo to photo" if bend > _BENDS else ""
 
     def compared(self, lens: ZoomLens, label: Sequence[float]) -> list[tuple[str, ...]]:
@@ -176,7 +181,7 @@ class BoardBundle:
             "focal_px_std": [s if np.isfinite(s) else None for s in np.asarray(fit.focal_std).tolist()],
             "centre": np.asarray(fit.lens.centre).tolist(),
             "bend_steps": fit.bend.tolist(),
-            "bend_between_photos_steps": float(np.sqrt(np.mean(np.square(fit.poses.bend)))),
+            "bend_between_photos_steps": self.bend_between_photos,
             "flat_lines": self.bent,
             "lines_deviation": self.straightness and self.straightness.rms_seen,
             "lines_deviation_flat": self.straightness and self.straightness.rms_flat,

@@ -29,7 +29,11 @@ from ..models.zoom import PolynomialZoom, with_parameters
 _STRAIGHTER = 0.9
 """Deviation of lines of the flat board, in those of the bent one, below which they are taken."""
 
+_OF_A_PHOTO = 18
+"""Numbers that `fit_boards` fits to each photo: its pose, and how the board bends in it."""
+
 _RADII = 16
+"""Places from the centre to the corner where displacements are compared."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +91,7 @@ def straightness(
 def _of_freedom(fit: BoardFit) -> float:
     """By how much residuals are smaller for the numbers that were fitted."""
     count = 2 * int(np.isfinite(np.asarray(fit.poses.residual)).sum())
-    fitted = 18 * len(fit.frame_focal) + fit.coefficients.size
+    fitted = _OF_A_PHOTO * len(fit.frame_focal) + fit.coefficients.size
     return float(np.sqrt(count / max(count - fitted, count / 4)))
 
 
