@@ -21,7 +21,7 @@ def at_focal(lines, focal):
 @pytest.fixture(scope="module")
 def sweep(truth):
     """Ten focal lengths, few points."""
-    return zj.compress(scenes.board_lines(truth, scenes.focal_sweep(10), spacing=150.0, noise=0.3, seed=1))
+    return zj.compress(scenes.board_lines(truth, scenes.focal_sweep(10), spacing=150.0, noise=0.1, seed=1))
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +129,7 @@ def test_refined_focal_lengths_are_nearer_to_the_truth(truth, sweep, rounded, re
 @pytest.mark.slow
 def test_the_joint_minimum_is_one(rounded, refined):
     """No single focal length, moved either way, lowers the joint energy, with the model fitted again."""
-    from zoomjax.fit.focal_lengths import _prior_weights
+    from zoomjax.fit.focal_refinement import _prior_weights
 
     at = at_focal(rounded, refined.focal)
     tau = np.asarray(_prior_weights(at, refined.fit.lens.zoom))
@@ -256,7 +256,9 @@ def test_known_focal_lengths_of_frames_that_weigh_nothing_do_not_set_the_scale(s
 
 def test_focal_lengths_that_do_not_converge_are_said(rounded, refined, monkeypatch):
     whole = focal_fit.refined
-    monkeypatch.setattr(focal_fit, "refined", lambda *given: (*whole(*given)[:3], jnp.asarray(False)))
+    monkeypatch.setattr(
+        focal_fit, "refined", lambda *given: (*whole(*given)[:3], jnp.asarray(False), whole(*given)[4])
+    )
     with pytest.raises(RuntimeError, match="did not converge"):
         zj.fit.fit_focal(rounded, ROUNDED)
     found = zj.fit.fit_focal(rounded, ROUNDED, throw=False)
@@ -315,3 +317,42 @@ def test_a_centre_that_moves_raises(sweep):
     moving = eqx.tree_at(lambda fit: fit.lens, fit, lens)
     with pytest.raises(ValueError, match="a centre that moves along the zoom"):
         zj.fit.with_focal_sigma(moving, sweep, focal_sigma=0.1)
+
+
+# Focal lengths that are kept
+
+
+def test_focal_lengths_that_do_not_help_others_are_kept(truth):
+    """As uncertain as they differ, hardly anything holds them: they and the lens would go astray."""
+    rng = np.random.default_rng(0)
+    exact = np.linspace(50.0, 55.0, 20)
+    lines = zj.compress(scenes.board_lines(truth, exact, spacing=150.0, noise=0.5))
+    given = exact * np.exp(0.03 * rng.standard_normal(20))
+    spoiled = at_focal(lines, given)
+    found = zj.fit.fit_focal(spoiled, 0.03 * given)
+    plain = zj.fit_zoom(spoiled)
+    assert found.kept
+    np.testing.assert_allclose(found.focal, given, rtol=1e-12)
+    np.testing.assert_allclose(found.std, 0.03 * given)
+    np.testing.assert_allclose(found.fit.lens.zoom.parameters, plain.lens.zoom.parameters, rtol=1e-4)
+    corner = np.zeros(2)
+    assert zj.displacement_std(found.fit, corner, focal=52.0) > zj.displacement_std(
+        plain, corner, focal=52.0
+    )
+
+
+def test_focal_lengths_that_help_are_refined(rounded, refined):
+    assert not refined.kept
+    assert (refined.focal != rounded.focal).all()
+
+
+def test_one_that_nobody_knows_is_found_where_others_are_kept(truth):
+    exact = np.linspace(50.0, 55.0, 20)
+    lines = zj.compress(scenes.board_lines(truth, exact, spacing=150.0, noise=0.5))
+    given = exact * np.exp(0.03 * np.random.default_rng(0).standard_normal(20))
+    sigma = np.where(np.arange(20) == 4, np.inf, 0.03 * given)
+    found = zj.fit.fit_focal(at_focal(lines, given), sigma, throw=False)
+    assert found.kept
+    others = np.arange(20) != 4
+    np.testing.assert_allclose(found.focal[others], given[others], rtol=1e-12)
+    assert found.focal[4] != given[4]

@@ -1,6 +1,6 @@
 """Estimation of focal lengths from the lines, together with the zoom model.
 
-The energy that is minimised, and its derivatives, are in `focal_lengths`.
+The energy that is minimised, and its derivatives, are in `focal_refinement`.
 """
 
 from typing import Any, NoReturn
@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._core.arguments import kinds_checked
 from .._core.types import traced
@@ -17,16 +17,8 @@ from ..lines.buckets import bucketed
 from ..models.model import Model
 from ..models.zoom import AbstractZoom
 from .energy import counted_frames
-from .focal_lengths import (
-    MOST_STEPS,
-    UNKNOWN,
-    Sigma,
-    at_focal_lengths,
-    checked_sigma,
-    posterior,
-    refined,
-    with_covariance,
-)
+from .focal_lengths import UNKNOWN, Sigma, at_focal_lengths, checked_sigma, with_covariance
+from .focal_refinement import MOST_STEPS, posterior, refined
 from .prepare import asked_for
 from .result import RESULTS, ZoomFit, failed
 from .wrapper import about_own_centre
@@ -44,6 +36,8 @@ class FocalFit(eqx.Module):
             Infinite where it is not determined; that given for a frame whose lines all weigh nothing.
         given: the focal lengths of the lines.
         steps: number of steps the joint solver took.
+        kept: whether the given focal lengths were kept, as refined ones did not help: see `fit_focal`.
+            `std` is then that given.
     """
 
     fit: ZoomFit
@@ -51,6 +45,7 @@ class FocalFit(eqx.Module):
     std: Float[Array, "frame"]
     given: Float[Array, "frame"]
     steps: Int[Array, ""]
+    kept: Bool[Array, ""]
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
         """Raise TypeError: the lens of its fit is asked."""
@@ -73,7 +68,10 @@ def fit_focal(
     increasing function, another zoom model makes every line as straight. A polynomial in 1/f stays one if
     1/f is scaled and shifted, so the lines cannot correct scale and offset at all. The scale of the result
     is therefore that of the given focal lengths; the lines correct single ones that deviate from a smooth
-    k(f). Deviations that the zoom model cannot follow are attributed to focal lengths, too.
+    k(f). Deviations that the zoom model cannot follow would be attributed to focal lengths, too. So frames
+    are left out, a fifth at a time, and measured at their given focal lengths: where the model that was
+    fitted together with the focal lengths of the others makes them no straighter than the one fitted at
+    the given focal lengths, these are kept (all but those of infinite `focal_sigma`).
 
     Args:
         lines: the lines, or, much faster and with the same answer, ``compress(lines)``.
@@ -116,7 +114,7 @@ def fit_focal(
                 f"with lines that weigh something, but it is {focal_sigma}. {UNKNOWN}"
             )
     start = fit_zoom(lines, zoom=model, invertible=False, throw=throw)
-    focal, refitted, steps, reached = refined(lines, start.lens.zoom, sigma)
+    focal, refitted, steps, reached, kept = refined(lines, start.lens.zoom, sigma)
     if throw and not traced(reached) and not reached:
         raise RuntimeError(
             f"The focal lengths did not converge in {MOST_STEPS} steps: the lines hardly determine those "
@@ -125,7 +123,7 @@ def fit_focal(
     moved = at_focal_lengths(lines, focal)
     fit = fit_zoom(moved, zoom=refitted, invertible=invertible, throw=throw)
     std, covariance, joint, determined = posterior(
-        moved, fit.lens.zoom, fit.covariance, fit.joint, sigma, given
+        moved, fit.lens.zoom, fit.covariance, fit.joint, sigma, given, kept
     )
     fit = with_covariance(_judged(fit, reached, determined), covariance, joint)
     return FocalFit(
@@ -134,6 +132,7 @@ def fit_focal(
         std=std,
         given=given,
         steps=steps,
+        kept=kept,
     )
 
 
