@@ -10,7 +10,12 @@ If errors were independent, a sum of scores g would have the covariance ``H_g - 
 lines tell of the lens, H_g, and V, the covariance of the lens. The mean of ``g^T V g`` over its expectation
 is how often the same is said. It does not depend on which lines are put together if errors are independent,
 and so two lines that are mistaken for one do no harm.
+
+Views of a track may have errors in common, too: the track drifts, its point is nearer than others, or it is
+on a thing that moves. The same mean, of the scores of tracks, is then what variances are too small by.
 """
+
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,7 +27,8 @@ import scipy.spatial
 from jaxtyping import Array, Float, Int
 
 from ._motion_rows import Data, Model, Noise, Stage, line_planes_of, rows_of, units_of
-from ._schur import columns, lens_equations, reduced
+from ._schur import Reduced, Unknowns, columns, lens_equations, reduced
+from ._structure import Structure
 
 _NEAR = 0.01
 """Between the normals of planes, radians: below this two lines are one, seen twice."""
@@ -60,6 +66,42 @@ def repeated(
     score = jnp.einsum("lrp,lr->lp", effect, rows.lines)
     told = jnp.einsum("lrp,lrq->lpq", effect, effect)
     score, told = (jax.ops.segment_sum(of, group, len(group)) for of in (score, told))
+    return _more_than_chance(score, told, information)
+
+
+def common_errors_of(
+    jacobian: Any, pull: Float[Array, "view 2"], matrix: Reduced, like: Unknowns, structure: Structure
+) -> Float[Array, ""]:
+    """The mean square of how tracks pull at the lens, over what independent views of noise 1 would do.
+
+    Args:
+        jacobian: of the rows by the unknowns.
+        pull: of each view, the derivative of its loss by its residual.
+        matrix: the normal equations.
+        like: the unknowns' shapes.
+        structure: which track and frame each view belongs to.
+    """
+    information, by_lens = lens_equations(matrix)
+    by_frame, by_ray, of_lens = columns(jacobian, like)
+    answer = by_lens.reshape(-1, 4, by_lens.shape[-1])[structure.frame]
+    effect = of_lens.views - jnp.einsum("vrf,vfp->vrp", by_frame.views, answer)
+
+    def of_tracks(one, other):
+        products = jnp.einsum("vri,vrj->vij", one, other)
+        return jax.ops.segment_sum(products, structure.track, structure.tracks)
+
+    with_rays = jnp.einsum("tpi,tij->tpj", of_tracks(effect, by_ray.views), matrix.rays[0])
+    of_rays = jnp.concatenate(
+        [of_tracks(by_ray.views, effect), of_tracks(by_ray.views, pull[..., None])], -1
+    )
+    less = with_rays @ of_rays
+    told = of_tracks(effect, effect) - less[..., :-1]
+    score = of_tracks(effect, pull[..., None])[..., 0] - less[..., -1]
+    return _more_than_chance(score, told, information)
+
+
+def _more_than_chance(score, told, information):
+    """The mean of ``g^T V g`` over its expectation; 1 if nothing is expected."""
     covariance = jnp.linalg.inv(information)
     own = jnp.einsum("gpq,qr->gpr", told, covariance)  # H V
     expected = jnp.einsum("gpp->", own) - jnp.einsum("gpq,gqp->", own, own)

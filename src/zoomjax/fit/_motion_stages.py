@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
 from ._motion_parallax import parallax_of
-from ._motion_repeated import groups_of, repeated
+from ._motion_repeated import common_errors_of, groups_of, repeated
 from ._motion_rows import (
     WRONG_LINE,
     Model,
@@ -57,7 +57,7 @@ _STILL = 1.0
 _MOST_STEPS = 30  # of a stage
 
 _AS_GOOD = 1.3
-"""Times as many points of lines that count as one: with less of a change, lines are counted as before."""
+"""Times as much of errors that views or lines have in common: what is less may be chance."""
 
 _MOST_COUNTS = 4
 
@@ -210,7 +210,11 @@ def _described(data, model, noise, stage, result, steps):
     log_variance = own[:, 0, 0] * unit**2 + 2 * both[:, 0, -1] * unit * of_lens[-1] + lens[-1, -1]
     count = 2 * jnp.sum(inlier)
     free = count / (count - data.unknowns - len(lens))
-    inflation = _INFLATION * free
+    flat = jnp.where(inlier, 1 / (1 + squared), 0)  # of the loss: its slope over the residual
+    pull = flat[:, None] * missed / noise.points
+    common = common_errors_of(jacobian, pull, matrix, zeros, data.structure)
+    common = common / jnp.mean(flat**2, where=inlier) ** 2 / (_INFLATION * free)
+    inflation = _INFLATION * free * jnp.where(common > _AS_GOOD, common, 1)
     zoom_size = ravel_pytree(model.zoom.parameters)[0].size
     joint, log_std = lens[:-2, :-2] * inflation, jnp.sqrt(log_variance * inflation)
     focal = jnp.exp(model.path.log_focal)
