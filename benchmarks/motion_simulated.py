@@ -113,7 +113,7 @@ def wide(lens: ZoomLens) -> ZoomLens:
 
 
 def simulated(clips: int, only: str) -> Rows:
-    """Errors and bounds of each kind of clip."""
+    """Errors and bounds of each kind of clip: a row after each clip."""
     for kind, (path, tracks) in KINDS.items():
         found = []
         if only not in kind:
@@ -140,22 +140,23 @@ def simulated(clips: int, only: str) -> Rows:
                     "seconds": seconds,
                 }
             )
-        accepted = [clip for clip in found if clip["good"]] or found
-        mean = {
-            name: float(np.sqrt(np.mean([clip[name] ** 2 for clip in accepted])))
-            for name in ("f", "f_bound", "lens", "lens_bound")
-        }
-        yield (
-            kind,
-            mean
-            | {
-                "clips": clips,
-                "diverged": sum(clip["diverged"] for clip in found),
-                "told": sum(not clip["good"] for clip in found),
-                "seconds": float(np.median([clip["seconds"] for clip in found])),
-                "found": found,
-            },
-        )
+            yield kind, _summary(found)
+
+
+def _summary(found: list[dict]) -> dict:
+    """The row of a kind from its clips so far, so that a run that is stopped leaves what it has."""
+    accepted = [clip for clip in found if clip["good"]] or found
+    mean = {
+        name: float(np.sqrt(np.mean([clip[name] ** 2 for clip in accepted])))
+        for name in ("f", "f_bound", "lens", "lens_bound")
+    }
+    return mean | {
+        "clips": len(found),
+        "diverged": sum(clip["diverged"] for clip in found),
+        "told": sum(not clip["good"] for clip in found),
+        "seconds": float(np.median([clip["seconds"] for clip in found])),
+        "found": list(found),
+    }
 
 
 def timed(only: str) -> Rows:

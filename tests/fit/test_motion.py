@@ -94,6 +94,29 @@ def test_the_standard_deviation_is_that_of_the_common_factor(path, fit):
     assert abs(error) < 4 * std
 
 
+def long_focal(seed, low, pan, tilt):
+    """A random lens of long focal lengths on a random path, and its tracks."""
+    k = np.random.default_rng(seed).normal(size=(3, 2)) * [[0.02, 0.005], [0.05, 0.01], [0.1, 0.03]]
+    zoom, reach = PolynomialZoom(2, jnp.asarray(k), jnp.array(low)), jnp.array([low, 3 * low])
+    lens = ZoomLens(zoom, jnp.array([645.0, 356.0]), reach, SIZE, "px")
+    path = pan_and_zoom(lens, FRAMES, pan=pan, tilt=tilt, seed=seed)
+    return motion_tracks(lens, *path, views=60, life=12, noise=0.3, seed=seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "low", "pan", "tilt"),
+    # In the first ones the best chain has a wrong scale: with this one alone, seed 2 is off by a factor of
+    # 2. In the others the scale is hardly told, and the way to the minimum is long.
+    [*((seed, 1600.0, 10, 2) for seed in (1, 2, 7)), *((seed, 6000.0, 3, 1) for seed in (3, 4, 5))],
+)
+def test_long_focal_lengths_are_found_within_their_deviation(seed, low, pan, tilt):
+    scene = long_focal(seed, low, pan, tilt)
+    found = fit_motion(scene.tracks, throw=False)
+    off = np.mean(np.log(np.asarray(found.focal) / scene.focal))
+    assert abs(off) < 2.5 * np.sqrt(found.covariance[-1, -1])
+
+
 @pytest.mark.slow
 def test_things_that_move_do_little_harm(lens, path):
     fit = fit_motion(tracked(lens, path, noise=0.3, moving=0.2).tracks)
@@ -205,6 +228,47 @@ def test_lines_of_the_same_frames_make_the_lens_better(lens, path, fit, with_lin
     # Distances across a line have the noise of one coordinate.
     assert float(with_lines.line_noise) == pytest.approx(0.2, rel=0.1)
     assert np.isnan(fit.line_noise)
+
+
+@pytest.mark.slow
+def test_lines_with_the_same_errors_in_every_frame_count_as_few():
+    lens = ZoomLens(
+        PolynomialZoom(0, jnp.array([[-0.05, 0.01]]), jnp.array(1800.0)),
+        jnp.array([645.0, 356.0]),
+        jnp.array([1800.0, 2000.0]),
+        SIZE,
+        "px",
+    )
+    path = pan_and_zoom(lens, FRAMES, pan=5, tilt=2)
+    scene = motion_tracks(lens, *path, views=60, life=12, noise=0.2, seed=1)
+    off, std = [], []
+    for bend in (0.0, 1.0):
+        lines = marked(lens, path, bend)
+        found = fit_motion(scene.tracks, lines=lines, throw=False)
+        off.append(np.mean(np.log(np.asarray(found.focal) / path[0])))
+        std.append(np.sqrt(found.covariance[-1, -1]))
+    assert (np.abs(off) < 2.5 * np.array(std)).all()
+    assert std[1] > 2 * std[0]
+
+
+def marked(lens, path, bend):
+    """Eight markings of a scene in every frame, each bent by so many px, seen with little noise."""
+    rng, points, frame = np.random.default_rng(0), [], []
+    ends = np.column_stack([rng.uniform(-0.3, 0.3, (16, 1)), rng.uniform(-0.15, 0.15, (16, 1))])
+    along = np.linspace(0, 1, 200)[:, None]
+    bends = bend / 1800 * rng.choice([-1, 1], 8)
+    for number, (f, turn) in enumerate(zip(*path, strict=True)):
+        for first, last, bent in zip(ends[::2], ends[1::2], bends, strict=True):
+            across = np.array([first[1] - last[1], last[0] - first[0]]) / np.linalg.norm(last - first)
+            scene = first + along * (last - first) + 4 * bent * along * (1 - along) * across
+            ahead = np.column_stack([scene, np.ones(len(scene))]) @ turn.T
+            straight = np.asarray(lens.centre) + f * ahead[:, :2] / ahead[:, 2:]
+            seen = np.asarray(lens(float(f)).distort(straight)) + rng.normal(0, 0.1, straight.shape)
+            inside = ((seen >= 0) & (seen <= np.array(SIZE) - 1)).all(axis=1)
+            if inside.sum() > 20:
+                points.append(seen[inside])
+                frame.append(number)
+    return Lines.from_ragged(points, frame, path[0], image_size=SIZE, focal_unit="px")
 
 
 def test_lines_may_be_compressed_and_have_any_focal_length(noisy, lines, with_lines):

@@ -62,14 +62,21 @@ class Stage(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """Standard deviations, px: of a coordinate of a track's points, and of a line's points across it."""
+    """Standard deviations, px, and how many points of lines count as one.
+
+    Attributes:
+        points: of a coordinate of a track's points.
+        lines: of a line's points across it.
+        repeated: points of lines that say no more than one (`_motion_repeated`).
+    """
 
     points: Array
     lines: Array
+    repeated: float | Array = 1.0
 
     def wider(self, factor) -> "Noise":
-        """Both, times a factor."""
-        return Noise(factor * self.points, factor * self.lines)
+        """Both standard deviations, times a factor."""
+        return Noise(factor * self.points, factor * self.lines, self.repeated)
 
 
 class Data(eqx.Module):
@@ -285,14 +292,10 @@ def line_residuals_of(data: Data, model: Model) -> Float[Array, "line row"]:
     lines, moments = data.lines, data.moments
     if lines is None or moments is None:
         return jnp.zeros((0, 1))
-    rows, frame = _rows_of_frames(data, model), data.structure.line_frame
-    far = (jnp.asarray(data.size) - 1) / 2 / data.scale
-    expand = jax.vmap(lambda k: jnp.asarray(model.family.expansion(k, far @ far)[0]))
-    powers = expand(rows.coefficients[0])[frame]
-    corrected = lines.corrected(jnp.concatenate([powers, rows.offset[frame]], axis=1))
-    normal = jax.vmap(line_normal)(corrected)
+    straight, powers = _corrected_lines(data, model, _rows_of_frames(data, model))
+    normal = jax.vmap(line_normal)(straight)
     squared = jax.vmap(radial_stretch)(powers, normal, moments, lines.counts)
-    distances = jnp.einsum("lrc,lc->lr", corrected, normal)
+    distances = jnp.einsum("lrc,lc->lr", straight, normal)
     return distances / jnp.sqrt(jnp.maximum(squared, 0.01))[:, None]
 
 
@@ -304,8 +307,37 @@ def line_squares_of(data: Data, distances: Float[Array, "line row"]) -> Float[Ar
     return jnp.where(free > 0, jnp.sum(distances**2, axis=1) / jnp.maximum(free, 1), jnp.nan)
 
 
-def weighed(data: Data, rows: Float[Array, "line row"]) -> Float[Array, "line row"]:
-    """Each line's rows times the root of its weight."""
+def line_planes_of(data: Data, model: Model) -> Float[Array, "line 3"]:
+    """The normal of the plane through the camera that each line lies in, in the scene; of length 1."""
+    lines = data.lines
+    if lines is None:
+        return jnp.zeros((0, 3))
+    rows, frame = _rows_of_frames(data, model), data.structure.line_frame
+    first = lines.triangle[:, 0]  # the sums of the monomials 1, x, y ... over a number
+    middle = data.scale * first[:, 1:3] / jnp.where(first[:, :1] > 0, first[:, :1], 1)
+
+    def plane(point, corrected_rows, frame):
+        coefficients, offset = rows.coefficients[0][frame], rows.offset[frame]
+        normal = line_normal(corrected_rows)
+        seen = corrected(point, coefficients, offset, model.family, data.scale)
+        across = jnp.append(normal, -normal @ seen / jnp.exp(model.path.log_focal[frame]))
+        return product(model.path.rotation[frame].T, across / jnp.linalg.norm(across))
+
+    return jax.vmap(plane)(middle, _corrected_lines(data, model, rows)[0], frame)
+
+
+def _corrected_lines(data, model, rows):
+    """Rows with the scatter of each line's corrected points, px, and the powers that correct it."""
+    far = (jnp.asarray(data.size) - 1) / 2 / data.scale
+    expand = jax.vmap(lambda k: jnp.asarray(model.family.expansion(k, far @ far)[0]))
+    frame = data.structure.line_frame
+    powers = expand(rows.coefficients[0])[frame]
+    return data.lines.corrected(jnp.concatenate([powers, rows.offset[frame]], axis=1)), powers
+
+
+def weighed(data: Data, noise: Noise, rows: Float[Array, "line row"]) -> Float[Array, "line row"]:
+    """Each line's rows in units of the noise, times the root of its weight."""
+    rows = rows / (noise.lines * jnp.sqrt(noise.repeated))
     weight = None if data.lines is None else data.lines.weight
     return rows if weight is None else jnp.sqrt(weight)[:, None] * rows
 
@@ -337,7 +369,7 @@ def rows_of(unknowns: Unknowns, args: tuple[Data, Model, Noise, Stage]) -> Rows:
     of_lines = jnp.nan_to_num(line_squares_of(data, lines)) / (noise.lines * WRONG_LINE) ** 2
     return Rows(
         views * flattened(squared)[:, None],
-        weighed(data, lines / noise.lines * flattened(of_lines)[:, None]),
+        weighed(data, noise, lines * flattened(of_lines)[:, None]),
         about_frames(data, there.path, unknowns, steps, stage),
         about_lens(data, there, unknowns, stage),
     )

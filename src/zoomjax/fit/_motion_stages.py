@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
 from ._motion_parallax import parallax_of
+from ._motion_repeated import common_errors_of, groups_of, repeated
 from ._motion_rows import (
     WRONG_LINE,
     Model,
@@ -39,16 +40,26 @@ from .result import RESULTS, ZoomFit, judged
 STAGES = (
     Stage(0.3, 0.01, 0.05, 4.0, change=1.0, damping=1e-3, own=0.05, fresh=1.0),
     Stage(1.0, 0.05, 1.0, 1.0, change=3.0, damping=1e-4, own=0.05),
-    *[Stage(1.0, 0.05, 1.0, 1.0, change=0.1, damping=1e-7, own=0.05)] * 4,
+    Stage(1.0, 0.05, 1.0, 1.0, change=0.01, damping=1e-7, own=0.05),
 )
-"""They widen the prior of the lens and narrow the loss; they end where the noise and the solver do."""
+"""They widen the prior of the lens and narrow the loss; the last is repeated until it changes nothing."""
+
+_MOST_REPEATS = 12
 
 _SAME = 0.99  # of the noise before a stage: one that leaves less was not the last
 
 _SETTLED = 3.0
 """Change of the residuals over a whole stage, in all and in units of the noise, that is as good as none."""
 
+_STILL = 1.0
+"""Such a change over a stage that was the last: as much as a standard deviation of the estimate."""
+
 _MOST_STEPS = 30  # of a stage
+
+_AS_GOOD = 1.3
+"""Times as much of errors that views or lines have in common: what is less may be chance."""
+
+_MOST_COUNTS = 4
 
 _INFLATION = 1 / 0.95  # of variances, by what the loss loses
 
@@ -58,7 +69,7 @@ _UNKNOWN_SCALE = 0.1
 """Standard deviation of log f from which the focal lengths have no scale."""
 
 
-def in_stages(data, paths, spreads, zoom, shift, family, terms):
+def in_stages(data, paths, spreads, zoom, shift, family, terms, shot):
     """The fit, with a prior of the lens that widens from stage to stage: the program is the same.
 
     The first stage goes from all starts. The one that leaves the least noise goes on.
@@ -67,6 +78,7 @@ def in_stages(data, paths, spreads, zoom, shift, family, terms):
         data: tracks and lines.
         paths, spreads: starts, and the medians of their residuals, px.
         zoom, shift, family, terms: as for `fit_motion`.
+        shot: number of each frame's shot.
 
     Returns:
         The parts of a `MotionFit` by name, the sizes of the residuals of all views, the model, and the
@@ -81,15 +93,31 @@ def in_stages(data, paths, spreads, zoom, shift, family, terms):
         model = Model(path, prepared_zoom, prepared, data.readout[0], nothing, family)
         noise = Noise(spread / MEDIAN_OF_SIZE, jnp.asarray(jnp.nan)).wider(STAGES[0].wider)
         tried.append(_solved(data, *_arrays((model, noise, STAGES[0]))))
-    model, noise, result, steps = min(tried, key=lambda found: np.nan_to_num(found[1].points, nan=np.inf))
-    weighted_by = noise
-    for number, stage in enumerate(STAGES[1:]):
-        weighted_by = noise.wider(stage.wider)
-        model, noise, result, steps = _solved(data, *_arrays((model, weighted_by, stage)))
-        if number > 0 and result == RESULTS.successful and noise.points > _SAME * weighted_by.points:
+    model, noise, *_ = min(tried, key=lambda found: np.nan_to_num(found[1].points, nan=np.inf))
+    model, noise, *_ = _solved(data, *_arrays((model, noise.wider(STAGES[1].wider), STAGES[1])))
+    model, noise, weighted_by, result, steps = _settled(data, model, noise)
+    for _ in range(_MOST_COUNTS if data.lines is not None else 0):
+        more = repeated(data, model, *_arrays((noise, STAGES[-1])), groups_of(data, model, shot))
+        if 1 / _AS_GOOD < more < _AS_GOOD or (more <= 1 and noise.repeated == 1):
             break
+        noise = noise._replace(repeated=jnp.maximum(noise.repeated * more, 1.0))
+        model, noise, weighted_by, result, steps = _settled(data, model, noise)
     free = _arrays(STAGES[-1]._replace(own=_FREE))
     return *_described(data, model, noise, free, result, steps), *_arrays((model, weighted_by))
+
+
+def _settled(data, model, noise):
+    """The last stage until it changes nothing: the model, its noise, that before, the status, the steps.
+
+    Where little tells the scale of f, the way to the minimum is long and bent, and each step short.
+    """
+    for _ in range(_MOST_REPEATS):
+        weighted_by = noise.wider(STAGES[-1].wider)
+        model, noise, result, steps, change = _solved(data, *_arrays((model, weighted_by, STAGES[-1])))
+        same = noise.points > _SAME * weighted_by.points
+        if result == RESULTS.successful and same and change < _STILL:
+            break
+    return model, noise, weighted_by, result, steps
 
 
 def _each(paths):
@@ -106,7 +134,9 @@ def _arrays(tree):
 
 @eqx.filter_jit
 def _solved(data, model, noise, stage):
-    """The path and the lens of least energy, the noise, the solver's status and its steps.
+    """The path and the lens of least energy, the noise, the solver's status, its steps, and the change.
+
+    The change is that of the residuals, in all and in units of the noise.
 
     A stage whose steps are spent is successful if all of them moved the residuals by less than their noise
     does: with heavy tails the last steps are many and small.
@@ -131,15 +161,15 @@ def _solved(data, model, noise, stage):
     views = residuals_of(data, model)
     size = jnp.linalg.norm(views, axis=-1)
     near = (size < 3 * CAUCHY * noise.points)[:, None]
-    settled = optx.two_norm(jnp.where(near, views - first, 0)) < _SETTLED * noise.points
+    change = optx.two_norm(jnp.where(near, views - first, 0)) / noise.points
     points = jnp.nanmedian(jnp.where(data.there, size, jnp.nan)) / MEDIAN_OF_SIZE
     rays = model.path.rays / jnp.linalg.norm(model.path.rays, axis=1, keepdims=True)
     model = eqx.tree_at(lambda m: m.path.rays, model, rays)
-    noise = Noise(jnp.maximum(points, EXACT), _line_noise(data, model))
+    noise = Noise(jnp.maximum(points, EXACT), _line_noise(data, model), noise.repeated)
     spent = solution.result == optx.RESULTS.nonlinear_max_steps_reached
     good: Any = RESULTS.successful
-    result = RESULTS.where(settled & spent, good, RESULTS.promote(solution.result))
-    return model, noise, result, solution.stats["num_steps"]
+    result = RESULTS.where((change < _SETTLED) & spent, good, RESULTS.promote(solution.result))
+    return model, noise, result, solution.stats["num_steps"], change
 
 
 def _line_noise(data, model):
@@ -159,10 +189,10 @@ def _described(data, model, noise, stage, result, steps):
         steps = jax.tree.map(jnp.multiply, unknowns, units)
         there = moved(model, steps)
         views = residuals_of(data, there) / noise.points
-        lines = line_residuals_of(data, there) / noise.lines
+        lines = line_residuals_of(data, there)
         return Rows(
             jnp.where(inlier[:, None], views, 0),
-            weighed(data, jnp.where(good[:, None], lines, 0)),
+            weighed(data, noise, jnp.where(good[:, None], lines, 0)),
             about_frames(data, there.path, unknowns, steps, stage),
             about_lens(data, there, unknowns, stage),
         )
@@ -180,7 +210,11 @@ def _described(data, model, noise, stage, result, steps):
     log_variance = own[:, 0, 0] * unit**2 + 2 * both[:, 0, -1] * unit * of_lens[-1] + lens[-1, -1]
     count = 2 * jnp.sum(inlier)
     free = count / (count - data.unknowns - len(lens))
-    inflation = _INFLATION * free
+    flat = jnp.where(inlier, 1 / (1 + squared), 0)  # of the loss: its slope over the residual
+    pull = flat[:, None] * missed / noise.points
+    common = common_errors_of(jacobian, pull, matrix, zeros, data.structure)
+    common = common / jnp.mean(flat**2, where=inlier) ** 2 / (_INFLATION * free)
+    inflation = _INFLATION * free * jnp.where(common > _AS_GOOD, common, 1)
     zoom_size = ravel_pytree(model.zoom.parameters)[0].size
     joint, log_std = lens[:-2, :-2] * inflation, jnp.sqrt(log_variance * inflation)
     focal = jnp.exp(model.path.log_focal)

@@ -83,7 +83,7 @@ def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, dam
         structure: which frame each view belongs to.
         damping: added to each unknown's diagonal entry.
     """
-    by_frame, by_ray, by_lens = _columns(jacobian, like)
+    by_frame, by_ray, by_lens = columns(jacobian, like)
     views, by_track = rows.views[..., None], structure.track
 
     def summed(of_views):
@@ -126,7 +126,7 @@ def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, dam
     )
 
 
-def _columns(jacobian, like):
+def columns(jacobian: Any, like: Unknowns) -> tuple[Rows, Rows, Rows]:
     """The Jacobian's columns of each row: by its frame, by its ray and by the lens; the last axis."""
     lens, unravel = ravel_pytree(like.lens)
     along = jnp.eye(6 + lens.size)
@@ -137,10 +137,10 @@ def _columns(jacobian, like):
     )
     out = jax.vmap(jacobian)(directions)  # at once: compiled once
 
-    def columns(part):
+    def those(part):
         return jax.tree.map(lambda leaf: jnp.moveaxis(leaf[part], 0, -1), out)
 
-    by_frame, by_ray, by_lens = columns(slice(4)), columns(slice(4, 6)), columns(slice(6, None))
+    by_frame, by_ray, by_lens = those(slice(4)), those(slice(4, 6)), those(slice(6, None))
     own = jnp.diagonal(by_frame.frames, axis1=1, axis2=2)
     return by_frame._replace(frames=own), by_ray, by_lens
 
@@ -295,6 +295,15 @@ def solution_of(matrix: Reduced, right: Unknowns, structure: Structure) -> Unkno
         right_frames=own, right_lens=of_lens, rays=(inverse, coupling, to_lens, right.rays)
     )
     return solution(matrix, right, structure)
+
+
+def lens_equations(matrix: Reduced) -> tuple[Float[Array, "lens lens"], Float[Array, "block n lens"]]:
+    """The lens's matrix without the frames, and how much their numbers fall where each of its rises.
+
+    The latter by blocks.
+    """
+    by_lens = _solve_blocks(_factored(matrix), matrix.border)
+    return matrix.corner - jnp.einsum("bni,bnj->ij", matrix.border, by_lens), by_lens
 
 
 def covariances(

@@ -227,7 +227,7 @@ def _solved_motion(given, asked):
     by_frame = views_by_frame(problem.piece, problem.moment, len(problem.data.log_focal))
     paths, spreads = _started(problem.data, by_frame)
     parts, missed, model, noise = in_stages(
-        problem.data, paths, spreads, asked.zoom, asked.shift, asked.family, asked.terms
+        problem.data, paths, spreads, asked.zoom, asked.shift, asked.family, asked.terms, problem.shot
     )
     parts["fit"] = eqx.tree_at(lambda fit: fit.frame_rms, parts["fit"], parts["fit"].frame_rms[:frames])
     residual = jnp.full(np.shape(given.tracks.mask), jnp.nan)

@@ -1,0 +1,109 @@
+"""How often lines repeat one another: how many of their points count as one.
+
+Points of a line have errors in common: the detector's, and those of a marking that is not quite straight.
+Where a camera turns little, it sees the same few lines in every frame, with the same errors. Lines as a
+whole then say much less than as many independent points would.
+
+At the minimum each line pulls at the lens: its score is the gradient of its part of the energy. Lines of
+all frames that lie in one plane through the camera are the same line of the scene, and their scores add up.
+If errors were independent, a sum of scores g would have the covariance ``H_g - H_g V H_g``, with what these
+lines tell of the lens, H_g, and V, the covariance of the lens. The mean of ``g^T V g`` over its expectation
+is how often the same is said. It does not depend on which lines are put together if errors are independent,
+and so two lines that are mistaken for one do no harm.
+
+Views of a track may have errors in common, too: the track drifts, its point is nearer than others, or it is
+on a thing that moves. The same mean, of the scores of tracks, is then what variances are too small by.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+import scipy.spatial
+from jaxtyping import Array, Float, Int
+
+from ._motion_rows import Data, Model, Noise, Stage, line_planes_of, rows_of, units_of
+from ._schur import Reduced, Unknowns, columns, lens_equations, reduced
+from ._structure import Structure
+
+_NEAR = 0.01
+"""Between the normals of planes, radians: below this two lines are one, seen twice."""
+
+_LITTLE = 1e-9  # added to the diagonal: unknowns that no view sees
+
+
+def groups_of(data: Data, model: Model, shot: Int[np.ndarray, "frame"]) -> Int[np.ndarray, "line"]:
+    """The number of the line of the scene that each line shows."""
+    plane, frame = np.asarray(line_planes_of(data, model)), np.asarray(data.structure.line_frame)
+    # Cameras of different shots have no rotation in common.
+    place = np.column_stack(
+        [plane, np.where(frame < len(shot), shot[np.minimum(frame, len(shot) - 1)], -1)]
+    )
+    tree = scipy.spatial.cKDTree(place)
+    other = scipy.spatial.cKDTree(place * [-1, -1, -1, 1])  # a plane has two normals
+    pairs = [tree.sparse_distance_matrix(of, _NEAR, output_type="coo_matrix") for of in (tree, other)]
+    one, two = (np.concatenate([getattr(of, name) for of in pairs]) for name in ("row", "col"))
+    links = scipy.sparse.coo_array((np.ones(len(one)), (one, two)), (len(place),) * 2)
+    return scipy.sparse.csgraph.connected_components(links, directed=False)[1]
+
+
+@eqx.filter_jit
+def repeated(
+    data: Data, model: Model, noise: Noise, stage: Stage, group: Int[Array, "line"]
+) -> Float[Array, ""]:
+    """How many points of lines count as one, beside what `noise` says of that; 1 if there is no line."""
+    zeros = jax.tree.map(jnp.zeros_like, units_of(data, model, noise))
+    rows, jacobian = jax.linearize(lambda x: rows_of(x, (data, model, noise, stage)), zeros)
+    matrix = reduced(jacobian, rows, zeros, data.structure, jnp.asarray(_LITTLE))
+    information, by_lens = lens_equations(matrix)
+    by_frame, _, of_lens = columns(jacobian, zeros)
+    answer = by_lens.reshape(-1, 4, by_lens.shape[-1])[data.structure.line_frame]
+    effect = of_lens.lines - jnp.einsum("lrf,lfp->lrp", by_frame.lines, answer)
+    score = jnp.einsum("lrp,lr->lp", effect, rows.lines)
+    told = jnp.einsum("lrp,lrq->lpq", effect, effect)
+    score, told = (jax.ops.segment_sum(of, group, len(group)) for of in (score, told))
+    return _more_than_chance(score, told, information)
+
+
+def common_errors_of(
+    jacobian: Any, pull: Float[Array, "view 2"], matrix: Reduced, like: Unknowns, structure: Structure
+) -> Float[Array, ""]:
+    """The mean square of how tracks pull at the lens, over what independent views of noise 1 would do.
+
+    Args:
+        jacobian: of the rows by the unknowns.
+        pull: of each view, the derivative of its loss by its residual.
+        matrix: the normal equations.
+        like: the unknowns' shapes.
+        structure: which track and frame each view belongs to.
+    """
+    information, by_lens = lens_equations(matrix)
+    by_frame, by_ray, of_lens = columns(jacobian, like)
+    answer = by_lens.reshape(-1, 4, by_lens.shape[-1])[structure.frame]
+    effect = of_lens.views - jnp.einsum("vrf,vfp->vrp", by_frame.views, answer)
+
+    def of_tracks(one, other):
+        products = jnp.einsum("vri,vrj->vij", one, other)
+        return jax.ops.segment_sum(products, structure.track, structure.tracks)
+
+    with_rays = jnp.einsum("tpi,tij->tpj", of_tracks(effect, by_ray.views), matrix.rays[0])
+    of_rays = jnp.concatenate(
+        [of_tracks(by_ray.views, effect), of_tracks(by_ray.views, pull[..., None])], -1
+    )
+    less = with_rays @ of_rays
+    told = of_tracks(effect, effect) - less[..., :-1]
+    score = of_tracks(effect, pull[..., None])[..., 0] - less[..., -1]
+    return _more_than_chance(score, told, information)
+
+
+def _more_than_chance(score, told, information):
+    """The mean of ``g^T V g`` over its expectation; 1 if nothing is expected."""
+    covariance = jnp.linalg.inv(information)
+    own = jnp.einsum("gpq,qr->gpr", told, covariance)  # H V
+    expected = jnp.einsum("gpp->", own) - jnp.einsum("gpq,gqp->", own, own)
+    found = jnp.einsum("gp,pq,gq->", score, covariance, score)
+    return jnp.where(expected > 0, found / jnp.where(expected > 0, expected, 1), 1.0)
