@@ -17,6 +17,7 @@ import numpy as np
 from zoomjax.app.image_calibration import ImageCalibration, calibrate_images
 from zoomjax.app.image_job import ImageJob
 
+from .shared import table
 from .wide_scenes import Scene, render, scene
 
 FOCALS = np.array([16.0, 18.0, 21.0, 25.0, 30.0, 38.0, 48.0, 60.0])
@@ -112,3 +113,34 @@ def bent(line: np.ndarray, made: Scene) -> float:
         (made.undistort(line + step) - made.undistort(line - step)) @ normal for step in 0.5 * np.eye(2)
     ]
     return float(np.sqrt(np.mean((centred @ normal / np.hypot(*slope)) ** 2)))
+
+
+def folders_page(rows: list[dict]) -> list[str]:
+    """What tying does, on the page of results."""
+    lines = []
+    for row in rows:
+        for name, told in (("apart", "by themselves"), ("tied", "tied")):
+            of = row[name]
+            poor = [of["photos"][n] for n in row["poor"]]
+            right, wrong = (sum(photo[key] for photo in poor) for key in ("right", "wrong"))
+            far = f"{max(of['error_px']):.2f}"
+            lines.append(
+                [
+                    f"{row['seed']}, {told}",
+                    str(len(of["again"])),
+                    str(right),
+                    str(wrong),
+                    far,
+                    of["verdict"],
+                ]
+            )
+    return [
+        "## Photos tied by the zoom lens",
+        "",
+        f"Rendered folders with photos at {len(FOCALS)} focal lengths of a zoom lens. In each, four photos "
+        "mislead: two of arcs with a few dashed lines, one with few lines and clutter, one blurred and "
+        "noisy. Lines in these photos are right if they are straight under the true lens. The lens's error is the "
+        "greatest of all photos, px RMS of the image.",
+        "",
+        *table(["folder, photos", "searched again", "right", "wrong", "error, px", "verdict"], lines),
+    ]

@@ -20,8 +20,8 @@ _APART = 1.5e-3
 tolerated when pieces of lines are joined."""
 
 _LEAST_KEPT = 0.25
-"""Share of what the search of a photo alone explains that the lens of all must explain. In photos of arcs,
-which a wrong model joins to lines, it is 0.35 and more; in photos by a very different lens less."""
+"""Share of what the search of a photo alone explains that the lens of all must explain. Photos of
+arcs, which a wrong model joins to lines, have more; photos by a very different lens less."""
 
 _STRAIGHT = 1.0
 """px, RMS: lines that the lens of all makes as straight count for it."""
