@@ -139,8 +139,9 @@ def folders_page(rows: list[dict]) -> list[str]:
         "",
         f"Rendered folders with photos at {len(FOCALS)} focal lengths of a zoom lens. In each, four photos "
         "mislead: two of arcs with a few dashed lines, one with few lines and clutter, one blurred and "
-        "noisy. Lines in these photos are right if they are straight under the true lens. The lens's error is the "
-        "greatest of all photos, px RMS of the image.",
+        "noisy. Lines in these photos are right if they are straight under the true lens. The lens's error "
+        "is "
+        "the greatest of all photos, px RMS of the image.",
         "",
         *table(["folder, photos", "searched again", "right", "wrong", "error, px", "verdict"], lines),
     ]

@@ -95,3 +95,8 @@ def test_a_photo_of_arcs_is_searched_again(tmp_path, workers):
     apart = calibrate_images(dataclasses.replace(job, tied=False))
     assert apart.tied == ()
     assert calibrate_images(job).tied == done.tied  # from the cache
+    verdicts = {row["name"]: row["verdict"] for row in done.about()["images"]}
+    assert [verdicts[f"{n}.png"] for n in range(4)] == ["good"] * 4
+    alone = dict(zip((d.name for d in apart.used), apart.verdicts(), strict=True))
+    assert alone.get("arcs.png", ("not determined", "x"))[0] != "good"
+    assert all(reason for verdict, reason in alone.values() if verdict != "good")

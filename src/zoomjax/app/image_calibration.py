@@ -17,6 +17,7 @@ from .._core.text import plain
 from ..detect.batch import DETECTORS, NO_LINES, Detection, detect
 from ..detect.sources import Source
 from ..models.about import UNKNOWN
+from ..trust.assessment import Verdict
 from ._flags import with_flags
 from .board_bundle import BoardBundle, bundle_of
 from .calibration import Calibration, calibrate
@@ -28,7 +29,14 @@ from .overlay import draw_lines
 from .plane_focals import Sharing
 from .results_folder import OF_A_LENS, results_folder
 from .tying import Bend, tied, to_search_again
-from .verdict import findings_of_edges, findings_of_focals, findings_of_photos, findings_of_sizes
+from .verdict import (
+    findings_of_edges,
+    findings_of_focals,
+    findings_of_photos,
+    findings_of_sizes,
+    nothing_usable,
+    verdict_of_photo,
+)
 
 MOST_OVERLAYS = 200
 """Images drawn with their lines, unless all are asked for."""
@@ -73,6 +81,11 @@ class ImageCalibration:
         """For each used image, which of its lines were rejected as not straight in the scene."""
         return [self.calibration.rejected[members] for members in self.members()]
 
+    def verdicts(self) -> list[tuple[Verdict, str]]:
+        """For each used image the verdict on it, and why it is not good."""
+        parts = enumerate(zip(self.used, self.rejected(), strict=True))
+        return [verdict_of_photo(self.calibration, frame, *part) for frame, part in parts]
+
     def about(self) -> dict[str, Any]:
         """The entries of summary.json about the images."""
         images = [
@@ -84,8 +97,12 @@ class ImageCalibration:
                 "rejected": int(rejected.sum()),
                 "unexplained": detection.unexplained,
                 "searched_again": detection.name in self.tied,
+                "verdict": verdict,
+                "reason": reason,
             }
-            for detection, rejected in zip(self.used, self.rejected(), strict=True)
+            for detection, rejected, (verdict, reason) in zip(
+                self.used, self.rejected(), self.verdicts(), strict=True
+            )
         ]
         return {
             "detector": self.job.detector,
@@ -266,7 +283,7 @@ def _calibrated(
     usable, others = _of_one_size([d for d in detections if not d.problem])
     unused |= others
     if not usable:
-        raise ValueError(_nothing(detections))
+        raise ValueError(nothing_usable(detections))
     stage("Finding the focal lengths")
     way = "track" if job.video and job.focal not in (None, *MEASURED) else job.focal
     if job.video and job.focal is None:
@@ -377,13 +394,3 @@ def _of_one_size(detections: Sequence[Detection]) -> tuple[list[Detection], dict
             else ": use images as stored by the camera, neither resized nor cropped"
         )
     return [d for d in detections if d.image_size == (width, height)], others
-
-
-def _nothing(detections: Sequence[Detection]) -> str:
-    """The error message when no image can be used."""
-    problems = Counter(d.problem.rstrip(".") for d in detections)
-    if len(problems) == 1 and len(detections) > 1:
-        return f"None of the {len(detections)} images can be used: {next(iter(problems))}."
-    listed = "; ".join(f"{plain(d.name)}: {plain(d.problem)}" for d in detections[:4])
-    more = f"; and {len(detections) - 4} more" if len(detections) > 4 else ""
-    return f"None of the images can be used. {listed}{more}."

@@ -15,7 +15,7 @@ from ..detect.batch import Detection
 from ..detect.bend import Bend, bend_of, bends_apart, straight_length
 from ..models.lens import ZoomLens
 
-_APART = 1.5e-3
+APART = 1.5e-3
 """In diagonals, RMS: by how much a photo's own model may bend straight lines of the lens. Twice of what is
 tolerated when pieces of lines are joined."""
 
@@ -57,7 +57,7 @@ def to_search_again(
     asked, known = [d for d in detections if d.name in focal], {}
     if sum(bool(d.lines) for d in asked) < _LEAST_PHOTOS:
         return {}
-    limit = _APART * float(np.hypot(*lens.image_size))
+    limit = APART * float(np.hypot(*lens.image_size))
     for detection in asked:
         if detection.bend is not None:
             by_all = bend_at(lens, focal[detection.name])
