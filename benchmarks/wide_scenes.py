@@ -12,6 +12,9 @@ import numpy as np
 _OVER = 2
 """Samples a pixel, each way."""
 
+HARD = ("few lines", "blur", "noise", "clutter", "tiny", "few lines and clutter", "blur and noise")
+"""What makes scenes hard."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
@@ -22,12 +25,14 @@ class Scene:
         corner: by how many times its radius the corner moves outwards.
         centre: of distortion, px.
         seed: of all that is drawn.
+        hard: what makes it hard: one of `HARD`, or nothing.
     """
 
     size: tuple[int, int]
     corner: float
     centre: np.ndarray
     seed: int
+    hard: str = ""
 
     def undistort(self, points: np.ndarray) -> np.ndarray:
         """Corrected positions of points (..., 2), px."""
@@ -44,9 +49,21 @@ def scene(seed: int) -> Scene:
     return Scene(size, float(rng.uniform(-0.3, 1.2)), (np.array(size) - 1) / 2 + shift, seed)
 
 
+def hard_scene(seed: int) -> Scene:
+    """A scene as `scene` makes them, but with what makes lines hard to find: each of `HARD` in turn."""
+    rng, made = np.random.default_rng((79, seed)), scene(seed)
+    hard = HARD[seed % len(HARD)]
+    if hard != "tiny":
+        return dataclasses.replace(made, hard=hard)
+    width = int(rng.choice([120, 180, 240]))
+    size = (width, round(width / 1.5))
+    shift = (made.centre - (np.array(made.size) - 1) / 2) * width / made.size[0]
+    return dataclasses.replace(made, size=size, centre=(np.array(size) - 1) / 2 + shift, hard=hard)
+
+
 def render(made: Scene) -> np.ndarray:
     """A photo of the scene: grey levels, with blur, vignetting, noise of 3 levels and JPEG."""
-    rng = np.random.default_rng((78, made.seed))
+    rng, harder = np.random.default_rng((78, made.seed)), np.random.default_rng((80, made.seed))
     width, height = made.size
     wide, high = width * _OVER, height * _OVER
     y, x = np.mgrid[0:high, 0:wide]
@@ -54,6 +71,10 @@ def render(made: Scene) -> np.ndarray:
     corrected = made.undistort(at)
     side = np.quantile(np.abs(corrected - made.centre).reshape(-1, 2), 0.995, axis=0)
     plane, extent = _facade(rng) if made.seed % 3 else _hall(rng)
+    if "few lines" in made.hard:
+        plane, extent = _bare(harder)
+    if made.hard in PLANES:
+        plane, extent = PLANES[made.hard](harder)
     # A plane turned and tilted by a homography of its four corners, somewhat larger than what is seen.
     square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
     shaken = square * side * rng.uniform(1.0, 1.2) * (1 + rng.uniform(-0.2, 0.2, (4, 2))) + made.centre
@@ -69,12 +90,15 @@ def render(made: Scene) -> np.ndarray:
         borderMode=cv2.BORDER_REFLECT,
     )
     _people(big, rng)
+    if "clutter" in made.hard:
+        _people(big, harder, int(harder.integers(40, 160)))
     image = cv2.resize(big, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
-    image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.5, 1.1))
+    blur = harder.uniform(2.5, 8) if "blur" in made.hard else rng.uniform(0.5, 1.1)
+    image = cv2.GaussianBlur(image, (0, 0), blur)
     row, column = np.indices((height, width))
     distance = np.hypot(row - height / 2, column - width / 2)
     image *= 1 - 0.3 * (distance / np.hypot(width, height) * 2) ** 2
-    image += rng.normal(0, 3, image.shape)
+    image += rng.normal(0, harder.uniform(12, 20) if "noise" in made.hard else 3, image.shape)
     _, packed = cv2.imencode(
         ".jpg", np.clip(np.rint(image), 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 90]
     )
@@ -129,16 +153,54 @@ def _hall(rng: np.random.Generator) -> tuple[np.ndarray, tuple[int, int]]:
     return plane, extent
 
 
+def _bare(rng: np.random.Generator) -> tuple[np.ndarray, tuple[int, int]]:
+    """A wall with two to five boards, level or upright, and nothing else."""
+    extent = (2400, 1600)
+    wall = rng.uniform(140, 200)
+    plane = np.full(extent[::-1], wall, np.float32)
+    for _ in range(int(rng.integers(2, 6))):
+        (x, y), thick = rng.uniform(0.1, 0.9, 2) * extent, rng.uniform(15, 60)
+        long = rng.uniform(0.4, 1.6) * extent[1]
+        level = rng.random() < 0.5
+        size = np.array((long, thick) if level else (thick, long))
+        _box(plane, (x - size[0] / 2, y - size[1] / 2), size, wall * rng.uniform(0.2, 0.8))
+    return plane, extent
+
+
+def _arena(rng: np.random.Generator) -> tuple[np.ndarray, tuple[int, int]]:
+    """Rows of seats on arcs about one point, and a few level and upright boards seen through gaps."""
+    extent = (2400, 1600)
+    ground = rng.uniform(120, 180)
+    plane = np.full(extent[::-1], ground, np.float32)
+    middle = (round(rng.uniform(0.2, 0.8) * extent[0]), round(rng.uniform(1.3, 2.2) * extent[1]))
+    row, column = np.indices(plane.shape, dtype=np.float32)
+    radius, step = np.hypot(column - middle[0], row - middle[1]), rng.uniform(60, 110)
+    tones = ground * rng.uniform(0.4, 0.8, int(radius.max() / step) + 1)
+    seats = radius % step < 14
+    plane[seats] = tones[(radius[seats] / step).astype(int)]
+    for _ in range(int(rng.integers(4, 8))):
+        place, thick, tone = rng.uniform(0.1, 0.9, 2) * extent, rng.uniform(20, 50), ground * 0.25
+        level = rng.random() < 0.4
+        for start in np.arange(0, extent[0 if level else 1], 260):
+            size = (140, thick) if level else (thick, 140)
+            _box(plane, (start, place[1]) if level else (place[0], start), size, tone)
+    return plane, extent
+
+
+PLANES = {"arcs": _arena}
+"""What is photographed in place of facades and halls, by what makes scenes hard."""
+
+
 def _box(plane: np.ndarray, corner, size, tone: float) -> None:
     """Fill a box with a tone."""
     left, top = (round(value) for value in corner)
     plane[max(top, 0) : round(top + size[1]), max(left, 0) : round(left + size[0])] = tone
 
 
-def _people(image: np.ndarray, rng: np.random.Generator) -> None:
+def _people(image: np.ndarray, rng: np.random.Generator, number: int | None = None) -> None:
     """Blobs in front of the scene, round and in all directions."""
     high, wide = image.shape
-    for _ in range(int(rng.integers(4, 14))):
+    for _ in range(int(rng.integers(4, 14)) if number is None else number):
         middle = tuple(rng.integers((0, 0), (wide, high)).tolist())
         axes = tuple(rng.integers((20, 40), (60, 140)).tolist())
         cv2.ellipse(

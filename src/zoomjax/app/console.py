@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 REPORT = "report.html"
 
+_MOST_NOTABLE = 8
+"""Photos whose verdict is not good that are listed."""
+
 _TICK = 10.0
 """Seconds between signs of life where there is no terminal."""
 
@@ -294,6 +297,15 @@ def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()
         say(f"Their standard deviations: {deviation[0]:.2%} to {deviation[-1]:.2%}.")
     for sentence in [*done.shared(), *(done.bundle.sentences() if done.bundle else ())]:
         say(sentence)
+    notable = [
+        f"{plain(d.name)}: {verdict}, {reason}."
+        for d, (verdict, reason) in zip(done.used, done.verdicts(), strict=True)
+        if verdict != "good"
+    ]
+    for sentence in notable[:_MOST_NOTABLE]:
+        say(sentence)
+    if len(notable) > _MOST_NOTABLE:
+        say(f"And {len(notable) - _MOST_NOTABLE} photos more that are not good, in summary.json.")
     tell(done.warnings())
     print()
     say(f"Check the detected lines, drawn over each image, in {plain(str(folder / 'lines'))}.")

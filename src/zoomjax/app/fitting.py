@@ -195,15 +195,18 @@ def _under_family(
     if robust and (judge is None or judge.name != model.name):
         stage("Rejecting lines that are not straight")
         placed = _straight(whole, model)
-    how = found.centre
+    how, zoom = found.centre, None
     if isinstance(centre, str) and centre == "fit" and isinstance(model.family, AbstractRadial):
         stage("Fitting the centre of distortion")
-        own = fit_centre(placed, zoom=model, throw=False)
+        own, judged = fit_centre(placed, zoom=model, throw=False), placed
+        if own.determined and robust:
+            judged = _straight(placed.about(own.fit.lens.centre), model)
+            if not np.array_equal(np.asarray(judged.weight), np.asarray(placed.weight)):
+                own = fit_centre(judged.about(placed.centre), zoom=model, throw=False)
         if own.determined:
-            how = CentreFound.of(lines, None, own)
-            placed = placed.about(own.fit.lens.centre)
-            placed = _straight(placed, model) if robust else placed
-    return _Centred(compress_family(placed, model.family, terms=model.terms), model, how, selection, None)
+            how, zoom = CentreFound.of(lines, None, own), own.fit
+            placed = judged.about(own.fit.lens.centre)
+    return _Centred(compress_family(placed, model.family, terms=model.terms), model, how, selection, zoom)
 
 
 def _kept_by_either(lines: Lines, wanted: WantedModel, found: _Centred, robust: bool) -> Lines:

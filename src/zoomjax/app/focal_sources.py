@@ -131,9 +131,9 @@ def choose_focals(
     if way is None:
         way = "board" if board else "exif" if any(d.focal for d in detections) else "plane"
     if way == "exif":
-        found = Focals(_own(detections), "mm", "EXIF data", "its EXIF data have no focal length")
+        found = Focals(_own(detections), "mm", _EXIF, "its EXIF data have no focal length")
     elif way == "track":
-        found = Focals(_own(detections), unit, "the track of the video", "the track has none for it")
+        found = Focals(_own(detections), unit, _TRACK, "the track has none for it")
     elif way == "board":
         if board is None:
             raise ValueError(_NO_BOARD)
@@ -179,6 +179,27 @@ def choose_focals(
             "another zoom model give the same correction.)"
         )
     return found
+
+
+def known_focals(detections: Sequence[Detection], way: str | None, others: Focals) -> dict[str, float]:
+    """The focal lengths of images without lines, as far as they are known without them.
+
+    Args:
+        detections: of these images.
+        way: the source of focal lengths that was asked for.
+        others: the focal lengths of the images with lines.
+    """
+    if others.origin in (_EXIF, _TRACK):
+        return _own(detections)
+    if way is None or way in MEASURED or way == "exif" or not detections:
+        return {}
+    try:
+        return choose_focals(detections, way, unit=others.unit).focal
+    except ValueError:  # a table without them
+        return {}
+
+
+_EXIF, _TRACK = "EXIF data", "the track of the video"
 
 
 _UNKNOWN = "not known, and not needed for one photo: 1 mm stands for it"

@@ -5,7 +5,7 @@ import contextlib
 import dataclasses
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
@@ -14,20 +14,29 @@ import cv2
 import numpy as np
 
 from .._core.text import plain
-from ..detect.batch import DETECTORS, Detection, detect
+from ..detect.batch import DETECTORS, NO_LINES, Detection, detect
 from ..detect.sources import Source
 from ..models.about import UNKNOWN
+from ..trust.assessment import Verdict
 from ._flags import with_flags
 from .board_bundle import BoardBundle, bundle_of
 from .calibration import Calibration, calibrate
 from .choice import chosen_frames, colour_limit
 from .equipment import with_equipment
-from .focal_sources import MEASURED, Focals, choose_focals, focal_sigmas, lines_of
+from .focal_sources import MEASURED, Focals, choose_focals, focal_sigmas, known_focals, lines_of
 from .image_job import ImageJob, overlay_name
 from .overlay import draw_lines
 from .plane_focals import Sharing
 from .results_folder import OF_A_LENS, results_folder
-from .verdict import findings_of_edges, findings_of_focals, findings_of_photos, findings_of_sizes
+from .tying import Bend, tied, to_search_again
+from .verdict import (
+    findings_of_edges,
+    findings_of_focals,
+    findings_of_photos,
+    findings_of_sizes,
+    nothing_usable,
+    verdict_of_photo,
+)
 
 MOST_OVERLAYS = 200
 """Images drawn with their lines, unless all are asked for."""
@@ -51,6 +60,7 @@ class ImageCalibration:
         images: the names of all images, in order; overlays are numbered by their place in it, from 1.
         unused: for each image that was not used, the reason.
         bundle: the bundle adjustment of the grids in them; None if there are too few.
+        tied: the names of the images in which lines were found again under the lens of all images.
     """
 
     job: ImageJob
@@ -60,6 +70,7 @@ class ImageCalibration:
     images: tuple[str, ...]
     unused: dict[str, str]
     bundle: BoardBundle | None = None
+    tied: tuple[str, ...] = ()
 
     def members(self) -> list[np.ndarray]:
         """For each used image, the numbers of its lines among those of the calibration."""
@@ -69,6 +80,11 @@ class ImageCalibration:
     def rejected(self) -> list[np.ndarray]:
         """For each used image, which of its lines were rejected as not straight in the scene."""
         return [self.calibration.rejected[members] for members in self.members()]
+
+    def verdicts(self) -> list[tuple[Verdict, str]]:
+        """For each used image the verdict on it, and why it is not good."""
+        parts = enumerate(zip(self.used, self.rejected(), strict=True))
+        return [verdict_of_photo(self.calibration, frame, *part) for frame, part in parts]
 
     def about(self) -> dict[str, Any]:
         """The entries of summary.json about the images."""
@@ -80,8 +96,13 @@ class ImageCalibration:
                 "lines": len(detection.lines),
                 "rejected": int(rejected.sum()),
                 "unexplained": detection.unexplained,
+                "searched_again": detection.name in self.tied,
+                "verdict": verdict,
+                "reason": reason,
             }
-            for detection, rejected in zip(self.used, self.rejected(), strict=True)
+            for detection, rejected, (verdict, reason) in zip(
+                self.used, self.rejected(), self.verdicts(), strict=True
+            )
         ]
         return {
             "detector": self.job.detector,
@@ -203,6 +224,25 @@ def calibrate_images(
         RuntimeError: the lines do not determine the model.
     """
     sources, total = job.sources()
+    detections = _detected(job, sources, lambda done: progress(done, total), executor)
+    done = _calibrated(job, detections, stage)
+    known = _disagreeing(done, detections) if job.tied and job.detector == "edges" else {}
+    if not known:
+        return done
+    stage("Finding lines again under the lens of all photos")
+    detections, replaced = tied(
+        detections, known, lambda known: _detected(job, _bent(job, known), lambda _: None, executor)
+    )
+    if not replaced:
+        return done
+    done = _calibrated(job, detections, stage)
+    return dataclasses.replace(done, tied=tuple(replaced))
+
+
+def _detected(
+    job: ImageJob, sources: Iterable[Source], progress: Callable[[int], None], executor: Executor | None
+) -> list[Detection]:
+    """What is found in images; `progress` is called with the number of those done."""
     detections = []
     looked = detect(
         sources,
@@ -215,12 +255,35 @@ def calibrate_images(
     with contextlib.closing(looked):  # ends the processes after an error, too
         for detection in looked:
             detections.append(detection)
-            progress(len(detections), total)
+            progress(len(detections))
+    return detections
+
+
+def _bent(job: ImageJob, known: dict[str, Bend]) -> Iterable[Source]:
+    """Some of the images, with what is known of how bent they are."""
+    for source in job.sources()[0]:
+        if source.name in known:
+            yield dataclasses.replace(source, bend=known[source.name])
+
+
+def _disagreeing(done: ImageCalibration, detections: Sequence[Detection]) -> dict[str, Bend]:
+    """The images that are to be searched again, and how bent the lens makes them."""
+    lens = done.calibration.zoom.lens
+    ours = [d for d in detections if d.image_size == lens.image_size and d.problem in ("", NO_LINES)]
+    empty = [d for d in ours if d.problem]
+    focal = done.focals.focal | known_focals(empty, done.job.focal, done.focals)
+    return to_search_again(ours, focal, lens)
+
+
+def _calibrated(
+    job: ImageJob, detections: Sequence[Detection], stage: Callable[[str], None]
+) -> ImageCalibration:
+    """The calibration from what was found in all images."""
     unused = {d.name: with_flags(d.problem) for d in detections if d.problem}
     usable, others = _of_one_size([d for d in detections if not d.problem])
     unused |= others
     if not usable:
-        raise ValueError(_nothing(detections))
+        raise ValueError(nothing_usable(detections))
     stage("Finding the focal lengths")
     way = "track" if job.video and job.focal not in (None, *MEASURED) else job.focal
     if job.video and job.focal is None:
@@ -331,13 +394,3 @@ def _of_one_size(detections: Sequence[Detection]) -> tuple[list[Detection], dict
             else ": use images as stored by the camera, neither resized nor cropped"
         )
     return [d for d in detections if d.image_size == (width, height)], others
-
-
-def _nothing(detections: Sequence[Detection]) -> str:
-    """The error message when no image can be used."""
-    problems = Counter(d.problem.rstrip(".") for d in detections)
-    if len(problems) == 1 and len(detections) > 1:
-        return f"None of the {len(detections)} images can be used: {next(iter(problems))}."
-    listed = "; ".join(f"{plain(d.name)}: {plain(d.problem)}" for d in detections[:4])
-    more = f"; and {len(detections) - 4} more" if len(detections) > 4 else ""
-    return f"None of the images can be used. {listed}{more}."

@@ -42,6 +42,7 @@ class ImageJob:
         cache: folder for cached detections; None: no cache.
         overlays: which images are drawn with their lines: "some" (all up to 200, beyond that the worst and
             others over the zoom), "all" or "none".
+        tied: whether photos that disagree with the lens of all of them are searched for lines again.
     """
 
     inputs: tuple[str | os.PathLike[str], ...]
@@ -57,6 +58,7 @@ class ImageJob:
     workers: int = 1
     cache: Path | None = None
     overlays: str = "some"
+    tied: bool = True
 
     def __post_init__(self):
         """Check the settings before any work.

@@ -1,18 +1,27 @@
 """The verdict on a calibration from photos: that of the fit, and what the photos say about themselves."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from .._core.text import listed, plain
 from ..detect.batch import Detection
-from ..trust.assessment import Finding
+from ..detect.bend import bends_apart
+from ..trust.assessment import NEGLIGIBLE, Finding, Verdict
+from .calibration import Calibration
 from .equipment import equipment_of
 from .plane_focals import FocalGroup
+from .tying import APART, bend_at
 
 _MOST = 4
 _SHAPE = 1.01
 """Ratio of the shapes of images that differ by more than rounding."""
+_FEWEST = 3
+"""Straight lines of a photo that can tell something."""
+_UNPREDICTED = 1.5
+"""How many times the RMS of a photo left out may exceed that of its own fit."""
 _UNEXPLAINED = 0.5
 """Of the length of a photo's long smooth edges: lines that hold less are little of what there is."""
 
@@ -85,6 +94,44 @@ def findings_of_edges(detections: Iterable[Detection]) -> list[Finding]:
             "Look at the drawn lines: if straight edges have none, photograph a scene with fewer curves.",
         )
     ]
+
+
+def verdict_of_photo(
+    calibration: Calibration, frame: int, detection: Detection, rejected: np.ndarray
+) -> tuple[Verdict, str]:
+    """The verdict on one photo, and why: its lines left out, and whether it agrees with the lens of all.
+
+    Args:
+        calibration: of all photos.
+        frame: the photo's number in it.
+        detection: what was found in the photo.
+        rejected: which of its lines were rejected.
+    """
+    lens, kept = calibration.zoom.lens, int((~rejected).sum())
+    diagonal = float(np.hypot(*lens.image_size))
+    if kept < _FEWEST:
+        return "not determined", f"{kept} of its lines are straight: too few to tell anything"
+    if kept < rejected.sum():
+        return "doubtful", f"{rejected.sum()} of its {len(rejected)} lines were rejected"
+    joint, own = (float(of[frame]) for of in (calibration.held_out, calibration.each_held_out))
+    if joint > _UNPREDICTED * own and joint > NEGLIGIBLE * diagonal / 2:
+        return "doubtful", f"the lens of the other photos leaves {joint:.2g} px, its own lines {own:.2g} px"
+    focal = float(np.asarray(calibration.lines.focal)[frame])
+    if detection.bend is not None and len(calibration.none) > 1:
+        apart = bends_apart(lens.image_size, bend_at(lens, focal), detection.bend)
+        if apart > APART * diagonal:
+            return "doubtful", f"its own lines are bent by {apart:.2g} px otherwise than the lens says"
+    return "good", ""
+
+
+def nothing_usable(detections: Sequence[Detection]) -> str:
+    """The error message when no image can be used."""
+    problems = Counter(d.problem.rstrip(".") for d in detections)
+    if len(problems) == 1 and len(detections) > 1:
+        return f"None of the {len(detections)} images can be used: {next(iter(problems))}."
+    listed = "; ".join(f"{plain(d.name)}: {plain(d.problem)}" for d in detections[:4])
+    more = f"; and {len(detections) - 4} more" if len(detections) > 4 else ""
+    return f"None of the images can be used. {listed}{more}."
 
 
 def _mixed(what: str, names: Counter[str]) -> Iterable[Finding]:

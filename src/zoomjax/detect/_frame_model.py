@@ -11,11 +11,15 @@ in a cloth) are weighted down as a whole.
 """
 
 import dataclasses
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 _PRIOR = np.array([1.0, 0.3, 0.05, 0.05])
 """Standard deviations of k1 and k2 about the start, and of the centre, in scales, before lines are seen."""
+
+_TIED = np.array([0.03, 0.02, 0.01, 0.01])
+"""The same about a model that other photos have determined."""
 
 _STEPS = 6
 _LEAST_SPREAD = 0.1
@@ -33,17 +37,58 @@ class OneFrame:
         image_size: (width, height) px.
         k: k1 and k2.
         shift: of the centre of distortion from that of the image, in scales.
+        tied: whether other photos have determined it.
     """
 
     image_size: tuple[int, int]
     k: tuple[float, float] = (0.0, 0.0)
     shift: tuple[float, float] = (0.0, 0.0)
+    tied: bool = False
 
     @classmethod
     def of_angle(cls, image_size: tuple[int, int], square: float) -> "OneFrame":
         """The model nearest to the lens of `_search`, by the square of the corner's angle."""
         k1 = -square / 3
         return cls(image_size, (k1, float(1 / tangent_ratio(np.array([square]))[0]) - 1 - k1))
+
+    @classmethod
+    def of_values(cls, image_size: tuple[int, int], values: Sequence[float]) -> "OneFrame":
+        """The model of these values, as `values` gives them, which other photos have determined."""
+        k1, k2, x, y = map(float, values)
+        return cls(image_size, (k1, k2), (x, y), tied=True)
+
+    @classmethod
+    def of_correction(
+        cls,
+        image_size: tuple[int, int],
+        centre: np.ndarray,
+        undistort: Callable[[np.ndarray], np.ndarray],
+        reach: float = 1.0,
+    ) -> "OneFrame":
+        """The model nearest to a radial correction of points (n, 2), px, about its centre.
+
+        The farther from there the less it counts; beyond `reach`, in scales, or a fold, nothing does.
+        """
+        scale = float(np.hypot(*image_size)) / 2
+        shift = (np.asarray(centre, float) - (np.array(image_size) - 1) / 2) / scale
+        r = np.linspace(0.05, reach, 48)
+        corner = np.where(shift > 0, -1.0, 1.0) * np.array(image_size) / (2 * scale)
+        moved = np.asarray(undistort(np.asarray(centre) + scale * r[:, None] * corner))
+        ratio = np.sum((moved - centre) * corner, axis=-1) / (scale * r)
+        sound = np.isfinite(ratio) & (ratio > 0)
+        sound &= np.append(True, np.diff(np.where(sound, r * ratio, -1.0)) > 0)
+        sound = np.logical_and.accumulate(sound)
+        if sound.sum() < 2:
+            return cls(image_size)
+        t, divisor = r[sound] ** 2, 1 / ratio[sound]
+        columns = np.stack([t, t * t], axis=-1) * r[sound, None]
+        k = np.linalg.lstsq(columns, (divisor - 1) * r[sound], rcond=None)[0]
+        return cls.of_values(image_size, (*k, *shift))
+
+    @property
+    def values(self) -> tuple[float, float, float, float]:
+        """k1, k2 and the shift."""
+        return (*self.k, *self.shift)
 
     @property
     def scale(self) -> float:
@@ -86,6 +131,7 @@ class OneFrame:
         chosen = [line[np.linspace(0, len(line) - 1, samples).round().astype(int)] for line in lines]
         points, length = np.stack(chosen), np.array([extent(line) for line in lines])
         start = model = self
+        certain = (_TIED if self.tied else _PRIOR) ** -2.0
         damping = 1e-3
         error = model.errors(points)
         weight = _weights(error, length)
@@ -93,8 +139,8 @@ class OneFrame:
         for _ in range(_STEPS):
             slope = model._slopes(points, error)
             apart = model._values() - start._prior_mean()
-            hessian = np.einsum("l,lsk,lsj->kj", weight, slope, slope) + np.diag(_PRIOR**-2.0)
-            gradient = np.einsum("l,lsk,ls->k", weight, slope, error) + apart / _PRIOR**2
+            hessian = np.einsum("l,lsk,lsj->kj", weight, slope, slope) + np.diag(certain)
+            gradient = np.einsum("l,lsk,ls->k", weight, slope, error) + apart * certain
             step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
             other = model._at(model._values() - step)
             new_error = other.errors(points)
@@ -131,17 +177,17 @@ class OneFrame:
         return np.stack([(m - error) / step for m in flipped], axis=-1)
 
     def _values(self) -> np.ndarray:
-        return np.array([*self.k, *self.shift])
+        return np.array(self.values)
 
     def _prior_mean(self) -> np.ndarray:
-        return np.array([*self.k, 0.0, 0.0])
+        return np.array(self.values if self.tied else [*self.k, 0.0, 0.0])
 
     def _at(self, values: np.ndarray) -> "OneFrame":
         k1, k2, x, y = map(float, values)
-        return OneFrame(self.image_size, (k1, k2), (x, y))
+        return OneFrame(self.image_size, (k1, k2), (x, y), self.tied)
 
     def _loss(self, error: np.ndarray, weight: np.ndarray, start: "OneFrame") -> float:
-        prior = (self._values() - start._prior_mean()) / _PRIOR
+        prior = (self._values() - start._prior_mean()) / (_TIED if start.tied else _PRIOR)
         return float(np.sum(weight[:, None] * error**2) + np.sum(prior**2))
 
 

@@ -63,6 +63,7 @@ class Detection:
         unexplained: share of the length of the strong long edges that no line explains, as in `Edges`; None
             for other detectors than `EdgeDetector`.
         problem: why the image cannot be used; empty if it can.
+        bend: how bent the image was taken to be, as `Edges.bend`; None for other detectors.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Detection:
     nodes: np.ndarray | None = None
     problem: str = ""
     unexplained: float | None = None
+    bend: tuple[float, float, float, float] | None = None
 
 
 def detect(
@@ -203,12 +205,12 @@ def _detected(task: _Task, *, detector: AbstractDetector, grid: str) -> Detectio
         nodes = _grid_detector(detector).find(image) if wanted else None
         if known is not None:
             return dataclasses.replace(known, nodes=nodes)
-        lines, unexplained = _lines(detector, image, nodes)
+        lines, unexplained, bend = _lines(detector, image, nodes, source.bend)
     except Exception as error:
         return found(
             size, problem=f"the detector failed: {type(error).__name__}: {reason(error).rstrip('.')}"
         )
-    return found(size, lines, focal, nodes, "" if lines else _NO_LINES, unexplained)
+    return found(size, lines, focal, nodes, "" if lines else NO_LINES, unexplained, bend)
 
 
 def _grid_detector(detector: AbstractDetector) -> GridDetector:
@@ -216,22 +218,23 @@ def _grid_detector(detector: AbstractDetector) -> GridDetector:
 
 
 def _lines(
-    detector: AbstractDetector, image: np.ndarray, nodes
-) -> tuple[tuple[np.ndarray, ...], float | None]:
-    """The thinned lines, and the share of edges that they leave unexplained."""
+    detector: AbstractDetector, image: np.ndarray, nodes, known: tuple[float, ...] | None
+) -> tuple[tuple[np.ndarray, ...], float | None, tuple[float, float, float, float] | None]:
+    """The thinned lines, the share of edges that they leave unexplained, and how bent the image is."""
     if isinstance(detector, EdgeDetector):
-        edges = detector.find(image)
-        return _thinned(edges.lines), edges.unexplained
+        edges = detector.find(image, bend=known)
+        return _thinned(edges.lines), edges.unexplained, edges.bend
     lines = detector.lines(nodes) if isinstance(detector, GridDetector) else detector(image)
-    return _thinned(lines), None
+    return _thinned(lines), None, None
 
 
 _ANOTHER = "Try another detector, such as edges (argument detector)"
 
-_NO_LINES = (
+NO_LINES = (
     "no lines were found. Check that straight edges are in focus, well lit and large in the image. "
     + _ANOTHER
 )
+"""The problem of an image in which there are none, which more knowledge of the lens may mend."""
 
 
 def _thinned(lines: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
@@ -256,7 +259,7 @@ def _finished(
         detection = result if isinstance(result, Detection) else result.result()
     except LostError as error:
         return Detection(source.name, source.file, problem=str(error))
-    if entries is not None and detection.problem in ("", _NO_LINES):  # other problems may be mended
+    if entries is not None and detection.problem in ("", NO_LINES):  # other problems may be mended
         of_image = None if detection.focal == source.focal else detection.focal
         _save(dataclasses.replace(detection, focal=of_image), entries.lines)
         if _wants_grid(grid, detector, detection.focal):
@@ -281,7 +284,8 @@ class _Entries(NamedTuple):
             shown = source.digest()
         except (OSError, ValueError) as error:  # reported when it is read
             shown = repr(error).encode()
-        ways = ("lines", detector), ("grid", _grid_detector(detector))
+        lines = "lines" if source.bend is None else f"lines {source.bend}"
+        ways = (lines, detector), ("grid", _grid_detector(detector))
         return cls(*(cache / f"{hashlib.sha256(_way(*way) + shown).hexdigest()}.npz" for way in ways))
 
 
@@ -317,6 +321,7 @@ def _save(detection: Detection, file: Path) -> None:
         focal=np.array(np.nan if detection.focal is None else detection.focal),
         problem=np.array(detection.problem),
         unexplained=np.array(np.nan if detection.unexplained is None else detection.unexplained),
+        bend=np.array(() if detection.bend is None else detection.bend, float),
     )
 
 
@@ -362,6 +367,7 @@ def _load(file: Path, source: Source) -> Detection | None:
             counts, focal = stored["counts"].tolist(), float(stored["focal"])
             width, height = map(int, stored["image_size"].tolist())
             problem, unexplained = str(stored["problem"]), float(stored["unexplained"])
+            k1, k2, x, y = stored["bend"].tolist() or [np.nan] * 4
         sound = (
             points.shape == (sum(counts), 2)
             and np.isfinite(points).all()
@@ -381,4 +387,5 @@ def _load(file: Path, source: Source) -> Detection | None:
         focal=source.focal or (None if np.isnan(focal) else focal),
         problem=problem,
         unexplained=None if np.isnan(unexplained) else unexplained,
+        bend=None if np.isnan(k1) else (k1, k2, x, y),
     )

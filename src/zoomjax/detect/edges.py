@@ -8,6 +8,7 @@ longer as the model gets better. The two edges of a stripe are separate lines.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -33,6 +34,9 @@ _TURNS = (1.0, 0.6, 0.4)
 """px, at most, by which lines may be bent as the model is not exact, turn by turn; at least `_EXACT`."""
 
 _EXACT = 0.15
+_TIED = 0.3
+"""The same, at most, of a model that other photos have told, after the first turn."""
+
 _ROUGHEST = 4.0
 """Greatest RMS of a line, in such px of the last turn, and the least one that counts as rough."""
 
@@ -48,10 +52,14 @@ class Edges:
         lines: for each line an (n, 2) array of points, px, in order along it, the longest line first.
         unexplained: share, 0 to 1, of the length of all long and smooth edges that is on none of the lines.
             Arcs and branches add to it; where it is large, the lines are little of what there is.
+        bend: how bent the image was taken to be when they were joined: k1 and k2 of the division model
+            ``1 / (1 + k1 r^2 + k2 r^4)``, and the place of its centre from the image's, x and y, all
+            lengths in halves of the image's diagonal.
     """
 
     lines: tuple[np.ndarray, ...]
     unexplained: float
+    bend: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
 
 class EdgeDetector(AbstractDetector):
@@ -95,30 +103,39 @@ class EdgeDetector(AbstractDetector):
         """
         return list(self.find(image).lines)
 
-    def find(self, image: np.ndarray) -> Edges:
+    def find(self, image: np.ndarray, *, bend: Sequence[float] | None = None) -> Edges:
         """Detect edges, and say how bent the image is and how much of it the lines explain.
 
         Args:
             image: as for calls.
+            bend: how bent it is, as `Edges.bend`, where other photos by the lens have told: it is not
+                searched for, and hardly changes. None: it is searched for.
 
         Raises:
-            ValueError: the image is not such an array.
+            ValueError: the image is not such an array, or `bend` not four finite numbers.
         """
         grey = as_grey(image)
         size = (grey.shape[1], grey.shape[0])
+        if bend is not None and (len(bend) != 4 or not np.isfinite(bend).all()):
+            raise ValueError(f"Argument bend must be four finite numbers, but it is {bend!r}.")
         pieces = fragments(edge_points(grey))
-        model = OneFrame.of_angle(size, likely_angle(pieces, size))
-        label, sigma = np.zeros(0, int), _TURNS[0]
-        for most in _TURNS:
-            sigma = min(sigma, most)
+        if bend is None:
+            model = OneFrame.of_angle(size, likely_angle(pieces, size))
+        else:
+            model = OneFrame.of_values(size, bend)
+        label, sigma = np.zeros(0, int), _TURNS[0] if bend is None else _TURNS[-1]
+        for turn in _TURNS:
+            sigma = min(sigma, turn)
             label = collinear(pieces, model, sigma)
             long = _long(pieces, label, _LEAST_FITTED * min(size))
             if len(long) < _LEAST_LINES:
                 break
             model = model.fitted(long)
-            sigma = float(np.clip(2 * np.median([_rms(line, model) for line in long]), _EXACT, 1.0))
+            most = 1.0 if bend is None else _TIED  # lines of arcs are no measure of a model that is known
+            sigma = float(np.clip(2 * np.median([_rms(line, model) for line in long]), _EXACT, most))
         good = [self._is_good(line, model, sigma, min(size)) for line in border_lines(pieces, label)]
-        return _found(pieces, label, np.array(good, bool), min(size))
+        found = _found(pieces, label, np.array(good, bool), min(size))
+        return dataclasses.replace(found, bend=model.values)
 
     def _is_good(self, line: np.ndarray, model: OneFrame, sigma: float, side: int) -> bool:
         """Whether a line is long, visible and straight enough."""

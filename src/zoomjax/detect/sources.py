@@ -35,12 +35,14 @@ class Source:
         path: the file, or None for a frame of a video.
         image: the frame's pixels, or None.
         focal: the focal length that a video's track gives.
+        bend: how bent the image is, as `Edges.bend`, where other photos have told.
     """
 
     name: str
     path: Path | None = None
     image: UInt8[np.ndarray, "height width *channels"] | None = None
     focal: float | None = None
+    bend: tuple[float, float, float, float] | None = None
 
     def __post_init__(self):
         """Check that there is one of both."""
