@@ -36,7 +36,7 @@ class FocalFit(eqx.Module):
             Infinite where it is not determined; that given for a frame whose lines all weigh nothing.
         given: the focal lengths of the lines.
         steps: number of steps the joint solver took.
-        kept: whether the given focal lengths were kept, as refined ones did not help: see `fit_focal`.
+        kept: whether the given focal lengths were kept, as refined ones did harm: see `fit_focal`.
             `std` is then that given.
     """
 
@@ -70,8 +70,9 @@ def fit_focal(
     is therefore that of the given focal lengths; the lines correct single ones that deviate from a smooth
     k(f). Deviations that the zoom model cannot follow would be attributed to focal lengths, too. So frames
     are left out, a fifth at a time, and measured at their given focal lengths: where the model that was
-    fitted together with the focal lengths of the others makes them no straighter than the one fitted at
-    the given focal lengths, these are kept (all but those of infinite `focal_sigma`).
+    fitted together with the focal lengths of the others makes them less straight than the one fitted at
+    the given focal lengths, by more than one standard error, these are kept (all but those of infinite
+    `focal_sigma`).
 
     Args:
         lines: the lines, or, much faster and with the same answer, ``compress(lines)``.

@@ -41,9 +41,6 @@ MOST_STEPS = 100
 _PARTS = 5
 """That frames are left out in, to see whether refined focal lengths help."""
 
-_TIE = 1e-9
-"""Part of the error by which refined focal lengths must be better."""
-
 _LEAST_NOISE = 1e-3
 """px: points are not taken for better than that, or a scene without noise would leave the prior no say."""
 
@@ -111,11 +108,11 @@ def _prior_noise(lines, zoom):
 
 @bucketed_jit(frames=["sigma"], returns=[of_frames, None, None, None, None], light=False)
 def refined(lines, zoom, sigma):
-    """The focal lengths, and the zoom model with them, if that makes other frames straighter.
+    """The focal lengths, and the zoom model with them, unless that makes other frames less straight.
 
     Frames are left out, a fifth at a time, and measured at their given focal lengths: under the model
     fitted at the given focal lengths of the others, and under that fitted together with them. Where the
-    second is not the better one, all focal lengths but those that nobody knows are kept.
+    second is worse by more than one standard error, all focal lengths but those that nobody knows are kept.
 
     And the number of steps, whether the end is reached, and whether focal lengths were kept.
     """
@@ -129,7 +126,7 @@ def refined(lines, zoom, sigma):
         focal, model, steps, reached = _jointly(part, zoom, sigma)
         squares = jnp.sum(residuals(lines, coefficients_by(model, lines)) ** 2, axis=1)
         told = (fold == left_out) & known
-        error = jnp.sum(jnp.where(told[lines.frame], squares, 0))
+        error = jax.ops.segment_sum(jnp.where(told[lines.frame], squares, 0), lines.frame, fold.shape[0])
         return focal, ravel_pytree(model.parameters)[0], steps, reached, error
 
     fixed = jnp.where(known, 0, sigma)
@@ -137,10 +134,18 @@ def refined(lines, zoom, sigma):
     left_out = jnp.tile(jnp.arange(number) - 1, 2)  # none at first
     sigmas = jnp.repeat(jnp.stack([fixed, sigma]), number, axis=0)
     focal, flat, steps, reached, error = jax.lax.map(run, (left_out, sigmas))
-    before, after = jnp.sum(error.reshape(2, number)[:, 1:], axis=1)
-    kept = ~(after < (1 - _TIE) * before)
+    before, after = jnp.sum(error.reshape(2, number, -1)[:, 1:], axis=1)
+    kept = _worse(after - before, counted_frames(lines) & known)
     chosen = jnp.where(kept, 0, number)
     return focal[chosen], with_parameters(zoom, unravel(flat[chosen])), steps[chosen], reached[chosen], kept
+
+
+def _worse(difference, counted):
+    """Whether the frames' errors have grown by more than one standard error of their sum."""
+    number = jnp.sum(counted)
+    total = jnp.sum(difference)
+    off = jnp.where(counted, difference - total / jnp.maximum(number, 1), 0)
+    return total > jnp.sqrt(number / jnp.maximum(number - 1, 1) * jnp.sum(off**2))
 
 
 def _folds(lines):
