@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
-import scipy.spatial
 from jaxtyping import Array, Float, Int
+from scipy.spatial import KDTree
 
 from ._motion_rows import Data, Model, Noise, Stage, line_planes_of, rows_of, units_of
 from ._schur import Reduced, Unknowns, columns, lens_equations, reduced
@@ -43,8 +43,8 @@ def groups_of(data: Data, model: Model, shot: Int[np.ndarray, "frame"]) -> Int[n
     place = np.column_stack(
         [plane, np.where(frame < len(shot), shot[np.minimum(frame, len(shot) - 1)], -1)]
     )
-    tree = scipy.spatial.cKDTree(place)
-    other = scipy.spatial.cKDTree(place * [-1, -1, -1, 1])  # a plane has two normals
+    tree = KDTree(place)
+    other = KDTree(place * [-1, -1, -1, 1])  # a plane has two normals
     pairs = [tree.sparse_distance_matrix(of, _NEAR, output_type="coo_matrix") for of in (tree, other)]
     one, two = (np.concatenate([getattr(of, name) for of in pairs]) for name in ("row", "col"))
     links = scipy.sparse.coo_array((np.ones(len(one)), (one, two)), (len(place),) * 2)

@@ -97,7 +97,8 @@ def in_stages(data, paths, spreads, zoom, shift, family, terms, shot):
     model, noise, *_ = _solved(data, *_arrays((model, noise.wider(STAGES[1].wider), STAGES[1])))
     model, noise, weighted_by, result, steps = _settled(data, model, noise)
     for _ in range(_MOST_COUNTS if data.lines is not None else 0):
-        more = repeated(data, model, *_arrays((noise, STAGES[-1])), groups_of(data, model, shot))
+        group = groups_of(data, model, shot)
+        more = repeated(data, model, *_arrays((noise, STAGES[-1])), group=jnp.asarray(group))
         if 1 / _AS_GOOD < more < _AS_GOOD or (more <= 1 and noise.repeated == 1):
             break
         noise = noise._replace(repeated=jnp.maximum(noise.repeated * more, 1.0))
@@ -111,13 +112,15 @@ def _settled(data, model, noise):
 
     Where little tells the scale of f, the way to the minimum is long and bent, and each step short.
     """
-    for _ in range(_MOST_REPEATS):
+    turns = 0
+    while True:
         weighted_by = noise.wider(STAGES[-1].wider)
         model, noise, result, steps, change = _solved(data, *_arrays((model, weighted_by, STAGES[-1])))
         same = noise.points > _SAME * weighted_by.points
-        if result == RESULTS.successful and same and change < _STILL:
-            break
-    return model, noise, weighted_by, result, steps
+        still = result == RESULTS.successful and same and change < _STILL
+        turns += 1
+        if still or turns == _MOST_REPEATS:
+            return model, noise, weighted_by, result, steps
 
 
 def _each(paths):
