@@ -62,13 +62,13 @@ def calibrate_images(
     from .pictures import pictures
     from .report import report
 
-    with contextlib.ExitStack() as shown:
-        executor = shown.enter_context(cluster_executor(cluster, quiet=quiet))
+    # The cluster stays open: photos that disagree with the lens are searched again.
+    with cluster_executor(cluster, quiet=quiet) as executor, contextlib.ExitStack() as shown:
         progress = shown.enter_context(progress_bar("Detecting lines", quiet=quiet))
 
         def stage(name: str) -> None:
             nonlocal current
-            if current is None:  # replace the bar by the stages; the cluster has done its part
+            if current is None:  # replace the bar by the stages
                 shown.close()
                 current = shown.enter_context(stages(quiet=quiet))
             current(name)
