@@ -11,7 +11,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.trust.cross_validation import errors_of, held_out_frames, held_out_zoom
+from zoomjax.trust.cross_validation import _errors_by_fits, errors_of, held_out_frames, held_out_zoom
 from zoomjax.trust.folds import HoldOut, LineErrors, folds_of, shares
 from zoomjax.trust.selection import compare, compare_errors, default_candidates
 
@@ -124,6 +124,20 @@ def test_a_line_is_not_measured_by_what_it_said_itself(measure, kind):
     fitted = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=0), terms=1)
     assert fitted.rms < 0.02 * bent
     np.testing.assert_allclose(measure(lines), bent, rtol=0.02)
+
+
+@pytest.mark.parametrize("zoom", [zj.PolynomialZoom(degree=2), zj.models.SmoothZoom()])
+@pytest.mark.parametrize("hold_out", ["focal", "line"])
+def test_in_the_image_folds_are_what_their_fits_are(zoom, hold_out):
+    """The stretch of a strong lens, its derivative and the prior, in NumPy and in JAX."""
+    strong = zj.scenes.nikkor_18_200()
+    strong = eqx.tree_at(lambda lens: lens.zoom.parameters, strong, 3 * strong.zoom.parameters)
+    seen = zj.scenes.board_lines(strong, zj.scenes.focal_sweep(5), spacing=200, noise=1.0)
+    lines, model = zj.fit.in_image(zj.compress(seen)), zj.models.Model(zoom, 2)
+    parts = folds_of(lines, hold_out, 3, 0)
+    found, expected = errors_of(lines, model, parts), _errors_by_fits(lines, model, parts)
+    np.testing.assert_allclose(found.seen, expected.seen, rtol=1e-7)
+    np.testing.assert_allclose(found.unseen, expected.unseen, rtol=1e-7)
 
 
 def test_lines_left_out_are_measured_by_the_fit_of_the_others(lines):
@@ -416,7 +430,7 @@ def test_lines_that_say_nothing_are_refused(measure, spoiled, lines):
 
 @pytest.mark.slow
 def test_in_the_image_the_same_model_is_selected(lines):
-    """Every fold is fitted by itself then; with as little noise the metric makes no difference."""
+    """With as little noise the metric makes no difference."""
     candidates = [zj.PolynomialZoom(degree=degree) for degree in (1, 2)]
     paper, image = (
         zj.select_model(of, candidates, hold_out="line", folds=3) for of in (lines, zj.fit.in_image(lines))

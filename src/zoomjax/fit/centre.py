@@ -24,7 +24,6 @@ from .._core.programs import light_program, program
 from .._core.types import Coefficients, Focal
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed, bucketed_frames, of_frames
-from ..lines.free_centre import AnyCentreLines
 from ..lines.lines import Lines
 from ..models.family import AbstractFamily
 from ..models.invertibility import certify
@@ -189,7 +188,7 @@ def _about(lines, centre, model):
     return compressed_as_measured(placed, model.terms) if points else placed
 
 
-def refit_centre(lines: AnyCentreLines, found: CentreFit) -> AbstractZoom:
+def refit_centre(lines: AbstractLines, found: CentreFit) -> AbstractZoom:
     """Coefficients and centre of least energy for other weights of the lines, started from a fit.
 
     A model that gives the coefficients and, after them, the centre's offset, for `AnyCentreLines`.

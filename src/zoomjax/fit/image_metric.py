@@ -24,6 +24,9 @@ from ..lines.base import AbstractLines
 from .energy import line_normal
 from .wrapper import AbstractWrapper, wrapped
 
+LEAST_STRETCH = 1e-4
+"""Of the squared stretch. Beyond a fold, where it may vanish, nothing is to be gained either."""
+
 
 class ImageLines(AbstractWrapper):
     """Lines whose distances are measured in the distorted image: made by `in_image`.
@@ -37,8 +40,7 @@ class ImageLines(AbstractWrapper):
         """Corrected points of each line about their mean, divided by the stretch across the line."""
         rows = self.lines.corrected(coefficients)
         squared = self.lines.squared_stretch(coefficients, jax.vmap(line_normal)(rows))
-        # Beyond a fold, where it may vanish, nothing is to be gained either.
-        return rows / jnp.sqrt(jnp.maximum(squared, 1e-4))[:, None, None]
+        return rows / jnp.sqrt(jnp.maximum(squared, LEAST_STRETCH))[:, None, None]
 
     def about(self, centre: Centres) -> "ImageLines":
         """The same lines about another centre of distortion; see `AbstractLines.about`."""

@@ -7,6 +7,9 @@ all lines, where one to three damped Gauss-Newton steps are enough, and there is
 certificate. Nothing is approximated: a fold's model is the one that `fit_zoom` (``invertible=False``) finds
 on its lines.
 
+Lines measured in the distorted image (`in_image`) have their distances divided by the stretch across the
+line, which depends on the coefficients, too: by way of the line's normal as well.
+
 Once: the compression, and each fold's basis. Per fold and step: one pass over the compressed lines. It is
 NumPy, float64 whatever the lines' dtype: with sums as small as these, compiling would take longer than
 50 folds of 12 models do.
@@ -19,6 +22,7 @@ import numpy as np
 
 from .._core.programs import light_program
 from ..fit.energy import prior_jacobian, settings
+from ..fit.image_metric import LEAST_STRETCH, ImageLines, in_corrected
 from ..lines.buckets import bucketed_jit, padded_frames
 from ..models.zoom import (
     AbstractPriorZoom,
@@ -30,7 +34,7 @@ _MOST_STEPS = 40  # of Gauss-Newton: from the fit of all lines it takes 1 to 3, 
 
 
 def linear_errors(lines, model, parts):
-    lanes = lanes_of(lines, parts.fold, model.terms)
+    lanes, lines = lanes_of(lines, parts.fold, model.terms), in_corrected(lines)
     known: dict[bytes, Design | str] = {}
     designs, problem = [], ""
     for fold in range(-1, parts.number):
@@ -106,6 +110,9 @@ class Lanes(NamedTuple):
 
     starts: np.ndarray  # where each frame's lines begin
     frames: int  # how many there are, with or without lines
+    moments: np.ndarray | None = (
+        None  # (2 terms, 3, line): xx, xy and yy of r^(2i) z z^T, means; in the image
+    )
 
     def total(self, values: np.ndarray) -> np.ndarray:
         """Sums over the lines of each frame that has some."""
@@ -113,16 +120,27 @@ class Lanes(NamedTuple):
 
 
 def lanes_of(lines, fold, terms):
+    small = in_corrected(lines)
     frame = np.asarray(lines.frame)
     order = np.argsort(frame, kind="stable")
-    rows = np.asarray(lines.triangle, float)[order, 1:, 1 : 3 + 2 * terms] * lines.scale
+    whole = np.asarray(small.triangle, float)[order, :, 1 : 3 + 2 * terms]
+    rows = whole[:, 1:] * small.scale
     columns = rows.reshape(*rows.shape[:2], terms + 1, 2).transpose(3, 2, 1, 0)
     x, y = columns = np.ascontiguousarray(columns)
     gram = np.stack([np.einsum("irl,jrl->ijl", one, other) for one, other in ((x, x), (x, y), (y, y))])
     counts = np.maximum(counts_of(lines), 1)
     frame, counts, weight, fold = (a[order] for a in (frame, counts, own_weights(lines), np.asarray(fold)))
+    moments = _moments(whole, terms) / counts if isinstance(lines, ImageLines) else None
     starts = np.flatnonzero(np.diff(frame, prepend=-1))
-    return Lanes(columns, gram, frame, counts, weight, fold, starts, len(lines.focal))
+    return Lanes(columns, gram, frame, counts, weight, fold, starts, len(lines.focal), moments)
+
+
+def _moments(rows, terms):
+    """``sum r^(2i) z z^T`` of each line, i = 0 ... 2 N - 1, from the rows of its triangle: (i, 3, line)."""
+    x, y = np.moveaxis(rows.reshape(*rows.shape[:2], terms + 1, 2), (3, 2), (0, 1))
+    pairs = [(i - i // 2, i // 2) for i in range(2 * terms)]
+    products = (x, x), (x, y), (y, y)
+    return np.stack([[np.einsum("lr,lr->l", a[i], b[j]) for a, b in products] for i, j in pairs])
 
 
 class _Pass(NamedTuple):
@@ -278,4 +296,29 @@ def passed(lanes, coefficients):
     xx, xy, yy = (gram[1:, 1:] for gram in (xx, xy, yy))
     matrix = c * c * yy - c * s * (xy + xy.swapaxes(0, 1)) + s * s * xx
     cross = turn[:, None] * (pull - turn / 2 * length)
-    return _Pass(squares, c * on_y - s * on_x, matrix - cross - cross.swapaxes(0, 1))
+    found = _Pass(squares, c * on_y - s * on_x, matrix - cross - cross.swapaxes(0, 1))
+    return found if lanes.moments is None else _in_image(found, lanes.moments, kappa, c, s, turn)
+
+
+def _in_image(found, moments, kappa, c, s, turn):
+    """The same of residuals divided by the root of the stretch q: they change by ``(dr - r dq/2q) / q^½``.
+
+    q is that of `image_metric`. It changes with k_j, and with the normal (-s, c), which turns.
+    """
+    xx, xy, yy = moments.swapaxes(0, 1)
+    along_normal = s * s * xx - 2 * s * c * xy + c * c * yy
+    by_angle = 2 * (s * c * (xx - yy) - (c * c - s * s) * xy)
+    i, j = np.indices((len(kappa), len(kappa)))
+    often, place = (2 * i + 2 * j + 4 * i * j)[..., None], np.maximum(i + j - 1, 0)
+    every = (xx + yy)[place] + often * along_normal[place]
+    every[0, 0] = 1
+    q = np.einsum("il,ijl,jl->l", kappa, every, kappa)
+    q_by_angle = np.einsum("il,ijl,jl->l", kappa, often * by_angle[place], kappa)
+    change = 2 * np.einsum("ijl,jl->il", every, kappa)[1:] + q_by_angle * turn
+    free = q > LEAST_STRETCH
+    q = np.where(free, q, LEAST_STRETCH)
+    change = np.where(free, change, 0) / (2 * q)
+    squares, gradient, matrix = (of / q for of in found)
+    cross = gradient[:, None] * change
+    matrix = matrix - cross - cross.swapaxes(0, 1) + squares * change[:, None] * change
+    return _Pass(squares, gradient - squares * change, matrix)

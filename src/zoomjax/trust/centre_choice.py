@@ -6,7 +6,7 @@ import numpy as np
 
 from ..fit.centre import CentreFit, fit_centre, refit_centre
 from ..fit.energy import line_squares
-from ..lines.free_centre import AnyCentreLines
+from ..lines.base import AbstractLines
 from ..models.model import Model
 from .cross_validation import errors_of
 from .folds import folds_of, own_weights, shares
@@ -35,13 +35,13 @@ class CentreChoice:
         return bool(self.found.determined) and self.fitted <= self.given
 
 
-def choose_centre(lines: AnyCentreLines, model: Model) -> CentreChoice:
+def choose_centre(lines: AbstractLines, model: Model) -> CentreChoice:
     """Fit the centre of distortion, one for all focal lengths, and cross-validate it.
 
     A fifth of the frames is left out at a time, or, with fewer than five, of the lines of each frame.
 
     Args:
-        lines: the lines, compressed for any centre.
+        lines: the lines, compressed for any centre, in either metric.
         model: the zoom model, without parameters, and its number of coefficients.
 
     Raises:

@@ -15,6 +15,7 @@ from .._core.types import of_known_values
 from ..fit.compression import compressed_as_measured
 from ..fit.energy import line_squares, line_squares_by_frame, settings
 from ..fit.frames import fit_frames
+from ..fit.image_metric import in_corrected, measured_as
 from ..fit.prepare import asked_for, ready_model
 from ..fit.result import RESULTS
 from ..fit.wrapper import AbstractWrapper
@@ -45,8 +46,8 @@ def held_out_zoom(
     has it.
 
     Args:
-        lines: the lines, or, much faster, ``compress(lines)``; or ``compress_family(lines, family)`` or
-            ``in_image(lines)``, with a separate fit for each part.
+        lines: the lines, or, much faster, ``compress(lines)``, either also measured in the image
+            (`in_image`); or ``compress_family(lines, family)``, with a separate fit for each part.
         zoom, terms: as for `fit_zoom`. The model is made ready anew for each part: of a fitted one only the
             settings and the number of coefficients count.
         hold_out, folds, seed: as for `select_model`.
@@ -95,7 +96,7 @@ def held_out_frames(
     """
     terms = checked_terms(terms)
     small = _small(lines, terms)
-    if not isinstance(small, CompressedLines):
+    if not is_compressed(small):
         return _frames_by_fits(small, terms, folds, seed)
     parts = folds_of(small, "line", folds, seed)
     lanes = lanes_of(small, parts.fold, terms)
@@ -112,6 +113,7 @@ def held_out_frames(
             lanes.fold[own],
             starts=np.zeros(1, int),
             frames=1,
+            moments=None if lanes.moments is None else lanes.moments[..., own],
         )
         unseen[own] = cross_validated(alone, [one] * (parts.number + 1))[1]
     return _by_frame(small, as_given(small, unseen))
@@ -119,8 +121,16 @@ def held_out_frames(
 
 def _small(lines, terms):
     """The lines compressed, under their own distortion model and in their own metric."""
-    wrapped = isinstance(lines, AbstractWrapper)
-    return compressed_as_measured(lines, terms) if wrapped else small_lines(lines, terms)
+    plain = in_corrected(lines)
+    wrapped = isinstance(plain, AbstractWrapper)
+    return (
+        compressed_as_measured(lines, terms) if wrapped else measured_as(small_lines(plain, terms), lines)
+    )
+
+
+def is_compressed(lines: AbstractLines) -> bool:
+    """Whether lines are compressed for the radial polynomial, in whatever metric."""
+    return isinstance(in_corrected(lines), CompressedLines)
 
 
 def errors_of(lines: AbstractLines, model: Model, parts: Folds) -> LineErrors:
@@ -131,7 +141,7 @@ def errors_of(lines: AbstractLines, model: Model, parts: Folds) -> LineErrors:
         model: a model without parameters.
         parts: the folds.
     """
-    if isinstance(model.zoom, AbstractLinearZoom) and isinstance(lines, CompressedLines):
+    if isinstance(model.zoom, AbstractLinearZoom) and is_compressed(lines):
         return linear_errors(lines, model, parts)
     return _errors_by_fits(lines, model, parts)
 

@@ -35,6 +35,7 @@ from ..fit.energy import (
     prior_residuals,
 )
 from ..fit.family_lines import compress_family
+from ..fit.image_metric import measured_as
 from ..fit.result import ZoomFit
 from ..fit.same_camera import check_lines_of, placed_as
 from ..fit.wrapper import about_own_centre
@@ -165,7 +166,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
         focals=np.unique(np.asarray(lines.focal)[frames]).size,
         rms=float(fit.rms),
         rms_uncorrected=float(np.sqrt(np.nanmean(before))),
-        noise=_noise(placed, lens, np.flatnonzero(weight)),
+        noise=_noise(measured_as(placed, compressed), lens, np.flatnonzero(weight)),
         displacement=float(np.max(_over_image(np.linalg.norm(moved, axis=-1)))),
         std=float(np.max(_over_image(std))),
         halves=tuple(_halves(compressed, fit, weight, rows)),

@@ -165,8 +165,7 @@ def select_model(
     is chosen, and fitted to all lines.
 
     Args:
-        lines: the lines, or ``compress(lines, terms=3)``; measured in the image (`in_image`), every fold is
-            fitted by itself.
+        lines: the lines, or ``compress(lines, terms=3)``; either also measured in the image (`in_image`).
         candidates: zoom models, or `Model` for other `terms` than 2 or another distortion model. By
             default polynomials in 1/f of degree 0 to 3 with 1 to 3 coefficients (or as many as the lines
             are compressed for), and `SmoothZoom`.
@@ -258,8 +257,8 @@ def candidate_errors(lines, candidate, parts):
     """The errors, or why there are none."""
     model = candidate.with_parameters(None)
     try:
-        if isinstance(lines, CompressedLines):
-            lines.check_terms(model.terms)
+        if isinstance(small := in_corrected(lines), CompressedLines):
+            small.check_terms(model.terms)
         ready_model(lines, model)  # complains of too few focal lengths
         return errors_of(lines, model, parts)
     except ValueError as error:

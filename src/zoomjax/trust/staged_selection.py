@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from ..fit.zoom import fit_zoom
-from ..lines.compressed import CompressedLines
+from ..lines.base import AbstractLines
 from ..models.model import Model
 from ..models.smooth import SmoothZoom
 from ..models.zoom import AbstractZoom
@@ -12,7 +12,7 @@ from .selection import Selection, candidate_errors, compare_errors
 
 
 def select_in_stages(
-    lines: CompressedLines, zooms: Sequence[AbstractZoom], terms: Sequence[int], *, folds: int = 10
+    lines: AbstractLines, zooms: Sequence[AbstractZoom], terms: Sequence[int], *, folds: int = 10
 ) -> Selection:
     """Select a zoom model with the first of the numbers of coefficients, and then that number.
 
@@ -20,7 +20,7 @@ def select_in_stages(
     model whose prior is for another number of coefficients keeps its own.
 
     Args:
-        lines: the lines, compressed for the largest of `terms`.
+        lines: the lines, compressed for the largest of `terms`, in either metric.
         zooms: zoom models, specified but not fitted.
         terms: numbers of coefficients.
         folds: parts into which focal lengths are split, or lines where there are fewer than four.
