@@ -1,6 +1,8 @@
 """The misfit of a zoom model: nothing where the model is right, its size where it is not."""
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -40,17 +42,40 @@ def test_few_frames_have_no_estimate(truth):
     assert zj.trust.with_misfit(fit, few).misfit is None
 
 
+@pytest.mark.parametrize("metric", [lambda lines: lines, zj.fit.in_image])
+def test_a_coefficient_that_the_model_lacks_is_in_the_bands(truth, metric):
+    """Of a lens of three coefficients, fitted with two: its corner is off by many standard deviations."""
+    three = np.pad(np.asarray(truth.zoom.parameters), ((0, 0), (0, 1)))
+    three[0, 2] = -0.02
+    lens = eqx.tree_at(lambda lens: lens.zoom.parameters, truth, jnp.asarray(three))
+    seen = scenes.board_lines(lens, FOCAL, spacing=200.0, noise=0.1, seed=3)
+    lines = metric(zj.compress(seen, terms=3))
+    fit = zj.fit_zoom(lines, terms=2)
+    wide = zj.trust.with_misfit(fit, lines)
+    corner = np.zeros(2)
+    off = np.array(
+        [np.linalg.norm(fit.lens(f).undistort(corner) - lens(f).undistort(corner)) for f in FOCAL]
+    )
+    before, after = (np.asarray(zj.displacement_std(x, corner, focal=FOCAL)) for x in (fit, wide))
+    assert (off > 3 * before).mean() > 0.6
+    assert (off < 2 * after).mean() > 0.9
+    assert wide.misfit.shape == (3, 3)
+    assert zj.trust.coefficient_std(wide, FOCAL).shape == (len(FOCAL), 2)
+    two = metric(zj.compress(seen, terms=2))
+    assert zj.trust.with_misfit(fit, two).misfit.shape == (2, 2)
+
+
 def size_of(fit):
     return np.sqrt(np.diag(fit.misfit))
 
 
 @pytest.mark.slow
-def test_by_residuals_it_is_what_it_is_by_moments(lines):
+@pytest.mark.parametrize("metric", [lambda lines: lines, zj.fit.in_image])
+def test_by_residuals_it_is_what_it_is_by_moments(lines, metric):
+    lines = metric(lines)
     fit = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=1))
-    quickly, by_residuals = (
-        of(lines, np.asarray(jax.vmap(fit.lens.zoom)(lines.focal)), fit.lens.family)
-        for of in (misfit._quickly, misfit._by_residuals)
-    )
+    k = np.asarray(jax.vmap(fit.lens.zoom)(lines.focal))
+    quickly, by_residuals = misfit._quickly(lines, k), misfit._by_residuals(lines, k, fit.lens.family)
     for one, other in zip(quickly, by_residuals, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * np.abs(one).max())
 

@@ -97,8 +97,9 @@ def _of_freedom(fit: BoardFit) -> float:
 
 def widened(fit: ZoomFit, board: BoardFit) -> ZoomFit:
     """A fit to lines of the flat board with what is uncertain of the board's shape in its bands."""
-    common = coefficient_covariance(board, fit.lens.family, fit)
-    misfit = common if fit.misfit is None else fit.misfit + common
+    misfit = coefficient_covariance(board, fit.lens.family, fit)
+    if fit.misfit is not None:
+        misfit = fit.misfit.at[: len(misfit), : len(misfit)].add(misfit)
     fit = eqx.tree_at(lambda f: f.misfit, fit, misfit, is_leaf=lambda leaf: leaf is None)
     own = board.fit.joint
     if fit.joint is None or own is None or fit.lens.shift is not None:

@@ -89,8 +89,8 @@ class ZoomFit(eqx.Module):
         joint: covariance of the zoom model's parameters and, after them, of the fitted centre (x, y, in
             half diagonals; for a centre that moves, the parameters of its model); None where the centre
             was given.
-        misfit: covariance of what the lens's coefficients are off the model at any focal length: see
-            `zoomjax.trust.with_misfit`; None where it was not estimated.
+        misfit: covariance of what the lens's coefficients, and maybe the next one, are off the model at any
+            focal length: see `zoomjax.trust.with_misfit`; None where it was not estimated.
     """
 
     lens: ZoomLens
@@ -102,7 +102,7 @@ class ZoomFit(eqx.Module):
     certificate: Certificate
     rms_unconstrained: Float[Array, ""]
     joint: Float[Array, "both both"] | None = None
-    misfit: Float[Array, "terms terms"] | None = None
+    misfit: Float[Array, "coefficients coefficients"] | None = None
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
         """Raise TypeError: call the lens of the fit instead."""

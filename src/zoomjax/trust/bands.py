@@ -72,7 +72,8 @@ def std_of(fit: ZoomFit, function: Callable[[ZoomLens], PyTree]) -> PyTree:
 
     Args:
         fit: the fit.
-        function: a function from a lens to arrays, differentiable by JAX.
+        function: a function from a lens to arrays, differentiable by JAX. If the fit has a `misfit`, the
+            lens may have one coefficient more than that of the fit: see `with_misfit`.
 
     Returns:
         What `function` returns, each number replaced by its standard deviation: infinite where it depends
@@ -104,16 +105,17 @@ def _derivatives(function, flat):
 
 
 class _OffZoom(AbstractZoom):
-    """A zoom model off by the same coefficients at every focal length."""
+    """A zoom model off by the same coefficients at every focal length; it may have one more of them."""
 
     zoom: AbstractZoom
-    parameters: Float[Array, "terms"]
+    parameters: Float[Array, "coefficients"]
 
     def prepare(self, focal: Focal, terms: int) -> "_OffZoom":
         return _OffZoom(zoom=self.zoom.prepare(focal, terms), parameters=jnp.zeros(terms))
 
     def __call__(self, *settings: ScalarLike) -> Coefficients:
-        return self.zoom(*settings) + self.parameters
+        k = self.zoom(*settings)
+        return self.parameters.at[: len(k)].add(k)
 
 
 def _uncertain(fit):
@@ -167,7 +169,11 @@ def coefficient_std(fit: ZoomFit, focal: Focals) -> Float[Array, "*focal terms"]
         >>> coefficient_std(fit_zoom(compress(lines)), focal).shape
         (3, 2)
     """
-    return _each_focal(lambda f: std_of(fit, lambda lens: lens.zoom(f)), fit, focal)
+
+    def of_model(f):  # without the next one that a misfit may have
+        return std_of(fit, lambda lens: lens.zoom(f))[: len(fit.lens.zoom(f))]
+
+    return _each_focal(of_model, fit, focal)
 
 
 @kinds_checked
