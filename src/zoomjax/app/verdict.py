@@ -101,12 +101,17 @@ def verdict_of_photo(
 ) -> tuple[Verdict, str]:
     """The verdict on one photo, and why: its lines left out, and whether it agrees with the lens of all.
 
+    That on the only photo is that on the lens.
+
     Args:
         calibration: of all photos.
         frame: the photo's number in it.
         detection: what was found in the photo.
         rejected: which of its lines were rejected.
     """
+    if len(calibration.none) == 1:
+        of = calibration.assessment
+        return of.verdict, "" if of.verdict == "good" else of.findings[0].found.rstrip(".")
     lens, kept = calibration.zoom.lens, int((~rejected).sum())
     diagonal = float(np.hypot(*lens.image_size))
     if kept < _FEWEST:
@@ -117,7 +122,7 @@ def verdict_of_photo(
     if joint > _UNPREDICTED * own and joint > NEGLIGIBLE * diagonal / 2:
         return "doubtful", f"the lens of the other photos leaves {joint:.2g} px, its own lines {own:.2g} px"
     focal = float(np.asarray(calibration.lines.focal)[frame])
-    if detection.bend is not None and len(calibration.none) > 1:
+    if detection.bend is not None:
         apart = bends_apart(lens.image_size, bend_at(lens, focal), detection.bend)
         if apart > APART * diagonal:
             return "doubtful", f"its own lines are bent by {apart:.2g} px otherwise than the lens says"

@@ -4,6 +4,8 @@ Lines cannot tell a homography of the corrected image, and nobody sees one as di
 one is left out. What remains is in px of the image, RMS over it, so that a strong lens, which stretches the
 corners of the corrected image, is judged like a weak one.
 
+Of one photo of a strong lens another distortion model may follow the lines as well: see `_rival`.
+
 Lines are taken as independent, as in the bands: see `zoomjax.fit.covariance`. Unlike there, the centre of
 distortion is free in any case, within what is usual of cameras: where lines do not determine it, it was
 kept where it was assumed, and a lens about a wrong one is right along the lines and wrong beside them.
@@ -21,18 +23,19 @@ from jax.flatten_util import ravel_pytree
 from ..fit.energy import coefficients_by
 from ..lines.buckets import bucketed_jit, of_frames
 from ..lines.lines import Lines
-from ..models.family import AbstractFamily
 from ..models.lens import ZoomLens
+from ..models.polynomial import RadialPolynomial
 from ..models.zoom import with_parameters
+from ._in_image import beyond, derivatives, over_image, residuals
+from ._rival import apart_from_division
 
 _CENTRE = 0.02
 """Standard deviation of the centre of a camera about where it is assumed, in half diagonals."""
 
-_MOST_LINES, _POINTS = 2000, 24
-_GRID = (15, 11)
-"""Points over the image."""
+_STRONG = 0.01
+"""Of the diagonal: the least that a strong lens bends. The series of models of weaker ones are alike."""
 
-_STEP = 1e-5
+_MOST_LINES, _POINTS = 2000, 24
 _SINGULAR = 1e-12  # eigenvalues, of the largest
 _TURNS = 3
 
@@ -68,7 +71,7 @@ def bending(lines: Lines, lens: ZoomLens, weight: np.ndarray, prior: np.ndarray)
     points, mask = np.asarray(lines.points, float)[chosen], np.asarray(lines.mask)[chosen]
     z = np.stack([_some(p[m]) for p, m in zip(points, mask, strict=True)])
     z = (z - centre[frame[chosen], None]) / lens.scale
-    error, slope = _residuals(family, z, k[frame[chosen]], by_parameter[frame[chosen]])
+    error, slope = residuals(family, z, k[frame[chosen]], by_parameter[frame[chosen]])
     wanted = np.zeros((slope.shape[-1],) * 2)
     wanted[:-2, :-2] = prior / lens.scale**2
     root = _root(error, slope, share, wanted)
@@ -79,7 +82,12 @@ def bending(lines: Lines, lens: ZoomLens, weight: np.ndarray, prior: np.ndarray)
         moved, rows = _over_image(lens, centre[at], k[at], by_parameter[at])
         std = np.sqrt(np.sum((rows @ root) ** 2) / len(rows)) if len(rows) else np.inf
         found.append(Bending(moved * lens.scale, float(std) * lens.scale))
-    return max(found, key=lambda of: of.std)
+    worst = max(found, key=lambda of: of.std)
+    strong = worst.moved > _STRONG * 2 * lens.scale
+    if len(there) > 1 or not strong or not isinstance(family, RadialPolynomial):
+        return worst
+    other = apart_from_division(z, k[there[0]], centre[there[0]], lens.image_size)
+    return Bending(worst.moved, float(np.hypot(worst.std, other)))
 
 
 @bucketed_jit(returns=[of_frames] * 3)
@@ -95,60 +103,6 @@ def _coefficients(lines, lens):
 
 def _some(points: np.ndarray) -> np.ndarray:
     return points[np.linspace(0, len(points) - 1, _POINTS).round().astype(int)]
-
-
-def _corrected(family: AbstractFamily, z: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """Corrected points (..., s, 2) by coefficients (..., n)."""
-    x, y = np.moveaxis(z, -1, 0)
-    return np.stack(family.correct((x, y), x * x + y * y, np.moveaxis(k, -1, 0)[..., None]), axis=-1)
-
-
-def _derivatives(
-    family: AbstractFamily, z: np.ndarray, k: np.ndarray, by_parameter: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corrected points (..., s, 2), and derivatives by the points, (..., s, 2, 2), and by all parameters.
-
-    These are those of the zoom model and the place of the centre: (..., s, 2, p + 2).
-    """
-
-    def slope(moved_z, moved_k):
-        plus, minus = (
-            _corrected(family, z + sign * moved_z, k + sign * moved_k) for sign in (_STEP, -_STEP)
-        )
-        return (plus - minus) / (2 * _STEP)
-
-    by_point = np.stack([slope(unit, 0) for unit in np.eye(2)], axis=-1)
-    by_k = np.stack([slope(0, unit) for unit in np.eye(k.shape[-1])], axis=-1)
-    by_zoom = np.einsum("...sck,...kp->...scp", by_k, by_parameter)
-    return _corrected(family, z, k), by_point, np.concatenate([by_zoom, np.eye(2) - by_point], axis=-1)
-
-
-def _residuals(
-    family: AbstractFamily, z: np.ndarray, k: np.ndarray, by_parameter: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (l, s) of points to their lines, in the image, and their derivatives (l, s, p + 2).
-
-    The best line follows the parameters: what a shift or a turn of it explains is taken out of these.
-    """
-    at, by_point, by_all = _derivatives(family, z, k, by_parameter)
-    weight = np.ones(at.shape[:2])
-    for _ in range(2):  # the first line is good enough for the stretch across it
-        total = weight.sum(axis=1)[:, None]
-        centred = at - (np.einsum("ls,lsc->lc", weight, at) / total)[:, None]
-        along, normal = _axes(np.einsum("ls,lsc,lsd->lcd", weight, centred, centred))
-        stretch = np.linalg.norm(np.einsum("lsck,lc->lsk", by_point, normal), axis=-1)
-        weight = stretch**-2.0
-    error = np.einsum("lsc,lc->ls", centred, normal) / stretch
-    slope = np.einsum("lscp,lc->lsp", by_all, normal) / stretch[..., None]
-    free = np.stack([np.ones_like(stretch), np.einsum("lsc,lc->ls", centred, along)], axis=-1)
-    basis = np.linalg.qr(free / stretch[..., None])[0]
-    return error, slope - basis @ (np.swapaxes(basis, 1, 2) @ slope)
-
-
-def _axes(scatter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The unit vectors of most and of least scatter."""
-    vectors = np.linalg.eigh(scatter)[1]
-    return vectors[..., 1], vectors[..., 0]
 
 
 def _root(error: np.ndarray, slope: np.ndarray, share: np.ndarray, prior: np.ndarray) -> np.ndarray:
@@ -184,23 +138,7 @@ def _over_image(
     lens: ZoomLens, centre: np.ndarray, k: np.ndarray, by_parameter: np.ndarray
 ) -> tuple[float, np.ndarray]:
     """How far points are moved beyond a homography, and by each parameter, (n, 2, p + 2), in the image."""
-    sides = (
-        np.linspace(0.02, 0.98, n) * (side - 1) for n, side in zip(_GRID, lens.image_size, strict=True)
-    )
-    z = (np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2) - centre) / lens.scale
-    at, by_point, by_all = _derivatives(lens.family, z, k, by_parameter)
-    sound = np.isfinite(by_all).all(axis=(1, 2)) & (np.linalg.det(by_point) > 0)  # not beyond a fold
-    if sound.sum() < 8:
-        return np.inf, by_all[:0]
-    at, z, by_all, into = at[sound], z[sound], by_all[sound], np.linalg.inv(by_point[sound])
-    x, y = ((at - at.mean(axis=0)) / np.abs(at - at.mean(axis=0)).max()).T
-    one, none = np.ones_like(x), np.zeros_like(x)
-    free = np.array(
-        [[x, y, one, none, none, none, x * x, x * y], [none, none, none, x, y, one, x * y, y * y]]
-    )
-    free = (into @ np.moveaxis(free, -1, 0)).reshape(-1, 8)
-    moved = np.concatenate([(at - z)[..., None], by_all], axis=-1)
-    moved = (into @ moved).reshape(2 * len(at), -1)
-    moved = moved - free @ np.linalg.lstsq(free, moved, rcond=None)[0]
-    rows = moved.reshape(len(at), 2, -1)
-    return float(np.sqrt(np.sum(rows[..., 0] ** 2) / len(rows))), rows[..., 1:]
+    z = (over_image(lens.image_size) - centre) / lens.scale
+    at, by_point, by_all = derivatives(lens.family, z, k, by_parameter)
+    rows = beyond(at, by_point, np.concatenate([(at - z)[..., None], by_all], axis=-1))
+    return float(np.sqrt(np.sum(rows[..., 0] ** 2) / max(len(rows), 1))), rows[..., 1:]

@@ -40,10 +40,11 @@ _BEYOND_NOISE = 3.0  # how many times farther apart halves are than by chance
 _UNPREDICTED = 1.5  # how many times the RMS of frames left out may exceed that of their own fits
 _REJECTED = 1 / 3  # of the lines
 _FEW_LINES = 4  # per frame
+_UNSEEN_PX = 0.25  # of images so small that `NEGLIGIBLE` is less
 _BENT_PX, _BENT = 0.4, 3.5e-4
-"""What may stay bent, px and a part of the diagonal, whichever is larger."""
+"""How uncertain a good lens may be beyond a homography: px, a part of the diagonal, whichever is larger."""
 _BENT_SHARE, _BENT_MOST = 0.03, 1e-3
-"""So much of what is straightened, and no more than this part of the diagonal, may, too."""
+"""A strong one by this part of what it straightens, up to this one of the diagonal."""
 _UNPARALLEL, _SURE = 0.25, 4.0  # a factor's distance from 1 that counts: at least, and in deviations
 
 
@@ -174,10 +175,13 @@ def _judged(error: float, of: Evidence) -> Verdict:
     return "doubtful" if error <= _UNDETERMINED * of.displacement else "not determined"
 
 
-def _may_be_bent(of: Evidence) -> float:
-    """px of the image: how uncertain a good correction may be beyond a homography."""
+def _is_bent(of: Evidence) -> bool:
+    """Whether what is uncertain beyond a homography may be seen, or is much of what is straightened."""
+    if of.bent_std <= max(_UNSEEN_PX, NEGLIGIBLE * of.diagonal):
+        return False
     strong = min(_BENT_SHARE * of.bent, _BENT_MOST * of.diagonal)
-    return max(_BENT_PX, _BENT * of.diagonal, strong)
+    most = max(_BENT_PX, _BENT * of.diagonal, strong)
+    return not of.bent_std <= (most if of.frames > 1 else min(most, _DOUBTFUL * of.bent))
 
 
 def _of_bands(of: Evidence, fit: ZoomFit) -> Iterator[Finding]:
@@ -197,7 +201,7 @@ def _of_bands(of: Evidence, fit: ZoomFit) -> Iterator[Finding]:
             f"{_px(of.std)} px."
         )
         yield Finding("bands", verdict, found, more)
-    elif not of.bent_std <= _may_be_bent(of):
+    elif _is_bent(of):
         yield Finding(
             "bending",
             "doubtful" if of.bent_std <= _UNDETERMINED * of.bent else "not determined",

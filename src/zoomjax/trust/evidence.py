@@ -57,6 +57,7 @@ _MOST_LINES, _LINES_AT_ONCE = 2000, 256  # enough to average over, and a few MB 
 _LEAST_POINTS = 12  # of a line whose noise counts
 _LEAST_SHARE = 0.2  # of the lines, that each direction needs
 _SCATTER = 2.7  # noises, by which lines that are not straight exceed it
+_STRAIGHT = 0.01  # px: no line of a photo is straighter
 _SINGULAR = 1e-10  # eigenvalues, of the largest
 
 
@@ -119,7 +120,7 @@ class Evidence:
     @property
     def crooked(self) -> bool:
         """Whether lines deviate from straight ones by far more than the noise of their points."""
-        return bool(self.rms > _SCATTER * self.noise)
+        return bool(self.rms > max(_SCATTER * self.noise, _STRAIGHT))
 
 
 @kinds_checked
