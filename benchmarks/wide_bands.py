@@ -91,11 +91,11 @@ def bands_page(told: dict[str, Any], house: dict[str, Any] | None) -> list[str]:
         "## What the facade's lines can tell",
         "",
         f"The polynomial about the image's centre, fitted to those {told['lines']} of the authors' lines "
-        "that are straight. Per cent of the displacement at shares of the way to the corner, but where it is "
-        f"said. Lines are drawn {DRAWS} times; halves are parted {DRAWS // 2} times. Bands take lines as "
-        f"independent. What is found automatically differs by {np.max(np.abs(apart / moved)):.1%} at most, "
-        f"and by {np.max(np.abs(apart / spread)):.1f} standard deviations of both: lines of this photo do "
-        "not tell more.",
+        "that are straight. Per cent of the displacement at shares of the way to the corner, but where it "
+        f"is said. Lines are drawn {DRAWS} times; halves are parted {DRAWS // 2} times. Bands take lines "
+        f"as independent. What is found automatically differs by {np.max(np.abs(apart / moved)):.1%} at "
+        f"most, and by {np.max(np.abs(apart / spread)):.1f} standard deviations of both: lines of this "
+        "photo do not tell more.",
         "",
         *table(["", *map(str, RADII)], rows),
     ]
