@@ -8,6 +8,7 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.models.division import Division
+from zoomjax.trust._rival import apart_from_division
 from zoomjax.trust.assessment import assess
 from zoomjax.trust.evidence import evidence
 
@@ -99,3 +100,29 @@ def test_frames_and_a_moving_centre_are_each_at_their_own_place():
     one, other = (evidence(lines, of) for of in (fit, moved))
     assert other.bent_std == pytest.approx(one.bent_std, rel=1e-3)
     assert 0 < one.bent_std < 0.4
+
+
+@pytest.mark.parametrize("k", [-4.0, 30.0])
+@pytest.mark.parametrize("family", [None, Division()])
+def test_a_lens_with_a_fold_or_a_pole_is_not_known(k, family):
+    """No error, and no number that would pass for a good one."""
+    _, lines = photo(-0.3, CENTRE)
+    fit = zj.fit_zoom(lines, zoom=ONE, family=family, terms=1)
+    wrong = eqx.tree_at(lambda of: of.lens.zoom.parameters, fit, np.full((1, 1), k))
+    found = evidence(lines, wrong)
+    assert not found.bent_std <= 0.4
+
+
+def test_of_a_strong_lens_another_model_counts():
+    """Two terms of the polynomial follow the few lines of a division model, and correct otherwise."""
+    lens, lines = photo(-0.48, CENTRE, lines=4, noise=0.2, seed=3)
+    fit = zj.fit_zoom(lines, zoom=ONE, terms=2)
+    rest = np.linalg.norm(np.asarray(fit.lens.centre) - CENTRE)
+    assert rest < 1e-6
+    z = (np.asarray(lines.points) - CENTRE) / lens.scale
+    k = np.asarray(fit.lens(1.0).coefficients)
+    other = apart_from_division(z, k, CENTRE, SIZE)
+    assert other > 0.4
+    assert evidence(lines, fit).bent_std >= other
+    flat, still = photo(0.0, CENTRE, lines=4, noise=0.2)
+    assert apart_from_division((np.asarray(still.points) - CENTRE) / flat.scale, 0 * k, CENTRE, SIZE) < 0.4

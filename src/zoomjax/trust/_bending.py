@@ -72,6 +72,10 @@ def bending(lines: Lines, lens: ZoomLens, weight: np.ndarray, prior: np.ndarray)
     z = np.stack([_some(p[m]) for p, m in zip(points, mask, strict=True)])
     z = (z - centre[frame[chosen], None]) / lens.scale
     error, slope = residuals(family, z, k[frame[chosen]], by_parameter[frame[chosen]])
+    sound = np.isfinite(error).all(axis=1)
+    if not sound.any():
+        return Bending(np.nan, np.inf)
+    chosen, z, error, slope, share = chosen[sound], z[sound], error[sound], slope[sound], share[sound]
     wanted = np.zeros((slope.shape[-1],) * 2)
     wanted[:-2, :-2] = prior / lens.scale**2
     root = _root(error, slope, share, wanted)
@@ -118,8 +122,9 @@ def _root(error: np.ndarray, slope: np.ndarray, share: np.ndarray, prior: np.nda
     each = noise * float(np.sum(share**2) / np.sum(share))
     centre = np.zeros(len(prior))
     centre[-2:] = 1 / _CENTRE
-    together = 1.0
-    for _ in range(_TURNS):
+
+    def estimated(together):
+        """A root of the inverse normal matrix, and by it the lines' scores, and independent points."""
         total = own + prior + np.diag(together * each * centre**2)
         size = np.sqrt(np.diagonal(total)).clip(1e-150)
         values, vectors = np.linalg.eigh(total / size / size[:, None])
@@ -127,7 +132,11 @@ def _root(error: np.ndarray, slope: np.ndarray, share: np.ndarray, prior: np.nda
         rows = slope @ back
         score = share[:, None] * np.einsum("lsp,ls->lp", rows, error)
         alone = noise * np.einsum("l,lsp,lsq->pq", share**2, rows, rows)
-        together = max(float(np.sum(score**2) / max(np.trace(alone), 1e-300)), 1.0)
+        return back, score, alone, max(float(np.sum(score**2) / max(np.trace(alone), 1e-300)), 1.0)
+
+    back, score, alone, together = estimated(1.0)
+    for _ in range(_TURNS - 1):
+        back, score, alone, together = estimated(together)
     values, vectors = np.linalg.eigh(together * alone)
     shape = vectors * np.sqrt(values.clip(0))
     assumed = back @ back.T[:, -2:] * (together * each * centre[-1])

@@ -12,6 +12,7 @@ _GRID = (15, 11)
 """Points over the image."""
 
 _STEP = 1e-5
+_LEAST_STRETCH = 1e-6
 _LEAST_SOUND = 8
 
 
@@ -35,10 +36,12 @@ def derivatives(
         )
         return (plus - minus) / (2 * _STEP)
 
-    by_point = np.stack([slope(unit, 0) for unit in np.eye(2)], axis=-1)
-    by_k = np.stack([slope(0, unit) for unit in np.eye(k.shape[-1])], axis=-1)
+    with np.errstate(all="ignore"):  # beyond a pole
+        by_point = np.stack([slope(unit, 0) for unit in np.eye(2)], axis=-1)
+        by_k = np.stack([slope(0, unit) for unit in np.eye(k.shape[-1])], axis=-1)
+        at = corrected(family, z, k)
     by_zoom = np.einsum("...sck,...kp->...scp", by_k, by_parameter)
-    return corrected(family, z, k), by_point, np.concatenate([by_zoom, np.eye(2) - by_point], axis=-1)
+    return at, by_point, np.concatenate([by_zoom, np.eye(2) - by_point], axis=-1)
 
 
 def residuals(
@@ -47,20 +50,28 @@ def residuals(
     """Distances (l, s) of points to their lines, in the image, and their derivatives (l, s, p + 2).
 
     The best line follows the parameters: what a shift or a turn of it explains is taken out of these.
+    Distances are NaN of a line that is moved nowhere, beyond a pole.
     """
     at, by_point, by_all = derivatives(family, z, k, by_parameter)
-    weight = np.ones(at.shape[:2])
-    for _ in range(2):  # the first line is good enough for the stretch across it
-        total = weight.sum(axis=1)[:, None]
-        centred = at - (np.einsum("ls,lsc->lc", weight, at) / total)[:, None]
-        along, normal = _axes(np.einsum("ls,lsc,lsd->lcd", weight, centred, centred))
-        stretch = np.linalg.norm(np.einsum("lsck,lc->lsk", by_point, normal), axis=-1)
-        weight = stretch**-2.0
+    nowhere = ~(np.isfinite(at).all(axis=(1, 2)) & np.isfinite(by_all).all(axis=(1, 2, 3)))
+    at[nowhere], by_point[nowhere], by_all[nowhere] = z[nowhere], np.eye(2), 0
+    *_, stretch = _best_lines(at, by_point, np.ones(at.shape[:2]))  # good enough for the stretch across it
+    centred, along, normal, stretch = _best_lines(at, by_point, stretch**-2.0)
     error = np.einsum("lsc,lc->ls", centred, normal) / stretch
+    error[nowhere] = np.nan
     slope = np.einsum("lscp,lc->lsp", by_all, normal) / stretch[..., None]
     free = np.stack([np.ones_like(stretch), np.einsum("lsc,lc->ls", centred, along)], axis=-1)
     basis = np.linalg.qr(free / stretch[..., None])[0]
     return error, slope - basis @ (np.swapaxes(basis, 1, 2) @ slope)
+
+
+def _best_lines(at: np.ndarray, by_point: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Points about their mean, the directions along lines and across, and the stretch across at points."""
+    mean = np.einsum("ls,lsc->lc", weight, at) / weight.sum(axis=1)[:, None]
+    centred = at - mean[:, None]
+    along, normal = _axes(np.einsum("ls,lsc,lsd->lcd", weight, centred, centred))
+    stretch = np.linalg.norm(np.einsum("lsck,lc->lsk", by_point, normal), axis=-1).clip(_LEAST_STRETCH)
+    return centred, along, normal, stretch
 
 
 def _axes(scatter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -84,7 +95,9 @@ def beyond(at: np.ndarray, by_point: np.ndarray, moved: np.ndarray) -> np.ndarra
             nowhere, are left out; all, if there are too few others.
         moved: what displaces them.
     """
-    sound = np.isfinite(moved).all(axis=(1, 2)) & (np.linalg.det(by_point) > 0)
+    with np.errstate(all="ignore"):
+        sound = np.isfinite(moved).all(axis=(1, 2)) & np.isfinite(by_point).all(axis=(1, 2))
+        sound &= np.linalg.det(by_point) > 0
     if sound.sum() < _LEAST_SOUND:
         return moved[:0]
     at, moved, into = at[sound], moved[sound], np.linalg.inv(by_point[sound])

@@ -38,18 +38,20 @@ def apart_from_division(
     own, other = RadialPolynomial(), Division()
     k, shift, lost = _fitted(own, z, k, np.zeros(2))
     squared = _PROFILE**2
-    divisor = 1 / own.factor(squared, k[:, None]) - 1
+    with np.errstate(all="ignore"):
+        divisor = 1 / own.factor(squared, k[:, None]) - 1
+    if not np.isfinite(divisor).all():
+        return 0.0
     powers = squared[:, None] ** np.arange(1, _TERMS + 1)
     start = np.linalg.lstsq(powers * _PROFILE[:, None], divisor * _PROFILE, rcond=None)[0]
-    if not np.isfinite(start).all():
-        return 0.0
     other_k, other_shift, other_lost = _fitted(other, z, start, shift)
     if not other_lost <= lost:
         return 0.0
     scale = float(np.hypot(*image_size)) / 2
     over = (over_image(image_size) - centre) / scale
     at, by_point, _ = derivatives(own, over - shift, k, np.eye(len(k)))
-    moved = corrected(other, over - other_shift, other_k) + other_shift - at - shift
+    with np.errstate(all="ignore"):  # beyond a pole
+        moved = corrected(other, over - other_shift, other_k) + other_shift - at - shift
     rows = beyond(at, by_point, moved[..., None])
     return scale * float(np.sqrt(np.sum(rows**2) / max(len(rows), 1)))
 
