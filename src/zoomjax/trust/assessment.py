@@ -185,7 +185,8 @@ def _is_bent(of: Evidence) -> bool:
 
 
 def _of_bands(of: Evidence, fit: ZoomFit) -> Iterator[Finding]:
-    more = "Add photos with long straight lines near the edges of the image, at several focal lengths."
+    more = "Add photos with long straight lines near the edges of the image"
+    more += ", at several focal lengths." if of.frames > 1 else "."
     if bool(fit.result == RESULTS.folded):
         yield Finding(
             "fold",
@@ -193,7 +194,7 @@ def _of_bands(of: Evidence, fit: ZoomFit) -> Iterator[Finding]:
             "the corrected image folds over.",
             "Add lines near the corners, or choose a smaller degree or fewer terms.",
         )
-    if not np.isfinite(of.std):
+    if not np.isfinite([of.std, of.bent_std]).all():
         yield Finding("bands", "not determined", "the lines do not determine the correction.", more)
     elif of.frames > 1 and (verdict := _judged(of.std, of)) != "good":
         found = (
@@ -213,7 +214,8 @@ def _of_bands(of: Evidence, fit: ZoomFit) -> Iterator[Finding]:
         yield Finding(
             "few lines",
             "doubtful",
-            f"there are only {of.lines} usable lines in {of.frames} photos, fewer than {_FEW_LINES} each.",
+            f"there are only {of.lines} usable lines in {of.frames} photo{'s' * (of.frames > 1)}, fewer "
+            f"than {_FEW_LINES} each.",
             "Photograph a scene with more straight lines, or try another detector.",
         )
 
