@@ -295,11 +295,12 @@ def hard(seed: int) -> dict[str, Any]:
     except (ValueError, RuntimeError):
         return row
     error = apart(done.zoom.lens(1.0), made)
+    evidence = done.assessment.summary()["evidence"]  # None for what is not finite
     return row | {
         "error_px": error if np.isfinite(error) else None,
         "verdict": done.assessment.verdict,
-        "std_px": float(done.assessment.evidence.std),
-        "bent_std_px": float(done.assessment.evidence.bent_std),
+        "std_px": evidence["std"],
+        "bent_std_px": evidence["bent_std"],
         "findings": [finding.about for finding in done.assessment.findings],
     }
 
