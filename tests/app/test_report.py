@@ -146,9 +146,11 @@ def test_names_are_escaped_and_lead_to_their_pictures(calibration):
         warnings=lambda: ["<b>two</b>\n  lines & more"],
         focals=SimpleNamespace(origin='"here" <there>'),
         shared=lambda: ["<i>3</i> photos share f"],
+        verdicts=lambda: [("good", ""), ("doubtful", "<i>bent</i> otherwise"), ("good", ""), ("good", "")],
         bundle=None,
     )
     page = Page(report(calibration, images))
+    assert "doubtful<i>bent</i> otherwise" in page.text
     assert sum(tag == "script" for tag, _ in page.elements) == 2  # its own
     for name in names:
         assert name in page.text

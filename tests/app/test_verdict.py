@@ -2,8 +2,11 @@
 
 import dataclasses
 
+import numpy as np
+import pytest
 from PIL import ExifTags, Image
 
+from zoomjax import compress
 from zoomjax.app.calibration import calibrate
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.plane_focals import FocalGroup
@@ -12,8 +15,13 @@ from zoomjax.app.verdict import (
     findings_of_focals,
     findings_of_photos,
     findings_of_sizes,
+    told_undetermined,
+    verdict_of_photo,
 )
 from zoomjax.detect.batch import Detection
+from zoomjax.trust.assessment import Finding
+from zoomjax.trust.folds import folds_of
+from zoomjax.trust.selection import compare_errors
 
 
 def photo(path, model=None, lens=None, written=None):
@@ -104,3 +112,46 @@ def test_photos_whose_strong_edges_are_on_no_line_are_remarked_on():
     assert "90% in 2.jpg" in found.found
     assert findings_of_edges([*photos[:2], Detection("a.jpg", unexplained=0.1)]) == []
     assert findings_of_edges([Detection("grid.jpg")]) == []
+
+
+def test_lines_that_determine_nothing_are_named_for_what_they_are():
+    with pytest.raises(ValueError, match=r"do not determine a lens.*1 of 10 folds"), told_undetermined():
+        raise ValueError("No candidate can be compared. 1 of 10 folds do not converge")
+    with pytest.raises(ValueError, match=r"^Another"), told_undetermined():
+        raise ValueError("Another problem.")
+
+
+def test_selection_still_says_what_that_is_told_by(noisy):
+    """The start of its message where no model can be compared."""
+    small = compress(noisy)
+    parts = folds_of(small, "line", 2, 0)
+    with pytest.raises(ValueError, match=r"^No candidate can be compared"):
+        compare_errors(small, [object()], ["it failed"], parts, "least")
+
+
+def test_the_photo_at_an_end_of_the_zoom_is_told_from_the_others(noisy):
+    """By the lens of the others beyond their focal lengths, or by nothing."""
+    done = calibrate(noisy, model=WantedModel("polynomial"), centre=None)
+    first = int(np.argmin(done.lines.focal))
+    kept = np.zeros(9, bool)
+
+    def judged(joint):
+        held_out = np.where(np.arange(4) == first, joint, done.held_out)
+        return verdict_of_photo(dataclasses.replace(done, held_out=held_out), first, Detection("a"), kept)
+
+    verdict, reason = judged(9.0)
+    assert verdict == "doubtful"
+    assert "the other photos, extrapolated to its focal length, leaves 9 px" in reason
+    assert judged(done.each_held_out[first]) == ("good", "")
+    verdict, reason = judged(np.nan)
+    assert verdict == "good"
+    assert "could contradict it" in reason
+
+
+def test_the_verdict_on_one_photo_is_that_on_its_lens(noisy):
+    done = calibrate(noisy, model=WantedModel("polynomial"), centre=None)
+    bad = Finding("a", "doubtful", "lines are bent.", "Look.")
+    for findings, told in (((), ("good", "")), ((bad,), ("doubtful", "lines are bent"))):
+        assessment = dataclasses.replace(done.assessment, findings=findings)
+        one = dataclasses.replace(done, none=done.none[:1], assessment=assessment)
+        assert verdict_of_photo(one, 0, Detection("a"), np.zeros(9, bool)) == told

@@ -300,7 +300,7 @@ def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()
     notable = [
         f"{plain(d.name)}: {verdict}, {reason}."
         for d, (verdict, reason) in zip(done.used, done.verdicts(), strict=True)
-        if verdict != "good"
+        if verdict != "good" and len(done.used) > 1  # of one photo the verdict is above
     ]
     for sentence in notable[:_MOST_NOTABLE]:
         say(sentence)

@@ -35,6 +35,7 @@ from .verdict import (
     findings_of_photos,
     findings_of_sizes,
     nothing_usable,
+    told_undetermined,
     verdict_of_photo,
 )
 
@@ -198,7 +199,7 @@ class ImageCalibration:
                 draw(source)
                 progress(done, len(used))
         else:
-            with concurrent.futures.ThreadPoolExecutor(self.job.workers) as pool:
+            with concurrent.futures.ThreadPoolExecutor(max(1, self.job.workers)) as pool:
                 for done, _ in enumerate(pool.map(draw, sources), start=1):
                     progress(done, len(used))
 
@@ -306,16 +307,17 @@ def _calibrated(
         shown = used if bundle is None else bundle.lines_used(used)
         lines = lines_of(shown, np.array([focals.focal[d.name] for d in used]), focals.unit)
         sigma = np.array([focals.deviation.get(d.name, 0.0) for d in used])
-        calibration = calibrate(
-            lines,
-            model=job.model,
-            centre=job.centre,
-            robust=True,
-            focal_sigma=sigma,
-            shared=_shared(used, focals),
-            widened=(lambda fit: fit) if bundle is None else bundle.widened,
-            stage=stage,
-        )
+        with told_undetermined():
+            calibration = calibrate(
+                lines,
+                model=job.model,
+                centre=job.centre,
+                robust=True,
+                focal_sigma=sigma,
+                shared=_shared(used, focals),
+                widened=(lambda fit: fit) if bundle is None else bundle.widened,
+                stage=stage,
+            )
         done = ImageCalibration(job, calibration, used, focals, tuple(d.name for d in detections), unused)
         done = dataclasses.replace(done, bundle=bundle)
         hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}

@@ -11,6 +11,7 @@ import numpy as np
 
 from .._core.text import span
 from ..models.registry import family_name
+from ..trust.assessment import Verdict
 from ..trust.selection import COLUMNS
 from .board_plot import plot_boards
 from .calibration import Calibration, rms_over_frames
@@ -53,6 +54,7 @@ def report(
     lens = calibration.zoom.lens
     versions = calibration.summary()["versions"]
     run, moving = run or Run(), slider(calibration.zoom)
+    verdicts = images.verdicts() if images else []
     return rendered(
         "report.html",
         title=run.title,
@@ -70,19 +72,33 @@ def report(
         slider=embedded_data(moving),
         slider_times=f"{moving['times']:g}" if moving and moving["times"] > 1 else None,
         limit=f"{colour_limit(calibration):.2g}" if pictures and images else None,
-        photos=[_photo(calibration, images, one) for one in pictures] if images else [],
+        photos=_photos(calibration, images, pictures, verdicts) if images else [],
         straightness=_straightness(calibration),
         coverage=_coverage(calibration),
         lens=_lens(calibration),
         distortion=_distortion(calibration),
         board=_board(calibration, images),
         next=calibration.advice(),
-        frames=_frames(calibration, images),
+        frames=_frames(calibration, images, verdicts),
         images=images,
         run=run.rows,
         files=["lens.json", "summary.json", "lines.npz", "model.png"],
         versions=", ".join(f"{name} {of}" for name, of in versions.items()),
     )
+
+
+def _photos(
+    calibration: Calibration,
+    images: "ImageCalibration",
+    pictures: Sequence[Pictures],
+    verdicts: Sequence[tuple[Verdict, str]],
+) -> list[dict[str, Any]]:
+    """Photos before and after, each with the verdict on it."""
+    shown = []
+    for one in pictures:
+        verdict, reason = verdicts[one.frame]
+        shown.append({"verdict": verdict, "reason": reason, **_photo(calibration, images, one)})
+    return shown
 
 
 def _photo(calibration: Calibration, images: "ImageCalibration", one: Pictures) -> dict[str, Any]:
@@ -265,8 +281,10 @@ def _board(calibration: Calibration, images: "ImageCalibration | None") -> dict[
     }
 
 
-def _frames(calibration: Calibration, images: "ImageCalibration | None") -> dict[str, Any]:
-    """The list of frames, each with its least straight lines."""
+def _frames(
+    calibration: Calibration, images: "ImageCalibration | None", verdicts: Sequence[tuple[Verdict, str]]
+) -> dict[str, Any]:
+    """The list of frames, of photos each with the verdict on it, and each with its least straight lines."""
     summary = calibration.summary()["per_frame"]
     worst = np.argsort(-np.asarray(calibration.zoom.frame_rms), kind="stable")[:_MOST_FRAMES]
     shown = worst[np.lexsort([worst, np.asarray(calibration.lines.focal)[worst]])]
@@ -278,11 +296,12 @@ def _frames(calibration: Calibration, images: "ImageCalibration | None") -> dict
     unit, overlays = f"f, {lines.focal_unit}", images.overlays() if images else [""] * len(summary)
     return {
         "number": len(summary),
-        "head": ["photo" if images else "frame", unit, *_COLUMNS],
+        "head": [*(["photo", "verdict"] if images else ["frame"]), unit, *_COLUMNS],
         "rows": [
             {
                 "name": images.used[number].name if images else str(number),
                 "picture": f"lines/{overlays[number]}" if overlays[number] else None,
+                "verdict": verdicts[number] if verdicts else None,
                 "cells": _frame_cells(summary[number], calibration.rejected[members[number]]),
                 "worst": _worst_lines(calibration, members[number]),
             }

@@ -1,7 +1,8 @@
 """The verdict on a calibration from photos: that of the fit, and what the photos say about themselves."""
 
+import contextlib
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ _FEWEST = 3
 """Straight lines of a photo that can tell something."""
 _UNPREDICTED = 1.5
 """How many times the RMS of a photo left out may exceed that of its own fit."""
+_UNTOLD = "without it the other photos determine no lens at its focal length that could contradict it"
 _UNEXPLAINED = 0.5
 """Of the length of a photo's long smooth edges: lines that hold less are little of what there is."""
 
@@ -101,12 +103,18 @@ def verdict_of_photo(
 ) -> tuple[Verdict, str]:
     """The verdict on one photo, and why: its lines left out, and whether it agrees with the lens of all.
 
+    That on the only photo is that on the lens. Of a good photo that no other photo could contradict the
+    reason says so.
+
     Args:
         calibration: of all photos.
         frame: the photo's number in it.
         detection: what was found in the photo.
         rejected: which of its lines were rejected.
     """
+    if len(calibration.none) == 1:
+        of = calibration.assessment
+        return of.verdict, "" if of.verdict == "good" else of.findings[0].found.rstrip(".")
     lens, kept = calibration.zoom.lens, int((~rejected).sum())
     diagonal = float(np.hypot(*lens.image_size))
     if kept < _FEWEST:
@@ -114,14 +122,35 @@ def verdict_of_photo(
     if kept < rejected.sum():
         return "doubtful", f"{rejected.sum()} of its {len(rejected)} lines were rejected"
     joint, own = (float(of[frame]) for of in (calibration.held_out, calibration.each_held_out))
-    if joint > _UNPREDICTED * own and joint > NEGLIGIBLE * diagonal / 2:
-        return "doubtful", f"the lens of the other photos leaves {joint:.2g} px, its own lines {own:.2g} px"
+    others = np.delete(np.asarray(calibration.lines.focal, float), frame)
     focal = float(np.asarray(calibration.lines.focal)[frame])
-    if detection.bend is not None and len(calibration.none) > 1:
+    if joint > _UNPREDICTED * own and joint > NEGLIGIBLE * diagonal / 2:
+        how = "" if others.min() <= focal <= others.max() else ", extrapolated to its focal length,"
+        leaves = f"the lens of the other photos{how} leaves {joint:.2g} px, its own lines {own:.2g} px"
+        return "doubtful", leaves
+    if detection.bend is not None:
         apart = bends_apart(lens.image_size, bend_at(lens, focal), detection.bend)
         if apart > APART * diagonal:
             return "doubtful", f"its own lines are bent by {apart:.2g} px otherwise than the lens says"
-    return "good", ""
+    return "good", "" if np.isfinite(joint) else _UNTOLD
+
+
+@contextlib.contextmanager
+def told_undetermined() -> Iterator[None]:
+    """Say of an error that no model can be compared what it means of photos: too few straight lines.
+
+    Raises:
+        ValueError: that error, or another as it is.
+    """
+    try:
+        yield
+    except ValueError as error:
+        if not str(error).startswith("No candidate can be compared"):
+            raise
+        raise ValueError(
+            "The lines found in the images do not determine a lens: they are too few, or not straight in "
+            f"the scene. Photograph a scene with long straight lines. ({error})"
+        ) from error
 
 
 def nothing_usable(detections: Sequence[Detection]) -> str:

@@ -6,6 +6,10 @@ between lenses fitted to halves of the lines where it exceeds what noise explain
 left out beyond that of their own fits. Vanishing points that ask for another correction make it doubtful.
 An error below `NEGLIGIBLE` of the image's diagonal does no harm,
 however small the displacement.
+
+A tenth of a strong lens's displacement is much, and all of it may bend lines. So what the noise leaves
+uncertain beyond a homography must be small in px of the image, too. Of one photo that alone counts: its
+bands are those of lines, and the homography in them is no distortion.
 """
 
 import dataclasses
@@ -35,7 +39,12 @@ _DOUBTFUL, _UNDETERMINED = 0.1, 0.5  # errors, in displacements
 _BEYOND_NOISE = 3.0  # how many times farther apart halves are than by chance
 _UNPREDICTED = 1.5  # how many times the RMS of frames left out may exceed that of their own fits
 _REJECTED = 1 / 3  # of the lines
-_FEW_LINES = 5  # per frame
+_FEW_LINES = 4  # per frame
+_UNSEEN_PX = 0.25  # of images so small that `NEGLIGIBLE` is less
+_BENT_PX, _BENT = 0.4, 3.5e-4
+"""How uncertain a good lens may be beyond a homography: px, a part of the diagonal, whichever is larger."""
+_BENT_SHARE, _BENT_MOST = 0.03, 1e-3
+"""A strong one by this part of what it straightens, up to this one of the diagonal."""
 _UNPARALLEL, _SURE = 0.25, 4.0  # a factor's distance from 1 that counts: at least, and in deviations
 
 
@@ -81,7 +90,8 @@ class Assessment:
         if self.verdict == "good":
             return (
                 f"Good: the correction moves points by {_px(self.evidence.displacement)} px on average, "
-                f"with a standard deviation of {_px(self.evidence.std)} px."
+                f"with a standard deviation of {_px(self.evidence.std)} px. Beyond a change of view it is "
+                f"uncertain by {_px(self.evidence.bent_std)} px of the image."
             )
         return f"{self.verdict.capitalize()}: {self.findings[0].found}"
 
@@ -165,8 +175,18 @@ def _judged(error: float, of: Evidence) -> Verdict:
     return "doubtful" if error <= _UNDETERMINED * of.displacement else "not determined"
 
 
+def _is_bent(of: Evidence) -> bool:
+    """Whether what is uncertain beyond a homography may be seen, or is much of what is straightened."""
+    if of.bent_std <= max(_UNSEEN_PX, NEGLIGIBLE * of.diagonal):
+        return False
+    strong = min(_BENT_SHARE * of.bent, _BENT_MOST * of.diagonal)
+    most = max(_BENT_PX, _BENT * of.diagonal, strong)
+    return not of.bent_std <= (most if of.frames > 1 else min(most, _DOUBTFUL * of.bent))
+
+
 def _of_bands(of: Evidence, fit: ZoomFit) -> Iterator[Finding]:
-    more = "Add photos with long straight lines near the edges of the image, at several focal lengths."
+    more = "Add photos with long straight lines near the edges of the image"
+    more += ", at several focal lengths." if of.frames > 1 else "."
     if bool(fit.result == RESULTS.folded):
         yield Finding(
             "fold",
@@ -174,19 +194,28 @@ def _of_bands(of: Evidence, fit: ZoomFit) -> Iterator[Finding]:
             "the corrected image folds over.",
             "Add lines near the corners, or choose a smaller degree or fewer terms.",
         )
-    if not np.isfinite(of.std):
+    if not np.isfinite([of.std, of.bent_std]).all():
         yield Finding("bands", "not determined", "the lines do not determine the correction.", more)
-    elif (verdict := _judged(of.std, of)) != "good":
+    elif of.frames > 1 and (verdict := _judged(of.std, of)) != "good":
         found = (
             f"the correction moves points by {_px(of.displacement)} px on average, but is uncertain by "
             f"{_px(of.std)} px."
         )
         yield Finding("bands", verdict, found, more)
+    elif _is_bent(of):
+        yield Finding(
+            "bending",
+            "doubtful" if of.bent_std <= _UNDETERMINED * of.bent else "not determined",
+            f"the correction straightens what is bent by {_px(of.bent)} px on average, but is uncertain by "
+            f"{_px(of.bent_std)} px in that.",
+            more,
+        )
     if of.lines < _FEW_LINES * of.frames:
         yield Finding(
             "few lines",
             "doubtful",
-            f"there are only {of.lines} usable lines in {of.frames} photos, fewer than {_FEW_LINES} each.",
+            f"there are only {of.lines} usable lines in {of.frames} photo{'s' * (of.frames > 1)}, fewer "
+            f"than {_FEW_LINES} each.",
             "Photograph a scene with more straight lines, or try another detector.",
         )
 

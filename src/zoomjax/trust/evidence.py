@@ -4,6 +4,7 @@
   `_CURVE` along each corrected line. A line that is bent as a whole is smooth, so the noise is that of the
   edges alone, and an RMS far above it says that lines are not straight or that the model is too simple.
 - *Displacement and its standard deviation* are averaged over the image at several focal lengths.
+- *Bending* is the part of both that is no homography, in px of the image: see `_bending`.
 - *Halves*: the model is fitted to one half of the lines and to the other, by a Gauss-Newton step from the
   fit of all. Noise makes the two lenses differ by what the bands predict; whatever else bends lines (a
   curved board, two lenses in one data set) makes them differ by more. The lines are parted in three ways:
@@ -45,6 +46,7 @@ from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
 from ..models.zoom import AbstractZoom, with_parameters
+from ._bending import bending
 from .bands import displacement_std
 from .folds import counts_of, own_weights
 from .vanishing import VanishingPoints, vanishing_points
@@ -56,6 +58,7 @@ _MOST_LINES, _LINES_AT_ONCE = 2000, 256  # enough to average over, and a few MB 
 _LEAST_POINTS = 12  # of a line whose noise counts
 _LEAST_SHARE = 0.2  # of the lines, that each direction needs
 _SCATTER = 2.7  # noises, by which lines that are not straight exceed it
+_STRAIGHT = 0.01  # px: no line of a photo is straighter
 _SINGULAR = 1e-10  # eigenvalues, of the largest
 
 
@@ -92,6 +95,9 @@ class Evidence:
         displacement: how far the correction moves points, RMS over the image, where that is largest.
         std: standard deviation of the displacement, as in the bands, averaged likewise, where that is
             largest.
+        bent: how far the correction moves points beyond a homography of the corrected image, px of the
+            image, RMS over it, at the frame's focal length where `bent_std` is largest.
+        bent_std: the standard deviation of that.
         halves: the agreement of halves of the lines, as far as halves determine a lens.
         diagonal: of the image.
         vanishing: whether lines that are parallel in the scene meet.
@@ -106,6 +112,8 @@ class Evidence:
     noise: float
     displacement: float
     std: float
+    bent: float
+    bent_std: float
     halves: tuple[Halves, ...]
     diagonal: float
     vanishing: VanishingPoints
@@ -113,7 +121,7 @@ class Evidence:
     @property
     def crooked(self) -> bool:
         """Whether lines deviate from straight ones by far more than the noise of their points."""
-        return bool(self.rms > _SCATTER * self.noise)
+        return bool(self.rms > max(_SCATTER * self.noise, _STRAIGHT))
 
 
 @kinds_checked
@@ -157,6 +165,8 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     raster = jnp.asarray(_raster(lens), dtype)
     moved, rows = map(np.asarray, _derivatives(lens, raster, jnp.asarray(focals, dtype)))
     std = np.asarray(displacement_std(fit, raster[None], focal=focals[:, None]))
+    pulled = _normal_terms(compressed, lens.zoom)
+    bent = bending(lines, lens, weight, pulled[0])
     zero = jax.device_put(np.zeros((len(lines.focal), np.size(lens.zoom(lens.focal_range[0]))), dtype))
     before = np.asarray(frame_energy(compressed, zero))
     return Evidence(
@@ -169,7 +179,9 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
         noise=_noise(measured_as(placed, compressed), lens, np.flatnonzero(weight)),
         displacement=float(np.max(_over_image(np.linalg.norm(moved, axis=-1)))),
         std=float(np.max(_over_image(std))),
-        halves=tuple(_halves(compressed, fit, weight, rows)),
+        bent=bent.moved,
+        bent_std=bent.std,
+        halves=tuple(_halves(compressed, fit, weight, rows, *pulled)),
         diagonal=2 * lens.scale,
         vanishing=vanishing_points(lines, lens),
     )
@@ -222,9 +234,15 @@ def _roughness(points: np.ndarray) -> float:
     return float(rest @ rest) / (len(across) - _CURVE - 1)
 
 
-def _halves(lines: AbstractLines, fit: ZoomFit, weight: np.ndarray, rows: np.ndarray) -> Iterator[Halves]:
-    """The agreement of halves, in the partings that determine lenses."""
-    prior, terms = _normal_terms(lines, fit.lens.zoom)
+def _halves(
+    lines: AbstractLines,
+    fit: ZoomFit,
+    weight: np.ndarray,
+    rows: np.ndarray,
+    prior: np.ndarray,
+    terms: tuple[np.ndarray, np.ndarray],
+) -> Iterator[Halves]:
+    """The agreement of halves, in the partings that determine lenses; the last two as `_normal_terms`."""
     for name, first in _partings(lines, fit, weight).items():
         one, other = (
             _half(prior, *(values[half & (weight > 0)] for values in terms)) for half in (first, ~first)

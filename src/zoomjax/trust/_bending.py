@@ -1,0 +1,153 @@
+"""How far a correction may bend what is straight: the part of its error that straightness has a say in.
+
+Lines cannot tell a homography of the corrected image, and nobody sees one as distortion: an error that is
+one is left out. What remains is in px of the image, RMS over it, so that a strong lens, which stretches the
+corners of the corrected image, is judged like a weak one.
+
+Of one photo of a strong lens another distortion model may follow the lines as well: see `_rival`.
+
+Lines are taken as independent, as in the bands: see `zoomjax.fit.covariance`. Unlike there, the centre of
+distortion is free in any case, within what is usual of cameras: where lines do not determine it, it was
+kept where it was assumed, and a lens about a wrong one is right along the lines and wrong beside them.
+
+In NumPy, without a program to compile: 24 points of at most 2000 lines, once per fit.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from ..fit.energy import coefficients_by
+from ..lines.buckets import bucketed_jit, of_frames
+from ..lines.lines import Lines
+from ..models.lens import ZoomLens
+from ..models.polynomial import RadialPolynomial
+from ..models.zoom import with_parameters
+from ._in_image import beyond, derivatives, over_image, residuals
+from ._rival import apart_from_division
+
+_CENTRE = 0.02
+"""Standard deviation of the centre of a camera about where it is assumed, in half diagonals."""
+
+_STRONG = 0.01
+"""Of the diagonal: the least that a strong lens bends. The series of models of weaker ones are alike."""
+
+_MOST_LINES, _POINTS = 2000, 24
+_SINGULAR = 1e-12  # eigenvalues, of the largest
+_TURNS = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Bending:
+    """How far a correction moves points beyond a homography, where it is most uncertain.
+
+    Attributes:
+        moved: px of the image, RMS over it.
+        std: its standard deviation, likewise.
+    """
+
+    moved: float
+    std: float
+
+
+def bending(lines: Lines, lens: ZoomLens, weight: np.ndarray, prior: np.ndarray) -> Bending:
+    """What lines of a fit tell of the part of a lens that is no homography.
+
+    Args:
+        lines: the lines.
+        lens: fitted to them.
+        weight: of each line in the fit; 0 for those that do not count.
+        prior: (p, p), the normal matrix of the zoom model's prior, in the units of the energy.
+    """
+    frame, family = np.asarray(lines.frame), lens.family
+    k, by_parameter, centre = (np.asarray(of, float) for of in _coefficients(lines, lens))
+    share = weight / np.bincount(frame, weight, len(k))[frame].clip(1e-300)
+    counted = np.flatnonzero(weight > 0)
+    chosen = counted[np.unique(np.linspace(0, len(counted) - 1, _MOST_LINES).astype(int))]
+    share = share[chosen] / share[chosen].sum() / _POINTS
+    points, mask = np.asarray(lines.points, float)[chosen], np.asarray(lines.mask)[chosen]
+    z = np.stack([_some(p[m]) for p, m in zip(points, mask, strict=True)])
+    z = (z - centre[frame[chosen], None]) / lens.scale
+    error, slope = residuals(family, z, k[frame[chosen]], by_parameter[frame[chosen]])
+    sound = np.isfinite(error).all(axis=1)
+    if not sound.any():
+        return Bending(np.nan, np.inf)
+    chosen, z, error, slope, share = chosen[sound], z[sound], error[sound], slope[sound], share[sound]
+    wanted = np.zeros((slope.shape[-1],) * 2)
+    wanted[:-2, :-2] = prior / lens.scale**2
+    root = _root(error, slope, share, wanted)
+    there = np.unique(frame[chosen])
+    there = there[np.argsort(np.asarray(lines.focal)[there], kind="stable")]
+    found = []
+    for at in np.unique(there[[0, len(there) // 2, -1]]):
+        moved, rows = _over_image(lens, centre[at], k[at], by_parameter[at])
+        std = np.sqrt(np.sum((rows @ root) ** 2) / len(rows)) if len(rows) else np.inf
+        found.append(Bending(moved * lens.scale, float(std) * lens.scale))
+    worst = max(found, key=lambda of: of.std)
+    strong = worst.moved > _STRONG * 2 * lens.scale
+    if len(there) > 1 or not strong or not isinstance(family, RadialPolynomial):
+        return worst
+    other = apart_from_division(z, k[there[0]], centre[there[0]], lens.image_size)
+    return Bending(worst.moved, float(np.hypot(worst.std, other)))
+
+
+@bucketed_jit(returns=[of_frames] * 3)
+def _coefficients(lines, lens):
+    """Each frame's coefficients, their derivatives by the parameters, and its centre."""
+    flat, unravel = ravel_pytree(lens.zoom.parameters)
+
+    def at(flat):
+        return coefficients_by(with_parameters(lens.zoom, unravel(flat)), lines)
+
+    return at(flat), jax.jacfwd(at)(flat), jax.vmap(lens.centre_at)(jnp.asarray(lines.focal))
+
+
+def _some(points: np.ndarray) -> np.ndarray:
+    return points[np.linspace(0, len(points) - 1, _POINTS).round().astype(int)]
+
+
+def _root(error: np.ndarray, slope: np.ndarray, share: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """A root of the covariance of the parameters: lines err each by itself, and the centre is as usual.
+
+    Of two estimates the mean: the sandwich of the lines' scores, which of few lines knows its shape badly,
+    and that of independent points, of which as many count as one as the size of the sandwich says. How
+    surely the centre is where it is assumed, beside what the lines say, follows from that number, too.
+    """
+    own = np.einsum("l,lsp,lsq->pq", share, slope, slope)
+    lost = float(share @ np.einsum("ls,ls->l", error, error))
+    noise = lost / (1 - 2 / error.shape[1])  # of a point, squared
+    each = noise * float(np.sum(share**2) / np.sum(share))
+    centre = np.zeros(len(prior))
+    centre[-2:] = 1 / _CENTRE
+
+    def estimated(together):
+        """A root of the inverse normal matrix, and by it the lines' scores, and independent points."""
+        total = own + prior + np.diag(together * each * centre**2)
+        size = np.sqrt(np.diagonal(total)).clip(1e-150)
+        values, vectors = np.linalg.eigh(total / size / size[:, None])
+        back = vectors / np.sqrt(values.clip(_SINGULAR * values[-1])) / size[:, None]
+        rows = slope @ back
+        score = share[:, None] * np.einsum("lsp,ls->lp", rows, error)
+        alone = noise * np.einsum("l,lsp,lsq->pq", share**2, rows, rows)
+        return back, score, alone, max(float(np.sum(score**2) / max(np.trace(alone), 1e-300)), 1.0)
+
+    back, score, alone, together = estimated(1.0)
+    for _ in range(_TURNS - 1):
+        back, score, alone, together = estimated(together)
+    values, vectors = np.linalg.eigh(together * alone)
+    shape = vectors * np.sqrt(values.clip(0))
+    assumed = back @ back.T[:, -2:] * (together * each * centre[-1])
+    return np.concatenate([back @ score.T / np.sqrt(2), back @ shape / np.sqrt(2), assumed], axis=1)
+
+
+def _over_image(
+    lens: ZoomLens, centre: np.ndarray, k: np.ndarray, by_parameter: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """How far points are moved beyond a homography, and by each parameter, (n, 2, p + 2), in the image."""
+    z = (over_image(lens.image_size) - centre) / lens.scale
+    at, by_point, by_all = derivatives(lens.family, z, k, by_parameter)
+    rows = beyond(at, by_point, np.concatenate([(at - z)[..., None], by_all], axis=-1))
+    return float(np.sqrt(np.sum(rows[..., 0] ** 2) / max(len(rows), 1))), rows[..., 1:]
