@@ -34,7 +34,7 @@ from ._motion_rows import (
 from ._motion_start import STARTS
 from ._normal_solver import damped_solver
 from ._schur import Rows, Schur, Unknowns, covariances, reduced
-from ._views import CAUCHY, EXACT, MEDIAN_OF_SIZE
+from ._views import CAUCHY, EXACT, MEDIAN_OF_SIZE, core_median
 from .result import RESULTS, ZoomFit, judged
 
 STAGES = (
@@ -165,7 +165,7 @@ def _solved(data, model, noise, stage):
     size = jnp.linalg.norm(views, axis=-1)
     near = (size < 3 * CAUCHY * noise.points)[:, None]
     change = optx.two_norm(jnp.where(near, views - first, 0)) / noise.points
-    points = jnp.nanmedian(jnp.where(data.there, size, jnp.nan)) / MEDIAN_OF_SIZE
+    points = core_median(size, data.there) / MEDIAN_OF_SIZE
     rays = model.path.rays / jnp.linalg.norm(model.path.rays, axis=1, keepdims=True)
     model = eqx.tree_at(lambda m: m.path.rays, model, rays)
     noise = Noise(jnp.maximum(points, EXACT), _line_noise(data, model), noise.repeated)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ._structure import bucket
+from ._views import core_median
 
 FIELDS_OF_VIEW = (70.0, 45.0, 28.0, 17.0, 10.0, 5.0)
 """Guesses, degrees across the image."""
@@ -135,8 +136,8 @@ def _next(state, track, present, seen):
         return jnp.exp(state.log_focal + unknown[0]) * ahead[:, :2] / depth - seen
 
     def spread(unknown):
-        size = jnp.where(known, jnp.linalg.norm(residuals(unknown), axis=1), jnp.nan)
-        return jnp.maximum(jnp.nan_to_num(jnp.nanmedian(size)), 0.1)
+        size = core_median(jnp.linalg.norm(residuals(unknown), axis=1), known)
+        return jnp.maximum(jnp.nan_to_num(size), 0.1)
 
     def turn(unknown, _):
         error, scale = residuals(unknown), 2 * spread(unknown)
