@@ -15,7 +15,7 @@ NumPy, float64 whatever the lines' dtype: with sums as small as these, compiling
 50 folds of 12 models do.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -120,7 +120,7 @@ class Lanes(NamedTuple):
 
 
 def lanes_of(lines, fold, terms):
-    small = in_corrected(lines)
+    small: Any = in_corrected(lines)
     frame = np.asarray(lines.frame)
     order = np.argsort(frame, kind="stable")
     whole = np.asarray(small.triangle, float)[order, :, 1 : 3 + 2 * terms]
