@@ -13,8 +13,8 @@ s^2 that is left. So the mean of ``d d^T`` over the frames, times ``1 - q s^2 / 
 
 Beside it a radial polynomial lacks its next coefficient. What one that is linear in 1/f, with the d(f) that
 goes with it, takes away of those squares is judged in the same way, and adds its own covariance.
-Lines that are hardly straighter for it move far: with two coefficients for a lens of OpenCV's model by
-0.1 px, where lines become straighter by a tenth of that.
+Lines are hardly straighter for it, and it moves points by far more: a polynomial of two coefficients for a
+lens of OpenCV's model, whose coefficients bend where ours straighten, is off by ten times as much.
 """
 
 from typing import NamedTuple
