@@ -367,6 +367,14 @@ def test_a_pupil_off_the_axis_is_seen_and_drift_is_none(lens, path, fit):
     assert fit_motion(tracked(lens, path, noise=0.3, drift=0.1).tracks).parallax_score < 3
 
 
+@pytest.mark.parametrize("shared", [{"pupil": 0.3}, {"drift": 0.2}])
+def test_errors_that_views_of_a_track_share_widen_the_bands(lens, path, fit, shared):
+    found = fit_motion(tracked(lens, path, noise=0.3, **shared).tracks)
+    std = np.sqrt(found.covariance[-1, -1])
+    assert std / found.noise > 1.15 * np.sqrt(fit.covariance[-1, -1]) / fit.noise
+    assert abs(np.mean(np.asarray(found.focal) / path[0] - 1)) < 3 * std
+
+
 def test_few_tracks_tell_no_parallax(lens, path):
     few = motion_tracks(lens, *path, views=5, life=60, noise=0.3)
     assert np.isnan(fit_motion(few.tracks, throw=False).parallax)
