@@ -34,8 +34,10 @@ _LOOSE_SCALE = 0.01
 _TOLD_SHUTTER = 0.1
 """Standard deviation of the readout, in frames, below which it is told."""
 
-_ROUGH = 1.0  # px, of the noise of points
-_WRONG = 2.0  # px, of the noise of points: what is seen is no camera that turns
+_ROUGH, _WRONG = 0.8, 1.2
+"""px, of the noise of points: two and three times what the way of a point there and back may miss, so that
+more is hardly noise. Much moves by itself, or what is seen is no camera that turns."""
+
 _MISSED = 9.0  # times the noise, squared: views beyond do not follow the model
 _FEW = 0.3  # of the views that do follow it: below, most of what is seen may move by itself
 _MANY = 9.0  # focal lengths, more than any model needs
