@@ -17,25 +17,23 @@ from jaxtyping import Float, Int
 
 from .._core.text import span
 from .._core.types import AnyArray
-from ..fit.algebraic import algebraic_zoom
 from ..fit.energy import line_squares
 from ..fit.focal_lengths import with_focal_sigma
 from ..fit.result import RESULTS, FrameFits, ZoomFit
 from ..fit.straightness import frame_rms
 from ..fit.zoom import CentreArgument
-from ..lines.compressed import CompressedLines
 from ..lines.lines import Lines
 from ..models.about import UNKNOWN
 from ..models.invertibility import Certificate
 from ..models.registry import family_name
-from ..models.zoom import AbstractLinearZoom, PolynomialZoom
+from ..models.zoom import PolynomialZoom
 from ..trust.assessment import NEGLIGIBLE, Assessment, assess
 from ..trust.bands import displacement_std
 from ..trust.cross_validation import held_out_frames, held_out_zoom
 from ..trust.misfit import with_misfit
 from ..trust.next_photo import Suggestion, suggest_next
 from ..trust.selection import Selection
-from .fitting import fitted
+from .fitting import algebraic_rms, fitted
 from .model_choice import CentreFound, WantedModel
 from .outward import outward
 from .results_folder import OF_A_LENS, results_folder
@@ -346,16 +344,12 @@ def calibrate(
         RuntimeError: the solver failed.
     """
     used = fitted(lines, model, centre, robust=robust, stage=stage)
-    exact, small, terms, chosen = used.zoom, used.lines, used.model.terms, used.model.zoom
-    assert isinstance(chosen, AbstractLinearZoom)  # `WantedModel` has no other
+    exact, small, terms = used.zoom, used.lines, used.model.terms
     sigma = np.broadcast_to(focal_sigma, lines.focal.shape)
     zoom = exact
     if sigma.any():
         zoom = with_focal_sigma(exact, small, focal_sigma=sigma, shared=shared)
     zoom = widened(with_misfit(zoom, small))
-    algebraic = None
-    if isinstance(small, CompressedLines):  # others are estimated to first order alone: far off, if strong
-        algebraic = np.asarray(frame_rms(small, algebraic_zoom(small, zoom=chosen, terms=terms)))
     stage("Checking the fit on lines left out")
     held_out, each_held_out = np.full(len(sigma), np.nan), held_out_frames(small, terms=terms)
     if len(sigma) > 1:
@@ -366,7 +360,7 @@ def calibrate(
         zoom=zoom,
         each=used.each,
         none=np.asarray(frame_rms(small, None)),
-        algebraic=algebraic,
+        algebraic=algebraic_rms(small, used.model),
         rejected=np.asarray(lines.weight) == 0
         if lines.weight is not None
         else np.zeros(len(lines.frame), bool),
