@@ -217,11 +217,13 @@ def _facade_page(house: dict) -> list[str]:
         f"{of['lines']} lines in {of['cpu_s']:.1f} s with the {names[model].rpartition(' ')[2]}"
         for model, of in program.items()
     )
+    when = "in an earlier run " if house.get("program_earlier") else ""
     return [
         *told,
         "",
-        f"The authors' program, built from its public source, finds {runs}, of all cores' time, pictures "
-        "included. Its points of lines are not quite those of primitives.txt, which another build wrote.",
+        f"The authors' program, built from its public source, {when}finds {runs}, of all cores' time, "
+        "pictures included. Its points of lines are not quite those of primitives.txt, which another build "
+        "wrote.",
     ]
 
 
@@ -350,7 +352,10 @@ def measure(name: str, given: argparse.Namespace, data: Path, measured: dict) ->
 
     if name not in EACH:
         whole = {"facade": lambda: facade(data, given.program), "bands": lambda: bands(data)}
-        keep(whole.get(name, lambda: board(data / "board"))())
+        found = whole.get(name, lambda: board(data / "board"))()
+        if "program" not in found and "program" in measured.get(name, {}):
+            found |= {"program": measured[name]["program"], "program_earlier": True}
+        keep(found)
         return
     rows = {row["seed"]: row for row in measured.get(name, [])}
     for seed in range(given.folders if name == "folders" else given.scenes):

@@ -10,9 +10,11 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app.calibration import calibrate, rms_over_frames
+from zoomjax.app.coverage import _residuals
 from zoomjax.app.focal_sources import focal_sigmas
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.report import report
+from zoomjax.fit.image_metric import in_corrected, in_image
 
 _TRUTH = scenes.nikkor_18_200()
 UNDISTORTED = eqx.tree_at(
@@ -32,6 +34,35 @@ def test_stages_are_told(calibration):
     told = []
     calibrate(calibration.lines, **GIVEN, stage=told.append)
     assert len(told) == 4
+
+
+@pytest.mark.parametrize("metric", [in_image, in_corrected])
+def test_distances_are_measured_where_the_metric_says(calibration, metric):
+    """By default in the distorted image; both are the fits that the library makes."""
+    found = calibration if metric is in_image else calibrate(calibration.lines, **GIVEN, metric=metric)
+    expected = zj.fit_zoom(metric(zj.compress(calibration.lines)))
+    np.testing.assert_allclose(found.zoom.frame_rms, expected.frame_rms, rtol=1e-9)
+    focal = np.asarray(calibration.lines.focal)
+    k, truly = (
+        np.stack([np.asarray(fit.lens(f).coefficients) for f in focal]) for fit in (found.zoom, expected)
+    )
+    np.testing.assert_allclose(k, truly, rtol=1e-6)
+    assert found.summary()["distances"] == f"{'distorted' if metric is in_image else 'corrected'} image"
+    assert f"px of the {found.summary()['distances']}." in report(found)
+
+
+def test_residuals_over_the_radius_are_those_of_the_fit(calibration):
+    """The plot's residuals are divided by the stretch of each point, the fit's by that of each line."""
+    radius, residual = _residuals(
+        calibration.lines, calibration.zoom.lens, np.arange(len(calibration.lines.frame))
+    )
+    frame = np.broadcast_to(np.asarray(calibration.lines.frame)[:, None], calibration.lines.mask.shape)
+    frame = frame[np.asarray(calibration.lines.mask)]
+    squares = np.bincount(frame, residual**2) / np.bincount(frame)
+    np.testing.assert_allclose(np.sqrt(squares), calibration.zoom.frame_rms, rtol=0.02)
+    corrected = zj.frame_rms(calibration.lines, calibration.zoom.lens)
+    assert abs(corrected[0] / calibration.zoom.frame_rms[0] - 1) > 0.04
+    assert radius.shape == residual.shape
 
 
 def test_pixel_polynomials_give_the_coefficients_of_the_lens(calibration):
@@ -149,7 +180,8 @@ def test_zoomcam_gives_the_reference_figures(data):
     lines = read_zoomcam(data / "zoomcam")
     assert len(lines.focal) == 5
     assert len(lines.frame) == 116 * (15 + 22)
-    by_degree = {d: calibrate(lines, model=WantedModel(degree=d), centre=None) for d in (0, 1, 2)}
+    paper = {"centre": None, "metric": in_corrected}
+    by_degree = {d: calibrate(lines, model=WantedModel(degree=d), **paper) for d in (0, 1, 2)}
     assert float(by_degree[2].each.rms) == pytest.approx(0.8796, abs=5e-4)
     for degree, rms in {0: 0.9969, 1: 0.8855, 2: 0.8809}.items():
         assert float(by_degree[degree].zoom.rms) == pytest.approx(rms, abs=5e-4)
@@ -161,7 +193,8 @@ def test_zoomcam_gives_the_reference_figures(data):
 def test_bands_allow_for_uncertain_focal_lengths(calibration):
     sigma = 0.01 * np.asarray(calibration.lines.focal)
     allowed = calibrate(calibration.lines, **GIVEN, focal_sigma=focal_sigmas("1%", calibration.lines.focal))
-    expected = zj.fit.with_focal_sigma(calibration.zoom, zj.compress(calibration.lines), focal_sigma=sigma)
+    small = in_image(zj.compress(calibration.lines))
+    expected = zj.fit.with_focal_sigma(calibration.zoom, small, focal_sigma=sigma)
     np.testing.assert_allclose(allowed.zoom.covariance, expected.covariance, rtol=1e-6)
     assert all(a[2] > b[2] for a, b in zip(allowed.corner(), calibration.corner(), strict=True))
     told = [row["focal_sigma"] for row in allowed.summary()["per_frame"]]

@@ -17,25 +17,23 @@ from jaxtyping import Float, Int
 
 from .._core.text import span
 from .._core.types import AnyArray
-from ..fit.algebraic import algebraic_zoom
 from ..fit.energy import line_squares
 from ..fit.focal_lengths import with_focal_sigma
+from ..fit.image_metric import ImageLines, in_image
 from ..fit.result import RESULTS, FrameFits, ZoomFit
 from ..fit.straightness import frame_rms
 from ..fit.zoom import CentreArgument
-from ..lines.compressed import CompressedLines
 from ..lines.lines import Lines
 from ..models.about import UNKNOWN
-from ..models.invertibility import Certificate
 from ..models.registry import family_name
-from ..models.zoom import AbstractLinearZoom, PolynomialZoom
+from ..models.zoom import PolynomialZoom
 from ..trust.assessment import NEGLIGIBLE, Assessment, assess
 from ..trust.bands import displacement_std
 from ..trust.cross_validation import held_out_frames, held_out_zoom
 from ..trust.misfit import with_misfit
 from ..trust.next_photo import Suggestion, suggest_next
 from ..trust.selection import Selection
-from .fitting import fitted
+from .fitting import Metric, algebraic_rms, fitted
 from .model_choice import CentreFound, WantedModel
 from .outward import outward
 from .results_folder import OF_A_LENS, results_folder
@@ -66,6 +64,7 @@ class Calibration:
         centre: the centre of distortion, and how it was found.
         assessment: the verdict, with what was found and what to do about it.
         selection: how the model was selected; None if it was given.
+        in_image: whether all RMS are of distances in the distorted image, not in the corrected one.
     """
 
     lines: Lines
@@ -82,6 +81,7 @@ class Calibration:
     centre: CentreFound
     assessment: Assessment
     selection: Selection | None = None
+    in_image: bool = True
 
     def corner(self) -> list[tuple[float, float, float]]:
         """Displacement of the farthest corner at both ends of the focal range and in its middle.
@@ -194,6 +194,7 @@ class Calibration:
         return (
             self.assessment.summary()
             | {
+                "distances": "distorted image" if self.in_image else "corrected image",
                 "rms_none": rms_over_frames(self.none),
                 "rms_algebraic": None if self.algebraic is None else rms_over_frames(self.algebraic),
                 "rms_frames": float(self.each.rms),
@@ -212,7 +213,7 @@ class Calibration:
                 "focal_unit": lens.focal_unit,
                 "image_size": list(lens.image_size),
                 "result": RESULTS[self.zoom.result] or "successful",
-                "certificate": _plain(self.zoom.certificate),
+                "certificate": {name: of.item() for name, of in vars(self.zoom.certificate).items()},
                 "rms_unconstrained": float(self.zoom.rms_unconstrained),
                 "frames_without_a_model": sum(map(bool, self.each.messages())),
                 "warnings": self.warnings(),
@@ -321,6 +322,7 @@ def calibrate(
     model: WantedModel = WantedModel(),  # noqa: B008, it is frozen
     centre: CentreArgument | None = "fit",
     robust: bool = False,
+    metric: Metric = in_image,
     focal_sigma: float | Float[np.ndarray, "frame"] = 0.0,
     shared: Int[np.ndarray, "frame"] | None = None,
     widened: Callable[[ZoomFit], ZoomFit] = lambda fit: fit,
@@ -336,6 +338,8 @@ def calibrate(
             that were not fitted are not straighter about it.
         robust: whether to reject lines that are not straight in the scene. All figures are then computed
             from the remaining lines.
+        metric: where distances are measured: `in_image`, where the noise is, or, as in the paper,
+            `in_corrected`.
         focal_sigma: standard deviation of the focal lengths: a number, or one per frame; 0 where exact.
         shared: for each frame a number: frames of one number share a focal length and its error.
         widened: adds to the uncertainty of a fit what the lines do not show of it.
@@ -345,17 +349,13 @@ def calibrate(
         ValueError: an argument is not one of these, or there are too few focal lengths for the model.
         RuntimeError: the solver failed.
     """
-    used = fitted(lines, model, centre, robust=robust, stage=stage)
-    exact, small, terms, chosen = used.zoom, used.lines, used.model.terms, used.model.zoom
-    assert isinstance(chosen, AbstractLinearZoom)  # `WantedModel` has no other
+    used = fitted(lines, model, centre, robust=robust, metric=metric, stage=stage)
+    exact, small, terms = used.zoom, used.lines, used.model.terms
     sigma = np.broadcast_to(focal_sigma, lines.focal.shape)
     zoom = exact
     if sigma.any():
         zoom = with_focal_sigma(exact, small, focal_sigma=sigma, shared=shared)
     zoom = widened(with_misfit(zoom, small))
-    algebraic = None
-    if isinstance(small, CompressedLines):  # others are estimated to first order alone: far off, if strong
-        algebraic = np.asarray(frame_rms(small, algebraic_zoom(small, zoom=chosen, terms=terms)))
     stage("Checking the fit on lines left out")
     held_out, each_held_out = np.full(len(sigma), np.nan), held_out_frames(small, terms=terms)
     if len(sigma) > 1:
@@ -366,7 +366,7 @@ def calibrate(
         zoom=zoom,
         each=used.each,
         none=np.asarray(frame_rms(small, None)),
-        algebraic=algebraic,
+        algebraic=algebraic_rms(small, used.model),
         rejected=np.asarray(lines.weight) == 0
         if lines.weight is not None
         else np.zeros(len(lines.frame), bool),
@@ -378,6 +378,7 @@ def calibrate(
         centre=used.centre.as_uncertain_as(zoom),
         assessment=assess(lines, zoom, compressed=small, held_out=held_out, each_held_out=each_held_out),
         selection=used.selection,
+        in_image=isinstance(small, ImageLines),
     )
 
 
@@ -385,13 +386,6 @@ def rms_over_frames(frame_rms: Float[AnyArray, "frame"]) -> float:
     """Root of the mean of the frames' squared RMS: eq. 13 from eq. 3. NaN frames are ignored."""
     known = np.asarray(frame_rms)[~np.isnan(frame_rms)]
     return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
-
-
-def _plain(certificate: Certificate) -> dict[str, bool | float]:
-    """The fields of a certificate as plain values, for JSON."""
-    return {
-        field.name: getattr(certificate, field.name).item() for field in dataclasses.fields(certificate)
-    }
 
 
 def _finite(values: Iterable[float]) -> list[float | None]:

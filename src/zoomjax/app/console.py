@@ -167,9 +167,8 @@ def show_calibration(
         f"{calibration.focal_text()}\n",
         highlight=False,
     )
-    table = Table(
-        title="RMS distance of corrected points to straight lines", title_justify="left", box=None
-    )
+    table = Table(title=f"RMS distance of points to lines, in the {summary['distances']}")
+    table.title_justify, table.box = "left", None
     table.add_column("", no_wrap=True)
     table.add_column("px, held out", justify="right", no_wrap=True)
     table.add_column("px", justify="right")

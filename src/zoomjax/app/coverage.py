@@ -8,6 +8,7 @@ from ..models.lens import ZoomLens
 from .colours import FRAMES, MODEL, SHADES
 
 _CELLS, _RINGS = 16, 12
+_LEAST_STRETCH = 0.01  # beyond a fold, where it may vanish, residuals tell nothing
 _MOST_POINTS = 200_000  # are enough to average over
 
 
@@ -77,17 +78,22 @@ def plot_radius(lines: Lines, lens: ZoomLens, weight: np.ndarray) -> Figure:
 
 
 def _residuals(lines: Lines, lens: ZoomLens, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances of points from the centre, and of corrected points from their lines, px."""
+    """Distances of points from the centre, and, in the distorted image, from their lines, px."""
     points, mask = np.asarray(lines.points)[chosen], np.asarray(lines.mask)[chosen]
     frame, focal = np.asarray(lines.frame)[chosen], np.asarray(lines.focal)
     corrected, away = np.zeros(points.shape), np.zeros(points.shape)
+    stretch = np.zeros((*points.shape, 2))  # by which the correction stretches, along x and along y
     for index in np.unique(frame):
         own = (frame == index)[:, None] & mask
         distortion = lens(float(focal[index]))
         corrected[own] = distortion.undistort(points[own])
+        for axis, step in enumerate(np.eye(2) / 2):
+            ends = (np.asarray(distortion.undistort(points[own] + way)) for way in (step, -step))
+            stretch[own, axis] = next(ends) - next(ends)
         away[own] = points[own] - np.asarray(distortion.centre)
     mean = corrected.sum(axis=1) / mask.sum(axis=1)[:, None]
     rows = np.where(mask[..., None], corrected - mean[:, None], 0)
     normal = np.linalg.eigh(np.einsum("lpc,lpd->lcd", rows, rows))[1][..., 0]
-    residual = np.einsum("lpc,lc->lp", rows, normal)
+    across = np.linalg.norm(np.einsum("lpac,lc->lpa", stretch, normal), axis=-1)
+    residual = np.einsum("lpc,lc->lp", rows, normal) / np.maximum(across, _LEAST_STRETCH)
     return np.hypot(away[..., 0], away[..., 1])[mask], residual[mask]

@@ -7,13 +7,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
+from ..fit.algebraic import algebraic_zoom
 from ..fit.centre import fit_centre
-from ..fit.family_lines import compress_family
+from ..fit.compression import compressed_as_measured
+from ..fit.family_lines import with_family
 from ..fit.frames import fit_frames
+from ..fit.image_metric import in_corrected
 from ..fit.prepare import ready_model
 from ..fit.result import FrameFits, ZoomFit, failed
 from ..fit.robust import reweighted
+from ..fit.straightness import frame_rms
+from ..fit.wrapper import points_of
 from ..fit.zoom import CentreArgument, about_centre, fit_zoom
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines, compress
@@ -22,12 +28,17 @@ from ..lines.lines import Lines
 from ..models.family import AbstractRadial
 from ..models.model import Model
 from ..models.polynomial import RadialPolynomial
+from ..models.zoom import AbstractLinearZoom
 from ..trust.centre_choice import choose_centre
 from ..trust.selection import Selection
 from .model_choice import STRONG, CentreFound, WantedModel
 
 _TURNS = 2
 """How often centre and weights of the lines are found in turn, at most."""
+
+
+Metric = Callable[[AbstractLines], AbstractLines]
+"""`in_image` or `in_corrected`: where distances are measured."""
 
 
 class Fitted(NamedTuple):
@@ -56,6 +67,7 @@ def fitted(
     centre: CentreArgument | None,
     *,
     robust: bool,
+    metric: Metric,
     stage: Callable[[str], None],
 ) -> Fitted:
     """The fits of a calibration; see `calibrate`.
@@ -68,13 +80,15 @@ def fitted(
     radial = dataclasses.replace(wanted, family="radial")
     model = radial.base(lines.focal)
     ready_model(lines, model)  # raises if there are too few focal lengths, before any work
-    found = _about_centre(lines, radial, centre, robust, wanted.family in (None, "radial", "auto"), stage)
+    stage("Compressing the lines")
+    held = metric(_compressed(lines, centre, radial.most_terms(lines)))
+    found = _about_centre(held, radial, model, robust, wanted.family in (None, "radial", "auto"), stage)
     if wanted.family is None and found.zoom is None:
         stage("Fitting the zoom model")
         found = found._replace(zoom=fit_zoom(found.lines, zoom=found.model, throw=False))
     strong = found.zoom is not None and wanted.is_beyond(found.zoom)
     if strong or wanted.family not in (None, "radial"):
-        found = _under_family(lines, wanted, found, centre, robust, stage)
+        found = _under_family(metric(_widest(lines)), wanted, found, centre, robust, stage)
     small, model, zoom = found.lines, found.model, found.zoom
     if zoom is None or failed(zoom.result):
         stage("Fitting the zoom model")
@@ -100,9 +114,9 @@ class _Centred(NamedTuple):
 
 
 def _about_centre(
-    lines: Lines,
+    held: AbstractLines,
     wanted: WantedModel,
-    centre: CentreArgument | None,
+    model: Model,
     robust: bool,
     choose: bool,
     stage: Callable[[str], None],
@@ -111,21 +125,18 @@ def _about_centre(
 
     The centre is that of the lens, whatever function of the radius describes it.
     """
-    model, choose = wanted.base(lines.focal), choose and wanted.automatic
-    stage("Compressing the lines")
-    held = _compressed(lines, centre, wanted.most_terms(lines))
     small = held.about(held.centre)
     if robust:
         stage("Rejecting lines that are not straight")
         weight = _weights(held, model)
         small, held = small.weighted(weight), held.weighted(weight)
     selection = None
-    if choose:
+    if choose and wanted.automatic:
         stage("Choosing the model")
         selection = wanted.choose(small)
         model = selection.chosen
     choice = found = None
-    if isinstance(held, AnyCentreLines):
+    if _for_any_centre(held):
         stage("Fitting the centre of distortion")
         choice = choose_centre(held, model)
         found = choice.found if choice.better else None
@@ -141,7 +152,11 @@ def _about_centre(
     return _Centred(held.about(found.fit.lens.centre), model, how, selection, found.fit)
 
 
-def _weights(held: CompressedLines | AnyCentreLines, model: Model) -> np.ndarray:
+def _for_any_centre(lines: AbstractLines) -> bool:
+    return isinstance(points_of(lines), AnyCentreLines)
+
+
+def _weights(held: AbstractLines, model: Model) -> np.ndarray:
     """The weights of the lines about their centre, or about one fitted to them, whichever keeps more.
 
     About a centre that is far from the lens's, straight lines look bent, the longest ones most.
@@ -151,7 +166,7 @@ def _weights(held: CompressedLines | AnyCentreLines, model: Model) -> np.ndarray
         return np.asarray(reweighted(held.about(centre), model)[0].weight)
 
     best, tried = about(held.centre), held
-    for _ in range(_TURNS if isinstance(held, AnyCentreLines) and not best.all() else 0):
+    for _ in range(_TURNS if _for_any_centre(held) and not best.all() else 0):
         found = fit_centre(tried, zoom=model, throw=False)
         other = about(found.fit.lens.centre)
         if not found.determined or other.sum() <= best.sum():
@@ -161,7 +176,7 @@ def _weights(held: CompressedLines | AnyCentreLines, model: Model) -> np.ndarray
 
 
 def _under_family(
-    lines: Lines,
+    lines: AbstractLines,
     wanted: WantedModel,
     found: _Centred,
     centre: CentreArgument | None,
@@ -174,7 +189,7 @@ def _under_family(
     and the model chosen judges them by itself.
     """
     model, selection = found.model, found.selection
-    placed = whole = _widest(lines).about(found.lines.centre)
+    placed = whole = lines.about(found.lines.centre)
     judge = None
     if wanted.family in (None, "auto"):
         stage("Choosing the distortion model")
@@ -206,10 +221,17 @@ def _under_family(
         if own.determined:
             how, zoom = CentreFound.of(lines, None, own), own.fit
             placed = judged.about(own.fit.lens.centre)
-    return _Centred(compress_family(placed, model.family, terms=model.terms), model, how, selection, zoom)
+    return _Centred(_in_family(placed, model), model, how, selection, zoom)
 
 
-def _kept_by_either(lines: Lines, wanted: WantedModel, found: _Centred, robust: bool) -> Lines:
+def _in_family(lines: AbstractLines, model: Model) -> AbstractLines:
+    """The lines compressed for a distortion model."""
+    return compressed_as_measured(with_family(lines, model.family), model.terms)
+
+
+def _kept_by_either(
+    lines: AbstractLines, wanted: WantedModel, found: _Centred, robust: bool
+) -> AbstractLines:
     """The lines, each with the larger of its weights under the polynomial and the division model."""
     if not robust or found.lines.weight is None:
         return lines
@@ -218,10 +240,9 @@ def _kept_by_either(lines: Lines, wanted: WantedModel, found: _Centred, robust: 
     return lines.weighted(np.maximum(np.asarray(other.weight), np.asarray(found.lines.weight)))
 
 
-def _straight(lines: Lines, model: Model) -> Lines:
+def _straight(lines: AbstractLines, model: Model) -> AbstractLines:
     """The lines with the weights that the model gives them."""
-    form = compress_family(lines, model.family, terms=model.terms)
-    return lines.weighted(np.asarray(reweighted(form, model)[0].weight))
+    return lines.weighted(np.asarray(reweighted(_in_family(lines, model), model)[0].weight))
 
 
 def _widest(lines: Lines) -> Lines:
@@ -244,3 +265,15 @@ def _compressed(
     if held.weight is not None:
         return held
     return held.weighted(np.ones(held.frame.shape))  # as where some are left out: one compiled program
+
+
+def algebraic_rms(lines: AbstractLines, model: Model) -> Float[np.ndarray, "frame"] | None:
+    """RMS of the frames, px, under the algebraic estimate.
+
+    None for other distortion models than the radial polynomial: estimated to first order, and far off, if
+    strong.
+    """
+    if not isinstance(in_corrected(lines), CompressedLines):
+        return None
+    assert isinstance(model.zoom, AbstractLinearZoom)  # `WantedModel` has no other
+    return np.asarray(frame_rms(lines, algebraic_zoom(lines, zoom=model.zoom, terms=model.terms)))

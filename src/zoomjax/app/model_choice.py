@@ -11,7 +11,6 @@ from ..fit.centre import CentreFit
 from ..fit.result import ZoomFit
 from ..fit.zoom import CentreArgument
 from ..lines.base import AbstractLines
-from ..lines.compressed import CompressedLines
 from ..lines.lines import Lines
 from ..models.brown_conrady import BrownConrady
 from ..models.division import Division
@@ -137,10 +136,10 @@ class WantedModel:
         return self.model == "auto" and self.degree is None
 
     def most_terms(self, lines: Lines) -> int:
-        """The largest number of coefficients that is fitted or compared."""
-        return max(self._terms(lines))
+        """The largest number of coefficients that is fitted, compared or, for the misfit, thought of."""
+        return max(*self._terms(lines), min(self._terms(lines)[0] + 1, RadialPolynomial.most_terms))
 
-    def choose(self, lines: CompressedLines) -> Selection:
+    def choose(self, lines: AbstractLines) -> Selection:
         """The model of least cross-validation error.
 
         Left out are focal lengths, or, with fewer than four, lines. Polynomials, splines of few knots and
@@ -155,7 +154,7 @@ class WantedModel:
         zooms += [SmoothZoom()] if distinct > 1 and terms[0] == _TERMS else []
         return select_in_stages(lines, zooms, terms)
 
-    def choose_in_family(self, lines: Lines) -> Selection:
+    def choose_in_family(self, lines: AbstractLines) -> Selection:
         """The model of least cross-validation error under another distortion model than the polynomial.
 
         Each part that is left out takes a fit, so that few compete: polynomials with two coefficients, and
@@ -167,7 +166,7 @@ class WantedModel:
         pairs += [(min(_DEGREE, distinct - 1), number) for number in terms[1:]]
         return _selected(lines, [Model(PolynomialZoom(degree=d), n, self.distortion) for d, n in pairs])
 
-    def choose_family(self, lines: Lines, chosen: Model, compared: Sequence[Model]) -> Selection:
+    def choose_family(self, lines: AbstractLines, chosen: Model, compared: Sequence[Model]) -> Selection:
         """The distortion model of least cross-validation error: of all, or of two for a strong lens.
 
         Args:
@@ -210,7 +209,7 @@ class WantedModel:
         return [_TERMS, 1, *([3] if len(lines.frame) >= _MANY_LINES else [])]
 
 
-def _selected(lines: Lines, candidates: Sequence[Model]) -> Selection:
+def _selected(lines: AbstractLines, candidates: Sequence[Model]) -> Selection:
     """The candidate of least error, over focal lengths left out, or lines where there are few."""
     distinct = np.unique(np.asarray(lines.focal)).size
     folds = min(_FOLDS, distinct - 2) if distinct > 3 else _FOLDS

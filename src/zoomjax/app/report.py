@@ -175,6 +175,7 @@ def _straightness(calibration: Calibration) -> dict[str, Any]:
             )
             for name, value in ((name, rms_over_frames(frames)) for name, frames in calibration.rows())
         ],
+        "unit": f"px of the {'distorted' if calibration.in_image else 'corrected'} image",
         "choice": chosen and {"title": chosen.title, "columns": COLUMNS, "rows": chosen.rows()},
         "plot": embedded_plot(figure, "Residual RMS of each frame against 1/f", class_="box plot"),
     }
