@@ -46,6 +46,9 @@ TOGETHER = 60
 
 SIZE = (1280, 720)
 
+LINES_OF = ("automatic", "their points")
+"""The facade's lines: found by us, and by the authors' program."""
+
 
 def board(folder: Path) -> dict:
     """A board before an action camera: lenses from edges, from grids seen in part, and from whole ones."""
@@ -192,6 +195,16 @@ def _facade_page(house: dict) -> list[str]:
         [name, f"{fit['rms_px']:.2f}", str(fit["rejected"]), *_row(fit)]
         for name, fit in house["fits"].items()
     ]
+    found, best = (np.array(house["fits"][f"by default, {of}"]["displacement_px"]) for of in LINES_OF)
+    fits.append(
+        [
+            "the same, less that of their points, %",
+            "",
+            "",
+            "",
+            *(f"{x:+.1f}" for x in 100 * (found / best - 1)),
+        ]
+    )
     names = {"pol": "their program, polynomial", "div": "their program, division"}
     program = house.get("program", {})
     fits += [[names[model], "", "", *_row(of)] for model, of in program.items()]

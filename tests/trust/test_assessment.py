@@ -118,6 +118,17 @@ def test_curved_things_are_not_good(lines, rng):
     assert "crooked lines" in about(found)
 
 
+def test_lines_without_noise_are_not_crooked(lens, lines):
+    """Rounding leaves 1e-13 px, many times the noise, which is less still."""
+    exact = scenes.board_lines(lens, scenes.focal_sweep(6), spacing=24.0, noise=0)
+    fit = zj.fit_zoom(zj.compress(exact))
+    found = evidence(exact, fit)
+    assert found.rms < 1e-6
+    assert not found.crooked
+    assert dataclasses.replace(found, rms=0.02).crooked  # by which noise of a micropixel is exceeded
+    assert "crooked lines" not in about(assessed(exact))
+
+
 def test_few_lines_are_not_good(lines):
     weight = np.zeros(len(lines.frame))
     for frame in range(6):
