@@ -116,14 +116,18 @@ def test_page_says_what_the_summary_says(page, calibration):
 
 
 def test_worst_lines_are_those_of_the_lens(page, calibration):
-    """The distance of a line's corrected points to it, from their own singular values."""
+    """The distance of a line's corrected points to it, over the stretch across it, from singular values."""
     lines, lens = calibration.lines, calibration.zoom.lens
     rms = []
     for line, frame in enumerate(np.asarray(lines.frame)):
         seen = np.asarray(lines.points[line])[np.asarray(lines.mask[line])]
-        corrected = np.asarray(lens(float(lines.focal[frame])).undistort(seen))
-        spread = np.linalg.svd(corrected - corrected.mean(axis=0), compute_uv=False)[1]
-        rms.append(spread / np.sqrt(len(seen)))
+        correct = lens(float(lines.focal[frame])).undistort
+        corrected = np.asarray(correct(seen))
+        _, (_, spread), (_, normal) = np.linalg.svd(corrected - corrected.mean(axis=0), full_matrices=False)
+        across = [
+            (np.asarray(correct(seen + d)) - np.asarray(correct(seen - d))) @ normal for d in np.eye(2)
+        ]
+        rms.append(spread / (np.linalg.norm(across) / 2))
     np.testing.assert_allclose(calibration.line_rms, rms, rtol=1e-6)
     assert re.search(rf"{REJECTED} at \(\d+, \d+\): {rms[REJECTED]:.2f} px, rejected", page.text)
     own = np.flatnonzero((np.asarray(lines.frame) == 0) & ~calibration.rejected)
