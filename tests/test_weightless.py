@@ -66,6 +66,45 @@ def test_all_weights_of_zero_leave_the_whole_range(board):
     np.testing.assert_allclose(lens.focal_range, [board.focal.min(), board.focal.max()])
 
 
+@pytest.mark.parametrize(
+    "zoom",
+    [
+        zj.PolynomialZoom(),
+        zj.SmoothZoom(),
+        zj.models.PowerZoom(),
+        zj.models.TableZoom(),
+        zj.models.SplineZoom(),
+    ],
+    ids=lambda zoom: type(zoom).__name__,
+)
+@pytest.mark.parametrize("wrong", [1e-6, 1.0, 5000.0])
+def test_the_reference_and_the_knots_of_models(board, zoom, wrong):
+    focal = np.append(board.focal, wrong)
+    points, frame = board.to_ragged(), np.asarray(board.frame)
+    far = zj.Lines.from_ragged(
+        [*points, points[0]], np.append(frame, 8), focal, image_size=board.image_size
+    ).weighted(np.append(np.ones(len(frame)), 0.0))
+    one, other = (zj.fit_zoom(zj.compress(lines), zoom=zoom) for lines in (far, board))
+    assert one.result == other.result
+    np.testing.assert_allclose(one.frame_rms[:8], other.frame_rms, rtol=1e-6)
+    np.testing.assert_allclose(one.lens(50.0).coefficients, other.lens(50.0).coefficients, rtol=1e-6)
+    std, expected = (zj.displacement_std(fit, np.array([30.0, 40.0]), focal=50.0) for fit in (one, other))
+    np.testing.assert_allclose(std, expected, rtol=1e-4)
+
+
+def test_the_reference_of_a_centre_that_moves(board):
+    points, frame = board.to_ragged(), np.asarray(board.frame)
+    far = zj.Lines.from_ragged(
+        [*points, points[0]], np.append(frame, 8), np.append(board.focal, 1e-6), image_size=board.image_size
+    ).weighted(np.append(np.ones(len(frame)), 0.0))
+    one, other = (
+        zj.fit.fit_centre(zj.lines.compress_any_centre(lines), centre=zj.PolynomialZoom(degree=1))
+        for lines in (far, board)
+    )
+    assert one.determined == other.determined
+    np.testing.assert_allclose(one.centre[:8], other.centre, atol=1e-6)
+
+
 @pytest.mark.parametrize("hold_out", ["focal", "frame", "line"])
 def test_cross_validation(both, hold_out):
     if hold_out == "focal" and len(both[2]) < 5:

@@ -415,6 +415,11 @@ WRONG = {
     "a line that is not there": (["lines.npz", "--exclude", "9999"], "There is no line 9999"),
     "lines of images": (["a.jpg", "--exclude", "3"], "--exclude is for a file of lines"),
     "two files": (["lines.npz", "./lines.npz"], "lines.npz is given twice"),
+    "a copy of a file": (["lines.npz", "copy.npz"], "copy.npz holds a frame of lines.npz again, 0 here"),
+    "files with a frame in common": (
+        ["lines.npz", "more.npz"],
+        "more.npz holds a frame of lines.npz again, 1 here and 0 there: its lines would count twice",
+    ),
     "options for another kind": (["lines.npz", "--image-size", "640x480"], "for CSV files"),
     "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),
     "a degree of another model": (["lines.npz", "--model", "spline", "--degree", "1"], "for polynomials"),
@@ -455,10 +460,20 @@ WRONG = {
 }
 
 
+def _with_a_frame_before(lines):
+    """Another frame, and then the first frame of the lines."""
+    own = [line for line, frame in zip(lines.to_ragged(), lines.frame, strict=True) if frame == 0]
+    frame = np.repeat([0, 1], len(own))
+    points = [*(line + 0.25 for line in own), *own]
+    return zj.Lines.from_ragged(points, frame, [35, 50], image_size=lines.image_size)
+
+
 @pytest.fixture(scope="module")
 def wrong_files(few_lines, tmp_path_factory):
     folder = tmp_path_factory.mktemp("wrong")
     few_lines.save(folder / "lines.npz")
+    few_lines.save(folder / "copy.npz")
+    _with_a_frame_before(few_lines).save(folder / "more.npz")
     (folder / "truncated.npz").write_bytes((folder / "lines.npz").read_bytes()[:5000])
     np.savez(folder / "foreign.npz", corners=np.zeros(3))
     (folder / "notes.txt").write_text("straight lines")

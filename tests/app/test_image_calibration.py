@@ -36,12 +36,16 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("photos")
     good = demo.write_photos(folder, number=5, image_size=SIZE)
     image = cv2.imread(str(good[0]), cv2.IMREAD_GRAYSCALE)
-    cv2.imwrite(str(folder / "no-exif.png"), image)
+    noise = np.random.default_rng(0).integers(-2, 3, image.shape)  # or it is a copy
+    cv2.imwrite(str(folder / "no-exif.png"), np.clip(image + noise, 0, 255).astype(np.uint8))
     cv2.imwrite(str(folder / "small.png"), cv2.resize(image, None, fx=0.5, fy=0.5))
     cv2.imwrite(str(folder / "turned.png"), np.rot90(image))
     cv2.imwrite(str(folder / "blank.png"), np.full_like(image, 90))
     (folder / "empty.jpg").write_bytes(b"")
     (folder / "cut.jpg").write_bytes(good[1].read_bytes()[:20000])
+    shutil.copy(good[1], folder / "the same.jpg")
+    bare = cv2.imread(str(good[2]), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(folder / "a-copy-without-exif.png"), bare)
     return folder
 
 
@@ -49,7 +53,7 @@ def folder(tmp_path_factory):
 def done(folder):
     steps = []
     calibrated = calibrate_images(ImageJob((folder,)), progress=lambda *step: steps.append(step))
-    assert steps == [(number, 11) for number in range(1, 12)]
+    assert steps == [(number, 13) for number in range(1, 14)]
     return calibrated
 
 
@@ -73,12 +77,14 @@ def test_bad_images_are_reported_and_do_not_matter(done):
         "blank.png": "no lines were found",
         "empty.jpg": "the file is empty",
         "cut.jpg": "the file is damaged or cut off",
+        "the same.jpg": "it shows the same lines as board-",
+        "a-copy-without-exif.png": "it shows the same lines as board-",
     }
     assert set(done.unused) == set(expected)
     for name, reason in expected.items():
         assert reason in done.unused[name]
     [told, *_] = done.warnings()
-    assert told.startswith("6 of 11 images are not used.")
+    assert told.startswith("8 of 13 images are not used.")
     assert all(name in told for name in expected)
     [sizes] = [found for found in done.calibration.assessment.findings if found.about == "other sizes"]
     assert sizes.found.startswith("2 of 7 photos are of another size")
@@ -225,8 +231,9 @@ def write_exif(path, image, focal):
 
 
 def test_several_photos_need_focal_lengths(folder, tmp_path):
-    for name in "ab":
-        shutil.copy(folder / "no-exif.png", tmp_path / f"{name}.png")
+    image = cv2.imread(str(folder / "no-exif.png"), cv2.IMREAD_GRAYSCALE)
+    for shift, name in enumerate("ab"):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.roll(image, 5 * shift, axis=0))
     with pytest.raises(ValueError, match=r"No focal length found .*one focal length for all"):
         calibrate_images(ImageJob((tmp_path,)))
 

@@ -16,10 +16,10 @@ from zoomjax.app.focal_sources import Focals, choose_focals
 from zoomjax.app.image_calibration import calibrate_images
 from zoomjax.app.image_job import ImageJob
 from zoomjax.app.model_choice import WantedModel
-from zoomjax.app.plane_focals import FocalGroup, Sharing, similar
+from zoomjax.app.plane_focals import FocalGroup, Sharing, focals_from_grids, similar
 from zoomjax.app.plans import images_plan
 from zoomjax.app.report import report
-from zoomjax.detect.batch import detect
+from zoomjax.detect.batch import Detection, detect
 from zoomjax.detect.sources import find_photos
 from zoomjax.io.exif import exif_with_focal
 
@@ -50,6 +50,26 @@ def photo(focal, tilt, rng):
     bright = np.where(board, (i + j) % 2, 1.0).reshape(SIZE[1], 2, SIZE[0], 2).mean(axis=(1, 3))
     image = cv2.GaussianBlur(40 + 170 * bright, None, 0.7) + 10 * rng.standard_normal(bright.shape)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def grid_seen(turn, cell=1.0, off=0.0):
+    """Nodes as a camera of 900 px sees them, rows so far apart, corrected about a centre so far off."""
+    y, x = np.meshgrid(cell * (np.arange(ROWS) - ROWS / 2), np.arange(COLUMNS) - COLUMNS / 2, indexing="ij")
+    points = np.stack([x, np.cos(turn) * y, 25 + np.sin(turn) * y], -1)
+    seen = 900 * points[..., :2] / points[..., 2:]
+    radius = np.sum((seen / 300) ** 2, -1, keepdims=True)
+    moved = np.sum(((seen - [0, off]) / 300) ** 2, -1, keepdims=True)
+    middle = (np.array(SIZE) - 1) / 2
+    return Detection("a", image_size=SIZE, nodes=middle + seen * (1 + 0.1 * radius) / (1 + 0.1 * moved))
+
+
+@pytest.mark.parametrize("cell", [0.9, 0.97, 1.0, 1.03])
+@pytest.mark.parametrize("off", [-6.0, -2.0, 0.0, 2.0, 6.0])
+def test_a_view_from_the_front_tells_no_focal_length_whatever_the_cells(cell, off):
+    straight = zj.Distortion(jnp.zeros(1), jnp.array((np.array(SIZE) - 1) / 2), jnp.array(300.0))
+    assert not focals_from_grids([grid_seen(0.001, cell, off)], [straight]).focal
+    found = focals_from_grids([grid_seen(0.4)], [straight]).focal["a"]
+    assert float(found.focal) == pytest.approx(900, rel=1e-3)
 
 
 @pytest.fixture(scope="module")

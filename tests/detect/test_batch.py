@@ -11,6 +11,7 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 import zoomjax as zj
 from zoomjax._core import executors
@@ -265,6 +266,20 @@ def test_the_cache_does_not_keep_a_videos_track(marker, tmp_path):
     [found] = detect([Source("a", image=image)], marker, cache=tmp_path / "cache")
     assert found.focal is None
     assert looks(marker) == 1
+
+
+@pytest.mark.parametrize("first", [None, 35.0, 50.0])
+@pytest.mark.parametrize("second", [None, 35.0, 50.0])
+def test_exif_data_come_before_a_focal_length_that_is_given_also_in_the_cache(
+    first, second, marker, tmp_path
+):
+    image, photo = np.zeros((40, 120, 3), np.uint8), tmp_path / "photo.jpg"
+    image[6:10] = 255
+    exif = b"Exif\0\0" + zj.io.exif_with_focal(35.0)
+    Image.fromarray(image).save(photo, exif=exif, quality=95)
+    for focal in (first, second):
+        [found] = detect([Source("a", photo, focal=focal)], marker, cache=tmp_path / "cache")
+        assert found.focal == 35
 
 
 def test_what_no_detector_can_do_with_an_image_is_told(tmp_path):

@@ -268,6 +268,18 @@ def test_parts_hold_each_line_once_and_never_the_ends(hold_out, lines):
         assert np.unique(parts.fold[parts.unit == unit]).size == 1
 
 
+@pytest.mark.parametrize("hold_out", ["focal", "frame"])
+def test_parting_does_not_depend_on_the_numbers_of_frames(hold_out, lines):
+    order = np.random.default_rng(3).permutation(FOCALS)
+    moved = eqx.tree_at(
+        lambda lines: (lines.frame, lines.focal),
+        lines,
+        (jnp.asarray(np.argsort(order))[lines.frame], lines.focal[order]),
+    )
+    one, other = (folds_of(each, hold_out, 3, 0).fold for each in (lines, moved))
+    np.testing.assert_array_equal(one, other)
+
+
 def test_parting_depends_on_the_seed_alone(lines):
     one, same, other = (folds_of(lines, "line", None, seed).fold for seed in (0, 0, 1))
     np.testing.assert_array_equal(one, same)

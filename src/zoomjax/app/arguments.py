@@ -82,6 +82,7 @@ def read_lines(
     parts = [_read_lines(path, focal, image_size, focal_unit) for path in inputs]
     if len(parts) == 1:
         return parts[0]
+    _refuse_frames_again(inputs, parts)
     from ..fit.concatenation import concatenate
 
     try:
@@ -91,6 +92,28 @@ def read_lines(
         for index, path in reversed([*enumerate(inputs)]):
             told = told.replace(f"parts[{index}]", str(path))
         raise ValueError(told) from error
+
+
+def _refuse_frames_again(inputs: list[Path], parts: "list[Lines]") -> None:
+    """Refuse files of which one holds a frame of another: a copy, or of two results with photos in common.
+
+    Raises:
+        ValueError: the lines of two frames are the same to the last digit of a float32.
+    """
+    import numpy as np
+
+    first: dict[tuple[bytes, ...], tuple[int, int]] = {}
+    for file, part in enumerate(parts):
+        frame, points = np.asarray(part.frame), part.to_ragged()
+        for number in range(len(part.focal)):
+            own = [np.asarray(points[line], np.float32) for line in np.flatnonzero(frame == number)]
+            lines = sorted(line.tobytes() for line in own)
+            earlier, other = first.setdefault(tuple(lines), (file, number))
+            if earlier != file:
+                raise ValueError(
+                    f"{inputs[file]} holds a frame of {inputs[earlier]} again, {number} here and {other} "
+                    "there: its lines would count twice. Give files that have no frames in common."
+                )
 
 
 def results_of(path: str) -> Path | None:

@@ -4,7 +4,6 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import os
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -29,6 +28,7 @@ from .overlay import draw_lines
 from .plane_focals import Sharing
 from .results_folder import OF_A_LENS, results_folder
 from .tying import Bend, tied, to_search_again
+from .usable import OTHER_SIZE, usable_of
 from .verdict import (
     findings_of_edges,
     findings_of_focals,
@@ -281,7 +281,7 @@ def _calibrated(
 ) -> ImageCalibration:
     """The calibration from what was found in all images."""
     unused = {d.name: with_flags(d.problem) for d in detections if d.problem}
-    usable, others = _of_one_size([d for d in detections if not d.problem])
+    usable, others = usable_of(detections)
     unused |= others
     if not usable:
         raise ValueError(nothing_usable(detections))
@@ -362,7 +362,7 @@ def _with_findings(done: ImageCalibration) -> ImageCalibration:
     found = findings_of_focals(done.focals.groups, done.focals.unit) + findings_of_edges(done.used)
     if done.job.video is None:
         found += findings_of_photos(Path(detection.file) for detection in done.used)
-        others = sum(why.startswith(_OTHER_SIZE) for why in done.unused.values())
+        others = sum(why.startswith(OTHER_SIZE) for why in done.unused.values())
         found += findings_of_sizes(others, len(done.used))
     assessment = done.calibration.assessment.joined_by(found)
     return dataclasses.replace(
@@ -373,26 +373,3 @@ def _with_findings(done: ImageCalibration) -> ImageCalibration:
 _NONE_AGREES = (
     "none of its lines is straight under the model fitted to the other images. Check its focal length"
 )
-
-
-_OTHER_SIZE = "its size is"
-
-
-def _of_one_size(detections: Sequence[Detection]) -> tuple[list[Detection], dict[str, str]]:
-    """The images of the most frequent size, and why the others are not used."""
-    if not detections:
-        return [], {}
-    (width, height), _ = Counter(d.image_size for d in detections).most_common(1)[0]
-    others = {}
-    for detection in detections:
-        if detection.image_size == (width, height):
-            continue
-        own = "x".join(map(str, detection.image_size))
-        here = f"{_OTHER_SIZE} {own} px, but most images have {width}x{height}"
-        turned = detection.image_size == (height, width)
-        others[detection.name] = here + (
-            ": it was rotated, so rotate it back"
-            if turned
-            else ": use images as stored by the camera, neither resized nor cropped"
-        )
-    return [d for d in detections if d.image_size == (width, height)], others

@@ -32,6 +32,10 @@ SHARED_BY = ("exif", "folder", "similarity")
 MOST_UNCERTAIN = 0.2
 """Largest standard deviation, relative to the focal length, of an estimate that is used."""
 
+_LEAST_DEPTH = 0.01
+"""Part by which the depth of a grid's nodes differs where it tells a focal length. What the correction and
+cells that are not quite square leave is as large in a view from the front, whatever the noise is."""
+
 _UNLIKELY = 0.01
 """Probability of photos that differ by so much, or more, below which they do not share a focal length."""
 
@@ -210,7 +214,7 @@ def _views(detections: Sequence[Detection], corrections: Sequence[Distortion]) -
     shape = (len(known), most)
     views = _Views(np.zeros((*shape, 2)), np.zeros((*shape, 2)), np.zeros(shape, bool))
     for view, (of, correction) in enumerate(zip(known, corrections, strict=True)):
-        if of is None or not np.isfinite(of[0]).all():
+        if of is None or not np.isfinite(of[0]).all() or not _differ_in_depth(*of):
             continue
         points, places = of
         views.points[view, : len(points)] = points - np.asarray(correction.centre)
@@ -239,5 +243,15 @@ def nodes(detection: Detection, correction: Distortion) -> tuple[np.ndarray, np.
     row, column = np.nonzero(seen)
     if np.unique(row).size < 3 or np.unique(column).size < 3:
         return None
-    corrected = correction.undistort(jnp.asarray(detection.nodes[seen]))
-    return np.asarray(corrected), np.stack([column, row], axis=-1).astype(float)
+    corrected = np.asarray(correction.undistort(jnp.asarray(detection.nodes[seen])))
+    places = np.stack([column, row], axis=-1).astype(float)
+    return corrected, places
+
+
+def _differ_in_depth(points: np.ndarray, places: np.ndarray) -> bool:
+    """Whether some nodes of a grid are farther away than others, by the homography of all."""
+    image, plane = (((of - of.mean(axis=0)) / of.std(axis=0)) for of in (points, places))
+    row, none = np.column_stack([plane, np.ones(len(plane))]), np.zeros((len(plane), 3))
+    table = np.block([[row, none, -image[:, :1] * row], [none, row, -image[:, 1:] * row]])
+    depth = row @ np.linalg.svd(table, full_matrices=False)[2][-1, 6:]
+    return float(np.ptp(depth)) > _LEAST_DEPTH * abs(float(depth.mean()))

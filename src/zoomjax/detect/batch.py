@@ -285,6 +285,8 @@ class _Entries(NamedTuple):
         except (OSError, ValueError) as error:  # reported when it is read
             shown = repr(error).encode()
         lines = "lines" if source.bend is None else f"lines {source.bend}"
+        if source.path is not None and source.focal is not None:  # which its EXIF data come before
+            lines += f" {source.focal}"
         ways = (lines, detector), ("grid", _grid_detector(detector))
         return cls(*(cache / f"{hashlib.sha256(_way(*way) + shown).hexdigest()}.npz" for way in ways))
 
@@ -384,7 +386,7 @@ def _load(file: Path, source: Source) -> Detection | None:
         file=source.file,
         image_size=(width, height),
         lines=tuple(np.split(points, np.cumsum(counts)[:-1])) if counts else (),
-        focal=source.focal or (None if np.isnan(focal) else focal),
+        focal=source.focal if np.isnan(focal) else focal,
         problem=problem,
         unexplained=None if np.isnan(unexplained) else unexplained,
         bend=None if np.isnan(k1) else (k1, k2, x, y),

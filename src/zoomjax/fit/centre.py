@@ -34,10 +34,10 @@ from ..models.zoom import AbstractZoom, PolynomialZoom, with_parameters
 from ._least_squares import Solver, default_solver
 from .compression import compressed_as_measured
 from .covariance import parameter_covariance
-from .energy import AbstractJointZoom, linearised
+from .energy import AbstractJointZoom, counted_frames, linearised
 from .minimise import fit_about, minimised
 from .moved_centre import for_any_centre
-from .prepare import asked_for, ready_model
+from .prepare import asked_for, prepared_for, ready_model
 from .result import RESULTS, FrameFits, ZoomFit, collected, each_of_given, of_given
 from .wrapper import points_of
 
@@ -169,7 +169,7 @@ def fit_centre(
     unfitted = model.zoom.parameters is None
     options = {"algebraic": unfitted, "solver": solver, "max_steps": max_steps, "throw": throw}
     fixed = fit_about(_about(lines, lines.centre, model), ready, **options)
-    offset = (PolynomialZoom(degree=0) if centre is None else centre).prepare(lines.focal, 2)
+    offset = prepared_for(given, PolynomialZoom(degree=0) if centre is None else centre, 2)
     start = _both(fixed.lens.zoom, offset)
     found, each, covariance, std, determined = _search(
         lines, start, solver or default_solver(lines), max_steps
@@ -257,7 +257,10 @@ def _accepted(lines, start, found):
     variance = jnp.einsum("mcp,pq,mcq->mc", by_parameter, covariance, by_parameter)
     std = jnp.sqrt(jnp.where(variance >= 0, variance, jnp.inf))
     distance = jnp.linalg.norm(offsets(found.parameters), axis=1)
-    determined = jnp.all(std <= _MOST_UNCERTAIN) & jnp.all(distance <= _FARTHEST)
+    counted = counted_frames(lines)
+    left_out = ~counted & jnp.any(counted)  # at whatever focal length, the centre there is of no account
+    near = jnp.all(std <= _MOST_UNCERTAIN, axis=1) & (distance <= _FARTHEST)
+    determined = jnp.all(near | left_out)
     parameters = jax.tree.map(
         lambda new, old: jnp.where(determined, new, old), found.parameters, start.parameters
     )

@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ..lines.base import AbstractLines, SomeLines
 from ..models.family import AbstractFamily
@@ -13,6 +14,7 @@ from ..models.zoom import AbstractZoom
 from .defaults import DEFAULT_ZOOM
 from .energy import settings
 from .family_lines import with_family
+from .own_weights import frames_that_count
 
 
 def asked_for(
@@ -38,15 +40,35 @@ def asked_for(
 
 
 def ready_model(lines: AbstractLines, model: Model) -> Model:
-    """The model ready to be fitted to these lines, in their dtype.
+    """The model ready to be fitted to these lines, in their dtype: for the frames that count.
 
     Raises:
         ValueError: the zoom model needs more focal lengths, or the focus, which the lines do not have.
     """
-    focal, *focus = settings(model.zoom, lines)
-    prepared = model.zoom.prepare(focal, model.size, *focus)  # complains of too few focal lengths
+    prepared = prepared_for(lines, model.zoom, model.size)  # complains of too few focal lengths
     if model.zoom.parameters is None:
         return model.with_zoom(prepared)
     dtype = jnp.asarray(lines.focal).dtype
     arrays, rest = eqx.partition(model.zoom, eqx.is_inexact_array)
     return model.with_zoom(eqx.combine(jax.tree.map(lambda array: array.astype(dtype), arrays), rest))
+
+
+def prepared_for(lines: AbstractLines, zoom: AbstractZoom, size: int) -> AbstractZoom:
+    """A zoom model of so many coefficients, for the frames that count, or for all, if those are too few.
+
+    From others, such as photos left out for a wrong focal length, it takes neither its reference, which a
+    prior is about, nor knots, which the lines would not determine.
+
+    Raises:
+        ValueError: all are too few, or the model needs the focus, which the lines do not have.
+    """
+    focal, *focus = settings(zoom, lines)
+    counted = frames_that_count(lines)
+    if counted is not None:
+        try:
+            return zoom.prepare(
+                np.asarray(focal)[counted], size, *(np.asarray(of)[counted] for of in focus)
+            )
+        except ValueError:  # the fit of all then says that it is not determined
+            pass
+    return zoom.prepare(focal, size, *focus)

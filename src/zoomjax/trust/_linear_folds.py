@@ -23,12 +23,13 @@ import numpy as np
 from .._core.programs import light_program
 from ..fit.energy import prior_jacobian, settings
 from ..fit.image_metric import LEAST_STRETCH, ImageLines, in_corrected
+from ..fit.own_weights import counts_of, own_weights
 from ..lines.buckets import bucketed_jit, padded_frames
 from ..models.zoom import (
     AbstractPriorZoom,
     with_parameters,
 )
-from .folds import LineErrors, counts_of, own_weights
+from .folds import LineErrors
 
 _MOST_STEPS = 40  # of Gauss-Newton: from the fit of all lines it takes 1 to 3, from zero 4 to 8
 

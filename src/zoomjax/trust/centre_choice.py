@@ -6,10 +6,11 @@ import numpy as np
 
 from ..fit.centre import CentreFit, fit_centre, refit_centre
 from ..fit.energy import line_squares
+from ..fit.own_weights import own_weights
 from ..lines.base import AbstractLines
 from ..models.model import Model
 from .cross_validation import errors_of
-from .folds import folds_of, own_weights, shares
+from .folds import folds_of, shares
 
 _FOLDS = 5
 

@@ -16,6 +16,7 @@ from ..fit.compression import compressed_as_measured
 from ..fit.energy import line_squares, line_squares_by_frame, settings
 from ..fit.frames import fit_frames
 from ..fit.image_metric import in_corrected, measured_as
+from ..fit.own_weights import own_weights
 from ..fit.prepare import asked_for, ready_model
 from ..fit.result import RESULTS
 from ..fit.wrapper import AbstractWrapper
@@ -25,7 +26,7 @@ from ..lines.compressed import CompressedLines
 from ..models.model import Model
 from ..models.zoom import AbstractLinearZoom, AbstractZoom
 from ._linear_folds import Design, Lanes, as_given, cross_validated, lanes_of, linear_errors
-from .folds import Folds, HoldOut, LineErrors, folds_of, own_weights, shares, small_lines
+from .folds import Folds, HoldOut, LineErrors, folds_of, shares, small_lines
 
 
 @kinds_checked

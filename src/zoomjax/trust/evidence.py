@@ -37,6 +37,7 @@ from ..fit.energy import (
 )
 from ..fit.family_lines import compress_family
 from ..fit.image_metric import measured_as
+from ..fit.own_weights import counts_of, own_weights
 from ..fit.result import ZoomFit
 from ..fit.same_camera import check_lines_of, placed_as
 from ..fit.wrapper import about_own_centre
@@ -48,7 +49,6 @@ from ..models.sizes import at_focal
 from ..models.zoom import AbstractZoom, with_parameters
 from ._bending import bending
 from .bands import displacement_std
-from .folds import counts_of, own_weights
 from .vanishing import VanishingPoints, vanishing_points
 
 _CURVE = 5

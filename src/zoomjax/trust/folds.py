@@ -7,11 +7,10 @@ from jaxtyping import Float
 
 from .._core.checks import checked_integer
 from ..fit.compression import compressed
+from ..fit.own_weights import own_weights
 from ..fit.wrapper import AbstractWrapper
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
-from ..lines.lines import Lines
-from ..lines.triangles import AbstractTriangles
 
 HoldOut = Literal["focal", "frame", "line"]
 
@@ -99,7 +98,9 @@ def folds_of(lines: AbstractLines, hold_out: HoldOut, folds: int | None, seed: i
     there = np.unique(frame[counted])
     if hold_out == "frame":
         number, needed = len(there), "two or more frames"
-        place = np.searchsorted(there, frame)
+        place = np.full(len(focal), -1)
+        place[there[np.argsort(focal[there], kind="stable")]] = np.arange(number)  # however numbered
+        place = place[frame]
     else:
         distinct = np.unique(focal[there])
         number, needed = (
@@ -129,20 +130,3 @@ def focals_there(lines: AbstractLines) -> Float[np.ndarray, "some"]:
     """The distinct focal lengths of frames of which a line counts."""
     counted = own_weights(lines) > 0
     return np.unique(np.asarray(lines.focal)[np.asarray(lines.frame)[counted]])
-
-
-def own_weights(lines):
-    """The weight of each line; 0 for those of too few points to count."""
-    own = np.ones(lines.frame.shape) if lines.weight is None else np.asarray(lines.weight, float)
-    return np.where(counts_of(lines) > 2, own, 0)
-
-
-def counts_of(lines):
-    """Numbers of points, in NumPy where it can be: of what JAX does once, most is compiling."""
-    while isinstance(lines, AbstractWrapper):
-        lines = lines.lines
-    if isinstance(lines, Lines):
-        return np.asarray(lines.mask).sum(axis=1).astype(float)
-    if not isinstance(lines, AbstractTriangles):
-        return np.asarray(lines.counts)
-    return np.round(np.asarray(lines.triangle)[:, 0, 0].astype(float) ** 2)

@@ -29,6 +29,7 @@ from .._core.types import of_known_values
 from ..fit.compression import compressed_as_measured
 from ..fit.energy import frame_coefficients, frame_normal_equations
 from ..fit.image_metric import in_corrected, measured_as
+from ..fit.own_weights import own_weights
 from ..fit.result import ZoomFit
 from ..fit.same_camera import check_lines_of, placed_as
 from ..lines.base import AbstractLines
@@ -36,7 +37,7 @@ from ..lines.compressed import CompressedLines
 from ..models.polynomial import RadialPolynomial
 from ..models.requirements import check
 from ._linear_folds import lanes_of, passed
-from .folds import own_weights, small_lines
+from .folds import small_lines
 
 _FEWEST = 8
 """Frames: with fewer, the misfit cannot be told from errors of single photos, and counts as these."""

@@ -24,6 +24,7 @@ from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
 from ..fit.energy import counted_frames, line_residuals, line_weights, linearised, number_counted
 from ..fit.family_lines import with_family
+from ..fit.own_weights import own_weights
 from ..fit.result import ZoomFit
 from ..fit.same_camera import check_lines_of
 from ..lines.base import AbstractLines
@@ -32,7 +33,6 @@ from ..models.requirements import check
 from ..models.sizes import at_focal
 from ..models.zoom import with_parameters
 from .bands import displacement_std
-from .folds import own_weights
 
 _FOCALS = 5  # over the range, evenly in 1/f
 _DIRECTIONS = ("horizontal", "vertical")

@@ -19,11 +19,11 @@ from scipy.special import bdtrc
 
 from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
+from ..fit.own_weights import own_weights
 from ..fit.same_camera import check_camera
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
-from .folds import own_weights
 
 _PHOTOS = 12  # evenly spread over the focal lengths
 _MOST_LINES = 100  # of a photo, the longest

@@ -1,0 +1,47 @@
+"""Weights of lines as they are given, and the frames that count by them.
+
+In NumPy where it can be: of what JAX does once, most is compiling.
+"""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .._core.types import traced
+from ..lines.base import AbstractLines
+from ..lines.lines import Lines
+from ..lines.triangles import AbstractTriangles
+from .wrapper import AbstractWrapper
+
+
+def own_weights(lines: AbstractLines) -> Float[np.ndarray, "line"]:
+    """The weight of each line; 0 for those of too few points to count."""
+    own = np.ones(lines.frame.shape) if lines.weight is None else np.asarray(lines.weight, float)
+    return np.where(counts_of(lines) > 2, own, 0)
+
+
+def counts_of(lines: AbstractLines) -> Float[np.ndarray, "line"]:
+    """Numbers of points."""
+    inside: Any = lines
+    while isinstance(inside, AbstractWrapper):
+        inside = inside.lines
+    if isinstance(inside, Lines):
+        return np.asarray(inside.mask).sum(axis=1).astype(float)
+    if not isinstance(inside, AbstractTriangles):
+        return np.asarray(inside.counts)
+    return np.round(np.asarray(inside.triangle)[:, 0, 0].astype(float) ** 2)
+
+
+def frames_that_count(lines: AbstractLines) -> Bool[np.ndarray, "frame"] | None:
+    """The frames of which a line counts. None where all do, or none, or nobody can tell here and now."""
+    if lines.weight is None or traced(lines) or not all(map(_here, jax.tree.leaves(lines))):
+        return None
+    counted = np.zeros(len(lines.focal), bool)
+    counted[np.asarray(lines.frame)[own_weights(lines) > 0]] = True
+    return None if counted.all() or not counted.any() else counted
+
+
+def _here(array: Any) -> bool:
+    return not isinstance(array, jax.Array) or array.is_fully_addressable
