@@ -36,6 +36,17 @@ def test_terms_are_those_asked_for(ragged, terms):
     np.testing.assert_array_equal(small.counts, ragged.counts)
 
 
+def test_what_more_terms_need_is_left_out_for_fewer(ragged, small):
+    """And fits of fewer coefficients do so: to the last digit they are those of lines made for these."""
+    wide = zj.lines.compress_any_centre(ragged, 3)
+    np.testing.assert_allclose(wide.for_terms(2).triangle, small.triangle, rtol=1e-9, atol=1e-12)
+    assert small.for_terms(3) is small
+    model = {"zoom": zj.PolynomialZoom(degree=0), "throw": False}
+    found, expected = (zj.fit.fit_centre(lines, terms=2, **model) for lines in (wide, wide.for_terms(2)))
+    np.testing.assert_array_equal(found.fit.lens.centre, expected.fit.lens.centre)
+    np.testing.assert_array_equal(found.fit.lens.zoom.parameters, expected.fit.lens.zoom.parameters)
+
+
 @pytest.mark.parametrize("centre", CENTRES)
 def test_about_a_centre_it_is_the_compression_there(ragged, small, centre):
     there, expected = small.about(centre), zj.compress(about(ragged, centre))

@@ -197,7 +197,8 @@ def refit_centre(lines: AbstractLines, found: CentreFit) -> AbstractZoom:
     if centre is None:
         offset = (lens.centre - jnp.asarray(lines.centre))[None] / lens.scale
         centre = with_parameters(PolynomialZoom(degree=0).prepare(lines.focal, 2), offset)
-    joint, *_ = _search(bucketed(lines), _both(lens.zoom, centre), default_solver(lines), 256)
+    lines = for_any_centre(bucketed(lines), lens(lens.focal_range[0]).coefficients.shape[-1])
+    joint, *_ = _search(lines, _both(lens.zoom, centre), default_solver(lines), 256)
     return joint
 
 

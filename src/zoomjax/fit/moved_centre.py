@@ -87,7 +87,9 @@ def for_any_centre(lines: AbstractLines, terms: int) -> AbstractLines:
     check("fit_centre", family=lines.family)
     if isinstance(lines, ImageLines):
         return in_image(for_any_centre(lines.as_weighted(), terms))
-    if isinstance(lines, AnyCentreLines | MovedLines):
+    if isinstance(lines, AnyCentreLines):
+        return lines.for_terms(terms)
+    if isinstance(lines, MovedLines):
         return lines
     if isinstance(lines, Lines):
         return compress_any_centre(lines, terms)

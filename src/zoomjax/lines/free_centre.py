@@ -56,6 +56,13 @@ class AnyCentreLines(AbstractTriangles):
         """The largest number of coefficients N for which these triangles are valid."""
         return (round((8 * self.triangle.shape[-1] + 1) ** 0.5) - 5) // 4
 
+    def for_terms(self, terms: int) -> "AnyCentreLines":
+        """The same lines for no more coefficients than these, which takes less work."""
+        size = (2 * terms + 2) * (2 * terms + 3) // 2  # monomials are ordered by degree: the first ones
+        if size >= self.triangle.shape[-1]:
+            return self
+        return eqx.tree_at(lambda lines: lines.triangle, self, self.triangle[:, :size, :size])
+
     def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
         """Rows, px, with the scatter of the corrected points about their mean.
 
