@@ -358,13 +358,45 @@ def test_a_camera_that_stands_still_tells_nothing_of_its_shutter(lens, path):
     assert fit.readout_std > 0.4
 
 
-def test_a_pupil_off_the_axis_is_seen_and_drift_is_none(lens, path, fit):
-    seen = fit_motion(tracked(lens, path, noise=0.3, pupil=0.3).tracks)
-    true = np.std(0.3 / np.linalg.norm(tracked(lens, path, pupil=0.3).points, axis=1))
-    assert seen.parallax_score > 3
-    assert seen.parallax == pytest.approx(true, rel=0.4)
+@pytest.fixture(scope="module")
+def off_axis(lens, path):
+    return tracked(lens, path, noise=0.3, pupil=0.3)
+
+
+@pytest.fixture(scope="module")
+def with_levers(off_axis):
+    return fit_motion(off_axis.tracks)
+
+
+def test_a_pupil_off_the_axis_is_seen_and_drift_is_none(lens, path, fit, off_axis, with_levers):
+    true = np.std(0.3 / np.linalg.norm(off_axis.points, axis=1))
+    assert with_levers.parallax_score > 3
+    assert with_levers.parallax == pytest.approx(true, rel=0.4)
     assert fit.parallax_score < 3
     assert fit_motion(tracked(lens, path, noise=0.3, drift=0.1).tracks).parallax_score < 3
+
+
+def test_near_points_that_move_otherwise_are_allowed_for(fit, off_axis, with_levers, monkeypatch):
+    true = 0.3 / np.linalg.norm(off_axis.points, axis=1)
+    assert with_levers.lever_std == pytest.approx(np.std(true), rel=0.3)
+    assert np.corrcoef(with_levers.lever, true)[0, 1] > 0.5
+    monkeypatch.setattr("zoomjax.fit._motion_stages.is_seen", lambda *_: False)
+    without = fit_motion(off_axis.tracks)
+    assert with_levers.noise == pytest.approx(float(fit.noise), rel=0.05)
+    assert without.noise > 1.08 * with_levers.noise
+    assert not without.lever.any()
+    assert without.lever_std == 0
+
+
+def test_what_all_levers_have_in_common_is_in_the_bands(path, fit, with_levers):
+    # Seen by all alike it looks like a longer lens: by that share, whatever the frame.
+    common = 3 * float(with_levers.lever_std)
+    std = np.asarray(with_levers.focal_std) / np.asarray(with_levers.focal)
+    alone = np.sqrt(std**2 - common**2)
+    assert np.isfinite(alone).all()
+    assert np.sqrt(with_levers.covariance[-1, -1]) == pytest.approx(np.mean(std), rel=0.1)
+    assert abs(np.mean(np.asarray(with_levers.focal) / path[0] - 1)) < 3 * np.mean(std)
+    assert fit.lever_std == 0
 
 
 @pytest.mark.parametrize("shared", [{"pupil": 0.3}, {"drift": 0.2}])
@@ -412,8 +444,10 @@ def test_tracks_of_short_clips_stay_whole_and_of_long_ones_do_not(frames, life, 
 
 
 @pytest.mark.slow
-def test_derivatives_are_those_of_the_minimum(noisy, lines):
+@pytest.mark.parametrize("scene", ["noisy", "off_axis"])
+def test_derivatives_are_those_of_the_minimum(scene, lines, request):
     """Newton's method from the fit gives the minimum for other points, with the noise held."""
+    noisy = request.getfixturevalue(scene)
     asked = Asked(PolynomialZoom(), RadialPolynomial(), 2, PolynomialZoom(degree=1), None)
     given = Given(noisy.tracks, lines, None, None, None)
     _, model, noise = _fitted(given, asked, True)

@@ -11,8 +11,9 @@ from zoomjax.fit._schur import Rows, Schur, Unknowns, covariances, reduced
 from zoomjax.fit._structure import structure_of
 
 
-def problem(rng, frames, tracks, longest):
+def problem(rng, frames, tracks, longest, levers=False):
     """Rows that depend linearly on their frame, their ray and the lens, at random."""
+    own = 3 if levers else 2
     first = rng.integers(0, frames - 1, tracks)
     count = np.minimum(rng.integers(2, longest + 1, tracks), frames - first)
     track = np.repeat(np.arange(tracks), count)
@@ -20,23 +21,25 @@ def problem(rng, frames, tracks, longest):
     line_frame = rng.integers(0, frames, 12)
     structure = structure_of(track, frame, frames, line_frame=line_frame)
     line_of_frame, line_of_lens = (rng.normal(size=(12, 5, n)) for n in (4, 3))
-    of_frame, of_ray, of_lens = (rng.normal(size=(len(track), 2, n)) for n in (4, 2, 3))
+    of_frame, of_ray, of_lens = (rng.normal(size=(len(track), 2, n)) for n in (4, own, 3))
     about, with_lens = rng.uniform(0.5, 2, (frames, 4)), rng.normal(size=(frames, 4, 3))
 
     def jacobian(x):
         views = jnp.einsum("vij,vj->vi", of_frame, x.frames[frame])
         views += jnp.einsum("vij,vj->vi", of_ray, x.rays[track]) + of_lens @ x.lens[0]
         lines = jnp.einsum("lij,lj->li", line_of_frame, x.frames[line_frame]) + line_of_lens @ x.lens[0]
-        return Rows(views, lines, about * x.frames + with_lens @ x.lens[0], x.lens[0] / 3)
+        known = 0.7 * x.rays[:, 2:] if levers else None
+        return Rows(views, lines, about * x.frames + with_lens @ x.lens[0], x.lens[0] / 3, known)
 
-    like = Unknowns(jnp.zeros((frames, 4)), jnp.zeros((tracks, 2)), (jnp.zeros(3), None))
+    like = Unknowns(jnp.zeros((frames, 4)), jnp.zeros((tracks, own)), (jnp.zeros(3), None))
     rows = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), jacobian(like))
     return jacobian, rows, like, structure
 
 
+@pytest.mark.parametrize("levers", [False, True])
 @pytest.mark.parametrize(("frames", "longest"), [(30, 5), (9, 9), (3, 2), (17, 8)])
-def test_steps_are_those_of_dense_least_squares(rng, frames, longest):
-    jacobian, rows, like, structure = problem(rng, frames, 40, longest)
+def test_steps_are_those_of_dense_least_squares(rng, frames, longest, levers):
+    jacobian, rows, like, structure = problem(rng, frames, 40, longest, levers)
     flat, unravel = ravel_pytree(like)
     dense = jax.jacfwd(lambda x: ravel_pytree(jacobian(unravel(x)))[0])(flat)
     damping = 0.3
@@ -54,8 +57,9 @@ def test_steps_are_those_of_dense_least_squares(rng, frames, longest):
     np.testing.assert_allclose(ravel_pytree(found)[0], expected, atol=1e-9)
 
 
-def test_covariances_are_blocks_of_the_dense_inverse(rng):
-    jacobian, rows, like, structure = problem(rng, 21, 60, 6)
+@pytest.mark.parametrize("levers", [False, True])
+def test_covariances_are_blocks_of_the_dense_inverse(rng, levers):
+    jacobian, rows, like, structure = problem(rng, 21, 60, 6, levers)
     flat, unravel = ravel_pytree(like)
     dense = np.asarray(jax.jacfwd(lambda x: ravel_pytree(jacobian(unravel(x)))[0])(flat))
     inverse = np.linalg.inv(dense.T @ dense)

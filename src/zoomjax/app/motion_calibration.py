@@ -41,8 +41,7 @@ more is hardly noise. Much moves by itself, or what is seen is no camera that tu
 _MISSED = 9.0  # times the noise, squared: views beyond do not follow the model
 _FEW = 0.3  # of the views that do follow it: below, most of what is seen may move by itself
 _MANY = 9.0  # focal lengths, more than any model needs
-_SURE = 3.0  # times chance: of a parallax
-_NEARLY_NONE, _HARMLESS = 1e-4, 5e-4  # of the pupil's offset over distances: its standard deviation
+_HARMLESS = 5e-4  # of the pupil's offset over distances: its standard deviation, by the test
 _WORTH = 0.03  # share of more views for which it is fitted again
 _LEAST_ZOOM = 1.2  # between the ends of the focal lengths
 
@@ -140,14 +139,14 @@ class MotionCalibration:
             )
 
     def _of_parallax(self) -> Iterator[Finding]:
-        size, score = float(self.fit.parallax), float(self.fit.parallax_score)
-        if score > _SURE and size > _NEARLY_NONE:
+        if (spread := float(self.fit.lever_std)) > 0:
             yield Finding(
                 "parallax",
-                "doubtful" if size > _HARMLESS else "good",
+                "doubtful" if float(self.fit.parallax) > _HARMLESS else "good",
                 "near points move otherwise than far ones as the camera turns, by a share of "
-                f"{size:.2%}: its entrance pupil is off the axis of rotation. Focal lengths may be off by "
-                "a few times that, and the lens with them.",
+                f"{spread:.2%}: its entrance pupil is off the axis of rotation. That is allowed for, but "
+                "what all points have in common looks like a lens: focal lengths may be off by a few times "
+                "that share, and the lens with them. The bands allow for three times.",
                 "Turn the camera about its entrance pupil, or film what is farther away.",
             )
 

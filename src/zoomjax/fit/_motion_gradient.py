@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.sparse.linalg import cg
 
-from ._motion_rows import Data, Model, Noise, Stage, moved, rows_of, units_of
+from ._motion_model import Data, Model, Noise, Stage, moved, units_of
+from ._motion_rows import rows_of
 from ._motion_stages import STAGES
 from ._schur import Unknowns, reduced, solution_of
 

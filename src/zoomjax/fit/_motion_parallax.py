@@ -11,15 +11,30 @@ give both alike, and what it has is subtracted.
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._motion_rows import Data, Model, Noise, moved, residuals_of, units_of
+from ._motion_model import Data, Model, Noise, moved, units_of
+from ._motion_rows import residuals_of
 from ._schur import Unknowns
+from ._views import FAR
 
 _WILD = 5.0  # standard deviations, of a slope that is no chance: of a thing that moves
 _FEWEST = 20  # tracks
+_ROUNDS = 8
+
+SURE = 3.0
+"""Standard deviations of chance from which a parallax is seen."""
+
+NEARLY_NONE = 1e-4
+"""e/D, the standard deviation over tracks below which nothing comes of a parallax."""
+
+
+def is_seen(parallax: float | Array, score: float | Array) -> bool:
+    """Whether the tracks tell a parallax that is worth a word."""
+    return bool((score > SURE) & (parallax > NEARLY_NONE))
 
 
 class _Slopes(NamedTuple):
@@ -40,18 +55,11 @@ def parallax_of(
         noise: of the residuals.
         inlier: views that count.
     """
-    tracks, track = data.structure.tracks, data.structure.track
-    none = jnp.zeros(tracks)
-    missed, pattern = jax.jvp(lambda lever: residuals_of(data, model, lever), (none,), (none + 1,))
-    turned = jnp.stack([-pattern[:, 1], pattern[:, 0]], axis=1)
-    own = _by_rays(data, model, noise)
-    there = inlier[:, None]
+    views, turned = _patterns(data, model, noise, inlier)
     basis = _smooth(data, model, inlier)
 
-    def variance(pattern):
-        views = [jnp.where(there, of, 0) for of in (missed, pattern, *own)]
-        slopes = _slopes(views, noise, track, tracks)
-        slopes = _rough(slopes, basis)
+    def variance(views):
+        slopes = _rough(_slopes(views, noise, data.structure), basis)
         usual = (slopes.weight > 0) & (slopes.value**2 < _WILD**2)
         weight = jnp.where(usual, slopes.weight**2, 0)
         total, more = jnp.sum(weight**2), jnp.where(usual, slopes.value**2 - 1, 0)
@@ -59,10 +67,55 @@ def parallax_of(
         scatter = jnp.sum((weight * (more - excess * weight)) ** 2) / total**2
         return excess, scatter, jnp.sum(usual)
 
-    (along, one, count), (across, two, _) = variance(pattern), variance(turned)
+    (along, one, count), (across, two, _) = variance(views), variance(turned)
     few = count < _FEWEST
     found, std = along - jnp.maximum(across, 0), jnp.sqrt(one + two)
     return jnp.where(few, jnp.nan, found), jnp.where(few, jnp.nan, std)
+
+
+@eqx.filter_jit
+def spread_of(
+    data: Data, model: Model, noise: Noise, missed: Float[Array, "view"], least: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Standard deviation over the tracks of e/D where it is seen; at least the square root of the test's.
+
+    The test weighs tracks, and drops wild ones, as if there were no parallax. Here both are by how much
+    slopes vary with noise and parallax, from round to round.
+
+    Args:
+        data: the tracks.
+        model: fitted to them without levers.
+        noise: of the residuals.
+        missed: sizes of the residuals, px.
+        least: the test's standard deviation.
+    """
+    inlier = data.there & (missed < FAR * noise.points)
+    views, turned = _patterns(data, model, noise, inlier)
+    both = [_slopes(of, noise, data.structure) for of in (views, turned)]
+    basis = _smooth(data, model, inlier)
+
+    def excess(slopes, variance):
+        total = 1 + variance * slopes.weight**2
+        scaled = _Slopes(slopes.value / jnp.sqrt(total), slopes.weight / jnp.sqrt(total))
+        value, weight = _rough(scaled, basis)
+        weight = jnp.where(value**2 < _WILD**2, weight**2, 0)
+        return jnp.sum(weight * (value**2 - 1 / total)) / jnp.sum(weight**2)
+
+    def again(variance, _):
+        along, across = (excess(slopes, variance) for slopes in both)
+        return jnp.maximum(along - jnp.maximum(across, 0), least**2), None
+
+    return jnp.sqrt(jax.lax.scan(again, least**2, None, length=_ROUNDS)[0])
+
+
+def _patterns(data, model, noise, inlier):
+    """Residuals, how they change with levers, and with the numbers of rays; and the same turned."""
+    none = jnp.zeros(data.structure.tracks)
+    missed, pattern = jax.jvp(lambda lever: residuals_of(data, model, lever), (none,), (none + 1,))
+    turned = jnp.stack([-pattern[:, 1], pattern[:, 0]], axis=1)
+    own = _by_rays(data, model, noise)
+    there = inlier[:, None]
+    return [[jnp.where(there, of, 0) for of in (missed, to, *own)] for to in (pattern, turned)]
 
 
 def _by_rays(data, model, noise):
@@ -77,9 +130,10 @@ def _by_rays(data, model, noise):
     return [jax.jvp(seen, (still.rays,), (direction,))[1] for direction in along]
 
 
-def _slopes(views, noise, track, tracks):
+def _slopes(views, noise, structure):
     """Of residuals along a pattern, where rays are free: a Gauss-Newton step of each track."""
     missed, pattern, first, second = views
+    tracks, track = structure.tracks, structure.track
 
     def dot(one, other):
         return jax.ops.segment_sum(jnp.sum(one * other, axis=1), track, tracks)

@@ -15,7 +15,7 @@ from ..models.family import AbstractFamily
 from ..models.requirements import check
 from ..models.zoom import AbstractZoom
 from ..tracks.tracks import Tracks
-from ._motion_rows import Data
+from ._motion_model import Data
 from ._structure import bucket, padded, structure_of
 
 _READOUT = (0.0, 0.5)

@@ -26,8 +26,9 @@ import scipy.sparse.csgraph
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
-from ._motion_rows import Data, Model, Noise, Stage, line_planes_of, rows_of, units_of
-from ._schur import Reduced, Unknowns, columns, lens_equations, reduced
+from ._motion_model import Data, Model, Noise, Stage, units_of
+from ._motion_rows import line_planes_of, rows_of
+from ._schur import Reduced, Rows, Unknowns, columns, lens_equations, reduced
 from ._structure import Structure
 
 _NEAR = 0.01
@@ -70,13 +71,13 @@ def repeated(
 
 
 def common_errors_of(
-    jacobian: Any, pull: Float[Array, "view 2"], matrix: Reduced, like: Unknowns, structure: Structure
+    jacobian: Any, pull: Rows, matrix: Reduced, like: Unknowns, structure: Structure
 ) -> Float[Array, ""]:
     """The mean square of how tracks pull at the lens, over what independent views of noise 1 would do.
 
     Args:
         jacobian: of the rows by the unknowns.
-        pull: of each view, the derivative of its loss by its residual.
+        pull: of each view, and of what is known of each ray, the derivative of its loss by its residual.
         matrix: the normal equations.
         like: the unknowns' shapes.
         structure: which track and frame each view belongs to.
@@ -91,12 +92,13 @@ def common_errors_of(
         return jax.ops.segment_sum(products, structure.track, structure.tracks)
 
     with_rays = jnp.einsum("tpi,tij->tpj", of_tracks(effect, by_ray.views), matrix.rays[0])
-    of_rays = jnp.concatenate(
-        [of_tracks(by_ray.views, effect), of_tracks(by_ray.views, pull[..., None])], -1
-    )
+    pull_ray = of_tracks(by_ray.views, pull.views[..., None])
+    if by_ray.rays is not None and pull.rays is not None:
+        pull_ray = pull_ray + jnp.einsum("tki,tk->ti", by_ray.rays, pull.rays)[..., None]
+    of_rays = jnp.concatenate([of_tracks(by_ray.views, effect), pull_ray], -1)
     less = with_rays @ of_rays
     told = of_tracks(effect, effect) - less[..., :-1]
-    score = of_tracks(effect, pull[..., None])[..., 0] - less[..., -1]
+    score = of_tracks(effect, pull.views[..., None])[..., 0] - less[..., -1]
     return _more_than_chance(score, told, information)
 
 

@@ -1,5 +1,6 @@
 """The stages of `fit_motion`: from a start to the fit, and what is known about it."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -11,24 +12,20 @@ from jax.flatten_util import ravel_pytree
 
 from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
-from ._motion_parallax import parallax_of
+from ._motion_levers import common_lever, told_levers
+from ._motion_model import Levers, Model, Noise, Speed, Stage, moved, speed_of, units_of
+from ._motion_parallax import is_seen, parallax_of, spread_of
 from ._motion_repeated import common_errors_of, groups_of, repeated
 from ._motion_rows import (
     WRONG_LINE,
-    Model,
-    Noise,
-    Speed,
-    Stage,
     about_frames,
     about_lens,
+    about_rays,
     averaged,
     line_residuals_of,
     line_squares_of,
-    moved,
     residuals_of,
     rows_of,
-    speed_of,
-    units_of,
     weighed,
 )
 from ._motion_start import STARTS
@@ -104,7 +101,15 @@ def in_stages(data, paths, spreads, zoom, shift, family, terms, shot):
         noise = noise._replace(repeated=jnp.maximum(noise.repeated * more, 1.0))
         model, noise, weighted_by, result, steps = _settled(data, model, noise)
     free = _arrays(STAGES[-1]._replace(own=_FREE))
-    return *_described(data, model, noise, free, result, steps), *_arrays((model, weighted_by))
+    parts, missed = _described(data, model, noise, free, result, steps)
+    if is_seen(parts["parallax"], parts["parallax_score"]):
+        spread = spread_of(data, model, _arrays(noise), missed, parts["parallax"])
+        levers = Levers(jnp.zeros(data.structure.tracks), spread)
+        model = dataclasses.replace(model, levers=levers)
+        model, noise, weighted_by, result, steps = _settled(data, model, noise)
+        described, missed = _described(data, model, noise, free, result, steps)
+        parts = parts | described
+    return parts, missed, *_arrays((model, weighted_by))
 
 
 def _settled(data, model, noise):
@@ -198,6 +203,7 @@ def _described(data, model, noise, stage, result, steps):
             weighed(data, noise, jnp.where(good[:, None], lines, 0)),
             about_frames(data, there.path, unknowns, steps, stage),
             about_lens(data, there, unknowns, stage),
+            about_rays(there),
         )
 
     missed = residuals_of(data, model)
@@ -212,14 +218,19 @@ def _described(data, model, noise, stage, result, steps):
     unit = units.frames[:, 0]
     log_variance = own[:, 0, 0] * unit**2 + 2 * both[:, 0, -1] * unit * of_lens[-1] + lens[-1, -1]
     count = 2 * jnp.sum(inlier)
-    free = count / (count - data.unknowns - len(lens))
+    free = count / (count - data.unknowns - len(lens) - told_levers(model, matrix, units))
     flat = jnp.where(inlier, 1 / (1 + squared), 0)  # of the loss: its slope over the residual
     pull = flat[:, None] * missed / noise.points
-    common = common_errors_of(jacobian, pull, matrix, zeros, data.structure)
+    common = common_errors_of(jacobian, rows._replace(views=pull), matrix, zeros, data.structure)
     common = common / jnp.mean(flat**2, where=inlier) ** 2 / (_INFLATION * free)
     inflation = _INFLATION * free * jnp.where(common > _AS_GOOD, common, 1)
     zoom_size = ravel_pytree(model.zoom.parameters)[0].size
-    joint, log_std = lens[:-2, :-2] * inflation, jnp.sqrt(log_variance * inflation)
+    lens, log_variance = lens * inflation, log_variance * inflation
+    if model.levers is not None:
+        common = common_lever(model, jacobian, units, data.structure)
+        lens = lens + jnp.outer(common.lens, common.lens)
+        log_variance = log_variance + common.log_focal**2
+    joint, log_std = lens[:-2, :-2], jnp.sqrt(log_variance)
     focal = jnp.exp(model.path.log_focal)
     unseen = jnp.zeros(frames).at[data.structure.frame].add(1.0 * data.there) == 0
     fitted = ZoomLens(
@@ -251,18 +262,19 @@ def _described(data, model, noise, stage, result, steps):
         rms_unconstrained=rms,
         joint=None if model.shift is None else joint,
     )
-    parallax, parallax_std = parallax_of(data, model, noise, inlier)
     parts = {
         "fit": fit,
         "focal": jnp.where(unseen, jnp.nan, focal),
         "focal_std": jnp.where(unseen, jnp.nan, focal * log_std),
-        "covariance": lens * inflation,
+        "covariance": lens,
         "rotation": model.path.rotation,
         "noise": noise.points * jnp.sqrt(free),
         "line_noise": noise.lines if len(good) else jnp.asarray(jnp.nan),
         "readout": model.readout,
-        "readout_std": jnp.sqrt(lens[-2, -2] * inflation),
-        "parallax": jnp.sqrt(jnp.maximum(parallax, 0)),
-        "parallax_score": parallax / parallax_std,
+        "readout_std": jnp.sqrt(lens[-2, -2]),
     }
+    if model.levers is None:
+        parallax, parallax_std = parallax_of(data, model, noise, inlier)
+        parts["parallax"] = jnp.sqrt(jnp.maximum(parallax, 0))
+        parts["parallax_score"] = parallax / parallax_std
     return parts, jnp.linalg.norm(missed, axis=-1)

@@ -1,10 +1,10 @@
 """Linear least squares for many frames, many rays and one lens, in time that is linear in the frames.
 
-Each row belongs to one view: it depends on the four numbers of its frame, on the two of its ray, and on the
-lens; or to a line of a frame, and depends on no ray. Rays are eliminated point by point (Schur complement).
-What is left couples frames that see a common ray. With frames in blocks as long as the longest track, only
-neighbouring blocks are coupled, and a block Cholesky factorisation goes from block to block; the lens is a
-border of few columns.
+Each row belongs to one view: it depends on the four numbers of its frame, on the two or three of its ray,
+and on the lens; or to a line of a frame, and depends on no ray; or to a ray alone. Rays are eliminated
+point by point (Schur complement). What is left couples frames that see a common ray. With frames in blocks
+as long as the longest track, only neighbouring blocks are coupled, and a block Cholesky factorisation goes
+from block to block; the lens is a border of few columns.
 
 Normal equations square the condition of the problem: float64 only.
 """
@@ -26,12 +26,12 @@ class Unknowns(NamedTuple):
 
     Attributes:
         frames: four numbers a frame: log f, and a rotation vector.
-        rays: two numbers a ray.
+        rays: two numbers a ray, or three: the third is its lever.
         lens: a tree of arrays.
     """
 
     frames: Float[Array, "frame 4"]
-    rays: Float[Array, "track 2"]
+    rays: Float[Array, "track own"]
     lens: PyTree
 
 
@@ -43,12 +43,14 @@ class Rows(NamedTuple):
         lines: of each line; they depend on its frame and the lens.
         frames: of each frame, a number for each of its own; each depends on that one and the lens.
         lens: of the lens alone.
+        rays: of each ray alone; None if nothing is known beforehand.
     """
 
     views: Float[Array, "view 2"]
     lines: Float[Array, "line some"]
     frames: Float[Array, "frame 4"]
     lens: Float[Array, "row"]
+    rays: Float[Array, "track known"] | None = None
 
 
 class Reduced(NamedTuple):
@@ -76,8 +78,8 @@ def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, dam
     """The normal equations of ``jacobian x = rows``, with `damping` added to the diagonal.
 
     Args:
-        jacobian: maps `Unknowns` to `Rows`. All columns come from 6 products and one for each number of
-            the lens, as no row has two frames or two rays.
+        jacobian: maps `Unknowns` to `Rows`. All columns come from a product for each number of a frame, of
+            a ray and of the lens, as no row has two frames or two rays.
         rows: the right-hand side.
         like: the unknowns' shapes.
         structure: which frame each view belongs to.
@@ -89,10 +91,14 @@ def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, dam
     def summed(of_views):
         return jax.ops.segment_sum(of_views, by_track, structure.tracks, indices_are_sorted=True)
 
-    inverse = _inverse(summed(_products(by_ray.views, by_ray.views)) + damping * jnp.eye(2)[None])
+    of_rays = summed(_products(by_ray.views, by_ray.views)) + damping * jnp.eye(like.rays.shape[1])[None]
     coupling = _products(by_frame.views, by_ray.views)
     to_lens = summed(_products(by_lens.views, by_ray.views))
     right_ray = summed(_products(by_ray.views, views))
+    if by_ray.rays is not None and rows.rays is not None:
+        of_rays = of_rays + jnp.einsum("tki,tkj->tij", by_ray.rays, by_ray.rays)
+        right_ray = right_ray + jnp.einsum("tki,tk->ti", by_ray.rays, rows.rays)[..., None]
+    inverse, root = _inverses(of_rays)
     solved, lens_solved = _times(inverse, right_ray), _times(inverse, to_lens.swapaxes(1, 2))
 
     border = _products(by_frame.views, by_lens.views) - _times(coupling, lens_solved[by_track])
@@ -102,7 +108,7 @@ def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, dam
     line_border = _line_products(by_frame.lines, by_lens.lines)
     line_right = _line_products(by_frame.lines, rows.lines[..., None])[..., 0]
     own = _products(by_frame.views, by_frame.views)
-    diagonal, above = _frame_blocks(own, _times(coupling, _root(inverse)[by_track]), extra, structure)
+    diagonal, above = _frame_blocks(own, _times(coupling, root[by_track]), extra, structure)
     corner = by_lens.lens.T @ by_lens.lens + damping * jnp.eye(by_lens.lens.shape[1])
     for part in (by_lens.views, by_lens.lines, by_lens.frames):
         corner = corner + jnp.einsum("vri,vrj->ij", part, part)
@@ -129,18 +135,19 @@ def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, dam
 def columns(jacobian: Any, like: Unknowns) -> tuple[Rows, Rows, Rows]:
     """The Jacobian's columns of each row: by its frame, by its ray and by the lens; the last axis."""
     lens, unravel = ravel_pytree(like.lens)
-    along = jnp.eye(6 + lens.size)
+    ray = slice(4, 4 + like.rays.shape[1])
+    along = jnp.eye(ray.stop + lens.size)
     directions = Unknowns(
         jnp.broadcast_to(along[:, None, :4], (len(along), *like.frames.shape)),
-        jnp.broadcast_to(along[:, None, 4:6], (len(along), *like.rays.shape)),
-        jax.vmap(unravel)(along[:, 6:]),
+        jnp.broadcast_to(along[:, None, ray], (len(along), *like.rays.shape)),
+        jax.vmap(unravel)(along[:, ray.stop :]),
     )
     out = jax.vmap(jacobian)(directions)  # at once: compiled once
 
     def those(part):
         return jax.tree.map(lambda leaf: jnp.moveaxis(leaf[part], 0, -1), out)
 
-    by_frame, by_ray, by_lens = those(slice(4)), those(slice(4, 6)), those(slice(6, None))
+    by_frame, by_ray, by_lens = those(slice(4)), those(ray), those(slice(ray.stop, None))
     own = jnp.diagonal(by_frame.frames, axis1=1, axis2=2)
     return by_frame._replace(frames=own), by_ray, by_lens
 
@@ -160,9 +167,26 @@ def _line_products(left, right):
 
 
 def _times(left, right):
-    """Products of matrices of two columns and of two rows."""
-    x, y = (left[:, :, column, None] * right[:, None, column, :] for column in (0, 1))
-    return x + y
+    """Products of matrices of few columns and of few rows."""
+    first, *others = (
+        left[:, :, column, None] * right[:, None, column, :] for column in range(left.shape[2])
+    )
+    return sum(others, start=first)
+
+
+def _inverses(matrix):
+    """Inverses of symmetric 2 x 2 or 3 x 3 matrices, and what gives them times its transpose."""
+    inverse = _inverse(matrix[:, :2, :2])
+    root = _root(inverse)
+    if matrix.shape[2] == 2:
+        return inverse, root
+    across = matrix[:, :2, 2:]
+    solved = _times(inverse, across)
+    left = matrix[:, 2, 2] - jnp.sum(across * solved, axis=(1, 2))
+    left = jnp.where(left > 0, left, jnp.inf)
+    column = jnp.pad(-solved, ((0, 0), (0, 1), (0, 0)), constant_values=1) / jnp.sqrt(left)[:, None, None]
+    inverse, root = (jnp.pad(of, ((0, 0), (0, 1), (0, more))) for of, more in ((inverse, 1), (root, 0)))
+    return inverse + column * column.swapaxes(1, 2), jnp.concatenate([root, column], axis=2)
 
 
 def _inverse(matrix):
@@ -203,7 +227,7 @@ def _frame_blocks(own, halves, extra, structure):
 
     def of_block(number):
         here = jnp.where(structure.begin == number, structure.place, structure.most)  # or dropped
-        rows = jnp.zeros((structure.most, reach, 4, 2), own.dtype)
+        rows = jnp.zeros((structure.most, reach, 4, halves.shape[2]), own.dtype)
         rows = rows.at[here, within].set(halves, mode="drop")
         rows = rows.transpose(1, 2, 0, 3).reshape(4 * reach, -1)
         return rows @ rows.T

@@ -29,8 +29,8 @@ from ..models.zoom import (
 )
 from ..tracks.tracks import Tracks
 from ._motion_gradient import sensitive
+from ._motion_model import Model, Noise, scaled
 from ._motion_problem import LONGEST_LOOP, Asked, Given, Problem, problem_of
-from ._motion_rows import Model, Noise, scaled
 from ._motion_stages import in_stages
 from ._motion_start import starts_of, views_by_frame
 from .defaults import zoom_or_default
@@ -71,10 +71,14 @@ class MotionFit(eqx.Module):
         readout_std: its standard deviation. A large one says that nothing is known: the camera was too slow
             to tell, and it does no harm.
         parallax: distance of the entrance pupil before the axis of rotation, over that of a point of the
-            scene: its standard deviation from point to point, which tracks tell. What all points have in
-            common looks like a lens, and nobody can tell; it is likely a few times as large, and so is the
-            relative error of f that it makes. 0 if none is seen, NaN with few tracks.
+            scene: its standard deviation from point to point, by a test of a fit without it, and at least.
+            What all points have in common looks like a lens, and nobody can tell; it is likely a few times
+            as large, and so is the relative error of f that it makes. 0 if none is seen, NaN with few
+            tracks.
         parallax_score: its square in standard deviations of chance: above 3 or so it is seen.
+        lever: that of each track, less what all have in common, where a parallax is seen; 0 elsewhere.
+        lever_std: its standard deviation from track to track, to which levers are held; 0 if none is seen.
+            What all have in common is taken to be as large as 3 of these in `focal_std` and `covariance`.
     """
 
     fit: ZoomFit
@@ -91,6 +95,8 @@ class MotionFit(eqx.Module):
     readout_std: Float[Array, ""]
     parallax: Float[Array, ""]
     parallax_score: Float[Array, ""]
+    lever: Float[Array, "track"]
+    lever_std: Float[Array, ""]
 
     @property
     def lens(self) -> ZoomLens:
@@ -158,7 +164,8 @@ def fit_motion(
     """Fit focal lengths, rotations and a zoom lens to tracks of points that are far away or do not move.
 
     The camera turns about its entrance pupil, or about a point near it beside the distance of the scene,
-    and zooms. Computed in float64, which has to be enabled.
+    and zooms. Where near points are seen to move otherwise than far ones, all is fitted again, and that is
+    allowed for (`MotionFit.lever`). Computed in float64, which has to be enabled.
 
     Args:
         tracks: the tracks.
@@ -236,6 +243,8 @@ def _solved_motion(given, asked):
         rays=_rays_of(model, problem, len(given.tracks.mask)),
         residual=residual.at[problem.track, problem.view].set(missed[: len(problem.track)]),
         shot=jnp.asarray(problem.shot, jnp.int32),
+        lever=_levers_of(model, problem, len(given.tracks.mask)),
+        lever_std=jnp.zeros(()) if model.levers is None else model.levers.std,
     )
     return fit, model, noise
 
@@ -244,6 +253,17 @@ def _rays_of(model, problem, tracks):
     """The direction of each track: the mean of those of its pieces."""
     rays = jnp.zeros((tracks, 3)).at[problem.track].add(model.path.rays[problem.piece])
     return rays / jnp.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def _levers_of(model, problem, tracks):
+    """The lever of each track: the mean of those of its pieces; 0 if the model has none."""
+    if model.levers is None:
+        return jnp.zeros(tracks)
+    ones = jnp.ones(len(problem.track))
+    total, count = (
+        jnp.zeros(tracks).at[problem.track].add(of) for of in (model.levers.value[problem.piece], ones)
+    )
+    return total / jnp.maximum(count, 1)
 
 
 @eqx.filter_custom_jvp
@@ -266,7 +286,7 @@ def _with_model(fit: MotionFit, model: Model, problem: Problem) -> MotionFit:
     if model.shift is not None:
         lens = eqx.tree_at(lambda lens: lens.shift, lens, model.shift)
     return eqx.tree_at(
-        lambda fit: (fit.fit.lens, fit.focal, fit.rotation, fit.rays, fit.readout),
+        lambda fit: (fit.fit.lens, fit.focal, fit.rotation, fit.rays, fit.readout, fit.lever),
         fit,
         (
             lens,
@@ -274,6 +294,7 @@ def _with_model(fit: MotionFit, model: Model, problem: Problem) -> MotionFit:
             model.path.rotation[: len(fit.focal)],
             _rays_of(model, problem, len(fit.rays)),
             model.readout,
+            _levers_of(model, problem, len(fit.rays)),
         ),
     )
 
