@@ -36,7 +36,7 @@ from .compression import compressed_as_measured
 from .covariance import parameter_covariance
 from .energy import AbstractJointZoom, counted_frames, linearised
 from .minimise import fit_about, minimised
-from .moved_centre import for_any_centre
+from .moved_centre import for_any_centre, for_terms
 from .prepare import asked_for, prepared_for, ready_model
 from .result import RESULTS, FrameFits, ZoomFit, collected, each_of_given, of_given
 from .wrapper import points_of
@@ -172,7 +172,7 @@ def fit_centre(
     offset = prepared_for(given, PolynomialZoom(degree=0) if centre is None else centre, 2)
     start = _both(fixed.lens.zoom, offset)
     found, each, covariance, std, determined = _search(
-        lines, start, solver or default_solver(lines), max_steps
+        for_terms(lines, model.terms), start, solver or default_solver(lines), max_steps
     )
     # Once more about these centres, for all else that is to know of a fit: the same compiled program.
     fit = fit_about(_about(lines, each, model), ready, **options)
@@ -197,7 +197,7 @@ def refit_centre(lines: AbstractLines, found: CentreFit) -> AbstractZoom:
     if centre is None:
         offset = (lens.centre - jnp.asarray(lines.centre))[None] / lens.scale
         centre = with_parameters(PolynomialZoom(degree=0).prepare(lines.focal, 2), offset)
-    lines = for_any_centre(bucketed(lines), lens(lens.focal_range[0]).coefficients.shape[-1])
+    lines = for_terms(bucketed(lines), lens(lens.focal_range[0]).coefficients.shape[-1])
     joint, *_ = _search(lines, _both(lens.zoom, centre), default_solver(lines), 256)
     return joint
 

@@ -87,9 +87,7 @@ def for_any_centre(lines: AbstractLines, terms: int) -> AbstractLines:
     check("fit_centre", family=lines.family)
     if isinstance(lines, ImageLines):
         return in_image(for_any_centre(lines.as_weighted(), terms))
-    if isinstance(lines, AnyCentreLines):
-        return lines.for_terms(terms)
-    if isinstance(lines, MovedLines):
+    if isinstance(lines, AnyCentreLines | MovedLines):
         return lines
     if isinstance(lines, Lines):
         return compress_any_centre(lines, terms)
@@ -99,3 +97,10 @@ def for_any_centre(lines: AbstractLines, terms: int) -> AbstractLines:
         "The centre is fitted to lines that are not compressed about one centre: pass the lines "
         "themselves, or compress_any_centre(lines)."
     )
+
+
+def for_terms(lines: AbstractLines, terms: int) -> AbstractLines:
+    """Lines of `for_any_centre` without what only more coefficients need."""
+    if isinstance(lines, ImageLines):
+        return in_image(for_terms(lines.as_weighted(), terms))
+    return lines.for_terms(terms) if isinstance(lines, AnyCentreLines) else lines
