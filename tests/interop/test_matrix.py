@@ -50,7 +50,8 @@ def there_and_back(name, path, lens, pitch, focal):
 
 def apart(lens, back, focal, factor, *, any_scale=False):
     """The greatest distance of corrected points, px; up to a magnification where the tool has one."""
-    wanted, got = (np.asarray(d.undistort(shown(lens))) for d in (lens(focal), back(focal * factor)))
+    own = np.clip(focal * factor, *np.asarray(back.focal_range))  # the ends are fitted, too
+    wanted, got = (np.asarray(d.undistort(shown(lens))) for d in (lens(focal), back(own)))
     from_centre = got - np.asarray(lens.centre)
     if any_scale:
         more = np.sum(from_centre * (wanted - got)) / np.sum(from_centre**2)

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..models.brown_conrady import BrownConrady
-from ..models.distortion import Distortion
 from ..models.division import Division
 from ..models.family import AbstractFamily
 from ..models.lens import ZoomLens
@@ -27,8 +26,9 @@ from ..models.tables import TableZoom
 from ..models.zoom import AbstractLinearZoom, AbstractPriorZoom, PolynomialZoom, with_parameters
 from ._centre import centres_and_family
 from ._forms import Form
+from ._pinhole import pitch_of
 from ._samples import Pairs, distortions
-from ._seen import Seen, inside, seen_of
+from ._seen import Seen, against, distance, inside, seen_of
 from .base import TOLERANCE, Contents, Node, Sampled
 from .radial_table import RadialTable, zoom_of_table
 
@@ -50,6 +50,9 @@ _SHARES = tuple(tuple(i / parts for i in range(1, parts)) for parts in (1, 2, 4,
 _CHECKED = (0.2, 0.45, 0.8)
 """Where that is looked at."""
 
+_PASSES, _SAME_SCALE = 5, 1e-7
+"""Fits at most, until the scale of corrected points changes by so little."""
+
 
 class UnsuitedError(ValueError):
     """The zoom model that was asked for does not suit the contents of a file that is sound."""
@@ -61,12 +64,14 @@ class Made:
 
     Attributes:
         lens: the lens.
+        focal: focal lengths of the nodes, as the lens has them.
         at_nodes: its greatest error at the nodes, px (see `Report`).
         between: its greatest error between them; None where the tool does not interpolate.
         notes: what the user should know.
     """
 
     lens: ZoomLens
+    focal: tuple[float, ...]
     at_nodes: float
     between: float | None
     notes: tuple[str, ...]
@@ -108,6 +113,7 @@ def lens_of(
             f"The file's distortion turns back before the border of the image at {', '.join(short)} "
             f"{contents.focal_unit}: the lens is not validated beyond."
         )
+    contents, seen = _with_rays(contents, seen, zoom, family, count)
     lens, at_nodes, between, note = _following(contents, seen, zoom, family, count)
     if not math.isfinite(at_nodes):
         if chosen and isinstance(zoom, SmoothZoom):
@@ -129,7 +135,35 @@ def lens_of(
             f"Between the file's focal lengths the lens is smooth, up to {between:.2g} px from the tool's "
             "own interpolation: a table, TableZoom(), keeps to that."
         )
-    return Made(lens, at_nodes, between, (*notes, *note))
+    focal = tuple(float(each.node.focal) for each in seen)
+    return Made(lens, focal, at_nodes, between, (*notes, *note))
+
+
+def _with_rays(
+    contents: Contents, seen: list[Seen], zoom: AbstractLinearZoom, family: AbstractFamily, terms: int
+) -> tuple[Contents, list[Seen]]:
+    """What files of fields of view say, in the scale of corrected points that a lens through them has.
+
+    The fit chooses this scale, and focal lengths follow it, so that rays are kept. Errors are then those of
+    rays. Where focal lengths are labels in mm, the pixel pitch follows, and the scale stays free.
+    """
+    if any(each.focal_px is None for each in seen):
+        return contents, seen
+    in_px = contents.focal_unit == "px"
+    for _ in range(_PASSES):
+        lens, _notes = _lens(contents, seen, zoom, family, terms)
+        each = distortions(lens, np.array([one.node.focal for one in seen]))
+        by = np.array([against(*pair, lens.scale)[3] for pair in zip(each, seen, strict=True)])
+        if not (np.isfinite(by) & (by > 0)).all():
+            break
+        seen = [one.magnified(float(b), focal=in_px) for one, b in zip(seen, by, strict=True)]
+        if np.abs(by - 1).max() < _SAME_SCALE:
+            break
+    if in_px:
+        seen = [dataclasses.replace(one, any_scale=False) for one in seen]
+        return contents, sorted(seen, key=lambda one: one.node.focal)
+    pitch = pitch_of([one.node.focal for one in seen], [one.focal_px or math.nan for one in seen])
+    return dataclasses.replace(contents, pixel_pitch=pitch), seen
 
 
 def _following(
@@ -184,7 +218,8 @@ def _of_table(contents: Contents, table: RadialTable, auto: bool) -> Made | None
         pixel_pitch=contents.pixel_pitch,
         about=contents.about,
     )
-    return Made(lens, found.at_nodes, found.between if len(table.focal) > 1 else None, tuple(notes))
+    between = found.between if len(table.focal) > 1 else None
+    return Made(lens, tuple(table.focal), found.at_nodes, between, tuple(notes))
 
 
 def _lens(
@@ -347,22 +382,4 @@ def _prior(zoom: AbstractPriorZoom, number: int) -> np.ndarray:
 def _error(lens: ZoomLens, seen: list[Seen]) -> float:
     """The greatest distance of the lens from nodes, px."""
     each = distortions(lens, np.array([one.node.focal for one in seen]))
-    return max(_distance(*pair, lens.scale) for pair in zip(each, seen, strict=True))
-
-
-def _distance(distortion: Distortion, seen: Seen, scale: float) -> float:
-    """The greatest distance from a node, px, in the image into which the file maps.
-
-    Where the lens does not reach, it is that in the other image.
-    """
-    centre = np.asarray(distortion.centre, float)
-    distorted, corrected = seen.about(centre, scale)
-    found = (np.asarray(distortion.undistort(distorted * scale + centre)) - centre) / scale
-    if seen.any_scale:
-        corrected = corrected * np.sum(found * corrected) / np.sum(corrected * corrected)
-    distance = np.hypot(*(found - corrected).T)
-    if not seen.corrects:
-        back = (np.asarray(distortion.distort(corrected * scale + centre)) - centre) / scale
-        other = np.hypot(*(back - distorted).T)
-        distance = np.where(np.isfinite(other), other, distance)
-    return float(distance.max() * scale) if np.isfinite(distance).all() else np.inf
+    return max(distance(*pair, lens.scale) for pair in zip(each, seen, strict=True))

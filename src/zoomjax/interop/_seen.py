@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from ..models.distortion import Distortion
 from ._samples import Pairs, pairs_of
 from .base import Node, Sampled
 
@@ -19,12 +20,14 @@ class Seen:
         node: the node, with its centre.
         distorted, corrected: the points, in half diagonals from the node's centre.
         whole: whether they reach the border of the image everywhere.
+        any_scale: whether the tool scales corrected points as it likes.
     """
 
     node: Node | Sampled
     distorted: np.ndarray
     corrected: np.ndarray
     whole: bool
+    any_scale: bool = False
 
     def about(self, centre: np.ndarray, scale: float) -> Pairs:
         """Distorted and corrected points from another centre."""
@@ -32,10 +35,19 @@ class Seen:
         offset = (self.node.centre - centre) / scale
         return self.distorted + offset, self.corrected + offset
 
+    def magnified(self, by: float, *, focal: bool) -> "Seen":
+        """The same rays with corrected points of another scale; `focal` if they are of its focal length."""
+        assert isinstance(self.node, Node)
+        assert self.node.focal_px is not None
+        node = dataclasses.replace(
+            self.node, focal=self.node.focal * (by if focal else 1.0), focal_px=self.node.focal_px * by
+        )
+        return dataclasses.replace(self, node=node, corrected=self.corrected * by)
+
     @property
-    def any_scale(self) -> bool:
-        """Whether the tool scales corrected points as it likes."""
-        return isinstance(self.node, Node) and self.node.form.any_scale
+    def focal_px(self) -> float | None:
+        """Focal length in px of the tool's rays, where that goes with the scale of corrected points."""
+        return self.node.focal_px if isinstance(self.node, Node) else None
 
     @property
     def corrects(self) -> bool:
@@ -46,7 +58,7 @@ class Seen:
 def seen_of(node: Node | Sampled, size: tuple[int, int]) -> Seen:
     """A node, and points of the image by it."""
     if not isinstance(node, Sampled):
-        return Seen(node, *pairs_of(node, size))
+        return Seen(node, *pairs_of(node, size), node.form.any_scale)
     assert node.centre is not None
     scale = math.hypot(*size) / 2
     distorted, corrected = ((points - node.centre) / scale for points in (node.distorted, node.corrected))
@@ -65,3 +77,30 @@ def inside(
         ways = [share * low / (high + share * (low - high)) for share in shares]
         found += [seen_of(between(i, way), size) for way in ways]
     return found
+
+
+def against(
+    distortion: Distortion, seen: Seen, scale: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """A node's distorted and corrected points, the latter by the lens, and the scale of these in that."""
+    centre = np.asarray(distortion.centre, float)
+    distorted, corrected = seen.about(centre, scale)
+    found = (np.asarray(distortion.undistort(distorted * scale + centre)) - centre) / scale
+    by = float(np.sum(found * corrected) / np.sum(corrected * corrected))
+    return distorted, corrected, found, by
+
+
+def distance(distortion: Distortion, seen: Seen, scale: float) -> float:
+    """The greatest distance from a node, px, in the image into which the file maps.
+
+    Where the lens does not reach, it is that in the other image.
+    """
+    distorted, corrected, found, by = against(distortion, seen, scale)
+    centre = np.asarray(distortion.centre, float)
+    corrected = by * corrected if seen.any_scale else corrected
+    far = np.hypot(*(found - corrected).T)
+    if not seen.corrects:
+        back = (np.asarray(distortion.distort(corrected * scale + centre)) - centre) / scale
+        other = np.hypot(*(back - distorted).T)
+        far = np.where(np.isfinite(other), other, far)
+    return float(far.max() * scale) if np.isfinite(far).all() else np.inf

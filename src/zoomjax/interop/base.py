@@ -36,6 +36,8 @@ class Node:
         frame: number of the frame in a track; None without one.
         stretch: by how much the tool's unit of x and of y is longer than `theta` has it: (1, 1) unless its
             pixels are not quite square.
+        focal_px: focal length in px of the tool's rays through corrected points, where the formula leaves
+            the scale of these free and a field of view tells it; None elsewhere.
     """
 
     focal: float
@@ -44,6 +46,7 @@ class Node:
     centre: np.ndarray
     frame: int | None = None
     stretch: tuple[float, float] = (1.0, 1.0)
+    focal_px: float | None = None
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         """What the tool makes of points, in half image diagonals from the centre."""

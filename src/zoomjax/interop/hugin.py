@@ -4,7 +4,8 @@
 
 from corrected radii r to distorted ones, in units of half the short side. The factor is 1 at r = 1, and the
 corrected image is scaled for that: the field of view v is that of the scaled one, so that rays are right.
-The focal length of a file is that at its centre, which differs from the lens's by what the fit does there.
+A lens that is read has the focal length by which its rays are those of the file, whatever slope the fit of
+its formula has at the centre.
 d and e are the centre, px from the middle of the image.
 """
 
@@ -84,4 +85,4 @@ def _node(words: dict[str, str], size: tuple[int, int]) -> Node:
     factors = np.array([1 - a - b - c, c, b, a])
     focal = size[0] / 2 / math.tan(math.radians(view) / 2) * factors[0]
     theta = _FORM.rescaled(of_unit_slope(factors), math.hypot(*size) / min(size))
-    return Node(focal, _FORM, theta, (np.array(size) - 1) / 2 + [d, e])
+    return Node(focal, _FORM, theta, (np.array(size) - 1) / 2 + [d, e], focal_px=focal)

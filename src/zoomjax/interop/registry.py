@@ -248,8 +248,7 @@ def read(
     except _DAMAGED as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
         raise ValueError(f"Cannot read a {fmt.name} lens from {path}: {reason}.") from error
-    nodes = tuple(sorted({node.focal for node in contents.nodes}))
-    report = Report(fmt.name, nodes, made.at_nodes, made.between, made.notes, tuple(paths))
+    report = Report(fmt.name, made.focal, made.at_nodes, made.between, made.notes, tuple(paths))
     return Reading(made.lens, report)
 
 
