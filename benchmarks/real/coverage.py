@@ -128,7 +128,7 @@ def flat_board(folder: Path, chosen: np.ndarray, places: jax.Array, outward: jax
         image_size=size,
         focal_unit="px",
     )
-    held = zj.lines.compress_any_centre(lines, TERMS)
+    held = zj.fit.in_image(zj.lines.compress_any_centre(lines, TERMS))
     one = zj.fit_zoom(held, terms=2, centre="fit")
     return along(widened(zj.trust.with_misfit(one, held), fit), places, outward, fit.focal)
 
