@@ -128,7 +128,7 @@ def test_every_package_that_a_command_needs_is_declared():
 def test_calibrate_gives_the_lens_that_the_library_gives(calibrated, few_lines):
     out, _ = calibrated
     lens = zj.load_lens(out / "lens.json")
-    fit = zj.fit_zoom(zj.compress(few_lines))
+    fit = zj.fit_zoom(zj.fit.in_image(zj.compress(few_lines)))
     np.testing.assert_allclose(lens.zoom.parameters, fit.lens.zoom.parameters, atol=1e-9)
     np.testing.assert_array_equal(zj.load_lines(out / "lines.npz").points, few_lines.points)
 
