@@ -59,9 +59,7 @@ def test_what_is_no_ordinary_file_is_not_replaced(tmp_path):
     (tmp_path / "link").symlink_to("pipe")
     (tmp_path / "null").symlink_to("/dev/null")
     for name in ("pipe", "link", "null"):
-        before = (
-            tmp_path / name
-        ).lstat()  # following a link is reading it, which changes its time of access
+        before = (tmp_path / name).lstat()  # reading a link, to follow it, changes its time of access
         with pytest.raises(FileExistsError, match="in place of a device"), whole_file(tmp_path / name):
             pytest.fail("the work began")
         after = (tmp_path / name).lstat()
