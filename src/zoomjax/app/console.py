@@ -167,8 +167,9 @@ def show_calibration(
         f"{calibration.focal_text()}\n",
         highlight=False,
     )
-    table = Table(title=f"RMS distance of points to lines, in the {summary['distances']}")
-    table.title_justify, table.box = "left", None
+    title = f"RMS distance of points to lines, in the {summary['distances']}"
+    console.print(title, style="italic", highlight=False)  # a table would break it to its own width
+    table = Table(box=None)
     table.add_column("", no_wrap=True)
     table.add_column("px, held out", justify="right", no_wrap=True)
     table.add_column("px", justify="right")

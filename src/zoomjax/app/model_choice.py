@@ -137,7 +137,8 @@ class WantedModel:
 
     def most_terms(self, lines: Lines) -> int:
         """The largest number of coefficients that is fitted, compared or, for the misfit, thought of."""
-        return max(*self._terms(lines), min(self._terms(lines)[0] + 1, RadialPolynomial.most_terms))
+        terms = self._terms(lines)
+        return max(*terms, min(terms[0] + 1, RadialPolynomial.most_terms))
 
     def choose(self, lines: AbstractLines) -> Selection:
         """The model of least cross-validation error.
