@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
-from zoomjax.fit.energy import line_normal, line_residuals, line_weights
+from zoomjax.fit.energy import line_weights
+from zoomjax.lines.best_line import line_normal, line_residuals
 
 from .._reference import assert_derivatives_agree, frame_energies, squared_distances
 from ..conftest import RAGGED_COUNTS, RAGGED_FRAMES, moved

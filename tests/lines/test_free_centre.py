@@ -9,7 +9,7 @@ import pytest
 import zoomjax as zj
 from zoomjax.fit.energy import energy_by_frame, weighted_distances
 from zoomjax.fit.moved_centre import for_terms
-from zoomjax.fit.wrapper import points_of
+from zoomjax.fit.problem import data_of
 
 from ..conftest import SEED
 
@@ -48,7 +48,7 @@ def test_what_more_terms_need_is_left_out_for_fewer(ragged, small):
     np.testing.assert_allclose(found.fit.lens.centre, expected.fit.lens.centre, rtol=1e-9)
     np.testing.assert_allclose(found.fit.rms, expected.fit.rms, rtol=1e-12)
     searched = for_terms(zj.fit.in_image(wide), 2)
-    np.testing.assert_array_equal(points_of(searched).triangle, wide.for_terms(2).triangle)
+    np.testing.assert_array_equal(data_of(searched).triangle, wide.for_terms(2).triangle)
 
 
 @pytest.mark.parametrize("centre", CENTRES)

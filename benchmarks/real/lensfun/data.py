@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import zoomjax as zj
-from zoomjax.fit.energy import line_residuals
+from zoomjax.lines.best_line import line_residuals
 
 SIZE = (4288, 2848)
 SCALE = float(np.hypot(*SIZE)) / 2

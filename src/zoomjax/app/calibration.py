@@ -19,7 +19,7 @@ from .._core.text import span
 from .._core.types import AnyArray
 from ..fit.energy import line_squares
 from ..fit.focal_lengths import with_focal_sigma
-from ..fit.image_metric import ImageLines, in_image
+from ..fit.image_metric import in_image
 from ..fit.result import RESULTS, FrameFits, ZoomFit
 from ..fit.straightness import frame_rms
 from ..fit.zoom import CentreArgument
@@ -378,7 +378,7 @@ def calibrate(
         centre=used.centre.as_uncertain_as(zoom),
         assessment=assess(lines, zoom, compressed=small, held_out=held_out, each_held_out=each_held_out),
         selection=used.selection,
-        in_image=isinstance(small, ImageLines),
+        in_image=small.metric == "distorted",
     )
 
 

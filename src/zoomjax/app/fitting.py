@@ -16,10 +16,10 @@ from ..fit.family_lines import with_family
 from ..fit.frames import fit_frames
 from ..fit.image_metric import in_corrected
 from ..fit.prepare import ready_model
+from ..fit.problem import data_of
 from ..fit.result import FrameFits, ZoomFit, failed
 from ..fit.robust import reweighted
 from ..fit.straightness import frame_rms
-from ..fit.wrapper import points_of
 from ..fit.zoom import CentreArgument, about_centre, fit_zoom
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines, compress
@@ -153,7 +153,7 @@ def _about_centre(
 
 
 def _for_any_centre(lines: AbstractLines) -> bool:
-    return isinstance(points_of(lines), AnyCentreLines)
+    return isinstance(data_of(lines), AnyCentreLines)
 
 
 def _weights(held: AbstractLines, model: Model) -> np.ndarray:

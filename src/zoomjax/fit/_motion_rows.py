@@ -17,13 +17,13 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from ..lines.best_line import line_normal
 from ..lines.stretch import radial_stretch
 from ..models.zoom import AbstractPriorZoom
 from ._motion_model import Data, Model, Noise, Stage, moved, units_of
 from ._motion_start import turned
 from ._schur import Rows, Unknowns
 from ._views import CAUCHY, corrected, flattened, product, view_residual
-from .energy import line_normal
 
 WRONG_LINE = 3.0
 """Times the noise: the RMS of a line's distances where its loss begins to flatten."""

@@ -38,8 +38,8 @@ from .energy import AbstractJointZoom, counted_frames, linearised
 from .minimise import fit_about, minimised
 from .moved_centre import for_any_centre, for_terms
 from .prepare import asked_for, prepared_for, ready_model
+from .problem import data_of
 from .result import RESULTS, FrameFits, ZoomFit, collected, each_of_given, of_given
-from .wrapper import points_of
 
 _MOST_UNCERTAIN = 0.05
 """Largest standard deviation of a centre, in half diagonals, with which it is accepted."""
@@ -184,7 +184,7 @@ def fit_centre(
 def _about(lines, centre, model):
     """The lines about a centre, compressed."""
     placed = lines.about(centre)
-    points = isinstance(points_of(placed), Lines)
+    points = isinstance(data_of(placed), Lines)
     return compressed_as_measured(placed, model.terms) if points else placed
 
 
@@ -231,7 +231,7 @@ def _fit_frame_centres(lines, frames, model, solver, max_steps):
     def one(frame):
         return fit_centre(lines.take(*frame), zoom=model.zoom, **options)
 
-    batch = 1 if isinstance(points_of(lines), Lines) else len(frames.chosen)  # as in `fit_frames`
+    batch = 1 if isinstance(data_of(lines), Lines) else len(frames.chosen)  # as in `fit_frames`
     found = jax.lax.map(one, (frames.chosen, frames.present), batch_size=batch)
     each = collected(lines, found.fit, frames.there)
     each = eqx.tree_at(lambda fits: fits.centre, each, found.centre[:, 0])

@@ -3,9 +3,8 @@
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines, compress
 from ..lines.lines import Lines
-from .family_lines import FamilyLines
 from .image_metric import in_corrected, measured_as
-from .wrapper import about_own_centre
+from .problem import Problem, about_own_centre
 
 
 def compressed(lines: AbstractLines, terms: int) -> CompressedLines:
@@ -27,7 +26,7 @@ def compressed(lines: AbstractLines, terms: int) -> CompressedLines:
 def small_of(lines: AbstractLines, terms: int) -> AbstractLines:
     """The lines compressed, under their own distortion model; the metric is the paper's."""
     plain = in_corrected(lines)
-    return plain.compressed(terms) if isinstance(plain, FamilyLines) else compressed(plain, terms)
+    return plain.compressed(terms) if isinstance(plain, Problem) else compressed(plain, terms)
 
 
 def compressed_as_measured(lines: AbstractLines, terms: int) -> AbstractLines:

@@ -13,8 +13,7 @@ from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
 from ..lines.free_centre import AnyCentreLines
 from ..lines.lines import Lines
-from .family_lines import FamilyLines, with_family
-from .image_metric import ImageLines, in_image
+from .problem import Problem, data_of, posed
 
 SomeLines = TypeVar("SomeLines", bound=AbstractLines)
 
@@ -67,10 +66,8 @@ def concatenate(parts: Sequence[SomeLines]) -> SomeLines:
                 f"parts[{index}] {type(part).__name__}. Compress all of them, or none."
             )
         _check_same(first, part, index)
-    if isinstance(first, ImageLines):
-        return in_image(concatenate([part.as_weighted() for part in parts]))  # pyright: ignore
-    if isinstance(first, FamilyLines):
-        return with_family(concatenate([part.as_weighted() for part in parts]), first.family)  # pyright: ignore
+    if isinstance(first, Problem):
+        return posed(concatenate(list(map(data_of, parts))), first.family, first.metric)  # pyright: ignore
     if not isinstance(first, Lines | CompressedLines | AnyCentreLines):
         raise TypeError(f"Lines of type {type(first).__name__} cannot be concatenated.")
     given: list[Any] = list(parts)

@@ -9,7 +9,6 @@ and within it every line. The M frames are those that have a line of a weight ab
 """
 
 import abc
-import math
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +17,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._core.arguments import kinds_checked
 from .._core.fields import numbers
-from .._core.products import exact_products
 from .._core.programs import light_program
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines
+from ..lines.best_line import line_residuals
 from ..lines.buckets import bucketed_jit, of_frames, of_lines
 from ..models.zoom import (
     AbstractFocusZoom,
@@ -29,34 +28,7 @@ from ..models.zoom import (
     AbstractZoom,
     with_parameters,
 )
-from .wrapper import about_own_centre
-
-# The angle of a line, ½ atan2, jumps by half a turn at one direction: harmless to derivatives, but the
-# residuals change sign there and finite differences across it are wrong. Left alone the jump sits at
-# exactly vertical lines, the commonest there are; this turns it to 110.9° from the x axis.
-_CUT = 0.73
-
-
-@exact_products
-def line_normal(centred: Float[Array, "rows 2"]) -> Float[Array, "2"]:
-    """The unit normal of the total-least-squares line of points about their mean.
-
-    Points without a direction (none, one, or an isotropic cloud) get a fixed normal, with zero gradient.
-    """
-    x, y = centred[:, 0], centred[:, 1]
-    difference, product = x @ x - y @ y, 2 * (x @ y)
-    cos, sin = math.cos(_CUT), math.sin(_CUT)
-    along, across = cos * difference + sin * product, cos * product - sin * difference
-    # Guard the input of atan2: at (0, 0) its gradient is NaN, and stays so through a where().
-    directed = (along != 0) | (across != 0)
-    twice = jnp.arctan2(jnp.where(directed, across, 0), jnp.where(directed, along, 1)) + _CUT
-    return jnp.stack([-jnp.sin(twice / 2), jnp.cos(twice / 2)])
-
-
-@exact_products
-def line_residuals(centred: Float[Array, "rows 2"]) -> Float[Array, "rows"]:
-    """Signed distances of points about their mean to their own best line, in their unit."""
-    return centred @ line_normal(centred)
+from .problem import about_own_centre
 
 
 def line_weights(lines: AbstractLines) -> Float[Array, "line"]:

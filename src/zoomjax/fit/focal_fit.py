@@ -20,8 +20,8 @@ from .energy import counted_frames
 from .focal_lengths import UNKNOWN, Sigma, at_focal_lengths, checked_sigma, with_covariance
 from .focal_refinement import MOST_STEPS, posterior, refined
 from .prepare import asked_for
+from .problem import about_own_centre
 from .result import RESULTS, ZoomFit, failed
-from .wrapper import about_own_centre
 from .zoom import fit_zoom
 
 

@@ -20,8 +20,8 @@ from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
 from .minimise import minimise
 from .prepare import asked_for, ready_model
+from .problem import about_own_centre, data_of
 from .result import FrameFits, collected, described_fit, each_of_given, is_invertible, outcome_of, thrown
-from .wrapper import about_own_centre, points_of
 
 
 @kinds_checked
@@ -104,7 +104,7 @@ def _over_frames(function, lines, frames, *rows):
     Small compressed frames are taken side by side; the points themselves one frame at a time, for side by
     side they would all be in memory at once, padded to the fullest frame.
     """
-    batch = 1 if isinstance(points_of(lines), Lines) else len(frames.chosen)
+    batch = 1 if isinstance(data_of(lines), Lines) else len(frames.chosen)
 
     def one(frame):
         return function(lines.take(*frame[0]), *frame[1])

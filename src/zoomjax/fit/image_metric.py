@@ -14,45 +14,13 @@ the quotient is then least at the true lens, to first order. To hold the stretch
 as reweighting would, does not remove the bias: the stretch's derivative does.
 """
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
-
 from .._core.arguments import kinds_checked
-from .._core.types import Centres
 from ..lines.base import AbstractLines
-from .energy import line_normal
-from .wrapper import AbstractWrapper, wrapped
-
-LEAST_STRETCH = 1e-4
-"""Of the squared stretch. Beyond a fold, where it may vanish, nothing is to be gained either."""
-
-
-class ImageLines(AbstractWrapper):
-    """Lines whose distances are measured in the distorted image: made by `in_image`.
-
-    Attributes:
-        lines: the lines.
-        frame, focal, focus, centre, image_size, focal_unit, weight: those of the lines.
-    """
-
-    def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
-        """Corrected points of each line about their mean, divided by the stretch across the line."""
-        rows = self.lines.corrected(coefficients)
-        squared = self.lines.squared_stretch(coefficients, jax.vmap(line_normal)(rows))
-        return rows / jnp.sqrt(jnp.maximum(squared, LEAST_STRETCH))[:, None, None]
-
-    def about(self, centre: Centres) -> "ImageLines":
-        """The same lines about another centre of distortion; see `AbstractLines.about`."""
-        return in_image(self.as_weighted().about(centre))
-
-    def take(self, lines: Int[Array, "some"], present: Bool[Array, "some"]) -> "ImageLines":
-        """The chosen lines as a data set of one frame."""
-        return in_image(self.as_weighted().take(lines, present))
+from .problem import posed
 
 
 @kinds_checked
-def in_image(lines: AbstractLines) -> ImageLines:
+def in_image(lines: AbstractLines) -> AbstractLines:
     """The same lines with distances measured in the distorted image, px, which removes the paper's bias.
 
     `fit_zoom`, `fit_frames`, `fit_robust` and `frame_rms` accept them like other lines; every RMS is then
@@ -70,16 +38,14 @@ def in_image(lines: AbstractLines) -> ImageLines:
         >>> bool(fit_zoom(in_image(compress(lines))).rms < 1)
         True
     """
-    if isinstance(lines, ImageLines):
-        return lines
-    return wrapped(ImageLines, lines)
+    return posed(lines, metric="distorted")
 
 
 def in_corrected(lines: AbstractLines) -> AbstractLines:
     """The same lines with distances measured in the corrected image, as the paper does."""
-    return lines.as_weighted() if isinstance(lines, ImageLines) else lines
+    return posed(lines, metric="corrected")
 
 
 def measured_as(lines: AbstractLines, other: AbstractLines) -> AbstractLines:
     """The lines in the metric of other ones."""
-    return in_image(lines) if isinstance(other, ImageLines) else lines
+    return posed(lines, metric=other.metric)

@@ -33,9 +33,9 @@ from ..models.zoom import AbstractZoom
 from ._least_squares import Solver, default_solver
 from .minimise import fit_freely
 from .prepare import asked_for, ready_model
+from .problem import about_own_centre
 from .result import RESULTS, ZoomFit, failed, of_given
 from .robust import RobustFit, fit_robust, fit_robust_freely, robust_of_given
-from .wrapper import about_own_centre
 from .zoom import fit_zoom
 
 _STACK = 16

@@ -24,11 +24,12 @@ from jaxtyping import Bool, Float
 from .._core.arguments import kinds_checked
 from .._core.programs import program
 from .._core.types import of_known_values
+from ..lines.best_line import line_normal
 from ..lines.lines import Lines
 from ..models.family import AbstractFamily
 from ..models.model import Model
 from ..models.zoom import AbstractZoom
-from .energy import coefficients_by, line_normal
+from .energy import coefficients_by
 from .family_lines import compress_family, with_family
 from .prepare import asked_for, ready_model
 from .robust import RobustFit, fit_robust

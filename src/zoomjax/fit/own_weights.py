@@ -13,7 +13,7 @@ from .._core.types import traced
 from ..lines.base import AbstractLines
 from ..lines.lines import Lines
 from ..lines.triangles import AbstractTriangles
-from .wrapper import points_of
+from .problem import data_of
 
 
 def own_weights(lines: AbstractLines) -> Float[np.ndarray, "line"]:
@@ -24,7 +24,7 @@ def own_weights(lines: AbstractLines) -> Float[np.ndarray, "line"]:
 
 def counts_of(lines: AbstractLines) -> Float[np.ndarray, "line"]:
     """Numbers of points."""
-    inside: Any = points_of(lines)
+    inside = data_of(lines)
     if isinstance(inside, Lines):
         return np.asarray(inside.mask).sum(axis=1).astype(float)
     if not isinstance(inside, AbstractTriangles):

@@ -26,6 +26,7 @@ from jaxtyping import Array, Float, Int
 from .._core.arguments import kinds_checked
 from .._core.programs import light_program, program
 from ..lines.base import AbstractLines, SomeLines
+from ..lines.best_line import line_residuals
 from ..lines.buckets import bucketed, of_lines
 from ..models.family import AbstractFamily
 from ..models.model import Model
@@ -34,11 +35,11 @@ from ..models.zoom import AbstractLinearZoom, AbstractZoom, with_parameters
 from ._least_squares import Solver
 from ._linear import least_squares
 from .algebraic import algebraic_model
-from .energy import coefficients_by, line_residuals, linearised, prior_jacobian
+from .energy import coefficients_by, linearised, prior_jacobian
 from .minimise import fit_prepared
 from .prepare import asked_for, ready_model
+from .problem import about_own_centre
 from .result import ZoomFit, of_given
-from .wrapper import about_own_centre
 from .zoom import fit_zoom
 
 _CUT = 6.0  # standard deviations of r among good lines, were they normal

@@ -11,8 +11,8 @@ from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_jit, of_frames
 from ..models.lens import ZoomLens
 from .energy import coefficients_by, frame_energy
+from .problem import about_own_centre
 from .same_camera import check_camera, placed_as
-from .wrapper import about_own_centre
 
 
 @kinds_checked

@@ -26,8 +26,8 @@ from ._least_squares import Solver
 from .centre import fit_centre
 from .minimise import fit_about
 from .prepare import asked_for, ready_model
+from .problem import about_own_centre
 from .result import ZoomFit, of_given
-from .wrapper import about_own_centre
 
 CentreArgument = Literal["fit", "image"] | tuple[float, float] | Float[AnyArray, "2"]
 """The centre of distortion: fitted, the image's, or its coordinates, px."""

@@ -6,7 +6,7 @@ or rows that are exactly equivalent.
 
 import abc
 import math
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import equinox as eqx
 import jax
@@ -42,6 +42,9 @@ from ..models.polynomial import RadialPolynomial
 from .stretch import radial_stretch
 
 SomeLines = TypeVar("SomeLines", bound="AbstractLines")
+
+Metric = Literal["corrected", "distorted"]
+"""The image in which distances of points to their lines are measured."""
 
 
 class AbstractLines(eqx.Module):
@@ -82,8 +85,13 @@ class AbstractLines(eqx.Module):
 
     @property
     def family(self) -> AbstractFamily:
-        """The distortion model of the coefficients: the radial polynomial, except for `FamilyLines`."""
+        """The distortion model of the coefficients: the radial polynomial, unless a problem has another."""
         return RadialPolynomial()
+
+    @property
+    def metric(self) -> Metric:
+        """The image in which distances are measured: the corrected one, unless a problem says otherwise."""
+        return "corrected"
 
     def expansion(
         self, coefficients: Float[Array, "some size"]

@@ -22,8 +22,9 @@ import numpy as np
 
 from .._core.programs import light_program
 from ..fit.energy import prior_jacobian, settings
-from ..fit.image_metric import LEAST_STRETCH, ImageLines, in_corrected
+from ..fit.image_metric import in_corrected
 from ..fit.own_weights import counts_of, own_weights
+from ..fit.problem import LEAST_STRETCH
 from ..lines.buckets import bucketed_jit, padded_frames
 from ..models.zoom import (
     AbstractPriorZoom,
@@ -131,7 +132,7 @@ def lanes_of(lines, fold, terms):
     gram = np.stack([np.einsum("irl,jrl->ijl", one, other) for one, other in ((x, x), (x, y), (y, y))])
     counts = np.maximum(counts_of(lines), 1)
     frame, counts, weight, fold = (a[order] for a in (frame, counts, own_weights(lines), np.asarray(fold)))
-    moments = _moments(whole, terms) / counts if isinstance(lines, ImageLines) else None
+    moments = _moments(whole, terms) / counts if lines.metric == "distorted" else None
     starts = np.flatnonzero(np.diff(frame, prepend=-1))
     return Lanes(columns, gram, frame, counts, weight, fold, starts, len(lines.focal), moments)
 

@@ -28,8 +28,8 @@ from .._core.arguments import kinds_checked
 from .._core.fields import real_argument
 from .._core.programs import light_program
 from .._core.types import AnyArray, traced
-from ..fit.energy import line_normal
 from ..fit.same_camera import check_camera
+from ..lines.best_line import line_normal
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..models.requirements import check

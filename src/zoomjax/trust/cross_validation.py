@@ -18,8 +18,8 @@ from ..fit.frames import fit_frames
 from ..fit.image_metric import in_corrected, measured_as
 from ..fit.own_weights import own_weights
 from ..fit.prepare import asked_for, ready_model
+from ..fit.problem import Problem
 from ..fit.result import RESULTS
-from ..fit.wrapper import AbstractWrapper
 from ..fit.zoom import fit_zoom
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
@@ -123,7 +123,7 @@ def held_out_frames(
 def _small(lines, terms):
     """The lines compressed, under their own distortion model and in their own metric."""
     plain = in_corrected(lines)
-    wrapped = isinstance(plain, AbstractWrapper)
+    wrapped = isinstance(plain, Problem)
     return (
         compressed_as_measured(lines, terms) if wrapped else measured_as(small_lines(plain, terms), lines)
     )

@@ -38,9 +38,9 @@ from ..fit.energy import (
 from ..fit.family_lines import compress_family
 from ..fit.image_metric import measured_as
 from ..fit.own_weights import counts_of, own_weights
+from ..fit.problem import about_own_centre, data_of
 from ..fit.result import ZoomFit
 from ..fit.same_camera import check_lines_of, placed_as
-from ..fit.wrapper import about_own_centre
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed, bucketed_jit, of_lines
 from ..lines.lines import Lines
@@ -150,7 +150,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     placed: Any = placed_as(lens, lines)
     if compressed is None:
         terms = np.asarray(lens.zoom(lens.focal_range[0])).size
-        points: Any = placed if isinstance(placed, Lines) else placed.as_weighted()
+        points = data_of(placed)
         compressed = compress_family(points, lens.family, terms=terms)
     compressed = _same_lines(lines, compressed)
     weight = own_weights(compressed)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from .._core.checks import checked_integer
 from ..fit.compression import compressed
 from ..fit.own_weights import own_weights
-from ..fit.wrapper import AbstractWrapper
+from ..fit.problem import Problem
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
 
@@ -56,7 +56,7 @@ def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
         TypeError: they are no lines, or have a distortion model or a metric of their own.
         ValueError: they are compressed already, for fewer terms; a point is not finite; or no line counts.
     """
-    if isinstance(lines, AbstractWrapper):
+    if isinstance(lines, Problem):
         raise TypeError(
             "Argument lines has a distortion model of its own, and here each candidate has one: pass the "
             "lines without with_family, and Model(zoom, terms, family)."

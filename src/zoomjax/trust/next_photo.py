@@ -22,12 +22,13 @@ from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
-from ..fit.energy import counted_frames, line_residuals, line_weights, linearised, number_counted
+from ..fit.energy import counted_frames, line_weights, linearised, number_counted
 from ..fit.family_lines import with_family
 from ..fit.own_weights import own_weights
 from ..fit.result import ZoomFit
 from ..fit.same_camera import check_lines_of
 from ..lines.base import AbstractLines
+from ..lines.best_line import line_residuals
 from ..lines.buckets import bucketed_jit, of_lines
 from ..models.requirements import check
 from ..models.sizes import at_focal

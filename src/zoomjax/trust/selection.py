@@ -23,8 +23,8 @@ from .._core.types import of_known_values
 from ..fit.family_lines import compress_family, with_family
 from ..fit.image_metric import in_corrected, measured_as
 from ..fit.prepare import ready_model
+from ..fit.problem import about_own_centre
 from ..fit.result import ZoomFit
-from ..fit.wrapper import about_own_centre
 from ..fit.zoom import fit_zoom
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
