@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zoomjax._core.text import listed, numbered_name, plain, reason, span
+from zoomjax._core.text import listed, numbered_name, plain, reason, span, with_std
 
 names = st.text(max_size=300) | st.text(
     st.sampled_from("./\\:*?<>|\"' -=~a\x1b\n\udcff\u202e"), max_size=300
@@ -64,6 +64,22 @@ def test_a_span_of_one_value_is_that_value():
     assert span(20.56, 127.36, "mm") == "20.56 to 127.36 mm"
     assert span(28.0, 28.0, "mm") == "28 mm"
     assert span(1000.01, 1000.02, "px") == "1000 px"
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "shown"),
+    [
+        (4191.46, 307.1, "+4191 \u00b1 307 px"),
+        (-24.36, 20.39, "-24 \u00b1 20 px"),
+        (103.381, 0.1234, "+103.38 \u00b1 0.12 px"),
+        (0.5, 0.0, "+0.50 \u00b1 0.00 px"),
+        (1.0, 1e-12, "+1.000000 \u00b1 0.000000 px"),
+        (9.87, float("inf"), "+9.87 px (uncertainty unknown)"),
+        (9.87, float("nan"), "+9.87 px (uncertainty unknown)"),
+    ],
+)
+def test_values_are_shown_as_far_as_they_are_known(value, std, shown):
+    assert with_std(value, std, "px") == shown
 
 
 def test_lists_end_by_how_much_is_left_out():

@@ -15,7 +15,6 @@ from zoomjax.app.verdict import (
     findings_of_focals,
     findings_of_photos,
     findings_of_sizes,
-    told_undetermined,
     verdict_of_photo,
 )
 from zoomjax.detect.batch import Detection
@@ -112,13 +111,6 @@ def test_photos_whose_strong_edges_are_on_no_line_are_remarked_on():
     assert "90% in 2.jpg" in found.found
     assert findings_of_edges([*photos[:2], Detection("a.jpg", unexplained=0.1)]) == []
     assert findings_of_edges([Detection("grid.jpg")]) == []
-
-
-def test_lines_that_determine_nothing_are_named_for_what_they_are():
-    with pytest.raises(ValueError, match=r"do not determine a lens.*1 of 10 folds"), told_undetermined():
-        raise ValueError("No candidate can be compared. 1 of 10 folds do not converge")
-    with pytest.raises(ValueError, match=r"^Another"), told_undetermined():
-        raise ValueError("Another problem.")
 
 
 def test_selection_still_says_what_that_is_told_by(noisy):

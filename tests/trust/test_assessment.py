@@ -118,6 +118,26 @@ def test_curved_things_are_not_good(lines, rng):
     assert "crooked lines" in about(found)
 
 
+@pytest.mark.parametrize("curved", [True, False])
+def test_a_photo_of_curved_things_alone_determines_no_lens(lens, rng, curved):
+    """Half a dozen arcs, which no lens straightens together: lines left out gain nothing."""
+    board = scenes.board_lines(lens, np.array([50.0]), spacing=24.0, noise=NOISE)
+    chosen = np.linspace(0, len(board.frame) - 1, 6).astype(int)
+    points = [board.to_ragged()[line] for line in chosen]
+    if curved:
+        points = [
+            line + side * np.linspace(-1, 1, len(line))[:, None] ** 2 * [3.0, -3.0]
+            for line, side in zip(points, rng.permutation([-1, 1, -1, 1, -1, 1]), strict=True)
+        ]
+    lines = zj.Lines.from_ragged(points, [0] * 6, [50.0], image_size=SIZE)
+    small = zj.compress(lines)
+    fit = zj.fit_zoom(small, zoom=zj.PolynomialZoom(degree=0))
+    left_out = {"held_out": np.full(1, np.nan), "each_held_out": held_out_frames(small)}
+    found = assess(lines, fit, compressed=small, **left_out)
+    assert (found.verdict == "not determined") == curved
+    assert ("lines left out" in about(found)) == curved
+
+
 def test_lines_without_noise_are_not_crooked(lens, lines):
     """Rounding leaves 1e-13 px, many times the noise, which is less still."""
     exact = scenes.board_lines(lens, scenes.focal_sweep(6), spacing=24.0, noise=0)

@@ -1,5 +1,6 @@
 """Safe display and use of file names that others chose."""
 
+import math
 import re
 import unicodedata
 from collections.abc import Iterable
@@ -41,6 +42,14 @@ def span(low: float, high: float, unit: str) -> str:
     """Two ends in their unit, or the one value that both are."""
     ends = [f"{value:.5g}" for value in (low, high)]
     return f"{' to '.join(dict.fromkeys(ends))} {unit}"
+
+
+def with_std(value: float, std: float, unit: str) -> str:
+    """A signed value and its standard deviation, as far as it is known: +4191 ± 307 px."""
+    if not math.isfinite(std):
+        return f"{value:+.4g} {unit} (uncertainty unknown)"
+    decimals = 2 if std <= 0 else min(max(1 - math.floor(math.log10(std)), 0), 6)
+    return f"{value:+.{decimals}f} ± {std:.{decimals}f} {unit}"
 
 
 def listed(names: Iterable[str], most: int, between: str = ", ") -> str:

@@ -313,8 +313,13 @@ def calibrate(
     if dry_run:
         return tell_plan(images_plan(job), output)
     names = [*job.results(), REPORT]
-    with results_folder(output, names, clears=OF_A_LENS, overwrite=overwrite) as folder:
-        done = calibrate_images(job, folder, title=title_of(inputs), quiet=quiet, cluster=cluster)
+    from .undetermined import Undetermined
+
+    try:
+        with results_folder(output, names, clears=OF_A_LENS, overwrite=overwrite) as folder:
+            done = calibrate_images(job, folder, title=title_of(inputs), quiet=quiet, cluster=cluster)
+    except Undetermined as error:
+        raise ValueError(f"{error} {error.keep(output, overwrite=overwrite)}") from error
     return show.images(done, output)
 
 

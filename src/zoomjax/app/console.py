@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .._core.text import plain
+from .._core.text import plain, with_std
 from ._interrupts import go_on
 
 if TYPE_CHECKING:
@@ -199,7 +199,7 @@ def show_calibration(
         console.print(_coefficients(calibration))
     console.print(f"\n{calibration.centre.sentence}", highlight=False)
     corner = [
-        f"{moved:+.2f} ± {std:.2g} px" + f" at {f:.4g} {unit}" * calibration.focal_known
+        with_std(moved, std, "px") + f" at {f:.4g} {unit}" * calibration.focal_known
         for f, moved, std in calibration.corner()
     ]
     console.print(f"\nThe correction moves a corner by {', '.join(corner)}.", highlight=False)
@@ -287,10 +287,8 @@ def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()
     found = sum(len(detection.lines) for detection in done.used)
     rejected = int(done.calibration.rejected.sum())
     print()
-    say(
-        f"{found} lines found in {_images(len(done.used))}; {rejected} of them are not straight in the "
-        "scene and were rejected."
-    )
+    lost = "none" if not rejected else f"{rejected} of them {'is' if rejected == 1 else 'are'}"
+    say(f"{found} lines found in {_images(len(done.used))}; {lost} rejected as not straight in the scene.")
     say(f"Focal lengths: {plain(done.focals.origin)}.")
     deviation = sorted(s / done.focals.focal[name] for name, s in done.focals.deviation.items())
     if deviation:

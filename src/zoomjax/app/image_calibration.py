@@ -28,6 +28,7 @@ from .overlay import draw_lines
 from .plane_focals import Sharing
 from .results_folder import OF_A_LENS, results_folder
 from .tying import Bend, tied, to_search_again
+from .undetermined import told_undetermined
 from .usable import OTHER_SIZE, usable_of
 from .verdict import (
     findings_of_edges,
@@ -35,7 +36,6 @@ from .verdict import (
     findings_of_photos,
     findings_of_sizes,
     nothing_usable,
-    told_undetermined,
     verdict_of_photo,
 )
 
@@ -307,7 +307,7 @@ def _calibrated(
         shown = used if bundle is None else bundle.lines_used(used)
         lines = lines_of(shown, np.array([focals.focal[d.name] for d in used]), focals.unit)
         sigma = np.array([focals.deviation.get(d.name, 0.0) for d in used])
-        with told_undetermined():
+        with told_undetermined(job, used, unused):
             calibration = calibrate(
                 lines,
                 model=job.model,

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from .._core.text import with_std
 from ..detect.batch import Detection
 from ..fit.motion import LOOPS, MotionFit, fit_motion
 from ..fit.result import RESULTS
@@ -189,7 +190,7 @@ class MotionCalibration:
     def figures(self) -> list[str]:
         """The figures, in lines of text."""
         views = int(np.sum(np.asarray(self.tracks.mask)))
-        corner = [f"{moved:+.2f} ± {std:.2g} px at {f:.4g} px" for f, moved, std in self.corner()]
+        corner = [f"{with_std(moved, std, 'px')} at {f:.4g} px" for f, moved, std in self.corner()]
         lens = self.fit.lens
         low, high = (float(f) for f in lens.focal_range)
         where = [np.asarray(lens(f).centre) for f in (low, high)]

@@ -25,6 +25,8 @@ MOST = 12
 """Photos shown: the page stays small enough to be sent by mail."""
 
 _WIDE = 560  # px of the longer side
+_LEAST_SCALE = 0.5
+"""Of corrected pictures: corners that a strong lens moves far out are cut off, for the rest to be seen."""
 _CROP, _CROP_SIDE = 3, 260  # crops per photo, and px of their side
 _QUALITY = 78
 
@@ -85,10 +87,14 @@ def before_after(image: UInt8[np.ndarray, "..."], distortion: Distortion) -> tup
 
 
 def _corrected(small: np.ndarray, distortion: Distortion) -> tuple[np.ndarray, Framing]:
-    """All of a picture, corrected, and how it is framed."""
+    """A picture, corrected, and how it is framed: all of it, unless that would be too small to see."""
+    size = (small.shape[1], small.shape[0])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of folds, which the report states
-        framing = frame_output(distortion, (small.shape[1], small.shape[0]), keep="all")
+        framing = frame_output(distortion, size, keep="all")
+        if framing.scale < _LEAST_SCALE:
+            fixed = np.asarray(distortion.centre)  # stays where it is
+            framing = Framing(np.array(_LEAST_SCALE), fixed - fixed / _LEAST_SCALE, size, size)
         return undistort_image(small, distortion, keep=framing, border_value=128), framing
 
 

@@ -1,8 +1,7 @@
 """The verdict on a calibration from photos: that of the fit, and what the photos say about themselves."""
 
-import contextlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -133,24 +132,6 @@ def verdict_of_photo(
         if apart > APART * diagonal:
             return "doubtful", f"its own lines are bent by {apart:.2g} px otherwise than the lens says"
     return "good", "" if np.isfinite(joint) else _UNTOLD
-
-
-@contextlib.contextmanager
-def told_undetermined() -> Iterator[None]:
-    """Say of an error that no model can be compared what it means of photos: too few straight lines.
-
-    Raises:
-        ValueError: that error, or another as it is.
-    """
-    try:
-        yield
-    except ValueError as error:
-        if not str(error).startswith("No candidate can be compared"):
-            raise
-        raise ValueError(
-            "The lines found in the images do not determine a lens: they are too few, or not straight in "
-            f"the scene. Photograph a scene with long straight lines. ({error})"
-        ) from error
 
 
 def nothing_usable(detections: Sequence[Detection]) -> str:

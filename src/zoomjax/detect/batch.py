@@ -197,7 +197,7 @@ def _detected(task: _Task, *, detector: AbstractDetector, grid: str) -> Detectio
         return found(problem=f"it is {size[0]}x{size[1]} px: at least {_SMALLEST} px a side are needed")
     if isinstance(detector, PitchDetector) and image.ndim == 2:
         return found(
-            size, problem=f"it is grey, but the pitch detector finds grass by its colour. {_ANOTHER}"
+            size, problem=f"it is grey, but the pitch detector finds grass by its colour. {_EDGES}"
         )
     try:
         focal = source.focal if focal is None else focal
@@ -228,11 +228,11 @@ def _lines(
     return _thinned(lines), None, None
 
 
-_ANOTHER = "Try another detector, such as edges (argument detector)"
+_EDGES = "Try another detector, such as edges (argument detector)"
 
 NO_LINES = (
-    "no lines were found. Check that straight edges are in focus, well lit and large in the image. "
-    + _ANOTHER
+    "no lines were found. Check that straight edges are in focus, well lit and large in the image, "
+    "or try another detector (argument detector)"
 )
 """The problem of an image in which there are none, which more knowledge of the lens may mend."""
 

@@ -137,7 +137,8 @@ def assess(
         lines: the lines of the fit, with their points and weights.
         fit: the fit.
         compressed: the same lines compressed for the fit's distortion model, if they are at hand.
-        held_out, each_held_out: from `held_out_zoom` and `held_out_frames`, if they are to be judged.
+        held_out, each_held_out: from `held_out_zoom` and `held_out_frames`, if they are to be judged. Of
+            one frame the second alone is.
 
     Raises:
         ValueError: as `evidence`; or there is not one number a frame in these two, or one of them alone.
@@ -162,6 +163,7 @@ def assess(
     if held_out is not None and each_held_out is not None:
         both = (np.asarray(values, float) for values in (held_out, each_held_out))
         focal = np.asarray(lines.focal, float)
+        findings += _of_one_frame(found, float(np.sum(each_held_out)))
         findings += _of_frames(found, np.where(np.isin(focal, focals_there(lines)), focal, np.nan), *both)
     return Assessment((), found).joined_by(findings)
 
@@ -305,6 +307,24 @@ def _of_frames(of: Evidence, focal: np.ndarray, zoom: np.ndarray, each: np.ndarr
             f"the model leaves {_px(joint)} px in photos that it was not fitted to, but {_px(own)} px in "
             "each photo by itself.",
             "Check that all photos come from one lens with the right focal lengths, or try another model.",
+        )
+
+
+def _of_one_frame(of: Evidence, each: float) -> Iterator[Finding]:
+    """Lines of a single photo that no other line makes straighter: there is no lens in them.
+
+    Where what is uncertain does no harm, there may be nothing to straighten.
+    """
+    if of.frames > 1 or of.bent_std <= max(_UNSEEN_PX, NEGLIGIBLE * of.diagonal):
+        return
+    if each >= of.rms_uncorrected:
+        yield Finding(
+            "lines left out",
+            "not determined",
+            f"lines that were left out of the fit deviate by {each:.3g} px corrected, and by "
+            f"{of.rms_uncorrected:.3g} px as they are.",
+            "Look at the drawn lines: do they follow straight things? Photograph long ones, near the edges "
+            "of the image.",
         )
 
 

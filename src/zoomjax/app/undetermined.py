@@ -1,0 +1,89 @@
+"""What is kept of photos whose lines determine no lens: the lines, drawn, and the verdict.
+
+Without it nobody could see what was taken for straight.
+"""
+
+import contextlib
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+
+from ..detect.batch import Detection
+from .image_job import ImageJob, overlay_name
+from .overlay import draw_lines
+from .results_folder import OF_A_LENS, results_folder
+
+_MOST = 24
+"""Photos drawn."""
+
+_SENTENCE = (
+    "The lines found in the images do not determine a lens: they are too few, or not straight in the scene."
+    " Photograph a scene with long straight lines."
+)
+
+
+class Undetermined(ValueError):
+    """No lens can be fitted to the lines of photos.
+
+    Attributes:
+        job: the settings of the calibration.
+        used: the photos, with what was found in each.
+        unused: for each photo that was not used, the reason.
+    """
+
+    def __init__(self, job: ImageJob, used: Sequence[Detection], unused: dict[str, str]):
+        super().__init__(_SENTENCE)
+        self.job, self.used, self.unused = job, used, unused
+
+    def keep(self, folder: Path, *, overwrite: bool) -> str:
+        """Write the photos with their lines, and summary.json, unless a lens is there; say where."""
+        if (folder / "lens.json").exists():
+            return f"What is in {folder} was left as it is."
+        names = [overlay_name(number, of.name) for number, of in enumerate(self.used[:_MOST], start=1)]
+        files = ["summary.json", *(f"lines/{name}" for name in names)]
+        with results_folder(folder, files, clears=OF_A_LENS, overwrite=overwrite) as part:
+            (part / "lines").mkdir()
+            self._draw(part / "lines", names)
+            (part / "summary.json").write_text(json.dumps(self._summary(), indent=2) + "\n")
+        return f"They are drawn in {folder / 'lines'}: look whether they follow straight things."
+
+    def _summary(self):
+        images = [
+            {"name": of.name, "lines": len(of.lines), "unexplained": of.unexplained} for of in self.used
+        ]
+        return {
+            "verdict": "not determined",
+            "verdict_sentence": str(self),
+            "detector": self.job.detector,
+            "images": images,
+            "unused": self.unused,
+        }
+
+    def _draw(self, folder: Path, names: Sequence[str]) -> None:
+        found = {of.name: (of.lines, name) for of, name in zip(self.used, names, strict=False)}
+        for source in self.job.sources()[0]:
+            if source.name not in found:
+                continue
+            lines, name = found[source.name]
+            labels = {line: str(line) for line in range(len(lines))}
+            picture = draw_lines(source.read()[0], lines, [False] * len(lines), labels=labels)
+            done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
+            assert done
+            (folder / name).write_bytes(content.tobytes())
+
+
+@contextlib.contextmanager
+def told_undetermined(job: ImageJob, used: Sequence[Detection], unused: dict[str, str]) -> Iterator[None]:
+    """Say of an error that no model can be compared what it means of photos: too few straight lines.
+
+    Raises:
+        Undetermined: that error.
+    """
+    try:
+        yield
+    except ValueError as error:
+        if not str(error).startswith("No candidate can be compared"):
+            raise
+        raise Undetermined(job, used, unused) from error
