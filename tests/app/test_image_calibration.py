@@ -205,6 +205,9 @@ def test_one_photo_needs_no_focal_length(folder, tmp_path):
     page = report(done.calibration, done)
     assert "focal length not known" in page
     assert "against 1/f" not in page  # plots of one point
+    assert [name for name, _ in done.calibration.rows()] == ["no correction", "corrected"]
+    for zooms in ("frame by frame", "over the zoom", "zoom polynomial", "focal range"):
+        assert zooms not in page
     for text in (page, done.calibration.advice(), str(done.calibration.summary()["next_photo"])):
         assert not re.search(r"\b1 mm\b(?! stands)", text)
     done.calibration.zoom.lens.save(tmp_path / "lens.json")

@@ -140,6 +140,8 @@ class Calibration:
 
     def rows(self) -> list[tuple[str, np.ndarray]]:
         """Rows of a table like the paper's Table 1: the correction and each frame's RMS, px."""
+        if len(self.none) == 1:  # then all models of the zoom are that of the frame
+            return [("no correction", self.none), (self.kind, np.asarray(self.zoom.frame_rms))]
         return [
             ("no correction", self.none),
             ("frame by frame", np.asarray(self.each.frame_rms)),
@@ -150,10 +152,14 @@ class Calibration:
     @property
     def kind(self) -> str:
         """What the zoom model is called in tables."""
+        if len(self.none) == 1:
+            return "corrected"
         return "zoom polynomial" if isinstance(self.zoom.lens.zoom, PolynomialZoom) else "zoom model"
 
     def held_out_rows(self) -> dict[str, np.ndarray]:
         """For some of the `rows`, each frame's RMS on lines that were not used in the fit, px."""
+        if len(self.none) == 1:
+            return {self.kind: self.each_held_out}
         return {"frame by frame": self.each_held_out, self.kind: self.held_out}
 
     def warnings(self, names: Sequence[str] | None = None) -> list[str]:

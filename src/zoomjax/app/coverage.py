@@ -13,15 +13,16 @@ _MOST_POINTS = 200_000  # are enough to average over
 
 
 def plot_coverage(lines: Lines, weight: np.ndarray) -> Figure:
-    """Plot how many lines pass each part of the image, and how many there are at each focal length.
+    """Plot how many lines pass each part of the image, and how many there are at each focal length, if any.
 
     Args:
         lines: the lines.
         weight: of each line; those of weight 0 are left out.
     """
     width, height = lines.image_size
-    figure = Figure(figsize=(9.6, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    zoomed = len(lines.focal) > 1
+    figure = Figure(figsize=(9.6 if zoomed else 4.8, 3.6), layout="constrained")
+    left, *others = figure.subplots(1, 1 + zoomed, squeeze=False)[0]
     counted = np.asarray(lines.mask) & (weight > 0)[:, None]
     line, point = np.nonzero(counted)
     cell = max(width, height) / _CELLS
@@ -34,6 +35,13 @@ def plot_coverage(lines: Lines, weight: np.ndarray) -> Figure:
     left.set(xlim=(0, width), ylim=(height, 0), xlabel="$x$  (px)", ylabel="$y$  (px)")
     left.set_title("lines through each part of the image", fontsize=10)
     figure.colorbar(shown, ax=left, shrink=0.8)
+    for right in others:
+        _by_focal(right, lines, weight)
+    return figure
+
+
+def _by_focal(right, lines, weight):
+    """How many lines there are at each focal length."""
     focal = np.asarray(lines.focal)
     per_frame = np.bincount(np.asarray(lines.frame)[weight > 0], minlength=len(focal))
     right.vlines(focal, 0, per_frame, color=FRAMES, linewidth=1)
@@ -46,7 +54,6 @@ def plot_coverage(lines: Lines, weight: np.ndarray) -> Figure:
         right.tick_params(axis="x", which="both", labelsize=8)
     right.set_title("lines in each photo", fontsize=10)
     right.spines[["top", "right"]].set_visible(False)
-    return figure
 
 
 def plot_radius(lines: Lines, lens: ZoomLens, weight: np.ndarray) -> Figure:

@@ -166,12 +166,13 @@ def _straightness(calibration: Calibration) -> dict[str, Any]:
     )
     chosen = calibration.selection
     return {
+        "against": "vs. frame by frame" if len(calibration.none) > 1 else "vs. corrected",
         "rows": [
             (
                 name,
                 f"{held_out[name]:.4f}" if held_out.get(name, np.nan) > 0 else "",
                 f"{value:.4f}",
-                "" if name == "frame by frame" else _excess(value, each),
+                "" if name in ("frame by frame", "corrected") else _excess(value, each),
             )
             for name, value in ((name, rms_over_frames(frames)) for name, frames in calibration.rows())
         ],

@@ -84,8 +84,9 @@ class Suggestion:
         photo = f"Next, photograph {self.direction} lines through {self.region} of the image {zoom}"
         if not np.isfinite(self.before):
             return f"{photo}: of all candidates, this one would determine the lens best."
+        where = "image and focal range" if len(self.focals) > 1 else "the image"
         return (
-            f"{photo}: the standard deviation of the displacement, averaged over image and focal range, "
+            f"{photo}: the standard deviation of the displacement, averaged over {where}, "
             f"would fall from {self.before:.2g} to {self.after:.2g} px."
         )
 
