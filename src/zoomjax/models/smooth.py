@@ -73,8 +73,9 @@ class SmoothZoom(AbstractPriorZoom):
     The defaults are learned from the 618 rectilinear zooms that the lensfun database (of lensfunpy 1.18)
     has at five or more focal lengths. Learned from half of the lenses and tested on the other half, and the
     other way round, it predicts a focal length that was left out better in the median than all other zoom
-    models here (docs/zoom-models.md, with what was chosen on all lenses). They are for two coefficients
-    of the radial polynomial: with other `terms`, or another distortion model, the prior has to be given.
+    models here (docs/zoom-models.md, with what was chosen on all lenses); from two or three, `for_lens`,
+    which knows more of the lens, predicts better still. They are for two coefficients of the radial
+    polynomial: with other `terms`, or another distortion model, the prior has to be given.
     The default `error` is 0.24 px at 4288 x 2848, by which hand calibrations are predicted best; a smaller
     one trusts each frame more.
 
