@@ -270,7 +270,7 @@ def pitch() -> str:
 def lensfun() -> str:
     """Six hundred lenses, a focal length left out."""
     names = {
-        "SmoothZoom, other half's prior": "`SmoothZoom`, prior from other lenses",
+        **_SMOOTH,
         "degree chosen inside": "degree 1, 2 or 3, chosen by leaving out inside",
         "degree 2": "`PolynomialZoom`, degree 2",
         "degree 3": "degree 3",
@@ -290,6 +290,12 @@ def lensfun() -> str:
     return markdown(["", "25 %", "median", "75 %", "90 %", "in sample, median"], rows)
 
 
+_SMOOTH = {
+    "SmoothZoom.for_lens, other half's prior": "`SmoothZoom.for_lens`, prior from other lenses",
+    "SmoothZoom, other half's prior": "`SmoothZoom`, prior from other lenses",
+}
+
+
 def _three(figure: float) -> str:
     return f"{figure:.3f}"
 
@@ -297,14 +303,23 @@ def _three(figure: float) -> str:
 def lensfun_few() -> str:
     """Six hundred lenses of which a few focal lengths are fitted."""
     names = {
-        "SmoothZoom, other half's prior": "`SmoothZoom`, prior from other lenses",
+        **_SMOOTH,
         "polynomial of degree 2, or the highest there is": "`PolynomialZoom`, degree 2 (of two: 1)",
         "table in 1/f": "`TableZoom` in 1/f",
     }
-    few = results("lensfun.json")["few"]
+    return _few(results("lensfun.json")["few"], names)
+
+
+def lensfun_part() -> str:
+    """The same lenses, of which the longer half of the range is photographed."""
+    told = {"the same, told the ends fitted": "`SmoothZoom.for_lens` of that half"}
+    return _few(results("lensfun.json")["part"]["errors"], _SMOOTH | told)
+
+
+def _few(errors: dict, names: dict[str, str]) -> str:
     rows = [
-        [number, shown, *map(_three, few[name][number])]
-        for number in ("2", "3", "4")
+        [number, shown, *map(_three, errors[name][number])]
+        for number in errors[next(iter(names))]
         for name, shown in names.items()
     ]
     return markdown(["fitted", "", "25 %", "median", "75 %", "90 %"], rows)
@@ -362,6 +377,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "pitch": pitch,
     "lensfun": lensfun,
     "lensfun-few": lensfun_few,
+    "lensfun-part": lensfun_part,
     "lensfun-forms": lensfun_forms,
     "board-focal": board_focal,
     "vision": vision,

@@ -7,10 +7,11 @@ import pytest
 from PIL import Image
 
 from zoomjax import scenes
-from zoomjax.app.equipment import with_equipment
+from zoomjax.app.equipment import KnownLens, known_lens, with_equipment
+from zoomjax.app.model_choice import WantedModel
 from zoomjax.io.equipment import FILM
 
-from ..io.test_equipment import CROP, FOCAL, PITCH, SIZE, block, plane
+from ..io.test_equipment import CROP, FOCAL, PITCH, SIZE, block, ends, plane
 
 SENSOR = plane(25.4 / PITCH, 2)
 
@@ -66,3 +67,45 @@ def test_without_the_database_the_sensor_is_not_known(lens, tmp_path, monkeypatc
 def test_the_maker_is_named_once(lens, tmp_path):
     found = with_equipment(lens, [photo(tmp_path / "a.jpg", maker="SONY", camera="ILCE-7M3")])
     assert found.about["camera"] == "SONY ILCE-7M3"
+
+
+ZOOM = ends((18, 1), (200, 1), (35, 10), (56, 10))
+
+
+def of_a_zoom(path, zoom=ZOOM, **sensor):
+    content = block(**FOCAL, **zoom, **(sensor or {"FocalLengthIn35mmFilm": 53}))
+    Image.fromarray(np.zeros((8, 12, 3), np.uint8)).save(path, exif=content)
+    return path
+
+
+def test_a_lens_that_all_photos_tell_is_known(tmp_path):
+    photos = [of_a_zoom(tmp_path / "a.jpg"), of_a_zoom(tmp_path / "b.jpg", FocalLengthIn35mmFilm=52)]
+    found = known_lens(photos, [18.0, 35.0], SIZE)
+    assert found == KnownLens(18.0, 200.0, 52.5 / 35)
+    assert found.prior().focal_ref == 18.0
+    assert "a lens of 18 to 200 mm at crop factor 1.5" in found.sentence()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"zoom": {}},
+        {"zoom": ends((16, 1), (85, 1), (35, 10), (56, 10))},
+        {"FocalLengthIn35mmFilm": 0},
+        {"FocalLengthIn35mmFilm": 70},
+    ],
+)
+def test_a_lens_that_one_photo_does_not_tell_or_contradicts_is_not_known(other, tmp_path):
+    photos = [of_a_zoom(tmp_path / "a.jpg"), of_a_zoom(tmp_path / "b.jpg", **other)]
+    assert known_lens(photos, [18.0, 35.0], SIZE) is None
+
+
+@pytest.mark.parametrize("focal", [[9.0, 35.0], [35.0, 280.0]])
+def test_focal_lengths_beyond_the_lens_are_those_of_another(focal, tmp_path):
+    assert known_lens([of_a_zoom(tmp_path / "a.jpg")], focal, SIZE) is None
+
+
+def test_the_models_that_are_compared_know_the_lens():
+    known = WantedModel("smooth", lens=KnownLens(18.0, 200.0, 1.5))
+    assert known.base([18.0, 35.0]).zoom.focal_ref == 18.0
+    assert WantedModel("smooth").base([18.0, 35.0]).zoom.mean is None

@@ -11,6 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 import zoomjax as zj
 from zoomjax import scenes
@@ -26,6 +28,7 @@ from zoomjax.io.exif import exif_with_focal
 from zoomjax.io.video_reader import decode_video
 
 from .. import _clips as clips
+from ..io.test_equipment import block, ends
 
 SIZE = (1072, 712)
 
@@ -189,6 +192,31 @@ def test_an_image_none_of_whose_lines_agrees_is_not_used(folder, tmp_path):
     assert list(done.unused) == ["bent.png"]
     assert "none of its lines is straight" in done.unused["bent.png"]
     assert len(done.used) == 5
+
+
+@pytest.mark.slow
+def test_a_lens_that_the_photos_tell_has_its_prior(folder, tmp_path):
+    """Of two photos from inside of its range; the report says so."""
+    for path in sorted(folder.glob("board-*"))[1:3]:
+        focal = float(path.name[6:12])
+        of_lens = block(
+            FocalLength=IFDRational(round(100 * focal), 100),
+            FocalLengthIn35mmFilm=round(1.5 * focal),
+            **ends((18, 1), (200, 1), (35, 10), (56, 10)),
+        )
+        Image.open(path).save(tmp_path / path.name, exif=of_lens, quality=95)
+    done = calibrate_images(ImageJob((tmp_path,), model=WantedModel("smooth"), overlays="none"))
+    zoom = done.calibration.zoom.lens.zoom
+    np.testing.assert_allclose(zoom.mean, zj.SmoothZoom.for_lens(18.0, 200.0, crop=1.5).mean, atol=5e-4)
+    assert zoom.focal_ref == 18.0
+    told = done.about()["prior"]
+    assert "that of a lens of 18 to 200 mm at crop factor 1.5" in told
+    assert told in report(done.calibration, done)
+
+
+def test_photos_that_tell_no_lens_have_the_prior_of_all(done):
+    assert done.lens is None
+    assert done.about()["prior"] is None
 
 
 @pytest.mark.slow

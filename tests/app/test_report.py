@@ -149,6 +149,7 @@ def test_names_are_escaped_and_lead_to_their_pictures(calibration):
         overlays=lambda: [f"{name}.jpg" for name in names],
         warnings=lambda: ["<b>two</b>\n  lines & more"],
         focals=SimpleNamespace(origin='"here" <there>'),
+        prior=lambda: "The prior is that of an <i>18-200</i>.",
         shared=lambda: ["<i>3</i> photos share f"],
         verdicts=lambda: [("good", ""), ("doubtful", "<i>bent</i> otherwise"), ("good", ""), ("good", "")],
         bundle=None,
@@ -162,6 +163,7 @@ def test_names_are_escaped_and_lead_to_their_pictures(calibration):
     assert [unquote(link) for link in links] == [f"lines/{name}.jpg" for name in names]
     assert all(re.fullmatch(r"[\w/.%-]+", link) for link in links)
     assert "Warning: <b>two</b> lines & more" in page.text
+    assert "The prior is that of an <i>18-200</i>." in page.text
     assert 'Focal lengths "here" <there>.' in page.text
 
 

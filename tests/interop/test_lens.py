@@ -8,7 +8,7 @@ import pytest
 
 import zoomjax as zj
 from benchmarks.mutations import LCP
-from zoomjax.models import PolynomialZoom, TableZoom
+from zoomjax.models import PolynomialZoom, SmoothZoom, TableZoom
 
 from ._lenses import LENSES, PITCH
 from ._readers import READERS, project
@@ -54,6 +54,15 @@ def test_centres_that_scatter_are_smoothed_and_that_is_said(tmp_path):
     [note] = [note for note in back.report.notes if "scatter" in note]
     assert float(note.split("up to ")[2].split()[0]) == pytest.approx(off, rel=0.1)
     assert zj.interop.read(tmp_path / "cameras.txt", zoom=TableZoom()).report.at_nodes < 0.1
+
+
+def test_a_prior_with_a_mean_draws_values_to_it(tmp_path):
+    rows = "1 SIMPLE_RADIAL 640 480 {} 320 240 -0.1\n"
+    (tmp_path / "cameras.txt").write_text("".join(map(rows.format, (500, 700, 1000))))
+    zoom = SmoothZoom(error=1e4, mean=[[0.05, -0.01], [0.03, 0.0], [0.0, 0.02]])
+    back = zj.interop.read(tmp_path / "cameras.txt", zoom=zoom).lens.zoom
+    np.testing.assert_allclose(back.parameters[:3], zoom.mean, atol=1e-6)
+    np.testing.assert_allclose(back.parameters[3:], 0, atol=1e-6)
 
 
 def test_values_that_no_smooth_model_follows_are_smoothed_and_that_is_said(tmp_path):

@@ -81,6 +81,34 @@ def test_a_focal_plane_that_film_contradicts_is_a_mistake_of_the_camera():
     assert right.pixel_pitch(SIZE) == pytest.approx(PITCH, rel=1e-5)
 
 
+def ends(*values):
+    return {"LensSpecification": tuple(IFDRational(*value) for value in values)}
+
+
+def test_the_lens_tells_its_range():
+    found = exif_equipment(block(**ends((180, 10), (2000, 10), (35, 10), (56, 10))))
+    assert found.zoom_range == (18.0, 200.0)
+    assert exif_equipment(block(**ends((18, 1), (200, 1), (0, 0), (0, 0)))).zoom_range == (18.0, 200.0)
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {},
+        ends((18, 1), (0, 0), (35, 10), (56, 10)),
+        ends((0, 0), (200, 1), (35, 10), (56, 10)),
+        ends((0, 1), (200, 1), (35, 10), (56, 10)),
+        ends((18, 0), (200, 1), (35, 10), (56, 10)),
+        ends((200, 1), (18, 1), (35, 10), (56, 10)),
+        ends((50, 1), (50, 1), (18, 10), (18, 10)),  # no zoom
+        ends((18, 1), (200, 1)),
+        {"LensSpecification": "18-200"},
+    ],
+)
+def test_a_range_that_is_none_is_not_known(tags):
+    assert exif_equipment(block(**tags)).zoom_range is None
+
+
 @pytest.mark.parametrize(
     "content",
     [

@@ -1,3 +1,6 @@
+import dataclasses
+import json
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -6,6 +9,7 @@ import pytest
 from numpy.polynomial import Legendre
 
 import zoomjax as zj
+from zoomjax import scenes
 from zoomjax.fit.energy import prior_residuals
 from zoomjax.models.zoom import with_parameters
 
@@ -104,6 +108,130 @@ def test_file_keeps_model_and_prior(smooth, tmp_path):
     loaded = zj.load_lens(tmp_path / "lens.json")
     for mine, theirs in zip(jax.tree.leaves(loaded), jax.tree.leaves(smooth.lens), strict=True):
         np.testing.assert_array_equal(mine, theirs)
+
+
+# What is known of a lens
+
+NIKKOR = zj.SmoothZoom.for_lens(18.0, 200.0, crop=1.5)
+
+
+def test_a_mean_is_where_the_standardised_parameters_are_zero():
+    zoom = NIKKOR.prepare(FOCAL, 2)
+    parameters = jnp.zeros((7, 2)).at[:3].set(zoom.mean)
+    assert not with_parameters(zoom, parameters).standardised().any()
+    assert zoom.standardised().any()
+
+
+def test_a_mean_of_zeros_is_none(small, smooth):
+    zeros = fitted(small, mean=jnp.zeros((3, 2)), focal_ref=small.focal.min())
+    np.testing.assert_array_equal(zeros.lens.zoom.parameters, smooth.lens.zoom.parameters)
+    assert zj.SmoothZoom().mean is None
+
+
+def test_with_much_weight_the_fit_is_the_mean(small):
+    fit = zj.fit_zoom(small, zoom=dataclasses.replace(NIKKOR, error=1e3))
+    np.testing.assert_allclose(fit.lens.zoom.parameters[:3], NIKKOR.mean, atol=1e-6)
+    np.testing.assert_allclose(fit.lens.zoom.parameters[3:], 0, atol=1e-6)
+
+
+def test_the_algebraic_estimate_goes_to_the_mean_too(small):
+    held = zj.fit.algebraic_zoom(small, zoom=dataclasses.replace(NIKKOR, error=1e3))
+    np.testing.assert_allclose(held.zoom.parameters[:3], NIKKOR.mean, atol=1e-6)
+
+
+def test_a_known_lens_is_about_its_own_wide_end(small):
+    """Photos may show a part of its range."""
+    zoom = NIKKOR.prepare(FOCAL[2:], 2)
+    assert zoom.focal_ref == 18.0
+    fit = zj.fit_zoom(small, zoom=NIKKOR)
+    assert fit.lens.zoom.focal_ref == 18.0 < small.focal.min()
+    again = zj.fit_zoom(small, zoom=fit.lens.zoom)
+    np.testing.assert_allclose(again.lens.zoom.parameters, fit.lens.zoom.parameters, atol=1e-9)
+
+
+@pytest.mark.parametrize("known", [(16.0, 35.0, 1.0), (24.0, 70.0, 1.0), (18.0, 55.0, 1.5)])
+def test_standard_zooms_are_a_priori_barrels_at_the_wide_end_and_cushions_at_the_long_one(known):
+    shortest, longest, crop = known
+    zoom = zj.SmoothZoom.for_lens(shortest, longest, crop=crop)
+    zoom = with_parameters(zoom, jnp.zeros((7, 2)).at[:3].set(zoom.mean))
+    assert 0.02 < jnp.sum(zoom(shortest)) < 0.1
+    assert -0.02 < jnp.sum(zoom(longest)) < 0
+
+
+def test_beyond_most_lenses_a_prior_is_that_of_the_last_ones():
+    phone, usual = (zj.SmoothZoom.for_lens(10.0, 10.0 * r, crop=1.6) for r in (125.0, 15.0))
+    assert eqx.tree_equal(phone, usual)
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ((0.0, 50.0, 1.5), "shortest"),
+        ((np.nan, 50.0, 1.5), "shortest"),
+        ((16.0, 16.0, 1.5), "longest"),
+        ((16.0, np.inf, 1.5), "longest"),
+        ((16.0, 50.0, -1.0), "crop"),
+    ],
+)
+def test_a_lens_that_is_none_raises(given, named):
+    shortest, longest, crop = given
+    with pytest.raises(ValueError, match=f"Argument {named} must be a finite number above"):
+        zj.SmoothZoom.for_lens(shortest, longest, crop=crop)
+
+
+def test_a_mean_of_another_shape_raises():
+    with pytest.raises(ValueError, match=r"mean must have shape \(3, 2\)"):
+        zj.SmoothZoom(mean=jnp.zeros((2, 2)))
+
+
+def drawn(zoom, seed):
+    """A lens of such a prior, and lines that it sees at two focal lengths and at one between."""
+    focal = np.array([18.0, 50.0, 200.0])
+    zoom = zoom.prepare(focal, 2)
+    rng = np.random.default_rng(seed)
+    low = np.asarray(zoom.mean).ravel() + np.asarray(zoom.quadratic) @ rng.standard_normal(6)
+    parameters = jnp.zeros((7, 2)).at[:3].set(low.reshape(3, 2))
+    lens = zj.ZoomLens(
+        with_parameters(zoom, parameters), jnp.array([319.5, 239.5]), jnp.array([18.0, 200.0]), (640, 480)
+    )
+    return lens, scenes.board_lines(lens, focal, spacing=60.0)
+
+
+def test_a_lens_like_others_of_its_kind_is_predicted_better_if_its_kind_is_known():
+    """Lenses as the database has them, of which both ends are photographed."""
+    worse = []
+    for seed in range(6):
+        lens, seen = drawn(NIKKOR, seed)
+        lines = zj.compress(seen).weighted(np.where(np.asarray(seen.frame) == 1, 0.0, 1.0))
+        at = jnp.asarray(50.0)
+        apart = [
+            jnp.sum(zj.fit_zoom(lines, zoom=zoom).lens.zoom(at) - lens.zoom(at))
+            for zoom in (NIKKOR, zj.SmoothZoom())
+        ]
+        worse.append(np.abs(apart))
+    known, unknown = np.mean(worse, axis=0)
+    assert known < 0.9 * unknown
+
+
+def test_gradient_with_respect_to_the_mean(small):
+    def corner(step):
+        zoom = dataclasses.replace(NIKKOR, mean=NIKKOR.mean + step)
+        return jnp.sum(zj.fit_zoom(small, zoom=zoom).lens.zoom(jnp.asarray(30.0)))
+
+    at = jnp.asarray(0.0)
+    difference = (corner(at + 1e-3) - corner(at - 1e-3)) / 2e-3
+    np.testing.assert_allclose(jax.grad(corner)(at), difference, rtol=1e-4)
+
+
+def test_files_have_the_mean_and_older_ones_load_without(small, smooth, tmp_path):
+    lens = zj.fit_zoom(small, zoom=NIKKOR).lens
+    lens.save(tmp_path / "lens.json")
+    assert eqx.tree_equal(zj.load_lens(tmp_path / "lens.json"), lens)
+    smooth.lens.save(tmp_path / "old.json")
+    content = json.loads((tmp_path / "old.json").read_text())
+    assert content["zoom"].pop("mean") is None
+    (tmp_path / "old.json").write_text(json.dumps(content))
+    assert eqx.tree_equal(zj.load_lens(tmp_path / "old.json"), smooth.lens)
 
 
 # Fits with a prior

@@ -23,6 +23,7 @@ MODELS = {
     "polynomial": (zj.PolynomialZoom(degree=2), 2),
     "one term": (zj.PolynomialZoom(degree=1), 1),
     "prior": (zj.SmoothZoom(), 2),
+    "prior of a lens": (zj.SmoothZoom.for_lens(16.0, 300.0, crop=1.5), 2),
     "table": (zj.models.TableZoom(), 2),
     "spline": (zj.models.SplineZoom(number=4), 2),
     "not linear": (zj.models.PowerZoom(), 1),

@@ -182,12 +182,18 @@ def _padded(lens: Frames, size: int) -> Frames:
     return Frames(focal, *(np.pad(a, [(0, more)] + [(0, 0)] * (a.ndim - 1)) for a in lens[1:]))
 
 
-def all_lenses(lenses: list[Frames], fit: Callable, chosen: np.ndarray | None = None) -> list[tuple]:
-    """A batched fit of all lenses, or of some: fitted, left out of each."""
+def all_lenses(
+    lenses: list[Frames],
+    fit: Callable,
+    chosen: np.ndarray | None = None,
+    facts: np.ndarray | None = None,
+) -> list[tuple]:
+    """A batched fit of all lenses, or of some, also of the facts of each: fitted, left out of each."""
     chosen = np.arange(len(lenses)) if chosen is None else chosen
     result: list[Any] = [None] * len(lenses)
     for members, frames in batches_of(lenses, chosen):
-        fitted, left_out = (np.asarray(k) for k in fit(frames)[:2])
+        more = () if facts is None else (jnp.asarray(facts[members]),)
+        fitted, left_out = (np.asarray(k) for k in fit(frames, *more)[:2])
         for row, i in enumerate(members):
             number = len(lenses[i].focal)
             result[i] = fitted[row, :number], left_out[row, :number]

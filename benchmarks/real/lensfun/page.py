@@ -8,6 +8,12 @@ from .data import LEVEL, SIZE, UPRIGHT
 OURS = "SmoothZoom, other half's prior"
 """The model that others are compared with."""
 
+KNOWN = "SmoothZoom.for_lens, other half's prior"
+"""The same with what is known of the lens: the ends of its range, and the crop factor."""
+
+FITTED = "the same, told the ends fitted"
+"""The same, where the range of the lens is taken to be what was photographed."""
+
 _COLUMNS = ("", "25 %", "median", "75 %", "90 %", "interval of the median", "corner, median", "lenses")
 
 
@@ -20,6 +26,7 @@ def markdown(results: dict) -> str:
         _left_out(results, order),
         _lens_by_lens(results, order),
         _few(results),
+        _part(results),
         _in_sample(results, order),
         _floor(results),
         _check(results),
@@ -62,7 +69,8 @@ def _left_out(r: dict, order: list[str]) -> list[str]:
         "",
         "`corner` is how far, px, the displacement at the image's corner is from that of the frame's own "
         "optimum. The prior of `SmoothZoom` was learned from the other half of the lenses, families kept "
-        "together; as it is in the package it was learned from all of them, so that its row is in sample. "
+        "together, and so was that of `SmoothZoom.for_lens`, which knows the ends of the lens's range and "
+        "the crop factor; as it is in the package it was learned from all, so that its row is in sample. "
         "What shape the prior has was found with all lenses at hand (see docs/zoom-models.md). Monotone "
         "cubics and the nearest frame are no models of the package; `degree chosen inside` takes the "
         "degree, 1 to 3, that predicts best within the focal lengths it may see. Power law and two regions "
@@ -92,20 +100,37 @@ def _lens_by_lens(r: dict, order: list[str]) -> list[str]:
     ]
 
 
-def _few(r: dict) -> list[str]:
+def _of_few(errors: dict) -> list[str]:
     rows = [
-        [name, number, *(f"{x:.3f}" for x in quantiles)]
-        for number in next(iter(r["few"].values()))
-        for name, of in r["few"].items()
-        for quantiles in (of[number],)
+        [name, number, *(f"{x:.3f}" for x in of[number])]
+        for number in next(iter(errors.values()))
+        for name, of in errors.items()
     ]
+    return table(("", "fitted", "25 %", "median", "75 %", "90 %"), rows)
+
+
+def _few(r: dict) -> list[str]:
     return [
         "## Few focal lengths",
         "",
         "Only so many are fitted: both ends of the zoom and, between them, those nearest to an even "
-        "spacing in 1/f. Errors at the other ones, by the quantiles over the lenses.",
+        "spacing in 1/f. Errors at the other ones, by the quantiles over the lenses. `for_lens` knows the "
+        "ends of the lens's range and the crop factor.",
         "",
-        *table(("", "fitted", "25 %", "median", "75 %", "90 %"), rows),
+        *_of_few(r["few"]),
+    ]
+
+
+def _part(r: dict) -> list[str]:
+    part = r["part"]
+    return [
+        "## A part of the range",
+        "",
+        f"The same of {part['lenses']} lenses with seven or more focal lengths of which the longer half is "
+        "photographed. `for_lens` knows the whole range of the lens, and is about its shortest focal "
+        "length (or, in its second row, is told that the lens had that half alone).",
+        "",
+        *_of_few(part["errors"]),
     ]
 
 

@@ -28,22 +28,18 @@ from .data import (
     halves,
     read,
 )
+from .few import Learned, few_focal_lengths, learn_both, part_of_the_range
 from .models import (
-    FEW,
     all_lenses,
-    batches_of,
     fit_chosen_degree,
     fit_polynomials,
-    inner,
     interpolate,
-    lens_error,
     one_by_one,
     power_law,
-    some_of,
     two_regions,
 )
 from .page import OURS
-from .prior import few_errors, fit_smooth, learn
+from .prior import Prior, fit_smooth, no_facts
 
 DRAWS = 2000
 
@@ -138,9 +134,7 @@ def study() -> dict:
 
     family = families(lenses)
     side = halves(family)
-    # What is independent goes side by side: half of the time is compiling, which takes one core.
-    with ThreadPoolExecutor(2) as pool:
-        learned = list(pool.map(lambda part: learn(data, side != part), (0, 1)))
+    learned = learn_both(lenses, data, side)
     lap("priors of both halves")
 
     fits = fit_all(data, side, learned)
@@ -152,10 +146,12 @@ def study() -> dict:
     left_out = {name: errors.left_out(fit) for name, fit in fits.items()}
     paired = {name: compared(left_out[OURS], error, bootstrap) for name, error in left_out.items()}
     few = few_focal_lengths(data, side, learned)
+    part = part_of_the_range(lenses, data, side, learned)
     pairs = twice_calibrated(lenses, data, np.split(np.asarray(triangle), errors.start[1:-1]))
     lap("true energies and intervals")
     study_time, processor = sum(times.values()), time.process_time()
-    zooms = {"degree 2": lambda i: zj.PolynomialZoom(), OURS: lambda i: learned[side[i]]}
+    zooms = {"degree 2": lambda i: zj.PolynomialZoom()}
+    zooms |= {name: partial(one.of_lens, side=side) for name, one in learned.items()}
     check = check_against_package(lines, lenses, data, zooms, fits)
     lap("comparison with fit_zoom")
     return {
@@ -168,6 +164,7 @@ def study() -> dict:
         "models": rows,
         "paired": paired,
         "few": few,
+        "part": part,
         "twice": {"pairs": len(pairs), "rms": np.quantile(pairs, QUANTILES).tolist()},
         "check": check,
         "seconds": study_time,
@@ -190,69 +187,31 @@ def stopwatch() -> tuple[dict[str, float], Callable[[str], None]]:
     return times, lap
 
 
-def fit_all(data: list[Frames], side: np.ndarray, learned: list[zj.SmoothZoom]) -> dict[str, list]:
+def fit_all(data: list[Frames], side: np.ndarray, learned: dict[str, Learned]) -> dict[str, list]:
     """Every model on every lens: coefficients fitted, and left out."""
 
-    def cross_fitted():
+    def cross_fitted(learned):
         smooth: list[Any] = [None] * len(data)
-        for part, zoom in enumerate(learned):
-            mine = all_lenses(data, partial(fit_smooth, zoom=zoom), np.flatnonzero(side == part))
+        for part, prior in enumerate(learned.priors):
+            fit, chosen = partial(fit_smooth, prior=prior), np.flatnonzero(side == part)
+            mine = all_lenses(data, fit, chosen, learned.facts)
             smooth = [new or old for new, old in zip(mine, smooth, strict=True)]
         return smooth
 
     kinds = ("nearest frame", "table in f", "table in 1/f", "spline in 1/f", "monotone cubic in 1/f")
-    own_prior = partial(fit_smooth, zoom=zj.SmoothZoom())
+    own_prior = partial(fit_smooth, prior=Prior(zj.SmoothZoom(), np.zeros((0, 7))))
     every_fit: dict[str, Callable[[], list]] = {
         **{f"degree {n}": partial(all_lenses, data, partial(fit_polynomials, degree=n)) for n in range(4)},
         "degree chosen inside": partial(all_lenses, data, partial(fit_chosen_degree, degrees=(1, 2, 3))),
         **{k: lambda k=k: [one_by_one(lens, partial(interpolate, kind=k)) for lens in data] for k in kinds},
         "power law": lambda: [one_by_one(lens, power_law) for lens in data],
         "two regions": lambda: [one_by_one(lens, two_regions) for lens in data],
-        OURS: cross_fitted,
-        "SmoothZoom, as in the package": partial(all_lenses, data, own_prior),
+        **{name: partial(cross_fitted, of) for name, of in learned.items()},
+        "SmoothZoom, as in the package": partial(all_lenses, data, own_prior, facts=no_facts(data)),
     }
     with ThreadPoolExecutor(2) as pool:
         running = {name: pool.submit(fit) for name, fit in every_fit.items()}
     return {name: future.result() for name, future in running.items()}
-
-
-def few_focal_lengths(
-    data: list[Frames], side: np.ndarray, learned: list[zj.SmoothZoom]
-) -> dict[str, dict[str, list[float]]]:
-    """Quantiles of the lenses' errors, px, at the interior focal lengths where only a few are fitted."""
-
-    def interpolated(frames: Frames, number: int) -> np.ndarray:
-        errors = []
-        for one in range(len(frames.focal)):
-            lens = Frames(*(np.asarray(values[one]) for values in frames))
-            known, there = np.asarray(some_of(lens, number)), lens.second[:, 0, 0] > 0
-            k = np.zeros_like(lens.k)
-            fitted = Frames(*(values[known] for values in lens))
-            k[there] = interpolate(fitted, lens.focal[there], "table in 1/f")
-            errors.append(lens_error(lens, jnp.asarray(k), inner(lens) & ~known))
-        return np.array(errors)
-
-    def polynomial(frames: Frames, number: int) -> Any:
-        seen = jnp.where(some_of(frames, number)[..., None, None], frames.second, 0)
-        k = fit_polynomials(frames._replace(second=seen), min(2, number - 1))[0]
-        return lens_error(frames, k, inner(frames) & ~some_of(frames, number))
-
-    found: dict[str, dict[str, list[float]]] = {}
-    for number in FEW:
-        parts: dict[str, list[np.ndarray]] = {}
-        for part, zoom in enumerate(learned):
-            for _, frames in batches_of(data, np.flatnonzero(side == part)):
-                errors = {
-                    OURS: few_errors(frames, number, zoom),
-                    "polynomial of degree 2, or the highest there is": polynomial(frames, number),
-                    "table in 1/f": interpolated(frames, number),
-                }
-                for name, of in errors.items():
-                    parts.setdefault(name, []).append(np.sqrt(np.asarray(of)))
-        for name, of in parts.items():
-            values = np.concatenate(of)
-            found.setdefault(name, {})[str(number)] = np.quantile(values, QUANTILES).tolist()
-    return found
 
 
 class Errors:

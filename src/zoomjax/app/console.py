@@ -293,6 +293,8 @@ def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()
     deviation = sorted(s / done.focals.focal[name] for name, s in done.focals.deviation.items())
     if deviation:
         say(f"Their standard deviations: {deviation[0]:.2%} to {deviation[-1]:.2%}.")
+    if prior := done.prior():
+        say(prior)
     for sentence in [*done.shared(), *(done.bundle.sentences() if done.bundle else ())]:
         say(sentence)
     notable = [

@@ -1,15 +1,67 @@
 """What the photos of a calibration were taken with, for ``lens.json``."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from ..io.equipment import FILM, Equipment, read_equipment
 from ..lenses.matching import crop_factor
 from ..models.lens import ZoomLens
+from ..models.smooth import SmoothZoom
 
 _SAME = 0.01
 """Share by which crop factors of photos may differ and count as one."""
+
+_ROUNDED = 1.1
+"""Ratio up to which what cameras round may be apart: crop factors by focal lengths of equal view, whole mm,
+and a focal length and the end of its lens."""
+
+
+@dataclasses.dataclass(frozen=True)
+class KnownLens:
+    """What a prior knows of a zoom lens, from the EXIF data of photos.
+
+    Attributes:
+        shortest, longest: the ends of its range, mm.
+        crop: crop factor of the photos.
+    """
+
+    shortest: float
+    longest: float
+    crop: float
+
+    def prior(self) -> SmoothZoom:
+        """The smooth zoom model with the prior for such lenses."""
+        return SmoothZoom.for_lens(self.shortest, self.longest, crop=self.crop)
+
+    def sentence(self) -> str:
+        """That it has been used."""
+        return (
+            f"The prior of the zoom model is that of a lens of {self.shortest:g} to {self.longest:g} mm at "
+            f"crop factor {self.crop:.2g}, as the EXIF data of the photos tell."
+        )
+
+
+def known_lens(
+    photos: Iterable[Path], focal: Sequence[float], image_size: tuple[int, int]
+) -> KnownLens | None:
+    """The zoom lens that the EXIF data of all photos, of one size and these focal lengths in mm, agree on.
+
+    None where one of them does not tell the ends of the lens's range, or nothing tells a crop factor, or
+    where their focal lengths are none of the lens's, as with a converter.
+    """
+    found = [equipment_of(photo) for photo in photos]
+    ranges = {one.zoom_range for one in found}
+    crops = [crop_factor(one, image_size) for one in found]
+    if len(ranges) != 1 or (ends := ranges.pop()) is None or not all(crops):
+        return None
+    close = _ROUNDED * min(focal) >= ends[0] and max(focal) <= _ROUNDED * ends[1]
+    known = np.array(crops, float)
+    if not close or known.max() > _ROUNDED * known.min():
+        return None
+    return KnownLens(*ends, float(np.median(known)))
 
 
 def with_equipment(lens: ZoomLens, photos: Iterable[Path]) -> ZoomLens:

@@ -16,12 +16,13 @@ from .._core.text import plain
 from ..detect.batch import DETECTORS, NO_LINES, Detection, detect
 from ..detect.sources import Source
 from ..models.about import UNKNOWN
+from ..models.smooth import SmoothZoom
 from ..trust.assessment import Verdict
 from ._flags import with_flags
 from .board_bundle import BoardBundle, bundle_of
 from .calibration import Calibration, calibrate
 from .choice import chosen_frames, colour_limit
-from .equipment import with_equipment
+from .equipment import KnownLens, known_lens, with_equipment
 from .focal_sources import MEASURED, Focals, choose_focals, focal_sigmas, known_focals, lines_of
 from .image_job import ImageJob, overlay_name
 from .overlay import draw_lines
@@ -62,6 +63,7 @@ class ImageCalibration:
         unused: for each image that was not used, the reason.
         bundle: the bundle adjustment of the grids in them; None if there are too few.
         tied: the names of the images in which lines were found again under the lens of all images.
+        lens: what the prior of the zoom model knows of the lens; None if nothing.
     """
 
     job: ImageJob
@@ -72,6 +74,7 @@ class ImageCalibration:
     unused: dict[str, str]
     bundle: BoardBundle | None = None
     tied: tuple[str, ...] = ()
+    lens: KnownLens | None = None
 
     def members(self) -> list[np.ndarray]:
         """For each used image, the numbers of its lines among those of the calibration."""
@@ -109,10 +112,16 @@ class ImageCalibration:
             "detector": self.job.detector,
             "focal_source": self.focals.origin,
             "board": self.bundle and self.bundle.about(),
+            "prior": self.prior() or None,
             "focal_groups": [dataclasses.asdict(group) for group in self.focals.groups],
             "images": images,
             "unused": self.unused,
         }
+
+    def prior(self) -> str:
+        """What the prior of the zoom model knows of the lens, in a sentence; empty if nothing."""
+        used = isinstance(self.calibration.zoom.lens.zoom, SmoothZoom)
+        return self.lens.sentence() if used and self.lens else ""
 
     def shared(self) -> list[str]:
         """Which images share a focal length, in sentences; none where that was not asked for."""
@@ -297,6 +306,10 @@ def _calibrated(
         sigma = focal_sigmas(job.focal_sigma, np.array(list(focals.focal.values())))
         focals = focals.deviating_by(dict(zip(focals.focal, sigma.tolist(), strict=True)))
     used = tuple(d for d in usable if d.name in focals.focal)
+    known = None
+    if job.video is None and focals.known and focals.unit == "mm":
+        photos = [Path(d.file) for d in used]
+        known = known_lens(photos, [focals.focal[d.name] for d in used], used[0].image_size)
     bundle = None
     if job.detector == "grid":
         stage("Fitting the shape of the board")
@@ -310,7 +323,7 @@ def _calibrated(
         with told_undetermined(job, used, unused):
             calibration = calibrate(
                 lines,
-                model=job.model,
+                model=dataclasses.replace(job.model, lens=known),
                 centre=job.centre,
                 robust=True,
                 focal_sigma=sigma,
@@ -319,7 +332,7 @@ def _calibrated(
                 stage=stage,
             )
         done = ImageCalibration(job, calibration, used, focals, tuple(d.name for d in detections), unused)
-        done = dataclasses.replace(done, bundle=bundle)
+        done = dataclasses.replace(done, bundle=bundle, lens=known)
         hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}
         if not hopeless:
             return _with_findings(_with_equipment(done))

@@ -24,6 +24,7 @@ from ..models.zoom import AbstractZoom, PolynomialZoom
 from ..trust.centre_choice import CentreChoice
 from ..trust.selection import Selection, select_model
 from ..trust.staged_selection import select_in_stages
+from .equipment import KnownLens
 from .outward import outward
 
 MODELS = ("auto", "polynomial", "smooth", "spline")
@@ -62,12 +63,14 @@ class WantedModel:
         family: the distortion model: one of `FAMILIES`, or "auto" for the one of least cross-validation
             error. None: the radial polynomial; where the lens turns out to be a strong one, it competes
             with the division model.
+        lens: what is known of the lens, for the prior of `SmoothZoom`.
     """
 
     model: str = "auto"
     degree: int | None = None
     terms: int | None = None
     family: str | None = None
+    lens: KnownLens | None = None
 
     def __post_init__(self):
         """Check that the settings go together.
@@ -101,6 +104,11 @@ class WantedModel:
         return FAMILIES.get(self.family or "radial", RadialPolynomial())
 
     @property
+    def smooth(self) -> SmoothZoom:
+        """The `SmoothZoom`, with a prior for what is known of the lens."""
+        return SmoothZoom() if self.lens is None else self.lens.prior()
+
+    @property
     def usual_centre(self) -> CentreArgument:
         """The centre of distortion where none is asked for."""
         return "image" if refusal("fit_centre", family=self.distortion) else "fit"
@@ -124,7 +132,7 @@ class WantedModel:
         if self.automatic:
             return Model(PolynomialZoom(degree=min(_DEGREE, distinct - 1)), terms, self.distortion)
         models: dict[str, AbstractZoom] = {
-            "smooth": SmoothZoom(),
+            "smooth": self.smooth,
             "spline": SplineZoom(number=min(_KNOTS[1], distinct)),
         }
         polynomial = PolynomialZoom(degree=_DEGREE if self.degree is None else self.degree)
@@ -152,7 +160,7 @@ class WantedModel:
         degrees = range(min(_MOST_DEGREE + 1, distinct))
         zooms: list[AbstractZoom] = [PolynomialZoom(degree=degree) for degree in degrees]
         zooms += [SplineZoom(number=knots) for knots in _KNOTS if knots < distinct]
-        zooms += [SmoothZoom()] if distinct > 1 and terms[0] == _TERMS else []
+        zooms += [self.smooth] if distinct > 1 and terms[0] == _TERMS else []
         return select_in_stages(lines, zooms, terms)
 
     def choose_in_family(self, lines: AbstractLines) -> Selection:

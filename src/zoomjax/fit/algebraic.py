@@ -28,7 +28,7 @@ from ..models.polynomial import RadialPolynomial
 from ..models.zoom import AbstractLinearZoom, PolynomialZoom, with_parameters
 from ._linear import least_squares
 from .compression import compressed, small_of
-from .energy import line_weights, prior_jacobian, settings
+from .energy import line_weights, prior_jacobian, prior_residuals, settings
 from .prepare import asked_for, ready_model
 from .result import lens_of
 
@@ -50,9 +50,11 @@ def algebraic_parameters(lines: AbstractLines, model: Model) -> Float[Array, "ba
     basis = jax.vmap(zoom.basis)(*settings(zoom, lines))[lines.frame]  # (line, basis)
     columns = jnp.einsum("lat,lb->labt", areas[..., 1:], basis)
     unknowns = basis.shape[1] * size
-    prior = prior_jacobian(lines, with_parameters(zoom, jnp.zeros((basis.shape[1], size), basis.dtype)))
-    matrix = jnp.concatenate([columns.reshape(-1, unknowns), prior])
-    right = jnp.concatenate([-areas[..., 0].reshape(-1), jnp.zeros(prior.shape[0], basis.dtype)])
+    nothing = with_parameters(zoom, jnp.zeros((basis.shape[1], size), basis.dtype))
+    matrix = jnp.concatenate([columns.reshape(-1, unknowns), prior_jacobian(lines, nothing)])
+    of_prior = prior_residuals(lines, nothing)
+    known = [areas[..., 0].reshape(-1), *([] if of_prior is None else [of_prior])]
+    right = -jnp.concatenate(known)
     # Lines through the centre do not change the areas, px, whatever the coefficients: those stay zero.
     solution = least_squares(matrix, right, floor=lines.scale)
     return solution.reshape(basis.shape[1], size)

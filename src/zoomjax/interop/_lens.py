@@ -335,9 +335,9 @@ def _fitted(
         rows.append(np.einsum("b,rk->rbk", phi, matrix).reshape(len(matrix), -1) * share)
         right.append(change * share)
     if isinstance(prepared, AbstractPriorZoom):
-        prior = _prior(prepared, basis.shape[1] * size)
+        prior, towards = _prior(prepared)
         rows.append(prior)
-        right.append(np.zeros(len(prior)))
+        right.append(towards)
     a = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
     return with_parameters(prepared, jnp.asarray(a.reshape(basis.shape[1], size)))
 
@@ -369,14 +369,15 @@ def _equations(
     return np.stack([column.ravel() for column in columns], axis=-1), change.ravel()
 
 
-def _prior(zoom: AbstractPriorZoom, number: int) -> np.ndarray:
-    """Rows whose sum of squares is the prior's part of the energy, times the number of nodes."""
-    shape = jnp.shape(jnp.asarray(zoom.parameters))
+def _prior(zoom: AbstractPriorZoom) -> tuple[np.ndarray, np.ndarray]:
+    """Equations whose sum of squares is the prior's part of the energy, times the number of nodes."""
+    none = jnp.zeros_like(jnp.asarray(zoom.parameters))
 
-    def row(flat):
-        return with_parameters(zoom, flat.reshape(shape)).standardised()
+    def row(parameters):
+        return float(zoom.error) * with_parameters(zoom, parameters).standardised()
 
-    return float(zoom.error) * np.asarray(jax.vmap(row, out_axes=1)(jnp.eye(number)), float)
+    rows = np.asarray(jax.jacfwd(row)(none), float)
+    return rows.reshape(len(rows), -1), -np.asarray(row(none), float)
 
 
 def _error(lens: ZoomLens, seen: list[Seen]) -> float:

@@ -38,6 +38,7 @@ class Equipment:
         plane_pitch: mm from pixel to pixel in the image as the camera wrote it.
         written: width and height px of that image.
         crop: crop factor, from the focal length of equal view on film.
+        zoom_range: the ends of the lens's own range, mm; None if they are not known, or one.
     """
 
     maker: str = ""
@@ -47,6 +48,7 @@ class Equipment:
     plane_pitch: float | None = None
     written: tuple[int, int] | None = None
     crop: float | None = None
+    zoom_range: tuple[float, float] | None = None
 
     def crop_factor(self, image_size: tuple[int, int]) -> float | None:
         """Crop factor of an image of this size: the diagonal of film over that of the sensor shown."""
@@ -103,7 +105,16 @@ def exif_equipment(block: bytes) -> Equipment:
         plane_pitch=unit / resolution if unit and resolution else None,
         written=(int(width), int(height)) if width and height else None,
         crop=crop if crop and _LEAST < crop < _MOST else None,
+        zoom_range=_zoom_range(tags.get(base.LensSpecification)),
     )
+
+
+def _zoom_range(specification: Any) -> tuple[float, float] | None:
+    """Shortest and longest focal length of a lens, mm, which stand before its widest apertures."""
+    if not isinstance(specification, tuple) or len(specification) != 4:
+        return None
+    shortest, longest = map(_positive, specification[:2])
+    return (shortest, longest) if shortest and longest and shortest < longest else None
 
 
 def _positive(value: Any) -> float | None:

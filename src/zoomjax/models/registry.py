@@ -35,6 +35,9 @@ _FAMILIES: dict[str, type[AbstractFamily]] = {}
 _RESERVED = {"model", "formula"}
 """Keys of a model in the file beside its fields."""
 
+_LATER = {"mean"}
+"""Fields that files of earlier versions do not have, and which are None there."""
+
 
 @overload
 def register_model(cls: type[SomeModel], *, name: str | None = None) -> type[SomeModel]: ...
@@ -146,7 +149,7 @@ def zoom_from(content: Any, numbers: int | None = None) -> AbstractZoom:
     model = _class_named(content["model"], _ZOOMS, "zoom model")
     fields = {}
     for field in dataclasses.fields(model):
-        value = content[field.name]
+        value = content.get(field.name) if field.name in _LATER else content[field.name]
         if field.metadata.get("static"):
             fields[field.name] = _fixed(value)
         elif value is not None or field.default is not None:

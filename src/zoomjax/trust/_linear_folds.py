@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 from .._core.programs import light_program
-from ..fit.energy import prior_jacobian, settings
+from ..fit.energy import prior_jacobian, prior_residuals, settings
 from ..fit.image_metric import in_corrected
 from ..fit.own_weights import counts_of, own_weights
 from ..fit.problem import LEAST_STRETCH
@@ -69,6 +69,7 @@ class Design(NamedTuple):
     basis: np.ndarray  # (frame, basis)
     project: np.ndarray  # (basis, frame): from coefficients at the frames that are left to parameters
     precision: np.ndarray  # (parameter, parameter): of the prior, in the unit of eq. 13
+    mean: np.ndarray  # (parameter,): of the prior
 
 
 def _design(lines, model, left):
@@ -81,13 +82,14 @@ def _design(lines, model, left):
     every = map(padded_frames, (focal, *focus))
     values = np.asarray(_basis_of(with_parameters(zoom, None), *every), float)[: len(focal)]
     size = values.shape[1]
-    precision = np.zeros((size * model.terms, size * model.terms))
+    precision, mean = np.zeros((size * model.terms, size * model.terms)), np.zeros(size * model.terms)
     if isinstance(zoom, AbstractPriorZoom):
-        whitener = np.asarray(_whitener(lines, zoom), float)
+        whitener, of_zero = (np.asarray(part, float) for part in _whitener(lines, zoom))
         precision = whitener.T @ whitener
+        mean = np.linalg.lstsq(whitener, -of_zero, rcond=None)[0]
     project = np.zeros((size, len(focal)))
     project[:, left] = np.linalg.pinv(values[left])
-    return Design(values, project, precision)
+    return Design(values, project, precision, mean)
 
 
 _basis_of = light_program(lambda model, *settings: jax.vmap(model.basis)(*settings))
@@ -96,8 +98,8 @@ _basis_of = light_program(lambda model, *settings: jax.vmap(model.basis)(*settin
 
 @bucketed_jit()
 def _whitener(lines, model):
-    """What makes of the flattened parameters what their prior adds to the residuals, px."""
-    return prior_jacobian(lines, model)
+    """What makes of the flattened parameters what their prior adds to the residuals, px; and of zeros."""
+    return prior_jacobian(lines, model), prior_residuals(lines, model)
 
 
 class Lanes(NamedTuple):
@@ -258,14 +260,15 @@ def _state(lanes, weights, design, parameters, known=None):
     lines = passed(lanes, design.basis @ parameters) if known is None else known
     gradient, matrix = (lanes.total(weights * a) for a in (lines.gradient, lines.matrix))
     rows, flat = design.basis[lanes.frame[lanes.starts]], parameters.reshape(-1)
-    pulled = design.precision @ flat
+    away = flat - design.mean
+    pulled = design.precision @ away
     terms, size = len(gradient), rows.shape[1]
     moved = lanes.total(weights * np.einsum("jjl->jl", lanes.gram[0] + lanes.gram[2])[1:])
     products = (rows[:, :, None] * rows[:, None]).reshape(len(rows), -1)
     blocks = (matrix.reshape(-1, len(rows)) @ products).reshape(terms, terms, size, size)
     return _State(
         parameters,
-        weights @ lines.squares + flat @ pulled,
+        weights @ lines.squares + away @ pulled,
         (gradient @ rows).T.reshape(-1) + pulled,
         blocks.transpose(2, 0, 3, 1).reshape(flat.size, flat.size) + design.precision,
         (moved @ rows**2).T.reshape(-1),

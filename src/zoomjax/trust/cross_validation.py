@@ -102,7 +102,7 @@ def held_out_frames(
     parts = folds_of(small, "line", folds, seed)
     lanes = lanes_of(small, parts.fold, terms)
     unseen = np.full(lanes.fold.shape, np.nan)
-    one = Design(np.ones((1, 1)), np.ones((1, 1)), np.zeros((terms, terms)))
+    one = Design(np.ones((1, 1)), np.ones((1, 1)), np.zeros((terms, terms)), np.zeros(terms))
     for frame in np.unique(lanes.frame):
         own = lanes.frame == frame
         alone = Lanes(
