@@ -22,7 +22,7 @@ from .._core.quiet import silent
 from ..models.distortion import Distortion
 from ..models.family import AbstractRadial
 from ._samples import border, distortions
-from .base import CONVENTION, Contents, Export, FolderFormat, Import, Sampled, one_size
+from .base import CONVENTION, Contents, Export, FolderFormat, Import, Sampled, one_size, refuse_others
 
 _ROWS = 128
 """Of a map that are computed at once."""
@@ -90,6 +90,7 @@ class STMap(FolderFormat):
             raise ValueError(f"argument focal must hold {len(paths)} focal lengths, one for each file")
         for number, path in enumerate(paths):
             header, red, green = _open(path)
+            refuse_others(header, {"pixelAspectRatio": 1})
             sizes.append(size := job.size(_window_size(header["displayWindow"])))
             given = None if job.focal is None else job.focal[number]
             if (focal := _told("focal", header, _FOCAL, given)) is None:
