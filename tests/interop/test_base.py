@@ -1,5 +1,6 @@
 """What a file may say beyond the numbers that are read: it changes nothing, is refused, or is said."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -174,3 +175,25 @@ def test_labels_that_contradict_focal_lengths_in_px_are_said(tmp_path):
         back = zj.interop.read(path, focal=labels, zoom=TableZoom())
         assert back.lens.pixel_pitch == (None if pitch is None else pytest.approx(pitch, rel=1e-9))
         assert any(note in told for told in back.report.notes) if note else back.report.notes == ()
+
+
+def test_maps_of_focal_lengths_in_two_units_are_no_lens(tmp_path):
+    """As of two lenses whose maps went into one folder."""
+    zj.interop.write(LENSES["landscape"](), tmp_path / "maps", format="stmap", focal=[24, 35])
+    lens = dataclasses.replace(LENSES["px"](), image_size=(640, 480))
+    zj.interop.write(lens, tmp_path / "maps", format="stmap", focal=[1300.0])
+    with pytest.raises(ValueError, match="some of its focal lengths are in mm and some in px"):
+        zj.interop.read(tmp_path / "maps")
+
+
+def test_frames_before_the_first_sample_are_refused_where_there_are_none(tmp_path):
+    track = zj.io.FocalTrack(np.array([-2.0, 3.0]), np.array([24.0, 50.0]), by_time=False)
+    with pytest.raises(ValueError, match="samples from 0, and the track begins at frame -2"):
+        zj.interop.write(
+            LENSES["landscape"](),
+            tmp_path / "a.jsonl",
+            format="opentrackio",
+            track=track,
+            pixel_pitch=PITCH,
+        )
+    assert not (tmp_path / "a.jsonl").exists()

@@ -44,6 +44,8 @@ class OpenTrackIO(NodeFormat):
 
     def text(self, nodes: list[Node], job: Export) -> str:
         """A sample on each line."""
+        if (first := min(job.frames or (0,))) < 0:
+            raise ValueError(f"OpenTrackIO numbers samples from 0, and the track begins at frame {first}.")
         return "".join(
             json.dumps(self._sample(node, number, job)) + "\n" for number, node in enumerate(nodes)
         )

@@ -99,7 +99,9 @@ class STMap(FolderFormat):
             points = _pairs(header, red, green, size, wanted, convention)
             nodes.append(Sampled(float(focal), *points, corrects=wanted == "redistort"))
             units.add(str(header.get(_UNIT, "mm")))
-        return Contents(tuple(nodes), one_size(sizes), "px" if units == {"px"} else "mm")
+        if len(units) > 1:
+            raise ValueError(f"some of its focal lengths are in {' and some in '.join(sorted(units))}")
+        return Contents(tuple(nodes), one_size(sizes), units.pop())
 
 
 def to_map(points: np.ndarray, size: tuple[int, int], convention: str) -> np.ndarray:
