@@ -107,8 +107,9 @@ def _pitch(camera: dict, size: tuple[int, int]) -> float:
     pitch, other = float(sensor["width"]) / size[0], float(sensor["height"]) / size[1]
     if abs(pitch - other) > _SQUARE * pitch:
         raise ValueError(f"its pixels are not square, but {pitch:.4g} by {other:.4g} mm")
-    squeeze = camera.get("anamorphicSqueeze", {"num": 1, "denom": 1})
-    refuse_others({"anamorphicSqueeze": squeeze["num"] / squeeze["denom"]}, {"anamorphicSqueeze": 1})
+    squeeze = camera.get("anamorphicSqueeze", 1)
+    squeeze = squeeze["num"] / squeeze["denom"] if isinstance(squeeze, dict) else squeeze
+    refuse_others({"anamorphicSqueeze": squeeze}, {"anamorphicSqueeze": 1})
     return pitch
 
 
