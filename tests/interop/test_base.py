@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
-from zoomjax.models import TableZoom
+from zoomjax.models import PolynomialZoom, TableZoom
 
 from ._lenses import LENSES, PITCH
 
@@ -197,3 +197,23 @@ def test_frames_before_the_first_sample_are_refused_where_there_are_none(tmp_pat
             pixel_pitch=PITCH,
         )
     assert not (tmp_path / "a.jsonl").exists()
+
+
+@pytest.mark.parametrize("name", ["lensfun", "opencv", "opentrackio", "stmap", "pftrack"])
+def test_a_focal_length_that_nobody_knows_is_not_written(name, tmp_path, recwarn):
+    """A number stands for it in the lens: 1 mm would be that of the tool's rays, or of its table."""
+    zoom = PolynomialZoom(0, np.array([[0.05, -0.01]]), np.array(1.0))
+    size = (640, 480)
+    lens = zj.ZoomLens(zoom, np.array([320.0, 240.0]), np.ones(2), size, about={"focal": "not known"})
+    for focal in (None, [24, 35]):
+        with pytest.raises(ValueError, match="Argument focal must be given, the one focal length"):
+            zj.interop.write(lens, tmp_path / "out", format=name, focal=focal, pixel_pitch=PITCH)
+    report = zj.interop.write(lens, tmp_path / "out", format=name, focal=35, pixel_pitch=PITCH)
+    assert report.focal == (35.0,)
+    told = {"image_size": size} if name == "lensfun" else {"focal": 35} if name == "pftrack" else {}
+    back = zj.interop.read(tmp_path / "out", format=name, **told)
+    assert back.report.focal == (35.0,)
+    points = np.array([[0.0, 0.0], [600.0, 300.0]])
+    moved = np.asarray(back.lens(35.0).undistort(points)) - np.asarray(lens(1.0).undistort(points))
+    assert np.abs(moved).max() < (5 if name == "lensfun" else 0.1)  # which scales as it likes
+    assert not recwarn.list

@@ -42,7 +42,7 @@ def with_earlier(lens: ZoomLens, files: Sequence[Path]) -> ZoomLens:
     Camera, lens, crop factor and pixel pitch, as far as all agree, and that its focal length is not known.
 
     Raises:
-        ValueError: there are several files, and the focal length of one is not known: 1 mm stands for it.
+        ValueError: there are several files, and the focal length of one is not known.
     """
     found = [_earlier(file, lens) for file in files]
     for file, one in zip(files, found, strict=True):
