@@ -56,3 +56,51 @@ def test_points_beyond_the_fold_are_in_any_block(batched, rng):
     assert np.flatnonzero(np.isnan(found[:, 0])).tolist() == beyond
     np.testing.assert_allclose(found[near_fold], [[0.999999 * radius, 0.0]] * 3, atol=1e-9)
     np.testing.assert_allclose(found, d.distort(points), atol=1e-9)
+
+
+POINTS = np.array([[10.0, 20.0], [30.0, 40.0], [50.0, 61.0]])
+LENS = zj.ZoomLens(
+    zj.PolynomialZoom(1, np.array([[0.0, 0.01], [0.1, 0.0]]), np.array(20.0)),
+    np.array([31.5, 23.5]),
+    np.array([20.0, 80.0]),
+    (64, 48),
+)
+USES = {
+    "undistort_image": lambda image, _: zj.undistort_image(image, LENS(24.0)),
+    "redistort_image": lambda image, _: zj.correct.redistort_image(image, LENS(24.0)),
+    "undistort": lambda _, points: LENS(24.0).undistort(points),
+    "distort": lambda _, points: LENS(24.0).distort(points),
+    "lens": lambda _, points: LENS(points[:, 0] + 20).coefficients,
+    "Distortion": lambda _, points: zj.Distortion(points[0] / 1000, points[1], 40.0).undistort([[1.0, 2]]),
+    "Lines": lambda _, points: (
+        zj.Lines.from_ragged([points], [0], points[:1, 0], image_size=(64, 64)).points
+    ),
+    "Tracks": lambda _, points: (
+        zj.tracks.Tracks.from_arrays(
+            points[:2, 1].astype(points.dtype.str.replace("f", "i")) * 0,
+            [0, 1],
+            points[:2],
+            image_size=(64, 64),
+        ).points
+    ),
+}
+
+
+@pytest.mark.parametrize("dtype", ["f4", "f8"])
+@pytest.mark.parametrize("use", USES)
+def test_numbers_in_another_order_of_bytes_are_the_same_numbers(use, dtype, rng):
+    """As FITS files, PNM files and TIFF files of Motorola order give them; OpenCV takes no notice of it."""
+    image = rng.uniform(size=(48, 64))
+    native, other = ([a.astype(order + dtype) for a in (image, POINTS)] for order in "=>")
+    expected, found = np.asarray(USES[use](*native)), np.asarray(USES[use](*other))
+    np.testing.assert_array_equal(found, expected)
+    assert found.dtype == expected.dtype
+
+
+@pytest.mark.parametrize("dtype", ["u2", "i2", "u4", "i4", "f2"])
+@pytest.mark.parametrize("use", ["undistort_image", "redistort_image"])
+def test_pixels_in_another_order_of_bytes_are_the_same_pixels(use, dtype, rng):
+    image = (1000 * rng.uniform(size=(48, 64, 3))).astype(dtype)
+    found = USES[use](image.astype(">" + dtype), None)
+    np.testing.assert_array_equal(found, USES[use](image, None))
+    assert np.ptp(found.astype(float)) > 500

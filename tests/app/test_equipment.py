@@ -1,5 +1,6 @@
 """The camera and lens of a calibration's photos in the lens."""
 
+import dataclasses
 import sys
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from PIL import Image
 
 from zoomjax import scenes
-from zoomjax.app.equipment import KnownLens, known_lens, with_equipment
+from zoomjax.app.equipment import KnownLens, known_lens, with_earlier, with_equipment
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.io.equipment import FILM
 
@@ -109,3 +110,54 @@ def test_the_models_that_are_compared_know_the_lens():
     known = WantedModel("smooth", lens=KnownLens(18.0, 200.0, 1.5))
     assert known.base([18.0, 35.0]).zoom.focal_ref == 18.0
     assert WantedModel("smooth").base([18.0, 35.0]).zoom.mean is None
+
+
+FACTS = {"camera": "NIKON D300", "lens": "18-200", "crop_factor": 1.5}
+
+
+def results(folder, lens, summary=True):
+    """The files of a calibration that count here; the path of its lines."""
+    folder.mkdir()
+    lens.save(folder / "lens.json")
+    if summary:
+        (folder / "summary.json").write_text("{}")
+    return folder / "lines.npz"
+
+
+def test_lines_that_are_fitted_again_keep_what_the_earlier_lens_knew(lens, tmp_path):
+    known = dataclasses.replace(lens, about=FACTS, pixel_pitch=PITCH)
+    files = [results(tmp_path / "a", known), results(tmp_path / "b", known)]
+    found = with_earlier(lens, files)
+    assert (found.about, found.pixel_pitch) == (FACTS, PITCH)
+    narrow = dataclasses.replace(lens, focal_range=np.array([24.0, 70.0]))  # some frames left out
+    assert with_earlier(narrow, files[:1]).pixel_pitch == PITCH
+    other = dataclasses.replace(known, about={**FACTS, "lens": "24-70"}, pixel_pitch=2 * PITCH)
+    found = with_earlier(lens, [files[0], results(tmp_path / "c", other)])
+    assert (dict(found.about), found.pixel_pitch) == ({"camera": "NIKON D300", "crop_factor": 1.5}, None)
+
+
+def test_a_lens_beside_lines_that_is_not_theirs_says_nothing(lens, tmp_path):
+    known = dataclasses.replace(lens, about=FACTS, pixel_pitch=PITCH)
+    wide = dataclasses.replace(known, focal_range=np.array([24.0, 70.0]))
+    in_px = dataclasses.replace(known, focal_unit="px")
+    small = dataclasses.replace(known, image_size=(300, 200))
+    (tmp_path / "none").mkdir()
+    for files in (
+        [results(tmp_path / "imported", known, summary=False)],
+        [results(tmp_path / "range", wide)],
+        [results(tmp_path / "unit", in_px)],
+        [results(tmp_path / "size", small)],
+        [tmp_path / "none" / "lines.npz"],
+        [results(tmp_path / "other", known).with_name("own.npz")],
+        [results(tmp_path / "one", known), tmp_path / "none" / "lines.npz"],
+    ):
+        assert with_earlier(lens, files) is lens, files
+
+
+def test_a_focal_length_that_is_not_known_stays_so(lens, tmp_path):
+    one = dataclasses.replace(lens, focal_range=np.ones(2))
+    unknown = dataclasses.replace(one, about={"focal": "not known"})
+    files = [results(tmp_path / "a", unknown), results(tmp_path / "b", lens)]
+    assert with_earlier(one, files[:1]).about == {"focal": "not known"}
+    with pytest.raises(ValueError, match=r"lines\.npz is of one photo whose focal length is not known"):
+        with_earlier(dataclasses.replace(lens, focal_range=np.array([1.0, 200.0])), files)

@@ -53,3 +53,12 @@ def test_sizes_and_masks_are_checked():
         Tracks(good.points, good.frame, good.mask[:, :1], (8, 6), 2, good.number)
     with pytest.raises(ValueError, match="from 0 to 0"):
         Tracks(good.points, good.frame, good.mask, (8, 6), 1, good.number)
+
+
+@pytest.mark.parametrize("frame", [[0, 1, 0], [2, 0, 1], [1, 1, 1]])
+def test_frames_increase_across_views_that_are_not_there(frame):
+    """A view that is masked out does not part a track in two: a point is in one place in a frame."""
+    given = {"points": np.zeros((1, 3, 2)), "image_size": (8, 6), "frames": 3, "number": np.zeros(1, int)}
+    with pytest.raises(ValueError, match=r"frame must increase along a track, but frame\[0\] does not"):
+        Tracks(frame=np.array([frame]), mask=np.array([[True, False, True]]), **given)
+    Tracks(frame=np.array([[0, 0, 1]]), mask=np.array([[True, False, True]]), **given)

@@ -36,8 +36,14 @@ def aligned(*parts: tuple[Any, int]) -> list[Any]:
     ]
 
 
+def native(array: np.ndarray) -> np.ndarray:
+    """The same values in this machine's order of bytes, which OpenCV takes for granted."""
+    return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
 def held_as_given(array: np.ndarray) -> Any:
     """A JAX array, unless that would change the values' dtype."""
+    array = native(array)
     if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
         return jax.device_put(array)  # without a program, as jnp.asarray would compile for each shape
     return array

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .arrays import native
 from .fields import refuse_masked
 
 
@@ -204,7 +205,7 @@ def real_numbers(values: Any) -> np.ndarray | None:
     except ValueError:  # rows of different lengths
         return None
     if np.issubdtype(array.dtype, np.floating):
-        return array.astype(np.float32) if array.dtype.itemsize < 4 else array
+        return array.astype(np.float32) if array.dtype.itemsize < 4 else native(array)
     if np.issubdtype(array.dtype, np.integer):
         return array.astype(np.float64)
     return array.astype(np.float64) if array.size == 0 else None

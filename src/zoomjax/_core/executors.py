@@ -67,6 +67,7 @@ def in_order(
     *,
     size: Callable[[Item], int] = lambda item: 0,
     there: Callable[[Item], Item] = lambda item: item,
+    file: Callable[[Item], str | os.PathLike[str] | None] = lambda item: None,
 ) -> Generator[Done[Item, Result], None, None]:
     """``task(item)`` of each item, in their order. Closing the generator cancels what has not begun.
 
@@ -76,6 +77,7 @@ def in_order(
         items: taken as they are handed over, at most some thousands ahead.
         size: bytes that an item takes until it is done.
         there: makes of an item what the task is given: whole paths, as workers are in other folders.
+        file: what the task reads, if it is a file: a worker where it has another size does not run it.
 
     Raises:
         RuntimeError: the executor gave up, as a process pool does when one of its processes dies.
@@ -106,7 +108,7 @@ def in_order(
             while pending and (len(pending) >= _MOST_AHEAD or held + size(item) > _MOST_BYTES):
                 yield first()
             try:
-                future = executor.submit(away, there(item))
+                future = executor.submit(functools.partial(away, file=_seen(file(item))), there(item))
             except BrokenExecutor as error:
                 raise _gave_up(error) from error
             pending.append((item, future))
@@ -118,6 +120,23 @@ def in_order(
     finally:
         for _, future in pending:
             future.cancel()
+
+
+def _seen(file: str | os.PathLike[str] | None) -> tuple[str, int] | None:
+    """A file's path, and its size as it is here; None where there is none."""
+    with contextlib.suppress(OSError):
+        return None if file is None else (os.path.abspath(file), os.stat(file).st_size)
+    return None
+
+
+def _check_same(file: tuple[str, int] | None) -> None:
+    """In a worker: raise ValueError where a file has another size than where the work comes from."""
+    found = file and _seen(file[0])
+    if file and found and found != file:
+        raise ValueError(
+            f"the worker on {platform.node()} sees another file {file[0]}, of {found[1]} bytes in place of "
+            f"{file[1]}: workers must see the same files"
+        )
 
 
 def _gave_up(error: Exception) -> RuntimeError:
@@ -161,12 +180,18 @@ def _here() -> tuple[str, int]:
 
 
 def _away(
-    task: Callable[[Any], Any], home: tuple[str, int], wide: bool, item: Any
+    task: Callable[[Any], Any],
+    home: tuple[str, int],
+    wide: bool,
+    item: Any,
+    *,
+    file: tuple[str, int] | None,
 ) -> tuple[Any, list[tuple[str, type[Warning]]]]:
     """In a worker: the result of a task, and its warnings, where nobody would see them."""
     with _float64(wide):
         if _here() == home:
             return task(item), []
+        _check_same(file)
         _own.away, _own.told = True, []
         _listen()
         try:

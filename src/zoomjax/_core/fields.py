@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from .arrays import native
+
 _FEW = 2**16
 """Elements of a JAX array up to which its values are looked at: more would be waited for."""
 
@@ -71,6 +73,7 @@ def _converter(name: str, kind: str, make: Callable[[Any], Any] = jnp.array) -> 
                 raise ValueError(f"Argument {name} must hold {kind}, but it is {_shown(value)}.")
         elif isinstance(value, np.generic):
             array = np.asarray(value)
+        array = native(array) if isinstance(array, np.ndarray) else array
         if jnp.issubdtype(array.dtype, _KINDS[kind]):
             return array
         if kind == "real numbers" and jnp.issubdtype(array.dtype, jnp.integer) and hasattr(array, "astype"):

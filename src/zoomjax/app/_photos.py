@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import os
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -68,11 +69,38 @@ class CommonFraming:
 
 
 class _Task(NamedTuple):
-    """A photo, where its correction goes, and its focal length; None: that of its EXIF data."""
+    """A photo, where its correction goes, and its focal length; None: that of its EXIF data.
+
+    `before` is the file that is in place of the result.
+    """
 
     source: Path
     target: Path
     focal: float | Exception | None
+    before: tuple[int, ...] | None
+
+
+_ELSEWHERE = (
+    "its worker wrote it to a folder that is not this one: the output folder must be one that workers share"
+)
+
+
+def _file(path: Path) -> tuple[int, ...] | None:
+    """What tells a file from the one that it replaced; None where there is none."""
+    try:
+        about = path.stat()
+    except OSError:
+        return None
+    return about.st_ino, about.st_size, about.st_mtime_ns
+
+
+def _replaced(task: _Task) -> bool:
+    """Whether a file is there that was not before."""
+    if _file(task.target) != task.before:
+        return True
+    with contextlib.suppress(OSError):
+        os.listdir(task.target.parent)  # a folder on another machine may be remembered as it was
+    return _file(task.target) != task.before
 
 
 def corrected_photos(
@@ -92,18 +120,22 @@ def corrected_photos(
     Raises:
         OSError: a target cannot be written; those before it are complete.
     """
-    tasks = (_Task(*pair, _known(focal_of, pair[0])) for pair in pairs)
+    tasks = (_Task(*pair, _known(focal_of, pair[0]), _file(pair[1])) for pair in pairs)
     if executor is None:
         for task in tasks:
             yield task.source, task.target, _corrected(task, correction)
         return
     work = functools.partial(_corrected_there, correction=_sent(correction))
-    with contextlib.closing(in_order(checked_executor(executor), work, tasks, there=_absolute)) as done:
+    with contextlib.closing(
+        in_order(checked_executor(executor), work, tasks, there=_absolute, file=lambda task: task.source)
+    ) as done:
         for one in done:
             if isinstance(one.error, OSError):  # of the target
                 raise one.error
             if one.result is None:
                 yield one.item.source, one.item.target, RuntimeError(f"its task failed: {one.told()}")
+            elif isinstance(one.result, list) and not _replaced(one.item):
+                yield one.item.source, one.item.target, RuntimeError(_ELSEWHERE)
             else:
                 yield one.item.source, one.item.target, one.result
 

@@ -216,6 +216,7 @@ class Calibration:
                 ],
                 "points": int(np.sum(np.asarray(self.lines.mask))),
                 "focal_range": [low, high],
+                "focal_known": self.focal_known,
                 "focal_unit": lens.focal_unit,
                 "image_size": list(lens.image_size),
                 "result": RESULTS[self.zoom.result] or "successful",

@@ -260,7 +260,7 @@ def calibrate(
                 centre=about,
                 focal_sigma=focal_sigma,
                 robust=robust,
-                title=title_of(inputs),
+                files=files,
                 names=names,
             )
         return show.lines(calibration, output, robust=robust)

@@ -8,7 +8,8 @@ import numpy as np
 
 from ..io.equipment import FILM, Equipment, read_equipment
 from ..lenses.matching import crop_factor
-from ..models.lens import ZoomLens
+from ..models.about import UNKNOWN
+from ..models.lens import ZoomLens, load_lens
 from ..models.smooth import SmoothZoom
 
 _SAME = 0.01
@@ -83,6 +84,52 @@ def with_equipment(lens: ZoomLens, photos: Iterable[Path]) -> ZoomLens:
     }
     about = {**lens.about, **{name: fact for name, fact in facts.items() if fact}}
     return dataclasses.replace(lens, pixel_pitch=pitch, about=about)
+
+
+def with_earlier(lens: ZoomLens, files: Sequence[Path]) -> ZoomLens:
+    """The lens of lines of earlier results, with what those know of it beside its numbers.
+
+    Camera, lens, crop factor and pixel pitch, as far as all agree, and that its focal length is not known.
+
+    Raises:
+        ValueError: there are several files, and the focal length of one is not known.
+    """
+    found = [_earlier(file, lens) for file in files]
+    for file, one in zip(files, found, strict=True):
+        if len(files) > 1 and one is not None and one.about.get("focal") == UNKNOWN:
+            raise ValueError(
+                f"{file} is of one photo whose focal length is not known: leave it out, or calibrate its "
+                "photo again together with the others, with --focal."
+            )
+    known = [one for one in found if one is not None]
+    if len(known) < len(files) or not _spans(known, lens):
+        return lens
+    facts = [name for name, fact in known[0].about.items() if all(k.about.get(name) == fact for k in known)]
+    pitches = {one.pixel_pitch for one in known}
+    return dataclasses.replace(
+        lens,
+        pixel_pitch=pitches.pop() if len(pitches) == 1 else None,
+        about={**{name: known[0].about[name] for name in facts}, **lens.about},
+    )
+
+
+def _earlier(file: Path, lens: ZoomLens) -> ZoomLens | None:
+    """The lens of the results that a file of lines is one of; None if it is of none, or another lens."""
+    if file.name != "lines.npz" or not file.with_name("summary.json").is_file():
+        return None  # a lens.json without its summary is of another command
+    try:
+        found = load_lens(file.with_name("lens.json"))
+    except (OSError, ValueError):
+        return None
+    same = found.image_size == lens.image_size and found.focal_unit == lens.focal_unit
+    return found if same else None
+
+
+def _spans(known: Sequence[ZoomLens], lens: ZoomLens) -> bool:
+    """Whether focal lengths are among those of earlier lenses: else lines and lenses are of other runs."""
+    low, high = np.transpose([np.asarray(one.focal_range, float) for one in known])
+    first, last = np.asarray(lens.focal_range, float)
+    return bool(low.min() * (1 - 1e-6) <= first and last <= high.max() * (1 + 1e-6))
 
 
 def equipment_of(photo: Path) -> Equipment:

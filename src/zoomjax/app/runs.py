@@ -1,12 +1,13 @@
 """Calibrations as the command line runs them: with stages, a report, and what was run."""
 
 import contextlib
+import dataclasses
 import datetime
 import os
 import shlex
 import sys
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,11 +37,12 @@ def calibrate_lines(
     centre: "CentreArgument",
     focal_sigma: str | None,
     robust: bool,
-    title: str,
+    files: Sequence[Path],
     names: Collection[str],
 ) -> "Calibration":
-    """Calibrate from lines, and write those results into the folder that have such names."""
+    """Calibrate from lines of files, and write those results into the folder that have such names."""
     from .calibration import calibrate
+    from .equipment import with_earlier
     from .focal_sources import focal_sigmas
     from .report import report
 
@@ -48,8 +50,10 @@ def calibrate_lines(
     calibration = calibrate(
         lines, model=model, centre=centre, focal_sigma=sigma, robust=robust, stage=stage
     )
+    zoom = dataclasses.replace(calibration.zoom, lens=with_earlier(calibration.zoom.lens, files))
+    calibration = dataclasses.replace(calibration, zoom=zoom)
     stage("Writing the results")
-    pages = {REPORT: report(calibration, run=what_is_run(title))}
+    pages = {REPORT: report(calibration, run=what_is_run(title_of(list(map(str, files)))))}
     calibration.make(folder, pages=pages, lines="lines.npz" in names)
     return calibration
 

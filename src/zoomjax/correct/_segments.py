@@ -140,7 +140,9 @@ def encoded_segments(
     source = Path(work.source).absolute()  # workers are in other folders
     task = _Task(dataclasses.replace(work, source=source, lens=lens, framing=framing))
     with contextlib.closing(
-        in_order(checked_executor(executor), task, segments, size=lambda one: one.size)
+        in_order(
+            checked_executor(executor), task, segments, size=lambda one: one.size, file=lambda _: source
+        )
     ) as done:
         for one in done:
             if isinstance(one.error, ValueError | OSError):

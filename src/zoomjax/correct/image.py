@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Shaped
 
+from .._core.arrays import native
 from ..models.distortion import Distortion
 from ..models.lens import ZoomLens
 from ..models.sizes import (
@@ -93,7 +94,7 @@ def undistort_image(
         >>> undistort_image(np.eye(4, 6, dtype=np.uint8) * 200, d).shape
         (4, 6)
     """
-    check_image(image)
+    image = checked_image(image)
     check_sampling(interpolation, border)
     height, width = image.shape[:2]
     distortion = _distortion(distortion, focal, (width, height))
@@ -275,8 +276,8 @@ def check_sampling(interpolation: str, border: str) -> None:
             raise ValueError(f"Argument {name} must be one of {', '.join(known)}, but it is {value!r}.")
 
 
-def check_image(image) -> None:
-    """Refuse what is no image that OpenCV can warp.
+def checked_image(image) -> np.ndarray:
+    """The image, in this machine's order of bytes, if it is one that OpenCV can warp.
 
     Raises:
         ValueError: it is none; the message says what to do.
@@ -300,6 +301,7 @@ def check_image(image) -> None:
         raise ValueError(
             f"Argument image must be at most {LARGEST} px a side, but its shape is {image.shape}."
         )
+    return native(image)
 
 
 def _cast(values: np.ndarray, dtype: np.dtype) -> np.ndarray:

@@ -15,7 +15,7 @@ from ..models.lens import ZoomLens
 from ..models.sizes import check_image_size, checked_distortion, lens_for_size
 from ._inverse_polynomial import fold_radius
 from .framing import Framing, check_keep, frame_output
-from .image import border_values, check_image, check_sampling, remap, warn_of_fold
+from .image import border_values, check_sampling, checked_image, remap, warn_of_fold
 from .maps import OUTSIDE, Plane
 
 _ROWS = 64  # at a time: what is computed of them stays in the cache
@@ -58,7 +58,7 @@ def redistort_image(
         >>> redistort_image(np.eye(4, 6, dtype=np.uint8) * 200, d).shape
         (4, 6)
     """
-    check_image(image)
+    image = checked_image(image)
     check_sampling(interpolation, border)
     height, width = image.shape[:2]
     distortion, framing, made = _geometry(distortion, focal, keep, (width, height))

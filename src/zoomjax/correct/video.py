@@ -22,7 +22,15 @@ from .._core.checks import real_numbers
 from .._core.files import refuse_inputs, whole_file
 from ..io.focal_track import FocalTrack
 from ..io.pyav import av
-from ..io.video_reader import Report, decoded_items, frames_expected, numbered, opened_video
+from ..io.video_reader import (
+    Report,
+    decoded_items,
+    frames_expected,
+    frames_shown,
+    numbered,
+    opened_video,
+    warn_of_pixels,
+)
 from ..io.video_streams import CONTAINER, Carried, carried
 from ..io.video_writer import FrameWriter, Picture, first_frame
 from ..models.lens import ZoomLens
@@ -95,9 +103,9 @@ def undistort_video(
             or an option of it is unknown, or not suitable for these frames.
 
     Warns:
-        UserWarning: frames cannot be decoded, or are interlaced; focal lengths are outside of the fitted
-            range; the track goes on after the video's end; the lens is for another size, or folds within
-            the frames.
+        UserWarning: frames cannot be decoded, or are interlaced; pixels are not square; focal lengths are
+            outside of the fitted range; the track goes on after the video's end; the lens is for another
+            size, or folds within the frames.
     """
     how = _Work(lens, keep, interpolation, border, encoder, options, back=False)
     return _convert(source, target, focal, how, progress, executor)
@@ -159,12 +167,14 @@ def _convert(
     with opened_video(source) as input_, whole_file(target) as part:
         video = input_.streams.best("video")
         size = (video.codec_context.width, video.codec_context.height)
-        _check_length(track, video)
+        report = Report(frames_shown(source, video))
+        warn_of_pixels(video)
+        _check_length(track, video, report.announced)
         lens, framing = _geometry(how.lens, track, how.keep, size, how.back)
         warper = FrameWarper(
             lens, framing, interpolation=how.interpolation, border=how.border, back=how.back
         )
-        report, along = Report(video.frames), carried(input_, video, target)
+        along = carried(input_, video, target)
         segments = [] if executor is None else _segments_of(source, target, video, along, report)
         if executor is not None and segments:
             there = Work(source, target.name, lens, framing, how.interpolation, how.border, how.back, track)
@@ -235,13 +245,13 @@ def _constant(focal: Any) -> FocalTrack:
     return FocalTrack(np.zeros(1), number[None], hold=True)
 
 
-def _check_length(track: FocalTrack, video: Any) -> None:
+def _check_length(track: FocalTrack, video: Any, frames: int) -> None:
     """Refuse a track that ends well before the video's announced end: now, not after all the work."""
     rate = float(video.average_rate or 25)
     if track.by_time:
         length, slack = float((video.duration or 0) * video.time_base), 2 / rate  # durations are rounded
     else:
-        length, slack = float(video.frames), 1.0
+        length, slack = float(frames), 1.0
     end = float(track.position[-1])
     if not track.hold and end < length - slack:
         unit = "s" if track.by_time else "frames"

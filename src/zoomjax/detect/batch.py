@@ -141,7 +141,9 @@ def _by_executor(
     """The same on an executor: one task an image, with all reading in it."""
     place = None if cache is None else cache.absolute()
     task = functools.partial(_sent, detector=detector, grid=grid, cache=place)
-    with contextlib.closing(in_order(executor, task, sources, size=_pixels, there=_absolute)) as done:
+    with contextlib.closing(
+        in_order(executor, task, sources, size=_pixels, there=_absolute, file=lambda one: one.path)
+    ) as done:
         for one in done:
             if one.result is None:
                 yield Detection(one.item.name, one.item.file, problem=f"its task failed: {one.told()}")

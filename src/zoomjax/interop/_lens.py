@@ -28,7 +28,7 @@ from ._centre import centres_and_family
 from ._forms import Form
 from ._pinhole import pitch_of
 from ._samples import Pairs, distortions
-from ._seen import Seen, against, distance, inside, seen_of
+from ._seen import Seen, against, distance, inside, once, seen_of
 from .base import TOLERANCE, Contents, Node, Sampled
 from .radial_table import RadialTable, zoom_of_table
 
@@ -96,11 +96,13 @@ def lens_of(
         made = None if contents.table is None else _of_table(contents, contents.table, zoom is None)
         if made is not None:
             return made
-    nodes: list[Node | Sampled] = sorted(_averaged(contents.nodes), key=lambda node: node.focal)
-    size, notes, given = contents.image_size, list(contents.notes), family
+    nodes, others = once(contents.nodes)
+    size, notes, given = contents.image_size, [], family
     if sampled := [node for node in nodes if isinstance(node, Sampled)]:
         centres, family = centres_and_family(sampled, size, family)
-        nodes = [dataclasses.replace(n, centre=c) for n, c in zip(sampled, centres, strict=True)]
+        at = {node.focal: centre for node, centre in zip(sampled, centres, strict=True)}
+        nodes = [dataclasses.replace(node, centre=at[node.focal]) for node in nodes]
+        others = [dataclasses.replace(node, centre=at[node.focal]) for node in others]
     own, exact = _family(nodes, terms)
     family, exact = (own, exact) if family is None or type(family) is type(own) else (family, False)
     chosen = zoom is None
@@ -114,6 +116,7 @@ def lens_of(
             f"{contents.focal_unit}: the lens is not validated beyond."
         )
     contents, seen = _with_rays(contents, seen, zoom, family, count)
+    notes = [*contents.notes, *notes]
     lens, at_nodes, between, note = _following(contents, seen, zoom, family, count)
     if not math.isfinite(at_nodes):
         if chosen and isinstance(zoom, SmoothZoom):
@@ -134,6 +137,13 @@ def lens_of(
         notes.append(
             f"Between the file's focal lengths the lens is smooth, up to {between:.2g} px from the tool's "
             "own interpolation: a table, TableZoom(), keeps to that."
+        )
+    if others:
+        far = _error(lens, [seen_of(node, size) for node in others])
+        at_nodes = max(at_nodes, far)
+        notes.append(
+            f"Entries of one focal length are not alike, as at {others[0].focal:g} {contents.focal_unit}: "
+            f"the lens is that of the first of each, up to {far:.2g} px from the others."
         )
     focal = tuple(float(each.node.focal) for each in seen)
     return Made(lens, focal, at_nodes, between, (*notes, *note))
@@ -162,8 +172,8 @@ def _with_rays(
     if in_px:
         seen = [dataclasses.replace(one, any_scale=False) for one in seen]
         return contents, sorted(seen, key=lambda one: one.node.focal)
-    pitch = pitch_of([one.node.focal for one in seen], [one.focal_px or math.nan for one in seen])
-    return dataclasses.replace(contents, pixel_pitch=pitch), seen
+    pitch, notes = pitch_of([one.node.focal for one in seen], [one.focal_px or math.nan for one in seen])
+    return dataclasses.replace(contents, pixel_pitch=pitch, notes=(*contents.notes, *notes)), seen
 
 
 def _following(
@@ -266,11 +276,6 @@ def _through(
     basis = np.asarray(jax.vmap(prepared.basis)(jnp.asarray(focal)), float)
     parameters = np.linalg.lstsq(basis, values, rcond=None)[0]
     return with_parameters(prepared, jnp.asarray(parameters)), basis @ parameters
-
-
-def _averaged(nodes: tuple[Node | Sampled, ...]) -> list[Node | Sampled]:
-    """One node for each focal length: of several, as in a track that stands still, the first."""
-    return list({node.focal: node for node in reversed(nodes)}.values())
 
 
 def _family(nodes: list[Node | Sampled], terms: int | None) -> tuple[AbstractFamily, bool]:

@@ -24,6 +24,9 @@ _SQUARE = 0.01
 _SAME = 0.01
 """Share by which pixel pitches of several focal lengths may differ: labels on lenses are rounded."""
 
+_ALIKE = 1e-4
+"""The same without a word."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Pinhole:
@@ -141,15 +144,25 @@ def contents(
             raise ValueError(f"argument focal must hold {len(nodes)} focal lengths, one for each camera")
         nodes = [dataclasses.replace(n, focal=f) for n, f in zip(nodes, job.focal, strict=True)]
     mm = mm or job.focal is not None
-    pitch = pitch_of([node.focal for node in nodes], px) if mm and px is not None else None
-    return Contents(tuple(nodes), size, "mm" if mm else "px", pixel_pitch=pitch)
+    pitch, notes = None, ()
+    if mm and px is not None and not any(node.focal_px for node in nodes):
+        pitch, notes = pitch_of([node.focal for node in nodes], px)
+    return Contents(tuple(nodes), size, "mm" if mm else "px", notes, pixel_pitch=pitch)
 
 
-def pitch_of(mm: list[float], px: list[float]) -> float | None:
-    """The pixel pitch of focal lengths in mm and in px; None where it is not the same for all."""
+def pitch_of(mm: list[float], px: list[float]) -> tuple[float | None, tuple[str, ...]]:
+    """The pixel pitch of focal lengths in mm and in px, None where they contradict, and a note of that."""
     found = np.array(mm) / np.array(px)
     mean = float(found.mean()) if found.size else math.nan
-    return mean if np.ptp(found) <= _SAME * mean else None
+    apart = float(np.ptp(found)) / mean if found.size else 0.0
+    if not apart > _ALIKE:
+        return mean, ()
+    told = f"Its focal lengths in mm and in px are of pixels that differ by up to {100 * apart:.2g} %: "
+    if apart > _SAME:
+        return None, (told + "their size is left open.",)
+    return mean, (
+        told + "that of the lens is their mean, and its focal lengths in px are off by half of that.",
+    )
 
 
 def matrix_rows(camera: Pinhole) -> list[list[float]]:

@@ -104,3 +104,23 @@ def distance(distortion: Distortion, seen: Seen, scale: float) -> float:
         other = np.hypot(*(back - distorted).T)
         far = np.where(np.isfinite(other), other, far)
     return float(far.max() * scale) if np.isfinite(far).all() else np.inf
+
+
+def once(nodes: tuple[Node | Sampled, ...]) -> tuple[list[Node | Sampled], list[Node | Sampled]]:
+    """The first node of each focal length, in their order, and later ones that are not like it.
+
+    Those of a track that stands still are alike.
+    """
+    first = {node.focal: node for node in reversed(nodes)}
+    return [first[focal] for focal in sorted(first)], [n for n in nodes if not _alike(n, first[n.focal])]
+
+
+def _alike(one: Node | Sampled, other: Node | Sampled) -> bool:
+    """Whether they are the same distortion, up to rounding."""
+    if isinstance(one, Node) and isinstance(other, Node):
+        pairs = [(one.theta, other.theta), (one.centre, other.centre)]
+        return one.form == other.form and all(np.allclose(*pair, rtol=1e-9) for pair in pairs)
+    assert isinstance(one, Sampled)
+    assert isinstance(other, Sampled)
+    pairs = [(one.distorted, other.distorted), (one.corrected, other.corrected)]
+    return all(np.array_equal(*pair) for pair in pairs)

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from .._core.text import plain
 from ..models.lens import ZoomLens
 from ._forms import AbstractForm
 from .radial_table import RadialTable
@@ -222,6 +223,23 @@ def one_size(sizes: list[tuple[int, int]]) -> tuple[int, int]:
             "of each size into a file or folder of their own, and read these one after the other"
         )
     return found[0]
+
+
+def refuse_others(told: Mapping[str, Any], read: Mapping[str, Any]) -> None:
+    """Raise ValueError where a file says what the reader has no model of.
+
+    Args:
+        told: what the file says by name, words or numbers; it need not say all.
+        read: the word or number that alone is read, by name.
+    """
+    for name, only in read.items():
+        value = told.get(name, only)
+        if isinstance(only, str) or isinstance(value, str):
+            same = value == only
+        else:
+            same = np.allclose(np.asarray(value, float), only, rtol=1e-6, atol=1e-12)
+        if not same:
+            raise ValueError(f"its {name} is {plain(str(value))}, and only {only} is read")
 
 
 def read_text(path: Path) -> str:

@@ -12,10 +12,13 @@ from collections.abc import Callable
 import numpy as np
 
 from ._pinhole import Pinholes, contents, formula, from_opencv, matrix_rows, pinhole
-from .base import Contents, Export, Import, Node, one_size, read_text
+from .base import Contents, Export, Import, Node, one_size, read_text, refuse_others
 
 _MOST = 8
 """Coefficients that are read."""
+
+_NEUTRAL = {"input_horizontal_stretch": 1, "input_vertical_stretch": 1, "digital_lens": "none"}
+"""What Gyroflow does besides to pictures, and where it does nothing; so it is with 0 and null."""
 
 
 class Gyroflow(Pinholes):
@@ -72,6 +75,7 @@ class Gyroflow(Pinholes):
         model = table.get("distortion_model", "opencv_fisheye")
         if model != "opencv_standard":
             raise ValueError(f"its distortion model {model!r} is not opencv_standard")
+        refuse_others({name: table[name] for name in _NEUTRAL if table.get(name)}, _NEUTRAL)
         nodes, sizes, numbers = [], [], []
         entries = table.get("interpolations") or {}
         mm = bool(entries) or bool(table.get("focal_length"))

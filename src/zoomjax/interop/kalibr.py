@@ -1,7 +1,10 @@
 """Kalibr's camera chain YAML: pinhole with radtan, k1 k2 p1 p2, one focal length a file."""
 
+import dataclasses
+
 import numpy as np
 
+from .._core.text import plain
 from ._pinhole import contents, formula, from_opencv, load_yaml, numbers, pinhole
 from .base import Contents, Export, Import, Node, NodeFormat, one_size
 
@@ -37,9 +40,11 @@ class Kalibr(NodeFormat):
 
     def read(self, job: Import) -> Contents:
         """The first camera of each file."""
-        nodes, sizes = [], []
+        nodes, sizes, others = [], [], set()
         for path in job.paths:
-            camera = load_yaml(path)["cam0"]
+            chain = load_yaml(path)
+            camera = chain["cam0"]
+            others |= {plain(str(name)) for name in chain} - {"cam0"}
             if (camera["camera_model"], camera["distortion_model"]) != ("pinhole", "radtan"):
                 raise ValueError("its first camera is not pinhole with radtan")
             width, height = camera["resolution"]
@@ -48,4 +53,6 @@ class Kalibr(NodeFormat):
             matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float)
             nodes.append(from_opencv(None, matrix, camera["distortion_coeffs"], size))
             sizes.append(size)
-        return contents(nodes, one_size(sizes), job)
+        found = contents(nodes, one_size(sizes), job)
+        note = (f"cam0 is read, and {', '.join(sorted(others))} is not.",) * bool(others)
+        return dataclasses.replace(found, notes=(*found.notes, *note))

@@ -51,6 +51,8 @@ class LCP(Format):
         size, focal = one_size(sizes), sorted(found)
         rows = [found[f][1] for f in focal]
 
+        pitch, notes = pitch_of(focal, [float(row[0]) * max(size) for row in rows])
+
         def between(i: int, share: float) -> Node:
             at = (1 - share) * focal[i] + share * focal[i + 1]
             t = math.log(at / focal[i]) / math.log(focal[i + 1] / focal[i])
@@ -60,7 +62,8 @@ class LCP(Format):
             tuple(_node(f, row, size) for f, row in zip(focal, rows, strict=True)),
             size,
             "mm",
-            pixel_pitch=pitch_of(focal, [float(row[0]) * max(size) for row in rows]),
+            notes,
+            pixel_pitch=pitch,
             between=between,
         )
 

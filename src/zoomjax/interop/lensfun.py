@@ -27,7 +27,7 @@ import numpy as np
 from .._core.text import plain
 from ..io.equipment import FILM
 from ._forms import AbstractForm, Form, minimax
-from .base import Contents, Export, Import, InterpolatedFormat, Node
+from .base import Contents, Export, Import, InterpolatedFormat, Node, refuse_others
 from .radial_table import SPARE, RadialTable
 
 
@@ -168,6 +168,12 @@ class Lensfun(InterpolatedFormat):
     def read(self, job: Import) -> Contents:
         """One lens of a database."""
         lens = _chosen(job)
+        refuse_others({"type": lens.findtext("type", "rectilinear").strip()}, {"type": "rectilinear"})
+        sets = [each for each in lens.findall("calibration") if each.find("distortion") is not None]
+        if len(sets) > 1 or sets[0].attrib:
+            raise ValueError(
+                "it has calibrations of several cameras: leave one in the file, without attributes"
+            )
         size = job.size()
         crop = float(lens.findtext("cropfactor", "1"))
         if not 0 < crop < math.inf:

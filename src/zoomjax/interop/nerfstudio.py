@@ -9,7 +9,7 @@ import json
 import numpy as np
 
 from ._pinhole import Pinhole, contents, focal_px, formula, node_of, pinhole
-from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text
+from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text, refuse_others
 
 _MODELS = ("OPENCV", "RADIAL", "SIMPLE_RADIAL", "PINHOLE", "SIMPLE_PINHOLE")
 """That nerfstudio takes for one and the same, coefficients that are not there for 0."""
@@ -51,6 +51,7 @@ class Nerfstudio(NodeFormat):
         table = json.loads(read_text(job.paths[0]))
         if (model := table.get("camera_model", "OPENCV")) not in _MODELS:
             raise ValueError(f"its camera model {model!r} is none of {', '.join(_MODELS)}")
+        refuse_others(table, {"is_fisheye": False})
         common = {key: table[key] for key in (*_KEYS, "k4") if key in table}
         nodes, sizes, px, units = [], [], [], set()
         for frame in table["frames"] or [{}]:

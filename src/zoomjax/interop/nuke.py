@@ -11,18 +11,36 @@ import re
 
 import numpy as np
 
-from .._core.text import plain
 from ..models.brown_conrady import BrownConrady
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ._forms import Form
-from .base import Contents, Export, Import, Node, NodeFormat, read_text
+from .base import Contents, Export, Import, Node, NodeFormat, read_text, refuse_others
 
 _DEGREE_4 = Form(2, tangential=True, corrects=True)
 _RATIONAL = Form(3, 3, corrects=True)
 _NODE, _OWN_NODE = "LD_3DE4_Radial_Standard_Degree_4", "LensDistortion2"
 _SETTINGS = {"normalisationType": "Diagonal", "projection": "Rectilinear"}
 """Of Nuke's own node, as they are written and must be."""
+
+_NEUTRAL = {
+    _NODE: {
+        "tde4_pixel_aspect": 1,
+        **dict.fromkeys(("field_of_view_xa_unit", "field_of_view_ya_unit"), 0),
+        **dict.fromkeys(("field_of_view_xb_unit", "field_of_view_yb_unit"), 1),
+        **dict.fromkeys(("U_Degree_4", "V_Degree_4", "B_Cylindric_Bending"), 0),
+    },
+    _OWN_NODE: {
+        **_SETTINGS,
+        **{"distortionDomain": "Rectilinear", "distortInFisheyeSpace": "false"},
+        **{"anamorphicSqueeze": 1, "anamorphicScale": 1, "anamorphicTwist": 0, "beamSplitterBending": 0},
+    },
+}
+"""Knobs that change what a node does, and the values without which they are read: there is no model of
+others."""
+
+_ASYMMETRIC = re.compile(r"distortion(Numerator|Denominator)[A-Z]\d+")
+"""Knobs of Nuke's own node of which the same is true, and that must be 0."""
 
 _MOST = 12
 """Coefficients that are read."""
@@ -61,7 +79,16 @@ class Nuke(NodeFormat):
 
     def read(self, job: Import) -> Contents:
         """The first node; focal lengths are those of its curve, or of argument focal, one for each key."""
-        kind, knobs = _first_node(read_text(job.paths[0]))
+        kind, knobs, notes = _first_node(read_text(job.paths[0]))
+        neutral = _NEUTRAL[kind] | dict.fromkeys(filter(_ASYMMETRIC.fullmatch, knobs), 0)
+        words = {name: value.strip('"') for name, value in knobs.items()}
+        refuse_others(
+            {
+                n: words[n] if isinstance(neutral[n], str) else _all(n, words[n])
+                for n in neutral.keys() & knobs
+            },
+            neutral,
+        )
         size = job.size()
         form, terms, centre, focal = (_read_degree_4 if kind == _NODE else _read_rational)(knobs, size)
         curves = [*terms, *centre]
@@ -77,19 +104,23 @@ class Nuke(NodeFormat):
             raise ValueError(f"it holds no focal lengths: give argument focal, {len(frames)} of them")
         nodes = [Node(f, form, row[:-2], row[-2:]) for f, row in zip(told, values, strict=True)]
         pitch = 10 * float(knobs["tde4_filmback_width_cm"]) / size[0] if kind == _NODE else None
-        return Contents(tuple(nodes), size, "mm", pixel_pitch=pitch)
+        return Contents(tuple(nodes), size, "mm", notes, pixel_pitch=pitch)
 
 
 Keys = dict[int, float]
 """The values of a knob by frame: of a curve, or one of a constant."""
 
 
-def _first_node(text: str) -> tuple[str, dict[str, str]]:
-    """The class of the first node that is read, and its knobs."""
-    found = re.search(rf"^\s*({_NODE}|{_OWN_NODE})\s*\{{(.*?)^\s*\}}", text, re.MULTILINE | re.DOTALL)
-    if found is None:
+def _first_node(text: str) -> tuple[str, dict[str, str], tuple[str, ...]]:
+    """The class of the first node that is read, its knobs, and what is to be said of others."""
+    nodes = re.findall(rf"^\s*({_NODE}|{_OWN_NODE})\s*\{{(.*?)^\s*\}}", text, re.MULTILINE | re.DOTALL)
+    if not nodes:
         raise ValueError(f"it has no whole node {_NODE} or {_OWN_NODE}")
-    return found[1], dict(re.findall(r"^\s*([A-Za-z]\w*) +(\S.*?)\s*$", found[2], re.MULTILINE))
+    kind, knobs = nodes[0]
+    notes = (
+        (f"The first of the file's {len(nodes)} nodes is read, and no other.",) if len(nodes) > 1 else ()
+    )
+    return kind, dict(re.findall(r"^\s*([A-Za-z]\w*) +(\S.*?)\s*$", knobs, re.MULTILINE)), notes
 
 
 def _read_degree_4(
@@ -113,9 +144,6 @@ def _read_rational(
     knobs: dict[str, str], size: tuple[int, int]
 ) -> tuple[Form, list[Keys], list[Keys], Keys | None]:
     """The same of LensDistortion2, which has no focal length."""
-    for name, value in _SETTINGS.items():
-        if knobs.get(name, value) != value:
-            raise ValueError(f"its {name} is {plain(knobs[name])}, and only {value} is read")
     over, under = map(int, re.findall(r"\d+", knobs.get("distortionOrder", "{3 3}")))
     if not 0 < over + under <= _MOST:
         raise ValueError(f"it must have up to {_MOST} coefficients")
@@ -164,6 +192,13 @@ def _keys(name: str, text: str) -> Keys:
     if not keys:
         raise ValueError(f"its curve {name} has no keys")
     return keys
+
+
+def _all(name: str, text: str) -> list[float]:
+    """All numbers of a knob: the keys of a curve, or components."""
+    if "curve" in text:
+        return list(_keys(name, text).values())
+    return [float(word) for word in re.sub(r"[{}]", " ", text).split()]
 
 
 def _values(nodes: list[Node], values: np.ndarray) -> str:

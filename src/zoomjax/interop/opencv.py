@@ -16,7 +16,7 @@ from ._pinhole import (
     numbers,
     pinhole,
 )
-from .base import Contents, Export, Import, Node, NodeFormat, one_size
+from .base import Contents, Export, Import, Node, NodeFormat, one_size, refuse_others
 
 
 class OpenCV(NodeFormat):
@@ -55,6 +55,7 @@ class OpenCV(NodeFormat):
         nodes, sizes, px, units = [], [], [], set()
         for path in job.paths:
             table = load_yaml(path)
+            refuse_others(table, {"fisheye_model": 0})
             size = job.size(
                 (int(table["image_width"]), int(table["image_height"])) if "image_width" in table else None
             )

@@ -14,12 +14,17 @@ import numpy as np
 
 from ..models.family import AbstractRadial
 from ._forms import Form
-from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text
+from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text, refuse_others
 
 _MODEL = "Brown-Conrady D-U"
 _FORM = Form(3, 3, tangential=True, corrects=True)
 _SLOTS = np.array([0, 2, 4, 1, 3, 5])
 """Of the numerators, then of the denominators."""
+
+_OFFSET = "Its projectionOffset is left out: the rays of the lens are about its centre of distortion."
+
+_SQUARE = 0.01
+"""Share by which the sides of pixels may differ: sensors' sizes are rounded."""
 
 
 class OpenTrackIO(NodeFormat):
@@ -39,6 +44,8 @@ class OpenTrackIO(NodeFormat):
 
     def text(self, nodes: list[Node], job: Export) -> str:
         """A sample on each line."""
+        if (first := min(job.frames or (0,))) < 0:
+            raise ValueError(f"OpenTrackIO numbers samples from 0, and the track begins at frame {first}.")
         return "".join(
             json.dumps(self._sample(node, number, job)) + "\n" for number, node in enumerate(nodes)
         )
@@ -79,17 +86,31 @@ class OpenTrackIO(NodeFormat):
 
     def read(self, job: Import) -> Contents:
         """Samples, one a line, in an array, or one alone; what is static may be in the first of them."""
-        nodes, camera, sizes, pitches = [], {}, [], []
+        nodes, camera, sizes, pitches, notes = [], {}, [], [], ()
         for sample in _samples(read_text(job.paths[0])):
             camera = {**camera, **sample.get("static", {}).get("camera", {})}
             resolution = camera.get("activeSensorResolution")
             found = None if resolution is None else (int(resolution["width"]), int(resolution["height"]))
             sizes.append(size := job.size(found))
-            pitch = float(camera["activeSensorPhysicalDimensions"]["width"]) / size[0]
+            pitch = _pitch(camera, size)
             nodes.append(_node(sample["lens"], pitch, size))
             pitches.append(pitch)
+            if any(sample["lens"].get("projectionOffset", {}).values()):
+                notes = (_OFFSET,)
         pitch = pitches[0] if len(set(pitches)) == 1 else None
-        return Contents(tuple(nodes), one_size(sizes), "mm", pixel_pitch=pitch)
+        return Contents(tuple(nodes), one_size(sizes), "mm", notes, pixel_pitch=pitch)
+
+
+def _pitch(camera: dict, size: tuple[int, int]) -> float:
+    """mm from one pixel to the next; ValueError where pixels or what they show are not square."""
+    sensor = camera["activeSensorPhysicalDimensions"]
+    pitch, other = float(sensor["width"]) / size[0], float(sensor["height"]) / size[1]
+    if abs(pitch - other) > _SQUARE * pitch:
+        raise ValueError(f"its pixels are not square, but {pitch:.4g} by {other:.4g} mm")
+    squeeze = camera.get("anamorphicSqueeze", 1)
+    squeeze = squeeze["num"] / squeeze["denom"] if isinstance(squeeze, dict) else squeeze
+    refuse_others({"anamorphicSqueeze": squeeze}, {"anamorphicSqueeze": 1})
+    return pitch
 
 
 def _samples(text: str) -> list[dict]:
@@ -103,13 +124,21 @@ def _samples(text: str) -> list[dict]:
     return found
 
 
+def _first(number: int, values: list) -> np.ndarray:
+    """So many coefficients, 0 where they are not there; ValueError if there are more."""
+    found = np.append(np.asarray(values, float), np.zeros(number))
+    if np.any(found[number:]):
+        raise ValueError(f"it has more than {number} coefficients of a kind, which zoomjax has no model of")
+    return found[:number]
+
+
 def _node(lens: dict, pitch: float, size: tuple[int, int]) -> Node:
     chosen = [entry for entry in lens["distortion"] if entry.get("model", _MODEL) == _MODEL]
     if not chosen:
         models = ", ".join(repr(entry["model"]) for entry in lens["distortion"])
         raise ValueError(f"its distortion model {models} is not {_MODEL!r}")
-    radial = np.append(np.asarray(chosen[0]["radial"], float), np.zeros(6))[:6]
-    tangential = np.append(np.asarray(chosen[0].get("tangential", []), float), np.zeros(2))[:2]
+    radial = _first(6, chosen[0]["radial"])
+    tangential = _first(2, chosen[0].get("tangential", []))
     theta = np.concatenate([radial[_SLOTS], tangential])
     if not np.isfinite(theta).all():
         raise ValueError("its coefficients must be finite numbers")

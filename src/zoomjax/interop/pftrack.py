@@ -8,7 +8,7 @@ fraction of the image's size, y up, counted from pixel centres. Without a track 
 import numpy as np
 
 from ._forms import Form
-from .base import Contents, Export, Import, Node, NodeFormat, read_text
+from .base import Contents, Export, Import, Node, NodeFormat, read_text, refuse_others
 
 _FORM = Form(2, corrects=True)
 _UNIT = np.sqrt(2)
@@ -46,8 +46,8 @@ class PFTrack(NodeFormat):
         text = read_text(job.paths[0])
         lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
         width, height, aspect = int(lines[0]), int(lines[1]), float(lines[2])
-        if aspect != 1 or lines[5] != "High Order":
-            raise ValueError("its pixels are not square, or its model is not of high order")
+        told = {"pixel aspect": aspect, "model": lines[5], "squeeze": float(lines[6])}
+        refuse_others(told, {"pixel aspect": 1, "model": "High Order", "squeeze": 1})
         number = int(lines[7])
         if job.focal is None or len(job.focal) != number:
             raise ValueError(f"it holds no focal lengths: give argument focal, {number} of them")

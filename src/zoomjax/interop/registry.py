@@ -14,6 +14,7 @@ from .._core.arguments import kinds_checked
 from .._core.checks import checked_size
 from .._core.files import refuse_existing, whole_file, whole_folder
 from ..io.focal_track import FocalTrack
+from ..models.about import UNKNOWN
 from ..models.family import AbstractFamily
 from ..models.lens import ZoomLens
 from ..models.requirements import check
@@ -125,6 +126,8 @@ def write(
     fmt = _format_to_write(format, path)
     check_options(fmt, {"tolerance": tolerance, "convention": convention})
     check("interop.write", zoom=lens.zoom)
+    if lens.about.get("focal") == UNKNOWN:
+        lens = _labelled(lens, focal)
     job = Export(
         lens,
         *focal_lengths(fmt, lens, focal, track),
@@ -163,6 +166,17 @@ def write(
         (*fmt.notes(found.nodes, job), *_shortfall(fmt, found, job), *others),
         files,
     )
+
+
+def _labelled(lens: ZoomLens, focal: Any) -> ZoomLens:
+    """A lens whose focal length nobody knew, with the one that is told now."""
+    told = () if focal is None else positives("focal", focal)
+    if len(told) != 1:
+        raise ValueError(
+            "Argument focal must be given, the one focal length of the lens: its photo did not tell it."
+        )
+    about = {name: fact for name, fact in lens.about.items() if name != "focal"}
+    return dataclasses.replace(lens, focal_range=np.full(2, told[0]), about=about)
 
 
 def _write_nodes(fmt: NodeFormat, nodes: list[Node], job: Export, files: list[Path]) -> float:

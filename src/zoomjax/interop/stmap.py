@@ -22,7 +22,7 @@ from .._core.quiet import silent
 from ..models.distortion import Distortion
 from ..models.family import AbstractRadial
 from ._samples import border, distortions
-from .base import CONVENTION, Contents, Export, FolderFormat, Import, Sampled, one_size
+from .base import CONVENTION, Contents, Export, FolderFormat, Import, Sampled, one_size, refuse_others
 
 _ROWS = 128
 """Of a map that are computed at once."""
@@ -90,6 +90,7 @@ class STMap(FolderFormat):
             raise ValueError(f"argument focal must hold {len(paths)} focal lengths, one for each file")
         for number, path in enumerate(paths):
             header, red, green = _open(path)
+            refuse_others(header, {"pixelAspectRatio": 1})
             sizes.append(size := job.size(_window_size(header["displayWindow"])))
             given = None if job.focal is None else job.focal[number]
             if (focal := _told("focal", header, _FOCAL, given)) is None:
@@ -98,7 +99,9 @@ class STMap(FolderFormat):
             points = _pairs(header, red, green, size, wanted, convention)
             nodes.append(Sampled(float(focal), *points, corrects=wanted == "redistort"))
             units.add(str(header.get(_UNIT, "mm")))
-        return Contents(tuple(nodes), one_size(sizes), "px" if units == {"px"} else "mm")
+        if len(units) > 1:
+            raise ValueError(f"some of its focal lengths are in {' and some in '.join(sorted(units))}")
+        return Contents(tuple(nodes), one_size(sizes), units.pop())
 
 
 def to_map(points: np.ndarray, size: tuple[int, int], convention: str) -> np.ndarray:

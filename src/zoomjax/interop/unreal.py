@@ -13,7 +13,7 @@ import numpy as np
 from ._pinhole import Pinhole, Pinholes, contents, focal_px, formula, node_of, pinhole
 from ._samples import distortions
 from ._solve import same
-from .base import Contents, Export, Import, Node, read_text
+from .base import Contents, Export, Import, Node, read_text, refuse_others
 from .opentrackio import OpenTrackIO
 
 _END = 0.01
@@ -102,8 +102,9 @@ class Unreal(Pinholes):
     def read(self, job: Import) -> Contents:
         """The tables, at one focus."""
         table = json.loads(read_text(job.paths[0]))
-        if table["metadata"]["lensInfo"]["distortionModel"] != "Spherical":
-            raise ValueError("its distortion model is not Spherical")
+        about = table["metadata"]
+        refuse_others(about["lensInfo"], {"distortionModel": "Spherical"})
+        refuse_others(about, {"fxFyUnits": "Normalized", "cxCyUnits": "Normalized"})
         size = job.size((int(table["imageDimensions"]["width"]), int(table["imageDimensions"]["height"])))
         tables = {entry["parameterName"]: _rows(entry) for entry in table["cameraParameterTables"]}
         if len({row["FocusEncoder"] for row in tables["DistortionTable"]}) > 1:

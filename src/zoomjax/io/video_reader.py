@@ -38,14 +38,15 @@ def decode_video(
     """
     with opened_video(source) as input_:
         video = input_.streams.best("video")
-        report = Report(video.frames)
+        report = Report(frames_shown(source, video))
+        warn_of_pixels(video)
 
         def frames() -> Iterator[tuple[int, float, Callable[[], np.ndarray]]]:
             for item, number, time in numbered(decoded_items(input_, video, report), report, source):
                 if isinstance(item, av.VideoFrame):
                     yield number, time, functools.partial(item.to_ndarray, format="bgr24")
 
-        yield video.frames or _counted(source), frames()
+        yield report.announced or _counted(source), frames()
 
 
 @dataclasses.dataclass
@@ -93,9 +94,20 @@ def _counted(source: str | os.PathLike[str]) -> int:
     with opened_video(source) as input_, contextlib.suppress(av.error.FFmpegError):
         number = 0
         for packet in input_.demux(input_.streams.best("video")):
-            number += packet.size > 0
+            number += packet.size > 0 and not packet.is_discard
         return number
     return 0
+
+
+def frames_shown(source: str | os.PathLike[str], video: Any) -> int:
+    """How many frames a file announces; 0 if it does not.
+
+    Of a clip that was cut without encoding it anew, an edit list leaves out frames that are still there.
+    """
+    if not (video.frames and video.duration and video.average_rate):
+        return video.frames
+    hidden = video.frames / video.average_rate - video.duration * video.time_base
+    return _counted(source) if hidden * video.average_rate > 1 else video.frames
 
 
 def _frame_numbers(source: str | os.PathLike[str]) -> dict[int, int]:
@@ -166,9 +178,9 @@ def frames_expected(input_: Any, video: Any, report: Report) -> int:
     seconds alone, and the length of all is that of the longest stream.
     """
     rate = float(video.average_rate or video.guessed_rate or 25)
-    if video.frames:
-        whole = _is_avi(input_) and round(report.reached * rate) >= video.frames
-        return report.written if whole else video.frames
+    if report.announced:
+        whole = _is_avi(input_) and round(report.reached * rate) >= report.announced
+        return report.written if whole else report.announced
     if input_.format.name != "matroska,webm":
         return 0
     told = video.metadata.get("DURATION")
@@ -189,14 +201,16 @@ def numbered(
 
     Frames are counted. Once some did not decode, time stamps tell the numbers of the others.
     """
-    number, first, stamps = 0, None, None
+    number, first, stamps, fields = 0, None, None, False
     for item in items:
         if not isinstance(item, av.VideoFrame):
             yield item, -1, math.nan
             continue
         if first is None:
             first = item.time or 0.0
-            warn_of_fields(item)
+        if item.interlaced_frame and not fields:
+            fields = True
+            _warn_of_fields()
         if report.failed and item.pts is not None:
             stamps = _frame_numbers(source) if stamps is None else stamps
             number = stamps.get(item.pts, number)
@@ -204,11 +218,20 @@ def numbered(
         number += 1
 
 
-def warn_of_fields(frame: Any) -> None:
-    """Warn of a frame that is interlaced."""
-    if frame.interlaced_frame:
+def _warn_of_fields() -> None:
+    warnings.warn(
+        "The video is interlaced: each frame holds two moments in alternate rows, which are taken for one. "
+        "Deinterlace it first.",
+        stacklevel=3,
+    )
+
+
+def warn_of_pixels(video: Any) -> None:
+    """Warn of a video whose pixels are not square."""
+    if (aspect := video.sample_aspect_ratio) not in (None, 0, 1):
         warnings.warn(
-            "The video is interlaced: each frame holds two moments in alternate rows, which are taken for "
-            "one. Deinterlace it first.",
+            f"The video has pixels of {aspect.numerator}:{aspect.denominator}, which are not square, and "
+            "distortion is taken to be alike in all directions of the stored image. Scale it to square "
+            "pixels first.",
             stacklevel=2,
         )

@@ -58,7 +58,9 @@ def stream(
             yield compress(read(path), terms)
         return
     task = functools.partial(_reduced, terms=terms, read=read)
-    with contextlib.closing(in_order(checked_executor(executor), task, paths, there=_absolute)) as done:
+    with contextlib.closing(
+        in_order(checked_executor(executor), task, paths, there=_absolute, file=lambda path: path)
+    ) as done:
         for one in done:
             if one.error is not None:
                 raise one.error

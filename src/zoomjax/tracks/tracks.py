@@ -66,7 +66,8 @@ class Tracks(eqx.Module):
             raise ValueError("Argument points must be finite where mask is set: clear the mask there.")
         frame = known(self.frame)
         if frame is not None and mask is not None and frame.ndim == 2:
-            falls = (np.diff(frame, axis=1) <= 0) & mask[:, 1:] & mask[:, :-1]
+            before = np.maximum.accumulate(np.where(mask, frame, -1), axis=1)[:, :-1]
+            falls = mask[:, 1:] & (frame[:, 1:] <= before)
             if falls.any():
                 place = int(np.argmax(falls.any(axis=1)))
                 raise ValueError(

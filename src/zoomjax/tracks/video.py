@@ -10,6 +10,7 @@ across a cut. Memory holds two frames, whatever the clip's length.
 """
 
 import os
+import warnings
 from collections.abc import Callable, Iterable
 
 import cv2
@@ -50,19 +51,29 @@ def track_video(
             it can be followed.
 
     Warns:
-        UserWarning: the clip is interlaced.
+        UserWarning: the clip is interlaced, its pixels are not square, or some of its frames do not decode:
+            frames of the tracks are numbered without these.
     """
     with decode_video(clip) as (announced, items):
+        numbers = []
 
         def images() -> Iterable[UInt8[np.ndarray, "height width 3"]]:
-            for done, (_, _, image) in enumerate(items, 1):
+            for number, _, image in items:
+                numbers.append(number)
                 yield image()
-                progress(done, announced)
+                progress(len(numbers), announced)
 
         try:
-            return track_frames(images(), most=most, life=life)
+            tracks = track_frames(images(), most=most, life=life)
         except ValueError as error:
             raise ValueError(f"Cannot track points in {os.fspath(clip)}: {error}") from error
+    if lost := numbers[-1] + 1 - len(numbers):
+        warnings.warn(
+            f"{lost} of {numbers[-1] + 1} frames of {os.fspath(clip)} cannot be decoded: the tracks number "
+            "frames without them.",
+            stacklevel=2,
+        )
+    return tracks
 
 
 def track_frames(

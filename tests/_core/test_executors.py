@@ -1,0 +1,120 @@
+"""Workers of an executor that see other files than the machine that the work comes from."""
+
+import itertools
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax._core import executors
+from zoomjax.app.undistort_files import Job, undistort_files
+from zoomjax.detect import detect, find_photos
+from zoomjax.scenes import nikkor_18_200
+
+SIZE = (300, 200)
+
+
+@pytest.fixture
+def away(monkeypatch):
+    """Each task takes itself for one on another machine."""
+    machines = itertools.count()
+    monkeypatch.setattr(executors, "_here", lambda: (f"machine {next(machines)}", 0))
+
+
+class Elsewhere(ThreadPoolExecutor):
+    """An executor with something done before each task there, and after it."""
+
+    def __init__(self, before=lambda item: None, after=lambda item: None):
+        super().__init__(1)
+        self.before, self.after = before, after
+
+    def submit(self, function, /, item):
+        def run(item):
+            self.before(item)
+            done = function(item)
+            self.after(item)
+            return done
+
+        future = super().submit(run, item)
+        future.exception()  # one after the other
+        return future
+
+
+@pytest.fixture
+def photos(tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for name in ("a", "b"):
+        image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+        image[60:140, 80:220] = 200
+        cv2.imwrite(str(folder / f"{name}.png"), image)
+    return folder
+
+
+def is_b(item):
+    return Path(getattr(item, "source", None) or getattr(item, "path", item)).stem == "b"
+
+
+def grow(item):
+    """The file b, as another machine might have it."""
+    if is_b(item):
+        path = Path(getattr(item, "source", None) or getattr(item, "path", item))
+        path.write_bytes(path.read_bytes() + b"0")
+
+
+def test_a_file_that_is_another_there_is_told_and_no_result(photos, away):
+    with Elsewhere(before=grow) as executor:
+        found = list(detect(find_photos([photos]), zj.EdgeDetector(), executor=executor))
+    assert [bool(d.problem) for d in found] == [False, True]
+    assert "sees another file" in found[1].problem
+    assert "workers must see the same files" in found[1].problem
+
+
+def lens():
+    small = nikkor_18_200()
+    return zj.ZoomLens(small.zoom, (np.array(SIZE) - 1) / 2, small.focal_range, SIZE)
+
+
+@pytest.fixture
+def job(photos, tmp_path):
+    lens().save(tmp_path / "lens.json")
+    return Job(tmp_path / "lens.json", (photos,), tmp_path / "out", focal="24", overwrite=True)
+
+
+def remove(item):
+    """What a worker wrote, which is on its own disk."""
+    if is_b(item):
+        item.target.unlink()
+
+
+@pytest.mark.parametrize("hook", [{"before": grow}, {"after": remove}], ids=["another", "own disk"])
+def test_photos_that_are_not_corrected_here_are_said(hook, job, away, tmp_path):
+    with Elsewhere(**hook) as executor:
+        done = undistort_files(job, executor=executor)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.png"]
+    assert "1 of 2 photos corrected" in done.sentence
+    [problem] = done.skipped.values()
+    assert "workers must see the same files" in problem or "must be one that workers share" in problem
+
+
+def test_what_is_there_of_an_earlier_run_is_no_result(job, away, tmp_path):
+    undistort_files(job)
+    old = tmp_path / "out" / "b.png"
+    content, kept = old.read_bytes(), tmp_path / "kept"
+
+    def keep(item):
+        if is_b(item):
+            old.rename(kept)
+
+    def restore(item):
+        if is_b(item):
+            old.unlink()
+            kept.rename(old)
+
+    with Elsewhere(before=keep, after=restore) as executor:
+        done = undistort_files(job, executor=executor)
+    assert old.read_bytes() == content
+    assert "must be one that workers share" in next(iter(done.skipped.values()))
