@@ -1,0 +1,105 @@
+"""Which pieces of edges become one line, and which stay apart: pieces made by hand, with exact places."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from zoomjax.detect._collinear import _checked, _units, collinear
+from zoomjax.detect._frame_model import OneFrame
+from zoomjax.detect._segments import Fragments
+
+SIZE = (1200, 800)
+STRAIGHT = OneFrame.of_values(SIZE, (0.0, 0.0, 0.0, 0.0))
+EXACT = 0.15
+"""px by which lines may be bent."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Piece:
+    """A level piece of an edge from x to x, brighter below (+1) or above, with a contrast."""
+
+    low: float
+    high: float
+    y: float = 400.0
+    side: int = 1
+    contrast: float = 100.0
+
+    def points(self):
+        x = np.arange(self.low, self.high + 1)
+        return np.stack([x, np.full_like(x, self.y)], axis=1)
+
+
+def lines(*pieces):
+    """The number of the line of each piece."""
+    points = [piece.points() for piece in pieces]
+    gradient = [
+        np.tile([0.0, of.side * of.contrast], (len(p), 1)) for of, p in zip(pieces, points, strict=True)
+    ]
+    made = Fragments.of(
+        np.concatenate(points), np.concatenate(gradient), np.array([len(p) for p in points])
+    )
+    return collinear(made, STRAIGHT, EXACT).tolist()
+
+
+def are_one(*pieces):
+    return len(set(lines(*pieces))) == 1
+
+
+def test_pieces_of_one_edge_join_from_end_to_end():
+    assert are_one(Piece(100, 200), Piece(230, 330), Piece(360, 460))
+
+
+@pytest.mark.parametrize(("visible", "gap", "joins"), [(40, 70, True), (40, 95, False), (250, 95, True)])
+def test_a_longer_gap_needs_longer_pieces(visible, gap, joins):
+    assert are_one(Piece(100, 100 + visible), Piece(100 + visible + gap, 100 + 2 * visible + gap)) == joins
+
+
+@pytest.mark.parametrize(("gap", "joins"), [(8, True), (40, False)])
+def test_another_side_is_brighter_only_where_pieces_touch(gap, joins):
+    """As at the corners of a checkerboard; farther off it is the edge of another thing."""
+    assert are_one(Piece(100, 200), Piece(200 + gap, 300 + gap, side=-1)) == joins
+    assert are_one(Piece(100, 200), Piece(200 + gap, 300 + gap))
+
+
+@pytest.mark.parametrize(("ratio", "joins"), [(3.0, True), (6.0, False)])
+def test_neighbours_have_like_contrast(ratio, joins):
+    assert are_one(Piece(100, 200), Piece(230, 330, contrast=100 * ratio)) == joins
+    assert are_one(Piece(100, 200), Piece(230, 330, contrast=100 / ratio)) == joins
+
+
+@pytest.mark.parametrize(("aside", "joins"), [(0.3, True), (2.5, False)])
+def test_a_piece_beside_the_line_is_none_of_it(aside, joins):
+    assert are_one(Piece(100, 300), Piece(330, 530, y=400 + aside)) == joins
+
+
+@pytest.mark.parametrize("thick", [2.0, 3.0, 6.0])
+def test_both_edges_of_a_thin_bar_stay_two_lines(thick):
+    """Each broken where something stands before it: an upper piece goes on as an upper one."""
+    upper = [Piece(100, 300), Piece(330, 530)]
+    lower = [Piece(100, 300, 400 + thick, -1), Piece(330, 530, 400 + thick, -1)]
+    label = lines(*upper, *lower)
+    assert label[0] == label[1] != label[2] == label[3]
+
+
+def test_edges_beside_each_other_stay_two_lines_whatever_their_sides():
+    label = lines(Piece(100, 500), Piece(150, 450, y=401.0))
+    assert label[0] != label[1]
+
+
+def test_a_piece_belongs_to_one_line():
+    """Of two lines that could take it, the nearer end does."""
+    label = lines(Piece(100, 300), Piece(320, 400), Piece(450, 650, y=400.4), Piece(450, 650, y=404.0))
+    assert label[0] == label[1] == label[2] != label[3]
+
+
+@pytest.mark.parametrize(("aside", "stays"), [(0.2, True), (3.0, False)])
+def test_a_piece_that_the_rest_does_not_predict_leaves_its_line(aside, stays):
+    pieces = [Piece(100, 500), Piece(520, 900), Piece(920, 935, y=400 + aside)]
+    points = [piece.points() for piece in pieces]
+    gradient = np.tile([0.0, 100.0], (sum(map(len, points)), 1))
+    units = _units(
+        Fragments.of(np.concatenate(points), gradient, np.array([len(p) for p in points])), STRAIGHT
+    )
+    found = _checked(units, np.zeros(3, int), EXACT)
+    assert found.tolist() == [0, 0, 0 if stays else -1]
