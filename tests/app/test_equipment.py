@@ -159,5 +159,5 @@ def test_a_focal_length_that_is_not_known_stays_so(lens, tmp_path):
     unknown = dataclasses.replace(one, about={"focal": "not known"})
     files = [results(tmp_path / "a", unknown), results(tmp_path / "b", lens)]
     assert with_earlier(one, files[:1]).about == {"focal": "not known"}
-    with pytest.raises(ValueError, match=r"lines\.npz is of one photo whose focal length is not known"):
+    with pytest.raises(ValueError, match=r"lines\.npz is of photos whose focal length is not known"):
         with_earlier(dataclasses.replace(lens, focal_range=np.array([1.0, 200.0])), files)

@@ -44,6 +44,16 @@ def test_a_table_is_read(tmp_path):
     assert found.absent == "f.csv has no row for it"
 
 
+def test_one_zoom_of_photos_need_not_be_known():
+    found = choose_focals([of("a.jpg", 24.0), of("b.jpg")], "same")
+    assert found.focal == {"a.jpg": 1.0, "b.jpg": 1.0}
+    assert (found.known, found.unit) == (False, "mm")
+    assert "photos of one zoom" in found.origin
+    check_way("same", None, video=False)
+    with pytest.raises(ValueError, match="--focal same is for photos"):
+        check_way("same", None, video=True)
+
+
 def test_one_number_is_that_of_all():
     assert choose_focals([of("a.jpg", 24.0), of("b.jpg")], "35").focal == {"a.jpg": 35.0, "b.jpg": 35.0}
 

@@ -270,6 +270,19 @@ def test_several_photos_need_focal_lengths(folder, tmp_path):
 
 
 @pytest.mark.slow
+def test_several_photos_of_one_zoom_need_none(folder, tmp_path):
+    image = cv2.imread(str(folder / "no-exif.png"), cv2.IMREAD_GRAYSCALE)
+    for name in "ab":
+        cv2.imwrite(str(tmp_path / f"{name}.png"), image if name == "a" else image[:, ::-1])
+    done = calibrate_images(ImageJob((tmp_path,), focal="same", overlays="none"))
+    lens, truth = done.calibration.zoom.lens, scenes.nikkor_18_200(SIZE)(20.56)
+    corner = np.array([10.0, 10.0])
+    np.testing.assert_allclose(lens(1.0).undistort(corner), truth.undistort(corner), atol=0.3)
+    assert lens.about["focal"] == "not known"
+    assert not re.search(r"\b1 mm\b(?! stands)", report(done.calibration, done))
+
+
+@pytest.mark.slow
 def test_a_zooming_video_is_calibrated(tmp_path):
     clips.write_clip(tmp_path / "zoom.mp4", sound=False)
     track = [f"{n},{clips.focal(n)}" for n in range(clips.FRAMES)]

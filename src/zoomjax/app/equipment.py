@@ -98,7 +98,7 @@ def with_earlier(lens: ZoomLens, files: Sequence[Path]) -> ZoomLens:
     for file, one in zip(files, found, strict=True):
         if len(files) > 1 and one is not None and one.about.get("focal") == UNKNOWN:
             raise ValueError(
-                f"{file} is of one photo whose focal length is not known: leave it out, or calibrate its "
+                f"{file} is of photos whose focal length is not known: leave it out, or calibrate its "
                 "photo again together with the others, with --focal."
             )
     known = [one for one in found if one is not None]

@@ -33,7 +33,8 @@ from .board_focals import NOT_THE_BOARD, Board, focal_of_board
 from .plane_focals import MOST_UNCERTAIN, FocalGroup, Found, Sharing, focals_from_grids
 
 WAYS = (
-    "one focal length for all (--focal 24); a CSV file with the columns image,focal (--focal focal.csv); "
+    "one focal length for all (--focal 24), which need not be known (--focal same); a CSV file with the "
+    "columns image,focal (--focal focal.csv); "
     "EXIF data in the photos (--focal exif); a board parallel to the sensor (--focal board --pitch MM "
     "--distance MM --pixel MM); oblique photos of a flat checkerboard or dot grid (--focal plane); or "
     "markings of a football pitch (--focal pitch)"
@@ -59,7 +60,7 @@ class Focals:
         absent: why an image may have no focal length.
         deviation: standard deviations by name, where known: estimated from images, or given.
         groups: the images that share a focal length.
-        known: whether they are: of one image alone, one millimetre may stand for what nobody knows.
+        known: whether they are: of one zoom alone, one millimetre may stand for what nobody knows.
     """
 
     focal: dict[str, float]
@@ -92,7 +93,11 @@ def check_way(way: str | None, board: Board | None, *, video: bool) -> None:
             raise ValueError(_NO_BOARD)
     elif video and way in (None, "exif"):
         raise ValueError(f"A video needs --focal: {_VIDEO_WAYS}.")
-    elif way not in (None, "exif", "plane", "pitch") and _number(way) is None:
+    elif video and way == "same":
+        raise ValueError(
+            "--focal same is for photos: give one focal length for the video, such as --focal 24."
+        )
+    elif way not in (None, "exif", "plane", "pitch", "same") and _number(way) is None:
         if not way.lower().endswith(".csv"):
             raise ValueError(
                 f"--focal is {way!r}, which is not a source of focal lengths. Give "
@@ -116,7 +121,8 @@ def choose_focals(
 
     Args:
         detections: detections of images of one size, all with lines.
-        way: the source: "exif", "board", "plane", "pitch", a number or a CSV file. None for the best
+        way: the source: "exif", "board", "plane", "pitch", a number, a CSV file, or "same" for one that
+            nobody knows. None for the best
             available one: the `board` if it is given, else EXIF data, else an oblique grid; else, of one
             image alone, none: one millimetre stands for its focal length.
         unit: unit of a number or of the focal lengths in a CSV file.
@@ -144,11 +150,15 @@ def choose_focals(
             NOT_THE_BOARD,
             _each(functools.partial(focal_of_board, board)),
         )
+    elif way == "same":
+        return _unknown(detections)
+    elif way == "plane" and all(d.nodes is None for d in detections):
+        found = Focals({}, "px", _GRID, _NO_PLANE)
     elif way == "plane":
         found = _estimated(
             detections,
             "px",
-            "homographies of the grid",
+            _GRID,
             _NO_PLANE,
             functools.partial(focals_from_grids, sharing=sharing),
             zooms=sharing.known(detections) if sharing else None,
@@ -171,7 +181,7 @@ def choose_focals(
             {name: value for name, value in sigma.items() if value is not None},
         )
     if not found.focal and whole is None and board is None and len(detections) == 1:
-        return Focals({detections[0].name: 1.0}, "mm", _UNKNOWN, "", known=False)
+        return _unknown(detections)
     if not found.focal:
         raise ValueError(
             f"No focal length found for any image. Source: {found.origin}; problem: {found.absent}. Give "
@@ -202,7 +212,14 @@ def known_focals(detections: Sequence[Detection], way: str | None, others: Focal
 _EXIF, _TRACK = "EXIF data", "the track of the video"
 
 
-_UNKNOWN = "not known, and not needed for one photo: 1 mm stands for it"
+def _unknown(detections: Sequence[Detection]) -> Focals:
+    """One millimetre for all images."""
+    of = "one photo" if len(detections) == 1 else "photos of one zoom"
+    found = dict.fromkeys((d.name for d in detections), 1.0)
+    return Focals(found, "mm", f"not known, and not needed for {of}: 1 mm stands for it", "", known=False)
+
+
+_GRID = "homographies of the grid"
 
 
 _NO_PLANE = "no flat grid was found in it, or the view is too frontal to determine a focal length"

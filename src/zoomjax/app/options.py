@@ -116,10 +116,10 @@ Focal = Annotated[
     typer.Option(
         metavar="SOURCE",
         help="Source of the focal lengths: a CSV file (columns image,focal; for a video time,focal or "
-        "frame,focal; for CSV lines frame,focal), a number, exif, board (parallel to the sensor), "
-        "plane (oblique views of a flat grid), pitch (football markings), or for a video motion (as "
-        "the camera turns and zooms). Default for photos: board if --pitch is given, else exif, else "
-        "plane (with --detector pitch: pitch); for a video: motion.",
+        "frame,focal; for CSV lines frame,focal), a number, same (one for all photos, not known), exif, "
+        "board (parallel to the sensor), plane (oblique views of a flat grid), pitch (football markings), "
+        "or for a video motion (as the camera turns and zooms). Default for photos: board if --pitch is "
+        "given, else exif, else plane (with --detector pitch: pitch); for a video: motion.",
         rich_help_panel=FOCAL,
     ),
 ]
@@ -325,7 +325,7 @@ def refuse_idle(context: typer.Context, names: Iterable[str], where: str) -> Non
         raise ValueError(f"{' and '.join(given)} {has} no effect {where}: leave {them} out.")
 
 
-_OF_A_UNIT = (None, "exif", "board", "plane", "pitch")
+_OF_A_UNIT = (None, "exif", "board", "plane", "pitch", "same")
 """Sources of focal lengths that tell their unit."""
 
 
