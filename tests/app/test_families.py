@@ -2,6 +2,7 @@
 
 import json
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app.calibration import calibrate
+from zoomjax.app.fitting import _gains
 from zoomjax.app.model_choice import FAMILIES, WantedModel
 from zoomjax.app.report import report
 from zoomjax.lines.csv import read_lines_csv, write_lines_csv
@@ -165,3 +167,20 @@ def test_lines_that_the_first_model_cannot_follow_are_judged_again_by_the_one_ch
     assert rejected.mean() < 0.1
     assert all(not rejected[np.asarray(straight.frame) == frame].all() for frame in range(len(focal)))
     assert farthest(done.zoom.lens, lens) < 1.0
+
+
+def test_a_centre_is_one_about_which_lines_are_straighter(clean):
+    found = zj.fit.fit_centre(clean, zoom=zj.PolynomialZoom(degree=1))
+
+    def changed(**values):
+        names = list(values)
+        return eqx.tree_at(
+            lambda of: [getattr(of, name) for name in names],
+            found,
+            [jnp.asarray(values[name]) for name in names],
+        )
+
+    rms = float(found.fit.rms)
+    assert _gains(changed(rms_fixed=2 * rms, determined=True))
+    assert not _gains(changed(rms_fixed=rms / 2, determined=True))
+    assert not _gains(changed(rms_fixed=2 * rms, determined=False))

@@ -45,7 +45,7 @@ def span(low: float, high: float, unit: str) -> str:
 
 
 def with_std(value: float, std: float, unit: str) -> str:
-    """A signed value and its standard deviation, as far as it is known: +4191 ± 307 px."""
+    """A signed value and its standard deviation, to the second figure of the latter."""
     if not math.isfinite(std):
         return f"{value:+.4g} {unit} (uncertainty unknown)"
     decimals = 2 if std <= 0 else min(max(1 - math.floor(math.log10(std)), 0), 6)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..fit.algebraic import algebraic_zoom
-from ..fit.centre import fit_centre
+from ..fit.centre import CentreFit, fit_centre
 from ..fit.compression import compressed_as_measured
 from ..fit.family_lines import with_family
 from ..fit.frames import fit_frames
@@ -214,14 +214,19 @@ def _under_family(
     if isinstance(centre, str) and centre == "fit" and isinstance(model.family, AbstractRadial):
         stage("Fitting the centre of distortion")
         own, judged = fit_centre(placed, zoom=model, throw=False), placed
-        if own.determined and robust:
+        if _gains(own) and robust:
             judged = _straight(placed.about(own.fit.lens.centre), model)
             if not np.array_equal(np.asarray(judged.weight), np.asarray(placed.weight)):
                 own = fit_centre(judged.about(placed.centre), zoom=model, throw=False)
-        if own.determined:
+        if _gains(own):
             how, zoom = CentreFound.of(lines, None, own), own.fit
             placed = judged.about(own.fit.lens.centre)
     return _Centred(_in_family(placed, model), model, how, selection, zoom)
+
+
+def _gains(found: CentreFit) -> bool:
+    """Whether a centre was found about which lines are straighter: the search may go astray."""
+    return bool(found.determined) and float(found.fit.rms) <= float(found.rms_fixed)
 
 
 def _in_family(lines: AbstractLines, model: Model) -> AbstractLines:
