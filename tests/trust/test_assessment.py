@@ -149,6 +149,20 @@ def test_lines_without_noise_are_not_crooked(lens, lines):
     assert "crooked lines" not in about(assessed(exact))
 
 
+@pytest.mark.parametrize(("bend", "astray"), [(0.1, False), (3.0, True)])
+def test_rejected_lines_count_where_they_are_off_straight(lines, bend, astray):
+    """Half of the lines have a weight of 0 and are bent, by less than can be seen or by more."""
+    weight = np.arange(len(lines.frame)) % 2
+    points = np.array(lines.points)
+    for line in np.flatnonzero(weight == 0):
+        own = np.asarray(lines.mask)[line]
+        points[line, own] += bend * np.linspace(-1, 1, own.sum())[:, None] ** 2 * np.array([1.0, -1.0])
+    found = assessed(moved(lines, points).weighted(weight.astype(float)))
+    assert found.evidence.rejected == (weight == 0).sum()
+    assert (found.evidence.astray > 0.9 * found.evidence.rejected) == astray
+    assert ("rejected lines" in about(found)) == astray
+
+
 def test_few_lines_are_not_good(lines):
     weight = np.zeros(len(lines.frame))
     for frame in range(6):

@@ -9,7 +9,8 @@ import numpy as np
 from .._core.text import listed, plain
 from ..detect.batch import Detection
 from ..detect.bend import bends_apart
-from ..trust.assessment import NEGLIGIBLE, Finding, Verdict
+from ..trust.assessment import Finding, Verdict
+from ..trust.evidence import NEGLIGIBLE
 from .calibration import Calibration
 from .equipment import equipment_of
 from .plane_focals import FocalGroup

@@ -4,8 +4,8 @@ A lens is good if its correction is right to within a small part of itself. Thre
 the displacement (RMS over the image, at its largest): that of the noise (the bands), half the distance
 between lenses fitted to halves of the lines where it exceeds what noise explains, and the error of frames
 left out beyond that of their own fits. Vanishing points that ask for another correction make it doubtful.
-An error below `NEGLIGIBLE` of the image's diagonal does no harm,
-however small the displacement.
+An error below `NEGLIGIBLE` of the image's diagonal does no harm, however small the displacement; nor do
+lines that were rejected for less.
 
 A tenth of a strong lens's displacement is much, and all of it may bend lines. So what the noise leaves
 uncertain beyond a homography must be small in px of the image, too. Of one photo that alone counts: its
@@ -24,7 +24,7 @@ from .._core.types import of_known_values
 from ..fit.result import RESULTS, ZoomFit
 from ..lines.base import AbstractLines
 from ..lines.lines import Lines
-from .evidence import Evidence, evidence
+from .evidence import NEGLIGIBLE, UNSEEN_PX, Evidence, evidence
 from .folds import focals_there
 
 Verdict = Literal["good", "doubtful", "not determined"]
@@ -32,15 +32,11 @@ Verdict = Literal["good", "doubtful", "not determined"]
 VERDICTS: tuple[Verdict, ...] = ("good", "doubtful", "not determined")
 """From the best to the worst."""
 
-NEGLIGIBLE = 2.5e-4
-"""Of the image's diagonal: an error that does no harm."""
-
 _DOUBTFUL, _UNDETERMINED = 0.1, 0.5  # errors, in displacements
 _BEYOND_NOISE = 3.0  # how many times farther apart halves are than by chance
 _UNPREDICTED = 1.5  # how many times the RMS of frames left out may exceed that of their own fits
 _REJECTED = 1 / 3  # of the lines
 _FEW_LINES = 4  # per frame
-_UNSEEN_PX = 0.25  # of images so small that `NEGLIGIBLE` is less
 _BENT_PX, _BENT = 0.4, 3.5e-4
 """How uncertain a good lens may be beyond a homography: px, a part of the diagonal, whichever is larger."""
 _BENT_SHARE, _BENT_MOST = 0.03, 1e-3
@@ -179,7 +175,7 @@ def _judged(error: float, of: Evidence) -> Verdict:
 
 def _is_bent(of: Evidence) -> bool:
     """Whether what is uncertain beyond a homography may be seen, or is much of what is straightened."""
-    if of.bent_std <= max(_UNSEEN_PX, NEGLIGIBLE * of.diagonal):
+    if of.bent_std <= max(UNSEEN_PX, NEGLIGIBLE * of.diagonal):
         return False
     strong = min(_BENT_SHARE * of.bent, _BENT_MOST * of.diagonal)
     most = max(_BENT_PX, _BENT * of.diagonal, strong)
@@ -255,7 +251,7 @@ def _of_halves(of: Evidence) -> Iterator[Finding]:
 
 
 def _of_lines(of: Evidence) -> Iterator[Finding]:
-    if of.rejected > _REJECTED * (of.lines + of.rejected):
+    if of.astray > _REJECTED * (of.lines + of.rejected):
         yield Finding(
             "rejected lines",
             "doubtful",
@@ -315,7 +311,7 @@ def _of_one_frame(of: Evidence, each: float) -> Iterator[Finding]:
 
     Where what is uncertain does no harm, there may be nothing to straighten.
     """
-    if of.frames > 1 or of.bent_std <= max(_UNSEEN_PX, NEGLIGIBLE * of.diagonal):
+    if of.frames > 1 or of.bent_std <= max(UNSEEN_PX, NEGLIGIBLE * of.diagonal):
         return
     if each >= of.rms_uncorrected:
         yield Finding(

@@ -31,6 +31,7 @@ from .._core.types import of_known_values
 from ..fit.energy import (
     coefficients_by,
     frame_energy,
+    line_squares,
     linearised,
     prior_jacobian,
     prior_residuals,
@@ -50,6 +51,9 @@ from ..models.zoom import AbstractZoom, with_parameters
 from ._bending import bending
 from .bands import displacement_std
 from .vanishing import VanishingPoints, vanishing_points
+
+NEGLIGIBLE, UNSEEN_PX = 2.5e-4, 0.25
+"""Errors that do no harm: as a part of the image's diagonal, and, of small images, px."""
 
 _CURVE = 5
 _FOCALS = 3  # over the range, evenly in 1/f
@@ -90,6 +94,7 @@ class Evidence:
     Attributes:
         lines, frames, focals: how many lines, frames and distinct focal lengths count.
         rejected: how many lines of three points or more have a weight of 0.
+        astray: how many of these are off straight by more than does no harm (RMS).
         rms, rms_uncorrected: RMS distance to straight lines, with and without the correction.
         noise: RMS distance of points to smooth curves through their lines; NaN where they have few points.
         displacement: how far the correction moves points, RMS over the image, where that is largest.
@@ -105,6 +110,7 @@ class Evidence:
 
     lines: int
     rejected: int
+    astray: int
     frames: int
     focals: int
     rms: float
@@ -169,9 +175,13 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     bent = bending(lines, lens, weight, pulled[0])
     zero = jax.device_put(np.zeros((len(lines.focal), np.size(lens.zoom(lens.focal_range[0]))), dtype))
     before = np.asarray(frame_energy(compressed, zero))
+    rejected = (counts_of(lines) > 2) & (weight == 0)
+    harmless = max(UNSEEN_PX, NEGLIGIBLE * 2 * lens.scale)
+    seen = np.asarray(line_squares(compressed, lens.zoom)) > harmless**2
     return Evidence(
         lines=int((weight > 0).sum()),
-        rejected=int(((counts_of(lines) > 2) & (weight == 0)).sum()),
+        rejected=int(rejected.sum()),
+        astray=int((rejected & seen).sum()),
         frames=len(frames),
         focals=np.unique(np.asarray(lines.focal)[frames]).size,
         rms=float(fit.rms),
