@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import re
+import threading
 from collections.abc import Generator, Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -128,9 +129,9 @@ class FrameWriter(contextlib.AbstractContextManager):
             name = encoder or self._encoder(video.codec_context.codec.canonical_name, named)
             self._stream = self._pictures(name, video, first, like, options, free=encoder is None)
             self._stream.set_display_matrix(like.orientation)
-            with _blamed(name), _warnings() as warned:
+            with _blamed(name), _warnings() if options else contextlib.nullcontext([]) as warned:
                 self._stream.codec_context.open(strict=False)
-            if options is not None:
+            if options:
                 _refuse_unknown(name, options, self._stream.codec_context.options, warned)
             self._copies = put(self._output, along, named)
             starts(self._output, named, along.streams)
@@ -253,16 +254,26 @@ def _refuse_unknown(
         )
 
 
+_LEVEL = threading.Lock()
+"""Held while FFmpeg's level of logging is another."""
+
+
 @contextlib.contextmanager
 def _warnings() -> Generator[list[tuple[int, str, str]], None, None]:
-    """What FFmpeg warns of in this thread."""
-    level = av.logging.get_level()
-    av.logging.set_level(av.logging.WARNING)
-    try:
-        with av.logging.Capture() as warned:
-            yield warned
-    finally:
-        av.logging.set_level(level)
+    """What FFmpeg warns of in this thread.
+
+    One thread at a time: another would take the level that this one has set for the one to go back to. Then
+    FFmpeg's threads would speak to Python for ever after, and wait for a thread that, while it closes a
+    decoder, waits for them.
+    """
+    with _LEVEL:
+        level = av.logging.get_level()
+        av.logging.set_level(av.logging.WARNING)
+        try:
+            with av.logging.Capture() as warned:
+                yield warned
+        finally:
+            av.logging.set_level(level)
 
 
 def _options(name: str, source: Any) -> dict[str, str]:
