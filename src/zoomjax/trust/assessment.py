@@ -159,7 +159,7 @@ def assess(
     if held_out is not None and each_held_out is not None:
         both = (np.asarray(values, float) for values in (held_out, each_held_out))
         focal = np.asarray(lines.focal, float)
-        findings += _of_one_frame(found, float(np.sum(each_held_out)))
+        findings += _of_one_frame(found, float(np.nansum(each_held_out)))
         findings += _of_frames(found, np.where(np.isin(focal, focals_there(lines)), focal, np.nan), *both)
     return Assessment((), found).joined_by(findings)
 
