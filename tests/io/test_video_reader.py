@@ -2,7 +2,6 @@
 
 from fractions import Fraction
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -12,7 +11,9 @@ from zoomjax.detect import video_frames
 from zoomjax.io import FocalTrack, decode_video
 from zoomjax.tracks import track_video
 
-from .._clips import SIZE, lens, write_clip
+av = pytest.importorskip("av")
+
+from .._clips import SIZE, lens, write_clip  # noqa: E402 (needs PyAV too)
 
 FRAMES, HIDDEN = 20, 7
 

@@ -3,14 +3,14 @@
 import threading
 import time
 
-import av
-import av.logging
 import numpy as np
 import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.io.video_writer import _warnings
+
+av = pytest.importorskip("av")
 
 
 def test_threads_leave_the_level_of_logging_as_it_was():
