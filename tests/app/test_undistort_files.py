@@ -117,6 +117,18 @@ def test_photos_at_their_own_focal_lengths(folder):
         assert difference.mean() < 1
 
 
+def test_photos_corrected_before_are_counted(folder, tmp_path):
+    xmp = b'<x:xmpmeta><a crs:LensProfileEnable="1" crs:AlreadyApplied="True"/></x:xmpmeta>'
+    for number, told in enumerate((xmp, xmp, b"")):
+        Image.fromarray(picture(0)).convert("RGB").save(tmp_path / f"{number}.jpg", xmp=told)
+    job = Job(folder / "lens.json", (tmp_path,), tmp_path / "out", focal="40")
+    told = "Of 3 photos 2 say that Adobe's lens correction has corrected their distortion before."
+    assert any(note.startswith(told) for note in undistort_files(job).notes)
+    (tmp_path / "0.jpg").unlink()
+    (tmp_path / "1.jpg").unlink()
+    assert undistort_files(dataclasses.replace(job, output=tmp_path / "other")).notes == ()
+
+
 def test_photos_with_a_table_or_one_focal_length(folder):
     for focal, out in (("focal.csv", "table"), ("30", "number")):
         done = run(folder, "a.jpg", "b.jpg", "--focal", focal, "-o", out)

@@ -45,6 +45,21 @@ def test_photos_of_one_lens_say_nothing(tmp_path):
     assert findings_of_photos(photos) == []
 
 
+def test_photos_that_were_changed_before_are_doubtful(tmp_path):
+    xmp = b'<x:xmpmeta><a crs:LensProfileEnable="1" crs:AlreadyApplied="True"/></x:xmpmeta>'
+    for number in range(3):
+        Image.new("L", (40, 40)).save(tmp_path / f"{number}.png")
+    Image.new("L", (40, 40)).save(tmp_path / "0.jpg", xmp=xmp)
+    Image.new("L", (40, 40)).save(tmp_path / "2.png", dpi=(300, 200))
+    photos = [tmp_path / name for name in ("0.jpg", "1.png", "2.png")]
+    corrected, squeezed = findings_of_photos(photos)
+    assert (corrected.verdict, squeezed.verdict) == ("doubtful", "doubtful")
+    assert corrected.found.startswith(
+        "1 of 3 photos say that their distortion was corrected before, by Adobe's lens correction:"
+    )
+    assert squeezed.found.startswith("1 of 3 photos say that their pixels are not square, 300 on 200,")
+
+
 def test_two_lenses_and_bodies_are_doubtful(tmp_path):
     photos = [photo(tmp_path / f"{n}.jpg", f"D{n // 3}", f"lens {n % 2}") for n in range(5)]
     lenses, cameras = findings_of_photos(photos)

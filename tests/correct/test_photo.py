@@ -224,6 +224,14 @@ def test_what_is_corrected_is_not_corrected_twice(tmp_path, rng, suffix):
     zj.undistort_photo(tmp_path / f"back{suffix}", twice, lens=lens(), focal=20.0)
 
 
+def test_what_another_program_has_corrected_is_told_of(tmp_path, rng):
+    xmp = b'<x:xmpmeta><a crs:LensProfileEnable="1" crs:AlreadyApplied="True"/></x:xmpmeta>'
+    Image.fromarray(picture(rng)).save(tmp_path / "in.jpg", xmp=xmp)
+    with pytest.warns(UserWarning, match=r"in\.jpg says that Adobe's lens correction has .* twice"):
+        zj.undistort_photo(tmp_path / "in.jpg", tmp_path / "out.jpg", lens=lens(), focal=20.0)
+    zj.correct.redistort_photo(tmp_path / "in.jpg", tmp_path / "back.jpg", lens=lens(), focal=20.0)
+
+
 @pytest.mark.parametrize("keep", ["same", "all", "valid", "grow"])
 def test_back_is_where_it_began(tmp_path, rng, keep):
     """Of what is still there: with "grow" everything, at full size."""

@@ -1,7 +1,9 @@
 """Metadata from format to format, in files of Pillow and tifffile: what is kept, and what is said."""
 
 import io
+import shutil
 import struct
+import subprocess
 
 import cv2
 import numpy as np
@@ -11,7 +13,7 @@ from PIL import ExifTags, Image, IptcImagePlugin, PngImagePlugin
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from zoomjax.io.equipment import read_equipment
-from zoomjax.io.metadata import Metadata, geometry_of, marked, work_of
+from zoomjax.io.metadata import Metadata, geometry_of, marked, squeezed, straightened_by, work_of
 from zoomjax.io.photo import read_focal, read_metadata, read_pages, read_photo
 from zoomjax.io.photo_writer import encoded_photo
 
@@ -284,3 +286,68 @@ def test_iptc_data_of_any_type_are_kept_without_a_word(tmp_path, image, kind):
     write(tmp_path / "b.jpg", image, found)
     with Image.open(tmp_path / "b.jpg") as opened:
         assert IptcImagePlugin.getiptcinfo(opened)[2, 120] == b"ruler"
+
+
+def packet(inside):
+    return XMP.replace(b"</rdf:RDF>", inside + b"</rdf:RDF>")
+
+
+APPLIED = b'crs:AlreadyApplied="True"'
+HISTORY = b'<rdf:li darktable:num="8" darktable:operation="lens" darktable:enabled="%d"/>'
+DIGIKAM = b"<digiKam:LensCorrectionSettings>Distortion Correction: %s ;</digiKam:LensCorrectionSettings>"
+
+
+@pytest.mark.parametrize(
+    ("inside", "program"),
+    [
+        (b'<rdf:Description crs:LensProfileEnable="1" ' + APPLIED + b"/>", "Adobe's lens correction"),
+        (b"<a " + APPLIED + b' crs:LensManualDistortionAmount="+12"/>', "Adobe's lens correction"),
+        (
+            b"<crs:AlreadyApplied>True</crs:AlreadyApplied><crs:LensProfileEnable>1</crs:LensProfileEnable>",
+            "Adobe's lens correction",
+        ),
+        (b'<rdf:Description crs:LensProfileEnable="0" ' + APPLIED + b"/>", None),
+        (b'<a crs:LensProfileEnable="1" crs:AlreadyApplied="False"/>', None),  # settings of a RAW photo
+        (b'<a crs:LensProfileEnable="1"/>', None),
+        (
+            b'<a crs:LensManualDistortionAmount="0" ' + APPLIED + b"/>",
+            None,
+        ),
+        (HISTORY % 1, "darktable"),
+        (HISTORY % 0, None),
+        (b'<rdf:li darktable:enabled="1" darktable:operation="exposure"/>' + HISTORY % 0, None),
+        (DIGIKAM % b"enabled", "digiKam"),
+        (DIGIKAM % b"disabled", None),
+        (b"", None),
+    ],
+)
+def test_photos_that_say_that_their_distortion_was_corrected(tmp_path, image, inside, program):
+    for suffix in (".jpg", ".png", ".tif", ".webp"):
+        write(tmp_path / f"a{suffix}", image, Metadata(xmp=packet(inside)))
+        assert straightened_by(read_metadata(tmp_path / f"a{suffix}")) == program
+    assert straightened_by(marked(Metadata(xmp=packet(inside)), "undistorted")) == "zoomjax"
+
+
+@pytest.mark.skipif(shutil.which("exiftool") is None, reason="Needs exiftool.")
+def test_what_exiftool_writes_of_corrections_is_read(tmp_path, image):
+    write(tmp_path / "a.jpg", image, Metadata())
+    tags = ["-XMP-crs:AlreadyApplied=True", "-XMP-crs:LensProfileEnable=1", "-overwrite_original"]
+    subprocess.run(["exiftool", "-q", *tags, str(tmp_path / "a.jpg")], check=True)
+    assert straightened_by(read_metadata(tmp_path / "a.jpg")) == "Adobe's lens correction"
+
+
+def test_pixels_that_are_not_square(tmp_path, image):
+    written, _ = encoded_photo([(image, Metadata())], ".jpg")
+    at = written.index(b"JFIF\0") + 7
+    (tmp_path / "a.jpg").write_bytes(written[:at] + struct.pack(">BHH", 0, 59, 54) + written[at + 5 :])
+    found = read_metadata(tmp_path / "a.jpg")
+    assert (found.dpi, found.shape, squeezed(found)) == (None, (59, 54), (59, 54))
+    assert write(tmp_path / "b.jpg", image, found) == []
+    assert write(tmp_path / "b.png", image, found) == []
+    assert read_metadata(tmp_path / "b.jpg").shape == read_metadata(tmp_path / "b.png").shape == (59, 54)
+    assert write(tmp_path / "b.tif", image, found) == ["the shape of the pixels"]
+    Image.fromarray(image).save(tmp_path / "c.png", dpi=(300, 200))
+    assert squeezed(read_metadata(tmp_path / "c.png")) == pytest.approx((300, 200), abs=0.02)
+    for name in ("d.jpg", "d.png", "d.tif"):
+        Image.fromarray(image).save(tmp_path / name, dpi=(300, 300))
+        assert squeezed(read_metadata(tmp_path / name)) is None

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from ..io.equipment import FILM, Equipment, read_equipment
+from ..io.metadata import Metadata
+from ..io.photo import read_metadata
 from ..lenses.matching import crop_factor
 from ..models.about import UNKNOWN
 from ..models.lens import ZoomLens, load_lens
@@ -138,6 +140,14 @@ def equipment_of(photo: Path) -> Equipment:
         return read_equipment(photo)
     except (OSError, ValueError):
         return Equipment()
+
+
+def metadata_of(photo: Path) -> Metadata:
+    """The metadata of a photo; a photo that cannot be read has none."""
+    try:
+        return read_metadata(photo)
+    except (OSError, ValueError):
+        return Metadata()
 
 
 def _camera(one: Equipment) -> str:

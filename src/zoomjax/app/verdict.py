@@ -9,10 +9,11 @@ import numpy as np
 from .._core.text import listed, plain
 from ..detect.batch import Detection
 from ..detect.bend import bends_apart
+from ..io.metadata import Metadata, squeezed, straightened_by
 from ..trust.assessment import Finding, Verdict
 from ..trust.evidence import NEGLIGIBLE
 from .calibration import Calibration
-from .equipment import equipment_of
+from .equipment import equipment_of, metadata_of
 from .plane_focals import FocalGroup
 from .tying import APART, bend_at
 
@@ -29,18 +30,21 @@ _UNEXPLAINED = 0.5
 
 
 def findings_of_photos(photos: Iterable[Path]) -> list[Finding]:
-    """What speaks against one lens having taken all photos in one way, by their EXIF data.
+    """What speaks against one lens having taken all photos in one way, and unchanged, by what they say.
 
-    That is different bodies or lenses, or sizes of other shapes, of which what is left was cropped. Photos
-    that name no camera or lens, or that cannot be read any more, say nothing.
+    That is different bodies or lenses; sizes of other shapes, of which what is left was cropped; distortion
+    that a program has corrected; pixels that are not square. Photos that say nothing of it, or that cannot
+    be read any more, count for nothing.
     """
+    photos = list(photos)
     bodies, lenses, sizes = Counter[str](), Counter[str](), Counter[tuple[int, int]]()
     for found in map(equipment_of, photos):
         bodies.update(filter(None, [found.camera]))
         lenses.update(filter(None, [found.lens]))
         if found.written:
             sizes[max(found.written), min(found.written)] += 1
-    return [*_mixed("lenses", lenses), *_mixed("cameras", bodies), *_reshaped(sizes)]
+    of_camera = [*_mixed("lenses", lenses), *_mixed("cameras", bodies), *_reshaped(sizes)]
+    return [*of_camera, *_changed([metadata_of(photo) for photo in photos])]
 
 
 def findings_of_sizes(left_out: int, used: int) -> list[Finding]:
@@ -171,6 +175,33 @@ def _reshaped(sizes: Counter[tuple[int, int]]) -> Iterable[Finding]:
         "Use the photos as the camera stored them: where a photo is cropped, the lens's centre moves.",
         cause=True,
     )
+
+
+def _changed(photos: Sequence[Metadata]) -> Iterable[Finding]:
+    """Photos whose distortion was corrected before, and those whose pixels are not square."""
+    programs = Counter(filter(None, map(straightened_by, photos)))
+    if programs:
+        told, number = listed(programs, _MOST), programs.total()
+        yield Finding(
+            "corrected photos",
+            "doubtful",
+            f"{number} of {_photos(len(photos))} say that their distortion was corrected before, "
+            f"by {told}: the lens is what that left.",
+            "Switch that correction off, save the photos again, and calibrate from these.",
+            cause=True,
+        )
+    shapes = Counter(filter(None, map(squeezed, photos)))
+    if shapes:
+        across, down = shapes.most_common(1)[0][0]
+        yield Finding(
+            "pixels that are not square",
+            "doubtful",
+            f"{shapes.total()} of {_photos(len(photos))} say that their pixels are not square, "
+            f"{across:.4g} on {down:.4g}, and distortion is taken to be alike in all directions of the "
+            "stored image.",
+            "Scale the photos to square pixels first.",
+            cause=True,
+        )
 
 
 def _photos(number: int) -> str:

@@ -17,8 +17,8 @@ import jax
 import numpy as np
 
 from .._core.files import refuse_inputs, whole_file
-from ..io.metadata import geometry_of, marked
-from ..io.photo import FORMATS, Photo, metadata_focal, open_photo, read_focal, read_pages
+from ..io.metadata import geometry_of, marked, straightened_by
+from ..io.photo import FORMATS, Photo, metadata_focal, open_photo, read_focal, read_metadata, read_pages
 from ..io.photo_writer import check_written, encoded_photo
 from ..models.about import UNKNOWN
 from ..models.lens import ZoomLens
@@ -110,7 +110,8 @@ def undistort_photo(
             its suffix is unknown, or its format cannot store such pixels or several pages.
 
     Warns:
-        UserWarning: as `undistort_image` and `ZoomLens` do; or metadata are lost, as IPTC data in PNG.
+        UserWarning: as `undistort_image` and `ZoomLens` do; metadata are lost, as IPTC data in PNG; or
+            the photo says that another program has corrected its distortion before.
     """
     correction = Correction(lens, _scaled(keep), interpolation, border, again=again, shown=repr(keep))
     _convert(source, target, focal, correction)
@@ -156,6 +157,13 @@ def _convert(
     content, lost = corrected_photo(source, target.suffix, correction, focal)
     if lost:
         warnings.warn(not_kept(source, target.suffix, lost), stacklevel=3)
+    before = None if correction.back else straightened_by(read_metadata(source))
+    if before not in (None, "zoomjax"):
+        warnings.warn(
+            f"{os.fspath(source)} says that {before} has corrected its distortion before. Unless the lens "
+            "was calibrated from such photos, it is corrected twice now.",
+            stacklevel=3,
+        )
     with whole_file(target) as part:
         part.write_bytes(content)
 

@@ -22,7 +22,7 @@ def jpeg_metadata(content: bytes) -> tuple[Metadata, list[str]]:
     """The metadata of a JPEG file, and what else it holds that is lost when it is written again."""
     found: dict[str, bytes] = {}
     profile: dict[int, bytes] = {}
-    chunks, others, dpi = [], [], None
+    chunks, others, dpi, shape = [], [], None, None
     for mark, block in _segments(content):
         if mark == _APP1 and block.startswith(_EXIF):
             found.setdefault("exif", block[len(_EXIF) :])
@@ -37,13 +37,13 @@ def jpeg_metadata(content: bytes) -> tuple[Metadata, list[str]]:
         elif mark == _COMMENT:
             found.setdefault("comment", block)
         elif mark == _APP0 and block.startswith(_JFIF):
-            dpi = _density(block)
+            dpi, shape = _density(block)
         elif mark == _APP2 and block.startswith(_PICTURES):
             others.append("further pictures")
         elif mark in range(0xE0, 0xF0) and mark not in (_APP0, _APP14):
             others.append(f"the segment APP{mark - 0xE0}")
     found["icc"] = b"".join(profile[number] for number in sorted(profile))
-    return Metadata(**found, dpi=dpi, chunks=tuple(chunks)), list(dict.fromkeys(others))
+    return Metadata(**found, dpi=dpi, shape=shape, chunks=tuple(chunks)), list(dict.fromkeys(others))
 
 
 def is_cmyk(content: bytes) -> bool:
@@ -90,16 +90,20 @@ def _segments(content: bytes) -> Iterator[tuple[int, bytes]]:
         yield mark, content[start + 2 : start + int.from_bytes(content[start : start + 2], "big")]
 
 
-def _density(block: bytes) -> tuple[float, float] | None:
-    """Pixels per inch in a JFIF header; None if it tells only the shape of pixels."""
+def _density(block: bytes) -> tuple[tuple[float, float] | None, tuple[int, int] | None]:
+    """Pixels per inch in a JFIF header, or else the shape of pixels, as `Metadata` has them."""
     if len(block) < 12:
-        return None
+        return None, None
     unit, across, down = struct.unpack_from(">BHH", block, 7)
-    return (across * _INCHES[unit], down * _INCHES[unit]) if unit in _INCHES and across and down else None
+    if not across or not down:
+        return None, None
+    if unit in _INCHES:
+        return (across * _INCHES[unit], down * _INCHES[unit]), None
+    return None, (across, down) if across != down else None
 
 
 def _header(metadata: Metadata) -> bytes:
-    across, down = (round(value) for value in metadata.dpi or (1, 1))
+    across, down = (round(value) for value in metadata.dpi or metadata.shape or (1, 1))
     unit = int(metadata.dpi is not None)
     if not (0 < across < 65536 and 0 < down < 65536):
         unit, across, down = 0, 1, 1

@@ -26,6 +26,7 @@ class Metadata:
         iptc: Photoshop's image resources, as in JPEG and TIFF files, which hold the IPTC data.
         comment: a comment in no known encoding.
         dpi: pixels per inch across and down, or None.
+        shape: pixels across and down of one unknown length, where a file tells that these differ, or None.
         chunks: what only a file of the same format can hold: pairs of name and content.
     """
 
@@ -35,6 +36,7 @@ class Metadata:
     iptc: bytes = b""
     comment: bytes = b""
     dpi: tuple[float, float] | None = None
+    shape: tuple[int, int] | None = None
     chunks: tuple[tuple[bytes, bytes], ...] = ()
 
 
@@ -45,6 +47,7 @@ NAMES = {
     "iptc": "IPTC data",
     "comment": "the comment",
     "dpi": "the resolution",
+    "shape": "the shape of the pixels",
 }
 """How messages call the fields."""
 
@@ -64,6 +67,23 @@ def work_of(metadata: Metadata) -> str | None:
     """What the mark tells of the work that made a photo; None where it tells nothing."""
     found = _WORK.search(metadata.xmp)
     return None if found is None else found[1].decode()
+
+
+def straightened_by(metadata: Metadata) -> str | None:
+    """Which program says in a photo that it has corrected the distortion; None if none does.
+
+    Adobe's programs, darktable and digiKam do, where they are left to write their settings into a photo.
+    Cameras, and other programs, say nothing that can be relied on.
+    """
+    if geometry_of(metadata) == "undistorted":
+        return "zoomjax"
+    return next((name for name, says in _STRAIGHTENED.items() if says(metadata.xmp)), None)
+
+
+def squeezed(metadata: Metadata) -> tuple[float, float] | None:
+    """Pixels across and down of one length, where they differ: pixels are not square; else None."""
+    across, down = metadata.shape or metadata.dpi or (1, 1)
+    return (float(across), float(down)) if max(across, down) > _SQUARE * min(across, down) else None
 
 
 def marked(metadata: Metadata, geometry: str, work: str = "") -> Metadata:
@@ -102,3 +122,29 @@ _MARK = re.compile(
     + "|".join(GEOMETRIES).encode()
     + rb')"'
 )
+
+_SQUARE = 1.01
+"""Ratio of a pixel's sides that is more than rounding."""
+
+
+def _by_adobe(xmp: bytes) -> bool:
+    """Settings in a photo made from another file have been applied; elsewhere they are still to be."""
+    profile, by_hand = _setting(xmp, b"LensProfileEnable"), _setting(xmp, b"LensManualDistortionAmount")
+    used = profile not in (b"", b"0") or by_hand.strip(b"+-0.") != b""
+    return used and _setting(xmp, b"AlreadyApplied").lower() == b"true"
+
+
+def _setting(xmp: bytes, name: bytes) -> bytes:
+    """One of Adobe's settings, in an attribute or an element of its own; empty where there is none."""
+    found = re.search(rb"crs:" + name + rb"(?:\s*=\s*[\"']|>)\s*([^\"'<]*?)\s*[\"'<]", xmp)
+    return b"" if found is None else found[1]
+
+
+_STRAIGHTENED = {
+    "Adobe's lens correction": _by_adobe,
+    "darktable": re.compile(
+        rb"<rdf:li(?=[^>]*darktable:operation=.lens.)(?=[^>]*darktable:enabled=.1.)"
+    ).search,
+    "digiKam": re.compile(rb"digiKam:LensCorrectionSettings[^<]*Distortion Correction: enabled").search,
+}
+"""Programs, and whether an XMP packet says that they have corrected the distortion."""

@@ -76,7 +76,7 @@ def encoded_photo(pages: Pages, suffix: str) -> tuple[bytes, list[str]]:
         return _webp(image, metadata), _lost(pages, "exif", "xmp", "icc")
     content = _by_opencv(kind, image, _JPEG if kind in (".jpg", ".jpeg") else [])
     if kind == ".png":
-        return with_chunks(content, metadata), _lost(pages, "exif", "xmp", "icc", "comment", "dpi")
+        return with_chunks(content, metadata), _lost(pages, "exif", "xmp", "icc", "comment", "dpi", "shape")
     if kind == ".bmp":
         return _with_density(content, metadata), _lost(pages, "dpi")
     return with_segments(content, metadata)

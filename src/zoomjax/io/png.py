@@ -18,7 +18,7 @@ _COPIED = (b"gAMA", b"cHRM", b"sRGB", b"cICP", b"mDCV", b"cLLI", b"tEXt", b"zTXt
 def png_metadata(content: bytes) -> tuple[Metadata, list[str]]:
     """The metadata of a PNG file, and what else it holds that is lost when it is written again."""
     fields: dict[str, bytes] = {}
-    chunks, others, dpi = [], [], None
+    chunks, others, dpi, shape = [], [], None, None
     for name, block in _chunks(content):
         if name == b"eXIf":
             fields.setdefault("exif", block)
@@ -30,12 +30,15 @@ def png_metadata(content: bytes) -> tuple[Metadata, list[str]]:
             fields.setdefault("icc", _inflated(block.partition(b"\0")[2][1:]))
         elif name == b"pHYs" and len(block) == 9:
             across, down, metres = struct.unpack(">IIB", block)
-            dpi = (across * _INCH, down * _INCH) if metres and across and down else None
+            if across and down and metres:
+                dpi = (across * _INCH, down * _INCH)
+            elif across and down and across != down:
+                shape = (across, down)
         elif name == b"acTL":
             others.append("further pictures")
         elif name in _COPIED:
             chunks.append((name, block))
-    return Metadata(**fields, dpi=dpi, chunks=tuple(chunks)), others
+    return Metadata(**fields, dpi=dpi, shape=shape, chunks=tuple(chunks)), others
 
 
 def with_chunks(content: bytes, metadata: Metadata) -> bytes:
@@ -51,6 +54,8 @@ def with_chunks(content: bytes, metadata: Metadata) -> bytes:
     if metadata.dpi:
         metres = [min(round(value / _INCH), 2**31 - 1) for value in metadata.dpi]
         chunks.append((b"pHYs", struct.pack(">IIB", *metres, 1)))
+    elif metadata.shape:
+        chunks.append((b"pHYs", struct.pack(">IIB", *metadata.shape, 0)))
     if metadata.exif:
         chunks.append((b"eXIf", metadata.exif))
     if metadata.xmp:
