@@ -3,6 +3,7 @@
 import math
 import operator
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -182,6 +183,28 @@ def warn_of_points_outside(points: np.ndarray, mask: np.ndarray, size: tuple[int
         warnings.warn(
             f"{np.sum(outside):,} of {np.sum(mask):,} points lie outside of the image of {size[0]} x "
             f"{size[1]} px, by up to {np.max(beyond):.3g} px. Is image_size (width, height) right?",
+            stacklevel=3,
+        )
+
+
+def warn_of_units(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -> None:
+    """Lines that all lie within two px mean that coordinates are in units of the image's size."""
+    across, down = np.ptp(points[mask], axis=0) if mask.any() else (np.inf, np.inf)
+    if max(across, down) <= 2 < 0.1 * min(size):
+        warnings.warn(
+            f"All points lie within {across:.3g} x {down:.3g} px of an image of {size[0]} x {size[1]} px. "
+            "Coordinates are pixels, from 0 in the middle of the first: are these in units of its size?",
+            stacklevel=3,
+        )
+
+
+def warn_of_repeated_lines(lines: Sequence[np.ndarray], focal: np.ndarray) -> None:
+    """Warn of lines with the same points at the same focal length: copies make a lens look better known."""
+    seen = {(float(f), line.tobytes()) for f, line in zip(focal, lines, strict=True)}
+    if again := len(lines) - len(seen):
+        warnings.warn(
+            f"{again:,} of {len(lines):,} lines have the points of another line at the same focal length. "
+            "Copies add no information, but make deviations smaller: give each line once.",
             stacklevel=3,
         )
 
