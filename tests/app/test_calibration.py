@@ -129,6 +129,19 @@ def test_a_centre_that_is_given_is_taken(centre, calibration):
 
 
 @pytest.mark.slow
+def test_bands_about_a_given_centre_say_that_another_is_better():
+    aside = eqx.tree_at(lambda lens: lens.centre, _TRUTH, _TRUTH.centre + np.array([60.0, -40.0]))
+    focal = scenes.focal_sweep(8)
+    seen = scenes.board_lines(aside, focal, spacing=200, noise=0.3)
+    found = calibrate(seen, model=WantedModel(degree=2), centre="image").zoom
+    off = np.asarray(found.lens(focal[0]).undistort(np.zeros(2)) - aside(focal[0]).undistort(np.zeros(2)))
+    std = float(zj.displacement_std(found, np.zeros(2), focal=focal[0]))
+    alone = eqx.tree_at(lambda fit: fit.off_centre, found, None)
+    before = float(zj.displacement_std(alone, np.zeros(2), focal=focal[0]))
+    assert 3 * before < np.linalg.norm(off) < 2 * std
+
+
+@pytest.mark.slow
 def test_the_centre_stays_where_lines_do_not_determine_it():
     """Nothing is distorted, and lines left out by hand stay so."""
     lines = scenes.board_lines(UNDISTORTED, scenes.focal_sweep(4), spacing=150, noise=0.3)

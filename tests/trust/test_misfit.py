@@ -65,6 +65,91 @@ def test_a_coefficient_that_the_model_lacks_is_in_the_bands(truth, metric):
     assert zj.trust.with_misfit(fit, two).misfit.shape == (2, 2)
 
 
+@eqx.filter_jit
+def corner_of(lens, focal):
+    """Where the corner is corrected to, px, along its direction from the middle of the image."""
+    middle = (np.array(lens.image_size) - 1) / 2
+    outward = -middle / np.linalg.norm(middle)
+    return jax.vmap(lambda f: lens(f).undistort(jnp.zeros(2)) @ outward)(jnp.asarray(focal))
+
+
+def ratio_and_std(fit, truth, focal=FOCAL):
+    """The error of the corner, in standard deviations, and those, px."""
+    std = np.asarray(zj.displacement_std(fit, np.zeros(2), focal=focal))
+    return np.asarray(corner_of(fit.lens, focal) - corner_of(truth, focal)) / std, std
+
+
+def noisy(lens, focal=FOCAL, seed=3):
+    return zj.lines.compress_any_centre(
+        scenes.board_lines(lens, focal, spacing=200.0, noise=0.3, seed=seed), 3
+    )
+
+
+@pytest.fixture(scope="module")
+def off_centre(truth):
+    """A lens whose centre of distortion is not the middle of the image."""
+    return eqx.tree_at(lambda lens: lens.centre, truth, truth.centre + np.array([60.0, -40.0]))
+
+
+def test_a_centre_that_is_elsewhere_is_in_the_bands(off_centre):
+    lines = noisy(off_centre)
+    middle = (np.array(lines.image_size) - 1) / 2
+    fit = zj.fit_zoom(lines, centre=tuple(middle.tolist()))
+    wide = zj.trust.with_misfit(fit, lines)
+    small = zj.trust.with_misfit(fit, lines.about(middle))
+    assert wide.off_centre.shape == (4, 4)
+    assert small.off_centre is None
+    np.testing.assert_allclose(wide.misfit, small.misfit, rtol=1e-6, atol=1e-12)
+    moved = lines.scale * np.sqrt(np.diag(wide.off_centre)[-2:])
+    assert moved == pytest.approx([60.0, 40.0], rel=0.15)
+    before, _ = ratio_and_std(small, off_centre)
+    after, _ = ratio_and_std(wide, off_centre)
+    assert np.abs(before).max() > 4
+    assert np.abs(after).max() < 2
+
+
+def test_a_centre_that_is_right_adds_next_to_none(off_centre):
+    lines = noisy(off_centre)
+    for centre in (tuple(np.asarray(off_centre.centre).tolist()), "fit"):
+        fit = zj.fit_zoom(lines, centre=centre)
+        _, before = ratio_and_std(fit, off_centre)
+        _, after = ratio_and_std(zj.trust.with_misfit(fit, lines), off_centre)
+        assert (after < 1.5 * before).all()
+
+
+def strengths(truth, focal, deviation, seed=0):
+    """The lens, stronger or weaker by chance at each of these focal lengths, which increase."""
+    k = np.asarray(jax.vmap(truth.zoom)(jnp.asarray(focal)))
+    scatter = 1 + deviation * np.random.default_rng(seed).standard_normal(len(k))
+    table = zj.models.TableZoom(inverse=False, knots=jnp.asarray(focal), parameters=k * scatter[:, None])
+    ends = jnp.asarray([focal[0], focal[-1]])
+    return eqx.tree_at(lambda lens: (lens.zoom, lens.focal_range), truth, (table, ends))
+
+
+MANY = np.geomspace(18.0, 200.0, 20)
+
+
+def test_a_lens_that_differs_at_single_focal_lengths_has_that_in_its_bands(truth):
+    lens = strengths(truth, MANY, 0.03)
+    lines = zj.compress(scenes.board_lines(lens, MANY, spacing=200.0, noise=0.3, seed=3))
+    fit = zj.fit_zoom(lines)
+    wide = zj.trust.with_misfit(fit, lines)
+    before, _ = ratio_and_std(fit, lens, MANY)
+    after, _ = ratio_and_std(wide, lens, MANY)
+    assert (np.abs(before) < 1.96).mean() < 0.8
+    assert (np.abs(after) < 1.96).mean() >= 0.9
+
+
+def test_photos_of_one_focal_length_that_differ_are_no_other_lens(truth):
+    """A board that is bent in each photo makes lenses of single photos differ, but not the lens."""
+    several = np.sort(np.concatenate([FOCAL * (1 + 1e-4 * i) for i in range(4)]))
+    seen = scenes.board_lines(strengths(truth, several, 0.03), several, spacing=200.0, noise=0.3, seed=3)
+    alone = zj.compress(seen)
+    same = eqx.tree_at(lambda lines: lines.focal, alone, jnp.repeat(jnp.asarray(FOCAL), 4))
+    apart, together = (zj.trust.with_misfit(zj.fit_zoom(lines), lines).misfit for lines in (alone, same))
+    assert float(jnp.trace(together)) < 0.3 * float(jnp.trace(apart))
+
+
 def size_of(fit):
     return np.sqrt(np.diag(fit.misfit))
 
@@ -75,7 +160,8 @@ def test_by_residuals_it_is_what_it_is_by_moments(lines, metric):
     lines = metric(lines)
     fit = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=1))
     k = np.asarray(jax.vmap(fit.lens.zoom)(lines.focal))
-    quickly, by_residuals = misfit._quickly(lines, k), misfit._by_residuals(lines, k, fit.lens.family)
+    quickly = misfit._of_frames(misfit._passed(lines, k))
+    by_residuals = misfit._by_residuals(lines, k, fit.lens.family)
     for one, other in zip(quickly, by_residuals, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * np.abs(one).max())
 

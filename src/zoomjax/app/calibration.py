@@ -362,7 +362,7 @@ def calibrate(
     zoom = exact
     if sigma.any():
         zoom = with_focal_sigma(exact, small, focal_sigma=sigma, shared=shared)
-    zoom = widened(with_misfit(zoom, small))
+    zoom = widened(with_misfit(zoom, used.held))
     stage("Checking the fit on lines left out")
     held_out, each_held_out = np.full(len(sigma), np.nan), held_out_frames(small, terms=terms)
     if len(sigma) > 1:

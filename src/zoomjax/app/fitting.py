@@ -48,6 +48,7 @@ class Fitted(NamedTuple):
         zoom: the zoom lens.
         each: the separate fits of the frames, about its centre.
         lines: with their weights, about its centre.
+        held: the same, under the radial polynomial for any centre.
         model: its zoom model, not fitted.
         centre: its centre of distortion, and how it was found.
         selection: how the model was chosen; None where it was given.
@@ -56,6 +57,7 @@ class Fitted(NamedTuple):
     zoom: ZoomFit
     each: FrameFits
     lines: AbstractLines
+    held: AbstractLines
     model: Model
     centre: CentreFound
     selection: Selection | None
@@ -95,18 +97,24 @@ def fitted(
         zoom = fit_zoom(small, zoom=model)  # or says why not
     stage("Fitting each frame separately")
     each = fit_frames(small, terms=model.terms, throw=False)
-    return Fitted(zoom, each, small, model, found.centre, found.selection)
+    held = found.held
+    if isinstance(zoom.lens.family, RadialPolynomial) and not _for_any_centre(held):
+        about: Any = about_centre(_widest(lines), centre)
+        held = metric(compress_any_centre(about, radial.most_terms(lines)))
+        held = held if small.weight is None else held.weighted(small.weight)
+    return Fitted(zoom, each, small, held, model, found.centre, found.selection)
 
 
 class _Centred(NamedTuple):
     """Lines about the centre of distortion, and the model.
 
     Attributes:
-        lines, model, centre, selection: as of `Fitted`.
+        lines, held, model, centre, selection: as of `Fitted`.
         zoom: the fit, where there is one.
     """
 
     lines: AbstractLines
+    held: AbstractLines
     model: Model
     centre: CentreFound
     selection: Selection | None
@@ -148,8 +156,8 @@ def _about_centre(
                 selection, model = again, again.chosen
     how = CentreFound.of(held, choice, found)
     if found is None or not found.determined:
-        return _Centred(small, model, how, selection, None)
-    return _Centred(held.about(found.fit.lens.centre), model, how, selection, found.fit)
+        return _Centred(small, held, model, how, selection, None)
+    return _Centred(held.about(found.fit.lens.centre), held, model, how, selection, found.fit)
 
 
 def _for_any_centre(lines: AbstractLines) -> bool:
@@ -221,7 +229,8 @@ def _under_family(
         if _gains(own):
             how, zoom = CentreFound.of(lines, None, own), own.fit
             placed = judged.about(own.fit.lens.centre)
-    return _Centred(_in_family(placed, model), model, how, selection, zoom)
+    small = _in_family(placed, model)
+    return _Centred(small, small, model, how, selection, zoom)
 
 
 def _gains(found: CentreFit) -> bool:

@@ -224,12 +224,13 @@ def frame_normal_equations(
 ) -> tuple[Float[Array, "frame size"], Float[Array, "frame size size"]]:
     """Half the gradient of each frame's error (eq. 3) by its own coefficients, and the Gauss-Newton matrix.
 
-    A frame's residuals depend on its own coefficients alone: one direction serves all frames at once.
+    A frame's residuals depend on its own coefficients alone: one direction serves all frames at once. Of
+    lines for any centre, coefficients end with the centre's offset.
     """
 
     def along(direction):
         every = jnp.broadcast_to(direction[None], coefficients.shape)
-        return jax.jvp(lambda k: residuals(lines, k), (coefficients,), (every,))
+        return jax.jvp(lambda k: weighted_distances(lines, k), (coefficients,), (every,))
 
     directions = jnp.eye(coefficients.shape[1], dtype=coefficients.dtype)
     weighted, jacobian = jax.vmap(along, out_axes=(None, -1))(directions)

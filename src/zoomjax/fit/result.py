@@ -91,6 +91,8 @@ class ZoomFit(eqx.Module):
             was given.
         misfit: covariance of what the lens's coefficients, and maybe the next one, are off the model at any
             focal length: see `zoomjax.trust.with_misfit`; None where it was not estimated.
+        off_centre: covariance of what else the coefficients, and after them the centre (x, y, in half
+            diagonals), are off, since the centre may be elsewhere; None where it was not estimated.
     """
 
     lens: ZoomLens
@@ -103,6 +105,7 @@ class ZoomFit(eqx.Module):
     rms_unconstrained: Float[Array, ""]
     joint: Float[Array, "both both"] | None = None
     misfit: Float[Array, "coefficients coefficients"] | None = None
+    off_centre: Float[Array, "both_at_f both_at_f"] | None = None
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
         """Raise TypeError: call the lens of the fit instead."""

@@ -147,7 +147,7 @@ def _moments(rows, terms):
     return np.stack([[np.einsum("lr,lr->l", a[i], b[j]) for a, b in products] for i, j in pairs])
 
 
-class _Pass(NamedTuple):
+class Pass(NamedTuple):
     """What coefficients of the frames give for each line: the last axis."""
 
     squares: np.ndarray  # px^2
@@ -166,7 +166,7 @@ class _State(NamedTuple):
     gradient: np.ndarray
     matrix: np.ndarray
     moved: np.ndarray
-    lines: _Pass
+    lines: Pass
 
 
 def cross_validated(lanes, designs):
@@ -301,7 +301,7 @@ def passed(lanes, coefficients):
     xx, xy, yy = (gram[1:, 1:] for gram in (xx, xy, yy))
     matrix = c * c * yy - c * s * (xy + xy.swapaxes(0, 1)) + s * s * xx
     cross = turn[:, None] * (pull - turn / 2 * length)
-    found = _Pass(squares, c * on_y - s * on_x, matrix - cross - cross.swapaxes(0, 1))
+    found = Pass(squares, c * on_y - s * on_x, matrix - cross - cross.swapaxes(0, 1))
     return found if lanes.moments is None else _in_image(found, lanes.moments, kappa, c, s, turn)
 
 
@@ -326,4 +326,4 @@ def _in_image(found, moments, kappa, c, s, turn):
     squares, gradient, matrix = (of / q for of in found)
     cross = gradient[:, None] * change
     matrix = matrix - cross - cross.swapaxes(0, 1) + squares * change[:, None] * change
-    return _Pass(squares, gradient - squares * change, matrix)
+    return Pass(squares, gradient - squares * change, matrix)

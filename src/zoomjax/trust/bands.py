@@ -6,7 +6,7 @@ coefficients at a focal length and for corrected points, because these q are lin
 
 The parameters are those of the zoom model; those of the centre of distortion, where it was fitted
 (`ZoomFit.joint`); and what the lens is off the model at any focal length, where that was estimated
-(`ZoomFit.misfit`).
+(`ZoomFit.misfit`, `ZoomFit.off_centre`).
 
 Each call computes one derivative with respect to each parameter; nothing is fitted or sampled.
 """
@@ -122,28 +122,37 @@ def _uncertain(fit):
     """What of a lens is uncertain, flattened; the lens that other such numbers make; their covariance.
 
     These are the parameters of the zoom model; after them the centre, if it was fitted; and then what the
-    coefficients are off the model, 0 in the lens, if the misfit was estimated.
+    coefficients are off the model, 0 in the lens, if the misfit was estimated; and what they and the centre
+    are off, if the centre may be elsewhere.
     """
     lens, covariance = fit.lens, fit.covariance
-    centre = off = None
+    centre = off = elsewhere = None
     if fit.joint is not None:
         covariance = fit.joint
         centre = lens.centre / lens.scale if lens.shift is None else lens.shift.parameters
     if fit.misfit is not None:
         covariance = jax.scipy.linalg.block_diag(covariance, fit.misfit)
         off = jnp.zeros(fit.misfit.shape[0], covariance.dtype)
-    flat, unravel = ravel_pytree((lens.zoom.parameters, centre, off))
+    if fit.off_centre is not None:
+        covariance = jax.scipy.linalg.block_diag(covariance, fit.off_centre)
+        elsewhere = jnp.zeros(fit.off_centre.shape[0], covariance.dtype)
+    flat, unravel = ravel_pytree((lens.zoom.parameters, centre, off, elsewhere))
 
     def lens_at(flat):
-        parameters, centre, off = unravel(flat)
+        parameters, centre, off, elsewhere = unravel(flat)
+        if elsewhere is not None:
+            more = elsewhere[:-2]
+            off = more if off is None else off.at[: more.size].add(more)
         zoom = with_parameters(lens.zoom, parameters)
         zoom = zoom if off is None else _OffZoom(zoom=zoom, parameters=off)
         moved = eqx.tree_at(lambda lens: lens.zoom, lens, zoom)
-        if centre is None:
+        if centre is not None and lens.shift is None:
+            moved = eqx.tree_at(lambda lens: lens.centre, moved, lens.scale * centre)
+        elif centre is not None:
+            moved = eqx.tree_at(lambda lens: lens.shift, moved, with_parameters(lens.shift, centre))
+        if elsewhere is None:
             return moved
-        if lens.shift is None:
-            return eqx.tree_at(lambda lens: lens.centre, moved, lens.scale * centre)
-        return eqx.tree_at(lambda lens: lens.shift, moved, with_parameters(lens.shift, centre))
+        return eqx.tree_at(lambda lens: lens.centre, moved, moved.centre + lens.scale * elsewhere[-2:])
 
     return flat, lens_at, covariance
 
