@@ -10,9 +10,10 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app.calibration import calibrate
-from zoomjax.app.fitting import _gains
+from zoomjax.app.fitting import _gains, fitted
 from zoomjax.app.model_choice import FAMILIES, WantedModel
 from zoomjax.app.report import report
+from zoomjax.fit.image_metric import in_image
 from zoomjax.lines.csv import read_lines_csv, write_lines_csv
 from zoomjax.models import registry
 
@@ -116,6 +117,48 @@ def test_lines_are_judged_about_a_centre_that_they_determine(barrel):
     done = calibrate(some, model=wanted(None), centre="fit", robust=True)
     assert done.rejected.mean() < 0.05
     np.testing.assert_allclose(done.centre.centre, off.centre, atol=1.0)
+
+
+def wide_photo(seed, bend, *, number=24, arcs=9, size=(960, 640)):
+    """Lines of one photo through a lens that moves the corner by 1.17 radii, many of them arcs."""
+    rng, t = np.random.default_rng(seed), np.linspace(0, 1, 32)[:, None]
+    centre = (np.array(size) - 1) / 2 + (9.0, 30.0)
+    scale = np.array(np.hypot(*size) / 2)
+    lens = zj.Distortion(np.array([1 / 2.17 - 1]), centre, scale, family=zj.models.Division())
+    lines = []
+    while len(lines) < number:
+        first, last = rng.uniform((0, 0), size, (2, 2))
+        ends = np.asarray(lens.undistort(np.array([first, last])))
+        seen = np.asarray(lens.distort(ends[0] + t * (ends[1] - ends[0])))
+        long = np.hypot(*(last - first))
+        if long < 250 or not ((seen >= 0) & (seen <= np.array(size) - 1)).all():
+            continue
+        if len(lines) < arcs:
+            normal = np.array([first[1] - last[1], last[0] - first[0]]) / long
+            seen = seen + rng.uniform(*bend) * (1 - (2 * t - 1) ** 2) * normal * rng.choice([-1, 1])
+        lines.append(seen + rng.normal(0, 0.05, seen.shape))
+    return zj.Lines.from_ragged(lines, [0] * number, [1.0], image_size=size, focal_unit="px"), lens
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "bend"), [(3, (0.5, 2.0)), (0, (3.0, 20.0))])
+def test_the_search_for_a_strong_lens_starts_where_it_does_not_go_astray(seed, bend):
+    """Without a start from the corrected image the centre is 3 and 31 px off, and arcs are kept."""
+    some, truth = wide_photo(seed, bend)
+    done = fitted(some, WantedModel(), "fit", robust=True, metric=in_image, stage=lambda _: None)
+    np.testing.assert_allclose(done.centre.centre, truth.centre, atol=0.5)
+    assert np.flatnonzero(np.asarray(done.lines.weight) == 0).tolist() == list(range(9))
+    np.testing.assert_allclose(done.zoom.lens(1.0).coefficients, truth.coefficients, atol=0.002)
+
+
+@pytest.mark.slow
+def test_a_centre_that_is_given_stays_where_it_is_with_a_strong_lens():
+    some, truth = wide_photo(3, (3.0, 20.0))
+    given = (489.0, 350.0)
+    done = fitted(some, WantedModel(), given, robust=True, metric=in_image, stage=lambda _: None)
+    assert np.asarray(done.zoom.lens.centre).tolist() == [*given]
+    assert done.centre.centre == given
+    np.testing.assert_allclose(done.zoom.lens(1.0).coefficients, truth.coefficients, atol=0.01)
 
 
 @pytest.mark.slow

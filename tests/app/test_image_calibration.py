@@ -1,5 +1,6 @@
 """From images on disk to a lens: rendered photographs of the paper's board, and a clip that zooms."""
 
+import base64
 import dataclasses
 import json
 import re
@@ -28,6 +29,7 @@ from zoomjax.io.exif import exif_with_focal
 from zoomjax.io.video_reader import decode_video
 
 from .. import _clips as clips
+from .._browser import opened
 from ..io.test_equipment import block, ends
 
 SIZE = (1072, 712)
@@ -130,6 +132,50 @@ def test_the_report_shows_photos_before_and_after(done):
     assert f"line {next(iter(shown[0].crops))}: " in page
     assert "3 of 5 photos are shown" in page
     assert len(page) < 3_000_000
+
+
+SLID = """<!DOCTYPE html><meta charset="utf-8"><title>probe</title>
+<iframe id="page" src="report.html" style="width:1200px;height:800px;border:0"></iframe>
+<pre id="found"></pre>
+<script>
+onload = async () => {
+  const page = document.getElementById("page").contentDocument;
+  const input = page.getElementById("zoom-at"), found = [];
+  for (let step = 0; step <= Number(input.max); step += 4) {
+    input.value = step;
+    input.dispatchEvent(new Event("input"));
+    const images = ["zoom-before", "zoom-after"].map((name) => page.getElementById(name));
+    await Promise.all(images.map((image) => image.decode()));
+    found.push([step, page.getElementById("zoom-photo").textContent, ...images.map((image) => image.src),
+      images.every((image) => image.naturalWidth > 0 && image.getBoundingClientRect().width > 100)]);
+  }
+  document.getElementById("found").textContent = JSON.stringify(found);
+};
+</script>"""
+
+
+def test_under_the_slider_is_the_nearest_photo_before_and_after(done, tmp_path):
+    """In a browser, at every fourth place of the slider: by 1/f, with its own pictures, and to be seen."""
+    shown = pictures(done, most=3)
+    text = report(done.calibration, done, pictures=shown)
+    (tmp_path / "report.html").write_text(text, encoding="utf-8")
+    (tmp_path / "probe.html").write_text(SLID, encoding="utf-8")
+    document, console = opened(tmp_path / "probe.html", tmp_path / "profile")
+    assert not console
+    found = json.loads(re.search(r'<pre id="found">(.*?)</pre>', document)[1])
+    assert len(found) == 11
+    places = json.loads(re.search(r'id="lens-data">(.*?)</script>', text)[1])["focal"]
+    focal = np.array([float(done.calibration.lines.focal[one.frame]) for one in shown])
+    seen = set()
+    for step, told, before, after, visible in found:
+        nearest = int(np.argmin(abs(1 / focal - 1 / places[step])))
+        one = shown[nearest]
+        assert told == f"The nearest photo: {done.used[one.frame].name}, f = {focal[nearest]:.5g} mm"
+        for source, picture in ((before, one.before), (after, one.after)):
+            assert base64.b64decode(source.removeprefix("data:image/jpeg;base64,")) == picture
+        assert visible
+        seen.add(nearest)
+    assert seen == {0, 1, 2}
 
 
 def test_of_many_photos_some_are_drawn(done, monkeypatch):

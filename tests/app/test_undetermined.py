@@ -1,5 +1,6 @@
 """Photos whose lines determine no lens: what is kept for a person to look at."""
 
+import dataclasses
 import json
 
 import cv2
@@ -25,10 +26,12 @@ def photos(tmp_path):
     return job, [Detection(name, lines=LINES, unexplained=0.9) for name in names]
 
 
-def raised(photos):
+def raised(photos, images=None):
+    job, used = photos
+    images = [of.name for of in used] if images is None else images
     with (
         pytest.raises(Undetermined, match="do not determine a lens") as error,
-        told_undetermined(*photos, {"c.png": "it is cut off"}),
+        told_undetermined(job, images, used, {"c.png": "it is cut off"}),
     ):
         raise ValueError("No candidate can be compared. 1 of 10 folds do not converge")
     assert "folds" not in str(error.value)
@@ -66,5 +69,30 @@ def test_an_earlier_lens_and_what_belongs_to_it_stay(photos, tmp_path):
 
 
 def test_other_errors_pass(photos):
-    with pytest.raises(ValueError, match=r"^Another"), told_undetermined(*photos, {}):
+    with pytest.raises(ValueError, match=r"^Another"), told_undetermined(photos[0], [], photos[1], {}):
         raise ValueError("Another problem.")
+
+
+def test_without_overlays_nothing_is_drawn(photos, tmp_path):
+    job, used = photos
+    out = tmp_path / "out"
+    told = raised((dataclasses.replace(job, overlays="none"), used)).keep(out, overwrite=False)
+    assert sorted(path.name for path in out.iterdir()) == [".zoomjax.json", "summary.json"]
+    assert "drawn" not in told
+    assert str(out / "summary.json") in told
+
+
+@pytest.mark.parametrize(("overlays", "number"), [("some", 1), ("all", 2)])
+def test_all_are_drawn_only_if_that_is_asked_for(photos, overlays, number, tmp_path, monkeypatch):
+    monkeypatch.setattr("zoomjax.app.undetermined._MOST", 1)
+    job, used = photos
+    out = tmp_path / "out"
+    raised((dataclasses.replace(job, overlays=overlays), used)).keep(out, overwrite=False)
+    assert len(list((out / "lines").iterdir())) == number
+
+
+def test_pictures_are_numbered_as_those_of_a_lens_by_all_photos(photos, tmp_path):
+    job, used = photos
+    out = tmp_path / "out"
+    raised((job, used[1:]), images=[of.name for of in used]).keep(out, overwrite=False)
+    assert [path.name for path in (out / "lines").iterdir()] == ["0002-b.jpg"]

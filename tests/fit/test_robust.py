@@ -8,6 +8,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.fit.robust import reweighted, typical_rms
 
 from .._reference import image_grid
 from ..conftest import moved
@@ -169,3 +170,14 @@ def test_a_frame_of_which_nothing_is_left_has_no_error(board):
     assert zj.RESULTS[fit.result] == ""
     assert "do not determine" in each.messages()[2]
     assert float(each.rms) == pytest.approx(float(fit.rms), rel=0.05)
+
+
+def test_near_a_model_weights_are_those_that_it_gives(board):
+    """Started anew, arcs in half of the lines move the model away; near the lens they are rejected."""
+    spoiled, arcs = with_arcs(board, 0.45, sagitta=(20, 200), outward=True)
+    lines, model = zj.compress(spoiled), zj.fit_zoom(zj.compress(board)).lens.model
+    near, _ = reweighted(lines, model, near=True)
+    assert set(np.flatnonzero(np.asarray(near.weight) == 0)) == set(arcs)
+    far, found = reweighted(lines, model)
+    assert set(np.flatnonzero(np.asarray(far.weight) == 0)) != set(arcs)
+    assert typical_rms(lines, found) > 2 * typical_rms(lines, model)

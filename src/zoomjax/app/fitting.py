@@ -18,17 +18,17 @@ from ..fit.image_metric import in_corrected
 from ..fit.prepare import ready_model
 from ..fit.problem import data_of
 from ..fit.result import FrameFits, ZoomFit, failed
-from ..fit.robust import reweighted
+from ..fit.robust import reweighted, typical_rms
 from ..fit.straightness import frame_rms
 from ..fit.zoom import CentreArgument, about_centre, fit_zoom
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines, compress
 from ..lines.free_centre import AnyCentreLines, compress_any_centre
 from ..lines.lines import Lines
-from ..models.family import AbstractRadial
+from ..models.family import AbstractFamily, AbstractRadial
 from ..models.model import Model
 from ..models.polynomial import RadialPolynomial
-from ..models.zoom import AbstractLinearZoom
+from ..models.zoom import AbstractLinearZoom, PolynomialZoom
 from ..trust.centre_choice import choose_centre
 from ..trust.selection import Selection
 from .model_choice import STRONG, CentreFound, WantedModel
@@ -90,7 +90,7 @@ def fitted(
         found = found._replace(zoom=fit_zoom(found.lines, zoom=found.model, throw=False))
     strong = found.zoom is not None and wanted.is_beyond(found.zoom)
     if strong or wanted.family not in (None, "radial"):
-        found = _under_family(metric(_widest(lines)), wanted, found, centre, robust, stage)
+        found = _under_family(metric(_widest(lines)), held, wanted, found, centre, robust, stage)
     small, model, zoom = found.lines, found.model, found.zoom
     if zoom is None or failed(zoom.result):
         stage("Fitting the zoom model")
@@ -185,6 +185,7 @@ def _weights(held: AbstractLines, model: Model) -> np.ndarray:
 
 def _under_family(
     lines: AbstractLines,
+    held: AbstractLines,
     wanted: WantedModel,
     found: _Centred,
     centre: CentreArgument | None,
@@ -196,41 +197,127 @@ def _under_family(
     Lines that one model cannot follow may be straight under another: those that either keeps are compared,
     and the model chosen judges them by itself.
     """
-    model, selection = found.model, found.selection
-    placed = whole = lines.about(found.lines.centre)
-    judge = None
-    if wanted.family in (None, "auto"):
+    model, selection, whole = found.model, found.selection, lines.about(found.lines.centre)
+    centred = isinstance(centre, str) and centre == "fit"
+    compares = wanted.family in (None, "auto")
+    first = wanted.base(lines.focal)
+    if compares:
+        first = dataclasses.replace(first, family=STRONG)
+    stage("Rejecting lines that are not straight" if robust else "Fitting the distortion model")
+    how, start = found.centre, _judged(whole, first, robust)
+    apart = centred and not np.array_equal(np.asarray(lines.centre), np.asarray(whole.centre))
+    others = []
+    for place in (whole, lines) if apart else (whole,):
+        other, own = _from_corrected(place, first.family, robust, centred)
+        kept = how if place is whole else CentreFound.of(lines, None, None)
+        others.append((other, kept if own is None else CentreFound.of(lines, None, own)))
+    other, there = min(others, key=lambda of: of[0].spread)
+    if moved := other.spread < start.spread:
+        whole, how = lines.about(other.lines.centre), there
+        again = (_judged(whole, first, robust), _kept_near(whole, other.lines, first, robust))
+        start = min(other, *again, key=_spread)
+    if compares:
         stage("Choosing the distortion model")
         compared = [v.candidate for v in selection.verdicts] if selection else [model]
-        selection = wanted.choose_family(_kept_by_either(whole, wanted, found, robust), model, compared)
+        either = start.lines
+        if robust:
+            radial = reweighted(held.about(whole.centre), model)[0] if moved else found.lines
+            either = either.weighted(np.maximum(np.asarray(either.weight), np.asarray(radial.weight)))
+        selection = wanted.choose_family(either, model, compared)
         model = selection.chosen
-        if isinstance(model.family, RadialPolynomial):
+        if isinstance(model.family, RadialPolynomial) and not moved:
             return found._replace(model=model, selection=selection, zoom=None)
     else:
-        model = wanted.base(lines.focal)
+        model = first
         if wanted.automatic:
-            if robust:
-                stage("Rejecting lines that are not straight")
-                placed, judge = _straight(whole, model), model
             stage("Choosing the model")
-            selection = wanted.choose_in_family(placed)
+            selection = wanted.choose_in_family(start.lines)
             model = selection.chosen
-    if robust and (judge is None or judge.name != model.name):
+    if robust:
         stage("Rejecting lines that are not straight")
-        placed = _straight(whole, model)
-    how, zoom = found.centre, None
-    if isinstance(centre, str) and centre == "fit" and isinstance(model.family, AbstractRadial):
+    best = min(_judged(whole, model, robust), _kept_near(whole, start.lines, model, robust), key=_spread)
+    placed, zoom = best.lines, None
+    if centred and isinstance(model.family, AbstractRadial):
         stage("Fitting the centre of distortion")
-        own, judged = fit_centre(placed, zoom=model, throw=False), placed
+        own, judged = fit_centre(placed, zoom=best.model, throw=False), placed
         if _gains(own) and robust:
-            judged = _straight(placed.about(own.fit.lens.centre), model)
+            near = best.model.with_zoom(own.fit.lens.zoom)
+            judged = _judged(whole.about(own.fit.lens.centre), near, robust, near=True).lines
             if not np.array_equal(np.asarray(judged.weight), np.asarray(placed.weight)):
-                own = fit_centre(judged.about(placed.centre), zoom=model, throw=False)
+                own = fit_centre(judged.about(placed.centre), zoom=near, throw=False)
         if _gains(own):
             how, zoom = CentreFound.of(lines, None, own), own.fit
             placed = judged.about(own.fit.lens.centre)
+    if isinstance(model.family, RadialPolynomial):  # compressed for more coefficients than the model's
+        kept = held if placed.weight is None else held.weighted(placed.weight)
+        return _Centred(kept.about(placed.centre), kept, model, how, selection, zoom)
     small = _in_family(placed, model)
     return _Centred(small, small, model, how, selection, zoom)
+
+
+class _Start(NamedTuple):
+    """Where a fit starts.
+
+    Attributes:
+        lines: about a centre, with weights.
+        model: with parameters.
+        spread: what most lines are off straight under it, px.
+    """
+
+    lines: AbstractLines
+    model: Model
+    spread: float
+
+
+def _spread(start: _Start) -> float:
+    return start.spread
+
+
+def _judged(whole: AbstractLines, model: Model, robust: bool, near: bool = False) -> _Start:
+    """The lines with the weights that the model gives them, and what it is then.
+
+    It is found from all lines, or, with `near`, from its parameters.
+    """
+    small = _in_family(whole, model)
+    if not robust:
+        fit = fit_zoom(small, zoom=model, invertible=False, throw=False)
+        return _Start(whole, model.with_zoom(fit.lens.zoom), _or_infinite(fit.rms))
+    weighted, model = reweighted(small, model, near=near)
+    return _Start(
+        whole.weighted(np.asarray(weighted.weight)), model, _or_infinite(typical_rms(small, model))
+    )
+
+
+def _or_infinite(spread: Any) -> float:
+    return float(np.nan_to_num(spread, nan=np.inf))
+
+
+def _kept_near(whole: AbstractLines, kept: AbstractLines, model: Model, robust: bool) -> _Start:
+    """The lines as a model judges them that is fitted to those that were kept."""
+    fit = fit_zoom(_in_family(kept, model), zoom=model, invertible=False, throw=False)
+    return _judged(whole, model.with_zoom(fit.lens.zoom), robust, near=True)
+
+
+def _from_corrected(
+    whole: AbstractLines, family: AbstractFamily, robust: bool, centred: bool
+) -> tuple[_Start, CentreFit | None]:
+    """The start that one coefficient gives in the corrected image, in the metric of the lines; its centre.
+
+    Distances in the distorted image vanish where a lens stretches a part of it without bound. So beside
+    the minimum a valley leads away from it, to centres far off, and lines weighted on the way keep the
+    search there. Distances in the corrected image have no such valley, and their minimum is near. With one
+    coefficient, a line of 1/f, a lens cannot follow a few photos of things that are not straight.
+    """
+    degree = min(1, np.unique(np.asarray(whole.focal)).size - 1)
+    there, model = in_corrected(whole), Model(PolynomialZoom(degree=degree), 1, family)
+    start, found = _judged(there, model, robust), None
+    for _ in range(_TURNS if centred and isinstance(family, AbstractRadial) else 0):
+        own = fit_centre(start.lines, zoom=start.model, throw=False)
+        if not _gains(own):
+            break
+        found, placed = own, there.about(own.fit.lens.centre)
+        start = _judged(placed, model.with_zoom(own.fit.lens.zoom), robust, near=True)
+    return _judged(whole.about(start.lines.centre), start.model, robust, near=True), found
 
 
 def _gains(found: CentreFit) -> bool:
@@ -241,22 +328,6 @@ def _gains(found: CentreFit) -> bool:
 def _in_family(lines: AbstractLines, model: Model) -> AbstractLines:
     """The lines compressed for a distortion model."""
     return compressed_as_measured(with_family(lines, model.family), model.terms)
-
-
-def _kept_by_either(
-    lines: AbstractLines, wanted: WantedModel, found: _Centred, robust: bool
-) -> AbstractLines:
-    """The lines, each with the larger of its weights under the polynomial and the division model."""
-    if not robust or found.lines.weight is None:
-        return lines
-    model = wanted.base(lines.focal)
-    other = _straight(lines, dataclasses.replace(model, family=STRONG))
-    return lines.weighted(np.maximum(np.asarray(other.weight), np.asarray(found.lines.weight)))
-
-
-def _straight(lines: AbstractLines, model: Model) -> AbstractLines:
-    """The lines with the weights that the model gives them."""
-    return lines.weighted(np.asarray(reweighted(_in_family(lines, model), model)[0].weight))
 
 
 def _widest(lines: Lines) -> Lines:

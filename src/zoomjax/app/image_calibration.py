@@ -289,6 +289,7 @@ def _calibrated(
     job: ImageJob, detections: Sequence[Detection], stage: Callable[[str], None]
 ) -> ImageCalibration:
     """The calibration from what was found in all images."""
+    images = tuple(d.name for d in detections)
     unused = {d.name: with_flags(d.problem) for d in detections if d.problem}
     usable, others = usable_of(detections)
     unused |= others
@@ -320,7 +321,7 @@ def _calibrated(
         shown = used if bundle is None else bundle.lines_used(used)
         lines = lines_of(shown, np.array([focals.focal[d.name] for d in used]), focals.unit)
         sigma = np.array([focals.deviation.get(d.name, 0.0) for d in used])
-        with told_undetermined(job, used, unused):
+        with told_undetermined(job, images, used, unused):
             calibration = calibrate(
                 lines,
                 model=dataclasses.replace(job.model, lens=known),
@@ -331,7 +332,7 @@ def _calibrated(
                 widened=(lambda fit: fit) if bundle is None else bundle.widened,
                 stage=stage,
             )
-        done = ImageCalibration(job, calibration, used, focals, tuple(d.name for d in detections), unused)
+        done = ImageCalibration(job, calibration, used, focals, images, unused)
         done = dataclasses.replace(done, bundle=bundle, lens=known)
         hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}
         if not hopeless:

@@ -5,7 +5,7 @@ Without it nobody could see what was taken for straight.
 
 import contextlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -16,7 +16,7 @@ from .overlay import draw_lines
 from .results_folder import OF_A_LENS, results_folder
 
 _MOST = 24
-"""Photos drawn."""
+"""Photos drawn, unless all are asked for."""
 
 _SENTENCE = (
     "The lines found in the images do not determine a lens: they are too few, or not straight in the scene."
@@ -29,25 +29,37 @@ class Undetermined(ValueError):
 
     Attributes:
         job: the settings of the calibration.
+        images: the names of all photos; pictures are numbered by their place in it, from 1.
         used: the photos, with what was found in each.
         unused: for each photo that was not used, the reason.
     """
 
-    def __init__(self, job: ImageJob, used: Sequence[Detection], unused: dict[str, str]):
+    def __init__(
+        self, job: ImageJob, images: Sequence[str], used: Sequence[Detection], unused: dict[str, str]
+    ):
         super().__init__(_SENTENCE)
-        self.job, self.used, self.unused = job, used, unused
+        self.job, self.images, self.used, self.unused = job, images, used, unused
 
     def keep(self, folder: Path, *, overwrite: bool) -> str:
         """Write the photos with their lines, and summary.json, unless a lens is there; say where."""
         if (folder / "lens.json").exists():
             return f"What is in {folder} was left as it is."
-        names = [overlay_name(number, of.name) for number, of in enumerate(self.used[:_MOST], start=1)]
-        files = ["summary.json", *(f"lines/{name}" for name in names)]
+        names = self._pictures()
+        files = ["summary.json", *(f"lines/{name}" for name in names.values())]
         with results_folder(folder, files, clears=OF_A_LENS, overwrite=overwrite) as part:
-            (part / "lines").mkdir()
-            self._draw(part / "lines", names)
+            if names:
+                (part / "lines").mkdir()
+                self._draw(part / "lines", names)
             (part / "summary.json").write_text(json.dumps(self._summary(), indent=2) + "\n")
+        if not names:
+            return f"How many were found in each is in {folder / 'summary.json'}."
         return f"They are drawn in {folder / 'lines'}: look whether they follow straight things."
+
+    def _pictures(self) -> dict[str, str]:
+        """For each photo that is to be drawn, the name of its picture."""
+        numbers = {name: number for number, name in enumerate(self.images, start=1)}
+        most = {"some": _MOST, "all": len(self.used), "none": 0}[self.job.overlays]
+        return {of.name: overlay_name(numbers[of.name], of.name) for of in self.used[:most]}
 
     def _summary(self):
         images = [
@@ -61,12 +73,12 @@ class Undetermined(ValueError):
             "unused": self.unused,
         }
 
-    def _draw(self, folder: Path, names: Sequence[str]) -> None:
-        found = {of.name: (of.lines, name) for of, name in zip(self.used, names, strict=False)}
+    def _draw(self, folder: Path, names: Mapping[str, str]) -> None:
+        found = {of.name: of.lines for of in self.used}
         for source in self.job.sources()[0]:
-            if source.name not in found:
+            if source.name not in names:
                 continue
-            lines, name = found[source.name]
+            lines, name = found[source.name], names[source.name]
             labels = {line: str(line) for line in range(len(lines))}
             picture = draw_lines(source.read()[0], lines, [False] * len(lines), labels=labels)
             done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
@@ -75,7 +87,9 @@ class Undetermined(ValueError):
 
 
 @contextlib.contextmanager
-def told_undetermined(job: ImageJob, used: Sequence[Detection], unused: dict[str, str]) -> Iterator[None]:
+def told_undetermined(
+    job: ImageJob, images: Sequence[str], used: Sequence[Detection], unused: dict[str, str]
+) -> Iterator[None]:
     """Say of an error that no model can be compared what it means of photos: too few straight lines.
 
     Raises:
@@ -86,4 +100,4 @@ def told_undetermined(job: ImageJob, used: Sequence[Detection], unused: dict[str
     except ValueError as error:
         if not str(error).startswith("No candidate can be compared"):
             raise
-        raise Undetermined(job, used, unused) from error
+        raise Undetermined(job, images, used, unused) from error

@@ -44,6 +44,7 @@ from .zoom import fit_zoom
 
 _CUT = 6.0  # standard deviations of r among good lines, were they normal
 _NARROWING = (np.inf, 24.0, 16.0, 10.0, *(_CUT,) * 4)  # c of each turn
+_NEAR = (_CUT,) * len(_NARROWING)  # the same from a start that is to be kept: one compiled program
 _LEAST_SPREAD = 0.02  # of m: lines of thousands of points, or without noise, are all alike
 
 
@@ -139,18 +140,29 @@ def robust_of_given(robust: RobustFit, lines: AbstractLines) -> RobustFit:
     return eqx.tree_at(lambda robust: (robust.fit, robust.weight, robust.line_rms), robust, own)
 
 
-def reweighted(lines: SomeLines, asked: Model) -> tuple[SomeLines, Model]:
+def reweighted(lines: SomeLines, asked: Model, *, near: bool = False) -> tuple[SomeLines, Model]:
     """The lines with the weights of `fit_robust`, and the model of its last turn.
 
     The first turn starts from the algebraic estimate; under another distortion model, which has none, from
-    the fit to all lines: far from it, whole frames would seem not to be straight.
+    the fit to all lines: far from it, whole frames would seem not to be straight. A model that has
+    parameters is where it starts, and with `near` it stays there: no turn is with a wide c.
     """
     padded = bucketed(lines)
-    weighted, model = _turns(padded, ready_model(lines, asked), asked.zoom.parameters is None)
+    narrowing = _NEAR if near else _NARROWING
+    weighted, model = _turns(padded, ready_model(lines, asked), asked.zoom.parameters is None, narrowing)
     return lines.weighted(of_lines(jnp.asarray(weighted.weight), lines)), model
 
 
-def _turns(lines, model, unfitted):
+def typical_rms(lines: AbstractLines, model: Model) -> float:
+    """The median of the lines' RMS, px, under a model with parameters: the `scale` of `RobustFit`.
+
+    Of several models the one of the least median is nearest to what most lines have in common (Rousseeuw,
+    "Least median of squares regression", 1984), while fewer than half of them are not straight.
+    """
+    return float(_line_rms(bucketed(lines), model.zoom)[1])
+
+
+def _turns(lines, model, unfitted, narrowing=_NARROWING):
     """The lines with their weights, and the model of the last turn, of a prepared model."""
     if unfitted:
         if not isinstance(model.family, RadialPolynomial):
@@ -158,7 +170,7 @@ def _turns(lines, model, unfitted):
             model = model.with_zoom(fit_zoom(weighted, zoom=model, invertible=False, throw=False).lens.zoom)
         elif isinstance(model.zoom, AbstractLinearZoom):
             model = algebraic_model(lines, model)
-    weighted, zoom = _reweighted(lines, model.zoom)
+    weighted, zoom = _reweighted(lines, model.zoom, jnp.asarray(narrowing, lines.focal.dtype))
     return weighted, model.with_zoom(zoom)
 
 
@@ -167,7 +179,7 @@ def _own_weights(lines):
 
 
 @program
-def _reweighted(lines, start):
+def _reweighted(lines, start, narrowing):
     """The lines with their weights, and the model that goes with them: a Gauss-Newton step a turn."""
     own = _own_weights(lines)
 
@@ -181,7 +193,7 @@ def _reweighted(lines, start):
         step = least_squares(matrix, -right, floor=0.0)
         return with_parameters(model, unravel(flat + step)), None
 
-    model, _ = jax.lax.scan(turn, start, jnp.asarray(_NARROWING, lines.focal.dtype))
+    model, _ = jax.lax.scan(turn, start, narrowing)
     return lines.weighted(own * _weights(lines, model, _CUT)), model
 
 
