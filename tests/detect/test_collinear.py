@@ -81,7 +81,7 @@ def test_an_edge_of_a_thin_bar_goes_on_as_that_edge(thick, joins):
 
 
 def test_edges_of_a_rendered_bar_stay_apart_at_a_crossing():
-    """A dark bar of 2 px: left of the crossing it is as dark below, so that its upper edge ends there alone.
+    """A dark bar of 2 px: left of the crossing it is as dark below, and has an upper edge alone.
 
     Right of it something dark stands above, so that the upper edge begins again after the lower one.
     """
@@ -130,12 +130,30 @@ def test_a_piece_belongs_to_one_line():
     assert label[0] == label[1] == label[2] != label[3]
 
 
-@pytest.mark.parametrize(("aside", "stays"), [(0.2, True), (3.0, False)])
-def test_a_piece_that_the_rest_does_not_predict_leaves_its_line(aside, stays):
-    pieces = [Piece(100, 500), Piece(520, 900), Piece(920, 935, y=400 + aside)]
+def kept(*pieces):
+    """Which pieces of a line stay in it when each is left out in turn."""
     points = [piece.points() for piece in pieces]
     gradient = np.tile([0.0, 100.0], (sum(map(len, points)), 1))
     made = Fragments.of(np.concatenate(points), gradient, np.array([len(p) for p in points]))
     units = _units(made, STRAIGHT, thin_bars(made))
-    found = _checked(units, np.zeros(3, int), EXACT)
-    assert found.tolist() == [0, 0, 0 if stays else -1]
+    return (_checked(units, np.zeros(len(pieces), int), EXACT) >= 0).tolist()
+
+
+@pytest.mark.parametrize(("aside", "stays"), [(0.2, True), (3.0, False)])
+def test_a_piece_that_the_rest_does_not_predict_leaves_its_line(aside, stays):
+    assert kept(Piece(100, 500), Piece(520, 900), Piece(920, 935, y=400 + aside)) == [True, True, stays]
+
+
+def test_a_long_wrong_piece_leaves_its_line_and_the_others_stay():
+    """Though all others are off any line with it."""
+    right = [Piece(low, low + 60) for low in (100, 180, 260, 340, 420)]
+    assert kept(*right, Piece(500, 720, y=406)) == [True] * 5 + [False]
+
+
+def test_of_several_wrong_pieces_each_leaves_its_line():
+    right = [Piece(low, low + 60) for low in (100, 180, 260, 340, 420)]
+    assert kept(*right, Piece(500, 530, y=404), Piece(540, 600, y=395)) == [True] * 5 + [False] * 2
+
+
+def test_of_two_pieces_the_longer_one_stays():
+    assert kept(Piece(100, 200), Piece(220, 260, y=406)) == [True, False]

@@ -59,11 +59,11 @@ _TOUCH = 14.0
 """px between pieces of one edge whose brighter side flips: corners are blurred, and hold no points."""
 
 _ACROSS = 2.0
-"""px across the edge from one end to the other where the brighter side flips, at most. The two edges of a bar
-are farther apart, however thin it is: by twice the standard deviation of all smoothing, 2.6 px or more."""
+"""px across the edge from one end to the other where the brighter side flips, at most. The two edges of a
+bar are farther apart, however thin it is: by twice the standard deviation of all smoothing, 2.6 px."""
 
 _BAR = 5.0
-"""px from an edge of a thin bar to the other one, at most: farther off, no tolerance takes it for the same."""
+"""px from an edge of a thin bar to the other one, at most: no tolerance is as wide."""
 
 _WITHIN = (3, 10, 17)
 """Points from the end of a piece at which the other edge is looked for."""
@@ -82,6 +82,9 @@ _ROUNDS = (24, 24, 24, 0, 0, 0)
 
 _MARGIN = 8.0
 """px from the image's edge within which an edge leaves the image: nearer there are no edge points."""
+
+_CHECKS = 12
+"""So many pieces of a line may go one by one; then all that are still off."""
 
 _MOST = 1200
 _LEAST = 10.0
@@ -320,7 +323,7 @@ def _joined(
 def _on_line(
     units: _Units, longer: np.ndarray, shorter: np.ndarray, sigma: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (p, 2) of the shorter units' ends from the lines of the longer, and whether these hold them."""
+    """How far the shorter units' ends (p, 2) are off the longer ones' lines; whether they are on them."""
     miss, predicted = _predicted(units.sums[longer], units.ends[shorter], units.stretch[shorter])
     # The error of a line's end is twice that of its middle.
     own = 2 * _POINT_ERROR * np.sqrt(_LIKE / units.sums[shorter, 6])
@@ -356,14 +359,37 @@ def _mutual(first: np.ndarray, second: np.ndarray, gap: np.ndarray, number: int)
 
 
 def _checked(units: _Units, group: np.ndarray, sigma: float) -> np.ndarray:
-    """The groups, and -1 for units that the rest of their group does not predict."""
+    """The groups, and -1 for units that the rest of their group does not predict.
+
+    Of each group the unit that is off by most of its tolerances goes, and the others that are off are
+    checked again: a long wrong one makes all others seem so.
+    """
+    group = group.copy()
     total = np.zeros((int(group.max(initial=-1)) + 1, 7))
     np.add.at(total, group, units.sums)
-    rest = total[group] - units.sums
-    several = rest[:, 6] > units.sums[:, 6]
-    rest = np.where(several[:, None], rest, total[group])
-    miss, predicted = _predicted(rest, units.ends, units.stretch)
-    own = 2 * _POINT_ERROR * np.sqrt(_LIKE / units.sums[:, 6])
+    some = np.arange(len(group))
+    for left in range(_CHECKS, -1, -1):
+        excess = _excess(units, total[group[some]], some, sigma)
+        some, excess = some[excess > 1], excess[excess > 1]
+        order = np.lexsort((-excess, group[some]))
+        if left:
+            order = order[np.flatnonzero(np.diff(group[some][order], prepend=-1))]
+        gone = some[order]
+        if not len(gone):
+            break
+        np.subtract.at(total, group[gone], units.sums[gone])
+        group[gone] = -1
+        some = some[group[some] >= 0]
+    return group
+
+
+def _excess(units: _Units, total: np.ndarray, some: np.ndarray, sigma: float) -> np.ndarray:
+    """By how many tolerances units are off what the rest predicts; 0 where that is less than the unit."""
+    sums = units.sums[some]
+    rest = total - sums
+    several = rest[:, 6] > sums[:, 6]
+    rest = np.where(several[:, None], rest, total)
+    miss, predicted = _predicted(rest, units.ends[some], units.stretch[some])
+    own = 2 * _POINT_ERROR * np.sqrt(_LIKE / sums[:, 6])
     allowed = _SIGMAS * np.sqrt(sigma**2 + predicted**2 + own[:, None] ** 2) + _BLOOM
-    wrong = several & np.any(abs(miss) > allowed, axis=1)
-    return np.where(wrong, -1, group)
+    return np.where(several, np.max(abs(miss) / allowed, axis=1), 0.0)
