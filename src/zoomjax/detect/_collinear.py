@@ -60,7 +60,7 @@ _TOUCH = 14.0
 
 _ACROSS = 2.0
 """px across the edge from one end to the other where the brighter side flips, at most. The two edges of a
-bar are farther apart, however thin it is: by twice the standard deviation of all smoothing, 2.6 px."""
+bar are farther apart, however thin it is: by twice the standard deviation of all smoothing."""
 
 _BAR = 5.0
 """px from an edge of a thin bar to the other one, at most: no tolerance is as wide."""

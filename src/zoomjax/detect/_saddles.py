@@ -58,8 +58,8 @@ _SEEN = 0.5
 """Of the places of a grid, the share that has to be seen."""
 
 _LINKED = 0.92
-"""Of the neighbours in a grid, the share between which an edge runs. In photos of boards it is 0.96 or
-more; in stairs and the like, where a grid grew by chance, 0.88 or less."""
+"""Of the neighbours in a grid, the share between which an edge runs: nearly all in photos of boards, seven
+of eight or fewer where a grid grew by chance, on stairs and the like."""
 
 
 def grown_board(grey: np.ndarray) -> np.ndarray | None:
