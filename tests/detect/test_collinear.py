@@ -2,12 +2,15 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 
-from zoomjax.detect._collinear import _checked, _units, collinear
+from zoomjax.detect._collinear import _checked, _units, collinear, thin_bars
+from zoomjax.detect._edge_points import edge_points
 from zoomjax.detect._frame_model import OneFrame
-from zoomjax.detect._segments import Fragments
+from zoomjax.detect._joining import border_lines
+from zoomjax.detect._segments import Fragments, fragments
 
 SIZE = (1200, 800)
 STRAIGHT = OneFrame.of_values(SIZE, (0.0, 0.0, 0.0, 0.0))
@@ -30,7 +33,7 @@ class Piece:
         return np.stack([x, np.full_like(x, self.y)], axis=1)
 
 
-def lines(*pieces):
+def lines(*pieces, sigma=EXACT):
     """The number of the line of each piece."""
     points = [piece.points() for piece in pieces]
     gradient = [
@@ -39,11 +42,11 @@ def lines(*pieces):
     made = Fragments.of(
         np.concatenate(points), np.concatenate(gradient), np.array([len(p) for p in points])
     )
-    return collinear(made, STRAIGHT, EXACT).tolist()
+    return collinear(made, STRAIGHT, sigma, thin_bars(made)).tolist()
 
 
-def are_one(*pieces):
-    return len(set(lines(*pieces))) == 1
+def are_one(*pieces, sigma=EXACT):
+    return len(set(lines(*pieces, sigma=sigma))) == 1
 
 
 def test_pieces_of_one_edge_join_from_end_to_end():
@@ -60,6 +63,40 @@ def test_another_side_is_brighter_only_where_pieces_touch(gap, joins):
     """As at the corners of a checkerboard; farther off it is the edge of another thing."""
     assert are_one(Piece(100, 200), Piece(200 + gap, 300 + gap, side=-1)) == joins
     assert are_one(Piece(100, 200), Piece(200 + gap, 300 + gap))
+
+
+@pytest.mark.parametrize(("aside", "joins"), [(0.8, True), (2.4, False)])
+def test_another_side_is_brighter_only_without_a_jump(aside, joins):
+    """However far lines may be bent: the two edges of the thinnest bar are that far apart."""
+    pieces = Piece(100, 200), Piece(208, 308, y=400 + aside, side=-1)
+    assert are_one(*pieces, sigma=0.6) == joins
+
+
+@pytest.mark.parametrize(("thick", "joins"), [(3.0, False), (9.0, True)])
+def test_an_edge_of_a_thin_bar_goes_on_as_that_edge(thick, joins):
+    """The upper edge of a bar meets the lower one, beside which the upper one begins again farther off."""
+    pieces = Piece(100, 200), Piece(208, 408, y=401.0, side=-1), Piece(212, 408, y=401 - thick)
+    label = lines(*pieces, sigma=0.6)
+    assert (label[0] == label[1]) == joins
+
+
+def test_edges_of_a_rendered_bar_stay_apart_at_a_crossing():
+    """A dark bar of 2 px: left of the crossing it is as dark below, and has an upper edge alone.
+
+    Right of it something dark stands above, so that the upper edge begins again after the lower one.
+    """
+    over = 8
+    y, x = (np.indices((100 * over, 400 * over)) + 0.5) / over - 0.5
+    photo = np.full(y.shape, 160.0)
+    photo[(abs(x - 200) < 180) & (abs(y - 51) < 1)] = 100
+    photo[(abs(x - 110) < 90) & (abs(y - 65) < 15)] = 100
+    photo[(abs(x - 210) < 9) & (abs(y - 35) < 17)] = 100
+    photo = cv2.GaussianBlur(cv2.resize(photo, (400, 100), interpolation=cv2.INTER_AREA), (0, 0), 0.7)
+    pieces = fragments(edge_points(np.rint(photo).astype(np.uint8)))
+    label = collinear(pieces, OneFrame((400, 100)), 0.6, thin_bars(pieces))
+    for line in border_lines(pieces, label):
+        along = line[abs(line[:, 1] - 51) < 4]
+        assert len(along) == 0 or np.ptp(along[:, 1]) < 1.5
 
 
 @pytest.mark.parametrize(("ratio", "joins"), [(3.0, True), (6.0, False)])
@@ -93,13 +130,30 @@ def test_a_piece_belongs_to_one_line():
     assert label[0] == label[1] == label[2] != label[3]
 
 
-@pytest.mark.parametrize(("aside", "stays"), [(0.2, True), (3.0, False)])
-def test_a_piece_that_the_rest_does_not_predict_leaves_its_line(aside, stays):
-    pieces = [Piece(100, 500), Piece(520, 900), Piece(920, 935, y=400 + aside)]
+def kept(*pieces):
+    """Which pieces of a line stay in it when each is left out in turn."""
     points = [piece.points() for piece in pieces]
     gradient = np.tile([0.0, 100.0], (sum(map(len, points)), 1))
-    units = _units(
-        Fragments.of(np.concatenate(points), gradient, np.array([len(p) for p in points])), STRAIGHT
-    )
-    found = _checked(units, np.zeros(3, int), EXACT)
-    assert found.tolist() == [0, 0, 0 if stays else -1]
+    made = Fragments.of(np.concatenate(points), gradient, np.array([len(p) for p in points]))
+    units = _units(made, STRAIGHT, thin_bars(made))
+    return (_checked(units, np.zeros(len(pieces), int), EXACT) >= 0).tolist()
+
+
+@pytest.mark.parametrize(("aside", "stays"), [(0.2, True), (3.0, False)])
+def test_a_piece_that_the_rest_does_not_predict_leaves_its_line(aside, stays):
+    assert kept(Piece(100, 500), Piece(520, 900), Piece(920, 935, y=400 + aside)) == [True, True, stays]
+
+
+def test_a_long_wrong_piece_leaves_its_line_and_the_others_stay():
+    """Though all others are off any line with it."""
+    right = [Piece(low, low + 60) for low in (100, 180, 260, 340, 420)]
+    assert kept(*right, Piece(500, 720, y=406)) == [True] * 5 + [False]
+
+
+def test_of_several_wrong_pieces_each_leaves_its_line():
+    right = [Piece(low, low + 60) for low in (100, 180, 260, 340, 420)]
+    assert kept(*right, Piece(500, 530, y=404), Piece(540, 600, y=395)) == [True] * 5 + [False] * 2
+
+
+def test_of_two_pieces_the_longer_one_stays():
+    assert kept(Piece(100, 200), Piece(220, 260, y=406)) == [True, False]

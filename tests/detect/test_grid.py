@@ -10,6 +10,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax.detect import grid as module
+from zoomjax.detect._saddles import grown_board
 from zoomjax.detect.grid import find_checkerboard, find_dots
 
 SIZE = (400, 300)
@@ -117,6 +118,40 @@ def test_a_board_partly_outside_of_the_image_is_found_as_far_as_it_is_seen(pose,
                 np.array([place[tuple(p)] for p in matched(points, truth).tolist()]) if len(points) else []
             )
             assert len(points) < 2 or 0 in np.ptp(there, axis=0)
+
+
+def slanted(shrinking):
+    """Seen at a slant: columns shrink to the right, in the beginning to half from one to the next."""
+    return np.array([[60 + 200 * shrinking, 0, 20], [150 * shrinking, 36, 24], [shrinking, 0, 1]])
+
+
+@pytest.mark.parametrize("shrinking", [0.15, 0.25])
+@lenses
+def test_a_strongly_foreshortened_board_is_found_whole(shrinking, k):
+    pose = slanted(shrinking)
+    grid = find_checkerboard(rendered(squares, pose, k))
+    assert grid is not None
+    assert grid.shape == (ROWS, COLUMNS, 2)
+    assert rms(grid - seen(pose, k, nodes())) < 0.15
+
+
+def test_foreshortened_dots_are_found_as_far_as_they_are_alike():
+    """Those of the two columns nearest to the camera are much larger than others, and so no spots."""
+    found = find_dots(rendered(dots, slanted(0.2)))
+    assert found is not None
+    assert found.shape == (ROWS, COLUMNS - 2, 2)
+    assert rms(found - mapped(slanted(0.2), nodes())[:, 2:]) < 0.3
+
+
+@pytest.mark.parametrize(("columns", "found"), [(0, True), (COLUMNS - 1, False)])
+def test_a_grid_that_hangs_together_by_few_edges_is_no_board(columns, found):
+    """Rows of corners, of which edges join one column only: as on stairs by chance."""
+    image = rendered(squares, SQUARE).astype(float)
+    y, x = np.indices(image.shape)
+    for middle in mapped(SQUARE, nodes()[:-1] + np.array([0, 0.5]))[:, :columns].reshape(-1, 2):
+        faded = np.exp(-(((x - middle[0]) / 9) ** 4) - ((y - middle[1]) / 6) ** 4)
+        image += faded * (125 - image)
+    assert (grown_board(np.rint(image).astype(np.uint8)) is not None) == found
 
 
 def charuco(ratio):

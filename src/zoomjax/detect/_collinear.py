@@ -5,7 +5,8 @@ All pieces are corrected. Two of them join, end to end, when
 - both ends of the shorter one lie where the longer one's line says, within what the lines' and the model's
   uncertainty allow;
 - the same side is brighter, with like contrast; or the brighter side flips, as at the corners of a
-  checkerboard, and they touch, or each has flipped before;
+  checkerboard, and they touch, or each has flipped before; but not where either is an edge of a thin bar,
+  whose other edge is meant;
 - the gap is explained: no longer than some times the visible part of the shorter one, and, where it is
   long, than little more than that part; or it is outside the image;
 - they do not run beside each other: the two edges of a thin bar stay two lines;
@@ -57,6 +58,19 @@ _CORNER = 4.0
 _TOUCH = 14.0
 """px between pieces of one edge whose brighter side flips: corners are blurred, and hold no points."""
 
+_ACROSS = 2.0
+"""px across the edge from one end to the other where the brighter side flips, at most. The two edges of a
+bar are farther apart, however thin it is: by twice the standard deviation of all smoothing."""
+
+_BAR = 5.0
+"""px from an edge of a thin bar to the other one, at most: no tolerance is as wide."""
+
+_WITHIN = (3, 10, 17)
+"""Points from the end of a piece at which the other edge is looked for."""
+
+_DIRECTION = 10.0
+"""px that stand for a rad by which its normal is not opposite."""
+
 _CONTRAST = 4.0
 """Greatest ratio of the contrasts of neighbours on a line."""
 
@@ -68,6 +82,9 @@ _ROUNDS = (24, 24, 24, 0, 0, 0)
 
 _MARGIN = 8.0
 """px from the image's edge within which an edge leaves the image: nearer there are no edge points."""
+
+_CHECKS = 12
+"""So many pieces of a line may go one by one; then all that are still off."""
 
 _MOST = 1200
 _LEAST = 10.0
@@ -89,6 +106,7 @@ class _Units:
         length: (u,), px in the image.
         leaves: (u, 2), whether the edge leaves the image there.
         flips: (u,), whether the brighter side changes within.
+        barred: (u, 2), whether the edge is one of a thin bar there.
     """
 
     sums: np.ndarray
@@ -100,19 +118,21 @@ class _Units:
     length: np.ndarray
     leaves: np.ndarray
     flips: np.ndarray
+    barred: np.ndarray
 
 
-def collinear(pieces: Fragments, model: OneFrame, sigma: float) -> np.ndarray:
+def collinear(pieces: Fragments, model: OneFrame, sigma: float, barred: np.ndarray) -> np.ndarray:
     """(f,), for each piece the number of its line. What is not straight under the model is alone.
 
     Args:
         pieces: the pieces.
         model: the distortion.
         sigma: px by which lines may be bent because the model is not exact.
+        barred: of the pieces, as `thin_bars` tells.
     """
     if not len(pieces.count):
         return np.zeros(0, int)
-    units = _units(pieces, model)
+    units = _units(pieces, model, barred)
     _, _, roughness = _line(units.sums)
     straight = np.flatnonzero(roughness < max(2 * sigma, _ROUGH))
     units = _Units(*(getattr(units, field.name)[straight] for field in dataclasses.fields(_Units)))
@@ -129,7 +149,21 @@ def collinear(pieces: Fragments, model: OneFrame, sigma: float) -> np.ndarray:
     return label
 
 
-def _units(pieces: Fragments, model: OneFrame) -> _Units:
+def thin_bars(pieces: Fragments) -> np.ndarray:
+    """(f, 2), whether an edge with the other side brighter runs beside the first and the last points."""
+    if not len(pieces.count):
+        return np.zeros((0, 2), bool)
+    steep = np.hypot(*pieces.gradient.T)[:, None]
+    normal = _DIRECTION * pieces.gradient / np.maximum(steep, 1e-9)
+    known = np.concatenate([pieces.points, normal], axis=1)[::2]
+    inwards = np.minimum(_WITHIN, pieces.count[:, None] - 1)
+    rows = np.stack([pieces.start[:, None] + inwards, (pieces.start + pieces.count - 1)[:, None] - inwards])
+    asked = np.concatenate([pieces.points[rows], -normal[rows]], axis=-1)
+    far = KDTree(known).query(asked, distance_upper_bound=_BAR)[0]
+    return np.isfinite(far).any(axis=-1).T
+
+
+def _units(pieces: Fragments, model: OneFrame, barred: np.ndarray) -> _Units:
     """Each piece as a unit."""
     piece, count = pieces.piece(), pieces.count[:, None]
     corrected = model.undistort(pieces.points) - model.centre
@@ -163,6 +197,7 @@ def _units(pieces: Fragments, model: OneFrame) -> _Units:
         np.hypot(*chord.T),
         inside < _MARGIN,
         np.zeros(len(pieces.count), bool),
+        barred,
     )
 
 
@@ -212,6 +247,7 @@ def _merged(units: _Units, group: np.ndarray) -> _Units:
         np.hypot(*(tips[:, 1] - tips[:, 0]).T),
         units.leaves[unit, end],
         flips,
+        units.barred[unit, end],
     )
 
 
@@ -253,8 +289,8 @@ def _joined(
     """(u,), the number of the line of each unit, after the pairs that may join have done so."""
     number = len(units.length)
     middle, normal, _ = _line(units.sums)
-    keep = _on_line(units, longer, shorter, sigma)
-    longer, shorter = longer[keep], shorter[keep]
+    miss, keep = _on_line(units, longer, shorter, sigma)
+    longer, shorter, miss = longer[keep], shorter[keep], miss[keep]
     origin, way = middle[longer][:, None], _along(normal)[longer][:, None]
     own = np.sum((units.ends[longer] - origin) * way, axis=-1)
     other = np.sum((units.ends[shorter] - origin) * way, axis=-1)
@@ -274,6 +310,8 @@ def _joined(
     explained = np.maximum(np.minimum(_GAP * visible + 2 * _CORNER, long_gap + visible), _TOUCH)
     most = np.where(same, np.where(outside, np.inf, explained), _TOUCH)
     fits = (passed * scale < _OVERLAP) & (gap <= most)
+    barred = units.barred[longer, meet] | units.barred[shorter, met]
+    fits &= same | (~barred & (abs(miss[rows, met]) < _ACROSS))
     fits &= abs(units.contrast[longer, meet] - units.contrast[shorter, met]) < np.log(_CONTRAST)
     first, second = (2 * longer + meet)[fits], (2 * shorter + met)[fits]
     mutual = _mutual(first, second, gap[fits], 2 * number)
@@ -282,8 +320,10 @@ def _joined(
     return connected_components(graph, directed=False)[1]
 
 
-def _on_line(units: _Units, longer: np.ndarray, shorter: np.ndarray, sigma: float) -> np.ndarray:
-    """Whether the shorter units lie on the lines of the longer ones."""
+def _on_line(
+    units: _Units, longer: np.ndarray, shorter: np.ndarray, sigma: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far the shorter units' ends (p, 2) are off the longer ones' lines; whether they are on them."""
     miss, predicted = _predicted(units.sums[longer], units.ends[shorter], units.stretch[shorter])
     # The error of a line's end is twice that of its middle.
     own = 2 * _POINT_ERROR * np.sqrt(_LIKE / units.sums[shorter, 6])
@@ -293,7 +333,7 @@ def _on_line(units: _Units, longer: np.ndarray, shorter: np.ndarray, sigma: floa
     allowed += np.where(flips, _BLOOM, 0.0)[:, None]
     spread = np.hypot(2 * own, predicted[:, 1] - predicted[:, 0])
     turned = abs(miss[:, 1] - miss[:, 0]) < _SIGMAS * spread + _TURN * units.length[shorter]
-    return np.all(abs(miss) < allowed, axis=1) & turned
+    return miss, np.all(abs(miss) < allowed, axis=1) & turned
 
 
 def _predicted(sums: np.ndarray, ends: np.ndarray, stretch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -319,14 +359,37 @@ def _mutual(first: np.ndarray, second: np.ndarray, gap: np.ndarray, number: int)
 
 
 def _checked(units: _Units, group: np.ndarray, sigma: float) -> np.ndarray:
-    """The groups, and -1 for units that the rest of their group does not predict."""
+    """The groups, and -1 for units that the rest of their group does not predict.
+
+    Of each group the unit that is off by most of its tolerances goes, and the others that are off are
+    checked again: a long wrong one makes all others seem so.
+    """
+    group = group.copy()
     total = np.zeros((int(group.max(initial=-1)) + 1, 7))
     np.add.at(total, group, units.sums)
-    rest = total[group] - units.sums
-    several = rest[:, 6] > units.sums[:, 6]
-    rest = np.where(several[:, None], rest, total[group])
-    miss, predicted = _predicted(rest, units.ends, units.stretch)
-    own = 2 * _POINT_ERROR * np.sqrt(_LIKE / units.sums[:, 6])
+    some = np.arange(len(group))
+    for left in range(_CHECKS, -1, -1):
+        excess = _excess(units, total[group[some]], some, sigma)
+        some, excess = some[excess > 1], excess[excess > 1]
+        order = np.lexsort((-excess, group[some]))
+        if left:
+            order = order[np.flatnonzero(np.diff(group[some][order], prepend=-1))]
+        gone = some[order]
+        if not len(gone):
+            break
+        np.subtract.at(total, group[gone], units.sums[gone])
+        group[gone] = -1
+        some = some[group[some] >= 0]
+    return group
+
+
+def _excess(units: _Units, total: np.ndarray, some: np.ndarray, sigma: float) -> np.ndarray:
+    """By how many tolerances units are off what the rest predicts; 0 where that is less than the unit."""
+    sums = units.sums[some]
+    rest = total - sums
+    several = rest[:, 6] > sums[:, 6]
+    rest = np.where(several[:, None], rest, total)
+    miss, predicted = _predicted(rest, units.ends[some], units.stretch[some])
+    own = 2 * _POINT_ERROR * np.sqrt(_LIKE / sums[:, 6])
     allowed = _SIGMAS * np.sqrt(sigma**2 + predicted**2 + own[:, None] ** 2) + _BLOOM
-    wrong = several & np.any(abs(miss) > allowed, axis=1)
-    return np.where(wrong, -1, group)
+    return np.where(several, np.max(abs(miss) / allowed, axis=1), 0.0)

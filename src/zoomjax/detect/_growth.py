@@ -1,8 +1,8 @@
 """Grids that grow from one of scattered points, neighbour by neighbour.
 
-From a first point, each neighbour is expected one step of the grid further. Steps follow those found last,
-so that they bend with the lens and shrink with perspective. What is not there is left out, wherever it is:
-spots that are hidden, or a board of which a part is outside of the image.
+From a first point, each neighbour is expected one step of the grid further. Steps turn and shrink as the
+last two in their row or column did, so that they follow lens and perspective. What is not there is left
+out, wherever it is: spots that are hidden, or a board of which a part is outside of the image.
 """
 
 from collections import deque
@@ -13,6 +13,13 @@ import numpy as np
 
 _NEAR = 0.3
 """How far, in steps of the grid, a point may be from where it is expected."""
+
+_REACHES = (1.0, 0.75, 1.35)
+"""Shares of the expected step at which a neighbour is looked for, where an edge has to lead to it: of a
+board seen at a slant through a fisheye, squares next to each other may differ by half."""
+
+_QUICKEST = 1.6
+"""Most by which steps are expected to grow or shrink, from one to the next."""
 
 _LOOKED_AT = 80
 """Points around a first one among which its steps are; 12 where any two may be neighbours."""
@@ -85,18 +92,40 @@ def _grown_from(
             there = (row + i, column + j)
             if there in taken:
                 continue
-            step = i * down + j * across
-            other = _point_at(centres[spot] + step, nearest)
-            if other is None or other in place:
-                continue
-            found = centres[other] - centres[spot]
-            if np.hypot(*(found - step)) > _NEAR * min(np.hypot(*across), np.hypot(*down)):
-                continue
-            if linked is not None and not linked(spot, other):
-                continue
-            place[other], taken[there] = there, other
-            queue.append((other, j * found if j else across, i * found if i else down))
+            line = [taken.get((row - back * i, column - back * j)) for back in (0, 1, 2)]
+            step = _next_step(centres, line, i * down + j * across)
+            near = _NEAR * (min(np.hypot(*across), np.hypot(*down)) if linked is None else np.hypot(*step))
+            for reach in _REACHES[: 1 if linked is None else None]:
+                other = _point_at(centres[spot] + reach * step, nearest)
+                if other is None or other in place:
+                    continue
+                found = centres[other] - centres[spot]
+                if np.hypot(*(found - reach * step)) > reach * near:
+                    continue
+                if linked is not None and not linked(spot, other):
+                    continue
+                place[other], taken[there] = there, other
+                queue.append((other, j * found if j else across, i * found if i else down))
+                break
     return place
+
+
+def _next_step(centres: np.ndarray, line: list[int | None], otherwise: np.ndarray) -> np.ndarray:
+    """The step that goes on from a point as those to it did, in a row or column that ends there.
+
+    `line` are the point and those before it, the last first, as far as they are known.
+    """
+    if line[1] is None:
+        return otherwise
+    last = centres[line[0]] - centres[line[1]]
+    if line[2] is None:
+        return last
+    before = centres[line[1]] - centres[line[2]]
+    # Both as complex numbers: their ratio is a turn and a growth.
+    change = complex(*last) / complex(*before)
+    change *= np.clip(abs(change), 1 / _QUICKEST, _QUICKEST) / abs(change)
+    step = complex(*last) * change
+    return np.array([step.real, step.imag])
 
 
 def _first_steps(

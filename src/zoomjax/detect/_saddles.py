@@ -2,8 +2,9 @@
 
 Where four squares meet, grey levels have a saddle. Two saddles are neighbours on a board if an edge runs
 from one to the other of which one side is brighter, and if the brighter side changes beyond either of them:
-so no corner is passed over, and little that is no board is taken for one. Both sides are looked at close to
-the edge, so that a marker within a square (ChArUco) makes no difference.
+so no corner is passed over. What has grown is a board if nearly all neighbours in it are linked so, not
+only those along which it grew. Both sides are looked at close to the edge, so that a marker within a square
+(ChArUco) makes no difference.
 """
 
 import cv2
@@ -56,6 +57,10 @@ _FEWEST = 12
 _SEEN = 0.5
 """Of the places of a grid, the share that has to be seen."""
 
+_LINKED = 0.92
+"""Of the neighbours in a grid, the share between which an edge runs: nearly all in photos of boards, seven
+of eight or fewer where a grid grew by chance, on stairs and the like."""
+
 
 def grown_board(grey: np.ndarray) -> np.ndarray | None:
     """The corners (row, column, 2) of the largest checkerboard, px, NaN where none is seen; or None."""
@@ -67,12 +72,13 @@ def grown_board(grey: np.ndarray) -> np.ndarray | None:
     place = largest_grid(
         centres, nearest_of(centres, grey.shape[:2]), range(min(_SEEDS, len(centres))), contrast.linked
     )
-    if len(place) < _FEWEST:
+    if len(place) < _FEWEST or _share_linked(place, contrast) < _LINKED:
         return None
     grid = _trimmed(as_grid(centres, place))
     if min(grid.shape[:2]) < 3 or np.isfinite(grid[..., 0]).mean() < _SEEN:
         return None
-    return _refined(grey, grid)
+    refined = _refined(grey, grid)
+    return refined if np.isfinite(refined[..., 0]).sum() >= _FEWEST else None
 
 
 def _saddles(grey: np.ndarray) -> np.ndarray:
@@ -127,6 +133,18 @@ class _Contrast:
             return False
         difference = difference * np.sign(difference.sum())
         return bool(difference.min() > max(_CONTRAST * difference.max(), _FAINTEST))
+
+
+def _share_linked(place: dict[int, tuple[int, int]], contrast: _Contrast) -> float:
+    """Of the saddles side by side in a grid, the share between which an edge runs."""
+    at = {there: saddle for saddle, there in place.items()}
+    pairs = [
+        (saddle, at[beside])
+        for saddle, (row, column) in place.items()
+        for beside in ((row + 1, column), (row, column + 1))
+        if beside in at
+    ]
+    return float(np.mean([contrast.linked(*pair) for pair in pairs])) if pairs else 0.0
 
 
 def _trimmed(grid: np.ndarray) -> np.ndarray:

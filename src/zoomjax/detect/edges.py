@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from ._collinear import collinear
+from ._collinear import collinear, thin_bars
 from ._edge_points import edge_points
 from ._frame_model import OneFrame, extent
 from ._joining import border_lines
@@ -123,10 +123,11 @@ class EdgeDetector(AbstractDetector):
             model = OneFrame.of_angle(size, likely_angle(pieces, size))
         else:
             model = OneFrame.of_values(size, bend)
+        barred = thin_bars(pieces)
         label, sigma = np.zeros(0, int), _TURNS[0] if bend is None else _TURNS[-1]
         for turn in _TURNS:
             sigma = min(sigma, turn)
-            label = collinear(pieces, model, sigma)
+            label = collinear(pieces, model, sigma, barred)
             long = _long(pieces, label, _LEAST_FITTED * min(size))
             if len(long) < _LEAST_LINES:
                 break
