@@ -238,7 +238,8 @@ def test_what_was_run_is_said(calibration):
 def test_enough_is_said_when_a_further_photo_shows_nothing(clean):
     exact = calibrate(clean, **GIVEN)
     assert exact.enough()
-    assert "Enough: the standard deviation of the displacement is" in Page(report(exact)).text
+    told = "Enough: the standard deviation of the displacement, in the geometric mean"
+    assert told in Page(report(exact)).text
     assert exact.summary()["next_photo"]["enough"] is True
 
 

@@ -134,8 +134,8 @@ class Calibration:
         if not self.enough():
             return self.next.sentence if self.focal_known else replace(self.next, focal_unit="").sentence
         return (
-            f"Enough: the standard deviation of the displacement is {self.next.before:.2g} px, averaged "
-            f"over image and focal range, and would be {self.next.after:.2g} px with the best next photo."
+            "Enough: the standard deviation of the displacement, in the geometric mean over image and "
+            f"focal range, is {self.next.before:.2g} px, {self.next.after:.2g} px with the best next photo."
         )
 
     def rows(self) -> list[tuple[str, np.ndarray]]:

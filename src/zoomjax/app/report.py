@@ -125,6 +125,7 @@ def _cards(calibration: Calibration) -> list[tuple[str, str]]:
     left_out, own = (rms_over_frames(of) for of in (calibration.held_out, calibration.each_held_out))
     none, zoom = (rms_over_frames(of) for of in (calibration.none, calibration.zoom.frame_rms))
     after = left_out if np.isfinite(left_out) else zoom
+    where = " at the zoom where it is largest" if len(calibration.none) > 1 else ""
     cards = [
         (
             f"{short(none)} → {short(after)} px",
@@ -133,9 +134,12 @@ def _cards(calibration: Calibration) -> list[tuple[str, str]]:
         (f"{none / after:.3g} times" if after > 0 else "∞", "straighter"),
         (
             f"{short(found.displacement)} px",
-            "average shift of pixels by the correction",
+            f"shift of pixels by the correction, RMS{where}",
         ),
-        (f"± {short(found.std)} px" if np.isfinite(found.std) else "unknown", "uncertainty of that shift"),
+        (
+            f"± {short(found.std)} px" if np.isfinite(found.std) else "unknown",
+            f"its uncertainty, RMS{where}",
+        ),
     ]
     if np.isfinite(left_out) and np.isfinite(own):
         cards[0] = (cards[0][0], cards[0][1] + ", in photos left out of the fit")

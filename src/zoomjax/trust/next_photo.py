@@ -86,8 +86,8 @@ class Suggestion:
             return f"{photo}: of all candidates, this one would determine the lens best."
         where = "image and focal range" if len(self.focals) > 1 else "the image"
         return (
-            f"{photo}: the standard deviation of the displacement, averaged over {where}, "
-            f"would fall from {self.before:.2g} to {self.after:.2g} px."
+            f"{photo}: the standard deviation of the displacement, in the geometric mean over "
+            f"{where}, would fall from {self.before:.2g} to {self.after:.2g} px."
         )
 
 
