@@ -145,7 +145,8 @@ onload = async () => {
     input.value = step;
     input.dispatchEvent(new Event("input"));
     const images = ["zoom-before", "zoom-after"].map((name) => page.getElementById(name));
-    await Promise.all(images.map((image) => image.decode()));
+    const loaded = (image) => image.complete || new Promise((done) => { image.onload = done; });
+    await Promise.all(images.map(loaded));
     found.push([step, page.getElementById("zoom-photo").textContent, ...images.map((image) => image.src),
       images.every((image) => image.naturalWidth > 0 && image.getBoundingClientRect().width > 100)]);
   }
