@@ -5,7 +5,8 @@
 Compression could add up the products of its seven columns (1, z, r²z, r⁴z) and factor the sum, or add up
 the 22 monomials behind it. Both are timed without any factorisation, in as many threads as there are cores,
 as compression works; in turns with compression and with one pass over the points' memory (the sum of
-squares). The loss is the RMS that a straight line is given at no distortion, where it is zero: the largest
+squares). So are the products of the 21 columns that are exact for any centre, beside `compress_any_centre`.
+The loss is the RMS that a straight line is given at no distortion, where it is zero: the largest
 of 300 lines, 640 x 480 px. Results go to benchmarks/results/gram.md and gram.json.
 """
 
@@ -22,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import zoomjax as zj
+from zoomjax.lines import compress_any_centre
 
 from .shared import RESULTS, machine, machine_line, table, write
 
@@ -41,6 +43,16 @@ def columns(points):
 def gram(points):
     """The Gram matrix of the columns of one line."""
     a = columns(points)
+    return a @ a.T
+
+
+def any_gram(points):
+    """The Gram matrix of the monomials up to degree 5: of two coefficients, about any centre."""
+    x, y = points.T[:, None]
+    degree = [jnp.ones_like(x)]
+    for _ in range(5):
+        degree.append(jnp.concatenate([x * degree[-1], y * degree[-1][-1:]]))
+    a = jnp.concatenate(degree)
     return a @ a.T
 
 
@@ -121,13 +133,15 @@ def run(number: int) -> dict:
         focal_unit="mm",
     )
     one_pass = jax.jit(lambda points: jnp.sum(points * points))
-    by_gram, by_sums = threaded(gram), threaded(monomials, 2)
+    by_gram, by_sums, by_any = threaded(gram), threaded(monomials, 2), threaded(any_gram)
     seconds = in_turns(
         {
             "pass": lambda: one_pass(points),
             "gram": lambda: by_gram(points),
             "monomials": lambda: by_sums(points),
             "compress": lambda: zj.compress(lines).triangle,
+            "any_gram": lambda: by_any(points),
+            "any_centre": lambda: compress_any_centre(lines).triangle,
         }
     )
     passes = {name: t / seconds["pass"] for name, t in seconds.items()}
@@ -151,6 +165,8 @@ def page(r: dict) -> str:
         "gram": "columns and their Gram product, no factorisation",
         "monomials": "sums of the 22 monomials, no factorisation",
         "compress": "`compress`",
+        "any_gram": "the 21 columns for any centre and their Gram product, no factorisation",
+        "any_centre": "`compress_any_centre`",
     }
     times = [
         [name, f"{r['seconds'][key] * 1e3:.0f} ms", f"{r['passes'][key]:.1f}"]
