@@ -241,14 +241,6 @@ def test_coordinates_in_units_of_the_image_are_told(unit):
         zj.Lines.from_ragged(lines, [0, 0], [35.0], image_size=(640, 480))
 
 
-def test_lines_given_twice_are_told():
-    t = np.linspace(0.0, 479.0, 20)
-    line, other = (np.stack([np.full(20, x), t], axis=-1) for x in (9, 630))
-    with pytest.warns(UserWarning, match=r"2 of 4 lines have the points of another line at the same focal"):
-        zj.Lines.from_ragged([line, other, line, other], [0, 0, 1, 1], [35.0, 35.0], image_size=(640, 480))
-    zj.Lines.from_ragged([line, other, line, other], [0, 0, 1, 1], [35.0, 50.0], image_size=(640, 480))
-
-
 @pytest.mark.parametrize("offset", [(-40, 0), (0, 40)])
 def test_points_far_outside_of_the_image_are_told(offset):
     with pytest.warns(UserWarning, match=r"5 of 10 points lie outside of the image of 6 x 4 px, by up to"):

@@ -3,7 +3,6 @@
 import math
 import operator
 import warnings
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -194,17 +193,6 @@ def warn_of_units(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -
         warnings.warn(
             f"All points lie within {across:.3g} x {down:.3g} px of an image of {size[0]} x {size[1]} px. "
             "Coordinates are pixels, from 0 in the middle of the first: are these in units of its size?",
-            stacklevel=3,
-        )
-
-
-def warn_of_repeated_lines(lines: Sequence[np.ndarray], focal: np.ndarray) -> None:
-    """Warn of lines with the same points at the same focal length: copies make a lens look better known."""
-    seen = {(float(f), line.tobytes()) for f, line in zip(focal, lines, strict=True)}
-    if again := len(lines) - len(seen):
-        warnings.warn(
-            f"{again:,} of {len(lines):,} lines have the points of another line at the same focal length. "
-            "Copies add no information, but make deviations smaller: give each line once.",
             stacklevel=3,
         )
 

@@ -28,7 +28,6 @@ from .._core.checks import (
     checked_unit,
     usable_lines,
     warn_of_points_outside,
-    warn_of_repeated_lines,
     warn_of_units,
 )
 from .._core.fields import booleans, check_present, check_shapes, integers, known, numbers
@@ -128,7 +127,7 @@ class Lines(AbstractLines):
         Warns:
             UserWarning: lines with fewer than 3 distinct points are dropped; the message counts them. Or
                 points lie outside of the image, or all within two px of one another, as if they were not
-                in px; or two lines have the same points at the same focal length.
+                in px.
 
         Example:
             >>> import numpy as np
@@ -155,7 +154,6 @@ class Lines(AbstractLines):
         warn_of_points_outside(padded, mask, size)
         if not chunk:
             warn_of_units(padded, mask, size)
-            warn_of_repeated_lines(arrays, focals[frames])
         return cls(
             points=held_as_given(padded),
             mask=held_as_given(mask),
