@@ -170,7 +170,8 @@ def _turns(lines, model, unfitted, narrowing=_NARROWING):
             model = model.with_zoom(fit_zoom(weighted, zoom=model, invertible=False, throw=False).lens.zoom)
         elif isinstance(model.zoom, AbstractLinearZoom):
             model = algebraic_model(lines, model)
-    weighted, zoom = _reweighted(lines, model.zoom, jnp.asarray(narrowing, lines.focal.dtype))
+    dtype = jax.dtypes.canonicalize_dtype(lines.focal.dtype)
+    weighted, zoom = _reweighted(lines, model.zoom, jnp.asarray(narrowing, dtype))
     return weighted, model.with_zoom(zoom)
 
 
