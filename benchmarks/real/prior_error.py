@@ -55,6 +55,7 @@ def basis_of(shortest: float, focal: np.ndarray) -> np.ndarray:
 def precision_of(zoom: zj.SmoothZoom) -> np.ndarray:
     """The matrix of the prior's quadratic form in the parameters."""
     zero = zoom.prepare(jnp.array([1.0]), 2)
+    assert zero.parameters is not None
     shape = zero.parameters.shape
     rows = jax.jacfwd(lambda flat: with_parameters(zero, flat.reshape(shape)).standardised())(
         jnp.zeros(DIRECTIONS)
@@ -156,7 +157,7 @@ def clip_errors(clip: Clip, draw: int) -> dict[str, dict[str, list[float]]]:
     found: dict[str, dict[str, list[float]]] = {}
     for metric, lines in {"corrected": small, "distorted": zj.fit.in_image(small)}.items():
         start = jax.vmap(zj.fit_zoom(lines).lens.zoom)(jnp.asarray(focal))
-        score, second = map(np.asarray, frame_normal_equations(lines, start))
+        score, second = map(np.asarray, frame_normal_equations(lines, jnp.asarray(start)))
         k = np.asarray(start) - np.linalg.solve(second, score[..., None])[..., 0]
         variance = (SCALE * float(own.error)) ** 2
         basis = basis_of(focal.min(), focal)
