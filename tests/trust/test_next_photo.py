@@ -85,7 +85,7 @@ def test_adding_what_is_suggested_helps_more_than_adding_others(scene, lens, req
     fit, small = fitted(lines)
     suggestion = zj.suggest_next(fit, small, focal_range=RANGE)
     number = int(np.median(np.bincount(np.asarray(lines.frame))))
-    zero = jnp.zeros((lines.frame.shape[0], 1))
+    zero = jnp.zeros((lines.focal.shape[0], 1))
     extent = jnp.sum(small.corrected(zero) ** 2, axis=(1, 2)) / small.counts
     length = jnp.sqrt(12 * jnp.median(extent))
     points = int(np.median(small.counts))

@@ -80,7 +80,7 @@ def problem_of(given: Given, asked: Asked) -> Problem:
     shot = _shots(track, moment, tracks.frames)
     frames = bucket(tracks.frames)
     more = frames - tracks.frames
-    lines, line_frame = _ready_lines(given, asked.family, asked.family.size(asked.terms))
+    lines, line_frame = _ready_lines(given, frames, asked.family, asked.family.size(asked.terms))
     block = _block(track, moment, frames)
     piece = _pieces(track, moment, block)
     structure = structure_of(piece, moment, frames, block, line_frame=line_frame)
@@ -147,8 +147,8 @@ def _known_readout(readout):
     return readout, _TOLD
 
 
-def _ready_lines(given, family, size):
-    """Compressed lines, padded to one of few numbers of lines, and their frames."""
+def _ready_lines(given, padded_frames, family, size):
+    """Compressed lines, padded to one of few numbers of lines, and their frames among so many."""
     lines, line_frames, tracks = given.lines, given.line_frames, given.tracks
     if lines is None:
         if line_frames is not None:
@@ -182,11 +182,10 @@ def _ready_lines(given, family, size):
     frame = np.pad(frame, (0, more))
     triangle = jnp.pad(small.triangle.astype(float), ((0, more), (0, 0), (0, 0)))
     weight = jnp.pad(_relative_weights(small), (0, more))
-    ones = jnp.ones(1)  # nothing here depends on focal lengths
     ready = AnyCentreLines(
         triangle=triangle,
-        frame=jnp.zeros_like(frame),
-        focal=ones,
+        frame=frame,
+        focal=jnp.ones(padded_frames),  # nothing here depends on them
         centre=small.centre,
         image_size=small.image_size,
         focal_unit=small.focal_unit,

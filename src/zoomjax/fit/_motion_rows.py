@@ -122,8 +122,8 @@ def _corrected_lines(data, model, rows):
     far = (jnp.asarray(data.size) - 1) / 2 / data.scale
     expand = jax.vmap(lambda k: jnp.asarray(model.family.expansion(k, far @ far)[0]))
     frame = data.structure.line_frame
-    powers = expand(rows.coefficients[0])[frame]
-    return data.lines.corrected(jnp.concatenate([powers, rows.offset[frame]], axis=1)), powers
+    powers = expand(rows.coefficients[0])
+    return data.lines.corrected(jnp.concatenate([powers, rows.offset], axis=1)), powers[frame]
 
 
 def weighed(data: Data, noise: Noise, rows: Float[Array, "line row"]) -> Float[Array, "line row"]:

@@ -86,7 +86,7 @@ def weighted_distances(
             f"Argument coefficients must have a row for each of the {lines.focal.shape[0]} frames, but its "
             f"shape is {coefficients.shape}."
         )
-    distances = jax.vmap(line_residuals)(lines.corrected(coefficients[lines.frame]))
+    distances = jax.vmap(line_residuals)(lines.corrected(coefficients))
     weights = line_weights(lines)
     counted = weights > 0  # the root has no derivative at 0
     return jnp.where(counted, jnp.sqrt(jnp.where(counted, weights, 1)), 0)[:, None] * distances
@@ -192,7 +192,7 @@ def line_squares_by_frame(
 
 
 def _line_squares(lines, coefficients):
-    distances = jax.vmap(line_residuals)(lines.corrected(coefficients[lines.frame]))
+    distances = jax.vmap(line_residuals)(lines.corrected(coefficients))
     return jnp.sum(distances**2, axis=1) / jnp.maximum(lines.counts, 1)
 
 

@@ -114,7 +114,7 @@ def reject_points(
 @program
 def _distances(lines, family, zoom):
     """Signed distance of each corrected point from the line that most agree on, and each line's spread."""
-    corrected = with_family(lines, family).corrected(coefficients_by(zoom, lines)[lines.frame])
+    corrected = with_family(lines, family).corrected(coefficients_by(zoom, lines))
     distance, spread = jax.vmap(_from_most)(corrected, lines.mask)
     counts = lines.counts
     typical = jnp.nanmedian(jnp.where(counts >= _FEWEST, spread, jnp.nan))

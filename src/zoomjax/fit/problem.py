@@ -80,7 +80,7 @@ class Problem(AbstractLines):
         """``sum_p r_p^(2i) z_p z_p^T`` of the points as they were seen."""
         return self.lines.second_moments(order)
 
-    def corrected(self, coefficients: Float[Array, "line size"]) -> Float[Array, "line rows 2"]:
+    def corrected(self, coefficients: Float[Array, "frame size"]) -> Float[Array, "line rows 2"]:
         """Corrected points of each line about their mean, px, or rows with the same scatter.
 
         Measured in the distorted image, they are divided by the stretch across the line.
@@ -107,7 +107,7 @@ class Problem(AbstractLines):
         return self.lines.corrected(powers)
 
     def squared_stretch(
-        self, coefficients: Float[Array, "line size"], normals: Float[Array, "line 2"]
+        self, coefficients: Float[Array, "frame size"], normals: Float[Array, "line 2"]
     ) -> Float[Array, "line"]:
         """The mean of ``|J^T n|^2`` over each line's points."""
         if isinstance(self.lines, AnyCentreLines):
@@ -121,15 +121,15 @@ class Problem(AbstractLines):
         lines, k = self._moved(coefficients)
         z = (jnp.asarray(lines.points) - lines.centre[None, None]) / self.scale
         of_line = jax.vmap(stretch_of_points, in_axes=(0, 0, 0, 0, None))
-        return of_line(z, jnp.asarray(lines.mask), k, normals, self.family)
+        return of_line(z, jnp.asarray(lines.mask), k[lines.frame], normals, self.family)
 
     def _moved(self, coefficients):
-        """Points as the centre of each line sees them, and its coefficients without the centre's offset."""
+        """Points as the centre of each frame sees them, and coefficients without the centre's offset."""
         if not self.any_centre:
             return self.lines, coefficients
         k, offset = coefficients[:, :-2], coefficients[:, -2:]
         assert isinstance(self.lines, Lines)
-        moved = jnp.asarray(self.lines.points) - self.scale * offset[:, None]
+        moved = jnp.asarray(self.lines.points) - self.scale * offset[self.frame][:, None]
         return eqx.tree_at(lambda of: of.points, self.lines, moved), k
 
     def _powers_and_offset(self, coefficients):
@@ -144,11 +144,11 @@ class Problem(AbstractLines):
             )
         far = jnp.maximum(self.centre, jnp.asarray(self.image_size) - 1 - self.centre) / self.scale
 
-        def of_line(k):
+        def of_frame(k):
             reach = far + jnp.abs(k[-2:])
             return jnp.concatenate([jnp.asarray(self.family.expansion(k[:-2], reach @ reach)[0]), k[-2:]])
 
-        return jax.vmap(of_line)(coefficients)
+        return jax.vmap(of_frame)(coefficients)
 
     def _check(self, size):
         """Refuse lines that were compressed for something else."""

@@ -213,7 +213,7 @@ def _weights(lines, model, cut):
 @light_program
 def _line_rms(lines, model):
     """RMS distance of each line, px, over its degrees of freedom, and the median over lines."""
-    corrected = lines.corrected(coefficients_by(model, lines)[lines.frame])
+    corrected = lines.corrected(coefficients_by(model, lines))
     squares = jnp.sum(jax.vmap(line_residuals)(corrected) ** 2, axis=1)
     line_rms = jnp.sqrt(squares / jnp.maximum(lines.counts - 2, 1))
     return line_rms, _median(line_rms, _counted(lines))

@@ -18,6 +18,8 @@ def triangle(columns: Float[Array, "rows point"]) -> Float[Array, "rows rows"]:
     if jax.default_backend() != "cpu":
         return _orthogonalise_apart(list(columns))
     size, points = columns.shape
+    if points <= _RUN:
+        return _orthogonalise(columns)
     runs = -(-points // _RUN)
     whole = points - points % runs
     triangles = jax.vmap(_orthogonalise, in_axes=1)(columns[:, :whole].reshape(size, runs, -1))

@@ -108,10 +108,10 @@ class AbstractLines(eqx.Module):
         """Number of points of each line, Np(l, m); 0 marks a line that is not there."""
 
     @abc.abstractmethod
-    def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
+    def corrected(self, coefficients: Float[Array, "frame size"]) -> Float[Array, "line rows 2"]:
         """Corrected points of each line about their mean, px, or rows with the same scatter.
 
-        `coefficients` are those of each line's own frame. Rows beyond a line's end are zero.
+        `coefficients` are those of each frame. Rows beyond a line's end are zero.
         """
 
     @abc.abstractmethod
@@ -124,15 +124,15 @@ class AbstractLines(eqx.Module):
         return jnp.concatenate([self.counts[:, None].astype(traces.dtype), traces], axis=1)
 
     def squared_stretch(
-        self, coefficients: Float[Array, "line size"], normals: Float[Array, "line 2"]
+        self, coefficients: Float[Array, "frame size"], normals: Float[Array, "line 2"]
     ) -> Float[Array, "line"]:
         """The mean of ``|J^T n|^2`` over each line's points: see `zoomjax.fit.in_image`.
 
-        J is the derivative of the correction by a line's own coefficients. By moments: for radial models.
+        J is the derivative of the correction by the frame's coefficients. By moments: for radial models.
         """
         powers, _ = self.expansion(coefficients)
         moments = self.second_moments(2 * powers.shape[1])
-        return jax.vmap(radial_stretch)(powers, normals, moments, self.counts)
+        return jax.vmap(radial_stretch)(powers[self.frame], normals, moments, self.counts)
 
     @abc.abstractmethod
     def about(self, centre: Centres) -> "AbstractLines":

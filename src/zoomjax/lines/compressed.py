@@ -79,22 +79,18 @@ class CompressedLines(AbstractTriangles):
                 f"compress(lines, terms={terms})."
             )
 
-    def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
+    def corrected(self, coefficients: Float[Array, "frame terms"]) -> Float[Array, "line rows 2"]:
         """Rows, px, with the scatter of the corrected points about their mean.
 
         Raises:
             ValueError: there are more coefficients than the lines were compressed for.
         """
         self.check_terms(coefficients.shape[1])
-        return self.scale * jax.vmap(_combine)(self.triangle, coefficients)
+        return self.scale * jax.vmap(_combine)(self.triangle, coefficients[self.frame])
 
     def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
         """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1, with an order of at most 2 N + 1."""
-        columns = self.triangle[..., 1:].reshape(*self.triangle.shape[:2], -1, 2)
-        halves = [(total // 2, total - total // 2) for total in range(order)]
-        product = partial(jnp.einsum, "lrc,lrd->lcd", precision=EXACT)
-        products = [product(columns[:, :, i], columns[:, :, j]) for i, j in halves]
-        return jnp.stack(products, axis=1)
+        return moments_of(self.triangle, order)
 
     def about(self, centre: Centres) -> "CompressedLines":
         """These lines, if `centre` is their centre, px.
@@ -108,6 +104,14 @@ class CompressedLines(AbstractTriangles):
                 "the lines about that centre, or by compress_any_centre, or pass the lines themselves."
             )
         return self
+
+
+def moments_of(rows: Float[Array, "line row column"], order: int) -> Float[Array, "line moment 2 2"]:
+    """`second_moments`, of rows that stand for the columns A of each line."""
+    columns = rows[..., 1:].reshape(*rows.shape[:2], -1, 2)
+    halves = [(total // 2, total - total // 2) for total in range(order)]
+    product = partial(jnp.einsum, "lrc,lrd->lcd", precision=EXACT)
+    return jnp.stack([product(columns[:, :, i], columns[:, :, j]) for i, j in halves], axis=1)
 
 
 def _combine(triangle, k):

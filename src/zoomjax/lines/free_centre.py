@@ -27,7 +27,7 @@ from .._core.types import Centres, traced
 from ._triangle import triangle
 from .base import header_of
 from .buckets import bucketed_jit, of_lines
-from .compressed import CompressedLines, triangles_of
+from .compressed import CompressedLines, moments_of, triangles_of
 from .lines import Lines
 from .triangles import AbstractTriangles
 
@@ -63,55 +63,58 @@ class AnyCentreLines(AbstractTriangles):
             return self
         return eqx.tree_at(lambda lines: lines.triangle, self, self.triangle[:, :size, :size])
 
-    def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
+    def corrected(self, coefficients: Float[Array, "frame size"]) -> Float[Array, "line rows 2"]:
         """Rows, px, with the scatter of the corrected points about their mean.
 
         The last two of the `coefficients`, after (k1, ..., kN), are the centre's offset from `centre`,
         normalised.
         """
-
-        def combine(r, k):
-            return jnp.matmul(r[1:], _corrected_point(self.terms, k[:-2], k[-2:]).T, precision=EXACT)
-
-        return self.scale * jax.vmap(combine)(self.triangle, coefficients)
+        return self._rows(self._moved_points(coefficients))
 
     def decentred(
-        self, k: Float[Array, "line terms"], tangential: Float[Array, "line 2"]
+        self, k: Float[Array, "frame terms"], tangential: Float[Array, "frame 2"]
     ) -> Float[Array, "line rows 2"]:
-        """Such rows about `centre`, of the radial polynomial and the coefficients (p1, p2) of each line."""
-
-        def combine(r, k, p):
-            # The rows of R after the first hold the points about their mean.
-            return jnp.matmul(r[1:], _decentred_point(self.terms, k, p).T, precision=EXACT)
-
-        return self.scale * jax.vmap(combine)(self.triangle, k, tangential)
+        """Such rows about `centre`, of the radial polynomial and the coefficients (p1, p2) of frames."""
+        return self._rows(self._decentred_points(k, tangential))
 
     def squared_stretch(
-        self, coefficients: Float[Array, "line size"], normals: Float[Array, "line 2"]
+        self, coefficients: Float[Array, "frame size"], normals: Float[Array, "line 2"]
     ) -> Float[Array, "line"]:
         """The mean of ``|J^T n|^2`` over each line's points, of the corrections of `corrected`."""
-
-        def of_line(r, k, normal):
-            return _stretch(self.terms, r, normal @ _corrected_point(self.terms, k[:-2], k[-2:]))
-
-        return jax.vmap(of_line)(self.triangle, coefficients, normals)
+        return self._stretches(self._moved_points(coefficients), normals)
 
     def decentred_stretch(
         self,
-        k: Float[Array, "line terms"],
-        tangential: Float[Array, "line 2"],
+        k: Float[Array, "frame terms"],
+        tangential: Float[Array, "frame 2"],
         normals: Float[Array, "line 2"],
     ) -> Float[Array, "line"]:
         """The same of the corrections of `decentred`."""
+        return self._stretches(self._decentred_points(k, tangential), normals)
 
-        def of_line(r, k, p, normal):
-            return _stretch(self.terms, r, normal @ _decentred_point(self.terms, k, p))
+    def _moved_points(self, coefficients):
+        """The corrected point by monomials, of each frame: its lines share it."""
+        return jax.vmap(lambda k: _corrected_point(self.terms, k[:-2], k[-2:]))(coefficients)
 
-        return jax.vmap(of_line)(self.triangle, k, tangential, normals)
+    def _decentred_points(self, k, tangential):
+        return jax.vmap(lambda k, p: _decentred_point(self.terms, k, p))(k, tangential)
+
+    def _rows(self, points):
+        def combine(r, point):  # the rows of R after the first hold the points about their mean
+            return jnp.matmul(r, point.T, precision=EXACT)[1:]
+
+        return self.scale * jax.vmap(combine)(self.triangle, points[self.frame])
+
+    def _stretches(self, points, normals):
+        def of_line(r, point, normal):
+            return _stretch(self.terms, r, normal @ point)
+
+        return jax.vmap(of_line)(self.triangle, points[self.frame], normals)
 
     def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
         """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1, at most 2 N + 1, z from `centre`."""
-        return self.about(self.centre).second_moments(order)
+        columns = _radial_columns(self.terms, jnp.zeros(2, self.triangle.dtype))
+        return moments_of(jnp.matmul(self.triangle, columns.T, precision=EXACT), order)
 
     def about(self, centre: Centres) -> CompressedLines:
         """The lines compressed about a fixed centre, px: that of all frames, or of each frame.
@@ -265,26 +268,30 @@ def _moved(lines, centres):
     a, b = _powers(terms)
     binomials = np.array([[math.comb(i, j) for i in range(2 * terms + 2)] for j in range(2 * terms + 2)])
 
-    def one(r, offset):
+    def change(offset):
         powers = jnp.stack([(-offset) ** power for power in range(2 * terms + 2)], axis=1)
 
         def of(axis, lower, upper):  # what of lower^ there is in (x - offset)^upper
             rest = np.maximum(upper[None] - lower[:, None], 0)
-            return jnp.asarray(binomials[lower[:, None], upper[None]], r.dtype) * powers[axis][rest]
+            return jnp.asarray(binomials[lower[:, None], upper[None]], offset.dtype) * powers[axis][rest]
 
-        return triangle(jnp.matmul(r, of(0, a, a) * of(1, b, b), precision=EXACT).T)
+        return of(0, a, a) * of(1, b, b)
 
-    return jax.vmap(one)(lines.triangle, _offsets(lines, centres))
+    def one(r, change):
+        return triangle(jnp.matmul(r, change, precision=EXACT).T)
+
+    return jax.vmap(one)(lines.triangle, jax.vmap(change)(_offsets(lines, centres))[lines.frame])
 
 
 @bucketed_jit(frames=["centres"], returns=of_lines, light=False)
 def _about(lines, centres):
-    def one(r, offset):
-        return triangle(jnp.matmul(_radial_columns(lines.terms, offset), r.T, precision=EXACT))
+    def one(r, columns):
+        return triangle(jnp.matmul(r, columns.T, precision=EXACT).T)
 
-    return jax.vmap(one)(lines.triangle, _offsets(lines, centres))
+    columns = jax.vmap(lambda offset: _radial_columns(lines.terms, offset))(_offsets(lines, centres))
+    return jax.vmap(one)(lines.triangle, columns[lines.frame])
 
 
 def _offsets(lines, centres):
-    """Of each line's centre from that of the monomials, normalised."""
-    return ((centres - lines.centre[None]) / lines.scale)[lines.frame]
+    """Of each frame's centre from that of the monomials, normalised."""
+    return (centres - lines.centre[None]) / lines.scale

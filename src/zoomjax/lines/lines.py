@@ -256,7 +256,7 @@ class Lines(AbstractLines):
         """Number of points of each line."""
         return jnp.sum(self.mask, axis=1).astype(jnp.asarray(self.points).dtype)
 
-    def corrected(self, coefficients: Float[Array, "line terms"]) -> Float[Array, "line rows 2"]:
+    def corrected(self, coefficients: Float[Array, "frame terms"]) -> Float[Array, "line rows 2"]:
         """Corrected points of each line about their mean, px."""
         return corrected_points(self, self.family, coefficients)
 
@@ -289,12 +289,12 @@ class Lines(AbstractLines):
 
 
 def corrected_points(
-    lines: Lines, family: AbstractFamily, coefficients: Float[Array, "line size"]
+    lines: Lines, family: AbstractFamily, coefficients: Float[Array, "frame size"]
 ) -> Float[Array, "line point 2"]:
-    """Points of each line, corrected by a family's `coefficients` of each, about their mean, px."""
-    return jax.vmap(_correct_line, in_axes=(0, 0, 0, None, None, None))(
-        jnp.asarray(lines.points), jnp.asarray(lines.mask), coefficients, lines.centre, lines.scale, family
-    )
+    """Points of each line, corrected by a family's `coefficients` of its frame, about their mean, px."""
+    points, mask, k = jnp.asarray(lines.points), jnp.asarray(lines.mask), coefficients[lines.frame]
+    correct = jax.vmap(_correct_line, in_axes=(0, 0, 0, None, None, None))
+    return correct(points, mask, k, lines.centre, lines.scale, family)
 
 
 def _correct_line(points, mask, k, centre, scale, family):

@@ -231,8 +231,10 @@ def _noise(lines: AbstractLines, lens: ZoomLens, counted: np.ndarray) -> float:
 
 @light_program
 def _corrected(lines, index, zoom):
-    some = lines.take(index, jnp.ones(len(index), bool))
-    return some.corrected(coefficients_by(zoom, lines)[lines.frame[index]])
+    def one(line, k):
+        return lines.take(line[None], jnp.ones(1, bool)).corrected(k[None])[0]
+
+    return jax.vmap(one)(index, coefficients_by(zoom, lines)[lines.frame[index]])
 
 
 def _roughness(points: np.ndarray) -> float:
@@ -326,7 +328,7 @@ def _partings(lines: AbstractLines, fit: ZoomFit, weight: np.ndarray) -> dict[st
 @bucketed_jit(returns=of_lines)
 def _extent(lines, zoom):
     """How far each corrected line reaches, squared: across the image and down."""
-    rows = lines.corrected(coefficients_by(zoom, lines)[lines.frame])
+    rows = lines.corrected(coefficients_by(zoom, lines))
     return jnp.sum(rows**2, axis=1)
 
 

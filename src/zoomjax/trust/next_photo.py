@@ -187,7 +187,7 @@ def _typical(lines):
 
 @bucketed_jit(returns=[of_lines] * 3)
 def _sizes(lines):
-    unchanged = lines.corrected(jnp.zeros((lines.frame.shape[0], lines.family.size(1)), lines.focal.dtype))
+    unchanged = lines.corrected(jnp.zeros((lines.focal.shape[0], lines.family.size(1)), lines.focal.dtype))
     return line_weights(lines), lines.counts, jnp.sum(unchanged**2, axis=(1, 2))
 
 
