@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
-from zoomjax.lines import _triangle
+from zoomjax.lines import reduction
 
 from ..conftest import moved
 
@@ -81,7 +81,7 @@ def test_columns_apart_as_on_a_gpu_give_the_same_triangle(dtype, rng):
     for z in lines:
         squared = np.sum(z * z, axis=0)
         columns = jnp.asarray(np.vstack([squared**0, z, squared * z, squared**2 * z]), dtype)
-        one, other = (np.asarray(f(columns)) for f in (_triangle._orthogonalise, apart))
+        one, other = (np.asarray(f(columns)) for f in (reduction._orthogonalise, apart))
         size = np.linalg.norm(one, axis=0)
         np.testing.assert_allclose(
             other.T @ other / np.outer(size, size), one.T @ one / np.outer(size, size), atol=20 * eps
@@ -90,7 +90,7 @@ def test_columns_apart_as_on_a_gpu_give_the_same_triangle(dtype, rng):
 
 
 def apart(columns):
-    return _triangle._orthogonalise_apart(list(columns))
+    return reduction._orthogonalise_apart(list(columns))
 
 
 def test_straight_lines_stay_straight_to_rounding():

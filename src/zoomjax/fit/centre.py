@@ -167,15 +167,16 @@ def fit_centre(
     ready, given = ready_model(lines, model), lines
     lines = for_any_centre(bucketed(lines), model.terms)
     unfitted = model.zoom.parameters is None
-    options = {"algebraic": unfitted, "solver": solver, "max_steps": max_steps, "throw": throw}
-    fixed = fit_about(_about(lines, lines.centre, model), ready, **options)
+    options = {"solver": solver, "max_steps": max_steps, "throw": throw}
+    fixed = fit_about(_about(lines, lines.centre, model), ready, algebraic=unfitted, **options)
     offset = prepared_for(given, PolynomialZoom(degree=0) if centre is None else centre, 2)
     start = _both(fixed.lens.zoom, offset)
     found, each, covariance, std, determined = _search(
         for_terms(lines, model.terms), start, solver or default_solver(lines), max_steps
     )
     # Once more about these centres, for all else that is to know of a fit: the same compiled program.
-    fit = fit_about(_about(lines, each, model), ready, **options)
+    near = ready.with_zoom(found.first())
+    fit = fit_about(_about(lines, each, model), near, algebraic=False, **options)
     fit = _about_centres(lines, fit, found, each, covariance, determined)
     each, std = of_frames(each, given), of_frames(std, given)
     return CentreFit(of_given(fit, given), each, std, determined, fixed.rms, covariance)

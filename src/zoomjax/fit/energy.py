@@ -17,11 +17,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._core.arguments import kinds_checked
 from .._core.fields import numbers
+from .._core.products import EXACT
 from .._core.programs import light_program
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines
 from ..lines.best_line import line_residuals
 from ..lines.buckets import bucketed_jit, of_frames, of_lines
+from ..lines.reduction import triangle
 from ..models.zoom import (
     AbstractFocusZoom,
     AbstractPriorZoom,
@@ -206,16 +208,39 @@ def global_energy(
     return jnp.sum(residuals(lines, k) ** 2)
 
 
+def by_own_coefficients(
+    lines: AbstractLines, coefficients: Float[Array, "frame size"]
+) -> tuple[Float[Array, "line rows"], Float[Array, "line rows size"]]:
+    """The residuals of `weighted_distances`, and their derivatives by the coefficients of their own frame.
+
+    Residuals depend on no others: one direction serves all frames at once.
+    """
+
+    def along(direction):
+        every = jnp.broadcast_to(direction[None], coefficients.shape)
+        return jax.jvp(lambda k: weighted_distances(lines, k), (coefficients,), (every,))
+
+    directions = jnp.eye(coefficients.shape[1], dtype=coefficients.dtype)
+    return jax.vmap(along, out_axes=(None, -1))(directions)
+
+
 def linearised(lines, zoom):
-    """The residuals and their derivatives by the flattened parameters, a row a residual."""
+    """The residuals and their derivatives by the flattened parameters, a row a residual.
+
+    Of a line with more rows than these have coefficients, and one, those of its triangle stand for them.
+    """
     flat, unravel = ravel_pytree(zoom.parameters)
 
-    def function(flat):
-        k = coefficients_by(with_parameters(zoom, unravel(flat)), lines)
-        return (weighted := weighted_distances(lines, k)), weighted
+    def coefficients_at(flat):
+        return (k := coefficients_by(with_parameters(zoom, unravel(flat)), lines)), k
 
-    jacobian, weighted = jax.jacfwd(function, has_aux=True)(flat)
-    return weighted, jacobian
+    by_parameter, k = jax.jacfwd(coefficients_at, has_aux=True)(flat)
+    weighted, own = by_own_coefficients(lines, k)
+    if own.shape[1] > own.shape[2] + 1:
+        columns = jnp.concatenate([weighted[:, None], jnp.swapaxes(own, 1, 2)], axis=1)
+        triangles = jax.vmap(triangle)(columns)
+        weighted, own = triangles[..., 0], triangles[..., 1:]
+    return weighted, jnp.einsum("lrk,lkp->lrp", own, by_parameter[lines.frame], precision=EXACT)
 
 
 @bucketed_jit(frames=["coefficients"], returns=[of_frames, of_frames])
@@ -224,16 +249,9 @@ def frame_normal_equations(
 ) -> tuple[Float[Array, "frame size"], Float[Array, "frame size size"]]:
     """Half the gradient of each frame's error (eq. 3) by its own coefficients, and the Gauss-Newton matrix.
 
-    A frame's residuals depend on its own coefficients alone: one direction serves all frames at once. Of
-    lines for any centre, coefficients end with the centre's offset.
+    Of lines for any centre, coefficients end with the centre's offset.
     """
-
-    def along(direction):
-        every = jnp.broadcast_to(direction[None], coefficients.shape)
-        return jax.jvp(lambda k: weighted_distances(lines, k), (coefficients,), (every,))
-
-    directions = jnp.eye(coefficients.shape[1], dtype=coefficients.dtype)
-    weighted, jacobian = jax.vmap(along, out_axes=(None, -1))(directions)
+    weighted, jacobian = by_own_coefficients(lines, coefficients)
     number = number_counted(counted_frames(lines)).astype(coefficients.dtype)
     gradient = number * jnp.einsum("lr,lri->li", weighted, jacobian)
     matrix = number * jnp.einsum("lri,lrj->lij", jacobian, jacobian)

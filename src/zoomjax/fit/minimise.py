@@ -1,7 +1,7 @@
 """Minimisation of the global energy (eq. 13) over the parameters of a zoom model, and the fit around it.
 
 Compiled once for a shape of the lines; once per fit an algebraic start and, after it, the covariance and
-the certificate; per iteration one Jacobian of the residuals.
+the certificate; per iteration one pass over the lines' rows, of which the solver sees `frame_residuals`.
 """
 
 import functools
@@ -15,7 +15,8 @@ from ._least_squares import default_solver
 from .algebraic import algebraic_model, algebraic_start
 from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
-from .energy import coefficients_by, prior_residuals, weighted_distances
+from .energy import coefficients_by, prior_residuals
+from .frame_residuals import frame_residuals
 from .result import described_fit, outcome_of, thrown
 
 
@@ -57,7 +58,7 @@ def minimise(lines, zoom, solver, max_steps):
     def function(parameters, args):
         lines, zoom = args
         zoom = with_parameters(zoom, parameters)
-        return weighted_distances(lines, coefficients_by(zoom, lines)), prior_residuals(lines, zoom)
+        return frame_residuals(lines, coefficients_by(zoom, lines)), prior_residuals(lines, zoom)
 
     start = jax.tree.map(jax.lax.stop_gradient, zoom.parameters)
     solution = optx.least_squares(

@@ -37,10 +37,10 @@ from .._core.checks import checked_terms
 from .._core.products import EXACT
 from .._core.programs import program
 from .._core.types import Centres, traced
-from ._triangle import triangle
 from .base import header_of
 from .buckets import bucketed
 from .lines import Lines
+from .reduction import triangle
 from .triangles import AbstractTriangles
 
 _AT_ONCE = 2**22

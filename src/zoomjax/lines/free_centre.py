@@ -24,11 +24,11 @@ from .._core.arguments import kinds_checked
 from .._core.checks import checked_terms
 from .._core.products import EXACT
 from .._core.types import Centres, traced
-from ._triangle import triangle
 from .base import header_of
 from .buckets import bucketed_jit, of_lines
 from .compressed import CompressedLines, moments_of, triangles_of
 from .lines import Lines
+from .reduction import triangle
 from .triangles import AbstractTriangles
 
 
