@@ -15,7 +15,7 @@ from ._least_squares import default_solver
 from .algebraic import algebraic_model, algebraic_start
 from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
-from .energy import coefficients_by, prior_residuals, weighted_distances
+from .energy import coefficients_by, line_distances, prior_residuals, root_weights
 from .result import described_fit, outcome_of, thrown
 
 
@@ -55,14 +55,15 @@ def minimise(lines, zoom, solver, max_steps):
     """The model at the minimum of the global energy, from its own parameters as the start."""
 
     def function(parameters, args):
-        lines, zoom = args
+        lines, zoom, roots = args
         zoom = with_parameters(zoom, parameters)
-        return weighted_distances(lines, coefficients_by(zoom, lines)), prior_residuals(lines, zoom)
+        return roots[:, None] * line_distances(lines, coefficients_by(zoom, lines)), prior_residuals(
+            lines, zoom
+        )
 
     start = jax.tree.map(jax.lax.stop_gradient, zoom.parameters)
-    solution = optx.least_squares(
-        function, solver, start, args=(lines, zoom), max_steps=max_steps, throw=False
-    )
+    args = (lines, zoom, root_weights(lines))
+    solution = optx.least_squares(function, solver, start, args=args, max_steps=max_steps, throw=False)
     return with_parameters(zoom, solution.value), solution.result, solution.stats["num_steps"]
 
 
