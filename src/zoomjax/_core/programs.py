@@ -19,6 +19,8 @@ import jax.core
 import jax.extend.core
 from jax.core import eval_context
 
+from .kept import kept
+
 _PLAINLY = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_backend_optimization_level": 1,
@@ -56,6 +58,8 @@ def program(function: Callable[_Given, _Result], *, light: bool = False) -> Call
         if not _at_once() or not (settings := _settings(light and _few((args, kwargs)))):
             return plain(*args, **kwargs)
         try:
+            if (run := kept(function, settings, args, kwargs)) is not None:
+                return run()
             return _with_settings(function, settings)(*args, **kwargs)
         except jax.errors.JaxRuntimeError as error:
             unknown = {name for name, _ in settings if f"No such compile option: '{name}'" in str(error)}
