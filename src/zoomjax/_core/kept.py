@@ -79,7 +79,7 @@ def keep_programs(folder: Path | None) -> None:
 
 def kept(function: Call, settings: tuple, args: tuple, kwargs: dict) -> Call | None:
     """A function of the same arguments that does what a program does; None where it is not kept."""
-    if _STORE.folder is None:
+    if _STORE.folder is None or jax.default_backend() != "cpu":
         return None
     leaves, tree = jax.tree.flatten((args, kwargs))
     arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
@@ -108,7 +108,7 @@ def _looked_up(folder, function, settings, given, arrays):
     structure, exported = found
     if exported is None:
         return None
-    compiled = jax.jit(exported.call, compiler_options=dict(settings))
+    compiled = jax.jit(exported.call, compiler_options=dict(settings) or None)
     return lambda *arrays: put_together(structure, iter(compiled(*arrays)))
 
 
@@ -153,25 +153,25 @@ def taken_apart(value: Any, arrays: list) -> Any:
             [name, taken_apart(value.__dict__[name], arrays)] for name in fields if name in value.__dict__
         ]
         return ["module", _named(type(value)), parts]
-    kind = type(value)
-    if kind in (list, tuple) or (isinstance(value, tuple) and hasattr(value, "_fields")):
+    if isinstance(value, functools.partial) and type(value) in (functools.partial, jax.tree_util.Partial):
+        parts = (value.func, value.args, value.keywords)
+        return [type(value).__name__, [taken_apart(part, arrays) for part in parts]]
+    if isinstance(value, enum.Enum):
+        return ["enum", _named(type(value)), value.name]
+    kind: type = type(value)
+    if isinstance(value, list | tuple) and (kind in (list, tuple) or hasattr(value, "_fields")):
         parts = [taken_apart(part, arrays) for part in value]
         return [kind.__name__, parts] if kind in (list, tuple) else ["named", _named(kind), parts]
-    if kind is dict and all(isinstance(name, str) for name in value):
+    if isinstance(value, dict) and kind is dict and all(isinstance(name, str) for name in value):
         return ["dict", [[name, taken_apart(value[name], arrays)] for name in sorted(value)]]
-    if kind is float:
+    if isinstance(value, float) and kind is float:
         return ["float", value.hex()]
     if value is None or kind in (bool, int, str):
         return ["plain", value]
     if isinstance(value, Mapping):
         return ["mapping", _named(kind), taken_apart(dict(value), arrays)]
-    if isinstance(value, enum.Enum):
-        return ["enum", _named(kind), value.name]
     if isinstance(value, np.dtype):
         return ["dtype", value.str]
-    if kind in (functools.partial, jax.tree_util.Partial):
-        parts = (value.func, value.args, value.keywords)
-        return [kind.__name__, [taken_apart(part, arrays) for part in parts]]
     return ["object", _named(value)]
 
 
@@ -239,7 +239,7 @@ def _is_here(array: Any) -> bool:
     return not isinstance(array, jax.Array) or array.devices() == {jax.local_devices()[0]}
 
 
-def _kind(leaf: Any) -> Hashable:
+def _kind(leaf: Any) -> tuple[Hashable, ...]:
     if not eqx.is_array(leaf):
         return type(leaf), leaf.hex() if isinstance(leaf, float) else leaf
     return leaf.shape, leaf.dtype, isinstance(leaf, jax.Array) and leaf.weak_type
