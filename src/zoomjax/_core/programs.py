@@ -19,6 +19,8 @@ import jax.core
 import jax.extend.core
 from jax.core import eval_context
 
+from .kept import kept
+
 _PLAINLY = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_backend_optimization_level": 1,
@@ -39,7 +41,9 @@ _Given = ParamSpec("_Given")
 _Result = TypeVar("_Result")
 
 
-def program(function: Callable[_Given, _Result], *, light: bool = False) -> Callable[_Given, _Result]:
+def program(
+    function: Callable[_Given, _Result], *, light: bool = False, optimised: bool = False
+) -> Callable[_Given, _Result]:
     """As ``equinox.filter_jit``, with settings of the compiler that save its time.
 
     Inside of ``jit``, ``vmap`` and ``grad`` the function is a part of another program, with the settings of
@@ -48,15 +52,19 @@ def program(function: Callable[_Given, _Result], *, light: bool = False) -> Call
     Args:
         function: what to compile.
         light: whether its work is small for small arguments.
+        optimised: whether its work is so much that XLA's own settings pay.
     """
     plain = eqx.filter_jit(function)
 
     @functools.wraps(function)
     def call(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
-        if not _at_once() or not (settings := _settings(light and _few((args, kwargs)))):
+        if not _at_once():
             return plain(*args, **kwargs)
+        settings = () if optimised else _settings(light and _few((args, kwargs)))
         try:
-            return _with_settings(function, settings)(*args, **kwargs)
+            if (run := kept(function, settings, args, kwargs)) is not None:
+                return run()
+            return (_with_settings(function, settings) if settings else plain)(*args, **kwargs)
         except jax.errors.JaxRuntimeError as error:
             unknown = {name for name, _ in settings if f"No such compile option: '{name}'" in str(error)}
             if not unknown:
@@ -66,6 +74,11 @@ def program(function: Callable[_Given, _Result], *, light: bool = False) -> Call
             return call(*args, **kwargs)
 
     return call
+
+
+def optimised_program(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
+    """`program` of a function with much work."""
+    return program(function, optimised=True)
 
 
 def light_program(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:

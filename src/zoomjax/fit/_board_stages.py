@@ -9,7 +9,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._core.programs import program
+from .._core.programs import optimised_program, program
 from ..models.invertibility import Certificate, certificate_of
 from ._board_rows import (
     LOSS,
@@ -132,7 +132,7 @@ def _bend_of(data, model):
     return jnp.maximum(jnp.sqrt(squares / (jnp.sum(photos) * model.bend.shape[1])), _LEAST_BEND)
 
 
-@eqx.filter_jit  # whose steps XLA's own settings make a quarter faster
+@optimised_program  # whose steps that makes a quarter faster
 def _solved(data, model, stage):
     """Poses, board and lens of least energy, the noise, the solver's status and its steps."""
     units = units_of(data, model, stage.noise)

@@ -43,19 +43,24 @@ def gram_schmidt(
     dtype = jnp.result_type(*parts)
     parts = [part.astype(dtype) for part in parts]
 
+    columns = jnp.arange(parts[0].shape[-1])
+
     def reduce(left, column):
-        own = [part[..., column] for part in left]
+        own = [jax.lax.dynamic_index_in_dim(part, column, -1, keepdims=False) for part in left]
         products = _total(
             jnp.tensordot(o, p, o.ndim, precision="highest") for o, p in zip(own, left, strict=True)
         )
         norm = jnp.sqrt(products[column])
         inverse = jnp.where(norm > 0, 1 / jnp.where(norm > 0, norm, 1), 0)
         units, row = [part * inverse for part in own], products * inverse
-        taken = [unit[..., None] * row.reshape((1,) * unit.ndim + (-1,)) for unit in units]
-        left = [(p - t).at[..., column].set(0) for p, t in zip(left, taken, strict=True)]
+        lasts = [(1,) * unit.ndim + (-1,) for unit in units]
+        left = [
+            jnp.where((columns == column).reshape(last), 0, part - unit[..., None] * row.reshape(last))
+            for part, unit, last in zip(left, units, lasts, strict=True)
+        ]
         return left, (units, row)
 
-    _, (units, triangle) = jax.lax.scan(reduce, parts, jnp.arange(parts[0].shape[-1]))
+    _, (units, triangle) = jax.lax.scan(reduce, parts, columns)
     return units, triangle
 
 

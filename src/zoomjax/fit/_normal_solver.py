@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Bool, PyTree, Scalar
 
-from ._least_squares import RoundingTrustRegion
+from ._least_squares import FIRST_DAMPING, ROUNDING
 
 
 class AbstractNormalSolver(lx.AbstractLinearSolver):
@@ -52,6 +52,39 @@ class AbstractNormalSolver(lx.AbstractLinearSolver):
     def assume_full_rank(self) -> bool:
         """The damping of each step sees to it."""
         return True
+
+
+class RoundingTrustRegion(optx.AbstractSearch):
+    """`optimistix.ClassicalTrustRegion` with the two changes that `_least_squares` tells of."""
+
+    classical: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion()
+    first_damping: float | Array = FIRST_DAMPING
+
+    def init(self, y: PyTree, f_info_struct: Any) -> Any:
+        """The state before the first step."""
+        state = self.classical.init(y, f_info_struct)
+        dtype = jnp.result_type(*jax.tree.leaves(y))  # optimistix takes JAX's widest
+        return eqx.tree_at(lambda s: s.step_size, state, jnp.array(1 / self.first_damping, dtype))
+
+    def step(
+        self,
+        first_step: Bool[Array, ""],
+        y: PyTree,
+        y_eval: PyTree,
+        f_info: Any,
+        f_eval_info: Any,
+        state: Any,
+    ) -> tuple[Scalar, Bool[Array, ""], optx.RESULTS, Any]:
+        """The next step size, and whether this step is accepted."""
+        step_size, accept, result, new_state = self.classical.step(
+            first_step, y, y_eval, f_info, f_eval_info, state
+        )
+        before, after = f_info.as_min(), f_eval_info.as_min()
+        rounding = ROUNDING * jnp.finfo(before.dtype).eps * before
+        still = ~first_step & (jnp.abs(after - before) <= rounding)
+        step_size = jnp.where(still, state.step_size, step_size)
+        new_state = eqx.tree_at(lambda s: s.step_size, new_state, step_size)
+        return step_size, accept | still, result, new_state
 
 
 def damped_solver(

@@ -1,4 +1,4 @@
-"""A cache on disk for compiled programs: compiling takes most of a short run."""
+"""A cache on disk for programs: to trace, lower and compile them takes most of a short run."""
 
 import contextlib
 import glob
@@ -17,8 +17,10 @@ def cache_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Keep what JAX compiles on disk, for all later processes: call it before the first fit.
 
     Data sets are padded to a few sizes, and those of one size share programs. So after some calibrations
-    later ones compile next to nothing. The command line does this by itself. The folder is kept
-    below 100 MB where the package ``filelock`` is installed, without which JAX cannot tell.
+    later ones compile next to nothing. Where the package ``flatbuffers`` is installed, with which JAX
+    writes them, the traced programs of fits are kept, too, and later processes need not trace either. The
+    command line does all this by itself. The folder is kept below 100 MB where the package ``filelock`` is
+    installed, without which JAX cannot tell, and traced programs below 50 MB.
 
     Args:
         folder: where to; by default ``compiled`` in the folder ``ZOOMJAX_CACHE``, or in the user's cache.
@@ -40,6 +42,8 @@ def cache_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     import jax  # not needed to read this module, nor to remove a program
     from jax.experimental.compilation_cache import compilation_cache
 
+    from .._core.kept import keep_programs
+
     if own := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return Path(own)
     place = cache_folder("compiled") if folder is None else Path(folder).absolute()
@@ -52,6 +56,8 @@ def cache_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     if importlib.util.find_spec("filelock"):  # without it JAX warns, and keeps nothing
         jax.config.update("jax_compilation_cache_max_size", _MOST)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.03)
+    if importlib.util.find_spec("flatbuffers"):  # with which JAX writes what was traced
+        keep_programs(place)
     return place
 
 

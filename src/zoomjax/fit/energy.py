@@ -47,6 +47,13 @@ def line_weights(lines: AbstractLines) -> Float[Array, "line"]:
     return share / (number * per_frame[lines.frame] * jnp.maximum(lines.counts, 1))
 
 
+def root_weights(lines: AbstractLines) -> Float[Array, "line"]:
+    """The roots of `line_weights`, by which residuals are multiplied."""
+    weights = line_weights(lines)
+    counted = weights > 0  # the root has no derivative at 0
+    return jnp.where(counted, jnp.sqrt(jnp.where(counted, weights, 1)), 0)
+
+
 def counted_frames(lines: AbstractLines) -> Bool[Array, "frame"]:
     """Which frames have a usable line: three points or more and a weight above 0."""
     return _shares(lines)[1] > 0
@@ -88,10 +95,14 @@ def weighted_distances(
             f"Argument coefficients must have a row for each of the {lines.focal.shape[0]} frames, but its "
             f"shape is {coefficients.shape}."
         )
-    distances = jax.vmap(line_residuals)(lines.corrected(coefficients))
-    weights = line_weights(lines)
-    counted = weights > 0  # the root has no derivative at 0
-    return jnp.where(counted, jnp.sqrt(jnp.where(counted, weights, 1)), 0)[:, None] * distances
+    return root_weights(lines)[:, None] * line_distances(lines, coefficients)
+
+
+def line_distances(
+    lines: AbstractLines, coefficients: Float[Array, "frame terms"]
+) -> Float[Array, "line rows"]:
+    """The distances, px, without the weights, which do not depend on the coefficients."""
+    return jax.vmap(line_residuals)(lines.corrected(coefficients))
 
 
 def settings(zoom: AbstractZoom, lines: AbstractLines) -> tuple[Float[AnyArray, "frame"], ...]:
@@ -194,7 +205,7 @@ def line_squares_by_frame(
 
 
 def _line_squares(lines, coefficients):
-    distances = jax.vmap(line_residuals)(lines.corrected(coefficients))
+    distances = line_distances(lines, coefficients)
     return jnp.sum(distances**2, axis=1) / jnp.maximum(lines.counts, 1)
 
 

@@ -57,15 +57,17 @@ def triangles_by_frame(
 ) -> Float[Array, "frame column column"]:
     """R of the rows of each frame's lines, by modified Gram-Schmidt as in `gram_schmidt`."""
 
+    columns = jnp.arange(table.shape[-1])
+
     def reduce(left, column):
-        own = left[..., column]
+        own = jax.lax.dynamic_index_in_dim(left, column, -1, keepdims=False)
         products = _sums("lr,lrc->lc", own, left, frame, frames)
         norm = jnp.sqrt(products[:, column])
         inverse = jnp.where(norm > 0, 1 / jnp.where(norm > 0, norm, 1), 0)[:, None]
         taken = own[..., None] * (products * inverse**2)[frame][:, None]
-        return (left - taken).at[..., column].set(0), products * inverse
+        return jnp.where((columns == column)[None, None], 0, left - taken), products * inverse
 
-    _, rows = jax.lax.scan(reduce, table, jnp.arange(table.shape[-1]))
+    _, rows = jax.lax.scan(reduce, table, columns)
     return jnp.swapaxes(rows, 0, 1)
 
 

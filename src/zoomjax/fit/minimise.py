@@ -7,6 +7,7 @@ the certificate; per iteration one pass over the lines' rows, of which the solve
 import functools
 
 import jax
+import jax.numpy as jnp
 import optimistix as optx
 
 from .._core.programs import light_program, program
@@ -64,7 +65,8 @@ def minimise(lines, zoom, solver, max_steps):
     solution = optx.least_squares(
         function, solver, start, args=(lines, zoom), max_steps=max_steps, throw=False
     )
-    return with_parameters(zoom, solution.value), solution.result, solution.stats["num_steps"]
+    steps = jnp.asarray(solution.stats["num_steps"])
+    return with_parameters(zoom, solution.value), solution.result, steps.astype(steps.dtype)  # not weak
 
 
 minimised = program(minimise)

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._core.arrays import aligned, apart, finite, in_blocks, interleaved, namespace, once, together
 from .._core.fields import host_numbers
+from .._core.programs import optimised_program
 from .._core.spread import spread
 from .._core.types import AnyArray, Elements, Points, traced
 from ._arguments import as_points, check_distortion
@@ -141,7 +142,7 @@ def mapped(method: str, family: AbstractFamily, points: Any, k: Any, centre: Any
     return compiled(method, _given, jnp.asarray(points), (family, k, centre, scale))
 
 
-@eqx.filter_jit
+@optimised_program
 def compiled(
     method: str, distortion_of: Callable[[Any], Any], points: Float[Array, "... 2"], operands: Any
 ) -> Float[Array, "... 2"]:

@@ -1,0 +1,303 @@
+"""Programs that an earlier process traced."""
+
+import enum
+import functools
+import os
+import subprocess
+import sys
+import zlib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import zoomjax as zj
+from zoomjax._core import kept
+from zoomjax._core.programs import program
+from zoomjax.fit import RESULTS
+from zoomjax.models import About, Model
+
+
+def plain(x, y=1):
+    """Made a program by the tests."""
+    return {"sum": x + y, "all": [x.sum(), None, "text", 2.5, y]}
+
+
+def calling(x):
+    return eqx.error_if(x, x > 1, "too large")
+
+
+def weak(x):
+    return jnp.where(x > 0, 1.0, 2.0)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty folder in which programs are kept; those of this module, too."""
+    monkeypatch.setattr(kept, "_KNOWN", (*kept._KNOWN, __name__.split(".")[0]))
+    kept.keep_programs(tmp_path)
+    yield tmp_path
+    kept.keep_programs(None)
+
+
+@pytest.fixture
+def traced(monkeypatch):
+    """The names of the functions that are traced to be kept."""
+    names, trace = [], kept._traced
+    monkeypatch.setattr(
+        kept, "_traced", lambda function, *of: (names.append(function.__name__), trace(function, *of))[1]
+    )
+    return names
+
+
+def again():
+    """As in a process that begins."""
+    kept.keep_programs(kept._STORE.folder)
+
+
+def equal(a, b):
+    """Whether two trees are the same, to the last bit."""
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        if eqx.is_array(one):
+            assert one.dtype == other.dtype
+            np.testing.assert_array_equal(one, other)
+        else:
+            assert (type(one), one) == (type(other), other)
+
+
+PLAIN = st.none() | st.booleans() | st.integers() | st.text() | st.floats(allow_nan=False)
+NESTED = st.recursive(
+    PLAIN | st.just("array"),
+    lambda part: st.lists(part) | st.tuples(part, part) | st.dictionaries(st.text(), part),
+)
+
+
+@given(NESTED)
+def test_what_is_taken_apart_is_put_together(value):
+    value = jax.tree.map(lambda leaf: np.arange(3) if leaf == "array" else leaf, value)
+    arrays = []
+    structure = kept.taken_apart(value, arrays)
+    equal(kept.put_together(structure, iter(arrays)), value)
+    assert [id(of) for of in arrays] == [id(of) for of in jax.tree.leaves(value) if eqx.is_array(of)]
+
+
+OBJECTS = [
+    RESULTS.folded,
+    optx.RESULTS.successful,
+    RESULTS,
+    zj.PolynomialZoom(degree=3),
+    zj.PolynomialZoom(1, jnp.ones((2, 2)), jnp.array(20.0)),
+    Model(zj.SmoothZoom(), 2),
+    zj.Distortion(np.array([0.1]), np.zeros(2), np.array(1.0), zj.models.Division()),
+    About({"camera": "a", "crop_factor": 1.5}),
+    optx.max_norm,
+    functools.partial(zj.fit_zoom, terms=1),
+    jax.tree_util.Partial(optx.max_norm, jnp.ones(2)),
+    np.dtype("float32"),
+    float("inf"),
+    -0.0,
+]
+
+
+@pytest.mark.parametrize("value", OBJECTS, ids=str)
+def test_objects_of_known_packages_have_names(value):
+    arrays = []
+    structure = kept.taken_apart(value, arrays)
+    found = kept.put_together(structure, iter(arrays))
+    again = []
+    assert kept.taken_apart(found, again) == structure
+    equal(again, arrays)
+    assert type(found) is type(value)
+
+
+class Own(enum.Enum):
+    ONE = 1
+
+
+@pytest.mark.parametrize(
+    "value", [Own.ONE, lambda x: x, plain, pytest, {1, 2}, 1j, {1: 2}, b"bytes"], ids=str
+)
+def test_what_has_no_name_is_said_to_have_none(value):
+    with pytest.raises(kept._UnknownError):
+        kept.taken_apart([value], [])
+
+
+def test_a_program_is_traced_once_for_all_processes(folder, traced):
+    function = program(plain)
+    first = function(jnp.arange(4.0), y=2)
+    again()
+    equal(function(jnp.arange(4.0), y=2), first)
+    assert traced == ["plain"]
+    assert len(list(folder.glob("*.traced"))) == 1
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda f: f(jnp.arange(5.0)),
+        lambda f: f(jnp.arange(4)),
+        lambda f: f(jnp.arange(4.0), 2),
+        lambda f: f(jnp.arange(4.0), 1.0),
+        lambda f: f(jnp.arange(4.0), True),
+        lambda f: f(jnp.arange(4.0), y=1),
+        lambda f: f(jnp.arange(4.0), jnp.asarray(1.0)),
+        lambda f: f(jnp.arange(4.0), jnp.asarray(1.0, float)),
+        lambda f: f(jnp.arange(4.0, dtype=jnp.float32)),
+    ],
+)
+def test_other_arguments_are_another_program(folder, traced, other):
+    function = program(plain)
+    function(jnp.arange(4.0), 1)
+    for _ in range(2):
+        equal(other(function), other(plain))
+        again()
+    assert traced == ["plain", "plain"]
+
+
+def test_other_settings_are_another_program(folder, traced):
+    function, x = program(plain), np.arange(4, dtype=np.float32)
+    function(x)
+    with (
+        jax.experimental.disable_x64()
+        if hasattr(jax.experimental, "disable_x64")
+        else jax.enable_x64(False)
+    ):
+        function(x)
+    assert traced == ["plain", "plain"]
+
+
+def test_another_version_is_another_program(folder, traced, monkeypatch):
+    function = program(plain)
+    function(np.ones(2))
+    monkeypatch.setattr(kept, "_versions", lambda: "another")
+    again()
+    function(np.ones(2))
+    assert traced == ["plain", "plain"]
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"poison", zlib.compress(b"null"), zlib.compress(b'["array"]\nprogram')]
+)
+def test_what_cannot_be_read_is_traced_anew(folder, traced, content):
+    function = program(plain)
+    first = function(np.ones(3))
+    (file,) = folder.glob("*.traced")
+    whole = file.read_bytes()
+    file.write_bytes(content)
+    again()
+    equal(function(np.ones(3)), first)
+    if content != zlib.compress(b"null"):  # that says: it cannot be kept
+        assert traced == ["plain", "plain"]
+        assert kept._read(file) is not None
+        assert len(file.read_bytes()) > len(whole) / 2
+
+
+def test_files_cut_off_anywhere_are_no_harm(folder):
+    function = program(plain)
+    first = function(np.ones(3))
+    (file,) = folder.glob("*.traced")
+    whole = file.read_bytes()
+    for end in np.linspace(0, len(whole) - 1, 12).astype(int):
+        file.write_bytes(whole[:end])
+        again()
+        equal(function(np.ones(3)), first)
+
+
+def test_programs_that_call_python_do_so_still(folder, traced):
+    function = program(calling)
+    for _ in range(2):
+        assert float(function(jnp.asarray(1.0, float))) == 1
+        with pytest.raises(eqx.EquinoxRuntimeError, match="too large"):
+            function(jnp.asarray(2.0, float))
+        again()
+    assert traced == ["calling"]  # a later process does not try again
+
+
+def test_weak_types_stay_weak(folder):
+    function = program(weak)
+    for _ in range(2):
+        assert function(jnp.ones(2)).weak_type
+        again()
+
+
+def test_functions_from_elsewhere_are_not_kept(folder, traced, monkeypatch):
+    monkeypatch.setattr(kept, "_KNOWN", ("zoomjax",))
+    assert float(program(plain)(jnp.ones(1))["sum"][0]) == 2
+    assert traced == []
+
+
+def test_functions_that_hold_others_are_not_kept(folder, traced):
+    power = 3
+    assert float(program(lambda x: x**power)(jnp.asarray(2.0, float))) == 8
+    assert traced == []
+
+
+def test_errors_of_arguments_are_raised_as_they_are(folder):
+    with pytest.raises((TypeError, ValueError), match=r"[Ii]ncompatible|broadcast"):
+        program(plain)(jnp.ones(2), jnp.ones(3))
+    assert not list(folder.iterdir())
+
+
+def test_a_folder_that_is_gone_is_no_harm(folder):
+    folder.rmdir()
+    assert float(program(plain)(jnp.ones(1))["sum"][0]) == 2
+    folder.mkdir()
+
+
+def test_the_oldest_are_removed_where_all_are_too_many(folder, monkeypatch):
+    monkeypatch.setattr(kept, "_MOST", 250)
+    for number in range(4):
+        file = folder / f"{number}.traced"
+        file.write_bytes(bytes(100))
+        os.utime(file, (number, number))
+    (folder / "whole-cache").write_bytes(bytes(500))
+    again()
+    assert sorted(os.listdir(folder)) == ["2.traced", "3.traced", "whole-cache"]
+
+
+def test_inside_of_other_programs_nothing_is_kept(folder, traced):
+    function = program(plain)
+    jax.jit(lambda x: function(x)["sum"])(jnp.ones(2))
+    jax.vmap(lambda x: function(x)["sum"])(jnp.ones((2, 2)))
+    assert traced == []
+
+
+def test_fits_are_the_same_to_the_last_bit(small, folder, traced):
+    kept.keep_programs(None)
+    plainly = zj.fit_zoom(small, terms=1)
+    kept.keep_programs(folder)
+    for _ in range(2):
+        equal(zj.fit_zoom(small, terms=1), plainly)
+        again()
+    assert len(traced) == len(set(traced)) >= 3
+
+
+DEVICES = """
+import jax, jax.numpy as jnp, sys
+from pathlib import Path
+from zoomjax._core import kept
+from zoomjax.fit._linear import triangle_of
+from zoomjax._core.programs import program
+kept.keep_programs(Path(sys.argv[1]))
+other = jax.device_put(jnp.eye(3), jax.devices()[1])
+found = program(triangle_of)(other)
+assert found.devices() == {jax.devices()[1]}, found.devices()
+print(len(list(Path(sys.argv[1]).iterdir())))
+program(triangle_of)(jnp.eye(3))
+print(len(list(Path(sys.argv[1]).iterdir())))
+"""
+
+
+def test_arrays_on_other_devices_stay_there(tmp_path):
+    own = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    done = subprocess.run(
+        [sys.executable, "-c", DEVICES, str(tmp_path)], env=own, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["0", "1"]
