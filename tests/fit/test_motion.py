@@ -127,6 +127,38 @@ def test_things_that_move_do_little_harm(lens, path, moving):
     assert fit.noise == pytest.approx(0.3, rel=0.1)
 
 
+def with_a_thing(tracks, focal, share, seed):
+    """Tracks, and those of one thing that the camera follows, which has a share of all."""
+    rng = np.random.default_rng(seed)
+    track, view = np.nonzero(np.asarray(tracks.mask))
+    frame, points = (np.asarray(of)[track, view] for of in (tracks.frame, tracks.points))
+    time = np.arange(FRAMES)
+    sway = [120 * np.sin(2 * np.pi * time / 40 + seed), 20 * np.sin(2 * np.pi * time / 25)]
+    middle = np.array(SIZE) / 2 + np.column_stack(sway)
+    parts = [(track, frame, points)]
+    number = round(share / (1 - share) * len(track) / FRAMES)
+    for name, begin in enumerate(np.repeat([-6, 6, 18], number), track.max() + 1):
+        seen = np.arange(max(begin, 0), min(begin + 12, FRAMES))
+        place = rng.uniform([-230, -230], [230, 230]) * (focal[seen] / np.mean(focal))[:, None]
+        place = middle[seen] + place + rng.normal(0, 0.3, place.shape)
+        inside = ((place > 0) & (place < np.array(SIZE) - 1)).all(axis=1)
+        parts.append((np.full(inside.sum(), name), seen[inside], place[inside]))
+    track, frame, points = (np.concatenate(column) for column in zip(*parts, strict=True))
+    twice = (np.bincount(track) > 1)[track]
+    return Tracks.from_arrays(track[twice], frame[twice], points[twice], image_size=SIZE, frames=FRAMES)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_thing_that_the_camera_follows_is_not_taken_for_the_scene(lens, seed):
+    path = pan_and_zoom(lens, FRAMES, pan=25, tilt=6, seed=seed)
+    scene = motion_tracks(lens, *path, views=84, life=12, noise=0.3, seed=seed)
+    fit = fit_motion(with_a_thing(scene.tracks, path[0], 0.3, seed), throw=False)
+    assert fit.fit.result == RESULTS.successful
+    assert abs(np.asarray(fit.focal) / path[0] - 1).max() < 0.02
+    assert displaced(lens, fit, path[0]) < 0.8
+
+
 def test_a_camera_that_does_not_turn_has_no_scale(lens, path):
     focal, rotation = path
     still = (focal, np.broadcast_to(rotation[0], rotation.shape))
