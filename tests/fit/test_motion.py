@@ -10,6 +10,8 @@ import pytest
 from zoomjax import Lines, PolynomialZoom, ZoomLens
 from zoomjax.fit import RESULTS, fit_motion
 from zoomjax.fit._motion_gradient import sensitive
+from zoomjax.fit._motion_levers import guessed_levers
+from zoomjax.fit._motion_parallax import Spread
 from zoomjax.fit._motion_problem import Asked, Given, problem_of
 from zoomjax.fit._motion_start import rotation_vector, shrunk_ray, turned
 from zoomjax.fit.motion import _fitted, thrown_motion
@@ -420,15 +422,41 @@ def test_near_points_that_move_otherwise_are_allowed_for(fit, off_axis, with_lev
     assert without.lever_std == 0
 
 
+def test_levers_are_guessed_on_the_side_that_the_tracks_tell():
+    for side in (-1, 0, 0.6, 1):
+        levers = guessed_levers(Spread(jnp.array(1e-3), jnp.array(side)), 3)
+        np.testing.assert_allclose(levers.value, levers.mean)
+        assert levers.mean == pytest.approx(2.5e-3 * side)
+        # Of an even chance for 1.25 to 3.75 deviations, on both sides as likely as they are.
+        assert levers.mean**2 + levers.mean_std**2 == pytest.approx(1e-6 * (2.5**2 + 1.25**2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pupil", [0.5, -0.5])
+def test_what_levers_have_in_common_is_on_the_side_of_the_near_points(lens, path, pupil, monkeypatch):
+    scene = motion_tracks(lens, *path, views=200, life=24, noise=0.3, seed=3, pupil=pupil)
+    fit = fit_motion(scene.tracks)
+    true = pupil / np.linalg.norm(scene.points, axis=1)
+    assert 0.5 < fit.lever_mean / np.mean(true) < 1.2
+    monkeypatch.setattr("zoomjax.fit._motion_levers.COMMON", 0.0)
+    without = fit_motion(scene.tracks)
+    # Seen by all alike it looks like a longer lens: by that share, whatever the frame.
+    share = np.asarray(without.focal) / np.asarray(fit.focal) - 1
+    np.testing.assert_allclose(share, fit.lever_mean, rtol=0.2)
+    assert without.lever_mean == 0
+
+
 def test_what_all_levers_have_in_common_is_in_the_bands(path, fit, with_levers):
     # Seen by all alike it looks like a longer lens: by that share, whatever the frame.
-    common = 3 * float(with_levers.lever_std)
+    least, most = (float(with_levers.lever_std) * times for times in (1.25, np.hypot(1.25, 2.5)))
+    common = np.sqrt(most**2 - float(with_levers.lever_mean) ** 2)
+    assert least < 1.001 * common
     std = np.asarray(with_levers.focal_std) / np.asarray(with_levers.focal)
     alone = np.sqrt(std**2 - common**2)
     assert np.isfinite(alone).all()
     assert np.sqrt(with_levers.covariance[-1, -1]) == pytest.approx(np.mean(std), rel=0.1)
     assert abs(np.mean(np.asarray(with_levers.focal) / path[0] - 1)) < 3 * np.mean(std)
-    assert fit.lever_std == 0
+    assert fit.lever_std == fit.lever_mean == 0
 
 
 @pytest.mark.parametrize("shared", [{"pupil": 0.3}, {"drift": 0.2}])

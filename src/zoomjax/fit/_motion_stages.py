@@ -12,8 +12,8 @@ from jax.flatten_util import ravel_pytree
 
 from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
-from ._motion_levers import common_lever, told_levers
-from ._motion_model import Levers, Model, Noise, Speed, Stage, moved, speed_of, units_of
+from ._motion_levers import common_lever, guessed_levers, told_levers
+from ._motion_model import Model, Noise, Speed, Stage, moved, speed_of, units_of
 from ._motion_parallax import is_seen, parallax_of, spread_of
 from ._motion_repeated import common_errors_of, groups_of, repeated
 from ._motion_rows import (
@@ -104,8 +104,7 @@ def in_stages(data, paths, spreads, zoom, shift, family, terms, shot):
     parts, missed = _described(data, model, noise, free, result, steps)
     if is_seen(parts["parallax"], parts["parallax_score"]):
         spread = spread_of(data, model, _arrays(noise), missed, parts["parallax"])
-        levers = Levers(jnp.zeros(data.structure.tracks), spread)
-        model = dataclasses.replace(model, levers=levers)
+        model = dataclasses.replace(model, levers=guessed_levers(spread, data.structure.tracks))
         model, noise, weighted_by, result, steps = _settled(data, model, noise)
         described, missed = _described(data, model, noise, free, result, steps)
         parts = parts | described
