@@ -28,7 +28,6 @@ STARTS = 3
 _TURNS = 12  # Gauss-Newton steps a frame
 _LEAST_VIEWS = 4
 _PAIRS = 24  # of tracks: with half of all on things that move, none is without in one frame of 1,000
-_PAIR_TURNS = 4  # Gauss-Newton steps, of two tracks
 _AGREES = 1 / 400  # of the image's width: what is farther off than this hardly agrees
 
 
@@ -100,7 +99,8 @@ def starts_of(
     track, view, present = by_frame
     seen = points[view]
     guesses = width / 2 / np.tan(np.radians(FIELDS_OF_VIEW) / 2)
-    drawn = jax.random.uniform(jax.random.key(0), (len(track), _PAIRS, 2))
+    drawn = np.random.default_rng(0).uniform(size=(1, _PAIRS, 2))
+    drawn = (drawn + 0.618 * jnp.arange(len(track))[:, None, None]) % 1  # other ones in each frame
 
     def chain(focal):
         state = _State(jnp.log(focal), jnp.eye(3), jnp.zeros((tracks, 3)), jnp.zeros(()))
@@ -159,22 +159,18 @@ def _next(state, track, present, seen, drawn, *, near):
     directions = directions / jnp.maximum(jnp.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
     enough = jnp.sum(known) >= _LEAST_VIEWS
 
-    def residuals(unknown, some=slice(None)):
-        ahead = jax.vmap(lambda ray: turned(state.rotation @ ray, unknown[1:]))(directions[some])
-        return _errors(ahead, state.log_focal + unknown[0], seen[some])
+    def residuals(unknown):
+        ahead = jax.vmap(lambda ray: turned(state.rotation @ ray, unknown[1:]))(directions)
+        return _errors(ahead, state.log_focal + unknown[0], seen)
 
-    def stepped(unknown, weight, some=slice(None)):
-        error, jacobian = residuals(unknown, some), jax.jacfwd(residuals)(unknown, some)
+    def change(error, jacobian, weight):
         normal = jnp.einsum("vri,vrj,v->ij", jacobian, jacobian, weight)
         right = jnp.einsum("vri,vr,v->i", jacobian, error, weight)
         normal = normal + 1e-9 * (1 + jnp.trace(normal)) * jnp.eye(4)
-        return unknown - jnp.clip(jnp.linalg.solve(normal, right), -0.3, 0.3)
+        return -jnp.clip(jnp.linalg.solve(normal, right), -0.3, 0.3)
 
     def of_pair(pair):
-        def turn(unknown, _):
-            return stepped(unknown, jnp.ones(2), pair), None
-
-        return jax.lax.scan(turn, still, None, length=_PAIR_TURNS)[0]
+        return change(error[pair], jacobian[pair], jnp.ones(2))
 
     def cost(unknown):
         size = jnp.linalg.norm(residuals(unknown), axis=1)
@@ -185,11 +181,14 @@ def _next(state, track, present, seen, drawn, *, near):
         return jnp.maximum(jnp.nan_to_num(size), 0.1)
 
     def turn(unknown, _):
-        squared, scale = jnp.sum(residuals(unknown) ** 2, axis=1), 2 * spread(unknown)
-        return stepped(unknown, jnp.where(known, 1 / (1 + squared / scale**2), 0)), None
+        error, scale = residuals(unknown), 2 * spread(unknown)
+        weight = jnp.where(known, 1 / (1 + jnp.sum(error**2, axis=1) / scale**2), 0)
+        return unknown + change(error, jax.jacfwd(residuals)(unknown), weight), None
 
     still = jnp.zeros(4, seen.dtype)
-    pairs = jnp.argsort(~known)[(drawn * jnp.sum(known)).astype(int)]
+    error, jacobian = residuals(still), jax.jacfwd(residuals)(still)
+    count = jnp.cumsum(known)
+    pairs = jnp.sum(count[None, None] <= jnp.floor(drawn * count[-1])[..., None], axis=-1)
     begins = jnp.concatenate([still[None], jax.vmap(of_pair)(pairs)])
     costs = jax.vmap(cost)(begins)
     start = begins[jnp.argmin(jnp.where(jnp.isfinite(costs), costs, jnp.inf))]
