@@ -10,6 +10,8 @@ import pytest
 from zoomjax import Lines, PolynomialZoom, ZoomLens
 from zoomjax.fit import RESULTS, fit_motion
 from zoomjax.fit._motion_gradient import sensitive
+from zoomjax.fit._motion_levers import guessed_levers
+from zoomjax.fit._motion_parallax import Spread
 from zoomjax.fit._motion_problem import Asked, Given, problem_of
 from zoomjax.fit._motion_start import rotation_vector, shrunk_ray, turned
 from zoomjax.fit.motion import _fitted, thrown_motion
@@ -125,6 +127,38 @@ def test_things_that_move_do_little_harm(lens, path, moving):
     assert abs(np.asarray(fit.focal) / path[0] - 1).max() < 0.02
     assert displaced(lens, fit, path[0]) < 0.6
     assert fit.noise == pytest.approx(0.3, rel=0.1)
+
+
+def with_a_thing(tracks, focal, share, seed):
+    """Tracks, and those of one thing that the camera follows, which has a share of all."""
+    rng = np.random.default_rng(seed)
+    track, view = np.nonzero(np.asarray(tracks.mask))
+    frame, points = (np.asarray(of)[track, view] for of in (tracks.frame, tracks.points))
+    time = np.arange(FRAMES)
+    sway = [120 * np.sin(2 * np.pi * time / 40 + seed), 20 * np.sin(2 * np.pi * time / 25)]
+    middle = np.array(SIZE) / 2 + np.column_stack(sway)
+    parts = [(track, frame, points)]
+    number = round(share / (1 - share) * len(track) / FRAMES)
+    for name, begin in enumerate(np.repeat([-6, 6, 18], number), track.max() + 1):
+        seen = np.arange(max(begin, 0), min(begin + 12, FRAMES))
+        place = rng.uniform([-230, -230], [230, 230]) * (focal[seen] / np.mean(focal))[:, None]
+        place = middle[seen] + place + rng.normal(0, 0.3, place.shape)
+        inside = ((place > 0) & (place < np.array(SIZE) - 1)).all(axis=1)
+        parts.append((np.full(inside.sum(), name), seen[inside], place[inside]))
+    track, frame, points = (np.concatenate(column) for column in zip(*parts, strict=True))
+    twice = (np.bincount(track) > 1)[track]
+    return Tracks.from_arrays(track[twice], frame[twice], points[twice], image_size=SIZE, frames=FRAMES)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_thing_that_the_camera_follows_is_not_taken_for_the_scene(lens, seed):
+    path = pan_and_zoom(lens, FRAMES, pan=25, tilt=6, seed=seed)
+    scene = motion_tracks(lens, *path, views=84, life=12, noise=0.3, seed=seed)
+    fit = fit_motion(with_a_thing(scene.tracks, path[0], 0.3, seed), throw=False)
+    assert fit.fit.result == RESULTS.successful
+    assert abs(np.asarray(fit.focal) / path[0] - 1).max() < 0.02
+    assert displaced(lens, fit, path[0]) < 0.8
 
 
 def test_a_camera_that_does_not_turn_has_no_scale(lens, path):
@@ -388,15 +422,41 @@ def test_near_points_that_move_otherwise_are_allowed_for(fit, off_axis, with_lev
     assert without.lever_std == 0
 
 
+def test_levers_are_guessed_on_the_side_that_the_tracks_tell():
+    for side in (-1, 0, 0.6, 1):
+        levers = guessed_levers(Spread(jnp.array(1e-3), jnp.array(side)), 3)
+        np.testing.assert_allclose(levers.value, levers.mean)
+        assert levers.mean == pytest.approx(2.5e-3 * side)
+        # Of an even chance for 1.25 to 3.75 deviations, on both sides as likely as they are.
+        assert levers.mean**2 + levers.mean_std**2 == pytest.approx(1e-6 * (2.5**2 + 1.25**2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pupil", [0.5, -0.5])
+def test_what_levers_have_in_common_is_on_the_side_of_the_near_points(lens, path, pupil, monkeypatch):
+    scene = motion_tracks(lens, *path, views=200, life=24, noise=0.3, seed=3, pupil=pupil)
+    fit = fit_motion(scene.tracks)
+    true = pupil / np.linalg.norm(scene.points, axis=1)
+    assert 0.5 < fit.lever_mean / np.mean(true) < 1.2
+    monkeypatch.setattr("zoomjax.fit._motion_levers.COMMON", 0.0)
+    without = fit_motion(scene.tracks)
+    # Seen by all alike it looks like a longer lens: by that share, whatever the frame.
+    share = np.asarray(without.focal) / np.asarray(fit.focal) - 1
+    np.testing.assert_allclose(share, fit.lever_mean, rtol=0.2)
+    assert without.lever_mean == 0
+
+
 def test_what_all_levers_have_in_common_is_in_the_bands(path, fit, with_levers):
     # Seen by all alike it looks like a longer lens: by that share, whatever the frame.
-    common = 3 * float(with_levers.lever_std)
+    least, most = (float(with_levers.lever_std) * times for times in (1.25, np.hypot(1.25, 2.5)))
+    common = np.sqrt(most**2 - float(with_levers.lever_mean) ** 2)
+    assert least < 1.001 * common
     std = np.asarray(with_levers.focal_std) / np.asarray(with_levers.focal)
     alone = np.sqrt(std**2 - common**2)
     assert np.isfinite(alone).all()
     assert np.sqrt(with_levers.covariance[-1, -1]) == pytest.approx(np.mean(std), rel=0.1)
     assert abs(np.mean(np.asarray(with_levers.focal) / path[0] - 1)) < 3 * np.mean(std)
-    assert fit.lever_std == 0
+    assert fit.lever_std == fit.lever_mean == 0
 
 
 @pytest.mark.parametrize("shared", [{"pupil": 0.3}, {"drift": 0.2}])

@@ -146,8 +146,8 @@ class MotionCalibration:
                 "doubtful" if float(self.fit.parallax) > _HARMLESS else "good",
                 "near points move otherwise than far ones as the camera turns, by a share of "
                 f"{spread:.2%}: its entrance pupil is off the axis of rotation. That is allowed for, but "
-                "what all points have in common looks like a lens: focal lengths may be off by a few times "
-                "that share, and the lens with them. The bands allow for three times.",
+                "what all points have in common looks like a lens and is a guess: focal lengths may be off "
+                "by once or twice that share, and the lens with them. The bands allow for that.",
                 "Turn the camera about its entrance pupil, or film what is farther away.",
             )
 

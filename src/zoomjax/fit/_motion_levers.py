@@ -1,10 +1,12 @@
 """Levers of tracks: how far the entrance pupil is before the axis of rotation, over each point's distance.
 
 Where a parallax is seen (`_motion_parallax`), each track has a lever beside its ray, with a normal prior
-of mean 0 whose variance the tracks tell.
+whose variance the tracks tell.
 
-What all levers have in common looks like a lens, so that the fit takes it for one. Distances are positive,
-and it is likely a few times as large as the levers' standard deviation: the covariance has that in it.
+What all levers have in common looks like a lens, and no track tells it. But distances are positive: it is
+likely a few times as large as the levers' standard deviation, and on the side of the near points, to which
+levers have their long tail. So that is guessed, as far as the tail is seen, and the covariance has in it
+by how much the guess may be off.
 """
 
 from typing import Any, NamedTuple
@@ -14,12 +16,24 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ._motion_model import Model
+from ._motion_model import Levers, Model
+from ._motion_parallax import Spread
 from ._schur import Reduced, Unknowns, reduced, solution
 from ._structure import Structure
 
-COMMON = 3.0
-"""What levers have in common, in standard deviations of them: that of points from 40 to 120 m away."""
+COMMON, COMMON_STD = 2.5, 1.25
+"""What levers have in common, in standard deviations of them, and how far that varies from scene to scene.
+
+Of points that are spread evenly from 40 to 120 m away it is 3.1, from 10 to 50 m 2.1, from 20 to 40 m 5.0.
+"""
+
+
+def guessed_levers(spread: Spread, tracks: int) -> Levers:
+    """Levers before there is any data: of either sign, as likely as the tracks tell."""
+    side, std = spread.side, spread.std
+    mean = COMMON * side * std
+    mean_std = std * jnp.sqrt(COMMON_STD**2 + COMMON**2 * (1 - side**2))
+    return Levers(jnp.full(tracks, mean), std, mean, mean_std)
 
 
 class Common(NamedTuple):
@@ -38,7 +52,7 @@ def told_levers(model: Model, matrix: Reduced, units: Unknowns) -> Float[Array, 
 
 
 def common_lever(model: Model, jacobian: Any, units: Unknowns, structure: Structure) -> Common:
-    """What the covariance lacks, as the fit takes what levers have in common for a lens; 0 without levers.
+    """What the covariance lacks, as what levers have in common is a guess; 0 without levers.
 
     Args:
         model: the fitted one.
@@ -50,7 +64,7 @@ def common_lever(model: Model, jacobian: Any, units: Unknowns, structure: Struct
     of_lens = ravel_pytree(units.lens)[0]
     if model.levers is None:
         return Common(jnp.zeros(len(units.frames)), jnp.zeros_like(of_lens))
-    equal = COMMON * model.levers.std / units.rays[:, 2]
+    equal = model.levers.mean_std / units.rays[:, 2]
     seen = jacobian(still._replace(rays=still.rays.at[:, 2].set(equal)))
     seen = seen._replace(rays=jnp.zeros_like(seen.rays))  # the prior is of what levers differ by
     moved = solution(reduced(jacobian, seen, still, structure, jnp.zeros(())), still, structure)

@@ -111,11 +111,17 @@ class Speed(NamedTuple):
 class Levers(NamedTuple):
     """How far the entrance pupil is before the axis of rotation, over the distance of each track's point.
 
-    What they have in common looks like a lens, and no track tells it: they are about 0.
+    Attributes:
+        value: of each track.
+        std: standard deviation from track to track, before there is any data.
+        mean: what they have in common. It looks like a lens, and no track tells it: a guess.
+        mean_std: standard deviation of that guess.
     """
 
     value: Float[Array, "track"]
-    std: Float[Array, ""]  # before there is any data
+    std: Float[Array, ""]
+    mean: Float[Array, ""]
+    mean_std: Float[Array, ""]
 
 
 class Model(eqx.Module):

@@ -24,6 +24,8 @@ from ._views import FAR
 _WILD = 5.0  # standard deviations, of a slope that is no chance: of a thing that moves
 _FEWEST = 20  # tracks
 _ROUNDS = 8
+_SKEWNESS = 0.8  # of one over distances, where these are spread evenly over some range
+_TAIL = 3.0  # standard deviations: beyond, a slope counts no more for which side the tail is on
 
 SURE = 3.0
 """Standard deviations of chance from which a parallax is seen."""
@@ -42,6 +44,13 @@ class _Slopes(NamedTuple):
 
     value: Float[Array, "track"]  # in its standard deviations by noise
     weight: Float[Array, "track"]  # 1 over that standard deviation
+
+
+class Spread(NamedTuple):
+    """Of e/D, over the tracks."""
+
+    std: Float[Array, ""]
+    side: Float[Array, ""]  # how likely e is above 0, less how likely below it
 
 
 def parallax_of(
@@ -76,11 +85,14 @@ def parallax_of(
 @eqx.filter_jit
 def spread_of(
     data: Data, model: Model, noise: Noise, missed: Float[Array, "view"], least: Float[Array, ""]
-) -> Float[Array, ""]:
-    """Standard deviation over the tracks of e/D where it is seen; at least the square root of the test's.
+) -> Spread:
+    """How e/D varies over the tracks where that is seen; at least as much as the test says.
 
     The test weighs tracks, and drops wild ones, as if there were no parallax. Here both are by how much
     slopes vary with noise and parallax, from round to round.
+
+    Near points have a long tail of large e/D. The third Hermite polynomial of slopes tells on which side
+    it is: its mean is their skewness, and its variance is 6.
 
     Args:
         data: the tracks.
@@ -94,18 +106,24 @@ def spread_of(
     both = [_slopes(of, noise, data.structure) for of in (views, turned)]
     basis = _smooth(data, model, inlier)
 
-    def excess(slopes, variance):
+    def scaled(slopes, variance):
         total = 1 + variance * slopes.weight**2
-        scaled = _Slopes(slopes.value / jnp.sqrt(total), slopes.weight / jnp.sqrt(total))
-        value, weight = _rough(scaled, basis)
-        weight = jnp.where(value**2 < _WILD**2, weight**2, 0)
+        value, weight = _rough(_Slopes(*(of / jnp.sqrt(total) for of in slopes)), basis)
+        return value, jnp.where(value**2 < _WILD**2, weight**2, 0), total
+
+    def excess(slopes, variance):
+        value, weight, total = scaled(slopes, variance)
         return jnp.sum(weight * (value**2 - 1 / total)) / jnp.sum(weight**2)
 
     def again(variance, _):
         along, across = (excess(slopes, variance) for slopes in both)
         return jnp.maximum(along - jnp.maximum(across, 0), least**2), None
 
-    return jnp.sqrt(jax.lax.scan(again, least**2, None, length=_ROUNDS)[0])
+    variance, _ = jax.lax.scan(again, least**2, None, length=_ROUNDS)
+    value, weight, _ = scaled(both[0], variance)
+    value = jnp.clip(value, -_TAIL, _TAIL)
+    skewness = _SKEWNESS * (variance * weight) ** 1.5
+    return Spread(jnp.sqrt(variance), jnp.tanh(jnp.sum(skewness * (value**3 - 3 * value)) / 6))
 
 
 def _patterns(data, model, noise, inlier):

@@ -177,7 +177,8 @@ def about_frames(data, path, unknowns, steps, stage):
 
 def about_rays(model):
     """What is known of levers; None if there are none."""
-    return None if model.levers is None else (model.levers.value / model.levers.std)[:, None]
+    levers = model.levers
+    return None if levers is None else ((levers.value - levers.mean) / levers.std)[:, None]
 
 
 def about_lens(data, model, unknowns, prior):

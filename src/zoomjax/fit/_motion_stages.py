@@ -12,8 +12,8 @@ from jax.flatten_util import ravel_pytree
 
 from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
-from ._motion_levers import common_lever, told_levers
-from ._motion_model import Levers, Model, Noise, Speed, Stage, moved, speed_of, units_of
+from ._motion_levers import common_lever, guessed_levers, told_levers
+from ._motion_model import Model, Noise, Speed, Stage, moved, speed_of, units_of
 from ._motion_parallax import is_seen, parallax_of, spread_of
 from ._motion_repeated import common_errors_of, groups_of, repeated
 from ._motion_rows import (
@@ -28,7 +28,7 @@ from ._motion_rows import (
     rows_of,
     weighed,
 )
-from ._motion_start import STARTS
+from ._motion_start import STARTS, disagreement
 from ._normal_solver import damped_solver
 from ._schur import Rows, Schur, Unknowns, covariances, reduced
 from ._views import CAUCHY, EXACT, MEDIAN_OF_SIZE, core_median
@@ -69,7 +69,7 @@ _UNKNOWN_SCALE = 0.1
 def in_stages(data, paths, spreads, zoom, shift, family, terms, shot):
     """The fit, with a prior of the lens that widens from stage to stage: the program is the same.
 
-    The first stage goes from all starts. The one that leaves the least noise goes on.
+    The first stage goes from all starts. The one that most views follow best goes on.
 
     Args:
         data: tracks and lines.
@@ -90,7 +90,7 @@ def in_stages(data, paths, spreads, zoom, shift, family, terms, shot):
         model = Model(path, prepared_zoom, prepared, data.readout[0], nothing, family)
         noise = Noise(spread / MEDIAN_OF_SIZE, jnp.asarray(jnp.nan)).wider(STAGES[0].wider)
         tried.append(_solved(data, *_arrays((model, noise, STAGES[0]))))
-    model, noise, *_ = min(tried, key=lambda found: np.nan_to_num(found[1].points, nan=np.inf))
+    model, noise, *_ = _best(tried, data.there)
     model, noise, *_ = _solved(data, *_arrays((model, noise.wider(STAGES[1].wider), STAGES[1])))
     model, noise, weighted_by, result, steps = _settled(data, model, noise)
     for _ in range(_MOST_COUNTS if data.lines is not None else 0):
@@ -104,12 +104,19 @@ def in_stages(data, paths, spreads, zoom, shift, family, terms, shot):
     parts, missed = _described(data, model, noise, free, result, steps)
     if is_seen(parts["parallax"], parts["parallax_score"]):
         spread = spread_of(data, model, _arrays(noise), missed, parts["parallax"])
-        levers = Levers(jnp.zeros(data.structure.tracks), spread)
-        model = dataclasses.replace(model, levers=levers)
+        model = dataclasses.replace(model, levers=guessed_levers(spread, data.structure.tracks))
         model, noise, weighted_by, result, steps = _settled(data, model, noise)
         described, missed = _described(data, model, noise, free, result, steps)
         parts = parts | described
     return parts, missed, *_arrays((model, weighted_by))
+
+
+def _best(tried, there):
+    """The one of `_solved`'s that most views follow best: what has the least noise may be of few views."""
+    noises = [np.nan_to_num(noise.points, nan=np.inf) for _, noise, *_ in tried]
+    sizes = [jnp.where(there, size, jnp.nan) for *_, size in tried]
+    costs = [float(disagreement(size, CAUCHY * min(noises))) for size in sizes]
+    return tried[int(np.argmin(np.nan_to_num(costs, nan=np.inf)))]
 
 
 def _settled(data, model, noise):
@@ -120,7 +127,7 @@ def _settled(data, model, noise):
     turns = 0
     while True:
         weighted_by = noise.wider(STAGES[-1].wider)
-        model, noise, result, steps, change = _solved(data, *_arrays((model, weighted_by, STAGES[-1])))
+        model, noise, result, steps, change, _ = _solved(data, *_arrays((model, weighted_by, STAGES[-1])))
         same = noise.points > _SAME * weighted_by.points
         still = result == RESULTS.successful and same and change < _STILL
         turns += 1
@@ -142,9 +149,9 @@ def _arrays(tree):
 
 @eqx.filter_jit
 def _solved(data, model, noise, stage):
-    """The path and the lens of least energy, the noise, the solver's status, its steps, and the change.
+    """The path and the lens of least energy, the noise, the solver's status, its steps, and two more.
 
-    The change is that of the residuals, in all and in units of the noise.
+    They are the change of the residuals, in all and in units of the noise, and the size of each, px.
 
     A stage whose steps are spent is successful if all of them moved the residuals by less than their noise
     does: with heavy tails the last steps are many and small.
@@ -177,7 +184,7 @@ def _solved(data, model, noise, stage):
     spent = solution.result == optx.RESULTS.nonlinear_max_steps_reached
     good: Any = RESULTS.successful
     result = RESULTS.where((change < _SETTLED) & spent, good, RESULTS.promote(solution.result))
-    return model, noise, result, solution.stats["num_steps"], change
+    return model, noise, result, solution.stats["num_steps"], change, size
 
 
 def _line_noise(data, model):

@@ -2,7 +2,11 @@
 
 The rays of the first frame follow from a guess of its focal length. Each frame after it is fitted to the
 rays that frames before it gave (log f and rotation, robustly), and its views give or improve rays. All
-guesses run side by side; those that leave the least median residuals are starts.
+guesses run side by side; those that most views follow best are starts.
+
+A camera often follows something that moves. What has a share of the tracks, and stays where it was in the
+image, then draws a fit that begins with the frame before. So each fit begins with what most of the frame's
+views agree with, among what two tracks each say (Fischler, Bolles 1981).
 """
 
 from typing import NamedTuple
@@ -13,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ._structure import bucket
-from ._views import core_median
+from ._views import CAUCHY, MEDIAN_OF_SIZE, core_median
 
 FIELDS_OF_VIEW = (70.0, 45.0, 28.0, 17.0, 10.0, 5.0)
 """Guesses, degrees across the image."""
@@ -23,6 +27,8 @@ STARTS = 3
 
 _TURNS = 12  # Gauss-Newton steps a frame
 _LEAST_VIEWS = 4
+_PAIRS = 24  # of tracks: with half of all on things that move, none is without in one frame of 1,000
+_AGREES = 1 / 400  # of the image's width: what is farther off than this hardly agrees
 
 
 class Path(NamedTuple):
@@ -82,7 +88,7 @@ def shrunk_ray(ray: Float[Array, "3"], factor: Float[Array, ""]) -> Float[Array,
 def starts_of(
     points: Float[Array, "view 2"], tracks: int, width: float, by_frame: tuple
 ) -> tuple[Path, Array]:
-    """The best `STARTS` chains of all guesses, best first, and the medians of their residuals, px.
+    """The best `STARTS` chains of all guesses, best first, and the medians of their frames' residuals, px.
 
     Args:
         points: of each view, about the centre of the image, px.
@@ -93,22 +99,40 @@ def starts_of(
     track, view, present = by_frame
     seen = points[view]
     guesses = width / 2 / np.tan(np.radians(FIELDS_OF_VIEW) / 2)
+    drawn = np.random.default_rng(0).uniform(size=(1, _PAIRS, 2))
+    drawn = (drawn + 0.618 * jnp.arange(len(track))[:, None, None]) % 1  # other ones in each frame
 
     def chain(focal):
         state = _State(jnp.log(focal), jnp.eye(3), jnp.zeros((tracks, 3)), jnp.zeros(()))
 
         def step(state, frame):
-            state = _next(state, *frame)
+            state = _next(state, *frame, near=_AGREES * width)
             return state, (state.log_focal, state.rotation, state.residual)
 
-        final, (log_focal, rotation, residual) = jax.lax.scan(step, state, (track, present, seen))
+        frames = (track, present, seen, drawn)
+        final, (log_focal, rotation, residual) = jax.lax.scan(step, state, frames)
         norm = jnp.linalg.norm(final.rays, axis=1, keepdims=True)
         rays = jnp.where(norm > 0, final.rays / jnp.where(norm > 0, norm, 1), jnp.array([[0.0, 0.0, 1.0]]))
         return Path(log_focal, rotation, rays), jnp.nanmean(residual)
 
+    def missed(path):
+        def frame(log_focal, rotation, track, present, seen):
+            errors = _errors(path.rays[track] @ rotation.T, log_focal, seen)
+            return jnp.where(present, jnp.linalg.norm(errors, axis=1), jnp.nan)
+
+        return jax.vmap(frame)(path.log_focal, path.rotation, track, present, seen)
+
     paths, residuals = jax.vmap(chain)(jnp.asarray(guesses, points.dtype))
-    best = jnp.argsort(jnp.where(jnp.isfinite(residuals), residuals, jnp.inf))[:STARTS]
+    residuals = jnp.where(jnp.isfinite(residuals), residuals, jnp.inf)
+    near = CAUCHY * jnp.min(residuals) / MEDIAN_OF_SIZE
+    costs = jax.lax.map(lambda path: disagreement(missed(path), near), paths)
+    best = jnp.argsort(jnp.where(jnp.isfinite(residuals), costs, jnp.inf))[:STARTS]
     return jax.tree.map(lambda leaf: leaf[best], paths), residuals[best]
+
+
+def disagreement(size: Float[Array, "*some"], near: Float[Array, ""] | float) -> Float[Array, ""]:
+    """How far views are off, in all, where those far off count little more: a mean; NaN is no view."""
+    return jnp.nanmean(jnp.log1p((size / near) ** 2))
 
 
 def views_by_frame(
@@ -123,7 +147,12 @@ def views_by_frame(
     return padded[0], padded[1], np.arange(padded.shape[2]) < count[:, None]
 
 
-def _next(state, track, present, seen):
+def _errors(ahead, log_focal, seen):
+    """How far points ahead of a camera without distortion are from where they were seen, px."""
+    return jnp.exp(log_focal) * ahead[:, :2] / jnp.maximum(ahead[:, 2:], 0.05) - seen
+
+
+def _next(state, track, present, seen, drawn, *, near):
     """The state after one more frame: its focal length and rotation, and the rays with its views."""
     known = present & (jnp.sum(state.rays[track] ** 2, axis=1) > 0)
     directions = state.rays[track]
@@ -132,8 +161,20 @@ def _next(state, track, present, seen):
 
     def residuals(unknown):
         ahead = jax.vmap(lambda ray: turned(state.rotation @ ray, unknown[1:]))(directions)
-        depth = jnp.maximum(ahead[:, 2:], 0.05)
-        return jnp.exp(state.log_focal + unknown[0]) * ahead[:, :2] / depth - seen
+        return _errors(ahead, state.log_focal + unknown[0], seen)
+
+    def change(error, jacobian, weight):
+        normal = jnp.einsum("vri,vrj,v->ij", jacobian, jacobian, weight)
+        right = jnp.einsum("vri,vr,v->i", jacobian, error, weight)
+        normal = normal + 1e-9 * (1 + jnp.trace(normal)) * jnp.eye(4)
+        return -jnp.clip(jnp.linalg.solve(normal, right), -0.3, 0.3)
+
+    def of_pair(pair):
+        return change(error[pair], jacobian[pair], jnp.ones(2))
+
+    def cost(unknown):
+        size = jnp.linalg.norm(residuals(unknown), axis=1)
+        return disagreement(jnp.where(known, size, jnp.nan), near)
 
     def spread(unknown):
         size = core_median(jnp.linalg.norm(residuals(unknown), axis=1), known)
@@ -142,13 +183,16 @@ def _next(state, track, present, seen):
     def turn(unknown, _):
         error, scale = residuals(unknown), 2 * spread(unknown)
         weight = jnp.where(known, 1 / (1 + jnp.sum(error**2, axis=1) / scale**2), 0)
-        jacobian = jax.jacfwd(residuals)(unknown)
-        normal = jnp.einsum("vri,vrj,v->ij", jacobian, jacobian, weight)
-        right = jnp.einsum("vri,vr,v->i", jacobian, error, weight)
-        normal = normal + 1e-9 * (1 + jnp.trace(normal)) * jnp.eye(4)
-        return unknown - jnp.clip(jnp.linalg.solve(normal, right), -0.3, 0.3), None
+        return unknown + change(error, jax.jacfwd(residuals)(unknown), weight), None
 
-    unknown, _ = jax.lax.scan(turn, jnp.zeros(4, seen.dtype), None, length=_TURNS)
+    still = jnp.zeros(4, seen.dtype)
+    error, jacobian = residuals(still), jax.jacfwd(residuals)(still)
+    count = jnp.cumsum(known)
+    pairs = jnp.sum(count[None, None] <= jnp.floor(drawn * count[-1])[..., None], axis=-1)
+    begins = jnp.concatenate([still[None], jax.vmap(of_pair)(pairs)])
+    costs = jax.vmap(cost)(begins)
+    start = begins[jnp.argmin(jnp.where(jnp.isfinite(costs), costs, jnp.inf))]
+    unknown, _ = jax.lax.scan(turn, start, None, length=_TURNS)
     unknown = jnp.where(enough, unknown, 0)
     rotation = jax.vmap(turned, (1, None), 1)(state.rotation, unknown[1:])
     focal = jnp.exp(state.log_focal + unknown[0])

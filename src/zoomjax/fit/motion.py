@@ -78,7 +78,9 @@ class MotionFit(eqx.Module):
         parallax_score: its square in standard deviations of chance: above 3 or so it is seen.
         lever: that of each track, less what all have in common, where a parallax is seen; 0 elsewhere.
         lever_std: its standard deviation from track to track, to which levers are held; 0 if none is seen.
-            What all have in common is taken to be as large as 3 of these in `focal_std` and `covariance`.
+        lever_mean: what all are taken to have in common, as no track tells it: 2.5 of these standard
+            deviations, less where it is not sure whether the pupil is before the axis or behind it.
+            `focal_std` and `covariance` have in them by how much that may be off.
     """
 
     fit: ZoomFit
@@ -97,6 +99,7 @@ class MotionFit(eqx.Module):
     parallax_score: Float[Array, ""]
     lever: Float[Array, "track"]
     lever_std: Float[Array, ""]
+    lever_mean: Float[Array, ""]
 
     @property
     def lens(self) -> ZoomLens:
@@ -245,6 +248,7 @@ def _solved_motion(given, asked):
         shot=jnp.asarray(problem.shot, jnp.int32),
         lever=_levers_of(model, problem, len(given.tracks.mask)),
         lever_std=jnp.zeros(()) if model.levers is None else model.levers.std,
+        lever_mean=jnp.zeros(()) if model.levers is None else model.levers.mean,
     )
     return fit, model, noise
 
@@ -256,12 +260,13 @@ def _rays_of(model, problem, tracks):
 
 
 def _levers_of(model, problem, tracks):
-    """The lever of each track: the mean of those of its pieces; 0 if the model has none."""
+    """The lever of each track, less their mean: that of its pieces; 0 if the model has none."""
     if model.levers is None:
         return jnp.zeros(tracks)
     ones = jnp.ones(len(problem.track))
     total, count = (
-        jnp.zeros(tracks).at[problem.track].add(of) for of in (model.levers.value[problem.piece], ones)
+        jnp.zeros(tracks).at[problem.track].add(of)
+        for of in (model.levers.value[problem.piece] - model.levers.mean, ones)
     )
     return total / jnp.maximum(count, 1)
 
