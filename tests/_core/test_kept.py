@@ -105,7 +105,7 @@ OBJECTS = [
 ]
 
 
-@pytest.mark.parametrize("value", OBJECTS, ids=str)
+@pytest.mark.parametrize("value", OBJECTS, ids=lambda value: type(value).__name__)
 def test_objects_of_known_packages_have_names(value):
     arrays = []
     structure = kept.taken_apart(value, arrays)
