@@ -120,9 +120,10 @@ class Own(enum.Enum):
     ONE = 1
 
 
-@pytest.mark.parametrize(
-    "value", [Own.ONE, lambda x: x, plain, pytest, {1, 2}, 1j, {1: 2}, b"bytes"], ids=str
-)
+UNKNOWN = [Own.ONE, lambda x: x, plain, pytest, {1, 2}, 1j, {1: 2}, b"bytes"]
+
+
+@pytest.mark.parametrize("value", UNKNOWN, ids=range(len(UNKNOWN)))
 def test_what_has_no_name_is_said_to_have_none(value):
     with pytest.raises(kept._UnknownError):
         kept.taken_apart([value], [])
