@@ -40,9 +40,8 @@ def weak(x):
 def folder(tmp_path, monkeypatch):
     """An empty folder in which programs are kept; those of this module, too."""
     monkeypatch.setattr(kept, "_KNOWN", (*kept._KNOWN, __name__.split(".")[0]))
-    kept.keep_programs(tmp_path)
-    yield tmp_path
-    kept.keep_programs(None)
+    monkeypatch.setattr(kept, "_STORE", kept._Store(tmp_path))
+    return tmp_path
 
 
 @pytest.fixture
@@ -57,7 +56,7 @@ def traced(monkeypatch):
 
 def again():
     """As in a process that begins."""
-    kept.keep_programs(kept._STORE.folder)
+    kept._STORE.calls.clear()
 
 
 def equal(a, b):
@@ -258,7 +257,7 @@ def test_the_oldest_are_removed_where_all_are_too_many(folder, monkeypatch):
         file.write_bytes(bytes(100))
         os.utime(file, (number, number))
     (folder / "whole-cache").write_bytes(bytes(500))
-    again()
+    kept._remove_oldest(folder)
     assert sorted(os.listdir(folder)) == ["2.traced", "3.traced", "whole-cache"]
 
 
@@ -269,10 +268,10 @@ def test_inside_of_other_programs_nothing_is_kept(folder, traced):
     assert traced == []
 
 
-def test_fits_are_the_same_to_the_last_bit(small, folder, traced):
-    kept.keep_programs(None)
-    plainly = zj.fit_zoom(small, terms=1)
-    kept.keep_programs(folder)
+def test_fits_are_the_same_to_the_last_bit(small, folder, traced, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(kept, "_STORE", kept._Store())
+        plainly = zj.fit_zoom(small, terms=1)
     for _ in range(2):
         equal(zj.fit_zoom(small, terms=1), plainly)
         again()

@@ -1,4 +1,4 @@
-"""The cache on disk of compiled programs, from process to process."""
+"""The cache on disk of traced and compiled programs, from process to process."""
 
 import os
 import subprocess
@@ -13,8 +13,11 @@ import sys
 if sys.argv[1] == "bare":
     sys.modules["filelock"] = None
 import jax, numpy as np, zoomjax as zj
-missed = []
+missed, traced = [], []
 jax.monitoring.register_event_listener(lambda name, **_: missed.append(name))
+jax.monitoring.register_event_duration_secs_listener(
+    lambda name, seconds, fun_name="", **_: traced.append(fun_name) if "trace" in name else None
+)
 assert zj.cache_compiled() is not None
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 number = int(sys.argv[2])
@@ -26,6 +29,7 @@ lines = zj.compress(zj.Lines.from_ragged(bent, frame, [50, 70, 100], image_size=
 zj.fit_zoom(lines, terms=1)
 zj.fit_robust(lines, terms=1)
 print(sum("cache_misses" in name for name in missed), sum("cache_hits" in name for name in missed))
+print(len({"minimise", "described", "_reweighted"} & set(traced)))
 """
 
 
@@ -45,12 +49,14 @@ def run(folder, *argv):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["with filelock", "bare"])
-def test_a_later_process_with_other_sizes_compiles_nothing(tmp_path, how):
-    missed, _ = run(tmp_path, how, "40")
+def test_a_later_process_with_other_sizes_traces_and_compiles_nothing(tmp_path, how):
+    missed, _, traced = run(tmp_path, how, "40")
     assert missed > 3
-    missed, found = run(tmp_path, how, "55")
+    assert traced == 3
+    missed, found, traced = run(tmp_path, how, "55")
     assert missed == 0
     assert found > 3
+    assert traced == 0
 
 
 TWO_FOLDERS = """
