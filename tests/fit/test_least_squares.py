@@ -82,6 +82,25 @@ def test_columns_without_effect_stay_where_they_are():
     np.testing.assert_allclose(found.value, [0.2, 7.0], atol=1e-9)
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e2, 1e4])
+@pytest.mark.parametrize("seed", range(6))
+def test_dependent_columns_are_no_reason_to_go_on_for_ever(seed, scale):
+    rng = np.random.default_rng(seed)
+    matrix, right = scale * rng.standard_normal((2000, 5)), rng.standard_normal(2000)
+    matrix[:, 4] = matrix[:, 0] - 2 * matrix[:, 2]
+    found = solve(lambda y, args: (jnp.asarray(matrix) @ y - jnp.asarray(right), None), jnp.ones(5))
+    assert found.result == optx.RESULTS.successful
+    assert found.stats["num_steps"] < 40
+    best = np.linalg.norm(matrix @ np.linalg.lstsq(matrix, right)[0] - right)
+    np.testing.assert_allclose(np.linalg.norm(matrix @ found.value - right), best, rtol=1e-9)
+
+
+def test_a_start_without_numbers_ends_at_once():
+    found = solve(lambda y, args: (jnp.exp(y), None), jnp.array([1e4]))
+    assert found.result == optx.RESULTS.nonfinite
+    assert found.stats["num_steps"] == 1
+
+
 @pytest.mark.parametrize("start", [jnp.nan, 1e200])
 def test_what_is_not_finite_is_no_success(start):
     found = solve(lambda y, args: (jnp.exp(y) - 1, None), jnp.array([start]), max_steps=40)

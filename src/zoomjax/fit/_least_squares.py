@@ -1,7 +1,7 @@
 """The default solver of fits: Levenberg-Marquardt for many residuals and few unknowns.
 
-It is a solver of optimistix, with the trust region of its `LevenbergMarquardt`, which finds the same
-minimum in the same steps. Three things differ.
+It is a solver of optimistix, with the trust region of its `LevenbergMarquardt`. It takes the same steps but
+for three things.
 
 * Of a Jacobian with thousands of rows and the residuals beside it, it keeps the small triangle of their QR
   alone: a step, what it promises and whether it moves anything follow from that. The program is half as
@@ -11,7 +11,7 @@ minimum in the same steps. Three things differ.
   Gauss-Newton matrix of the paper's scene, in px, and costs 8 steps instead of 4.
 * It accepts a step that leaves the sum of squares as it was, up to rounding. At the minimum the actual and
   the predicted reduction are both rounding errors; comparing them rejects every step to the last one
-  allowed, in float32 often.
+  allowed, in float32 often. The next step is damped more, lest such steps go on for ever.
 """
 
 from collections.abc import Callable
@@ -43,6 +43,7 @@ class _State(eqx.Module):
         triangle: R of the Jacobian and, as the last column, the residuals.
         squares: the sum of the squared residuals; infinite before the first step.
         done: whether the last step moved nothing.
+        lost: whether the residuals at the start are not finite.
     """
 
     proposed: Float[Array, "unknown"]
@@ -50,6 +51,7 @@ class _State(eqx.Module):
     triangle: Float[Array, "column column"]
     squares: Float[Array, ""]
     done: Bool[Array, ""]
+    lost: Bool[Array, ""]
 
 
 class TriangularLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
@@ -74,10 +76,14 @@ class TriangularLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             triangle=jnp.zeros((start.size + 1, start.size + 1), start.dtype),
             squares=jnp.array(jnp.inf, start.dtype),
             done=jnp.array(False),
+            lost=jnp.array(False),
         )
 
     def step(self, fn, y, args, options, state: _State, tags) -> tuple[PyTree, _State, Any]:
-        """Try the unknowns proposed, go there if they are better, and propose the next."""
+        """Try the unknowns proposed, go there if they are better, and propose the next.
+
+        What the function returns besides is that of the unknowns tried.
+        """
         here, unravel = ravel_pytree(y)
         triangle, aux = _triangle_at(lambda flat: fn(unravel(flat), args), state.proposed)
         squares = jnp.sum(triangle[:, -1] ** 2)
@@ -86,14 +92,17 @@ class TriangularLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         change = state.triangle[:, :-1] @ moved
         promised = jnp.sum((state.triangle[:, -1] + change) ** 2) - state.squares
         gained = squares - state.squares
-        still = jnp.abs(gained) <= ROUNDING * jnp.finfo(gained.dtype).eps * state.squares
+        first = jnp.isinf(state.squares)
+        numbers = jnp.finfo(gained.dtype)
+        still = ~first & (jnp.abs(gained) <= ROUNDING * numbers.eps * state.squares)
         accepted = (gained <= _TRUSTED.low_cutoff * promised) | still
-        as_promised = (gained < _TRUSTED.high_cutoff * promised) & (promised < 0) & ~still
+        as_promised = (gained < _TRUSTED.high_cutoff * promised) & (promised < 0)
         weaker = jnp.where(as_promised, 1 / _TRUSTED.high_constant, 1)
-        damping = state.damping * jnp.where(accepted, weaker, 1 / _TRUSTED.low_constant)
+        damping = state.damping * jnp.where(accepted & ~still, weaker, 1 / _TRUSTED.low_constant)
+        damping = jnp.maximum(damping, numbers.tiny)
 
-        little = jnp.all(jnp.abs(moved) < self.atol + self.rtol * jnp.abs(state.proposed))
-        little &= jnp.linalg.norm(change) < self.atol + self.rtol * jnp.sqrt(squares)
+        little = jnp.all(jnp.abs(moved) <= self.atol + self.rtol * jnp.abs(state.proposed))
+        little &= jnp.linalg.norm(change) <= self.atol + self.rtol * jnp.sqrt(squares)
         here = jnp.where(accepted, state.proposed, here)
         triangle = jnp.where(accepted, triangle, state.triangle)
         new = _State(
@@ -101,14 +110,16 @@ class TriangularLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             damping=damping,
             triangle=triangle,
             squares=jnp.where(accepted, squares, state.squares),
-            done=accepted & little & jnp.isfinite(state.squares),
+            done=accepted & little & ~first,
+            lost=first & ~accepted,
         )
         return unravel(here), new, aux
 
     def terminate(self, fn, y, args, options, state: _State, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
-        """Whether the last step moved nothing."""
-        result: Any = optx.RESULTS.successful
-        return state.done, result
+        """Whether the last step moved nothing, or there is no start."""
+        good: Any = optx.RESULTS.successful
+        nonfinite: Any = optx.RESULTS.nonfinite
+        return state.done, optx.RESULTS.where(state.lost, nonfinite, good)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result) -> tuple[PyTree, Any, dict]:
         """The unknowns as they are."""

@@ -201,9 +201,11 @@ def check_channels_last(shape: tuple[int, ...]) -> None:
         )
 
 
-at_focal = light_program(lambda lens, focal: lens._distortion(focal, None))
-"""``lens(focal)`` compiled, for videos.
+@light_program
+def at_focal(lens: Any, focal: Any) -> Any:
+    """``lens(focal)`` compiled, for videos.
 
-It extrapolates beyond the fitted range without a warning: for callers that have checked the range, or that
-measure how uncertain the lens is there.
-"""
+    It extrapolates beyond the fitted range without a warning: for callers that have checked the range, or
+    that measure how uncertain the lens is there.
+    """
+    return lens._distortion(focal, None)

@@ -92,8 +92,10 @@ def _design(lines, model, left):
     return Design(values, project, precision, mean)
 
 
-_basis_of = light_program(lambda model, *settings: jax.vmap(model.basis)(*settings))
-"""Of a model without its parameters: one compiled program for any number of terms."""
+@light_program
+def _basis_of(model, *settings):
+    """Of a model without its parameters: one compiled program for any number of terms."""
+    return jax.vmap(model.basis)(*settings)
 
 
 @bucketed_jit()
