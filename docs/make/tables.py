@@ -362,6 +362,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "rooms": rooms.table,
     "fit": fit,
     "compiling": whole("compiling.md"),
+    "end_to_end": whole("end_to_end.md"),
     "many": whole("many.md"),
     "correct": correct,
     "pipeline": pipeline,
