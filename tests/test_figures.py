@@ -65,11 +65,11 @@ def test_a_figure_without_a_source_is_found():
 
 
 def test_a_figure_with_another_value_than_its_source_is_found():
-    assert not wrong("15.4 passes\n<!-- results: fit.md -->\n")
+    assert not wrong("25.1 passes\n<!-- results: fit.md -->\n")
     assert wrong("15.5 passes\n<!-- results: fit.md -->\n")
-    assert not wrong("15 passes\n<!-- results: fit.json#compress_over_pass -->\n")
-    assert wrong("16 passes\n<!-- results: fit.json#compress_over_pass -->\n")
-    assert not wrong("30.3 ms, 10.2 million\n<!-- results: fit.json#fit, fit.json#points -->\n")
+    assert not wrong("25 passes\n<!-- results: fit.json#compress_over_pass -->\n")
+    assert wrong("26 passes\n<!-- results: fit.json#compress_over_pass -->\n")
+    assert not wrong("18.9 ms, 10.2 million\n<!-- results: fit.json#fit, fit.json#points -->\n")
     assert wrong("3.05 px\n<!-- results: trust.md#Coverage of the corner's displacement -->\n")
     assert not wrong("3.05 px\n<!-- results: trust.md#Arcs in the place of lines -->\n")
 
@@ -101,7 +101,7 @@ def test_code_and_formulas_are_no_figures():
 
 def test_a_table_follows_its_results():
     text = "<!-- table: fit -->\nold\n<!-- end -->\n"
-    assert "| compression, once | 153 ms | 15.4 memory passes |" in tables.filled(text)
+    assert "| compression, once | 184 ms | 25.1 memory passes |" in tables.filled(text)
     assert tables.filled(tables.filled(text)) == tables.filled(text)
 
 
