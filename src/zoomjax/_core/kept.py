@@ -28,9 +28,7 @@ import equinox as eqx
 import jax
 import jax.export
 import jaxlib
-import lineax
 import numpy as np
-import optimistix
 
 from .files import whole_file
 from .structure import UnknownError, put_together, taken_apart, wrapped_name
@@ -187,6 +185,9 @@ def _name(function, given, arrays) -> str:
 @functools.cache
 def _versions() -> str | None:
     """Those of all packages that take part, and the text of this one; None if it has changed since."""
+    import lineax  # neither needed nor quick to be read where no program is kept
+    import optimistix
+
     text, package = hashlib.sha256(), Path(__file__).parents[1]
     try:
         for path in sorted(package.rglob("*.py")):
