@@ -16,6 +16,8 @@ import zoomjax as zj
 from zoomjax._core import kept, structure
 from zoomjax._core.programs import program
 
+from ._trees import equal
+
 
 def plain(x, y=1):
     """Made a program by the tests."""
@@ -51,17 +53,6 @@ def traced(monkeypatch):
 def again():
     """As in a process that begins."""
     kept._STORE.calls.clear()
-
-
-def equal(a, b):
-    """Whether two trees are the same, to the last bit."""
-    assert jax.tree.structure(a) == jax.tree.structure(b)
-    for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        if eqx.is_array(one):
-            assert one.dtype == other.dtype
-            np.testing.assert_array_equal(one, other)
-        else:
-            assert (type(one), one) == (type(other), other)
 
 
 def test_a_program_is_traced_once_for_all_processes(folder, traced):

@@ -18,17 +18,7 @@ from zoomjax._core.structure import UnknownError, found, named, put_together, ta
 from zoomjax.fit import RESULTS
 from zoomjax.models import About, Model
 
-
-def equal(a, b):
-    """Whether two trees are the same, to the last bit."""
-    assert jax.tree.structure(a) == jax.tree.structure(b)
-    for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        if eqx.is_array(one):
-            assert one.dtype == other.dtype
-            np.testing.assert_array_equal(one, other)
-        else:
-            assert (type(one), one) == (type(other), other)
-
+from ._trees import equal
 
 PLAIN = st.none() | st.booleans() | st.integers() | st.text() | st.floats(allow_nan=False)
 NESTED = st.recursive(

@@ -47,13 +47,6 @@ def line_weights(lines: AbstractLines) -> Float[Array, "line"]:
     return share / (number * per_frame[lines.frame] * jnp.maximum(lines.counts, 1))
 
 
-def root_weights(lines: AbstractLines) -> Float[Array, "line"]:
-    """The roots of `line_weights`, by which residuals are multiplied."""
-    weights = line_weights(lines)
-    counted = weights > 0  # the root has no derivative at 0
-    return jnp.where(counted, jnp.sqrt(jnp.where(counted, weights, 1)), 0)
-
-
 def counted_frames(lines: AbstractLines) -> Bool[Array, "frame"]:
     """Which frames have a usable line: three points or more and a weight above 0."""
     return _shares(lines)[1] > 0
@@ -95,13 +88,16 @@ def weighted_distances(
             f"Argument coefficients must have a row for each of the {lines.focal.shape[0]} frames, but its "
             f"shape is {coefficients.shape}."
         )
-    return root_weights(lines)[:, None] * line_distances(lines, coefficients)
+    weights = line_weights(lines)
+    counted = weights > 0  # the root has no derivative at 0
+    roots = jnp.where(counted, jnp.sqrt(jnp.where(counted, weights, 1)), 0)
+    return roots[:, None] * line_distances(lines, coefficients)
 
 
 def line_distances(
     lines: AbstractLines, coefficients: Float[Array, "frame terms"]
 ) -> Float[Array, "line rows"]:
-    """The distances, px, without the weights, which do not depend on the coefficients."""
+    """The same without the weights, px."""
     return jax.vmap(line_residuals)(lines.corrected(coefficients))
 
 
