@@ -46,7 +46,7 @@ _KEPT = Path(os.environ["ZOOMJAX_CACHE"]) / "tests" / os.environ.get("PYTEST_XDI
 jax.config.update("jax_compilation_cache_dir", str(_KEPT))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 # Tests change what programs are made of: traced ones are kept by processes of their own alone.
-kept.keep_programs = lambda folder: None
+keep_programs, kept.keep_programs = kept.keep_programs, lambda folder: None
 hypothesis.settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=50)
 hypothesis.settings.load_profile("fixed")
 

@@ -16,6 +16,7 @@ import zoomjax as zj
 from zoomjax._core import kept, structure
 from zoomjax._core.programs import program
 
+from ..conftest import keep_programs
 from ._trees import equal
 
 
@@ -248,6 +249,15 @@ def test_few_programs_are_at_hand(folder, traced, monkeypatch):
         program(plain)(np.ones(size))
     assert len(kept._STORE.calls) == 3
     assert traced == ["plain"] * 5
+
+
+@pytest.mark.parametrize("missing", ["flatbuffers", "jax.export"])
+def test_nothing_is_kept_where_jax_cannot_write_programs(folder, traced, monkeypatch, missing):
+    monkeypatch.setitem(sys.modules, missing, None)
+    keep_programs(folder)
+    assert float(program(plain)(jnp.ones(1))["sum"][0]) == 2
+    assert not traced
+    assert not list(folder.iterdir())
 
 
 def test_a_folder_that_is_gone_is_no_harm(folder):

@@ -26,7 +26,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.export
 import jaxlib
 import numpy as np
 
@@ -73,11 +72,11 @@ _STORE = _Store()
 
 
 def keep_programs(folder: Path | None) -> None:
-    """Keep programs in a folder from now on; None: no longer."""
-    _STORE.folder = folder
+    """Keep programs in a folder from now on, where JAX can write them; None: no longer."""
+    _STORE.folder = folder if _can_export() else None
     _STORE.calls.clear()
-    if folder is not None:
-        _remove_oldest(folder)
+    if _STORE.folder is not None:
+        _remove_oldest(_STORE.folder)
 
 
 def kept(function: Call, settings: tuple, args: tuple, kwargs: dict) -> Call | None:
@@ -98,6 +97,16 @@ def kept(function: Call, settings: tuple, args: tuple, kwargs: dict) -> Call | N
         if len(calls) > _CALLS:
             calls.pop(next(iter(calls)), None)
     return None if call is None else functools.partial(call, *arrays)
+
+
+def _can_export() -> bool:
+    """Whether there is what JAX writes programs with, and what older versions of it import to do so."""
+    try:
+        import flatbuffers  # noqa: F401
+        import jax.export  # noqa: F401
+    except ImportError:
+        return False
+    return True
 
 
 def _can_keep() -> bool:
@@ -131,6 +140,8 @@ def _looked_up(folder, function, settings, given, arrays):
 
 def _traced(function, given, arrays):
     """The structure of a function's result and its program: none if it cannot be written."""
+    from jax import export
+
     leaves, tree = jax.tree.flatten(given)
     structure: Any = None
 
@@ -150,7 +161,7 @@ def _traced(function, given, arrays):
     except UnknownError:
         return None, b""
     try:
-        return structure, bytes(jax.export.export(jitted)(*arrays).serialize())
+        return structure, bytes(export.export(jitted)(*arrays).serialize())
     except (NotImplementedError, ValueError):  # it calls Python
         return None, b""
 
@@ -202,12 +213,14 @@ def _versions() -> str | None:
     return " ".join([sys.version, *others, text.hexdigest()])
 
 
-def _exported(program: bytes) -> jax.export.Exported | None:
+def _exported(program: bytes) -> Any:
     """The program in these bytes; None if there are none, as it cannot be written."""
-    return jax.export.deserialize(bytearray(program)) if program else None
+    from jax import export
+
+    return export.deserialize(bytearray(program)) if program else None
 
 
-def _read(file: Path) -> tuple[Any, jax.export.Exported | None] | None:
+def _read(file: Path) -> tuple[Any, Any] | None:
     """The structure and the program in a file; None if there is no file, or none that can be read."""
     try:
         packed = file.read_bytes()

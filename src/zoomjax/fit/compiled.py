@@ -56,8 +56,7 @@ def cache_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     if importlib.util.find_spec("filelock"):  # without it JAX warns, and keeps nothing
         jax.config.update("jax_compilation_cache_max_size", _MOST)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.03)
-    if importlib.util.find_spec("flatbuffers"):  # with which JAX writes what was traced
-        keep_programs(place)
+    keep_programs(place)
     return place
 
 
