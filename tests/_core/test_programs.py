@@ -59,8 +59,8 @@ def test_settings_of_the_environment_come_first(monkeypatch):
 def test_settings_that_xla_does_not_know_are_left_away(monkeypatch):
     monkeypatch.setattr(programs, "_PLAINLY", {"xla_no_such_setting": True, **programs._PLAINLY})
     assert float(program(lambda x: x + 1)(jnp.ones(()))) == 2
-    assert {"xla_no_such_setting"} == programs._UNKNOWN
-    assert "xla_cpu_use_fusion_emitters" in dict(programs._settings(False))
+    assert "xla_no_such_setting" in programs._UNKNOWN  # others are, too, in some versions
+    assert "xla_backend_optimization_level" in dict(programs._settings(False))
 
 
 def test_other_errors_are_raised():
