@@ -85,7 +85,7 @@ class Assessment:
         """The verdict and its main reason."""
         if self.verdict == "good":
             return (
-                f"Good: the correction moves points by {_px(self.evidence.displacement)} px on average, "
+                f"Good: the correction moves points by {_px(self.evidence.displacement)} px (RMS), "
                 f"with a standard deviation of {_px(self.evidence.std)} px. Beyond a change of view it is "
                 f"uncertain by {_px(self.evidence.bent_std)} px of the image."
             )
@@ -196,7 +196,7 @@ def _of_bands(of: Evidence, fit: ZoomFit) -> Iterator[Finding]:
         yield Finding("bands", "not determined", "the lines do not determine the correction.", more)
     elif of.frames > 1 and (verdict := _judged(of.std, of)) != "good":
         found = (
-            f"the correction moves points by {_px(of.displacement)} px on average, but is uncertain by "
+            f"the correction moves points by {_px(of.displacement)} px (RMS), but is uncertain by "
             f"{_px(of.std)} px."
         )
         yield Finding("bands", verdict, found, more)
@@ -204,7 +204,7 @@ def _of_bands(of: Evidence, fit: ZoomFit) -> Iterator[Finding]:
         yield Finding(
             "bending",
             "doubtful" if of.bent_std <= _UNDETERMINED * of.bent else "not determined",
-            f"the correction straightens what is bent by {_px(of.bent)} px on average, but is uncertain by "
+            f"the correction straightens what is bent by {_px(of.bent)} px (RMS), but is uncertain by "
             f"{_px(of.bent_std)} px in that.",
             more,
         )
