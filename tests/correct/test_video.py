@@ -14,6 +14,7 @@ import pytest
 import zoomjax as zj
 from zoomjax.correct._planes import sampled_planes
 from zoomjax.correct.video import undistort_video
+from zoomjax.io.pyav import open_container
 from zoomjax.io.video_reader import decode_video
 from zoomjax.io.video_writer import display_matrix
 
@@ -231,8 +232,9 @@ def test_only_sound(tmp_path):
 def test_tags_that_are_not_utf_8_go_over_as_they_are(tmp_path):
     """As older recorders write them."""
     given = tmp_path / "in.avi"
-    with av.open(str(given), "w", metadata_encoding="latin-1") as out:
-        out.metadata["title"] = "Straße Ä"
+    title = "Straße Ä".encode("latin-1").decode("utf-8", "surrogateescape")
+    with open_container(given, "w") as out:
+        out.metadata["title"] = title
         stream = out.add_stream("mpeg4", rate=30)
         stream.width, stream.height = SIZE
         for packet in [
@@ -241,8 +243,8 @@ def test_tags_that_are_not_utf_8_go_over_as_they_are(tmp_path):
         ]:
             out.mux(packet)
     undistort_video(given, tmp_path / "out.avi", lens=lens(), focal=30.0)
-    with av.open(str(tmp_path / "out.avi"), metadata_encoding="latin-1") as found:
-        assert found.metadata["title"] == "Straße Ä"
+    with open_container(tmp_path / "out.avi") as found:
+        assert found.metadata["title"] == title
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")

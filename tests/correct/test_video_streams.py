@@ -10,6 +10,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax.correct.video import redistort_video, undistort_video
+from zoomjax.io.video_hdr import side_data
 from zoomjax.io.video_reader import decode_video
 
 from .._clips import FRAMES, SIZE, lens, luma, picture, write_clip
@@ -135,7 +136,7 @@ HDR = {
 def hdr(path):
     """Numbers of the mastering display, as real ones, and of the light level."""
     with av.open(str(path)) as container:
-        found = {item.type.name: bytes(item) for item in next(container.decode(video=0)).side_data}
+        found = side_data(next(container.decode(video=0)), container.streams.video[0].codec_context)
     numbers = struct.unpack("<22i", found["MASTERING_DISPLAY_METADATA"])
     display = [a / b for a, b in zip(numbers[:20:2], numbers[1:20:2], strict=True)]
     return display, struct.unpack("<2I", found["CONTENT_LIGHT_LEVEL"])

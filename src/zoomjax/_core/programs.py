@@ -3,8 +3,8 @@
 The time of a first fit is that of the compiler. On processors two of its settings matter. The emitters of
 fusions by MLIR take half of the time, and what they emit for our programs is no faster: all but those that
 correct points and images are compiled without, where XLA has others (newer versions have not). Optimisation
-by LLVM takes two thirds of the rest, and makes a program some three times as fast: where the work is that of
-going over the arguments once or twice, and these are small, that saves a millisecond for a second.
+by LLVM takes two thirds of the rest, and makes a program some three times as fast: where the work is that
+of going over the arguments once or twice, and these are small, that saves a millisecond for a second.
 """
 
 import functools

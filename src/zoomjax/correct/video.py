@@ -283,7 +283,7 @@ def _warped(
         for item, number, time in numbered(items, report, source):
             if isinstance(item, av.VideoFrame):
                 if report.first is None:
-                    report.first = first_frame(item)
+                    report.first = first_frame(item, report.side)
                 report.last = (number, time)
                 yield warper(item, track.at(number, time))
             else:
@@ -355,7 +355,7 @@ def _write_segments(
         break
     else:
         raise ValueError(f"Cannot read a video from {input_.name}: none of its frames can be decoded.")
-    report.first = first_frame(frame)
+    report.first = first_frame(frame, own.side)
     work = dataclasses.replace(work, like=report.first, zero=frame.time or 0.0)
     made = warper(frame, work.track.at(number, time))
 

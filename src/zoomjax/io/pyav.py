@@ -1,6 +1,7 @@
 """PyAV, imported when it is first used: modules that need it only for video are imported without it."""
 
-from typing import TYPE_CHECKING, Any
+import os
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     import av
@@ -22,4 +23,11 @@ else:
 
     av = _PyAV()
 
-__all__ = ["av"]
+__all__ = ["av", "open_container"]
+
+
+def open_container(path: str | os.PathLike[str], mode: Literal["r", "w"] = "r", **more: Any) -> Any:
+    """A file as a container of PyAV's, whose tags need not be UTF-8: other bytes are surrogates."""
+    if int(av.__version__.partition(".")[0]) < 19:  # later ones do so by themselves
+        more["metadata_errors"] = "surrogateescape"
+    return av.open(os.fspath(path), mode, **more)

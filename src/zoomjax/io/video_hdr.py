@@ -26,9 +26,13 @@ _PARAMETERS = {"libx265": "x265-params", "libx264": "x264-params", "libsvtav1": 
 """Options of the encoders that write these metadata."""
 
 
-def side_data(frame: Any) -> dict[str, bytes]:
-    """What a frame carries beside its pixels, by FFmpeg's names."""
-    return {item.type.name: bytes(item) for item in frame.side_data}
+def side_data(frame: Any, context: Any) -> dict[str, bytes]:
+    """What a frame and its decoder tell beside the pixels, by FFmpeg's names."""
+    stream = getattr(context, "decoded_side_data", {})  # where newer FFmpegs tell some things alone
+    items = (frame.side_data[index] for index in range(len(frame.side_data)))
+    return {kind.name: bytes(value) for kind, value in stream.items()} | {
+        item.type.name: bytes(item) for item in items
+    }
 
 
 def with_hdr(

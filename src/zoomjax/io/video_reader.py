@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from .pyav import av
+from .pyav import av, open_container
+from .video_hdr import side_data
 
 _MOST_ERRORS = 1000
 """Of one file: a demuxer may fail for ever."""
@@ -51,13 +52,15 @@ def decode_video(
 
 @dataclasses.dataclass
 class Report:
-    """What happened on the way, in threads: counts of frames, and where packets end, s."""
+    """What happened on the way, in threads: counts of frames, where packets end, s, and what the first
+    frame carries."""
 
     announced: int
     written: int = 0
     corrupt: int = 0
     failed: int = 0
     error: str = ""
+    side: dict[str, bytes] | None = None
     first: Any = None
     last: tuple[int, float] = (-1, math.nan)
     end: float = 0.0
@@ -74,7 +77,7 @@ def opened_video(source: str | os.PathLike[str]) -> Any:
     if path.stat().st_size == 0:
         raise ValueError(f"Cannot read a video from {path}: the file is empty.")
     try:
-        container: Any = av.open(str(path), metadata_errors="surrogateescape")  # tags need not be UTF-8
+        container = open_container(path)
     except av.error.FFmpegError as error:
         raise ValueError(
             f"Cannot read a video from {path}: {error.strerror}. The file is damaged, cut off, or no video."
@@ -161,6 +164,8 @@ def decoded_items(
                 heapq.heapify(steps)
             continue
         for frame in frames:
+            if report.side is None:
+                report.side = side_data(frame, video.codec_context)  # here, where the decoder is at rest
             if steps:
                 frame.pts = heapq.heappop(steps)
             report.corrupt += bool(frame.is_corrupt)

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .pyav import av
-from .video_hdr import side_data, with_hdr
+from .pyav import av, open_container
+from .video_hdr import with_hdr
 from .video_streams import CONTAINER, Carried, put, starts
 
 _ENCODER = {
@@ -78,7 +78,8 @@ class Picture(NamedTuple):
     @classmethod
     def of(cls, packet: Any) -> "Picture":
         """A packet of an encoder's."""
-        times = (packet.pts, packet.dts, packet.duration or 0, packet.time_base)
+        unit = Fraction(packet.time_base.numerator, packet.time_base.denominator)
+        times = (packet.pts, packet.dts, packet.duration or 0, unit)
         return cls(bytes(packet), *times, bool(packet.is_keyframe))
 
 
@@ -119,9 +120,7 @@ class FrameWriter(contextlib.AbstractContextManager):
         self._last: int | None = None
         self._moved = 0
         self._encodes = False
-        self._output = av.open(
-            str(path), "w", format=CONTAINER[named.suffix.lower()], metadata_errors="surrogateescape"
-        )
+        self._output = open_container(path, "w", format=CONTAINER[named.suffix.lower()])
         try:
             self._output.metadata.update(
                 {key: value for key, value in input_.metadata.items() if key not in _OWN_TAGS}
@@ -190,7 +189,7 @@ class FrameWriter(contextlib.AbstractContextManager):
 
     def _encoder(self, source: str, named: Path) -> str:
         """The first of the source's own encoder, H.264 and VP9 that the container takes."""
-        takes = _TAKES.get(self._output.format.name, self._output.supported_codecs)
+        takes = _TAKES.get(self._output.format.name) or self._output.supported_codecs
         name = next(
             name for name in (_ENCODER.get(source, "libx264"), "libx264", "libvpx-vp9") if name in takes
         )
@@ -283,9 +282,9 @@ def _options(name: str, source: Any) -> dict[str, str]:
     return dict(_OPTIONS.get(name, {}))
 
 
-def first_frame(frame: Any) -> FirstFrame:
+def first_frame(frame: Any, side: dict[str, bytes] | None) -> FirstFrame:
     """What a source's first frame tells of all."""
-    return FirstFrame(display_matrix(frame), side_data(frame))
+    return FirstFrame(display_matrix(frame), side or {})
 
 
 def display_matrix(frame: Any) -> list[int] | None:
