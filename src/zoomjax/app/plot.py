@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
@@ -22,6 +20,7 @@ from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..trust.bands import coefficient_std, displacement_std
 from .colours import DEPTHS, FRAMES, MODEL
+from .outward import distortions_at
 
 _EXAGGERATIONS = np.outer(10.0 ** np.arange(7), (1, 2, 5)).ravel()
 _VISIBLE = 0.03  # of the image's longer side: how far the drawn grid is bent at least
@@ -73,9 +72,7 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
     sigma = np.sqrt(np.diagonal(np.asarray(each.covariance), axis1=1, axis2=2)) * to_pixel
 
     def model(focal: np.ndarray) -> np.ndarray:
-        return (
-            np.asarray(jax.vmap(lens.zoom)(jnp.asarray(focal, jnp.asarray(lines.focal).dtype))) * to_pixel
-        )
+        return np.stack([d.coefficients for d in distortions_at(lens, focal)]) * to_pixel
 
     curve, expected = model(1 / grid), model(focal)
     spread = np.asarray(coefficient_std(zoom, 1 / grid)) * to_pixel
