@@ -16,6 +16,7 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax._core import kept
+from zoomjax._core.programs import use_once
 
 SEED = 2012
 
@@ -91,6 +92,13 @@ def _programs_of_a_file_are_dropped():
     """Let go of what one file's tests compiled."""
     yield
     _drop_programs()
+
+
+@pytest.fixture(autouse=True)
+def _commands_leave_no_settings():
+    """Sizes and settings of the compiler are those of the library again, after a command's."""
+    yield
+    use_once(False)
 
 
 @pytest.fixture(autouse=True)

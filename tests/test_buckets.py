@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 import zoomjax as zj
 from tests.conftest import MOST_MAPS
 from zoomjax import scenes
+from zoomjax._core.programs import use_once
 from zoomjax.fit import (
     algebraic_frames,
     algebraic_zoom,
@@ -77,6 +78,15 @@ def test_padding_repeats_no_line_and_no_frame():
     assert not padded.weight[number:].any()
     assert padded.weight[:number].all()
     np.testing.assert_array_equal(padded.focal[7:], LINES.focal[-1])
+
+
+def test_commands_have_fewer_sizes():
+    small = zj.compress(LINES)
+    use_once()
+    assert {len(bucketed(scene(5, lines, 4)).frame) for lines in (2, 60, 250, 400)} == {256, 2048}
+    other = zj.fit_zoom(small, terms=1)
+    use_once(False)
+    assert_same(other.lens, zj.fit_zoom(small, terms=1).lens, 1e-12)
 
 
 def test_millions_of_points_are_not_copied():

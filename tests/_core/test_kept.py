@@ -65,6 +65,15 @@ def test_a_program_is_traced_once_for_all_processes(folder, traced):
     assert len(list(folder.glob("*.traced"))) == 1
 
 
+def test_what_takes_its_results_is_compiled_once(folder):
+    """JAX has two programs for arrays that are committed to a device and for others."""
+    taking = jax.jit(lambda x: 2 * x)
+    for x in (jnp.arange(4.0), program(plain)(jnp.arange(4.0))["sum"]):
+        assert not x.committed
+        taking(x)
+    assert taking._cache_size() == 1
+
+
 @pytest.mark.parametrize(
     "other",
     [

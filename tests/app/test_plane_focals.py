@@ -127,6 +127,19 @@ def test_a_shared_focal_length_is_nearer_to_the_truth(how, detections, alone):
     assert len(set(shared.focal.values())) == 3
 
 
+def test_other_numbers_of_photos_compile_nothing_and_change_nothing(detections, compilations):
+    middle = (np.array(SIZE) - 1) / 2
+    none = zj.Distortion(np.zeros(2), middle, np.array(np.hypot(*SIZE) / 2))
+    all_of_them = focals_from_grids(detections, [none] * 15, Sharing("folder"))
+    compilations()
+    focals_from_grids(detections[3:12], [none] * 9, Sharing("folder"))
+    assert compilations() == 0
+    own = focals_from_grids(detections[:5], [none] * 5, Sharing("folder"))  # in arrays of other sizes
+    for name, estimate in own.focal.items():
+        np.testing.assert_allclose(estimate.focal, all_of_them.focal[name].focal, rtol=1e-11)
+        np.testing.assert_allclose(estimate.std, all_of_them.focal[name].std, rtol=1e-8)
+
+
 def test_photos_without_a_grid_have_the_focal_length_of_their_zoom(detections):
     some = [
         dataclasses.replace(d, nodes=None) if place % 5 == 1 else d for place, d in enumerate(detections)

@@ -3,12 +3,37 @@
 import io
 
 import jax.numpy as jnp
+import matplotlib
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app.plot import plot_distortion, plot_model
+from zoomjax.app.plot import plot_distortion, plot_model, save_plot
+
+
+@pytest.mark.parametrize("kind", ["svg", "png"])
+@pytest.mark.parametrize("layout", ["constrained", None])
+def test_plots_are_drawn_once_and_are_the_same_to_the_last_byte(kind, layout):
+    def written(save):
+        figure, drawn = Figure(figsize=(3, 2), layout=layout), []
+        axes = figure.subplots()
+        axes.plot([1e-3, 2e5], [3.0, 4.0], label="a line")
+        axes.set(title="a title", ylabel="$k_1$  (px$^{-2}$)")
+        axes.legend()
+        patch = figure.patch.draw
+        figure.patch.draw = lambda renderer: (drawn.append(renderer), patch(renderer))
+        about = {"format": kind, "metadata": {"Date": None} if kind == "svg" else {}}
+        file = io.BytesIO()
+        with matplotlib.rc_context({"svg.hashsalt": "zoomjax"}):
+            save(figure, file, **about)
+        return file.getvalue(), len(drawn)
+
+    once, number = written(save_plot)
+    other, _ = written(lambda figure, *of, **about: figure.savefig(*of, dpi=150, **about))
+    assert number == 1
+    assert once == other
 
 
 @pytest.mark.slow

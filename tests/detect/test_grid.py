@@ -324,6 +324,17 @@ def test_nodes_of_large_images_are_where_they_are(pattern, find):
     assert rms((found + 0.5) / 6 - 0.5 - mapped(OBLIQUE, nodes())) < 0.05
 
 
+def test_dots_are_searched_for_unless_a_board_is_whole(monkeypatch):
+    monkeypatch.setattr(module, "find_dots", lambda grey: pytest.fail("dots were searched for"))
+    image = rendered(squares, OBLIQUE)
+    np.testing.assert_array_equal(zj.detect.GridDetector().find(image), find_checkerboard(image))
+    other = nodes(20, 20)
+    monkeypatch.setattr(module, "find_dots", lambda grey: other)
+    hidden = image.copy()
+    hidden[120:170, 170:230] = 220
+    np.testing.assert_array_equal(zj.detect.GridDetector().find(hidden), other)
+
+
 def test_strided_views_are_read_as_they_are():
     image = rendered(dots, OBLIQUE)
     wide = np.repeat(image, 2, axis=1)

@@ -90,6 +90,19 @@ def test_shapes_broadcast(fit):
     assert zj.trust.displacement_covariance(fit, POINTS[:, None], focal=FOCAL[:2]).shape == (3, 2, 2, 2)
 
 
+def test_other_numbers_of_points_compile_nothing_and_change_nothing(fit, rng, compilations):
+    focal = np.array([[20.0], [50.0], [100.0]])
+    points = rng.uniform(0, 300, (5, 2))
+    first = np.asarray(zj.displacement_std(fit, points, focal=focal))
+    compilations()
+    one = zj.displacement_std(fit, points[0], focal=np.array(20.0))
+    np.testing.assert_allclose(one, first[0, 0], rtol=1e-12)
+    assert zj.displacement_std(fit, points[1:4].reshape(3, 1, 2), focal=focal[:2, 0]).shape == (3, 2)
+    assert compilations() == 0
+    plain = eqx.filter_jit(lambda points, focal: zj.displacement_std(fit, points, focal=focal))
+    np.testing.assert_allclose(first, plain(points, focal), rtol=1e-12)
+
+
 def test_band_is_about_the_outward_displacement(fit):
     low, high = zj.displacement_band(fit, POINTS, focal=FOCAL, level=0.95)
     std = zj.displacement_std(fit, POINTS, focal=FOCAL)

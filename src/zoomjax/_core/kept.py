@@ -26,8 +26,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.extend.core
 import jaxlib
 import numpy as np
+from jax.interpreters import mlir
 
 from .files import whole_file
 from .structure import UnknownError, put_together, taken_apart, wrapped_name
@@ -134,8 +136,26 @@ def _looked_up(folder, function, settings, given, arrays):
     structure, exported = content
     if exported is None:
         return None
-    compiled = jax.jit(exported.call, compiler_options=dict(settings) or None)
+    run = functools.partial(_program.bind, of=_Exported(exported))
+    compiled = jax.jit(run, compiler_options=dict(settings) or None)
     return lambda *arrays: put_together(structure, iter(compiled(*arrays)))
+
+
+class _Exported:
+    """A program, which is itself alone."""
+
+    def __init__(self, program: Any):
+        self.program = program
+
+
+# JAX takes results of `Exported.call` for committed to a device, and compiles what takes them anew, beside
+# what it compiled for results of other programs. It does not look into this.
+_program = jax.extend.core.Primitive("kept")
+_program.multiple_results = True
+_program.def_abstract_eval(lambda *_, of: list(of.program.out_avals))
+mlir.register_lowering(
+    _program, mlir.lower_fun(lambda *arrays, of: of.program.call(*arrays), multiple_results=True)
+)
 
 
 def _traced(function, given, arrays):

@@ -4,9 +4,11 @@ The time of a first fit is that of the compiler. On processors two of its settin
 fusions by MLIR take half of the time, and what they emit for our programs is no faster: all but those that
 correct points and images are compiled without, where XLA has others (newer versions have not). Optimisation
 by LLVM takes two thirds of the rest, and makes a program some three times as fast: where the work is that
-of going over the arguments once or twice, and these are small, that saves a millisecond for a second.
+of going over the arguments once or twice, and these are small, that saves a millisecond for a second. In a
+process that does each thing once or twice, as a command does, it pays for larger ones, too (`use_once`).
 """
 
+import dataclasses
 import functools
 import math
 import os
@@ -31,6 +33,19 @@ _UNOPTIMISED = {**_PLAINLY, "xla_backend_optimization_level": 0, "xla_cpu_parall
 
 _ROWS, _NUMBERS = 1024, 3 * 2**19
 """Of the arguments of a light program, up to which it is not optimised: the longest, and all in all."""
+
+_LARGER = 4
+"""How many times as large they may be where programs run once or twice."""
+
+
+@dataclasses.dataclass
+class _Use:
+    """What programs of this process are for."""
+
+    once: bool = False
+
+
+_USE = _Use()
 
 # It moved from `jax.core` to where it is now.
 _trace_state: Any = getattr(jax.extend.core, "get_opaque_trace_state", None) or getattr(
@@ -76,6 +91,19 @@ def program(
     return call
 
 
+def use_once(once: bool = True) -> None:
+    """Set that programs of this process run once or twice: it is quicker to compile less than to run fast.
+
+    Data sets then share programs with others of more sizes, too: see `zoomjax.lines.buckets`.
+    """
+    _USE.once = once
+
+
+def used_once() -> bool:
+    """Whether programs of this process run once or twice."""
+    return _USE.once
+
+
 def optimised_program(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
     """`program` of a function with much work."""
     return program(function, optimised=True)
@@ -109,7 +137,8 @@ def _few(arguments: Any) -> bool:
     """Whether arrays are short, and hold few numbers in all."""
     shapes = [leaf.shape for leaf in jax.tree.leaves(arguments) if eqx.is_array(leaf)]
     longest = max((shape[0] for shape in shapes if shape), default=0)
-    return longest <= _ROWS and sum(map(math.prod, shapes)) <= _NUMBERS
+    times = _LARGER if _USE.once else 1
+    return longest <= times * _ROWS and sum(map(math.prod, shapes)) <= times * _NUMBERS
 
 
 def _at_once() -> bool:

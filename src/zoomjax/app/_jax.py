@@ -1,7 +1,8 @@
-"""Settings of JAX for a command: float64, and a cache on disk for compiled programs."""
+"""Settings of JAX for a command: float64, a cache on disk for compiled programs, and few sizes of these."""
 
 import logging
 
+from .._core.programs import use_once
 from ..fit.compiled import cache_compiled
 
 
@@ -14,4 +15,5 @@ def set_up_jax() -> None:
 
     jax.config.update("jax_enable_x64", True)
     cache_compiled()
+    use_once()
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # no messages about fonts and its own folders

@@ -49,7 +49,7 @@ def focal_of_board(board: Board, detection: Detection, correction: Distortion) -
         points, places = known
         parts = [(points, pitch * places)]
     else:
-        corrected = [np.asarray(correction.undistort(jnp.asarray(line))) for line in detection.lines]
+        corrected = [np.asarray(correction.undistort(line)) for line in detection.lines]
         parts = [(points, pitch * places) for points, places in _parallels(corrected)]
     found = [
         focal_from_board(points, places, distance=board.distance, pixel=board.pixel)

@@ -311,14 +311,14 @@ class Calibration:
         lines: bool = True,
     ) -> None:
         """Write the files of `write`, with or without the lines, into an empty `results_folder`."""
-        from .plot import plot_model  # so that `calibrate` does not need Matplotlib
+        from .plot import plot_model, save_plot  # so that `calibrate` does not need Matplotlib
 
         folder = Path(folder)
         self.zoom.lens.save(folder / "lens.json")
         if lines:
             self.lines.save(folder / "lines.npz")
         (folder / "summary.json").write_text(json.dumps(self.summary() | (about or {}), indent=2) + "\n")
-        plot_model(self.zoom, self.each, self.lines).savefig(folder / "model.png", dpi=150)
+        save_plot(plot_model(self.zoom, self.each, self.lines), folder / "model.png")
         for name, text in (pages or {}).items():
             (folder / name).write_text(text, encoding="utf-8")
 

@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from .colours import FRAMES, MODEL, SHADES
+from .outward import distortions_at
 
 _CELLS, _RINGS = 16, 12
 _LEAST_STRETCH = 0.01  # beyond a fold, where it may vanish, residuals tell nothing
@@ -90,9 +91,9 @@ def _residuals(lines: Lines, lens: ZoomLens, chosen: np.ndarray) -> tuple[np.nda
     frame, focal = np.asarray(lines.frame)[chosen], np.asarray(lines.focal)
     corrected, away = np.zeros(points.shape), np.zeros(points.shape)
     stretch = np.zeros((*points.shape, 2))  # by which the correction stretches, along x and along y
-    for index in np.unique(frame):
+    shown = np.unique(frame)
+    for index, distortion in zip(shown, distortions_at(lens, focal[shown].tolist()), strict=True):
         own = (frame == index)[:, None] & mask
-        distortion = lens(float(focal[index]))
         corrected[own] = distortion.undistort(points[own])
         for axis, step in enumerate(np.eye(2) / 2):
             ends = (np.asarray(distortion.undistort(points[own] + way)) for way in (step, -step))

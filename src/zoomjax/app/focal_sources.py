@@ -322,7 +322,7 @@ def lines_of(
 
 def _from_pitch(detection: Detection, correction: Distortion) -> FocalEstimate | None:
     principal = np.asarray(correction.centre)
-    corrected = [np.asarray(correction.undistort(jnp.asarray(line))) for line in detection.lines]
+    corrected = [np.asarray(correction.undistort(line)) for line in detection.lines]
     named = name_pitch_lines(corrected, principal=principal, image_size=detection.image_size)
     return focal_from_pitch(named, principal=principal) if named else None
 

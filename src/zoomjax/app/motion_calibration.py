@@ -265,13 +265,14 @@ class MotionCalibration:
         """Write the files of `FILES` into an empty folder."""
         from .motion_plot import plot_motion  # so that the rest does not need Matplotlib
         from .panorama import write_panorama
+        from .plot import save_plot
 
         stage("Writing the results")
         self.fit.lens.save(folder / "lens.json")
         self.tracks.save(folder / "tracks.npz")
         self.write_track(folder / "track.csv")
         (folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n")
-        plot_motion(self.fit).savefig(folder / "motion.png", dpi=150)
+        save_plot(plot_motion(self.fit), folder / "motion.png")
         stage("Joining frames into a panorama")
         write_panorama(self.clip, self.fit, folder / "panorama.jpg")
 

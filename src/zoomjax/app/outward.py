@@ -1,10 +1,35 @@
-"""How far the correction moves a point outward: what tables, plots and reports say of a lens."""
+"""A lens at many focal lengths, and how far it moves a point outward: for tables, plots and reports."""
 
+import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
 
+from ..lines.buckets import bucket, padded_to
+from ..models.distortion import Distortion
 from ..models.lens import ZoomLens
+from ..models.sizes import at_focal
+
+_FOCALS = (32, 128)
+"""Numbers of focal lengths that a program is compiled for; larger ones are four to each doubling."""
+
+
+def distortions_at(lens: ZoomLens, focal: Iterable[float]) -> list[Distortion]:
+    """The distortion at each focal length, in NumPy's arrays.
+
+    As ``[lens(f) for f in focal]``, which runs an operation of JAX after the other for each.
+    """
+    focal = np.asarray(list(focal), float)
+    if not len(focal):
+        return []
+    both = at_focal(lens, padded_to(focal, bucket(len(focal), _FOCALS)))
+    k, centre, scale = (np.asarray(of) for of in (both.coefficients, both.centre, both.scale))
+    return [
+        dataclasses.replace(
+            both, coefficients=k[place], centre=centre if centre.ndim == 1 else centre[place], scale=scale
+        )
+        for place in range(len(focal))
+    ]
 
 
 def outward(lens: ZoomLens, points: np.ndarray, focal: Iterable[float]) -> np.ndarray:
@@ -13,10 +38,9 @@ def outward(lens: ZoomLens, points: np.ndarray, focal: Iterable[float]) -> np.nd
     The centre is that at the focal length, if it moves along the zoom.
     """
 
-    def at(f):
-        distortion = lens(float(f))
+    def moved(distortion):
         centre = np.asarray(distortion.centre)
         before, after = points - centre, np.asarray(distortion.undistort(points)) - centre
         return np.hypot(after[..., 0], after[..., 1]) - np.hypot(before[..., 0], before[..., 1])
 
-    return np.stack([at(f) for f in focal])
+    return np.stack([moved(distortion) for distortion in distortions_at(lens, focal)])

@@ -18,6 +18,7 @@ import matplotlib
 from matplotlib.figure import Figure
 
 from .._core.text import plain
+from .plot import save_plot
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +80,7 @@ def embedded_plot(
     """A plot, embedded as a data URL, with its natural size so that text stays readable."""
     file = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "zoomjax"}):
-        figure.savefig(file, format=kind, dpi=150, metadata={"Date": None} if kind == "svg" else {})
+        save_plot(figure, file, format=kind, metadata={"Date": None} if kind == "svg" else {})
     width, height = (f"{96 * side:.0f}" for side in figure.get_size_inches())
     source = data_url(file.getvalue(), kind.replace("svg", "svg+xml"))
     return {"source": source, "label": label, "class": class_, "width": width, "height": height}

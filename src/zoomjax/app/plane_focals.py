@@ -24,6 +24,7 @@ from scipy.special import gammaincc
 from ..detect.batch import Detection
 from ..focal.estimate import FocalEstimate
 from ..focal.plane import focal_from_planes
+from ..lines.buckets import bucket
 from ..models.distortion import Distortion
 
 SHARED_BY = ("exif", "folder", "similarity")
@@ -38,6 +39,9 @@ cells that are not quite square leave is as large in a view from the front, what
 
 _UNLIKELY = 0.01
 """Probability of photos that differ by so much, or more, below which they do not share a focal length."""
+
+_VIEWS, _OF_A_GROUP, _POINTS = (8, 32, 64, 128), (8, 32), (64, 128, 256)
+"""Numbers of views, of those of one focal length, and of points of each, that programs are compiled for."""
 
 _EXACT = 1e-9
 """Relative standard deviation below which focal lengths are not told apart."""
@@ -117,7 +121,8 @@ def focals_from_grids(
     views = _views(detections, corrections)
     if views is None:
         return Found({})
-    _, each = focal_from_planes(views.points, views.plane, principal=np.zeros(2), mask=views.mask)
+    _, all_alone = focal_from_planes(views.points, views.plane, principal=np.zeros(2), mask=views.mask)
+    each = jax.tree.map(lambda of: np.asarray(of)[: len(detections)], all_alone)
     focal, std, rms = (np.asarray(of) for of in (each.focal, each.std, each.rms))
     good = np.isfinite(focal) & (std < MOST_UNCERTAIN * np.nan_to_num(focal))
     alone = {int(i): jax.tree.map(lambda of, i=i: of[i], each) for i in np.flatnonzero(good)}
@@ -197,7 +202,8 @@ def _squares(focal: np.ndarray, std: np.ndarray, common: float) -> float:
 class _Views(NamedTuple):
     """Nodes of grids, corrected and about the centre, px, and their places in the grid, steps.
 
-    In arrays of one shape, so that all is compiled once; images without a grid have no valid points.
+    In arrays of one shape, and of few sizes, so that all is compiled once; images without a grid, and those
+    that are not there, have no valid points.
     """
 
     points: np.ndarray
@@ -211,7 +217,7 @@ def _views(detections: Sequence[Detection], corrections: Sequence[Distortion]) -
     most = max((len(of[0]) for of in known if of is not None), default=0)
     if not most:
         return None
-    shape = (len(known), most)
+    shape = (bucket(len(known), _VIEWS), bucket(most, _POINTS))
     views = _Views(np.zeros((*shape, 2)), np.zeros((*shape, 2)), np.zeros(shape, bool))
     for view, (of, correction) in enumerate(zip(known, corrections, strict=True)):
         if of is None or not np.isfinite(of[0]).all() or not _differ_in_depth(*of):
@@ -225,7 +231,8 @@ def _views(detections: Sequence[Detection], corrections: Sequence[Distortion]) -
 
 def _together(views: _Views, group: np.ndarray, most: int) -> FocalEstimate | None:
     """One focal length of several views, if they determine one; `most` views are in any group."""
-    points, plane, mask = (np.zeros((most, *of.shape[1:]), of.dtype) for of in views)
+    shape = bucket(most, _OF_A_GROUP)
+    points, plane, mask = (np.zeros((shape, *of.shape[1:]), of.dtype) for of in views)
     points[: len(group)], plane[: len(group)] = views.points[group], views.plane[group]
     mask[: len(group)] = views.mask[group]
     if not mask.any():
@@ -243,7 +250,7 @@ def nodes(detection: Detection, correction: Distortion) -> tuple[np.ndarray, np.
     row, column = np.nonzero(seen)
     if np.unique(row).size < 3 or np.unique(column).size < 3:
         return None
-    corrected = np.asarray(correction.undistort(jnp.asarray(detection.nodes[seen])))
+    corrected = np.asarray(correction.undistort(detection.nodes[seen]))
     places = np.stack([column, row], axis=-1).astype(float)
     return corrected, places
 

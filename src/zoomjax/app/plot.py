@@ -1,10 +1,11 @@
-"""Plots with matplotlib (extra ``zoomjax[app]``). Functions return figures; nothing is shown or saved."""
+"""Plots with matplotlib (extra ``zoomjax[app]``). Functions return figures; nothing is shown."""
 
+import io
+import os
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
@@ -19,11 +20,33 @@ from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..trust.bands import coefficient_std, displacement_std
 from .colours import DEPTHS, FRAMES, MODEL
+from .outward import distortions_at
 
 _EXAGGERATIONS = np.outer(10.0 ** np.arange(7), (1, 2, 5)).ravel()
 _VISIBLE = 0.03  # of the image's longer side: how far the drawn grid is bent at least
 _STEP = 7  # from one arrow to the next, in points at which the field is known
 _ROUNDING = 1e-6  # of half the diagonal: smaller displacements are none
+
+
+def save_plot(figure: Figure, file: str | os.PathLike[str] | io.BytesIO, **how: Any) -> None:
+    """As ``figure.savefig(file, dpi=150, **how)``, in three quarters of the time, with the same bytes.
+
+    Matplotlib draws a figure with a layout twice: at first with a renderer that does nothing, when it needs
+    the layout alone.
+    """
+    engine, draw = figure.get_layout_engine(), figure.draw
+
+    def lay_out_or_draw(renderer: Any) -> None:
+        if engine is not None and figure.get_layout_engine() is engine:  # it has another when it is drawn
+            engine.execute(figure)
+        else:
+            draw(renderer)
+
+    figure.draw = lay_out_or_draw
+    try:
+        figure.savefig(file, dpi=150, **how)
+    finally:
+        del figure.draw
 
 
 def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
@@ -49,9 +72,7 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
     sigma = np.sqrt(np.diagonal(np.asarray(each.covariance), axis1=1, axis2=2)) * to_pixel
 
     def model(focal: np.ndarray) -> np.ndarray:
-        return (
-            np.asarray(jax.vmap(lens.zoom)(jnp.asarray(focal, jnp.asarray(lines.focal).dtype))) * to_pixel
-        )
+        return np.stack([d.coefficients for d in distortions_at(lens, focal)]) * to_pixel
 
     curve, expected = model(1 / grid), model(focal)
     spread = np.asarray(coefficient_std(zoom, 1 / grid)) * to_pixel

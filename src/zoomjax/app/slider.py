@@ -9,7 +9,7 @@ import numpy as np
 
 from ..fit.result import ZoomFit
 from ..trust.bands import displacement_std
-from .outward import outward
+from .outward import distortions_at, outward
 
 _STEPS, _RADII, _CELLS, _PER_CELL = 41, 25, 12, 3
 _VISIBLE = 0.03  # of the longer side: how far the grid is bent at least, where that is most
@@ -32,7 +32,7 @@ def slider(fit: ZoomFit) -> dict[str, Any] | None:
     centre, size = np.asarray(lens.centre), np.array(lens.image_size)
     straight = _grid(size)
     joints = np.concatenate(straight)
-    off = np.stack([np.asarray(lens(float(f)).distort(joints)) - joints for f in focals])
+    off = np.stack([np.asarray(d.distort(joints)) - joints for d in distortions_at(lens, focals)])
     far = float(np.nanmax(np.hypot(*np.moveaxis(off, -1, 0)), initial=0.0))
     enough = _EXAGGERATIONS[_EXAGGERATIONS * far >= _VISIBLE * max(size)]
     times = float(enough[0]) if len(enough) else 1.0

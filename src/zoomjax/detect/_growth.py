@@ -24,8 +24,8 @@ _QUICKEST = 1.6
 _LOOKED_AT = 80
 """Points around a first one among which its steps are; 12 where any two may be neighbours."""
 
-Linked = Callable[[int, int], bool]
-"""Whether two points, by their numbers, may be neighbours in a grid."""
+Linked = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Whether points and others (n,), by their numbers, may be neighbours in a grid."""
 
 
 def nearest_of(centres: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -102,7 +102,7 @@ def _grown_from(
                 found = centres[other] - centres[spot]
                 if np.hypot(*(found - reach * step)) > reach * near:
                     continue
-                if linked is not None and not linked(spot, other):
+                if linked is not None and not linked(np.array([spot]), np.array([other]))[0]:
                     continue
                 place[other], taken[there] = there, other
                 queue.append((other, j * found if j else across, i * found if i else down))
@@ -134,10 +134,7 @@ def _first_steps(
     """From a point to the nearest other one, and to the nearest in a clearly other direction."""
     offsets = centres - centres[seed]
     others = np.argsort(np.hypot(*offsets.T), kind="stable")[1 : _LOOKED_AT + 1]
-    if linked is None:
-        others = others[:12]
-    else:
-        others = np.array([other for other in others.tolist() if linked(seed, other)], int)
+    others = others[:12] if linked is None else others[linked(np.full(len(others), seed), others)]
     if not len(others):
         return None
     near = offsets[others]

@@ -115,24 +115,22 @@ class _Contrast:
     def __init__(self, grey: np.ndarray, centres: np.ndarray):
         self.grey, self.centres = grey, centres
 
-    def linked(self, first: int, second: int) -> bool:
-        """Whether an edge of a square runs from the one to the other."""
+    def linked(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Whether edges of squares run from ones (n,) to others."""
         start, step = self.centres[first], self.centres[second] - self.centres[first]
-        length = float(np.hypot(*step))
-        if length < _LEAST_STEP:
-            return False
-        aside = _ASIDE * np.array([-step[1], step[0]])
-        place = start + _ALONG[:, None] * step
+        across = np.stack([-step[:, 1], step[:, 0]], axis=-1)
+        place = start[:, None] + _ALONG[:, None] * step[:, None]
+        aside = _ASIDE * across[:, None]
         sides = np.rint(np.stack([place + aside, place - aside])).astype(int)
         limit = np.array(self.grey.shape[::-1])
-        inside = np.all((sides >= 0) & (sides < limit), axis=(0, 2))
+        inside = np.all((sides >= 0) & (sides < limit), axis=(0, 3))
         x, y = np.moveaxis(np.clip(sides, 0, limit - 1), -1, 0)
         difference = _SIGNS * (self.grey[y[0], x[0]] - self.grey[y[1], x[1]])
-        difference = difference[inside]
-        if len(difference) < 3:
-            return False
-        difference = difference * np.sign(difference.sum())
-        return bool(difference.min() > max(_CONTRAST * difference.max(), _FAINTEST))
+        difference *= np.sign(np.sum(difference, axis=1, where=inside))[:, None]
+        least = np.min(difference, axis=1, where=inside, initial=np.inf)
+        most = np.max(difference, axis=1, where=inside, initial=-np.inf)
+        enough = (np.hypot(step[:, 0], step[:, 1]) >= _LEAST_STEP) & (inside.sum(axis=1) >= 3)
+        return enough & (least > np.maximum(_CONTRAST * most, _FAINTEST))
 
 
 def _share_linked(place: dict[int, tuple[int, int]], contrast: _Contrast) -> float:
@@ -144,7 +142,7 @@ def _share_linked(place: dict[int, tuple[int, int]], contrast: _Contrast) -> flo
         for beside in ((row + 1, column), (row, column + 1))
         if beside in at
     ]
-    return float(np.mean([contrast.linked(*pair) for pair in pairs])) if pairs else 0.0
+    return float(np.mean(contrast.linked(*np.array(pairs).T))) if pairs else 0.0
 
 
 def _trimmed(grid: np.ndarray) -> np.ndarray:

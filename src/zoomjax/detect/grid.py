@@ -44,6 +44,10 @@ _WHOLE = 0.8
 """Of a grown board's places, the share from which on it holds all that is seen of the board: some corners
 may be hidden, or outside of the image."""
 
+_SURE = 36
+"""Corners of a board that has grown, none of them missing, from which on no dots are searched for in the
+image. What is only searched for has had 42 by chance, in a photo of dots."""
+
 _FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 
 _FEWEST_PIXELS = 6
@@ -57,7 +61,7 @@ class GridDetector(AbstractDetector):
     """Detects rows and columns of a checkerboard's inner corners, or of a grid of dots, as lines.
 
     Checkerboards, dark dots and bright dots are searched for, and the grid with most nodes is used: one per
-    image, of any size.
+    image, of any size. Where a checkerboard is whole, dots are not searched for.
 
     Attributes:
         fewest: smallest number of rows and of columns of a grid, at least 3.
@@ -98,9 +102,12 @@ class GridDetector(AbstractDetector):
         Rows run to the right, columns downwards. Corners and dots that are not seen are NaN.
         """
         grey = _grey(image)
-        grids = [grid for grid in (find_checkerboard(grey), find_dots(grey)) if grid is not None]
+        best, whole = _checkerboard(grey)
         # A board's squares are dots of a sort, half as many; boards found by chance among dots are small.
-        best = max(grids, key=lambda grid: np.isfinite(grid[..., 0]).sum(), default=None)
+        corners = 0 if best is None else int(np.isfinite(best[..., 0]).sum())
+        if not whole or corners < _SURE:
+            dots = find_dots(grey)
+            best = dots if dots is not None and np.isfinite(dots[..., 0]).sum() > corners else best
         return None if best is None or min(best.shape[:2]) < self.fewest else best
 
 
@@ -116,9 +123,14 @@ def find_checkerboard(
         At least 3 x 3 corners; rows run to the right, columns downwards. NaN where no corner is seen: a
         part of the board may be hidden, or outside of the image.
     """
-    grey, reduced = shrunk(_grey(image), _LONGEST)
-    best = _board(grey)
-    return None if best is None else _upright((best + 0.5) / reduced - 0.5)
+    return _checkerboard(_grey(image))[0]
+
+
+def _checkerboard(grey: np.ndarray) -> tuple[np.ndarray | None, bool]:
+    """As `find_checkerboard`, and whether it has grown and is whole."""
+    small, reduced = shrunk(grey, _LONGEST)
+    best, whole = _board(small)
+    return None if best is None else _upright((best + 0.5) / reduced - 0.5), whole
 
 
 def find_dots(
@@ -171,16 +183,19 @@ def _resized(grey: np.ndarray, scale: float) -> np.ndarray:
     return cv2.resize(grey, None, fx=scale, fy=scale, interpolation=way)
 
 
-def _board(grey: np.ndarray) -> np.ndarray | None:
-    """Corners of the largest checkerboard: grown from those that are there, or searched for as a whole."""
+def _board(grey: np.ndarray) -> tuple[np.ndarray | None, bool]:
+    """Corners of the largest checkerboard: grown from those that are there, or searched for as a whole.
+
+    And whether it has grown, and the search finds all of its corners, too.
+    """
     grown = _grown(grey)
     if grown is not None and np.isfinite(grown[..., 0]).mean() >= _WHOLE:
         sharp = _sharp(grey, grown)
-        return grown if sharp is None else sharp
+        return (grown, False) if sharp is None else (sharp, True)
     found = _searched(grey)
     if grown is None or (found is not None and found[..., 0].size > np.isfinite(grown[..., 0]).sum()):
-        return found
-    return grown
+        return found, False
+    return grown, False
 
 
 def _grown(grey: np.ndarray) -> np.ndarray | None:

@@ -17,6 +17,9 @@ from ._structure import bucket
 _PHOTOS = (16, 32, 64, 96, 128)
 """Numbers of photos that programs are compiled for; larger ones are four to each doubling."""
 
+_OF_A_BOARD = (8, *_PHOTOS)
+"""The same of one board, where there are several."""
+
 LEAST_CORNERS = 12
 """Corners of a photo that count: fewer hardly tell its pose and something more."""
 
@@ -120,7 +123,7 @@ def data_of(
 def _members(board, boards, wide):
     """The photos of each board, padded to few numbers of them with one that there is not."""
     counts = np.bincount(board, minlength=boards or 0)
-    out = np.full((bucket(len(counts)), bucket(int(counts.max()))), wide)
+    out = np.full((bucket(len(counts)), bucket_of(int(counts.max()), _OF_A_BOARD)), wide)
     for number, count in enumerate(counts):
         out[number, :count] = np.flatnonzero(board == number)
     return out

@@ -136,10 +136,10 @@ def _bend_of(data, model):
 def _solved(data, model, stage):
     """Poses, board and lens of least energy, the noise, the solver's status and its steps."""
     units = units_of(data, model, stage.noise)
-    steps = PoseSchur(_structure(data, units, stage))
+    linear = PoseSchur(_structure(data, units, stage))
     solution = optx.least_squares(
         rows_of,
-        damped_solver(steps, Unknowns, stage.change, stage.damping),
+        damped_solver(linear, Unknowns, stage.change, stage.damping),
         jax.tree.map(jnp.zeros_like, units),
         args=(data, model, stage),
         max_steps=_MOST_STEPS,
@@ -147,7 +147,8 @@ def _solved(data, model, stage):
     )
     model = moved(model, scaled_steps(solution.value, data, model, stage))
     noise = _noise_of(data, residuals_of(data, model))
-    return model, noise, RESULTS.promote(solution.result), solution.stats["num_steps"]
+    steps = jnp.asarray(solution.stats["num_steps"], int)  # of no weak type, which is not kept on disk
+    return model, noise, RESULTS.promote(solution.result), steps
 
 
 @program

@@ -86,7 +86,7 @@ def focal_from_planes(
             f"{mask.shape}."
         )
     if not traced(mask):
-        counts = np.sum(mask, axis=1)
+        counts = np.sum(np.asarray(mask), axis=1)
         few = counts[(counts > 0) & (counts < 5)]
         if few.size:
             raise ValueError(

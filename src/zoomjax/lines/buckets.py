@@ -20,7 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
-from .._core.programs import program
+from .._core.programs import program, used_once
 from .._core.types import AnyArray, traced
 from .base import AbstractLines, SomeLines
 
@@ -29,6 +29,10 @@ _FRAMES = (8, 32, 64, 128)
 _IN_FRAME = (16, 32, 64, 128, 256)
 _POINTS = (64, 128, 256)
 """Sizes; a fit of so few lines takes a few milliseconds. Larger ones are four to each doubling."""
+
+_LINES_ONCE = (256, 2048, 4096)
+"""Sizes in a process that does each thing once or twice (`use_once`): twenty photos of a board share them
+with thirty, which saves a minute, and some milliseconds more in each fit are not noticed."""
 
 _MANY = 2**17
 """Numbers in the points, from which on lines, too, are padded to sizes that are closer together."""
@@ -67,8 +71,10 @@ def bucketed(lines: SomeLines, *, closely: bool = False) -> SomeLines:
     number = lines.frame.shape[0]
     if closely:
         number = max(_LINES[0], 1 << (number - 1).bit_length())
+    elif _are_many(lines):
+        number = bucket(number, _LINES[:1])
     else:
-        number = bucket(number, _LINES[:1] if _are_many(lines) else _LINES)
+        number = bucket(number, _LINES_ONCE if used_once() else _LINES)
     return _padded(lines, number, bucket(lines.focal.shape[0], _FRAMES))
 
 

@@ -13,6 +13,7 @@ Each call computes one derivative with respect to each parameter; nothing is fit
 
 import functools
 import inspect
+import math
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
@@ -26,12 +27,16 @@ from jaxtyping import Array, Float, Num, PyTree, ScalarLike
 
 from .._core.arguments import kinds_checked
 from .._core.fields import check_positive, real_argument
-from .._core.programs import light_program
+from .._core.programs import light_program, used_once
 from .._core.types import AnyArray, Coefficients, Focal, Points, traced
 from ..fit.result import ZoomFit
+from ..lines.buckets import bucket, padded_to
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
 from ..models.zoom import AbstractZoom, with_parameters
+
+_SIZES = (16, 512, 8192)
+"""Numbers of points that functions of points are compiled for; larger ones are four to each doubling."""
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
@@ -40,7 +45,8 @@ Result = TypeVar("Result")
 def _compiled(function: Callable[Given, Result]) -> Callable[Given, Result]:
     """Compile a function of a fit; refuse focal lengths and levels that are none, where they are known.
 
-    It does not see the errors of the frames, so that their number is no matter.
+    It does not see the errors of the frames, so that their number is no matter, and gets points in a row of
+    few sizes.
     """
     compiled, signature = light_program(function), inspect.signature(function)
 
@@ -54,9 +60,34 @@ def _compiled(function: Callable[Given, Result]) -> Callable[Given, Result]:
         if not traced(level) and not (_is_number(level) and 0 < level < 1):
             raise ValueError(f"Argument level must be a number between 0 and 1, but it is {level!r}.")
         given["fit"] = eqx.tree_at(lambda fit: fit.frame_rms, given["fit"], None)
+        if "points" in given and _known(given) and np.shape(given["points"])[-1:] == (2,):
+            return _in_few_sizes(compiled, given)
         return compiled(**given)  # pyright: ignore[reportCallIssue]
 
     return checked
+
+
+def _known(given: dict[str, Any]) -> bool:
+    """Whether all is known, and where to pad costs nothing."""
+    return jax.default_backend() == "cpu" and not traced(given)
+
+
+def _in_few_sizes(compiled: Callable[..., Any], given: dict[str, Any]) -> Any:
+    """What a function finds of points, which are padded by the last one."""
+    points, focal = np.asarray(given["points"]), np.asarray(given["focal"])
+    shape = np.broadcast_shapes(points.shape[:-1], focal.shape)
+    number = math.prod(shape)
+    if not number:
+        return compiled(**given)
+    points = np.broadcast_to(points, (*shape, 2)).reshape(number, 2)
+    focal = np.broadcast_to(focal, shape).reshape(number)
+    size = bucket(number, _SIZES[1:] if used_once() else _SIZES)
+    found = compiled(**given | {"points": padded_to(points, size), "focal": padded_to(focal, size)})
+
+    def cut(of):  # by NumPy, which compiles nothing
+        return jnp.asarray(np.asarray(of)[:number].reshape((*shape, *of.shape[1:])))
+
+    return jax.tree.map(cut, found)
 
 
 def _is_number(value: Any) -> bool:
