@@ -30,10 +30,11 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
 # fusions, whose own compiler (MLIR) takes two thirds of the time that remains. The older emitters compute a
 # value again where it is used again, and then multiply and add in one rounding here, in two there; without
 # such instructions both are the same. XLA ends a process with a flag that it does not know: it has no other
-# emitters from JAX 0.11 on.
+# emitters from JAX 0.11 on. Each part in which a program is compiled costs: so in one.
 FLAGS = [
     "--xla_backend_optimization_level=0",
     "--xla_llvm_disable_expensive_passes=true",
+    "--xla_cpu_parallel_codegen_split_count=1",
     *(["--xla_cpu_use_fusion_emitters=false"] if jax.__version_info__ < (0, 11) else []),
     *(["--xla_cpu_max_isa=AVX"] if platform.machine() in ("x86_64", "AMD64") else []),
 ]
