@@ -1,5 +1,6 @@
 """What all tests share: float64, strict ranks, one seed, and small scenes with exact truth."""
 
+import gc
 import os
 import platform
 import tempfile
@@ -50,6 +51,8 @@ jax.config.update("jax_compilation_cache_dir", str(_KEPT))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 # Tests change what programs are made of: traced ones are kept by processes of their own alone.
 keep_programs, kept.keep_programs = kept.keep_programs, lambda folder: None
+# Python looks for garbage in cycles after 700 new objects, and JAX then looks too; tracing makes millions.
+gc.set_threshold(50_000, 20, 50)
 hypothesis.settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=50)
 hypothesis.settings.load_profile("fixed")
 
@@ -62,6 +65,12 @@ def pytest_itemcollected(item):
 def pytest_collection_modifyitems(items):
     """Slow tests last, so that quick ones are not kept waiting and `SECONDS` leaves out slow ones alone."""
     items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+    gc.collect()
+    gc.freeze()  # what was imported stays
+
+
+def pytest_unconfigure():
+    gc.unfreeze()
 
 
 SECONDS = float(os.environ.get("ZOOMJAX_TEST_SECONDS", "inf"))
