@@ -20,7 +20,9 @@ def interop(folder: Path) -> None:
 
 def lensfun(folder: Path) -> None:
     """A lens of the library, by a part of its name, saved and corrected by."""
-    lens = zj.lenses.load(zj.lenses.find("nikkor 18-200")[0], image_size=(1200, 800), crop=1.523)
+    lens = zj.interop.library_lens(
+        zj.interop.find_lenses("nikkor 18-200")[0], image_size=(1200, 800), crop=1.523
+    )
     lens.save(folder / "lens.json")
     assert np.isfinite(zj.load_lens(folder / "lens.json")(35.0).undistort([0.0, 0.0])).all()
 

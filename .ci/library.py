@@ -17,8 +17,8 @@ EXTRAS = ("matplotlib", "typer", "rich", "jinja2", "av", "filelock", "lensfunpy"
 found = [name for name in EXTRAS if importlib.util.find_spec(name)]
 assert not found, f"this environment is not that of the bare library: it has {found}"
 
-ROOMS = (zj.models, zj.focal, zj.io, zj.interop, zj.detect, zj.lenses)
-ROOMS += (zj.lines, zj.correct, zj.scenes, zj.fit, zj.trust)
+ROOMS = (zj.models, zj.focal, zj.io, zj.interop, zj.detect)
+ROOMS += (zj.lines, zj.tracks, zj.correct, zj.scenes, zj.fit, zj.trust)
 names = [getattr(door, name) for door in (zj, *ROOMS) for name in door.__all__]
 assert len(names) > 100
 assert callable(calibrate)  # a calibration draws nothing until it is written

@@ -47,7 +47,7 @@ def _steps(sizes: tuple[int, int, int]) -> dict[str, Callable[[], object]]:
     import zoomjax as zj
     from zoomjax.fit import fit_centre, with_focal_sigma
     from zoomjax.lines import compress_any_centre
-    from zoomjax.trust import assess, held_out_zoom, suggest_next, with_misfit
+    from zoomjax.trust import assess, cross_validate_zoom, suggest_next, with_misfit
 
     lines, got = _lines(*sizes), {}
 
@@ -62,7 +62,7 @@ def _steps(sizes: tuple[int, int, int]) -> dict[str, Callable[[], object]]:
         "compress_any_centre": kept("held", lambda: compress_any_centre(lines)),
         "fit_centre": lambda: fit_centre(got["held"]),
         "select_model": lambda: zj.select_model(got["small"]),
-        "held_out_zoom": lambda: held_out_zoom(got["small"]),
+        "cross_validate_zoom": lambda: cross_validate_zoom(got["small"]),
         "with_misfit": lambda: with_misfit(got["fit"], got["small"]),
         "with_focal_sigma": lambda: with_focal_sigma(got["fit"], got["small"], focal_sigma=0.3),
         "assess": lambda: assess(lines, got["fit"]),

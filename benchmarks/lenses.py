@@ -5,7 +5,7 @@
 Every zoom of the database is loaded in one process, in float64, for images of 4288 x 2848 px of the sensor
 that it was calibrated on, compiling included; then those that the database has for sensors of crop factor 1
 and 1.5. The error is the greatest distance in the distorted image from where lensfun puts a point, over the
-image and all focal lengths, at the best magnification of each (`table_error_px`); tests/lenses compares it
+image and all focal lengths, at the best magnification of each (`table_error_px`); tests/interop compares it
 with lensfun's own code. Results go to benchmarks/results/lenses.md and lenses.json.
 """
 
@@ -32,9 +32,9 @@ def loaded(crop: float | None) -> dict:
     """All zooms for one crop factor; those of smaller sensors are left out."""
     wall, processor = time.perf_counter(), time.process_time()
     lenses, refused = [], 0
-    for entry in zj.lenses.find(zooms=True):
+    for entry in zj.interop.find_lenses(zooms=True):
         try:
-            lenses.append(zj.lenses.load(entry, image_size=SIZE, crop=crop))
+            lenses.append(zj.interop.library_lens(entry, image_size=SIZE, crop=crop))
         except ValueError:
             refused += 1
     wall, processor = time.perf_counter() - wall, time.process_time() - processor

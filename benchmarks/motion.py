@@ -1,18 +1,22 @@
 """Focal lengths and the lens from how a clip moves: errors beside the Cramér-Rao bound, and times.
 
-    python -m benchmarks.motion [--sections NAME ...] [--only TEXT] [--clips N] [--data FOLDER]
+    python -m benchmarks.motion [--sections NAME ...] [--only TEXT] [--clips N] [--draws N]
+        [--resume] [--data FOLDER]
 
 `simulated`: tracks with exact truth, of random lenses on random paths; everything is started from nothing.
 f is the RMS over the clips of the error of all focal lengths, relative. The lens's error is the RMS
 distance of corrected points over the image, without a shift common to all of them, which turns the camera.
 The bound of each is what the covariance of the fit says, without what the robust loss loses. A clip
-diverged if its focal lengths are off by more than 3 times the bound and 1 %, and the fit says nothing.
-Errors are those of clips of which the fit does not say that it failed.
+diverged if its focal lengths are off by more than 3 times the bound and 1 %, and the fit says nothing;
+silently if the verdict on it is good, too. Doubted are clips whose verdict is not good, refused ones among
+them. Errors are those of clips of which the fit does not say that it failed, if there are any.
 
 `real`: focal lengths, principal points and lenses of the shared broadcast clips, every fourth frame; the
 camera stands where it stood, and what it looks at wanders over the pitch, as the data does not tell that.
 Tracks of points of a stadium, noise 0.5 px, the centre unknown. The pupil is on the axis of rotation, or
-before it; and with the pitch's lines in every fifth frame, a point each 20 px, noise 0.5 px.
+before it; and with the pitch's lines in every fifth frame, a point each 20 px, noise 0.5 px. Points and
+noise are drawn several times: f and the lens are of the draw in the middle and of the worst, over all
+frames, and the error over its standard deviation is the RMS over the draws.
 
 `rendered`: clips of 1080p and 150 frames, rendered from photographs and encoded as H.264, through the
 command line alone, `zoomjax calibrate clip.mp4`.
@@ -25,6 +29,7 @@ tells; --panorama FILE writes what they look like put together.
 `time`: seconds of a second fit in the process, tracking apart, and the memory of the process.
 
 Results go to benchmarks/results/motion.md and motion.json after each row. With --only, other rows stay.
+With --resume, rows go on after the clips and draws that are stored, which are those of the first seeds.
 """
 
 import argparse
@@ -40,7 +45,7 @@ from .motion_broadcast import broadcast
 from .motion_cameras import real
 from .motion_clips import rendered
 from .motion_rivals import rivals
-from .motion_simulated import simulated, timed
+from .motion_simulated import Rows, simulated, timed
 from .shared import RESULTS as FOLDER
 from .shared import machine, machine_line, table, write
 
@@ -57,26 +62,26 @@ def _percent(value: float) -> str:
     return f"{100 * value:.3f}"
 
 
-def _told(good: bool) -> str:
-    return "yes" if good else "no"
-
+_BESIDE_BOUNDS = ("f, %", "bound", "ratio", "lens, px", "bound", "ratio")
 
 SECTIONS = {
     "simulated": Section(
         "Simulated tracks",
-        ("f, %", "bound", "ratio", "lens, px", "bound", "ratio", "clips", "diverged", "refused"),
+        (*_BESIDE_BOUNDS, "clips", "refused", "doubted", "diverged", "silent"),
         lambda r: [
             *(_percent(r["f"]), _percent(r["f_bound"]), f"{r['f'] / r['f_bound']:.2f}"),
             *(f"{r['lens']:.3f}", f"{r['lens_bound']:.3f}", f"{r['lens'] / r['lens_bound']:.2f}"),
-            *(str(r["clips"]), str(r["diverged"]), str(r["told"])),
+            *(str(r["clips"]), str(r["told"]), "–" if r.get("doubted") is None else str(r["doubted"])),
+            *(str(r["diverged"]), str(r.get("silent", r["diverged"]))),
         ],
     ),
     "real": Section(
         "Real lenses",
-        ("frames", "f, %", "its sd", "lens, px", "successful"),
+        ("frames", "draws", "f, %", "worst", "its sd", "error over sd", "lens, px", "worst", "refused"),
         lambda r: [
-            *(str(r["frames"]), _percent(r["f"]), _percent(r["f_bound"]), f"{r['lens']:.3f}"),
-            _told(r["good"]),
+            *(str(r["frames"]), str(r["draws"]), _percent(r["f"]), _percent(r["f_worst"])),
+            *(_percent(r["f_bound"]), f"{r['f_ratio']:.2f}"),
+            *(f"{r['lens']:.3f}", f"{r['lens_worst']:.3f}", str(r["told"])),
         ],
     ),
     "rendered": Section(
@@ -129,6 +134,18 @@ def page(results: dict) -> str:
     return "\n".join(lines)
 
 
+def _measured(name: str, options: argparse.Namespace, found: dict[str, list[dict]]) -> Rows:
+    """The rows of a section, after what was found before."""
+    return {
+        "simulated": lambda: simulated(options.clips, options.only, found),
+        "real": lambda: real(options.data, options.only, options.draws, found),
+        "rendered": lambda: rendered(options.only),
+        "broadcast": lambda: broadcast(options.data, options.only, options.panorama),
+        "rivals": lambda: rivals(options.only),
+        "time": lambda: timed(options.only),
+    }[name]()
+
+
 def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -137,6 +154,8 @@ def main():
     parser.add_argument("--sections", nargs="+", choices=names, default=list(names))
     parser.add_argument("--only", default="", help="rows whose names have this text")
     parser.add_argument("--clips", type=int, default=20, help="of each kind")
+    parser.add_argument("--draws", type=int, default=5, help="of each real clip")
+    parser.add_argument("--resume", action="store_true", help="go on after the stored clips and draws")
     parser.add_argument("--data", type=Path, default=os.environ.get("ZOOMJAX_DATA"), help="shared data")
     parser.add_argument("--panorama", type=Path, help="where to write panoramas of the broadcast")
     parser.add_argument("--output", type=Path, default=FOLDER / "motion.md")
@@ -147,15 +166,10 @@ def main():
     for name in options.sections:
         if name in ("real", "broadcast") and options.data is None:
             parser.error("--data or ZOOMJAX_DATA must name the folder of the shared data")
-        rows = {
-            "simulated": lambda: simulated(options.clips, options.only),
-            "real": lambda: real(options.data, options.only),
-            "rendered": lambda: rendered(options.only),
-            "broadcast": lambda: broadcast(options.data, options.only, options.panorama),
-            "rivals": lambda: rivals(options.only),
-            "time": lambda: timed(options.only),
-        }[name]()
-        if not options.only:
+        kept = results.get(name, {"rows": {}})["rows"] if options.resume else {}
+        found = {key: row["found"] for key, row in kept.items() if "found" in row}
+        rows = _measured(name, options, found)
+        if not (options.only or options.resume):
             results.pop(name, None)
         section = results.setdefault(name, {"rows": {}})
         section["machine"] = machine()

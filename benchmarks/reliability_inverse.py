@@ -43,7 +43,7 @@ class Count:
         return self
 
 
-FAMILIES = {
+DISTORTION_MODELS = {
     "polynomial, 1 term": (RadialPolynomial(), 1),
     "polynomial, 2 terms": (RadialPolynomial(), 2),
     "polynomial, 3 terms": (RadialPolynomial(), 3),
@@ -53,29 +53,29 @@ FAMILIES = {
 }
 
 
-def random_coefficients(family, terms: int, rng: np.random.Generator) -> np.ndarray:
+def random_coefficients(distortion_model, terms: int, rng: np.random.Generator) -> np.ndarray:
     """From nearly none to very strong; a third of them with the last term against the first."""
     k = rng.normal(size=terms) * 10 ** rng.uniform(-4, 0.3)
     if terms > 1 and rng.uniform() < 0.5:  # a slope that falls to nearly zero and rises again, or folds
         k[0] = rng.choice([-1, 1]) * rng.uniform(0.1, 1.5)
         k[1] = -rng.uniform(0.3, 0.5) * k[0] * (1 if k[0] > 0 else rng.uniform(0.5, 1.5) * k[0])
-    if isinstance(family, BrownConrady):
+    if isinstance(distortion_model, BrownConrady):
         return np.append(k, rng.normal(size=2) * 10 ** rng.uniform(-5, -1.5))
     return k
 
 
 def newton_cycles(distortion: Distortion, radius: np.ndarray) -> np.ndarray:
     """Of radii, normalised, those that the plain method of Newton does not find in 60 steps."""
-    family = distortion.family
-    if not isinstance(family, AbstractRadial):
+    distortion_model = distortion.distortion_model
+    if not isinstance(distortion_model, AbstractRadial):
         return radius[:0]
     k = np.asarray(distortion.coefficients)
-    rho = radius * family.factor(radius**2, k)
+    rho = radius * distortion_model.factor(radius**2, k)
     limit = float(distortion.monotone_radius)
     with np.errstate(all="ignore"):
         r = np.minimum(rho, limit)
         for _ in range(60):
-            error, slope = family.equation(r, r * r, rho, k)
+            error, slope = distortion_model.equation(r, r * r, rho, k)
             r = np.clip(r - error / np.where(slope > 0, slope, 1), 0, limit)
         return radius[~(abs(r - radius) < 1e-6 * radius)]
 
@@ -113,7 +113,7 @@ def check(distortion: Distortion, radius: np.ndarray, angle: np.ndarray, compile
     wide = back.astype(np.longdouble)
     k = np.asarray(distortion.coefficients).astype(np.longdouble)
     with np.errstate(divide="ignore", invalid="ignore"):  # exactly at a pole
-        again = distortion.family.correct((wide[:, 0], wide[:, 1]), (wide**2).sum(axis=1), k)
+        again = distortion.distortion_model.correct((wide[:, 0], wide[:, 1]), (wide**2).sum(axis=1), k)
     again = np.stack(again, axis=1)
     rho = np.hypot(*np.asarray(corrected).astype(np.longdouble).T)
     r = np.hypot(*wide.T)
@@ -132,33 +132,33 @@ def check(distortion: Distortion, radius: np.ndarray, angle: np.ndarray, compile
 def _steepness(distortion: Distortion, r: np.ndarray) -> np.ndarray:
     """What a relative error of the coefficients, and of r, does to the corrected radius, over r."""
     k = abs(np.asarray(distortion.coefficients, float))
-    family = distortion.family
-    orders = family.orders(len(k))
+    distortion_model = distortion.distortion_model
+    orders = distortion_model.orders(len(k))
     changes = np.ones_like(r)
     for order, size in zip(orders, k, strict=True):
         changes += 6 * (order + 1) * size * r**order
-    if isinstance(family, Division):
-        factor = np.asarray(family.factor(r * r, np.asarray(distortion.coefficients, float)))
+    if isinstance(distortion_model, Division):
+        factor = np.asarray(distortion_model.factor(r * r, np.asarray(distortion.coefficients, float)))
         return changes * factor**2
     return changes
 
 
 def inverse_round_trips(count: int, seed: int) -> dict[str, dict[str, int]]:
-    """About `count` round trips, in equal parts of all families, dtypes and of NumPy and JAX."""
+    """About `count` round trips, in equal parts of all distortion models, dtypes and of NumPy and JAX."""
     rng = np.random.default_rng(seed)
     counts = {}
-    for name, (family, terms) in FAMILIES.items():
+    for name, (distortion_model, terms) in DISTORTION_MODELS.items():
         for dtype in (np.float64, np.float32):
             total = Count()
-            wanted = math.ceil(count / len(FAMILIES) / 2)
+            wanted = math.ceil(count / len(DISTORTION_MODELS) / 2)
             number = 0
             while total.tried < wanted:
                 number += 1
                 d = Distortion(
-                    random_coefficients(family, terms, rng).astype(dtype),
+                    random_coefficients(distortion_model, terms, rng).astype(dtype),
                     np.zeros(2, dtype),
                     dtype(1),
-                    family,
+                    distortion_model,
                 )
                 radius, cycles = radii(d, rng)
                 radius = np.resize(radius, _LENGTH)  # one shape: JAX compiles once

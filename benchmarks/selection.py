@@ -22,7 +22,7 @@ import numpy as np
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.trust.cross_validation import held_out_frames, held_out_zoom
+from zoomjax.trust.cross_validation import cross_validate_frames, cross_validate_zoom
 from zoomjax.trust.folds import HoldOut, folds_of
 from zoomjax.trust.selection import compare, default_candidates
 
@@ -53,8 +53,8 @@ def times() -> dict:
         "fits": len(CANDIDATES) * (parts.number + 1),
         "cold": runs[0],
         "warm": min(runs[1:], key=lambda run: run["cpu"]),
-        "held_out_zoom": seconds(lambda: held_out_zoom(small)),
-        "held_out_frames": seconds(lambda: held_out_frames(small)),
+        "cross_validate_zoom": seconds(lambda: cross_validate_zoom(small)),
+        "cross_validate_frames": seconds(lambda: cross_validate_frames(small)),
     }
 
 
@@ -117,8 +117,8 @@ def markdown(results: dict) -> str:
         for name, key in (
             ("12 candidates, each frame left out, cold", "cold"),
             ("the same, warm", "warm"),
-            ("held_out_zoom", "held_out_zoom"),
-            ("held_out_frames", "held_out_frames"),
+            ("cross_validate_zoom", "cross_validate_zoom"),
+            ("cross_validate_frames", "cross_validate_frames"),
         )
     ]
     draws = results["draws"]

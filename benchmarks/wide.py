@@ -127,12 +127,12 @@ def rendered(seed: int) -> dict[str, Any]:
         done = calibrate(_lines(edges.lines[:number], made.size), centre="fit", robust=True)
     except (ValueError, RuntimeError) as error:
         return row | {"problem": str(error)}
-    lens = done.zoom.lens
+    lens = done.fit.lens
     return row | {
         "error_px": apart(lens(1.0), made),
         "verdict": done.assessment.verdict,
-        "family": type(lens.family).__name__,
-        "rms_px": float(done.zoom.rms),
+        "distortion_model": type(lens.distortion_model).__name__,
+        "rms_px": float(done.fit.rms),
         "std_px": float(done.assessment.evidence.std),
         "rejected": int(done.rejected.sum()),
         "centre_off_px": float(np.hypot(*(np.asarray(lens.centre) - made.centre))),
@@ -309,7 +309,7 @@ def hard(seed: int) -> dict[str, Any]:
         done = calibrate(_lines(edges.lines[: NUMBERS[-1]], made.size), centre="fit", robust=True)
     except (ValueError, RuntimeError):
         return row
-    error = apart(done.zoom.lens(1.0), made)
+    error = apart(done.fit.lens(1.0), made)
     evidence = done.assessment.summary()["evidence"]  # None for what is not finite
     return row | {
         "error_px": error if np.isfinite(error) else None,

@@ -62,18 +62,18 @@ def facade(folder: Path, program: Path | None) -> dict:
         "their_reach": _reach(theirs, size),
         "fits": {},
     }
-    for model, family in (("polynomial", None), ("division", Division())):
+    for model, distortion_model in (("polynomial", None), ("division", Division())):
         for who, lines in (("their points", theirs), ("automatic", own)):
-            robust = fitted(lines, size, family)
+            robust = fitted(lines, size, distortion_model)
             found = _figures(robust.fit.lens(1.0), theirs)
             found |= {"rms_px": float(robust.fit.rms), "rejected": len(robust.rejected)}
             result["fits"][f"{model}, {who}"] = found
     for who, done in best.items():
-        lens = done.zoom.lens
+        lens = done.fit.lens
         found = _figures(lens(1.0), theirs) | {
-            "rms_px": float(done.zoom.rms),
+            "rms_px": float(done.fit.rms),
             "rejected": int(done.rejected.sum()),
-            "family": type(lens.family).__name__,
+            "distortion_model": type(lens.distortion_model).__name__,
             "centre_px": np.asarray(lens.centre).tolist(),
             "verdict": done.assessment.verdict,
         }
@@ -83,10 +83,16 @@ def facade(folder: Path, program: Path | None) -> dict:
     return result
 
 
-def fitted(lines: Sequence[np.ndarray], size: tuple[int, int], family: Any = None, terms: int = 2) -> Any:
+def fitted(
+    lines: Sequence[np.ndarray], size: tuple[int, int], distortion_model: Any = None, terms: int = 2
+) -> Any:
     """The robust fit to the lines of one photograph, about the image's centre."""
     return zj.fit_robust(
-        as_lines(lines, size), zoom=zj.PolynomialZoom(degree=0), family=family, terms=terms, throw=False
+        as_lines(lines, size),
+        zoom=zj.PolynomialZoom(degree=0),
+        distortion_model=distortion_model,
+        terms=terms,
+        throw=False,
     )
 
 

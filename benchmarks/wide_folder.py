@@ -88,7 +88,7 @@ def _figures(done: ImageCalibration, made: Folder) -> dict[str, Any]:
                 "length_px": float(sum(np.hypot(*(line[-1] - line[0])) for line in right)),
             }
         )
-    lens = done.calibration.zoom.lens
+    lens = done.calibration.fit.lens
     return {
         "photos": photos,
         "again": [int(Path(name).stem) for name in done.tied],

@@ -53,9 +53,9 @@ def lens(terms=2):
     return zj.ZoomLens(zoom, jnp.array([29.0, 20.0]), jnp.array([FOCAL[0], FOCAL[-1]]), SIZE)
 
 
-def distortion(family=None, k=(0.1, -0.02)):
-    family = zj.models.RadialPolynomial() if family is None else family
-    return zj.Distortion(jnp.array(k), jnp.array([29.0, 20.0]), jnp.array(36.0), family)
+def distortion(distortion_model=None, k=(0.1, -0.02)):
+    distortion_model = zj.models.RadialPolynomial() if distortion_model is None else distortion_model
+    return zj.Distortion(jnp.array(k), jnp.array([29.0, 20.0]), jnp.array(36.0), distortion_model)
 
 
 @functools.cache
@@ -281,10 +281,10 @@ ROWS = [
         line_points,
     ),
     Row(
-        "compress_family",
+        "compress_for",
         with_points(
             lambda data: zj.frame_rms(
-                zj.fit.compress_family(data, zj.models.Division(), terms=1), coefficients()
+                zj.fit.compress_for(data, zj.models.Division(), terms=1), coefficients()
             )
         ),
         lines,
@@ -292,9 +292,11 @@ ROWS = [
         slow=True,
     ),
     Row(
-        "with_family",
+        "with_distortion_model",
         with_points(
-            lambda data: zj.frame_rms(zj.fit.with_family(data, zj.models.Division()), coefficients())
+            lambda data: zj.frame_rms(
+                zj.fit.with_distortion_model(data, zj.models.Division()), coefficients()
+            )
         ),
         lines,
         line_points,
@@ -411,7 +413,7 @@ FILES = "reads or writes files, images or videos"
 LEFT_OUT = {
     **dict.fromkeys(
         (
-            *("frame_output", "select_model", "held_out_zoom", "held_out_frames"),
+            *("frame_output", "select_model", "cross_validate_zoom", "cross_validate_frames"),
             *("suggest_next", "reject_points", "barrel_crossover", "assess", "evidence", "with_misfit"),
             *("many", "vanishing_points"),
         ),
@@ -432,7 +434,7 @@ LEFT_OUT = {
             ),
             *("write_lines_csv", "undistort_image", "undistort_photo", "undistort_video"),
             *("redistort_image", "redistort_photo", "redistort_video", "read", "write", "formats"),
-            *("find", "load", "match", "names", "stream"),
+            *("find_lenses", "lens_names", "library_lens", "match_lens", "stream"),
         ),
         FILES,
     ),

@@ -1,4 +1,4 @@
-"""A zoom model and a family of distortions as users write them."""
+"""A zoom model and a distortion model as users write them."""
 
 from typing import ClassVar
 
@@ -50,11 +50,11 @@ class Halved(zj.models.AbstractRadial):
     def equation(self, r, squared, rho, k):
         return zj.models.RadialPolynomial().equation(r, squared, rho, k / 2)
 
-    def conditions(self, size):
-        return zj.models.RadialPolynomial().conditions(size) / 2
+    def conditions(self, number):
+        return zj.models.RadialPolynomial().conditions(number) / 2
 
-    def expansion_terms(self, size):
-        return size
+    def expansion_terms(self, number):
+        return number
 
     def expansion(self, k, reach):
         return k / 2, k[:0]
@@ -63,4 +63,4 @@ class Halved(zj.models.AbstractRadial):
 def own_lens() -> zj.ZoomLens:
     zoom = LogZoom(parameters=jnp.array([[0.02, 0.01], [-0.1, 0.03]]), start=jnp.asarray(20.0))
     centre, ends = jnp.array([319.5, 239.5]), np.array([20.0, 80.0])
-    return zj.ZoomLens(zoom, centre, jnp.asarray(ends), (640, 480), family=Halved())
+    return zj.ZoomLens(zoom, centre, jnp.asarray(ends), (640, 480), distortion_model=Halved())

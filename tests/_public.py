@@ -8,7 +8,6 @@ ROOMS = (
     "io",
     "interop",
     "detect",
-    "lenses",
     "lines",
     "tracks",
     "correct",

@@ -46,7 +46,7 @@ def ready(name):
 
 def own_lines(name):
     """The lines with their distortion model, not compressed."""
-    return zj.fit.with_family(models.lines_of(name), ROWS[name].distortion)
+    return zj.fit.with_distortion_model(models.lines_of(name), ROWS[name].distortion)
 
 
 def traced(function, *trees):
@@ -98,7 +98,7 @@ def with_focal_sigma(name):
 def reject_points(name):
     row = ROWS[name]
     return zj.fit.reject_points(
-        models.lines_of(name), zoom=row.zoom, family=row.distortion, terms=row.terms, throw=False
+        models.lines_of(name), zoom=row.zoom, distortion_model=row.distortion, terms=row.terms, throw=False
     )
 
 
@@ -138,7 +138,9 @@ def fit_motion(name):
     row = ROWS[name]
     try:
         with mock.patch.object(motion, "_fitted", side_effect=Accepted):
-            return zj.fit.fit_motion(tracks(), zoom=row.zoom, family=row.distortion, terms=row.terms)
+            return zj.fit.fit_motion(
+                tracks(), zoom=row.zoom, distortion_model=row.distortion, terms=row.terms
+            )
     except Accepted:
         return "accepted"
 
@@ -152,14 +154,14 @@ def fit_motion_with_lines(name):
     fit_motion(name)
     row = ROWS[name]
     given = motion.Given(tracks(), any_centre_lines(), None, None, None)
-    return _motion_problem._ready_lines(given, row.distortion, row.distortion.size(row.terms))
+    return _motion_problem._ready_lines(given, row.distortion, row.distortion.num_coefficients(row.terms))
 
 
 def fit_boards(name):
     """As far as its arguments are looked at: it takes any model that it has accepted."""
     row, places = ROWS[name], np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), axis=-1)
     grids = [100 + 50 * places] * len(FOCAL)
-    options = {"zoom": row.zoom, "family": row.distortion, "terms": row.terms}
+    options = {"zoom": row.zoom, "distortion_model": row.distortion, "terms": row.terms}
     try:
         with mock.patch.object(boards, "coefficients_of", side_effect=Accepted):
             return zj.fit.fit_boards(grids, FOCAL, image_size=SIZE, **options)
@@ -237,7 +239,7 @@ KINDS = ("PolynomialZoom", "PowerZoom", "SmoothZoom", "FocusSplineZoom", "Divisi
 
 def refused(row: Try, name: str) -> bool:
     """Whether the code says that the model is not served."""
-    parts = {"zoom": ROWS[name].zoom, "family": ROWS[name].distortion, "shift": None}
+    parts = {"zoom": ROWS[name].zoom, "distortion_model": ROWS[name].distortion, "shift": None}
     for use in row.uses:
         asked = requirements.REQUIREMENTS[use]
         if requirements.refusal(use, **{part: parts[part] for part in asked}):

@@ -61,7 +61,7 @@ def check_fits(lines: zj.Lines, plain: zj.lines.CompressedLines) -> None:
         np.testing.assert_allclose(
             fit.lens.zoom.parameters, one.lens.zoom.parameters, rtol=1e-12, atol=1e-12
         )
-        model = ready_model(data, Model(one.lens.zoom, 2, data.family))
+        model = ready_model(data, Model(one.lens.zoom, 2, data.distortion_model))
         program = eqx.filter_jit(fit_prepared).lower(data, model, default_solver(data), 256).compile()
         found = exchanged(program)
         assert set(found) == {"all-reduce"}, found

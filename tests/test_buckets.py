@@ -20,7 +20,7 @@ from zoomjax._core.programs import use_once
 from zoomjax.fit import (
     algebraic_frames,
     algebraic_zoom,
-    compress_family,
+    compress_for,
     fit_centre,
     fit_focal,
     fit_frame_centres,
@@ -32,7 +32,7 @@ from zoomjax.fit import (
 from zoomjax.lines import compress_any_centre
 from zoomjax.lines.buckets import bucket, bucketed
 from zoomjax.models import BrownConrady, Division, Model, SmoothZoom, SplineZoom, TableZoom
-from zoomjax.trust import assess, held_out_frames, held_out_zoom, suggest_next, with_misfit
+from zoomjax.trust import assess, cross_validate_frames, cross_validate_zoom, suggest_next, with_misfit
 
 
 def scene(frames: int, lines: int, points: int, seed: int = 0) -> zj.Lines:
@@ -113,8 +113,8 @@ FORMS = {
     "weighted": lambda: weighted(zj.compress(LINES)),
     "any centre": lambda: compress_any_centre(LINES),
     "in the image": lambda: in_image(zj.compress(LINES)),
-    "division": lambda: compress_family(LINES, Division(), terms=1),
-    "Brown-Conrady": lambda: compress_family(LINES, BrownConrady()),
+    "division": lambda: compress_for(LINES, Division(), terms=1),
+    "Brown-Conrady": lambda: compress_for(LINES, BrownConrady()),
 }
 ZOOMS = {
     "polynomial": zj.PolynomialZoom(degree=2),
@@ -196,7 +196,7 @@ def everything(frames: int, lines: int, points: int) -> None:
     zj.fit_zoom(weighted(small), zoom=TableZoom(number=3))
     zj.fit_zoom(in_image(small), zoom=SmoothZoom())
     zj.fit_zoom(small, zoom=SmoothZoom())  # which is chosen below for some of the sets
-    zj.fit_zoom(compress_family(given, Division(), terms=1))
+    zj.fit_zoom(compress_for(given, Division(), terms=1))
     algebraic_zoom(small)
     algebraic_frames(small)
     zj.frame_rms(small, fit.lens)
@@ -205,8 +205,8 @@ def everything(frames: int, lines: int, points: int) -> None:
     fit_frame_centres(held)
     held.about(held.centre + 1)
     zj.select_model(small)
-    held_out_zoom(small)
-    held_out_frames(small)
+    cross_validate_zoom(small)
+    cross_validate_frames(small)
     with_misfit(fit, small)
     with_focal_sigma(fit, small, focal_sigma=0.3)
     fit_focal(small, 0.3)

@@ -122,9 +122,12 @@ LENS = {
     "no model": ({"zoom": 2}, r"zoom must be a zoom model .* its type is int: PolynomialZoom\(degree"),
     "class of a model": ({"zoom": zj.PolynomialZoom}, r"it is the class PolynomialZoom: pass an instance"),
     "model not fitted": ({"zoom": zj.PolynomialZoom()}, "specified but not fitted"),
-    "class of a family": ({"family": zj.models.Division}, "it is the class Division: pass an instance"),
+    "class of a distortion model": (
+        {"distortion_model": zj.models.Division},
+        "it is the class Division: pass an instance",
+    ),
     "two for Brown and Conrady": (
-        {"family": zj.models.BrownConrady()},
+        {"distortion_model": zj.models.BrownConrady()},
         "zoom must give from 3 to 6 coefficients, for a BrownConrady, but it gives 2",
     ),
     "a shift of three": (

@@ -141,8 +141,8 @@ KNOWN = {
         table.zoomed(table.lens(), x), table.SIZE, keep="all"
     ),
     "select_model": lambda x: zj.select_model(traced_lines(x)),
-    "held_out_zoom": lambda x: zj.trust.held_out_zoom(traced_lines(x)),
-    "held_out_frames": lambda x: zj.trust.held_out_frames(traced_lines(x)),
+    "cross_validate_zoom": lambda x: zj.trust.cross_validate_zoom(traced_lines(x)),
+    "cross_validate_frames": lambda x: zj.trust.cross_validate_frames(traced_lines(x)),
     "with_misfit": lambda x: zj.trust.with_misfit(table.fit(), traced_lines(x)),
     "reject_points": lambda x: zj.fit.reject_points(traced_lines(x)),
     "suggest_next": lambda x: zj.suggest_next(table.fit(), traced_lines(x)),

@@ -14,7 +14,7 @@ import zoomjax as zj
 
 from . import _embeddings as table
 
-FAMILIES = {
+DISTORTION_MODELS = {
     "RadialPolynomial": ((0.1, -0.02), zj.models.RadialPolynomial()),
     "three terms": ((0.1, -0.02, 0.01), zj.models.RadialPolynomial()),
     "Division": ((-0.1,), zj.models.Division()),
@@ -51,10 +51,10 @@ def elsewhere(function, folder, *arrays):
 
 
 @pytest.mark.parametrize("method", ["undistort", "distort"])
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", DISTORTION_MODELS)
 def test_any_number_of_points(name, method):
-    k, family = FAMILIES[name]
-    d = table.distortion(family, k)
+    k, distortion_model = DISTORTION_MODELS[name]
+    d = table.distortion(distortion_model, k)
     [n] = export.symbolic_shape("n")
     spec = jax.ShapeDtypeStruct((n, 2), jnp.float64)
     function = exported(lambda points: getattr(d, method)(points), spec)

@@ -1,4 +1,4 @@
-"""The package is thirteen rooms on a private base, and imports go one way: from a room to those below."""
+"""The package is twelve rooms on a private base, and imports go one way: from a room to those below."""
 
 import ast
 from pathlib import Path
@@ -13,7 +13,6 @@ ROOMS = (
     "fit",
     "scenes",
     "correct",
-    "lenses",
     "lines",
     "tracks",
     "detect",
@@ -33,8 +32,7 @@ LIBRARIES = {
     "correct": {"cv2"},
     "detect": {"cv2"},
     "io": {"cv2", "av", "PIL", "pillow_heif", "rawpy", "tifffile"},
-    "interop": {"OpenEXR", "yaml"},
-    "lenses": {"lensfunpy"},
+    "interop": {"OpenEXR", "lensfunpy", "yaml"},
     "torch": {"torch"},
     "tracks": {"cv2"},
 }

@@ -50,8 +50,8 @@ USES = {
     "with_focal_sigma": lambda fit, lines: _std(zj.fit.with_focal_sigma(fit, lines, focal_sigma=0.3)),
     "with_misfit": lambda fit, lines: zj.trust.with_misfit(fit, lines).misfit,
     "suggest_next": lambda fit, lines: zj.suggest_next(fit, lines).table,
-    "held_out_zoom": lambda fit, lines: zj.trust.held_out_zoom(lines),
-    "held_out_frames": lambda fit, lines: zj.trust.held_out_frames(lines),
+    "cross_validate_zoom": lambda fit, lines: zj.trust.cross_validate_zoom(lines),
+    "cross_validate_frames": lambda fit, lines: zj.trust.cross_validate_frames(lines),
     "select_model": lambda fit, lines: zj.select_model(lines, [zj.PolynomialZoom()]).fit.rms,
 }
 """What takes lines in any form."""
@@ -135,20 +135,20 @@ def test_evidence_takes_the_same_lines_compressed_however_and_no_others(photos):
 def test_held_out_errors_are_one_a_frame_and_both(given, photos, unchecked):
     held_out, each = given
     with pytest.raises(ValueError, match="held_out"):
-        zj.trust.assess(*photos, held_out=held_out, each_held_out=each)
+        zj.trust.assess(*photos, rms_held_out=held_out, rms_frames_held_out=each)
 
 
 def test_a_model_with_parameters_tells_the_number_of_coefficients(photos):
     lines, _ = photos
     small = zj.compress(lines, terms=3)
     model = zj.fit_zoom(small, terms=3).lens.zoom
-    expected = zj.trust.held_out_zoom(small, terms=3)
-    np.testing.assert_array_equal(zj.trust.held_out_zoom(small, zoom=model), expected)
+    expected = zj.trust.cross_validate_zoom(small, terms=3)
+    np.testing.assert_array_equal(zj.trust.cross_validate_zoom(small, zoom=model), expected)
     assert zj.fit.algebraic_zoom(small, zoom=model).zoom.parameters.shape == (3, 3)
     assert zj.fit.fit_centre(lines, zoom=model).fit.lens.zoom.parameters.shape == (3, 3)
     assert zj.select_model(small, [model]).chosen.terms == 3
     uses = (
-        lambda: zj.trust.held_out_zoom(small, zoom=model, terms=2),
+        lambda: zj.trust.cross_validate_zoom(small, zoom=model, terms=2),
         lambda: zj.fit.algebraic_zoom(small, zoom=model, terms=2),
         lambda: zj.fit.fit_centre(lines, zoom=model, terms=2),
         lambda: zj.models.Model(model, 2),

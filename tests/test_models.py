@@ -34,7 +34,7 @@ class Row(NamedTuple):
     """A model: the zoom model as a user gives it to a fit, and the distortion model."""
 
     zoom: zj.models.AbstractZoom
-    distortion: zj.models.AbstractFamily = zj.models.RadialPolynomial()
+    distortion: zj.models.AbstractDistortionModel = zj.models.RadialPolynomial()
     terms: int = 2
 
 
@@ -60,7 +60,7 @@ def test_every_registered_model_is_in_the_table():
     """But for those that other tests register."""
     ours = {
         name
-        for table in (registry._ZOOMS, registry._FAMILIES)
+        for table in (registry._ZOOMS, registry._DISTORTION_MODELS)
         for name, cls in table.items()
         if cls.__module__.startswith(("zoomjax.", "tests._own_models"))
     }
@@ -76,7 +76,7 @@ def lens_of(name):
     """A lens of the model itself, mild and invertible, with parameters that differ."""
     row = ROWS[name]
     zoom = row.zoom.prepare(
-        jnp.asarray(FOCAL), row.distortion.size(row.terms), *map(jnp.asarray, focus_of(row))
+        jnp.asarray(FOCAL), row.distortion.num_coefficients(row.terms), *map(jnp.asarray, focus_of(row))
     )
     if isinstance(zoom, zj.models.PowerZoom):
         k = jnp.array([[0.05], [-0.12], [-1.0]])
@@ -92,7 +92,7 @@ def lens_of(name):
         )
         u = 20 / FOCAL[:, None]
         k = np.concatenate([0.05 - 0.12 * u, -0.01 + 0.02 * u], axis=1)
-        if row.distortion.size(2) == 4:
+        if row.distortion.num_coefficients(2) == 4:
             k = np.concatenate([k, 2e-3 * u, -1e-3 * u], axis=1)
         parameters = np.linalg.lstsq(basis, k, rcond=None)[0]
         zoom = eqx.tree_at(lambda z: z.parameters, zoom, jnp.asarray(parameters))
@@ -103,7 +103,7 @@ def lens_of(name):
         jnp.asarray([20.0, 80.0]),
         SIZE,
         focus_range=None if ends is None else jnp.asarray(ends),
-        family=row.distortion,
+        distortion_model=row.distortion,
     )
 
 
@@ -134,7 +134,7 @@ def lines_of(name, crooked=False):
 @functools.cache
 def ready(name, crooked=False):
     """The lines, compressed in the distortion model."""
-    return zj.fit.compress_family(lines_of(name, crooked), ROWS[name].distortion, terms=ROWS[name].terms)
+    return zj.fit.compress_for(lines_of(name, crooked), ROWS[name].distortion, terms=ROWS[name].terms)
 
 
 @functools.cache
@@ -148,7 +148,7 @@ def fit_of(name):
 @every
 def test_shapes(name):
     lens = lens_of(name)
-    size = ROWS[name].distortion.size(ROWS[name].terms)
+    size = ROWS[name].distortion.num_coefficients(ROWS[name].terms)
     assert at(lens, 1).coefficients.shape == (size,)
     focus = focus_of(ROWS[name])
     assert lens(FOCAL, *focus).coefficients.shape == (len(FOCAL), size)
@@ -237,7 +237,7 @@ def test_cross_validation(name):
     row = ROWS[name]
     candidate = zj.models.Model(row.zoom, row.terms, row.distortion)
     if name == "FocusSplineZoom":
-        focal = zj.trust.held_out_zoom(zj.compress(lines_of(name)), zoom=row.zoom)
+        focal = zj.trust.cross_validate_zoom(zj.compress(lines_of(name)), zoom=row.zoom)
         assert np.nanmax(focal) < 1
         return
     chosen = zj.select_model(lines_of(name), candidates=[candidate], hold_out="line", folds=3)

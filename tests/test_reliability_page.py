@@ -19,7 +19,6 @@ ROOMS = (
     "focal",
     "interop",
     "io",
-    "lenses",
     "lines",
     "models",
     "scenes",

@@ -34,9 +34,9 @@ DTYPES = {torch.float32: jnp.float32, torch.float64: jnp.float64}
 both = pytest.mark.parametrize("dtype", DTYPES)
 
 
-def distortion(family=None, k=(0.1, -0.02)):
-    family = zj.models.RadialPolynomial() if family is None else family
-    return zj.Distortion(jnp.array(k), jnp.array([29.0, 20.0]), jnp.array(36.0), family)
+def distortion(distortion_model=None, k=(0.1, -0.02)):
+    distortion_model = zj.models.RadialPolynomial() if distortion_model is None else distortion_model
+    return zj.Distortion(jnp.array(k), jnp.array([29.0, 20.0]), jnp.array(36.0), distortion_model)
 
 
 def lens():
@@ -45,12 +45,12 @@ def lens():
     return zj.ZoomLens(zoom, jnp.array([29.0, 20.0]), jnp.array([20.0, 80.0]), (60, 40))
 
 
-FAMILIES = [
+DISTORTION_MODELS = [
     distortion(),
     distortion(zj.models.Division(), (-0.1,)),
     distortion(zj.models.BrownConrady(), (0.1, 0.01, -0.02)),
 ]
-families = pytest.mark.parametrize("d", FAMILIES, ids=lambda d: type(d.family).__name__)
+models = pytest.mark.parametrize("d", DISTORTION_MODELS, ids=lambda d: type(d.distortion_model).__name__)
 methods = pytest.mark.parametrize("method", ["undistort", "distort"])
 
 
@@ -60,7 +60,7 @@ def points(dtype, *, requires_grad=False):
 
 
 @both
-@families
+@models
 @methods
 def test_values_are_those_of_jax(method, d, dtype):
     given = points(dtype)
@@ -71,7 +71,7 @@ def test_values_are_those_of_jax(method, d, dtype):
     np.testing.assert_allclose(result.numpy(), expected, rtol=1e-14 if dtype == torch.float64 else 1e-6)
 
 
-@families
+@models
 @methods
 def test_gradients_of_distortions(method, d):
     k = zt.coefficients_of(d, torch.float64).requires_grad_()

@@ -111,14 +111,14 @@ def test_cross_validation(both, hold_out):
         pytest.skip("two focal lengths between the ends alone")
 
     def errors(_, small):
-        return trust.held_out_zoom(small, hold_out=hold_out, folds=5)
+        return trust.cross_validate_zoom(small, hold_out=hold_out, folds=5)
 
     whole, few, left = both
     np.testing.assert_allclose(errors(*whole)[left], errors(*few), rtol=1e-6)
 
 
 def test_cross_validation_of_each_frame(both):
-    same(lambda _, small: trust.held_out_frames(small), both)
+    same(lambda _, small: trust.cross_validate_frames(small), both)
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ def test_frames_left_out_are_judged_without_the_ends_that_count(both):
         held_out, each = np.full((2, size), np.nan)
         held_out[there], each[there] = 0.3, 0.3
         held_out[there[[0, -1]]] = 30.0  # extrapolated
-        found = trust.assess(lines, zj.fit_zoom(of), held_out=held_out, each_held_out=each)
+        found = trust.assess(lines, zj.fit_zoom(of), rms_held_out=held_out, rms_frames_held_out=each)
         return [finding.about for finding in found.findings if finding.about == "photos left out"]
 
     assert judged(whole, small) == judged(few, tiny) == []

@@ -5,8 +5,8 @@
 116 photos of a checkerboard at five zooms (see zoomcam.py), split into random halves of each zoom's photos.
 All is fitted to one half and judged by the other: `fit_boards` with a shape for each zoom's photos, which
 are of one day, and a flat board; the straightness fit (`fit_zoom`, centre fitted); and, for the first pair
-of halves, OpenCV's `calibrateCamera` zoom by zoom (k1, k2). Its `calibrateCameraRO`, which moves the
-board's points, does not end on these photos in the version here.
+of halves, OpenCV's `calibrateCamera` zoom by zoom (k1, k2). What frees the board's shape in OpenCV and in
+mrcal is in board_rivals.py.
 
 *Photos not seen*: RMS distance of corners from where the model puts them, with the pose and, where the
 board bends, the 12 numbers of how it bends in the photo beside its shape refitted; and the pose alone.

@@ -26,7 +26,7 @@ import numpy as np
 import zoomjax as zj
 from zoomjax.app.calibration import Calibration, calibrate
 from zoomjax.app.model_choice import WantedModel
-from zoomjax.models.registry import family_name
+from zoomjax.models.registry import distortion_model_name
 
 from .coverage import clip_lines, held
 from .pitch import annotated_lines, read_pitch
@@ -53,10 +53,10 @@ def calibrated(lines: zj.Lines, setting: str) -> tuple[Calibration, float]:
 
 def of(done: Calibration) -> dict:
     """The model that was chosen, its centre, and the verdict."""
-    lens = done.zoom.lens
+    lens = done.fit.lens
     number = np.asarray(lens(float(lens.focal_range[0])).coefficients).size
     return {
-        "model": f"{type(lens.zoom).__name__}, {number} of {family_name(lens.family)}",
+        "model": f"{type(lens.zoom).__name__}, {number} of {distortion_model_name(lens.distortion_model)}",
         "centre": np.asarray(lens.centre).tolist(),
         "verdict": done.assessment.verdict,
     }
@@ -66,7 +66,7 @@ def broadcast_clip(clip: Clip, draw: int, setting: str) -> dict:
     """The error of the lens in frames not fitted, and how often its bands of 95 % hold there."""
     lines, learnt = clip_lines(clip, draw)
     done, seconds = calibrated(lines, setting)
-    lens = done.zoom.lens
+    lens = done.fit.lens
     unseen = np.setdiff1d(np.arange(len(clip.focal)), learnt)
     low, high = (float(f) for f in lens.focal_range)
     unseen = unseen[(clip.focal[unseen] >= low) & (clip.focal[unseen] <= high)]
@@ -81,7 +81,7 @@ def broadcast_clip(clip: Clip, draw: int, setting: str) -> dict:
         error.append(np.asarray(lens(float(clip.focal[frame])).undistort(places)) - truth[0])
         covariance = np.asarray(
             zj.trust.displacement_covariance(
-                done.zoom, places, focal=np.full(len(places), clip.focal[frame])
+                done.fit, places, focal=np.full(len(places), clip.focal[frame])
             )
         )
         variance.append(np.einsum("pi,pij,pj->p", outward, covariance, outward))
@@ -131,7 +131,7 @@ def annotated(frame: dict) -> bool:
 
 def straightness(lines: zj.Lines, done: Calibration) -> np.ndarray:
     """RMS distance of corrected points from their lines in each frame, px."""
-    lens = done.zoom.lens
+    lens = done.fit.lens
     return np.asarray(zj.frame_rms(lines.about(np.asarray(lens.centre)), lens))
 
 

@@ -7,7 +7,7 @@ is fitted to a random half of the photos of each zoom and tested on the others, 
 the same with one zoom left out of the training, on whose photos it is tested. The first and the last zoom
 left out are extrapolations. Figures are the RMS distance of the corrected corners from straight lines, px,
 of eq. 13: every zoom weighs the same. The board is paper on a wall and not flat, which is most of it: what
-tells is the excess over the model that knows each zoom, from the other half of its own photos.
+counts is the excess over the model that knows each zoom, from the other half of its own photos.
 
 Results go to benchmarks/results/zoomcam.md and zoomcam.json.
 """
@@ -130,8 +130,8 @@ def page(r: dict) -> list[str]:
         "",
         "116 photos, 1280 × 720 px, of a checkerboard of 22 × 15 corners at five zooms (1× to 9×) of a "
         "surveillance camera. RMS distances from straight lines, px, every zoom weighing the same. The "
-        "board is paper on a wall: most of these pixels are its own waves, and only differences between "
-        "models tell.",
+        "board is paper on a wall: most of the error is its own waves, and only differences between "
+        "models count.",
         "",
         "## Photos held out",
         "",
@@ -153,9 +153,10 @@ def page(r: dict) -> list[str]:
         "",
         "## A zoom left out",
         "",
-        "The same, but of the zoom tested no photo is in the training: 3×, 5× and 7× are interpolated from "
-        f"their neighbours, 1× and 9× extrapolated. {LEFT_OUT_HALVES} random halves. *{EACH}* has seen the "
-        "other half of that zoom's photos, which the others have not: the best that can be expected.",
+        "The same, but without any photo of the tested zoom in the training: 3×, 5× and 7× are "
+        f"interpolated from their neighbours, 1× and 9× extrapolated. {LEFT_OUT_HALVES} random halves. "
+        f"*{EACH}* has seen the other half of that zoom's photos, which the others have not: the best "
+        "that can be expected.",
         "",
         *table(
             ["model", *zooms, "interior", "ends"],

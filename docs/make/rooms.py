@@ -52,7 +52,7 @@ ABOUT = {
     "tracks": "points followed in clips",
     "detect": "images to lines",
     "focal": "focal lengths from planes",
-    "interop": "other tools' formats",
+    "interop": "lenses of other tools",
     "models": "distortion and zoom models",
     "io": "EXIF, tables, video",
     "_core": "types, checks, files",

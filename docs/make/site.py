@@ -27,7 +27,6 @@ ROOMS = (
     "trust",
     "correct",
     "interop",
-    "lenses",
     "detect",
     "focal",
     "io",

@@ -11,6 +11,8 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
 from . import rooms
 
 ROOT = Path(__file__).parents[2]
@@ -310,6 +312,42 @@ def lensfun_few() -> str:
     return _few(results("lensfun.json")["few"], names)
 
 
+def few_default() -> str:
+    """What the command line gives for two or three focal lengths."""
+    found = results("few_focal_lengths.json")
+    names = {"default": "`zoomjax calibrate`", "polynomial": "with `--degree` 1 or 2"}
+    rows = []
+    for number in ("2", "3"):
+        for setting, shown in names.items():
+            of = found[number][setting]
+            errors = np.quantile([row["image_px"] for row in of], (0.5, 0.75, 0.9))
+            held = (100 * np.mean([row[kind]["image"] for row in of]) for kind in ("held", "held_by_both"))
+            good = [row["image_px"] for row in of if row["verdict"] == "good"]
+            worst = f"{max(good):.2f}" if good else ""
+            rows.append(
+                [
+                    number,
+                    shown,
+                    *(f"{x:.2f}" for x in errors),
+                    *(f"{x:.1f}" for x in held),
+                    str(len(good)),
+                    worst,
+                ]
+            )
+    head = [
+        "photographed",
+        "",
+        "median",
+        "75 %",
+        "90 %",
+        "bands hold, %",
+        "with calibrations', %",
+        "good",
+        "worst",
+    ]
+    return markdown(head, rows)
+
+
 def lensfun_part() -> str:
     """The same lenses, of which the longer half of the range is photographed."""
     told = {"the same, told the ends fitted": "`SmoothZoom.for_lens` of that half"}
@@ -342,10 +380,40 @@ def board_focal() -> str:
     return markdown(["zoom", "theirs, px", "median of single photos", "all photos together"], rows)
 
 
+def board_rivals() -> str:
+    """Bent boards, fitted by others, half against half."""
+    found = results("board_rivals.json")
+    names = {
+        "`cv2.calibrateCamera`": "`cv2.calibrateCamera`, flat",
+        "`cv2.calibrateCameraRO`": "`cv2.calibrateCameraRO`, corners free",
+        "mrcal, OPENCV4, flat board": "mrcal, OPENCV4, flat",
+        "mrcal, OPENCV4, bent board": "mrcal, OPENCV4, two parabolas",
+    }
+    fits = {"`fit_boards`": found["ours"]["pose"]}
+    fits |= {shown: found["others"][name] for name, shown in names.items() if name in found["others"]}
+    rows = [
+        [
+            name,
+            f"{of['not_seen']:.3f}",
+            f"{np.mean(of['scatter']):.3f}",
+            f"{np.mean(of['scatter_bent']):.3f}",
+            f"{100 * max(of['repeats']):.2f}",
+        ]
+        for name, of in fits.items()
+    ]
+    head = ["", "photos not seen, px", "lens, px", "beyond a homography, px", "f, %"]
+    return markdown(head, rows)
+
+
 def vision() -> str:
     """What detectors find, and how fast."""
     heads, rows = table_of("vision.md")
     return markdown(heads, list(rows.values()))
+
+
+def focal_off() -> str:
+    """Focal lengths of broadcast clips that are wrong, as given and refined."""
+    return markdown(*rows_of("coverage.md", "Broadcast clips, focal lengths off"))
 
 
 def motion(section: str) -> Callable[[], str]:
@@ -372,15 +440,18 @@ TABLES: dict[str, Callable[[], str]] = {
     "metrics": trust_table("metrics"),
     "outliers": trust_table("outliers"),
     "rounded-focal": trust_table("rounded_focal"),
+    "focal-off": focal_off,
     "trust-cost": trust_table("cost"),
     "zoomcam": zoomcam,
     "broadcast": broadcast,
     "pitch": pitch,
     "lensfun": lensfun,
     "lensfun-few": lensfun_few,
+    "few-default": few_default,
     "lensfun-part": lensfun_part,
     "lensfun-forms": lensfun_forms,
     "board-focal": board_focal,
+    "board-rivals": board_rivals,
     "vision": vision,
     "motion": motion("Simulated tracks"),
     "motion-real": motion("Real lenses"),

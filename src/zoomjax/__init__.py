@@ -18,7 +18,6 @@ _ROOMS = (
     "io",
     "interop",
     "detect",
-    "lenses",
     "lines",
     "tracks",
     "correct",

@@ -6,7 +6,6 @@ from . import fit as fit
 from . import focal as focal
 from . import interop as interop
 from . import io as io
-from . import lenses as lenses
 from . import lines as lines
 from . import models as models
 from . import scenes as scenes

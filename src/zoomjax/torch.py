@@ -210,7 +210,7 @@ def _pullback(function, options, lens, wanted, arrays, cotangent):
 
 def _with(lens, coefficients):
     if isinstance(lens, Distortion):
-        return Distortion(coefficients, lens.centre, lens.scale, lens.family)
+        return Distortion(coefficients, lens.centre, lens.scale, lens.distortion_model)
     return eqx.tree_at(lambda lens: lens.zoom, lens, with_parameters(lens.zoom, coefficients))
 
 

@@ -23,15 +23,27 @@ def things(noisy, small, fit, frame_fits, truth):
 
 
 MISTAKES = {
-    "the class of a family": (
-        "fit_zoom(small, family=zj.models.Division)",
-        f"family .* Division: {INSTANCE}",
+    "the class of a distortion model": (
+        "fit_zoom(small, distortion_model=zj.models.Division)",
+        f"distortion_model .* Division: {INSTANCE}",
     ),
-    "in fit_frames": ("fit_frames(small, family=zj.models.Division)", f"class Division: {INSTANCE}"),
-    "in fit_robust": ("fit_robust(small, family=zj.models.Division)", f"class Division: {INSTANCE}"),
-    "in with_family": ("with_family(small, zj.models.Division)", f"class Division: {INSTANCE}"),
-    "in compress_family": ("compress_family(lines, zj.models.Division)", f"class Division: {INSTANCE}"),
-    "in held_out_zoom": ("held_out_zoom(small, zoom=zj.models.TableZoom)", f"class TableZoom: {INSTANCE}"),
+    "in fit_frames": (
+        "fit_frames(small, distortion_model=zj.models.Division)",
+        f"class Division: {INSTANCE}",
+    ),
+    "in fit_robust": (
+        "fit_robust(small, distortion_model=zj.models.Division)",
+        f"class Division: {INSTANCE}",
+    ),
+    "in with_distortion_model": (
+        "with_distortion_model(small, zj.models.Division)",
+        f"class Division: {INSTANCE}",
+    ),
+    "in compress_for": ("compress_for(lines, zj.models.Division)", f"class Division: {INSTANCE}"),
+    "in cross_validate_zoom": (
+        "cross_validate_zoom(small, zoom=zj.models.TableZoom)",
+        f"class TableZoom: {INSTANCE}",
+    ),
     "the class of a model": (
         "fit_zoom(small, zoom=zj.PolynomialZoom)",
         f"class Poly.*: {INSTANCE}",
@@ -109,7 +121,7 @@ MASKED = {
     "shared": "with_focal_sigma(fit, small, focal_sigma=0.3, shared=hidden)",
     "sigma of a fit": "fit_focal(small, hidden)",
     "std": "cramer_rao(lens, lines, std=hidden)",
-    "errors": "assess(lines, fit, held_out=hidden, each_held_out=hidden)",
+    "errors": "assess(lines, fit, rms_held_out=hidden, rms_frames_held_out=hidden)",
     "a centre": "fit_zoom(lines, centre=hidden)",
     "focal lengths to write": "write(lens, 'never.jsonl', format='opentrackio', focal=hidden)",
 }

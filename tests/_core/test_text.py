@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zoomjax._core.text import listed, numbered_name, plain, reason, span, with_std
+from zoomjax._core.text import listed, numbered_name, percentages, plain, reason, span, with_std
 
 names = st.text(max_size=300) | st.text(
     st.sampled_from("./\\:*?<>|\"' -=~a\x1b\n\udcff\u202e"), max_size=300
@@ -58,6 +58,11 @@ def test_made_names_are_files_names_everywhere(number, name):
 )
 def test_made_names_can_be_read(name, made):
     assert numbered_name(3, name, ".jpg") == made
+
+
+def test_percentages_of_one_value_are_that_value():
+    assert percentages([0.0043, 0.00431]) == "0.43%"
+    assert percentages([0.02, 0.0043, 0.0117]) == "0.43% to 2.00%"
 
 
 def test_a_span_of_one_value_is_that_value():

@@ -41,10 +41,10 @@ def test_distances_are_measured_where_the_metric_says(calibration, metric):
     """By default in the distorted image; both are the fits that the library makes."""
     found = calibration if metric is in_image else calibrate(calibration.lines, **GIVEN, metric=metric)
     expected = zj.fit_zoom(metric(zj.compress(calibration.lines)))
-    np.testing.assert_allclose(found.zoom.frame_rms, expected.frame_rms, rtol=1e-9)
+    np.testing.assert_allclose(found.fit.frame_rms, expected.frame_rms, rtol=1e-9)
     focal = np.asarray(calibration.lines.focal)
     k, truly = (
-        np.stack([np.asarray(fit.lens(f).coefficients) for f in focal]) for fit in (found.zoom, expected)
+        np.stack([np.asarray(fit.lens(f).coefficients) for f in focal]) for fit in (found.fit, expected)
     )
     np.testing.assert_allclose(k, truly, rtol=1e-6)
     assert found.summary()["distances"] == f"{'distorted' if metric is in_image else 'corrected'} image"
@@ -54,27 +54,27 @@ def test_distances_are_measured_where_the_metric_says(calibration, metric):
 def test_residuals_over_the_radius_are_those_of_the_fit(calibration):
     """The plot's residuals are divided by the stretch of each point, the fit's by that of each line."""
     radius, residual = _residuals(
-        calibration.lines, calibration.zoom.lens, np.arange(len(calibration.lines.frame))
+        calibration.lines, calibration.fit.lens, np.arange(len(calibration.lines.frame))
     )
     frame = np.broadcast_to(np.asarray(calibration.lines.frame)[:, None], calibration.lines.mask.shape)
     frame = frame[np.asarray(calibration.lines.mask)]
     squares = np.bincount(frame, residual**2) / np.bincount(frame)
-    np.testing.assert_allclose(np.sqrt(squares), calibration.zoom.frame_rms, rtol=0.02)
-    corrected = zj.frame_rms(calibration.lines, calibration.zoom.lens)
-    assert abs(corrected[0] / calibration.zoom.frame_rms[0] - 1) > 0.04
+    np.testing.assert_allclose(np.sqrt(squares), calibration.fit.frame_rms, rtol=0.02)
+    corrected = zj.frame_rms(calibration.lines, calibration.fit.lens)
+    assert abs(corrected[0] / calibration.fit.frame_rms[0] - 1) > 0.04
     assert radius.shape == residual.shape
 
 
 def test_pixel_polynomials_give_the_coefficients_of_the_lens(calibration):
     polynomials = calibration.pixel_polynomials()
     for f in (20.56, 50.0, 127.0):
-        expected = calibration.zoom.lens(f).pixel_coefficients
+        expected = calibration.fit.lens(f).pixel_coefficients
         np.testing.assert_allclose(f ** -np.arange(3.0) @ polynomials, expected, rtol=1e-9)
 
 
 def test_summary_is_json_and_agrees_with_the_fits(calibration):
     summary = json.loads(json.dumps(calibration.summary(), allow_nan=False))
-    assert summary["rms_zoom"] == float(calibration.zoom.rms)
+    assert summary["rms_zoom"] == float(calibration.fit.rms)
     assert summary["certificate"]["certified"] is True
     assert summary["rms_none"] == pytest.approx(rms_over_frames(zj.frame_rms(calibration.lines, None)))
     assert [row["frame"] for row in summary["per_frame"]] == list(range(5))
@@ -99,7 +99,7 @@ def test_by_default_model_and_centre_are_chosen():
     centre, std = np.array([summary["centre"][axis] for axis in "xy"]), np.array(summary["centre"]["std"])
     assert (abs(centre - np.asarray(aside.centre)) < 4 * std).all()
     assert (std < 10).all()
-    np.testing.assert_allclose(np.asarray(found.zoom.lens.centre), centre)
+    np.testing.assert_allclose(np.asarray(found.fit.lens.centre), centre)
     chosen = summary["selection"]["chosen"]
     by_name = {row["candidate"]: row for row in summary["selection"]["candidates"]}
     assert by_name[chosen]["held_out"] <= 1.0005 * min(
@@ -107,12 +107,16 @@ def test_by_default_model_and_centre_are_chosen():
     )
     fewer = [row for row in by_name.values() if row["parameters"] < by_name[chosen]["parameters"]]
     assert all(row["problem"] or row["held_out"] > 1.0005 * by_name[chosen]["held_out"] for row in fewer)
-    assert found.zoom.joint is not None
+    assert found.fit.joint is not None
     page = report(found)
     assert "The centre of distortion was fitted: " in page
+    assert found.own_centres is not None
+    off = np.nanmedian(found.own_centres.centre, axis=0) - centre
+    assert (abs(off) < 10).all()
+    assert "Centre of distortion of single frames, and of the lens" in page
     assert all(f">{name}<" in page for name in by_name)
-    own = np.asarray(zj.trust.displacement_std(found.zoom, middle, focal=50.0))
-    alone = eqx.tree_at(lambda fit: fit.joint, found.zoom, None)
+    own = np.asarray(zj.trust.displacement_std(found.fit, middle, focal=50.0))
+    alone = eqx.tree_at(lambda fit: fit.joint, found.fit, None)
     assert own > 2 * np.asarray(zj.trust.displacement_std(alone, middle, focal=50.0))
 
 
@@ -122,10 +126,10 @@ def test_a_centre_that_is_given_is_taken(centre, calibration):
     lines = calibration.lines.about(np.array([1000.0, 700.0]))
     found = calibrate(lines, model=WantedModel(degree=1), centre=centre)
     expected = {"image": calibration.lines.centre, None: lines.centre}.get(centre, centre)
-    np.testing.assert_allclose(found.zoom.lens.centre, expected)
+    np.testing.assert_allclose(found.fit.lens.centre, expected)
     np.testing.assert_allclose(found.lines.centre, expected)
     assert found.centre.how == ("image" if centre == "image" else "given")
-    assert found.zoom.joint is None
+    assert found.fit.joint is None
 
 
 @pytest.mark.slow
@@ -133,7 +137,7 @@ def test_bands_about_a_given_centre_say_that_another_is_better():
     aside = eqx.tree_at(lambda lens: lens.centre, _TRUTH, _TRUTH.centre + np.array([60.0, -40.0]))
     focal = scenes.focal_sweep(8)
     seen = scenes.board_lines(aside, focal, spacing=200, noise=0.3)
-    found = calibrate(seen, model=WantedModel(degree=2), centre="image").zoom
+    found = calibrate(seen, model=WantedModel(degree=2), centre="image").fit
     off = np.asarray(found.lens(focal[0]).undistort(np.zeros(2)) - aside(focal[0]).undistort(np.zeros(2)))
     std = float(zj.displacement_std(found, np.zeros(2), focal=focal[0]))
     alone = eqx.tree_at(lambda fit: fit.off_centre, found, None)
@@ -149,7 +153,7 @@ def test_the_centre_stays_where_lines_do_not_determine_it():
     found = calibrate(lines, model=WantedModel(degree=0, terms=1))
     assert found.centre.how == "image"
     assert "was kept at the middle of the image" in found.centre.sentence
-    np.testing.assert_array_equal(found.zoom.lens.centre, lines.centre)
+    np.testing.assert_array_equal(found.fit.lens.centre, lines.centre)
     assert np.flatnonzero(found.rejected).tolist() == [0, 1]
 
 
@@ -157,9 +161,10 @@ def test_the_centre_stays_where_lines_do_not_determine_it():
 def test_one_photo_works_out_of_the_box():
     lines = scenes.board_lines(scenes.nikkor_18_200(), scenes.focal_sweep(2)[:1], spacing=60, noise=0.3)
     found = calibrate(lines)
-    assert found.zoom.lens.zoom.degree == 0
-    assert found.zoom.rms < 0.35
+    assert found.fit.lens.zoom.degree == 0
+    assert found.fit.rms < 0.35
     assert ">nan<" not in report(found)
+    assert "Centre of distortion of single frames" not in report(found)
 
 
 @pytest.mark.slow
@@ -195,10 +200,10 @@ def test_zoomcam_gives_the_reference_figures(data):
     assert len(lines.frame) == 116 * (15 + 22)
     paper = {"centre": None, "metric": in_corrected}
     by_degree = {d: calibrate(lines, model=WantedModel(degree=d), **paper) for d in (0, 1, 2)}
-    assert float(by_degree[2].each.rms) == pytest.approx(0.8796, abs=5e-4)
+    assert float(by_degree[2].frames.rms) == pytest.approx(0.8796, abs=5e-4)
     for degree, rms in {0: 0.9969, 1: 0.8855, 2: 0.8809}.items():
-        assert float(by_degree[degree].zoom.rms) == pytest.approx(rms, abs=5e-4)
-    first, last = by_degree[2].each.coefficients[0], by_degree[2].each.coefficients[-1]
+        assert float(by_degree[degree].fit.rms) == pytest.approx(rms, abs=5e-4)
+    first, last = by_degree[2].frames.coefficients[0], by_degree[2].frames.coefficients[-1]
     np.testing.assert_allclose(first, [0.0815, -0.0303], atol=1e-4)
     np.testing.assert_allclose(last, [-0.0491, -0.0057], atol=1e-4)
 
@@ -207,12 +212,12 @@ def test_bands_allow_for_uncertain_focal_lengths(calibration):
     sigma = 0.01 * np.asarray(calibration.lines.focal)
     allowed = calibrate(calibration.lines, **GIVEN, focal_sigma=focal_sigmas("1%", calibration.lines.focal))
     small = in_image(zj.compress(calibration.lines))
-    expected = zj.fit.with_focal_sigma(calibration.zoom, small, focal_sigma=sigma)
-    np.testing.assert_allclose(allowed.zoom.covariance, expected.covariance, rtol=1e-6)
+    expected = zj.fit.with_focal_sigma(calibration.fit, small, focal_sigma=sigma)
+    np.testing.assert_allclose(allowed.fit.covariance, expected.covariance, rtol=1e-6)
     assert all(a[2] > b[2] for a, b in zip(allowed.corner(), calibration.corner(), strict=True))
     told = [row["focal_sigma"] for row in allowed.summary()["per_frame"]]
     np.testing.assert_allclose(told, sigma)
-    assert allowed.next.sentence == calibration.next.sentence
+    assert allowed.next_photo.sentence == calibration.next_photo.sentence
 
 
 def test_deviations_are_numbers_or_per_cent():

@@ -18,9 +18,12 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.app import console
 from zoomjax.app.arguments import centre_of, read_lines
-from zoomjax.app.console import show_choice
+from zoomjax.app.console import show_choice, stages
 from zoomjax.app.demo import write_photos
+from zoomjax.app.model_choice import WantedModel
+from zoomjax.app.runs import calibrate_lines
 from zoomjax.lines.csv import write_lines_csv
 from zoomjax.models import BrownConrady, Model, PolynomialZoom, SmoothZoom, SplineZoom
 from zoomjax.trust.selection import Selection, Verdict
@@ -93,7 +96,7 @@ def test_calibrate_writes_all_results(calibrated, few_lines):
     assert f"{summary['rms_zoom']:.4f}" in done.stdout
 
 
-STAGE = re.compile(r"  \S.* +\d+\.\d\d s")
+STAGE = re.compile(r"  \S.* +\d+\.\d\d s|  … \S.*, for \d+ s so far")
 
 
 @pytest.mark.exhaustive
@@ -166,7 +169,7 @@ def test_calibrate_allows_for_uncertain_focal_lengths(calibrated, tmp_path):
     exact = json.loads((calibrated[0] / "summary.json").read_text())
     done = zoomjax("calibrate", calibrated[0] / "lines.npz", "-o", tmp_path, *FORCED, "--focal-sigma", "1%")
     assert done.returncode == 0, done.stderr
-    assert "include those of the focal lengths, 1.00% to 1.00%" in done.stdout
+    assert "include those of the focal lengths, 1.00%." in done.stdout
     told = json.loads((tmp_path / "summary.json").read_text())
     assert [row["focal_sigma"] / row["focal"] for row in told["per_frame"]] == pytest.approx([0.01] * 5)
     assert told["corner_displacement"][0]["std"] > 2 * exact["corner_displacement"][0]["std"]
@@ -233,6 +236,62 @@ def test_calibrate_reads_csv(calibrated, few_lines, tmp_path):
     of_csv = json.loads((tmp_path / "summary.json").read_text())
     of_npz = json.loads((calibrated[0] / "summary.json").read_text())
     assert of_csv["rms_zoom"] == pytest.approx(of_npz["rms_zoom"], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("given", "unit", "known", "focal"),
+    [("35", None, True, 35.0), ("1200", "px", True, 1200.0), ("same", None, False, 1.0)],
+)
+def test_csv_lines_of_one_zoom_need_one_focal_length_or_none(
+    given, unit, known, focal, few_lines, tmp_path
+):
+    (tmp_path / "lines.csv").write_text(
+        "frame,line,x,y\n"
+        + "".join(
+            f"{frame},{number},{x!r},{y!r}\n"
+            for number, line in enumerate(few_lines.to_ragged())
+            if (frame := int(few_lines.frame[number])) < 2
+            for x, y in line[::4].tolist()
+        )
+    )
+    out = tmp_path / "out"
+    out.mkdir()
+    file = tmp_path / "lines.csv"
+    lines = read_lines([file], given, "4288x2848", unit)
+    assert np.asarray(lines.focal).tolist() == [focal, focal]
+    assert lines.focal_unit == (unit or "mm")
+    calibrate_lines(
+        lines,
+        out,
+        lambda _: None,
+        model=WantedModel("polynomial", degree=0),
+        centre="image",
+        focal_sigma=None,
+        robust=False,
+        files=[file],
+        names=["lines.npz"],
+        focal_known=given != "same",
+    )
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["focal_known"] is known
+    assert summary["focal_range"] == [focal, focal]
+    about = zj.load_lens(out / "lens.json").about
+    assert (about.get("focal") == "not known") is not known
+
+
+@pytest.mark.slow
+def test_the_command_takes_one_zoom_of_csv_lines(few_lines, tmp_path):
+    rows = "".join(
+        f"0,{n},{x!r},{y!r}\n"
+        for n, line in enumerate(few_lines.to_ragged()[:40])
+        for x, y in line.tolist()
+    )
+    (tmp_path / "lines.csv").write_text(f"frame,line,x,y\n{rows}")
+    size = ("--image-size", "4288x2848")
+    done = zoomjax("calibrate", "lines.csv", *size, "--focal", "same", "-o", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["focal_known"] is False
+    assert "focal length not known" in done.stdout
 
 
 @pytest.mark.exhaustive
@@ -320,6 +379,11 @@ def test_a_dry_run_writes_nothing(calibrated, tmp_path):
     done = zoomjax("calibrate", calibrated[0] / "lines.npz", "-o", tmp_path / "o", "--dry-run")
     assert "lines in 5 frames, f = 20.56 to 127.36 mm" in done.stdout
     assert not (tmp_path / "o").exists()
+    assert done.stderr == ""
+    for inputs in ("shots", calibrated[0] / "lines.npz"):
+        done = zoomjax("calibrate", inputs, "--centre", "5000,90", "-o", "o", "--dry-run", cwd=tmp_path)
+        assert done.returncode == 0
+        assert done.stderr.count("The centre of distortion, (5000, 90) px, is outside of the image of") == 1
     photos = sorted((tmp_path / "shots").iterdir())
     (tmp_path / "f.csv").write_text(f"image,focal\n{photos[0].name},50\n{photos[2].name},70.5\n")
     done = zoomjax("calibrate", "shots", "--focal", "f.csv", "-o", "out", "--dry-run", cwd=tmp_path)
@@ -377,6 +441,27 @@ def test_the_table_of_models_fits_a_terminal(capsys, monkeypatch):
     assert re.search(r"^> SmoothZoom, degree 6, 2 terms +8\.3 +1\.7458 ± 0\.2870 +\+1\.7321", told, re.M)
     assert re.search(r"^  degree 2, 2 terms .* best *$", told, re.M)
     assert "not compared" in told
+    assert "by no more than one standard error of the difference" in " ".join(told.split())
+    object.__setattr__(selection, "rule", "least")
+    show_choice(selection)
+    assert "by no more than 0.05 %, which is nothing, that of fewest" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    object.__setattr__(selection, "best", names[1])
+    show_choice(selection)
+    assert "fewest" not in capsys.readouterr().out
+
+
+def test_a_stage_that_takes_long_says_so_and_its_name_counts_once(capsys, monkeypatch):
+    monkeypatch.setattr(console, "_TICK", 0.05)
+    with stages() as stage:
+        stage("Fitting the lens")
+        time.sleep(0.4)
+        stage("Making the report")
+    told = capsys.readouterr().err.splitlines()
+    assert "… Fitting the lens, for 0 s so far" in told[0]
+    assert sum(line.strip().startswith("Fitting the lens") for line in told) == 1
+    assert sum(line.strip().startswith("Making the report") for line in told) == 1
 
 
 @pytest.mark.slow
@@ -425,14 +510,17 @@ WRONG = {
     "a degree of another model": (["lines.npz", "--model", "spline", "--degree", "1"], "for polynomials"),
     "no such model": (["lines.npz", "--model", "best"], "--model must be one of auto, polynomial"),
     "a centre that is none": (["lines.npz", "--centre", "middle"], "--centre must be fit, image, or X,Y"),
-    "no such family": (["lines.npz", "--family", "fisheye"], "'radial', 'division', 'brown-conrady'"),
-    "a centre of decentering": (
-        ["lines.npz", "--family", "brown-conrady", "--centre", "fit"],
-        '--centre cannot be "fit" with --family brown-conrady',
+    "no such distortion model": (
+        ["lines.npz", "--distortion-model", "fisheye"],
+        "'radial', 'division', 'brown-conrady'",
     ),
-    "a prior of another family": (
-        ["lines.npz", "--family", "division", "--model", "smooth"],
-        "--model smooth has a prior for the radial polynomial",
+    "a centre of decentering": (
+        ["lines.npz", "--distortion-model", "brown-conrady", "--centre", "fit"],
+        '--centre cannot be "fit" with --distortion-model brown-conrady',
+    ),
+    "a prior of another distortion model": (
+        ["lines.npz", "--distortion-model", "brown-conrady", "--model", "smooth"],
+        "--model smooth has no prior for this distortion model: leave out --distortion-model",
     ),
     "focal lengths that are not measured": (
         ["a.jpg", "--shared-focal", "folder"],
@@ -449,9 +537,25 @@ WRONG = {
         ["a.jpg", "--model", "smooth", "--terms", "3"],
         "leave out --terms",
     ),
-    "one focal length of csv": (
-        ["lines.csv", "--image-size", "640x480", "--focal", "35"],
-        "--focal must be a CSV file with the columns frame,focal",
+    "a focal length of csv that is none": (
+        ["bare.csv", "--image-size", "640x480", "--focal", "-35"],
+        "a positive number, or same if it is not known",
+    ),
+    "a source of photos for csv": (
+        ["bare.csv", "--image-size", "640x480", "--focal", "exif"],
+        "must be a CSV file with the columns frame,focal, or one focal length of",
+    ),
+    "one focal length beside those of csv": (
+        ["lines.csv", "--image-size", "640x480", "--focal", "same"],
+        "focal lengths are also given separately",
+    ),
+    "a unit of what is not known": (
+        ["bare.csv", "--image-size", "640x480", "--focal", "same", "--focal-unit", "px"],
+        "leave out --focal-unit",
+    ),
+    "how uncertain what is not known is": (
+        ["a.jpg", "--focal", "same", "--focal-sigma", "1%"],
+        "--focal-sigma has no effect with --focal same",
     ),
     "a size in other digits": (["lines.csv", "--image-size", "²x3"], "--image-size must be like"),
     "csv without image size": (["lines.csv"], "--image-size"),
@@ -503,7 +607,10 @@ _BOARD = ("--pitch", "30", "--distance", "1185", "--pixel", "0.0055")
         (["lines.npz", "--overlays", "all", "--frames", "3"], "--frames and --overlays have no effect"),
         (["a.png", "--frames", "3"], "--frames has no effect for photos"),
         (["lines.npz", "--shared-focal", "exif"], "--shared-focal has no effect for lines.npz"),
-        (["a.mp4", "--family", "division"], "--family has no effect with --focal motion"),
+        (
+            ["a.mp4", "--distortion-model", "division"],
+            "--distortion-model has no effect with --focal motion",
+        ),
         (["a.png", "--focal-unit", "px"], "--focal-unit has no effect without --focal"),
         (
             ["a.png", "--focal", "exif", "--focal-unit", "px"],

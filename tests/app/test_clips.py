@@ -265,3 +265,26 @@ def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
     done = MotionCalibration(tmp_path / "clip.mp4", tracks, fit, np.zeros((FRAMES, 2)))
     assert any(finding in sentence for sentence in map(str, done.findings)), done.findings
     assert done.verdict == verdict
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Dropped")
+@pytest.mark.parametrize("seed", [3, 4])
+def test_things_that_move_and_pass_for_noise_are_told(tmp_path, seed):
+    """Four of five points are on things that move slowly: most of them follow by that little."""
+    from zoomjax.app.motion_calibration import MotionCalibration
+
+    long_lens = zj.ZoomLens(
+        zj.PolynomialZoom(2, jnp.array([[0.02, 0.0], [-0.05, 0.01], [-0.15, 0.05]]), jnp.array(800.0)),
+        jnp.array([645.0, 356.0]),
+        jnp.array([800.0, 2400.0]),
+        (1280, 720),
+        "px",
+    )
+    where = pan_and_zoom(long_lens, 24, pan=25, tilt=6, seed=seed)
+    scene = motion_tracks(long_lens, *where, views=60, life=12, noise=0.3, moving=0.8, seed=seed)
+    fit = fit_motion(scene.tracks, throw=False)
+    done = MotionCalibration(tmp_path / "clip.mp4", scene.tracks, fit, np.zeros((24, 2)))
+    assert done.following() > 0.6
+    assert any("may be on things that move" in str(finding) for finding in done.findings)
+    assert done.verdict != "good"

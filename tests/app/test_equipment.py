@@ -8,9 +8,10 @@ import pytest
 from PIL import Image
 
 from zoomjax import scenes
-from zoomjax.app.equipment import KnownLens, known_lens, with_earlier, with_equipment
+from zoomjax.app.equipment import KnownLens, known_lens, taken_otherwise, with_earlier, with_equipment
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.io.equipment import FILM
+from zoomjax.models.about import UNKNOWN
 
 from ..io.test_equipment import CROP, FOCAL, PITCH, SIZE, block, ends, plane
 
@@ -44,6 +45,28 @@ def test_what_photos_do_not_agree_on_is_left_out(lens, tmp_path):
     assert found.pixel_pitch is None
 
 
+def test_photos_of_another_lens_than_the_one_they_are_corrected_by_are_told(lens, tmp_path):
+    photos = [photo(tmp_path / "a.jpg"), photo(tmp_path / "b.jpg", lens="24-105"), bare(tmp_path / "c.jpg")]
+    assert taken_otherwise(lens, photos) == []  # nothing is known of the lens
+    known = dataclasses.replace(lens, about={"lens": "18-200"})
+    (told,) = taken_otherwise(known, photos)
+    assert "that of 18-200, and by their EXIF data 1 of 3 photos" in told
+    assert "(24-105)" in told
+    assert taken_otherwise(known, photos[:1]) == []
+
+
+def test_photos_of_several_zooms_by_a_lens_of_one_that_is_not_known_are_told(lens, tmp_path):
+    of_one = dataclasses.replace(lens, about={"focal": UNKNOWN})
+    for name, focal in (("a.jpg", 20.0), ("b.jpg", 80.0)):
+        content = block(of={"Model": "D300"}, FocalLength=focal)
+        Image.fromarray(np.zeros((8, 12, 3), np.uint8)).save(tmp_path / name, exif=content)
+    photos = [tmp_path / "a.jpg", tmp_path / "b.jpg"]
+    (told,) = taken_otherwise(of_one, photos)
+    assert "20 to 80 mm" in told
+    assert taken_otherwise(of_one, photos[:1]) == []
+    assert taken_otherwise(lens, photos) == []
+
+
 def bare(path):
     """A photo whose EXIF data name the body, and nothing of its sensor."""
     block_of_it = block(of={"Make": "NIKON CORPORATION", "Model": "NIKON D300"})
@@ -58,7 +81,7 @@ def test_the_database_tells_the_sensor_of_a_body_whose_photos_do_not(lens, tmp_p
 
 
 def test_without_the_database_the_sensor_is_not_known(lens, tmp_path, monkeypatch):
-    from zoomjax.lenses import database
+    from zoomjax.interop import database
 
     database.database.cache_clear()
     monkeypatch.setitem(sys.modules, "lensfunpy", None)

@@ -9,7 +9,7 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app.board_focals import Board
-from zoomjax.app.focal_sources import check_way, choose_focals
+from zoomjax.app.focal_sources import check_source, choose_focals
 from zoomjax.app.image_job import ImageJob
 from zoomjax.detect.batch import Detection, detect
 from zoomjax.detect.sources import Source
@@ -49,9 +49,9 @@ def test_one_zoom_of_photos_need_not_be_known():
     assert found.focal == {"a.jpg": 1.0, "b.jpg": 1.0}
     assert (found.known, found.unit) == (False, "mm")
     assert "photos of one zoom" in found.origin
-    check_way("same", None, video=False)
+    check_source("same", None, video=False)
     with pytest.raises(ValueError, match="--focal same is for photos"):
-        check_way("same", None, video=True)
+        check_source("same", None, video=True)
 
 
 def test_one_number_is_that_of_all():
@@ -60,7 +60,7 @@ def test_one_number_is_that_of_all():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("way", "message"),
+    ("source", "message"),
     [
         (None, "no flat grid.*image,focal.*EXIF.*parallel.*oblique"),
         ("exif", "EXIF data.*image,focal.*EXIF.*parallel.*oblique"),
@@ -68,14 +68,14 @@ def test_one_number_is_that_of_all():
         ("board", "--pitch and --distance"),
     ],
 )
-def test_without_a_focal_length_the_ways_are_named(way, message):
+def test_without_a_focal_length_the_ways_are_named(source, message):
     with pytest.raises(ValueError, match=message):
-        choose_focals([of("a.jpg"), of("b.jpg")], way)
+        choose_focals([of("a.jpg"), of("b.jpg")], source)
 
 
 @pytest.mark.parametrize("video", [False, True])
 @pytest.mark.parametrize(
-    ("way", "error", "message"),
+    ("source", "error", "message"),
     [
         ("board", ValueError, "--pitch and --distance"),
         ("zoom", ValueError, "'zoom', which is not a source"),
@@ -88,24 +88,24 @@ def test_without_a_focal_length_the_ways_are_named(way, message):
         ("nothing.csv", FileNotFoundError, r"nothing\.csv"),
     ],
 )
-def test_what_is_no_way_is_told_before_any_work(way, video, error, message):
+def test_what_is_no_way_is_told_before_any_work(source, video, error, message):
     with pytest.raises(error, match=message):
-        check_way(way, None, video=video)
+        check_source(source, None, video=video)
 
 
 def test_the_ways_that_there_are(tmp_path):
     (tmp_path / "f.csv").write_text("image,focal\na.jpg,1200\n")
     (tmp_path / "t.csv").write_text("frame,focal\n0,1200\n")
     board = Board((20.0, 20.0), 1000.0, 0.005)
-    for way in (None, "exif", "plane", "35", str(tmp_path / "f.csv")):
-        check_way(way, None, video=False)
-    for way in ("plane", "35", str(tmp_path / "t.csv")):
-        check_way(way, None, video=True)
-    for way in (None, "board"):
-        check_way(way, board, video=True)
-    for way in (None, "exif"):
+    for source in (None, "exif", "plane", "35", str(tmp_path / "f.csv")):
+        check_source(source, None, video=False)
+    for source in ("plane", "35", str(tmp_path / "t.csv")):
+        check_source(source, None, video=True)
+    for source in (None, "board"):
+        check_source(source, board, video=True)
+    for source in (None, "exif"):
         with pytest.raises(ValueError, match=r"A video needs --focal.*time,focal"):
-            check_way(way, None, video=True)
+            check_source(source, None, video=True)
 
 
 @pytest.fixture(scope="module")
@@ -193,7 +193,8 @@ def test_a_square_view_tells_nothing():
     detections = [*oblique(1000.0, [(0.5, 0.0), (0.0, 0.5), (0.0, 0.0)])]
     found = choose_focals(detections, "plane")
     assert set(found.focal) == {"1000-0.png", "1000-1.png"}
-    assert "too frontal" in found.absent
+    assert "too squarely" in found.absence(detections[2])
+    assert "no flat grid" in found.absence(of("without.png"))
 
 
 def test_markings_of_a_pitch_tell_the_focal_lengths_of_frames():
@@ -215,13 +216,13 @@ def test_markings_of_a_pitch_tell_the_focal_lengths_of_frames():
     for name, value in found.focal.items():
         true = focal[int(name[0])] / SENSOR * lens.image_size[0]
         assert abs(value / true - 1) < max(0.03, 4 * found.deviation[name] / value)
-    with pytest.raises(ValueError, match="its lines cannot be told to be the markings of a football pitch"):
+    with pytest.raises(ValueError, match="its lines cannot be identified as the markings of a"):
         choose_focals([dataclasses.replace(detections[0], lines=detections[0].lines[:2])], "pitch")
 
 
 @pytest.mark.parametrize("video", [False, True])
 def test_a_pitch_is_a_source_that_needs_its_detector(video):
-    check_way("pitch", None, video=video)
+    check_source("pitch", None, video=video)
     with pytest.raises(ValueError, match='needs the markings of a pitch: give argument detector "pitch"'):
         ImageJob(("a.mp4" if video else "a.jpg",), detector="edges", focal="pitch")
     job = ImageJob(("a.mp4" if video else "a.jpg",), detector="pitch", focal="pitch" if video else None)

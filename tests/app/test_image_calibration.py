@@ -64,7 +64,7 @@ def done(folder):
 
 @pytest.mark.slow
 def test_the_lens_is_that_of_the_photographs(done):
-    lens, truth = done.calibration.zoom.lens, scenes.nikkor_18_200(SIZE)
+    lens, truth = done.calibration.fit.lens, scenes.nikkor_18_200(SIZE)
     assert demo.worst_error(lens, truth, done.focals.focal.values()) < 0.1
     assert (lens.image_size, lens.focal_unit) == (SIZE, "mm")
     np.testing.assert_allclose(lens.focal_range, [20.56, 127.36])
@@ -183,7 +183,7 @@ def test_of_many_photos_some_are_drawn(done, monkeypatch):
     monkeypatch.setattr("zoomjax.app.image_calibration.MOST_OVERLAYS", 3)
     drawn = [bool(name) for name in done.overlays()]
     assert sum(drawn) == 3
-    assert drawn[int(np.argmax(done.calibration.zoom.frame_rms))]
+    assert drawn[int(np.argmax(done.calibration.fit.frame_rms))]
     every = dataclasses.replace(done, job=dataclasses.replace(done.job, overlays="all"))
     assert all(every.overlays())
     none = dataclasses.replace(done, job=dataclasses.replace(done.job, overlays="none"))
@@ -214,7 +214,7 @@ def test_lines_that_are_not_straight_are_rejected(folder, tmp_path):
     assert [int(r.sum()) for r in rejected[:-1]] == [0] * 4
     assert 1 <= rejected[-1].sum() <= 6  # both sides, each perhaps in pieces
     truth = scenes.nikkor_18_200(SIZE)
-    assert demo.worst_error(spoiled.calibration.zoom.lens, truth, [20.56, 50.0, 127.36]) < 0.1
+    assert demo.worst_error(spoiled.calibration.fit.lens, truth, [20.56, 50.0, 127.36]) < 0.1
 
 
 @pytest.mark.slow
@@ -253,7 +253,7 @@ def test_a_lens_that_the_photos_tell_has_its_prior(folder, tmp_path):
         )
         Image.open(path).save(tmp_path / path.name, exif=of_lens, quality=95)
     done = calibrate_images(ImageJob((tmp_path,), model=WantedModel("smooth"), overlays="none"))
-    zoom = done.calibration.zoom.lens.zoom
+    zoom = done.calibration.fit.lens.zoom
     np.testing.assert_allclose(zoom.mean, zj.SmoothZoom.for_lens(18.0, 200.0, crop=1.5).mean, atol=5e-4)
     assert zoom.focal_ref == 18.0
     told = done.about()["prior"]
@@ -271,7 +271,7 @@ def test_one_photo_needs_no_focal_length(folder, tmp_path):
     path = tmp_path / "no-exif.png"
     shutil.copy(folder / "no-exif.png", path)
     done = calibrate_images(ImageJob((path,), overlays="none"))
-    lens, truth = done.calibration.zoom.lens, scenes.nikkor_18_200(SIZE)(20.56)
+    lens, truth = done.calibration.fit.lens, scenes.nikkor_18_200(SIZE)(20.56)
     corner = np.array([10.0, 10.0])
     np.testing.assert_allclose(lens(1.0).undistort(corner), truth.undistort(corner), atol=0.3)
     assert lens.about["focal"] == "not known"
@@ -285,7 +285,7 @@ def test_one_photo_needs_no_focal_length(folder, tmp_path):
         assert zooms not in page
     for text in (page, done.calibration.advice(), str(done.calibration.summary()["next_photo"])):
         assert not re.search(r"\b1 mm\b(?! stands)", text)
-    done.calibration.zoom.lens.save(tmp_path / "lens.json")
+    done.calibration.fit.lens.save(tmp_path / "lens.json")
     expected = zj.undistort_image(cv2.imread(str(path)), lens(1.0))
     image = cv2.imread(str(path))
     cv2.imwrite(str(tmp_path / "later.tif"), image)  # and it knows no more
@@ -322,7 +322,7 @@ def test_several_photos_of_one_zoom_need_none(folder, tmp_path):
     for name in "ab":
         cv2.imwrite(str(tmp_path / f"{name}.png"), image if name == "a" else image[:, ::-1])
     done = calibrate_images(ImageJob((tmp_path,), focal="same", overlays="none"))
-    lens, truth = done.calibration.zoom.lens, scenes.nikkor_18_200(SIZE)(20.56)
+    lens, truth = done.calibration.fit.lens, scenes.nikkor_18_200(SIZE)(20.56)
     corner = np.array([10.0, 10.0])
     np.testing.assert_allclose(lens(1.0).undistort(corner), truth.undistort(corner), atol=0.3)
     assert lens.about["focal"] == "not known"
@@ -342,7 +342,7 @@ def test_a_zooming_video_is_calibrated(tmp_path):
         done = calibrate_images(job)
     assert done.focals.origin == "the track of the video"
     assert len(done.used) == 8
-    lens, truth = done.calibration.zoom.lens, clips.lens()
+    lens, truth = done.calibration.fit.lens, clips.lens()
     assert demo.worst_error(lens, truth, [20.0, 35.0, 80.0]) < 1.5  # 320 px wide, few lines
     done.write(tmp_path)
     assert len(list((tmp_path / "lines").glob("*-zoom-*.jpg"))) == 8

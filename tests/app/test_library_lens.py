@@ -15,8 +15,8 @@ from zoomjax.app.commands_lens import app
 from zoomjax.app.library_lens import rows, undistort_by_library, write_lens
 from zoomjax.app.results_folder import results_folder
 from zoomjax.app.undistort_files import Job
+from zoomjax.interop.database import one_named
 from zoomjax.io import read_photo
-from zoomjax.lenses.database import one_named
 
 from .._commands import SEVERAL
 from ..io.test_equipment import block
@@ -48,7 +48,7 @@ def test_photos_of_two_lenses_are_corrected_each_by_its_own(tmp_path):
     assert "Canon EF-S 18-55mm f/3.5-5.6 IS II, crop factor 1.613, within" in done.sentence
     assert list(done.skipped) == [str(unknown)]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.png", "b.png"]
-    lens = zj.lenses.load(NIKKOR, image_size=SIZE, crop=1.523)
+    lens = zj.interop.library_lens(NIKKOR, image_size=SIZE, crop=1.523)
     expected = zj.undistort_image(read_photo(first)[0], lens, focal=18.0)
     np.testing.assert_array_equal(read_photo(tmp_path / "out" / "a.png")[0], expected)
     assert np.abs(expected.astype(float) - read_photo(first)[0]).max() > 20

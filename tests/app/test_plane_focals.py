@@ -12,12 +12,12 @@ import pytest
 import zoomjax as zj
 from zoomjax.app.board_bundle import bundle_of
 from zoomjax.app.console import show_images
-from zoomjax.app.focal_sources import Focals, choose_focals
+from zoomjax.app.focal_sources import GRID, Focals, choose_focals
 from zoomjax.app.image_calibration import calibrate_images
 from zoomjax.app.image_job import ImageJob
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.plane_focals import FocalGroup, Sharing, focals_from_grids, similar
-from zoomjax.app.plans import images_plan
+from zoomjax.app.plans import images_plan, lines_plan
 from zoomjax.app.report import report
 from zoomjax.detect.batch import Detection, detect
 from zoomjax.detect.sources import find_photos
@@ -200,26 +200,54 @@ def test_groups_are_told_in_terminal_report_and_summary(folder, tmp_path, capsys
     assert board["photos"] == 15
     assert board["bend_steps"][0] < 0.1  # it is flat
     assert [group["focal"] for group in groups] == pytest.approx(board["focal_px"])
-    assert [row[0] for row in done.bundle.compared(done.calibration.zoom.lens, board["focal_px"])] == [
-        f"{f:.4g}" for f in board["focal_px"]
-    ]
+    compared = done.bundle.compared(done.calibration.fit.lens, board["focal_px"])
+    alone = [f"{f:.4g}" for f in np.asarray(done.bundle.fit.label)]  # by homographies alone
+    assert [row[0] for row in compared] == alone
+    assert [row[1].partition(" ")[0] for row in compared] == [f"{f:.0f}" for f in board["focal_px"]]
     sentence = done.bundle.sentences()[0]
     assert "bundle adjustment of 15 photos" in sentence
     assert sentence in out
     page = report(done.calibration, done)
     assert sentence in page
     assert "Straightness and bundle adjustment" in page
+    assert "f of homographies, px" in page
     assert [len(group["names"]) for group in groups] == [5, 5, 5]
     for group, focal in zip(groups, ZOOMS.values(), strict=True):
         assert group["focal"] == pytest.approx(focal, rel=0.02)
         assert group["std"] > 0
 
 
-def test_few_photos_make_no_bundle(detections):
+def test_few_photos_make_no_bundle_and_say_what_would(detections):
     focals = Focals({d.name: 1.0 for d in detections}, "px", "", "")
-    assert bundle_of(detections[:3], focals) is None
+    bundle, told = bundle_of(detections[:3], focals)
+    assert bundle is None
+    assert told == (
+        "The board counts as flat: 3 photos at 1 focal length cannot separate its shape from the lens. "
+        "That takes 4 at each, or 12 in all."
+    )
     apart = Focals({d.name: 1.0 + i for i, d in enumerate(detections)}, "px", "", "")
-    assert bundle_of(detections, apart) is None  # each at a zoom of its own
+    assert bundle_of(detections[:11], apart).bundle is None  # each at a zoom of its own
+
+
+def test_options_that_say_which_photos_are_of_one_zoom_are_named_where_they_help(detections):
+    few = [dataclasses.replace(d, file=f"a/{i}.png", focal=None) for i, d in enumerate(detections[:6])]
+    measured = Focals({d.name: 1.0 + i for i, d in enumerate(few)}, "px", GRID, "")
+    ways = ImageJob(("a.png",), focal="plane").other_sharing
+
+    def told(used, focals=measured, sharing=ways):
+        return bundle_of(used, focals, sharing=sharing).told
+
+    assert "say so: --focal plane --shared-focal folder, if the photos of a folder are" in told(few)
+    exif = [dataclasses.replace(d, focal=24.0) for d in few]
+    assert "--shared-focal exif, for photos of one focal length in their EXIF data." in told(exif)
+    alone = [dataclasses.replace(d, file=f"{i}/a.png") for i, d in enumerate(few)]
+    assert told(alone).endswith("say so: --focal plane --shared-focal similarity.")
+    clip = ImageJob(("a.mp4",), focal="plane").other_sharing
+    assert told(exif, sharing=clip).endswith("--shared-focal similarity.")
+    shared = ImageJob(("a.png",), focal="plane", shared_focal="similarity").other_sharing
+    assert "--shared" not in told(few, sharing=shared)  # it is given
+    given = dataclasses.replace(measured, origin="EXIF data")
+    assert "--shared" not in told(few, given)
 
 
 @pytest.mark.slow
@@ -257,6 +285,16 @@ def test_a_dry_run_shows_which_photos_would_share(folder):
         said = [line.partition(": ")[0] for line in told[len(alone) + 1 :]]
         assert said == [f"  {called.format(mm)}" for mm in ZOOMS]
         assert all(line.count(".png") == len(TILTS) for line in told[len(alone) + 1 :])
+
+
+def test_a_dry_run_says_that_a_focal_length_is_not_known(folder):
+    _, *photos = images_plan(ImageJob((str(folder / "24mm"),), detector="grid", focal="same"))
+    assert photos
+    assert all(line.endswith(".png: f not known") for line in photos)
+    lines = zj.Lines.from_ragged([[[1, 1], [2, 2], [3, 4]]] * 2, [0, 1], [1.0, 1.0], image_size=(640, 480))
+    told = "2 of 2 lines in 2 frames, all at one f, which is not known."
+    assert lines_plan(lines, [], focal_known=False) == [told]
+    assert lines_plan(lines, [1]) == ["1 of 2 lines in 2 frames, f = 1 mm."]
 
 
 @pytest.mark.parametrize(

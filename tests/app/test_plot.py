@@ -1,6 +1,7 @@
 """Plots: what is drawn is what was fitted."""
 
 import io
+import itertools
 
 import jax.numpy as jnp
 import matplotlib
@@ -10,6 +11,7 @@ from matplotlib.figure import Figure
 
 import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.app.coverage import plot_coverage
 from zoomjax.app.plot import plot_distortion, plot_model, save_plot
 
 
@@ -126,3 +128,25 @@ def test_a_lens_without_distortion_can_be_drawn(folding):
         assert np.ptp(line.get_xydata(), axis=0).min() < 1e-9
     assert len(figure.axes[1].collections) == 1  # no arrows of rounding errors
     figure.savefig(io.BytesIO(), format="png")
+
+
+@pytest.mark.parametrize(
+    "focal", [[1140, 3071, 4946, 6947, 8840], [18.0, 35.0, 50.0, 200.0], [4.0, 20.0, 900.0], [20.0, 45.0]]
+)
+def test_labels_of_focal_lengths_do_not_overlap(focal):
+    ends = np.array([[100.0, 100.0], [300.0, 200.0], [500.0, 300.0]])
+    number = len(focal)
+    lines = zj.Lines.from_ragged([ends] * number, range(number), focal, image_size=(640, 480))
+    figure = plot_coverage(lines, np.ones(number))
+    figure.draw_without_rendering()
+    right = figure.axes[1]
+    low, high = right.get_xlim()
+    ticks = [*right.xaxis.get_major_ticks(), *right.xaxis.get_minor_ticks()]
+    boxes = [
+        tick.label1.get_window_extent()
+        for tick in ticks
+        if low <= tick.get_loc() <= high and tick.label1.get_text()
+    ]
+    boxes.sort(key=lambda box: box.x0)
+    assert len(boxes) >= 2
+    assert all(one.x1 + 2 < other.x0 for one, other in itertools.pairwise(boxes))

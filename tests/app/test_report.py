@@ -19,6 +19,8 @@ from zoomjax.app.calibration import calibrate
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.page import Run
 from zoomjax.app.report import report
+from zoomjax.models import Model, PolynomialZoom
+from zoomjax.trust.selection import Selection, Verdict
 
 from .._browser import opened
 
@@ -93,7 +95,7 @@ def test_page_is_well_formed_and_by_itself(page, text):
     for source in page.all("img", "src"):
         assert source.startswith(("data:image/svg+xml;base64,", "data:image/png;base64,"))
         assert len(base64.b64decode(source.split(",")[1], validate=True)) > 1000
-    assert len(page.all("img", "src")) == 6
+    assert len(page.all("img", "src")) == 7
     assert all(page.all("img", "alt"))
     assert page.all("a", "href") == ["lens.json", "summary.json", "lines.npz", "model.png"]
     outside = [attributes for tag, attributes in page.elements if tag in ("link", "iframe", "object")]
@@ -117,7 +119,7 @@ def test_page_says_what_the_summary_says(page, calibration):
 
 def test_worst_lines_are_those_of_the_lens(page, calibration):
     """The distance of a line's corrected points to it, over the stretch across it, from singular values."""
-    lines, lens = calibration.lines, calibration.zoom.lens
+    lines, lens = calibration.lines, calibration.fit.lens
     rms = []
     for line, frame in enumerate(np.asarray(lines.frame)):
         seen = np.asarray(lines.points[line])[np.asarray(lines.mask[line])]
@@ -153,6 +155,7 @@ def test_names_are_escaped_and_lead_to_their_pictures(calibration):
         shared=lambda: ["<i>3</i> photos share f"],
         verdicts=lambda: [("good", ""), ("doubtful", "<i>bent</i> otherwise"), ("good", ""), ("good", "")],
         bundle=None,
+        board=lambda: ["The <i>board</i> counts as flat"],
     )
     page = Page(report(calibration, images))
     assert "doubtful<i>bent</i> otherwise" in page.text
@@ -165,15 +168,16 @@ def test_names_are_escaped_and_lead_to_their_pictures(calibration):
     assert "Warning: <b>two</b> lines & more" in page.text
     assert "The prior is that of an <i>18-200</i>." in page.text
     assert 'Focal lengths "here" <there>.' in page.text
+    assert "The <i>board</i> counts as flat" in page.text
 
 
 def test_what_is_not_determined_is_said(calibration):
     zoom = eqx.tree_at(
         lambda fit: (fit.covariance, fit.result),
-        calibration.zoom,
-        (jnp.full_like(calibration.zoom.covariance, jnp.inf), RESULTS.undetermined),
+        calibration.fit,
+        (jnp.full_like(calibration.fit.covariance, jnp.inf), RESULTS.undetermined),
     )
-    page = Page(report(dataclasses.replace(calibration, zoom=zoom)))
+    page = Page(report(dataclasses.replace(calibration, fit=zoom)))
     assert "Warning: The lines do not determine" in page.text
     assert "not determined" in page.text
 
@@ -182,20 +186,35 @@ def test_what_is_not_determined_is_said(calibration):
 def test_a_lens_that_folds_is_called_so(calibration):
     zoom = eqx.tree_at(
         lambda fit: (fit.certificate.certified, fit.certificate.slope),
-        calibration.zoom,
+        calibration.fit,
         (jnp.array(False), jnp.array(-0.2)),
     )
-    page = Page(report(dataclasses.replace(calibration, zoom=zoom)))
+    page = Page(report(dataclasses.replace(calibration, fit=zoom)))
     assert "The lens is not invertible" in page.text
     assert "falls to -0.2, at f = " in page.text
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("best", [0, 1])
+def test_the_choice_of_a_model_is_explained_under_its_table(calibration, best):
+    names = [Model(PolynomialZoom(1), 2), Model(PolynomialZoom(2), 2)]
+    verdicts = tuple(Verdict(of, 8.3, 1.5, 1.7, 0.2, 0.0, 0.2) for of in names)
+    chosen = Selection(names[0], names[best], calibration.fit, verdicts, "focal", 4, "least")
+    page = Page(report(dataclasses.replace(calibration, selection=chosen)))
+    why = (
+        "worse than the best by no more than 0.05 %, which is nothing, that of fewest parameters is chosen"
+    )
+    assert (why in page.text) == bool(best)
+    if best:
+        assert page.text.index("degree 1, 2 terms") < page.text.index(why)
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_long_lists_are_cut_to_the_worst_frames(calibration, monkeypatch):
     monkeypatch.setattr(zoomjax.app.report, "_MOST_FRAMES", 2)
     page = Page(report(calibration))
-    assert "Of 4 frames, the 2 that the polynomial fits worst are shown." in page.text
-    rms = np.asarray(calibration.zoom.frame_rms)
+    assert "Of 4 frames, the 2 that the zoom model fits worst are shown." in page.text
+    rms = np.asarray(calibration.fit.frame_rms)
     frames = page.text[page.text.index("worst lines are listed") :]
     for frame in range(4):
         assert (f"{rms[frame]:.3f}" in frames) == (frame in np.argsort(-rms)[:2])
@@ -218,7 +237,7 @@ def test_frames_are_sorted_by_focal_length(noisy):
 
 def test_the_slider_shows_the_lens(text, calibration):
     data = json.loads(re.search(r'id="lens-data">(.*?)</script>', text)[1])
-    lens = calibration.zoom.lens
+    lens = calibration.fit.lens
     for step in (0, 20, 40):
         corner = np.asarray(lens(data["focal"][step]).undistort(np.zeros(2)))
         moved = np.hypot(*(corner - lens.centre)) - np.hypot(*np.asarray(lens.centre))
@@ -238,7 +257,7 @@ def test_what_was_run_is_said(calibration):
 def test_enough_is_said_when_a_further_photo_shows_nothing(clean):
     exact = calibrate(clean, **GIVEN)
     assert exact.enough()
-    told = "Enough: the standard deviation of the displacement, in the geometric mean"
+    told = "Enough: the standard deviation that noise gives the displacement, in the geometric mean"
     assert told in Page(report(exact)).text
     assert exact.summary()["next_photo"]["enough"] is True
 
@@ -285,7 +304,7 @@ def test_in_a_browser(text, tmp_path, width):
     found = json.loads(re.search(r'<pre id="found">(.*?)</pre>', document)[1])
     assert found["width"] == width
     assert found["needed"] == width
-    assert found["images"] == found["shown"] == 6
+    assert found["images"] == found["shown"] == 7
     focused, first, last, told, redrawn = found["moved"]
     assert focused
     assert redrawn

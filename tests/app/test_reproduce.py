@@ -56,7 +56,7 @@ def test_the_polynomial_of_55_frames_corrects_all_841(done):
 def test_lenses_are_those_of_the_paper(done):
     """In px at the corner, at three focal lengths: the board's bends move 6 of 173 px."""
     for experiment, most in zip(done[1], (8.0, 2.0), strict=True):
-        truth, lens = experiment.truth, experiment.calibration.zoom.lens
+        truth, lens = experiment.truth, experiment.calibration.fit.lens
         corner = np.zeros(2)
         for f in np.geomspace(*np.asarray(truth.focal_range), 3):
             apart = np.asarray(lens(f).undistort(corner)) - np.asarray(truth(f).undistort(corner))

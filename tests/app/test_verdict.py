@@ -12,7 +12,9 @@ from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.plane_focals import FocalGroup
 from zoomjax.app.verdict import (
     findings_of_edges,
+    findings_of_exif,
     findings_of_focals,
+    findings_of_own_focals,
     findings_of_photos,
     findings_of_sizes,
     verdict_of_photo,
@@ -85,6 +87,15 @@ def test_photos_cropped_from_other_shapes_are_doubtful(tmp_path):
     assert "6000 x 3376 px (1 photo)" in found.found
 
 
+def test_focal_lengths_that_photos_may_share_come_first_where_something_is_wrong():
+    options = "--focal plane --shared-focal folder, if the photos of a folder are of one zoom,"
+    assert findings_of_own_focals(options, "good") == []
+    assert findings_of_own_focals("", "doubtful") == []
+    (found,) = findings_of_own_focals(options, "doubtful")
+    assert (found.verdict, found.cause) == ("doubtful", True)
+    assert found.advice.endswith("--shared-focal folder, if the photos of a folder are of one zoom.")
+
+
 def test_photos_of_other_sizes_are_remarked_on():
     assert findings_of_sizes(0, 9) == []
     (found,) = findings_of_sizes(2, 9)
@@ -133,7 +144,7 @@ def test_selection_still_says_what_that_is_told_by(noisy):
     small = compress(noisy)
     parts = folds_of(small, "line", 2, 0)
     with pytest.raises(ValueError, match=r"^No candidate can be compared"):
-        compare_errors(small, [object()], ["it failed"], parts, "least")
+        compare_errors([object()], ["it failed"], parts, "least")
 
 
 def test_the_photo_at_an_end_of_the_zoom_is_told_from_the_others(noisy):
@@ -143,16 +154,18 @@ def test_the_photo_at_an_end_of_the_zoom_is_told_from_the_others(noisy):
     kept = np.zeros(9, bool)
 
     def judged(joint):
-        held_out = np.where(np.arange(4) == first, joint, done.held_out)
-        return verdict_of_photo(dataclasses.replace(done, held_out=held_out), first, Detection("a"), kept)
+        held_out = np.where(np.arange(4) == first, joint, done.rms_held_out)
+        return verdict_of_photo(
+            dataclasses.replace(done, rms_held_out=held_out), first, Detection("a"), kept
+        )
 
     verdict, reason = judged(9.0)
     assert verdict == "doubtful"
     assert "the other photos, extrapolated to its focal length, leaves 9 px" in reason
-    assert judged(done.each_held_out[first]) == ("good", "")
+    assert judged(done.rms_frames_held_out[first]) == ("good", "")
     verdict, reason = judged(np.nan)
     assert verdict == "good"
-    assert "could contradict it" in reason
+    assert "the other photos do not determine the lens" in reason
 
 
 def test_the_verdict_on_one_photo_is_that_on_its_lens(noisy):
@@ -160,5 +173,26 @@ def test_the_verdict_on_one_photo_is_that_on_its_lens(noisy):
     bad = Finding("a", "doubtful", "lines are bent.", "Look.")
     for findings, told in (((), ("good", "")), ((bad,), ("doubtful", "lines are bent"))):
         assessment = dataclasses.replace(done.assessment, findings=findings)
-        one = dataclasses.replace(done, none=done.none[:1], assessment=assessment)
+        one = dataclasses.replace(done, rms_uncorrected=done.rms_uncorrected[:1], assessment=assessment)
         assert verdict_of_photo(one, 0, Detection("a"), np.zeros(9, bool)) == told
+
+
+@pytest.mark.parametrize(
+    ("exif", "used", "told"),
+    [
+        ([18.0, 35.0, 200.0], [1.0, 1.0, 1.0], "a.jpg 18 mm and c.jpg 200 mm are of other zooms"),
+        ([18.0, 35.0, 200.0], [18.3, 35.2, 190.0], ""),
+        ([18.0, 35.0, 200.0], [3600.0, 7000.0, 39000.0], ""),
+        ([18.0, 35.0, 200.0], [18.0, 200.0, 35.0], "b.jpg 35 mm and c.jpg 200 mm"),
+        ([None, 35.0, None], [1.0, 1.0, 1.0], ""),
+    ],
+    ids=["taken as one", "rounded", "in px", "rows in another order", "one known"],
+)
+def test_focal_lengths_that_contradict_exif_data_are_doubtful(exif, used, told):
+    names = ["a.jpg", "b.jpg", "c.jpg"]
+    found = findings_of_exif(
+        [Detection(name, focal=f) for name, f in zip(names, exif, strict=True)],
+        dict(zip(names, used, strict=True)),
+    )
+    assert [finding.verdict for finding in found] == ["doubtful"] * bool(told)
+    assert told in "".join(finding.found for finding in found)

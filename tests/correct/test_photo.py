@@ -11,8 +11,9 @@ from PIL import ExifTags, Image
 
 import zoomjax as zj
 from zoomjax.correct.photo import photo_focal
-from zoomjax.io.metadata import Metadata
+from zoomjax.io.metadata import Metadata, framing_of, marked
 from zoomjax.io.photo import read_focal, read_pages, read_photo
+from zoomjax.io.png import with_chunks
 from zoomjax.io.tiff import encode_tiff
 
 from .._exif import exif
@@ -246,3 +247,86 @@ def test_back_is_where_it_began(tmp_path, rng, keep):
     assert np.abs(back[middle].astype(int) - image[middle]).max() <= 4
     wrong = cv2.imread(str(tmp_path / "out.png"))[: SIZE[1], : SIZE[0]]
     assert np.abs(wrong[middle].astype(int) - image[middle]).max() > 10
+
+
+@pytest.mark.parametrize("keep", ["same", "all"])
+def test_another_framing_than_the_one_it_was_corrected_with_is_refused(tmp_path, rng, keep):
+    """Of the same size, so that only the mark tells."""
+    cv2.imwrite(str(tmp_path / "in.png"), picture(rng))
+    common = zj.correct.frame_output(lens(), SIZE, keep="all")
+    zj.undistort_photo(tmp_path / "in.png", tmp_path / "out.png", lens=lens(), focal=20.0, keep=common)
+    with pytest.raises(ValueError, match="was corrected with another framing"):
+        zj.correct.redistort_photo(
+            tmp_path / "out.png", tmp_path / "back.png", lens=lens(), focal=80.0, keep=keep
+        )
+    assert not (tmp_path / "back.png").exists()
+    zj.correct.redistort_photo(
+        tmp_path / "out.png", tmp_path / "back.png", lens=lens(), focal=80.0, keep=common
+    )
+
+
+def test_signed_numbers_are_refused_where_the_format_has_none(tmp_path, rng):
+    signed = (picture(rng, 1, np.uint16).astype(np.int32) - 30000).astype(np.int16)
+    tifffile.imwrite(tmp_path / "in.tif", signed, photometric="minisblack")
+    with pytest.raises(ValueError, match=r"signed numbers, which a \.png file does not hold: choose \.tif"):
+        zj.undistort_photo(tmp_path / "in.tif", tmp_path / "out.png", lens=lens(), focal=20.0)
+    assert not (tmp_path / "out.png").exists()
+    zj.undistort_photo(tmp_path / "in.tif", tmp_path / "out.tif", lens=lens(), focal=20.0)
+    assert tifffile.imread(tmp_path / "out.tif").min() < 0
+
+
+@pytest.mark.parametrize("mode", ["L", "I;16"])
+def test_transparent_grey_of_png_files_stays_so(tmp_path, mode):
+    grey = np.full((SIZE[1], SIZE[0]), 90, np.uint8 if mode == "L" else np.uint16)
+    grey[40:80, 60:120] = 106
+    Image.fromarray(grey).save(tmp_path / "in.png", transparency=106)
+    image, _ = read_photo(tmp_path / "in.png")
+    most = np.iinfo(grey.dtype).max
+    np.testing.assert_array_equal(image[..., 3], np.where(grey == 106, 0, most))
+    np.testing.assert_array_equal(image[..., 0], grey)
+
+
+def test_a_profile_of_greys_does_not_go_with_colours(tmp_path):
+    profile = bytes(16) + b"GRAY" + bytes(108)
+    grey = Image.fromarray(np.full((SIZE[1], SIZE[0]), 90, np.uint8))
+    grey.convert("LA").save(tmp_path / "in.png", icc_profile=profile)
+    with pytest.warns(UserWarning, match="the colour profile"):
+        zj.undistort_photo(tmp_path / "in.png", tmp_path / "out.png", lens=lens(), focal=20.0)
+    with Image.open(tmp_path / "out.png") as written:
+        assert "icc_profile" not in written.info
+
+
+def test_chunks_of_another_format_are_named(tmp_path, rng):
+    plain = write(tmp_path / "plain.png", picture(rng)).read_bytes()
+    chunks = Metadata(chunks=((b"cICP", bytes([9, 16, 0, 1])), (b"tEXt", b"Author\0somebody")))
+    (tmp_path / "in.png").write_bytes(with_chunks(plain, chunks))
+    with pytest.warns(UserWarning, match="the colour space, texts"):
+        zj.undistort_photo(tmp_path / "in.png", tmp_path / "out.tif", lens=lens(), focal=20.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        zj.undistort_photo(tmp_path / "in.png", tmp_path / "out.png", lens=lens(), focal=20.0)
+
+
+@pytest.mark.parametrize("interpolation", ["cubic", "lanczos"])
+@pytest.mark.parametrize("k", [-0.12, 0.12])
+def test_valid_shows_nothing_of_the_border_under_any_kernel(interpolation, k):
+    white = np.full((SIZE[1], SIZE[0]), 1000.0, np.float32)
+    d = zj.Distortion(np.array([k]), (np.array(SIZE) - 1) / 2, np.array(np.hypot(*SIZE) / 2))
+    corrected = zj.undistort_image(white, d, keep="valid", interpolation=interpolation)
+    np.testing.assert_allclose(corrected, 1000.0, rtol=1e-5)
+
+
+def test_half_floats_do_not_overflow():
+    bright = np.zeros((SIZE[1], SIZE[0]), np.float16)
+    bright[40:80, 60:120] = np.finfo(np.float16).max
+    d = zj.Distortion(np.array([0.1]), (np.array(SIZE) - 1) / 2, np.array(np.hypot(*SIZE) / 2))
+    assert np.isfinite(zj.undistort_image(bright, d, interpolation="cubic")).all()
+
+
+def test_the_mark_gives_the_framing_back_and_none_that_cannot_be():
+    def told(shown):
+        return framing_of(marked(Metadata(), "undistorted", framing=shown))
+
+    assert told((0.9, -1.5, 1e-7)) == (0.9, -1.5, 1e-7)
+    assert told((0.0, 0.0, 0.0)) is None
+    assert told(None) is None

@@ -171,13 +171,13 @@ TWICE = {
 @pytest.mark.parametrize("case", TWICE)
 def test_second_derivatives_are_those_of_plain_sums(rng, case, interpolation):
     """By all numbers of the distortion and one of the image, in reverse and forward alone."""
-    k, family = TWICE[case]
+    k, distortion_model = TWICE[case]
     image = jnp.asarray(rng.random((7, 10)))
     numbers = jnp.array([*k, 4.81, 3.17, 6.1, 0.3])
 
     def square(warp, numbers):
         *k, x, y, scale, pixel = numbers
-        d = zj.Distortion(jnp.stack(k), jnp.stack([x, y]), scale, family)
+        d = zj.Distortion(jnp.stack(k), jnp.stack([x, y]), scale, distortion_model)
         return jnp.sum(warp(image.at[3, 5].set(pixel), d) ** 2)
 
     def ours(numbers):
@@ -447,3 +447,20 @@ def test_a_large_border_value_leaves_the_picture_its_digits(border, interpolatio
     plain = zj.warp_image(image, d, interpolation=interpolation)
     found = zj.warp_image(image, d, interpolation=interpolation, border_value=border)
     np.testing.assert_allclose(found[5:35, 5:55], plain[5:35, 5:55], atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", ["uint32", "int32"])
+def test_large_integers_stay_within_their_type(dtype):
+    most = np.iinfo(dtype).max
+    image = jnp.full((16, 24), most, dtype)
+    corrected = zj.warp_image(
+        image, zj.Distortion(jnp.array([0.0]), jnp.array([11.5, 7.5]), jnp.array(14.0))
+    )
+    assert corrected.dtype == image.dtype
+    assert np.abs(np.asarray(corrected, float) / most - 1).max() < 1e-6
+
+
+def test_complex_images_are_refused():
+    d = zj.Distortion(jnp.array([0.1]), jnp.array([11.5, 7.5]), jnp.array(14.0))
+    with pytest.raises(ValueError, match="must hold real numbers"):
+        zj.warp_image(jnp.zeros((16, 24), complex), d)

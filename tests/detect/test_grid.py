@@ -228,14 +228,35 @@ def test_noise_and_uneven_light_move_nodes_little(pattern, find, rng):
     assert rms(found - mapped(OBLIQUE, nodes())) < 0.15
 
 
-@pytest.mark.parametrize("turns", [0, 1, 2, 3])
-@pytest.mark.parametrize("pattern", [squares, dots])
-def test_rows_run_to_the_right_and_columns_down_however_the_image_is_turned(pattern, turns):
-    image = np.ascontiguousarray(np.rot90(rendered(pattern, OBLIQUE), turns))
+@pytest.mark.parametrize("turns", range(4))
+def test_rows_of_dots_run_to_the_right_and_columns_down_however_the_image_is_turned(turns):
+    image = np.ascontiguousarray(np.rot90(rendered(dots, OBLIQUE), turns))
     grid = zj.detect.GridDetector().find(image)
     assert grid.shape[:2] == ((ROWS, COLUMNS) if turns % 2 == 0 else (COLUMNS, ROWS))
     assert (np.diff(grid[..., 0], axis=1) > 0).all()
     assert (np.diff(grid[..., 1], axis=0) > 0).all()
+
+
+def turned_back(points, size):
+    """Where points of an image turned by a quarter (`np.rot90`) were in the image, of this size."""
+    return np.stack([size[0] - 1 - points[..., 1], points[..., 0]], axis=-1)
+
+
+@pytest.mark.parametrize("turns", range(4))
+@pytest.mark.parametrize("first", [0, 1])
+def test_corners_of_a_board_are_the_same_ones_however_the_image_is_turned(turns, first):
+    """Of odd by even corners: the first square is dark. Seen on its side, rows are columns."""
+    image = rendered(lambda places: abs(first - squares(places)), OBLIQUE)
+    upright = find_checkerboard(image)
+    found = find_checkerboard(np.ascontiguousarray(np.rot90(image, turns)))
+    for turn in range(turns):  # the last of the turns first
+        found = turned_back(found, SIZE if (turns - turn) % 2 else SIZE[::-1])
+    if turns % 2:
+        assert found.shape[:2] == (COLUMNS, ROWS)
+        found = np.rot90(found, 1 if ROWS % 2 == 0 else 3)
+    np.testing.assert_allclose(found, upright, atol=0.1)
+    middle = (upright[0, 0] + upright[1, 1]) / 2
+    assert image[tuple(np.rint(middle[::-1]).astype(int))] < 100
 
 
 @pytest.mark.parametrize("pattern", [squares, dots])

@@ -81,13 +81,13 @@ def test_too_few_focal_lengths_raise(ragged):
         zj.fit.algebraic_zoom(ragged, zoom=zj.PolynomialZoom(3))
 
 
-@pytest.mark.parametrize("family", [zj.models.BrownConrady(), Halved()])
-def test_other_distortion_models_are_estimated_too(family, clean, truth):
+@pytest.mark.parametrize("distortion_model", [zj.models.BrownConrady(), Halved()])
+def test_other_distortion_models_are_estimated_too(distortion_model, clean, truth):
     """Both hold the polynomial: the estimate is its own, of half the coefficients, or next to it."""
-    small = zj.fit.compress_family(clean, family)
+    small = zj.fit.compress_for(clean, distortion_model)
     found = np.asarray(zj.fit.algebraic_zoom(small).zoom.parameters)
     radial = np.asarray(zj.fit.algebraic_zoom(clean).zoom.parameters)
-    if family == Halved():
+    if distortion_model == Halved():
         np.testing.assert_allclose(found / 2, radial, rtol=1e-6)
         frames = zj.fit.algebraic_frames(small) / 2
         np.testing.assert_allclose(frames, zj.fit.algebraic_frames(clean), rtol=1e-6)
@@ -105,5 +105,5 @@ def test_of_the_division_model_to_first_order(clean):
     straight = np.linspace([200.0, 300.0], [3500.0, 700.0], 50)
     seen = [weak.distort(straight + np.array([0, step])) for step in range(0, 2000, 300)]
     lines = zj.Lines.from_ragged(seen, [0] * len(seen), [50.0], image_size=clean.image_size)
-    small = zj.fit.compress_family(lines, zj.models.Division(), terms=1)
+    small = zj.fit.compress_for(lines, zj.models.Division(), terms=1)
     np.testing.assert_allclose(zj.fit.algebraic_frames(small, terms=1), [[-1e-4]], rtol=1e-3)

@@ -251,6 +251,23 @@ def test_standard_deviations_are_the_scatter_of_fits_to_noise(exact):
     assert 0.5 < np.sqrt(np.mean(np.var(shapes, axis=0, ddof=1))) / said < 2
 
 
+def test_standard_deviations_hold_for_a_focal_length_a_photo(exact):
+    """A photo that alone tells its focal length leaves no score in it, which is not certainty."""
+    _, grids, _ = exact
+    rng = np.random.default_rng(7)
+    label = FOCAL * (1 + 1e-3 * np.arange(len(FOCAL)))  # none the same, and in the order of time
+    missed = []
+    for _ in range(4):
+        fit = fit_boards(
+            grids + 0.3 * rng.standard_normal(grids.shape), label, image_size=SIZE, throw=False
+        )
+        in_order = np.argsort(np.argsort(label))
+        missed.append((np.asarray(fit.focal)[in_order] - FOCAL) / np.asarray(fit.focal_std)[in_order])
+    missed = np.abs(missed)
+    assert 0.4 < np.median(missed) < 0.95  # 0.67, and what photos have in common
+    assert np.mean(missed < 1.96) > 0.85
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -8,6 +8,8 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.models import BrownConrady, Model
+from zoomjax.trust import selection
 
 from ..conftest import NOISE, SEED
 
@@ -155,3 +157,109 @@ def test_other_zoom_models_have_centres_too(lines):
     found = zj.fit.fit_centre(lines, zoom=zj.models.PowerZoom())
     assert found.determined
     assert found.fit.rms < found.rms_fixed
+
+
+TAKEN = {
+    "fit_zoom": lambda lines, **how: zj.fit_zoom(lines, **how),
+    "fit_robust": lambda lines, **how: zj.fit_robust(lines, **how).fit,
+    "many": lambda lines, **how: zj.fit.many([lines], **how)[0],
+    "many, robust": lambda lines, **how: zj.fit.many([lines], zj.fit_robust, **how)[0].fit,
+    "select_model": lambda lines, **how: zj.select_model(lines, [zj.PolynomialZoom(2)], **how).fit,
+}
+
+
+@pytest.mark.parametrize("name", TAKEN)
+def test_a_given_centre_is_taken_by_all_fits(name, lines, aside):
+    fit = TAKEN[name]
+    given = fit(lines, centre=tuple(np.asarray(aside.centre).tolist()))
+    np.testing.assert_array_equal(given.lens.centre, aside.centre)
+    image = fit(lines, centre="image")
+    np.testing.assert_array_equal(image.lens.centre, (np.array(lines.image_size) - 1) / 2)
+    np.testing.assert_array_equal(image.lens(30.0).coefficients, fit(lines).lens(30.0).coefficients)
+    assert given.rms < 0.99 * image.rms
+    with pytest.raises(ValueError, match='must be "fit", "image" or two coordinates'):
+        fit(lines, centre=(np.nan, 1.0))
+
+
+@pytest.mark.parametrize("name", TAKEN)
+def test_a_fitted_centre_is_that_of_fit_centre(name, lines, found):
+    own = TAKEN[name](lines, centre="fit")
+    tolerance = 0.2 if "robust" in name else 1e-9  # weights make a difference
+    np.testing.assert_allclose(own.lens.centre, found.fit.lens.centre, atol=tolerance)
+    assert own.joint is not None
+
+
+def test_frames_have_the_given_centre_or_each_its_own(lines, aside):
+    given = zj.fit_frames(lines, centre=np.asarray(aside.centre))
+    np.testing.assert_array_equal(given.centre, np.broadcast_to(aside.centre, given.centre.shape))
+    assert given.rms < zj.fit_frames(lines, centre="image").rms
+    own, known = zj.fit_frames(lines, centre="fit"), zj.fit.fit_frame_centres(lines)
+    np.testing.assert_array_equal(own.centre, known.each.centre)
+    np.testing.assert_array_equal(own.coefficients, known.each.coefficients)
+    with pytest.raises(RuntimeError, match="The fit failed"):
+        zj.fit_frames(lines, centre="fit", max_steps=1)
+    assert np.isfinite(zj.fit_frames(lines, centre="fit", max_steps=1, throw=False).centre).all()
+
+
+@pytest.mark.parametrize("fit", [zj.fit_zoom, zj.fit_robust, zj.fit_frames])
+def test_what_need_not_be_invertible_has_no_fitted_centre(fit, lines):
+    for one in (fit, lambda lines, **how: zj.fit.many([lines], fit, **how)):
+        if one is not fit and fit is zj.fit_frames:
+            continue
+        with pytest.raises(ValueError, match="needs invertible=True"):
+            one(lines, centre="fit", invertible=False)
+
+
+def test_a_selection_says_at_once_that_no_centre_can_be_fitted(lines, monkeypatch):
+    monkeypatch.setattr(selection, "compare", lambda *_: pytest.fail("candidates are compared first"))
+    with pytest.raises(ValueError, match="not compressed about one centre"):
+        zj.select_model(lines.about(lines.centre), centre="fit")
+    decentred = Model(zj.PolynomialZoom(degree=1), distortion_model=BrownConrady())
+    with pytest.raises(ValueError, match=r"Decentering .* fit one of them"):
+        zj.select_model(lines, [zj.PolynomialZoom(degree=1), decentred], centre="fit")
+
+
+def test_the_data_set_that_has_one_centre_alone_is_named(lines):
+    with pytest.raises(ValueError, match=r"Data set 1: .*not compressed about one centre"):
+        zj.fit.many([lines, lines.about(lines.centre)], centre="fit")
+
+
+@pytest.fixture(scope="module")
+def with_arcs(truth):
+    """Lines of a lens whose centre is far off, and arcs among them."""
+    lens = eqx.tree_at(lambda lens: lens.centre, truth, truth.centre + 4 * AWAY)
+    straight = seen(lens, NOISE)
+    points, bent = np.array(straight.points), np.arange(0, len(straight.points), 9)
+    for line in bent:
+        there = np.flatnonzero(straight.mask[line])
+        along, way = np.linspace(-1, 1, len(there)), points[line, there[-1]] - points[line, there[0]]
+        across = np.array([-way[1], way[0]]) / np.linalg.norm(way)
+        points[line, there] += 6.0 * (1 - along**2)[:, None] * across
+    return lens, bent, zj.lines.compress_any_centre(eqx.tree_at(lambda of: of.points, straight, points))
+
+
+@pytest.mark.slow
+def test_robust_fits_find_weights_and_centre_in_turn(with_arcs):
+    lens, bent, lines = with_arcs
+    fixed, free = zj.fit_robust(lines), zj.fit_robust(lines, centre="fit")
+    assert set(free.rejected.tolist()) == set(bent.tolist()) != set(fixed.rejected.tolist())
+    np.testing.assert_allclose(free.fit.lens.centre, lens.centre, atol=3)
+    placed = lines.about(free.fit.lens.centre)
+    of_line = zj.frame_rms(placed.weighted(free.weight), free.fit.lens)
+    np.testing.assert_allclose(of_line, free.fit.frame_rms, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_robustly_fitted_centre_has_derivatives(with_arcs):
+    _, _, lines = with_arcs
+
+    def centre(weight):
+        return zj.fit_robust(lines.weighted(weight), centre="fit", throw=False).fit.lens.centre
+
+    weight = jnp.ones(lines.frame.shape)
+    step = jnp.zeros_like(weight).at[4].set(1.0)
+    value, moved = jax.jvp(centre, (weight,), (step,))
+    np.testing.assert_allclose(value, centre(weight), atol=1e-6)
+    h = 1e-3
+    finite = (centre(weight + h * step) - centre(weight - h * step)) / (2 * h)
+    np.testing.assert_allclose(moved, finite, rtol=0.05, atol=2e-4)

@@ -29,12 +29,12 @@ WAYS = {
     "points": lambda lines: lines,
     "compressed": zj.compress,
     "for any centre": zj.lines.compress_any_centre,
-    "of a family": lambda lines: zj.fit.compress_family(lines, zj.models.Division()),
+    "of a distortion model": lambda lines: zj.fit.compress_for(lines, zj.models.Division()),
     "in the image": lambda lines: zj.fit.in_image(zj.compress(lines)),
 }
 SLOW = {
-    "in the image, of a family": lambda lines: zj.fit.in_image(
-        zj.fit.compress_family(lines, zj.models.Division())
+    "in the image, of a distortion model": lambda lines: zj.fit.in_image(
+        zj.fit.compress_for(lines, zj.models.Division())
     )
 }
 every_way = pytest.mark.parametrize(
@@ -133,9 +133,10 @@ def test_other_kinds_are_refused(noisy, small, unchecked):
     with pytest.raises(TypeError, match=r"parts\[0\] are CompressedLines and parts\[1\] Lines"):
         zj.fit.concatenate([small, noisy])
     division, decentred = (
-        zj.fit.with_family(noisy, family) for family in (zj.models.Division(), zj.models.BrownConrady())
+        zj.fit.with_distortion_model(noisy, distortion_model)
+        for distortion_model in (zj.models.Division(), zj.models.BrownConrady())
     )
-    with pytest.raises(ValueError, match=r"the family of parts\[0\] is Division, and"):
+    with pytest.raises(ValueError, match=r"the distortion model of parts\[0\] is Division, and"):
         zj.fit.concatenate([division, decentred])
     with pytest.raises(TypeError, match=r"parts\[1\] must be Lines"):
         zj.fit.concatenate([small, "lines.npz"])

@@ -21,7 +21,7 @@ TANGENTIAL = jnp.array([[0.01, -0.02], [0.0, 0.01], [0.02, 0.0]])
 def cases(ragged):
     """Lines of all kinds, and coefficients of their frames."""
     any_centre = zj.lines.compress_any_centre(ragged)
-    conrady = zj.fit.with_family(ragged, zj.models.BrownConrady())
+    conrady = zj.fit.with_distortion_model(ragged, zj.models.BrownConrady())
     return {
         "points": (ragged, K),
         "compressed": (zj.compress(ragged), K),

@@ -16,11 +16,11 @@ K = jnp.array([[0.1, -0.05], [0.02, 0.03], [-0.1, 0.01]])
 DECENTRED = jnp.concatenate([K, jnp.array([[0.01, -0.004], [0.0, 0.006], [-0.01, 0.002]])], axis=1)
 
 
-def stretch(lines, k, index, family=zj.models.RadialPolynomial()):  # noqa: B008, it has no state
+def stretch(lines, k, index, distortion_model=zj.models.RadialPolynomial()):  # noqa: B008, it has no state
     """Root of the mean of ``|J^T n|^2`` of one line, from the Jacobian at each of its points."""
     points = np.asarray(lines.points[index])[np.asarray(lines.mask[index])]
     coefficients = k[int(lines.frame[index])]
-    d = zj.Distortion(coefficients, jnp.asarray(lines.centre), jnp.asarray(lines.scale), family)
+    d = zj.Distortion(coefficients, jnp.asarray(lines.centre), jnp.asarray(lines.scale), distortion_model)
     corrected = np.asarray(d.undistort(points))
     normal = np.linalg.svd(corrected - corrected.mean(axis=0))[2][1]
     across = [normal @ np.asarray(jax.jacfwd(d.undistort)(jnp.asarray(point))) for point in points]
@@ -36,12 +36,12 @@ def test_stretch_is_that_of_the_jacobian(ragged):
 
 
 def test_the_stretch_of_a_model_that_is_not_radial_too(ragged):
-    family = zj.models.BrownConrady()
-    expected = [stretch(ragged, DECENTRED, index, family) for index in range(len(ragged.frame))]
+    distortion_model = zj.models.BrownConrady()
+    expected = [stretch(ragged, DECENTRED, index, distortion_model) for index in range(len(ragged.frame))]
     radial = [stretch(ragged, K, index) for index in range(len(ragged.frame))]
     assert np.abs(np.array(expected) - radial).max() > 1e-3
-    paper = zj.fit.with_family(ragged, family)
-    for lines in (zj.fit.in_image(paper), zj.fit.in_image(zj.fit.compress_family(ragged, family))):
+    paper = zj.fit.with_distortion_model(ragged, distortion_model)
+    for lines in (zj.fit.in_image(paper), zj.fit.in_image(zj.fit.compress_for(ragged, distortion_model))):
         ratio = [
             np.linalg.norm(np.asarray(zj.fit.residuals(of, DECENTRED)), axis=1)
             for of in (in_corrected(lines), lines)

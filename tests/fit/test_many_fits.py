@@ -107,7 +107,7 @@ def test_other_data_sets_compile_nothing(sets, compilations):
     [
         {"zoom": zj.PolynomialZoom(degree=1), "terms": 1},
         {"zoom": zj.models.TableZoom()},
-        {"family": zj.models.Division(), "terms": 1},
+        {"distortion_model": zj.models.Division(), "terms": 1},
     ],
     ids=["degree", "table", "division"],
 )
@@ -120,8 +120,8 @@ def test_options_are_those_of_the_fit(options):
 def compressed_for(options):
     """Data sets compressed as these options need them."""
     made = [distorted_lines(None, focal, offset=60.0, noise=0.2) for focal in FOCAL[:2]]
-    if "family" in options:
-        return [zj.fit.compress_family(lines, options["family"]) for lines in made]
+    if "distortion_model" in options:
+        return [zj.fit.compress_for(lines, options["distortion_model"]) for lines in made]
     return [zj.compress(lines) for lines in made]
 
 

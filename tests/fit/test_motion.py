@@ -355,7 +355,7 @@ def test_lines_of_something_else_are_refused(noisy, lines, path):
     with pytest.raises(ValueError, match="line_frames is for argument lines"):
         fit_motion(noisy.tracks, line_frames=np.arange(FRAMES))
     with pytest.raises(ValueError, match="given a BrownConrady"):
-        fit_motion(noisy.tracks, lines=lines, family=BrownConrady())
+        fit_motion(noisy.tracks, lines=lines, distortion_model=BrownConrady())
 
 
 @pytest.fixture(scope="module")

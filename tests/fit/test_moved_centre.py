@@ -22,7 +22,7 @@ EACH = np.array([[-0.2, 0.01, *OFFSET], [-0.1, 0.0, *OFFSET], [0.02, 0.01, *OFFS
 @pytest.fixture(scope="module")
 def barrel():
     zoom = zj.PolynomialZoom(1, jnp.array([[0.02], [-0.3]]), jnp.asarray(20.0))
-    return zj.ZoomLens(zoom, jnp.asarray(CENTRE), jnp.array([20.0, 80.0]), SIZE, family=DIVISION)
+    return zj.ZoomLens(zoom, jnp.asarray(CENTRE), jnp.array([20.0, 80.0]), SIZE, distortion_model=DIVISION)
 
 
 @pytest.fixture(scope="module")
@@ -38,15 +38,15 @@ def with_offset(lines, k):
 
 def forms(lines):
     """The same lines, corrected about a moved centre in all ways that there are."""
-    own = zj.fit.with_family(lines, DIVISION)
-    small = zj.fit.with_family(zj.lines.compress_any_centre(lines, 8), DIVISION)
+    own = zj.fit.with_distortion_model(lines, DIVISION)
+    small = zj.fit.with_distortion_model(zj.lines.compress_any_centre(lines, 8), DIVISION)
     return [for_any_centre(of, 2) for of in (own, small)]
 
 
 @pytest.mark.parametrize("measured", [lambda lines: lines, zj.fit.in_image], ids=["paper", "Sampson"])
 def test_about_a_moved_centre_is_about_that_centre(lines, measured):
     moved = np.asarray(lines.centre) + lines.scale * OFFSET
-    there = measured(zj.fit.with_family(lines.about(moved), DIVISION))
+    there = measured(zj.fit.with_distortion_model(lines.about(moved), DIVISION))
     expected = zj.fit.frame_energy(there, jnp.asarray(EACH[:, :2]))
     for form in forms(lines):
         found = with_offset(measured(form), jnp.asarray(EACH))
@@ -62,7 +62,9 @@ def test_so_is_the_stretch_of_lines_compressed_for_any_centre(lines):
 
 
 def test_too_few_powers_are_refused(lines):
-    small = for_any_centre(zj.fit.with_family(zj.lines.compress_any_centre(lines, 2), DIVISION), 2)
+    small = for_any_centre(
+        zj.fit.with_distortion_model(zj.lines.compress_any_centre(lines, 2), DIVISION), 2
+    )
     with pytest.raises(ValueError, match=r"compress_any_centre\(lines, terms=8\)"):
         with_offset(small, jnp.asarray(EACH))
 
@@ -75,7 +77,7 @@ def test_one_centre_that_is_given_is_not_fitted(lines):
 @pytest.mark.slow
 @pytest.mark.parametrize("measured", [lambda lines: lines, zj.fit.in_image], ids=["paper", "Sampson"])
 def test_the_centre_of_a_division_model_is_found(lines, barrel, measured):
-    seen = measured(zj.fit.with_family(lines, DIVISION))
+    seen = measured(zj.fit.with_distortion_model(lines, DIVISION))
     found = zj.fit.fit_centre(seen, zoom=zj.PolynomialZoom(1), terms=1)
     assert found.determined
     assert (np.abs(found.fit.lens.centre - CENTRE) < 4 * np.asarray(found.std[0])).all()
@@ -89,7 +91,7 @@ def test_the_centre_of_a_division_model_is_found(lines, barrel, measured):
 
 @pytest.mark.slow
 def test_of_each_frame_too(lines):
-    found = zj.fit.fit_frame_centres(lines, family=DIVISION, terms=1)
+    found = zj.fit.fit_frame_centres(lines, distortion_model=DIVISION, terms=1)
     known = np.asarray(found.determined)
     assert known[0]
     off = np.abs(np.asarray(found.each.centre) - CENTRE)

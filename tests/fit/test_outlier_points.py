@@ -136,7 +136,7 @@ def test_compressed_lines_raise_and_say_what_to_do(small, unchecked):
 @pytest.mark.slow
 def test_under_another_distortion_model_the_same_points_go(good):
     bad, which = with_blunders(good, 0.01)
-    own, other = (zj.fit.reject_points(bad, family=of) for of in (None, zj.models.BrownConrady()))
-    assert other.fit.fit.lens.family == zj.models.BrownConrady()
+    own, other = (zj.fit.reject_points(bad, distortion_model=of) for of in (None, zj.models.BrownConrady()))
+    assert other.fit.fit.lens.distortion_model == zj.models.BrownConrady()
     assert (own.rejected != other.rejected).sum() <= 0.05 * own.rejected.sum()
     assert other.rejected[which].mean() >= own.rejected[which].mean() - 0.02 > 0.5

@@ -25,16 +25,19 @@ def test_a_problem_has_the_lines_and_frames_of_its_data(small):
 def test_the_problem_of_the_paper_is_the_data_set(small):
     assert posed(small, zj.models.RadialPolynomial(), "corrected") is small
     assert in_corrected(zj.fit.in_image(small)) is small
-    assert zj.fit.with_family(zj.fit.with_family(small, DIVISION), small.family) is small
+    assert (
+        zj.fit.with_distortion_model(zj.fit.with_distortion_model(small, DIVISION), small.distortion_model)
+        is small
+    )
 
 
 def test_model_and_metric_commute_and_make_one_layer(noisy):
-    one = zj.fit.in_image(zj.fit.with_family(noisy, DIVISION))
-    other = zj.fit.with_family(zj.fit.in_image(noisy), DIVISION)
+    one = zj.fit.in_image(zj.fit.with_distortion_model(noisy, DIVISION))
+    other = zj.fit.with_distortion_model(zj.fit.in_image(noisy), DIVISION)
     assert isinstance(one, Problem)
     assert eqx.tree_equal(one, other)
     assert data_of(one) is noisy
-    assert (one.family, one.metric) == (DIVISION, "distorted")
+    assert (one.distortion_model, one.metric) == (DIVISION, "distorted")
 
 
 def test_what_is_not_asked_for_stays(noisy):
@@ -46,7 +49,7 @@ def test_what_is_not_asked_for_stays(noisy):
     fixed = seen.about(noisy.centre)
     assert isinstance(fixed, Problem)
     assert not fixed.any_centre
-    assert (fixed.family, fixed.metric) == (DIVISION, "distorted")
+    assert (fixed.distortion_model, fixed.metric) == (DIVISION, "distorted")
 
 
 def test_lines_for_any_centre_end_with_their_centre_under_the_polynomial(noisy):
@@ -70,4 +73,4 @@ def test_compressed_for_fewer_coefficients_is_refused(noisy):
     with pytest.raises(ValueError, match=r"compress\(lines, terms=3\)"):
         zj.frame_rms(zj.fit.in_image(zj.compress(noisy, 2)), k)
     with pytest.raises(ValueError, match="Division needs lines compressed for 8 terms"):
-        zj.frame_rms(zj.fit.with_family(zj.compress(noisy, 2), DIVISION), k[:, :1])
+        zj.frame_rms(zj.fit.with_distortion_model(zj.compress(noisy, 2), DIVISION), k[:, :1])

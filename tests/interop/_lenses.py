@@ -58,12 +58,14 @@ LENSES = {
         np.hstack([STRONG, [[0.001], [-0.003], [0.0]]]), (960, 540), (479.5, 269.5)
     ),
     "px": in_pixels,
-    "division": lambda: polynomial([[0.02], [-0.07]], (640, 480), (325.0, 236.0), family=Division()),
+    "division": lambda: polynomial(
+        [[0.02], [-0.07]], (640, 480), (325.0, 236.0), distortion_model=Division()
+    ),
     "decentred": lambda: polynomial(
         [[-0.02, 0.001, 3e-4, -5e-4], [0.07, -0.01, 1e-4, 2e-4]],
         (640, 480),
         (325.0, 236.0),
-        family=BrownConrady(),
+        distortion_model=BrownConrady(),
     ),
     "smooth": lambda: of_zoom(fitted(SmoothZoom())),
     "spline": lambda: of_zoom(fitted(SplineZoom(number=5))),

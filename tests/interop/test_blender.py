@@ -172,7 +172,7 @@ def nuke_camera(lens, focal):
 
 def two_terms():
     rows = [[0.02, -0.001], [-0.07, 0.004]]
-    return polynomial(rows, (640, 480), (325.0, 236.0), family=Division())
+    return polynomial(rows, (640, 480), (325.0, 236.0), distortion_model=Division())
 
 
 MODELS = {

@@ -50,7 +50,7 @@ def told(tmp_path_factory):
         "no focal": "export lens.json --to pftrack -o b.pfb",
         "no format": "export lens.json --to that -o b.pfb",
         "import": "import a.xml --image-size 640x480 -o back",
-        "import division": "import a.pfb --focal 20,30,40 --family division --terms 1 -o division",
+        "import division": "import a.pfb --focal 20,30,40 --distortion-model division --terms 1 -o other",
         "smooth": "import few.json -o smooth",
         "table": "import few.json --table -o table",
         "terms": "import a.xml --image-size 640x480 --terms 9 -o never",
@@ -106,8 +106,8 @@ def test_a_lens_goes_out_and_comes_back(told):
 def test_the_model_of_an_import_can_be_chosen(told):
     folder, said = told
     assert said["import division"][0] == 0, said["import division"][1]
-    lens = zj.load_lens(folder / "division" / "lens.json")
-    assert isinstance(lens.family, zj.models.Division)
+    lens = zj.load_lens(folder / "other" / "lens.json")
+    assert isinstance(lens.distortion_model, zj.models.Division)
     assert lens(20.0).coefficients.shape == (1,)
     assert "interpolation: --table keeps to that." in said["smooth"][1]
     assert "--table" not in said["table"][1]

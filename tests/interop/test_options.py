@@ -56,7 +56,7 @@ WRONG = {
     "Argument terms must be an integer of at least 1, but it is -1": {"terms": -1},
     "Argument terms must be an integer of at least 1, but it is 0": {"terms": 0},
     "Argument terms must be at most 4, but it is 5": {"terms": 5},
-    "Argument family must be a family such as": {"family": "division"},
+    "Argument distortion_model must be a distortion model such as": {"distortion_model": "division"},
     "Argument image_size": {"image_size": (0, 3)},
     "Argument focal must hold positive numbers, but it is 'wide'": {"focal": "wide"},
     r"Argument focal must hold positive numbers, but it is \[24, -1\]": {"focal": [24, -1]},
@@ -195,7 +195,7 @@ def test_a_pinhole_of_nerfstudio_has_no_distortion(model, tmp_path):
     back = zj.interop.read(tmp_path / "a.json")
     assert np.asarray(back.lens(500.0).coefficients) == pytest.approx(0, abs=1e-12)
     (tmp_path / "b.json").write_text(json.dumps(table | {"frames": [], "camera_model": "OPENCV_FISHEYE"}))
-    with pytest.raises(ValueError, match="its camera model 'OPENCV_FISHEYE' is none of OPENCV"):
+    with pytest.raises(ValueError, match="its camera model 'OPENCV_FISHEYE' is not one of OPENCV"):
         zj.interop.read(tmp_path / "b.json")
 
 

@@ -40,9 +40,9 @@ def entry(name, folder):
 def test_a_file_of_the_database_is_the_lens_of_the_library(name, smaller, tmp_path):
     path = entry(name, tmp_path)
     own = round(float(ET.parse(path).getroot().findtext(".//cropfactor")), 3)
-    [table] = [t for t in zj.lenses.find(name) if (t.name, t.crop_factor) == (name, own)]
+    [table] = [t for t in zj.interop.find_lenses(name) if (t.name, t.crop_factor) == (name, own)]
     crop = smaller * own
-    wanted = zj.lenses.load(table, image_size=SIZE, crop=crop)
+    wanted = zj.interop.library_lens(table, image_size=SIZE, crop=crop)
     found = zj.interop.read(path, image_size=SIZE, crop=crop)
     assert type(found.lens.zoom) is type(wanted.zoom)
     # Lensfun's 0.3 counts a pixel less along each side, which the library leaves out.
@@ -125,8 +125,8 @@ def test_the_model_that_is_asked_for_is_taken(tmp_path):
     assert isinstance(table.lens.zoom, TableZoom)
     four = zj.interop.read(path, image_size=SIZE, terms=4)
     assert four.lens.zoom.parameters.shape[1] == 4
-    division = zj.interop.read(path, image_size=SIZE, family=zj.models.Division())
-    assert isinstance(division.lens.family, zj.models.Division)
+    division = zj.interop.read(path, image_size=SIZE, distortion_model=zj.models.Division())
+    assert isinstance(division.lens.distortion_model, zj.models.Division)
     assert table.report.at_nodes < min(four.report.at_nodes, division.report.at_nodes)
 
 

@@ -68,7 +68,9 @@ def test_rays_come_back_within_the_reported_error(name, unit, k, tmp_path):
         assert in_px(back.lens, own) == pytest.approx(in_px(lens, f), rel=2e-3)
 
 
-@pytest.mark.parametrize("more", [{"zoom": TableZoom()}, {"family": Division()}, {"terms": 4}], ids=str)
+@pytest.mark.parametrize(
+    "more", [{"zoom": TableZoom()}, {"distortion_model": Division()}, {"terms": 4}], ids=str
+)
 def test_a_field_of_view_keeps_its_rays_in_any_model(more, tmp_path):
     """The better a model fits, the nearer: its scale is that of its own fit."""
     lens, focal = strong(K[2], "px")

@@ -183,7 +183,7 @@ def test_a_node_that_was_written_for_nuke_is_read_again(kind, tmp_path):
     own = "LensDistortion2" in (tmp_path / "a.nk").read_text()
     told = {"image_size": lens.image_size, "zoom": TableZoom()} | ({"focal": focal} if own else {})
     back = zj.interop.read(tmp_path / "a.nk", **told)
-    assert type(back.lens.family) is type(lens.family)
+    assert type(back.lens.distortion_model) is type(lens.distortion_model)
     factor = PITCH if lens.focal_unit == "px" and not own else 1.0
     assert back.report.focal == pytest.approx(focal * factor)
     for f in focal:
@@ -206,7 +206,7 @@ def test_curves_that_do_not_say_it_all_are_refused(first, second, message, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("name", "kind", "family"),
+    ("name", "kind", "distortion_model"),
     [
         ("opentrackio", "decentred", BrownConrady),
         ("opentrackio", "division", Division),
@@ -214,12 +214,12 @@ def test_curves_that_do_not_say_it_all_are_refused(first, second, message, tmp_p
         ("opencv", "decentred", BrownConrady),
     ],
 )
-def test_other_distortion_models_come_back(name, kind, family, tmp_path):
+def test_other_distortion_models_come_back(name, kind, distortion_model, tmp_path):
     lens = LENSES[kind]()
     path = tmp_path / ("cv" if name == "opencv" else f"a{BOTH[name].suffixes[0]}")
     zj.interop.write(lens, path, format=name, focal=FOCAL, pixel_pitch=PITCH)
     back = zj.interop.read(path)
-    assert isinstance(back.lens.family, family)
+    assert isinstance(back.lens.distortion_model, distortion_model)
     factor = 1 if back.lens.focal_unit == "mm" else 1 / PITCH
     points = shown(lens)
     difference = lens(35.0).undistort(points) - back.lens(35.0 * factor).undistort(points)
@@ -295,16 +295,16 @@ def test_maps_of_a_decentred_lens_come_back_decentred(direction, focal, tmp_path
     lens = LENSES["decentred"]()
     zj.interop.write(lens, tmp_path / "m", format="stmap", focal=focal)
     back = zj.interop.read(tmp_path / "m", direction=direction, focal=None)
-    assert isinstance(back.lens.family, BrownConrady)
+    assert isinstance(back.lens.distortion_model, BrownConrady)
     assert np.asarray(back.lens.centre) == pytest.approx(np.asarray(lens.centre), abs=0.05)
     assert back.report.worst < 1e-3
     for f in focal:
         moved = back.lens(float(f)).undistort(shown(lens)) - lens(float(f)).undistort(shown(lens))
         assert np.abs(moved).max() < 1e-3
     radial = zj.interop.read(
-        tmp_path / "m", direction=direction, family=RadialPolynomial(), zoom=TableZoom()
+        tmp_path / "m", direction=direction, distortion_model=RadialPolynomial(), zoom=TableZoom()
     )
-    assert isinstance(radial.lens.family, RadialPolynomial)
+    assert isinstance(radial.lens.distortion_model, RadialPolynomial)
     assert radial.report.worst > 0.05
 
 
@@ -349,11 +349,11 @@ def test_a_project_of_hugin_that_is_no_lens_is_refused(old, new, message, tmp_pa
         zj.interop.read(tmp_path / "a.pto")
 
 
-@pytest.mark.parametrize(("family", "most"), [(Division(), 0.2), (BrownConrady(), 0.1)])
-def test_a_distortion_model_that_is_asked_for_is_taken(family, most, written):
+@pytest.mark.parametrize(("distortion_model", "most"), [(Division(), 0.2), (BrownConrady(), 0.1)])
+def test_a_distortion_model_that_is_asked_for_is_taken(distortion_model, most, written):
     _, found = written
-    back = zj.interop.read(found["opentrackio"][0], family=family, zoom=TableZoom())
-    assert type(back.lens.family) is type(family)
+    back = zj.interop.read(found["opentrackio"][0], distortion_model=distortion_model, zoom=TableZoom())
+    assert type(back.lens.distortion_model) is type(distortion_model)
     assert back.report.worst < most
 
 
@@ -472,7 +472,7 @@ def test_plumb_bob_and_one_entry_without_a_zoom(tmp_path):
     )
     back = zj.interop.read(tmp_path / "c.yaml")
     assert back.report.format == "ros"
-    assert isinstance(back.lens.family, RadialPolynomial)
+    assert isinstance(back.lens.distortion_model, RadialPolynomial)
     assert np.asarray(back.lens.focal_range).tolist() == [500, 500]
     assert np.asarray(zj.interop.read(tmp_path / "c.yaml", focal=35).lens.focal_range).tolist() == [35, 35]
 
@@ -519,7 +519,7 @@ def test_what_a_file_does_not_say_is_asked_for(written, tmp_path):
         zj.interop.read(tmp_path / "a.xml", image_size=(600, 400), name="Three")
     map_of = sorted(found["stmap"][0].iterdir())[0]
     (tmp_path / "x.exr").write_bytes(map_of.read_bytes().replace(b"zoomjaxDirection", b"unknownDirection"))
-    with pytest.raises(ValueError, match="its name does not tell its direction: give argument direction"):
+    with pytest.raises(ValueError, match="its name does not say its direction: give argument direction"):
         zj.interop.read(tmp_path / "x.exr")
     with pytest.raises(FileNotFoundError):
         zj.interop.read(tmp_path / "none.yaml")
@@ -566,7 +566,7 @@ def test_a_smooth_zoom_that_folds_over_gives_way_to_a_table(tmp_path):
 @pytest.mark.parametrize("rows", [[(500, 50.0)], [(500, -0.3), (700, 40.0), (1000, -0.3)]])
 def test_a_lens_that_folds_over_is_refused(rows, tmp_path):
     with pytest.raises(
-        ValueError, match=r"the lens that is nearest to it folds over within the image as a "
+        ValueError, match=r"the lens that is nearest to it folds over within the image with a "
     ):
         zj.interop.read(cameras(tmp_path / "c.txt", *rows))
 

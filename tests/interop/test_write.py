@@ -65,12 +65,13 @@ def test_at_its_focal_lengths_a_file_does_as_the_lens(name, lens, tmp_path):
     worst = max(error(name, file, lens, f, i) for i, (file, f) in enumerate(zip(files, focal, strict=True)))
     assert worst <= report.worst + MARGIN
     exact = (
-        isinstance(lens.family, zj.models.RadialPolynomial) and lens(focal[0]).coefficients.shape[-1] < 3
+        isinstance(lens.distortion_model, zj.models.RadialPolynomial)
+        and lens(focal[0]).coefficients.shape[-1] < 3
     )
     if fmt.exact and exact:
         assert max(worst, report.worst) < 1e-8
     rational = name in ("opencv", "ros", "mrcal", "colmap", "opentrackio")
-    radial = isinstance(lens.family, zj.models.AbstractRadial)
+    radial = isinstance(lens.distortion_model, zj.models.AbstractRadial)
     if rational and radial:
         assert report.worst < MARGIN
 
@@ -93,7 +94,7 @@ def test_between_its_focal_lengths_a_file_does_as_reported(name, kind, tmp_path)
 @pytest.mark.parametrize("name", ["discorpy", "hugin", "opentrackio", "nuke", "opencv"])
 def test_the_error_that_is_said_is_the_greatest_of_all_points(name, tmp_path):
     """Refitted are seven coefficients, which leave narrow rings."""
-    lens = zj.lenses.load(
+    lens = zj.interop.library_lens(
         "Nikon AF-S DX VR Zoom-Nikkor 18-200mm f/3.5-5.6G IF-ED II", image_size=(4288, 2848)
     )
     [low, _] = np.asarray(lens.focal_range).tolist()
@@ -150,7 +151,7 @@ def test_it_is_said_whether_the_formula_or_the_focal_lengths_are_what_is_wrong(t
 def test_opentrackio_is_named_for_unreal_where_it_takes_the_lens(tmp_path):
     better = "Unreal's reader of OpenTrackIO takes the lens without a refit."
     assert better in said(LENSES["landscape"](), tmp_path, format="unreal", focal=[18, 200])[1]
-    seven = zj.lenses.load("Canon EF 24-70mm f/2.8L II USM", image_size=(600, 400), model="table")
+    seven = zj.interop.library_lens("Canon EF 24-70mm f/2.8L II USM", image_size=(600, 400), model="table")
     assert seven(35.0).coefficients.shape[-1] > 3
     assert better not in said(seven, tmp_path, format="unreal", focal=[24, 70])[1]
 

@@ -13,7 +13,7 @@ from PIL.TiffImagePlugin import IFDRational
 from zoomjax.io.exif import exif_focal
 from zoomjax.io.metadata import Metadata
 from zoomjax.io.photo import read_focal, read_photo
-from zoomjax.io.tiff import as_stored, encode_tiff, tiff_metadata
+from zoomjax.io.tiff import as_stored, encode_tiff, read_tiff, tiff_metadata
 
 DEPTHS = [(np.uint8, 1), (np.uint8, 3), (np.uint8, 4), (np.uint16, 3), (np.uint16, 4), (np.float32, 3)]
 
@@ -105,3 +105,39 @@ def test_damaged_exif_data_are_left_out(rng):
     for damaged in (b"", b"nothing", block()[:30]):
         content = encode_tiff([(image, Metadata(exif=damaged))])
         np.testing.assert_array_equal(decoded(content), image)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_grey_with_transparency_becomes_colours_with_it(rng, tmp_path, dtype):
+    image = picture(rng, dtype, 2)
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, image, photometric="minisblack", extrasamples=["unassalpha"])
+    back, _ = read_photo(path)
+    np.testing.assert_array_equal(back, image[..., [0, 0, 0, 1]])
+
+
+def test_compressed_grey_with_transparency_that_opencv_would_drop_is_refused(rng, tmp_path):
+    path = tmp_path / "a.tif"
+    Image.fromarray(picture(rng, np.uint8, 2)).save(path, compression="tiff_lzw")
+    with pytest.raises(ValueError, match="grey with transparency"):
+        read_photo(path)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"extrasamples": ["assocalpha"]}, "multiplied by transparency"),
+        ({"extrasamples": ["unspecified"]}, "no transparency"),
+        ({"extrasamples": ["unassalpha"]}, ""),
+        (
+            {"extrasamples": ["unassalpha"], "extratags": [(33550, 12, 3, (1.0, 1.0, 0.0), True)]},
+            "place on a map",
+        ),
+    ],
+)
+def test_what_the_result_does_not_hold_is_named(rng, options, told):
+    content = io.BytesIO()
+    tifffile.imwrite(content, picture(rng, np.uint8, 4), photometric="rgb", **options)
+    [page] = read_tiff(content.getvalue())
+    assert len(page.others) == bool(told)
+    assert told in " ".join(page.others)

@@ -52,6 +52,14 @@ def test_focal_lengths_as_a_sequence_count_frames_from_zero(tmp_path):
     np.testing.assert_array_equal(lines.focal, [24, 50])
 
 
+def test_one_focal_length_is_that_of_all_frames(tmp_path):
+    rows = [f"{m},0,{i},{i * i}" for m in (3, 9) for i in range(4)]
+    path = write(tmp_path / "lines.csv", "\n".join(["frame,line,x,y", *rows]))
+    for focal in (35, 35.0):
+        lines = read_lines_csv(path, image_size=SIZE, focal=focal)
+        assert np.asarray(lines.focal).tolist() == [35.0, 35.0]
+
+
 REFUSED = {
     "empty": ("", "frame,line,x,y"),
     "column missing": (
@@ -94,6 +102,13 @@ def test_frames_without_focal_length_are_named(tmp_path):
     path = write(tmp_path / "lines.csv", "frame,line,x,y\n0,0,1,1\n7,0,2,2\n")
     with pytest.raises(ValueError, match=r"no focal length for 1 of its 2 frames .*7"):
         read_lines_csv(path, image_size=SIZE, focal={0: 20.0})
+
+
+def test_more_focal_lengths_than_frames_are_refused(tmp_path):
+    """Of frames 1 and 2, whose focal lengths may be meant."""
+    path = write(tmp_path / "lines.csv", "frame,line,x,y\n1,0,1,1\n2,0,2,2\n")
+    with pytest.raises(ValueError, match="its last frame is 2, and there are 4 focal lengths"):
+        read_lines_csv(path, image_size=SIZE, focal=[20.0, 30.0, 40.0, 50.0])
 
 
 def test_a_frame_given_twice_is_refused(tmp_path):

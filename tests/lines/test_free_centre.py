@@ -80,12 +80,14 @@ DECENTRED = jnp.concatenate([K, jnp.array([[0.01, -0.004], [0.0, 0.006], [-0.01,
 @pytest.mark.parametrize("centre", [CENTRES[0], CENTRES], ids=["one", "each"])
 def test_all_monomials_may_be_moved_to_another_centre(ragged, centre):
     """As a model needs that is not radial: the energy is that of the points about that centre."""
-    family = zj.models.BrownConrady()
-    lines = zj.fit.compress_family(ragged, family).about(centre)
-    expected = zj.fit.frame_energy(zj.fit.with_family(ragged.about(centre), family), DECENTRED)
+    distortion_model = zj.models.BrownConrady()
+    lines = zj.fit.compress_for(ragged, distortion_model).about(centre)
+    expected = zj.fit.frame_energy(
+        zj.fit.with_distortion_model(ragged.about(centre), distortion_model), DECENTRED
+    )
     np.testing.assert_allclose(zj.fit.frame_energy(lines, DECENTRED), expected, rtol=1e-11)
     jitted = jax.jit(lambda lines, k: zj.fit.frame_energy(lines.about(centre), k))
-    again = jitted(zj.fit.compress_family(ragged, family), DECENTRED)
+    again = jitted(zj.fit.compress_for(ragged, distortion_model), DECENTRED)
     np.testing.assert_allclose(again, expected, rtol=1e-11)
 
 

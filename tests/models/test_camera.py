@@ -140,3 +140,25 @@ def test_what_is_no_camera_is_refused(bad):
     name = list(bad)[-1]
     with pytest.raises(ValueError, match=f"Argument {name} must"):
         zj.models.Camera(zj.scenes.nikkor_18_200(), **bad)
+
+
+def test_focal_lengths_in_px_of_images_of_another_size(tmp_path):
+    """The ray of a point of the scene is the same in images of half the size, and the camera matrix."""
+    zoom = zj.PolynomialZoom(1, jnp.array([[0.0], [0.1]]), jnp.array(1000.0))
+    lens = zj.ZoomLens(zoom, [319.5, 239.5], [1000.0, 4000.0], (640, 480), focal_unit="px")
+    with pytest.warns(UserWarning, match="scaled"):
+        half = zj.models.lens_for_size(lens, (320, 240))
+    with pytest.warns(UserWarning, match="scaled"):
+        back = zj.models.lens_for_size(half, (640, 480))
+    half.save(tmp_path / "half.json")
+    point = np.array([600.0, 400.0])
+    expected, _ = zj.Camera(lens).rays(point, 1500.0)
+    for other in (half, zj.load_lens(tmp_path / "half.json")):
+        ray, _ = zj.Camera(other).rays((point + 0.5) / 2 - 0.5, 1500.0)
+        np.testing.assert_allclose(ray, expected, rtol=1e-12)
+        pixel, _ = zj.Camera(other).project(np.asarray(expected), 1500.0)
+        np.testing.assert_allclose(pixel, (point + 0.5) / 2 - 0.5, rtol=1e-9)
+    np.testing.assert_allclose(zj.Camera(back).rays(point, 1500.0)[0], expected, rtol=1e-12)
+    zj.interop.write(half, tmp_path / "half.yaml", format="opencv", focal=[1500.0])
+    found = zj.interop.read(tmp_path / "half.yaml", format="opencv")
+    np.testing.assert_allclose(np.asarray(found.lens.focal_range), 750.0)

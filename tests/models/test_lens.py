@@ -312,3 +312,13 @@ def test_masks_are_refused_and_not_dropped():
         lens.distort(points, 35.0)
     with pytest.raises(ValueError, match="focal is a masked array"):
         lens(np.ma.array([24.0, 50.0], mask=[0, 1]))
+
+
+def test_a_name_that_stands_twice_in_a_file_is_refused(truth, tmp_path):
+    truth.save(path := tmp_path / "lens.json")
+    text = path.read_text()
+    path.write_text(text.replace('"focal_unit": "mm"', '"focal_unit": "mm", "focal_unit": "px"'))
+    with pytest.raises(ValueError, match="it has 'focal_unit' twice"):
+        zj.load_lens(path)
+    path.write_text(text, encoding="utf-8-sig")  # as some editors save it
+    assert zj.load_lens(path).focal_unit == "mm"

@@ -1,4 +1,4 @@
-"""Users' zoom models and families in lens.json."""
+"""Users' zoom models and distortion models in lens.json."""
 
 import json
 import subprocess
@@ -24,7 +24,7 @@ jax.config.update("jax_enable_x64", True)
 import zoomjax as zj
 {more}
 lens = zj.load_lens(sys.argv[1])
-print(lens.zoom.powers, type(lens.family).__name__)
+print(lens.zoom.powers, type(lens.distortion_model).__name__)
 print(*lens(33.0).undistort([[0.0, 0.0], [600.0, 400.0]]).ravel().tolist())
 """
 
@@ -76,7 +76,7 @@ def test_the_file_says_what_the_numbers_mean(saved):
     assert content["zoom"]["model"] == "LogZoom"
     assert content["zoom"]["formula"] == LogZoom.formula
     assert content["zoom"]["powers"] == [0, 1]
-    assert content["family"] == "half-polynomial"
+    assert content["distortion_model"] == "half-polynomial"
     assert content["radial"] == Halved.formula
 
 
@@ -87,7 +87,7 @@ def test_every_field_comes_back(saved):
 def test_they_are_fitted_and_certified_through_the_public_pieces(tmp_path):
     lens = own_lens()
     lines = distorted_lines(lens, np.array([20.0, 30.0, 45.0, 80.0]), offset=150.0)
-    fit = zj.fit_zoom(lines, zoom=LogZoom(), family=Halved())
+    fit = zj.fit_zoom(lines, zoom=LogZoom(), distortion_model=Halved())
     assert fit.certificate.certified
     np.testing.assert_allclose(fit.lens.zoom.parameters, lens.zoom.parameters, atol=1e-6)
     fit.lens.save(tmp_path / "fitted.json")
@@ -118,12 +118,12 @@ def registry(monkeypatch):
     from zoomjax.models import registry as models
 
     monkeypatch.setattr(models, "_ZOOMS", dict(models._ZOOMS))
-    monkeypatch.setattr(models, "_FAMILIES", dict(models._FAMILIES))
+    monkeypatch.setattr(models, "_DISTORTION_MODELS", dict(models._DISTORTION_MODELS))
 
 
 def test_what_cannot_be_registered(registry):
     for thing in (3, zj.ZoomLens, zj.PolynomialZoom()):
-        with pytest.raises(TypeError, match="class of AbstractZoom or AbstractFamily"):
+        with pytest.raises(TypeError, match="class of AbstractZoom or AbstractDistortionModel"):
             zj.models.register_model(thing)
     with pytest.raises(TypeError, match="Still needs a class attribute formula"):
         zj.models.register_model(model(formula=None))

@@ -15,10 +15,10 @@ ROOT = Path(zj.__file__).parent
 def test_the_sentence_names_the_use_and_what_was_given(use):
     wrong = {
         "zoom": zj.models.FocusSplineZoom(),
-        "family": zj.models.BrownConrady(),
+        "distortion_model": zj.models.BrownConrady(),
         "shift": zj.PolynomialZoom(1),
     }
-    right = {"zoom": zj.PolynomialZoom(), "family": zj.models.Division(), "shift": None}
+    right = {"zoom": zj.PolynomialZoom(), "distortion_model": zj.models.Division(), "shift": None}
     for name in requirements.REQUIREMENTS[use]:
         given = "a centre that moves" if name == "shift" else type(wrong[name]).__name__
         with pytest.raises(ValueError, match=rf"^{use} needs an? .*, and it was given .*{given}"):

@@ -192,3 +192,8 @@ def test_photo_shows_its_edges_where_the_lines_say(truth):
     assert len(distances) > 100
     assert np.abs(distances).max() < 0.06  # other is rounded, and lines are tilted
     assert abs(np.mean(distances)) < 0.005
+
+
+def test_focal_lengths_at_which_the_lens_folds_everywhere_are_refused():
+    with pytest.raises(ValueError, match="Argument focal must be within the range of the lens, but at 200"):
+        scenes.board_lines(scenes.nikkor_18_200(), np.array([60.0, 200.0]), spacing=99)

@@ -13,7 +13,7 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.trust.assessment import VERDICTS, Finding, assess
-from zoomjax.trust.cross_validation import held_out_frames, held_out_zoom
+from zoomjax.trust.cross_validation import cross_validate_frames, cross_validate_zoom
 from zoomjax.trust.evidence import evidence
 
 from ..conftest import moved
@@ -36,7 +36,10 @@ def lines(lens):
 def assessed(lines):
     small = zj.compress(lines)
     fit = zj.fit_zoom(small, throw=False)
-    left_out = {"held_out": held_out_zoom(small), "each_held_out": held_out_frames(small)}
+    left_out = {
+        "rms_held_out": cross_validate_zoom(small),
+        "rms_frames_held_out": cross_validate_frames(small),
+    }
     return assess(lines, fit, compressed=small, **left_out)
 
 
@@ -132,7 +135,7 @@ def test_a_photo_of_curved_things_alone_determines_no_lens(lens, rng, curved):
     lines = zj.Lines.from_ragged(points, [0] * 6, [50.0], image_size=SIZE)
     small = zj.compress(lines)
     fit = zj.fit_zoom(small, zoom=zj.PolynomialZoom(degree=0))
-    left_out = {"held_out": np.full(1, np.nan), "each_held_out": held_out_frames(small)}
+    left_out = {"rms_held_out": np.full(1, np.nan), "rms_frames_held_out": cross_validate_frames(small)}
     found = assess(lines, fit, compressed=small, **left_out)
     assert (found.verdict == "not determined") == curved
     assert ("lines left out" in about(found)) == curved

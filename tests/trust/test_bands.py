@@ -36,6 +36,20 @@ def test_bands_hold_the_truth_as_often_as_they_say(correlation, draws, slack):
     assert 95 - slack[1] < 100 * np.mean(ratio < 1.96) < 98 + slack[1]
 
 
+def test_a_photo_whose_lines_go_through_the_centre_tells_nothing_of_the_others():
+    """Three photos decide all, and the fourth shows two lines there: noise makes all that it says."""
+    from benchmarks.trust import SCENES, board
+
+    _, scene = board(*SCENES["4 photos, few lines"])
+    lines = zj.compress(scenes.with_noise(scene, jax.random.key(0), std=0.1))
+    others = lines.weighted((np.asarray(lines.frame) != 3).astype(float))
+    focal = np.asarray(lines.focal[:3])
+    with_it, without = (
+        zj.displacement_std(zj.fit_zoom(some), np.zeros(2), focal=focal) for some in (lines, others)
+    )
+    np.testing.assert_allclose(with_it, without, rtol=0.05)
+
+
 # The delta method
 
 

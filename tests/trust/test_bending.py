@@ -47,7 +47,7 @@ def test_it_is_the_error_that_noise_makes():
     errors, said = [], []
     for seed in range(8):
         lens, lines = photo(-0.3, CENTRE + np.array([9, -6]), seed=seed)
-        fit = zj.fit.fit_centre(lines, zoom=ONE, family=Division(), terms=1).fit
+        fit = zj.fit.fit_centre(lines, zoom=ONE, distortion_model=Division(), terms=1).fit
         errors.append(apart(fit.lens(1.0), lens))
         said.append(evidence(lines, fit).bent_std)
     true = np.sqrt(np.mean(np.square(errors)))
@@ -56,7 +56,7 @@ def test_it_is_the_error_that_noise_makes():
 
 def test_what_is_moved_is_no_homography():
     lens, lines = photo(-0.3, CENTRE, noise=0.01)
-    found = evidence(lines, zj.fit_zoom(lines, zoom=ONE, family=Division(), terms=1))
+    found = evidence(lines, zj.fit_zoom(lines, zoom=ONE, distortion_model=Division(), terms=1))
     same = zj.Distortion(np.zeros(1), CENTRE, lens.scale, Division())
     assert found.bent == pytest.approx(apart(lens, same), rel=0.4)  # to first order in what is straightened
     assert found.bent < 0.3 * found.displacement
@@ -65,18 +65,20 @@ def test_what_is_moved_is_no_homography():
 def test_a_centre_that_lines_do_not_tell_counts():
     """Lines that are straight about a wrong centre, too: the verdict does not trust it."""
     _, lines = photo(-0.35, CENTRE + np.array([25, 20]), lines=3, noise=0.05)
-    fit = zj.fit_zoom(lines, zoom=ONE, family=Division(), terms=1)
+    fit = zj.fit_zoom(lines, zoom=ONE, distortion_model=Division(), terms=1)
     found = evidence(lines, fit)
     assert found.rms < 0.5
     assert found.bent_std > 0.4
     _, lines = photo(-0.35, CENTRE, lines=12, noise=0.05)
-    assert evidence(lines, zj.fit_zoom(lines, zoom=ONE, family=Division(), terms=1)).bent_std < 0.2
+    assert (
+        evidence(lines, zj.fit_zoom(lines, zoom=ONE, distortion_model=Division(), terms=1)).bent_std < 0.2
+    )
 
 
 def test_a_strong_lens_that_is_uncertain_in_px_is_doubtful():
     """Though its bands are a small part of the displacement."""
     _, lines = photo(-0.45, CENTRE, lines=6, noise=3.0)
-    found = assess(lines, zj.fit_zoom(lines, zoom=ONE, family=Division(), terms=1))
+    found = assess(lines, zj.fit_zoom(lines, zoom=ONE, distortion_model=Division(), terms=1))
     assert found.evidence.std < 0.1 * found.evidence.displacement
     assert {of.about: of.verdict for of in found.findings}["bending"] == "doubtful"
     assert "the correction straightens what is bent by" in found.sentence
@@ -103,11 +105,11 @@ def test_frames_and_a_moving_centre_are_each_at_their_own_place():
 
 
 @pytest.mark.parametrize("k", [-4.0, 30.0])
-@pytest.mark.parametrize("family", [None, Division()])
-def test_a_lens_with_a_fold_or_a_pole_is_not_known(k, family):
+@pytest.mark.parametrize("distortion_model", [None, Division()])
+def test_a_lens_with_a_fold_or_a_pole_is_not_known(k, distortion_model):
     """No error, and no number that would pass for a good one."""
     _, lines = photo(-0.3, CENTRE)
-    fit = zj.fit_zoom(lines, zoom=ONE, family=family, terms=1)
+    fit = zj.fit_zoom(lines, zoom=ONE, distortion_model=distortion_model, terms=1)
     wrong = eqx.tree_at(lambda of: of.lens.zoom.parameters, fit, np.full((1, 1), k))
     found = evidence(lines, wrong)
     assert not found.bent_std <= 0.4

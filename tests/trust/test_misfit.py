@@ -161,17 +161,17 @@ def test_by_residuals_it_is_what_it_is_by_moments(lines, metric):
     fit = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=1))
     k = np.asarray(jax.vmap(fit.lens.zoom)(lines.focal))
     quickly = misfit._of_frames(misfit._passed(lines, k))
-    by_residuals = misfit._by_residuals(lines, k, fit.lens.family)
+    by_residuals = misfit._by_residuals(lines, k, fit.lens.distortion_model)
     for one, other in zip(quickly, by_residuals, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * np.abs(one).max())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("family", [zj.models.Division(), zj.models.BrownConrady()])
-def test_other_distortion_models_have_one_too(truth, family):
+@pytest.mark.parametrize("distortion_model", [zj.models.Division(), zj.models.BrownConrady()])
+def test_other_distortion_models_have_one_too(truth, distortion_model):
     """The scene is a polynomial's: what degree 1 misses of k1 is the same, up to Division's sign."""
     seen = scenes.board_lines(truth, FOCAL, spacing=200.0, noise=0.3, seed=3)
-    small = zj.fit.compress_family(seen, family)
+    small = zj.fit.compress_for(seen, distortion_model)
     fit = zj.fit_zoom(small, zoom=zj.PolynomialZoom(degree=1))
     own = zj.fit_zoom(zj.compress(seen), zoom=zj.PolynomialZoom(degree=1))
     found = size_of(zj.trust.with_misfit(fit, small))

@@ -11,7 +11,12 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.trust.cross_validation import _errors_by_fits, errors_of, held_out_frames, held_out_zoom
+from zoomjax.trust.cross_validation import (
+    _errors_by_fits,
+    cross_validate_frames,
+    cross_validate_zoom,
+    errors_of,
+)
 from zoomjax.trust.folds import HoldOut, LineErrors, folds_of, shares
 from zoomjax.trust.selection import compare, compare_errors, default_candidates
 
@@ -79,7 +84,7 @@ def rms_of(lines, zoom):
 @every_model
 def test_a_frame_left_out_is_corrected_by_the_fit_of_the_others(zoom, terms, lines):
     """Fits of one shape, so that each model is compiled once."""
-    held_out = held_out_zoom(lines, zoom=zoom, terms=terms)
+    held_out = cross_validate_zoom(lines, zoom=zoom, terms=terms)
     for frame in (0, 3):
         model = zoom.prepare(np.delete(lines.focal, frame), terms)
         fit = zj.fit_zoom(counting_nothing(lines, frame), zoom=model, invertible=False)
@@ -94,7 +99,7 @@ def test_a_frame_left_out_is_corrected_by_the_fit_of_the_others(zoom, terms, lin
 
 def test_a_fold_is_a_plain_fit_of_a_subset_of_the_lines(lines):
     fit = zj.fit_zoom(without(lines, [2]))
-    np.testing.assert_allclose(held_out_zoom(lines)[2], rms_of(lines, fit.lens.zoom)[2], rtol=1e-9)
+    np.testing.assert_allclose(cross_validate_zoom(lines)[2], rms_of(lines, fit.lens.zoom)[2], rtol=1e-9)
 
 
 def alone_bent():
@@ -110,10 +115,10 @@ def alone_bent():
 @pytest.mark.parametrize(
     "measure",
     [
-        lambda lines: held_out_zoom(
+        lambda lines: cross_validate_zoom(
             lines, zoom=zj.PolynomialZoom(degree=0), terms=1, hold_out="line", folds=7
         ),
-        lambda lines: held_out_frames(lines, terms=1, folds=7),
+        lambda lines: cross_validate_frames(lines, terms=1, folds=7),
     ],
     ids=["zoom", "frames"],
 )
@@ -164,7 +169,7 @@ def test_frames_by_themselves_are_the_fits_of_their_other_lines(lines):
         each = zj.fit_frames(lines.weighted(1 - own), terms=2, invertible=False)
         share = np.bincount(frame, own) / number
         squares += share * np.asarray(zj.frame_rms(lines.weighted(own), each.coefficients)) ** 2
-    np.testing.assert_allclose(held_out_frames(lines, folds=5), np.sqrt(squares), rtol=1e-8)
+    np.testing.assert_allclose(cross_validate_frames(lines, folds=5), np.sqrt(squares), rtol=1e-8)
 
 
 def test_lines_without_weight_count_nothing(lines):
@@ -176,7 +181,7 @@ def test_lines_without_weight_count_nothing(lines):
         (lines.triangle[5:], lines.frame[5:], None),
     )
     np.testing.assert_allclose(
-        held_out_zoom(lines.weighted(weight)), held_out_zoom(fewer), rtol=1e-9, atol=0
+        cross_validate_zoom(lines.weighted(weight)), cross_validate_zoom(fewer), rtol=1e-9, atol=0
     )
 
 
@@ -219,7 +224,7 @@ def test_least_error_is_a_rule_of_its_own(worse, chosen, lines, rng):
         LineErrors(np.ones(len(square)), square, 4.0, ""),
     ]
     rules = ("one standard error", "least")
-    found = [compare_errors(lines, candidates, errors, parts, rule)[1:] for rule in rules]
+    found = [compare_errors(candidates, errors, parts, rule)[1:] for rule in rules]
     assert [candidates.index(simplest) for _, simplest in found] == list(chosen)
     assert [candidates.index(best) for best, _ in found] == [1, 1]
 
@@ -378,8 +383,8 @@ def test_bad_arguments_are_told(options, message, lines):
 def test_other_types_are_told(lines):
     with pytest.raises(TypeError, match="must be Lines"):
         zj.select_model(np.zeros(3))  # pyright: ignore[reportArgumentType]
-    with pytest.raises(TypeError, match="without with_family"):
-        zj.select_model(zj.fit.with_family(lines, zj.models.Division()))
+    with pytest.raises(TypeError, match="without with_distortion_model"):
+        zj.select_model(zj.fit.with_distortion_model(lines, zj.models.Division()))
     with pytest.raises(TypeError, match="zoom model"):
         zj.select_model(lines, ["quadratic"])  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="must be a list of zoom models"):
@@ -396,31 +401,31 @@ def test_too_few_focal_lengths_to_leave_one_out_are_told(lines):
 
 def test_frames_that_cannot_be_left_out_are_nan(lines):
     few = without(lines, [1, 3, 4, 5])
-    assert np.isnan(held_out_zoom(few, zoom=zj.PolynomialZoom(degree=2))).all()
-    assert np.isfinite(held_out_zoom(few, zoom=zj.PolynomialZoom(degree=1))).all()
+    assert np.isnan(cross_validate_zoom(few, zoom=zj.PolynomialZoom(degree=2))).all()
+    assert np.isfinite(cross_validate_zoom(few, zoom=zj.PolynomialZoom(degree=1))).all()
 
 
 @pytest.mark.slow
-def test_families_are_compared(scene):
+def test_distortion_models_are_compared(scene):
     """A lens that the division model describes, and the polynomial not so well, with one term each."""
     zoom = zj.PolynomialZoom(1, jnp.array([[0.0], [-0.25]]), jnp.asarray(20.0))
     lens = zj.ZoomLens(
-        zoom, scene.centre, jnp.array([20.0, 80.0]), scene.image_size, family=zj.models.Division()
+        zoom, scene.centre, jnp.array([20.0, 80.0]), scene.image_size, distortion_model=zj.models.Division()
     )
     focal = np.array([20.0, 28.0, 45.0, 80.0])
     bent = scenes.board_lines(lens, focal, spacing=150, noise=0.05)
     candidates = [
-        zj.models.Model(zj.PolynomialZoom(degree=1), 1, family)
-        for family in (zj.models.RadialPolynomial(), zj.models.Division())
+        zj.models.Model(zj.PolynomialZoom(degree=1), 1, distortion_model)
+        for distortion_model in (zj.models.RadialPolynomial(), zj.models.Division())
     ]
     selection = zj.select_model(bent, candidates, hold_out="line", folds=3)
     assert selection.chosen.name == "Division, degree 1, 1 term"
-    assert isinstance(selection.fit.lens.family, zj.models.Division)
+    assert isinstance(selection.fit.lens.distortion_model, zj.models.Division)
     assert selection.verdicts[0].held_out > 1.5 * selection.verdicts[1].held_out
     np.testing.assert_allclose(selection.fit.lens.zoom.parameters, zoom.parameters, atol=0.01)
 
 
-def test_a_family_that_the_triangles_do_not_serve_says_so(lines):
+def test_a_distortion_model_that_the_triangles_do_not_serve_says_so(lines):
     candidates = [zj.PolynomialZoom(), zj.models.Model(zj.PolynomialZoom(), 1, zj.models.Division())]
     _, verdict = zj.select_model(lines, candidates, hold_out="line", folds=2).verdicts
     assert "compress(lines, terms=8)" in verdict.problem
@@ -435,7 +440,7 @@ def with_a_point_that_is_nan(lines):
 
 
 @pytest.mark.parametrize("spoiled", [without_any_weight, with_a_point_that_is_nan])
-@pytest.mark.parametrize("measure", [held_out_zoom, held_out_frames, zj.select_model])
+@pytest.mark.parametrize("measure", [cross_validate_zoom, cross_validate_frames, zj.select_model])
 def test_lines_that_say_nothing_are_refused(measure, spoiled, lines):
     with pytest.raises(ValueError, match="Argument lines must"):
         measure(spoiled(lines))

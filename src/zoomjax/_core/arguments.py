@@ -25,7 +25,7 @@ _WANTED = {
     "CompressedLines": "compressed lines, compress(lines)",
     "AbstractZoom": "a zoom model such as PolynomialZoom(degree=2)",
     "AbstractLinearZoom": "a zoom model that is linear in its parameters, such as PolynomialZoom(degree=2)",
-    "AbstractFamily": "a family such as Division()",
+    "AbstractDistortionModel": "a distortion model such as Division()",
     "ZoomLens": "a ZoomLens, such as fit.lens or load_lens(path)",
     "Distortion": "a Distortion, such as lens(35.0)",
     "ZoomFit": "a ZoomFit, what fit_zoom returns",

@@ -49,14 +49,6 @@ def _is_finite(value: Any) -> bool:
         return False
 
 
-def checked_terms(terms: Any, most: int | None = None) -> int:
-    """The number N of distortion coefficients, at most those that a distortion model takes."""
-    number = checked_integer("terms", terms, 1)
-    if most is not None and number > most:
-        raise ValueError(f"Argument terms must be at most {most}, but it is {number}.")
-    return number
-
-
 def checked_size(size: Any, name: str = "image_size") -> tuple[int, int]:
     """(width, height) px."""
     try:

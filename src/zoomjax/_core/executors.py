@@ -134,7 +134,7 @@ def _check_same(file: tuple[str, int] | None) -> None:
     found = file and _seen(file[0])
     if file and found and found != file:
         raise ValueError(
-            f"the worker on {platform.node()} sees another file {file[0]}, of {found[1]} bytes in place of "
+            f"the worker on {platform.node()} sees another file {file[0]}, of {found[1]} bytes instead of "
             f"{file[1]}: workers must see the same files"
         )
 

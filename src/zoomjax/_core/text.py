@@ -44,6 +44,12 @@ def span(low: float, high: float, unit: str) -> str:
     return f"{' to '.join(dict.fromkeys(ends))} {unit}"
 
 
+def percentages(shares: Iterable[float]) -> str:
+    """The ends of some shares, or the one value that all are, as percentages."""
+    every = [float(share) for share in shares]
+    return " to ".join(dict.fromkeys(f"{end:.2%}" for end in (min(every), max(every))))
+
+
 def with_std(value: float, std: float, unit: str) -> str:
     """A signed value and its standard deviation, to the second figure of the latter."""
     if not math.isfinite(std):

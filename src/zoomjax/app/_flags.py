@@ -16,7 +16,7 @@ FLAGS = {
             "crop",
             "degree",
             "detector",
-            "family",
+            "distortion_model",
             "direction",
             "focal",
             "focal_sigma",

@@ -38,7 +38,7 @@ Degree = Annotated[
     typer.Option(
         min=0,
         metavar="N",
-        help="Degree of the polynomials in 1/f; default: chosen.",
+        help="Degree of the polynomials in 1/f. Default: by cross-validation; 2 with --model polynomial.",
         rich_help_panel=FIT,
     ),
 ]
@@ -47,17 +47,17 @@ Terms = Annotated[
     typer.Option(
         min=1,
         metavar="N",
-        help="Number of distortion coefficients, k1 to kN; default: chosen.",
+        help="Number of coefficients, k1 to kN. Default: by cross-validation; 2 with --model or --degree.",
         rich_help_panel=FIT,
     ),
 ]
-Family = Annotated[
+DistortionModel = Annotated[
     Literal["radial", "division", "brown-conrady", "auto"] | None,
     typer.Option(
         metavar="MODEL",
         help="Distortion model: radial (polynomial), division (strong barrel distortion), brown-conrady "
-        "(the polynomial with decentering) or auto (of least cross-validation error). Default: radial; of "
-        "a strong lens, that of radial and division.",
+        "(the polynomial with decentering) or auto (of least cross-validation error). Default: radial; "
+        "for a strong lens, the better of radial and division.",
         rich_help_panel=FIT,
     ),
 ]
@@ -66,7 +66,7 @@ Centre = Annotated[
     typer.Option(
         metavar="fit|image|X,Y",
         help="Centre of distortion: fit (where the lines determine it, else the image's), image, or its "
-        "coordinates in px. Default: fit, but image with --family brown-conrady.",
+        "coordinates in px. Default: fit, but image with --distortion-model brown-conrady.",
         rich_help_panel=FIT,
     ),
 ]
@@ -141,21 +141,34 @@ def _read_lines(path: Path, focal: str | None, image_size: str | None, focal_uni
 
         return load_lines(path)
     if kind == ".csv":
-        from ..lines.csv import read_focal_csv, read_lines_csv
+        from ..lines.csv import read_lines_csv
 
         if (size := size_of(image_size)) is None:
             raise ValueError(f"The image size of {path} is not known: give --image-size, e.g. 1920x1080.")
-        if focal is not None and not focal.lower().endswith(".csv"):
-            raise ValueError(
-                f"--focal must be a CSV file with the columns frame,focal for {path}, but it is {focal!r}."
-            )
+        if focal == "same" and focal_unit is not None:
+            raise ValueError("--focal same has no unit, for f is not known: leave out --focal-unit.")
         return read_lines_csv(
-            path,
-            image_size=size,
-            focal=None if focal is None else read_focal_csv(Path(focal)),
-            focal_unit=focal_unit or "mm",
+            path, image_size=size, focal=_focal_of_lines(path, focal), focal_unit=focal_unit or "mm"
         )
     raise ValueError(f"Cannot calibrate from {path}: give lines.npz, or a CSV file frame,line,x,y[,focal].")
+
+
+def _focal_of_lines(path: Path, focal: str | None) -> "dict[int, float] | float | None":
+    """The focal lengths of a CSV of lines: by frame, or one of all frames, as of photos."""
+    from ..io.text_table import plain_number
+    from ..lines.csv import read_focal_csv
+
+    if focal is None or focal.lower().endswith(".csv"):
+        return None if focal is None else read_focal_csv(Path(focal))
+    if focal == "same":
+        return 1.0  # it stands for what nobody knows
+    number = plain_number(focal)
+    if number is None or number <= 0:
+        raise ValueError(
+            f"--focal for {path} must be a CSV file with the columns frame,focal, or one focal length of "
+            f"all frames: a positive number, or same if it is not known; but it is {focal!r}."
+        )
+    return number
 
 
 def centre_of(text: str) -> Literal["fit", "image"] | tuple[float, float]:

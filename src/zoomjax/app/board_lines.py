@@ -22,7 +22,7 @@ from ..fit.result import RESULTS, ZoomFit, failed
 from ..fit.zoom import CentreArgument, fit_zoom
 from ..lines.free_centre import compress_any_centre
 from ..lines.lines import Lines
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.lens import ZoomLens
 from ..models.zoom import PolynomialZoom, with_parameters
 
@@ -56,12 +56,17 @@ class Straightness:
         return self.rms_flat < _STRAIGHTER * self.rms_seen
 
 
-def flat_detections(fit: BoardFit, detections: Sequence[Detection]) -> list[Detection]:
-    """The detections that were fitted, in their order, with the lines of a flat board."""
+def flat_detections(
+    fit: BoardFit, detections: Sequence[Detection], turns: Sequence[int]
+) -> list[Detection]:
+    """The detections that were fitted, in their order, with the lines of a flat board.
+
+    Of each, `turns` says by how many quarters its grid was turned for the fit (`np.rot90`).
+    """
     flat = []
-    for detection, moved in zip(detections, fit.flattening(), strict=True):
+    for detection, moved, turn in zip(detections, fit.flattening(), turns, strict=True):
         assert detection.nodes is not None  # it has been fitted
-        nodes = detection.nodes + np.nan_to_num(moved)
+        nodes = detection.nodes + np.nan_to_num(np.rot90(moved, -turn))
         flat.append(dataclasses.replace(detection, nodes=nodes, lines=tuple(GridDetector.lines(nodes))))
     return flat
 
@@ -97,7 +102,7 @@ def _of_freedom(fit: BoardFit) -> float:
 
 def widened(fit: ZoomFit, board: BoardFit) -> ZoomFit:
     """A fit to lines of the flat board with what is uncertain of the board's shape in its bands."""
-    misfit = coefficient_covariance(board, fit.lens.family, fit)
+    misfit = coefficient_covariance(board, fit.lens.distortion_model, fit)
     if fit.misfit is not None:
         misfit = fit.misfit.at[: len(misfit), : len(misfit)].add(misfit)
     fit = eqx.tree_at(lambda f: f.misfit, fit, misfit, is_leaf=lambda leaf: leaf is None)
@@ -107,7 +112,9 @@ def widened(fit: ZoomFit, board: BoardFit) -> ZoomFit:
     return eqx.tree_at(lambda f: f.joint, fit, fit.joint.at[-2:, -2:].add(own[-2:, -2:]))
 
 
-def coefficient_covariance(board: BoardFit, family: AbstractFamily, fit: ZoomFit) -> jax.Array:
+def coefficient_covariance(
+    board: BoardFit, distortion_model: AbstractDistortionModel, fit: ZoomFit
+) -> jax.Array:
     """Covariance of a distortion model's coefficients that displaces as that of the bundle's lens.
 
     In the mean over the zooms.
@@ -117,26 +124,28 @@ def coefficient_covariance(board: BoardFit, family: AbstractFamily, fit: ZoomFit
     share = (np.asarray(board.label) - board.label.min()) / max(float(np.ptp(board.label)), 1e-9)
     total = np.zeros((numbers, numbers))
     for focal, at in zip(np.asarray(board.focal), low + (high - low) * share, strict=True):
-        moved = np.asarray(_moved(board.lens.zoom, board.lens.family, jnp.asarray(focal)))
-        own = np.asarray(_columns(family, jnp.asarray(fit.lens.zoom(at)), jnp.linspace(0, 1, _RADII)))
+        moved = np.asarray(_moved(board.lens.zoom, board.lens.distortion_model, jnp.asarray(focal)))
+        own = np.asarray(
+            _columns(distortion_model, jnp.asarray(fit.lens.zoom(at)), jnp.linspace(0, 1, _RADII))
+        )
         gain = np.linalg.pinv(own) @ moved
         total += gain @ np.asarray(board.fit.covariance) @ gain.T / len(board.focal)
     return jnp.asarray(total)
 
 
 @eqx.filter_jit
-def _moved(zoom, family, focal):
+def _moved(zoom, distortion_model, focal):
     """How each parameter of a zoom model moves points at some radii."""
     flat, unravel = ravel_pytree(zoom.parameters)
     by_parameter = jax.jacfwd(lambda flat: with_parameters(zoom, unravel(flat))(focal))(flat)
-    return _columns(family, zoom(focal), jnp.linspace(0, 1, _RADII)) @ by_parameter
+    return _columns(distortion_model, zoom(focal), jnp.linspace(0, 1, _RADII)) @ by_parameter
 
 
 @eqx.filter_jit
-def _columns(family, k, radii):
+def _columns(distortion_model, k, radii):
     """How each coefficient moves points at some radii along the image's x axis."""
 
     def moved(k):
-        return jax.vmap(lambda r: family.correct((r, 0 * r), r * r, k)[0])(radii)
+        return jax.vmap(lambda r: distortion_model.correct((r, 0 * r), r * r, k)[0])(radii)
 
     return jax.jacfwd(moved)(k)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.text import span
+from .._core.text import percentages, span
 from .._core.types import AnyArray
 from ..fit.energy import line_squares
 from ..fit.focal_lengths import with_focal_sigma
@@ -25,15 +25,16 @@ from ..fit.straightness import frame_rms
 from ..fit.zoom import CentreArgument
 from ..lines.lines import Lines
 from ..models.about import UNKNOWN
-from ..models.registry import family_name
+from ..models.registry import distortion_model_name
 from ..models.zoom import PolynomialZoom
 from ..trust.assessment import NEGLIGIBLE, Assessment, assess
 from ..trust.bands import displacement_std
-from ..trust.cross_validation import held_out_frames, held_out_zoom
+from ..trust.cross_validation import cross_validate_frames
 from ..trust.misfit import with_misfit
 from ..trust.next_photo import Suggestion, suggest_next
+from ..trust.own_centres import OwnCentres, own_centres
 from ..trust.selection import Selection
-from .fitting import Metric, algebraic_rms, fitted
+from .fitting import Metric, algebraic_rms, fitted, left_out
 from .model_choice import CentreFound, WantedModel
 from .outward import outward
 from .results_folder import OF_A_LENS, results_folder
@@ -51,36 +52,38 @@ class Calibration:
 
     Attributes:
         lines: the lines.
-        zoom: the zoom model's fit.
-        each: separate fits of the frames.
-        none, algebraic: each frame's RMS, px, without correction and with the algebraic estimate, which
-            is None for another distortion model than the radial polynomial.
+        fit: the zoom model's fit.
+        frames: separate fits of the frames.
+        rms_uncorrected, rms_algebraic: each frame's RMS, px, without correction and with the algebraic
+            estimate, which is None for another distortion model than the radial polynomial.
         rejected: which lines have weight 0: left out by hand, or not straight in the scene.
         line_rms: RMS of each line under the zoom model, px, rejected lines included.
-        next: the photo that would reduce the uncertainty most.
+        next_photo: the photo that would reduce the uncertainty most.
         focal_sigma: standard deviation of each frame's focal length, included in the bands; 0: exact.
-        held_out: each frame's RMS, px, under the zoom model fitted to all others; NaN if that fit fails.
-        each_held_out: each frame's RMS, px, each tenth of its lines under the model of its other lines.
+        rms_held_out: each frame's RMS, px, under the zoom model of all others; NaN if that fit fails.
+        rms_frames_held_out: that of each tenth of a frame's lines under the model of its other lines.
         centre: the centre of distortion, and how it was found.
         assessment: the verdict, with what was found and what to do about it.
         selection: how the model was selected; None if it was given.
+        own_centres: the centres of single frames; None where there are none to tell.
         in_image: whether all RMS are of distances in the distorted image, not in the corrected one.
     """
 
     lines: Lines
-    zoom: ZoomFit
-    each: FrameFits
-    none: np.ndarray
-    algebraic: np.ndarray | None
+    fit: ZoomFit
+    frames: FrameFits
+    rms_uncorrected: np.ndarray
+    rms_algebraic: np.ndarray | None
     rejected: np.ndarray
     line_rms: np.ndarray
-    next: Suggestion
+    next_photo: Suggestion
     focal_sigma: np.ndarray
-    held_out: np.ndarray
-    each_held_out: np.ndarray
+    rms_held_out: np.ndarray
+    rms_frames_held_out: np.ndarray
     centre: CentreFound
     assessment: Assessment
     selection: Selection | None = None
+    own_centres: OwnCentres | None = None
     in_image: bool = True
 
     def corner(self) -> list[tuple[float, float, float]]:
@@ -90,26 +93,26 @@ class Calibration:
             For each focal length: the focal length, the displacement away from the centre, px, of the
             corner farthest from it, and the standard deviation of the displacement, px.
         """
-        lens = self.zoom.lens
+        lens = self.fit.lens
         low, high = (float(f) for f in lens.focal_range)
         centre = np.asarray(lens.centre)
         last = np.array(lens.image_size) - 1
         corner = np.where(centre > last / 2, 0.0, last)
         focal = [low, *([float(np.sqrt(low * high)), high] if high > low else [])]
-        std = np.asarray(displacement_std(self.zoom, corner, focal=np.array(focal)))
+        std = np.asarray(displacement_std(self.fit, corner, focal=np.array(focal)))
         return list(zip(focal, outward(lens, corner, focal).tolist(), std.tolist(), strict=True))
 
     @property
     def focal_known(self) -> bool:
         """Whether f is known: of one photo alone, a number may stand for it."""
-        return self.zoom.lens.about.get("focal") != UNKNOWN
+        return self.fit.lens.about.get("focal") != UNKNOWN
 
     def focal_text(self) -> str:
         """The range of focal lengths in words."""
-        low, high = (float(f) for f in self.zoom.lens.focal_range)
+        low, high = (float(f) for f in self.fit.lens.focal_range)
         if not self.focal_known:
             return "focal length not known"
-        return f"f = {span(low, high, self.zoom.lens.focal_unit)}"
+        return f"f = {span(low, high, self.fit.lens.focal_unit)}"
 
     def allowed_for(self) -> str:
         """A sentence on the uncertainty of focal lengths in the bands; empty if they are exact."""
@@ -117,58 +120,59 @@ class Calibration:
         if not share.any():
             return ""
         return (
-            "Standard deviations include those of the focal lengths, "
-            f"{share.min():.2%} to {share.max():.2%}. The next photo is chosen without them."
+            f"Standard deviations include those of the focal lengths, {percentages(share)}. What the next "
+            "photo would improve is of the noise alone."
         )
 
     def enough(self) -> bool:
         """Whether a further photo could improve nothing that can be seen."""
         visible = _ENOUGH * self.assessment.evidence.diagonal
-        return self.assessment.verdict == "good" and self.next.before < visible
+        return self.assessment.verdict == "good" and self.next_photo.before < visible
 
     def advice(self) -> str:
         """What to photograph next, or that there is enough, or that something else comes first."""
         causes = [finding.advice for finding in self.assessment.findings if finding.cause]
         if causes:
             return f"{causes[0]} That comes before another photo."
+        photo = self.next_photo
         if not self.enough():
-            return self.next.sentence if self.focal_known else replace(self.next, focal_unit="").sentence
+            return photo.sentence if self.focal_known else replace(photo, focal_unit="").sentence
         return (
-            "Enough: the standard deviation of the displacement, in the geometric mean over image and "
-            f"focal range, is {self.next.before:.2g} px, {self.next.after:.2g} px with the best next photo."
+            "Enough: the standard deviation that noise gives the displacement, in the geometric mean over "
+            f"image and focal range, is {photo.before:.2g} px, {photo.after:.2g} px with the best photo."
         )
 
     def rows(self) -> list[tuple[str, np.ndarray]]:
         """Rows of a table like the paper's Table 1: the correction and each frame's RMS, px."""
-        if len(self.none) == 1:  # then all models of the zoom are that of the frame
-            return [("no correction", self.none), (self.kind, np.asarray(self.zoom.frame_rms))]
+        if len(self.rms_uncorrected) == 1:  # then all models of the zoom are that of the frame
+            return [("no correction", self.rms_uncorrected), (self.kind, np.asarray(self.fit.frame_rms))]
         return [
-            ("no correction", self.none),
-            ("frame by frame", np.asarray(self.each.frame_rms)),
-            *([] if self.algebraic is None else [(f"{self.kind} (algebraic)", self.algebraic)]),
-            (self.kind, np.asarray(self.zoom.frame_rms)),
+            ("no correction", self.rms_uncorrected),
+            ("frame by frame", np.asarray(self.frames.frame_rms)),
+            *([] if self.rms_algebraic is None else [(f"{self.kind} (algebraic)", self.rms_algebraic)]),
+            (self.kind, np.asarray(self.fit.frame_rms)),
         ]
 
     @property
     def kind(self) -> str:
         """What the zoom model is called in tables."""
-        if len(self.none) == 1:
+        if len(self.rms_uncorrected) == 1:
             return "corrected"
-        return "zoom polynomial" if isinstance(self.zoom.lens.zoom, PolynomialZoom) else "zoom model"
+        return "zoom polynomial" if isinstance(self.fit.lens.zoom, PolynomialZoom) else "zoom model"
 
     def held_out_rows(self) -> dict[str, np.ndarray]:
         """For some of the `rows`, each frame's RMS on lines that were not used in the fit, px."""
-        if len(self.none) == 1:
-            return {self.kind: self.each_held_out}
-        return {"frame by frame": self.each_held_out, self.kind: self.held_out}
+        if len(self.rms_uncorrected) == 1:
+            return {self.kind: self.rms_frames_held_out}
+        return {"frame by frame": self.rms_frames_held_out, self.kind: self.rms_held_out}
 
     def warnings(self, names: Sequence[str] | None = None) -> list[str]:
         """User-facing warnings about the zoom model, and about frames without a good fit.
 
         `names` are the names of the frames; by default their numbers, from 0.
         """
-        warnings = [RESULTS[self.zoom.result]] if self.zoom.result != RESULTS.successful else []
-        for message in dict.fromkeys(filter(None, messages := self.each.messages())):
+        warnings = [RESULTS[self.fit.result]] if self.fit.result != RESULTS.successful else []
+        for message in dict.fromkeys(filter(None, messages := self.frames.messages())):
             frames = [
                 names[frame] if names else str(frame)
                 for frame, other in enumerate(messages)
@@ -183,31 +187,31 @@ class Calibration:
 
     def summary(self) -> dict[str, Any]:
         """All figures as plain numbers and strings, for JSON."""
-        lens = self.zoom.lens
+        lens = self.fit.lens
         low, high = (float(f) for f in lens.focal_range)
         frame = np.asarray(self.lines.frame)
         fits = {
-            "frame": range(len(self.none)),
+            "frame": range(len(self.rms_uncorrected)),
             "focal": np.asarray(self.lines.focal).tolist(),
             "focal_sigma": self.focal_sigma.tolist(),
-            "lines": np.bincount(frame, minlength=len(self.none)).tolist(),
-            "rms_none": _finite(self.none),
-            "rms_frames": _finite(np.asarray(self.each.frame_rms)),
-            "rms_zoom": _finite(np.asarray(self.zoom.frame_rms)),
-            "rms_held_out": _finite(self.held_out),
-            "rms_frames_held_out": _finite(self.each_held_out),
+            "lines": np.bincount(frame, minlength=len(self.rms_uncorrected)).tolist(),
+            "rms_none": _finite(self.rms_uncorrected),
+            "rms_frames": _finite(np.asarray(self.frames.frame_rms)),
+            "rms_zoom": _finite(np.asarray(self.fit.frame_rms)),
+            "rms_held_out": _finite(self.rms_held_out),
+            "rms_frames_held_out": _finite(self.rms_frames_held_out),
         }
         return (
             self.assessment.summary()
             | {
                 "distances": "distorted image" if self.in_image else "corrected image",
-                "rms_none": rms_over_frames(self.none),
-                "rms_algebraic": None if self.algebraic is None else rms_over_frames(self.algebraic),
-                "rms_frames": float(self.each.rms),
-                "rms_zoom": float(self.zoom.rms),
-                "rms_held_out": _finite([rms_over_frames(self.held_out)])[0],
-                "rms_frames_held_out": _finite([rms_over_frames(self.each_held_out)])[0],
-                "frames": len(self.none),
+                "rms_none": rms_over_frames(self.rms_uncorrected),
+                "rms_algebraic": None if (of := self.rms_algebraic) is None else rms_over_frames(of),
+                "rms_frames": float(self.frames.rms),
+                "rms_zoom": float(self.fit.rms),
+                "rms_held_out": _finite([rms_over_frames(self.rms_held_out)])[0],
+                "rms_frames_held_out": _finite([rms_over_frames(self.rms_frames_held_out)])[0],
+                "frames": len(self.rms_uncorrected),
                 "lines": len(frame),
                 "rejected_lines": int(self.rejected.sum()),
                 "rejected": [
@@ -219,13 +223,13 @@ class Calibration:
                 "focal_known": self.focal_known,
                 "focal_unit": lens.focal_unit,
                 "image_size": list(lens.image_size),
-                "result": RESULTS[self.zoom.result] or "successful",
-                "certificate": {name: of.item() for name, of in vars(self.zoom.certificate).items()},
-                "rms_unconstrained": float(self.zoom.rms_unconstrained),
-                "frames_without_a_model": sum(map(bool, self.each.messages())),
+                "result": RESULTS[self.fit.result] or "successful",
+                "certificate": {k: np.asarray(v).item() for k, v in vars(self.fit.certificate).items()},
+                "rms_unconstrained": float(self.fit.rms_unconstrained),
+                "frames_without_a_model": sum(map(bool, self.frames.messages())),
                 "warnings": self.warnings(),
                 "model": type(lens.zoom).__name__,
-                "family": family_name(lens.family),
+                "distortion_model": distortion_model_name(lens.distortion_model),
                 "centre": self.centre.summary(),
                 "pixel_polynomials": self.pixel_polynomials().tolist(),
                 "coefficients": self.coefficient_rows(),
@@ -234,15 +238,15 @@ class Calibration:
                     {"focal": f, "px": moved, "std": _finite([std])[0]} for f, moved, std in self.corner()
                 ],
                 "next_photo": {
-                    "focal": self.next.focal,
-                    "direction": self.next.direction,
-                    "region": self.next.region,
-                    "displacement_std": _finite([self.next.before])[0],
-                    "displacement_std_with_it": _finite([self.next.after])[0],
+                    "focal": self.next_photo.focal,
+                    "direction": self.next_photo.direction,
+                    "region": self.next_photo.region,
+                    "displacement_std": _finite([self.next_photo.before])[0],
+                    "displacement_std_with_it": _finite([self.next_photo.after])[0],
                     "enough": self.enough(),
                     "sentence": self.advice(),
                 },
-                "parameter_sigma": _finite(np.sqrt(np.diag(np.asarray(self.zoom.covariance)))),
+                "parameter_sigma": _finite(np.sqrt(np.diag(np.asarray(self.fit.covariance)))),
                 "per_frame": [
                     dict(zip(fits, row, strict=True)) for row in zip(*fits.values(), strict=True)
                 ],
@@ -258,23 +262,24 @@ class Calibration:
 
         None, of shape (0, 0), for another model.
         """
-        model = self.zoom.lens.zoom
+        model = self.fit.lens.zoom
         if not isinstance(model, PolynomialZoom):
             return np.zeros((0, 0))
         normalised = np.asarray(model.in_inverse_focal())
-        return normalised / self.zoom.lens.scale ** self.zoom.lens.family.orders(normalised.shape[1])
+        orders = self.fit.lens.distortion_model.orders(normalised.shape[1])
+        return normalised / self.fit.lens.scale**orders
 
     def coefficient_names(self) -> dict[str, int]:
         """Names of the coefficients, k1, ..., kN and p1, p2, and the powers of 1/px in their units."""
-        family = self.zoom.lens.family
-        size = np.asarray(self.zoom.lens(self.zoom.lens.focal_range[0]).coefficients).size
-        radial, orders = size - family.size(0), family.orders(size).tolist()
+        distortion_model = self.fit.lens.distortion_model
+        size = np.asarray(self.fit.lens(self.fit.lens.focal_range[0]).coefficients).size
+        radial, orders = size - distortion_model.num_coefficients(0), distortion_model.orders(size).tolist()
         names = [f"k{i + 1}" if i < radial else f"p{i + 1 - radial}" for i in range(size)]
         return dict(zip(names, orders, strict=True))
 
     def coefficient_rows(self) -> list[list[float]]:
         """Focal length and k1, ..., kN, px, at some focal lengths over the range, evenly in 1/f."""
-        lens = self.zoom.lens
+        lens = self.fit.lens
         low, high = (float(f) for f in lens.focal_range)
         focal = np.unique(1 / np.linspace(1 / low, 1 / high, 5))
         return [[f, *np.asarray(lens(f).pixel_coefficients).tolist()] for f in focal.tolist()]
@@ -314,11 +319,11 @@ class Calibration:
         from .plot import plot_model, save_plot  # so that `calibrate` does not need Matplotlib
 
         folder = Path(folder)
-        self.zoom.lens.save(folder / "lens.json")
+        self.fit.lens.save(folder / "lens.json")
         if lines:
             self.lines.save(folder / "lines.npz")
         (folder / "summary.json").write_text(json.dumps(self.summary() | (about or {}), indent=2) + "\n")
-        save_plot(plot_model(self.zoom, self.each, self.lines), folder / "model.png")
+        save_plot(plot_model(self.fit, self.frames, self.lines), folder / "model.png")
         for name, text in (pages or {}).items():
             (folder / name).write_text(text, encoding="utf-8")
 
@@ -345,8 +350,7 @@ def calibrate(
             that were not fitted are not straighter about it.
         robust: whether to reject lines that are not straight in the scene. All figures are then computed
             from the remaining lines.
-        metric: where distances are measured: `in_image`, where the noise is, or, as in the paper,
-            `in_corrected`.
+        metric: where distances are measured: `in_image`, or `in_corrected` as in the paper.
         focal_sigma: standard deviation of the focal lengths: a number, or one per frame; 0 where exact.
         shared: for each frame a number: frames of one number share a focal length and its error.
         widened: adds to the uncertainty of a fit what the lines do not show of it.
@@ -357,34 +361,30 @@ def calibrate(
         RuntimeError: the solver failed.
     """
     used = fitted(lines, model, centre, robust=robust, metric=metric, stage=stage)
-    exact, small, terms = used.zoom, used.lines, used.model.terms
-    sigma = np.broadcast_to(focal_sigma, lines.focal.shape)
-    zoom = exact
+    exact, small, terms = used.fit, used.lines, used.model.terms
+    sigma, zoom = np.broadcast_to(focal_sigma, lines.focal.shape), exact
     if sigma.any():
         zoom = with_focal_sigma(exact, small, focal_sigma=sigma, shared=shared)
     zoom = widened(with_misfit(zoom, used.held))
     stage("Checking the fit on lines left out")
-    held_out, each_held_out = np.full(len(sigma), np.nan), held_out_frames(small, terms=terms)
-    if len(sigma) > 1:
-        held_out = held_out_zoom(small, zoom=used.model)
+    held_out = {"rms_held_out": left_out(small, used.model)}
+    held_out["rms_frames_held_out"] = cross_validate_frames(small, terms=terms)
     lines = (lines.weighted(np.asarray(small.weight)) if robust else lines).about(np.asarray(small.centre))
     return Calibration(
         lines=lines,
-        zoom=zoom,
-        each=used.each,
-        none=np.asarray(frame_rms(small, None)),
-        algebraic=algebraic_rms(small, used.model),
-        rejected=np.asarray(lines.weight) == 0
-        if lines.weight is not None
-        else np.zeros(len(lines.frame), bool),
+        fit=zoom,
+        frames=used.each,
+        rms_uncorrected=np.asarray(frame_rms(small, None)),
+        rms_algebraic=algebraic_rms(small, used.model),
+        rejected=(np.ones(len(lines.frame)) if lines.weight is None else np.asarray(lines.weight)) == 0,
         line_rms=np.sqrt(line_squares(small, zoom.lens.zoom)),
-        next=suggest_next(exact, small),  # from the noise alone, without focal_sigma
+        next_photo=suggest_next(exact, small),  # from the noise alone, without focal_sigma
         focal_sigma=sigma,
-        held_out=held_out,
-        each_held_out=each_held_out,
+        **held_out,
         centre=used.centre.as_uncertain_as(zoom),
-        assessment=assess(lines, zoom, compressed=small, held_out=held_out, each_held_out=each_held_out),
+        assessment=assess(lines, zoom, compressed=small, **held_out),
         selection=used.selection,
+        own_centres=own_centres(exact, used.held),
         in_image=small.metric == "distorted",
     )
 

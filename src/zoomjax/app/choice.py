@@ -11,7 +11,7 @@ def chosen_frames(calibration: Calibration, most: int) -> list[int]:
     order = np.argsort(focal, kind="stable")
     if len(order) <= most:
         return order.tolist()
-    worst = np.argsort(-np.nan_to_num(np.asarray(calibration.zoom.frame_rms)))[: most // 3]
+    worst = np.argsort(-np.nan_to_num(np.asarray(calibration.fit.frame_rms)))[: most // 3]
     others = order[~np.isin(order, worst)]
     spread = others[np.linspace(0, len(others) - 1, most - len(worst)).round().astype(int)]
     chosen = set(worst.tolist()) | set(spread.tolist())

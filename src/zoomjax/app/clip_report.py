@@ -71,7 +71,7 @@ def _cards(done: MotionCalibration) -> list[tuple[str, str]]:
     scale = done.scale_std()
     return [
         (f"{done.following():.0%}", "of the points move as a camera that turns makes them"),
-        (f"{short(float(done.fit.noise))} px", "how far these stray from the model"),
+        (f"{short(float(done.fit.noise))} px", "distance of these from the model"),
         (f"{pan:.0f}° × {tilt:.0f}°", "how far the camera turned"),
         (
             f"± {scale:.2%}" if np.isfinite(scale) else "unknown",

@@ -58,7 +58,7 @@ class ClipJob:
         from .image_job import is_video
 
         if len(self.inputs) != 1 or not is_video(self.inputs[0]):
-            raise ValueError("--focal motion is for one video: its motion tells the focal lengths.")
+            raise ValueError("--focal motion is for one video: its motion determines the focal lengths.")
         if self.centre not in ("fit", "image"):
             raise ValueError("With --focal motion, --centre is fit or image: it moves along the zoom.")
 

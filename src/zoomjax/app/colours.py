@@ -1,4 +1,4 @@
-"""The colours of all pictures; those of the report's page around them are in templates/report.css."""
+"""Colours of plots. Those of drawn lines are in overlay.py, those of the page in templates/report.css."""
 
 from matplotlib.colors import LinearSegmentedColormap
 

@@ -16,7 +16,7 @@ from ._jax import set_up_jax
 from .arguments import (
     Centre,
     Degree,
-    Family,
+    DistortionModel,
     ModelName,
     Overwrite,
     Terms,
@@ -78,7 +78,7 @@ from .options import (
     refuse_idle,
     refuse_idle_sources,
 )
-from .plans import images_plan, lines_plan, tell_plan, without
+from .plans import check_centre, images_plan, lines_plan, photo_sizes, tell_plan, without
 from .runs import calibrate_images, calibrate_lines, title_of
 from .shown import Shown, show_outcome
 
@@ -136,7 +136,7 @@ def demo(
         job = ImageJob(tuple(made), workers=number_of_cores())
         done = calibrate_images(job, folder, title="The paper's board")
         focal = sorted(done.focals.focal.values())
-        lens = done.calibration.zoom.lens
+        lens = done.calibration.fit.lens
         demo.write_before_after(made[0], folder / "before-after.jpg", lens, focal[0])
     show_calibration(done.calibration, board.magnification)
     show_images(done, output, also=["before-after.jpg", "photos/"])
@@ -163,7 +163,7 @@ def calibrate(
     model: ModelName = None,
     degree: Degree = None,
     terms: Terms = None,
-    family: Family = None,
+    distortion_model: DistortionModel = None,
     centre: Centre = None,
     robust: Annotated[
         bool,
@@ -224,18 +224,20 @@ def calibrate(
     Writes lens.json, summary.json, report.html, model.png and lines.npz. From
     images it also writes lines/: each image with its detected lines. From a
     video without focal lengths it writes track.csv, the focal length of each
-    frame, and panorama.jpg in their place. Results of an earlier run in the
-    same folder are replaced or removed; its lines.npz, tracks.npz and
-    track.csv stay until they are written again.
+    frame, and panorama.jpg instead. Results of an earlier run in the same
+    folder are replaced or removed; its lines.npz, tracks.npz and track.csv
+    stay until they are written again.
     """
     set_up_jax()
     show = Shown(strict, quiet, as_json, verbose)
     from .model_choice import WantedModel
 
     refuse_auto(model, degree)
-    wanted = WantedModel(model or "auto", degree, terms, family)
+    wanted = WantedModel(model or "auto", degree, terms, distortion_model)
     about = wanted.usual_centre if centre is None else centre_of(centre)
     wanted.check_centre(about)
+    if focal == "same":
+        refuse_idle(context, ("focal_sigma",), "with --focal same, for f is not known")
     inputs = [str(results_of(path) or path) for path in inputs]
     if any(path.lower().endswith((".npz", ".csv")) for path in inputs):
         refuse_idle(context, IDLE_FOR_LINES, f"for {inputs[0]}, which contains lines")
@@ -248,7 +250,8 @@ def calibrate(
         results = results_folder(output, [*names, REPORT], clears=OF_A_LENS, overwrite=overwrite)
         if dry_run:
             lines = read_lines(files, focal, image_size, focal_unit)
-            return tell_plan(lines_plan(lines, excluded(exclude)), output)
+            check_centre(about, [lines.image_size])
+            return tell_plan(lines_plan(lines, excluded(exclude), focal_known=focal != "same"), output)
         with results as folder, stages(quiet=quiet) as stage:
             stage("Reading the lines")
             lines = without(read_lines(files, focal, image_size, focal_unit), excluded(exclude))
@@ -262,6 +265,7 @@ def calibrate(
                 robust=robust,
                 files=files,
                 names=names,
+                focal_known=focal != "same",
             )
         return show.lines(calibration, output, robust=robust)
     if image_size is not None:
@@ -311,6 +315,7 @@ def calibrate(
         refuse_idle(context, ("jobs",), "with --cluster, whose workers detect lines")
     refuse_to_replace(job, output)
     if dry_run:
+        check_centre(about, photo_sizes(job))
         return tell_plan(images_plan(job), output)
     names = [*job.results(), REPORT]
     from .undetermined import Undetermined

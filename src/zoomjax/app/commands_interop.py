@@ -70,7 +70,7 @@ def export(
         str | None,
         typer.Option(
             metavar="CONVENTION",
-            help="Of STMaps: centres (Nuke), gyroflow or alicevision. Default: centres.",
+            help="For STMaps: centres (Nuke), gyroflow or alicevision. Default: centres.",
         ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
@@ -144,17 +144,17 @@ def import_(
         str | None,
         typer.Option(
             metavar="DIRECTION",
-            help="Of STMaps: undistort or redistort; default: what the file name says.",
+            help="For STMaps: undistort or redistort; default: what the file name says.",
         ),
     ] = None,
     convention: Annotated[
         str | None,
         typer.Option(
             metavar="CONVENTION",
-            help="Of STMaps: centres (Nuke), gyroflow or alicevision. Default: centres.",
+            help="For STMaps: centres (Nuke), gyroflow or alicevision. Default: centres.",
         ),
     ] = None,
-    family: Annotated[
+    distortion_model: Annotated[
         Literal["radial", "division", "brown-conrady"] | None,
         typer.Option(
             metavar="MODEL",
@@ -188,7 +188,7 @@ def import_(
     set_up_jax()
     from ..interop.registry import read
     from ..models.tables import TableZoom
-    from .model_choice import FAMILIES
+    from .model_choice import DISTORTION_MODELS
     from .results_folder import OF_A_LENS, results_folder
 
     inputs = list(source.iterdir()) if source.is_dir() else [source]
@@ -204,7 +204,7 @@ def import_(
         convention=convention,
         zoom=TableZoom() if table else None,
         terms=terms,
-        family=None if family is None else FAMILIES[family],
+        distortion_model=None if distortion_model is None else DISTORTION_MODELS[distortion_model],
     )
     with results_folder(output, RESULTS, clears=OF_A_LENS, overwrite=overwrite) as folder:
         found.lens.save(folder / RESULTS[0])

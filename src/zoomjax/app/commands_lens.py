@@ -41,9 +41,9 @@ def lens(
 ) -> None:
     """Search the library of lenses, or write one of them as lens.json.
 
-    The lenses are those of the lensfun database. The table shows what each
-    becomes: its zoom model, and how far, at most, that puts a point of the
-    image from where the database does. Needs the extra "lensfun".
+    The lenses are those of the lensfun database. The table shows the zoom
+    model of each, and the largest distance of a corrected point from that
+    of the database. Needs the extra "lensfun".
     """
     set_up_jax()
     from .library_lens import rows, write_lens

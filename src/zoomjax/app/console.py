@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .._core.text import plain, with_std
+from .._core.text import percentages, plain, with_std
 from ._interrupts import go_on
 
 if TYPE_CHECKING:
@@ -76,11 +76,16 @@ def _stage_done(console: "Console", name: str, start: float) -> None:
     console.print(f"  [dim]{name:<40}{time.perf_counter() - start:7.2f} s[/dim]", highlight=False)
 
 
+def _going_on(console: "Console", name: str, start: float) -> None:
+    console.print(f"  [dim]… {name}, for {time.perf_counter() - start:.0f} s so far[/dim]", highlight=False)
+
+
 @contextlib.contextmanager
 def stages(*, quiet: bool = False) -> Iterator[Callable[[str], None]]:
     """Yield a function that starts a stage: it shows its name, and prints the previous stage's time.
 
-    Where there is no terminal, a line is printed every ten seconds. If `quiet`, nothing is printed.
+    Where there is no terminal, a line says every ten seconds what goes on, and since when. If `quiet`,
+    nothing is printed.
     """
     from rich.console import Console
 
@@ -94,7 +99,7 @@ def stages(*, quiet: bool = False) -> Iterator[Callable[[str], None]]:
     with contextlib.ExitStack() as shown:
         status = shown.enter_context(console.status("Starting"))
         if not console.is_terminal:
-            shown.enter_context(_ticking(lambda: [_stage_done(console, *last) for last in begun[-1:]]))
+            shown.enter_context(_ticking(lambda: [_going_on(console, *last) for last in begun[-1:]]))
 
         def stage(name: str) -> None:
             go_on()
@@ -188,8 +193,8 @@ def show_calibration(
     console.print()
     if calibration.selection:
         show_choice(calibration.selection)
-    if summary["family"] != "RadialPolynomial":
-        console.print(f"Distortion model: {summary['family']}", highlight=False)
+    if summary["distortion_model"] != "RadialPolynomial":
+        console.print(f"Distortion model: {summary['distortion_model']}", highlight=False)
     polynomials = calibration.pixel_polynomials()
     for (name, order), column in zip(calibration.coefficient_names().items(), polynomials.T, strict=False):
         powers = ["", *(f" /f{'' if j == 1 else f'^{j}'}" for j in range(1, len(column)))]
@@ -228,6 +233,8 @@ def show_choice(selection: "Selection") -> None:
         )
     console = Console()
     console.print(table)
+    if selection.why:
+        say(selection.why)
     console.print()
 
 
@@ -274,7 +281,7 @@ def _coefficients(calibration: "Calibration") -> "Table":
 
     rows = calibration.coefficient_rows()
     table = Table(box=None)
-    table.add_column(f"f, {calibration.zoom.lens.focal_unit}", justify="right")
+    table.add_column(f"f, {calibration.fit.lens.focal_unit}", justify="right")
     for name, order in calibration.coefficient_names().items():
         table.add_column(f"{name}, px^-{order}", justify="right")
     for focal, *values in rows:
@@ -292,10 +299,10 @@ def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()
     say(f"Focal lengths: {plain(done.focals.origin)}.")
     deviation = sorted(s / done.focals.focal[name] for name, s in done.focals.deviation.items())
     if deviation:
-        say(f"Their standard deviations: {deviation[0]:.2%} to {deviation[-1]:.2%}.")
+        say(f"Their standard deviations: {percentages(deviation)}.")
     if prior := done.prior():
         say(prior)
-    for sentence in [*done.shared(), *(done.bundle.sentences() if done.bundle else ())]:
+    for sentence in [*done.shared(), *done.board()]:
         say(sentence)
     notable = [
         f"{plain(d.name)}: {verdict}, {reason}."
@@ -305,7 +312,7 @@ def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()
     for sentence in notable[:_MOST_NOTABLE]:
         say(sentence)
     if len(notable) > _MOST_NOTABLE:
-        say(f"And {len(notable) - _MOST_NOTABLE} photos more that are not good, in summary.json.")
+        say(f"{len(notable) - _MOST_NOTABLE} more photos that are not good are listed in summary.json.")
     tell(done.warnings())
     print()
     say(f"Check the detected lines, drawn over each image, in {plain(str(folder / 'lines'))}.")

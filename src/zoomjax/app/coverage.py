@@ -2,6 +2,7 @@
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
@@ -50,9 +51,12 @@ def _by_focal(right, lines, weight):
     right.set(ylim=(0, None), xlabel=f"$f$  ({lines.focal_unit})", ylabel="lines")
     if focal.max() > 2 * focal.min():
         right.set_xscale("log")
+        # As many as there is room for.
+        steps = (1, 1.5, 2, 3, 5, 7) if focal.max() < 10 * focal.min() else (1, 2, 5)
+        right.xaxis.set_major_locator(LogLocator(subs=steps))
+        right.xaxis.set_minor_locator(NullLocator())
         right.xaxis.set_major_formatter(lambda f, _: f"{f:g}")
-        right.xaxis.set_minor_formatter(lambda f, _: f"{f:g}")
-        right.tick_params(axis="x", which="both", labelsize=8)
+        right.tick_params(axis="x", labelsize=8)
     right.set_title("lines in each photo", fontsize=10)
     right.spines[["top", "right"]].set_visible(False)
 

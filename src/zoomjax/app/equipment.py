@@ -1,18 +1,21 @@
 """What the photos of a calibration were taken with, for ``lens.json``."""
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from .._core.text import plain
+from ..interop.matching import crop_factor
 from ..io.equipment import FILM, Equipment, read_equipment
 from ..io.metadata import Metadata
 from ..io.photo import read_metadata
-from ..lenses.matching import crop_factor
 from ..models.about import UNKNOWN
 from ..models.lens import ZoomLens, load_lens
 from ..models.smooth import SmoothZoom
+from .earlier import is_of_results
 
 _SAME = 0.01
 """Share by which crop factors of photos may differ and count as one."""
@@ -43,7 +46,7 @@ class KnownLens:
         """That it has been used."""
         return (
             f"The prior of the zoom model is that of a lens of {self.shortest:g} to {self.longest:g} mm at "
-            f"crop factor {self.crop:.2g}, as the EXIF data of the photos tell."
+            f"crop factor {self.crop:.2g}, by the EXIF data of the photos."
         )
 
 
@@ -117,7 +120,7 @@ def with_earlier(lens: ZoomLens, files: Sequence[Path]) -> ZoomLens:
 
 def _earlier(file: Path, lens: ZoomLens) -> ZoomLens | None:
     """The lens of the results that a file of lines is one of; None if it is of none, or another lens."""
-    if file.name != "lines.npz" or not file.with_name("summary.json").is_file():
+    if not is_of_results(file):
         return None  # a lens.json without its summary is of another command
     try:
         found = load_lens(file.with_name("lens.json"))
@@ -142,6 +145,29 @@ def equipment_of(photo: Path) -> Equipment:
         return Equipment()
 
 
+def taken_otherwise(lens: ZoomLens, photos: Iterable[Path]) -> list[str]:
+    """That EXIF data say that photos were not taken as those of a lens, in sentences."""
+    found = [equipment_of(photo) for photo in photos]
+    told, own = [], lens.about.get("lens")
+    if own and (others := Counter(one.lens for one in found if one.lens and one.lens != own)):
+        name, _ = others.most_common(1)[0]
+        told.append(
+            f"The lens is that of {own}, and by their EXIF data {others.total()} of {len(found)} photos "
+            f"were taken with another one ({plain(name)})."
+        )
+    focal = [one.focal for one in found if one.focal]
+    if lens.about.get("focal") == UNKNOWN and focal and max(focal) > _SAME_ZOOM * min(focal):
+        told.append(
+            "The lens is for one zoom, whose focal length is not known, and by their EXIF data photos are "
+            f"of {min(focal):.4g} to {max(focal):.4g} mm: some are of another zoom."
+        )
+    return told
+
+
+_SAME_ZOOM = 1.05
+"""Ratio of focal lengths up to which one zoom's may be apart in EXIF data."""
+
+
 def metadata_of(photo: Path) -> Metadata:
     """The metadata of a photo; a photo that cannot be read has none."""
     try:
@@ -161,3 +187,8 @@ def _common(names: Iterable[str]) -> str | None:
     """The name that all share who have one."""
     different = {name for name in names if name}
     return different.pop() if len(different) == 1 else None
+
+
+def without_focal(lens: ZoomLens) -> ZoomLens:
+    """The lens of one zoom whose focal length nobody knows: a number stands for it."""
+    return dataclasses.replace(lens, pixel_pitch=None, about={**lens.about, "focal": UNKNOWN})

@@ -12,24 +12,26 @@ from jaxtyping import Float
 from ..fit.algebraic import algebraic_zoom
 from ..fit.centre import CentreFit, fit_centre
 from ..fit.compression import compressed_as_measured
-from ..fit.family_lines import with_family
+from ..fit.distortion_models import with_distortion_model
 from ..fit.frames import fit_frames
 from ..fit.image_metric import in_corrected
 from ..fit.prepare import ready_model
 from ..fit.problem import data_of
 from ..fit.result import FrameFits, ZoomFit, failed
-from ..fit.robust import reweighted, typical_rms
+from ..fit.robust import reweighted, typical_rms, weights_for_any_centre
 from ..fit.straightness import frame_rms
 from ..fit.zoom import CentreArgument, about_centre, fit_zoom
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines, compress
 from ..lines.free_centre import AnyCentreLines, compress_any_centre
 from ..lines.lines import Lines
-from ..models.family import AbstractFamily, AbstractRadial
+from ..models.distortion_model import AbstractDistortionModel, AbstractRadial
 from ..models.model import Model
 from ..models.polynomial import RadialPolynomial
-from ..models.zoom import AbstractLinearZoom, PolynomialZoom
+from ..models.zoom import AbstractLinearZoom, AbstractPriorZoom, PolynomialZoom
+from ..trust.between import FEWEST_CHECKED
 from ..trust.centre_choice import choose_centre
+from ..trust.cross_validation import cross_validate_zoom
 from ..trust.selection import Selection
 from .model_choice import STRONG, CentreFound, WantedModel
 
@@ -45,7 +47,7 @@ class Fitted(NamedTuple):
     """The fits of a calibration, and what they are made from.
 
     Attributes:
-        zoom: the zoom lens.
+        fit: the zoom lens.
         each: the separate fits of the frames, about its centre.
         lines: with their weights, about its centre.
         held: the same, under the radial polynomial for any centre.
@@ -54,7 +56,7 @@ class Fitted(NamedTuple):
         selection: how the model was chosen; None where it was given.
     """
 
-    zoom: ZoomFit
+    fit: ZoomFit
     each: FrameFits
     lines: AbstractLines
     held: AbstractLines
@@ -79,30 +81,32 @@ def fitted(
     model than the radial polynomial starts from there, and has its own centre and weights of lines.
     """
     wanted.check_centre(centre)
-    radial = dataclasses.replace(wanted, family="radial")
+    radial = dataclasses.replace(wanted, distortion_model="radial")
     model = radial.base(lines.focal)
     ready_model(lines, model)  # raises if there are too few focal lengths, before any work
     stage("Compressing the lines")
     held = metric(_compressed(lines, centre, radial.most_terms(lines)))
-    found = _about_centre(held, radial, model, robust, wanted.family in (None, "radial", "auto"), stage)
-    if wanted.family is None and found.zoom is None:
+    found = _about_centre(
+        held, radial, model, robust, wanted.distortion_model in (None, "radial", "auto"), stage
+    )
+    if wanted.distortion_model is None and found.fit is None:
         stage("Fitting the zoom model")
-        found = found._replace(zoom=fit_zoom(found.lines, zoom=found.model, throw=False))
-    strong = found.zoom is not None and wanted.is_beyond(found.zoom)
-    if strong or wanted.family not in (None, "radial"):
-        found = _under_family(metric(_widest(lines)), held, wanted, found, centre, robust, stage)
-    small, model, zoom = found.lines, found.model, found.zoom
-    if zoom is None or failed(zoom.result):
+        found = found._replace(fit=fit_zoom(found.lines, zoom=found.model, throw=False))
+    strong = found.fit is not None and wanted.is_beyond(found.fit)
+    if strong or wanted.distortion_model not in (None, "radial"):
+        found = _under_distortion_model(metric(_widest(lines)), held, wanted, found, centre, robust, stage)
+    small, model, fit = found.lines, found.model, found.fit
+    if fit is None or failed(fit.result):
         stage("Fitting the zoom model")
-        zoom = fit_zoom(small, zoom=model)  # or says why not
+        fit = fit_zoom(small, zoom=model)  # or says why not
     stage("Fitting each frame separately")
     each = fit_frames(small, terms=model.terms, throw=False)
     held = found.held
-    if isinstance(zoom.lens.family, RadialPolynomial) and not _for_any_centre(held):
+    if isinstance(fit.lens.distortion_model, RadialPolynomial) and not _for_any_centre(held):
         about: Any = about_centre(_widest(lines), centre)
         held = metric(compress_any_centre(about, radial.most_terms(lines)))
         held = held if small.weight is None else held.weighted(small.weight)
-    return Fitted(zoom, each, small, held, model, found.centre, found.selection)
+    return Fitted(fit, each, small, held, model, found.centre, found.selection)
 
 
 class _Centred(NamedTuple):
@@ -110,7 +114,7 @@ class _Centred(NamedTuple):
 
     Attributes:
         lines, held, model, centre, selection: as of `Fitted`.
-        zoom: the fit, where there is one.
+        fit: the fit, where there is one.
     """
 
     lines: AbstractLines
@@ -118,7 +122,7 @@ class _Centred(NamedTuple):
     model: Model
     centre: CentreFound
     selection: Selection | None
-    zoom: ZoomFit | None
+    fit: ZoomFit | None
 
 
 def _about_centre(
@@ -165,25 +169,13 @@ def _for_any_centre(lines: AbstractLines) -> bool:
 
 
 def _weights(held: AbstractLines, model: Model) -> np.ndarray:
-    """The weights of the lines about their centre, or about one fitted to them, whichever keeps more.
-
-    About a centre that is far from the lens's, straight lines look bent, the longest ones most.
-    """
-
-    def about(centre: Any) -> np.ndarray:
-        return np.asarray(reweighted(held.about(centre), model)[0].weight)
-
-    best, tried = about(held.centre), held
-    for _ in range(_TURNS if _for_any_centre(held) and not best.all() else 0):
-        found = fit_centre(tried, zoom=model, throw=False)
-        other = about(found.fit.lens.centre)
-        if not found.determined or other.sum() <= best.sum():
-            break
-        best, tried = other, held.weighted(other)
-    return best
+    """The weights of the lines, about whichever centre keeps more of them, if it may be another."""
+    if _for_any_centre(held):
+        return np.asarray(weights_for_any_centre(held, model))
+    return np.asarray(reweighted(held.about(held.centre), model)[0].weight)
 
 
-def _under_family(
+def _under_distortion_model(
     lines: AbstractLines,
     held: AbstractLines,
     wanted: WantedModel,
@@ -199,16 +191,16 @@ def _under_family(
     """
     model, selection, whole = found.model, found.selection, lines.about(found.lines.centre)
     centred = isinstance(centre, str) and centre == "fit"
-    compares = wanted.family in (None, "auto")
+    compares = wanted.distortion_model in (None, "auto")
     first = wanted.base(lines.focal)
     if compares:
-        first = dataclasses.replace(first, family=STRONG)
+        first = dataclasses.replace(first, distortion_model=STRONG)
     stage("Rejecting lines that are not straight" if robust else "Fitting the distortion model")
     how, start = found.centre, _judged(whole, first, robust)
     apart = centred and not np.array_equal(np.asarray(lines.centre), np.asarray(whole.centre))
     others = []
     for place in (whole, lines) if apart else (whole,):
-        other, own = _from_corrected(place, first.family, robust, centred)
+        other, own = _from_corrected(place, first.distortion_model, robust, centred)
         kept = how if place is whole else CentreFound.of(lines, None, None)
         others.append((other, kept if own is None else CentreFound.of(lines, None, own)))
     other, there = min(others, key=lambda of: of[0].spread)
@@ -223,21 +215,21 @@ def _under_family(
         if robust:
             radial = reweighted(held.about(whole.centre), model)[0] if moved else found.lines
             either = either.weighted(np.maximum(np.asarray(either.weight), np.asarray(radial.weight)))
-        selection = wanted.choose_family(either, model, compared)
+        selection = wanted.choose_distortion_model(either, model, compared)
         model = selection.chosen
-        if isinstance(model.family, RadialPolynomial) and not moved:
-            return found._replace(model=model, selection=selection, zoom=None)
+        if isinstance(model.distortion_model, RadialPolynomial) and not moved:
+            return found._replace(model=model, selection=selection, fit=None)
     else:
         model = first
         if wanted.automatic:
             stage("Choosing the model")
-            selection = wanted.choose_in_family(start.lines)
+            selection = wanted.choose_zoom(start.lines)
             model = selection.chosen
     if robust:
         stage("Rejecting lines that are not straight")
     best = min(_judged(whole, model, robust), _kept_near(whole, start.lines, model, robust), key=_spread)
-    placed, zoom = best.lines, None
-    if centred and isinstance(model.family, AbstractRadial):
+    placed, fit = best.lines, None
+    if centred and isinstance(model.distortion_model, AbstractRadial):
         stage("Fitting the centre of distortion")
         own, judged = fit_centre(placed, zoom=best.model, throw=False), placed
         if _gains(own) and robust:
@@ -246,13 +238,14 @@ def _under_family(
             if not np.array_equal(np.asarray(judged.weight), np.asarray(placed.weight)):
                 own = fit_centre(judged.about(placed.centre), zoom=near, throw=False)
         if _gains(own):
-            how, zoom = CentreFound.of(lines, None, own), own.fit
+            how, fit = CentreFound.of(lines, None, own), own.fit
             placed = judged.about(own.fit.lens.centre)
-    if isinstance(model.family, RadialPolynomial):  # compressed for more coefficients than the model's
+    if isinstance(model.distortion_model, RadialPolynomial):
+        # Compressed for more coefficients than the model's.
         kept = held if placed.weight is None else held.weighted(placed.weight)
-        return _Centred(kept.about(placed.centre), kept, model, how, selection, zoom)
-    small = _in_family(placed, model)
-    return _Centred(small, small, model, how, selection, zoom)
+        return _Centred(kept.about(placed.centre), kept, model, how, selection, fit)
+    small = _compressed_for(placed, model)
+    return _Centred(small, small, model, how, selection, fit)
 
 
 class _Start(NamedTuple):
@@ -278,7 +271,7 @@ def _judged(whole: AbstractLines, model: Model, robust: bool, near: bool = False
 
     It is found from all lines, or, with `near`, from its parameters.
     """
-    small = _in_family(whole, model)
+    small = _compressed_for(whole, model)
     if not robust:
         fit = fit_zoom(small, zoom=model, invertible=False, throw=False)
         return _Start(whole, model.with_zoom(fit.lens.zoom), _or_infinite(fit.rms))
@@ -294,12 +287,12 @@ def _or_infinite(spread: Any) -> float:
 
 def _kept_near(whole: AbstractLines, kept: AbstractLines, model: Model, robust: bool) -> _Start:
     """The lines as a model judges them that is fitted to those that were kept."""
-    fit = fit_zoom(_in_family(kept, model), zoom=model, invertible=False, throw=False)
+    fit = fit_zoom(_compressed_for(kept, model), zoom=model, invertible=False, throw=False)
     return _judged(whole, model.with_zoom(fit.lens.zoom), robust, near=True)
 
 
 def _from_corrected(
-    whole: AbstractLines, family: AbstractFamily, robust: bool, centred: bool
+    whole: AbstractLines, distortion_model: AbstractDistortionModel, robust: bool, centred: bool
 ) -> tuple[_Start, CentreFit | None]:
     """The start that one coefficient gives in the corrected image, in the metric of the lines; its centre.
 
@@ -309,9 +302,9 @@ def _from_corrected(
     coefficient, a line of 1/f, a lens cannot follow a few photos of things that are not straight.
     """
     degree = min(1, np.unique(np.asarray(whole.focal)).size - 1)
-    there, model = in_corrected(whole), Model(PolynomialZoom(degree=degree), 1, family)
+    there, model = in_corrected(whole), Model(PolynomialZoom(degree=degree), 1, distortion_model)
     start, found = _judged(there, model, robust), None
-    for _ in range(_TURNS if centred and isinstance(family, AbstractRadial) else 0):
+    for _ in range(_TURNS if centred and isinstance(distortion_model, AbstractRadial) else 0):
         own = fit_centre(start.lines, zoom=start.model, throw=False)
         if not _gains(own):
             break
@@ -325,9 +318,9 @@ def _gains(found: CentreFit) -> bool:
     return bool(found.determined) and float(found.fit.rms) <= float(found.rms_fixed)
 
 
-def _in_family(lines: AbstractLines, model: Model) -> AbstractLines:
+def _compressed_for(lines: AbstractLines, model: Model) -> AbstractLines:
     """The lines compressed for a distortion model."""
-    return compressed_as_measured(with_family(lines, model.family), model.terms)
+    return compressed_as_measured(with_distortion_model(lines, model.distortion_model), model.terms)
 
 
 def _widest(lines: Lines) -> Lines:
@@ -350,6 +343,16 @@ def _compressed(
     if held.weight is not None:
         return held
     return held.weighted(np.ones(held.frame.shape))  # as where some are left out: one compiled program
+
+
+def left_out(lines: AbstractLines, model: Model) -> Float[np.ndarray, "frame"]:
+    """RMS of each frame under the model of all others, px; NaN where that tells nothing.
+
+    Of two or three frames, a prior would extrapolate from what is left: that says nothing of the lens.
+    """
+    least = FEWEST_CHECKED if isinstance(model.zoom, AbstractPriorZoom) else 2
+    few = len(lines.focal) < least
+    return np.full(len(lines.focal), np.nan) if few else np.asarray(cross_validate_zoom(lines, zoom=model))
 
 
 def algebraic_rms(lines: AbstractLines, model: Model) -> Float[np.ndarray, "frame"] | None:

@@ -32,7 +32,7 @@ from ..models.zoom import PolynomialZoom
 from .board_focals import NOT_THE_BOARD, Board, focal_of_board
 from .plane_focals import MOST_UNCERTAIN, FocalGroup, Found, Sharing, focals_from_grids
 
-WAYS = (
+SOURCES = (
     "one focal length for all (--focal 24), which need not be known (--focal same); a CSV file with the "
     "columns image,focal (--focal focal.csv); "
     "EXIF data in the photos (--focal exif); a board parallel to the sensor (--focal board --pitch MM "
@@ -40,7 +40,7 @@ WAYS = (
     "markings of a football pitch (--focal pitch)"
 )
 
-_VIDEO_WAYS = (
+_VIDEO_SOURCES = (
     "one focal length, a CSV file with time,focal or frame,focal, motion, or plane, board or pitch as for "
     "photos"
 )
@@ -76,34 +76,38 @@ class Focals:
         groups = (dataclasses.replace(group, std=deviation[group.names[0]]) for group in self.groups)
         return dataclasses.replace(self, deviation=deviation, groups=tuple(groups))
 
+    def absence(self, detection: Detection) -> str:
+        """Why an image has no focal length."""
+        return _TOO_FRONTAL if self.absent == _NO_PLANE and detection.nodes is not None else self.absent
+
     def number_of_group(self, name: str) -> int:
         """Of an image: the number of its group, from 0; -1 where it has a focal length of its own."""
         return next((n for n, group in enumerate(self.groups) if name in group.names), -1)
 
 
-def check_way(way: str | None, board: Board | None, *, video: bool) -> None:
+def check_source(source: str | None, board: Board | None, *, video: bool) -> None:
     """Check a focal source before any image is read.
 
     Raises:
         FileNotFoundError: there is no such CSV file.
         ValueError: the source is unknown or incomplete; the message lists the sources.
     """
-    if way == "board" or (way is None and board):
+    if source == "board" or (source is None and board):
         if board is None:
             raise ValueError(_NO_BOARD)
-    elif video and way in (None, "exif"):
-        raise ValueError(f"A video needs --focal: {_VIDEO_WAYS}.")
-    elif video and way == "same":
+    elif video and source in (None, "exif"):
+        raise ValueError(f"A video needs --focal: {_VIDEO_SOURCES}.")
+    elif video and source == "same":
         raise ValueError(
             "--focal same is for photos: give one focal length for the video, such as --focal 24."
         )
-    elif way not in (None, "exif", "plane", "pitch", "same") and _number(way) is None:
-        if not way.lower().endswith(".csv"):
+    elif source not in (None, "exif", "plane", "pitch", "same") and _number(source) is None:
+        if not source.lower().endswith(".csv"):
             raise ValueError(
-                f"--focal is {way!r}, which is not a source of focal lengths. Give "
-                f"{_VIDEO_WAYS if video else WAYS}."
+                f"--focal is {source!r}, which is not a source of focal lengths. Give "
+                f"{_VIDEO_SOURCES if video else SOURCES}."
             )
-        read_focal_track(way) if video else read_focal_table(way)
+        read_focal_track(source) if video else read_focal_table(source)
 
 
 _NO_BOARD = "--focal board needs the board's --pitch and --distance, and the sensor's --pixel, in mm."
@@ -111,7 +115,7 @@ _NO_BOARD = "--focal board needs the board's --pitch and --distance, and the sen
 
 def choose_focals(
     detections: Sequence[Detection],
-    way: str | None = None,
+    source: str | None = None,
     *,
     unit: str = "mm",
     board: Board | None = None,
@@ -121,7 +125,7 @@ def choose_focals(
 
     Args:
         detections: detections of images of one size, all with lines.
-        way: the source: "exif", "board", "plane", "pitch", a number, a CSV file, or "same" for one that
+        source: the source: "exif", "board", "plane", "pitch", a number, a CSV file, or "same" for one that
             nobody knows. None for the best
             available one: the `board` if it is given, else EXIF data, else an oblique grid; else, of one
             image alone, none: one millimetre stands for its focal length.
@@ -133,14 +137,14 @@ def choose_focals(
         FileNotFoundError: there is no such CSV file.
         ValueError: no focal length was found; the message lists the other sources.
     """
-    whole = way
-    if way is None:
-        way = "board" if board else "exif" if any(d.focal for d in detections) else "plane"
-    if way == "exif":
+    whole = source
+    if source is None:
+        source = "board" if board else "exif" if any(d.focal for d in detections) else "plane"
+    if source == "exif":
         found = Focals(_own(detections), "mm", _EXIF, "its EXIF data have no focal length")
-    elif way == "track":
+    elif source == "track":
         found = Focals(_own(detections), unit, _TRACK, "the track has none for it")
-    elif way == "board":
+    elif source == "board":
         if board is None:
             raise ValueError(_NO_BOARD)
         found = _estimated(
@@ -150,34 +154,34 @@ def choose_focals(
             NOT_THE_BOARD,
             _each(functools.partial(focal_of_board, board)),
         )
-    elif way == "same":
+    elif source == "same":
         return _unknown(detections)
-    elif way == "plane" and all(d.nodes is None for d in detections):
-        found = Focals({}, "px", _GRID, _NO_PLANE)
-    elif way == "plane":
+    elif source == "plane" and all(d.nodes is None for d in detections):
+        found = Focals({}, "px", GRID, _NO_PLANE)
+    elif source == "plane":
         found = _estimated(
             detections,
             "px",
-            _GRID,
+            GRID,
             _NO_PLANE,
             functools.partial(focals_from_grids, sharing=sharing),
             zooms=sharing.known(detections) if sharing else None,
         )
-    elif way == "pitch":
+    elif source == "pitch":
         found = _estimated(
             detections, "px", "the markings of the pitch", _NO_PITCH, _each(_from_pitch), few=True
         )
-    elif (number := _number(way)) is not None:
+    elif (number := _number(source)) is not None:
         found = Focals({d.name: number for d in detections}, unit, "--focal", "")
     else:
-        table = read_focal_table(way)
+        table = read_focal_table(source)
         known = table.of([d.file for d in detections])
         sigma = {d.name: table.sigma(d.file) for d in detections if d.file in known}
         found = Focals(
             {d.name: known[d.file] for d in detections if d.file in known},
             unit,
-            Path(way).name,
-            f"{Path(way).name} has no row for it",
+            Path(source).name,
+            f"{Path(source).name} has no row for it",
             {name: value for name, value in sigma.items() if value is not None},
         )
     if not found.focal and whole is None and board is None and len(detections) == 1:
@@ -185,26 +189,26 @@ def choose_focals(
     if not found.focal:
         raise ValueError(
             f"No focal length found for any image. Source: {found.origin}; problem: {found.absent}. Give "
-            f"{WAYS}. (Straight lines alone do not determine focal lengths: other focal lengths with "
+            f"{SOURCES}. (Straight lines alone do not determine focal lengths: other focal lengths with "
             "another zoom model give the same correction.)"
         )
     return found
 
 
-def known_focals(detections: Sequence[Detection], way: str | None, others: Focals) -> dict[str, float]:
+def known_focals(detections: Sequence[Detection], source: str | None, others: Focals) -> dict[str, float]:
     """The focal lengths of images without lines, as far as they are known without them.
 
     Args:
         detections: of these images.
-        way: the source of focal lengths that was asked for.
+        source: the source of focal lengths that was asked for.
         others: the focal lengths of the images with lines.
     """
     if others.origin in (_EXIF, _TRACK):
         return _own(detections)
-    if way is None or way in MEASURED or way == "exif" or not detections:
+    if source is None or source in MEASURED or source == "exif" or not detections:
         return {}
     try:
-        return choose_focals(detections, way, unit=others.unit).focal
+        return choose_focals(detections, source, unit=others.unit).focal
     except ValueError:  # a table without them
         return {}
 
@@ -219,15 +223,18 @@ def _unknown(detections: Sequence[Detection]) -> Focals:
     return Focals(found, "mm", f"not known, and not needed for {of}: 1 mm stands for it", "", known=False)
 
 
-_GRID = "homographies of the grid"
+GRID = "homographies of the grid"
+
+
+_TOO_FRONTAL = "its grid is seen too squarely, or too little of it, to determine a focal length"
 
 
 _NO_PLANE = "no flat grid was found in it, or the view is too frontal to determine a focal length"
 
 
 _NO_PITCH = (
-    "its lines cannot be told to be the markings of a football pitch, of which at least four must be seen, "
-    "two along and two across it, or they do not determine a focal length"
+    "its lines cannot be identified as the markings of a football pitch, of which at least four must be "
+    "seen, two along and two across it, or they do not determine a focal length"
 )
 
 

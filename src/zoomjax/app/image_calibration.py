@@ -15,15 +15,14 @@ import numpy as np
 from .._core.text import plain
 from ..detect.batch import DETECTORS, NO_LINES, Detection, detect
 from ..detect.sources import Source
-from ..models.about import UNKNOWN
 from ..models.smooth import SmoothZoom
 from ..trust.assessment import Verdict
 from ._flags import with_flags
-from .board_bundle import BoardBundle, bundle_of
+from .board_bundle import BoardBundle, bundle_of, sharing_options
 from .calibration import Calibration, calibrate
 from .choice import chosen_frames, colour_limit
-from .equipment import KnownLens, known_lens, with_equipment
-from .focal_sources import MEASURED, Focals, choose_focals, focal_sigmas, known_focals, lines_of
+from .equipment import KnownLens, known_lens, with_equipment, without_focal
+from .focal_sources import GRID, MEASURED, Focals, choose_focals, focal_sigmas, known_focals, lines_of
 from .image_job import ImageJob, overlay_name
 from .overlay import draw_lines
 from .plane_focals import Sharing
@@ -33,7 +32,9 @@ from .undetermined import told_undetermined
 from .usable import OTHER_SIZE, usable_of
 from .verdict import (
     findings_of_edges,
+    findings_of_exif,
     findings_of_focals,
+    findings_of_own_focals,
     findings_of_photos,
     findings_of_sizes,
     nothing_usable,
@@ -62,6 +63,7 @@ class ImageCalibration:
         images: the names of all images, in order; overlays are numbered by their place in it, from 1.
         unused: for each image that was not used, the reason.
         bundle: the bundle adjustment of the grids in them; None if there are too few.
+        board_note: why there is none, or what would make it better; empty if nothing.
         tied: the names of the images in which lines were found again under the lens of all images.
         lens: what the prior of the zoom model knows of the lens; None if nothing.
     """
@@ -73,6 +75,7 @@ class ImageCalibration:
     images: tuple[str, ...]
     unused: dict[str, str]
     bundle: BoardBundle | None = None
+    board_note: str = ""
     tied: tuple[str, ...] = ()
     lens: KnownLens | None = None
 
@@ -112,6 +115,7 @@ class ImageCalibration:
             "detector": self.job.detector,
             "focal_source": self.focals.origin,
             "board": self.bundle and self.bundle.about(),
+            "board_note": self.board_note,
             "prior": self.prior() or None,
             "focal_groups": [dataclasses.asdict(group) for group in self.focals.groups],
             "images": images,
@@ -120,8 +124,13 @@ class ImageCalibration:
 
     def prior(self) -> str:
         """What the prior of the zoom model knows of the lens, in a sentence; empty if nothing."""
-        used = isinstance(self.calibration.zoom.lens.zoom, SmoothZoom)
+        used = isinstance(self.calibration.fit.lens.zoom, SmoothZoom)
         return self.lens.sentence() if used and self.lens else ""
+
+    def board(self) -> list[str]:
+        """How bent the board is, or why that is not known, in sentences; none where no grids were found."""
+        told = [self.board_note] if self.board_note else []
+        return [*(self.bundle.sentences() if self.bundle else ()), *told]
 
     def shared(self) -> list[str]:
         """Which images share a focal length, in sentences; none where that was not asked for."""
@@ -129,7 +138,7 @@ class ImageCalibration:
             return []
         groups = [group.sentence(self.focals.unit) for group in self.focals.groups]
         rest = len(groups) - _MOST_GROUPS
-        more = [f"And {rest} groups more, in summary.json."] if rest > 0 else []
+        more = [f"{rest} more groups are listed in summary.json."] if rest > 0 else []
         return [*groups[:_MOST_GROUPS], *more] or ["No two photos share a focal length."]
 
     def warnings(self) -> list[str]:
@@ -226,7 +235,7 @@ def calibrate_images(
         job: the settings.
         progress: called after each image.
         stage: called with a description before each later step.
-        executor: where lines are detected, in place of the job's processes: see `zoomjax.detect.detect`.
+        executor: where lines are detected, instead of the job's processes: see `zoomjax.detect.detect`.
 
     Raises:
         FileNotFoundError: an input does not exist.
@@ -278,7 +287,7 @@ def _bent(job: ImageJob, known: dict[str, Bend]) -> Iterable[Source]:
 
 def _disagreeing(done: ImageCalibration, detections: Sequence[Detection]) -> dict[str, Bend]:
     """The images that are to be searched again, and how bent the lens makes them."""
-    lens = done.calibration.zoom.lens
+    lens = done.calibration.fit.lens
     ours = [d for d in detections if d.image_size == lens.image_size and d.problem in ("", NO_LINES)]
     empty = [d for d in ours if d.problem]
     focal = done.focals.focal | known_focals(empty, done.job.focal, done.focals)
@@ -296,27 +305,29 @@ def _calibrated(
     if not usable:
         raise ValueError(nothing_usable(detections))
     stage("Finding the focal lengths")
-    way = "track" if job.video and job.focal not in (None, *MEASURED) else job.focal
+    source = "track" if job.video and job.focal not in (None, *MEASURED) else job.focal
     if job.video and job.focal is None:
-        way = "board"
-    if way is None and job.detector == "pitch" and not job.board and not any(d.focal for d in usable):
-        way = "pitch"
-    focals = choose_focals(usable, way, unit=job.focal_unit, board=job.board, sharing=_sharing(job))
-    unused |= {d.name: focals.absent for d in usable if d.name not in focals.focal}
-    if job.focal_sigma is not None:
-        sigma = focal_sigmas(job.focal_sigma, np.array(list(focals.focal.values())))
-        focals = focals.deviating_by(dict(zip(focals.focal, sigma.tolist(), strict=True)))
+        source = "board"
+    if source is None and job.detector == "pitch" and not job.board and not any(d.focal for d in usable):
+        source = "pitch"
+    focals = choose_focals(usable, source, unit=job.focal_unit, board=job.board, sharing=_sharing(job))
+    unused |= {d.name: focals.absence(d) for d in usable if d.name not in focals.focal}
     used = tuple(d for d in usable if d.name in focals.focal)
     known = None
     if job.video is None and focals.known and focals.unit == "mm":
         photos = [Path(d.file) for d in used]
         known = known_lens(photos, [focals.focal[d.name] for d in used], used[0].image_size)
-    bundle = None
+    bundle, told = None, ""
     if job.detector == "grid":
         stage("Fitting the shape of the board")
-        bundle = bundle_of(used, focals, job.centre)
-        if bundle is not None and job.focal == "plane":
+        bundle, told = bundle_of(used, focals, job.centre, job.other_sharing)
+        if bundle is not None and focals.origin == GRID:
             focals = bundle.measured(focals)
+            unused |= {d.name: focals.absence(d) for d in used if d.name not in focals.focal}
+            used = tuple(d for d in used if d.name in focals.focal)
+    if job.focal_sigma is not None:
+        sigma = focal_sigmas(job.focal_sigma, np.array(list(focals.focal.values())))
+        focals = focals.deviating_by(dict(zip(focals.focal, sigma.tolist(), strict=True)))
     while True:
         shown = used if bundle is None else bundle.lines_used(used)
         lines = lines_of(shown, np.array([focals.focal[d.name] for d in used]), focals.unit)
@@ -333,7 +344,7 @@ def _calibrated(
                 stage=stage,
             )
         done = ImageCalibration(job, calibration, used, focals, images, unused)
-        done = dataclasses.replace(done, bundle=bundle, lens=known)
+        done = dataclasses.replace(done, bundle=bundle, board_note=told, lens=known)
         hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}
         if not hopeless:
             return _with_findings(_with_equipment(done))
@@ -363,12 +374,12 @@ def _with_equipment(done: ImageCalibration) -> ImageCalibration:
     if done.job.video is not None:
         return done
     photos = [Path(detection.file) for detection in done.used]
-    zoom = done.calibration.zoom
+    zoom = done.calibration.fit
     lens = with_equipment(zoom.lens, photos)
     if not done.focals.known:
-        lens = dataclasses.replace(lens, pixel_pitch=None, about={**lens.about, "focal": UNKNOWN})
+        lens = without_focal(lens)
     zoom = dataclasses.replace(zoom, lens=lens)
-    return dataclasses.replace(done, calibration=dataclasses.replace(done.calibration, zoom=zoom))
+    return dataclasses.replace(done, calibration=dataclasses.replace(done.calibration, fit=zoom))
 
 
 def _with_findings(done: ImageCalibration) -> ImageCalibration:
@@ -377,13 +388,13 @@ def _with_findings(done: ImageCalibration) -> ImageCalibration:
     if done.job.video is None:
         found += findings_of_photos(Path(detection.file) for detection in done.used)
         others = sum(why.startswith(OTHER_SIZE) for why in done.unused.values())
-        found += findings_of_sizes(others, len(done.used))
+        told = {} if done.job.focal in (None, *MEASURED) else done.focals.focal  # measured ones may differ
+        found += findings_of_sizes(others, len(done.used)) + findings_of_exif(done.used, told)
     assessment = done.calibration.assessment.joined_by(found)
-    return dataclasses.replace(
-        done, calibration=dataclasses.replace(done.calibration, assessment=assessment)
-    )
+    options = sharing_options(done.used, done.focals, done.job.other_sharing)
+    assessment = assessment.joined_by(findings_of_own_focals(options, assessment.verdict))
+    calibration = dataclasses.replace(done.calibration, assessment=assessment)
+    return dataclasses.replace(done, calibration=calibration)
 
 
-_NONE_AGREES = (
-    "none of its lines is straight under the model fitted to the other images. Check its focal length"
-)
+_NONE_AGREES = "none of its lines is straight under the lens of the other images. Check its focal length"

@@ -16,7 +16,7 @@ from ..io.photo import read_focal
 from ..io.text_table import plain_number
 from .board_focals import Board
 from .calibration import FILES
-from .focal_sources import MEASURED, check_way, focal_sigmas
+from .focal_sources import MEASURED, check_source, focal_sigmas
 from .model_choice import WantedModel
 from .plane_focals import SHARED_BY
 
@@ -73,7 +73,7 @@ class ImageJob:
             )
         if len(self.inputs) > 1 and any(map(is_video, self.inputs)):
             raise ValueError("Give photos, or one video.")
-        check_way(self.focal, self.board, video=self.video is not None)
+        check_source(self.focal, self.board, video=self.video is not None)
         if self.focal == "pitch" and self.detector != "pitch":
             raise ValueError(
                 'Argument focal "pitch" needs the markings of a pitch: give argument detector "pitch", too.'
@@ -104,6 +104,13 @@ class ImageJob:
                 'Argument shared_focal "exif" needs focal lengths in the EXIF data, but no photo has one: '
                 'photos of one zoom can share a focal length by "folder" or "similarity".'
             )
+
+    @property
+    def other_sharing(self) -> tuple[str, ...]:
+        """Ways by which images could share a focal length, where none is asked for."""
+        if self.shared_focal is not None:
+            return ()
+        return ("similarity",) if self.video is not None else SHARED_BY
 
     @property
     def video(self) -> Path | None:

@@ -10,12 +10,12 @@ from .._core.files import refuse_existing, refuse_inputs
 from .._core.text import plain
 from ..correct.framing import check_keep
 from ..correct.image import check_sampling
+from ..interop.database import LensTable, find_lenses, one_named
+from ..interop.library import library_lens, table_for
+from ..interop.matching import match_lens
 from ..io.equipment import read_equipment
 from ..io.focal_table import read_focal_table
 from ..io.photo import read_size
-from ..lenses.database import LensTable, find, one_named
-from ..lenses.library import load, table_for
-from ..lenses.matching import match
 from ..models.lens import ZoomLens
 from .results_folder import OF_A_LENS, results_folder
 from .undistort_files import (
@@ -66,7 +66,7 @@ def rows(search: str, size: tuple[int, int] | None = None) -> tuple[list[Row], i
         ImportError: lensfunpy is not installed.
         ValueError: none is found.
     """
-    found = find(search) or one_named(search)  # which says that there is none
+    found = find_lenses(search) or one_named(search)  # which says that there is none
     return [_row(table, size) for table in found[:_MOST_SHOWN]], len(found) - _MOST_SHOWN
 
 
@@ -74,7 +74,7 @@ def _row(table: LensTable, size: tuple[int, int] | None) -> Row:
     low, high = table.focal_range
     focal = f"{low:g}" if low == high else f"{low:.4g}-{high:.4g}"
     try:
-        lens = load(table, image_size=size or _size_of(table))
+        lens = library_lens(table, image_size=size or _size_of(table))
     except ValueError:
         return Row(table.name, f"{table.crop_factor:g}", focal, "folds over", "")
     model = f"{type(lens.zoom).__name__}, {lens.zoom.parameters.size} numbers"
@@ -90,12 +90,12 @@ def write_lens(
 
     Raises:
         OSError: the file exists, or cannot be written.
-        ValueError: no lens has this name, or several have; or as `load`.
+        ValueError: no lens has this name, or several have; or as `library_lens`.
     """
     target = output if output.suffix.lower() == ".json" else output / _FILE
     refuse_existing([target], overwrite=overwrite)
     table = table_for(one_named(name), crop)
-    lens = load(table, image_size=size or _size_of(table), crop=crop)
+    lens = library_lens(table, image_size=size or _size_of(table), crop=crop)
     if target == output:
         target.parent.mkdir(parents=True, exist_ok=True)
         lens.save(target)
@@ -176,10 +176,10 @@ def _by_lens(photos: list[Path], name: str | None) -> tuple[list["_Group"], dict
     for photo in photos:
         try:
             size = read_size(photo)
-            found = match(read_equipment(photo), size, lens=name)
+            found = match_lens(read_equipment(photo), size, lens=name)
             key = (found.table.name, found.crop, size)
             if key not in groups:
-                groups[key] = _Group(load(found.table, image_size=size, crop=found.crop), [])
+                groups[key] = _Group(library_lens(found.table, image_size=size, crop=found.crop), [])
         except (ValueError, OSError) as error:
             skipped[str(photo)] = str(error)
         else:

@@ -6,22 +6,23 @@ from typing import Any
 
 import numpy as np
 
-from .._core.checks import checked_terms
 from ..fit.centre import CentreFit
 from ..fit.result import ZoomFit
 from ..fit.zoom import CentreArgument
 from ..lines.base import AbstractLines
 from ..lines.lines import Lines
 from ..models.brown_conrady import BrownConrady
+from ..models.distortion_model import AbstractDistortionModel, checked_terms
 from ..models.division import Division
-from ..models.family import AbstractFamily
 from ..models.model import Model
 from ..models.polynomial import RadialPolynomial
 from ..models.requirements import refusal
 from ..models.smooth import SmoothZoom
 from ..models.spline import SplineZoom
 from ..models.zoom import AbstractZoom, PolynomialZoom
+from ..trust.between import FEWEST_CHECKED, zoom_places
 from ..trust.centre_choice import CentreChoice
+from ..trust.folds import focals_there
 from ..trust.selection import Selection, select_model
 from ..trust.staged_selection import select_in_stages
 from .equipment import KnownLens
@@ -30,15 +31,19 @@ from .outward import outward
 MODELS = ("auto", "polynomial", "smooth", "spline")
 """Zoom models by the names that `calibrate` takes; "auto" chooses."""
 
-FAMILIES: dict[str, AbstractFamily] = {
+DISTORTION_MODELS: dict[str, AbstractDistortionModel] = {
     "radial": RadialPolynomial(),
     "division": Division(),
     "brown-conrady": BrownConrady(),
 }
 """Distortion models by the names that `calibrate` takes, besides "auto", which chooses."""
 
-STRONG: AbstractFamily = Division()
+STRONG: AbstractDistortionModel = Division()
 """The distortion model that competes with the polynomial for strong lenses."""
+
+_SMOOTH_STRONG = Model(SmoothZoom(), 2, STRONG)
+"""For two or three places in the zoom. To first order the coefficients of the division model are those of
+the polynomial with the other sign, so that a prior without a mean is the same."""
 
 _STRONG = 0.15
 """Displacement of a corner, in radii. Below it a polynomial with two terms and the division model with one
@@ -54,22 +59,22 @@ _MANY_LINES = 300
 
 @dataclasses.dataclass(frozen=True)
 class WantedModel:
-    """A zoom model as asked for.
+    """The model asked for: zoom model, number of coefficients and distortion model.
 
     Attributes:
         model: one of `MODELS`.
         degree: of the polynomials; None for the default.
         terms: number of coefficients; None for the default, or for a choice.
-        family: the distortion model: one of `FAMILIES`, or "auto" for the one of least cross-validation
-            error. None: the radial polynomial; where the lens turns out to be a strong one, it competes
-            with the division model.
+        distortion_model: one of `DISTORTION_MODELS`, or "auto" for the one of least cross-validation error.
+            None: the radial polynomial; where the lens turns out to be a strong one, it competes with the
+            division model.
         lens: what is known of the lens, for the prior of `SmoothZoom`.
     """
 
     model: str = "auto"
     degree: int | None = None
     terms: int | None = None
-    family: str | None = None
+    distortion_model: str | None = None
     lens: KnownLens | None = None
 
     def __post_init__(self):
@@ -84,34 +89,39 @@ class WantedModel:
             raise ValueError(f"Argument model must be one of {names}, but it is {self.model!r}.")
         if self.degree is not None and self.model not in ("auto", "polynomial"):
             raise ValueError(f"Argument degree is for polynomials: leave it out for model {self.model}.")
-        if self.family not in (None, "auto", *FAMILIES):
-            names = ", ".join(["auto", *FAMILIES])
-            raise ValueError(f"Argument family must be one of {names}, but it is {self.family!r}.")
+        if self.distortion_model not in (None, "auto", *DISTORTION_MODELS):
+            names = ", ".join(["auto", *DISTORTION_MODELS])
+            raise ValueError(
+                f"Argument distortion_model must be one of {names}, but it is {self.distortion_model!r}."
+            )
         if self.terms is not None:
-            checked_terms(self.terms, self.distortion.most_terms)
+            checked_terms(self.terms, self.first_distortion_model.most_terms)
         if self.model == "smooth" and self.terms not in (None, _TERMS):
             raise ValueError(
                 f"Argument model smooth has a prior for {_TERMS} coefficients: leave out argument terms."
             )
-        if self.family not in (None, "radial") and self.model == "smooth":
+        if self.distortion_model not in (None, "radial", "division") and self.model == "smooth":
             raise ValueError(
-                "Argument model smooth has a prior for the radial polynomial: leave out argument family."
+                "Argument model smooth has no prior for this distortion model: leave out argument "
+                "distortion_model."
             )
 
     @property
-    def distortion(self) -> AbstractFamily:
+    def first_distortion_model(self) -> AbstractDistortionModel:
         """The distortion model, or, where it is to be chosen, the first one."""
-        return FAMILIES.get(self.family or "radial", RadialPolynomial())
+        return DISTORTION_MODELS.get(self.distortion_model or "radial", RadialPolynomial())
 
     @property
     def smooth(self) -> SmoothZoom:
-        """The `SmoothZoom`, with a prior for what is known of the lens."""
-        return SmoothZoom() if self.lens is None else self.lens.prior()
+        """The `SmoothZoom`, with a prior for what is known of the lens, which is for the polynomial."""
+        if self.lens is None or not isinstance(self.first_distortion_model, RadialPolynomial):
+            return SmoothZoom()
+        return self.lens.prior()
 
     @property
     def usual_centre(self) -> CentreArgument:
         """The centre of distortion where none is asked for."""
-        return "image" if refusal("fit_centre", family=self.distortion) else "fit"
+        return "image" if refusal("fit_centre", distortion_model=self.first_distortion_model) else "fit"
 
     def check_centre(self, centre: CentreArgument | None) -> None:
         """Refuse to fit the centre of a model that has none of its own.
@@ -121,8 +131,8 @@ class WantedModel:
         """
         if isinstance(centre, str) and centre == "fit" and self.usual_centre != "fit":
             raise ValueError(
-                f'Argument centre cannot be "fit" with argument family {self.family}: give "image" or '
-                f"coordinates. ({refusal('fit_centre', family=self.distortion)})"
+                f'Argument centre cannot be "fit" with argument distortion_model {self.distortion_model}: '
+                'give "image" or coordinates. (Its decentering does nearly the same as another centre.)'
             )
 
     def base(self, focal: Any) -> Model:
@@ -130,13 +140,15 @@ class WantedModel:
         distinct = np.unique(np.asarray(focal)).size
         terms = _TERMS if self.terms is None else self.terms
         if self.automatic:
-            return Model(PolynomialZoom(degree=min(_DEGREE, distinct - 1)), terms, self.distortion)
+            return Model(
+                PolynomialZoom(degree=min(_DEGREE, distinct - 1)), terms, self.first_distortion_model
+            )
         models: dict[str, AbstractZoom] = {
             "smooth": self.smooth,
             "spline": SplineZoom(number=min(_KNOTS[1], distinct)),
         }
         polynomial = PolynomialZoom(degree=_DEGREE if self.degree is None else self.degree)
-        return Model(models.get(self.model, polynomial), terms, self.distortion)
+        return Model(models.get(self.model, polynomial), terms, self.first_distortion_model)
 
     @property
     def automatic(self) -> bool:
@@ -153,29 +165,39 @@ class WantedModel:
 
         Left out are focal lengths, or, with fewer than four, lines. Polynomials, splines of few knots and
         `SmoothZoom` compete with two coefficients, and then the best of them with one and, where there are
-        many lines, with three.
+        many lines, with three. Of two or three places in the zoom none can be left out, and lines say
+        nothing of what lies between: there `SmoothZoom` alone is taken, which knows what zoom lenses do.
         """
         distinct = np.unique(np.asarray(lines.focal)).size
         terms = self._terms(lines)
+        if terms[0] == _TERMS and _has_few_places(lines):
+            return select_in_stages(lines, [self.smooth], terms)
         degrees = range(min(_MOST_DEGREE + 1, distinct))
         zooms: list[AbstractZoom] = [PolynomialZoom(degree=degree) for degree in degrees]
         zooms += [SplineZoom(number=knots) for knots in _KNOTS if knots < distinct]
         zooms += [self.smooth] if distinct > 1 and terms[0] == _TERMS else []
         return select_in_stages(lines, zooms, terms)
 
-    def choose_in_family(self, lines: AbstractLines) -> Selection:
+    def choose_zoom(self, lines: AbstractLines) -> Selection:
         """The model of least cross-validation error under another distortion model than the polynomial.
 
         Each part that is left out takes a fit, so that few compete: polynomials with two coefficients, and
-        with other numbers of them the one of degree 2, or of the highest degree that there is.
+        with other numbers of them the one of degree 2, or of the highest degree that there is. For two or
+        three places in the zoom see `choose`.
         """
         distinct, terms = np.unique(np.asarray(lines.focal)).size, self._terms(lines)
+        if self.first_distortion_model == STRONG and terms[0] == _TERMS and _has_few_places(lines):
+            return _selected(lines, [_SMOOTH_STRONG])
         degrees = range(min(_MOST_DEGREE + 1, distinct))
         pairs = [(degree, terms[0]) for degree in degrees]
         pairs += [(min(_DEGREE, distinct - 1), number) for number in terms[1:]]
-        return _selected(lines, [Model(PolynomialZoom(degree=d), n, self.distortion) for d, n in pairs])
+        return _selected(
+            lines, [Model(PolynomialZoom(degree=d), n, self.first_distortion_model) for d, n in pairs]
+        )
 
-    def choose_family(self, lines: AbstractLines, chosen: Model, compared: Sequence[Model]) -> Selection:
+    def choose_distortion_model(
+        self, lines: AbstractLines, chosen: Model, compared: Sequence[Model]
+    ) -> Selection:
         """The distortion model of least cross-validation error: of all, or of two for a strong lens.
 
         Args:
@@ -187,13 +209,15 @@ class WantedModel:
         if isinstance(zoom, SmoothZoom):  # its prior is for the radial polynomial
             zoom = PolynomialZoom(degree=min(_DEGREE, np.unique(np.asarray(lines.focal)).size - 1))
         numbers = dict.fromkeys([chosen.terms, *self._terms(lines)])
-        families = list(FAMILIES.values())[1:] if self.family == "auto" else [STRONG]
+        several = list(DISTORTION_MODELS.values())[1:] if self.distortion_model == "auto" else [STRONG]
         others = [
-            Model(zoom, number, family)
-            for family in families
+            Model(zoom, number, other)
+            for other in several
             for number in numbers
-            if number <= family.most_terms
+            if number <= other.most_terms
         ]
+        if isinstance(chosen.zoom, SmoothZoom) and _has_few_places(lines):
+            others = [_SMOOTH_STRONG]
         return _selected(lines, [*compared, *others])
 
     def is_beyond(self, fit: ZoomFit) -> bool:
@@ -202,7 +226,7 @@ class WantedModel:
         It is where it moves a corner by more than `_STRONG` of the way, or folds: a polynomial follows such
         lenses with many terms only.
         """
-        if self.family is not None or self.model == "smooth":
+        if self.distortion_model is not None or self.model == "smooth":
             return False
         lens = fit.lens
         centre = np.asarray(lens.centre)
@@ -216,6 +240,11 @@ class WantedModel:
         if self.terms is not None or not self.automatic:
             return [_TERMS if self.terms is None else self.terms]
         return [_TERMS, 1, *([3] if len(lines.frame) >= _MANY_LINES else [])]
+
+
+def _has_few_places(lines: AbstractLines) -> bool:
+    """Whether lines are at two or three places in the zoom, of which none can be left out."""
+    return 1 < len(zoom_places(focals_there(lines))) < FEWEST_CHECKED
 
 
 def _selected(lines: AbstractLines, candidates: Sequence[Model]) -> Selection:
@@ -274,6 +303,11 @@ class CentreFound:
             why = (
                 f"lines that were not fitted are {choice.fitted:.4f} px off straight about the fitted one, "
                 f"and {choice.given:.4f} px about this"
+            )
+        if found is None and choice.found.determined and choice.far is not None:
+            why = (
+                f"the one about which lines would be straightest is {choice.far:.0f} px away. With so "
+                "few images that may also come from bent lines. If it is there, give --centre X,Y"
             )
         return cls((x, y), None, how, f"The centre of distortion was kept at {place}: {why}.")
 

@@ -39,7 +39,9 @@ def _direction(axes: Axes, fit: MotionFit) -> None:
         axes.plot(of_shot[:, 0], of_shot[:, 1], color=FRAMES, lw=1)
         axes.plot(*of_shot[0], "o", color=MODEL, ms=5)
     axes.set(
-        xlabel="to the right, degrees", ylabel="up, degrees", title="Where it looked (a dot: the beginning)"
+        xlabel="to the right, degrees",
+        ylabel="up, degrees",
+        title="Direction of the camera (dot: the start)",
     )
     axes.set_aspect("equal", adjustable="datalim")
 
@@ -74,6 +76,6 @@ def _residuals(axes: Axes, fit: MotionFit) -> None:
     axes.set(
         xlabel="distance of a tracked point from the model, px",
         ylabel="share of points",
-        title=f"How well points follow (dashed: noise of {noise:.2f} px alone)",
+        title=f"Residuals of tracked points (dashed: noise of {noise:.2f} px alone)",
         ylim=(0, 1),
     )

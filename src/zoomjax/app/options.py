@@ -38,7 +38,7 @@ Verbose = Annotated[
 ]
 AsJson = Annotated[
     bool,
-    typer.Option("--json", help="Print summary.json in place of the tables.", rich_help_panel=OUTPUT),
+    typer.Option("--json", help="Print summary.json instead of the tables.", rich_help_panel=OUTPUT),
 ]
 DryRun = Annotated[
     bool,
@@ -73,8 +73,8 @@ Frames = Annotated[
 
 _CLUSTER: dict[str, Any] = {
     "metavar": "tcp://HOST:PORT",
-    "help": "Work on a cluster of Dask, whose scheduler has this address: a photo, or a segment of a "
-    "video, is a task. Workers and this machine must find the files by the same paths.",
+    "help": "Run on the Dask cluster whose scheduler has this address, one task for each photo or segment "
+    "of a video. Workers and this machine must find the files by the same paths.",
 }
 Cluster = Annotated[str | None, typer.Option(**_CLUSTER, rich_help_panel=INPUT)]
 ClusterToCorrect = Annotated[str | None, typer.Option(**_CLUSTER)]
@@ -116,10 +116,10 @@ Focal = Annotated[
     typer.Option(
         metavar="SOURCE",
         help="Source of the focal lengths: a CSV file (columns image,focal; for a video time,focal or "
-        "frame,focal; for CSV lines frame,focal), a number, same (one for all photos, not known), exif, "
-        "board (parallel to the sensor), plane (oblique views of a flat grid), pitch (football markings), "
-        "or for a video motion (as the camera turns and zooms). Default for photos: board if --pitch is "
-        "given, else exif, else plane (with --detector pitch: pitch); for a video: motion.",
+        "frame,focal; for CSV lines frame,focal), a number, same (one for all photos or frames, unknown), "
+        "exif, board (parallel to the sensor), plane (oblique views of a flat grid), pitch (football "
+        "markings), or for a video motion (as the camera turns and zooms). Default for photos: board if "
+        "--pitch is given, else exif, else plane (with --detector pitch: pitch); for a video: motion.",
         rich_help_panel=FOCAL,
     ),
 ]
@@ -141,8 +141,8 @@ SharedFocal = Annotated[
     SharedBy | None,
     typer.Option(
         help="With --focal plane: photos of one zoom share one focal length, estimated from all of them "
-        "together. Of one zoom are photos of one EXIF focal length (exif), of one folder (folder), or "
-        "whose focal lengths agree within their standard deviations (similarity).",
+        "together. Photos are of one zoom if they have one EXIF focal length (exif), are in one folder "
+        "(folder), or have focal lengths that agree within their standard deviations (similarity).",
         rich_help_panel=FOCAL,
     ),
 ]
@@ -171,8 +171,8 @@ OtherLens = Annotated[
     str | None,
     typer.Option(
         metavar="auto|NAME",
-        help="In place of lens.json, a lens of the library (zoomjax lens): that of each photo's EXIF data, "
-        "or by its name.",
+        help="A lens of the library (see zoomjax lens) instead of lens.json: auto, the one in each photo's "
+        "EXIF data, or its name.",
         rich_help_panel=USE,
     ),
 ]
@@ -224,7 +224,7 @@ Redistort = Annotated[
     bool,
     typer.Option(
         "--redistort",
-        help="Go back: apply the distortion to corrected images.",
+        help="The reverse: apply the distortion to corrected images.",
         rich_help_panel=PICTURE,
     ),
 ]
@@ -256,7 +256,7 @@ JsonOfWork = Annotated[
     bool,
     typer.Option(
         "--json",
-        help="Print what was written and skipped as JSON, in place of sentences.",
+        help="Print what was written and skipped as JSON instead of sentences.",
         rich_help_panel=OUTPUT,
     ),
 ]
@@ -269,7 +269,7 @@ IDLE_FOR_LINES = (
 
 IDLE_FOR_MOTION = (
     *("focal_sigma", "focal_unit", "pitch", "distance", "pixel", "robust", "overlays", "shared_focal"),
-    *("family", "cluster", "verbose"),
+    *("distortion_model", "cluster", "verbose"),
 )
 """And about a clip whose motion gives its focal lengths."""
 
@@ -284,7 +284,7 @@ Examples:
 
   zoomjax calibrate zoom.mp4 --focal track.csv -o mylens
 
-  zoomjax calibrate fisheye/ --family division -o mylens
+  zoomjax calibrate fisheye/ --distortion-model division -o mylens
 
   zoomjax calibrate mylens --exclude 15,17 -o mylens
 """

@@ -1,6 +1,7 @@
 """What a command would do (``--dry-run``), and lines left out by hand (``--exclude``)."""
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,21 +11,49 @@ from .._core.text import listed, plain, span
 
 if TYPE_CHECKING:
     from ..detect.sources import Source
+    from ..fit.zoom import CentreArgument
     from ..lines.lines import Lines
     from .image_job import ImageJob
 
 _LISTED, _NAMED = 20, 6
 
+_UNKNOWN = "all at one f, which is not known"
 
-def lines_plan(lines: "Lines", exclude: Sequence[int]) -> list[str]:
+
+def check_centre(centre: "CentreArgument", sizes: Iterable[tuple[int, int]]) -> None:
+    """Warn of a centre of distortion outside of the images, as a fit would.
+
+    Args:
+        centre: coordinates, px, or how it is found.
+        sizes: width and height of the images, px.
+    """
+    if isinstance(centre, str):
+        return
+    from ..fit.zoom import given_centre
+
+    for size in sorted(set(sizes)):
+        given_centre(centre, size, stacklevel=2)
+
+
+def photo_sizes(job: "ImageJob") -> Iterator[tuple[int, int]]:
+    """Width and height of the photos that say them before they are decoded."""
+    from ..io.photo import read_size
+
+    for source in () if job.video is not None else job.sources()[0]:
+        with contextlib.suppress(OSError, ValueError):  # said in the plan
+            yield read_size(source.path or Path())
+
+
+def lines_plan(lines: "Lines", exclude: Sequence[int], *, focal_known: bool = True) -> list[str]:
     """What would be fitted, in lines of text."""
     left, focal = len(lines.frame) - len(exclude), np.asarray(without(lines, exclude).focal)
     if not left:
         raise ValueError("No line is left: give fewer to be excluded.")
-    return [
-        f"{left:,} of {len(lines.frame):,} lines in {len(focal)} frames, "
-        f"f = {span(float(focal.min()), float(focal.max()), lines.focal_unit)}."
-    ]
+    zooms = (
+        f"f = {span(float(focal.min()), float(focal.max()), lines.focal_unit)}" if focal_known else _UNKNOWN
+    )
+    frames = f"{len(focal)} frame{'s' * (len(focal) != 1)}"
+    return [f"{left:,} of {len(lines.frame):,} lines in {frames}, {zooms}."]
 
 
 def images_plan(job: "ImageJob") -> list[str]:
@@ -32,7 +61,8 @@ def images_plan(job: "ImageJob") -> list[str]:
     if job.video is not None:
         return [f"Up to {job.frames} frames of {plain(str(job.video))}, by the detector {job.detector}."]
     sources = list(job.sources()[0])
-    told = [f"{len(sources)} photos, by the detector {job.detector}:"]
+    photos = "1 photo" if len(sources) == 1 else f"{len(sources)} photos"
+    told = [f"{photos}, by the detector {job.detector}:"]
     focal_of = _focal_lengths(job, [source.path or Path() for source in sources])
     for source in sources[:_LISTED]:
         try:
@@ -86,6 +116,8 @@ def _focal_lengths(job: "ImageJob", photos: Sequence[Path]) -> Callable[[Path], 
     if job.focal is None or job.focal == "exif":
         none = "no f in EXIF data" + (", f from a grid in it" if job.focal is None else "")
         return lambda photo: none if (focal := read_focal(photo)) is None else f"{focal:g} mm"
+    if job.focal == "same":
+        return lambda photo: "f not known"
     if (number := plain_number(job.focal)) is not None:
         return lambda photo: f"{number:g} {job.focal_unit}"
     table, name = read_focal_table(job.focal), plain(Path(job.focal).name)

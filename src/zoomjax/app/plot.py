@@ -64,7 +64,7 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
     """
     lens = zoom.lens
     terms = each.coefficients.shape[1]
-    orders = lens.family.orders(terms)
+    orders = lens.distortion_model.orders(terms)
     to_pixel = lens.scale ** (-1.0 * orders)
     focal = np.asarray(lines.focal)
     grid = np.linspace(1 / focal.max(), 1 / focal.min(), 200)

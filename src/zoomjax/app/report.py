@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._core.text import span
-from ..models.registry import family_name
+from ..models.registry import distortion_model_name
 from ..trust.assessment import Verdict
 from ..trust.selection import COLUMNS
 from .board_plot import plot_boards
 from .calibration import Calibration, rms_over_frames
+from .centre_plot import FEWEST, plot_own_centres
 from .choice import colour_limit
 from .coverage import plot_coverage, plot_radius
 from .page import Run, counted, data_url, embedded_data, embedded_plot, rendered, short
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 _MOST_FRAMES = 300
 """Limit for the list of frames and for vector plots. It keeps the page readable."""
 
-_COLUMNS = ("zoom", "left out", "alone", "none", "lines", "worst lines")
+_COLUMNS = ("before", "after", "left out", "alone", "lines", "worst lines")
 """Of the list of frames: RMS distances, the number of lines and the worst of them."""
 
 _WORST, _WORST_REJECTED = 3, 2
@@ -51,9 +52,9 @@ def report(
         pictures: pictures of some of the images, to be embedded.
         run: what was run.
     """
-    lens = calibration.zoom.lens
+    lens = calibration.fit.lens
     versions = calibration.summary()["versions"]
-    run, moving = run or Run(), slider(calibration.zoom)
+    run, moving = run or Run(), slider(calibration.fit)
     verdicts = images.verdicts() if images else []
     return rendered(
         "report.html",
@@ -61,11 +62,11 @@ def report(
         about=[
             calibration.focal_text(),
             f"{lens.image_size[0]} × {lens.image_size[1]} px",
-            counted(len(calibration.none), "photo" if images else "frame"),
+            counted(len(calibration.rms_uncorrected), "photo" if images else "frame"),
             counted(len(calibration.rejected), "line"),
             counted(int(np.sum(np.asarray(calibration.lines.mask))), "point"),
         ],
-        several=len(calibration.none) > 1,
+        several=len(calibration.rms_uncorrected) > 1,
         verdict=calibration.assessment,
         cards=_cards(calibration),
         warnings=images.warnings() if images else calibration.warnings(),
@@ -104,7 +105,7 @@ def _photos(
 def _photo(calibration: Calibration, images: "ImageCalibration", one: Pictures) -> dict[str, Any]:
     """A photo before and after, with crops of its worst lines."""
     focal = float(np.asarray(calibration.lines.focal)[one.frame])
-    rms = np.asarray(calibration.zoom.frame_rms)[one.frame], calibration.none[one.frame]
+    rms = np.asarray(calibration.fit.frame_rms)[one.frame], calibration.rms_uncorrected[one.frame]
     return {
         "name": images.used[one.frame].name,
         "focal": f"{focal:.5g}",
@@ -122,10 +123,12 @@ def _photo(calibration: Calibration, images: "ImageCalibration", one: Pictures) 
 def _cards(calibration: Calibration) -> list[tuple[str, str]]:
     """The key figures at the top of the page: of photos left out, where they are known."""
     found = calibration.assessment.evidence
-    left_out, own = (rms_over_frames(of) for of in (calibration.held_out, calibration.each_held_out))
-    none, zoom = (rms_over_frames(of) for of in (calibration.none, calibration.zoom.frame_rms))
+    left_out, own = (
+        rms_over_frames(of) for of in (calibration.rms_held_out, calibration.rms_frames_held_out)
+    )
+    none, zoom = (rms_over_frames(of) for of in (calibration.rms_uncorrected, calibration.fit.frame_rms))
     after = left_out if np.isfinite(left_out) else zoom
-    where = " at the zoom where it is largest" if len(calibration.none) > 1 else ""
+    where = " at the zoom where it is largest" if len(calibration.rms_uncorrected) > 1 else ""
     cards = [
         (
             f"{short(none)} → {short(after)} px",
@@ -149,7 +152,7 @@ def _cards(calibration: Calibration) -> list[tuple[str, str]]:
 
 def _coverage(calibration: Calibration) -> list[dict[str, Any]]:
     weight = (~calibration.rejected).astype(float)
-    lens = calibration.zoom.lens
+    lens = calibration.fit.lens
     plots = [
         embedded_plot(
             plot_coverage(calibration.lines, weight), "Coverage of the image and of the zoom by lines"
@@ -160,17 +163,17 @@ def _coverage(calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def _straightness(calibration: Calibration) -> dict[str, Any]:
-    each = rms_over_frames(calibration.each.frame_rms)
+    each = rms_over_frames(calibration.frames.frame_rms)
     held_out = {name: rms_over_frames(frames) for name, frames in calibration.held_out_rows().items()}
     figure = plot_residues(
         calibration.lines,
-        calibration.none,
-        np.asarray(calibration.each.frame_rms),
-        np.asarray(calibration.zoom.frame_rms),
+        calibration.rms_uncorrected,
+        np.asarray(calibration.frames.frame_rms),
+        np.asarray(calibration.fit.frame_rms),
     )
     chosen = calibration.selection
     return {
-        "against": "vs. frame by frame" if len(calibration.none) > 1 else "vs. corrected",
+        "against": "vs. frame by frame" if len(calibration.rms_uncorrected) > 1 else "vs. corrected",
         "rows": [
             (
                 name,
@@ -181,21 +184,23 @@ def _straightness(calibration: Calibration) -> dict[str, Any]:
             for name, value in ((name, rms_over_frames(frames)) for name, frames in calibration.rows())
         ],
         "unit": f"px of the {'distorted' if calibration.in_image else 'corrected'} image",
-        "choice": chosen and {"title": chosen.title, "columns": COLUMNS, "rows": chosen.rows()},
+        "choice": chosen
+        and {"title": chosen.title, "columns": COLUMNS, "rows": chosen.rows(), "why": chosen.why},
         "plot": embedded_plot(figure, "Residual RMS of each frame against 1/f", class_="box plot"),
     }
 
 
 def _lens(calibration: Calibration) -> dict[str, Any]:
-    x, y = (float(value) for value in np.asarray(calibration.zoom.lens.centre))
+    x, y = (float(value) for value in np.asarray(calibration.fit.lens.centre))
     names = calibration.coefficient_names()
     return {
-        "unit": calibration.zoom.lens.focal_unit,
+        "unit": calibration.fit.lens.focal_unit,
         "centre": f"{x:.6g}, {y:.6g}",
         "centre_found": calibration.centre.sentence,
+        "centres": _own_centres(calibration),
         "coefficients": _coefficients(calibration),
-        "family": family_name(calibration.zoom.lens.family),
-        "formula": calibration.zoom.lens.family.formula,
+        "distortion_model": distortion_model_name(calibration.fit.lens.distortion_model),
+        "formula": calibration.fit.lens.distortion_model.formula,
         "names": list(names),
         "polynomials": [
             (name[0], name[1:], order, [_term(value, power) for power, value in enumerate(column)])
@@ -203,11 +208,22 @@ def _lens(calibration: Calibration) -> dict[str, Any]:
         ],
         "certificate": _certificate(calibration),
         "plot": embedded_plot(
-            plot_model(calibration.zoom, calibration.each, calibration.lines),
+            plot_model(calibration.fit, calibration.frames, calibration.lines),
             "Distortion coefficients against 1/f: separate fits of the frames, and the zoom model",
-            kind="svg" if len(calibration.none) <= _MOST_FRAMES else "png",
+            kind="svg" if len(calibration.rms_uncorrected) <= _MOST_FRAMES else "png",
         ),
     }
+
+
+def _own_centres(calibration: Calibration) -> Any:
+    """The centres of single frames beside that of the lens; None where too few tell theirs."""
+    own = calibration.own_centres
+    if own is None or own.known.sum() < FEWEST:
+        return None
+    figure = plot_own_centres(calibration.fit, own, np.asarray(calibration.lines.focal))
+    return embedded_plot(
+        figure, "Centre of distortion of single frames, and of the lens", class_="box plot"
+    )
 
 
 def _coefficients(calibration: Calibration) -> list[tuple[str, ...]]:
@@ -219,7 +235,7 @@ def _coefficients(calibration: Calibration) -> list[tuple[str, ...]]:
 
 
 def _certificate(calibration: Calibration) -> str:
-    lens, proof = calibration.zoom.lens, calibration.zoom.certificate
+    lens, proof = calibration.fit.lens, calibration.fit.certificate
     low, high = (float(f) for f in lens.focal_range)
     known = calibration.focal_known
     at = f"at f = {float(proof.focal):.4g} {lens.focal_unit}, " * known
@@ -243,7 +259,7 @@ def _certificate(calibration: Calibration) -> str:
 
 
 def _distortion(calibration: Calibration) -> dict[str, Any]:
-    lens, focal = calibration.zoom.lens, np.asarray(calibration.lines.focal)
+    lens, focal = calibration.fit.lens, np.asarray(calibration.lines.focal)
     known = calibration.focal_known
     ends = sorted({float(focal.min()), float(focal.max())})
     frames = sorted({int(np.argmin(focal)), int(np.argmax(focal))}, key=lambda frame: focal[frame])
@@ -258,7 +274,7 @@ def _distortion(calibration: Calibration) -> dict[str, Any]:
         ],
         "allowed_for": calibration.allowed_for(),
         "grid": embedded_plot(
-            plot_distortion(calibration.zoom, focal=ends),
+            plot_distortion(calibration.fit, focal=ends),
             "A straight grid, distorted, and the displacement of pixels, at both ends of the zoom",
         ),
         "points": embedded_plot(
@@ -270,20 +286,24 @@ def _distortion(calibration: Calibration) -> dict[str, Any]:
 
 
 def _board(calibration: Calibration, images: "ImageCalibration | None") -> dict[str, Any] | None:
-    """How bent the board is, and its bundle adjustment beside straightness."""
-    bundle = images.bundle if images else None
-    if images is None or bundle is None:
+    """How bent the board is, and its bundle adjustment beside straightness; or why there is none."""
+    if images is None or not images.board():
         return None
+    told, bundle = images.board(), images.bundle
+    if bundle is None:
+        return {"sentences": told, "plot": None}
     place = [bundle.names[int(np.argmax(bundle.number == zoom))] for zoom in range(len(bundle.fit.focal))]
-    label = [images.focals.focal[name] for name in place]
+    rows = bundle.compared(calibration.fit.lens, [images.focals.focal[name] for name in place])
+    head = ["f of the bundle, px", "as seen, px", "lens.json, px", "bundle, px"]
+    known = calibration.focal_known
+    zooms = bundle.of_boards() if known else []
     return {
-        "sentences": bundle.sentences(),
-        "head": [
-            f"f of the photos, {images.focals.unit}",
-            *("f of the bundle, px", "as seen, px", "lens.json, px", "bundle, px"),
-        ],
-        "rows": bundle.compared(calibration.zoom.lens, label),
-        "plot": embedded_plot(plot_boards(bundle.fit), "Height of the board's corners over its plane"),
+        "sentences": told,
+        "head": [f"f {bundle.before}, {bundle.unit}", *head] if known else head,
+        "rows": rows if known else [row[1:] for row in rows],
+        "plot": embedded_plot(
+            plot_boards(bundle.fit, zooms), "Height of the board's corners over its plane"
+        ),
     }
 
 
@@ -292,7 +312,7 @@ def _frames(
 ) -> dict[str, Any]:
     """The list of frames, of photos each with the verdict on it, and each with its least straight lines."""
     summary = calibration.summary()["per_frame"]
-    worst = np.argsort(-np.asarray(calibration.zoom.frame_rms), kind="stable")[:_MOST_FRAMES]
+    worst = np.argsort(-np.asarray(calibration.fit.frame_rms), kind="stable")[:_MOST_FRAMES]
     shown = worst[np.lexsort([worst, np.asarray(calibration.lines.focal)[worst]])]
     lines = calibration.lines
     members = np.split(
@@ -320,7 +340,7 @@ def _frame_cells(frame: dict[str, Any], rejected: np.ndarray) -> list[str]:
     """Its focal length, RMS values and number of lines."""
     values = (
         "" if frame[key] is None else f"{frame[key]:.3f}"  # of a frame whose lines are all rejected
-        for key in ("rms_zoom", "rms_held_out", "rms_frames", "rms_none")
+        for key in ("rms_none", "rms_zoom", "rms_held_out", "rms_frames")
     )
     counted = f"{frame['lines']:,}" + (f" ({rejected.sum()} rejected)" if rejected.any() else "")
     return [f"{frame['focal']:.4g}", *values, counted]

@@ -137,7 +137,7 @@ def broadcast_experiment(stage: Callable[[str], None] = lambda _: None) -> Exper
     stage("Correcting all 841 frames")
     video = broadcast_lines(truth, focal_sweep(841, low, high), noise=_BROADCAST_NOISE, seed=3)
     pixels = [rms_over_frames(values) for values in _residues(calibration)]
-    corrected = rms_over_frames(np.asarray(frame_rms(video, calibration.zoom.lens)))
+    corrected = rms_over_frames(np.asarray(frame_rms(video, calibration.fit.lens)))
     rows = (
         *_table(pixels, (1.0601, 0.5478, 0.5551), "px"),
         Row("excess of the zoom polynomial over frame by frame", 1.33, _excess(pixels), "%"),
@@ -154,9 +154,9 @@ _BROADCAST_NOISE = 0.557  # px
 def _residues(calibration: Calibration) -> list[np.ndarray]:
     """RMS of each frame, px: without correction, frame by frame, with the zoom polynomial."""
     return [
-        calibration.none,
-        np.asarray(calibration.each.frame_rms),
-        np.asarray(calibration.zoom.frame_rms),
+        calibration.rms_uncorrected,
+        np.asarray(calibration.frames.frame_rms),
+        np.asarray(calibration.fit.frame_rms),
     ]
 
 
@@ -212,10 +212,10 @@ def _figures(board: Experiment, centres: FrameCentres, football: Experiment) -> 
     focal = np.asarray(board.lines.focal)
     per_mm = np.array([StripedBoard.before(board.truth).magnification(float(f)) for f in focal])
     return {
-        "figure-05": plot.plot_primitives(board.lines, board.calibration.zoom.lens, (0, -1)),
-        "figure-06": plot.plot_primitives(football.lines, football.calibration.zoom.lens, (0, -1)),
+        "figure-05": plot.plot_primitives(board.lines, board.calibration.fit.lens, (0, -1)),
+        "figure-06": plot.plot_primitives(football.lines, football.calibration.fit.lens, (0, -1)),
         "figure-07": plot.plot_centres(centres, board.lines),
-        "figure-08": plot.plot_model(board.calibration.zoom, board.calibration.each, board.lines),
+        "figure-08": plot.plot_model(board.calibration.fit, board.calibration.frames, board.lines),
         "figure-09": residues(board, per_mm, "mm"),
         "figure-10": residues(football, np.ones(1), "px"),
     }

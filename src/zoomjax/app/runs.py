@@ -11,6 +11,8 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from .._core.text import listed
 from .cluster import cluster_executor
 from .console import REPORT, progress_bar, stages
@@ -39,22 +41,45 @@ def calibrate_lines(
     robust: bool,
     files: Sequence[Path],
     names: Collection[str],
+    focal_known: bool = True,
 ) -> "Calibration":
-    """Calibrate from lines of files, and write those results into the folder that have such names."""
+    """Calibrate from lines of files, and write those results into the folder that have such names.
+
+    Where `focal_known` is false, a number stands for the one focal length of all lines. Of lines in a
+    folder of results the summary tells how uncertain focal lengths are, unless that is given; and where
+    their centre was fitted, it is fitted again from the middle of the image.
+    """
     from .calibration import calibrate
-    from .equipment import with_earlier
+    from .earlier import earlier_of
+    from .equipment import with_earlier, without_focal
     from .focal_sources import focal_sigmas
     from .report import report
 
+    known = earlier_of(files, lines)
+    if known.centre and centre == "fit":
+        lines = lines.about((np.array(lines.image_size) - 1) / 2)
     sigma = focal_sigmas("0" if focal_sigma is None else focal_sigma, lines.focal)
+    if focal_sigma is None and known.sigma is not None:
+        sigma = known.sigma
+    known = known._replace(sigma=sigma, lost=known.lost and focal_sigma is None)
     calibration = calibrate(
-        lines, model=model, centre=centre, focal_sigma=sigma, robust=robust, stage=stage
+        lines,
+        model=model,
+        centre=centre,
+        focal_sigma=sigma,
+        shared=known.shared,
+        robust=robust,
+        stage=stage,
     )
-    zoom = dataclasses.replace(calibration.zoom, lens=with_earlier(calibration.zoom.lens, files))
-    calibration = dataclasses.replace(calibration, zoom=zoom)
+    assessment = calibration.assessment.joined_by(known.findings())
+    calibration = dataclasses.replace(calibration, assessment=assessment)
+    lens = with_earlier(calibration.fit.lens, files)
+    zoom = dataclasses.replace(calibration.fit, lens=lens if focal_known else without_focal(lens))
+    calibration = dataclasses.replace(calibration, fit=zoom)
     stage("Writing the results")
     pages = {REPORT: report(calibration, run=what_is_run(title_of(list(map(str, files)))))}
-    calibration.make(folder, pages=pages, lines="lines.npz" in names)
+    about = {"earlier": known.about()}
+    calibration.make(folder, about=about, pages=pages, lines="lines.npz" in names)
     return calibration
 
 

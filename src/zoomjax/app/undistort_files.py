@@ -20,6 +20,7 @@ from ..io.photo import read_metadata
 from ..models.about import UNKNOWN
 from ..models.lens import ZoomLens, load_lens
 from ._photos import BAD_FILE, SAME, CommonFraming, corrected_before, corrected_photos
+from .equipment import taken_otherwise
 from .plans import files_plan
 from .undistort_inputs import Found, find_inputs, focal_number, targets_of
 
@@ -249,7 +250,8 @@ def undistort_photos(
     unmarked = [
         path for path in targets if path not in {target for _, target in todo} and _holds_none(path)
     ]
-    before = () if job.redistort else corrected_before([source for source, _ in wanted])
+    given = [source for source, _ in wanted]
+    before = () if job.redistort else (*corrected_before(given), *taken_otherwise(lens, given))
     notes = (*_losses(lost), *_unmarked(unmarked), *before)
     sentence, files = (
         _counted(written, len(sources), earlier, job, "photo"),

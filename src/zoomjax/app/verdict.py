@@ -1,7 +1,7 @@
 """The verdict on a calibration from photos: that of the fit, and what the photos say about themselves."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +20,13 @@ from .tying import APART, bend_at
 _MOST = 4
 _SHAPE = 1.01
 """Ratio of the shapes of images that differ by more than rounding."""
+_OTHER_ZOOM = 1.1
+"""Ratio of ratios of focal lengths that differ by more than EXIF data are rounded to, or measured."""
 _FEWEST = 3
 """Straight lines of a photo that can tell something."""
 _UNPREDICTED = 1.5
 """How many times the RMS of a photo left out may exceed that of its own fit."""
-_UNTOLD = "without it the other photos determine no lens at its focal length that could contradict it"
+_NOT_CHECKED = "not checked: the other photos do not determine the lens at its focal length"
 _UNEXPLAINED = 0.5
 """Of the length of a photo's long smooth edges: lines that hold less are little of what there is."""
 
@@ -61,6 +63,26 @@ def findings_of_sizes(left_out: int, used: int) -> list[Finding]:
     ]
 
 
+def findings_of_exif(detections: Iterable[Detection], focal: Mapping[str, float]) -> list[Finding]:
+    """That focal lengths are not those of the photos' EXIF data, up to a common factor: as in px."""
+    ratio = {d.name: d.focal / focal[d.name] for d in detections if d.focal and d.name in focal}
+    if len(ratio) < 2 or max(ratio.values()) < _OTHER_ZOOM * min(ratio.values()):
+        return []
+    low, high = min(ratio, key=lambda name: ratio[name]), max(ratio, key=lambda name: ratio[name])
+    told = [f"{plain(name)} {ratio[name] * focal[name]:.4g} mm" for name in (low, high)]
+    used = f"{focal[low]:.4g}" if focal[low] == focal[high] else f"{focal[low]:.4g} and {focal[high]:.4g}"
+    return [
+        Finding(
+            "EXIF data",
+            "doubtful",
+            f"by their EXIF data {told[0]} and {told[1]} are of other zooms than the focal lengths used "
+            f"say, {used}.",
+            "Check --focal, or leave it out: then the EXIF data count.",
+            cause=True,
+        )
+    ]
+
+
 def findings_of_focals(groups: Iterable[FocalGroup], unit: str) -> list[Finding]:
     """What speaks against photos sharing focal lengths: what they give alone, if that is too far apart."""
     apart = [group for group in groups if not group.agree]
@@ -75,6 +97,26 @@ def findings_of_focals(groups: Iterable[FocalGroup], unit: str) -> list[Finding]
             "doubtful",
             worst.sentence(unit) + more,
             "Check that the photos of a group were taken at one zoom, and that the board is flat.",
+            cause=True,
+        )
+    ]
+
+
+def findings_of_own_focals(options: str, verdict: Verdict) -> list[Finding]:
+    """That photos may share focal lengths that each has by itself, where the verdict is not good.
+
+    Args:
+        options: that would say which photos do; empty if none would.
+        verdict: on all that is known.
+    """
+    if not options or verdict == "good":
+        return []
+    return [
+        Finding(
+            "focal lengths of single photos",
+            verdict,
+            "each photo has a focal length of its own, by a homography of the board as if it was flat.",
+            f"Say which photos are of one zoom: {options.rstrip(',')}.",
             cause=True,
         )
     ]
@@ -97,7 +139,7 @@ def findings_of_edges(detections: Iterable[Detection]) -> list[Finding]:
             "edges without lines",
             "good",
             f"more than half of the long smooth edges{of} are on no line: {share}.",
-            "Look at the drawn lines: if straight edges have none, photograph a scene with fewer curves.",
+            "Check the detected lines: if straight edges have none, photograph a scene with fewer curves.",
         )
     ]
 
@@ -116,16 +158,16 @@ def verdict_of_photo(
         detection: what was found in the photo.
         rejected: which of its lines were rejected.
     """
-    if len(calibration.none) == 1:
+    if len(calibration.rms_uncorrected) == 1:
         of = calibration.assessment
         return of.verdict, "" if of.verdict == "good" else of.findings[0].found.rstrip(".")
-    lens, kept = calibration.zoom.lens, int((~rejected).sum())
+    lens, kept = calibration.fit.lens, int((~rejected).sum())
     diagonal = float(np.hypot(*lens.image_size))
     if kept < _FEWEST:
-        return "not determined", f"{kept} of its lines are straight: too few to tell anything"
+        return "not determined", f"{kept} of its lines are straight: too few to say anything"
     if kept < rejected.sum():
         return "doubtful", f"{rejected.sum()} of its {len(rejected)} lines were rejected"
-    joint, own = (float(of[frame]) for of in (calibration.held_out, calibration.each_held_out))
+    joint, own = (float(of[frame]) for of in (calibration.rms_held_out, calibration.rms_frames_held_out))
     others = np.delete(np.asarray(calibration.lines.focal, float), frame)
     focal = float(np.asarray(calibration.lines.focal)[frame])
     if joint > _UNPREDICTED * own and joint > NEGLIGIBLE * diagonal / 2:
@@ -135,8 +177,8 @@ def verdict_of_photo(
     if detection.bend is not None:
         apart = bends_apart(lens.image_size, bend_at(lens, focal), detection.bend)
         if apart > APART * diagonal:
-            return "doubtful", f"its own lines are bent by {apart:.2g} px otherwise than the lens says"
-    return "good", "" if np.isfinite(joint) else _UNTOLD
+            return "doubtful", f"its own lines are bent by {apart:.2g} px differently from the lens"
+    return "good", "" if np.isfinite(joint) else _NOT_CHECKED
 
 
 def nothing_usable(detections: Sequence[Detection]) -> str:
@@ -186,7 +228,7 @@ def _changed(photos: Sequence[Metadata]) -> Iterable[Finding]:
             "corrected photos",
             "doubtful",
             f"{number} of {_photos(len(photos))} say that their distortion was corrected before, "
-            f"by {told}: the lens is what that left.",
+            f"by {told}: the fitted lens is what remained.",
             "Switch that correction off, save the photos again, and calibrate from these.",
             cause=True,
         )
@@ -197,8 +239,8 @@ def _changed(photos: Sequence[Metadata]) -> Iterable[Finding]:
             "pixels that are not square",
             "doubtful",
             f"{shapes.total()} of {_photos(len(photos))} say that their pixels are not square, "
-            f"{across:.4g} on {down:.4g}, and distortion is taken to be alike in all directions of the "
-            "stored image.",
+            f"{across:.4g} on {down:.4g}, but the model assumes the same distortion in all directions of "
+            "the stored image.",
             "Scale the photos to square pixels first.",
             cause=True,
         )

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.polynomial import chebyshev, polynomial
 
 from ..models.distortion import Distortion
-from ..models.family import AbstractRadial
+from ..models.distortion_model import AbstractRadial
 
 TOLERANCE = 0.01
 """px: the error up to which the polynomial stands in for the exact inverse: less than a third of the
@@ -37,14 +37,14 @@ class RadialInverse:
     Attributes:
         powers: coefficients of the powers of ``v = 2 τ/reach² - 1``, lowest first, float32.
         steps: steps of Newton's method that follow.
-        family, coefficients: of the distortion, float32.
+        distortion_model, coefficients: of the distortion, float32.
         reach: the corrected radius, normalised, up to which it holds; beyond it nothing is seen.
         error: the largest distance, px, between its distorted positions and the exact ones.
     """
 
     powers: np.ndarray
     steps: int
-    family: AbstractRadial
+    distortion_model: AbstractRadial
     coefficients: np.ndarray
     reach: float
     error: float
@@ -55,7 +55,7 @@ def fit_inverse(
 ) -> RadialInverse | None:
     """The polynomial for corrected points up to `radius` px from the centre; None if none is accurate.
 
-    None, too, where the family is not radial.
+    None, too, where the distortion model is not radial.
 
     Args:
         distortion: with concrete values (this is NumPy, in float64).
@@ -63,17 +63,17 @@ def fit_inverse(
         seen: the distorted radius, px, beyond which positions are of no interest: all off the image.
         tolerance: the largest error allowed, px.
     """
-    family = distortion.family
-    if not isinstance(family, AbstractRadial):
+    distortion_model = distortion.distortion_model
+    if not isinstance(distortion_model, AbstractRadial):
         return None
     k = np.asarray(distortion.coefficients, float)
     scale = float(distortion.scale)
-    top = min(_first_radius(family, k, radius / scale), seen / scale)
+    top = min(_first_radius(distortion_model, k, radius / scale), seen / scale)
     # Exact pairs, denser towards the end, where polynomials go wrong first.
     r = top * np.sin(np.linspace(0, np.pi / 2, 64)[1:])
-    rho = _corrected(family, r, k)
+    rho = _corrected(distortion_model, r, k)
     between = top * np.sin((np.arange(512) + 0.5) * np.pi / 1024)
-    rho_between = _corrected(family, between, k)
+    rho_between = _corrected(distortion_model, between, k)
     reach = float(rho[-1])
     squared = (rho_between**2).astype(np.float32)
     single = k.astype(np.float32)
@@ -83,18 +83,18 @@ def fit_inverse(
         powers = np.zeros(degree + 1, np.float32)
         trimmed = chebyshev.cheb2poly(fitted)
         powers[: len(trimmed)] = trimmed
-        ratio = radius_ratio(squared, np.float32(reach), powers, steps, family, single)
+        ratio = radius_ratio(squared, np.float32(reach), powers, steps, distortion_model, single)
         error = float(scale * np.max(np.abs(rho_between * ratio - between)))
         if error <= tolerance:
-            return RadialInverse(powers, steps, family, single, reach, error)
+            return RadialInverse(powers, steps, distortion_model, single, reach, error)
     return None
 
 
-def radius_ratio(squared, reach, powers, steps, family, k):
+def radius_ratio(squared, reach, powers, steps, distortion_model, k):
     """Distorted over corrected radius at squared corrected radii: the same code for NumPy and JAX."""
     ratio = _horner(powers, squared * (2 / (reach * reach)) - 1)
     for _ in range(steps):  # on q L(τ q²) - 1 = 0, in the ratio q
-        error, slope = family.equation(ratio, squared * ratio * ratio, 1, k)
+        error, slope = distortion_model.equation(ratio, squared * ratio * ratio, 1, k)
         ratio = ratio - error / slope
     return ratio
 
@@ -104,12 +104,12 @@ def fold_radius(distortion: Distortion) -> float:
 
     `Distortion.monotone_radius` is for tracing, in JAX's precision and on its device. Here eigenvalues from
     NumPy do: in float64 whatever JAX's setting, with nothing to compile, once for each frame of a video.
-    (Not for families that are not radial.)
+    (For radial models only.)
     """
-    family = distortion.family
-    if not isinstance(family, AbstractRadial):
+    distortion_model = distortion.distortion_model
+    if not isinstance(distortion_model, AbstractRadial):
         return float(distortion.monotone_radius)
-    return float(distortion.scale) * _fold(family, np.asarray(distortion.coefficients, float))
+    return float(distortion.scale) * _fold(distortion_model, np.asarray(distortion.coefficients, float))
 
 
 def _horner(powers, x):
@@ -120,25 +120,25 @@ def _horner(powers, x):
     return value
 
 
-def _corrected(family, r, k):
+def _corrected(distortion_model, r, k):
     """``r L(r²)``."""
-    return r * family.factor(r * r, k)
+    return r * distortion_model.factor(r * r, k)
 
 
-def _fold(family: AbstractRadial, k: np.ndarray) -> float:
+def _fold(distortion_model: AbstractRadial, k: np.ndarray) -> float:
     """The first positive root of what must stay positive, as a radius."""
     first = math.inf
-    for row in family.conditions(len(k)):
+    for row in distortion_model.conditions(len(k)):
         roots = polynomial.polyroots(np.trim_zeros(np.append(1.0, row * k), "b"))
         folds = roots.real[(abs(roots.imag) < 1e-9 * (1 + abs(roots.real))) & (roots.real > 0)]
         first = min(first, folds.min(initial=math.inf))
     return math.sqrt(first)
 
 
-def _first_radius(family: AbstractRadial, k: np.ndarray, rho: float) -> float:
+def _first_radius(distortion_model: AbstractRadial, k: np.ndarray, rho: float) -> float:
     """A distorted radius just large enough to be corrected to `rho`, or that of the fold before it."""
-    limit, end = _fold(family, k), rho
-    while end < limit and _corrected(family, np.array([end]), k)[0] < rho:
+    limit, end = _fold(distortion_model, k), rho
+    while end < limit and _corrected(distortion_model, np.array([end]), k)[0] < rho:
         end *= 2
     r = np.linspace(0, min(end, limit), 1025)
-    return float(r[min(np.searchsorted(_corrected(family, r, k), rho), 1024)])
+    return float(r[min(np.searchsorted(_corrected(distortion_model, r, k), rho), 1024)])

@@ -227,7 +227,7 @@ def _outline(distortion: Distortion, image_size: tuple[int, int], inset: float) 
     squared = np.sum((away / scale) ** 2, axis=1)
     k = np.asarray(distortion.coefficients, float)
     x, y = (away / scale).T
-    return centre + scale * np.stack(distortion.family.correct((x, y), squared, k), axis=1)
+    return centre + scale * np.stack(distortion.distortion_model.correct((x, y), squared, k), axis=1)
 
 
 def _clearance(apart: np.ndarray) -> float:

@@ -34,6 +34,9 @@ _INTERPOLATION = {
     "cubic": cv2.INTER_CUBIC,
     "lanczos": cv2.INTER_LANCZOS4,
 }
+_WIDE = ("cubic", "lanczos")
+"""Interpolations that reach over more than the pixels next to a position."""
+
 _BORDER = {
     "constant": cv2.BORDER_CONSTANT,
     "replicate": cv2.BORDER_REPLICATE,
@@ -119,6 +122,11 @@ def undistort_image(
     return corrected
 
 
+def _all_within(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> bool:
+    """Whether every pixel of the output is within the middles of an image's outermost pixels."""
+    return all(p.min() >= 0 and p.max() <= side - 1 for p, side in zip((x, y), size, strict=True))
+
+
 def _distortion(
     distortion: Distortion | ZoomLens, focal: float | int | None, size: tuple[int, int]
 ) -> Distortion:
@@ -173,8 +181,11 @@ def remap(
 ) -> np.ndarray:
     """`cv2.remap` for any dtype and number of channels.
 
-    `out` may be given for the dtypes that OpenCV knows, with up to 4 channels.
+    Where nothing beyond the image is shown, wide kernels do not mix a constant border in either. `out` may
+    be given for the dtypes that OpenCV knows, with up to 4 channels.
     """
+    if interpolation in _WIDE and border == "constant" and _all_within(x, y, image.shape[1::-1]):
+        border = "replicate"
     working = np.dtype(_WORKING.get(image.dtype.name, image.dtype))
     if working != image.dtype:
         scaled = image.astype(working) * (255 if image.dtype == bool else 1)
@@ -309,6 +320,7 @@ def _cast(values: np.ndarray, dtype: np.dtype) -> np.ndarray:
     if dtype.kind == "b":
         return values >= 128
     if dtype.kind == "f":
-        return values.astype(dtype)
+        clipped = np.clip(values, np.finfo(dtype).min, np.finfo(dtype).max)
+        return np.where(np.isfinite(values), clipped, values).astype(dtype)
     limits = np.iinfo(dtype)
     return np.clip(np.rint(values), limits.min, limits.max).astype(dtype)

@@ -74,18 +74,18 @@ def source_positions(
         reach,
         geometry.astype(np.float32),
         inverse.steps,
-        inverse.family,
+        inverse.distortion_model,
         plane.size,
     )
 
 
-@functools.partial(jax.jit, static_argnames=("steps", "family", "size"))
-def _positions(powers, k, reach, geometry, steps, family, size):
+@functools.partial(jax.jit, static_argnames=("steps", "distortion_model", "size"))
+def _positions(powers, k, reach, geometry, steps, distortion_model, size):
     start, step, centre, scale = geometry
     x = start[0] + step[0] * jax.lax.broadcasted_iota(jnp.float32, size[::-1], 1)
     y = start[1] + step[1] * jax.lax.broadcasted_iota(jnp.float32, size[::-1], 0)
     squared = x * x + y * y
-    ratio = radius_ratio(squared, reach, powers, steps, family, k)
+    ratio = radius_ratio(squared, reach, powers, steps, distortion_model, k)
     seen = squared <= reach * reach * (1 + 1e-6)
     return (
         jnp.where(seen, centre[0] + scale[0] * x * ratio, OUTSIDE),

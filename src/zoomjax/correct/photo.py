@@ -17,14 +17,15 @@ import jax
 import numpy as np
 
 from .._core.files import refuse_inputs, whole_file
-from ..io.metadata import geometry_of, marked, straightened_by
+from ..io.metadata import Metadata, framing_of, geometry_of, marked, straightened_by
 from ..io.photo import FORMATS, Photo, metadata_focal, open_photo, read_focal, read_metadata, read_pages
 from ..io.photo_writer import check_written, encoded_photo
 from ..models.about import UNKNOWN
 from ..models.lens import ZoomLens
-from .framing import Framing, framing_for_size
+from ..models.sizes import lens_for_size
+from .framing import Framing, frame_output, framing_for_size
 from .image import undistort_image
-from .redistort import redistort_image
+from .redistort import framing_of_corrected, redistort_image
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Correction:
             OSError, ValueError: the photo cannot be read, as `open_photo` says.
         """
         lens = self.lens
-        kinds = [type(of).__qualname__ for of in (lens, lens.zoom, lens.family)]
+        kinds = [type(of).__qualname__ for of in (lens, lens.zoom, lens.distortion_model)]
         options = (self.geometry, self.shown, self.interpolation, self.border, float(focal))
         digest = hashlib.sha256(repr((kinds, lens.image_size, lens.focal_unit, options)).encode())
         for leaf in jax.tree.leaves(lens):
@@ -69,6 +70,23 @@ class Correction:
     def geometry(self) -> str:
         """What the photos are afterwards, as the mark has it."""
         return "distorted" if self.back else "undistorted"
+
+    def framing(self, image: np.ndarray, focal: float | int) -> tuple[float, float, float]:
+        """Scale and origin of the framing of the corrected one of both images."""
+        size = (image.shape[1], image.shape[0])
+        framing = self.keep(size)
+        if framing == "same":
+            return 1.0, 0.0, 0.0
+        if not isinstance(framing, Framing):
+            with warnings.catch_warnings():  # the correction warns of the same
+                warnings.simplefilter("ignore")
+                framing = (
+                    framing_of_corrected(self.lens, focal, framing, size)
+                    if self.back
+                    else frame_output(lens_for_size(self.lens, size)(focal), size, keep=framing)
+                )
+        x, y = (float(value) for value in np.asarray(framing.origin))
+        return float(framing.scale), x, y
 
     def __call__(self, image: np.ndarray, focal: float | int) -> np.ndarray:
         """The corrected image, at a focal length in the lens's unit."""
@@ -130,7 +148,7 @@ def redistort_photo(
 ) -> None:
     """Apply distortion to a corrected photo, as `redistort_image`, and write it to a new file.
 
-    Arguments and errors are those of `undistort_photo`; `keep` tells how the photo was corrected.
+    Arguments and errors are those of `undistort_photo`; `keep` says how the photo was corrected.
     """
     correction = Correction(lens, _scaled(keep), interpolation, border, True, again, shown=repr(keep))
     _convert(source, target, focal, correction)
@@ -180,6 +198,27 @@ def check_target(target: Path) -> None:
         )
 
 
+def _check_framing(
+    source: str | os.PathLike[str],
+    used: tuple[float, float, float],
+    before: tuple[float, float, float],
+    shape: tuple[int, ...],
+) -> None:
+    """Refuse another framing than the one that a photo was corrected with, which may have the same size."""
+    reach = max(shape[:2])
+    apart = abs(used[0] / before[0] - 1) * reach + max(abs(used[1] - before[1]), abs(used[2] - before[2]))
+    if apart > _SAME_FRAMING:
+        raise ValueError(
+            f"{os.fspath(source)} was corrected with another framing, of scale {before[0]:.6g} and origin "
+            f"({before[1]:.6g}, {before[2]:.6g}) px. Give the argument keep that it was corrected with; of "
+            "photos that were corrected together, give all of them."
+        )
+
+
+_SAME_FRAMING = 0.05
+"""px by which framings may differ: by rounding."""
+
+
 def not_kept(source: str | os.PathLike[str], suffix: str, lost: list[str]) -> str:
     """A sentence about what a photo loses."""
     return f"Not kept of {os.fspath(source)} in a {suffix} file: {', '.join(lost)}."
@@ -198,10 +237,13 @@ def corrected_photo(
         known = metadata_focal(photo.pages[0][1]) if correction.lens.focal_unit == "mm" else None
         focal = _known(known, source, correction.lens)
     work = correction.work(source, focal)
-    pages = [
-        (correction(image, focal), marked(metadata, correction.geometry, work))
-        for image, metadata in photo.pages
-    ]
+    pages: list[tuple[np.ndarray, Metadata]] = []
+    for image, metadata in photo.pages:
+        framing, before = correction.framing(image, focal), framing_of(metadata)
+        if correction.back and before is not None:
+            _check_framing(source, framing, before, image.shape)
+        mark = marked(metadata, correction.geometry, work, None if correction.back else framing)
+        pages.append((correction(image, focal), mark))
     with _blamed(source):
         content, lost = encoded_photo(pages, suffix)
     mark_alone = not any(metadata.xmp for _, metadata in photo.pages)

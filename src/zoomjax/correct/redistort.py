@@ -71,6 +71,11 @@ def redistort_image(
     return result
 
 
+def framing_of_corrected(lens: ZoomLens, focal: float | int, keep: str, size: tuple[int, int]) -> Framing:
+    """The framing of a corrected image of a size, as `redistort_image` takes it."""
+    return _geometry(lens, focal, keep, size)[1]
+
+
 def _geometry(
     distortion: Distortion | ZoomLens,
     focal: float | int | None,
@@ -135,7 +140,7 @@ def redistortion_map(
         rows = slice(top, min(top + _ROWS, plane.size[1]))
         down = (np.arange(rows.start, rows.stop) * step[1] + offset[1] - centre[1])[:, None] / scale
         squared = across**2 + down**2
-        corrected = distortion.family.correct((across + 0 * down, down + 0 * across), squared, k)
+        corrected = distortion.distortion_model.correct((across + 0 * down, down + 0 * across), squared, k)
         seen = squared <= fold**2
         for axis, (out, values) in enumerate(zip((x, y), corrected, strict=True)):
             pixels = (centre[axis] + scale * np.asarray(values) - origin[axis]) * zoom

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 
@@ -62,6 +62,17 @@ class CorrectedVideo:
     not_kept: tuple[str, ...] = ()
 
 
+class _Others(TypedDict, total=False):
+    """Other arguments of `undistort_video`, by name."""
+
+    interpolation: str
+    border: str
+    encoder: str | None
+    options: dict[str, str] | None
+    progress: Callable[[int, int], None]
+    executor: Executor | None
+
+
 def undistort_video(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
@@ -107,8 +118,8 @@ def undistort_video(
             outside of the fitted range; the track goes on after the video's end; the lens is for another
             size, or folds within the frames.
     """
-    how = _Work(lens, keep, interpolation, border, encoder, options, back=False)
-    return _convert(source, target, focal, how, progress, executor)
+    how = _Work(lens, keep, interpolation, border, encoder, options, progress, executor)
+    return _convert(source, target, focal, how)
 
 
 def redistort_video(
@@ -118,31 +129,27 @@ def redistort_video(
     lens: ZoomLens,
     focal: float | int | FocalTrack,
     keep: str | Framing = "same",
-    interpolation: str = "linear",
-    border: str = "constant",
-    encoder: str | None = None,
-    options: dict[str, str] | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-    executor: Executor | None = None,
+    **others: Unpack[_Others],
 ) -> CorrectedVideo:
     """Apply distortion to a corrected video, as `redistort_image`, and write it to a new file.
 
-    Arguments, result and errors are those of `undistort_video`; `keep` tells how the video was corrected.
+    Arguments, result and errors are those of `undistort_video`; `keep` says how the video was corrected.
     """
-    how = _Work(lens, keep, interpolation, border, encoder, options, back=True)
-    return _convert(source, target, focal, how, progress, executor)
+    return _convert(source, target, focal, _Work(lens, keep, back=True, **others))
 
 
 class _Work(NamedTuple):
-    """What is done to a video: arguments of `undistort_video`, and whether distortion is applied."""
+    """What is done to a video, and where: arguments of `undistort_video`, and whether it is its inverse."""
 
     lens: ZoomLens
     keep: str | Framing
-    interpolation: str
-    border: str
-    encoder: str | None
-    options: dict[str, str] | None
-    back: bool
+    interpolation: str = "linear"
+    border: str = "constant"
+    encoder: str | None = None
+    options: dict[str, str] | None = None
+    progress: Callable[[int, int], None] = lambda done, total: None
+    executor: Executor | None = None
+    back: bool = False
 
 
 def _convert(
@@ -150,9 +157,8 @@ def _convert(
     target: str | os.PathLike[str],
     focal: float | int | FocalTrack,
     how: _Work,
-    progress: Callable[[int, int], None],
-    executor: Executor | None,
 ) -> CorrectedVideo:
+    progress, executor = how.progress, how.executor
     target = Path(target)
     if target.suffix.lower() not in CONTAINER:
         raise ValueError(

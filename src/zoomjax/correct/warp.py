@@ -19,7 +19,7 @@ from jaxtyping import Array, DTypeLike, Float, Num, ScalarLike
 from .._core.products import EXACT
 from .._core.types import traced
 from ..models.distortion import Distortion
-from ..models.family import AbstractRadial
+from ..models.distortion_model import AbstractRadial
 from ..models.sizes import check_channels_last, check_image_size, check_one_image, checked_distortion
 from ._sampling import KERNELS, mixes_border, sample
 from .framing import Framing, check_framing
@@ -81,8 +81,10 @@ def warp_image(
         raise ValueError(
             f"Argument image must have shape (height, width, ...) with pixels, but it is {image.shape}."
         )
-    if image.dtype == bool:
-        raise ValueError("Argument image must hold numbers, but its dtype is bool: image.astype(float).")
+    if image.dtype == bool or jnp.issubdtype(image.dtype, jnp.complexfloating):
+        raise ValueError(
+            f"Argument image must hold real numbers, but its dtype is {image.dtype}: image.astype(float)."
+        )
     if interpolation not in KERNELS:
         raise ValueError(
             f'Argument interpolation must be "linear" or "cubic", but it is {interpolation!r}.'
@@ -146,8 +148,8 @@ def sample_positions(
     Newton's method on the ratio q of the radii, ``q L(τ q²) = 1`` for squared corrected radii τ: started
     from a polynomial, iterated together until it has arrived on a sample of radii, and a last time.
     """
-    family = distortion.family
-    if not isinstance(family, AbstractRadial):
+    distortion_model = distortion.distortion_model
+    if not isinstance(distortion_model, AbstractRadial):
         return _exact_positions(distortion, framing, dtype)
     k, centre, scale, origin, zoom = (
         jnp.asarray(leaf, dtype)
@@ -164,9 +166,9 @@ def sample_positions(
     y = ((origin[1] + jnp.arange(height, dtype=dtype) / zoom) - centre[1]) / scale
     squared = x[None, :] ** 2 + y[:, None] ** 2
     fixed = jax.lax.stop_gradient((k, squared, scale))
-    ratio, seen = _arrived_ratio(family, *fixed)
+    ratio, seen = _arrived_ratio(distortion_model, *fixed)
     # Where nothing is seen for a NaN in k, as beyond a lens's focal range, it is no part of derivatives.
-    ratio = _ratio(family, ratio, jnp.where(seen, squared, 0), jnp.where(jnp.isfinite(k), k, 0))
+    ratio = _ratio(distortion_model, ratio, jnp.where(seen, squared, 0), jnp.where(jnp.isfinite(k), k, 0))
     return (
         jnp.where(seen, centre[0] + scale * x[None, :] * ratio, _OFF),
         jnp.where(seen, centre[1] + scale * y[:, None] * ratio, _OFF),
@@ -186,36 +188,36 @@ def _exact_positions(distortion, framing, dtype):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _ratio(family, near, squared, k):
+def _ratio(distortion_model, near, squared, k):
     """The ratio q, by one Newton step from near to it."""
-    value, slope = _equation(family, near, squared, k)
+    value, slope = _equation(distortion_model, near, squared, k)
     return near - value / slope
 
 
 @_ratio.defjvp
-def _ratio_jvp(family, primals, tangents):
+def _ratio_jvp(distortion_model, primals, tangents):
     """By the implicit function theorem at the solution, itself differentiated for the next order."""
-    q, (_, squared, k) = _ratio(family, *primals), primals
-    value_dot = jax.jvp(lambda *at: _equation(family, q, *at)[0], (squared, k), tangents[1:])[1]
-    return q, -value_dot / _equation(family, q, squared, k)[1]
+    q, (_, squared, k) = _ratio(distortion_model, *primals), primals
+    value_dot = jax.jvp(lambda *at: _equation(distortion_model, q, *at)[0], (squared, k), tangents[1:])[1]
+    return q, -value_dot / _equation(distortion_model, q, squared, k)[1]
 
 
-def _equation(family, q, squared, k):
+def _equation(distortion_model, q, squared, k):
     """``q L(τ q²) - 1`` and its derivative with respect to q, kept off zero."""
-    value, slope = family.equation(q, squared * q * q, 1, k)
+    value, slope = distortion_model.equation(q, squared * q * q, 1, k)
     return value, jnp.maximum(slope, jnp.finfo(slope.dtype).eps)
 
 
-def _arrived_ratio(family, k, squared, scale):
+def _arrived_ratio(distortion_model, k, squared, scale):
     """The ratio q, at most one Newton step from its solution, and which τ have one."""
-    limit = family.limit(k)
+    limit = distortion_model.monotone_radius(k)
     farthest = jnp.sqrt(jnp.max(squared))
-    reach = family.reach(k, limit)
+    reach = distortion_model.reach(k, limit)
     end = jnp.minimum(farthest, reach)
-    top = end * family.ratio(end * end, k, limit)[0]
+    top = end * distortion_model.ratio(end * end, k, limit)[0]
     # Exact pairs of radii, and the least-squares polynomial through them, in Chebyshev's basis.
     r = top * jnp.sin(jnp.linspace(0, jnp.pi / 2, 65, dtype=k.dtype)[1:])
-    rho = r * family.factor(r * r, k)
+    rho = r * distortion_model.factor(r * r, k)
     v = 2 * (rho / rho[-1]) ** 2 - 1
     angle = jnp.arccos(jnp.clip(v, -1, 1))
     design = jnp.cos(jnp.outer(angle, jnp.arange(_DEGREE + 1, dtype=k.dtype)))
@@ -227,7 +229,7 @@ def _arrived_ratio(family, k, squared, scale):
         return _chebyshev(powers, jnp.clip(2 * squared / bound - 1, -1, 1))
 
     def step(q, squared):
-        value, slope = _equation(family, q, squared, k)
+        value, slope = _equation(distortion_model, q, squared, k)
         return q - value / slope
 
     def unfinished(state):
@@ -248,7 +250,7 @@ def _arrived_ratio(family, k, squared, scale):
     late = seen & ~(move <= _TOLERANCE)
 
     def replaced(state):
-        exact, found = family.ratio(jnp.where(late, squared, 0), k, limit)
+        exact, found = distortion_model.ratio(jnp.where(late, squared, 0), k, limit)
         return jnp.where(late, jnp.where(found, exact, jnp.nan), state[0]), False
 
     ratio, _ = jax.lax.while_loop(lambda state: state[1], replaced, (ratio, jnp.any(late)))
@@ -267,4 +269,6 @@ def _chebyshev(coefficients, v):
 def _rounded(values, dtype):
     """Floating values as integers of a dtype."""
     limits = jnp.iinfo(dtype)
-    return jnp.clip(jnp.round(values), limits.min, limits.max).astype(dtype)
+    most = values.dtype.type(limits.max)  # of 32 bits it may be rounded up, beyond the largest
+    most = np.nextafter(most, 0, dtype=most.dtype) if most > limits.max else most
+    return jnp.clip(jnp.round(values), limits.min, most).astype(dtype)

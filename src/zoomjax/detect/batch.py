@@ -97,7 +97,7 @@ def detect(
             reported as a problem. 0: detect in this process, without this protection.
         cache: folder of cached detections by the same detector; None: no cache. A detector of one's own is
             the same while its settings and the file that defines it are.
-        executor: in place of `workers`, any executor of `concurrent.futures`: a task an image. Its workers
+        executor: instead of `workers`, any executor of `concurrent.futures`: a task an image. Its workers
             read the images, and the cache, by the same paths; only lines come back. There is no limit of
             time.
 

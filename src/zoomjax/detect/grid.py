@@ -99,7 +99,8 @@ class GridDetector(AbstractDetector):
     ) -> Float[np.ndarray, "row column 2"] | None:
         """The nodes of the grid, px, or None if there is none.
 
-        Rows run to the right, columns downwards. Corners and dots that are not seen are NaN.
+        Rows run to the right, columns downwards; or both the other way, where a checkerboard shows itself
+        upside down (see `find_checkerboard`). Corners and dots that are not seen are NaN.
         """
         grey = _grey(image)
         best, whole = _checkerboard(grey)
@@ -121,7 +122,10 @@ def find_checkerboard(
 
     Returns:
         At least 3 x 3 corners; rows run to the right, columns downwards. NaN where no corner is seen: a
-        part of the board may be hidden, or outside of the image.
+        part of the board may be hidden, or outside of the image. A board with an odd number of rows and an
+        even one of columns, or the other way round, looks different upside down: its corners are in the
+        order in which the first square, between the first corners of the first two rows, is dark. So they
+        are the same corners of the board in all photos.
     """
     return _checkerboard(_grey(image))[0]
 
@@ -130,7 +134,11 @@ def _checkerboard(grey: np.ndarray) -> tuple[np.ndarray | None, bool]:
     """As `find_checkerboard`, and whether it has grown and is whole."""
     small, reduced = shrunk(grey, _LONGEST)
     best, whole = _board(small)
-    return None if best is None else _upright((best + 0.5) / reduced - 0.5), whole
+    if best is None:
+        return None, whole
+    best = _upright(best)
+    best = best[::-1, ::-1] if _is_upside_down(small, best) else best
+    return (best + 0.5) / reduced - 0.5, whole
 
 
 def find_dots(
@@ -252,16 +260,31 @@ def _search(grey: np.ndarray, size: tuple[int, int], flags: int) -> np.ndarray |
 
 def _alternates(grey: np.ndarray, grid: np.ndarray) -> bool:
     """Whether the squares between the corners are dark and bright in turn."""
-    middle = (grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1] + grid[:-1, :-1]) / 4
-    x, y = np.moveaxis(middle.astype(np.float32), -1, 0)
-    bright = cv2.remap(grey, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_LINEAR).astype(
-        float
-    )
+    bright = _squares(grey, grid)
     odd = np.indices(bright.shape).sum(axis=0) % 2 == 1
     rises = [bright[1:] > bright[:-1], bright[:, 1:] > bright[:, :-1]]
     as_odd = [rises[0] == odd[1:], rises[1] == odd[:, 1:]]
     share = float(np.mean(np.concatenate([part.ravel() for part in as_odd])))
     return max(share, 1 - share) >= _ALTERNATE
+
+
+def _squares(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """How bright the squares between the corners are; NaN where a corner is not seen."""
+    middle = (grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1] + grid[:-1, :-1]) / 4
+    x, y = np.moveaxis(np.nan_to_num(middle).astype(np.float32), -1, 0)
+    bright = cv2.remap(grey, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_LINEAR)
+    return np.where(np.isfinite(middle[..., 0]), bright.astype(float), np.nan)
+
+
+def _is_upside_down(grey: np.ndarray, grid: np.ndarray) -> bool:
+    """Whether the first square of a board is bright, where another one would be first if it was turned."""
+    if sum(grid.shape[:2]) % 2 == 0:
+        return False
+    bright = _squares(grey, grid)
+    even = np.indices(bright.shape).sum(axis=0) % 2 == 0
+    seen = np.isfinite(bright)
+    first, second = (bright[seen & of] for of in (even, ~even))
+    return bool(len(first) and len(second) and first.mean() > second.mean())
 
 
 def _upright(grid: np.ndarray) -> np.ndarray:

@@ -35,7 +35,7 @@ class Source:
         path: the file, or None for a frame of a video.
         image: the frame's pixels, or None.
         focal: the focal length that a video's track gives.
-        bend: how bent the image is, as `Edges.bend`, where other photos have told.
+        bend: how bent the image is, as `Edges.bend`, where other photos have shown it.
     """
 
     name: str

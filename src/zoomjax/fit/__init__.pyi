@@ -11,11 +11,11 @@ from .centre import fit_centre as fit_centre
 from .centre import fit_frame_centres as fit_frame_centres
 from .compiled import cache_compiled as cache_compiled
 from .concatenation import concatenate as concatenate
+from .distortion_models import compress_for as compress_for
+from .distortion_models import with_distortion_model as with_distortion_model
 from .energy import frame_energy as frame_energy
 from .energy import global_energy as global_energy
 from .energy import residuals as residuals
-from .family_lines import compress_family as compress_family
-from .family_lines import with_family as with_family
 from .focal_fit import FocalFit as FocalFit
 from .focal_fit import fit_focal as fit_focal
 from .focal_lengths import with_focal_sigma as with_focal_sigma

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.zoom import AbstractPriorZoom, AbstractZoom, with_parameters
 from ._board_schur import Rows, Unknowns
 from ._board_shape import Basis, shape_of
@@ -26,7 +26,7 @@ LOSS = 7.0
 than the noise: a photo is not to lose its weight for that, and a corner that is mistaken is."""
 
 _PIN = 1e4
-"""Weight of what is held: the log f of padding, and a centre that is given."""
+"""Weight of what is held: the log f of zooms without photos, as of padding, and a centre that is given."""
 
 
 class Data(eqx.Module):
@@ -69,7 +69,7 @@ class Model(eqx.Module):
         log_focal: of each zoom.
         zoom: the zoom model.
         offset: of the centre, half image diagonals.
-        family: the distortion model.
+        distortion_model: the distortion model.
     """
 
     rotation: Float[Array, "photo 3 3"]
@@ -79,7 +79,7 @@ class Model(eqx.Module):
     log_focal: Float[Array, "zoom"]
     zoom: AbstractZoom
     offset: Float[Array, "2"]
-    family: AbstractFamily
+    distortion_model: AbstractDistortionModel
 
 
 class Stage(NamedTuple):
@@ -140,7 +140,7 @@ def moved(model: Model, steps: Unknowns) -> Model:
         log_focal=model.log_focal + log_focal,
         zoom=with_parameters(model.zoom, jax.tree.map(jnp.add, model.zoom.parameters, parameters)),
         offset=model.offset + offset,
-        family=model.family,
+        distortion_model=model.distortion_model,
     )
 
 
@@ -159,7 +159,13 @@ def residuals_of(
         def corner(point, place):
             ahead = product(rotation, place) + position
             return view_residual(
-                point, focal[zoom], coefficients[zoom], model.offset, ahead, model.family, data.scale
+                point,
+                focal[zoom],
+                coefficients[zoom],
+                model.offset,
+                ahead,
+                model.distortion_model,
+                data.scale,
             )
 
         return jnp.where(there[:, None], jax.vmap(corner)(seen, places), 0)
@@ -187,10 +193,11 @@ def scaled_steps(unknowns: Unknowns, data: Data, model: Model, stage: Stage) -> 
 
 def known_rows(data: Data, model: Model, stage: Stage) -> tuple[Array, Array, Array]:
     """What is known beforehand of photos' own bends, of the shape, and of the lens."""
-    padding = jnp.arange(len(model.log_focal)) >= data.zooms
+    seen = jnp.zeros(len(model.log_focal)).at[data.zoom].add(1.0 * jnp.any(data.there, axis=1)) > 0
+    held = model.log_focal - jax.lax.stop_gradient(model.log_focal)  # where it is, of one that nobody sees
     rows = [
         data.smooth @ model.log_focal,
-        jnp.where(padding, _PIN * model.log_focal, 0),
+        jnp.where(seen, 0, _PIN * held),
         model.offset / data.centre_std,
         ravel_pytree(model.zoom.parameters)[0] * 1e-3,  # so that none is free where nothing tells it
     ]

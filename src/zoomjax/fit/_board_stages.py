@@ -47,6 +47,8 @@ _FLAT = 1e-9
 
 _MOST_STEPS = 40  # of a stage
 
+_NOTHING = 1e-9  # of what the parameter told best is told: this much is nothing
+
 
 class Described(NamedTuple):
     """What is known of a fit.
@@ -173,7 +175,7 @@ def described(
     rows = rows._replace(views=missed / stage.noise)
     structure = _structure(data, units, stage)
     normal = reduced(jacobian, rows, zeros, structure, jnp.asarray(0.0))
-    lens, of_boards = _of_photos(normal, structure)
+    lens, of_boards = _of_photos(normal, structure, _alone(data, len(normal.lens)))
     own = ravel_pytree(units.lens)[0]
     variance = jax.vmap(structure.basis.variance)(of_boards)
     inlier = data.there & (squared < 9)  # beyond, the loss nearly ignores a corner
@@ -188,7 +190,9 @@ def described(
         missed=missed,
         inlier=inlier,
         noise=stage.noise * jnp.sqrt(free),
-        certificate=certificate_of(model.zoom, centre, focal_range, size, family=model.family),
+        certificate=certificate_of(
+            model.zoom, centre, focal_range, size, distortion_model=model.distortion_model
+        ),
     )
 
 
@@ -197,16 +201,20 @@ def _structure(data, units, stage):
     return Structure(data.basis.scaled(stage.free * units.shape[0, 0]), bend, data.board, data.members)
 
 
-def _of_photos(normal, structure):
+def _of_photos(normal, structure, alone):
     """Covariances of the lens and of the shapes: photos err each by itself, their corners together.
 
-    Shapes are eliminated from the matrix and from each photo's score; both are then in parameters in which
-    the matrix is the identity, as `of_clusters` takes them.
+    Shapes are eliminated from the matrix and from each photo's score; and then what a photo has `alone`,
+    its focal length where no other is of its zoom: the fit leaves it no score in that, which would say that
+    nothing is uncertain. What is left is in parameters in which the matrix is the identity, as
+    `of_clusters` takes them; how much larger it finds their covariance than that of independent corners
+    holds for what photos have alone, too.
     """
     photos, functions = normal.photos, structure.basis.size
     gain = solved_boards(normal.shape, normal.mixed)  # shapes follow the lens by its negative
     matrix = normal.lens - jnp.einsum("bfi,bfj->ij", normal.mixed, gain)
-    back = jnp.linalg.inv(jnp.linalg.cholesky(matrix))
+    matrix, own, to_all = _shared(matrix, alone)
+    back = jnp.linalg.inv(jnp.linalg.cholesky(matrix)) @ to_all.T
     along = gain[structure.board]
     score = photos.scores[:, functions:] - jnp.einsum("pfi,pf->pi", along, photos.scores[:, :functions])
     moved = jax.vmap(structure.basis.moved)(along)
@@ -218,13 +226,36 @@ def _of_photos(normal, structure):
     leverage = jnp.einsum("pnri,pnrj->pij", moved, moved)
     leverage = leverage - jnp.einsum("pci,pcj->pij", white(photos.border), white(photos.solved))
     score = score @ back.T
-    numbers = 2.0 * len(matrix) * jnp.sum(jnp.any(score != 0, axis=1))
-    covariance = of_clusters(score, leverage, leverage, numbers - len(matrix))
+    there = jnp.sum(jnp.any(score != 0, axis=1))
+    covariance = of_clusters(score, leverage, leverage, (2.0 * there - 1) * jnp.sum(~alone))
     independent = jnp.trace(jnp.sum(leverage, axis=0))
     size = jnp.maximum(jnp.trace(covariance) / jnp.where(independent > 0, independent, 1), 1)
     # What is known beforehand draws to its mean: by how much, in the mean.
     prior = normal.prior_lens + jnp.einsum("bfi,bf,bfj->ij", gain, normal.prior_shape, gain)
-    lens = back.T @ (covariance + back @ prior @ back.T) @ back
+    inverse = back.T @ back + own
+    lens = back.T @ covariance @ back + size * own + inverse @ prior @ inverse
     identity = jnp.broadcast_to(jnp.eye(functions), normal.shape.shape)
     shape = solved_boards(normal.shape, identity) * size + gain @ lens[None] @ gain.swapaxes(1, 2)
     return lens, shape
+
+
+def _alone(data, size):
+    """Which parameters of the lens only one photo has: log f of its zoom."""
+    photos = jnp.any(data.there, axis=1)
+    counts = jnp.zeros(len(data.smooth), int).at[data.zoom].add(photos)
+    return jnp.zeros(size, bool).at[: len(counts)].set(counts == 1)
+
+
+def _shared(matrix, alone):
+    """The matrix without what photos have alone, the inverse of their block, and how they follow the rest.
+
+    Of the same size: the matrix is the identity where they were, and the inverse is 0 elsewhere. A photo
+    whose corners are all outliers tells nothing: its variance is next to infinite, without harm to others.
+    """
+    both, size = alone[:, None] & alone[None], jnp.diag(matrix)
+    least = jnp.where(alone, _NOTHING * jnp.max(size), 1)
+    block = jnp.where(both, matrix, 0) + jnp.diag(least)
+    follow = jnp.linalg.solve(block, jnp.where(alone[:, None] & ~alone[None], matrix, 0))
+    to_all = jnp.diag(1.0 * ~alone) - follow
+    shared = to_all.T @ matrix @ to_all + jnp.diag(1.0 * alone)
+    return shared, jnp.where(both, jnp.linalg.inv(block), 0), to_all

@@ -11,10 +11,10 @@ from .._core.programs import program
 from ..focal.estimate import estimate_of
 from ..focal.homography import homography, matrix_of
 from ..lines.lines import Lines
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.zoom import AbstractZoom, with_parameters
 from ._views import corrected
-from .family_lines import compress_family
+from .distortion_models import compress_for
 from .frames import fit_frames
 
 _UNCERTAIN = 0.3
@@ -50,7 +50,7 @@ def coefficients_of(
     zoom: Int[np.ndarray, "photo"],
     image_size: tuple[int, int],
     centre: Float[np.ndarray, "2"],
-    family: AbstractFamily,
+    distortion_model: AbstractDistortionModel,
     terms: int,
     zooms: int,
 ) -> Float[np.ndarray, "zoom size"]:
@@ -64,9 +64,11 @@ def coefficients_of(
                 frame.append(number)
     shown, frame = np.unique(frame, return_inverse=True)
     made = Lines.from_ragged(lines, frame, np.arange(1.0, len(shown) + 1), image_size=image_size)
-    small = compress_family(made.about(centre), family, terms=terms)
-    coefficients = np.zeros((zooms, family.size(terms)))
-    coefficients[shown] = fit_frames(small, family=family, terms=terms, throw=False).coefficients
+    small = compress_for(made.about(centre), distortion_model, terms=terms)
+    coefficients = np.zeros((zooms, distortion_model.num_coefficients(terms)))
+    coefficients[shown] = fit_frames(
+        small, distortion_model=distortion_model, terms=terms, throw=False
+    ).coefficients
     return coefficients
 
 
@@ -78,7 +80,7 @@ def homographies(
     zoom: Int[Array, "photo"],
     places: Float[Array, "corner 2"],
     coefficients: Float[Array, "zoom size"],
-    family: AbstractFamily,
+    distortion_model: AbstractDistortionModel,
     scale: float,
 ) -> tuple[Float[Array, "photo 3 3"], Float[Array, "zoom"], Float[Array, "zoom"]]:
     """The homography of each photo, corrected, in half image diagonals; f of each zoom there, and its std.
@@ -87,7 +89,7 @@ def homographies(
     """
 
     def straight(point, k):
-        return corrected(point, k, jnp.zeros(2), family, scale) / scale
+        return corrected(point, k, jnp.zeros(2), distortion_model, scale) / scale
 
     def photo(seen, there, k):
         count = jnp.maximum(jnp.sum(there), 1)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..lines.free_centre import AnyCentreLines
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.zoom import AbstractZoom, with_parameters
 from ._motion_start import Path, rotation_vector, shrunk_ray, turned
 from ._schur import Unknowns
@@ -133,7 +133,7 @@ class Model(eqx.Module):
         shift: of the centre's offset; None if there is none.
         readout: time from the first row to the last, in frames.
         speed: of log f and of the rotation, by which rows differ. Fixed while a stage lasts.
-        family: the distortion model.
+        distortion_model: the distortion model.
         levers: of the tracks; None if all points are seen as if they were far away.
     """
 
@@ -142,7 +142,7 @@ class Model(eqx.Module):
     shift: AbstractZoom | None
     readout: Float[Array, ""]
     speed: Speed
-    family: AbstractFamily
+    distortion_model: AbstractDistortionModel
     levers: Levers | None = None
 
 
@@ -227,7 +227,7 @@ def moved(model, steps):
         shift=None if model.shift is None else with_parameters(model.shift, offsets),
         readout=readout,
         speed=model.speed,
-        family=model.family,
+        distortion_model=model.distortion_model,
         levers=levers,
     )
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from .._core.types import AnyArray, traced
 from ..lines.free_centre import AnyCentreLines, compress_any_centre
 from ..lines.lines import Lines
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.requirements import check
 from ..models.zoom import AbstractZoom
 from ..tracks.tracks import Tracks
@@ -46,7 +46,7 @@ class Asked(NamedTuple):
     """What is fitted."""
 
     zoom: AbstractZoom
-    family: AbstractFamily
+    distortion_model: AbstractDistortionModel
     terms: int
     shift: AbstractZoom | None
     readout: float | int | None
@@ -80,7 +80,9 @@ def problem_of(given: Given, asked: Asked) -> Problem:
     shot = _shots(track, moment, tracks.frames)
     frames = bucket(tracks.frames)
     more = frames - tracks.frames
-    lines, line_frame = _ready_lines(given, frames, asked.family, asked.family.size(asked.terms))
+    lines, line_frame = _ready_lines(
+        given, frames, asked.distortion_model, asked.distortion_model.num_coefficients(asked.terms)
+    )
     block = _block(track, moment, frames)
     piece = _pieces(track, moment, block)
     structure = structure_of(piece, moment, frames, block, line_frame=line_frame)
@@ -147,14 +149,14 @@ def _known_readout(readout):
     return readout, _TOLD
 
 
-def _ready_lines(given, padded_frames, family, size):
+def _ready_lines(given, padded_frames, distortion_model, size):
     """Compressed lines, padded to one of few numbers of lines, and their frames among so many."""
     lines, line_frames, tracks = given.lines, given.line_frames, given.tracks
     if lines is None:
         if line_frames is not None:
             raise ValueError("Argument line_frames is for argument lines, which is not given.")
         return None, np.zeros(0, int)
-    check("fit_motion with lines", family=family)
+    check("fit_motion with lines", distortion_model=distortion_model)
     if lines.image_size != tracks.image_size:
         raise ValueError(
             f"Argument lines is of images of {lines.image_size} px, but the tracks are of "
@@ -168,7 +170,7 @@ def _ready_lines(given, padded_frames, family, size):
             f"{len(lines.focal)} frames of the lines is, and it does not."
         )
     middle = (np.array(tracks.image_size) - 1) / 2
-    terms = family.expansion_terms(size)
+    terms = distortion_model.expansion_terms(size)
     small = compress_any_centre(lines.about(middle), terms) if isinstance(lines, Lines) else lines
     if not np.allclose(small.centre, middle):
         raise ValueError("Argument lines must be compressed about the centre of the image, and it is not.")

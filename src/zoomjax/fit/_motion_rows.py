@@ -72,7 +72,7 @@ def residuals_of(
         ahead = turned(product(model.path.rotation[frame], model.path.rays[track]), turning)
         ahead = ahead.at[2].add(-lever[track])
         camera = jnp.exp(log_focal), coefficients, rows.offset[frame]
-        return view_residual(point, *camera, ahead, model.family, data.scale)
+        return view_residual(point, *camera, ahead, model.distortion_model, data.scale)
 
     views = jax.vmap(view)(data.points, data.structure.frame, data.structure.track)
     return jnp.where(data.there[:, None], views, 0)
@@ -110,7 +110,7 @@ def line_planes_of(data: Data, model: Model) -> Float[Array, "line 3"]:
     def plane(point, corrected_rows, frame):
         coefficients, offset = rows.coefficients[0][frame], rows.offset[frame]
         normal = line_normal(corrected_rows)
-        seen = corrected(point, coefficients, offset, model.family, data.scale)
+        seen = corrected(point, coefficients, offset, model.distortion_model, data.scale)
         across = jnp.append(normal, -normal @ seen / jnp.exp(model.path.log_focal[frame]))
         return product(model.path.rotation[frame].T, across / jnp.linalg.norm(across))
 
@@ -120,7 +120,7 @@ def line_planes_of(data: Data, model: Model) -> Float[Array, "line 3"]:
 def _corrected_lines(data, model, rows):
     """Rows with the scatter of each line's corrected points, px, and the powers that correct it."""
     far = (jnp.asarray(data.size) - 1) / 2 / data.scale
-    expand = jax.vmap(lambda k: jnp.asarray(model.family.expansion(k, far @ far)[0]))
+    expand = jax.vmap(lambda k: jnp.asarray(model.distortion_model.expansion(k, far @ far)[0]))
     frame = data.structure.line_frame
     powers = expand(rows.coefficients[0])
     return data.lines.corrected(jnp.concatenate([powers, rows.offset], axis=1)), powers[frame]
@@ -139,7 +139,7 @@ def averaged(data: Data, model: Model) -> Float[Array, "track 3"]:
 
     def direction(point, frame):
         log_focal, coefficients, turning = rows.at(frame, point)
-        straight = corrected(point, coefficients, rows.offset[frame], model.family, data.scale)
+        straight = corrected(point, coefficients, rows.offset[frame], model.distortion_model, data.scale)
         ahead = turned(jnp.concatenate([straight / jnp.exp(log_focal), jnp.ones(1)]), -turning)
         return product(model.path.rotation[frame].T, ahead) / jnp.linalg.norm(ahead)
 

@@ -66,7 +66,7 @@ _UNKNOWN_SCALE = 0.1
 """Standard deviation of log f from which the focal lengths have no scale."""
 
 
-def in_stages(data, paths, spreads, zoom, shift, family, terms, shot):
+def in_stages(data, paths, spreads, zoom, shift, distortion_model, terms, shot):
     """The fit, with a prior of the lens that widens from stage to stage: the program is the same.
 
     The first stage goes from all starts. The one that most views follow best goes on.
@@ -74,7 +74,7 @@ def in_stages(data, paths, spreads, zoom, shift, family, terms, shot):
     Args:
         data: tracks and lines.
         paths, spreads: starts, and the medians of their residuals, px.
-        zoom, shift, family, terms: as for `fit_motion`.
+        zoom, shift, distortion_model, terms: as for `fit_motion`.
         shot: number of each frame's shot.
 
     Returns:
@@ -86,8 +86,8 @@ def in_stages(data, paths, spreads, zoom, shift, family, terms, shot):
         focal = np.exp(np.asarray(path.log_focal))
         prepared = None if shift is None else shift.prepare(focal, 2)
         nothing = Speed(*2 * (jnp.zeros((len(focal), 4)),))
-        prepared_zoom = zoom.prepare(focal, family.size(terms))
-        model = Model(path, prepared_zoom, prepared, data.readout[0], nothing, family)
+        prepared_zoom = zoom.prepare(focal, distortion_model.num_coefficients(terms))
+        model = Model(path, prepared_zoom, prepared, data.readout[0], nothing, distortion_model)
         noise = Noise(spread / MEDIAN_OF_SIZE, jnp.asarray(jnp.nan)).wider(STAGES[0].wider)
         tried.append(_solved(data, *_arrays((model, noise, STAGES[0]))))
     model, noise, *_ = _best(tried, data.there)
@@ -249,11 +249,16 @@ def _described(data, model, noise, stage, result, steps):
         image_size=data.size,
         focal_unit="px",
         shift=model.shift,
-        family=model.family,
+        distortion_model=model.distortion_model,
     )
     known = jnp.min(jnp.where(unseen, jnp.inf, log_std)) < _UNKNOWN_SCALE
     certificate = certificate_of(
-        fitted.zoom, fitted.centre, fitted.focal_range, data.size, family=model.family, shift=model.shift
+        fitted.zoom,
+        fitted.centre,
+        fitted.focal_range,
+        data.size,
+        distortion_model=model.distortion_model,
+        shift=model.shift,
     )
     kept = jnp.where(inlier, jnp.sum(missed**2, axis=-1), 0)
     in_frame = [jnp.zeros(frames).at[data.structure.frame].add(leaf) for leaf in (kept, 1.0 * inlier)]

@@ -136,13 +136,16 @@ def columns(jacobian: Any, like: Unknowns) -> tuple[Rows, Rows, Rows]:
     """The Jacobian's columns of each row: by its frame, by its ray and by the lens; the last axis."""
     lens, unravel = ravel_pytree(like.lens)
     ray = slice(4, 4 + like.rays.shape[1])
-    along = jnp.eye(ray.stop + lens.size)
-    directions = Unknowns(
-        jnp.broadcast_to(along[:, None, :4], (len(along), *like.frames.shape)),
-        jnp.broadcast_to(along[:, None, ray], (len(along), *like.rays.shape)),
-        jax.vmap(unravel)(along[:, ray.stop :]),
-    )
-    out = jax.vmap(jacobian)(directions)  # at once: compiled once
+
+    def column(along):
+        frames, rays = (
+            jnp.broadcast_to(along[part], of.shape)
+            for part, of in ((slice(4), like.frames), (ray, like.rays))
+        )
+        return jacobian(Unknowns(frames, rays, unravel(along[ray.stop :])))
+
+    # One after the other: all at once take longer, as what they need does not fit a cache.
+    out = jax.lax.map(column, jnp.eye(ray.stop + lens.size))
 
     def those(part):
         return jax.tree.map(lambda leaf: jnp.moveaxis(leaf[part], 0, -1), out)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 
 CAUCHY = 2.3849
 """Of the noise: where the loss begins to flatten; of normal errors it wastes a twentieth."""
@@ -33,12 +33,12 @@ def corrected(
     point: Float[Array, "2"],
     coefficients: Float[Array, "terms"],
     offset: Float[Array, "2"],
-    family: AbstractFamily,
+    distortion_model: AbstractDistortionModel,
     scale: float,
 ) -> Float[Array, "2"]:
     """A point corrected, px about the centre of distortion, which is the principal point, too."""
     z = point / scale - offset
-    return scale * jnp.stack(family.correct((z[0], z[1]), z @ z, coefficients))
+    return scale * jnp.stack(distortion_model.correct((z[0], z[1]), z @ z, coefficients))
 
 
 def view_residual(
@@ -47,13 +47,13 @@ def view_residual(
     coefficients: Float[Array, "terms"],
     offset: Float[Array, "2"],
     ahead: Float[Array, "3"],
-    family: AbstractFamily,
+    distortion_model: AbstractDistortionModel,
     scale: float,
 ) -> Float[Array, "2"]:
     """The residual of one view, px of the image."""
 
     def straight(point):
-        return corrected(point, coefficients, offset, family, scale)
+        return corrected(point, coefficients, offset, distortion_model, scale)
 
     depth = jnp.where(ahead[2] > 0.05, ahead[2], 0.05)
     missed = straight(point) - focal * ahead[:2] / depth

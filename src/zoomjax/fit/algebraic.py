@@ -35,7 +35,9 @@ from .result import lens_of
 
 def algebraic_start(lines: AbstractLines, model: Model) -> CompressedLines | None:
     """What the algebraic estimate is made from; None for a model that has none."""
-    if not (isinstance(model.zoom, AbstractLinearZoom) and isinstance(model.family, RadialPolynomial)):
+    if not (
+        isinstance(model.zoom, AbstractLinearZoom) and isinstance(model.distortion_model, RadialPolynomial)
+    ):
         return None
     return compressed(lines, model.terms)
 
@@ -43,7 +45,7 @@ def algebraic_start(lines: AbstractLines, model: Model) -> CompressedLines | Non
 def algebraic_parameters(lines: AbstractLines, model: Model) -> Float[Array, "basis size"]:
     """The parameters of a prepared model, linear in them, that the algebraic estimate gives."""
     zoom: Any = model.zoom
-    terms, size = model.terms, model.size
+    terms, size = model.terms, model.num_coefficients
     rows = _triangle_rows(lines, terms) if isinstance(lines, CompressedLines) else _rows(lines, size)
     areas = jax.vmap(_areas)(*rows)  # (line, area, 1 + size)
     areas = lines.scale * jnp.sqrt(line_weights(lines))[:, None, None] * areas
@@ -99,7 +101,7 @@ def algebraic_zoom(
     """Estimate a zoom lens algebraically, without iterations.
 
     Args:
-        lines: the lines, or their compressed form; for another distortion model `compress_family` makes it.
+        lines: the lines, or their compressed form; for another distortion model `compress_for` makes it.
         zoom: a model that is linear in its parameters; `PolynomialZoom` of degree 2 by default. It is made
             ready anew: of a fitted one only the settings and the number of coefficients count.
         terms: the number N of coefficients: by default 2, or as many as a `zoom` with parameters has.
@@ -121,7 +123,7 @@ def algebraic_model(lines: AbstractLines, model: Model) -> Model:
 @kinds_checked
 def algebraic_frames(lines: AbstractLines, *, terms: int = 2) -> Float[Array, "frame terms"]:
     """Estimate the normalised coefficients of each frame separately; lines as of `algebraic_zoom`."""
-    model = Model(PolynomialZoom(degree=0), terms, lines.family)
+    model = Model(PolynomialZoom(degree=0), terms, lines.distortion_model)
     padded, frames = bucketed_frames(lines)
     return of_frames(_solve_frames(small_of(padded, model.terms), frames, model), lines)
 

@@ -18,9 +18,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, Num
 
 from .._core.arguments import kinds_checked
-from .._core.checks import check_above, checked_terms
+from .._core.checks import check_above
 from .._core.types import AnyArray
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel, checked_terms
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ..models.requirements import check
@@ -153,8 +153,10 @@ class BoardFit(eqx.Module):
             )
         data = data_of(given, number, len(known), np.asarray(lens.centre), _HELD, boards=boards)
         coefficients = padded_to(np.asarray(jax.vmap(lens.zoom)(self.focal)), len(data.smooth))
-        matrices, *_ = _homographies(data, coefficients, lens.family)
-        start = _model(data, matrices, np.asarray(self.focal), lens.zoom, lens.family, bucket(boards))
+        matrices, *_ = _homographies(data, coefficients, lens.distortion_model)
+        start = _model(
+            data, matrices, np.asarray(self.focal), lens.zoom, lens.distortion_model, bucket(boards)
+        )
         start = eqx.tree_at(
             lambda model: model.shape, start, padded_to(np.asarray(self.coefficients), bucket(boards))
         )
@@ -195,7 +197,7 @@ def fit_boards(
     *,
     image_size: Sequence[int],
     zoom: AbstractZoom | None = None,
-    family: AbstractFamily | None = None,
+    distortion_model: AbstractDistortionModel | None = None,
     terms: int = 2,
     centre: CentreArgument = "fit",
     board: Int[AnyArray, "photo"] | Sequence[int] | None = None,
@@ -217,7 +219,7 @@ def fit_boards(
             or of EXIF data, and need not be exact.
         image_size: width and height of the photos, px.
         zoom: the zoom model; by default `PolynomialZoom` of degree 2, or less where there are fewer zooms.
-        family: the distortion model; `RadialPolynomial` by default.
+        distortion_model: the distortion model; `RadialPolynomial` by default.
         terms: the number N of radial distortion coefficients.
         centre: of distortion, which is the principal point, too: "fit", "image", or two coordinates, px.
         board: for each photo the number of its board, from 0, if there are several of one size, or if one
@@ -249,32 +251,34 @@ def fit_boards(
     label, number = np.unique(given.label, return_inverse=True)
     zoom = PolynomialZoom(degree=min(2, len(label) - 1)) if zoom is None else zoom
     check("fit_boards", zoom=zoom)
-    family = RadialPolynomial() if family is None else family
-    terms = checked_terms(terms, family.most_terms)
+    distortion_model = RadialPolynomial() if distortion_model is None else distortion_model
+    terms = checked_terms(terms, distortion_model.most_terms)
     fitted = isinstance(centre, str) and centre == "fit"
     origin = given_centre("image" if fitted else centre, given.image_size, stacklevel=4)
     if smooth is not None:
         check_above(0, smooth=smooth)
     data = data_of(given, number, len(label), origin, _CENTRE_STD if fitted else _HELD, smooth, label)
-    lens = (given.image_size, origin, family, terms, len(label))
+    lens = (given.image_size, origin, distortion_model, terms, len(label))
     wide = padded_to(coefficients_of(given.grids, number, *lens), len(data.smooth))
-    matrices, found, std = _homographies(data, wide, family)
+    matrices, found, std = _homographies(data, wide, distortion_model)
     focal_px = filled(found[: len(label)], std[: len(label)], label) * data.scale
-    ready = zoom.prepare(focal_px, family.size(terms))
+    ready = zoom.prepare(focal_px, distortion_model.num_coefficients(terms))
     ready = through(ready, padded_to(focal_px, len(wide)), wide)
     boards = int(given.board.max()) + 1
-    start = _model(data, matrices, focal_px, ready, family, bucket(boards))
+    start = _model(data, matrices, focal_px, ready, distortion_model, bucket(boards))
     model, stage, result, steps = in_stages(data, start, flat=flat)
     fit = _described(given, data, (model, stage, result, steps), label, origin, fitted)
     return _thrown(fit) if throw else fit
 
 
-def _homographies(data, coefficients, family):
-    found = homographies(data.points, data.there, data.zoom, data.places, coefficients, family, data.scale)
+def _homographies(data, coefficients, distortion_model):
+    found = homographies(
+        data.points, data.there, data.zoom, data.places, coefficients, distortion_model, data.scale
+    )
     return found[0], *(np.asarray(of) for of in found[1:])
 
 
-def _model(data, matrices, focal_px, zoom, family, boards):
+def _model(data, matrices, focal_px, zoom, distortion_model, boards):
     """Poses from homographies, of a flat board."""
     focal = padded_to(focal_px, len(data.smooth))
     rotation, position = poses_of(matrices, focal[data.zoom] / data.scale)
@@ -286,7 +290,7 @@ def _model(data, matrices, focal_px, zoom, family, boards):
         log_focal=jnp.log(focal),
         zoom=zoom,
         offset=jnp.zeros(2),
-        family=family,
+        distortion_model=distortion_model,
     )
 
 
@@ -337,7 +341,7 @@ def _described(given, data, solved, label, origin, fitted):
         focal_range=focal_range,
         image_size=given.image_size,
         focal_unit="px",
-        family=model.family,
+        distortion_model=model.distortion_model,
     )
     determined = bool(np.isfinite(covariance).all() and log_std.max() < _UNKNOWN)
     fit = ZoomFit(

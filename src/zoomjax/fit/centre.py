@@ -25,7 +25,7 @@ from .._core.types import Coefficients, Focal
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed, bucketed_frames, of_frames
 from ..lines.lines import Lines
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.invertibility import certify
 from ..models.lens import ZoomLens
 from ..models.model import Model
@@ -126,7 +126,7 @@ def fit_centre(
     lines: AbstractLines,
     *,
     zoom: AbstractZoom | Model | None = None,
-    family: AbstractFamily | None = None,
+    distortion_model: AbstractDistortionModel | None = None,
     centre: AbstractZoom | None = None,
     terms: int | None = None,
     solver: Solver | None = None,
@@ -138,9 +138,9 @@ def fit_centre(
     Args:
         lines: the lines, or, with the same result, ``compress_any_centre(lines)``, which can be reused for
             several fits. Their `centre` is the start, and is kept if the lines do not determine another.
-        zoom, family, terms, solver, max_steps, throw: as for `fit_zoom`, whose errors also apply. The
-            distortion model must be radial; under another one than the radial polynomial every step of the
-            search goes over the points, unless the lines are compressed for any centre.
+        zoom, distortion_model, terms, solver, max_steps, throw: as for `fit_zoom`, whose errors also apply.
+            The distortion model must be radial; under another one than the radial polynomial every step of
+            the search goes over the points, unless the lines are compressed for any centre.
         centre: how the centre depends on the focal length, as any zoom model: by default
             ``PolynomialZoom(degree=0)``, one centre for all frames.
 
@@ -162,13 +162,13 @@ def fit_centre(
         >>> found.fit.lens.centre.round(1).tolist()
         [310.0, 250.0]
     """
-    lines, model = asked_for(lines, zoom, terms, family)
-    check("fit_centre", zoom=model.zoom)
+    lines, model = asked_for(lines, zoom, terms, distortion_model)
+    check("fit_centre", zoom=model.zoom, distortion_model=model.distortion_model)
     ready, given = ready_model(lines, model), lines
     lines = for_any_centre(bucketed(lines), model.terms)
     unfitted = model.zoom.parameters is None
     options = {"solver": solver, "max_steps": max_steps, "throw": throw}
-    fixed = fit_about(_about(lines, lines.centre, model), ready, algebraic=unfitted, **options)
+    fixed = fit_about(small_about(lines, lines.centre, model), ready, algebraic=unfitted, **options)
     offset = prepared_for(given, PolynomialZoom(degree=0) if centre is None else centre, 2)
     start = _both(fixed.lens.zoom, offset)
     found, each, covariance, std, determined = _search(
@@ -176,13 +176,13 @@ def fit_centre(
     )
     # Once more about these centres, for all else that is to know of a fit: the same compiled program.
     near = ready.with_zoom(found.first())
-    fit = fit_about(_about(lines, each, model), near, algebraic=False, **options)
+    fit = fit_about(small_about(lines, each, model), near, algebraic=False, **options)
     fit = _about_centres(lines, fit, found, each, covariance, determined)
     each, std = of_frames(each, given), of_frames(std, given)
     return CentreFit(of_given(fit, given), each, std, determined, fixed.rms, covariance)
 
 
-def _about(lines, centre, model):
+def small_about(lines, centre, model):
     """The lines about a centre, compressed."""
     placed = lines.about(centre)
     points = isinstance(data_of(placed), Lines)
@@ -207,7 +207,7 @@ def refit_centre(lines: AbstractLines, found: CentreFit) -> AbstractZoom:
 def fit_frame_centres(
     lines: AbstractLines,
     *,
-    family: AbstractFamily | None = None,
+    distortion_model: AbstractDistortionModel | None = None,
     terms: int = 2,
     solver: Solver | None = None,
     max_steps: int = 256,
@@ -215,9 +215,10 @@ def fit_frame_centres(
     """Fit distortion and centre of distortion of each frame separately (the paper's Figure 7).
 
     Args:
-        lines, family, terms, solver, max_steps: as for `fit_centre`.
+        lines, distortion_model, terms, solver, max_steps: as for `fit_centre`.
     """
-    lines, model = asked_for(lines, PolynomialZoom(degree=0), terms, family)
+    lines, model = asked_for(lines, PolynomialZoom(degree=0), terms, distortion_model)
+    check("fit_centre", zoom=model.zoom, distortion_model=model.distortion_model)
     padded, frames = bucketed_frames(for_any_centre(lines, model.terms))
     found = _fit_frame_centres(padded, frames, model, solver, max_steps)
     each, std, determined, fixed = found.each, found.std, found.determined, found.rms_fixed

@@ -17,7 +17,7 @@ def cache_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Keep what JAX compiles on disk, for all later processes: call it before the first fit.
 
     Data sets are padded to a few sizes, and those of one size share programs. So after some calibrations
-    later ones compile next to nothing. Where the package ``flatbuffers`` is installed, with which JAX
+    later ones compile almost nothing. Where the package ``flatbuffers`` is installed, with which JAX
     writes them, the traced programs of fits are kept, too, and later processes need not trace either. The
     command line does all this by itself. The folder is kept below 100 MB where the package ``filelock`` is
     installed, without which JAX cannot tell, and traced programs below 50 MB.
@@ -27,8 +27,8 @@ def cache_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
             Of several calls the last one counts.
 
     Returns:
-        The folder. None, and nothing is kept, if none can be written to. If JAX has been told of a folder
-        by ``JAX_COMPILATION_CACHE_DIR``, it is that one, and stays as it is.
+        The folder. None, and nothing is kept, if none can be written to. If ``JAX_COMPILATION_CACHE_DIR``
+        is set, it is that folder, which stays as it is.
 
     Example:
         >>> import tempfile, jax

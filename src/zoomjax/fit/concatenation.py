@@ -27,7 +27,7 @@ def concatenate(parts: Sequence[SomeLines]) -> SomeLines:
 
     Args:
         parts: one or more, all `Lines` or all compressed in the same way, of one camera: with the same
-            image size, unit of focal lengths, centre of distortion and family.
+            image size, unit of focal lengths, centre of distortion and distortion model.
 
     Returns:
         One set of the same kind. The lines' `number`, their position in one list, is no longer known.
@@ -67,7 +67,7 @@ def concatenate(parts: Sequence[SomeLines]) -> SomeLines:
             )
         _check_same(first, part, index)
     if isinstance(first, Problem):
-        return posed(concatenate(list(map(data_of, parts))), first.family, first.metric)  # pyright: ignore
+        return posed(concatenate(list(map(data_of, parts))), first.distortion_model, first.metric)  # pyright: ignore
     if not isinstance(first, Lines | CompressedLines | AnyCentreLines):
         raise TypeError(f"Lines of type {type(first).__name__} cannot be concatenated.")
     given: list[Any] = list(parts)
@@ -96,7 +96,7 @@ def _check_same(first: AbstractLines, other: AbstractLines, index: int) -> None:
     facts = {
         "image size": (first.image_size, other.image_size),
         "unit of focal lengths": (first.focal_unit, other.focal_unit),
-        "family": (type(first.family).__name__, type(other.family).__name__),
+        "distortion model": (type(first.distortion_model).__name__, type(other.distortion_model).__name__),
         "number of terms": (getattr(first, "terms", None), getattr(other, "terms", None)),
         "kind of lines within": (_inner(first), _inner(other)),
         "focus": tuple("None" if lines.focus is None else "given" for lines in (first, other)),

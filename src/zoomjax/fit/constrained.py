@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 
 from .._core.programs import program
 from .._core.types import traced
-from ..models.invertibility import slope_controls, stated_pieces
+from ..models.invertibility import slope_controls
 from ..models.zoom import AbstractLinearZoom, with_parameters
 from ._interior import implicit, least_squares_within
 from .energy import coefficients_by, prior_residuals, residuals
@@ -33,7 +33,7 @@ _MOST_STEPS = 200
 def refit_zoom(lines, free):
     """The best invertible model."""
     zoom = free.lens.zoom
-    if stated_pieces(zoom, free.lens.focal_range, lines.family) is None:  # there is nothing to demand
+    if not free.certificate.stated:  # there is nothing to demand
         return free, outcome_of(free)
     nothing = jax.tree.map(jnp.zeros_like, zoom.parameters)
     if not isinstance(zoom, AbstractLinearZoom):
@@ -49,12 +49,7 @@ def refit_zoom(lines, free):
             return distances if prior is None else jnp.concatenate([distances, prior])
 
         def slack(flat):
-            lens = lens_of(lines, with_parameters(zoom, unravel(flat)))
-            controls = slope_controls(
-                lens.zoom, lens.centre, lens.focal_range, lens.image_size, lens.family
-            )
-            assert controls is not None
-            return controls - LEAST_SLOPE
+            return slope_controls(lens_of(lines, with_parameters(zoom, unravel(flat)))) - LEAST_SLOPE
 
         return errors, slack
 

@@ -12,6 +12,8 @@ parameter. So it is shrunk towards the shape for independent points, by an amoun
 docs/trust.md has the measured coverage, and that of alternatives.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
@@ -25,6 +27,21 @@ from .energy import coefficients_by, counted_frames, line_weights, prior_error, 
 _ROUNDING = 64
 """Error of the corrected points without noise, in units in the last place of their mean radius."""
 
+_TELLS = 0.01
+"""A photo tells how photos scatter where noise feigns less than this part of what it says of the model."""
+
+
+class KnownErrors(NamedTuple):
+    """Errors of single photos whose size is known, as of their focal lengths.
+
+    Attributes:
+        scores: for each photo, the mean of the squares of the scores that they leave after the fit.
+        covariance: what they add to that of the parameters.
+    """
+
+    scores: Float[Array, "frame parameter parameter"]
+    covariance: Float[Array, "parameter parameter"]
+
 
 def parameter_covariance(
     lines: AbstractLines,
@@ -33,6 +50,7 @@ def parameter_covariance(
     jacobian: Float[Array, "line rows parameter"],
     extra: int = 0,
     photos: bool = True,
+    errors: KnownErrors | None = None,
 ) -> tuple[Float[Array, "parameter parameter"], Bool[Array, ""]]:
     """Covariance of the flattened parameters, and whether the lines determine them all.
 
@@ -51,6 +69,7 @@ def parameter_covariance(
         weighted, jacobian: the residuals, times the root of their weights, and their derivatives.
         extra: how many numbers the model gives after the coefficients.
         photos: whether lines of one photo may err together.
+        errors: what photos are known to err by; in the covariance, too.
     """
     energy = jnp.sum(weighted**2)
     weights = line_weights(lines)
@@ -64,7 +83,9 @@ def parameter_covariance(
     reciprocal = jnp.where(good, 1 / jnp.where(good, values, 1), 0)
     back = right.T * reciprocal[None]  # to the parameters that change the residuals by one unit
     # Of the directions that change them so, those in which noise would feign more than half of it.
-    feigned = _feigned(lines, zoom, weights, energy, extra) / size[:, None] / size[None]
+    by_noise = _feigned(lines, zoom, weights, energy, extra)
+    feigned = sum(jnp.einsum("mip,mij,mjq->pq", rows, noise, rows) for rows, noise in by_noise)
+    feigned = feigned / size[:, None] / size[None]
     shares, directions = jnp.linalg.eigh(back.T @ feigned @ back)
     doubtful = jnp.concatenate([back @ directions, right.T], axis=1)
     doubtful = doubtful / jnp.maximum(jnp.linalg.norm(doubtful, axis=0), jnp.finfo(size.dtype).tiny)[None]
@@ -85,8 +106,16 @@ def parameter_covariance(
     if photos:
         frames = lines.focal.shape[0]
         of_photos = [jax.ops.segment_sum(of, lines.frame, frames) for of in (score, leverage, share)]
-        free = terms * jnp.sum(counted_frames(lines)) - jnp.sum(good)
-        covariance = _of_whole_photos(of_photos, covariance, free, terms)
+        own = [(rows @ inverse, noise) for rows, noise in by_noise]
+        own = sum(jnp.einsum("mip,mij,mjp->m", rows, noise, rows) for rows, noise in own)
+        tells = own < _TELLS * jnp.trace(of_photos[1], axis1=1, axis2=2)
+        free = terms * jnp.sum(tells & counted_frames(lines)) - jnp.sum(good)
+        of_photos = [jnp.where(jnp.expand_dims(tells, range(1, of.ndim)), of, 0) for of in of_photos]
+        if errors is None:
+            errors = KnownErrors(jnp.zeros_like(of_photos[1]), jnp.zeros_like(covariance))
+        left = jnp.einsum("mpq,pi,qi->m", errors.scores, inverse, inverse)
+        known = jnp.sum(jnp.where(tells, left, 0)), triangle @ errors.covariance @ triangle.T
+        covariance = _of_whole_photos(of_photos, covariance, known, free, terms)
     covariance = inverse @ covariance @ inverse.T
     if (own := prior_of(zoom)) is not None:
         # The prior draws the parameters to its mean: by how much, in the mean over what it expects.
@@ -126,7 +155,7 @@ def of_clusters(score, leverage, share, scores):
     return jnp.where((nu > 0) & (c > 0), size * shape, independent)
 
 
-def _of_whole_photos(of_photos, by_line, free, terms):
+def _of_whole_photos(of_photos, by_line, known_errors, free, terms):
     """The covariance where the lines of a photo may err together, in the parameters of `of_clusters`.
 
     A bent board bends all lines of a photo alike, and a wrong focal length or a model that does not follow
@@ -136,17 +165,22 @@ def _of_whole_photos(of_photos, by_line, free, terms):
         E sum_m |g_m|^2 = sum_m tr(A_m - 2 H_m A_m + H_m C H_m),    H_m = J_m^T J_m,
 
     since the fit takes ``H_m sum_k g_k`` from each. This is exact whatever the leverages, so that it serves
-    few photos too. The ratio phi of what is found to that enlarges C where it is above 1. It has `free`
+    few photos too. `known_errors` of single photos have their mean of these squares, and their covariance:
+    both are added. The ratio phi of what is found to that enlarges C where it is above 1. It has `free`
     degrees of freedom, the coefficients that the photos would have by themselves, `terms` each, less the
     parameters; for these few, ``2 (phi - 1)/free`` is added. The shape is that of C, shrunk less towards it
     the more photos are left over, `free` by `terms`, as for lines.
+
+    Photos whose lines all lie near the centre are not counted: noise makes most of what little they say of
+    the model, of their derivatives as well as of their residuals, whose product is then no mean of zero.
+    Where the others determine the model by themselves, all that is left over would be in those.
     """
     score, leverage, share = of_photos
     length = jnp.sum(score**2, axis=1)
     own = share * (jnp.trace(by_line) / _positive(jnp.trace(jnp.sum(share, axis=0))))
     taken = jnp.einsum("mij,mji->", leverage, own)
     left = jnp.trace(jnp.sum(own, axis=0)) - 2 * taken
-    left = left + jnp.einsum("mij,jk,mki->", leverage, by_line, leverage)
+    left = left + jnp.einsum("mij,jk,mki->", leverage, by_line, leverage) + known_errors[0]
     ratio = jnp.sum(length) / _positive(left)
     known = (free > 0) & (left > 0) & (ratio > 1)
     ratio = jnp.where(known, ratio, 1)
@@ -156,7 +190,8 @@ def _of_whole_photos(of_photos, by_line, free, terms):
     by_chance = terms * (jnp.sum(total**2) + jnp.trace(total) ** 2) / _positive(free)
     shrink = jnp.clip(by_chance / _positive(apart), 0, 1)
     shape = shrink * by_line + (1 - shrink) * total / ratio
-    return jnp.where(known, (ratio + 2 * (ratio - 1) / _positive(free)) * shape, by_line)
+    enlarged = (ratio + 2 * (ratio - 1) / _positive(free)) * (shape + known_errors[1])
+    return jnp.where(known, enlarged, by_line + known_errors[1])
 
 
 def _positive(value):
@@ -165,28 +200,34 @@ def _positive(value):
 
 
 def _feigned(lines, zoom, weights, energy, extra):
-    """What the points' own noise contributes to ``J^T J`` in the mean, by parameter and parameter."""
+    """What the points' own noise contributes to ``J^T J`` in the mean, of each frame.
+
+    In two parts, of radial and of tangential coefficients: their derivatives by the parameters, and noise.
+    """
     flat, unravel = ravel_pytree(zoom.parameters)
 
     def coefficients_at(flat):
         k = coefficients_by(with_parameters(zoom, unravel(flat)), lines)
-        return lines.expansion(k[:, : k.shape[1] - extra])
+        return lines.in_powers(k[:, : k.shape[1] - extra])
 
     k, _ = coefficients_at(flat)
     terms = k.shape[1]
     order = jnp.arange(terms + 1)
     moments = lines.radial_moments(2 * terms)[:, order[:, None] + order[None]] * weights[:, None, None]
+    moments = jax.ops.segment_sum(moments, lines.frame, lines.focal.shape[0])
     # The residuals have the noise of the corrected image, shrunk by L: divide by its mean square.
-    kappa = jnp.concatenate([jnp.ones_like(k[:, :1]), k], axis=1)[lines.frame]
-    variance_in_image = energy / jnp.einsum("li,lij,lj->", kappa, moments, kappa)
+    kappa = jnp.concatenate([jnp.ones_like(k[:, :1]), k], axis=1)
+    variance_in_image = energy / jnp.einsum("mi,mij,mj->", kappa, moments, kappa)
     # Points without noise have that of their rounding, which sums over a line multiply.
     mean = jnp.sum(moments, axis=0)
     radius = lines.scale * jnp.sqrt(mean[1, 1] / _positive(mean[0, 0]))
     rounding = _ROUNDING * jnp.finfo(moments.dtype).eps * radius
     variance_in_image = jnp.maximum(variance_in_image, rounding**2)
-    by_parameter, tangential = (rows[lines.frame] for rows in jax.jacfwd(coefficients_at)(flat))
-    # (line, terms, parameter). Decentering moves points by squares of x and y: noise enters its derivative
-    # by matrices whose mean square over all directions is 12 r^2.
-    decentred = 12 * jnp.einsum("lip,l,liq->pq", tangential, moments[:, 0, 1], tangential)
-    radial = jnp.einsum("lip,lij,ljq->pq", by_parameter, moments[:, 1:, 1:], by_parameter)
-    return variance_in_image * (radial + decentred)
+    by_parameter, tangential = jax.jacfwd(coefficients_at)(flat)  # (frame, terms, parameter)
+    # Decentering moves points by squares of x and y: noise enters its derivative by matrices whose mean
+    # square over all directions is 12 r^2.
+    decentred = 12 * moments[:, 0, 1, None, None] * jnp.eye(tangential.shape[1])[None]
+    return (
+        (by_parameter, variance_in_image * moments[:, 1:, 1:]),
+        (tangential, variance_in_image * decentred),
+    )

@@ -3,9 +3,7 @@
 from ..models.zoom import AbstractZoom, PolynomialZoom
 
 DEFAULT_ZOOM = PolynomialZoom(degree=2)
-"""The paper's: with `DEFAULT_TERMS` coefficients six numbers."""
-
-DEFAULT_TERMS = 2
+"""The paper's: with two coefficients six numbers."""
 
 
 def zoom_or_default(zoom: AbstractZoom | None) -> AbstractZoom:

@@ -5,6 +5,9 @@ a change so that the gradient g of the energy stays zero (the implicit function 
 
     da = R t,    R = -(dg/da)^-1 dg/dt,    and their covariance is larger by R diag(sigma^2 / f^2) R^T.
 
+The photos of a fit that does not know of the errors scatter more than lines explain, and its covariance
+allows for that: what the errors explain of it is not counted twice.
+
 Frames meet in the energy only through their coefficients k_m = k(f_m): near the minimum it is a sum over
 frames of quadratics in k_m, found by N + 1 gradients whatever the number of frames, and all derivatives
 by a and t are those of that sum.
@@ -26,9 +29,9 @@ from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_jit
 from ..models.requirements import check
 from ..models.zoom import with_parameters
-from .covariance import parameter_covariance
+from .covariance import KnownErrors, parameter_covariance
+from .distortion_models import with_distortion_model
 from .energy import coefficients_by, linearised, prior_residuals, residuals
-from .family_lines import with_family
 from .result import ZoomFit
 from .same_camera import check_lines_of
 
@@ -51,7 +54,8 @@ def with_focal_sigma(
             the zoom whose focal length was measured once.
 
     Returns:
-        The fit with `covariance` larger, to first order in the errors.
+        The fit whose `covariance` includes them, to first order. A fit that does not know of the errors
+        allows for photos that scatter more than their lines: what the errors explain of that is taken out.
 
     Raises:
         ValueError: `focal_sigma` does not hold finite numbers of at least 0, one or one a frame; `shared`
@@ -82,7 +86,7 @@ def with_focal_sigma(
             f"Argument shared must hold a number for each of the {number} frames, but its shape is "
             f"{np.shape(together)}."
         )
-    lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
+    lines = with_distortion_model(lines, fit.lens.distortion_model).about(fit.lens.centre)
     own = (fit.lens.zoom, fit.covariance, fit.joint)
     return with_covariance(fit, *_widened_by(lines, *own, sigma, together))
 
@@ -180,35 +184,53 @@ def inverse_of(matrix):
     return jnp.linalg.pinv(matrix / size[:, None] / size[None], hermitian=True) / size[:, None] / size[None]
 
 
-def widened_by_focal(lines, zoom, covariance, joint, of_focal):
+def widened_by_focal(lines, zoom, covariance, joint, of_focal, refined=False):
     """The covariance, and that with the centre, enlarged by that of the logarithms of the focal lengths.
 
-    Wrong focal lengths also show as errors that the lines of a photo share, for which the covariance allows
-    already: only what goes beyond that is added. A fitted centre is held where it is.
+    What they explain of the scatter of the photos does not enlarge it again: nothing where they were
+    `refined`, as then the scatter is what is left. A fitted centre is held where it is; its covariance had
+    been enlarged by the same factor as that of the parameters.
     """
-    response = _response(lines, zoom)
     weighted, jacobian = linearised(lines, zoom)
-    by_line, _ = parameter_covariance(lines, zoom, weighted, jacobian, photos=False)
-    infinite = jnp.isinf(jnp.diagonal(covariance)) | jnp.isinf(jnp.diagonal(by_line))
+    errors = _errors_of_focal(lines, zoom, of_focal)
+    errors = errors._replace(scores=jnp.where(refined, 0, errors.scores))
+    none = errors._replace(covariance=jnp.zeros_like(errors.covariance))
+    before, told, after = (
+        parameter_covariance(lines, zoom, weighted, jacobian, errors=known)[0]
+        for known in (None, none, errors)
+    )
+    infinite = jnp.isinf(jnp.diagonal(covariance)) | jnp.isinf(jnp.diagonal(before))
     known = ~(infinite[:, None] | infinite[None])
-    own, by_line = (jnp.where(known, matrix, 0) for matrix in (covariance, by_line))
-    size = jnp.sqrt(jnp.maximum(jnp.diagonal(own), 0))
-    unit = jnp.where(size > 0, size, 1)
-    both = unit[:, None] * unit[None]
-    shared = _positive_part((own - by_line) / both)
-    of_focal = jnp.where(known, response @ of_focal @ response.T, 0) / both
-    more = _positive_part(of_focal - shared) * both
-    wider = jnp.where(known, covariance + more, covariance)
+    own, before, told, after = (jnp.where(known, m, 0) for m in (covariance, before, told, after))
     if joint is None:
-        return wider, None
-    number = wider.shape[0]
-    return wider, joint.at[:number, :number].add(jnp.where(known, more, 0))
+        return jnp.where(known, own + (after - before), covariance), None
+    matrix, number = jnp.einsum("lri,lrj->ij", jacobian, jacobian), own.shape[0]
+    enlarged = jnp.sum(matrix * before)
+    part = jnp.minimum(jnp.sum(matrix * told) / jnp.where(enlarged > 0, enlarged, 1), 1)
+    wider = jnp.where(known, part * own + after - told, covariance)
+    return wider, (part * joint).at[:number, :number].set(wider)
 
 
-def _positive_part(matrix):
-    """A symmetric matrix without its negative eigenvalues."""
-    values, vectors = jnp.linalg.eigh(matrix)
-    return (vectors * jnp.maximum(values, 0)[None]) @ vectors.T
+def _errors_of_focal(lines, zoom, of_focal):
+    """Focal lengths with this covariance of their logarithms, as errors of photos."""
+    flat, unravel = ravel_pytree(zoom.parameters)
+    focal = jnp.asarray(lines.focal)
+
+    def coefficients(flat, t):
+        model = with_parameters(zoom, unravel(flat))
+        return coefficients_by(model, at_focal_lengths(lines, focal * jnp.exp(t)))
+
+    still = jnp.zeros_like(focal)
+    rows = jax.jacfwd(coefficients)(flat, still)
+    k, slope = jax.jvp(lambda t: coefficients(flat, t), (still,), (jnp.ones_like(focal),))
+    response = _response(lines, zoom)
+    # Of the coefficients of a frame, from its own focal length and, by the fit, from all.
+    by_fit, covariance = rows @ (response @ of_focal).T[..., None], response @ of_focal @ response.T
+    both = by_fit * slope[:, None]
+    moved = rows @ covariance @ jnp.swapaxes(rows, 1, 2) + both + jnp.swapaxes(both, 1, 2)
+    moved = moved + jnp.diagonal(of_focal)[:, None, None] * slope[:, :, None] * slope[:, None]
+    pull = near_energy(lines, k).hessian @ rows
+    return KnownErrors(jnp.einsum("mip,mij,mjq->mpq", pull, moved, pull), covariance)
 
 
 def at_focal_lengths(lines, focal):

@@ -233,7 +233,8 @@ def posterior(lines, zoom, covariance, joint, sigma, given, kept):
     covariance = _unknown(covariance, free[:number])
     if joint is not None:
         joint = _unknown(joint, jnp.pad(free[:number], (0, joint.shape[0] - number)))
-    return std, *widened_by_focal(lines, zoom, covariance, joint, of_focal), ~jnp.any(free[:number])
+    wider = widened_by_focal(lines, zoom, covariance, joint, of_focal, refined=~kept)
+    return std, *wider, ~jnp.any(free[:number])
 
 
 def _free(matrix):

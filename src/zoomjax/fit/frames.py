@@ -12,24 +12,27 @@ from .._core.programs import light_program, program
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_frames
 from ..lines.lines import Lines
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.zoom import PolynomialZoom
 from ._least_squares import Solver, default_solver
 from .algebraic import algebraic_parameters, algebraic_start
+from .centre import fit_frame_centres
 from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
 from .minimise import minimise
 from .prepare import asked_for, ready_model
-from .problem import about_own_centre, data_of
+from .problem import data_of
 from .result import FrameFits, collected, described_fit, each_of_given, is_invertible, outcome_of, thrown
+from .zoom import CentreArgument, about_centre, is_to_be_fitted
 
 
 @kinds_checked
 def fit_frames(
     lines: AbstractLines,
     *,
-    family: AbstractFamily | None = None,
+    distortion_model: AbstractDistortionModel | None = None,
     terms: int = 2,
+    centre: CentreArgument | None = None,
     solver: Solver | None = None,
     max_steps: int = 256,
     invertible: bool = True,
@@ -38,13 +41,21 @@ def fit_frames(
     """Fit the distortion of each frame separately (eq. 3 and 6), for comparison with a zoom model.
 
     Args:
-        lines, family, terms, solver, max_steps, invertible, throw: as for `fit_zoom`, frame by frame.
+        lines, distortion_model, terms, solver, max_steps, invertible, throw: as for `fit_zoom`, frame by
+            frame.
+        centre: as for `fit_zoom`, but with "fit" each frame has its own, where its lines determine one:
+            `fit_frame_centres(...).each`.
 
     Raises:
         RuntimeError: the solver failed on some frame, and `throw` is set.
     """
-    placed, model = asked_for(lines, PolynomialZoom(degree=0), terms, family)
-    lines = about_own_centre(placed)
+    if is_to_be_fitted(centre, invertible=invertible):
+        found = fit_frame_centres(
+            lines, distortion_model=distortion_model, terms=terms, solver=solver, max_steps=max_steps
+        ).each
+        return thrown(found, outcome_of(found), throw) if throw else found
+    placed, model = asked_for(lines, PolynomialZoom(degree=0), terms, distortion_model)
+    lines = about_centre(placed, centre)
     padded, frames = bucketed_frames(lines)
     solver = default_solver(lines) if solver is None else solver
     start = algebraic_start(padded, model)

@@ -12,6 +12,7 @@ Once for each data set: padding and the zoom model made ready. A fit that is not
 is done again by the function itself.
 """
 
+import contextlib
 import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -27,16 +28,15 @@ from .._core.programs import program
 from .._core.types import of_known_values
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.model import Model
 from ..models.zoom import AbstractZoom
 from ._least_squares import Solver, default_solver
 from .minimise import fit_freely
 from .prepare import asked_for, ready_model
-from .problem import about_own_centre
 from .result import RESULTS, ZoomFit, failed, of_given
 from .robust import RobustFit, fit_robust, fit_robust_freely, robust_of_given
-from .zoom import fit_zoom
+from .zoom import CentreArgument, about_centre, fit_zoom, is_to_be_fitted
 
 _STACK = 16
 """Data sets in a stack. More of them save nothing, and leave a core idle at the end."""
@@ -61,8 +61,9 @@ def many(
     fit: Callable[..., ZoomFit] = ...,
     *,
     zoom: AbstractZoom | Model | None = ...,
-    family: AbstractFamily | None = ...,
+    distortion_model: AbstractDistortionModel | None = ...,
     terms: int | None = ...,
+    centre: CentreArgument | None = ...,
     solver: Solver | None = ...,
     max_steps: int = ...,
     invertible: bool = ...,
@@ -76,8 +77,9 @@ def many(
     fit: Callable[..., RobustFit],
     *,
     zoom: AbstractZoom | Model | None = ...,
-    family: AbstractFamily | None = ...,
+    distortion_model: AbstractDistortionModel | None = ...,
     terms: int | None = ...,
+    centre: CentreArgument | None = ...,
     solver: Solver | None = ...,
     max_steps: int = ...,
     invertible: bool = ...,
@@ -91,8 +93,9 @@ def many(
     fit: Callable[..., Any] = fit_zoom,
     *,
     zoom: AbstractZoom | Model | None = None,
-    family: AbstractFamily | None = None,
+    distortion_model: AbstractDistortionModel | None = None,
     terms: int | None = None,
+    centre: CentreArgument | None = None,
     solver: Solver | None = None,
     max_steps: int = 256,
     invertible: bool = True,
@@ -103,7 +106,9 @@ def many(
     Args:
         lines: the data sets, of any sizes; compressed, by ``compress``, fits are much faster.
         fit: `fit_zoom` or `fit_robust`.
-        zoom, family, terms, solver, max_steps, invertible: as for `fit_zoom`, of all data sets.
+        zoom, distortion_model, terms, centre, solver, max_steps, invertible: as for `fit`, of all data
+            sets. Fits of the centre (``centre="fit"``) are made one after the other, no sooner than without
+            this function.
         throw: whether to raise if a solver fails. By default the results of the others are returned,
             and the `result` of that one says what happened.
 
@@ -113,7 +118,8 @@ def many(
 
     Raises:
         ValueError: a data set has too few distinct focal lengths for the zoom model, or was compressed for
-            fewer terms; the message begins with its number. Nothing has been fitted then.
+            fewer terms or about another centre; the message begins with its number. Nothing has been fitted
+            then, unless the centre is.
         TypeError: `fit` is another function, or `lines` not a sequence of lines.
         RuntimeError: a solver failed (see `throw`).
 
@@ -133,17 +139,19 @@ def many(
             "other: [function(one) for one in lines]."
         )
     sets = data_sets(lines)
-    own: dict[str, Any] = {"zoom": zoom, "family": family, "terms": terms}
-    jobs = [_job(number, one, own) for number, one in enumerate(sets)]
+    own: dict[str, Any] = {"zoom": zoom, "distortion_model": distortion_model, "terms": terms}
+    fitted = is_to_be_fitted(centre, invertible=invertible)
+    jobs = [_job(number, one, own, None if fitted else centre) for number, one in enumerate(sets)]
     fits: list[Any] = [None] * len(sets)
-    for number, found, certified in _in_stacks(jobs, fit, solver, max_steps):
+    for number, found, certified in () if fitted else _in_stacks(jobs, fit, solver, max_steps):
         if certified or not invertible:
             fits[number] = _KINDS[fit].of_given(found, sets[number])
     fits = jax.device_put(fits)
     options: dict[str, Any] = {"solver": solver, "max_steps": max_steps, "invertible": invertible}
     for number, one in enumerate(sets):
         if fits[number] is None:
-            fits[number] = fit(one, **own, **options, throw=False)
+            with _of_set(number):
+                fits[number] = fit(one, **own, **options, centre=centre, throw=False)
     if throw:
         _raise_failed(fits)
     return fits
@@ -178,14 +186,21 @@ class _Job(NamedTuple):
     stacked: bool  # or else it is too large, or on other devices
 
 
-def _job(number, one, own):
+@contextlib.contextmanager
+def _of_set(number):
+    """Errors begin with the number of the data set."""
     try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"Data set {number}: {error}") from error
+
+
+def _job(number, one, own, centre):
+    with _of_set(number):
         placed, asked = asked_for(one, **own)
         model = ready_model(placed, asked)
         padded = bucketed(placed, closely=True)
-        lines = about_own_centre(padded)
-    except ValueError as error:
-        raise ValueError(f"Data set {number}: {error}") from error
+        lines = about_centre(padded, centre)
     return _Job(lines, model, asked.zoom.parameters is None, padded is not placed)
 
 

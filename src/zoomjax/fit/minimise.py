@@ -4,8 +4,6 @@ Compiled once for a shape of the lines; once per fit an algebraic start and, aft
 the certificate; per iteration one pass over the lines' rows, of which the solver sees `frame_residuals`.
 """
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import optimistix as optx
@@ -29,8 +27,9 @@ def fit_about(lines, model, *, algebraic, solver=None, max_steps=256, invertible
     solver = default_solver(lines) if solver is None else solver
     fit, outcome = fit_freely(lines, model, algebraic, solver, max_steps)
     if invertible:
-        small = functools.partial(compressed_as_measured, lines, model.terms)
-        fit, outcome = or_else(fit, outcome, lambda: refit_zoom(small(), fit))
+        fit, outcome = or_else(
+            fit, outcome, lambda: refit_zoom(compressed_as_measured(lines, model.terms), fit)
+        )
     return thrown(fit, outcome, throw)
 
 

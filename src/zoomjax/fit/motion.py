@@ -15,11 +15,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
-from .._core.checks import checked_terms
 from .._core.types import AnyArray, traced
 from ..lines.free_centre import AnyCentreLines
 from ..lines.lines import Lines
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel, checked_terms
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ..models.requirements import check
@@ -69,16 +68,16 @@ class MotionFit(eqx.Module):
         line_noise: standard deviation of points of lines from these, px of the image; NaN without lines.
         readout: time that a rolling shutter takes from the first row to the last, in frames.
         readout_std: its standard deviation. A large one says that nothing is known: the camera was too slow
-            to tell, and it does no harm.
+            to determine it, and it does no harm.
         parallax: distance of the entrance pupil before the axis of rotation, over that of a point of the
             scene: its standard deviation from point to point, by a test of a fit without it, and at least.
-            What all points have in common looks like a lens, and nobody can tell; it is likely a few times
-            as large, and so is the relative error of f that it makes. 0 if none is seen, NaN with few
-            tracks.
+            What all points have in common looks like a lens, and cannot be determined; it is likely a few
+            times as large, and so is the relative error of f that it makes. 0 if none is seen, NaN with
+            few tracks.
         parallax_score: its square in standard deviations of chance: above 3 or so it is seen.
         lever: that of each track, less what all have in common, where a parallax is seen; 0 elsewhere.
         lever_std: its standard deviation from track to track, to which levers are held; 0 if none is seen.
-        lever_mean: what all are taken to have in common, as no track tells it: 2.5 of these standard
+        lever_mean: what all are taken to have in common, which no track determines: 2.5 of these standard
             deviations, less where it is not sure whether the pupil is before the axis or behind it.
             `focal_std` and `covariance` have in them by how much that may be off.
     """
@@ -154,7 +153,7 @@ def fit_motion(
     tracks: Tracks,
     *,
     zoom: AbstractZoom | None = None,
-    family: AbstractFamily | None = None,
+    distortion_model: AbstractDistortionModel | None = None,
     terms: int = 2,
     shift: AbstractZoom | None = PolynomialZoom(degree=1),  # noqa: B008, it is frozen
     lines: Lines | AnyCentreLines | None = None,
@@ -173,7 +172,7 @@ def fit_motion(
     Args:
         tracks: the tracks.
         zoom: the zoom model; `PolynomialZoom` of degree 2 by default.
-        family: the distortion model; `RadialPolynomial` by default.
+        distortion_model: the distortion model; `RadialPolynomial` by default.
         terms: the number N of radial distortion coefficients.
         shift: zoom model of the offset of the centre of distortion from the centre of the image: linear
             in 1/f by default; None if there is none.
@@ -208,10 +207,10 @@ def fit_motion(
         )
     zoom = zoom_or_default(zoom)
     check("fit_motion", zoom=zoom)
-    family = RadialPolynomial() if family is None else family
-    terms = checked_terms(terms, family.most_terms)
+    distortion_model = RadialPolynomial() if distortion_model is None else distortion_model
+    terms = checked_terms(terms, distortion_model.most_terms)
     given = Given(tracks, lines, line_frames, focal, focal_std)
-    asked = Asked(zoom, family, terms, shift, readout)
+    asked = Asked(zoom, distortion_model, terms, shift, readout)
     if not traced(given):
         return _fitted(given, asked, throw)[0]
     fit, model, noise = _constant(given, asked, throw)
@@ -237,7 +236,14 @@ def _solved_motion(given, asked):
     by_frame = views_by_frame(problem.piece, problem.moment, len(problem.data.log_focal))
     paths, spreads = _started(problem.data, by_frame)
     parts, missed, model, noise = in_stages(
-        problem.data, paths, spreads, asked.zoom, asked.shift, asked.family, asked.terms, problem.shot
+        problem.data,
+        paths,
+        spreads,
+        asked.zoom,
+        asked.shift,
+        asked.distortion_model,
+        asked.terms,
+        problem.shot,
     )
     parts["fit"] = eqx.tree_at(lambda fit: fit.frame_rms, parts["fit"], parts["fit"].frame_rms[:frames])
     residual = jnp.full(np.shape(given.tracks.mask), jnp.nan)

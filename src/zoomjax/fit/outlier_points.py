@@ -26,11 +26,11 @@ from .._core.programs import program
 from .._core.types import of_known_values
 from ..lines.best_line import line_normal
 from ..lines.lines import Lines
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.model import Model
 from ..models.zoom import AbstractZoom
+from .distortion_models import compress_for, with_distortion_model
 from .energy import coefficients_by
-from .family_lines import compress_family, with_family
 from .prepare import asked_for, ready_model
 from .robust import RobustFit, fit_robust
 
@@ -72,7 +72,7 @@ def reject_points(
     lines: Lines,
     *,
     zoom: AbstractZoom | Model | None = None,
-    family: AbstractFamily | None = None,
+    distortion_model: AbstractDistortionModel | None = None,
     terms: int | None = None,
     throw: bool = True,
 ) -> PointRejection:
@@ -82,7 +82,7 @@ def reject_points(
 
     Args:
         lines: the lines, not compressed.
-        zoom, family, terms, throw: as for `fit_robust`, which is used in every turn.
+        zoom, distortion_model, terms, throw: as for `fit_robust`, which is used in every turn.
 
     Raises:
         TypeError: `lines` are not `Lines`.
@@ -97,13 +97,15 @@ def reject_points(
         >>> np.argwhere(reject_points(lines, zoom=PolynomialZoom(degree=0), terms=1).rejected).tolist()
         [[3, 7]]
     """
-    _, model = asked_for(lines, zoom, terms, family)
+    _, model = asked_for(lines, zoom, terms, distortion_model)
     ready_model(lines, model)  # complains of too few focal lengths
     everything, kept, seen = np.asarray(lines.mask), lines, set[bytes]()
     few = everything.sum(axis=1, keepdims=True) < _FEWEST
     while True:
-        fit = fit_robust(compress_family(kept, model.family, terms=model.terms), zoom=model, throw=throw)
-        distance, spread = map(np.asarray, _distances(lines, model.family, fit.fit.lens.zoom))
+        fit = fit_robust(
+            compress_for(kept, model.distortion_model, terms=model.terms), zoom=model, throw=throw
+        )
+        distance, spread = map(np.asarray, _distances(lines, model.distortion_model, fit.fit.lens.zoom))
         good = everything & (few | (np.abs(distance) <= _CUT * spread[:, None]))
         seen.add(np.asarray(kept.mask).tobytes())
         if good.tobytes() in seen:  # settled, or a doubtful point comes and goes
@@ -112,9 +114,9 @@ def reject_points(
 
 
 @program
-def _distances(lines, family, zoom):
+def _distances(lines, distortion_model, zoom):
     """Signed distance of each corrected point from the line that most agree on, and each line's spread."""
-    corrected = with_family(lines, family).corrected(coefficients_by(zoom, lines))
+    corrected = with_distortion_model(lines, distortion_model).corrected(coefficients_by(zoom, lines))
     distance, spread = jax.vmap(_from_most)(corrected, lines.mask)
     counts = lines.counts
     typical = jnp.nanmedian(jnp.where(counts >= _FEWEST, spread, jnp.nan))

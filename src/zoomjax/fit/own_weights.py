@@ -7,9 +7,9 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Bool, Float
 
-from .._core.types import traced
 from ..lines.base import AbstractLines
 from ..lines.lines import Lines
 from ..lines.triangles import AbstractTriangles
@@ -34,7 +34,7 @@ def counts_of(lines: AbstractLines) -> Float[np.ndarray, "line"]:
 
 def frames_that_count(lines: AbstractLines) -> Bool[np.ndarray, "frame"] | None:
     """The frames of which a line counts. None where all do, or none, or nobody can tell here and now."""
-    if lines.weight is None or traced(lines) or not all(map(_here, jax.tree.leaves(lines))):
+    if lines.weight is None or not all(map(_here, jax.tree.leaves(lines))):
         return None
     counted = np.zeros(len(lines.focal), bool)
     counted[np.asarray(lines.frame)[own_weights(lines) > 0]] = True
@@ -42,4 +42,7 @@ def frames_that_count(lines: AbstractLines) -> Bool[np.ndarray, "frame"] | None:
 
 
 def _here(array: Any) -> bool:
-    return not isinstance(array, jax.Array) or array.is_fully_addressable
+    """Whether values are known in this process: not being traced, and not on another machine."""
+    return not isinstance(array, jax.Array) or (
+        not isinstance(array, Tracer) and array.is_fully_addressable
+    )

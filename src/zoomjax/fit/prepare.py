@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..lines.base import AbstractLines, SomeLines
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.model import Model
 from ..models.zoom import AbstractZoom
 from .defaults import DEFAULT_ZOOM
+from .distortion_models import with_distortion_model
 from .energy import settings
-from .family_lines import with_family
 from .own_weights import frames_that_count
 
 
@@ -21,22 +21,22 @@ def asked_for(
     lines: SomeLines,
     zoom: AbstractZoom | Model | None,
     terms: int | None = None,
-    family: AbstractFamily | None = None,
+    distortion_model: AbstractDistortionModel | None = None,
 ) -> tuple[SomeLines, Model]:
     """The lines under the distortion model asked for, and the model: by default that of the paper.
 
     Raises:
-        ValueError: `zoom` is a `Model`, and `terms` or `family` is given besides.
+        ValueError: `zoom` is a `Model`, and `terms` or `distortion_model` is given besides.
     """
     if isinstance(zoom, Model):
-        if terms is not None or family is not None:
+        if terms is not None or distortion_model is not None:
             raise ValueError(
                 "Argument zoom is a Model, which has a number of terms and a distortion model of its own: "
-                "leave out the arguments terms and family."
+                "leave out the arguments terms and distortion_model."
             )
-        zoom, terms, family = zoom.zoom, zoom.terms, zoom.family
-    placed: Any = lines if family is None else with_family(lines, family)
-    return placed, Model(DEFAULT_ZOOM if zoom is None else zoom, terms, placed.family)
+        zoom, terms, distortion_model = zoom.zoom, zoom.terms, zoom.distortion_model
+    placed: Any = lines if distortion_model is None else with_distortion_model(lines, distortion_model)
+    return placed, Model(DEFAULT_ZOOM if zoom is None else zoom, terms, placed.distortion_model)
 
 
 def ready_model(lines: AbstractLines, model: Model) -> Model:
@@ -45,7 +45,7 @@ def ready_model(lines: AbstractLines, model: Model) -> Model:
     Raises:
         ValueError: the zoom model needs more focal lengths, or the focus, which the lines do not have.
     """
-    prepared = prepared_for(lines, model.zoom, model.size)  # complains of too few focal lengths
+    prepared = prepared_for(lines, model.zoom, model.num_coefficients)  # complains of too few focal lengths
     if model.zoom.parameters is None:
         return model.with_zoom(prepared)
     dtype = jnp.asarray(lines.focal).dtype

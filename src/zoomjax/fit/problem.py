@@ -1,8 +1,8 @@
 """The problem that lines pose: their data, the distortion model that corrects them, and the metric.
 
 A data set by itself is a problem, too: that of the paper, the radial polynomial with distances in the
-corrected image. `with_family`, `in_image` and the fit of the centre make others of it. Energies, fits and
-cross-validation take all of them alike, through `AbstractLines`.
+corrected image. `with_distortion_model`, `in_image` and the fit of the centre make others of it. Energies,
+fits and cross-validation take all of them alike, through `AbstractLines`.
 
 Uncompressed points are corrected by the model's own formula. Compressed lines stand for powers, in which
 corrected points are linear: so are they in the coefficients of `BrownConrady`, by the triangles for any
@@ -26,7 +26,7 @@ from ..lines.compressed import CompressedLines, compress
 from ..lines.free_centre import AnyCentreLines, compress_any_centre
 from ..lines.lines import Lines, corrected_points
 from ..lines.stretch import stretch_of_points
-from ..models.family import AbstractFamily, AbstractRadial
+from ..models.distortion_model import AbstractDistortionModel, AbstractRadial
 from ..models.polynomial import RadialPolynomial
 
 LEAST_STRETCH = 1e-4
@@ -48,7 +48,7 @@ class Problem(AbstractLines):
     """
 
     lines: Any
-    corrected_by: AbstractFamily
+    corrected_by: AbstractDistortionModel
     measured_in: Metric = eqx.field(static=True)
     any_centre: bool = eqx.field(static=True)
 
@@ -62,7 +62,7 @@ class Problem(AbstractLines):
     weight = _of_data("weight")
 
     @property
-    def family(self) -> AbstractFamily:
+    def distortion_model(self) -> AbstractDistortionModel:
         """What the coefficients mean."""
         return self.corrected_by
 
@@ -97,11 +97,11 @@ class Problem(AbstractLines):
     def _corrected(self, coefficients):
         if isinstance(self.lines, Lines):
             lines, k = self._moved(coefficients)
-            return corrected_points(lines, self.family, k)
+            return corrected_points(lines, self.distortion_model, k)
         if self.any_centre:
             return self.lines.corrected(self._powers_and_offset(coefficients))
         self._check(coefficients.shape[1])
-        powers, tangential = self.expansion(coefficients)
+        powers, tangential = self.in_powers(coefficients)
         if isinstance(self.lines, AnyCentreLines):
             return self.lines.decentred(powers, tangential)
         return self.lines.corrected(powers)
@@ -114,14 +114,14 @@ class Problem(AbstractLines):
             if self.any_centre:
                 return self.lines.squared_stretch(self._powers_and_offset(coefficients), normals)
             self._check(coefficients.shape[1])
-            return self.lines.decentred_stretch(*self.expansion(coefficients), normals)
-        if isinstance(self.family, AbstractRadial) and not self.any_centre:
+            return self.lines.decentred_stretch(*self.in_powers(coefficients), normals)
+        if isinstance(self.distortion_model, AbstractRadial) and not self.any_centre:
             return super().squared_stretch(coefficients, normals)
         assert isinstance(self.lines, Lines)
         lines, k = self._moved(coefficients)
         z = (jnp.asarray(lines.points) - lines.centre[None, None]) / self.scale
         of_line = jax.vmap(stretch_of_points, in_axes=(0, 0, 0, 0, None))
-        return of_line(z, jnp.asarray(lines.mask), k[lines.frame], normals, self.family)
+        return of_line(z, jnp.asarray(lines.mask), k[lines.frame], normals, self.distortion_model)
 
     def _moved(self, coefficients):
         """Points as the centre of each frame sees them, and coefficients without the centre's offset."""
@@ -135,29 +135,31 @@ class Problem(AbstractLines):
     def _powers_and_offset(self, coefficients):
         """The radial polynomial that is the model up to the corner farthest from each centre, and it."""
         assert isinstance(self.lines, AnyCentreLines)
-        needed = self.family.expansion_terms(coefficients.shape[1] - 2)
+        needed = self.distortion_model.expansion_terms(coefficients.shape[1] - 2)
         if self.lines.terms < needed:
             raise ValueError(
-                f"{type(self.family).__name__} needs lines compressed for any centre and {needed} terms, "
-                f"but they are for {self.lines.terms}: compress_any_centre(lines, terms={needed}), or pass "
-                "the lines themselves."
+                f"{type(self.distortion_model).__name__} needs lines compressed for any centre and "
+                f"{needed} terms, but they are for {self.lines.terms}: "
+                f"compress_any_centre(lines, terms={needed}), or pass the lines themselves."
             )
         far = jnp.maximum(self.centre, jnp.asarray(self.image_size) - 1 - self.centre) / self.scale
 
         def of_frame(k):
             reach = far + jnp.abs(k[-2:])
-            return jnp.concatenate([jnp.asarray(self.family.expansion(k[:-2], reach @ reach)[0]), k[-2:]])
+            return jnp.concatenate(
+                [jnp.asarray(self.distortion_model.expansion(k[:-2], reach @ reach)[0]), k[-2:]]
+            )
 
         return jax.vmap(of_frame)(coefficients)
 
     def _check(self, size):
         """Refuse lines that were compressed for something else."""
-        if isinstance(self.family, RadialPolynomial):
+        if isinstance(self.distortion_model, RadialPolynomial):
             return  # the lines say it themselves
-        name = type(self.family).__name__
-        needed = self.family.expansion_terms(size)
+        name = type(self.distortion_model).__name__
+        needed = self.distortion_model.expansion_terms(size)
         enough = needed <= getattr(self.lines, "terms", 0)
-        if isinstance(self.family, AbstractRadial):
+        if isinstance(self.distortion_model, AbstractRadial):
             if not (isinstance(self.lines, CompressedLines) and enough):
                 raise ValueError(
                     f"{name} needs lines compressed for {needed} terms about a fixed centre, but they are "
@@ -173,13 +175,13 @@ class Problem(AbstractLines):
         """The same problem of compressed lines, unless they are."""
         if not isinstance(self.lines, Lines):
             return self
-        reduce = compress if isinstance(self.family, AbstractRadial) else compress_any_centre
-        needed = self.family.expansion_terms(self.family.size(terms))
+        reduce = compress if isinstance(self.distortion_model, AbstractRadial) else compress_any_centre
+        needed = self.distortion_model.expansion_terms(self.distortion_model.num_coefficients(terms))
         return self._of(reduce(self.lines, needed))
 
     def about(self, centre: Centres) -> AbstractLines:
         """The same about a fixed centre of distortion, px; see `AbstractLines.about`."""
-        if isinstance(self.lines, AnyCentreLines) and not isinstance(self.family, AbstractRadial):
+        if isinstance(self.lines, AnyCentreLines) and not isinstance(self.distortion_model, AbstractRadial):
             same = not traced((self.centre, centre)) and np.array_equal(self.centre, centre)
             return self if same else self._of(self.lines.moved(centre))
         return self._of(self.lines.about(centre))
@@ -189,12 +191,12 @@ class Problem(AbstractLines):
         return self._of(self.lines.take(lines, present), self.any_centre)
 
     def _of(self, lines: AbstractLines, any_centre: bool = False) -> AbstractLines:
-        return posed(lines, self.family, self.metric, any_centre=any_centre)
+        return posed(lines, self.distortion_model, self.metric, any_centre=any_centre)
 
 
 def posed(
     lines: AbstractLines,
-    family: AbstractFamily | None = None,
+    distortion_model: AbstractDistortionModel | None = None,
     metric: Metric | None = None,
     *,
     any_centre: bool | None = None,
@@ -205,24 +207,24 @@ def posed(
 
     Args:
         lines: a data set, or a problem.
-        family: the distortion model.
+        distortion_model: the distortion model.
         metric: the image in which distances are measured.
         any_centre: whether the last two coefficients are the offset of the centre. Under the radial
             polynomial, those of `AnyCentreLines` are, whatever is asked.
     """
-    if family is None and any_centre is None and metric in (None, lines.metric):
+    if distortion_model is None and any_centre is None and metric in (None, lines.metric):
         return lines
     data = data_of(lines)
-    family = lines.family if family is None else family
+    distortion_model = lines.distortion_model if distortion_model is None else distortion_model
     metric = lines.metric if metric is None else metric
     if any_centre is None:
         any_centre = isinstance(lines, Problem) and lines.any_centre
-    polynomial = isinstance(family, RadialPolynomial)
+    polynomial = isinstance(distortion_model, RadialPolynomial)
     own = polynomial and isinstance(data, AnyCentreLines)
     if polynomial and metric == "corrected" and (own or not any_centre):
         return data
     make: Any = Problem  # whose other fields are properties
-    return make(data, family, metric, any_centre or own)
+    return make(data, distortion_model, metric, any_centre or own)
 
 
 def data_of(lines: AbstractLines) -> Any:

@@ -13,7 +13,7 @@ from .._core.types import Centres, traced
 from ..lines.base import AbstractLines
 from ..lines.buckets import of_frames
 from ..models.distortion import Distortion
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.invertibility import Certificate, certificate_of
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
@@ -34,7 +34,7 @@ def lens_of(lines: AbstractLines, zoom: AbstractZoom) -> ZoomLens:
         image_size=lines.image_size,
         focal_unit=lines.focal_unit,
         focus_range=None if focus is None else _range(jnp.asarray(focus), fitted),
-        family=lines.family,
+        distortion_model=lines.distortion_model,
     )
 
 
@@ -71,7 +71,8 @@ class ZoomFit(eqx.Module):
 
     Attributes:
         lens: from a focal length to the distortion there.
-        rms: root of the global energy (eq. 13), px of the corrected image.
+        rms: root of the global energy (eq. 13), px of the image in which lines are measured: the corrected
+            one, or with `in_image` the distorted one.
         frame_rms: root of each frame's error (eq. 3), px; NaN for a frame whose lines all weigh nothing.
         covariance: of the zoom model's parameters in normalised units, flattened row by row (for a
             polynomial: all terms of power 0, then of power 1, ...). Errors are assumed independent between
@@ -116,7 +117,7 @@ class FrameFits(eqx.Module):
     """Separate fits of each frame (eq. 6).
 
     Attributes:
-        coefficients: normalised (k1, ..., kN) of each frame.
+        coefficients: of each frame, normalised: (k1, ..., kN), or those of another distortion model.
         rms: root of the mean of the frames' errors, px, comparable with the `rms` of a zoom model.
         frame_rms: root of each frame's error (eq. 3), px; NaN for a frame whose lines all weigh nothing.
         covariance: of each frame's coefficients; see `ZoomFit`.
@@ -125,7 +126,7 @@ class FrameFits(eqx.Module):
         rms_unconstrained: `rms` of the fits without the constraint of invertibility.
         centre: centre of distortion, px: of all frames, or of each.
         scale: the length in px that is radius 1.
-        family: the distortion model of the coefficients.
+        distortion_model: what the coefficients mean.
     """
 
     coefficients: Float[Array, "frame terms"]
@@ -137,7 +138,7 @@ class FrameFits(eqx.Module):
     rms_unconstrained: Float[Array, ""]
     centre: Centres
     scale: float = eqx.field(static=True)
-    family: AbstractFamily = RadialPolynomial()
+    distortion_model: AbstractDistortionModel = RadialPolynomial()
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
         """Raise TypeError: each frame has its own distortion, and there is no lens."""
@@ -167,7 +168,7 @@ class FrameFits(eqx.Module):
             self.coefficients[frame],
             jnp.broadcast_to(jnp.asarray(self.centre, dtype), (frames, 2))[frame],
             jnp.asarray(self.scale, dtype),
-            self.family,
+            self.distortion_model,
         )
 
 
@@ -177,7 +178,9 @@ def described_fit(lines, zoom, result, steps):
     errors = energy_by_frame(lines, weighted)
     covariance, determined = parameter_covariance(lines, zoom, weighted, jacobian)
     lens, rms = lens_of(lines, zoom), jnp.sqrt(jnp.nanmean(errors))
-    certificate = certificate_of(zoom, lens.centre, lens.focal_range, lens.image_size, family=lens.family)
+    certificate = certificate_of(
+        zoom, lens.centre, lens.focal_range, lens.image_size, distortion_model=lens.distortion_model
+    )
     return ZoomFit(
         lens=lens,
         rms=rms,
@@ -222,7 +225,7 @@ def collected(lines, fits, there=True):
         rms_unconstrained=jnp.sqrt(jnp.nanmean(free)),
         centre=jnp.asarray(lines.centre),
         scale=lines.scale,
-        family=lines.family,
+        distortion_model=lines.distortion_model,
     )
 
 
@@ -242,8 +245,8 @@ def judged(zoom, result, determined, certificate):
 
 def is_invertible(fit):
     """Whether no refit is needed: the model is invertible, or the fit failed, or it has no certificate."""
-    stated = ~jnp.isneginf(fit.certificate.least)
-    return fit.certificate.certified | ~stated | failed(fit.result)
+    proved = fit.certificate.certified | (not fit.certificate.stated)
+    return proved | failed(fit.result)
 
 
 def failed(result):

@@ -25,26 +25,29 @@ from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
 from .._core.programs import light_program, program
+from .._core.types import AnyArray, traced
 from ..lines.base import AbstractLines, SomeLines
 from ..lines.best_line import line_residuals
 from ..lines.buckets import bucketed, of_lines
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.model import Model
 from ..models.polynomial import RadialPolynomial
 from ..models.zoom import AbstractLinearZoom, AbstractZoom, with_parameters
 from ._least_squares import Solver
 from ._linear import least_squares
 from .algebraic import algebraic_model
+from .centre import fit_centre, small_about
 from .energy import coefficients_by, linearised, prior_jacobian
 from .minimise import fit_prepared
+from .moved_centre import for_any_centre
 from .prepare import asked_for, ready_model
-from .problem import about_own_centre
 from .result import ZoomFit, of_given
-from .zoom import fit_zoom
+from .zoom import CentreArgument, about_centre, fit_zoom, is_to_be_fitted
 
 _CUT = 6.0  # standard deviations of r among good lines, were they normal
 _NARROWING = (np.inf, 24.0, 16.0, 10.0, *(_CUT,) * 4)  # c of each turn
 _NEAR = (_CUT,) * len(_NARROWING)  # the same from a start that is to be kept: one compiled program
+_CENTRES = 2  # how often weights and a centre that is fitted are found in turn, at most
 _LEAST_SPREAD = 0.02  # of m: lines of thousands of points, or without noise, are all alike
 
 
@@ -81,8 +84,9 @@ def fit_robust(
     lines: AbstractLines,
     *,
     zoom: AbstractZoom | Model | None = None,
-    family: AbstractFamily | None = None,
+    distortion_model: AbstractDistortionModel | None = None,
     terms: int | None = None,
+    centre: CentreArgument | None = None,
     solver: Solver | None = None,
     max_steps: int = 256,
     invertible: bool = True,
@@ -93,7 +97,10 @@ def fit_robust(
     Args:
         lines: the lines, or, much faster and with the same result, ``compress(lines)``. Existing weights
             are kept as factors.
-        zoom, family, terms, invertible, throw: as for `fit_zoom`, whose errors also apply.
+        zoom, distortion_model, terms, invertible, throw: as for `fit_zoom`, whose errors also apply.
+        centre: as for `fit_zoom`. With "fit", weights and centre are found in turn: about a centre that is
+            far from the lens's, straight lines look bent, the longest ones most. Those weights count that
+            keep more of the lines.
         solver, max_steps: of the final fit with fixed weights; as for `fit_zoom`. The turns before it are
             single Gauss-Newton steps.
 
@@ -110,14 +117,46 @@ def fit_robust(
         >>> fit_robust(compress(lines), zoom=PolynomialZoom(degree=0), terms=1).rejected.tolist()
         [10]
     """
-    given, asked = asked_for(lines, zoom, terms, family)
+    given, asked = asked_for(lines, zoom, terms, distortion_model)
     model = ready_model(given, asked)
-    padded = about_own_centre(bucketed(given))
+    options: Any = {"solver": solver, "max_steps": max_steps, "throw": throw}
+    if is_to_be_fitted(centre, invertible=invertible):
+        held = for_any_centre(bucketed(given), asked.terms)
+        weighted = held.weighted(weights_for_any_centre(held, asked))
+        fit = fit_zoom(weighted, zoom=asked, centre="fit", **options)
+        return robust_of_given(_described(small_about(held, fit.lens.centre, asked), weighted, fit), given)
+    padded = about_centre(bucketed(given), centre)
     weighted, model = _turns(padded, model, asked.zoom.parameters is None)
-    fit = fit_zoom(
-        weighted, zoom=model, solver=solver, max_steps=max_steps, invertible=invertible, throw=throw
-    )
+    fit = fit_zoom(weighted, zoom=model, invertible=invertible, **options)
     return robust_of_given(_described(padded, weighted, fit), given)
+
+
+def weights_for_any_centre(held: AbstractLines, model: Model) -> Float[AnyArray, "line"]:
+    """The weights of the lines about their centre, or about one fitted to them, whichever keeps more.
+
+    Args:
+        held: lines for any centre.
+        model: of them.
+    """
+
+    def about(centre: Any) -> Any:
+        weight = reweighted(small_about(held, centre, model), model)[0].weight
+        return weight if traced(weight) else np.asarray(weight)
+
+    best, tried = about(held.centre), held
+    for _ in range(_CENTRES):
+        if not traced(best) and best.all():
+            break
+        found = fit_centre(tried, zoom=model, throw=False)
+        other = about(found.fit.lens.centre)
+        if not traced((found.determined, other)):
+            if not found.determined or other.sum() <= best.sum():
+                break
+            best = other
+        else:
+            best = jnp.where(found.determined & (jnp.sum(other) > jnp.sum(best)), other, best)
+        tried = held.weighted(best)
+    return best
 
 
 def fit_robust_freely(lines, model, algebraic, solver, max_steps):
@@ -165,7 +204,7 @@ def typical_rms(lines: AbstractLines, model: Model) -> float:
 def _turns(lines, model, unfitted, narrowing=_NARROWING):
     """The lines with their weights, and the model of the last turn, of a prepared model."""
     if unfitted:
-        if not isinstance(model.family, RadialPolynomial):
+        if not isinstance(model.distortion_model, RadialPolynomial):
             weighted = lines.weighted(_own_weights(lines))
             model = model.with_zoom(fit_zoom(weighted, zoom=model, invertible=False, throw=False).lens.zoom)
         elif isinstance(model.zoom, AbstractLinearZoom):

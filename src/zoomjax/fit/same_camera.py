@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_jit, of_frames
 from ..models.lens import ZoomLens
-from .family_lines import with_family
+from .distortion_models import with_distortion_model
 from .result import ZoomFit
 
 
@@ -46,7 +46,7 @@ def check_lines_of(fit: ZoomFit, lines: AbstractLines) -> None:
 
 def placed_as(lens: ZoomLens, lines: AbstractLines) -> AbstractLines:
     """The lines under the distortion model of a lens and about its centre, at each frame's focal length."""
-    moved: Any = with_family(lines, lens.family)
+    moved: Any = with_distortion_model(lines, lens.distortion_model)
     return moved.about(lens.centre if lens.shift is None else _centres(lines, lens))
 
 

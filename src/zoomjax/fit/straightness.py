@@ -50,7 +50,9 @@ def frame_rms(
     if isinstance(lens, ZoomLens):
         return _frame_rms(lines, lens.zoom, None)
     if lens is None:
-        lens = np.zeros((lines.focal.shape[0], lines.family.size(1)), lines.focal.dtype)
+        lens = np.zeros(
+            (lines.focal.shape[0], lines.distortion_model.num_coefficients(1)), lines.focal.dtype
+        )
     return _frame_rms(lines, None, jnp.asarray(lens))
 
 

@@ -19,7 +19,7 @@ from .._core.types import AnyArray
 from ..lines.base import AbstractLines, SomeLines
 from ..lines.buckets import bucketed
 from ..lines.compressed import CompressedLines
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.model import Model
 from ..models.zoom import AbstractZoom
 from ._least_squares import Solver
@@ -38,7 +38,7 @@ def fit_zoom(
     lines: AbstractLines,
     *,
     zoom: AbstractZoom | Model | None = None,
-    family: AbstractFamily | None = None,
+    distortion_model: AbstractDistortionModel | None = None,
     terms: int | None = None,
     centre: CentreArgument | None = None,
     solver: Solver | None = None,
@@ -50,12 +50,12 @@ def fit_zoom(
 
     Args:
         lines: the lines, or, much faster and with the same result, ``compress(lines)``.
-        zoom: the zoom model; `PolynomialZoom` of degree 2 by default. Or a `Model`, which has `family` and
-            `terms`, too. If it has parameters, the solver starts there. Otherwise it starts from the
-            algebraic estimate if the model is linear and the distortion model is the radial polynomial,
-            else from no distortion.
-        family: the distortion model: `RadialPolynomial` (eq. 2) unless the lines have another one
-            (`compress_family`); or `Division`, or `BrownConrady`, which has two additional coefficients.
+        zoom: the zoom model; `PolynomialZoom` of degree 2 by default. Or a `Model`, which has
+            `distortion_model` and `terms`, too. If it has parameters, the solver starts there. Otherwise it
+            starts from the algebraic estimate if the model is linear and the distortion model is the radial
+            polynomial, else from no distortion.
+        distortion_model: by default that of the lines (see `compress_for`), else `RadialPolynomial` (eq.
+            2). Others are `Division` and `BrownConrady`, which has two additional coefficients.
         terms: the number N of radial distortion coefficients (eq. 2): by default 2, or as many as a `zoom`
             with parameters has.
         centre: the centre of distortion: "fit" fits it too, one for all focal lengths, where the lines
@@ -94,15 +94,25 @@ def fit_zoom(
         >>> bool(fit.rms < 1)
         True
     """
-    lines, model = asked_for(lines, zoom, terms, family)
+    lines, model = asked_for(lines, zoom, terms, distortion_model)
     options: Any = {"solver": solver, "max_steps": max_steps, "throw": throw}
-    if isinstance(centre, str) and centre == "fit":
-        if not invertible:
-            raise ValueError('Argument centre is "fit", which needs invertible=True.')
+    if is_to_be_fitted(centre, invertible=invertible):
         return fit_centre(lines, zoom=model, **options).fit
-    ready, unfitted = ready_model(lines, model), model.zoom.parameters is None
-    placed = about_centre(bucketed(lines), centre)
+    padded, unfitted = bucketed(lines), model.zoom.parameters is None
+    placed, ready = about_centre(padded, centre), ready_model(lines, model)
     return of_given(fit_about(placed, ready, algebraic=unfitted, invertible=invertible, **options), lines)
+
+
+def is_to_be_fitted(centre: CentreArgument | None, *, invertible: bool = True) -> bool:
+    """Whether an argument asks for a centre of distortion that is fitted.
+
+    Raises:
+        ValueError: it does, and for a model that need not be `invertible`.
+    """
+    fitted = isinstance(centre, str) and centre == "fit"
+    if fitted and not invertible:
+        raise ValueError('Argument centre is "fit", which needs invertible=True.')
+    return fitted
 
 
 def about_centre(lines: SomeLines, centre: CentreArgument | None) -> SomeLines | CompressedLines:

@@ -113,7 +113,7 @@ def name_pitch_lines(
 
     Returns:
         For each name in `PITCH_LINES` that was found the positions on it, as `focal_from_pitch` takes them.
-        It is empty if the lines do not tell clearly: if they are fewer than four, or where cameras with
+        It is empty if the lines are not clear: if they are fewer than four, or where cameras with
         other focal lengths explain them as well.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Lenses in the formats of other tools: written for them, and read from them."""
+"""Lenses of other tools: their formats, written and read, and the lenses of the lensfun database."""
 
 import lazy_loader
 

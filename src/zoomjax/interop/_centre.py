@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from ..models.brown_conrady import BrownConrady
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.polynomial import RadialPolynomial
 from .base import Sampled
 
@@ -35,16 +35,16 @@ class _Found(NamedTuple):
 
     centres: np.ndarray
     worst: float
-    family: AbstractFamily
+    formula: AbstractDistortionModel
 
 
-def centres_and_family(
-    nodes: list[Sampled], size: tuple[int, int], family: AbstractFamily | None
-) -> tuple[np.ndarray, AbstractFamily]:
+def centres_and_model(
+    nodes: list[Sampled], size: tuple[int, int], distortion_model: AbstractDistortionModel | None
+) -> tuple[np.ndarray, AbstractDistortionModel]:
     """The centre of each map, px, and the distortion model; that which is nearest to them if it is None."""
     formulas = [RadialPolynomial(), BrownConrady()]
-    if family is not None:
-        formulas = [BrownConrady() if isinstance(family, BrownConrady) else RadialPolynomial()]
+    if distortion_model is not None:
+        formulas = [BrownConrady() if isinstance(distortion_model, BrownConrady) else RadialPolynomial()]
     best = _about(nodes, size, formulas[0], moves=False)
     for formula, moves in list(itertools.product(formulas, (False, True)))[1:]:
         if best.worst <= _WELL:
@@ -53,10 +53,12 @@ def centres_and_family(
             continue
         found = _about(nodes, size, formula, moves=moves)
         best = found if found.worst < _LESS * best.worst else best
-    return best.centres, family or best.family
+    return best.centres, distortion_model or best.formula
 
 
-def _about(nodes: list[Sampled], size: tuple[int, int], formula: AbstractFamily, *, moves: bool) -> _Found:
+def _about(
+    nodes: list[Sampled], size: tuple[int, int], formula: AbstractDistortionModel, *, moves: bool
+) -> _Found:
     """The centres about which a formula is nearest to maps: one for all, or linear in 1/f."""
     middle, scale = (np.array(size) - 1) / 2, math.hypot(*size) / 2
     each = [((n.distorted - middle) / scale, (n.corrected - middle) / scale) for n in nodes]
@@ -78,7 +80,7 @@ def _about(nodes: list[Sampled], size: tuple[int, int], formula: AbstractFamily,
 
 
 def _residuals(
-    distorted: np.ndarray, corrected: np.ndarray, shift: np.ndarray, formula: AbstractFamily
+    distorted: np.ndarray, corrected: np.ndarray, shift: np.ndarray, formula: AbstractDistortionModel
 ) -> np.ndarray:
     """What a formula leaves of a map, about a centre that is shifted from that of its points."""
     z = distorted - shift

@@ -17,14 +17,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..models.brown_conrady import BrownConrady
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.division import Division
-from ..models.family import AbstractFamily
 from ..models.lens import ZoomLens
+from ..models.model import Model
 from ..models.polynomial import RadialPolynomial
 from ..models.smooth import SmoothZoom
 from ..models.tables import TableZoom
-from ..models.zoom import AbstractLinearZoom, AbstractPriorZoom, PolynomialZoom, with_parameters
-from ._centre import centres_and_family
+from ..models.zoom import (
+    AbstractLinearZoom,
+    AbstractPriorZoom,
+    AbstractZoom,
+    PolynomialZoom,
+    with_parameters,
+)
+from ._centre import centres_and_model
 from ._forms import Form
 from ._pinhole import pitch_of
 from ._samples import Pairs, distortions
@@ -35,7 +42,7 @@ from .radial_table import RadialTable, zoom_of_table
 _MUCH = 0.5
 """px at the nodes from which a user is told of tables."""
 
-_TERMS, _KEPT = 2, AbstractFamily.most_terms
+_TERMS, _KEPT = 2, AbstractDistortionModel.most_terms
 """Coefficients of a `SmoothZoom`, whose prior is for two, and of models that keep a file's values."""
 
 _MOVED = 0.05
@@ -81,7 +88,7 @@ def lens_of(
     contents: Contents,
     zoom: AbstractLinearZoom | None,
     terms: int | None,
-    family: AbstractFamily | None = None,
+    distortion_model: AbstractDistortionModel | None = None,
 ) -> Made:
     """The zoom lens of a file's contents.
 
@@ -90,40 +97,42 @@ def lens_of(
         zoom: the zoom model; None for the default, which depends on the contents.
         terms: number of radial coefficients; None for two of a `SmoothZoom`, else for those of the file
             where its formula is ours, or four.
-        family: the distortion model; None for that which holds the file's values, or is nearest to them.
+        distortion_model: None for that which holds the file's values, or is nearest to them.
     """
-    if terms is None and family is None and (zoom is None or _keeps_all(zoom)):
+    if terms is None and distortion_model is None and (zoom is None or _keeps_all(zoom)):
         made = None if contents.table is None else _of_table(contents, contents.table, zoom is None)
         if made is not None:
             return made
     nodes, others = once(contents.nodes)
-    size, notes, given = contents.image_size, [], family
+    size, notes, given = contents.image_size, [], distortion_model
     if sampled := [node for node in nodes if isinstance(node, Sampled)]:
-        centres, family = centres_and_family(sampled, size, family)
+        centres, distortion_model = centres_and_model(sampled, size, distortion_model)
         at = {node.focal: centre for node, centre in zip(sampled, centres, strict=True)}
         nodes = [dataclasses.replace(node, centre=at[node.focal]) for node in nodes]
         others = [dataclasses.replace(node, centre=at[node.focal]) for node in others]
-    own, exact = _family(nodes, terms)
-    family, exact = (own, exact) if family is None or type(family) is type(own) else (family, False)
+    own, exact = _distortion_model(nodes, terms)
+    if distortion_model is not None and type(distortion_model) is not type(own):
+        own, exact = distortion_model, False
     chosen = zoom is None
     if zoom is None:
-        zoom = _default_zoom(family, len(nodes), terms)
+        zoom = _default_zoom(own, len(nodes), terms)
     count = terms or (_TERMS if isinstance(zoom, SmoothZoom) else _terms(nodes, exact))
+    model = _unfitted(zoom, count, own)
     seen = [seen_of(node, size) for node in nodes]
     if short := [f"{each.node.focal:g}" for each in seen if not each.whole]:
         notes.append(
             f"The file's distortion turns back before the border of the image at {', '.join(short)} "
             f"{contents.focal_unit}: the lens is not validated beyond."
         )
-    contents, seen = _with_rays(contents, seen, zoom, family, count)
+    contents, seen = _with_rays(contents, seen, model)
     notes = [*contents.notes, *notes]
-    lens, at_nodes, between, note = _following(contents, seen, zoom, family, count)
+    lens, at_nodes, between, note = _following(contents, seen, model)
     if not math.isfinite(at_nodes):
         if chosen and isinstance(zoom, SmoothZoom):
             return lens_of(contents, TableZoom(), terms, given)
         raise ValueError(
-            f"the lens that is nearest to it folds over within the image as a {type(zoom).__name__} of "
-            f"{type(family).__name__}"
+            f"the lens that is nearest to it folds over within the image with a {type(zoom).__name__} and "
+            f"the distortion model {type(own).__name__}"
         )
     stretched = [abs(n.stretch[0] / n.stretch[1] - 1) for n in nodes if isinstance(n, Node)]
     if (most := max(stretched, default=0.0)) > _NOT_SQUARE:
@@ -149,9 +158,14 @@ def lens_of(
     return Made(lens, focal, at_nodes, between, (*notes, *note))
 
 
-def _with_rays(
-    contents: Contents, seen: list[Seen], zoom: AbstractLinearZoom, family: AbstractFamily, terms: int
-) -> tuple[Contents, list[Seen]]:
+def _unfitted(zoom: AbstractLinearZoom, terms: int, distortion_model: AbstractDistortionModel) -> Model:
+    try:
+        return Model(zoom, terms, distortion_model)
+    except ValueError as error:
+        raise UnsuitedError(str(error)) from error
+
+
+def _with_rays(contents: Contents, seen: list[Seen], model: Model) -> tuple[Contents, list[Seen]]:
     """What files of fields of view say, in the scale of corrected points that a lens through them has.
 
     The fit chooses this scale, and focal lengths follow it, so that rays are kept. Errors are then those of
@@ -161,7 +175,7 @@ def _with_rays(
         return contents, seen
     in_px = contents.focal_unit == "px"
     for _ in range(_PASSES):
-        lens, _notes = _lens(contents, seen, zoom, family, terms)
+        lens, _notes = _lens(contents, seen, model)
         each = distortions(lens, np.array([one.node.focal for one in seen]))
         by = np.array([against(*pair, lens.scale)[3] for pair in zip(each, seen, strict=True)])
         if not (np.isfinite(by) & (by > 0)).all():
@@ -177,7 +191,7 @@ def _with_rays(
 
 
 def _following(
-    contents: Contents, seen: list[Seen], zoom: AbstractLinearZoom, family: AbstractFamily, terms: int
+    contents: Contents, seen: list[Seen], model: Model
 ) -> tuple[ZoomLens, float, float | None, tuple[str, ...]]:
     """The lens through nodes, its errors at and between them, and notes.
 
@@ -185,22 +199,22 @@ def _following(
     """
     between, size = contents.between, contents.image_size
     if between is None or len(seen) == 1:
-        lens, notes = _lens(contents, seen, zoom, family, terms)
+        lens, notes = _lens(contents, seen, model)
         return lens, _error(lens, seen), None, notes
     nodes = [each.node for each in seen]
     checked = inside(between, nodes, _CHECKED, size)
-    levels = _SHARES if _keeps_all(zoom) else _SHARES[:1]
+    levels = _SHARES if _keeps_all(model.zoom) else _SHARES[:1]
     for shares in levels:
         more = inside(between, nodes, shares, size)
         told = sorted([*seen, *more], key=lambda each: each.node.focal)
-        lens, notes = _lens(contents, told, zoom, family, terms)
+        lens, notes = _lens(contents, told, model)
         at_nodes, error = _error(lens, seen), _error(lens, checked)
         if error <= max(TOLERANCE, at_nodes) or shares is levels[-1]:
             return lens, at_nodes, error, notes
     raise AssertionError
 
 
-def _keeps_all(zoom: AbstractLinearZoom) -> bool:
+def _keeps_all(zoom: AbstractZoom) -> bool:
     """Whether it is a table with entries wherever there are values."""
     return isinstance(zoom, TableZoom) and zoom.number is None and zoom.parameters is None
 
@@ -232,16 +246,14 @@ def _of_table(contents: Contents, table: RadialTable, auto: bool) -> Made | None
     return Made(lens, tuple(table.focal), found.at_nodes, between, tuple(notes))
 
 
-def _lens(
-    contents: Contents, seen: list[Seen], zoom: AbstractLinearZoom, family: AbstractFamily, terms: int
-) -> tuple[ZoomLens, tuple[str, ...]]:
+def _lens(contents: Contents, seen: list[Seen], model: Model) -> tuple[ZoomLens, tuple[str, ...]]:
     """The lens of least squares through nodes, and what is to be said of its centre."""
     size = contents.image_size
     scale, focal = math.hypot(*size) / 2, np.array([each.node.focal for each in seen])
     own = np.array([each.node.centre for each in seen], float)
     centre, shift, notes = np.mean(own, axis=0), None, ()
     if np.ptp(own, axis=0).max() > _MOVED and len(seen) > 1:
-        shift = TableZoom() if _keeps_all(zoom) else PolynomialZoom(1)
+        shift = TableZoom() if _keeps_all(model.zoom) else PolynomialZoom(1)
         shift, moved = _through(shift, focal, (own - centre) / scale)
         off = np.hypot(*(own - centre - scale * moved).T).max()
         notes = (
@@ -252,15 +264,15 @@ def _lens(
     else:
         moved = np.zeros_like(own)
     points = [each.about(centre + scale * by, scale) for each, by in zip(seen, moved, strict=True)]
-    model = _fitted(zoom, focal, points, [each.any_scale for each in seen], family, terms)
+    zoom = _fitted(model, focal, points, [each.any_scale for each in seen])
     lens = ZoomLens(
-        model,
+        zoom,
         jnp.asarray(centre),
         jnp.asarray([focal[0], focal[-1]]),
         size,
         focal_unit=contents.focal_unit,
         shift=shift,
-        family=family,
+        distortion_model=model.distortion_model,
         pixel_pitch=contents.pixel_pitch,
         about=contents.about,
     )
@@ -278,7 +290,9 @@ def _through(
     return with_parameters(prepared, jnp.asarray(parameters)), basis @ parameters
 
 
-def _family(nodes: list[Node | Sampled], terms: int | None) -> tuple[AbstractFamily, bool]:
+def _distortion_model(
+    nodes: list[Node | Sampled], terms: int | None
+) -> tuple[AbstractDistortionModel, bool]:
     """The distortion model that holds the file's coefficients or comes near, and whether it holds them."""
     forms = {node.form for node in nodes if isinstance(node, Node)}
     form = forms.pop() if len(forms) == 1 else None
@@ -303,35 +317,30 @@ def _terms(nodes: list[Node | Sampled], exact: bool) -> int:
     return min(most, _KEPT)
 
 
-def _default_zoom(family: AbstractFamily, number: int, terms: int | None) -> AbstractLinearZoom:
+def _default_zoom(
+    distortion_model: AbstractDistortionModel, number: int, terms: int | None
+) -> AbstractLinearZoom:
     if number == 1:
         return PolynomialZoom(degree=0)
-    if isinstance(family, RadialPolynomial) and terms in (None, _TERMS):
+    if isinstance(distortion_model, RadialPolynomial) and terms in (None, _TERMS):
         return SmoothZoom()
     return TableZoom()
 
 
 def _fitted(
-    zoom: AbstractLinearZoom,
-    focal: np.ndarray,
-    points: list[Pairs],
-    any_scale: list[bool],
-    family: AbstractFamily,
-    terms: int,
+    model: Model, focal: np.ndarray, points: list[Pairs], any_scale: list[bool]
 ) -> AbstractLinearZoom:
     """The zoom model with the parameters of least squares."""
-    size = family.size(terms)
     try:
-        prepared = zoom.prepare(jnp.asarray(focal), size)
+        prepared = model.zoom.prepare(jnp.asarray(focal), model.num_coefficients)
     except ValueError as error:
         raise UnsuitedError(str(error)) from error
     assert isinstance(prepared, AbstractLinearZoom)
     basis = np.asarray(jax.vmap(prepared.basis)(jnp.asarray(focal)), float)  # (node, basis)
     equations = [
-        _scaled_equations(family, *pair, terms, scaled)
-        for pair, scaled in zip(points, any_scale, strict=True)
+        _scaled_equations(model, *pair, scaled) for pair, scaled in zip(points, any_scale, strict=True)
     ]
-    if _keeps_all(zoom):  # each node by itself
+    if _keeps_all(model.zoom):  # each node by itself
         rows = np.array([np.linalg.lstsq(*pair, rcond=None)[0] for pair in equations])
         return with_parameters(prepared, jnp.asarray(basis.T @ rows))  # a permutation
     rows, right = [], []
@@ -344,14 +353,14 @@ def _fitted(
         rows.append(prior)
         right.append(towards)
     a = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
-    return with_parameters(prepared, jnp.asarray(a.reshape(basis.shape[1], size)))
+    return with_parameters(prepared, jnp.asarray(a.reshape(basis.shape[1], -1)))
 
 
 def _scaled_equations(
-    family: AbstractFamily, distorted: np.ndarray, corrected: np.ndarray, terms: int, any_scale: bool
+    model: Model, distorted: np.ndarray, corrected: np.ndarray, any_scale: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Those of `_equations`, without the unknown scale of corrected points, if they have one."""
-    matrix, change = _equations(family, distorted, corrected, terms)
+    matrix, change = _equations(model, distorted, corrected)
     if any_scale:  # it is one more unknown, which drops out
         outwards = corrected.ravel() / np.linalg.norm(corrected)
         matrix = matrix - np.outer(outwards, outwards @ matrix)
@@ -359,18 +368,17 @@ def _scaled_equations(
     return matrix, change
 
 
-def _equations(
-    family: AbstractFamily, distorted: np.ndarray, corrected: np.ndarray, terms: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _equations(model: Model, distorted: np.ndarray, corrected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Linear equations for a node's coefficients in our order: matrix (row, coefficient), right side."""
     t = np.sum(distorted**2, axis=-1, keepdims=True)
     x, y = distorted.T
-    radial = corrected if isinstance(family, Division) else distorted
-    columns = [radial * t ** (i + 1) for i in range(terms)]
-    if isinstance(family, BrownConrady):
+    divides = isinstance(model.distortion_model, Division)
+    radial = corrected if divides else distorted
+    columns = [radial * t ** (i + 1) for i in range(model.terms)]
+    if isinstance(model.distortion_model, BrownConrady):
         t = t[:, 0]
         columns += [np.stack([2 * x * y, t + 2 * y * y], -1), np.stack([t + 2 * x * x, 2 * x * y], -1)]
-    change = distorted - corrected if isinstance(family, Division) else corrected - distorted
+    change = distorted - corrected if divides else corrected - distorted
     return np.stack([column.ravel() for column in columns], axis=-1), change.ravel()
 
 

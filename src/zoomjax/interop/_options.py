@@ -6,17 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from .._core.checks import checked_terms, real_numbers
+from .._core.checks import real_numbers
 from ..io.focal_track import FocalTrack
 from ..models.brown_conrady import BrownConrady
+from ..models.distortion_model import AbstractDistortionModel, checked_terms
 from ..models.division import Division
-from ..models.family import AbstractFamily
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from .base import Format
 from .stmap import CONVENTIONS, DIRECTIONS
 
-_FAMILIES = (RadialPolynomial, Division, BrownConrady)
+_DISTORTION_MODELS = (RadialPolynomial, Division, BrownConrady)
 """Distortion models of lenses that are read."""
 
 _CHOICES = {"convention": tuple(CONVENTIONS), "direction": DIRECTIONS}
@@ -47,13 +47,15 @@ def positive(name: str, value: Any) -> float:
     return number
 
 
-def check_model(terms: Any, family: Any) -> None:
+def check_model(terms: Any, distortion_model: Any) -> None:
     """Raise ValueError where a lens that is read cannot be of this distortion model."""
     if terms is not None:
-        checked_terms(terms, AbstractFamily.most_terms)
-    if family is not None and not isinstance(family, _FAMILIES):
-        names = ", ".join(f"{kind.__name__}()" for kind in _FAMILIES)
-        raise ValueError(f"Argument family must be one of {names}, but it is {family!r}.")
+        checked_terms(terms, AbstractDistortionModel.most_terms)
+    if distortion_model is not None and not isinstance(distortion_model, _DISTORTION_MODELS):
+        names = ", ".join(f"{kind.__name__}()" for kind in _DISTORTION_MODELS)
+        raise ValueError(
+            f"Argument distortion_model must be one of {names}, but it is {distortion_model!r}."
+        )
 
 
 def positives(name: str, values: Any) -> tuple[float, ...]:

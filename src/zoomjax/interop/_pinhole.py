@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..models.family import AbstractRadial
+from ..models.distortion_model import AbstractRadial
 from ..models.lens import ZoomLens
 from ._forms import Form
 from .base import Contents, Export, Import, InterpolatedFormat, Node, read_text
@@ -56,7 +56,7 @@ class Pinhole:
 
 def formula(lens: ZoomLens, numerators: int, denominators: int = 0) -> Form:
     """OpenCV's formula, with decentering where the lens has it."""
-    return Form(numerators, denominators, tangential=not isinstance(lens.family, AbstractRadial))
+    return Form(numerators, denominators, tangential=not isinstance(lens.distortion_model, AbstractRadial))
 
 
 class Pinholes(InterpolatedFormat):

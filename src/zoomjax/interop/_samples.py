@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from .._core.text import plain
 from ..models.distortion import Distortion
-from ..models.family import AbstractRadial
+from ..models.distortion_model import AbstractRadial
 from ..models.lens import ZoomLens
 from ..models.tables import TableZoom
 from .base import Node
@@ -32,7 +32,7 @@ def distortions(lens: ZoomLens, focal: Float[np.ndarray, "focal"]) -> list[Disto
     if isinstance(lens.zoom, TableZoom) and lens.shift is None:  # each of which JAX would compile anew
         lens.check_range(focal, stacklevel=3)
         k, centre = _of_table(lens.zoom, np.asarray(focal, float)), np.asarray(lens.centre, float)
-        return [Distortion(row, centre, np.float64(lens.scale), lens.family) for row in k]
+        return [Distortion(row, centre, np.float64(lens.scale), lens.distortion_model) for row in k]
     found = []
     for first in range(0, len(focal), _AT_ONCE):
         part = np.asarray(focal[first : first + _AT_ONCE], float)
@@ -40,7 +40,8 @@ def distortions(lens: ZoomLens, focal: Float[np.ndarray, "focal"]) -> list[Disto
         k = np.asarray(many.coefficients, float)
         centre = np.broadcast_to(np.asarray(many.centre, float), (_AT_ONCE, 2))
         found += [
-            Distortion(k[i], centre[i], np.float64(lens.scale), many.family) for i in range(len(part))
+            Distortion(k[i], centre[i], np.float64(lens.scale), many.distortion_model)
+            for i in range(len(part))
         ]
     return found
 
@@ -66,14 +67,14 @@ def pairs(
     first = each[0]
     centres, scale = np.array([one.centre for one in each], float), float(first.scale)
     ends = np.array([border(size, centre) for centre in centres])
-    one = isinstance(first.family, AbstractRadial) and not all_rays
+    one = isinstance(first.distortion_model, AbstractRadial) and not all_rays
     if one:
         farthest = np.argmax(np.hypot(ends[..., 0], ends[..., 1]), axis=1)
         ends = ends[np.arange(len(ends)), farthest][:, None]
     part = np.sin(np.linspace(0, np.pi / 2, (_ONE_RAY if one else _RADII) + 1)[1:])
     distorted = (part[:, None, None] * ends[:, None]).reshape(len(each), -1, 2)
     k = np.array([one.coefficients for one in each], float)
-    together = Distortion(k, centres, np.full(len(each), scale), first.family)
+    together = Distortion(k, centres, np.full(len(each), scale), first.distortion_model)
     corrected = np.asarray(together.undistort(distorted + centres[:, None])) - centres[:, None]
     whole = np.isfinite(corrected).all(axis=(1, 2))
     if not whole.all():

@@ -195,14 +195,14 @@ def same(form: AbstractForm, distortion: Distortion) -> np.ndarray | None:
     """The lens's own coefficients for a formula that holds it, else None."""
     if not isinstance(form, Form) or not form.corrects:
         return None
-    k, family = np.asarray(distortion.coefficients, float), type(distortion.family)
+    k, kind = np.asarray(distortion.coefficients, float), type(distortion.distortion_model)
     theta = np.zeros(len(form.orders))
     numerators, denominators, p = form.split(theta)  # views: what is written there is in theta
-    if family is RadialPolynomial and len(k) <= len(numerators):
+    if kind is RadialPolynomial and len(k) <= len(numerators):
         numerators[: len(k)] = k
-    elif family is Division and len(k) <= len(denominators):
+    elif kind is Division and len(k) <= len(denominators):
         denominators[: len(k)] = k
-    elif family is BrownConrady and len(k) - 2 <= len(numerators) and form.tangential:
+    elif kind is BrownConrady and len(k) - 2 <= len(numerators) and form.tangential:
         numerators[: len(k) - 2], p[:] = k[:-2], k[-2:]
     else:
         return None

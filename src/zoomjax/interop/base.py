@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from .._core.text import plain
+from ..models.camera import px_of_focal_px
 from ..models.lens import ZoomLens
 from ._forms import AbstractForm
 from .radial_table import RadialTable
@@ -147,11 +148,11 @@ class Export:
 
     def focal_px(self, focal: Any) -> Any:
         """Focal lengths in px; ValueError if the pixel pitch is needed and not known."""
-        return focal if self.lens.focal_unit == "px" else focal / self.pitch
+        return focal * px_of_focal_px(self.lens) if self.lens.focal_unit == "px" else focal / self.pitch
 
     def focal_mm(self, focal: Any) -> Any:
         """Focal lengths in mm; ValueError if the pixel pitch is needed and not known."""
-        return focal if self.lens.focal_unit == "mm" else focal * self.pitch
+        return focal if self.lens.focal_unit == "mm" else self.focal_px(focal) * self.pitch
 
 
 @dataclasses.dataclass(frozen=True)

@@ -34,7 +34,7 @@ class COLMAP(NodeFormat):
 
     def forms(self, lens: ZoomLens):
         """One term of division, which is ours, or rational, three over three."""
-        one_term = isinstance(lens.family, Division) and len(_at_some(lens)) == 1
+        one_term = isinstance(lens.distortion_model, Division) and len(_at_some(lens)) == 1
         return (Form(0, 1, corrects=True),) if one_term else (formula(lens, 3, 3),)
 
     def text(self, nodes: list[Node], job: Export) -> str:
@@ -66,7 +66,7 @@ class COLMAP(NodeFormat):
                 continue
             _, model, width, height, *words = line.split()
             if model not in _ORDER:
-                raise ValueError(f"its camera model {model} is none of {', '.join(_ORDER)}")
+                raise ValueError(f"its camera model {model} is not one of {', '.join(_ORDER)}")
             values = dict(zip(_ORDER[model].split(), map(float, words), strict=True))
             size = job.size((int(width), int(height)))
             nodes.append(_node(model, values, size))

@@ -52,7 +52,7 @@ class Mrcal(NodeFormat):
             table = ast.literal_eval(read_text(path))
             model = table["lensmodel"]
             if model not in _COEFFICIENTS:
-                raise ValueError(f"its lens model {model!r} is none of {', '.join(_COEFFICIENTS)}")
+                raise ValueError(f"its lens model {model!r} is not one of {', '.join(_COEFFICIENTS)}")
             width, height = table["imagersize"]
             size = job.size((int(width), int(height)))
             fx, fy, cx, cy, *k = table["intrinsics"]

@@ -50,7 +50,7 @@ class Nerfstudio(NodeFormat):
         """All frames, or the one camera of all."""
         table = json.loads(read_text(job.paths[0]))
         if (model := table.get("camera_model", "OPENCV")) not in _MODELS:
-            raise ValueError(f"its camera model {model!r} is none of {', '.join(_MODELS)}")
+            raise ValueError(f"its camera model {model!r} is not one of {', '.join(_MODELS)}")
         refuse_others(table, {"is_fisheye": False})
         common = {key: table[key] for key in (*_KEYS, "k4") if key in table}
         nodes, sizes, px, units = [], [], [], set()

@@ -63,10 +63,10 @@ class Nuke(NodeFormat):
 
     def forms(self, lens: ZoomLens):
         """3DEqualizer's degree 4 where it holds the lens, else rational."""
-        if isinstance(lens.family, BrownConrady):
+        if isinstance(lens.distortion_model, BrownConrady):
             return (_DEGREE_4,)
         k = lens(float(np.asarray(lens.focal_range)[0])).coefficients
-        polynomial = isinstance(lens.family, RadialPolynomial) and len(k) <= 2
+        polynomial = isinstance(lens.distortion_model, RadialPolynomial) and len(k) <= 2
         return (_DEGREE_4,) if polynomial else (_RATIONAL,)
 
     def text(self, nodes: list[Node], job: Export) -> str:

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from ..models.family import AbstractRadial
+from ..models.distortion_model import AbstractRadial
 from ._forms import Form
 from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text, refuse_others
 
@@ -40,7 +40,9 @@ class OpenTrackIO(NodeFormat):
 
     def forms(self, lens):
         """Rational, three over three, from distorted to corrected points."""
-        return (Form(3, 3, tangential=not isinstance(lens.family, AbstractRadial), corrects=True),)
+        return (
+            Form(3, 3, tangential=not isinstance(lens.distortion_model, AbstractRadial), corrects=True),
+        )
 
     def text(self, nodes: list[Node], job: Export) -> str:
         """A sample on each line."""

@@ -14,8 +14,8 @@ from .._core.arguments import kinds_checked
 from .._core.checks import checked_size
 from .._core.files import refuse_existing, whole_file, whole_folder
 from ..io.focal_track import FocalTrack
-from ..models.about import UNKNOWN
-from ..models.family import AbstractFamily
+from ..models.about import UNKNOWN, WIDTH_OF_FOCALS
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.lens import ZoomLens
 from ..models.requirements import check
 from ..models.zoom import AbstractLinearZoom
@@ -173,9 +173,9 @@ def _labelled(lens: ZoomLens, focal: Any) -> ZoomLens:
     told = () if focal is None else positives("focal", focal)
     if len(told) != 1:
         raise ValueError(
-            "Argument focal must be given, the one focal length of the lens: its photo did not tell it."
+            "Argument focal must be given, the one focal length of the lens: its photo did not have it."
         )
-    about = {name: fact for name, fact in lens.about.items() if name != "focal"}
+    about = {name: fact for name, fact in lens.about.items() if name not in ("focal", WIDTH_OF_FOCALS)}
     return dataclasses.replace(lens, focal_range=np.full(2, told[0]), about=about)
 
 
@@ -199,7 +199,7 @@ def read(
     convention: str | None = None,
     zoom: AbstractLinearZoom | None = None,
     terms: int | None = None,
-    family: AbstractFamily | None = None,
+    distortion_model: AbstractDistortionModel | None = None,
 ) -> Reading:
     """Read a lens that another tool measured or wrote.
 
@@ -221,7 +221,7 @@ def read(
             distortion and the division model, and to keep what the file says at its focal lengths.
         terms: number of radial coefficients; by default 2 for `SmoothZoom`, else those of a file with our
             own formula, or 4.
-        family: the distortion model: `RadialPolynomial`, `Division` or `BrownConrady`. By default that
+        distortion_model: `RadialPolynomial`, `Division` or `BrownConrady`. By default that
             which holds the file's coefficients, or is nearest to its maps.
 
     Raises:
@@ -231,7 +231,7 @@ def read(
     """
     size = None if image_size is None else checked_size(image_size)
     told = None if focal is None else positives("focal", focal)
-    check_model(terms, family)
+    check_model(terms, distortion_model)
     path = Path(path)
     paths = _files(path)
     fmt = _format_to_read(format, paths[0])
@@ -256,7 +256,7 @@ def read(
                 raise ValueError(f"its focal length {node.focal} is not a positive number")
             if isinstance(node, Node) and not np.isfinite([*node.theta, *node.centre]).all():
                 raise ValueError(f"its coefficients or centre at {node.focal:g} are not finite numbers")
-        made = lens_of(contents, zoom, terms, family)
+        made = lens_of(contents, zoom, terms, distortion_model)
     except (FileNotFoundError, UnsuitedError):
         raise
     except _DAMAGED as error:

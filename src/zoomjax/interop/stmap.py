@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 
 from .._core.quiet import silent
 from ..models.distortion import Distortion
-from ..models.family import AbstractRadial
+from ..models.distortion_model import AbstractRadial
 from ._samples import border, distortions
 from .base import CONVENTION, Contents, Export, FolderFormat, Import, Sampled, one_size, refuse_others
 
@@ -157,7 +157,7 @@ def _quick(
     second.
     """
     exact = getattr(distortion, method)
-    if not isinstance(distortion.family, AbstractRadial):
+    if not isinstance(distortion.distortion_model, AbstractRadial):
         return exact, 0.0
     centre, scale = np.asarray(distortion.centre), float(distortion.scale)
     corners = np.array(np.meshgrid(window[::2], window[1::2])).reshape(2, -1).T - centre
@@ -278,7 +278,7 @@ def _of_one_direction(job: Import) -> tuple[str, list[Path]]:
     wanted = job.direction or told[0]
     if wanted is None:
         raise ValueError(
-            'its name does not tell its direction: give argument direction, "undistort" or "redistort"'
+            'its name does not say its direction: give argument direction, "undistort" or "redistort"'
         )
     found = [path for path, way in zip(job.paths, told, strict=True) if way == wanted]
     if not found and None not in told:

@@ -29,7 +29,7 @@ _LEAST, _MOST = 0.2, 30.0
 
 @dataclasses.dataclass(frozen=True)
 class Equipment:
-    """Camera and lens of a photo, as far as its EXIF data tell.
+    """Camera and lens of a photo, as far as its EXIF data say.
 
     Attributes:
         maker, camera: of the body; empty if not known.

@@ -69,6 +69,17 @@ def work_of(metadata: Metadata) -> str | None:
     return None if found is None else found[1].decode()
 
 
+def framing_of(metadata: Metadata) -> tuple[float, float, float] | None:
+    """What the mark tells of a corrected photo's framing: scale and origin; None where it tells nothing."""
+    if (found := _FRAMING.search(metadata.xmp)) is None:
+        return None
+    try:
+        scale, x, y = map(float, found[1].split())
+    except ValueError:
+        return None
+    return (scale, x, y) if scale > 0 else None
+
+
 def straightened_by(metadata: Metadata) -> str | None:
     """Which program says in a photo that it has corrected the distortion; None if none does.
 
@@ -86,16 +97,23 @@ def squeezed(metadata: Metadata) -> tuple[float, float] | None:
     return (float(across), float(down)) if max(across, down) > _SQUARE * min(across, down) else None
 
 
-def marked(metadata: Metadata, geometry: str, work: str = "") -> Metadata:
+def marked(
+    metadata: Metadata, geometry: str, work: str = "", framing: tuple[float, float, float] | None = None
+) -> Metadata:
     """The metadata with the mark, in place of an earlier one. The rest of the XMP packet stays as it is.
 
-    `work` stands for all that the result depends on, in hexadecimal digits.
+    Args:
+        metadata: of the photo.
+        geometry: what the photo is now.
+        work: stands for all that the result depends on, in hexadecimal digits.
+        framing: scale and origin of a corrected photo, as in `Framing`.
     """
     xmp = _DESCRIPTION.sub(b"", metadata.xmp)
     version = importlib.metadata.version("zoomjax")
+    shown = "" if framing is None else ' zoomjax:Framing="{!r} {!r} {!r}"'.format(*framing)
     description = (
         f'<rdf:Description rdf:about="" xmlns:zoomjax="{NAMESPACE}" zoomjax:Version="{version}" '
-        f'zoomjax:Geometry="{geometry}" zoomjax:Work="{work}" xmlns:rdf="{_RDF}"/>'
+        f'zoomjax:Geometry="{geometry}" zoomjax:Work="{work}"{shown} xmlns:rdf="{_RDF}"/>'
     ).encode()
     end = max(xmp.rfind(f"</{prefix}:RDF>".encode()) for prefix in ("rdf", "RDF"))
     if end < 0:  # no packet, or one that is damaged, or in UTF-16, which only old programs wrote
@@ -114,6 +132,10 @@ _DESCRIPTION = re.compile(rb'<rdf:Description [^<>]*xmlns:zoomjax="[^<>]*/>')
 
 _WORK = re.compile(
     re.escape(f'xmlns:zoomjax="{NAMESPACE}"').encode() + rb'[^<>]*zoomjax:Work="([0-9a-f]*)"'
+)
+
+_FRAMING = re.compile(
+    re.escape(f'xmlns:zoomjax="{NAMESPACE}"').encode() + rb'[^<>]*zoomjax:Framing="([-+.0-9e ]*)"'
 )
 
 _MARK = re.compile(

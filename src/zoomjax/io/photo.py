@@ -22,7 +22,7 @@ from .heic import HEIC_SUFFIXES, decode_heic, heic_metadata
 from .jpeg import is_cmyk, jpeg_metadata
 from .metadata import Metadata
 from .photo_writer import FORMATS, MAKER_NOTES
-from .png import png_metadata
+from .png import png_metadata, transparent_grey
 from .raw import RAW_SUFFIXES, decode_raw, raw_metadata, raw_size
 from .tiff import read_tiff, tiff_metadata, tiff_size
 from .webp import webp_metadata
@@ -184,7 +184,12 @@ def _jpeg(content: bytes, most_pages: int) -> Photo:
 
 def _png(content: bytes, most_pages: int) -> Photo:
     metadata, others = png_metadata(content)
-    return Photo(((_decoded(content), metadata),), tuple(others))
+    image = _decoded(content)
+    if image.ndim == 2 and (transparent := transparent_grey(content)) is not None:  # which OpenCV drops
+        most = np.iinfo(image.dtype).max
+        alpha = np.where(image == transparent, 0, most).astype(image.dtype)
+        image = np.dstack([image, image, image, alpha])
+    return Photo(((image, metadata),), tuple(others))
 
 
 def _webp(content: bytes, most_pages: int) -> Photo:
@@ -196,7 +201,8 @@ def _tiff(content: bytes, most_pages: int) -> Photo:
     if most_pages > 1 and (number := tiff_size(content)) > _MOST_PIXELS:
         raise ValueError(f"its pages have {number:,} pixels, more than {_MOST_PIXELS:,}")
     pages = read_tiff(content, most_pages=most_pages)
-    others = (MAKER_NOTES,) if any(page.notes for page in pages) else ()
+    notes = [MAKER_NOTES] if any(page.notes for page in pages) else []
+    others = tuple(dict.fromkeys([*notes, *(other for page in pages for other in page.others)]))
     cmyk = any(page.cmyk for page in pages)
     return Photo(tuple((page.image, page.metadata) for page in pages), others, cmyk)
 

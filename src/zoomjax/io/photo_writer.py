@@ -1,5 +1,6 @@
 """Photos encoded with their metadata, and what of these a format does not hold."""
 
+import dataclasses
 import re
 import struct
 from collections.abc import Sequence
@@ -9,7 +10,7 @@ import numpy as np
 
 from .avif import encode_avif
 from .jpeg import with_segments
-from .metadata import Metadata, missing
+from .metadata import NAMES, Metadata, missing
 from .png import with_chunks
 from .tiff import encode_tiff, is_big
 
@@ -47,6 +48,8 @@ def check_written(pages: Pages, suffix: str) -> None:
     bits, channels = FORMATS[suffix.lower()]
     for image, _ in pages:
         own = 1 if image.ndim == 2 else image.shape[2]
+        if image.dtype.kind == "i" and suffix.lower() not in (".tif", ".tiff"):
+            raise ValueError(f"it has signed numbers, which a {suffix} file does not hold: choose .tif")
         if 8 * image.dtype.itemsize not in bits or own not in channels:
             raise ValueError(
                 f"it has {own} channels of {8 * image.dtype.itemsize} bits, which a {suffix} file does not "
@@ -68,22 +71,45 @@ def encoded_photo(pages: Pages, suffix: str) -> tuple[bytes, list[str]]:
         lost = ["the camera's data in EXIF"] if is_big(pages) else []
         if any(_MAKER_NOTES.search(metadata.exif) for _, metadata in pages):
             lost.append(MAKER_NOTES)
-        return encode_tiff(pages), [*lost, *_lost(pages, "exif", "xmp", "icc", "iptc", "dpi")]
+        held = ("exif", "xmp", "icc", "iptc", "dpi")
+        for _, metadata in pages:
+            lost += [*missing(metadata, *held), *_chunks_lost(kind, metadata)]
+        return encode_tiff(pages), list(dict.fromkeys(lost))
     [(image, metadata)] = pages
+    lost = []
+    if image.ndim > 2 and metadata.icc[16:20] == b"GRAY":  # which readers refuse
+        metadata, lost = dataclasses.replace(metadata, icc=b""), [NAMES["icc"]]
+    content, others = _encoded(kind, image, metadata)
+    return content, [*lost, *others, *_chunks_lost(kind, metadata)]
+
+
+def _encoded(kind: str, image: np.ndarray, metadata: Metadata) -> tuple[bytes, list[str]]:
+    """The content of a file of one page, and names of the fields of its metadata that it does not hold."""
     if kind == ".avif":
-        return encode_avif(image, metadata), _lost(pages, "exif", "xmp", "icc")
+        return encode_avif(image, metadata), missing(metadata, "exif", "xmp", "icc")
     if kind == ".webp":
-        return _webp(image, metadata), _lost(pages, "exif", "xmp", "icc")
+        return _webp(image, metadata), missing(metadata, "exif", "xmp", "icc")
     content = _by_opencv(kind, image, _JPEG if kind in (".jpg", ".jpeg") else [])
     if kind == ".png":
-        return with_chunks(content, metadata), _lost(pages, "exif", "xmp", "icc", "comment", "dpi", "shape")
+        return with_chunks(content, metadata), missing(
+            metadata, "exif", "xmp", "icc", "comment", "dpi", "shape"
+        )
     if kind == ".bmp":
-        return _with_density(content, metadata), _lost(pages, "dpi")
+        return _with_density(content, metadata), missing(metadata, "dpi")
     return with_segments(content, metadata)
 
 
-def _lost(pages: Pages, *held: str) -> list[str]:
-    return list(dict.fromkeys(name for _, metadata in pages for name in missing(metadata, *held)))
+def _chunks_lost(kind: str, metadata: Metadata) -> list[str]:
+    """What files of the source's format alone hold, where this is another one."""
+    there = {name for name, _ in metadata.chunks}
+    lost: list[str] = []
+    if kind not in (".jpg", ".jpeg") and any(len(name) == 1 for name in there):
+        lost.append("the rest of the XMP")
+    if kind == ".png":
+        return lost
+    if b"cICP" in there or (there & {b"gAMA", b"cHRM"} and b"sRGB" not in there and not metadata.icc):
+        lost.append("the colour space")
+    return [*lost, *(["texts"] if there & {b"tEXt", b"zTXt", b"iTXt"} else [])]
 
 
 def _webp(image: np.ndarray, metadata: Metadata) -> bytes:

@@ -41,6 +41,18 @@ def png_metadata(content: bytes) -> tuple[Metadata, list[str]]:
     return Metadata(**fields, dpi=dpi, shape=shape, chunks=tuple(chunks)), others
 
 
+def transparent_grey(content: bytes) -> int | None:
+    """The value of a grey file's transparent pixels, as of 8 or 16 bits; None if there is none such."""
+    depth, colour = content[24], content[25]
+    for name, block in _chunks(content):
+        if name == b"tRNS" and colour == 0 and len(block) == 2:
+            value = int.from_bytes(block, "big") & ((1 << depth) - 1)
+            return value if depth >= 8 else value * 255 // ((1 << depth) - 1)
+        if name == b"IDAT":
+            break
+    return None
+
+
 def with_chunks(content: bytes, metadata: Metadata) -> bytes:
     """An encoded PNG file with metadata; the caller sees to it that they fit in."""
     chunks = []

@@ -41,6 +41,9 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what is damag
 _MOST_BYTES = 100_000_000  # of metadata
 _MOST_PAGES = 10_000
 
+_PLACES = {33550, 33922, 34264, 34735}
+"""Tags of GeoTIFF that tie pixels to places."""
+
 _PLAIN = {"NONE", "ADOBE_DEFLATE", "DEFLATE", "PACKBITS", "LZMA"}
 """Compressions that tifffile undoes by itself."""
 
@@ -55,6 +58,7 @@ class TiffPage:
         orientation: 1 to 8, which is not applied to the pixels.
         cmyk: whether the file holds four colours for print, of which `image` has three.
         notes: whether the page holds notes of the camera's maker, which `metadata` lacks.
+        others: what else the page holds that is in neither.
     """
 
     image: np.ndarray
@@ -62,6 +66,7 @@ class TiffPage:
     orientation: int
     cmyk: bool
     notes: bool
+    others: tuple[str, ...] = ()
 
 
 def read_tiff(content: bytes, *, most_pages: int = _MOST_PAGES) -> list[TiffPage]:
@@ -104,6 +109,7 @@ def _page(content: bytes, file: tifffile.TiffFile, number: int) -> TiffPage:
         compression = getattr(page.compression, "name", str(page.compression))
         folder = page.tags.valueof(int(ExifTags.IFD.Exif))
         notes = isinstance(folder, dict) and "MakerNote" in folder
+        others = _others(page)
     except MemoryError:
         raise
     except Exception as error:  # as above
@@ -111,9 +117,24 @@ def _page(content: bytes, file: tifffile.TiffFile, number: int) -> TiffPage:
     if image is None and separate and page.dtype != np.uint8:
         # OpenCV takes its planes for interleaved, and shows noise.
         raise ValueError(f"its colours are stored one after the other and compressed ({compression})")
+    if image is None and page.samplesperpixel == 2:
+        raise ValueError(f"it is grey with transparency, and compressed ({compression})")  # OpenCV drops it
     if image is None:
         image = as_stored(_by_opencv(content, number), orientation)  # OpenCV turns TIFF files
-    return TiffPage(image, metadata, orientation, cmyk, notes)
+    return TiffPage(image, metadata, orientation, cmyk, notes, others)
+
+
+def _others(page: Any) -> tuple[str, ...]:
+    """What a page holds that is lost when it is written again."""
+    tags = {tag.code for tag in page.tags}
+    lost = ["further pictures"] if page.subifds else []
+    if tags & _PLACES:
+        lost.append("the place on a map, which does not hold for a corrected image")
+    extra = tuple(map(int, page.extrasamples))
+    if page.samplesperpixel in (2, 4) and extra and extra[-1] != 2:  # it is written as transparency alone
+        known = "the mark that colours are multiplied by transparency"
+        lost.append(known if extra[-1] == 1 else "the mark that the last channel is no transparency")
+    return tuple(lost)
 
 
 def _plain(page: Any) -> np.ndarray | None:
@@ -123,7 +144,7 @@ def _plain(page: Any) -> np.ndarray | None:
         or page.photometric.name not in ("MINISBLACK", "RGB")
         or page.dtype not in (np.uint8, np.uint16, np.float32, np.float64)
         or page.bitspersample != 8 * np.dtype(page.dtype).itemsize
-        or page.samplesperpixel not in (1, 3, 4)
+        or page.samplesperpixel not in (1, 2, 3, 4)
         or page.predictor not in (1, 2)
     ):
         return None
@@ -132,7 +153,9 @@ def _plain(page: Any) -> np.ndarray | None:
         values = np.moveaxis(values, 0, -1)
     if values.ndim not in (2, 3):
         return None
-    values = values[..., [2, 1, 0, 3][: values.shape[2]]] if values.ndim == 3 else values
+    if values.ndim == 3:
+        # Grey with transparency becomes colours with it, as of PNG files.
+        values = values[..., [0, 0, 0, 1] if values.shape[2] == 2 else [2, 1, 0, 3][: values.shape[2]]]
     return np.ascontiguousarray(values.astype(values.dtype.newbyteorder("="), copy=False))
 
 

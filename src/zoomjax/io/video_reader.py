@@ -235,8 +235,8 @@ def warn_of_pixels(video: Any) -> None:
     """Warn of a video whose pixels are not square."""
     if (aspect := video.sample_aspect_ratio) not in (None, 0, 1):
         warnings.warn(
-            f"The video has pixels of {aspect.numerator}:{aspect.denominator}, which are not square, and "
-            "distortion is taken to be alike in all directions of the stored image. Scale it to square "
-            "pixels first.",
+            f"The video has pixels of {aspect.numerator}:{aspect.denominator}, which are not square, but "
+            "the model assumes the same distortion in all directions of the stored image. Scale it to "
+            "square pixels first.",
             stacklevel=2,
         )

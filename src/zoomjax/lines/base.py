@@ -37,7 +37,7 @@ from .._core.types import (
     Point,
     traced,
 )
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.polynomial import RadialPolynomial
 from .stretch import radial_stretch
 
@@ -84,7 +84,7 @@ class AbstractLines(eqx.Module):
         return math.hypot(*self.image_size) / 2
 
     @property
-    def family(self) -> AbstractFamily:
+    def distortion_model(self) -> AbstractDistortionModel:
         """The distortion model of the coefficients: the radial polynomial, unless a problem has another."""
         return RadialPolynomial()
 
@@ -93,12 +93,12 @@ class AbstractLines(eqx.Module):
         """The image in which distances are measured: the corrected one, unless a problem says otherwise."""
         return "corrected"
 
-    def expansion(
+    def in_powers(
         self, coefficients: Float[Array, "some size"]
     ) -> tuple[Float[Array, "some power"], Float[Array, "some tangential"]]:
-        """The family's coefficients as what corrected points are linear in, up to the image's corners."""
+        """The coefficients as those of powers, in which corrected points are linear, up to the corners."""
         far = jnp.maximum(self.centre, jnp.asarray(self.image_size) - 1 - self.centre) / self.scale
-        expand = jax.vmap(lambda k: self.family.expansion(k, far @ far))
+        expand = jax.vmap(lambda k: self.distortion_model.expansion(k, far @ far))
         powers, tangential = expand(coefficients)
         return jnp.asarray(powers), jnp.asarray(tangential)
 
@@ -130,7 +130,7 @@ class AbstractLines(eqx.Module):
 
         J is the derivative of the correction by the frame's coefficients. By moments: for radial models.
         """
-        powers, _ = self.expansion(coefficients)
+        powers, _ = self.in_powers(coefficients)
         moments = self.second_moments(2 * powers.shape[1])
         return jax.vmap(radial_stretch)(powers[self.frame], normals, moments, self.counts)
 

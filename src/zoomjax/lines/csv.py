@@ -22,7 +22,7 @@ def read_lines_csv(
     path: str | os.PathLike[str],
     *,
     image_size: Sequence[int],
-    focal: Mapping[int, float] | Sequence[float] | None = None,
+    focal: Mapping[int, float] | Sequence[float] | float | int | None = None,
     focal_unit: str = "mm",
 ) -> Lines:
     """Read lines from a ``frame,line,x,y[,focal]`` file, in float64.
@@ -31,7 +31,7 @@ def read_lines_csv(
         path: a file that `zoomjax.io.text_table` can read; columns in any order, others are ignored.
         image_size: (width, height) px.
         focal: focal length by frame number, if the file has no column ``focal``; a sequence counts
-            frames from 0.
+            frames from 0, a number is that of all frames.
         focal_unit: "mm" or "px".
 
     Raises:
@@ -61,14 +61,23 @@ def read_lines_csv(
             "it has no focal lengths. Add a column focal, or give a file with the columns frame,focal"
         )
     else:
-        focal = focal if isinstance(focal, Mapping) else dict(enumerate(focal))
-        missing = [int(f) for f in frames if int(f) not in focal]
+        if isinstance(focal, Mapping):
+            known = dict(focal)
+        else:
+            given = np.asarray(focal, float)
+            known = dict(enumerate(given)) if given.ndim else dict.fromkeys(frames.tolist(), given)
+            if given.ndim and frames.size and len(given) > (last := int(frames.max())) + 1:
+                raise table.error(
+                    f"its last frame is {last}, and there are {len(given)} focal lengths, of frames 0 to "
+                    f"{len(given) - 1}: give them by the frames' numbers, {{{last}: ...}}"
+                )
+        missing = [int(f) for f in frames if int(f) not in known]
         if missing:
             raise table.error(
                 f"there is no focal length for {len(missing)} of its {frames.size} frames (the first are "
                 f"{', '.join(map(str, missing[:5]))})"
             )
-        focals = np.array([focal[int(f)] for f in frames])
+        focals = np.array([known[int(f)] for f in frames])
 
     order = np.lexsort((line, index))  # stable: points keep the order of their rows
     starts = np.flatnonzero(np.diff(index[order]) | np.diff(line[order])) + 1

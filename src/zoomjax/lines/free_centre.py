@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.arguments import kinds_checked
-from .._core.checks import checked_terms
+from .._core.checks import checked_integer
 from .._core.products import EXACT
 from .._core.types import Centres, traced
 from .base import header_of
@@ -158,7 +158,7 @@ def compress_any_centre(lines: Lines, terms: int = 2) -> AnyCentreLines:
         ((2, 21, 21), (2, 7, 7))
     """
     return AnyCentreLines(
-        triangle=_triangles(lines, checked_terms(terms)),
+        triangle=_triangles(lines, checked_integer("terms", terms, 1)),
         **header_of(lines),
     )
 

@@ -35,7 +35,7 @@ from .._core.files import whole_file
 from .._core.products import EXACT
 from .._core.steps import packed
 from .._core.types import AnyArray, Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Mask, Point
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from .base import AbstractLines, one_frame
 
 FORMAT, VERSION = "zoomjax.lines", 2
@@ -258,7 +258,7 @@ class Lines(AbstractLines):
 
     def corrected(self, coefficients: Float[Array, "frame terms"]) -> Float[Array, "line rows 2"]:
         """Corrected points of each line about their mean, px."""
-        return corrected_points(self, self.family, coefficients)
+        return corrected_points(self, self.distortion_model, coefficients)
 
     def second_moments(self, order: int) -> Float[Array, "line moment 2 2"]:
         """``sum_p r_p^(2i) z_p z_p^T`` for i = 0 ... order - 1."""
@@ -289,17 +289,17 @@ class Lines(AbstractLines):
 
 
 def corrected_points(
-    lines: Lines, family: AbstractFamily, coefficients: Float[Array, "frame size"]
+    lines: Lines, distortion_model: AbstractDistortionModel, coefficients: Float[Array, "frame size"]
 ) -> Float[Array, "line point 2"]:
-    """Points of each line, corrected by a family's `coefficients` of its frame, about their mean, px."""
+    """Points of each line, corrected with the `coefficients` of its frame, about their mean, px."""
     points, mask, k = jnp.asarray(lines.points), jnp.asarray(lines.mask), coefficients[lines.frame]
     correct = jax.vmap(_correct_line, in_axes=(0, 0, 0, None, None, None))
-    return correct(points, mask, k, lines.centre, lines.scale, family)
+    return correct(points, mask, k, lines.centre, lines.scale, distortion_model)
 
 
-def _correct_line(points, mask, k, centre, scale, family):
+def _correct_line(points, mask, k, centre, scale, distortion_model):
     """Corrected points of one line about their mean, px; zero where masked."""
     z = jnp.where(mask[:, None], (points - centre[None]) / scale, 0)
-    corrected = jnp.stack(family.correct((z[:, 0], z[:, 1]), jnp.sum(z * z, axis=1), k), axis=1)
+    corrected = jnp.stack(distortion_model.correct((z[:, 0], z[:, 1]), jnp.sum(z * z, axis=1), k), axis=1)
     mean = jnp.sum(corrected, axis=0) / jnp.maximum(jnp.sum(mask), 1)
     return jnp.where(mask[:, None], scale * (corrected - mean[None]), 0)

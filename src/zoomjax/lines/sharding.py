@@ -26,8 +26,8 @@ def shard(lines: SomeLines, devices: Sequence[Any] | None = None) -> SomeLines:
     """Spread lines over devices, each with as many lines as the others.
 
     Lines without points, which count as none, fill up where the numbers do not divide. With several
-    processes (`jax.distributed`) each process gives its own lines, of frames that all of them number alike:
-    `focal` and all else that is not of a line must be the same in all of them.
+    processes (`jax.distributed`) each process gives its own lines, of frames that all of them number in
+    the same way: `focal` and all else that is not of a line must be the same in all of them.
 
     Args:
         lines: the lines, or their compressed form; with several processes, those of this process.

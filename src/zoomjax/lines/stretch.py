@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 
 
 def radial_stretch(
@@ -34,12 +34,12 @@ def stretch_of_points(
     mask: Bool[Array, "point"],
     k: Float[Array, "size"],
     normal: Float[Array, "2"],
-    family: AbstractFamily,
+    distortion_model: AbstractDistortionModel,
 ) -> Float[Array, ""]:
     """That of one line under any distortion model, point by point; 1 where there are no points."""
 
     def corrected(x, y):
-        return family.correct((x, y), x * x + y * y, k)
+        return distortion_model.correct((x, y), x * x + y * y, k)
 
     x, y = jnp.where(mask[:, None], z, 0).T
     _, transposed = jax.vjp(corrected, x, y)

@@ -6,9 +6,9 @@ from .about import About as About
 from .brown_conrady import BrownConrady as BrownConrady
 from .camera import Camera as Camera
 from .distortion import Distortion as Distortion
+from .distortion_model import AbstractDistortionModel as AbstractDistortionModel
+from .distortion_model import AbstractRadial as AbstractRadial
 from .division import Division as Division
-from .family import AbstractFamily as AbstractFamily
-from .family import AbstractRadial as AbstractRadial
 from .focus import FocusSplineZoom as FocusSplineZoom
 from .invertibility import Certificate as Certificate
 from .invertibility import certify as certify

@@ -8,7 +8,7 @@ import numpy as np
 
 from .._core.arguments import check_kind
 from .._core.fields import check_finite, check_positive, refuse_masked
-from .family import AbstractFamily
+from .distortion_model import AbstractDistortionModel
 
 _NAN = "give an array with NaN in place of what is masked, .filled(np.nan)"
 
@@ -63,18 +63,18 @@ def check_broadcast(points: tuple[Any, ...], focal: tuple[Any, ...]) -> None:
         ) from error
 
 
-def check_distortion(coefficients, centre, scale, family):
+def check_distortion(coefficients, centre, scale, distortion_model):
     """What a `Distortion` is made of: shapes, and values where they are known."""
-    if isinstance(family, bool) or type(family) is object:
+    if isinstance(distortion_model, bool) or type(distortion_model) is object:
         return  # stands for one in filters and trees
-    check_kind("family", family, (AbstractFamily,))
+    check_kind("distortion_model", distortion_model, (AbstractDistortionModel,))
     parts = {"coefficients": coefficients, "centre": centre, "scale": scale}
     if not all(hasattr(part, "shape") and hasattr(part, "dtype") for part in parts.values()):
         if any(isinstance(part, np.ndarray | jax.Array) for part in parts.values()):
             missing = next(name for name, part in parts.items() if not hasattr(part, "dtype"))
             raise ValueError(f"Argument {missing} must hold real numbers, but it is {parts[missing]!r}.")
         return  # a stand-in, of a pytree's structure
-    check_terms("coefficients", coefficients.shape[-1] if coefficients.ndim else 0, family)
+    check_terms("coefficients", coefficients.shape[-1] if coefficients.ndim else 0, distortion_model)
     if centre.shape[-1:] != (2,):
         raise ValueError(f"Argument centre must be (x, y), but its shape is {centre.shape}.")
     batch = coefficients.shape[:-1]
@@ -89,15 +89,17 @@ def check_distortion(coefficients, centre, scale, family):
     check_positive("scale", scale)
 
 
-def check_terms(name: str, size: int, family: AbstractFamily) -> None:
+def check_terms(name: str, size: int, distortion_model: AbstractDistortionModel) -> None:
     """Raise ValueError where a distortion model has no such number of coefficients."""
-    sizes = [family.size(terms) for terms in range(1, family.most_terms + 1)]
-    more = [family.size(terms) for terms in family.more_terms]
+    sizes = [
+        distortion_model.num_coefficients(terms) for terms in range(1, distortion_model.most_terms + 1)
+    ]
+    more = [distortion_model.num_coefficients(terms) for terms in distortion_model.more_terms]
     if size in (*sizes, *more):
         return
     opencv = ": OpenCV's (k1, k2, p1, p2, k3, ...) are of another model" * (size in (5, 8, 12, 14))
     raise ValueError(
         f"Argument {name} must give from {min(sizes)} to {max(sizes)} coefficients"
-        f"{''.join(f', or {number}' for number in more)}, for a {type(family).__name__}, but it gives "
-        f"{size}{opencv}."
+        f"{''.join(f', or {number}' for number in more)}, for a {type(distortion_model).__name__}, but it "
+        f"gives {size}{opencv}."
     )

@@ -7,6 +7,9 @@ from typing import Any
 USUAL = ("camera", "lens", "crop_factor", "source", "focal")
 """Names that zoomjax itself writes."""
 
+WIDTH_OF_FOCALS = "width_of_focal_px"
+"""Where focal lengths in px are of images of another size than the lens's, the width of those, px."""
+
 UNKNOWN = "not known"
 """What ``about["focal"]`` says of a lens of one focal length that nobody knows: its number is arbitrary."""
 

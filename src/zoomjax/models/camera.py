@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Num
 from .._core.arrays import aligned, as_array, finite, namespace
 from .._core.fields import check_finite, check_positive, check_shapes, numbers
 from .._core.types import AnyArray, FocalLike, Points
+from .about import WIDTH_OF_FOCALS
 from .lens import ZoomLens
 
 
@@ -137,7 +138,15 @@ class Camera(eqx.Module):
         if self.lens.focal_unit == "mm":
             pitch = self.lens.pixel_pitch if self.pixel_pitch is None else self.pixel_pitch
             length = length / _as(pitch, points)
+        else:
+            length = length * px_of_focal_px(self.lens)
         return aligned((points, 1), (principal, 1), (length, 0))
+
+
+def px_of_focal_px(lens: ZoomLens) -> float:
+    """By what focal lengths in px are multiplied to be those of the lens's images: see `lens_for_size`."""
+    width = lens.about.get(WIDTH_OF_FOCALS, lens.image_size[0])
+    return lens.image_size[0] / float(width)
 
 
 def _as(values: Any, like: Any) -> Any:

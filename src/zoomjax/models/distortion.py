@@ -1,11 +1,10 @@
 """Distortion of one frame: the paper's L (eq. 1-2), its inverse, and where the inverse exists.
 
-With ``z = (x - c)/s`` the corrected point is ``c + s F(z)``. F is given by the distortion model (`family`),
-by default
+With ``z = (x - c)/s`` the corrected point is ``c + s F(z)``. F is given by the distortion model, by default
 
     F(z) = z L(t),  L(t) = 1 + k1 t + k2 t^2 + ... + kN t^N,  t = z.z.
 
-This module handles px, arrays of points and dtypes; formulas and inverses are in `family`.
+This module handles px, arrays of points and dtypes; formulas and inverses are in `distortion_model`.
 """
 
 from collections.abc import Callable
@@ -24,7 +23,7 @@ from .._core.programs import optimised_program
 from .._core.spread import spread
 from .._core.types import AnyArray, Elements, Points, traced
 from ._arguments import as_points, check_distortion
-from .family import AbstractFamily, AbstractRadial, Pair
+from .distortion_model import AbstractDistortionModel, AbstractRadial, Pair
 from .polynomial import RadialPolynomial
 
 
@@ -45,7 +44,7 @@ class Distortion(eqx.Module):
         coefficients: (k1, ..., kN), or those of another distortion model, for radii in units of `scale`.
         centre: centre of distortion, px.
         scale: length in px that is radius 1: half the image diagonal, unless stated otherwise.
-        family: the distortion model of the coefficients.
+        distortion_model: the distortion model of the coefficients.
 
     Example:
         >>> d = Distortion([0.1, -0.02], [319.5, 239.5], 400.0)
@@ -56,16 +55,16 @@ class Distortion(eqx.Module):
     coefficients: Float[AnyArray, "*batch terms"] = eqx.field(converter=host_numbers("coefficients"))
     centre: Float[AnyArray, "... 2"] = eqx.field(converter=host_numbers("centre"))
     scale: Float[AnyArray, "..."] = eqx.field(converter=host_numbers("scale"))
-    family: AbstractFamily = RadialPolynomial()
+    distortion_model: AbstractDistortionModel = RadialPolynomial()
 
     def __check_init__(self):
         """Check shapes, and values where they are known."""
-        check_distortion(self.coefficients, self.centre, self.scale, self.family)
+        check_distortion(self.coefficients, self.centre, self.scale, self.distortion_model)
 
     @property
     def pixel_coefficients(self) -> Float[AnyArray, "*batch terms"]:
         """The coefficients in the paper's units, ``k_i / scale^(2i)``, px^(-2i); p1 and p2 in px^-1."""
-        order = self.family.orders(self.coefficients.shape[-1])
+        order = self.distortion_model.orders(self.coefficients.shape[-1])
         scale = namespace(self.scale).asarray(self.scale)[..., None]
         lengths, order, k = aligned((scale, 0), (order, 0), (self.coefficients, 0))
         return k / lengths**order
@@ -76,7 +75,7 @@ class Distortion(eqx.Module):
 
         For `BrownConrady` a lower bound: the distortion is certain not to fold up to there.
         """
-        radius = self.scale * _limit(self.family, self.coefficients)
+        radius = self.scale * _limit(self.distortion_model, self.coefficients)
         xp, k = namespace(radius, self.coefficients), self.coefficients
         return xp.asarray(xp.where(xp.isnan(k).any(axis=-1), np.nan, radius))
 
@@ -122,10 +121,12 @@ class Distortion(eqx.Module):
             spread(leaf, leaf.ndim > own)
             for leaf, own in ((self.coefficients, 1), (self.centre, 1), (self.scale, 0))
         )
-        return mapped(method, self.family, points, k, centre, scale)
+        return mapped(method, self.distortion_model, points, k, centre, scale)
 
 
-def mapped(method: str, family: AbstractFamily, points: Any, k: Any, centre: Any, scale: Any) -> Any:
+def mapped(
+    method: str, distortion_model: AbstractDistortionModel, points: Any, k: Any, centre: Any, scale: Any
+) -> Any:
     """``undistort`` or ``distort`` for points and distortions that broadcast.
 
     In NumPy where everything is known and the points are NumPy's, else compiled.
@@ -136,10 +137,12 @@ def mapped(method: str, family: AbstractFamily, points: Any, k: Any, centre: Any
             leaves = ((points, 1), (np.asarray(k), 1), (np.asarray(centre), 1), (np.asarray(scale), 0))
             points, *distortion = (leaf[None] for leaf in aligned(*leaves))
             if method == "undistort":
-                return _undistorted(points, family, *distortion)[0]
+                return _undistorted(points, distortion_model, *distortion)[0]
             at = _normal(_apart(points), *distortion, spreading=False)
-            return together(*at.in_pixels(family.distort(at.z, at.k, family.limit(at.k))))[0]
-    return compiled(method, _given, jnp.asarray(points), (family, k, centre, scale))
+            return together(
+                *at.in_pixels(distortion_model.distort(at.z, at.k, distortion_model.monotone_radius(at.k)))
+            )[0]
+    return compiled(method, _given, jnp.asarray(points), (distortion_model, k, centre, scale))
 
 
 @optimised_program
@@ -150,9 +153,9 @@ def compiled(
 
     Args:
         method: which of them.
-        distortion_of: the family, coefficients, centre and scale that the operands make. `distort` calls it
-            again where Newton's steps do not arrive: coefficients of each point are then not kept in memory
-            for the branch that is nearly never taken.
+        distortion_of: the distortion model, coefficients, centre and scale that the operands make.
+            `distort` calls it again where Newton's steps do not arrive: coefficients of each point are then
+            not kept in memory for the branch that is nearly never taken.
         points: px.
         operands: a pytree.
     """
@@ -162,8 +165,8 @@ def compiled(
 
 
 def _given(operands):
-    family, *numbers = operands
-    return family, *map(jnp.asarray, numbers)
+    distortion_model, *numbers = operands
+    return distortion_model, *map(jnp.asarray, numbers)
 
 
 class _Normal(NamedTuple):
@@ -211,7 +214,7 @@ def _apart(points):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _corrected(distortion_of, points, operands):
-    """Corrected points; NaN, with derivatives of zero, beyond the limit."""
+    """Corrected points; NaN, with derivatives of zero, beyond the monotone radius."""
     return _undistorted(points, *distortion_of(operands))
 
 
@@ -222,7 +225,7 @@ def _corrected_jvp(distortion_of, primals, tangents):
     Where there is no value slopes are those at the centre: a NaN, times a cotangent of zero, is NaN.
     The value is that of the same function: under vmap it must have its batch axis at the same place.
     """
-    family = distortion_of(primals[1])[0]
+    distortion_model = distortion_of(primals[1])[0]
 
     def normal(points, operands):
         at = _normal(_apart(points), *distortion_of(operands)[1:])
@@ -231,22 +234,22 @@ def _corrected_jvp(distortion_of, primals, tangents):
     (z, k, _, scale), (_, k_dot, centre_dot, scale_dot) = jax.jvp(normal, primals, tangents)
     at = _normal(_apart(primals[0]), *distortion_of(primals[1])[1:], spreading=False)
     squared, own = _constant(z[0] * z[0] + z[1] * z[1]), _constant(at.own)
-    within = family.within(squared, own, digits=4) & (squared < np.inf)
+    within = distortion_model.within(squared, own, digits=4) & (squared < np.inf)
     for coefficient in apart(own):
         within = within & jnp.isfinite(coefficient)
     x, y = (jnp.where(within, side, 0) for side in z)
     squared = x * x + y * y
     away = tuple(tangents[0][..., i] - centre_dot[i] for i in (0, 1))
-    if isinstance(family, AbstractRadial):
+    if isinstance(distortion_model, AbstractRadial):
         along = jnp.where(within, x * away[0] + y * away[1] - squared * scale_dot, 0)
-        factor, bent = jax.jvp(family.factor, (squared, k), (2 * along, scale[None] * k_dot))
+        factor, bent = jax.jvp(distortion_model.factor, (squared, k), (2 * along, scale[None] * k_dot))
         within = within & (factor >= 0)
         factor = jnp.where(within, factor, 0)
         moved = factor * away[0] + x * bent, factor * away[1] + y * bent
     else:
         z_dot = (jnp.where(within, away[i] - (x, y)[i] * scale_dot, 0) for i in (0, 1))
         new, bent = jax.jvp(
-            lambda x, y, k: family.correct((x, y), x * x + y * y, k),
+            lambda x, y, k: distortion_model.correct((x, y), x * x + y * y, k),
             (x, y, k),
             (*z_dot, scale[None] * k_dot),
         )
@@ -257,17 +260,17 @@ def _corrected_jvp(distortion_of, primals, tangents):
     return _corrected(distortion_of, *primals), moved
 
 
-def _undistorted(points, family, k, centre, scale):
-    """Corrected points; NaN beyond the limit."""
+def _undistorted(points, distortion_model, k, centre, scale):
+    """Corrected points; NaN beyond the monotone radius."""
     at = _normal(_apart(points), k, centre, scale, spreading=False)
     xp, (x, y) = namespace(at.k), at.z
     squared = x * x + y * y
-    within = family.within(squared, at.own, digits=4)
-    if isinstance(family, AbstractRadial):
-        factor = family.factor(squared, at.k)
+    within = distortion_model.within(squared, at.own, digits=4)
+    if isinstance(distortion_model, AbstractRadial):
+        factor = distortion_model.factor(squared, at.k)
         factor = once(xp.where(within & (factor >= 0), factor, np.nan))
         return interleaved(*at.in_pixels((x * factor, y * factor)))
-    new_x, new_y = family.correct(at.z, squared, at.k)
+    new_x, new_y = distortion_model.correct(at.z, squared, at.k)
     # An invertible correction is monotone, and never goes to the other side; at a pole rounding does.
     within = within & (x * new_x + y * new_y >= 0)
     return interleaved(*at.in_pixels((xp.where(within, new_x, np.nan), xp.where(within, new_y, np.nan))))
@@ -281,12 +284,14 @@ def _distorted(distortion_of, points, operands):
     are 1/eps of the dtype at most.
     """
 
-    family, *distortion = distortion_of(operands)
+    distortion_model, *distortion = distortion_of(operands)
     at = _normal(_apart(points), *distortion, spreading=False)
-    if isinstance(family, AbstractRadial):
+    if isinstance(distortion_model, AbstractRadial):
         q = _ratio(distortion_of, points, operands)
         return interleaved(*at.in_pixels((at.z[0] * q, at.z[1] * q)))
-    return interleaved(*at.in_pixels(family.distort(at.z, at.k, family.limit(at.k))))
+    return interleaved(
+        *at.in_pixels(distortion_model.distort(at.z, at.k, distortion_model.monotone_radius(at.k)))
+    )
 
 
 def _ratio(distortion_of, points, operands):
@@ -298,29 +303,29 @@ def _ratio(distortion_of, points, operands):
     """
 
     def normal():
-        family, *distortion = distortion_of(operands)
+        distortion_model, *distortion = distortion_of(operands)
         at = _normal(_apart(points), *distortion, spreading=False)
-        return family, at.z[0] * at.z[0] + at.z[1] * at.z[1], at.k
+        return distortion_model, at.z[0] * at.z[0] + at.z[1] * at.z[1], at.k
 
     def certain():
-        family, squared, k = normal()
-        return in_blocks(partial(_settled, family), quick, squared, k)
+        distortion_model, squared, k = normal()
+        return in_blocks(partial(_settled, distortion_model), quick, squared, k)
 
-    family, squared, k = normal()
-    quick, arrived = family.quick_ratio(squared, k)
+    distortion_model, squared, k = normal()
+    quick, arrived = distortion_model.quick_ratio(squared, k)
     quick = once(jnp.where(arrived, quick, jnp.nan))
     return jax.lax.cond(jnp.any(jnp.isnan(quick)), certain, lambda: quick)
 
 
-def _settled(family, quick, squared, k):
+def _settled(distortion_model, quick, squared, k):
     """Ratios of which those that are NaN are found for certain, if there are such."""
 
     def certain():
-        q, found = family.ratio(squared, k, limit)
+        q, found = distortion_model.ratio(squared, k, monotone_radius)
         return jnp.where(found, q, jnp.nan)
 
-    limit = family.limit(k)
-    settled = ~jnp.isnan(quick) | ~family.reaches(squared, k, limit)
+    monotone_radius = distortion_model.monotone_radius(k)
+    settled = ~jnp.isnan(quick) | ~distortion_model.reaches(squared, k, monotone_radius)
     return jax.lax.cond(jnp.all(settled), lambda: quick, certain)
 
 
@@ -340,13 +345,13 @@ def _distorted_jvp(distortion_of, primals, tangents):
         at = _normal(points, jnp.where(jnp.isfinite(k), k, 0), centre, scale)
         return at.z, at.k, at.centre, at.scale
 
-    family = distortion_of(primals[1])[0]
+    distortion_model = distortion_of(primals[1])[0]
     (_, k, centre, scale), (y_dot, k_dot, centre_dot, scale_dot) = jax.jvp(normal, primals, tangents)
     z = tuple(jnp.where(exists, (w[..., i] - centre[i]) / scale, 0) for i in (0, 1))
     squared = z[0] * z[0] + z[1] * z[1]
     # dF/dz dz = dy - dF/dk dk.
-    by_k = jax.jvp(lambda k: family.correct(z, squared, k), (k,), (k_dot,))[1]
-    moved, determinant = _solved(family, z, squared, k, (y_dot[0] - by_k[0], y_dot[1] - by_k[1]))
+    by_k = jax.jvp(lambda k: distortion_model.correct(z, squared, k), (k,), (k_dot,))[1]
+    moved, determinant = _solved(distortion_model, z, squared, k, (y_dot[0] - by_k[0], y_dot[1] - by_k[1]))
     weight = 1 / jnp.maximum(determinant, jnp.finfo(w.dtype).eps)
     return w, together(
         *(
@@ -356,16 +361,19 @@ def _distorted_jvp(distortion_of, primals, tangents):
     )
 
 
-def _solved(family, z, squared, k, r):
+def _solved(distortion_model, z, squared, k, r):
     """The adjugate of ``dF/dz`` times r, and its determinant."""
     one, zero = jnp.ones_like(squared), jnp.zeros_like(squared)
-    if isinstance(family, AbstractRadial):  # dF/dz = L + 2 L' z z^T
-        factor, bend = jax.jvp(lambda t: family.factor(t, k), (squared,), (2 * one,))
+    if isinstance(distortion_model, AbstractRadial):  # dF/dz = L + 2 L' z z^T
+        factor, bend = jax.jvp(lambda t: distortion_model.factor(t, k), (squared,), (2 * one,))
         slope, along = factor + squared * bend, bend * (z[0] * r[0] + z[1] * r[1])
         return (slope * r[0] - along * z[0], slope * r[1] - along * z[1]), factor * slope
 
+    def moved(*z):
+        return distortion_model.correct(z, z[0] * z[0] + z[1] * z[1], k)
+
     def column(*direction):
-        return jax.jvp(lambda *z: family.correct(z, z[0] * z[0] + z[1] * z[1], k), z, direction)[1]
+        return jax.jvp(moved, z, direction)[1]
 
     (ax, ay), (bx, by) = column(one, zero), column(zero, one)
     return (by * r[0] - bx * r[1], ax * r[1] - ay * r[0]), ax * by - ay * bx
@@ -376,8 +384,8 @@ def _constant(array):
     return jax.lax.stop_gradient(array) if isinstance(array, jax.Array) else array
 
 
-def _limit(family, k):
+def _limit(distortion_model, k):
     if isinstance(k, np.ndarray):
         with np.errstate(all="ignore"):
-            return family.limit(np.moveaxis(k[None], -1, 0))[0]
-    return family.limit(_constant(jnp.moveaxis(k, -1, 0)))
+            return distortion_model.monotone_radius(np.moveaxis(k[None], -1, 0))[0]
+    return distortion_model.monotone_radius(_constant(jnp.moveaxis(k, -1, 0)))

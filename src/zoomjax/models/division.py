@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .._core.arrays import namespace
 from .._core.types import AnyArray, Elements
-from .family import AbstractRadial, radial_factor, radial_orders, radial_rest, times
+from .distortion_model import AbstractRadial, radial_factor, radial_orders, radial_rest, times
 
 
 class Division(AbstractRadial):
@@ -56,16 +56,16 @@ class Division(AbstractRadial):
         growth = radial_rest(squared, times(2 * radial_orders(len(k)) + 1, k)) - rest  # by r, times r
         return (r - rho) - rho * rest, 1 - rho / (r + (r == 0)) * growth
 
-    def conditions(self, size: int) -> np.ndarray:
+    def conditions(self, number: int) -> np.ndarray:
         """The numerator of the slope, and the divisor."""
-        return np.stack([1 - 2 * radial_orders(size), np.ones(size, int)])
+        return np.stack([1 - 2 * radial_orders(number), np.ones(number, int)])
 
-    def expansion_terms(self, size: int) -> int:
+    def expansion_terms(self, number: int) -> int:
         """8, or its own number if that is more.
 
         The error of L up to the corner is that of rounding for weak distortion, and grows towards the pole.
         """
-        return max(8, size)
+        return max(8, number)
 
     def expansion(
         self, k: Elements, reach: Float[Array, ""]

@@ -12,7 +12,8 @@ of the parabola of each row of controls is known in closed form. Boxes whose bou
 halved, the lowest first, which makes the bound better by a factor of four. Rounding errors are bounded by
 the size of the numbers and subtracted.
 
-Other families state what must be positive likewise (`AbstractFamily.conditions`): linear in k, too.
+Other distortion models state what must be positive likewise, linear in k
+(`AbstractDistortionModel.conditions`).
 
 Once per fit; a fit of a usual lens needs a few boxes, and 256 halvings are the most.
 """
@@ -30,7 +31,7 @@ from .._core.arguments import kinds_checked
 from .._core.programs import light_program
 from .._core.types import AnyArray, Point, Scalar
 from ._bernstein import Pieces, cut, power_controls
-from .family import AbstractFamily
+from .distortion_model import AbstractDistortionModel
 from .lens import ZoomLens
 from .polynomial import RadialPolynomial
 from .zoom import AbstractZoom
@@ -66,6 +67,7 @@ class Certificate(eqx.Module):
         least: a proved lower bound of the slope; -inf if there is no proof.
         slope: the smallest slope found. At most 0.01 above `least`, if that is finite.
         focal, radius: the focal length, and the distance from the centre in px, of that slope.
+        stated: whether the zoom model states its `pieces`, so that there is a proof or a fold.
     """
 
     certified: Bool[Array, ""]
@@ -73,11 +75,12 @@ class Certificate(eqx.Module):
     slope: Float[Array, ""]
     focal: Float[Array, ""]
     radius: Float[Array, ""]
+    stated: bool = eqx.field(static=True)
 
     @property
     def folded(self) -> Bool[Array, ""]:
         """Whether a fold was found, or not ruled out though the zoom model states its pieces."""
-        return ~self.certified & ~(jnp.isneginf(self.least) & (self.slope > 0))
+        return ~self.certified & (self.stated | (self.slope <= 0))
 
 
 @kinds_checked
@@ -94,7 +97,7 @@ def certify(lens: ZoomLens) -> Certificate:
         True
     """
     return certificate_of(
-        lens.zoom, lens.centre, lens.focal_range, lens.image_size, lens.shift, lens.family
+        lens.zoom, lens.centre, lens.focal_range, lens.image_size, lens.shift, lens.distortion_model
     )
 
 
@@ -105,11 +108,11 @@ def certificate_of(
     focal_range: Float[AnyArray, "2"],
     image_size: tuple[int, int],
     shift: AbstractZoom | None = None,
-    family: AbstractFamily = RadialPolynomial(),  # noqa: B008, it has no state
+    distortion_model: AbstractDistortionModel = RadialPolynomial(),  # noqa: B008, it has no state
 ) -> Certificate:
     """`certify` for the parts of a lens; constant for differentiation."""
     zoom, centre, focal_range, shift = jax.lax.stop_gradient((zoom, centre, focal_range, shift))
-    stated = stated_pieces(zoom, focal_range, family)
+    stated = _stated_pieces(zoom, focal_range, distortion_model)
     pieces = _sampled(zoom, focal_range) if stated is None else stated
     scale = math.hypot(*image_size) / 2
     reach = _squared_reach(centre, image_size)
@@ -118,10 +121,12 @@ def certificate_of(
         stated = None if path is None else stated
         # As if the centre were farthest off at every focal length: a bound, and near enough.
         reach = _squared_reach(centre, image_size, scale * _farthest(path or _sampled(shift, focal_range)))
-    nets = _slope_nets(pieces, reach, family)
+    nets = _slope_nets(pieces, reach, distortion_model)
     number = pieces.controls.shape[-1]
-    largest = np.abs(family.conditions(number)).max(axis=0).astype(nets.dtype)
-    size = 1 + jnp.sum(largest * reach ** (family.orders(number) / 2).astype(nets.dtype) * pieces.size)
+    largest = np.abs(distortion_model.conditions(number)).max(axis=0).astype(nets.dtype)
+    size = 1 + jnp.sum(
+        largest * reach ** (distortion_model.orders(number) / 2).astype(nets.dtype) * pieces.size
+    )
     rounding = _ROUNDING * (nets.shape[1] + nets.shape[2]) * float(jnp.finfo(nets.dtype).eps) * size
     bound, slope, net, place = _search(nets, rounding)
     low, high = pieces.ends[net % pieces.ends.shape[0]]
@@ -132,24 +137,19 @@ def certificate_of(
         slope=slope,
         focal=pieces.focal_of(low + place[0] * (high - low)),
         radius=scale * jnp.sqrt(place[1] * reach),
+        stated=stated is not None,
     )
 
 
-def slope_controls(
-    zoom: AbstractZoom,
-    centre: Point,
-    focal_range: Float[AnyArray, "2"],
-    image_size: tuple[int, int],
-    family: AbstractFamily = RadialPolynomial(),  # noqa: B008, it has no state
-) -> Float[Array, "control"] | None:
-    """Numbers such that the slope is nowhere below the least of them; None if the model states no pieces.
+def slope_controls(lens: ZoomLens) -> Float[Array, "control"]:
+    """Numbers such that the slope is nowhere below the least of them, of a zoom model that states pieces.
 
-    Linear, but for a constant, in the parameters of a linear zoom model.
+    Linear, but for a constant, in the parameters of a linear zoom model. The centre must not move.
     """
-    pieces = stated_pieces(zoom, focal_range, family)
-    if pieces is None:
-        return None
-    nets = _slope_nets(pieces, _squared_reach(centre, image_size), family)
+    pieces = _stated_pieces(lens.zoom, lens.focal_range, lens.distortion_model)
+    assert pieces is not None
+    assert lens.shift is None
+    nets = _slope_nets(pieces, _squared_reach(lens.centre, lens.image_size), lens.distortion_model)
     number, (_, rows, columns) = pieces.ends.shape[0], nets.shape
     along = cut(rows - 1, -(-_CELLS // number) if rows > 2 else 1)
     across = cut(columns - 1, _CELLS if columns > 2 else 1)
@@ -182,35 +182,35 @@ def _squared_reach(
     )
 
 
-def stated_pieces(
-    zoom: AbstractZoom, focal_range: Float[AnyArray, "2"], family: AbstractFamily
+def _stated_pieces(
+    zoom: AbstractZoom, focal_range: Float[AnyArray, "2"], distortion_model: AbstractDistortionModel
 ) -> Pieces | None:
-    """`AbstractZoom.pieces`, if they are of use for this family.
+    """`AbstractZoom.pieces`, if they are of use for this distortion model.
 
     Those that are below the coefficients bound only what grows with every coefficient.
     """
     pieces = zoom.pieces(focal_range)
     if pieces is None or pieces.exact:
         return pieces
-    growing = bool((family.conditions(pieces.controls.shape[-1]) >= 0).all())
+    growing = bool((distortion_model.conditions(pieces.controls.shape[-1]) >= 0).all())
     return pieces if growing else None
 
 
 def _slope_nets(
-    pieces: Pieces, reach: Scalar, family: AbstractFamily
+    pieces: Pieces, reach: Scalar, distortion_model: AbstractDistortionModel
 ) -> Float[Array, "net control column"]:
-    """The controls of the family's conditions: of each piece, in its variable and in t from 0 to `reach`.
+    """The controls of the model's conditions: of each piece, in its variable and in t from 0 to `reach`.
 
     One net a piece for the slope of the polynomial; all pieces, condition by condition, for others.
     """
     number = pieces.controls.shape[-1]
-    orders = family.orders(number)
+    orders = distortion_model.orders(number)
     powers = power_controls(jnp.zeros_like(reach), reach, int(orders.max()) // 2)
     # The radius itself, of decentering, is taken at its largest.
     powers = jnp.where((orders == 1)[None], jnp.sqrt(reach), powers[:, orders // 2])
     nets = [
         1 + jnp.einsum("pci,ti->pct", pieces.controls, powers * row[None], precision="highest")
-        for row in family.conditions(number).astype(powers.dtype)
+        for row in distortion_model.conditions(number).astype(powers.dtype)
     ]
     return jnp.concatenate(nets)
 

@@ -25,13 +25,22 @@ from ._arguments import as_focal, as_points, check_broadcast, check_terms
 from ._known_sizes import with_known_size
 from .about import About, checked_about, checked_pitch
 from .distortion import Distortion, compiled, mapped
-from .family import AbstractFamily
+from .distortion_model import AbstractDistortionModel
 from .model import Model
 from .polynomial import RadialPolynomial
-from .registry import array_of, coefficients_shape, described, family_name, family_named, zoom_from
+from .registry import (
+    array_of,
+    coefficients_shape,
+    described,
+    distortion_model_from,
+    distortion_model_name,
+    once,
+    zoom_from,
+)
 from .zoom import AbstractFocusZoom, AbstractLinearZoom, AbstractZoom
 
-_FORMAT, _VERSION = "zoomjax.lens", 2
+_FORMAT, _VERSION = "zoomjax.lens", 3
+_UNREADABLE = ValueError, TypeError, KeyError, AttributeError, ArithmeticError, RecursionError, OSError
 
 _SLACK = 1e-6
 """Share of a focal length by which it may be beyond the range: the end itself, through a float32."""
@@ -49,7 +58,7 @@ class ZoomLens(eqx.Module):
         image_size: (width, height) px of the images it is for.
         focal_unit: "mm" or "px".
         focus_range: the least and greatest focus fitted, if the zoom model depends on it.
-        family: the distortion model of the coefficients, by default the radial polynomial.
+        distortion_model: the distortion model of the coefficients, by default the radial polynomial.
         pixel_pitch: width of a pixel of these images on the sensor, mm; None if it is not known.
         about: words and numbers by name, such as camera, lens and crop_factor; see `About`.
 
@@ -69,15 +78,15 @@ class ZoomLens(eqx.Module):
     focal_unit: str = eqx.field(static=True, default="mm", converter=checked_unit)
     shift: AbstractZoom | None = None
     focus_range: Float[AnyArray, "2"] | None = eqx.field(default=None, converter=numbers("focus_range"))
-    family: AbstractFamily = RadialPolynomial()
+    distortion_model: AbstractDistortionModel = RadialPolynomial()
     pixel_pitch: float | None = eqx.field(static=True, default=None, converter=checked_pitch)
     about: Mapping[str, str | float] = eqx.field(static=True, default=About(), converter=checked_about)
 
     def __check_init__(self):
-        """Check the geometry, and that the zoom model gives the family's coefficients."""
+        """Check the geometry, and that the zoom model gives the coefficients of the distortion model."""
         for name, kinds in (
             ("zoom", (AbstractZoom,)),
-            ("family", (AbstractFamily,)),
+            ("distortion_model", (AbstractDistortionModel,)),
             ("shift", (AbstractZoom, type(None))),
         ):
             value = getattr(self, name)
@@ -101,8 +110,8 @@ class ZoomLens(eqx.Module):
             raise ValueError(
                 f"Argument shift must give two numbers, the offset of the centre, but it gives {shift}."
             )
-        if size is not None and isinstance(self.family, AbstractFamily):
-            check_terms("zoom", size, self.family)
+        if size is not None and isinstance(self.distortion_model, AbstractDistortionModel):
+            check_terms("zoom", size, self.distortion_model)
 
     @property
     def scale(self) -> float:
@@ -112,7 +121,7 @@ class ZoomLens(eqx.Module):
     @property
     def model(self) -> Model:
         """Zoom model, number of coefficients and distortion model, as fits of other lines take them."""
-        return Model(self.zoom, None, self.family)
+        return Model(self.zoom, None, self.distortion_model)
 
     def __call__(self, focal: FocalLike, focus: FocalLike | None = None) -> Distortion:
         """The distortion at a focal length in `focal_unit`, or at several.
@@ -180,7 +189,7 @@ class ZoomLens(eqx.Module):
         check_broadcast(points.shape[:-1], focal.shape)
         if isinstance(points, np.ndarray) and not traced((self, focal, focus)):
             d = self._distortion(focal, focus)
-            return mapped(method, d.family, points, d.coefficients, d.centre, d.scale)
+            return mapped(method, d.distortion_model, points, d.coefficients, d.centre, d.scale)
         points = jnp.asarray(points)
         operands = (self, jnp.asarray(focal, points.dtype), focus, traced((self, focal)))
         return compiled(method, _bent, points, operands)
@@ -202,7 +211,7 @@ class ZoomLens(eqx.Module):
         k = _at(self.zoom, focal, focus, dtype)
         if within:
             k = jnp.where(inside[..., None], k, jnp.nan)
-        return Distortion(k, self.centre_at(focal), jnp.asarray(self.scale, dtype), self.family)
+        return Distortion(k, self.centre_at(focal), jnp.asarray(self.scale, dtype), self.distortion_model)
 
     def centre_at(self, focal: FocalLike) -> Float[AnyArray, "*focal 2"]:
         """The centre of distortion at focal lengths, px.
@@ -232,22 +241,21 @@ class ZoomLens(eqx.Module):
 
         Raises:
             TypeError: the class of the zoom model or the distortion model is not registered
-            (`register_model`),
-                or has fields that a file cannot hold.
+                (`register_model`), or has fields that a file cannot hold.
         """
         check_kind("path", path, (str, os.PathLike))
-        polynomial = isinstance(self.family, RadialPolynomial)
+        polynomial = isinstance(self.distortion_model, RadialPolynomial)
         content = {
             "format": _FORMAT,
-            # Older readers know no families, and must not take this one's coefficients for a polynomial's.
+            # Older readers know the polynomial alone, or another key: they must not take k for its own.
             "version": 1 if polynomial else _VERSION,
             "image_size": list(self.image_size),
             "centre": _numbers(self.centre),
             "scale": self.scale,
             "focal_unit": self.focal_unit,
             "focal_range": _numbers(self.focal_range),
-            **({} if polynomial else {"family": family_name(self.family)}),
-            "radial": self.family.formula,
+            **({} if polynomial else {"distortion_model": distortion_model_name(self.distortion_model)}),
+            "radial": self.distortion_model.formula,
             "zoom": described(self.zoom),
         }
         if self.focus_range is not None:
@@ -311,7 +319,7 @@ def _at(zoom, focal, focus, dtype):
 def _bent(operands):
     lens, focal, focus, within = operands
     d = lens._distortion(focal, focus, within)
-    return d.family, d.coefficients, d.centre, d.scale
+    return d.distortion_model, d.coefficients, d.centre, d.scale
 
 
 def _coefficients(zoom: AbstractZoom | None) -> int | None:
@@ -351,8 +359,8 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
         ValueError: the file does not describe a lens, or is of a later version; the message names it.
     """
     try:
-        with open(path, encoding="utf-8") as file:
-            content = json.load(file)
+        with open(path, encoding="utf-8-sig") as file:
+            content = json.load(file, object_pairs_hook=once)
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise ValueError("it describes no zoom lens; ZoomLens.save writes such a file")
         if content["version"] not in range(1, _VERSION + 1):
@@ -368,7 +376,7 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
             focal_unit=content["focal_unit"],
             shift=zoom_from(content["shift"], 2) if "shift" in content else None,
             focus_range=_pair(content, "focus_range") if "focus_range" in content else None,
-            family=family_named(content.get("family", "RadialPolynomial")),
+            distortion_model=distortion_model_from(content),
             pixel_pitch=content.get("pixel_pitch"),
             about=content.get("about", {}),
         )
@@ -377,15 +385,7 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
         return lens
     except FileNotFoundError:
         raise
-    except (
-        ValueError,
-        TypeError,
-        KeyError,
-        AttributeError,
-        ArithmeticError,
-        RecursionError,
-        OSError,
-    ) as error:
+    except _UNREADABLE as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
         raise ValueError(f"Cannot read a lens from {os.fspath(path)}: {reason}.") from error
 

@@ -7,8 +7,8 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import PyTree
 
-from .._core.arguments import check_kind
-from .family import AbstractFamily
+from .._core.arguments import kinds_checked
+from .distortion_model import AbstractDistortionModel
 from .polynomial import RadialPolynomial
 from .zoom import AbstractZoom, PolynomialZoom, terms_of, with_parameters
 
@@ -18,42 +18,44 @@ _POLYNOMIAL = RadialPolynomial()
 class Model(eqx.Module):
     """A zoom model, its number of radial distortion coefficients, and the distortion model.
 
-    ``fit_zoom(lines, zoom=Model(PolynomialZoom(degree=2), terms=2, family=Division()))`` fits it, as do the
-    other fits; `select_model` compares several; `ZoomLens.model` is that of a lens.
+    ``fit_zoom(lines, zoom=Model(PolynomialZoom(degree=2), terms=1, distortion_model=Division()))`` fits it,
+    as do the other fits; `select_model` compares several; `ZoomLens.model` is that of a lens.
 
     Attributes:
         zoom: the zoom model, specified or fitted, such as ``PolynomialZoom(degree=2)``.
         terms: N, of eq. 2; by default 2, or as many as a `zoom` with parameters has.
-        family: the distortion model; by default the radial polynomial (eq. 2).
+        distortion_model: the distortion model; by default the radial polynomial (eq. 2).
 
     Raises:
-        TypeError: `zoom` or `family` is none.
+        TypeError: `zoom` or `distortion_model` is none.
         ValueError: there is no such number of coefficients, or the parameters of `zoom` are for another.
 
     Example:
         >>> from zoomjax.models import Division, Model
-        >>> Model(PolynomialZoom(degree=1), terms=1, family=Division()).name
+        >>> Model(PolynomialZoom(degree=1), terms=1, distortion_model=Division()).name
         'Division, degree 1, 1 term'
     """
 
     zoom: AbstractZoom
     terms: int = eqx.field(static=True)
-    family: AbstractFamily
+    distortion_model: AbstractDistortionModel
 
-    @typing.no_type_check  # checked below, with sentences of our own
+    @kinds_checked  # with sentences of our own
+    @typing.no_type_check
     def __init__(
-        self, zoom: AbstractZoom, terms: int | None = None, family: AbstractFamily = _POLYNOMIAL
+        self,
+        zoom: AbstractZoom,
+        terms: int | None = None,
+        distortion_model: AbstractDistortionModel = _POLYNOMIAL,
     ) -> None:
         """Check what it is made of."""
-        check_kind("zoom", zoom, (AbstractZoom,))
-        check_kind("family", family, (AbstractFamily,))
-        self.zoom, self.family = zoom, family
-        self.terms = terms_of(zoom, terms, family)
+        self.zoom, self.distortion_model = zoom, distortion_model
+        self.terms = terms_of(zoom, terms, distortion_model)
 
     @property
-    def size(self) -> int:
+    def num_coefficients(self) -> int:
         """The number of all coefficients: the radial ones, and what the distortion model has besides."""
-        return self.family.size(self.terms)
+        return self.distortion_model.num_coefficients(self.terms)
 
     @property
     def name(self) -> str:
@@ -64,7 +66,7 @@ class Model(eqx.Module):
             if field.metadata.get("static") and (value := getattr(self.zoom, field.name)) is not None
         ]
         other: list[Any] = [self.zoom] * (not isinstance(self.zoom, PolynomialZoom))
-        other += [self.family] * (not isinstance(self.family, RadialPolynomial))
+        other += [self.distortion_model] * (not isinstance(self.distortion_model, RadialPolynomial))
         kind = [type(model).__name__ for model in other]
         return ", ".join([*kind, *settings, f"{self.terms} term{'s' * (self.terms > 1)}"])
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.types import AnyArray, Elements
-from .family import AbstractRadial, radial_factor, radial_orders, radial_rest, radial_slope
+from .distortion_model import AbstractRadial, radial_factor, radial_orders, radial_rest, radial_slope
 
 
 class RadialPolynomial(AbstractRadial):
@@ -30,13 +30,13 @@ class RadialPolynomial(AbstractRadial):
         """``r L(t) - rho``, as r - rho, which is exact near the root, and the rest."""
         return (r - rho) + r * radial_rest(squared, k), radial_slope(squared, k)
 
-    def conditions(self, size: int) -> np.ndarray:
+    def conditions(self, number: int) -> np.ndarray:
         """One: the slope."""
-        return (2 * radial_orders(size) + 1)[None]
+        return (2 * radial_orders(number) + 1)[None]
 
-    def expansion_terms(self, size: int) -> int:
+    def expansion_terms(self, number: int) -> int:
         """Its own."""
-        return size
+        return number
 
     def expansion(
         self, k: Elements, reach: Float[Array, ""]

@@ -7,6 +7,7 @@ user-defined classes.
 
 import dataclasses
 import functools
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, TypeVar, cast, overload
 
@@ -16,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .brown_conrady import BrownConrady
+from .distortion_model import AbstractDistortionModel
 from .division import Division
-from .family import AbstractFamily
 from .focus import FocusSplineZoom
 from .polynomial import RadialPolynomial
 from .power import PowerZoom
@@ -27,10 +28,10 @@ from .tables import TableZoom
 from .two_region import TwoRegionZoom
 from .zoom import AbstractFocusZoom, AbstractZoom, PolynomialZoom
 
-SomeModel = TypeVar("SomeModel", bound=AbstractZoom | AbstractFamily)
+SomeModel = TypeVar("SomeModel", bound=AbstractZoom | AbstractDistortionModel)
 
 _ZOOMS: dict[str, type[AbstractZoom]] = {}
-_FAMILIES: dict[str, type[AbstractFamily]] = {}
+_DISTORTION_MODELS: dict[str, type[AbstractDistortionModel]] = {}
 
 _RESERVED = {"model", "formula"}
 """Keys of a model in the file beside its fields."""
@@ -57,8 +58,8 @@ def register_model(cls: Any = None, *, name: str | None = None) -> Any:
     booleans, words, None and tuples of these. Distortion models have no fields.
 
     Args:
-        cls: a final class of `AbstractZoom` or `AbstractFamily`, with a class attribute ``formula``: a
-            description of its numbers for readers of the file.
+        cls: a final class of `AbstractZoom` or `AbstractDistortionModel`, with a class attribute
+            ``formula``: a description of its numbers for readers of the file.
         name: the model's name in files, by default the name of the class.
 
     Returns:
@@ -85,11 +86,11 @@ def register_model(cls: Any = None, *, name: str | None = None) -> Any:
     """
     if cls is None:
         return functools.partial(register_model, name=name)
-    kinds: dict[type, dict[str, Any]] = {AbstractZoom: _ZOOMS, AbstractFamily: _FAMILIES}
+    kinds: dict[type, dict[str, Any]] = {AbstractZoom: _ZOOMS, AbstractDistortionModel: _DISTORTION_MODELS}
     table = next((kinds[k] for k in kinds if isinstance(cls, type) and issubclass(cls, k)), None)
     if table is None:
         raise TypeError(
-            f"Argument cls must be a class of AbstractZoom or AbstractFamily, but it is {cls!r}."
+            f"Argument cls must be a class of AbstractZoom or AbstractDistortionModel, but it is {cls!r}."
         )
     if not isinstance(getattr(cls, "formula", None), str):
         raise TypeError(
@@ -97,8 +98,10 @@ def register_model(cls: Any = None, *, name: str | None = None) -> Any:
             "the file what its numbers mean."
         )
     fields = {field.name for field in dataclasses.fields(cls)}
-    if table is _FAMILIES and fields:
-        raise TypeError(f"A family has no fields, but {cls.__name__} has {', '.join(sorted(fields))}.")
+    if table is _DISTORTION_MODELS and fields:
+        raise TypeError(
+            f"A distortion model has no fields, but {cls.__name__} has {', '.join(sorted(fields))}."
+        )
     if clash := fields & _RESERVED:
         raise TypeError(f"{cls.__name__} must not have a field {clash.pop()}, a key of the file's own.")
     name = cast(str, cls.__name__) if name is None else name
@@ -120,14 +123,24 @@ for _model in (
     register_model(_model)
 
 
-def family_name(family: AbstractFamily) -> str:
-    """What files call a family; TypeError if it is not registered."""
-    return _name_of(family, _FAMILIES)
+def distortion_model_name(distortion_model: AbstractDistortionModel) -> str:
+    """What files call a distortion model; TypeError if it is not registered."""
+    return _name_of(distortion_model, _DISTORTION_MODELS)
 
 
-def family_named(name: Any) -> AbstractFamily:
-    """The family that files call so; ValueError if none is registered."""
-    return _class_named(name, _FAMILIES, "family of distortions")()
+def distortion_model_from(content: dict[str, Any]) -> AbstractDistortionModel:
+    """The distortion model of a file: the polynomial if it names none; ValueError if it is unknown."""
+    name = content.get("distortion_model", content.get("family", "RadialPolynomial"))  # up to version 2
+    return _class_named(name, _DISTORTION_MODELS, "distortion model")()
+
+
+def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON whose names are all different: readers differ in which of two they take."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
+        raise ValueError(f"it has {twice!r} twice")
+    return found
 
 
 def described(model: AbstractZoom) -> dict[str, Any]:
@@ -181,7 +194,7 @@ def _class_named(name: Any, table: dict[str, Any], kind: str) -> Any:
     return table[name]
 
 
-def _name_of(model: AbstractZoom | AbstractFamily, table: dict[str, Any]) -> str:
+def _name_of(model: AbstractZoom | AbstractDistortionModel, table: dict[str, Any]) -> str:
     for name, cls in table.items():
         if cls is type(model):
             return name

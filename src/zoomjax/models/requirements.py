@@ -7,7 +7,7 @@ all models; docs/formulation.md has the table, which is made by trying.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from .family import AbstractRadial
+from .distortion_model import AbstractRadial
 from .zoom import AbstractFocusZoom
 
 
@@ -27,7 +27,7 @@ class Requirement(NamedTuple):
 
 _NO_CENTRE = "Decentering (p1, p2) does nearly the same as another centre: fit one of them."
 
-RADIAL = Requirement(lambda family: isinstance(family, AbstractRadial), "a radial distortion model")
+RADIAL = Requirement(lambda model: isinstance(model, AbstractRadial), "a radial distortion model")
 FOCAL_ALONE = Requirement(
     lambda zoom: not isinstance(zoom, AbstractFocusZoom),
     "a zoom model of the focal length alone",
@@ -38,15 +38,18 @@ STILL_CENTRE = Requirement(
 )
 
 REQUIREMENTS: dict[str, dict[str, Requirement]] = {
-    "fit_centre": {"zoom": FOCAL_ALONE._replace(instead=""), "family": RADIAL._replace(instead=_NO_CENTRE)},
+    "fit_centre": {
+        "zoom": FOCAL_ALONE._replace(instead=""),
+        "distortion_model": RADIAL._replace(instead=_NO_CENTRE),
+    },
     "fit_motion": {"zoom": FOCAL_ALONE._replace(instead="Tracks have no focus.")},
     "fit_boards": {"zoom": FOCAL_ALONE._replace(instead="Photos of boards have no focus.")},
-    "fit_motion with lines": {"family": RADIAL},
+    "fit_motion with lines": {"distortion_model": RADIAL},
     "with_focal_sigma": {"shift": STILL_CENTRE},
     "with_misfit": {"zoom": FOCAL_ALONE._replace(instead="")},
     "suggest_next": {"zoom": FOCAL_ALONE._replace(instead=""), "shift": STILL_CENTRE},
     "cramer_rao": {"zoom": FOCAL_ALONE},
-    "board_photo": {"zoom": FOCAL_ALONE, "family": RADIAL},
+    "board_photo": {"zoom": FOCAL_ALONE, "distortion_model": RADIAL},
     "interop.write": {"zoom": FOCAL_ALONE},
 }
 """By the use and by what is asked: the zoom model, the distortion model, or the shift of the centre."""

@@ -18,6 +18,7 @@ from .._core.checks import checked_size
 from .._core.programs import light_program
 from .._core.types import traced
 from ._known_sizes import known_size
+from .about import WIDTH_OF_FOCALS
 from .distortion import Distortion
 from .lens import ZoomLens
 
@@ -34,7 +35,7 @@ def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
 
     The normalised coefficients are unchanged; the centre becomes ``(c + 1/2) w'/w - 1/2``, and the pixel
     pitch is that of the other pixels. Focal lengths are unchanged, also those in px: they refer to images
-    of the lens's original size.
+    of the lens's original size, and `Camera` and exports convert them.
 
     Args:
         lens: the lens.
@@ -63,8 +64,11 @@ def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
     centre = jnp.asarray(lens.centre)
     ratio = jnp.asarray([width / old_width, height / old_height], centre.dtype)
     pitch = None if lens.pixel_pitch is None else lens.pixel_pitch * lens.scale / (math.hypot(*size) / 2)
+    about = dict(lens.about)
+    if lens.focal_unit == "px":
+        about[WIDTH_OF_FOCALS] = about.get(WIDTH_OF_FOCALS, float(old_width))
     return dataclasses.replace(
-        lens, centre=(centre + 0.5) * ratio - 0.5, image_size=size, pixel_pitch=pitch
+        lens, centre=(centre + 0.5) * ratio - 0.5, image_size=size, pixel_pitch=pitch, about=about
     )
 
 

@@ -75,7 +75,8 @@ class SmoothZoom(AbstractPriorZoom):
     other way round, it predicts a focal length that was left out better in the median than all other zoom
     models here (docs/zoom-models.md, with what was chosen on all lenses); from two or three, `for_lens`,
     which knows more of the lens, predicts better still. They are for two coefficients of the radial
-    polynomial: with other `terms`, or another distortion model, the prior has to be given.
+    polynomial; to first order, and so for weak lenses, those of the division model are the same with the
+    other sign. With other `terms` the prior has to be given.
     The default `error` is 0.24 px at 4288 x 2848, by which hand calibrations are predicted best; a smaller
     one trusts each frame more.
 

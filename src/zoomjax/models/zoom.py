@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, ScalarLike
 
-from .._core.checks import checked_integer, checked_terms
+from .._core.checks import checked_integer
 from .._core.fields import check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Coefficients, Focal, Focus, Scalar, traced
 from ._bernstein import Pieces, power_controls
-from .family import AbstractFamily
+from .distortion_model import AbstractDistortionModel, checked_terms
 
 SomeZoom = TypeVar("SomeZoom", bound="AbstractZoom")
 
@@ -39,6 +39,11 @@ class AbstractZoom(eqx.Module):
     @abc.abstractmethod
     def prepare(self, focal: Focal, terms: int) -> "AbstractZoom":
         """Prepare the model for these focal lengths: set knots and references, and parameters to zero.
+
+        Args:
+            focal: of the frames, in any order.
+            terms: the number of coefficients that it is to give at a focal length: all that the distortion
+                model has, as k1, k2, p1 and p2.
 
         Raises:
             ValueError: the focal lengths cannot determine the parameters.
@@ -252,18 +257,18 @@ def with_parameters(zoom: SomeZoom, parameters: PyTree) -> SomeZoom:
     return eqx.tree_at(lambda model: model.parameters, zoom, parameters, is_leaf=lambda leaf: leaf is None)
 
 
-def terms_of(zoom: AbstractZoom, terms: int | None, family: AbstractFamily) -> int:
+def terms_of(zoom: AbstractZoom, terms: int | None, distortion_model: AbstractDistortionModel) -> int:
     """The number N of radial coefficients that is asked for; by default the model's own, or else 2.
 
     Raises:
         ValueError: it is none, or the parameters of the model are for another number.
     """
-    own, besides = None, family.size(0)
+    own, besides = None, distortion_model.num_coefficients(0)
     if zoom.parameters is not None:
         given = (1.0, 1.0) if isinstance(zoom, AbstractFocusZoom) else (1.0,)
         own = jax.eval_shape(zoom, *given).shape[0] - besides
     terms = (2 if own is None else own) if terms is None else terms
-    terms = checked_terms(terms, family.most_terms)
+    terms = checked_terms(terms, distortion_model.most_terms)
     if own not in (None, terms):
         raise ValueError(
             f"Argument terms is {terms}, but the parameters of zoom are for {own}: give that number, or "

@@ -21,7 +21,7 @@ from .._core.checks import check_above, check_between, checked_focal, checked_in
 from .._core.types import AnyArray
 from ..lines.lines import Lines
 from ..models.distortion import Distortion
-from ..models.family import AbstractRadial
+from ..models.distortion_model import AbstractRadial
 from ..models.lens import ZoomLens
 from ..models.requirements import check
 from ..models.zoom import PolynomialZoom
@@ -221,8 +221,13 @@ def _reach(lens: ZoomLens, focal: np.ndarray) -> float:
         to_fold = distortion.monotone_radius / jnp.linalg.norm(lens.centre)
         return distortion.undistort(lens.centre * (1 - jnp.minimum(1, to_fold)))
 
-    corners = jax.vmap(corner)(jnp.asarray(focal))
-    return float(jnp.max(jnp.linalg.norm(corners - lens.centre[None], axis=-1)))
+    reach = np.linalg.norm(np.asarray(jax.vmap(corner)(jnp.asarray(focal)) - lens.centre[None]), axis=-1)
+    if not np.isfinite(reach).all():
+        beyond = focal[~np.isfinite(reach)][0]
+        raise ValueError(
+            f"Argument focal must be within the range of the lens, but at {beyond:g} it folds everywhere."
+        )
+    return float(reach.max())
 
 
 def board_photo(
@@ -255,7 +260,7 @@ def board_photo(
     Raises:
         ValueError: its distortion model is not radial.
     """
-    check("board_photo", zoom=lens.zoom, family=lens.family)
+    check("board_photo", zoom=lens.zoom, distortion_model=lens.distortion_model)
     check_above(0, focal=focal)
     check_between(0, math.inf, blur=blur, noise=noise)
     check_between(0, 1, vignetting=vignetting)
@@ -287,8 +292,8 @@ def _expose(
     image_size: tuple[int, int],
 ) -> Float[Array, "height width"]:
     """Light on each pixel, grey levels: coverage by white, and vignetting."""
-    k, scale, family = distortion.coefficients, distortion.scale, distortion.family
-    assert isinstance(family, AbstractRadial)
+    k, scale, distortion_model = distortion.coefficients, distortion.scale, distortion.distortion_model
+    assert isinstance(distortion_model, AbstractRadial)
     x, y = (
         (jnp.arange(side) - centre) / scale
         for side, centre in zip(image_size, distortion.centre, strict=True)
@@ -301,9 +306,9 @@ def _expose(
 
         def at(along):
             squared = across**2 + along**2
-            factor = family.factor(squared, k)
+            factor = distortion_model.factor(squared, k)
             # d(z L)/dz across, by L's derivative: (slope - L) / (2 t) per unit of t.
-            growth = (family.slope(squared, k) - factor) / jnp.where(squared > 0, squared, 1)
+            growth = (distortion_model.slope(squared, k) - factor) / jnp.where(squared > 0, squared, 1)
             span = (factor + across**2 * growth) / magnification
             return _coverage(across * factor * scale / magnification, span, blur, edges)
 

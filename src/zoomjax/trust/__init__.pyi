@@ -11,8 +11,8 @@ from .bands import std_of as std_of
 from .cramer_rao_bounds import cramer_rao as cramer_rao
 from .cramer_rao_bounds import displacement_bound as displacement_bound
 from .cramer_rao_bounds import displacement_rms as displacement_rms
-from .cross_validation import held_out_frames as held_out_frames
-from .cross_validation import held_out_zoom as held_out_zoom
+from .cross_validation import cross_validate_frames as cross_validate_frames
+from .cross_validation import cross_validate_zoom as cross_validate_zoom
 from .evidence import Evidence as Evidence
 from .evidence import evidence as evidence
 from .misfit import with_misfit as with_misfit

@@ -62,7 +62,7 @@ def bending(lines: Lines, lens: ZoomLens, weight: np.ndarray, prior: np.ndarray)
         weight: of each line in the fit; 0 for those that do not count.
         prior: (p, p), the normal matrix of the zoom model's prior, in the units of the energy.
     """
-    frame, family = np.asarray(lines.frame), lens.family
+    frame, distortion_model = np.asarray(lines.frame), lens.distortion_model
     k, by_parameter, centre = (np.asarray(of, float) for of in _coefficients(lines, lens))
     share = weight / np.bincount(frame, weight, len(k))[frame].clip(1e-300)
     counted = np.flatnonzero(weight > 0)
@@ -71,7 +71,7 @@ def bending(lines: Lines, lens: ZoomLens, weight: np.ndarray, prior: np.ndarray)
     points, mask = np.asarray(lines.points, float)[chosen], np.asarray(lines.mask)[chosen]
     z = np.stack([_some(p[m]) for p, m in zip(points, mask, strict=True)])
     z = (z - centre[frame[chosen], None]) / lens.scale
-    error, slope = residuals(family, z, k[frame[chosen]], by_parameter[frame[chosen]])
+    error, slope = residuals(distortion_model, z, k[frame[chosen]], by_parameter[frame[chosen]])
     sound = np.isfinite(error).all(axis=1)
     if not sound.any():
         return Bending(np.nan, np.inf)
@@ -88,7 +88,7 @@ def bending(lines: Lines, lens: ZoomLens, weight: np.ndarray, prior: np.ndarray)
         found.append(Bending(moved * lens.scale, float(std) * lens.scale))
     worst = max(found, key=lambda of: of.std)
     strong = worst.moved > _STRONG * 2 * lens.scale
-    if len(there) > 1 or not strong or not isinstance(family, RadialPolynomial):
+    if len(there) > 1 or not strong or not isinstance(distortion_model, RadialPolynomial):
         return worst
     other = apart_from_division(z, k[there[0]], centre[there[0]], lens.image_size)
     return Bending(worst.moved, float(np.hypot(worst.std, other)))
@@ -148,6 +148,6 @@ def _over_image(
 ) -> tuple[float, np.ndarray]:
     """How far points are moved beyond a homography, and by each parameter, (n, 2, p + 2), in the image."""
     z = (over_image(lens.image_size) - centre) / lens.scale
-    at, by_point, by_all = derivatives(lens.family, z, k, by_parameter)
+    at, by_point, by_all = derivatives(lens.distortion_model, z, k, by_parameter)
     rows = beyond(at, by_point, np.concatenate([(at - z)[..., None], by_all], axis=-1))
     return float(np.sqrt(np.sum(rows[..., 0] ** 2) / max(len(rows), 1))), rows[..., 1:]

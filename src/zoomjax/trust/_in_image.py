@@ -6,7 +6,7 @@ distortion, in half diagonals.
 
 import numpy as np
 
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 
 _GRID = (15, 11)
 """Points over the image."""
@@ -16,14 +16,16 @@ _LEAST_STRETCH = 1e-6
 _LEAST_SOUND = 8
 
 
-def corrected(family: AbstractFamily, z: np.ndarray, k: np.ndarray) -> np.ndarray:
+def corrected(distortion_model: AbstractDistortionModel, z: np.ndarray, k: np.ndarray) -> np.ndarray:
     """Corrected points (..., s, 2) by coefficients (..., n)."""
     x, y = np.moveaxis(z, -1, 0)
-    return np.stack(family.correct((x, y), x * x + y * y, np.moveaxis(k, -1, 0)[..., None]), axis=-1)
+    return np.stack(
+        distortion_model.correct((x, y), x * x + y * y, np.moveaxis(k, -1, 0)[..., None]), axis=-1
+    )
 
 
 def derivatives(
-    family: AbstractFamily, z: np.ndarray, k: np.ndarray, by_parameter: np.ndarray
+    distortion_model: AbstractDistortionModel, z: np.ndarray, k: np.ndarray, by_parameter: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Corrected points (..., s, 2), and derivatives by the points, (..., s, 2, 2), and by all parameters.
 
@@ -32,27 +34,27 @@ def derivatives(
 
     def slope(moved_z, moved_k):
         plus, minus = (
-            corrected(family, z + sign * moved_z, k + sign * moved_k) for sign in (_STEP, -_STEP)
+            corrected(distortion_model, z + sign * moved_z, k + sign * moved_k) for sign in (_STEP, -_STEP)
         )
         return (plus - minus) / (2 * _STEP)
 
     with np.errstate(all="ignore"):  # beyond a pole
         by_point = np.stack([slope(unit, 0) for unit in np.eye(2)], axis=-1)
         by_k = np.stack([slope(0, unit) for unit in np.eye(k.shape[-1])], axis=-1)
-        at = corrected(family, z, k)
+        at = corrected(distortion_model, z, k)
     by_zoom = np.einsum("...sck,...kp->...scp", by_k, by_parameter)
     return at, by_point, np.concatenate([by_zoom, np.eye(2) - by_point], axis=-1)
 
 
 def residuals(
-    family: AbstractFamily, z: np.ndarray, k: np.ndarray, by_parameter: np.ndarray
+    distortion_model: AbstractDistortionModel, z: np.ndarray, k: np.ndarray, by_parameter: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Distances (l, s) of points to their lines, in the image, and their derivatives (l, s, p + 2).
 
     The best line follows the parameters: what a shift or a turn of it explains is taken out of these.
     Distances are NaN of a line that is moved nowhere, beyond a pole.
     """
-    at, by_point, by_all = derivatives(family, z, k, by_parameter)
+    at, by_point, by_all = derivatives(distortion_model, z, k, by_parameter)
     nowhere = ~(np.isfinite(at).all(axis=(1, 2)) & np.isfinite(by_all).all(axis=(1, 2, 3)))
     at[nowhere], by_point[nowhere], by_all[nowhere] = z[nowhere], np.eye(2), 0
     *_, stretch = _best_lines(at, by_point, np.ones(at.shape[:2]))  # good enough for the stretch across it

@@ -23,7 +23,7 @@ import numpy as np
 from .._core.programs import light_program
 from ..fit.energy import prior_jacobian, prior_residuals, settings
 from ..fit.image_metric import in_corrected
-from ..fit.own_weights import counts_of, own_weights
+from ..fit.own_weights import counts_of
 from ..fit.problem import LEAST_STRETCH
 from ..lines.buckets import bucketed_jit, padded_frames
 from ..models.zoom import (
@@ -36,15 +36,19 @@ _MOST_STEPS = 40  # of Gauss-Newton: from the fit of all lines it takes 1 to 3, 
 
 
 def linear_errors(lines, model, parts):
-    lanes, lines = lanes_of(lines, parts.fold, model.terms), in_corrected(lines)
+    lanes = lanes_of(lines, parts.fold, parts.weight, model.terms)
+    lines = in_corrected(lines)
+    given = [np.asarray(values) for values in settings(model.zoom, lines)]
     known: dict[bytes, Design | str] = {}
     designs, problem = [], ""
     for fold in range(-1, parts.number):
         left = np.zeros(len(lines.focal), bool)
         left[lanes.frame[(lanes.weight > 0) & ((lanes.fold != fold) | (fold < 0))]] = True
         if (key := left.tobytes()) not in known:
-            known[key] = _design(lines, model, left)
+            known[key] = _design(lines, model, given, left)
         design = known[key]
+        if fold < 0 and isinstance(design, str):  # all lines: too few focal lengths, say
+            raise ValueError(design)
         if isinstance(design, str):
             problem, design = problem or design, None
         designs.append(design)
@@ -72,22 +76,22 @@ class Design(NamedTuple):
     mean: np.ndarray  # (parameter,): of the prior
 
 
-def _design(lines, model, left):
+def _design(lines, model, given, left):
     """The model as made ready for the frames that are left, or why it cannot be."""
     try:
-        focal, *focus = map(np.asarray, settings(model.zoom, lines))
-        zoom = model.zoom.prepare(focal[left], model.terms, *(values[left] for values in focus))
+        focal, *focus = (values[left] for values in given)
+        zoom = model.zoom.prepare(focal, model.terms, *focus)
     except ValueError as error:
         return str(error)
-    every = map(padded_frames, (focal, *focus))
-    values = np.asarray(_basis_of(with_parameters(zoom, None), *every), float)[: len(focal)]
+    every = map(padded_frames, given)
+    values = np.asarray(_basis_of(with_parameters(zoom, None), *every), float)[: len(left)]
     size = values.shape[1]
     precision, mean = np.zeros((size * model.terms, size * model.terms)), np.zeros(size * model.terms)
     if isinstance(zoom, AbstractPriorZoom):
         whitener, of_zero = (np.asarray(part, float) for part in _whitener(lines, zoom))
         precision = whitener.T @ whitener
         mean = np.linalg.lstsq(whitener, -of_zero, rcond=None)[0]
-    project = np.zeros((size, len(focal)))
+    project = np.zeros((size, len(left)))
     project[:, left] = np.linalg.pinv(values[left])
     return Design(values, project, precision, mean)
 
@@ -125,7 +129,8 @@ class Lanes(NamedTuple):
         return np.add.reduceat(values, self.starts, axis=-1)
 
 
-def lanes_of(lines, fold, terms):
+def lanes_of(lines, fold, weight, terms):
+    """The compressed lines, with the fold and the weight of each."""
     small: Any = in_corrected(lines)
     frame = np.asarray(lines.frame)
     order = np.argsort(frame, kind="stable")
@@ -135,7 +140,7 @@ def lanes_of(lines, fold, terms):
     x, y = columns = np.ascontiguousarray(columns)
     gram = np.stack([np.einsum("irl,jrl->ijl", one, other) for one, other in ((x, x), (x, y), (y, y))])
     counts = np.maximum(counts_of(lines), 1)
-    frame, counts, weight, fold = (a[order] for a in (frame, counts, own_weights(lines), np.asarray(fold)))
+    frame, counts, weight, fold = (a[order] for a in (frame, counts, weight, np.asarray(fold)))
     moments = _moments(whole, terms) / counts if lines.metric == "distorted" else None
     starts = np.flatnonzero(np.diff(frame, prepend=-1))
     return Lanes(columns, gram, frame, counts, weight, fold, starts, len(lines.focal), moments)

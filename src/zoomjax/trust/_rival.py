@@ -8,8 +8,8 @@ of the image, by Levenberg and Marquardt's method: some ten steps of a few ms, w
 
 import numpy as np
 
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.division import Division
-from ..models.family import AbstractFamily
 from ..models.polynomial import RadialPolynomial
 from ._in_image import beyond, corrected, derivatives, over_image, residuals
 
@@ -57,14 +57,14 @@ def apart_from_division(
 
 
 def _fitted(
-    family: AbstractFamily, z: np.ndarray, k: np.ndarray, shift: np.ndarray
+    distortion_model: AbstractDistortionModel, z: np.ndarray, k: np.ndarray, shift: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """The coefficients and the centre of least squared distances, and their sum."""
 
     def at(values):
         own = np.broadcast_to(values[:-2], (len(z), len(k)))
         return residuals(
-            family, z - values[-2:], own, np.broadcast_to(np.eye(len(k)), (len(z), *[len(k)] * 2))
+            distortion_model, z - values[-2:], own, np.broadcast_to(np.eye(len(k)), (len(z), *[len(k)] * 2))
         )
 
     values, damping = np.concatenate([k, shift]), 1e-3

@@ -5,7 +5,8 @@ the displacement (RMS over the image, at its largest): that of the noise (the ba
 between lenses fitted to halves of the lines where it exceeds what noise explains, and the error of frames
 left out beyond that of their own fits. Vanishing points that ask for another correction make it doubtful.
 An error below `NEGLIGIBLE` of the image's diagonal does no harm, however small the displacement; nor do
-lines that were rejected for less.
+lines that were rejected for less. Between two or three focal lengths nothing contradicts a model: there it
+is compared with what zoom lenses do (see `between`).
 
 A tenth of a strong lens's displacement is much, and all of it may bend lines. So what the noise leaves
 uncertain beyond a homography must be small in px of the image, too. Of one photo that alone counts: its
@@ -24,6 +25,9 @@ from .._core.types import of_known_values
 from ..fit.result import RESULTS, ZoomFit
 from ..lines.base import AbstractLines
 from ..lines.lines import Lines
+from ..models.polynomial import RadialPolynomial
+from ..models.zoom import AbstractPriorZoom
+from .between import FEWEST_CHECKED, deviation_between, zoom_places
 from .evidence import NEGLIGIBLE, UNSEEN_PX, Evidence, evidence
 from .folds import focals_there
 
@@ -86,8 +90,8 @@ class Assessment:
         if self.verdict == "good":
             return (
                 f"Good: the correction moves points by {_px(self.evidence.displacement)} px (RMS), "
-                f"with a standard deviation of {_px(self.evidence.std)} px. Beyond a change of view it is "
-                f"uncertain by {_px(self.evidence.bent_std)} px of the image."
+                f"with a standard deviation of {_px(self.evidence.std)} px. Apart from a change of view it "
+                f"is uncertain by {_px(self.evidence.bent_std)} px of the image."
             )
         return f"{self.verdict.capitalize()}: {self.findings[0].found}"
 
@@ -124,8 +128,8 @@ def assess(
     fit: ZoomFit,
     *,
     compressed: AbstractLines | None = None,
-    held_out: Float[np.ndarray, "frame"] | None = None,
-    each_held_out: Float[np.ndarray, "frame"] | None = None,
+    rms_held_out: Float[np.ndarray, "frame"] | None = None,
+    rms_frames_held_out: Float[np.ndarray, "frame"] | None = None,
 ) -> Assessment:
     """Judge a fit.
 
@@ -133,8 +137,8 @@ def assess(
         lines: the lines of the fit, with their points and weights.
         fit: the fit.
         compressed: the same lines compressed for the fit's distortion model, if they are at hand.
-        held_out, each_held_out: from `held_out_zoom` and `held_out_frames`, if they are to be judged. Of
-            one frame the second alone is.
+        rms_held_out, rms_frames_held_out: from `cross_validate_zoom` and `cross_validate_frames`, if they
+            are to be compared. Of one frame the second alone is.
 
     Raises:
         ValueError: as `evidence`; or there is not one number a frame in these two, or one of them alone.
@@ -146,20 +150,29 @@ def assess(
         >>> assess(lines, fit_zoom(compress(lines))).verdict
         'good'
     """
-    for name, values in {"held_out": held_out, "each_held_out": each_held_out}.items():
+    for name, values in {"rms_held_out": rms_held_out, "rms_frames_held_out": rms_frames_held_out}.items():
         if values is not None and np.shape(values) != np.shape(lines.focal):
             raise ValueError(
                 f"Argument {name} must hold one number for each of the {len(lines.focal)} frames, but its "
                 f"shape is {np.shape(values)}."
             )
-    if (held_out is None) != (each_held_out is None):
-        raise ValueError("Arguments held_out and each_held_out are compared: give both, or neither.")
+    if (rms_held_out is None) != (rms_frames_held_out is None):
+        raise ValueError(
+            "Arguments rms_held_out and rms_frames_held_out are compared: give both, or neither."
+        )
     found = evidence(lines, fit, compressed=compressed)
-    findings = [*_of_bands(found, fit), *_of_halves(found), *_of_lines(found), *_of_vanishing(found)]
-    if held_out is not None and each_held_out is not None:
-        both = (np.asarray(values, float) for values in (held_out, each_held_out))
+    places = zoom_places(focals_there(lines))
+    findings = [
+        *_of_bands(found, fit, len(places)),
+        *_of_halves(found),
+        *_of_lines(found),
+        *_of_vanishing(found),
+    ]
+    findings += _of_places(found, fit, places)
+    if rms_held_out is not None and rms_frames_held_out is not None:
+        both = (np.asarray(values, float) for values in (rms_held_out, rms_frames_held_out))
         focal = np.asarray(lines.focal, float)
-        findings += _of_one_frame(found, float(np.nansum(each_held_out)))
+        findings += _of_one_frame(found, float(np.nansum(rms_frames_held_out)))
         findings += _of_frames(found, np.where(np.isin(focal, focals_there(lines)), focal, np.nan), *both)
     return Assessment((), found).joined_by(findings)
 
@@ -182,7 +195,7 @@ def _is_bent(of: Evidence) -> bool:
     return not of.bent_std <= (most if of.frames > 1 else min(most, _DOUBTFUL * of.bent))
 
 
-def _of_bands(of: Evidence, fit: ZoomFit) -> Iterator[Finding]:
+def _of_bands(of: Evidence, fit: ZoomFit, places: int) -> Iterator[Finding]:
     more = "Add photos with long straight lines near the edges of the image"
     more += ", at several focal lengths." if of.frames > 1 else "."
     if bool(fit.result == RESULTS.folded):
@@ -199,6 +212,11 @@ def _of_bands(of: Evidence, fit: ZoomFit) -> Iterator[Finding]:
             f"the correction moves points by {_px(of.displacement)} px (RMS), but is uncertain by "
             f"{_px(of.std)} px."
         )
+        if 1 < places < FEWEST_CHECKED and isinstance(fit.lens.zoom, AbstractPriorZoom):
+            more += (
+                f" Between these {places} focal lengths the correction is that of other zoom lenses which "
+                "agree with it there."
+            )
         yield Finding("bands", verdict, found, more)
     elif _is_bent(of):
         yield Finding(
@@ -225,7 +243,7 @@ _PARTED = {
     ),
     "directions": (
         "steep and flat lines give different corrections",
-        "Check that the photographed thing is straight and flat: a board may be bent, a cup is round.",
+        "Check that what was photographed is straight and flat: a board may be bent, a cup is round.",
     ),
     "frames": (
         "two halves of the photos give different corrections",
@@ -256,7 +274,7 @@ def _of_lines(of: Evidence) -> Iterator[Finding]:
             "rejected lines",
             "doubtful",
             f"{of.rejected} of {of.lines + of.rejected} lines were rejected as not straight.",
-            "Look at the drawn lines: if they follow straight things, photos of two lenses may be mixed.",
+            "Check the detected lines: if they follow straight things, photos of two lenses may be mixed.",
         )
     if not of.crooked:
         return
@@ -285,8 +303,34 @@ def _of_vanishing(of: Evidence) -> Iterator[Finding]:
         "doubtful",
         f"{other.lines} lines meet in {other.points} vanishing points, but best with {other.factor:.2f} "
         f"\u00b1 {other.std:.2g} times the correction.",
-        "Look at the drawn lines: lines of different things may have become one. Add long lines near the "
+        "Check the detected lines: lines of different things may have become one. Add long lines near the "
         "edges of the image.",
+    )
+
+
+def _of_places(of: Evidence, fit: ZoomFit, places: np.ndarray) -> Iterator[Finding]:
+    """A model that was measured at two or three places in the zoom, and has no prior, or one for others."""
+    if not 1 < len(places) < FEWEST_CHECKED or not np.isfinite(of.std):
+        return
+    number, unit = len(places), fit.lens.focal_unit
+    if isinstance(fit.lens.zoom, AbstractPriorZoom):
+        if not isinstance(fit.lens.distortion_model, RadialPolynomial):
+            yield Finding(
+                "few focal lengths",
+                "doubtful",
+                f"lines are at {number} focal lengths only; between them the prior is for weaker lenses.",
+                "Add photos at focal lengths between them, four in all or more.",
+            )
+        return
+    deviation, focal = deviation_between(fit.lens, places)
+    if (verdict := _judged(deviation, of)) == "good":
+        return
+    yield Finding(
+        "few focal lengths",
+        verdict,
+        f"lines are at {number} focal lengths only; between them, at {focal:.4g} {unit}, other zoom lenses "
+        f"with that distortion there are {_px(deviation)} px (RMS) from the model.",
+        "Add photos at focal lengths between them, or choose the model smooth, whose bands allow for that.",
     )
 
 
@@ -319,8 +363,8 @@ def _of_one_frame(of: Evidence, each: float) -> Iterator[Finding]:
             "not determined",
             f"lines that were left out of the fit deviate by {each:.3g} px corrected, and by "
             f"{of.rms_uncorrected:.3g} px as they are.",
-            "Look at the drawn lines: do they follow straight things? Photograph long ones, near the edges "
-            "of the image.",
+            "Check the detected lines: do they follow straight things? Photograph long ones, near the "
+            "border of the image.",
         )
 
 

@@ -10,9 +10,15 @@ from ..fit.own_weights import own_weights
 from ..lines.base import AbstractLines
 from ..models.model import Model
 from .cross_validation import errors_of
-from .folds import folds_of, shares
+from .folds import folds_of
 
 _FOLDS = 5
+
+_FAR = 0.05
+"""Distance of a fitted centre from the given one, half diagonals, that fewer frames than folds do not tell.
+
+Their lines share what bends them, such as a board that is not flat, so that lines left out are no test.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,22 +30,26 @@ class CentreChoice:
         fitted: cross-validated RMS about the fitted centre, px; each part of the lines has another one,
             fitted to the others.
         given: the same about the lines' own centre.
+        far: how far the fitted one is from the given one, px, where that is farther than so few frames can
+            tell; otherwise None.
     """
 
     found: CentreFit
     fitted: float
     given: float
+    far: float | None = None
 
     @property
     def better(self) -> bool:
         """Whether the lines determine the centre, and lines left out are straighter about it."""
-        return bool(self.found.determined) and self.fitted <= self.given
+        return bool(self.found.determined) and self.fitted <= self.given and self.far is None
 
 
 def choose_centre(lines: AbstractLines, model: Model) -> CentreChoice:
     """Fit the centre of distortion, one for all focal lengths, and cross-validate it.
 
-    A fifth of the frames is left out at a time, or, with fewer than five, of the lines of each frame.
+    A fifth of the frames is left out at a time, or, with fewer than five, of the lines of each frame. These
+    few do not tell a centre that is far from the given one.
 
     Args:
         lines: the lines, compressed for any centre, in either metric.
@@ -61,8 +71,10 @@ def choose_centre(lines: AbstractLines, model: Model) -> CentreChoice:
         out = parts.fold == fold
         kept = lines.weighted(own * ~out)
         fitted[out] = np.asarray(line_squares(lines, refit_centre(kept, found)))[out]
-    share = np.where(np.isfinite(given) & np.isfinite(fitted), shares(small), 0)
+    share = np.where(np.isfinite(given) & np.isfinite(fitted), parts.share, 0)
     if not share.any():
         return CentreChoice(found, np.nan, np.nan)
+    away = float(np.linalg.norm(np.asarray(found.fit.lens.centre) - np.asarray(lines.centre)))
+    far = away if frames < _FOLDS and away > _FAR * float(found.fit.lens.scale) else None
     fitted, given = (float(np.sqrt(np.average(np.nan_to_num(of), weights=share))) for of in (fitted, given))
-    return CentreChoice(found, fitted, given)
+    return CentreChoice(found, fitted, given, far)

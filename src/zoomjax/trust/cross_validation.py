@@ -10,14 +10,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
-from .._core.checks import checked_terms
+from .._core.checks import checked_integer
 from .._core.types import of_known_values
 from ..fit.compression import compressed_as_measured
 from ..fit.energy import line_squares, line_squares_by_frame, settings
 from ..fit.frames import fit_frames
 from ..fit.image_metric import in_corrected, measured_as
-from ..fit.own_weights import own_weights
-from ..fit.prepare import asked_for, ready_model
+from ..fit.prepare import asked_for
 from ..fit.problem import Problem
 from ..fit.result import RESULTS
 from ..fit.zoom import fit_zoom
@@ -31,7 +30,7 @@ from .folds import Folds, HoldOut, LineErrors, folds_of, shares, small_lines
 
 @kinds_checked
 @of_known_values
-def held_out_zoom(
+def cross_validate_zoom(
     lines: AbstractLines,
     *,
     zoom: AbstractZoom | Model | None = None,
@@ -48,7 +47,7 @@ def held_out_zoom(
 
     Args:
         lines: the lines, or, much faster, ``compress(lines)``, either also measured in the image
-            (`in_image`); or ``compress_family(lines, family)``, with a separate fit for each part.
+            (`in_image`); or ``compress_for(lines, distortion_model)``, with a separate fit for each part.
         zoom, terms: as for `fit_zoom`. The model is made ready anew for each part: of a fitted one only the
             settings and the number of coefficients count.
         hold_out, folds, seed: as for `select_model`.
@@ -64,12 +63,11 @@ def held_out_zoom(
         ...         scenes.nikkor_18_200(), scenes.focal_sweep(5), spacing=200, noise=0.5
         ...     )
         ... )
-        >>> bool((held_out_zoom(lines) ** 2).mean() > fit_zoom(lines).rms ** 2)
+        >>> bool((cross_validate_zoom(lines) ** 2).mean() > fit_zoom(lines).rms ** 2)
         True
     """
     lines, asked = asked_for(lines, zoom, terms)
     model = asked.with_parameters(None)
-    ready_model(lines, model)  # complains of too few focal lengths
     small = _small(lines, model.terms)
     parts = folds_of(small, hold_out, folds, seed)
     found = errors_of(small, model, parts)
@@ -78,7 +76,7 @@ def held_out_zoom(
 
 @kinds_checked
 @of_known_values
-def held_out_frames(
+def cross_validate_frames(
     lines: AbstractLines, *, terms: int = 2, folds: int | None = None, seed: int = 0
 ) -> Float[np.ndarray, "frame"]:
     """Cross-validated RMS of each frame, px, under fits of other lines of the same frame.
@@ -95,12 +93,12 @@ def held_out_frames(
         The root of eq. 3 of each frame, of all its lines, each as it was left out. NaN for a frame with
         fewer than two lines.
     """
-    terms = checked_terms(terms)
+    terms = checked_integer("terms", terms, 1)
     small = _small(lines, terms)
     if not is_compressed(small):
         return _frames_by_fits(small, terms, folds, seed)
     parts = folds_of(small, "line", folds, seed)
-    lanes = lanes_of(small, parts.fold, terms)
+    lanes = lanes_of(small, parts.fold, parts.weight, terms)
     unseen = np.full(lanes.fold.shape, np.nan)
     one = Design(np.ones((1, 1)), np.ones((1, 1)), np.zeros((terms, terms)), np.zeros(terms))
     for frame in np.unique(lanes.frame):
@@ -159,8 +157,9 @@ def _by_frame(lines, of_line):
 
 
 def _frames_by_fits(lines, terms, folds, seed):
-    """`held_out_frames` of another distortion model, by fits of all frames for each part of their lines."""
-    own, parts = own_weights(lines), folds_of(lines, "line", folds, seed)
+    """`cross_validate_frames` of another distortion model, by fits of all frames for each part of lines."""
+    parts = folds_of(lines, "line", folds, seed)
+    own = parts.weight
     unseen = np.full(own.shape, np.nan)
     for fold in range(parts.number):
         out = parts.fold == fold
@@ -173,23 +172,23 @@ def _frames_by_fits(lines, terms, folds, seed):
 
 def _errors_by_fits(lines, model, parts):
     """By a fit of its own for each fold, from that of all lines, unless some of that would stay."""
-    own = own_weights(lines)
     everything = fit_zoom(lines, zoom=model, invertible=False, throw=False)
     seen = np.asarray(line_squares(lines, everything.lens.zoom))
     unseen, failed = np.full(seen.shape, np.nan), 0
     problem = ""
     for fold in range(parts.number):
-        kept = own * (parts.fold != fold)
+        kept = parts.weight * (parts.fold != fold)
         left = np.unique(np.asarray(lines.frame)[kept > 0])
         try:
             focal, *focus = (np.asarray(values)[left] for values in settings(model.zoom, lines))
-            model.zoom.prepare(focal, model.size, *focus)
+            model.zoom.prepare(focal, model.num_coefficients, *focus)
         except ValueError as error:
             problem = problem or str(error)
             continue
-        fit = fit_zoom(lines.weighted(kept), zoom=everything.lens.zoom, invertible=False, throw=False)
+        rest = lines.weighted(kept)
+        fit = fit_zoom(rest, zoom=everything.lens.zoom, invertible=False, throw=False)
         if fit.result == RESULTS.undetermined:  # where the start stays, which has seen the lines left out
-            fit = fit_zoom(lines.weighted(kept), zoom=model, invertible=False, throw=False)
+            fit = fit_zoom(rest, zoom=model, invertible=False, throw=False)
         if fit.result in (RESULTS.successful, RESULTS.undetermined, RESULTS.folded):
             out = parts.fold == fold
             unseen[out] = np.asarray(line_squares(lines, fit.lens.zoom))[out]

@@ -16,7 +16,7 @@ Once per fit: a pass over the points of at most `_MOST_LINES` lines, and a Jacob
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,15 +28,17 @@ from jaxtyping import Float
 from .._core.arguments import kinds_checked
 from .._core.programs import light_program
 from .._core.types import of_known_values
+from ..fit.distortion_models import compress_for
 from ..fit.energy import (
     coefficients_by,
     frame_energy,
     line_squares,
     linearised,
+    prior_error,
     prior_jacobian,
+    prior_of,
     prior_residuals,
 )
-from ..fit.family_lines import compress_family
 from ..fit.image_metric import measured_as
 from ..fit.own_weights import counts_of, own_weights
 from ..fit.problem import about_own_centre, data_of
@@ -157,7 +159,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     if compressed is None:
         terms = np.asarray(lens.zoom(lens.focal_range[0])).size
         points = data_of(placed)
-        compressed = compress_family(points, lens.family, terms=terms)
+        compressed = compress_for(points, lens.distortion_model, terms=terms)
     compressed = _same_lines(lines, compressed)
     weight = own_weights(compressed)
     if not weight.any():
@@ -254,21 +256,37 @@ def _halves(
     prior: np.ndarray,
     terms: tuple[np.ndarray, np.ndarray],
 ) -> Iterator[Halves]:
-    """The agreement of halves, in the partings that determine lenses; the last two as `_normal_terms`."""
+    """The agreement of halves, in the partings that determine lenses; the last two as `_normal_terms`.
+
+    A prior draws both halves to its mean, but the one that sees less of the zoom by more: by how much, in
+    the mean over what it expects, they are apart without noise.
+    """
+    own = prior_of(fit.lens.zoom)
+    pulled = np.zeros_like(prior) if own is None else float(prior_error(lines, own)) ** 2 * prior
     for name, first in _partings(lines, fit, weight).items():
         one, other = (
             _half(prior, *(values[half & (weight > 0)] for values in terms)) for half in (first, ~first)
         )
         if one is None or other is None:
             continue
-        apart = _over_image(np.linalg.norm(rows @ (one[0] - other[0]), axis=-1))
-        expected = _spread(rows, one[1] + other[1])
+        apart = _over_image(np.linalg.norm(rows @ (one.step - other.step), axis=-1))
+        unequal = one.inverse - other.inverse
+        expected = _spread(rows, one.covariance + other.covariance + unequal @ pulled @ unequal)
         at = int(np.argmax(apart))
         yield Halves(name, float(apart[at]), float(expected[at]))
 
 
-def _half(prior, gram, gradient):
-    """The step from the fit to that of some lines, and its covariance; None if they do not determine it.
+class _Half(NamedTuple):
+    """The fit to some of the lines: its step from that to all, its covariance without what a prior expects,
+    and the inverse of its normal matrix."""
+
+    step: Float[np.ndarray, "parameter"]
+    covariance: Float[np.ndarray, "parameter parameter"]
+    inverse: Float[np.ndarray, "parameter parameter"]
+
+
+def _half(prior: np.ndarray, gram: np.ndarray, gradient: np.ndarray) -> _Half | None:
+    """The fit to some lines; None if they do not determine it.
 
     Args:
         prior: the normal matrix of the model's prior.
@@ -284,7 +302,7 @@ def _half(prior, gram, gradient):
         return None
     inverse = (vectors / values) @ vectors.T / size / size[:, None]
     scatter = gradient - gradient.mean(axis=0)
-    return -inverse @ gradient.sum(axis=0), inverse @ (scatter.T @ scatter) @ inverse
+    return _Half(-inverse @ gradient.sum(axis=0), inverse @ (scatter.T @ scatter) @ inverse, inverse)
 
 
 def _normal_terms(

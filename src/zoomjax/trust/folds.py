@@ -25,11 +25,17 @@ class Folds(NamedTuple):
         fold: of each line, from 0; -1 for lines that are never left out, as those that weigh nothing.
         unit: of each line, the focal length, frame or line it stands for; -1 as before.
         number: of folds.
+        hold_out: what a unit is.
+        weight: of each line, 0 for those that do not count.
+        share: of each line in the energy of eq. 13: see `shares`.
     """
 
     fold: np.ndarray
     unit: np.ndarray
     number: int
+    hold_out: HoldOut
+    weight: np.ndarray
+    share: np.ndarray
 
 
 class LineErrors(NamedTuple):
@@ -59,7 +65,7 @@ def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
     if isinstance(lines, Problem):
         raise TypeError(
             "Argument lines has a distortion model of its own, and here each candidate has one: pass the "
-            "lines without with_family, and Model(zoom, terms, family)."
+            "lines without with_distortion_model, and Model(zoom, terms, distortion_model)."
         )
     if not isinstance(lines, AbstractLines):
         raise TypeError(
@@ -76,15 +82,20 @@ def small_lines(lines: AbstractLines, terms: int) -> CompressedLines:
     return small
 
 
-def folds_of(lines: AbstractLines, hold_out: HoldOut, folds: int | None, seed: int) -> Folds:
+def folds_of(lines: AbstractLines, hold_out: HoldOut | None, folds: int | None, seed: int) -> Folds:
     """The parts of the lines that are left out in turn; see `select_model`.
 
     Raises:
         ValueError: the way of holding out is none, or there are too few focal lengths, frames or lines.
     """
-    if hold_out not in get_args(HoldOut):
+    if hold_out not in (None, *get_args(HoldOut)):
         raise ValueError(f'Argument hold_out must be "focal", "frame" or "line", but it is {hold_out!r}.')
-    frame, focal, counted = np.asarray(lines.frame), np.asarray(lines.focal), own_weights(lines) > 0
+    frame, focal, weight = np.asarray(lines.frame), np.asarray(lines.focal), own_weights(lines)
+    counted, share = weight > 0, _shares(frame, weight, len(focal))
+    there = np.unique(frame[counted])
+    distinct = np.unique(focal[there])
+    if hold_out is None:
+        hold_out = "focal" if len(distinct) > 3 else "line"
     rng = np.random.default_rng(checked_integer("seed", seed, 0))
     most = _LINE_FOLDS if hold_out == "line" else _MOST_FOLDS
     most = most if folds is None else checked_integer("folds", folds, 2)
@@ -94,15 +105,14 @@ def folds_of(lines: AbstractLines, hold_out: HoldOut, folds: int | None, seed: i
         order = lines_there[np.lexsort([rng.random(len(lines_there)), frame[counted]])]
         fold = np.full(len(frame), -1)
         fold[order] = np.arange(len(order)) % most
-        return Folds(fold, np.where(counted, np.arange(len(frame)), -1), most)
-    there = np.unique(frame[counted])
+        unit = np.where(counted, np.arange(len(frame)), -1)
+        return Folds(fold, unit, most, hold_out, weight, share)
     if hold_out == "frame":
         number, needed = len(there), "two or more frames"
         place = np.full(len(focal), -1)
         place[there[np.argsort(focal[there], kind="stable")]] = np.arange(number)  # however numbered
         place = place[frame]
     else:
-        distinct = np.unique(focal[there])
         number, needed = (
             len(distinct) - 2,
             "4 or more distinct focal lengths, as both ends are never left out",
@@ -116,13 +126,17 @@ def folds_of(lines: AbstractLines, hold_out: HoldOut, folds: int | None, seed: i
         )
     parts = min(most, number)
     fold = np.arange(number) if parts == number else rng.permutation(number) % parts
-    return Folds(np.where(group >= 0, fold[group], -1), group, parts)
+    fold = np.where(group >= 0, fold[group], -1)
+    return Folds(fold, group, parts, hold_out, weight, share)
 
 
 def shares(lines: AbstractLines) -> Float[np.ndarray, "line"]:
     """The part of each line in the energy of eq. 13: every frame that counts weighs the same."""
-    frame, own = np.asarray(lines.frame), own_weights(lines)
-    total = np.bincount(frame, own, minlength=len(lines.focal))
+    return _shares(np.asarray(lines.frame), own_weights(lines), len(lines.focal))
+
+
+def _shares(frame, own, frames):
+    total = np.bincount(frame, own, minlength=frames)
     return own / (np.where(total > 0, total, 1) * max(np.sum(total > 0), 1))[frame]
 
 

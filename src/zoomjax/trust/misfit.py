@@ -37,8 +37,8 @@ from jaxtyping import Float, Int
 from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
 from ..fit.compression import compressed_as_measured
+from ..fit.distortion_models import with_distortion_model
 from ..fit.energy import frame_coefficients, frame_normal_equations
-from ..fit.family_lines import with_family
 from ..fit.image_metric import in_corrected, measured_as
 from ..fit.moved_centre import for_terms
 from ..fit.own_weights import own_weights
@@ -111,9 +111,9 @@ def with_misfit(fit: ZoomFit, lines: AbstractLines) -> ZoomFit:
     check("with_misfit", zoom=lens.zoom)
     placed = placed_as(lens, lines)
     k = np.asarray(frame_coefficients(placed, lens.zoom), float)
-    polynomial = isinstance(lens.family, RadialPolynomial)
+    polynomial = isinstance(lens.distortion_model, RadialPolynomial)
     passes = _passed(placed, k) if polynomial else None
-    frames = _by_residuals(placed, k, lens.family) if passes is None else _of_frames(passes)
+    frames = _by_residuals(placed, k, lens.distortion_model) if passes is None else _of_frames(passes)
     if len(frames.focal) < _FEWEST:
         return fit
     follows = _followed(frames, k.shape[1])
@@ -155,7 +155,7 @@ def _passed(lines, k) -> _Passes:
     most = plain.terms if isinstance(plain, CompressedLines) else RadialPolynomial().most_terms
     more = min(terms + 1, max(most, terms))
     small = measured_as(small_lines(plain, more), lines)
-    lanes = lanes_of(small, np.zeros(len(small.frame), int), more)
+    lanes = lanes_of(small, np.zeros(len(small.frame), int), own_weights(small), more)
     return _Passes(lanes, passed(lanes, np.pad(k, ((0, 0), (0, more - terms)))), np.asarray(small.focal))
 
 
@@ -171,9 +171,9 @@ def _of_frames(passes: _Passes) -> _Frames:
     return _Frames(score[used], matrix[used], number[used], focal[lanes.frame[lanes.starts]][used])
 
 
-def _by_residuals(lines, k, family):
+def _by_residuals(lines, k, distortion_model):
     """Of any distortion model and metric."""
-    small = compressed_as_measured(lines, k.shape[1] - family.size(0))
+    small = compressed_as_measured(lines, k.shape[1] - distortion_model.num_coefficients(0))
     dtype = jnp.asarray(small.focal).dtype
     score, matrix = map(np.asarray, frame_normal_equations(small, jnp.asarray(k, dtype)))
     number = np.bincount(np.asarray(small.frame), own_weights(small) > 0, minlength=len(k))
@@ -264,7 +264,7 @@ def _off_centre(fit, lines, k, frames, follows) -> Float[np.ndarray, "both both"
     lens, dtype = fit.lens, jnp.asarray(lines.focal).dtype
     offset = (np.asarray(lens.centre) - np.asarray(lines.centre)) / lens.scale
     both = np.concatenate([k, np.broadcast_to(offset, (len(k), 2))], axis=1)
-    few = for_terms(with_family(lines, lens.family), k.shape[1])
+    few = for_terms(with_distortion_model(lines, lens.distortion_model), k.shape[1])
     score, matrix = map(np.asarray, frame_normal_equations(few, jnp.asarray(both, dtype)))
     used = np.flatnonzero(np.bincount(np.asarray(lines.frame), own_weights(lines) > 0, minlength=len(k)))
     seen = _Frames(score[used], matrix[used], frames.number, frames.focal)

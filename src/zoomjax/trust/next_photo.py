@@ -22,8 +22,8 @@ from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
+from ..fit.distortion_models import with_distortion_model
 from ..fit.energy import counted_frames, line_weights, linearised, number_counted
-from ..fit.family_lines import with_family
 from ..fit.own_weights import own_weights
 from ..fit.result import ZoomFit
 from ..fit.same_camera import check_lines_of
@@ -86,8 +86,8 @@ class Suggestion:
             return f"{photo}: of all candidates, this one would determine the lens best."
         where = "image and focal range" if len(self.focals) > 1 else "the image"
         return (
-            f"{photo}: the standard deviation of the displacement, in the geometric mean over "
-            f"{where}, would fall from {self.before:.2g} to {self.after:.2g} px."
+            f"{photo}: the standard deviation that noise gives the displacement, in the geometric mean "
+            f"over {where}, would fall from {self.before:.2g} to {self.after:.2g} px."
         )
 
 
@@ -129,7 +129,7 @@ def suggest_next(
             f"{focal_range!r}."
         )
     check("suggest_next", zoom=fit.lens.zoom, shift=fit.lens.shift)
-    lines = with_family(lines, fit.lens.family).about(fit.lens.centre)
+    lines = with_distortion_model(lines, fit.lens.distortion_model).about(fit.lens.centre)
     if not own_weights(lines).any():
         raise ValueError(
             "Argument lines must have a usable line, but all have a weight of 0 or too few points."
@@ -187,7 +187,9 @@ def _typical(lines):
 
 @bucketed_jit(returns=[of_lines] * 3)
 def _sizes(lines):
-    unchanged = lines.corrected(jnp.zeros((lines.focal.shape[0], lines.family.size(1)), lines.focal.dtype))
+    unchanged = lines.corrected(
+        jnp.zeros((lines.focal.shape[0], lines.distortion_model.num_coefficients(1)), lines.focal.dtype)
+    )
     return line_weights(lines), lines.counts, jnp.sum(unchanged**2, axis=(1, 2))
 
 

@@ -20,22 +20,20 @@ import numpy as np
 
 from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
-from ..fit.family_lines import compress_family, with_family
+from ..fit.distortion_models import compressed_under
 from ..fit.image_metric import in_corrected, measured_as
-from ..fit.prepare import ready_model
-from ..fit.problem import about_own_centre
-from ..fit.result import ZoomFit
-from ..fit.zoom import fit_zoom
+from ..fit.moved_centre import check_any_centre
+from ..fit.result import ZoomFit, failed
+from ..fit.zoom import CentreArgument, about_centre, fit_zoom, is_to_be_fitted
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
-from ..lines.lines import Lines
-from ..models.family import AbstractFamily
+from ..models.distortion_model import AbstractDistortionModel
 from ..models.model import Model
-from ..models.polynomial import RadialPolynomial
+from ..models.requirements import check
 from ..models.smooth import SmoothZoom
 from ..models.zoom import AbstractZoom, PolynomialZoom
 from .cross_validation import errors_of
-from .folds import Folds, HoldOut, LineErrors, focals_there, folds_of, shares, small_lines
+from .folds import Folds, HoldOut, LineErrors, folds_of, small_lines
 
 _TERMS = 3  # of the default candidates, at most
 _DEGREES = 4
@@ -83,6 +81,7 @@ class Selection:
         verdicts: the figures of all candidates, in their order.
         hold_out: what was left out: "focal", "frame" or "line".
         folds: number of folds.
+        rule: by which the model was chosen.
     """
 
     chosen: Model
@@ -91,6 +90,7 @@ class Selection:
     verdicts: tuple[Verdict, ...]
     hold_out: HoldOut
     folds: int
+    rule: Rule = "one standard error"
 
     def rows(self) -> list[tuple[str, str, str, str, str, str]]:
         """The table: candidate, parameters, RMS as fitted and held out, difference to the best, mark."""
@@ -123,6 +123,18 @@ class Selection:
         """What the table shows."""
         what = {"focal": "inner focal lengths", "frame": "frames", "line": "lines"}[self.hold_out]
         return f"RMS distance to straight lines, px; {what} left out in {self.folds} parts"
+
+    @property
+    def why(self) -> str:
+        """Why the chosen model is not the best one, in a sentence; empty if it is."""
+        if self.chosen is self.best:
+            return ""
+        near = (
+            f"no more than {100 * _TIE:g} %, which is nothing,"
+            if self.rule == "least"
+            else "no more than one standard error of the difference"
+        )
+        return f"Of the models that are worse than the best by {near} that of fewest parameters is chosen."
 
     def summary(self) -> dict:
         """The figures, as plain numbers and strings that JSON can hold."""
@@ -157,6 +169,7 @@ def select_model(
     folds: int | None = None,
     seed: int = 0,
     rule: Rule = "one standard error",
+    centre: CentreArgument | None = None,
 ) -> Selection:
     """Select a model by cross-validation, by default with the one-standard-error rule.
 
@@ -180,7 +193,11 @@ def select_model(
             of the lines.
         seed: random seed of the split, where parts hold more than one. The split depends on nothing else.
         rule: "one standard error", or "least": the candidate of least error, or, of those whose error is
-            above it by next to nothing, the one with the fewest parameters.
+            hardly above it, the one with the fewest parameters.
+        centre: as for `fit_zoom`. With "fit", the model is chosen about the centre of the lines, the centre
+            fitted with it, where the lines determine one, and the model chosen again about that: parts of
+            the lines are compared about one centre. `Selection.fit` has the centre fitted with the model
+            chosen.
 
     Returns:
         The selection. Candidates that cannot be fitted, to all lines or to a fold's, or of which a fold
@@ -206,11 +223,15 @@ def select_model(
         >>> select_model(compress(scene, terms=2)).chosen.name
         'degree 2, 2 terms'
     """
-    lines = about_own_centre(lines)
     if isinstance(candidates, AbstractZoom | Model):
         raise TypeError(
             "Argument candidates must be a list of zoom models, [first, second], not one of them."
         )
+    if is_to_be_fitted(centre):
+        return _about_fitted(
+            lines, candidates, {"hold_out": hold_out, "folds": folds, "seed": seed, "rule": rule}
+        )
+    lines = about_centre(lines, centre)
     plain = in_corrected(lines)
     if candidates is None:
         most = min(_TERMS, plain.terms) if isinstance(plain, CompressedLines) else _TERMS
@@ -223,13 +244,30 @@ def select_model(
         raise ValueError("Argument candidates must hold one or more zoom models, but it is empty.")
     own = plain.terms if isinstance(plain, CompressedLines) else max(c.terms for c in compared)
     small = small_lines(plain, own)
-    forms = {c.family: measured_as(_in_family(plain, small, c.family, own), lines) for c in compared}
-    if hold_out is None:
-        hold_out = "focal" if focals_there(small).size > 3 else "line"
+    forms = {
+        c.distortion_model: measured_as(compressed_under(c.distortion_model, plain, small, own), lines)
+        for c in compared
+    }
     parts = folds_of(small, hold_out, folds, seed)
     verdicts, best, chosen = compare(small, compared, parts, forms, rule)
-    fit = fit_zoom(forms[chosen.family], zoom=chosen)
-    return Selection(chosen, best, fit, verdicts, hold_out, parts.number)
+    fit = fit_zoom(forms[chosen.distortion_model], zoom=chosen)
+    return Selection(chosen, best, fit, verdicts, parts.hold_out, parts.number, rule)
+
+
+def _about_fitted(lines, candidates, how):
+    """The selection about a centre that is fitted with the model chosen about that of the lines."""
+    check_any_centre(lines)
+    for each in candidates or ():  # whichever is chosen, its centre is fitted
+        model = each if isinstance(each, Model) else Model(each)
+        check("fit_centre", zoom=model.zoom, distortion_model=model.distortion_model)
+    first = select_model(lines, candidates, **how)
+    found = fit_zoom(lines, zoom=first.chosen, centre="fit", throw=False)
+    if failed(found.result) or np.array_equal(found.lens.centre, lines.centre):
+        return first
+    again = select_model(lines.about(found.lens.centre), candidates, **how)
+    same = again.chosen.name == first.chosen.name
+    fit = found if same else fit_zoom(lines, zoom=again.chosen, centre="fit")
+    return dataclasses.replace(again, fit=fit)
 
 
 def default_candidates(terms: int = _TERMS) -> tuple[Model, ...]:
@@ -242,24 +280,12 @@ def default_candidates(terms: int = _TERMS) -> tuple[Model, ...]:
     return (*polynomials, *([Model(SmoothZoom(), 2)] if terms > 1 else []))
 
 
-def _in_family(lines, small, family, terms):
-    """The lines as fits of a family need them."""
-    if isinstance(family, RadialPolynomial):
-        return small
-    return (
-        compress_family(lines, family, terms=terms)
-        if isinstance(lines, Lines)
-        else with_family(small, family)
-    )
-
-
 def candidate_errors(lines, candidate, parts):
     """The errors, or why there are none."""
     model = candidate.with_parameters(None)
     try:
         if isinstance(small := in_corrected(lines), CompressedLines):
             small.check_terms(model.terms)
-        ready_model(lines, model)  # complains of too few focal lengths
         return errors_of(lines, model, parts)
     except ValueError as error:
         return str(error)
@@ -269,22 +295,21 @@ def compare(
     lines: CompressedLines,
     candidates: Sequence[Model],
     parts: Folds,
-    forms: Mapping[AbstractFamily, AbstractLines] | None = None,
+    forms: Mapping[AbstractDistortionModel, AbstractLines] | None = None,
     rule: Rule = "one standard error",
 ) -> tuple[tuple[Verdict, ...], Model, Model]:
     """The verdicts, the best candidate and the chosen one; see `select_model`.
 
-    `forms` are the same lines for other families than the radial polynomial.
+    `forms` are the same lines for distortion models other than the radial polynomial.
     """
-    errors = [candidate_errors((forms or {}).get(c.family, lines), c, parts) for c in candidates]
-    return compare_errors(lines, candidates, errors, parts, rule)
+    errors = [candidate_errors((forms or {}).get(c.distortion_model, lines), c, parts) for c in candidates]
+    return compare_errors(candidates, errors, parts, rule)
 
 
-def compare_errors(lines, candidates, errors, parts, rule):
+def compare_errors(candidates, errors, parts, rule):
     """The same of candidates whose errors, or why there are none, are known."""
-    share = shares(lines)
-    counted = (parts.unit >= 0) & (share > 0)
-    unit, share = parts.unit[counted], share[counted] / share[counted].sum()
+    counted = (parts.unit >= 0) & (parts.share > 0)
+    unit, share = parts.unit[counted], parts.share[counted] / parts.share[counted].sum()
     weight = np.bincount(unit, share)
 
     def by_unit(of_line):

@@ -7,7 +7,7 @@ from ..lines.base import AbstractLines
 from ..models.model import Model
 from ..models.smooth import SmoothZoom
 from ..models.zoom import AbstractZoom
-from .folds import HoldOut, focals_there, folds_of
+from .folds import folds_of
 from .selection import Selection, candidate_errors, compare_errors
 
 
@@ -28,17 +28,13 @@ def select_in_stages(
     Raises:
         ValueError: no candidate can be compared.
     """
-    distinct = focals_there(lines).size
-    many = distinct > 3
-    hold_out: HoldOut = "focal" if many else "line"
-    most = min(folds, distinct - 2) if many else folds
-    parts = folds_of(lines, hold_out, most, 0)
+    parts = folds_of(lines, None, folds, 0)
     candidates = [Model(zoom, terms[0]) for zoom in zooms]
     errors = [candidate_errors(lines, candidate, parts) for candidate in candidates]
-    _, best, chosen = compare_errors(lines, candidates, errors, parts, "least")
+    _, best, chosen = compare_errors(candidates, errors, parts, "least")
     more = [Model(chosen.zoom, number) for number in terms[1:] if not isinstance(chosen.zoom, SmoothZoom)]
     errors += [candidate_errors(lines, candidate, parts) for candidate in more]
     candidates += more
-    verdicts, best, chosen = compare_errors(lines, candidates, errors, parts, "least")
+    verdicts, best, chosen = compare_errors(candidates, errors, parts, "least")
     fit = fit_zoom(lines, zoom=chosen)
-    return Selection(chosen, best, fit, verdicts, hold_out, parts.number)
+    return Selection(chosen, best, fit, verdicts, parts.hold_out, parts.number, "least")

@@ -71,7 +71,7 @@ def vanishing_points(lines: Lines, lens: ZoomLens) -> VanishingPoints:
 
     Returns:
         What was found. The `factor` is near 1, by its standard deviation, if the lens is right. Lines whose
-        middles are nearest to the centre of distortion tell nothing, as those that span the image do not.
+        middles are nearest to the centre of distortion say nothing, as those that span the image do not.
 
     Raises:
         ValueError: the lens is for images of another size or focal lengths in another unit.

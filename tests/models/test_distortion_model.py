@@ -1,5 +1,6 @@
-"""Every family through one table of tests, and what is particular to each."""
+"""Every distortion model through one table of tests, and what is particular to each."""
 
+import json
 import math
 
 import cv2
@@ -24,28 +25,30 @@ TABLE = {  # coefficients well within the domain, and some whose domain ends ins
     "division at a pole": (zj.models.Division(), [-0.3, 0.02], [-1.5]),
     "decentred": (zj.models.BrownConrady(), [-0.1, 0.02, 0.004, -0.003], [-0.4, 0.02, 0.01, 0.02]),
 }
-FAMILIES = {name: TABLE[name] for name in ("polynomial", "division 1", "decentred")}
+DISTORTION_MODELS = {name: TABLE[name] for name in ("polynomial", "division 1", "decentred")}
 RANGE = np.array([20.0, 80.0])
 
-every = pytest.mark.parametrize(("family", "k", "tight"), TABLE.values(), ids=TABLE)
+every = pytest.mark.parametrize(("distortion_model", "k", "tight"), TABLE.values(), ids=TABLE)
 
 
-def distortion(family, k, dtype=np.float64):
-    return zj.Distortion(*(jnp.asarray(leaf, dtype) for leaf in (k, CENTRE, SCALE)), family)
+def distortion(distortion_model, k, dtype=np.float64):
+    return zj.Distortion(*(jnp.asarray(leaf, dtype) for leaf in (k, CENTRE, SCALE)), distortion_model)
 
 
-def lens_of(family, k, change=0.5):
+def lens_of(distortion_model, k, change=0.5):
     """A lens whose coefficients grow from k to (1 + change) k at the shortest focal length."""
     parameters = jnp.stack([jnp.asarray(k), change * jnp.asarray(k)])
     zoom = zj.PolynomialZoom(1, parameters, jnp.asarray(RANGE[0]))
-    return zj.ZoomLens(zoom, jnp.asarray(CENTRE), jnp.asarray(RANGE), SIZE, family=family)
+    return zj.ZoomLens(
+        zoom, jnp.asarray(CENTRE), jnp.asarray(RANGE), SIZE, distortion_model=distortion_model
+    )
 
 
 @pytest.mark.slow
 @every
-def test_there_and_back(family, k, tight):
+def test_there_and_back(distortion_model, k, tight):
     grid = jnp.asarray(image_grid(SIZE, 9))
-    for d in (distortion(family, k), distortion(family, tight)):
+    for d in (distortion(distortion_model, k), distortion(distortion_model, tight)):
         corrected = d.undistort(grid)
         inside = np.linalg.norm(np.asarray(grid) - CENTRE, axis=1) < float(d.monotone_radius)
         np.testing.assert_array_equal(np.isfinite(corrected).all(axis=1), inside)
@@ -55,15 +58,18 @@ def test_there_and_back(family, k, tight):
 
 
 @every
-def test_where_there_is_no_inverse_is_nan(family, k, tight):
+def test_where_there_is_no_inverse_is_nan(distortion_model, k, tight):
     del k
-    d = distortion(family, tight)
+    d = distortion(distortion_model, tight)
     radius = float(d.monotone_radius)
     angle = np.linspace(0, 2 * np.pi, 8)
     border = CENTRE + (1 - 1e-6) * radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     beyond = jnp.asarray(CENTRE + 1.3 * (np.asarray(d.undistort(border)) - CENTRE))
     end = jnp.asarray((radius / SCALE) ** 2)
-    pole = isinstance(family, zj.models.Division) and not family.factor(end, jnp.asarray(tight)) < 1e6
+    pole = (
+        isinstance(distortion_model, zj.models.Division)
+        and not distortion_model.factor(end, jnp.asarray(tight)) < 1e6
+    )
     assert d.has_inverse(beyond).all() == pole
     np.testing.assert_array_equal(np.isnan(d.distort(beyond)), not pole)
     assert np.isnan(d.distort(jnp.array([jnp.nan, 3.0]))).all()
@@ -71,12 +77,12 @@ def test_where_there_is_no_inverse_is_nan(family, k, tight):
 
 @pytest.mark.slow
 @every
-def test_derivatives(family, k, tight):
+def test_derivatives(distortion_model, k, tight):
     del tight
     points = CENTRE + np.array([(0, 0), (30, -50), (-140, 100)])
 
     def both(k, points):
-        d = distortion(family, k)
+        d = distortion(distortion_model, k)
         return jnp.stack([d.undistort(points), d.distort(points)])
 
     for place, x in enumerate((np.array(k), points)):
@@ -92,34 +98,36 @@ def test_derivatives(family, k, tight):
 
 
 @every
-def test_pixel_coefficients(family, k, tight):
+def test_pixel_coefficients(distortion_model, k, tight):
     del tight
-    d = distortion(family, k)
-    pixels = zj.Distortion(d.pixel_coefficients, d.centre, jnp.asarray(1.0), family)
+    d = distortion(distortion_model, k)
+    pixels = zj.Distortion(d.pixel_coefficients, d.centre, jnp.asarray(1.0), distortion_model)
     grid = jnp.asarray(image_grid(SIZE, 5))
     np.testing.assert_allclose(pixels.undistort(grid), d.undistort(grid), rtol=1e-12)
 
 
 @every
-def test_float32(family, k, tight):
+def test_float32(distortion_model, k, tight):
     del tight
-    d, exact = distortion(family, k, np.float32), distortion(family, k)
+    d, exact = distortion(distortion_model, k, np.float32), distortion(distortion_model, k)
     grid = jnp.asarray(image_grid(SIZE, 5), jnp.float32)
     assert d.distort(grid).dtype == jnp.float32
     np.testing.assert_allclose(d.distort(grid), exact.distort(grid.astype(float)), rtol=0, atol=2e-3)
 
 
-def least_slope(family, zoom):
+def least_slope(distortion_model, zoom):
     """The least eigenvalue of the Jacobian, and of the divisor, sampled."""
     corner = np.array(SIZE) / 2  # pixels have an area
     z = jnp.asarray((image_grid(SIZE, 21) - CENTRE) * corner / (corner - 0.5) / SCALE)
 
     def least(f):
         k = zoom(f)
-        jacobian = jax.vmap(jax.jacfwd(lambda z: jnp.stack(family.correct((z[0], z[1]), z @ z, k))))(z)
+        jacobian = jax.vmap(
+            jax.jacfwd(lambda z: jnp.stack(distortion_model.correct((z[0], z[1]), z @ z, k)))
+        )(z)
         values = jnp.linalg.eigvalsh((jacobian + jacobian.mT) / 2)
-        if isinstance(family, zj.models.Division):  # its slope's numerator, and the divisor
-            factor = family.factor(jnp.sum(z**2, axis=1), k)
+        if isinstance(distortion_model, zj.models.Division):  # its slope's numerator, and the divisor
+            factor = distortion_model.factor(jnp.sum(z**2, axis=1), k)
             return jnp.minimum(jnp.min(values[:, 0] / factor**2), jnp.min(1 / factor))
         return jnp.min(values)
 
@@ -127,13 +135,13 @@ def least_slope(family, zoom):
 
 
 @every
-def test_certificate_against_sampling(family, k, tight):
+def test_certificate_against_sampling(distortion_model, k, tight):
     certify = eqx.filter_jit(zj.models.certify)
     outcomes = []
     for factor, base in ((0.5, k), (1.0, k), (0.2, tight), (0.6, tight), (1.0, tight)):
-        lens = lens_of(family, factor * np.array(base))
+        lens = lens_of(distortion_model, factor * np.array(base))
         ours = certify(lens)
-        sampled = least_slope(family, lens.zoom)
+        sampled = least_slope(distortion_model, lens.zoom)
         assert ours.least <= sampled + 1e-9
         assert ours.certified == (ours.least > 0)
         if sampled > 0.1:
@@ -148,21 +156,31 @@ def test_certificate_against_sampling(family, k, tight):
 
 
 @every
-def test_file(family, k, tight, tmp_path):
+def test_file(distortion_model, k, tight, tmp_path):
     del tight
-    lens = lens_of(family, k)
+    lens = lens_of(distortion_model, k)
     lens.save(tmp_path / "lens.json")
     again = zj.load_lens(tmp_path / "lens.json")
-    assert again.family == family
+    assert again.distortion_model == distortion_model
     point = jnp.array([3.0, 7.0])
     np.testing.assert_array_equal(again(30.0).undistort(point), lens(30.0).undistort(point))
 
 
-def test_files_of_unknown_families_and_too_few_coefficients_are_refused(tmp_path):
+def test_files_up_to_version_2_call_it_family(tmp_path):
+    lens = lens_of(zj.models.Division(), [-0.1])
+    lens.save(tmp_path / "lens.json")
+    content = json.loads((tmp_path / "lens.json").read_text())
+    assert (content["version"], content["distortion_model"]) == (3, "Division")
+    content |= {"version": 2, "family": content.pop("distortion_model")}
+    (tmp_path / "older.json").write_text(json.dumps(content))
+    assert zj.load_lens(tmp_path / "older.json").distortion_model == zj.models.Division()
+
+
+def test_files_of_unknown_models_and_too_few_coefficients_are_refused(tmp_path):
     lens_of(zj.models.Division(), [-0.1]).save(tmp_path / "lens.json")
     text = (tmp_path / "lens.json").read_text()
-    for family, message in (("Fisheye", "unknown"), ("BrownConrady", "it gives 1")):
-        (tmp_path / "other.json").write_text(text.replace('"Division"', f'"{family}"'))
+    for distortion_model, message in (("Fisheye", "unknown"), ("BrownConrady", "it gives 1")):
+        (tmp_path / "other.json").write_text(text.replace('"Division"', f'"{distortion_model}"'))
         with pytest.raises(ValueError, match=message):
             zj.load_lens(tmp_path / "other.json")
 
@@ -189,21 +207,21 @@ def lines_of(lens, bend=0.0, noise=0.0):
     return zj.Lines.from_ragged(points, frame, focal, image_size=SIZE)
 
 
-@pytest.fixture(scope="module", params=FAMILIES.values(), ids=FAMILIES)
+@pytest.fixture(scope="module", params=DISTORTION_MODELS.values(), ids=DISTORTION_MODELS)
 def fitted(request):
-    """A family, its true lens, noisy lines, and the fit to them compressed."""
-    family, k, _ = request.param
-    lens = lens_of(family, k)
+    """A distortion model, its true lens, noisy lines, and the fit to them compressed."""
+    distortion_model, k, _ = request.param
+    lens = lens_of(distortion_model, k)
     lines = lines_of(lens, noise=0.05)
-    terms = len(k) - family.size(0)
-    small = zj.fit.compress_family(lines, family, terms=terms)
+    terms = len(k) - distortion_model.num_coefficients(0)
+    small = zj.fit.compress_for(lines, distortion_model, terms=terms)
     return lens, lines, small, terms, zj.fit_zoom(small, zoom=zj.PolynomialZoom(degree=1), terms=terms)
 
 
 @pytest.mark.slow
 def test_fit_recovers_the_lens(fitted):
     lens, _, _, terms, fit = fitted
-    assert fit.lens.family == lens.family
+    assert fit.lens.distortion_model == lens.distortion_model
     assert fit.certificate.certified
     assert fit.result == zj.RESULTS.successful
     grid = jnp.asarray(image_grid(SIZE, 7))
@@ -214,7 +232,7 @@ def test_fit_recovers_the_lens(fitted):
     assert float(jnp.max(std)) < 1
     zoom = zj.PolynomialZoom(degree=1)
     exact = zj.fit_zoom(
-        zj.fit.compress_family(lines_of(lens), lens.family, terms=terms), zoom=zoom, terms=terms
+        zj.fit.compress_for(lines_of(lens), lens.distortion_model, terms=terms), zoom=zoom, terms=terms
     )
     np.testing.assert_allclose(exact.lens.zoom.parameters, lens.zoom.parameters, rtol=0, atol=2e-7)
 
@@ -222,9 +240,11 @@ def test_fit_recovers_the_lens(fitted):
 def test_points_and_their_compression_give_one_fit(fitted):
     lens, lines, small, terms, fit = fitted
     k = jax.vmap(lens.zoom)(jnp.asarray(lines.focal))
-    full = zj.fit.with_family(lines, lens.family)
+    full = zj.fit.with_distortion_model(lines, lens.distortion_model)
     np.testing.assert_allclose(zj.fit.frame_energy(small, k), zj.fit.frame_energy(full, k), rtol=1e-6)
-    ours = zj.fit_zoom(lines, family=lens.family, zoom=zj.PolynomialZoom(degree=1), terms=terms)
+    ours = zj.fit_zoom(
+        lines, distortion_model=lens.distortion_model, zoom=zj.PolynomialZoom(degree=1), terms=terms
+    )
     np.testing.assert_allclose(ours.lens.zoom.parameters, fit.lens.zoom.parameters, rtol=0, atol=1e-6)
     np.testing.assert_allclose(ours.covariance, fit.covariance, rtol=1e-3, atol=1e-12)
     for same in (lines, small):
@@ -236,7 +256,7 @@ def test_frames_by_themselves(fitted):
     lens, _, small, terms, _ = fitted
     fits = zj.fit_frames(small, terms=terms)
     d = fits.distortion(1)
-    assert d.family == lens.family
+    assert d.distortion_model == lens.distortion_model
     np.testing.assert_allclose(d.coefficients, lens(32.0).coefficients, rtol=0, atol=0.02)
 
 
@@ -248,32 +268,41 @@ def test_crooked_lines_are_rejected(fitted):
     crooked = zj.Lines.from_ragged(
         points, np.asarray(lines.frame), np.asarray(lines.focal), image_size=SIZE
     )
-    small = zj.fit.compress_family(crooked, lens.family, terms=terms)
+    small = zj.fit.compress_for(crooked, lens.distortion_model, terms=terms)
     robust = zj.fit_robust(small, zoom=zj.PolynomialZoom(degree=1), terms=terms)
     assert 7 in robust.rejected
-    assert robust.fit.lens.family == lens.family
+    assert robust.fit.lens.distortion_model == lens.distortion_model
 
 
 @pytest.mark.parametrize(
-    ("family", "terms", "message"),
+    ("distortion_model", "terms", "message"),
     [
         (zj.models.Division(), 1, r"compress\(lines, terms=8\)"),
         (zj.models.BrownConrady(), 2, r"compress_any_centre\(lines, terms=2\)"),
     ],
 )
-def test_lines_compressed_for_another_family_are_refused(family, terms, message, ragged):
+def test_lines_compressed_for_another_model_are_refused(distortion_model, terms, message, ragged):
     with pytest.raises(ValueError, match=message):
-        zj.fit_zoom(zj.compress(ragged), family=family, zoom=zj.PolynomialZoom(degree=1), terms=terms)
+        zj.fit_zoom(
+            zj.compress(ragged),
+            distortion_model=distortion_model,
+            zoom=zj.PolynomialZoom(degree=1),
+            terms=terms,
+        )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("family", "k", "tight"), list(FAMILIES.values())[1:], ids=list(FAMILIES)[1:])
-def test_a_fit_is_made_invertible(family, k, tight):
+@pytest.mark.parametrize(
+    ("distortion_model", "k", "tight"),
+    list(DISTORTION_MODELS.values())[1:],
+    ids=list(DISTORTION_MODELS)[1:],
+)
+def test_a_fit_is_made_invertible(distortion_model, k, tight):
     """Lines of a lens that does not fold, corrected by one that would."""
     del k
-    terms = len(tight) - family.size(0)
+    terms = len(tight) - distortion_model.num_coefficients(0)
     bent = lines_of(lens_of(zj.models.RadialPolynomial(), [0.0]), bend=-90.0 if tight[0] < 0 else 90.0)
-    small = zj.fit.compress_family(bent, family, terms=terms)
+    small = zj.fit.compress_for(bent, distortion_model, terms=terms)
     zoom = zj.PolynomialZoom(degree=0)
     free = zj.fit_zoom(small, zoom=zoom, terms=terms, invertible=False, throw=False)
     ours = zj.fit_zoom(small, zoom=zoom, terms=terms)
@@ -282,10 +311,12 @@ def test_a_fit_is_made_invertible(family, k, tight):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("family", "k", "tight"), FAMILIES.values(), ids=FAMILIES)
-def test_images_are_corrected_by_the_exact_inverse(family, k, tight):
+@pytest.mark.parametrize(
+    ("distortion_model", "k", "tight"), DISTORTION_MODELS.values(), ids=DISTORTION_MODELS
+)
+def test_images_are_corrected_by_the_exact_inverse(distortion_model, k, tight):
     del tight
-    d = distortion(family, k)
+    d = distortion(distortion_model, k)
     framing = zj.correct.frame_output(d, SIZE, keep="valid")
     pixels = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), axis=-1)
     exact = np.asarray(d.distort(framing.corrected(pixels)))
@@ -296,17 +327,19 @@ def test_images_are_corrected_by_the_exact_inverse(family, k, tight):
     np.testing.assert_allclose(shown, exact, rtol=0, atol=0.01)
     warped = zj.warp_image(jnp.asarray(image), d, framing=framing)
     np.testing.assert_allclose(warped, exact, rtol=0, atol=0.01)
-    assert (fit_inverse(d, 250.0) is None) == isinstance(family, zj.models.BrownConrady)
+    assert (fit_inverse(d, 250.0) is None) == isinstance(distortion_model, zj.models.BrownConrady)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("family", "k", "tight"), FAMILIES.values(), ids=FAMILIES)
-def test_positions_are_differentiable(family, k, tight):
+@pytest.mark.parametrize(
+    ("distortion_model", "k", "tight"), DISTORTION_MODELS.values(), ids=DISTORTION_MODELS
+)
+def test_positions_are_differentiable(distortion_model, k, tight):
     del tight
     framing = zj.Framing(np.array(1.0), np.array([5.0, 9.0]), (3, 2))
 
     def positions(k):
-        return jnp.stack(sample_positions(distortion(family, k), framing, jnp.float64))
+        return jnp.stack(sample_positions(distortion(distortion_model, k), framing, jnp.float64))
 
     finite = finite_jacobian(jax.jit(positions), np.array(k), 1e-5)
     np.testing.assert_allclose(jax.jacrev(positions)(jnp.array(k)), finite, rtol=1e-5, atol=1e-5)
@@ -314,13 +347,15 @@ def test_positions_are_differentiable(family, k, tight):
 
 @pytest.mark.parametrize("name", ["polynomial", "division 1", "decentred"])
 def test_distances_in_the_image(name):
-    family, k, _ = TABLE[name]
-    lens = lens_of(family, k)
+    distortion_model, k, _ = TABLE[name]
+    lens = lens_of(distortion_model, k)
     lines = lines_of(lens, noise=0.05)
-    small = zj.fit.compress_family(lines, family, terms=len(k) - family.size(0))
+    small = zj.fit.compress_for(
+        lines, distortion_model, terms=len(k) - distortion_model.num_coefficients(0)
+    )
     coefficients = jax.vmap(lens.zoom)(jnp.asarray(lines.focal))
     energy = zj.fit.global_energy(zj.fit.in_image(small), coefficients)
-    full = zj.fit.in_image(zj.fit.with_family(lines, family))
+    full = zj.fit.in_image(zj.fit.with_distortion_model(lines, distortion_model))
     np.testing.assert_allclose(energy, zj.fit.global_energy(full, coefficients), rtol=1e-6)
     assert math.sqrt(energy) == pytest.approx(0.05, rel=0.15)
 

@@ -1,4 +1,4 @@
-"""Distortion models ("families"): formulas for the coefficients k of one frame, and their inverses.
+"""Distortion models: formulas for the coefficients k of one frame, and their inverses.
 
 A distortion model maps a normalised point ``z = (x - c)/s`` to the corrected point, up to the radius where
 the map stops being invertible. Radial models have the form ``z L(t)``, ``t = z.z``, and define L; the rest
@@ -8,10 +8,10 @@ follows:
     Division            L = 1 / (1 + k1 t + ... + kN t^N)
     BrownConrady        the polynomial, and p1, p2 for a decentred lens, which is not radial
 
-The radius maps as ``r -> r L(r^2)``, and the *limit* is where that first stops growing; beyond it the image
-folds over and no inverse exists. Inverses are iterated until their residual is at the level of rounding
-errors, or are NaN; `distortion` differentiates them. A new distortion model is a final class of
-`AbstractRadial` or `AbstractFamily`; fits, certificates, files and images use these methods alone.
+The radius maps as ``r -> r L(r^2)``, and the `monotone_radius` is where that first stops growing; beyond it
+the image folds over and no inverse exists. Inverses are iterated until their residual is at the level of
+rounding errors, or are NaN; `distortion` differentiates them. A new distortion model is a final class of
+`AbstractRadial` or `AbstractDistortionModel`; fits, certificates, files and images use these methods alone.
 
 Formulas are written for one point, with coefficients ``k[0], k[1], ...``, in operations that NumPy and JAX
 share. They are also called for many points at once: ``k`` then has further axes, which broadcast against
@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._core.arrays import apart, namespace
+from .._core.checks import checked_integer
 from .._core.types import AnyArray, Elements
 from ._roots import first_positive_root, first_quadratic_root, increasing_root, newton_root
 
@@ -39,7 +40,7 @@ def radial_factor(
 ) -> Float[AnyArray, "..."]:
     """L(t) of eq. 2 for normalised squared radii `t` and coefficients `k = (k1, ..., kN)`.
 
-    The same code for NumPy and JAX, as all of a radial family's formulas.
+    The same code for NumPy and JAX, as all formulas of radial models.
     """
     return 1 + radial_rest(squared_radius, k)
 
@@ -96,7 +97,15 @@ def first_root(rows: np.ndarray, k: Elements) -> Float[AnyArray, "..."]:
     return first_positive_root(xp.moveaxis(polynomials, (0, 1), (-2, -1)))
 
 
-class AbstractFamily(eqx.Module):
+def checked_terms(terms: Any, most: int) -> int:
+    """The number N of radial distortion coefficients, at most those that a distortion model takes."""
+    number = checked_integer("terms", terms, 1)
+    if number > most:
+        raise ValueError(f"Argument terms must be at most {most}, but it is {number}.")
+    return number
+
+
+class AbstractDistortionModel(eqx.Module):
     """A distortion model: maps normalised points z, given coefficients k. It has no fields."""
 
     formula: ClassVar[str]
@@ -105,41 +114,41 @@ class AbstractFamily(eqx.Module):
     """Radial coefficients that a distortion may have beyond those that fits to lines determine."""
 
     @abc.abstractmethod
-    def size(self, terms: int) -> int:
+    def num_coefficients(self, terms: int) -> int:
         """The number of coefficients of a model with `terms` radial ones."""
 
     @abc.abstractmethod
-    def orders(self, size: int) -> np.ndarray:
+    def orders(self, number: int) -> np.ndarray:
         """The power of the radius that each coefficient goes with: a length in px has it as its unit."""
 
     @abc.abstractmethod
     def correct(self, z: Pair, squared: Float[AnyArray, "..."], k: Elements) -> Pair:
-        """The corrected point, by formula, also beyond the limit; `squared` is z.z."""
+        """The corrected point, by formula, also beyond the monotone radius; `squared` is z.z."""
 
     @abc.abstractmethod
-    def limit(self, k: Elements) -> Float[AnyArray, "..."]:
+    def monotone_radius(self, k: Elements) -> Float[AnyArray, "..."]:
         """The radius up to which `correct` is invertible; inf if everywhere. Constant for derivatives."""
 
     @abc.abstractmethod
-    def distort(self, z: Pair, k: Elements, limit: Float[AnyArray, "..."]) -> Pair:
-        """The point within the limit that is corrected to z; NaN where there is none."""
+    def distort(self, z: Pair, k: Elements, monotone_radius: Float[AnyArray, "..."]) -> Pair:
+        """The point within the monotone radius that is corrected to z; NaN where there is none."""
 
     def within(self, squared: Float[AnyArray, "..."], k: Elements, *, digits: int) -> Bool[AnyArray, "..."]:
-        """Whether a squared radius is within the limit, or beyond it by some last digits.
+        """Whether a squared radius is within the monotone radius, or beyond it by some last digits.
 
         Rounded, those are the same radius: what `distort` puts at the fold lies there.
         """
-        return squared <= (self.limit(k) * (1 + digits * np.finfo(squared.dtype).eps)) ** 2
+        return squared <= (self.monotone_radius(k) * (1 + digits * np.finfo(squared.dtype).eps)) ** 2
 
     @abc.abstractmethod
-    def conditions(self, size: int) -> np.ndarray:
+    def conditions(self, number: int) -> np.ndarray:
         """Rows m such that it is invertible up to R where ``1 + sum_i m_i k_i r^o_i > 0`` for r up to R.
 
         o are the `orders`; where those are 1, r is to be R itself. Linear in k, for proofs and fits.
         """
 
     @abc.abstractmethod
-    def expansion_terms(self, size: int) -> int:
+    def expansion_terms(self, number: int) -> int:
         """How many powers of t `expansion` needs."""
 
     @abc.abstractmethod
@@ -152,7 +161,7 @@ class AbstractFamily(eqx.Module):
         """
 
 
-class AbstractRadial(AbstractFamily):
+class AbstractRadial(AbstractDistortionModel):
     """A radial distortion model, ``z L(t)``."""
 
     @abc.abstractmethod
@@ -165,61 +174,61 @@ class AbstractRadial(AbstractFamily):
 
     @abc.abstractmethod
     def equation(self, r: Any, squared: Any, rho: Any, k: Elements) -> tuple[Any, Any]:
-        """A number with the sign of ``r L(t) - rho``, smooth up to the limit, and its derivative by r.
+        """A number with the sign of ``r L(t) - rho``, smooth up to the fold, and its derivative by r.
 
         ``t = r^2`` is given; with ``t = (r rho)^2`` and 1 for rho, it is about the ratio of both radii.
         """
 
-    def size(self, terms: int) -> int:
+    def num_coefficients(self, terms: int) -> int:
         """`terms`."""
         return terms
 
-    def orders(self, size: int) -> np.ndarray:
+    def orders(self, number: int) -> np.ndarray:
         """2, 4, ..., 2N."""
-        return 2 * radial_orders(size)
+        return 2 * radial_orders(number)
 
     def correct(self, z: Pair, squared: Float[AnyArray, "..."], k: Elements) -> Pair:
         """``z L(t)``."""
         factor = self.factor(squared, k)
         return z[0] * factor, z[1] * factor
 
-    def limit(self, k: Elements) -> Float[AnyArray, "..."]:
-        """The monotone radius: the first root of a condition in t."""
+    def monotone_radius(self, k: Elements) -> Float[AnyArray, "..."]:
+        """The first root of a condition in t."""
         return namespace(k).sqrt(first_root(self.conditions(len(k)), k))
 
-    def reach(self, k: Elements, limit: Float[AnyArray, "..."]) -> Float[AnyArray, "..."]:
-        """The corrected radius that the limit goes to; inf if there is none, or at a pole."""
-        xp = namespace(k, limit)
-        finite = xp.where(xp.isinf(limit), 0, limit)
+    def reach(self, k: Elements, monotone_radius: Float[AnyArray, "..."]) -> Float[AnyArray, "..."]:
+        """The corrected radius of the monotone radius; inf if there is none, or at a pole."""
+        xp = namespace(k, monotone_radius)
+        finite = xp.where(xp.isinf(monotone_radius), 0, monotone_radius)
         factor = self.factor(finite * finite, k)
-        end = xp.isinf(limit) | ~((factor > 0) & (factor < np.finfo(factor.dtype).eps ** -0.5))
+        end = xp.isinf(monotone_radius) | ~((factor > 0) & (factor < np.finfo(factor.dtype).eps ** -0.5))
         return xp.where(end, np.inf, finite * factor)
 
     def within(self, squared: Float[AnyArray, "..."], k: Elements, *, digits: int) -> Bool[AnyArray, "..."]:
         """Of one or two coefficients of each point by their conditions, without a root for each."""
         one_for_all = k.ndim == 1 or k.shape[-1] == 1
         if one_for_all or len(k) > 2:
-            return AbstractFamily.within(self, squared, k, digits=digits)
+            return AbstractDistortionModel.within(self, squared, k, digits=digits)
         inside = squared >= 0  # not NaN
         for row in self.conditions(len(k)):
             inside = inside & positive_up_to(squared, *times(row, k), digits=2 * digits)
         return inside
 
     def ratio(
-        self, squared: Float[AnyArray, "..."], k: Elements, limit: Float[AnyArray, "..."]
+        self, squared: Float[AnyArray, "..."], k: Elements, monotone_radius: Float[AnyArray, "..."]
     ) -> tuple[Float[AnyArray, "..."], Bool[AnyArray, "..."]]:
         """The distorted radius over the corrected one, whose square is given, and whether there is one.
 
         It solves ``q L(t q^2) = 1``, which needs no root of the squared radius and is regular at 0.
         """
         xp = namespace(squared, k)
-        exists = self.reaches(squared, k, limit)
+        exists = self.reaches(squared, k, monotone_radius)
         squared = xp.where(exists, squared, 0)
-        farthest = (limit * (1 + 8 * np.finfo(squared.dtype).eps)) ** 2
+        farthest = (monotone_radius * (1 + 8 * np.finfo(squared.dtype).eps)) ** 2
 
         def high():
             off_centre = squared > 0
-            return xp.where(off_centre, limit / xp.sqrt(xp.where(off_centre, squared, 1)), np.inf)
+            return xp.where(off_centre, monotone_radius / xp.sqrt(xp.where(off_centre, squared, 1)), np.inf)
 
         q, found = increasing_root(
             self._of_ratio(squared, k), xp.ones_like(squared), high, lambda q: squared * q * q <= farthest
@@ -227,13 +236,13 @@ class AbstractRadial(AbstractFamily):
         return q, exists & found
 
     def reaches(
-        self, squared: Float[AnyArray, "..."], k: Elements, limit: Float[AnyArray, "..."]
+        self, squared: Float[AnyArray, "..."], k: Elements, monotone_radius: Float[AnyArray, "..."]
     ) -> Bool[AnyArray, "..."]:
         """Whether a corrected point, of which the squared radius is given, can be reached."""
         eps = np.finfo(squared.dtype).eps
         # A few last digits beyond it are the same radius: what is corrected at the fold rounds to there.
         return namespace(squared, k).isfinite(squared) & (
-            squared <= (self.reach(k, limit) * (1 + 8 * eps)) ** 2
+            squared <= (self.reach(k, monotone_radius) * (1 + 8 * eps)) ** 2
         )
 
     def _of_ratio(self, squared, k):
@@ -250,8 +259,8 @@ class AbstractRadial(AbstractFamily):
             lambda q: self.within(squared * q * q, k, digits=8),
         )
 
-    def distort(self, z: Pair, k: Elements, limit: Float[AnyArray, "..."]) -> Pair:
+    def distort(self, z: Pair, k: Elements, monotone_radius: Float[AnyArray, "..."]) -> Pair:
         """By the `ratio` of the radii."""
-        q, found = self.ratio(z[0] * z[0] + z[1] * z[1], k, limit)
+        q, found = self.ratio(z[0] * z[0] + z[1] * z[1], k, monotone_radius)
         q = namespace(q).where(found, q, np.nan)
         return z[0] * q, z[1] * q

@@ -89,7 +89,7 @@ class LensTable:
         return np.array([1.0, 0.0, terms[0], 0.0, terms[1]])
 
 
-def names() -> list[str]:
+def lens_names() -> list[str]:
     """The names of all lenses, in order, each once.
 
     Raises:
@@ -98,7 +98,7 @@ def names() -> list[str]:
     return sorted({table.name for table in tables()}, key=str.casefold)
 
 
-def find(search: str = "", *, zooms: bool = False) -> list[LensTable]:
+def find_lenses(search: str = "", *, zooms: bool = False) -> list[LensTable]:
     """Find lenses by words of their names.
 
     Args:
@@ -113,7 +113,7 @@ def find(search: str = "", *, zooms: bool = False) -> list[LensTable]:
         ImportError: lensfunpy is not installed.
 
     Example:
-        >>> [table.focal_range for table in find("nikkor 18-200")]
+        >>> [table.focal_range for table in find_lenses("nikkor 18-200")]
         [(18.0, 200.0), (18.0, 200.0)]
     """
     if not isinstance(search, str):
@@ -134,7 +134,7 @@ def one_named(name: str) -> list[LensTable]:
     Raises:
         ValueError: there is none, or there are several.
     """
-    found = find(name)
+    found = find_lenses(name)
     exact = [table for table in found if table.name.casefold() == name.casefold().strip()]
     found = exact or found
     different = list(dict.fromkeys(table.name for table in found))

@@ -10,23 +10,23 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.checks import checked_size
-from ..interop.radial_table import MODELS, SPARE, RadialTable, TableFit, zoom_of_table
 from ..io.equipment import FILM
 from ..models.lens import ZoomLens
 from .database import LensTable, one_named, version
+from .radial_table import MODELS, SPARE, RadialTable, TableFit, zoom_of_table
 
 _LARGER = 1.02
 """How much larger than the sensor of the table that of the image may be: crop factors are rounded, too."""
 
 
-def load(
+def library_lens(
     lens: str | LensTable,
     *,
     image_size: tuple[int, int],
     crop: float | int | None = None,
     model: str = "auto",
 ) -> ZoomLens:
-    """Load a lens of the lensfun database as a `ZoomLens`.
+    """Make a lens of the lensfun database a `ZoomLens`.
 
     Its `about` has what it is of, and ``table_error_px``: how far it puts a point of the distorted image
     from where lensfun does, at most, over the whole image and all focal lengths, px. A magnification of
@@ -35,7 +35,7 @@ def load(
     The corrected image has the scale of the original in its centre.
 
     Args:
-        lens: its name, or words of it that no other lens has (`find`); or one of its tables.
+        lens: its name, or words of it that no other lens has (`find_lenses`); or one of its tables.
         image_size: (width, height) px of the images. They show the whole sensor, or the part of it that
             `crop` is for.
         crop: crop factor of the images, 43.27 mm over the diagonal of the sensor. By default that of the
@@ -49,7 +49,7 @@ def load(
             the model asked for is not invertible.
 
     Example:
-        >>> lens = load("nikkor 18-200mm f/3.5-5.6g if-ed ii", image_size=(4288, 2848))
+        >>> lens = library_lens("nikkor 18-200mm f/3.5-5.6g if-ed ii", image_size=(4288, 2848))
         >>> lens(35.0).undistort([0.0, 0.0]).round().tolist()
         [95.0, 63.0]
     """
@@ -87,7 +87,7 @@ def table_for(found: list[LensTable], crop: float | int | None) -> LensTable:
         least = min(table.crop_factor for table in found)
         raise ValueError(
             f'The lens "{found[0].name}" was calibrated on a sensor of crop factor {least:g}, and images '
-            f"of crop factor {crop:g} show more than that: the database does not tell how it draws there."
+            f"of crop factor {crop:g} show more than that: the database has no data there."
         )
     return max(covering, key=lambda table: table.crop_factor)
 

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from zoomjax.lenses import find, names
-from zoomjax.lenses.database import lensfunpy, one_named, tables
+from zoomjax.interop import find_lenses, lens_names
+from zoomjax.interop.database import lensfunpy, one_named, tables
 
 from ._lensfun import distorted
 
@@ -15,16 +15,16 @@ SIZE = (3001, 2001)
 
 
 def test_hundreds_of_zooms_are_found():
-    zooms = find(zooms=True)
+    zooms = find_lenses(zooms=True)
     assert len(zooms) > 600
-    assert {table.name for table in zooms} < set(names())
+    assert {table.name for table in zooms} < set(lens_names())
     assert all(len(table.focal) > 1 for table in zooms)
-    assert len(find()) == len(tables()) > 1200
+    assert len(find_lenses()) == len(tables()) > 1200
 
 
 @pytest.mark.parametrize("search", ["nikkor 18-200", "18-200 NIKKOR", "  vr zoom-nikkor 18-200mm "])
 def test_a_search_finds_all_words_in_any_order_and_case(search):
-    assert [table.name for table in find(search)] == [
+    assert [table.name for table in find_lenses(search)] == [
         "Nikon AF-S DX VR Zoom-Nikkor 18-200mm f/3.5-5.6G IF-ED",
         "Nikon AF-S DX VR Zoom-Nikkor 18-200mm f/3.5-5.6G IF-ED II",
     ]

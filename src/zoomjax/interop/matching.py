@@ -28,7 +28,7 @@ _DESCRIPTION = re.compile(
 
 
 @dataclasses.dataclass(frozen=True)
-class Match:
+class LensMatch:
     """A lens of the database that a photo was taken with.
 
     Attributes:
@@ -40,13 +40,14 @@ class Match:
     crop: float
 
 
-def match(equipment: Equipment, image_size: tuple[int, int], *, lens: str | None = None) -> Match:
-    """Find the lens that a photo was taken with, for `load`.
+def match_lens(equipment: Equipment, image_size: tuple[int, int], *, lens: str | None = None) -> LensMatch:
+    """Find the lens that a photo was taken with, for `library_lens`.
 
     Args:
-        equipment: what the photo's EXIF data tell, from `zoomjax.io.read_equipment`.
+        equipment: what the photo's EXIF data say, from `zoomjax.io.read_equipment`.
         image_size: (width, height) px of the photo.
-        lens: name of the lens, as for `load`, if that is known; then only the crop factor is looked for.
+        lens: name of the lens, as for `library_lens`, if that is known; then only the crop factor is looked
+            for.
 
     Raises:
         ImportError: lensfunpy is not installed.
@@ -55,7 +56,7 @@ def match(equipment: Equipment, image_size: tuple[int, int], *, lens: str | None
     Example:
         >>> from zoomjax.io import Equipment
         >>> photo = Equipment(maker="SONY", camera="ILCE-7M3", lens="FE 24-70mm F2.8 GM", focal=35.0)
-        >>> found = match(photo, (6000, 4000))
+        >>> found = match_lens(photo, (6000, 4000))
         >>> found.table.name, found.crop
         ('FE 24-70mm f/2.8 GM', 1.0)
     """
@@ -65,9 +66,9 @@ def match(equipment: Equipment, image_size: tuple[int, int], *, lens: str | None
     if crop is None:
         raise ValueError(
             "The crop factor of the photo is not known: its EXIF data have neither a camera of the lensfun "
-            "database nor the focal length of equal view on film nor the resolution of the focal plane."
+            "database nor the 35 mm equivalent focal length nor the resolution of the focal plane."
         )
-    return Match(table_for(found, crop), crop)
+    return LensMatch(table_for(found, crop), crop)
 
 
 def crop_factor(equipment: Equipment, image_size: tuple[int, int]) -> float | None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
-from zoomjax.lenses import find, load
+from zoomjax.interop import find_lenses, library_lens
 from zoomjax.models import TableZoom, certify
 
 from ._lensfun import largest_difference
@@ -35,9 +35,9 @@ def focal_lengths(table):
 @pytest.mark.parametrize("name", LENSES)
 @pytest.mark.parametrize("smaller", [1.0, 1.5])
 def test_the_error_of_a_lens_is_as_large_as_it_says(name, smaller):
-    table = next(table for table in find(name) if table.name == name)
+    table = next(table for table in find_lenses(name) if table.name == name)
     crop = table.crop_factor * smaller
-    lens = load(table, image_size=SIZE, crop=crop)
+    lens = library_lens(table, image_size=SIZE, crop=crop)
     worst = max(largest_difference(lens, table, focal, crop) for focal in focal_lengths(table))
     assert worst <= 1.1 * lens.about["table_error_px"] + 0.03
     assert certify(lens).certified
@@ -45,30 +45,30 @@ def test_the_error_of_a_lens_is_as_large_as_it_says(name, smaller):
 
 @pytest.mark.parametrize(("model", "kind"), [("smooth", zj.SmoothZoom), ("table", TableZoom)])
 def test_the_model_can_be_chosen(model, kind):
-    lens = load(NIKKOR, image_size=SIZE, model=model)
+    lens = library_lens(NIKKOR, image_size=SIZE, model=model)
     assert isinstance(lens.zoom, kind)
 
 
 def test_the_smooth_model_is_the_choice_within_a_pixel_and_a_table_is_nearer():
-    for table in find("nikkor", zooms=True)[::6]:
-        lens = load(table, image_size=SIZE)
+    for table in find_lenses("nikkor", zooms=True)[::6]:
+        lens = library_lens(table, image_size=SIZE)
         near = lens.about["table_error_px"]
         assert (
             isinstance(lens.zoom, zj.SmoothZoom)
-            == (load(table, image_size=SIZE, model="smooth").about["table_error_px"] <= 1)
+            == (library_lens(table, image_size=SIZE, model="smooth").about["table_error_px"] <= 1)
             or near <= 1
         )
-        assert load(table, image_size=SIZE, model="table").about["table_error_px"] < 1.5
+        assert library_lens(table, image_size=SIZE, model="table").about["table_error_px"] < 1.5
 
 
 def test_a_lens_of_one_focal_length_is_a_table_of_one():
-    lens = load("Nikon AF-S Nikkor 85mm f/1.8G", image_size=SIZE)
+    lens = library_lens("Nikon AF-S Nikkor 85mm f/1.8G", image_size=SIZE)
     assert lens.zoom.parameters.shape == (1, 7)
     assert lens.focal_range[0] < 85 < lens.focal_range[1]
 
 
 def test_what_a_lens_says_of_itself_is_kept_in_its_file(tmp_path):
-    lens = load(NIKKOR, image_size=SIZE)
+    lens = library_lens(NIKKOR, image_size=SIZE)
     lens.save(tmp_path / "lens.json")
     again = zj.load_lens(tmp_path / "lens.json")
     assert again.about == lens.about
@@ -79,7 +79,7 @@ def test_what_a_lens_says_of_itself_is_kept_in_its_file(tmp_path):
 
 
 def test_it_goes_through_transformations():
-    lens = load(NIKKOR, image_size=SIZE)
+    lens = library_lens(NIKKOR, image_size=SIZE)
 
     @eqx.filter_jit
     def corner(focal):
@@ -92,8 +92,8 @@ def test_it_goes_through_transformations():
 
 
 def test_a_smaller_sensor_sees_the_middle_of_the_same_lens():
-    whole = load("Canon EF 24-70mm f/2.8L II USM", image_size=(6000, 4000), crop=1.0, model="table")
-    part = load("Canon EF 24-70mm f/2.8L II USM", image_size=(3000, 2000), crop=2.0, model="table")
+    whole = library_lens("Canon EF 24-70mm f/2.8L II USM", image_size=(6000, 4000), crop=1.0, model="table")
+    part = library_lens("Canon EF 24-70mm f/2.8L II USM", image_size=(3000, 2000), crop=2.0, model="table")
     points = np.array([[0.0, 0.0], [2500.0, 300.0]])
     shift = np.array([1500.0, 1000.0])
     inner, outer = part(35.0).undistort(points), whole(35.0).undistort(points + shift) - shift
@@ -107,14 +107,14 @@ def test_a_larger_sensor_than_that_calibrated_is_refused():
     with pytest.raises(
         ValueError, match=r"calibrated on a sensor of crop factor 1\.5, and images of crop factor 1 "
     ):
-        load(NIKKOR, image_size=SIZE, crop=1.0)
+        library_lens(NIKKOR, image_size=SIZE, crop=1.0)
 
 
 def test_of_several_tables_the_nearest_sensor_counts():
     name = "Nikon AF Nikkor 20mm f/2.8D"
-    assert {table.crop_factor for table in find(name)} == {1.0, 1.528}
-    assert load(name, image_size=SIZE, crop=1.3).about["crop_factor"] == 1.3
-    one, other = (load(name, image_size=SIZE, crop=crop) for crop in (1.5, 1.53))
+    assert {table.crop_factor for table in find_lenses(name)} == {1.0, 1.528}
+    assert library_lens(name, image_size=SIZE, crop=1.3).about["crop_factor"] == 1.3
+    one, other = (library_lens(name, image_size=SIZE, crop=crop) for crop in (1.5, 1.53))
     assert one.about["table_error_px"] != other.about["table_error_px"]
 
 
@@ -128,7 +128,7 @@ def test_of_several_tables_the_nearest_sensor_counts():
 )
 def test_bad_arguments_are_a_sentence(change, message):
     with pytest.raises(ValueError, match=message):
-        load(NIKKOR, **({"image_size": SIZE} | change))
+        library_lens(NIKKOR, **({"image_size": SIZE} | change))
 
 
 def turns_back(table):
@@ -144,7 +144,7 @@ def turns_back(table):
 
 @pytest.mark.slow
 def test_every_zoom_of_the_database_is_invertible_and_near_its_table():
-    for table in find(zooms=True)[::9]:
-        lens = load(table, image_size=SIZE)
+    for table in find_lenses(zooms=True)[::9]:
+        lens = library_lens(table, image_size=SIZE)
         assert certify(dataclasses.replace(lens, about={})).certified
         assert lens.about["table_error_px"] < (3 if not turns_back(table) else 15)

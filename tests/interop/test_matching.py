@@ -2,8 +2,8 @@
 
 import pytest
 
+from zoomjax.interop import match_lens
 from zoomjax.io import Equipment
-from zoomjax.lenses import match
 
 SIZE = (6000, 4000)
 
@@ -35,7 +35,7 @@ SIZE = (6000, 4000)
     ],
 )
 def test_the_lens_of_a_photo_is_found(maker, camera, lens, focal, name, crop):
-    found = match(Equipment(maker, camera, lens, float(focal)), SIZE)
+    found = match_lens(Equipment(maker, camera, lens, float(focal)), SIZE)
     assert (found.table.name, found.crop) == (name, crop)
 
 
@@ -61,11 +61,11 @@ D300 = ("NIKON CORPORATION", "NIKON D300")
 )
 def test_where_none_or_several_fit_it_asks(photo, message):
     with pytest.raises(ValueError, match=message):
-        match(Equipment(*photo[:3], float(photo[3])), SIZE)
+        match_lens(Equipment(*photo[:3], float(photo[3])), SIZE)
 
 
 def test_a_name_settles_it_and_the_body_gives_the_crop_factor():
-    found = match(
+    found = match_lens(
         Equipment(*D300, "18.0-200.0 mm f/3.5-5.6", 35.0), SIZE, lens="18-200mm f/3.5-5.6g if-ed ii"
     )
     assert (found.table.name[-2:], found.crop) == ("II", 1.523)
@@ -73,11 +73,11 @@ def test_a_name_settles_it_and_the_body_gives_the_crop_factor():
 
 def test_a_part_of_the_sensor_has_the_crop_factor_of_its_own():
     part = Equipment("SONY", "ILCE-7M3", "FE 24-70mm F2.8 GM", 35.0, crop=1.53)
-    assert match(part, SIZE).crop == 1.53
+    assert match_lens(part, SIZE).crop == 1.53
     rounded = Equipment("SONY", "ILCE-7M3", "FE 24-70mm F2.8 GM", 35.0, crop=1.03)
-    assert match(rounded, SIZE).crop == 1.0
+    assert match_lens(rounded, SIZE).crop == 1.0
 
 
 def test_a_lens_for_a_smaller_sensor_is_refused_on_a_larger():
     with pytest.raises(ValueError, match=r"was calibrated on a sensor of crop factor 1\.5"):
-        match(Equipment("NIKON CORPORATION", "NIKON D3"), SIZE, lens="18-200mm f/3.5-5.6g if-ed ii")
+        match_lens(Equipment("NIKON CORPORATION", "NIKON D3"), SIZE, lens="18-200mm f/3.5-5.6g if-ed ii")

@@ -1,5 +1,0 @@
-"""Lenses that others measured: those of the lensfun database, as zoom lenses of this package."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

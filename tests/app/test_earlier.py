@@ -1,0 +1,146 @@
+"""Another fit to the lines of a folder of results: what its summary knows of them."""
+
+import json
+
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from zoomjax import scenes
+from zoomjax.app.earlier import Earlier, earlier_of
+from zoomjax.app.model_choice import WantedModel
+from zoomjax.app.runs import calibrate_lines
+
+SIGMA = [0.5, 0.5, 2.0]
+
+
+@pytest.fixture
+def results(tmp_path):
+    """A folder of results of three photos, two of which share a focal length."""
+    lens = scenes.nikkor_18_200((1072, 712))
+    lines = scenes.board_lines(lens, np.array([24.0, 24.0, 60.0]), spacing=24, noise=0.1)
+    lines = lines.about(np.array([541.0, 350.0]))
+    lines.save(tmp_path / "lines.npz")
+    lens.save(tmp_path / "lens.json")
+    names = ["a.jpg", "b.jpg", "c.jpg"]
+    summary = {
+        "centre": {"how": "fitted"},
+        "board": {"flat_lines": True},
+        "focal_groups": [{"names": ["a.jpg", "b.jpg", "e.jpg"]}],
+        "images": [
+            {"name": name, "focal": float(f), "focal_sigma": s}
+            for name, f, s in zip(names, lines.focal, SIGMA, strict=True)
+        ],
+    }
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    return tmp_path, lines, summary
+
+
+def test_deviations_groups_centre_and_board_are_those_of_the_summary(results):
+    folder, lines, _ = results
+    known = earlier_of([folder / "lines.npz"], lines)
+    np.testing.assert_array_equal(known.sigma, SIGMA)
+    assert known.shared[0] == known.shared[1] != known.shared[2]
+    assert known.centre
+    assert [finding.verdict for finding in known.findings()] == ["doubtful"]
+
+
+def test_several_folders_are_put_together(results):
+    folder, lines, _ = results
+    twice = zj.Lines.from_ragged(
+        lines.to_ragged() * 2,
+        np.concatenate([lines.frame, lines.frame + 3]),
+        np.concatenate([lines.focal, lines.focal]),
+        image_size=lines.image_size,
+    )
+    known = earlier_of([folder / "lines.npz"] * 2, twice)
+    np.testing.assert_array_equal(known.sigma, SIGMA * 2)
+    assert len(np.unique(known.shared)) == 4
+    assert not known.centre  # two may have been fitted, and differ
+
+
+def test_folders_that_were_fitted_again_and_lines_without_a_summary_keep_their_places(results):
+    """Of three files: one whose summary is of another fit to lines, one bare, one of photos."""
+    folder, lines, _ = results
+    (folder / "again").mkdir()
+    for name in ("lines.npz", "lens.json"):
+        (folder / "again" / name).write_bytes((folder / name).read_bytes())
+    before = {"focal_sigma": [0.1, 0.2, 0.3], "shared": [4, 7, 4], "centre": True, "flat": False}
+    rows = [{"focal": float(f)} for f in lines.focal]
+    (folder / "again" / "summary.json").write_text(
+        json.dumps({"centre": {"how": "image"}, "earlier": before, "per_frame": rows})
+    )
+    lines.save(folder / "bare.npz")
+    together = zj.fit.concatenate([lines] * 3)
+    files = [folder / "again" / "lines.npz", folder / "bare.npz", folder / "lines.npz"]
+    known = earlier_of(files, together)
+    np.testing.assert_array_equal(known.sigma, [0.1, 0.2, 0.3, 0, 0, 0, *SIGMA])
+    np.testing.assert_array_equal(known.shared, [0, 1, 0, 3, 4, 5, 6, 6, 8])
+    assert known.flat
+    assert not known.lost
+
+
+def test_uncertain_focal_lengths_that_are_those_of_other_lines_are_told(results):
+    folder, lines, _ = results
+    other = zj.Lines.from_ragged(
+        lines.to_ragged(), lines.frame, [24.0, 25.0, 60.0], image_size=lines.image_size
+    )
+    known = earlier_of([folder / "lines.npz"], other)
+    assert known.sigma is None
+    assert "focal lengths" in [finding.about for finding in known.findings()]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda folder, s: (folder / "summary.json").unlink(),
+        lambda folder, s: (folder / "lens.json").unlink(),
+        lambda folder, s: (folder / "summary.json").write_text("[1]"),
+        lambda folder, s: (folder / "summary.json").write_text("{"),
+        lambda folder, s: (folder / "summary.json").write_text(json.dumps(s | {"images": [1, 2, 3]})),
+        lambda folder, s: (folder / "summary.json").write_text(json.dumps(s | {"centre": None})),
+    ],
+)
+def test_nothing_is_known_of_what_is_not_there_or_not_so(results, change):
+    folder, lines, summary = results
+    change(folder, summary)
+    assert earlier_of([folder / "lines.npz"], lines) == Earlier()
+
+
+def test_focal_lengths_of_other_lines_are_not_taken(results):
+    folder, lines, _ = results
+    other = zj.Lines.from_ragged(
+        lines.to_ragged(), lines.frame, [24.0, 25.0, 60.0], image_size=lines.image_size
+    )
+    assert earlier_of([folder / "lines.npz"], other).sigma is None
+
+
+@pytest.mark.slow
+def test_bands_of_another_fit_have_them_and_of_one_after_that(results):
+    """In the folder itself, whose lines stay while the summary is written anew."""
+    folder, lines, _ = results
+
+    def fitted(sigma=None):
+        calibration = calibrate_lines(
+            lines,
+            folder,
+            lambda _: None,
+            model=WantedModel("polynomial", degree=1),
+            centre="fit",
+            focal_sigma=sigma,
+            robust=False,
+            files=[folder / "lines.npz"],
+            names=[],
+        )
+        return calibration, json.loads((folder / "summary.json").read_text())
+
+    first, summary = fitted()
+    assert first.focal_sigma.tolist() == SIGMA
+    assert summary["verdict"] != "good"
+    assert summary["centre"]["how"] == "fitted"  # from the middle of the image, not kept where it was
+    again, _ = fitted()
+    assert again.focal_sigma.tolist() == SIGMA
+    assert again.corner() == first.corner()
+    exact, _ = fitted("0")
+    assert exact.focal_sigma.tolist() == [0, 0, 0]
+    assert all(there[2] < of[2] for there, of in zip(exact.corner(), first.corner(), strict=True))
