@@ -77,10 +77,10 @@ def choices(degree: int, hold_out: HoldOut, draws: int) -> dict:
     for draw in range(draws):
         noisy = scenes.with_noise(scene, jax.random.key(draw), std=0.2)
         small = zj.compress(noisy, terms=3)
-        verdicts, first, choice = compare(small, CANDIDATES, folds_of(small, hold_out, None, 0))
+        compared, first, choice = compare(small, CANDIDATES, folds_of(small, hold_out, None, 0))
         chosen[choice.name] += 1
         best[first.name] += 1
-        error = {v.candidate.name: v.held_out for v in verdicts}
+        error = {v.candidate.name: v.held_out for v in compared}
         ratio.append(error[choice.name] / error[QUADRATIC.name])
     return {
         "chosen": dict(chosen.most_common()),
@@ -97,9 +97,9 @@ def real(folder: Path) -> dict:
     found = {}
     for hold_out in ("focal", "frame", "line"):
         candidates = default_candidates()
-        verdicts, best, chosen = compare(small, candidates, folds_of(small, hold_out, None, 0))
+        compared, best, chosen = compare(small, candidates, folds_of(small, hold_out, None, 0))
         found[hold_out] = {"best": best.name, "chosen": chosen.name} | {
-            v.candidate.name: [v.rms, v.held_out, v.difference, v.difference_std] for v in verdicts
+            v.candidate.name: [v.rms, v.held_out, v.difference, v.difference_std] for v in compared
         }
     return found
 

@@ -95,7 +95,7 @@ def board(stripes: tuple[int, int], frames: int, spacing: float = 12) -> tuple[z
     """The paper's lens, and its board with fewer stripes, without noise."""
     truth = scenes.nikkor_18_200(SIZE)
     whole = scenes.StripedBoard.before(truth)
-    fewer = scenes.StripedBoard(stripes=stripes, pixel=whole.pixel)
+    fewer = scenes.StripedBoard(stripes=stripes, pixel_pitch=whole.pixel_pitch)
     return truth, scenes.board_lines(truth, scenes.focal_sweep(frames), board=fewer, spacing=spacing)
 
 

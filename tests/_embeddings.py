@@ -382,7 +382,9 @@ ROWS = [
     ),
     Row(
         "focal_from_board",
-        lambda known, x: focal_numbers(zj.focal.focal_from_board(x, known, distance=1500.0, pixel=0.005)),
+        lambda known, x: focal_numbers(
+            zj.focal.focal_from_board(x, known, distance=1500.0, pixel_pitch=0.005)
+        ),
         board,
         oblique,
     ),

@@ -241,9 +241,9 @@ def test_cross_validation(name):
         assert np.nanmax(focal) < 1
         return
     chosen = zj.select_model(lines_of(name), candidates=[candidate], hold_out="line", folds=3)
-    (verdict,) = chosen.verdicts
-    assert not verdict.problem
-    assert verdict.rms < verdict.held_out < 0.05
+    (figures,) = chosen.compared
+    assert not figures.problem
+    assert figures.rms < figures.held_out < 0.05
 
 
 # Files and images

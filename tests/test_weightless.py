@@ -137,7 +137,7 @@ def test_selection(both, select):
         second.folds,
         second.chosen.name,
     )
-    for one, other in zip(first.verdicts, second.verdicts, strict=True):
+    for one, other in zip(first.compared, second.compared, strict=True):
         np.testing.assert_allclose(
             [one.held_out, one.held_out_std], [other.held_out, other.held_out_std], rtol=1e-6
         )

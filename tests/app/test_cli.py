@@ -26,7 +26,7 @@ from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.runs import calibrate_lines
 from zoomjax.lines.csv import write_lines_csv
 from zoomjax.models import BrownConrady, Model, PolynomialZoom, SmoothZoom, SplineZoom
-from zoomjax.trust.selection import Selection, Verdict
+from zoomjax.trust.selection import ComparedModel, Selection
 
 from .._commands import COMMAND, INTERRUPTIBLE, still_earlier, write_earlier
 
@@ -429,9 +429,11 @@ def test_the_table_of_models_fits_a_terminal(capsys, monkeypatch):
     """Also with the longest names, which are wrapped."""
     monkeypatch.setenv("COLUMNS", "80")
     names = [Model(PolynomialZoom(2), 2), Model(SmoothZoom(6), 2), Model(SplineZoom(4), 3, BrownConrady())]
-    figures = [Verdict(of, 8.3, 1.5924, 1.7458, 0.287, 1.73213 * n, 0.287) for n, of in enumerate(names)]
-    out = Verdict(names[2], problem="The fit failed. More.")
-    shown = {"chosen": names[1], "best": names[0], "verdicts": (*figures, out), "hold_out": "focal"}
+    figures = [
+        ComparedModel(of, 8.3, 1.5924, 1.7458, 0.287, 1.73213 * n, 0.287) for n, of in enumerate(names)
+    ]
+    out = ComparedModel(names[2], problem="The fit failed. More.")
+    shown = {"chosen": names[1], "best": names[0], "compared": (*figures, out), "hold_out": "focal"}
     selection = object.__new__(Selection)  # without the fit, which is not shown
     for name, value in (shown | {"folds": 10}).items():
         object.__setattr__(selection, name, value)
@@ -485,11 +487,14 @@ WRONG = {
     "truncated": (["truncated.npz"], "truncated.npz"),
     "unknown kind": (["notes.txt"], "notes.txt is not a photo"),
     "a folder without photos": (["."], "no photographs in the folder"),
-    "options of images for lines": (["lines.npz", "--pitch", "3"], "--pitch has no effect for lines.npz"),
+    "options of images for lines": (
+        ["lines.npz", "--spacing", "3"],
+        "no effect for lines.npz",
+    ),
     "an option of lines for images": (["a.jpg", "--image-size", "640x480"], "images have their own"),
-    "half a board": (["a.jpg", "--pitch", "20"], "Missing or wrong: --distance, --pixel"),
+    "half a board": (["a.jpg", "--spacing", "20"], "Missing or wrong: --distance, --pixel-pitch"),
     "a pitch that is none": (
-        ["a.jpg", "--pitch", "20x", "--distance", "9", "--pixel", "1"],
+        ["a.jpg", "--spacing", "20x", "--distance", "9", "--pixel-pitch", "1"],
         "Missing or wrong: --pitch",
     ),
     "not a source of focal lengths": (["a.jpg", "--focal", "zoom"], "is not a source of focal lengths"),
@@ -527,7 +532,7 @@ WRONG = {
         "--shared-focal is for focal lengths that are measured from a flat grid",
     ),
     "a board at infinity": (
-        ["a.jpg", "--pitch", "20", "--distance", "inf", "--pixel", "0.005"],
+        ["a.jpg", "--spacing", "20", "--distance", "inf", "--pixel-pitch", "0.005"],
         "Missing or wrong: --distance",
     ),
     "digits of another kind": (["a.jpg", "--focal", "35", "--focal-sigma", "1_0"], "such as 0.3, or 1%"),
@@ -596,7 +601,7 @@ def test_a_mistake_is_one_sentence_and_status_2(case, wrong_files):
     assert not (wrong_files / "out").exists()
 
 
-_BOARD = ("--pitch", "30", "--distance", "1185", "--pixel", "0.0055")
+_BOARD = ("--spacing", "30", "--distance", "1185", "--pixel-pitch", "0.0055")
 
 
 @pytest.mark.parametrize(
@@ -617,7 +622,10 @@ _BOARD = ("--pitch", "30", "--distance", "1185", "--pixel", "0.0055")
             "--focal-unit has no effect with --focal exif",
         ),
         (["a.png", "--focal", "plane", "--focal-unit", "mm"], "--focal-unit has no effect with --focal pl"),
-        (["a.png", "--focal", "35", *_BOARD], "--pitch and --distance and --pixel have no effect with --f"),
+        (
+            ["a.png", "--focal", "35", *_BOARD],
+            "--spacing and --distance and --pixel-pitch have no effect",
+        ),
         (["a.png", "--focal", "exif", *_BOARD], "have no effect with --focal exif"),
         (["lines.npz", "--model", "auto", "--degree", "2"], "--model auto has no effect with --degree"),
     ],

@@ -184,7 +184,7 @@ def test_lines_are_an_option_of_motion_alone(clip):
             "--robust and --focal-unit and --overlays have no effect",
         ),
         ("--detector grid --no-cache", "--detector and --no-cache have no effect without --lines"),
-        ("--focal motion --pitch 3", "--pitch has no effect with --focal motion"),
+        ("--focal motion --spacing 3", "--spacing has no effect with --focal motion"),
         ("--jobs 1 --frames 9", "--frames and --jobs have no effect without --lines"),
     ],
 )

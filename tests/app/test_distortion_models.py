@@ -101,7 +101,7 @@ def test_auto_takes_the_model_of_least_error_and_says_so(lines):
     done = calibrate(lines, model=wanted("auto"), centre="image")
     assert isinstance(done.fit.lens.distortion_model, zj.models.Division)
     assert done.selection.chosen.name == "Division, degree 1, 1 term"
-    names = [verdict.candidate.name for verdict in done.selection.verdicts]
+    names = [each.candidate.name for each in done.selection.compared]
     assert names == ["degree 1, 1 term", "Division, degree 1, 1 term", "BrownConrady, degree 1, 1 term"]
 
 
@@ -167,7 +167,7 @@ def test_a_centre_that_is_given_stays_where_it_is_with_a_strong_lens():
 def test_without_a_word_the_division_model_competes_for_strong_lenses_alone(lines, barrel):
     """It has its own centre, and its own judgement of lines."""
     done = calibrate(lines, model=wanted(None), centre="fit", robust=True)
-    names = [verdict.candidate.name for verdict in done.selection.verdicts]
+    names = [each.candidate.name for each in done.selection.compared]
     assert names == ["degree 1, 1 term", "Division, degree 1, 1 term"]
     assert done.selection.chosen.name == names[1]
     assert done.centre.how == "fitted"

@@ -65,7 +65,7 @@ def test_one_number_is_that_of_all():
         (None, "no flat grid.*image,focal.*EXIF.*parallel.*oblique"),
         ("exif", "EXIF data.*image,focal.*EXIF.*parallel.*oblique"),
         ("plane", "homographies"),
-        ("board", "--pitch and --distance"),
+        ("board", "--spacing and --distance"),
     ],
 )
 def test_without_a_focal_length_the_ways_are_named(source, message):
@@ -77,7 +77,7 @@ def test_without_a_focal_length_the_ways_are_named(source, message):
 @pytest.mark.parametrize(
     ("source", "error", "message"),
     [
-        ("board", ValueError, "--pitch and --distance"),
+        ("board", ValueError, "--spacing and --distance"),
         ("zoom", ValueError, "'zoom', which is not a source"),
         ("focal.txt", ValueError, "which is not a source"),
         ("-3", ValueError, "positive number"),
@@ -126,7 +126,7 @@ PITCHES = tuple(BOARD.size[axis] / BOARD.stripes[axis] / 2 for axis in (0, 1))  
 @pytest.mark.slow
 def test_the_pitch_of_a_board_gives_the_focal_length_within_a_thousandth(striped):
     focal, detections = striped
-    found = choose_focals(detections, board=Board(PITCHES, BOARD.distance, BOARD.pixel))
+    found = choose_focals(detections, board=Board(PITCHES, BOARD.distance, BOARD.pixel_pitch))
     assert (found.unit, found.origin) == ("mm", "the board's pitch (eq. 14)")
     for d, f in zip(detections, focal, strict=True):
         assert found.focal[d.name] == pytest.approx(f, rel=1e-3)
@@ -136,8 +136,8 @@ def test_the_pitch_of_a_board_gives_the_focal_length_within_a_thousandth(striped
 def test_a_board_whose_directions_disagree_is_refused(striped):
     """As the paper's board does, taken for one of square fields."""
     _, detections = striped  # of the first, only borders across are found evenly spaced
-    with pytest.raises(ValueError, match=r"differs between the two directions.*ACROSSxDOWN"):
-        choose_focals(detections[1:], board=Board((PITCHES[0],) * 2, BOARD.distance, BOARD.pixel))
+    with pytest.raises(ValueError, match=r"not spaced alike in both directions.*ACROSSxDOWN"):
+        choose_focals(detections[1:], board=Board((PITCHES[0],) * 2, BOARD.distance, BOARD.pixel_pitch))
 
 
 def upright(*positions):

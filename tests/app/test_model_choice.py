@@ -39,7 +39,7 @@ def test_nothing_else_competes_there():
     """Other models than the one with a prior do not compete, whatever their number of terms."""
     selection = calibrate(lines_at(FEW["two"]), centre="image").selection
     assert selection is not None
-    assert [type(v.candidate.zoom).__name__ for v in selection.verdicts] == ["SmoothZoom"]
+    assert [type(v.candidate.zoom).__name__ for v in selection.compared] == ["SmoothZoom"]
 
 
 @pytest.mark.slow
@@ -55,7 +55,7 @@ def test_other_numbers_of_terms_have_no_prior_and_are_doubtful(terms):
 def test_from_four_focal_lengths_on_polynomials_compete():
     selection = calibrate(lines_at((21.0, 35.0, 60.0, 120.0)), centre="image").selection
     assert selection is not None
-    assert sum(isinstance(v.candidate.zoom, zj.PolynomialZoom) for v in selection.verdicts) > 3
+    assert sum(isinstance(v.candidate.zoom, zj.PolynomialZoom) for v in selection.compared) > 3
 
 
 @pytest.mark.slow

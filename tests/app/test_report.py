@@ -20,7 +20,7 @@ from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.page import Run
 from zoomjax.app.report import report
 from zoomjax.models import Model, PolynomialZoom
-from zoomjax.trust.selection import Selection, Verdict
+from zoomjax.trust.selection import ComparedModel, Selection
 
 from .._browser import opened
 
@@ -198,8 +198,8 @@ def test_a_lens_that_folds_is_called_so(calibration):
 @pytest.mark.parametrize("best", [0, 1])
 def test_the_choice_of_a_model_is_explained_under_its_table(calibration, best):
     names = [Model(PolynomialZoom(1), 2), Model(PolynomialZoom(2), 2)]
-    verdicts = tuple(Verdict(of, 8.3, 1.5, 1.7, 0.2, 0.0, 0.2) for of in names)
-    chosen = Selection(names[0], names[best], calibration.fit, verdicts, "focal", 4, "least")
+    compared = tuple(ComparedModel(of, 8.3, 1.5, 1.7, 0.2, 0.0, 0.2) for of in names)
+    chosen = Selection(names[0], names[best], calibration.fit, compared, "focal", 4, "least")
     page = Page(report(dataclasses.replace(calibration, selection=chosen)))
     why = (
         "worse than the best by no more than 0.05 %, which is nothing, that of fewest parameters is chosen"

@@ -32,7 +32,7 @@ def photographed(lens, f, board=BOARD):
 
 def from_board(points, board, **settings):
     return zj.focal.focal_from_board(
-        points, board, **{"distance": BOARD.distance, "pixel": BOARD.pixel} | settings
+        points, board, **{"distance": BOARD.distance, "pixel_pitch": BOARD.pixel_pitch} | settings
     )
 
 
@@ -81,7 +81,7 @@ def test_pitch_alone_gives_equation_14():
     pitch, seen = 40.0, 3.0
     board = np.array([[0.0, 0.0], [0.0, pitch], [0.0, 2 * pitch]])
     image = np.array([[7.0, 5.0], [7.0, 5 + seen], [7.0, 5 + 2 * seen]])
-    estimate = from_board(image, board, distance=1000.0, pixel=0.5)
+    estimate = from_board(image, board, distance=1000.0, pixel_pitch=0.5)
     r_c = seen * 0.5
     assert estimate.focal == pytest.approx(1000 * r_c / (pitch + r_c))
 
@@ -112,7 +112,7 @@ def test_equation_14_under_jit_and_differentiated(truth):
 
 
 @pytest.mark.parametrize(
-    "settings", [{"distance": 0.0}, {"distance": -5.0}, {"pixel": 0.0}, {"distance": np.nan}]
+    "settings", [{"distance": 0.0}, {"distance": -5.0}, {"pixel_pitch": 0.0}, {"distance": np.nan}]
 )
 def test_lengths_must_be_positive(settings):
     with pytest.raises(ValueError, match="must be finite and positive"):
@@ -266,7 +266,7 @@ def test_the_two_focal_lengths_differ_by_the_focus():
     image_distance = f * distance / (distance - f)
     plane = 20 * (PLANE - PLANE.mean(axis=0))
     square = plane * image_distance / distance / pixel
-    assert from_board(square, plane, distance=distance, pixel=pixel).focal == pytest.approx(f)
+    assert from_board(square, plane, distance=distance, pixel_pitch=pixel).focal == pytest.approx(f)
     oblique = views(image_distance / pixel, plane=plane, depth=distance)
     together, _ = zj.focal.focal_from_planes(oblique, plane, principal=PRINCIPAL)
     assert together.focal * pixel == pytest.approx(image_distance)

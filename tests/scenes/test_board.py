@@ -34,7 +34,7 @@ def test_focal_lengths_are_even_in_one_over_f():
 def test_magnification_inverts_equation_14():
     board = scenes.StripedBoard()
     for f in ENDS:
-        seen = board.magnification(f) * board.pixel  # mm on the sensor of 1 mm on the board
+        seen = board.magnification(f) * board.pixel_pitch  # mm on the sensor of 1 mm on the board
         assert board.distance * seen / (1 + seen) == pytest.approx(f)
 
 

@@ -25,7 +25,7 @@ def lens():
 @pytest.fixture(scope="module")
 def scene(lens):
     """Lines of different lengths at three focal lengths, of up to 21 points."""
-    board = scenes.StripedBoard(stripes=(8, 5), pixel=scenes.StripedBoard.before(lens).pixel)
+    board = scenes.StripedBoard(stripes=(8, 5), pixel_pitch=scenes.StripedBoard.before(lens).pixel_pitch)
     return scenes.board_lines(lens, scenes.focal_sweep(3), board=board, spacing=31)
 
 

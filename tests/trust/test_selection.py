@@ -52,9 +52,9 @@ def selection(lines):
 
 
 def compared(lines, candidates, hold_out: HoldOut = "focal"):
-    """The verdicts and the names of the best and the chosen, without the fit."""
-    verdicts, best, chosen = compare(lines, candidates, folds_of(lines, hold_out, None, 0))
-    return verdicts, best.name, chosen.name
+    """The figures of each and the names of the best and the chosen, without the fit."""
+    figures, best, chosen = compare(lines, candidates, folds_of(lines, hold_out, None, 0))
+    return figures, best.name, chosen.name
 
 
 def without(lines, out):
@@ -204,10 +204,10 @@ def test_the_fit_is_that_of_the_chosen_model(selection, lines):
 
 
 def test_the_simplest_within_one_standard_error_is_chosen(selection):
-    best = min(selection.verdicts, key=lambda v: v.held_out)
+    best = min(selection.compared, key=lambda v: v.held_out)
     assert best.candidate is selection.best
     assert (best.difference, best.difference_std) == (0, 0)
-    good = [v for v in selection.verdicts if v.difference <= v.difference_std]
+    good = [v for v in selection.compared if v.difference <= v.difference_std]
     assert selection.chosen is min(good, key=lambda v: v.parameters).candidate
 
 
@@ -259,7 +259,7 @@ def test_the_order_of_the_frames_changes_nothing(hold_out, lines):
 
 
 def test_lines_that_were_not_fitted_are_less_straight(selection):
-    assert all(v.held_out > v.rms for v in selection.verdicts)
+    assert all(v.held_out > v.rms for v in selection.compared)
 
 
 @pytest.mark.parametrize("hold_out", ["focal", "frame", "line"])
@@ -300,9 +300,9 @@ def test_the_table_can_be_read(selection):
     assert sum("best" in row for row in rows) == 1
     assert sum("chosen" in row for row in rows) == 1
     assert rows[0].startswith("degree 0, 1 term ")
-    first = selection.verdicts[0]
+    first = selection.compared[0]
     assert f"{first.held_out:.4f} ± {first.held_out_std:.4f}" in rows[0]
-    ends = {row.index(f"{v.rms:.4f}") for row, v in zip(rows, selection.verdicts, strict=True)}
+    ends = {row.index(f"{v.rms:.4f}") for row, v in zip(rows, selection.compared, strict=True)}
     assert len(ends) == 1
 
 
@@ -324,12 +324,12 @@ def test_what_cannot_be_fitted_is_in_the_table_with_the_reason(lines):
         zj.models.Model(zj.PolynomialZoom(degree=1), 4),
     )
     selection = zj.select_model(lines, [many, left, terms, zj.PolynomialZoom(degree=2)])
-    problems = [v.problem for v in selection.verdicts]
+    problems = [v.problem for v in selection.compared]
     assert "8 or more distinct focal lengths, but there are 7" in problems[0]
     assert "7 or more distinct focal lengths, but there are 6" in problems[1]
     assert "compressed for 3 terms" in problems[2]
     assert problems[3] == ""
-    assert selection.chosen.zoom is selection.verdicts[3].candidate.zoom
+    assert selection.chosen.zoom is selection.compared[3].candidate.zoom
     assert str(selection).count("not compared: ") == 3
     json.dumps(selection.summary(), allow_nan=False)
 
@@ -347,9 +347,9 @@ def test_undetermined_candidates_do_not_win():
     lines = zj.Lines.from_ragged(
         points, np.repeat(np.arange(5), 3), [20, 30, 40, 60, 80], image_size=(640, 480)
     )
-    verdicts, _, chosen = compared(zj.compress(lines, 3), default_candidates()[:12])
-    assert next(v.parameters for v in verdicts if v.candidate.name == chosen) <= 3
-    assert all(np.isfinite(v.held_out) or v.problem for v in verdicts)
+    figures, _, chosen = compared(zj.compress(lines, 3), default_candidates()[:12])
+    assert next(v.parameters for v in figures if v.candidate.name == chosen) <= 3
+    assert all(np.isfinite(v.held_out) or v.problem for v in figures)
 
 
 def test_default_candidates_are_what_the_lines_serve_and_few_focal_lengths_leave_out_lines(lines):
@@ -358,7 +358,7 @@ def test_default_candidates_are_what_the_lines_serve_and_few_focal_lengths_leave
     few = eqx.tree_at(lambda lines: lines.triangle, few, few.triangle[:, :5, :5])
     selection = zj.select_model(few)
     assert selection.hold_out == "line"
-    assert [v.candidate.terms for v in selection.verdicts] == [1] * 4
+    assert [v.candidate.terms for v in selection.compared] == [1] * 4
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -421,14 +421,14 @@ def test_distortion_models_are_compared(scene):
     selection = zj.select_model(bent, candidates, hold_out="line", folds=3)
     assert selection.chosen.name == "Division, degree 1, 1 term"
     assert isinstance(selection.fit.lens.distortion_model, zj.models.Division)
-    assert selection.verdicts[0].held_out > 1.5 * selection.verdicts[1].held_out
+    assert selection.compared[0].held_out > 1.5 * selection.compared[1].held_out
     np.testing.assert_allclose(selection.fit.lens.zoom.parameters, zoom.parameters, atol=0.01)
 
 
 def test_a_distortion_model_that_the_triangles_do_not_serve_says_so(lines):
     candidates = [zj.PolynomialZoom(), zj.models.Model(zj.PolynomialZoom(), 1, zj.models.Division())]
-    _, verdict = zj.select_model(lines, candidates, hold_out="line", folds=2).verdicts
-    assert "compress(lines, terms=8)" in verdict.problem
+    _, figures = zj.select_model(lines, candidates, hold_out="line", folds=2).compared
+    assert "compress(lines, terms=8)" in figures.problem
 
 
 def without_any_weight(lines):
@@ -454,5 +454,5 @@ def test_in_the_image_the_same_model_is_selected(lines):
         zj.select_model(of, candidates, hold_out="line", folds=3) for of in (lines, zj.fit.in_image(lines))
     )
     assert image.chosen == paper.chosen
-    for one, other in zip(image.verdicts, paper.verdicts, strict=True):
+    for one, other in zip(image.compared, paper.compared, strict=True):
         assert one.held_out == pytest.approx(other.held_out, rel=0.1)

@@ -234,25 +234,25 @@ def unit_of(given: str | None) -> str:
     return given or "mm"
 
 
-def board_of(pitch: str | None, distance: float | None, pixel: float | None) -> "Board | None":
+def board_of(spacing: str | None, distance: float | None, pixel_pitch: float | None) -> "Board | None":
     """The board, if one is given."""
     from .board_focals import Board
 
-    if pitch is distance is pixel is None:
+    if spacing is distance is pixel_pitch is None:
         return None
-    pitches = [_positive(part) for part in (pitch or "").lower().split("x")]
+    spacings = [_positive(part) for part in (spacing or "").lower().split("x")]
     given = {
-        "--pitch": all(pitches),
+        "--spacing": all(spacings),
         "--distance": 0 < (distance or 0) < math.inf,
-        "--pixel": 0 < (pixel or 0) < math.inf,
+        "--pixel-pitch": 0 < (pixel_pitch or 0) < math.inf,
     }
     bad = [name for name, good in given.items() if not good]
-    if bad or len(pitches) > 2 or distance is None or pixel is None:
+    if bad or len(spacings) > 2 or distance is None or pixel_pitch is None:
         raise ValueError(
-            "A board needs --pitch (MM, or MMxMM across and down), --distance and --pixel (of the sensor), "
-            f"all positive and in mm. Missing or wrong: {', '.join(bad or ['--pitch'])}."
+            "A board needs --spacing (MM, or MMxMM across and down), --distance and --pixel-pitch (of the "
+            f"sensor), all positive and in mm. Missing or wrong: {', '.join(bad or ['--spacing'])}."
         )
-    return Board((pitches[0], pitches[-1]), distance, pixel)
+    return Board((spacings[0], spacings[-1]), distance, pixel_pitch)
 
 
 def _positive(text: str) -> float:

@@ -13,8 +13,8 @@ from ..models.distortion import Distortion
 from .plane_focals import nodes
 
 NOT_THE_BOARD = (
-    "no evenly spaced lines of a board were found in it, or their pitch differs between the two directions "
-    "(then give both: --pitch ACROSSxDOWN)"
+    "no evenly spaced lines of a board were found in it, or they are not spaced alike in both directions "
+    "(then give both: --spacing ACROSSxDOWN)"
 )
 """Why an image may have no focal length."""
 
@@ -30,29 +30,29 @@ class Board:
     """A board parallel to the sensor.
 
     Attributes:
-        pitch: mm between neighbouring lines on it, across and down: from one edge of a stripe to the next
+        spacing: mm between neighbouring lines on it, across and down: from one edge of a stripe to the next
             one, or from corner to corner, or from dot to dot.
         distance: mm from the camera's projection plane to it.
-        pixel: mm, side of a pixel on the sensor.
+        pixel_pitch: mm, side of a pixel on the sensor.
     """
 
-    pitch: tuple[float, float]
+    spacing: tuple[float, float]
     distance: float
-    pixel: float
+    pixel_pitch: float
 
 
 def focal_of_board(board: Board, detection: Detection, correction: Distortion) -> FocalEstimate | None:
     """The focal length of one image, mm; None if it shows no board, or its directions disagree."""
-    pitch = np.array(board.pitch)
+    spacing = np.array(board.spacing)
     known = nodes(detection, correction)
     if known is not None:
         points, places = known
-        parts = [(points, pitch * places)]
+        parts = [(points, spacing * places)]
     else:
         corrected = [np.asarray(correction.undistort(line)) for line in detection.lines]
-        parts = [(points, pitch * places) for points, places in _parallels(corrected)]
+        parts = [(points, spacing * places) for points, places in _parallels(corrected)]
     found = [
-        focal_from_board(points, places, distance=board.distance, pixel=board.pixel)
+        focal_from_board(points, places, distance=board.distance, pixel_pitch=board.pixel_pitch)
         for points, places in parts
     ]
     return _combined(found)

@@ -222,7 +222,7 @@ def show_choice(selection: "Selection") -> None:
     table.add_column("")
     for name in ("parameters", "px, held out", "to the best"):
         table.add_column(name, justify="right", no_wrap=True)
-    for of, row in zip(selection.verdicts, selection.rows(), strict=True):
+    for of, row in zip(selection.compared, selection.rows(), strict=True):
         mark = ">" if of.candidate is selection.chosen else " "
         if of.problem:
             table.add_row(f"{mark} {row[0]}", "", "not compared", "")

@@ -210,7 +210,7 @@ def _under_distortion_model(
         start = min(other, *again, key=_spread)
     if compares:
         stage("Choosing the distortion model")
-        compared = [v.candidate for v in selection.verdicts] if selection else [model]
+        compared = [v.candidate for v in selection.compared] if selection else [model]
         either = start.lines
         if robust:
             radial = reweighted(held.about(whole.centre), model)[0] if moved else found.lines

@@ -35,9 +35,9 @@ from .plane_focals import MOST_UNCERTAIN, FocalGroup, Found, Sharing, focals_fro
 SOURCES = (
     "one focal length for all (--focal 24), which need not be known (--focal same); a CSV file with the "
     "columns image,focal (--focal focal.csv); "
-    "EXIF data in the photos (--focal exif); a board parallel to the sensor (--focal board --pitch MM "
-    "--distance MM --pixel MM); oblique photos of a flat checkerboard or dot grid (--focal plane); or "
-    "markings of a football pitch (--focal pitch)"
+    "EXIF data in the photos (--focal exif); a board parallel to the sensor (--focal board --spacing MM "
+    "--distance MM --pixel-pitch MM); oblique photos of a flat checkerboard or dot grid (--focal plane); "
+    "or markings of a football pitch (--focal pitch)"
 )
 
 _VIDEO_SOURCES = (
@@ -110,7 +110,9 @@ def check_source(source: str | None, board: Board | None, *, video: bool) -> Non
         read_focal_track(source) if video else read_focal_table(source)
 
 
-_NO_BOARD = "--focal board needs the board's --pitch and --distance, and the sensor's --pixel, in mm."
+_NO_BOARD = (
+    "--focal board needs the board's --spacing and --distance, and the sensor's --pixel-pitch, in mm."
+)
 
 
 def choose_focals(

@@ -119,7 +119,7 @@ Focal = Annotated[
         "frame,focal; for CSV lines frame,focal), a number, same (one for all photos or frames, unknown), "
         "exif, board (parallel to the sensor), plane (oblique views of a flat grid), pitch (football "
         "markings), or for a video motion (as the camera turns and zooms). Default for photos: board if "
-        "--pitch is given, else exif, else plane (with --detector pitch: pitch); for a video: motion.",
+        "--spacing is given, else exif, else plane (with --detector pitch: pitch); for a video: motion.",
         rich_help_panel=FOCAL,
     ),
 ]
@@ -146,7 +146,7 @@ SharedFocal = Annotated[
         rich_help_panel=FOCAL,
     ),
 ]
-Pitch = Annotated[
+Spacing = Annotated[
     str | None,
     typer.Option(
         metavar="MM[xMM]",
@@ -162,9 +162,13 @@ Distance = Annotated[
         rich_help_panel=FOCAL,
     ),
 ]
-Pixel = Annotated[
+PixelPitch = Annotated[
     float | None,
-    typer.Option(metavar="MM", help="For --focal board: pixel size on the sensor.", rich_help_panel=FOCAL),
+    typer.Option(
+        metavar="MM",
+        help="For --focal board: distance between pixels on the sensor.",
+        rich_help_panel=FOCAL,
+    ),
 ]
 
 OtherLens = Annotated[
@@ -262,14 +266,14 @@ JsonOfWork = Annotated[
 ]
 
 IDLE_FOR_LINES = (
-    *("pitch", "distance", "pixel", "jobs", "detector", "frames", "cache", "overlays", "with_lines"),
-    *("shared_focal", "cluster"),
+    *("spacing", "distance", "pixel_pitch", "jobs", "detector", "frames", "cache", "overlays"),
+    *("with_lines", "shared_focal", "cluster"),
 )
 """Parameters of calibrate that say nothing about a file of lines."""
 
 IDLE_FOR_MOTION = (
-    *("focal_sigma", "focal_unit", "pitch", "distance", "pixel", "robust", "overlays", "shared_focal"),
-    *("distortion_model", "cluster", "verbose"),
+    *("focal_sigma", "focal_unit", "spacing", "distance", "pixel_pitch", "robust", "overlays"),
+    *("shared_focal", "distortion_model", "cluster", "verbose"),
 )
 """And about a clip whose motion gives its focal lengths."""
 
@@ -335,7 +339,7 @@ def refuse_idle_sources(context: typer.Context, focal: str | None) -> None:
         source = f"with --focal {focal}" if focal else "without --focal"
         refuse_idle(context, ("focal_unit",), f"{source}, for it is the unit of a number or a CSV file")
     if focal not in (None, "board"):
-        refuse_idle(context, ("pitch", "distance", "pixel"), f"with --focal {focal}")
+        refuse_idle(context, ("spacing", "distance", "pixel_pitch"), f"with --focal {focal}")
 
 
 def refuse_auto(model: str | None, degree: int | None) -> None:

@@ -20,7 +20,7 @@ def focal_from_board(
     board: Num[AnyArray, "point 2"] | list,
     *,
     distance: float | int | Scalar,
-    pixel: float | int | Scalar,
+    pixel_pitch: float | int | Scalar,
 ) -> FocalEstimate:
     """Estimate the focal length from one picture of a board parallel to the sensor: eq. 14.
 
@@ -29,11 +29,12 @@ def focal_from_board(
         board: the same points on the board, mm, x to the right and y downwards as seen by the camera; its
             position and rotation in its plane do not matter.
         distance: from the projection plane to the board, mm, > 0: eq. 14's d.
-        pixel: side of a pixel on the sensor, mm, > 0. 1 is for points measured in mm.
+        pixel_pitch: side of a pixel on the sensor, mm, > 0. 1 is for points measured in mm.
 
     Returns:
         The focal length in mm. Residuals are treated as independent errors of the points' coordinates.
-        Errors of distance, pixel and board are not included: f changes by as many per cent as the distance.
+        Errors of distance, pixel_pitch and board are not included: f changes by as many per cent as the
+        distance.
 
     Raises:
         ValueError: shapes differ, there are fewer than 3 points, or a length is not positive.
@@ -46,27 +47,29 @@ def focal_from_board(
         >>> import numpy as np
         >>> board = 10 * np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), axis=-1).reshape(-1, 2)
         >>> image = board * 50 / (1000 - 50) / 0.005 + 100
-        >>> print(round(float(focal_from_board(image, board, distance=1000, pixel=0.005).focal), 3))
+        >>> print(round(float(focal_from_board(image, board, distance=1000, pixel_pitch=0.005).focal), 3))
         50.0
     """
     points, board = as_points_of("points", points), as_points_of("board", board)
     check_pairs(points, board, fewest=3)
     check_positive("distance", np.asarray(distance) if isinstance(distance, int | float) else distance)
-    check_positive("pixel", np.asarray(pixel) if isinstance(pixel, int | float) else pixel)
+    check_positive(
+        "pixel_pitch", np.asarray(pixel_pitch) if isinstance(pixel_pitch, int | float) else pixel_pitch
+    )
     # A similarity is one complex factor: its absolute value is px in the image per mm on the board.
     seen, known = _complex(points), _complex(board)
     seen, known = seen - jnp.mean(seen), known - jnp.mean(known)
     spread = jnp.sum(abs(known) ** 2)
-    positive = (jnp.asarray(distance) > 0) & (jnp.asarray(pixel) > 0) & (spread > 0)
+    positive = (jnp.asarray(distance) > 0) & (jnp.asarray(pixel_pitch) > 0) & (spread > 0)
     spread = eqx.error_if(
         spread,
         ~positive,
-        "Arguments distance and pixel must be positive, and the points of board must differ.",
+        "Arguments distance and pixel_pitch must be positive, and the points of board must differ.",
     )
     factor = jnp.sum(jnp.conj(known) * seen) / spread
     squares = jnp.sum(abs(seen - factor * known) ** 2)
-    ratio = abs(factor) * pixel  # r_c / R
-    error = jnp.sqrt(squares / (2 * len(points) - 4) / spread) * pixel
+    ratio = abs(factor) * pixel_pitch  # r_c / R
+    error = jnp.sqrt(squares / (2 * len(points) - 4) / spread) * pixel_pitch
     return FocalEstimate(
         focal=distance * ratio / (1 + ratio),
         std=distance * error / (1 + ratio) ** 2,

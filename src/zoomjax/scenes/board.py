@@ -59,22 +59,22 @@ class StripedBoard:
         stripes: number of vertical and of horizontal white stripes.
         size: width and height, mm.
         distance: from the projection plane to the board, mm.
-        pixel: side of a pixel on the sensor, mm.
+        pixel_pitch: side of a pixel on the sensor, mm.
     """
 
     stripes: tuple[int, int] = (31, 23)
     size: tuple[float, float] = (1330.0, 1010.0)
     distance: float = 1185.0
-    pixel: float = _SENSOR[0] / _SENSOR[1]
+    pixel_pitch: float = _SENSOR[0] / _SENSOR[1]
 
     @classmethod
     def before(cls, lens: ZoomLens) -> "StripedBoard":
         """The paper's board, for a camera whose images have the size of the lens's."""
-        return cls(pixel=_SENSOR[0] / lens.image_size[0])
+        return cls(pixel_pitch=_SENSOR[0] / lens.image_size[0])
 
     def magnification(self, focal: float) -> float:
         """Pixels per mm on the board: eq. 7, ``r_c / R = f / (d - f)``."""
-        return focal / (self.distance - focal) / self.pixel
+        return focal / (self.distance - focal) / self.pixel_pitch
 
     def edges(self, axis: int) -> np.ndarray:
         """Positions, mm from the middle, of both edges of the stripes that are counted along an axis."""

@@ -18,8 +18,8 @@ from .evidence import evidence as evidence
 from .misfit import with_misfit as with_misfit
 from .next_photo import Suggestion as Suggestion
 from .next_photo import suggest_next as suggest_next
+from .selection import ComparedModel as ComparedModel
 from .selection import Selection as Selection
-from .selection import Verdict as Verdict
 from .selection import select_model as select_model
 from .vanishing import VanishingPoints as VanishingPoints
 from .vanishing import vanishing_points as vanishing_points

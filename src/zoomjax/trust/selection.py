@@ -45,7 +45,7 @@ _TIE = 5e-4
 
 
 @dataclasses.dataclass(frozen=True)
-class Verdict:
+class ComparedModel:
     """The figures of one candidate. All RMS are of the same lines, px; NaN where not available.
 
     Attributes:
@@ -78,7 +78,7 @@ class Selection:
         chosen: the simplest candidate within one standard error of the best.
         best: the candidate of least cross-validated error.
         fit: the fit of the chosen model to all lines.
-        verdicts: the figures of all candidates, in their order.
+        compared: the figures of all candidates, in their order.
         hold_out: what was left out: "focal", "frame" or "line".
         folds: number of folds.
         rule: by which the model was chosen.
@@ -87,16 +87,16 @@ class Selection:
     chosen: Model
     best: Model
     fit: ZoomFit
-    verdicts: tuple[Verdict, ...]
+    compared: tuple[ComparedModel, ...]
     hold_out: HoldOut
     folds: int
     rule: Rule = "one standard error"
 
     def rows(self) -> list[tuple[str, str, str, str, str, str]]:
         """The table: candidate, parameters, RMS as fitted and held out, difference to the best, mark."""
-        return [self._row(verdict) for verdict in self.verdicts]
+        return [self._row(each) for each in self.compared]
 
-    def _row(self, v: Verdict) -> tuple[str, str, str, str, str, str]:
+    def _row(self, v: ComparedModel) -> tuple[str, str, str, str, str, str]:
         if v.problem:
             return v.candidate.name, "", "", "", "", f"not compared: {v.problem.partition('. ')[0]}"
         return (
@@ -150,7 +150,7 @@ class Selection:
                     for field in dataclasses.fields(v)[1:]
                     for x in [getattr(v, field.name)]
                 }
-                for v in self.verdicts
+                for v in self.compared
             ],
         }
 
@@ -235,23 +235,23 @@ def select_model(
     plain = in_corrected(lines)
     if candidates is None:
         most = min(_TERMS, plain.terms) if isinstance(plain, CompressedLines) else _TERMS
-        compared = default_candidates(most)
+        models = default_candidates(most)
     else:
-        compared = tuple(c if isinstance(c, Model) else Model(c) for c in candidates)
+        models = tuple(c if isinstance(c, Model) else Model(c) for c in candidates)
     if rule not in get_args(Rule):
         raise ValueError(f'Argument rule must be "one standard error" or "least", but it is {rule!r}.')
-    if not compared:
+    if not models:
         raise ValueError("Argument candidates must hold one or more zoom models, but it is empty.")
-    own = plain.terms if isinstance(plain, CompressedLines) else max(c.terms for c in compared)
+    own = plain.terms if isinstance(plain, CompressedLines) else max(c.terms for c in models)
     small = small_lines(plain, own)
     forms = {
         c.distortion_model: measured_as(compressed_under(c.distortion_model, plain, small, own), lines)
-        for c in compared
+        for c in models
     }
     parts = folds_of(small, hold_out, folds, seed)
-    verdicts, best, chosen = compare(small, compared, parts, forms, rule)
+    compared, best, chosen = compare(small, models, parts, forms, rule)
     fit = fit_zoom(forms[chosen.distortion_model], zoom=chosen)
-    return Selection(chosen, best, fit, verdicts, parts.hold_out, parts.number, rule)
+    return Selection(chosen, best, fit, compared, parts.hold_out, parts.number, rule)
 
 
 def _about_fitted(lines, candidates, how):
@@ -297,8 +297,8 @@ def compare(
     parts: Folds,
     forms: Mapping[AbstractDistortionModel, AbstractLines] | None = None,
     rule: Rule = "one standard error",
-) -> tuple[tuple[Verdict, ...], Model, Model]:
-    """The verdicts, the best candidate and the chosen one; see `select_model`.
+) -> tuple[tuple[ComparedModel, ...], Model, Model]:
+    """The figures of each, the best candidate and the chosen one; see `select_model`.
 
     `forms` are the same lines for distortion models other than the radial polynomial.
     """
@@ -323,29 +323,29 @@ def compare_errors(candidates, errors, parts, rule):
         reasons = {e if isinstance(e, str) else e.problem for e in errors}
         raise ValueError(f"No candidate can be compared. {' '.join(sorted(reasons))}")
     best = min(unseen, key=lambda i: weight @ unseen[i])
-    verdicts = [
-        _verdict(candidate, judged, unseen.get(i), unseen[best], weight, by_unit)
+    compared = [
+        _figures(candidate, judged, unseen.get(i), unseen[best], weight, by_unit)
         for i, (candidate, judged) in enumerate(zip(candidates, errors, strict=True))
     ]
-    within = [v for v in verdicts if not v.problem and v.difference <= _allowed(v, rule)]
+    within = [v for v in compared if not v.problem and v.difference <= _allowed(v, rule)]
     chosen = min(within, key=lambda v: (round(v.parameters, 6), v.held_out)).candidate
-    return tuple(verdicts), candidates[best], chosen
+    return tuple(compared), candidates[best], chosen
 
 
-def _allowed(verdict, rule):
+def _allowed(each, rule):
     """By how much a candidate may be above the best to be chosen."""
-    return verdict.difference_std if rule == "one standard error" else _TIE * verdict.held_out
+    return each.difference_std if rule == "one standard error" else _TIE * each.held_out
 
 
-def _verdict(candidate, judged, unseen, best, weight, by_unit):
+def _figures(candidate, judged, unseen, best, weight, by_unit):
     if isinstance(judged, str):
-        return Verdict(candidate, problem=judged)
+        return ComparedModel(candidate, problem=judged)
     rms = float(np.sqrt(weight @ by_unit(judged.seen)))
     if unseen is None:
-        return Verdict(candidate, judged.parameters, rms, problem=judged.problem)
+        return ComparedModel(candidate, judged.parameters, rms, problem=judged.problem)
     own, own_part = _root(weight, unseen)
     least, least_part = _root(weight, best)
-    return Verdict(
+    return ComparedModel(
         candidate,
         judged.parameters,
         rms,

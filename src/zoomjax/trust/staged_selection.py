@@ -35,6 +35,6 @@ def select_in_stages(
     more = [Model(chosen.zoom, number) for number in terms[1:] if not isinstance(chosen.zoom, SmoothZoom)]
     errors += [candidate_errors(lines, candidate, parts) for candidate in more]
     candidates += more
-    verdicts, best, chosen = compare_errors(candidates, errors, parts, "least")
+    compared, best, chosen = compare_errors(candidates, errors, parts, "least")
     fit = fit_zoom(lines, zoom=chosen)
-    return Selection(chosen, best, fit, verdicts, parts.hold_out, parts.number, "least")
+    return Selection(chosen, best, fit, compared, parts.hold_out, parts.number, "least")
