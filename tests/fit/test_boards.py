@@ -170,7 +170,7 @@ def test_steps_solve_the_least_squares_of_the_dense_jacobian(exact):
     rows, linear = jax.linearize(lambda x: rows_of(x, problem_of_two), zeros)
     bend = units.poses[:, None, 6:] * data.basis.own[None]
     structure = Structure(data.basis.scaled(units.shape[0, 0]), bend, data.board, data.members)
-    step = PoseSchur(structure).step(linear, rows, zeros, jnp.asarray(1e-2))
+    step = PoseSchur(structure).step(zeros, linear, rows, jnp.asarray(1e-2))
     unknown, unravel = ravel_pytree((zeros.poses, zeros.shape, zeros.lens))
 
     def rows_at(unknown):

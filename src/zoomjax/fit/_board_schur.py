@@ -254,6 +254,7 @@ class PoseSchur(AbstractNormalSolver):
 
     structure: Structure
 
-    def step(self, jacobian: Any, rows: Rows, like: Unknowns, damping: Array) -> Unknowns:
+    def step(self, at: Unknowns, jacobian: Any, rows: Rows, damping: Array) -> Unknowns:
         """The unknowns of least squares."""
+        like = jax.tree.map(jnp.zeros_like, at)
         return solution(reduced(jacobian, rows, like, self.structure, damping), like, self.structure)

@@ -22,14 +22,20 @@ from ..lines.stretch import radial_stretch
 from ..models.zoom import AbstractPriorZoom
 from ._motion_model import Data, Model, Noise, Stage, moved, units_of
 from ._motion_start import turned
-from ._schur import Rows, Unknowns
+from ._schur import Rows, Unknowns, columns, derivatives
 from ._views import CAUCHY, corrected, flattened, product, view_residual
 
 WRONG_LINE = 3.0
 """Times the noise: the RMS of a line's distances where its loss begins to flatten."""
 
+_CHUNK = 1024
+"""Views whose derivatives are computed together: what that takes stays in a core's cache."""
+
 _PIN = 1e3
 """Weight of what is redundant: log f of one frame beside the common factor is 0."""
+
+
+Args = tuple[Data, Model, Noise, Stage]
 
 
 class _Rows(NamedTuple):
@@ -69,13 +75,19 @@ def residuals_of(
 
     def view(point, frame, track):
         log_focal, coefficients, turning = rows.at(frame, point)
-        ahead = turned(product(model.path.rotation[frame], model.path.rays[track]), turning)
-        ahead = ahead.at[2].add(-lever[track])
-        camera = jnp.exp(log_focal), coefficients, rows.offset[frame]
-        return view_residual(point, *camera, ahead, model.distortion_model, data.scale)
+        ahead = product(model.path.rotation[frame], model.path.rays[track])
+        given = log_focal, coefficients, rows.offset[frame], ahead, turning, lever[track]
+        return _missed(data, model, point, *given)
 
     views = jax.vmap(view)(data.points, data.structure.frame, data.structure.track)
     return jnp.where(data.there[:, None], views, 0)
+
+
+def _missed(data, model, point, log_focal, coefficients, offset, ahead, turning, lever):
+    """The residual of a view, px. The camera has turned since it saw the middle row, and has a lever."""
+    ahead = turned(ahead, turning).at[2].add(-lever)
+    camera = jnp.exp(log_focal), coefficients, offset
+    return view_residual(point, *camera, ahead, model.distortion_model, data.scale)
 
 
 def line_residuals_of(data: Data, model: Model) -> Float[Array, "line row"]:
@@ -149,22 +161,127 @@ def averaged(data: Data, model: Model) -> Float[Array, "track 3"]:
     return jnp.where(length > 0, rays / jnp.where(length > 0, length, 1), jnp.array([0.0, 0.0, 1.0]))
 
 
-def rows_of(unknowns: Unknowns, args: tuple[Data, Model, Noise, Stage]) -> Rows:
+def rows_of(unknowns: Unknowns, args: Args) -> Rows:
     """All residuals, robust, in units of the noise; `unknowns` are steps in their `units_of`."""
+    data, _, noise, _ = args
+    there = _there(unknowns, args)
+    views = residuals_of(data, there) / noise.points
+    squared = jnp.sum(views**2, axis=-1) / CAUCHY**2
+    return _other_rows(unknowns, args)._replace(views=views * flattened(squared)[:, None])
+
+
+def _there(unknowns, args):
+    """The path and the lens after steps."""
+    data, model, noise, _ = args
+    return moved(model, jax.tree.map(jnp.multiply, unknowns, units_of(data, model, noise)))
+
+
+def _other_rows(unknowns, args):
+    """`rows_of` without the views."""
     data, model, noise, stage = args
     steps = jax.tree.map(jnp.multiply, unknowns, units_of(data, model, noise))
     there = moved(model, steps)
-    views = residuals_of(data, there) / noise.points
     lines = line_residuals_of(data, there)
-    squared = jnp.sum(views**2, axis=-1) / CAUCHY**2
     of_lines = jnp.nan_to_num(line_squares_of(data, lines)) / (noise.lines * WRONG_LINE) ** 2
     return Rows(
-        views * flattened(squared)[:, None],
+        jnp.zeros((0, 2)),
         weighed(data, noise, lines * flattened(of_lines)[:, None]),
         about_frames(data, there.path, unknowns, steps, stage),
         about_lens(data, there, unknowns, stage),
         about_rays(there),
     )
+
+
+def columns_of(args: Args, unknowns: Unknowns) -> tuple[Rows, Rows, Rows]:
+    """The Jacobian's `columns` of `rows_of`.
+
+    A view depends on the lens by way of its frame, and on rotation and ray by way of where its point is. So
+    its derivatives by these few numbers are multiplied by what the unknowns do to them, which is known once
+    for each frame and each ray.
+    """
+    others = columns(jax.linearize(lambda x: _other_rows(x, args), unknowns)[1], unknowns)
+    views = _view_columns(unknowns, args)
+    ends = 4, 4 + unknowns.rays.shape[1]
+    parts = jnp.split(views, ends, axis=-1)
+    by_frame, by_ray, by_lens = (of._replace(views=part) for of, part in zip(others, parts, strict=True))
+    return by_frame, by_ray, by_lens
+
+
+class _Cameras(NamedTuple):
+    """What the views of a frame have in common; or how it changes with the unknowns, the last axis."""
+
+    log_focal: Array
+    coefficients: Array
+    slope: Array  # of the coefficients, by log f
+    offset: Array
+    rotation: Array
+
+
+def _view_columns(unknowns, args):
+    """(view, 2, unknown): the numbers of the frame, of the ray and of the lens."""
+    data, model, noise, _ = args
+
+    def what_is_seen_by(unknowns):
+        there = _there(unknowns, args)
+        rows = _rows_of_frames(data, there)
+        cameras = _Cameras(there.path.log_focal, *rows.coefficients, rows.offset, there.path.rotation)
+        levers = jnp.zeros(len(there.path.rays)) if there.levers is None else there.levers.value
+        return cameras, (there.path.rays, levers), there.readout
+
+    known, change = jax.linearize(what_is_seen_by, unknowns)
+    parts = derivatives(change, unknowns)
+    changes = jax.tree.map(lambda *of: jnp.concatenate(of, axis=-1), *parts)
+
+    def view(own):
+        point, there, frame, track = own
+        of_frames, of_rays, readout = zip(known, changes, strict=True)
+        camera, by_camera = (jax.tree.map(lambda leaf: leaf[frame], of) for of in of_frames)
+        (ray, lever), (by_ray, by_lever) = (jax.tree.map(lambda leaf: leaf[track], of) for of in of_rays)
+        height = data.size[1] - 1.0
+        first, second = model.speed.first[frame], model.speed.second[frame]
+        time = readout[0] * point[1] / height
+        gone = time * (first + time / 2 * second)
+        faster = point[1] / height * (first + time * second)  # by the readout
+
+        def missed(*given):
+            views = _missed(data, model, point, *given) / noise.points
+            return views * flattened(jnp.sum(views**2) / CAUCHY**2)
+
+        given = (
+            camera.log_focal + gone[0],
+            camera.coefficients + gone[0] * camera.slope,
+            camera.offset,
+            product(camera.rotation, ray),
+            gone[1:],
+            lever,
+        )
+        # One after the other: as loops that XLA fuses.
+        by = [jax.jacfwd(missed, argnums=place)(*given) for place in range(len(given))]
+        turned_ray = sum(by_camera.rotation[:, i] * ray[i] for i in range(3))
+        moved_ray = sum(camera.rotation[:, i, None] * by_ray[i][None] for i in range(3))
+        by_readout = (
+            by[0] * faster[0]
+            + sum(by[1][:, i] * faster[0] * camera.slope[i] for i in range(len(camera.slope)))
+            + sum(by[4][:, i] * faster[1 + i] for i in range(3))
+        )
+        found = (
+            by[0][:, None] * by_camera.log_focal[None]
+            + _combined(by[1], by_camera.coefficients + gone[0] * by_camera.slope)
+            + _combined(by[2], by_camera.offset)
+            + _combined(by[3], turned_ray + moved_ray)
+            + by_readout[:, None] * readout[1][None]
+        )
+        if model.levers is not None:
+            found = found + by[5][:, None] * by_lever[None]
+        return jnp.where(there, found, 0)
+
+    views = data.points, data.there, data.structure.frame, data.structure.track
+    return jax.lax.map(view, views, batch_size=_CHUNK)
+
+
+def _combined(by, changes):
+    """The product of two small matrices, as a sum that XLA fuses with what uses it."""
+    return sum(by[:, i, None] * changes[i][None] for i in range(len(changes)))
 
 
 def about_frames(data, path, unknowns, steps, stage):

@@ -22,6 +22,7 @@ from ._motion_rows import (
     about_lens,
     about_rays,
     averaged,
+    columns_of,
     line_residuals_of,
     line_squares_of,
     residuals_of,
@@ -156,18 +157,18 @@ def _solved(data, model, noise, stage):
     A stage whose steps are spent is successful if all of them moved the residuals by less than their noise
     does: with heavy tails the last steps are many and small.
     """
-    solver = damped_solver(Schur(data.structure), Unknowns, stage.change, stage.damping)
     model = eqx.tree_at(lambda m: m.speed, model, speed_of(model.path, data.neighbours))
     rays = jnp.where(stage.fresh > 0, averaged(data, model), model.path.rays)
     model = eqx.tree_at(lambda m: m.path.rays, model, rays)
     of_lines = stage.wider * _line_noise(data, model)
     noise = noise._replace(lines=jnp.where(jnp.isnan(noise.lines), of_lines, noise.lines))
-    units = units_of(data, model, noise)
+    units, args = units_of(data, model, noise), (data, model, noise, stage)
+    steps = Schur(data.structure, eqx.Partial(columns_of, args))
     solution = optx.least_squares(
-        rows_of,
-        solver,
+        jax.checkpoint(rows_of),  # what derivatives need is made again: it is much
+        damped_solver(steps, Unknowns, stage.change, stage.damping),
         jax.tree.map(jnp.zeros_like, units),
-        args=(data, model, noise, stage),
+        args=args,
         max_steps=_MOST_STEPS,
         throw=False,
     )

@@ -1,4 +1,4 @@
-"""Linear solvers of steps by normal equations of a known structure, for optimistix."""
+"""Steps of a damped Gauss-Newton method by normal equations of a known structure, for optimistix."""
 
 import abc
 from typing import Any
@@ -6,52 +6,64 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree, Scalar
 
 from ._least_squares import FIRST_DAMPING, ROUNDING
 
 
-class AbstractNormalSolver(lx.AbstractLinearSolver):
-    """Steps of a damped Gauss-Newton method.
-
-    The unknowns are a tree whose first leaf is damped as all others are.
-    """
+class AbstractNormalSolver(eqx.Module):
+    """How the normal equations of a problem are made and solved."""
 
     @abc.abstractmethod
-    def step(self, jacobian: Any, rows: Any, like: Any, damping: Array) -> Any:
-        """The unknowns of least squares of ``jacobian x = rows``, with `damping` added to the diagonal."""
+    def step(self, at: Any, jacobian: Any, rows: Any, damping: Array) -> Any:
+        """The unknowns of least squares of ``jacobian x = rows``, with `damping` added to the diagonal.
 
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
-        """The operator itself."""
-        del options
-        return operator
+        Args:
+            at: the unknowns where the rows are linearised.
+            jacobian: maps a change of the unknowns to that of the rows.
+            rows: the residuals there.
+            damping: added to each unknown's diagonal entry.
+        """
 
-    def compute(
-        self, state: Any, vector: PyTree[Array], options: dict[str, Any]
-    ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
-        """The unknowns: of rows, and of as many equations that damp each unknown."""
-        del options
-        rows, _ = vector
-        like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), state.in_structure())
-        leaves, shape = jax.tree.flatten(like)
-        _, damped = state.mv(jax.tree.unflatten(shape, [jnp.ones_like(leaves[0]), *leaves[1:]]))
-        damping = jax.tree.leaves(damped)[0].ravel()[0] ** 2
-        result: Any = lx.RESULTS.successful
-        return self.step(lambda x: state.mv(x)[0], rows, like, damping), result, {}
 
-    def transpose(self, state: Any, options: dict[str, Any]) -> Any:
-        """Not needed: steps of a solver are not differentiated."""
-        raise NotImplementedError("The steps of this solver have no transpose: pass another solver.")
+class _Linearised(eqx.Module):
+    """Where the last step that was accepted has led."""
 
-    def conj(self, state: Any, options: dict[str, Any]) -> Any:
-        """Real numbers stay what they are."""
-        return state, options
+    at: PyTree
+    rows: PyTree
+    jacobian: Any
 
-    def assume_full_rank(self) -> bool:
-        """The damping of each step sees to it."""
-        return True
+
+class NormalDescent(optx.AbstractDescent):
+    """`optimistix.DampedNewtonDescent` by normal equations."""
+
+    solver: AbstractNormalSolver
+
+    def init(self, y: PyTree, f_info_struct: Any) -> _Linearised:
+        """A state of the shapes of those that follow."""
+        known = jax.tree.map(
+            lambda leaf: (
+                jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
+            ),
+            f_info_struct,
+        )
+        return _Linearised(y, known.residual, known.jac)
+
+    def query(self, y: PyTree, f_info: Any, state: _Linearised) -> _Linearised:
+        """What steps from here are made of."""
+        del state
+        return _Linearised(y, f_info.residual, f_info.jac)
+
+    def step(self, step_size: Scalar, state: _Linearised) -> tuple[PyTree, optx.RESULTS]:
+        """The damped step; the damping is the inverse of the step's size."""
+        kind = jnp.finfo(step_size.dtype)
+        damping = jnp.where(
+            step_size > kind.eps, 1 / jnp.where(step_size > kind.eps, step_size, 1), kind.max
+        )
+        solved = self.solver.step(state.at, state.jacobian.mv, state.rows, damping)
+        result: Any = optx.RESULTS.successful
+        return jax.tree.map(jnp.negative, solved), result
 
 
 class RoundingTrustRegion(optx.AbstractSearch):
@@ -93,7 +105,7 @@ def damped_solver(
     """Levenberg-Marquardt with these steps, which ends with a step that moves the residuals by less.
 
     Args:
-        steps: the linear solver.
+        steps: what makes and solves the normal equations.
         unknowns: the class of the unknowns, whose own changes are not asked: along weak directions they say
             little.
         change: of the residuals, in all.
@@ -103,5 +115,9 @@ def damped_solver(
     def of_residuals(moved):
         return jnp.zeros(()) if isinstance(moved, unknowns) else optx.two_norm(moved)
 
-    solver = optx.LevenbergMarquardt(rtol=0.0, atol=change, norm=of_residuals, linear_solver=steps)
-    return eqx.tree_at(lambda s: s.search, solver, RoundingTrustRegion(first_damping=damping))
+    solver = optx.LevenbergMarquardt(rtol=0.0, atol=change, norm=of_residuals)
+    return eqx.tree_at(
+        lambda s: (s.descent, s.search),
+        solver,
+        (NormalDescent(steps), RoundingTrustRegion(first_damping=damping)),
+    )

@@ -9,6 +9,7 @@ from block to block; the lens is a border of few columns.
 Normal equations square the condition of the problem: float64 only.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +20,9 @@ from jaxtyping import Array, Float, PyTree
 
 from ._normal_solver import AbstractNormalSolver
 from ._structure import Structure
+
+_LARGE = 256
+"""Rows of a matrix from which it is worth while to compute half of a symmetric product."""
 
 
 class Unknowns(NamedTuple):
@@ -78,14 +82,20 @@ def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, dam
     """The normal equations of ``jacobian x = rows``, with `damping` added to the diagonal.
 
     Args:
-        jacobian: maps `Unknowns` to `Rows`. All columns come from a product for each number of a frame, of
-            a ray and of the lens, as no row has two frames or two rays.
+        jacobian: maps `Unknowns` to `Rows`.
         rows: the right-hand side.
         like: the unknowns' shapes.
         structure: which frame each view belongs to.
         damping: added to each unknown's diagonal entry.
     """
-    by_frame, by_ray, by_lens = columns(jacobian, like)
+    return reduced_of(columns(jacobian, like), rows, like, structure, damping)
+
+
+def reduced_of(
+    of_rows: tuple[Rows, Rows, Rows], rows: Rows, like: Unknowns, structure: Structure, damping: Array
+) -> Reduced:
+    """The same of the Jacobian's `columns`."""
+    by_frame, by_ray, by_lens = of_rows
     views, by_track = rows.views[..., None], structure.track
 
     def summed(of_views):
@@ -134,6 +144,16 @@ def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, dam
 
 def columns(jacobian: Any, like: Unknowns) -> tuple[Rows, Rows, Rows]:
     """The Jacobian's columns of each row: by its frame, by its ray and by the lens; the last axis."""
+    by_frame, by_ray, by_lens = derivatives(jacobian, like)
+    own = jnp.diagonal(by_frame.frames, axis1=1, axis2=2)
+    return by_frame._replace(frames=own), by_ray, by_lens
+
+
+def derivatives(jacobian: Any, like: Unknowns) -> tuple[Any, Any, Any]:
+    """What each number of all frames, each of all rays, and each of the lens does; the last axis.
+
+    That is enough for what belongs to one frame and one ray, at most.
+    """
     lens, unravel = ravel_pytree(like.lens)
     ray = slice(4, 4 + like.rays.shape[1])
 
@@ -150,9 +170,7 @@ def columns(jacobian: Any, like: Unknowns) -> tuple[Rows, Rows, Rows]:
     def those(part):
         return jax.tree.map(lambda leaf: jnp.moveaxis(leaf[part], 0, -1), out)
 
-    by_frame, by_ray, by_lens = those(slice(4)), those(ray), those(slice(ray.stop, None))
-    own = jnp.diagonal(by_frame.frames, axis1=1, axis2=2)
-    return by_frame._replace(frames=own), by_ray, by_lens
+    return those(slice(4)), those(ray), those(slice(ray.stop, None))
 
 
 def _products(left, right):
@@ -228,19 +246,31 @@ def _frame_blocks(own, halves, extra, structure):
     within = structure.frame - structure.begin * size
     reach = size if blocks == 1 else 2 * size
 
-    def of_block(number):
-        here = jnp.where(structure.begin == number, structure.place, structure.most)  # or dropped
-        rows = jnp.zeros((structure.most, reach, 4, halves.shape[2]), own.dtype)
-        rows = rows.at[here, within].set(halves, mode="drop")
-        rows = rows.transpose(1, 2, 0, 3).reshape(4 * reach, -1)
-        return rows @ rows.T
+    def of_block(members):
+        def there(values, other):
+            return values.at[members].get(mode="fill", fill_value=other)
 
-    coupled = jax.lax.map(of_block, jnp.arange(blocks))
+        rows = jnp.zeros((reach, 4, structure.most, halves.shape[2]), own.dtype)
+        here = there(structure.place, structure.most)  # where there is none, it is dropped
+        rows = rows.at[there(within, 0), :, here].set(there(halves, 0), mode="drop")
+        return _gram(rows.reshape(4 * reach, -1))
+
+    coupled = jax.lax.map(of_block, structure.members)
     diagonal = diagonal - coupled[:, :n, :n]
     if blocks == 1:
         return diagonal, 0 * diagonal  # no constant, which XLA would fold for seconds
     diagonal = diagonal.at[1:].add(-coupled[:-1, n:, n:])
     return diagonal, -coupled[:, :n, n:]
+
+
+def _gram(rows):
+    """``rows @ rows.T``, of which the half below the diagonal is a copy."""
+    number = len(rows)
+    if number < _LARGE:
+        return rows @ rows.T
+    first, last = rows[: number // 2], rows[number // 2 :]
+    both = first @ last.T
+    return jnp.block([[_gram(first), both], [both.T, _gram(last)]])
 
 
 def _by_block(values, frame, structure):
@@ -363,10 +393,16 @@ def covariances(
 
 
 class Schur(AbstractNormalSolver):
-    """Steps of a damped Gauss-Newton method for `Unknowns` and `Rows`, by `reduced` and `solution`."""
+    """Steps of a damped Gauss-Newton method for `Unknowns` and `Rows`, by `reduced` and `solution`.
+
+    `columns_at` gives the Jacobian's `columns` where the unknowns are.
+    """
 
     structure: Structure
+    columns_at: Callable[[Unknowns], tuple[Rows, Rows, Rows]]
 
-    def step(self, jacobian: Any, rows: Rows, like: Unknowns, damping: Array) -> Unknowns:
+    def step(self, at: Unknowns, jacobian: Any, rows: Rows, damping: Array) -> Unknowns:
         """The unknowns of least squares."""
-        return solution(reduced(jacobian, rows, like, self.structure, damping), like, self.structure)
+        del jacobian
+        matrix = reduced_of(self.columns_at(at), rows, at, self.structure, damping)
+        return solution(matrix, at, self.structure)

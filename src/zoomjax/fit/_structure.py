@@ -5,14 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+NONE = np.iinfo(np.int32).max
+"""The number of no view."""
+
 
 class Structure(eqx.Module):
     """Which track and which frame each view belongs to; views are sorted by track, then by frame.
 
     Attributes:
         track, frame: of each view.
-        place: of each view among those whose tracks begin in the same block; `members` of all blocks.
+        place: of each view's track, among those that begin in the same block.
         begin: the block in which its track begins.
+        members: the views of the tracks that begin in each block; `NONE` pads.
         line_frame: the frame of each line.
         tracks: their number.
         block: frames in a block: at least as many as a track is long, from its first to its last.
@@ -24,6 +28,7 @@ class Structure(eqx.Module):
     frame: Int[Array, "view"]
     place: Int[Array, "view"]
     begin: Int[Array, "view"]
+    members: Int[Array, "block some"]
     line_frame: Int[Array, "line"]
     tracks: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
@@ -50,13 +55,24 @@ def structure_of(
     count = np.bincount(begin, minlength=-(-frames // block))
     place = np.empty(len(tracks), int)
     place[order] = np.arange(len(tracks)) - np.repeat(np.cumsum(count) - count, count)
+    of_views = track, frame, place[track], begin[track], _members(begin[track], len(count))
     return Structure(
-        *(jnp.asarray(a, jnp.int32) for a in (track, frame, place[track], begin[track], line_frame)),
+        *(jnp.asarray(a, jnp.int32) for a in (*of_views, line_frame)),
         tracks=len(tracks),
         block=block,
         blocks=len(count),
         most=int(count.max()),
     )
+
+
+def _members(begin, blocks):
+    """The numbers of the views of each block."""
+    count = np.bincount(begin, minlength=blocks)
+    order = np.argsort(begin, kind="stable")
+    place = np.arange(len(begin)) - np.repeat(np.cumsum(count) - count, count)
+    members = np.full((blocks, count.max()), NONE)
+    members[begin[order], place] = order
+    return members
 
 
 def bucket(size: int) -> int:
@@ -72,6 +88,7 @@ def padded(structure: Structure) -> Structure:
     """The structure with more views, which belong to no block, and more tracks, to which these belong."""
     more = bucket(len(structure.track)) - len(structure.track)
     last = structure.tracks  # at least one more
+    wider = bucket(structure.members.shape[1]) - structure.members.shape[1]
     return Structure(
         *(
             jnp.asarray(np.pad(values, (0, more), constant_values=filling))
@@ -82,6 +99,7 @@ def padded(structure: Structure) -> Structure:
                 (structure.begin, structure.blocks),
             )
         ),
+        members=jnp.asarray(np.pad(structure.members, ((0, 0), (0, wider)), constant_values=NONE)),
         line_frame=structure.line_frame,
         tracks=bucket(structure.tracks + 1),
         block=structure.block,
