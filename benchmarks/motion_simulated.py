@@ -36,6 +36,7 @@ KINDS: dict[str, tuple[dict, dict]] = {
     "30 % of tracks on moving things": ({}, {"moving": 0.3}),
     "80 % of tracks on moving things": ({}, {"moving": 0.8}),
     "points kept as a map": ({}, {"returns": True}),
+    "zoom without turning": ({"pan": 0, "tilt": 0}, {}),
 }
 """Path and tracks that differ from the first line's."""
 
@@ -191,7 +192,7 @@ def timed(only: str) -> Rows:
         shown = np.arange(0, frames, max(frames // 10, 1))
         own = errors(wide(lens), scene, fit, shown)
         yield (
-            f"{frames:,}",
+            f"{frames:,} frames",
             {
                 "first": seconds[0],
                 "second": seconds[1],

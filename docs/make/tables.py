@@ -458,5 +458,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "motion-rendered": motion("Rendered clips"),
     "motion-broadcast": motion("Frames of a broadcast"),
     "motion-rivals": motion("Rivals"),
+    "motion-time": motion("Time"),
 }
 """What makes each table, by the name in its marker."""
