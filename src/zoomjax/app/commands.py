@@ -275,7 +275,7 @@ def calibrate(
     from .image_job import ImageJob
     from .results_folder import OF_A_LENS, results_folder
 
-    if wants_motion(inputs, focal, pitch):
+    if wants_motion(inputs, focal, spacing):
         refuse_idle(context, IDLE_FOR_MOTION, "with --focal motion")
         if not with_lines:
             refuse_idle(context, ("detector", "frames", "jobs", "cache"), "without --lines")
