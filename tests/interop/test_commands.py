@@ -51,6 +51,8 @@ def told(tmp_path_factory):
         "no format": "export lens.json --to that -o b.pfb",
         "import": "import a.xml --image-size 640x480 -o back",
         "import division": "import a.pfb --focal 20,30,40 --distortion-model division --terms 1 -o other",
+        "in px": "import a.pfb --focal 500,700,1100 --focal-unit px -o pixels",
+        "no numbers": "import a.pfb -o never",
         "smooth": "import few.json -o smooth",
         "table": "import few.json --table -o table",
         "terms": "import a.xml --image-size 640x480 --terms 9 -o never",
@@ -103,6 +105,14 @@ def test_a_lens_goes_out_and_comes_back(told):
     assert json.loads((folder / "back" / "import.json").read_text())["format"] == "lensfun"
 
 
+def test_focal_lengths_that_a_file_does_not_say_may_be_in_px(told):
+    folder, said = told
+    assert said["in px"][0] == 0, said["in px"][1]
+    lens = zj.load_lens(folder / "pixels" / "lens.json")
+    assert lens.focal_unit == "px"
+    assert list(lens.focal_range) == [500, 1100]
+
+
 def test_the_model_of_an_import_can_be_chosen(told):
     folder, said = told
     assert said["import division"][0] == 0, said["import division"][1]
@@ -126,6 +136,7 @@ def test_the_model_of_an_import_can_be_chosen(told):
         ("cut map", "from cut-undistort.exr: it is no EXR file, or it is damaged or cut off."),
         ("foreign", "Error: photo.png is of no format that is known: stmap, nuke"),
         ("foreign by its name", "Error: Cannot read a lensfun lens from photo.xml: "),
+        ("no numbers", "give --focal, 3 of them, in mm, or in px with --focal-unit."),
         ("no size", "it holds no image size: give --image-size"),
         ("no effect", "Error: --tolerance has no effect on the format opencv: leave it out."),
         ("no convention", "Error: --convention has no effect on the format nuke: leave it out."),

@@ -51,6 +51,35 @@ def test_facts_about_the_camera_are_no_options(tmp_path):
     zj.interop.read(tmp_path / "a.pfb", focal=24, image_size=lens.image_size)
 
 
+@pytest.mark.parametrize("name", ["pftrack", "discorpy", "nuke"])
+def test_focal_lengths_of_files_without_them_may_be_in_px(name, tmp_path):
+    """They were read as if they were in mm, whatever they were."""
+    lens, fmt = LENSES["px"](), FORMATS[name]
+    focal = np.array([18, 35, 90, 200]) / PITCH
+    path = tmp_path / f"a{fmt.suffixes[0] * (fmt.zoom != 'one')}"
+    zj.interop.write(lens, path, format=name, focal=focal, pixel_pitch=PITCH)
+    told = {"focal": focal} | ({} if name == "pftrack" else {"image_size": lens.image_size})
+    back = zj.interop.read(path, **told, focal_unit="px").lens
+    assert back.focal_unit == "px"
+    assert np.asarray(back.focal_range) == pytest.approx(focal[[0, -1]])
+    points = np.array([[10.0, 20.0], [600.0, 400.0]])
+    for f in focal:
+        np.testing.assert_allclose(back(f).undistort(points), lens(f).undistort(points), atol=0.05)
+    assert zj.interop.read(path, **told).lens.focal_unit == "mm"
+
+
+def test_a_unit_of_focal_lengths_that_are_not_given_is_refused(tmp_path):
+    lens = LENSES["px"]()
+    path = tmp_path / "a"
+    zj.interop.write(lens, path, format="opencv", focal=1000, pixel_pitch=PITCH)
+    with pytest.raises(ValueError, match="focal_unit is that of argument focal, which is not given"):
+        zj.interop.read(path, format="opencv", focal_unit="px")
+    with pytest.raises(ValueError, match="holds its focal lengths in px: leave out arguments focal"):
+        zj.interop.read(path, format="opencv", focal=900, focal_unit="px")
+    with pytest.raises(ValueError, match="focal_unit must be one of mm, px, but it is 'inch'"):
+        zj.interop.read(path, format="opencv", focal=900, focal_unit="inch")
+
+
 WRONG = {
     "Argument zoom must be a zoom model .* but it is the class TableZoom": {"zoom": TableZoom},
     "Argument terms must be an integer of at least 1, but it is -1": {"terms": -1},

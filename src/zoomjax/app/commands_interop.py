@@ -12,7 +12,7 @@ from .._core.text import plain
 from ._jax import set_up_jax
 from .arguments import Overwrite, lens_file, size_of
 from .commands import app
-from .options import ResultsFolder, place
+from .options import FocalUnit, ResultsFolder, place
 
 if TYPE_CHECKING:
     from ..interop.base import Report
@@ -126,6 +126,9 @@ def import_(
             help="Focal lengths of the files or entries, separated by commas, where these do not say them.",
         ),
     ] = None,
+    focal_unit: Annotated[
+        FocalUnit | None, typer.Option(help="Unit of --focal. Default: mm.", show_default=False)
+    ] = None,
     crop: Annotated[
         float | None,
         typer.Option(
@@ -198,6 +201,7 @@ def import_(
         format=of,
         image_size=None if image_size is None else size_of(image_size),
         focal=None if focal is None else _numbers(focal),
+        focal_unit=focal_unit,
         crop=crop,
         name=name,
         direction=direction,

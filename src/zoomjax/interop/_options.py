@@ -19,7 +19,7 @@ from .stmap import CONVENTIONS, DIRECTIONS
 _DISTORTION_MODELS = (RadialPolynomial, Division, BrownConrady)
 """Distortion models of lenses that are read."""
 
-_CHOICES = {"convention": tuple(CONVENTIONS), "direction": DIRECTIONS}
+_CHOICES = {"convention": tuple(CONVENTIONS), "direction": DIRECTIONS, "focal_unit": ("mm", "px")}
 """What some arguments may be."""
 
 _DIGITS = 9
@@ -31,7 +31,7 @@ def check_options(fmt: Format, given: dict[str, Any]) -> None:
     for name, value in given.items():
         if value is None:
             continue
-        if name not in fmt.options:
+        if name not in fmt.options and name != "focal_unit":  # which goes with focal
             raise ValueError(f"Argument {name} has no effect on the format {fmt.name}: leave it out.")
         if name in _CHOICES and value not in _CHOICES[name]:
             raise ValueError(

@@ -143,7 +143,9 @@ def contents(
         if len(job.focal) != len(nodes):
             raise ValueError(f"argument focal must hold {len(nodes)} focal lengths, one for each camera")
         nodes = [dataclasses.replace(n, focal=f) for n, f in zip(nodes, job.focal, strict=True)]
-    mm = mm or job.focal is not None
+        mm = job.focal_unit == "mm"
+        if px is not None and not mm:
+            raise ValueError("it holds its focal lengths in px: leave out arguments focal and focal_unit")
     pitch, notes = None, ()
     if mm and px is not None and not any(node.focal_px for node in nodes):
         pitch, notes = pitch_of([node.focal for node in nodes], px)

@@ -23,6 +23,9 @@ from .radial_table import RadialTable
 TOLERANCE, CONVENTION = 0.1, "centres"
 """What is taken if it is not given."""
 
+IN_PX = ", in mm, or in px with argument focal_unit"
+"""What is said where focal lengths must be given."""
+
 Theta = np.ndarray
 
 
@@ -164,6 +167,7 @@ class Import:
         paths: the files.
         image_size: (width, height) px, for files that do not say it.
         focal: focal lengths of the files or entries, for those that do not say them.
+        focal_unit: of these: "mm" or "px".
         crop: crop factor of the camera, for lensfun.
         name: of the lens, in files of several; a part of it will do.
         direction: of an STMap: "undistort" or "redistort".
@@ -174,6 +178,7 @@ class Import:
     paths: tuple[Path, ...]
     image_size: tuple[int, int] | None = None
     focal: tuple[float, ...] | None = None
+    focal_unit: str = "mm"
     crop: float | None = None
     name: str | None = None
     direction: str | None = None

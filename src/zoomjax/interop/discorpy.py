@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from ._forms import AbstractForm, minimax
 from ._pinhole import contents
-from .base import Contents, Export, Import, Node, NodeFormat, read_text
+from .base import IN_PX, Contents, Export, Import, Node, NodeFormat, read_text
 
 _TERMS = 6
 """Written: those of discorpy's own examples, and one more."""
@@ -80,7 +80,9 @@ class Discorpy(NodeFormat):
     def read(self, job: Import) -> Contents:
         """One camera a file; focal lengths are those of argument focal."""
         if job.focal is None or len(job.focal) != len(job.paths):
-            raise ValueError(f"it holds no focal length: give argument focal, {len(job.paths)} of them")
+            raise ValueError(
+                f"it holds no focal length: give argument focal, {len(job.paths)} of them{IN_PX}"
+            )
         nodes, size = [], job.size()
         for path, focal in zip(job.paths, job.focal, strict=True):
             lines = [line for line in read_text(path).splitlines() if line.strip()]

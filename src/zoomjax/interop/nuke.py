@@ -15,7 +15,7 @@ from ..models.brown_conrady import BrownConrady
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ._forms import Form
-from .base import Contents, Export, Import, Node, NodeFormat, read_text, refuse_others
+from .base import IN_PX, Contents, Export, Import, Node, NodeFormat, read_text, refuse_others
 
 _DEGREE_4 = Form(2, tangential=True, corrects=True)
 _RATIONAL = Form(3, 3, corrects=True)
@@ -97,14 +97,16 @@ class Nuke(NodeFormat):
             raise ValueError("its curves have keys at different frames")
         values = _at_frames(curves, frames)
         if job.focal is not None and len(job.focal) == len(frames):
-            told = job.focal
+            told, unit = job.focal, job.focal_unit
         elif job.focal is None and focal is not None and sorted(focal) == frames:
-            told = [10 * focal[frame] for frame in frames]  # mm in a cm
+            told, unit = [10 * focal[frame] for frame in frames], "mm"  # 10 mm in a cm
         else:
-            raise ValueError(f"it holds no focal lengths: give argument focal, {len(frames)} of them")
+            raise ValueError(
+                f"it holds no focal lengths: give argument focal, {len(frames)} of them{IN_PX}"
+            )
         nodes = [Node(f, form, row[:-2], row[-2:]) for f, row in zip(told, values, strict=True)]
         pitch = 10 * float(knobs["tde4_filmback_width_cm"]) / size[0] if kind == _NODE else None
-        return Contents(tuple(nodes), size, "mm", notes, pixel_pitch=pitch)
+        return Contents(tuple(nodes), size, unit, notes, pixel_pitch=pitch)
 
 
 Keys = dict[int, float]

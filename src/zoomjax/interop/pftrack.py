@@ -8,7 +8,7 @@ fraction of the image's size, y up, counted from pixel centres. Without a track 
 import numpy as np
 
 from ._forms import Form
-from .base import Contents, Export, Import, Node, NodeFormat, read_text, refuse_others
+from .base import IN_PX, Contents, Export, Import, Node, NodeFormat, read_text, refuse_others
 
 _FORM = Form(2, corrects=True)
 _UNIT = np.sqrt(2)
@@ -50,7 +50,7 @@ class PFTrack(NodeFormat):
         refuse_others(told, {"pixel aspect": 1, "model": "High Order", "squeeze": 1})
         number = int(lines[7])
         if job.focal is None or len(job.focal) != number:
-            raise ValueError(f"it holds no focal lengths: give argument focal, {number} of them")
+            raise ValueError(f"it holds no focal lengths: give argument focal, {number} of them{IN_PX}")
         values = np.array(lines[8 : 8 + 5 * number], float).reshape(number, 5)
         size = job.size((width, height))
         nodes = [
@@ -62,4 +62,4 @@ class PFTrack(NodeFormat):
             )
             for focal, row in zip(job.focal, values, strict=True)
         ]
-        return Contents(tuple(nodes), size, "mm")
+        return Contents(tuple(nodes), size, job.focal_unit)

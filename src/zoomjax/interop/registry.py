@@ -193,6 +193,7 @@ def read(
     format: str | None = None,
     image_size: tuple[int, int] | None = None,
     focal: float | int | Sequence[float | int] | np.ndarray | None = None,
+    focal_unit: str | None = None,
     crop: float | int | None = None,
     name: str | None = None,
     direction: str | None = None,
@@ -212,6 +213,7 @@ def read(
         image_size: (width, height) px, for files that do not say it; it must not contradict those that do.
         focal: focal lengths of the files of a folder in the order of their names, numbers in them by value
             (9 before 18); or those of the entries of a file. By default those that are in them.
+        focal_unit: unit of `focal`: "mm" or "px"; by default mm.
         crop: for lensfun: crop factor of the camera; by default that of the calibration.
         name: of the lens, for files of several; a part of it will do.
         direction: for STMaps: "undistort" or "redistort"; by default the file or its name says it.
@@ -235,13 +237,17 @@ def read(
     path = Path(path)
     paths = _files(path)
     fmt = _format_to_read(format, paths[0])
-    given = {"focal": focal, "crop": crop, "name": name, "direction": direction, "convention": convention}
+    if focal_unit is not None and focal is None:
+        raise ValueError("Argument focal_unit is that of argument focal, which is not given: leave it out.")
+    given = {"focal": focal, "focal_unit": focal_unit, "crop": crop, "name": name}
+    given |= {"direction": direction, "convention": convention}
     check_options(fmt, given)
     job = Import(
         path,
         tuple(paths),
         size,
         told,
+        focal_unit or "mm",
         None if crop is None else positive("crop", crop),
         name,
         direction,

@@ -22,7 +22,17 @@ from .._core.quiet import silent
 from ..models.distortion import Distortion
 from ..models.distortion_model import AbstractRadial
 from ._samples import border, distortions
-from .base import CONVENTION, Contents, Export, FolderFormat, Import, Sampled, one_size, refuse_others
+from .base import (
+    CONVENTION,
+    IN_PX,
+    Contents,
+    Export,
+    FolderFormat,
+    Import,
+    Sampled,
+    one_size,
+    refuse_others,
+)
 
 _ROWS = 128
 """Of a map that are computed at once."""
@@ -94,11 +104,13 @@ class STMap(FolderFormat):
             sizes.append(size := job.size(_window_size(header["displayWindow"])))
             given = None if job.focal is None else job.focal[number]
             if (focal := _told("focal", header, _FOCAL, given)) is None:
-                raise ValueError("it does not say its focal length: give argument focal, one for each file")
+                raise ValueError(
+                    f"it does not say its focal length: give argument focal, one for each file{IN_PX}"
+                )
             convention = _told("convention", header, _CONVENTION, job.convention) or CONVENTION
             points = _pairs(header, red, green, size, wanted, convention)
             nodes.append(Sampled(float(focal), *points, corrects=wanted == "redistort"))
-            units.add(str(header.get(_UNIT, "mm")))
+            units.add(str(header.get(_UNIT, job.focal_unit)))
         if len(units) > 1:
             raise ValueError(f"some of its focal lengths are in {' and some in '.join(sorted(units))}")
         return Contents(tuple(nodes), one_size(sizes), units.pop())
