@@ -493,9 +493,9 @@ WRONG = {
     ),
     "an option of lines for images": (["a.jpg", "--image-size", "640x480"], "images have their own"),
     "half a board": (["a.jpg", "--spacing", "20"], "Missing or wrong: --distance, --pixel-pitch"),
-    "a pitch that is none": (
+    "a spacing that is none": (
         ["a.jpg", "--spacing", "20x", "--distance", "9", "--pixel-pitch", "1"],
-        "Missing or wrong: --pitch",
+        "Missing or wrong: --spacing",
     ),
     "not a source of focal lengths": (["a.jpg", "--focal", "zoom"], "is not a source of focal lengths"),
     "a unit that is none": (["a.jpg", "--focal-unit", "km"], "'mm', 'px'"),

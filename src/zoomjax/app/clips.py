@@ -63,11 +63,11 @@ class ClipJob:
             raise ValueError("With --focal motion, --centre is fit or image: it moves along the zoom.")
 
 
-def wants_motion(inputs: Sequence[str], focal: str | None, pitch: str | None) -> bool:
+def wants_motion(inputs: Sequence[str], focal: str | None, spacing: str | None) -> bool:
     """Whether focal lengths are to come from motion: asked for, or a video alone."""
     from .image_job import is_video
 
-    alone = focal is None and pitch is None and len(inputs) == 1 and is_video(inputs[0])
+    alone = focal is None and spacing is None and len(inputs) == 1 and is_video(inputs[0])
     return focal == "motion" or alone
 
 
