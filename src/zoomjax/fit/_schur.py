@@ -19,10 +19,8 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, PyTree
 
 from ._normal_solver import AbstractNormalSolver
+from ._small_matrices import gram, inverses, line_products, products, times
 from ._structure import Structure
-
-_LARGE = 256
-"""Rows of a matrix from which it is worth while to compute half of a symmetric product."""
 
 
 class Unknowns(NamedTuple):
@@ -101,24 +99,24 @@ def reduced_of(
     def summed(of_views):
         return jax.ops.segment_sum(of_views, by_track, structure.tracks, indices_are_sorted=True)
 
-    of_rays = summed(_products(by_ray.views, by_ray.views)) + damping * jnp.eye(like.rays.shape[1])[None]
-    coupling = _products(by_frame.views, by_ray.views)
-    to_lens = summed(_products(by_lens.views, by_ray.views))
-    right_ray = summed(_products(by_ray.views, views))
+    of_rays = summed(products(by_ray.views, by_ray.views)) + damping * jnp.eye(like.rays.shape[1])[None]
+    coupling = products(by_frame.views, by_ray.views)
+    to_lens = summed(products(by_lens.views, by_ray.views))
+    right_ray = summed(products(by_ray.views, views))
     if by_ray.rays is not None and rows.rays is not None:
         of_rays = of_rays + jnp.einsum("tki,tkj->tij", by_ray.rays, by_ray.rays)
         right_ray = right_ray + jnp.einsum("tki,tk->ti", by_ray.rays, rows.rays)[..., None]
-    inverse, root = _inverses(of_rays)
-    solved, lens_solved = _times(inverse, right_ray), _times(inverse, to_lens.swapaxes(1, 2))
+    inverse, root = inverses(of_rays)
+    solved, lens_solved = times(inverse, right_ray), times(inverse, to_lens.swapaxes(1, 2))
 
-    border = _products(by_frame.views, by_lens.views) - _times(coupling, lens_solved[by_track])
-    right = (_products(by_frame.views, views) - _times(coupling, solved[by_track]))[..., 0]
+    border = products(by_frame.views, by_lens.views) - times(coupling, lens_solved[by_track])
+    right = (products(by_frame.views, views) - times(coupling, solved[by_track]))[..., 0]
     extra = jnp.eye(4)[None] * (by_frame.frames**2 + damping)[:, :, None]
-    extra = extra.at[structure.line_frame].add(_line_products(by_frame.lines, by_frame.lines))
-    line_border = _line_products(by_frame.lines, by_lens.lines)
-    line_right = _line_products(by_frame.lines, rows.lines[..., None])[..., 0]
-    own = _products(by_frame.views, by_frame.views)
-    diagonal, above = _frame_blocks(own, _times(coupling, root[by_track]), extra, structure)
+    extra = extra.at[structure.line_frame].add(line_products(by_frame.lines, by_frame.lines))
+    line_border = line_products(by_frame.lines, by_lens.lines)
+    line_right = line_products(by_frame.lines, rows.lines[..., None])[..., 0]
+    own = products(by_frame.views, by_frame.views)
+    diagonal, above = _frame_blocks(own, times(coupling, root[by_track]), extra, structure)
     corner = by_lens.lens.T @ by_lens.lens + damping * jnp.eye(by_lens.lens.shape[1])
     for part in (by_lens.views, by_lens.lines, by_lens.frames):
         corner = corner + jnp.einsum("vri,vrj->ij", part, part)
@@ -173,63 +171,6 @@ def derivatives(jacobian: Any, like: Unknowns) -> tuple[Any, Any, Any]:
     return those(slice(4)), those(ray), those(slice(ray.stop, None))
 
 
-def _products(left, right):
-    """Of each view, the sum over its two rows of the products of their columns.
-
-    As loops that XLA fuses: a product of matrices with two rows would be a call each.
-    """
-    x, y = (left[:, row, :, None] * right[:, row, None, :] for row in (0, 1))
-    return x + y
-
-
-def _line_products(left, right):
-    """Of each line, the sum over its rows of the products of their columns."""
-    return jnp.einsum("lri,lrj->lij", left, right)
-
-
-def _times(left, right):
-    """Products of matrices of few columns and of few rows."""
-    first, *others = (
-        left[:, :, column, None] * right[:, None, column, :] for column in range(left.shape[2])
-    )
-    return sum(others, start=first)
-
-
-def _inverses(matrix):
-    """Inverses of symmetric 2 x 2 or 3 x 3 matrices, and what gives them times its transpose."""
-    inverse = _inverse(matrix[:, :2, :2])
-    root = _root(inverse)
-    if matrix.shape[2] == 2:
-        return inverse, root
-    across = matrix[:, :2, 2:]
-    solved = _times(inverse, across)
-    left = matrix[:, 2, 2] - jnp.sum(across * solved, axis=(1, 2))
-    left = jnp.where(left > 0, left, jnp.inf)
-    column = jnp.pad(-solved, ((0, 0), (0, 1), (0, 0)), constant_values=1) / jnp.sqrt(left)[:, None, None]
-    inverse, root = (jnp.pad(of, ((0, 0), (0, 1), (0, more))) for of, more in ((inverse, 1), (root, 0)))
-    return inverse + column * column.swapaxes(1, 2), jnp.concatenate([root, column], axis=2)
-
-
-def _inverse(matrix):
-    """Inverses of symmetric 2 x 2 matrices."""
-    a, b, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
-    determinant = a * d - b * b
-    determinant = jnp.where(determinant > 0, determinant, jnp.inf)  # of a ray without views
-    return _symmetric(d, -b, a) / determinant[:, None, None]
-
-
-def _root(matrix):
-    """Lower triangles L of symmetric 2 x 2 matrices L L^T."""
-    first = jnp.sqrt(matrix[:, 0, 0])
-    off = matrix[:, 0, 1] / jnp.where(first > 0, first, 1)
-    last = jnp.sqrt(jnp.maximum(matrix[:, 1, 1] - off**2, 0))
-    return jnp.stack([jnp.stack([first, 0 * off], 1), jnp.stack([off, last], 1)], 1)
-
-
-def _symmetric(a, b, d):
-    return jnp.stack([jnp.stack([a, b], 1), jnp.stack([b, d], 1)], 1)
-
-
 def _frame_blocks(own, halves, extra, structure):
     """The frames' matrix by blocks: their own parts, less what the eliminated rays couple.
 
@@ -253,7 +194,7 @@ def _frame_blocks(own, halves, extra, structure):
         rows = jnp.zeros((reach, 4, structure.most, halves.shape[2]), own.dtype)
         here = there(structure.place, structure.most)  # where there is none, it is dropped
         rows = rows.at[there(within, 0), :, here].set(there(halves, 0), mode="drop")
-        return _gram(rows.reshape(4 * reach, -1))
+        return gram(rows.reshape(4 * reach, -1))
 
     coupled = jax.lax.map(of_block, structure.members)
     diagonal = diagonal - coupled[:, :n, :n]
@@ -261,16 +202,6 @@ def _frame_blocks(own, halves, extra, structure):
         return diagonal, 0 * diagonal  # no constant, which XLA would fold for seconds
     diagonal = diagonal.at[1:].add(-coupled[:-1, n:, n:])
     return diagonal, -coupled[:, :n, n:]
-
-
-def _gram(rows):
-    """``rows @ rows.T``, of which the half below the diagonal is a copy."""
-    number = len(rows)
-    if number < _LARGE:
-        return rows @ rows.T
-    first, last = rows[: number // 2], rows[number // 2 :]
-    both = first @ last.T
-    return jnp.block([[_gram(first), both], [both.T, _gram(last)]])
 
 
 def _by_block(values, frame, structure):
@@ -337,14 +268,14 @@ def solution(matrix: Reduced, like: Unknowns, structure: Structure) -> Unknowns:
     coupled = jnp.sum(coupling * frames[structure.frame][..., None], axis=1)
     right_ray = right_ray - jax.ops.segment_sum(coupled, structure.track, structure.tracks)
     right_ray = right_ray - jnp.einsum("tij,i->tj", to_lens, of_lens)
-    rays = _times(inverse, right_ray[..., None])[..., 0]
+    rays = times(inverse, right_ray[..., None])[..., 0]
     return Unknowns(frames[: len(like.frames)], rays, unravel(of_lens))
 
 
 def solution_of(matrix: Reduced, right: Unknowns, structure: Structure) -> Unknowns:
     """The unknowns for which the normal equations' matrix gives `right`."""
     inverse, coupling, to_lens, _ = matrix.rays
-    solved = _times(inverse, right.rays[..., None])[..., 0]
+    solved = times(inverse, right.rays[..., None])[..., 0]
     coupled = jnp.sum(coupling * solved[structure.track][:, None, :], axis=2)
     own = _padded(right.frames, structure) - _by_block(coupled, structure.frame, structure)
     of_lens = ravel_pytree(right.lens)[0] - jnp.einsum("tij,tj->i", to_lens, solved)
