@@ -34,6 +34,7 @@ With --resume, rows go on after the clips and draws that are stored, which are t
 
 import argparse
 import json
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -62,6 +63,11 @@ def _percent(value: float) -> str:
     return f"{100 * value:.3f}"
 
 
+def _px(value: float, digits: int = 3) -> str:
+    """A length, or a dash where there is none, as of a lens that is not determined."""
+    return f"{value:.{digits}f}" if math.isfinite(value) else "–"
+
+
 _BESIDE_BOUNDS = ("f, %", "bound", "ratio", "lens, px", "bound", "ratio")
 
 SECTIONS = {
@@ -70,7 +76,7 @@ SECTIONS = {
         (*_BESIDE_BOUNDS, "clips", "refused", "doubted", "diverged", "silent"),
         lambda r: [
             *(_percent(r["f"]), _percent(r["f_bound"]), f"{r['f'] / r['f_bound']:.2f}"),
-            *(f"{r['lens']:.3f}", f"{r['lens_bound']:.3f}", f"{r['lens'] / r['lens_bound']:.2f}"),
+            *(_px(r["lens"]), _px(r["lens_bound"]), _px(r["lens"] / r["lens_bound"], 2)),
             *(str(r["clips"]), str(r["told"]), "–" if r.get("doubted") is None else str(r["doubted"])),
             *(str(r["diverged"]), str(r.get("silent", r["diverged"]))),
         ],
