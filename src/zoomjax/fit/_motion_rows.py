@@ -237,11 +237,11 @@ def _view_columns(unknowns, args):
         of_frames, of_rays, readout = zip(known, changes, strict=True)
         camera, by_camera = (jax.tree.map(lambda leaf: leaf[frame], of) for of in of_frames)
         (ray, lever), (by_ray, by_lever) = (jax.tree.map(lambda leaf: leaf[track], of) for of in of_rays)
-        height = data.size[1] - 1.0
-        first, second = model.speed.first[frame], model.speed.second[frame]
-        time = readout[0] * point[1] / height
-        gone = time * (first + time / 2 * second)
-        faster = point[1] / height * (first + time * second)  # by the readout
+
+        def since_the_middle(readout):
+            return model.speed.over(frame, readout * point[1] / (data.size[1] - 1.0))
+
+        gone, faster = jax.jvp(since_the_middle, (readout[0],), (jnp.ones(()),))
 
         def missed(*given):
             views = _missed(data, model, point, *given) / noise.points

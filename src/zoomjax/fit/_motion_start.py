@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ._structure import bucket
+from ._structure import bucket, places
 from ._views import CAUCHY, MEDIAN_OF_SIZE, core_median
 
 FIELDS_OF_VIEW = (70.0, 45.0, 28.0, 17.0, 10.0, 5.0)
@@ -141,9 +141,8 @@ def views_by_frame(
     """The views of each frame, padded: their tracks, their numbers, which are there."""
     order = np.argsort(moment, kind="stable")
     count = np.bincount(moment, minlength=frames)
-    place = np.arange(len(moment)) - np.repeat(np.cumsum(count) - count, count)
     padded = np.zeros((2, frames, bucket(int(count.max()))), np.int32)
-    padded[:, moment[order], place] = track[order], order
+    padded[:, moment[order], places(count)] = track[order], order
     return padded[0], padded[1], np.arange(padded.shape[2]) < count[:, None]
 
 

@@ -54,7 +54,7 @@ def structure_of(
     order = np.argsort(begin, kind="stable")
     count = np.bincount(begin, minlength=-(-frames // block))
     place = np.empty(len(tracks), int)
-    place[order] = np.arange(len(tracks)) - np.repeat(np.cumsum(count) - count, count)
+    place[order] = places(count)
     of_views = track, frame, place[track], begin[track], _members(begin[track], len(count))
     return Structure(
         *(jnp.asarray(a, jnp.int32) for a in (*of_views, line_frame)),
@@ -65,13 +65,17 @@ def structure_of(
     )
 
 
+def places(count: Int[np.ndarray, "group"]) -> Int[np.ndarray, "member"]:
+    """0, 1, 2, ... for the members of each group, one group after the other."""
+    return np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+
+
 def _members(begin, blocks):
     """The numbers of the views of each block."""
     count = np.bincount(begin, minlength=blocks)
     order = np.argsort(begin, kind="stable")
-    place = np.arange(len(begin)) - np.repeat(np.cumsum(count) - count, count)
     members = np.full((blocks, count.max()), NONE)
-    members[begin[order], place] = order
+    members[begin[order], places(count)] = order
     return members
 
 
