@@ -1,4 +1,7 @@
-"""One formula for NumPy and JAX: the namespace to take operations from, and ranks made equal."""
+"""One formula for NumPy and JAX: the namespace to take operations from, and ranks made equal.
+
+And what is done with arrays in several rooms.
+"""
 
 import math
 from collections.abc import Callable
@@ -127,3 +130,8 @@ def in_blocks(function: Callable[..., Any], values: Any, *others: Any) -> Any:
         return jax.lax.fori_loop(0, -(-number // _BLOCK), one, 0 * operands[0]).reshape(shape)
 
     return jax.lax.platform_dependent(cpu=blocks, default=lambda: function(values, *others))
+
+
+def places(count: np.ndarray) -> np.ndarray:
+    """0, 1, 2, ... for the members of each group, one group after the other; `count` is of the groups."""
+    return np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)

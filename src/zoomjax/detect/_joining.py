@@ -11,6 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from .._core.arrays import places
 from ._frame_model import normals
 from ._segments import Fragments, main_direction
 
@@ -90,8 +91,7 @@ def _ends(pieces: Fragments) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, n
     size = np.minimum(pieces.count, _END)
     ends = []
     for start, outwards in ((pieces.start, -1), (pieces.start + pieces.count - size, 1)):
-        within = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
-        rows = np.repeat(start, size) + within
+        rows = np.repeat(start, size) + places(size)
         end = Fragments.of(pieces.points[rows], pieces.gradient[rows], size)
         middle = end.sums(end.points) / size[:, None]
         direction = main_direction(end, middle)

@@ -18,6 +18,7 @@ where it is nearest to the centre.
 import cv2
 import numpy as np
 
+from .._core.arrays import places
 from ._frame_model import tangent_ratio
 from ._segments import Fragments, main_direction
 
@@ -77,7 +78,7 @@ def _samples(pieces: Fragments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     spacing = max(_SAMPLE, length.sum() / _MOST)
     number = np.ceil(length / spacing).astype(int)
     owner = np.repeat(np.arange(len(number)), number)
-    within = np.arange(len(owner)) - np.repeat(np.cumsum(number) - number, number)
+    within = places(number)
     low = np.minimum(along[pieces.start], along[pieces.start + pieces.count - 1])[owner]
     t = low + (within + 0.5) / number[owner] * length[owner]
     a, b, c = bend[owner].T

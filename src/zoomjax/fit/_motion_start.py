@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ._structure import bucket, places
+from .._core.arrays import places
+from ._structure import bucket
 from ._views import CAUCHY, MEDIAN_OF_SIZE, core_median
 
 FIELDS_OF_VIEW = (70.0, 45.0, 28.0, 17.0, 10.0, 5.0)

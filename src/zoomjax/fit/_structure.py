@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from .._core.arrays import places
+
 NONE = np.iinfo(np.int32).max
 """The number of no view."""
 
@@ -63,11 +65,6 @@ def structure_of(
         blocks=len(count),
         most=int(count.max()),
     )
-
-
-def places(count: Int[np.ndarray, "group"]) -> Int[np.ndarray, "member"]:
-    """0, 1, 2, ... for the members of each group, one group after the other."""
-    return np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
 
 
 def _members(begin, blocks):
