@@ -6,10 +6,12 @@ import sys
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from zoomjax import scenes
 from zoomjax.app.equipment import KnownLens, known_lens, taken_otherwise, with_earlier, with_equipment
 from zoomjax.app.model_choice import WantedModel
+from zoomjax.interop import library_lens
 from zoomjax.io.equipment import FILM
 from zoomjax.models.about import UNKNOWN
 
@@ -65,6 +67,41 @@ def test_photos_of_several_zooms_by_a_lens_of_one_that_is_not_known_are_told(len
     assert "20 to 80 mm" in told
     assert taken_otherwise(of_one, photos[:1]) == []
     assert taken_otherwise(lens, photos) == []
+
+
+def test_photos_that_show_another_part_of_the_sensor_are_told(lens, tmp_path):
+    known = dataclasses.replace(lens, about={"crop_factor": 1.5})
+    photos = [of_a_zoom(tmp_path / "a.jpg"), of_a_zoom(tmp_path / "b.jpg", FocalLengthIn35mmFilm=35)]
+    (told,) = taken_otherwise(known, photos)
+    assert "of crop factor 1.5, and by their EXIF data 1 of 2 photos are of 1:" in told
+    assert taken_otherwise(known, photos[:1]) == taken_otherwise(lens, photos) == []
+    zoomed = of_a_zoom(tmp_path / "c.jpg", DigitalZoomRatio=IFDRational(2, 1))
+    for of in (known, lens):
+        (told,) = taken_otherwise(of, [photos[0], zoomed])
+        assert "for a digital zoom of 1, and by their EXIF data 1 of 2 photos were taken with 2:" in told
+    found = with_equipment(lens, [zoomed, zoomed])
+    assert (found.about, found.pixel_pitch) == ({"digital_zoom": 2.0}, None)
+    assert taken_otherwise(found, [zoomed]) == []
+    assert len(taken_otherwise(found, photos[:1])) == 1
+    assert with_equipment(lens, [photos[0], zoomed]).about == {}
+
+
+def test_photos_of_another_camera_than_that_of_a_lens_without_a_name_are_told(lens, tmp_path):
+    """As of a phone."""
+    known = dataclasses.replace(lens, about={"camera": "Apple iPhone"})
+    photos = [photo(tmp_path / "a.jpg", lens=""), bare(tmp_path / "b.jpg")]
+    (told,) = taken_otherwise(known, photos)
+    assert "the camera Apple iPhone, and by their EXIF data 2 of 2 photos" in told
+    assert taken_otherwise(dataclasses.replace(known, about={"camera": "NIKON D300"}), photos) == []
+    assert (
+        taken_otherwise(dataclasses.replace(known, about={"camera": "a", "lens": "18-200"}), photos) == []
+    )
+
+
+def test_names_of_the_database_are_not_those_of_exif_data(tmp_path):
+    known = library_lens("FE 24-70mm f/2.8 GM", image_size=(300, 200))
+    own = photo(tmp_path / "a.jpg", "SONY", "ILCE-7M3", lens="FE 24-70mm F2.8 GM", sensor={})
+    assert taken_otherwise(known, [own]) == []
 
 
 def bare(path):

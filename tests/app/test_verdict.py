@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
 
 from zoomjax import compress
 from zoomjax.app.calibration import calibrate
@@ -24,6 +25,10 @@ from zoomjax.trust.assessment import Finding
 from zoomjax.trust.folds import folds_of
 from zoomjax.trust.selection import compare_errors
 
+from ..io.test_equipment import block
+
+SIZE = (40, 40)
+
 
 def photo(path, model=None, lens=None, written=None):
     exif = Image.Exif()
@@ -37,14 +42,14 @@ def photo(path, model=None, lens=None, written=None):
             ExifTags.Base.ExifImageWidth: width,
             ExifTags.Base.ExifImageHeight: height,
         }
-    Image.new("L", (40, 40)).save(path, exif=exif)
+    Image.new("L", SIZE).save(path, exif=exif)
     return path
 
 
 def test_photos_of_one_lens_say_nothing(tmp_path):
     photos = [photo(tmp_path / f"{n}.jpg", "D90", "18-200") for n in range(3)]
     photos.append(photo(tmp_path / "unknown.jpg"))
-    assert findings_of_photos(photos) == []
+    assert findings_of_photos(photos, SIZE) == []
 
 
 def test_photos_that_were_changed_before_are_doubtful(tmp_path):
@@ -54,7 +59,7 @@ def test_photos_that_were_changed_before_are_doubtful(tmp_path):
     Image.new("L", (40, 40)).save(tmp_path / "0.jpg", xmp=xmp)
     Image.new("L", (40, 40)).save(tmp_path / "2.png", dpi=(300, 200))
     photos = [tmp_path / name for name in ("0.jpg", "1.png", "2.png")]
-    corrected, squeezed = findings_of_photos(photos)
+    corrected, squeezed = findings_of_photos(photos, SIZE)
     assert (corrected.verdict, squeezed.verdict) == ("doubtful", "doubtful")
     assert corrected.found.startswith(
         "1 of 3 photos say that their distortion was corrected before, by Adobe's lens correction:"
@@ -64,7 +69,7 @@ def test_photos_that_were_changed_before_are_doubtful(tmp_path):
 
 def test_two_lenses_and_bodies_are_doubtful(tmp_path):
     photos = [photo(tmp_path / f"{n}.jpg", f"D{n // 3}", f"lens {n % 2}") for n in range(5)]
-    lenses, cameras = findings_of_photos(photos)
+    lenses, cameras = findings_of_photos(photos, SIZE)
     assert (lenses.verdict, cameras.verdict) == ("doubtful", "doubtful")
     assert lenses.cause
     assert cameras.cause
@@ -79,12 +84,35 @@ def test_photos_cropped_from_other_shapes_are_doubtful(tmp_path):
     """Not those made smaller, or taken upright."""
     sizes = [(6000, 4000), (4000, 6000), (3001, 2000), (6000, 4000)]
     photos = [photo(tmp_path / f"{n}.jpg", written=size) for n, size in enumerate(sizes)]
-    assert findings_of_photos(photos) == []
+    assert findings_of_photos(photos, SIZE) == []
     photos.append(photo(tmp_path / "other.jpg", written=(6000, 3376)))
-    (found,) = findings_of_photos(photos)
+    (found,) = findings_of_photos(photos, SIZE)
     assert (found.verdict, found.cause) == ("doubtful", True)
     assert "6000 x 4000 px (3 photos), 3001 x 2000 px (1 photo)" in found.found
     assert "6000 x 3376 px (1 photo)" in found.found
+
+
+def view(path, zoom=None, film=53):
+    """A photo at 35 mm, with digital zoom, and the focal length of equal view on film."""
+    told = {} if zoom is None else {"DigitalZoomRatio": IFDRational(round(zoom * 100), 100)}
+    content = block(FocalLength=IFDRational(35, 1), FocalLengthIn35mmFilm=film, **told)
+    Image.new("L", SIZE).save(path, exif=content)
+    return path
+
+
+def test_photos_that_show_parts_of_the_sensor_of_different_size_are_doubtful(tmp_path):
+    """A camera's digital zoom and its smaller format write the same number of pixels, and the same f."""
+    alike = [view(tmp_path / "a.jpg"), view(tmp_path / "b.jpg", 0), view(tmp_path / "c.jpg", 1, film=52)]
+    assert findings_of_photos(alike, SIZE) == []
+    zoomed = [view(tmp_path / "2.jpg", 2), view(tmp_path / "too.jpg", 2)]
+    assert findings_of_photos(zoomed, SIZE) == []
+    (found,) = findings_of_photos([*alike, *zoomed], SIZE)
+    assert (found.verdict, found.cause) == ("doubtful", True)
+    assert "taken with digital zoom, up to 2, for 2 of 5 photos." in found.found
+    (found,) = findings_of_photos([*zoomed, view(tmp_path / "4.jpg", 4)], SIZE)
+    assert "with digital zoom, up to 4, for 3 of 3 photos." in found.found
+    (found,) = findings_of_photos([*alike, view(tmp_path / "full.jpg", film=35)], SIZE)
+    assert "at crop factors of 1 to 1.51." in found.found
 
 
 def test_focal_lengths_that_photos_may_share_come_first_where_something_is_wrong():
@@ -106,7 +134,8 @@ def test_photos_of_other_sizes_are_remarked_on():
 def test_two_lenses_are_to_be_parted_before_another_photo_is_taken(noisy, tmp_path):
     done = calibrate(noisy, model=WantedModel("polynomial"), centre=None)
     photos = [photo(tmp_path / f"{n}.jpg", lens=f"lens {n % 2}") for n in range(4)]
-    mixed = dataclasses.replace(done, assessment=done.assessment.joined_by(findings_of_photos(photos)))
+    found = findings_of_photos(photos, SIZE)
+    mixed = dataclasses.replace(done, assessment=done.assessment.joined_by(found))
     assert mixed.assessment.sentence.startswith("Doubtful: the photos were taken with 2 different lenses")
     assert mixed.advice() == (
         "Calibrate the photos of each lens and camera by themselves. That comes before another photo."

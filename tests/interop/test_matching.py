@@ -3,6 +3,7 @@
 import pytest
 
 from zoomjax.interop import match_lens
+from zoomjax.interop.matching import crop_factor
 from zoomjax.io import Equipment
 
 SIZE = (6000, 4000)
@@ -81,3 +82,12 @@ def test_a_part_of_the_sensor_has_the_crop_factor_of_its_own():
 def test_a_lens_for_a_smaller_sensor_is_refused_on_a_larger():
     with pytest.raises(ValueError, match=r"was calibrated on a sensor of crop factor 1\.5"):
         match_lens(Equipment("NIKON CORPORATION", "NIKON D3"), SIZE, lens="18-200mm f/3.5-5.6g if-ed ii")
+
+
+def test_a_photo_with_digital_zoom_has_no_crop_factor():
+    """Its body's would be that of all of the sensor."""
+    photo = Equipment("SONY", "ILCE-7M3", "FE 24-70mm F2.8 GM", 35.0, crop=2.0, digital_zoom=2.0)
+    assert crop_factor(photo, SIZE) is None
+    for lens in (None, "FE 24-70mm f/2.8 GM"):
+        with pytest.raises(ValueError, match="digital zoom of 2: which part of the sensor it shows is not"):
+            match_lens(photo, SIZE, lens=lens)

@@ -73,6 +73,20 @@ def test_equal_view_on_film_gives_the_pitch_to_its_rounding():
     assert found.pixel_pitch(SIZE) == pytest.approx(PITCH, rel=0.01)
 
 
+@pytest.mark.parametrize(("ratio", "zoom"), [((0, 1), 1), ((0, 0), 1), ((1, 1), 1), ((2, 1), 2)])
+def test_what_digital_zoom_shows_of_the_sensor_is_not_known(ratio, zoom):
+    found = exif_equipment(
+        block(
+            FocalLengthIn35mmFilm=53,
+            DigitalZoomRatio=IFDRational(*ratio),
+            **FOCAL,
+            **plane(25.4 / PITCH, 2),
+        )
+    )
+    assert (found.digital_zoom, found.enlarged) == (zoom, zoom > 1)
+    assert (found.pixel_pitch(SIZE) is None) == (zoom > 1)
+
+
 def test_a_focal_plane_that_film_contradicts_is_a_mistake_of_the_camera():
     film = {"FocalLengthIn35mmFilm": 53, **FOCAL}
     wrong = exif_equipment(block(**film, **plane(10 / PITCH, 2)))  # cm, and called inches

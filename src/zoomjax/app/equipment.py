@@ -17,6 +17,9 @@ from ..models.lens import ZoomLens, load_lens
 from ..models.smooth import SmoothZoom
 from .earlier import is_of_results
 
+OTHER_CROP = 1.2
+"""Ratio of crop factors in EXIF data from which images show parts of different size: they are rounded."""
+
 _SAME = 0.01
 """Share by which crop factors of photos may differ and count as one."""
 
@@ -74,18 +77,21 @@ def with_equipment(lens: ZoomLens, photos: Iterable[Path]) -> ZoomLens:
     """The lens with the camera, lens, crop factor and pixel pitch that all its photos agree on.
 
     Where EXIF data do not tell a crop factor, it is that of the body in the lensfun database, if there is
-    lensfunpy: a photo is taken to show the whole sensor.
+    lensfunpy: a photo is taken to show the whole sensor. After digital zoom it is not known.
 
     Photos without EXIF data, or of formats whose data cannot be read any more, say nothing.
     """
     found = [equipment_of(photo) for photo in photos]
+    zooms = [one.digital_zoom if one.enlarged else 1.0 for one in found]
+    zoom = round(zooms[0], 3) if zooms and max(zooms) <= (1 + _SAME) * min(zooms) else None
     crops = [crop for one in found if (crop := crop_factor(one, lens.image_size))]
-    crop = crops[0] if crops and max(crops) - min(crops) <= _SAME * min(crops) else None
+    crop = crops[0] if zoom == 1 and crops and max(crops) <= (1 + _SAME) * min(crops) else None
     pitch = None if crop is None else FILM / (crop * 2 * lens.scale)
     facts = {
         "camera": _common(_camera(one) for one in found),
         "lens": _common(one.lens for one in found),
         "crop_factor": None if crop is None else round(crop, 3),
+        "digital_zoom": zoom if zoom is not None and zoom > 1 else None,
     }
     about = {**lens.about, **{name: fact for name, fact in facts.items() if fact}}
     return dataclasses.replace(lens, pixel_pitch=pitch, about=about)
@@ -146,15 +152,21 @@ def equipment_of(photo: Path) -> Equipment:
 
 
 def taken_otherwise(lens: ZoomLens, photos: Iterable[Path]) -> list[str]:
-    """That EXIF data say that photos were not taken as those of a lens, in sentences."""
+    """That EXIF data say that photos were not taken as those of a lens, in sentences.
+
+    That is another lens, or where it has no name another body; another part of the sensor; another zoom
+    than the one of a lens whose focal length is not known.
+    """
     found = [equipment_of(photo) for photo in photos]
     told, own = [], lens.about.get("lens")
-    if own and (others := Counter(one.lens for one in found if one.lens and one.lens != own)):
+    named = own is not None and "table_error_px" not in lens.about  # lensfun's names are not those of EXIF
+    if named and (others := Counter(one.lens for one in found if one.lens and one.lens != own)):
         name, _ = others.most_common(1)[0]
         told.append(
             f"The lens is that of {own}, and by their EXIF data {others.total()} of {len(found)} photos "
             f"were taken with another one ({plain(name)})."
         )
+    told += _parts_taken(lens, found) + _bodies_taken(lens, found)
     focal = [one.focal for one in found if one.focal]
     if lens.about.get("focal") == UNKNOWN and focal and max(focal) > _SAME_ZOOM * min(focal):
         told.append(
@@ -162,6 +174,52 @@ def taken_otherwise(lens: ZoomLens, photos: Iterable[Path]) -> list[str]:
             f"of {min(focal):.4g} to {max(focal):.4g} mm: some are of another zoom."
         )
     return told
+
+
+def _parts_taken(lens: ZoomLens, found: Sequence[Equipment]) -> list[str]:
+    """That photos show more or less of the sensor than those of the lens."""
+    own, zoom = lens.about.get("crop_factor"), lens.about.get("digital_zoom", 1.0)
+    told = []
+    if isinstance(zoom, int | float):
+        others = [one.digital_zoom for one in found if _apart(one.digital_zoom, zoom, 1 + 2 * _SAME)]
+        if others:
+            told.append(
+                f"The lens is for a digital zoom of {zoom:.3g}, and by their EXIF data {len(others)} of "
+                f"{len(found)} photos were taken with {_span(others)}: they show another part of what it "
+                "does, and are corrected wrongly."
+            )
+    crops = [crop for one in found if (crop := one.crop_factor(lens.image_size)) is not None]
+    if isinstance(own, int | float) and (
+        others := [crop for crop in crops if _apart(crop, own, OTHER_CROP)]
+    ):
+        told.append(
+            f"The lens is for images of crop factor {own:.3g}, and by their EXIF data {len(others)} of "
+            f"{len(found)} photos are of {_span(others)}: they show another part of what it does, and are "
+            "corrected wrongly."
+        )
+    return told
+
+
+def _bodies_taken(lens: ZoomLens, found: Sequence[Equipment]) -> list[str]:
+    """That photos are of another body, where that tells the lens, whose name is not known."""
+    own = lens.about.get("camera")
+    bodies = Counter(_camera(one) for one in found if one.camera and _camera(one) != own)
+    if not own or lens.about.get("lens") or not bodies:
+        return []
+    name, _ = bodies.most_common(1)[0]
+    return [
+        f"The lens is that of the camera {own}, and by their EXIF data {bodies.total()} of {len(found)} "
+        f"photos were taken with another one ({plain(name)})."
+    ]
+
+
+def _apart(one: float, other: float, ratio: float) -> bool:
+    return max(one, other) > ratio * min(one, other)
+
+
+def _span(values: Sequence[float]) -> str:
+    low, high = f"{min(values):.3g}", f"{max(values):.3g}"
+    return low if low == high else f"{low} to {high}"
 
 
 _SAME_ZOOM = 1.05

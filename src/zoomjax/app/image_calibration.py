@@ -386,7 +386,7 @@ def _with_findings(done: ImageCalibration) -> ImageCalibration:
     """The same with what the photos and their focal lengths say about themselves in the verdict."""
     found = findings_of_focals(done.focals.groups, done.focals.unit) + findings_of_edges(done.used)
     if done.job.video is None:
-        found += findings_of_photos(Path(detection.file) for detection in done.used)
+        found += findings_of_photos([Path(d.file) for d in done.used], done.used[0].image_size)
         others = sum(why.startswith(OTHER_SIZE) for why in done.unused.values())
         told = {} if done.job.focal in (None, *MEASURED) else done.focals.focal  # measured ones may differ
         found += findings_of_sizes(others, len(done.used)) + findings_of_exif(done.used, told)

@@ -9,11 +9,12 @@ import numpy as np
 from .._core.text import listed, plain
 from ..detect.batch import Detection
 from ..detect.bend import bends_apart
+from ..io.equipment import Equipment
 from ..io.metadata import Metadata, squeezed, straightened_by
 from ..trust.assessment import Finding, Verdict
 from ..trust.evidence import NEGLIGIBLE
 from .calibration import Calibration
-from .equipment import equipment_of, metadata_of
+from .equipment import OTHER_CROP, equipment_of, metadata_of
 from .plane_focals import FocalGroup
 from .tying import APART, bend_at
 
@@ -31,21 +32,23 @@ _UNEXPLAINED = 0.5
 """Of the length of a photo's long smooth edges: lines that hold less are little of what there is."""
 
 
-def findings_of_photos(photos: Iterable[Path]) -> list[Finding]:
+def findings_of_photos(photos: Iterable[Path], image_size: tuple[int, int]) -> list[Finding]:
     """What speaks against one lens having taken all photos in one way, and unchanged, by what they say.
 
-    That is different bodies or lenses; sizes of other shapes, of which what is left was cropped; distortion
-    that a program has corrected; pixels that are not square. Photos that say nothing of it, or that cannot
-    be read any more, count for nothing.
+    That is different bodies or lenses; sizes of other shapes, of which what is left was cropped; parts of
+    the sensor of different size; distortion that a program has corrected; pixels that are not square.
+    Photos that say nothing of it, or that cannot be read any more, count for nothing.
     """
     photos = list(photos)
     bodies, lenses, sizes = Counter[str](), Counter[str](), Counter[tuple[int, int]]()
-    for found in map(equipment_of, photos):
+    equipment = [equipment_of(photo) for photo in photos]
+    for found in equipment:
         bodies.update(filter(None, [found.camera]))
         lenses.update(filter(None, [found.lens]))
         if found.written:
             sizes[max(found.written), min(found.written)] += 1
     of_camera = [*_mixed("lenses", lenses), *_mixed("cameras", bodies), *_reshaped(sizes)]
+    of_camera += _of_other_parts(equipment, image_size)
     return [*of_camera, *_changed([metadata_of(photo) for photo in photos])]
 
 
@@ -217,6 +220,26 @@ def _reshaped(sizes: Counter[tuple[int, int]]) -> Iterable[Finding]:
         "Use the photos as the camera stored them: where a photo is cropped, the lens's centre moves.",
         cause=True,
     )
+
+
+def _of_other_parts(photos: Sequence[Equipment], image_size: tuple[int, int]) -> Iterable[Finding]:
+    """Photos, now of one size, that show parts of the sensor of different size."""
+    zooms = [one.digital_zoom for one in photos if one.enlarged]
+    crops = [crop for one in photos if (crop := one.crop_factor(image_size)) is not None]
+    told = []
+    if zooms and (len(zooms) < len(photos) or max(zooms) > _SHAPE * min(zooms)):
+        told = [f"with digital zoom, up to {max(zooms):.3g}, for {len(zooms)} of {_photos(len(photos))}"]
+    if crops and max(crops) > OTHER_CROP * min(crops):
+        told.append(f"at crop factors of {min(crops):.3g} to {max(crops):.3g}")
+    if told:
+        yield Finding(
+            "parts of the sensor",
+            "doubtful",
+            "by their EXIF data the photos show parts of the sensor of different size, as they were taken "
+            f"{' and '.join(told)}.",
+            "Calibrate the photos of each digital zoom and crop factor by themselves.",
+            cause=True,
+        )
 
 
 def _changed(photos: Sequence[Metadata]) -> Iterable[Finding]:

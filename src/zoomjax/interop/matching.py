@@ -51,7 +51,8 @@ def match_lens(equipment: Equipment, image_size: tuple[int, int], *, lens: str |
 
     Raises:
         ImportError: lensfunpy is not installed.
-        ValueError: no lens fits, or several do, which the message names; or the crop factor is not known.
+        ValueError: no lens fits, or several do, which the message names; or the crop factor is not known,
+            as after digital zoom.
 
     Example:
         >>> from zoomjax.io import Equipment
@@ -60,6 +61,12 @@ def match_lens(equipment: Equipment, image_size: tuple[int, int], *, lens: str |
         >>> found.table.name, found.crop
         ('FE 24-70mm f/2.8 GM', 1.0)
     """
+    if equipment.enlarged:
+        raise ValueError(
+            f"The photo was taken with a digital zoom of {equipment.digital_zoom:.3g}: which part of the "
+            "sensor it shows is not known. Make the lens with the crop factor of what it shows, by "
+            "library_lens or zoomjax lens, and give that."
+        )
     body = _body(equipment, image_size)
     crop = _crop(body, equipment, image_size)
     found = _fitting(body, equipment) if lens is None else one_named(lens)
@@ -74,8 +81,10 @@ def match_lens(equipment: Equipment, image_size: tuple[int, int], *, lens: str |
 def crop_factor(equipment: Equipment, image_size: tuple[int, int]) -> float | None:
     """The crop factor of a photo: by its EXIF data, else of its body in the database; None if not known.
 
-    Without lensfunpy it is that of the EXIF data.
+    Without lensfunpy it is that of the EXIF data. After digital zoom it is not known.
     """
+    if equipment.enlarged:
+        return None
     if (told := equipment.crop_factor(image_size)) is not None:
         return told
     try:

@@ -3,6 +3,8 @@
 The width of a pixel has two sources. The resolution of the focal plane, in pixels of the image that the
 camera wrote, is the more exact. The focal length of equal view on film of 36 x 24 mm is rounded to whole
 mm. Where both are there and differ by more than a fifth, the first is taken for a mistake of the camera.
+A photo with digital zoom shows a part of the sensor, and makers do not agree on whether the two tell of
+that: then the width of a pixel is not known.
 """
 
 import dataclasses
@@ -25,6 +27,8 @@ _MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _DISAGREE = 1.2
 _LEAST, _MOST = 0.2, 30.0
 """Crop factors that there are: from plates to the smallest phones."""
+_ENLARGED = 1.02
+"""Digital zoom from which it is more than rounding."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +43,7 @@ class Equipment:
         written: width and height px of that image.
         crop: crop factor, from the focal length of equal view on film.
         zoom_range: the ends of the lens's own range, mm; None if they are not known, or one.
+        digital_zoom: by how much a part of the image was enlarged; 1 if it was not, or nothing is said.
     """
 
     maker: str = ""
@@ -49,9 +54,20 @@ class Equipment:
     written: tuple[int, int] | None = None
     crop: float | None = None
     zoom_range: tuple[float, float] | None = None
+    digital_zoom: float = 1.0
+
+    @property
+    def enlarged(self) -> bool:
+        """Whether there was digital zoom: the image shows less than its lens and sensor would."""
+        return self.digital_zoom > _ENLARGED
 
     def crop_factor(self, image_size: tuple[int, int]) -> float | None:
-        """Crop factor of an image of this size: the diagonal of film over that of the sensor shown."""
+        """Crop factor of an image of this size: the diagonal of film over that of the sensor shown.
+
+        None if it is not known, as after digital zoom.
+        """
+        if self.enlarged:
+            return None
         direct = self._direct(image_size)
         if direct is not None and self.crop is not None:
             return direct if 1 / _DISAGREE < direct / self.crop < _DISAGREE else self.crop
@@ -106,6 +122,7 @@ def exif_equipment(block: bytes) -> Equipment:
         written=(int(width), int(height)) if width and height else None,
         crop=crop if crop and _LEAST < crop < _MOST else None,
         zoom_range=_zoom_range(tags.get(base.LensSpecification)),
+        digital_zoom=max(_positive(tags.get(base.DigitalZoomRatio)) or 1.0, 1.0),
     )
 
 

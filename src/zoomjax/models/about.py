@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-USUAL = ("camera", "lens", "crop_factor", "source", "focal")
+USUAL = ("camera", "lens", "crop_factor", "digital_zoom", "source", "focal")
 """Names that zoomjax itself writes."""
 
 WIDTH_OF_FOCALS = "width_of_focal_px"
