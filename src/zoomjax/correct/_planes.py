@@ -103,18 +103,31 @@ class FrameWarper:
 
 
 def planar_format(name: str) -> str:
-    """The pixel format, one plane a component, 8 to 16 bits, in which frames of another are warped."""
+    """The pixel format, one plane a component, 8 to 16 bits, in which frames of another are warped.
+
+    Colours stay what they are, red, green and blue or luma and chroma, and transparency stays.
+    """
+    ours = name.removesuffix("be") + "le" if name.endswith("be") else name
+    if name in _PACKED or ours in _PACKED:
+        return _PACKED.get(name) or _PACKED[ours]
+    if _is_planar(ours):
+        return ours
+    given = av.VideoFormat(name, 16, 16)
+    deep = "16le" if any(component.bits > 8 for component in given.components) else ""
+    alpha = "a" if any(component.is_alpha for component in given.components) else ""
+    if len(given.components) == 1:
+        return f"gray{deep}"
+    return f"gbr{alpha}p{deep}" if given.is_rgb else f"yuv{alpha}444p{deep}"
+
+
+def _is_planar(name: str) -> bool:
     components = av.VideoFormat(name, 16, 16).components
-    planes = {component.plane for component in components}
-    if (
-        components
-        and len(planes) == len(components)
+    return (
+        len(components) > 0
+        and len({component.plane for component in components}) == len(components)
         and all(8 <= component.bits <= 16 for component in components)
-        and not name.endswith(("be", "f16le", "msble"))
-    ):
-        return name
-    deep = any(component.bits > 8 for component in components)
-    return _PACKED.get(name, "yuv444p16le" if deep else "yuv444p")
+        and not name.endswith(("f16le", "msble"))
+    )
 
 
 def sampled_planes(name: str, size: tuple[int, int]) -> list[Plane]:

@@ -39,6 +39,12 @@ _OWN_TAGS = {"major_brand", "minor_version", "compatible_brands", "encoder", "du
 """Tags that describe a file itself, not what it shows."""
 
 
+_ALPHA_TAG = "alpha_mode"
+"""Of Matroska's, which its own writer makes where there is transparency."""
+
+_RGB, _MATRIX, _LIMITED, _FULL = 0, 1, 1, 2
+"""FFmpeg's numbers for: no matrix, as of red, green and blue; that of BT.709; both ranges of values."""
+
 _PROFILES = {"Proxy": "0", "LT": "1", "Standard": "2", "HQ": "3", "4444": "4", "XQ": "5"}
 """Of ProRes: FFmpeg's names, and the encoder's numbers."""
 
@@ -148,12 +154,22 @@ class FrameWriter(contextlib.AbstractContextManager):
         self._encodes = frame is not None
         if frame is None:
             return self._stream.encode(None)
+        frame = self._in_its_pixels(frame)
         if frame.pts is not None:
             if self._last is not None and frame.pts <= self._last:
                 frame.pts = self._last + 1
                 self._moved += 1
             self._last = frame.pts
         return self._stream.encode(frame)
+
+    def _in_its_pixels(self, frame: Any) -> Any:
+        """A frame in the encoder's pixel format, and red, green and blue by the matrix that is written."""
+        wanted = self._stream.codec_context.pix_fmt
+        if frame.format.name == wanted:
+            return frame
+        if frame.format.is_rgb and not av.VideoFormat(wanted, 16, 16).is_rgb:
+            return frame.reformat(format=wanted, dst_colorspace=_MATRIX, dst_color_range=_LIMITED)
+        return frame.reformat(format=wanted)
 
     def put(self, picture: "Picture") -> None:
         """Write what another writer, with the same arguments, has encoded, after all before it."""
@@ -229,11 +245,20 @@ class FrameWriter(contextlib.AbstractContextManager):
         context.time_base = source.time_base
         for what in ("color_range", "color_primaries", "color_trc", "colorspace"):
             setattr(context, what, getattr(given, what))
+        made = av.VideoFormat(context.pix_fmt, 16, 16)
+        if made.is_rgb:
+            context.colorspace, context.color_range = _RGB, _FULL
+        elif first.format.is_rgb or given.colorspace == _RGB:
+            context.colorspace = _MATRIX
+            context.color_range = _LIMITED if first.format.is_rgb else given.color_range
+        if (_has_alpha(first.format) or _hides_alpha(source)) and not _has_alpha(made):
+            self.not_kept.append("transparency")
         if given.sample_aspect_ratio:
             context.sample_aspect_ratio = given.sample_aspect_ratio
         if name == "libx265" and self._output.format.name in ("mp4", "mov"):
             context.codec_tag = "hvc1"  # the tag that Apple's players ask for
-        stream.metadata.update({k: v for k, v in source.metadata.items() if k.lower() not in _OWN_TAGS})
+        tags = {k: v for k, v in source.metadata.items() if k.lower() not in (*_OWN_TAGS, _ALPHA_TAG)}
+        stream.metadata.update(tags)
         return stream
 
 
@@ -280,6 +305,16 @@ def _options(name: str, source: Any) -> dict[str, str]:
     if name == "prores_ks" and source.name == "prores" and source.profile in _PROFILES:
         return {"profile": _PROFILES[source.profile]}
     return dict(_OPTIONS.get(name, {}))
+
+
+def _has_alpha(pixels: Any) -> bool:
+    """Whether a pixel format has transparency."""
+    return any(component.is_alpha for component in pixels.components)
+
+
+def _hides_alpha(source: Any) -> bool:
+    """Whether a stream has transparency beside its packets, as VP9, which FFmpeg does not decode."""
+    return {key.lower(): value for key, value in source.metadata.items()}.get(_ALPHA_TAG) == "1"
 
 
 def first_frame(frame: Any, side: dict[str, bytes] | None) -> FirstFrame:
