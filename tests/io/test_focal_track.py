@@ -108,3 +108,30 @@ def test_samples_may_be_lists_and_must_be_numbers():
     for samples in ((["0", "1"], [20, 30]), ([0, 1], "track.csv"), (None, [20, 30])):
         with pytest.raises(ValueError, match=r"Arguments? (position|focal)"):
             zj.io.FocalTrack(*samples)
+
+
+def record(*missing, focal=lambda n: 20 + 0.2 * n):
+    frames = [n for n in range(200) if not any(first <= n < last for first, last in missing)]
+    return "frame,focal\n" + "".join(f"{n},{focal(n)}\n" for n in frames)
+
+
+def test_a_record_with_a_gap_in_which_the_lens_zooms_is_said(tmp_path):
+    with pytest.warns(
+        UserWarning, match="no samples from 49 to 100 frames, .* from 29.8 to 40, and one oth"
+    ):
+        zj.io.read_focal_track(written(tmp_path / "t.csv", record((50, 100), (150, 170))))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        record((50, 55)),  # a few frames
+        record((50, 100), focal=lambda n: 20 if n < 120 else 21),  # the lens rests
+        "frame,focal\n" + "".join(f"{n * n},{20 + n}\n" for n in range(30)),  # keys
+        "frame,focal\n0,20\n1,21\n2,22\n90,60\n",
+    ],
+)
+def test_keys_and_short_gaps_are_tracks_as_they_are(tmp_path, text):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        zj.io.read_focal_track(written(tmp_path / "t.csv", text))

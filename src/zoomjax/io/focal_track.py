@@ -108,6 +108,9 @@ def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> Foc
         FileNotFoundError: there is no such file.
         ValueError: the file is not such a track, or not in order of time; the message names it.
 
+    Warns:
+        UserWarning: samples follow each other closely, but some are missing while the lens zooms.
+
     Example:
         >>> import pathlib, tempfile
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "track.csv"
@@ -126,8 +129,38 @@ def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> Foc
     table.check("focal", focal >= np.finfo(np.float64).tiny, "a positive number")
     later = np.append(True, np.diff(position) > 0)
     table.check(header, later, "greater than in the row before: sort the track, and give each moment once")
-    return FocalTrack(position, focal, by_time=by_time, hold=hold)
+    track = FocalTrack(position, focal, by_time=by_time, hold=hold)
+    _warn_of_gap(track, path)
+    return track
 
+
+def _warn_of_gap(track: FocalTrack, path: str | os.PathLike[str]) -> None:
+    """Warn of a record with a gap, across which f is another: how the lens zoomed there is not known.
+
+    A track of few samples, or of uneven ones, is one of keys between which f is meant to be interpolated.
+    """
+    step = np.diff(track.position)
+    if len(step) < _RECORD or np.mean(step < 1.5 * np.median(step)) < _EVEN:
+        return
+    change = np.abs(np.diff(np.log(track.focal)))
+    gaps = np.flatnonzero((step > _GAP * np.median(step)) & (change > _ZOOMED))
+    if len(gaps):
+        at = int(gaps[np.argmax(change[gaps])])
+        unit = "s" if track.by_time else "frames"
+        more = {1: "", 2: ", and one other gap"}.get(len(gaps), f", and {len(gaps) - 1} other gaps")
+        warnings.warn(
+            f"{os.fspath(path)} has no samples from {track.position[at]:g} to {track.position[at + 1]:g} "
+            f"{unit}, while the focal length goes from {track.focal[at]:.4g} to {track.focal[at + 1]:.4g}"
+            f"{more}: it is interpolated there. Add rows if the lens did not zoom steadily.",
+            stacklevel=3,
+        )
+
+
+_RECORD, _EVEN = 20, 0.9
+"""Samples, and the share of even steps, from which a track is a record and not a few keys."""
+
+_GAP, _ZOOMED = 10, 0.02
+"""Steps that are missing, and the change of log f across them, from which it is said."""
 
 _LONGER = 0.05
 """Of a video's length, by which a track in seconds may be longer."""
