@@ -208,9 +208,9 @@ def focal_off(folder: Path) -> dict:
         ways, was_kept = refinements(lines, at_focal_lengths(lines, jnp.asarray(given)), OFF * given)
         kept[clip.name] = kept.get(clip.name, 0) + was_kept
         ends = jnp.asarray([focal.min(), focal.max()])  # of the truth; wrong ones may begin within
-        for way, (fit, its_lines) in ways.items():
+        for way, (fit, its_lines, sigma) in ways.items():
             fit = eqx.tree_at(lambda of: of.lens.focal_range, fit, ends)
-            band = zj.trust.with_misfit(fit, its_lines)
+            band = zj.trust.with_misfit(fit, its_lines, focal_sigma=sigma)
             moved, variance = along(band, *map(jnp.asarray, (places, outward, clip.focal[nearest])))
             error = np.asarray(moved) - np.einsum("fpi,pi->fp", truth, outward)
             found.setdefault(way, []).append((error, variance))
@@ -221,16 +221,16 @@ def focal_off(folder: Path) -> dict:
 
 
 def refinements(lines: zj.lines.AbstractLines, wrong: zj.lines.AbstractLines, sigma: np.ndarray):
-    """The fit and the lines by each way to the focal lengths, and whether `fit_focal` kept those given."""
+    """The fit, the lines and the errors of f by each way to f, and whether `fit_focal` kept those given."""
     plain = zj.fit_zoom(wrong, terms=2)
     found = zj.fit.fit_focal(wrong, sigma, terms=2)
     focal = _jointly_refined(wrong, plain.lens.zoom, jnp.asarray(sigma))
     always = at_focal_lengths(wrong, focal)
     ways = {
-        EXACT: (zj.fit_zoom(lines, terms=2), lines),
-        GIVEN: (zj.fit.with_focal_sigma(plain, wrong, focal_sigma=sigma), wrong),
-        FOUND: (found.fit, at_focal_lengths(wrong, found.focal)),
-        ALWAYS: (zj.fit_zoom(always, terms=2), always),
+        EXACT: (zj.fit_zoom(lines, terms=2), lines, 0.0),
+        GIVEN: (zj.fit.with_focal_sigma(plain, wrong, focal_sigma=sigma), wrong, sigma),
+        FOUND: (found.fit, at_focal_lengths(wrong, found.focal), 0.0),
+        ALWAYS: (zj.fit_zoom(always, terms=2), always, 0.0),
     }
     return ways, bool(found.kept)
 

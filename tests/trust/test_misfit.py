@@ -8,7 +8,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.trust import misfit
+from zoomjax.trust import _frame_scores
 
 FOCAL = scenes.focal_sweep(12)
 
@@ -160,9 +160,9 @@ def test_by_residuals_it_is_what_it_is_by_moments(lines, metric):
     lines = metric(lines)
     fit = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=1))
     k = np.asarray(jax.vmap(fit.lens.zoom)(lines.focal))
-    quickly = misfit._of_frames(misfit._passed(lines, k))
-    by_residuals = misfit._by_residuals(lines, k, fit.lens.distortion_model)
-    for one, other in zip(quickly, by_residuals, strict=True):
+    quickly = _frame_scores.of_frames(_frame_scores.passes_of(lines, k))
+    by_residuals = _frame_scores.by_residuals(lines, k, fit.lens.distortion_model)
+    for one, other in zip(quickly[:-1], by_residuals[:-1], strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * np.abs(one).max())
 
 
@@ -187,3 +187,55 @@ def test_nor_does_the_metric_matter(lines):
     paper = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(degree=1))
     found = size_of(zj.trust.with_misfit(fit, zj.fit.in_image(lines)))
     np.testing.assert_allclose(found, size_of(zj.trust.with_misfit(paper, lines)), rtol=0.2)
+
+
+def with_wrong_focal_lengths(truth, sigma, seed=0, noise=0.3, model=None):
+    """A fit to lines whose focal lengths are off by a part sigma, which its covariance knows."""
+    seen = zj.compress(scenes.board_lines(truth, FOCAL, spacing=200.0, noise=noise, seed=seed), 3)
+    wrong = np.asarray(FOCAL) * np.exp(sigma * np.random.default_rng(seed).standard_normal(len(FOCAL)))
+    lines = eqx.tree_at(lambda lines: lines.focal, seen, jnp.asarray(wrong))
+    fit = zj.fit_zoom(lines, terms=2, **({} if model is None else {"zoom": model}))
+    return zj.fit.with_focal_sigma(fit, lines, focal_sigma=sigma * wrong), lines, sigma * wrong
+
+
+INSIDE = FOCAL[2:-2]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_known_errors_of_focal_lengths_are_no_misfit(truth, seed):
+    fit, lines, sigma = with_wrong_focal_lengths(truth, 0.01, seed)
+    _, before = ratio_and_std(fit, truth, INSIDE)
+    _, unknown = ratio_and_std(zj.trust.with_misfit(fit, lines), truth, INSIDE)
+    _, known = ratio_and_std(zj.trust.with_misfit(fit, lines, focal_sigma=sigma), truth, INSIDE)
+    assert np.mean(unknown) > 1.3 * np.mean(before)
+    assert np.mean(known) < 1.2 * np.mean(before)
+
+
+def test_beside_known_errors_a_misfit_is_found(truth):
+    model = zj.PolynomialZoom(degree=1)
+    fit, lines, sigma = with_wrong_focal_lengths(truth, 0.005, model=model)
+    alone, beside = (zj.trust.with_misfit(fit, lines, focal_sigma=s).misfit for s in (0.0, sigma))
+    assert float(jnp.trace(beside)) == pytest.approx(float(jnp.trace(alone)), rel=0.3)
+
+
+def test_errors_may_be_shared(truth):
+    """Four photos at each focal length, wrong for all four: that is more than errors of single photos."""
+    off = np.exp(0.01 * np.random.default_rng(2).standard_normal(len(FOCAL)))
+    true, given = (np.repeat(f, 4) for f in (np.clip(FOCAL * off, FOCAL[0], FOCAL[-1]), np.asarray(FOCAL)))
+    seen = zj.compress(scenes.board_lines(truth, true, spacing=200.0, noise=0.3, seed=2), 3)
+    lines = eqx.tree_at(lambda lines: lines.focal, seen, jnp.asarray(given))
+    fit, alike = zj.fit_zoom(lines, terms=2), np.repeat(np.arange(len(FOCAL)), 4)
+    none, apart, together = (
+        float(jnp.trace(zj.trust.with_misfit(fit, lines, focal_sigma=sigma, shared=shared).misfit))
+        for sigma, shared in ((0.0, None), (0.01 * given, None), (0.01 * given, alike))
+    )
+    assert together < 0.5 * apart
+    assert apart < 0.5 * none
+
+
+def test_errors_of_focal_lengths_are_checked(truth, lines):
+    fit = zj.fit_zoom(lines)
+    with pytest.raises(ValueError, match="focal_sigma must be at least 0"):
+        zj.trust.with_misfit(fit, lines, focal_sigma=-1.0)
+    with pytest.raises(ValueError, match="shared must hold a number for each of the 12 frames"):
+        zj.trust.with_misfit(fit, lines, focal_sigma=1.0, shared=np.arange(3))

@@ -365,7 +365,7 @@ def calibrate(
     sigma, zoom = np.broadcast_to(focal_sigma, lines.focal.shape), exact
     if sigma.any():
         zoom = with_focal_sigma(exact, small, focal_sigma=sigma, shared=shared)
-    zoom = widened(with_misfit(zoom, used.held))
+    zoom = widened(with_misfit(zoom, used.held, focal_sigma=sigma, shared=shared))
     stage("Checking the fit on lines left out")
     held_out = {"rms_held_out": left_out(small, used.model)}
     held_out["rms_frames_held_out"] = cross_validate_frames(small, terms=terms)

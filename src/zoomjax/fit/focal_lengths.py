@@ -36,11 +36,12 @@ from .result import ZoomFit
 from .same_camera import check_lines_of
 
 Sigma = ScalarLike | Num[AnyArray, "frame"]
+Shared = Int[AnyArray, "frame"] | None
 
 
 @kinds_checked
 def with_focal_sigma(
-    fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma, shared: Int[AnyArray, "frame"] | None = None
+    fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma, shared: Shared = None
 ) -> ZoomFit:
     """Add the uncertainty of the focal lengths to a fit's covariance, and so to all bands.
 
@@ -72,13 +73,42 @@ def with_focal_sigma(
         >>> bool(wide[0] < wide[1])
         True
     """
+    check("with_focal_sigma", shift=fit.lens.shift)
+    sigma, together = _checked_errors(fit, lines, focal_sigma, shared)
+    lines = with_distortion_model(lines, fit.lens.distortion_model).about(fit.lens.centre)
+    own = (fit.lens.zoom, fit.covariance, fit.joint)
+    return with_covariance(fit, *_widened_by(lines, *own, sigma, together))
+
+
+def effects_of_focal(
+    fit: ZoomFit, lines: AbstractLines, focal_sigma: Sigma, shared: Shared
+) -> Float[np.ndarray, "frame coefficients error"]:
+    """What errors of the focal lengths make of the coefficients that a fit has for the frames.
+
+    Of independent errors of one standard deviation each: by a frame's own, and by the fit from all.
+
+    Args:
+        fit, lines, focal_sigma, shared: see `with_focal_sigma`; the lines about the centre of the fit.
+    """
+    sigma, together = _checked_errors(fit, lines, focal_sigma, shared)
+    moves = jax.tree.map(np.asarray, _moves(lines, fit.lens.zoom))
+    number, relative = len(sigma), np.asarray(sigma) / np.asarray(lines.focal)
+    _, error = np.unique(np.asarray(together), return_inverse=True)
+    by_fit = np.zeros((len(moves.response), error.max() + 1))
+    np.add.at(by_fit.T, error, (relative * moves.response[:, :number]).T)
+    effects = moves.rows[:number] @ by_fit
+    effects[np.arange(number), :, error] += relative[:, None] * moves.slope[:number]
+    return effects
+
+
+def _checked_errors(fit, lines, focal_sigma, shared):
+    """The standard deviation of each frame's focal length, and a number for the error that it has."""
     check_lines_of(fit, lines)
     sigma = checked_sigma(focal_sigma, lines.focal)
     if not traced(sigma) and not np.isfinite(sigma).all():
         raise ValueError(
             f"Argument focal_sigma must hold finite numbers, but it is {focal_sigma}. {UNKNOWN}"
         )
-    check("with_focal_sigma", shift=fit.lens.shift)
     number = lines.focal.shape[0]
     together: Any = np.arange(number) if shared is None else integers("shared")(shared)
     if np.shape(together) != (number,):
@@ -86,9 +116,7 @@ def with_focal_sigma(
             f"Argument shared must hold a number for each of the {number} frames, but its shape is "
             f"{np.shape(together)}."
         )
-    lines = with_distortion_model(lines, fit.lens.distortion_model).about(fit.lens.centre)
-    own = (fit.lens.zoom, fit.covariance, fit.joint)
-    return with_covariance(fit, *_widened_by(lines, *own, sigma, together))
+    return sigma, together
 
 
 def with_covariance(fit, covariance, joint):
@@ -211,8 +239,19 @@ def widened_by_focal(lines, zoom, covariance, joint, of_focal, refined=False):
     return wider, (part * joint).at[:number, :number].set(wider)
 
 
-def _errors_of_focal(lines, zoom, of_focal):
-    """Focal lengths with this covariance of their logarithms, as errors of photos."""
+class _Moves(NamedTuple):
+    """The coefficients of frames, and how they move."""
+
+    coefficients: Float[Array, "frame coefficients"]
+    rows: Float[Array, "frame coefficients parameter"]
+    """With the parameters."""
+    slope: Float[Array, "frame coefficients"]
+    """With the logarithm of the frame's own focal length."""
+    response: Float[Array, "parameter frame"]
+    """The parameters, with those of all."""
+
+
+def _moves_of(lines, zoom) -> _Moves:
     flat, unravel = ravel_pytree(zoom.parameters)
     focal = jnp.asarray(lines.focal)
 
@@ -223,7 +262,15 @@ def _errors_of_focal(lines, zoom, of_focal):
     still = jnp.zeros_like(focal)
     rows = jax.jacfwd(coefficients)(flat, still)
     k, slope = jax.jvp(lambda t: coefficients(flat, t), (still,), (jnp.ones_like(focal),))
-    response = _response(lines, zoom)
+    return _Moves(k, rows, slope, _response(lines, zoom))
+
+
+_moves = bucketed_jit()(_moves_of)
+
+
+def _errors_of_focal(lines, zoom, of_focal):
+    """Focal lengths with this covariance of their logarithms, as errors of photos."""
+    k, rows, slope, response = _moves_of(lines, zoom)
     # Of the coefficients of a frame, from its own focal length and, by the fit, from all.
     by_fit, covariance = rows @ (response @ of_focal).T[..., None], response @ of_focal @ response.T
     both = by_fit * slope[:, None]

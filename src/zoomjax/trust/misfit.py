@@ -25,55 +25,45 @@ and focal lengths are wrong. That is a variance t^2 of the strength, ``t^2 k(f) 
 of the focal lengths' strengths that the scatter of lines within photos, and of photos at one focal length,
 does not explain. A band has t in full, where its noise is divided by the number of frames. So t counts only
 as far as it exceeds what chance makes of it in 95 of 100 cases.
-"""
 
-from typing import NamedTuple
+Known errors of the focal lengths leave scores, too. They are unknowns of known variance beside the noise,
+and d(f) is sought by generalised least squares (see `_frame_scores.followed`).
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
-from ..fit.compression import compressed_as_measured
 from ..fit.distortion_models import with_distortion_model
 from ..fit.energy import frame_coefficients, frame_normal_equations
-from ..fit.image_metric import in_corrected, measured_as
+from ..fit.focal_lengths import Shared, Sigma, checked_sigma, effects_of_focal
 from ..fit.moved_centre import for_terms
 from ..fit.own_weights import own_weights
 from ..fit.problem import data_of
 from ..fit.result import ZoomFit
 from ..fit.same_camera import check_lines_of, placed_as
 from ..lines.base import AbstractLines
-from ..lines.compressed import CompressedLines
 from ..lines.free_centre import AnyCentreLines
 from ..models.polynomial import RadialPolynomial
 from ..models.requirements import check
-from ._linear_folds import Lanes, Pass, lanes_of, passed
-from .folds import small_lines
+from ._frame_scores import RCOND, Followed, Frames, by_residuals, followed, of_frames, passes_of
+from ._strengths import of_focal_lengths
 
 _FEWEST = 8
 """Frames: with fewer, the misfit cannot be told from errors of single photos, and counts as these."""
 
-_DEGREE = 6
-"""Of the polynomial added, at most."""
-
 _LINEAR = 2
 """Numbers that the next coefficient has, and either coordinate of the centre: they are linear in 1/f."""
-
-_SURE = 1.645
-"""Standard deviations below which chance stays in 95 of 100 cases."""
-
-_RCOND = 1e-10
-"""Of matrices: below it nothing is determined."""
-
-_TINY = np.finfo(float).tiny
 
 
 @kinds_checked
 @of_known_values
-def with_misfit(fit: ZoomFit, lines: AbstractLines) -> ZoomFit:
+def with_misfit(
+    fit: ZoomFit, lines: AbstractLines, *, focal_sigma: Sigma = 0.0, shared: Shared = None
+) -> ZoomFit:
     """Add the misfit of the zoom model to a fit, and so to all bands.
 
     The covariance of a fit says how uncertain the best model is, not how far the lens is from it. The
@@ -85,6 +75,8 @@ def with_misfit(fit: ZoomFit, lines: AbstractLines) -> ZoomFit:
         lines: the lines that it was fitted to, with their weights and in their metric. Compressed for more
             terms than the fit has, or not compressed, they also say what the next coefficient would do;
             compressed for any centre, about whichever, what another centre would.
+        focal_sigma, shared: the errors of the focal lengths that `zoomjax.fit.with_focal_sigma` was told:
+            what they explain is no misfit.
 
     Returns:
         The fit with `misfit`: a covariance of the normalised coefficients, and of the next one where there
@@ -92,8 +84,8 @@ def with_misfit(fit: ZoomFit, lines: AbstractLines) -> ZoomFit:
         With lines for any centre also with `off_centre`.
 
     Raises:
-        ValueError: the lens depends on the focus; or the lines are not those of the fit: of another image
-            size, unit or number of frames.
+        ValueError: the lens depends on the focus; the lines are not those of the fit: of another image
+            size, unit or number of frames; or `focal_sigma` or `shared` are not as there.
 
     Example:
         >>> from zoomjax import PolynomialZoom, compress, fit_zoom, scenes
@@ -112,14 +104,17 @@ def with_misfit(fit: ZoomFit, lines: AbstractLines) -> ZoomFit:
     placed = placed_as(lens, lines)
     k = np.asarray(frame_coefficients(placed, lens.zoom), float)
     polynomial = isinstance(lens.distortion_model, RadialPolynomial)
-    passes = _passed(placed, k) if polynomial else None
-    frames = _by_residuals(placed, k, lens.distortion_model) if passes is None else _of_frames(passes)
+    passes = passes_of(placed, k) if polynomial else None
+    frames = by_residuals(placed, k, lens.distortion_model) if passes is None else of_frames(passes)
+    effects = np.zeros((*k.shape, 0))
+    if np.any(checked_sigma(focal_sigma, lines.focal)):
+        effects = effects_of_focal(fit, placed, focal_sigma, shared)
     if len(frames.focal) < _FEWEST:
         return fit
-    follows = _followed(frames, k.shape[1])
+    follows = followed(frames, effects[frames.there])
     misfit, off_centre = _common(frames, follows), None
     if passes is not None:
-        own = _of_focal_lengths(passes, k, follows)
+        own = of_focal_lengths(passes, k, frames, follows, effects[frames.there])
         misfit = misfit + np.pad(own, (0, len(misfit) - len(own)))
     if polynomial and lens.shift is None and isinstance(data_of(lines), AnyCentreLines):
         off_centre = _off_centre(fit, lines, k, frames, follows)
@@ -132,92 +127,7 @@ def with_misfit(fit: ZoomFit, lines: AbstractLines) -> ZoomFit:
     )
 
 
-class _Frames(NamedTuple):
-    """The frames that have lines: score and matrix of each, its number of lines and its focal length."""
-
-    score: Float[np.ndarray, "frame coefficients"]
-    matrix: Float[np.ndarray, "frame coefficients coefficients"]
-    number: Float[np.ndarray, "frame"]
-    focal: Float[np.ndarray, "frame"]
-
-
-class _Passes(NamedTuple):
-    """Lines of the radial polynomial, in NumPy, which compiles nothing; what k gives for each."""
-
-    lanes: Lanes
-    at: Pass
-    focal: Float[np.ndarray, "frame"]
-
-
-def _passed(lines, k) -> _Passes:
-    """With the next coefficient, if the lines are compressed for it."""
-    plain, terms = in_corrected(lines), k.shape[1]
-    most = plain.terms if isinstance(plain, CompressedLines) else RadialPolynomial().most_terms
-    more = min(terms + 1, max(most, terms))
-    small = measured_as(small_lines(plain, more), lines)
-    lanes = lanes_of(small, np.zeros(len(small.frame), int), own_weights(small), more)
-    return _Passes(lanes, passed(lanes, np.pad(k, ((0, 0), (0, more - terms)))), np.asarray(small.focal))
-
-
-def _of_frames(passes: _Passes) -> _Frames:
-    lanes, at, focal = passes
-    total = lanes.total(lanes.weight)
-    used = np.flatnonzero(total > 0)
-    score, matrix = (
-        np.moveaxis(lanes.total(lanes.weight / lanes.counts * of) / np.where(total > 0, total, 1), -1, 0)
-        for of in (at.gradient, at.matrix)
-    )
-    number = lanes.total((lanes.weight > 0).astype(float))
-    return _Frames(score[used], matrix[used], number[used], focal[lanes.frame[lanes.starts]][used])
-
-
-def _by_residuals(lines, k, distortion_model):
-    """Of any distortion model and metric."""
-    small = compressed_as_measured(lines, k.shape[1] - distortion_model.num_coefficients(0))
-    dtype = jnp.asarray(small.focal).dtype
-    score, matrix = map(np.asarray, frame_normal_equations(small, jnp.asarray(k, dtype)))
-    number = np.bincount(np.asarray(small.frame), own_weights(small) > 0, minlength=len(k))
-    used = np.flatnonzero(number > 0)
-    return _Frames(score[used], matrix[used], number[used], np.asarray(small.focal)[used])
-
-
-class _Followed(NamedTuple):
-    """The polynomial d(f) of the frames that count.
-
-    Attributes:
-        basis: (frame, function of 1/f).
-        solve: the inverse of its normal equations.
-        added: what it adds to the coefficients: (frame, coefficients).
-        squares: what it takes away.
-        variance: what a number takes away by chance.
-    """
-
-    basis: Float[np.ndarray, "frame functions"]
-    solve: Float[np.ndarray, "numbers numbers"]
-    added: Float[np.ndarray, "frame coefficients"]
-    squares: float
-    variance: float
-
-
-def _followed(seen: _Frames, terms: int) -> _Followed:
-    frames, size = len(seen.focal), min(_DEGREE + 1, np.unique(seen.focal).size, len(seen.focal) - 3)
-    score = seen.number[:, None] * seen.score[:, :terms]
-    own = seen.number[:, None, None] * seen.matrix[:, :terms, :terms]
-    inverse = 1 / seen.focal
-    place = 2 * (inverse - inverse.min()) / max(np.ptp(inverse), _TINY) - 1
-    basis = np.polynomial.legendre.legvander(place, size - 1)
-    normal = np.einsum("mb,mij,mc->bicj", basis, own, basis).reshape(size * terms, -1)
-    solve = np.linalg.pinv(normal, rcond=_RCOND, hermitian=True)
-    pull = -np.einsum("mb,mi->bi", basis, score).reshape(-1)
-    more = solve @ pull
-    added = basis @ more.reshape(size, terms)
-    left = score + np.einsum("mij,mj->mi", own, added)
-    inverse_own = np.linalg.pinv(own, rcond=_RCOND, hermitian=True)
-    squares = np.einsum("mi,mij,mj->", left, inverse_own, left)
-    return _Followed(basis, solve, added, pull @ more, squares / ((frames - size) * terms))
-
-
-def _common(seen: _Frames, follows: _Followed) -> Float[np.ndarray, "coefficients coefficients"]:
+def _common(seen: Frames, follows: Followed) -> Float[np.ndarray, "coefficients coefficients"]:
     """The covariance of what all frames have in common: of the model's terms, and of the next one."""
     frames, terms = follows.added.shape
     kept = _kept(follows.squares, len(follows.solve) * follows.variance)
@@ -228,7 +138,7 @@ def _common(seen: _Frames, follows: _Followed) -> Float[np.ndarray, "coefficient
 
 
 def _lacking(
-    seen: _Frames, follows: _Followed, own: Float[np.ndarray, "frame functions"]
+    seen: Frames, follows: Followed, own: Float[np.ndarray, "frame functions"]
 ) -> Float[np.ndarray, "numbers numbers"]:
     """The covariance of numbers that the model lacks, and of what its own then become.
 
@@ -242,17 +152,26 @@ def _lacking(
         return np.zeros((seen.score.shape[1],) * 2)
     score, matrix = seen.number[:, None] * seen.score, seen.number[:, None, None] * seen.matrix
     left = score + np.einsum("mij,mj->mi", matrix[..., :terms], follows.added)
+    unknown = matrix[..., :terms] @ follows.unknown  # the scores by it
     column = np.einsum("mb,mie,mc->bice", follows.basis, matrix[:, :terms, terms:], own)
-    others = -(follows.solve @ column.reshape(len(follows.solve), -1)).reshape(column.shape)
+    column = column.reshape(len(follows.solve), -1)
+    by_basis = np.einsum("mb,mig->big", follows.basis, unknown[:, :terms]).reshape(len(column), -1)
+    by_own = np.einsum("mc,meg->ceg", own, unknown[:, terms:]).reshape(column.shape[1], -1)
+    others = -follows.solve @ (column - by_basis @ by_own.T)
     # What a unit of each number changes: (frame, numbers, function of 1/f, number).
-    change = np.zeros((frames, score.shape[1], *column.shape[2:]))
-    change[:, :terms] = np.einsum("mb,bice->mice", follows.basis, others)
-    for number in range(score.shape[1] - terms):
+    more = score.shape[1] - terms
+    change = np.zeros((frames, score.shape[1], own.shape[1], more))
+    change[:, :terms] = np.einsum(
+        "mb,bice->mice", follows.basis, others.reshape(-1, terms, *change.shape[2:])
+    )
+    for number in range(more):
         change[:, terms + number, :, number] = own
     change = change.reshape(frames, score.shape[1], -1)
-    known = np.einsum("mip,mij,mjq->pq", change, matrix, change, optimize=True)
-    noise = np.linalg.pinv(known, rcond=_RCOND, hermitian=True)
-    pull = -np.einsum("mip,mi->p", change, left)
+    by_change = np.einsum("mip,mig->pg", change, unknown)
+    known = np.einsum("mip,mij,mjq->pq", change, matrix, change, optimize=True) - by_change @ by_change.T
+    noise = np.linalg.pinv(known, rcond=RCOND, hermitian=True)
+    off = np.einsum("mig,mi->g", follows.unknown, left[:, :terms])
+    pull = by_change @ off - np.einsum("mip,mi->p", change, left)
     step = noise @ pull
     kept = _kept(pull @ step, len(pull) * follows.variance)
     there = kept**2 * np.outer(step, step) + kept * follows.variance * noise
@@ -267,70 +186,9 @@ def _off_centre(fit, lines, k, frames, follows) -> Float[np.ndarray, "both both"
     few = for_terms(with_distortion_model(lines, lens.distortion_model), k.shape[1])
     score, matrix = map(np.asarray, frame_normal_equations(few, jnp.asarray(both, dtype)))
     used = np.flatnonzero(np.bincount(np.asarray(lines.frame), own_weights(lines) > 0, minlength=len(k)))
-    seen = _Frames(score[used], matrix[used], frames.number, frames.focal)
+    seen = Frames(score[used], matrix[used], frames.number, frames.focal, used, frames.noise)
     first = 0 if fit.joint is None else 1  # a fitted centre is where it is best, in the mean
     return _lacking(seen, follows, follows.basis[:, first:_LINEAR])
-
-
-def _of_focal_lengths(
-    passes: _Passes, k: Float[np.ndarray, "frame coefficients"], follows: _Followed
-) -> Float[np.ndarray, "coefficients coefficients"]:
-    """The covariance of how much stronger or weaker the lens is at single focal lengths.
-
-    A strength y, as a part of the coefficients, adds ``G k y`` to a line's score, and so ``known y`` to its
-    `pull`. Were its points independent, the pull would have the variance `noise`.
-    """
-    lanes, at, focal = passes
-    on, terms = lanes.weight > 0, k.shape[1]
-    frame = lanes.frame[on]
-    used, place = np.unique(frame, return_inverse=True)
-    share = lanes.weight[on] / lanes.counts[on] / np.bincount(place, lanes.weight[on])[place]
-    matrix, of = np.moveaxis(at.matrix[:terms, :terms, on], -1, 0), k[frame]
-    gradient = at.gradient[:terms, on].T + np.einsum("lij,lj->li", matrix, follows.added[place])
-    known = share * np.einsum("li,lij,lj->l", of, matrix, of)
-    variance = np.sum(at.squares[on]) / max(np.sum(lanes.counts[on] - 2), 1)
-    lines = np.stack([share * np.einsum("li,li->l", of, gradient), known, variance * share * known])
-    photos = _sums(lines, place)
-    there, zoom = np.unique(focal[used], return_inverse=True)
-    zooms = _sums(photos, zoom)
-    scatter = max(_scatter(lines, place), _scatter(photos, zoom))
-    free = len(there) - follows.basis.shape[1]
-    seen = zooms[2] > 0
-    if scatter.free < 1 or free < 1 or not scatter.ratio > 0 or seen.sum() < 2:
-        return np.zeros((terms, terms))
-    pull, known, noise = zooms[:, seen]
-    chance = free * (1 + _SURE * np.sqrt(2 / free + 2 / scatter.free))
-    # The moment estimate of DerSimonian and Laird (1986), of what is beyond chance.
-    weight = known**2 / (scatter.ratio * noise)
-    strength = -pull / known
-    squares = weight @ (strength - np.average(strength, weights=weight)) ** 2
-    beyond = max(squares - chance, 0) / max(weight.sum() - (weight @ weight) / weight.sum(), _TINY)
-    return beyond * k[used].T @ k[used] / len(used)
-
-
-class _Scatter(NamedTuple):
-    """How much more strengths scatter than independent points would have them; degrees of freedom."""
-
-    ratio: float
-    free: int
-
-
-def _scatter(parts: Float[np.ndarray, "3 part"], group: Int[np.ndarray, "part"]) -> _Scatter:
-    """Of pulls (see `_of_focal_lengths`), within groups that share a strength."""
-    whole = _sums(parts, group)
-    pull, known, noise = parts
-    every = np.where(whole[1] > 0, whole[1], 1)
-    left = pull - (whole[0] / every)[group] * known
-    share = known / every[group]
-    expected = noise * (1 - 2 * share) + share**2 * whole[2][group]
-    free = len(group) - len(every)
-    return _Scatter(float(np.sum(left**2) / max(np.sum(expected), _TINY)) * (free > 0), free)
-
-
-def _sums(
-    parts: Float[np.ndarray, "3 part"], group: Int[np.ndarray, "part"]
-) -> Float[np.ndarray, "3 group"]:
-    return np.stack([np.bincount(group, of) for of in parts])
 
 
 def _kept(found: float, expected: float) -> float:
