@@ -35,8 +35,8 @@ from .energy import (
 )
 from .focal_lengths import at_focal_lengths, inverse_of, near_energy, widened_by_focal
 
-MOST_STEPS = 100
-"""Of the joint minimisation, which takes 5 to 15."""
+MOST_STEPS = 300
+"""Of the joint minimisation, which mostly takes 5 to 50; some that hardly tell noise from errors, 200."""
 
 _PARTS = 5
 """That frames are left out in, to see whether refined focal lengths help."""
