@@ -535,6 +535,10 @@ WRONG = {
         ["a.jpg", "--spacing", "20", "--distance", "inf", "--pixel-pitch", "0.005"],
         "Missing or wrong: --distance",
     ),
+    "pixels in µm": (
+        ["a.jpg", "--spacing", "20", "--distance", "900", "--pixel-pitch", "3.9"],
+        "--pixel-pitch must be the width of a pixel on the sensor in mm",
+    ),
     "digits of another kind": (["a.jpg", "--focal", "35", "--focal-sigma", "1_0"], "such as 0.3, or 1%"),
     "no digits": (["lines.npz", "--focal-sigma", ""], "such as 0.3, or 1%"),
     "too many coefficients": (["a.jpg", "--terms", "9"], "--terms must be at most 4"),
