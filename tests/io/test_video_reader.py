@@ -1,5 +1,6 @@
 """Videos whose file says more than their pictures: frames that are not shown, pixels, fields, damage."""
 
+import struct
 from fractions import Fraction
 
 import cv2
@@ -9,6 +10,7 @@ import pytest
 import zoomjax as zj
 from zoomjax.detect import video_frames
 from zoomjax.io import FocalTrack, decode_video
+from zoomjax.io.video_crop import shown_size
 from zoomjax.tracks import track_video
 
 av = pytest.importorskip("av")
@@ -112,3 +114,75 @@ def test_frames_of_tracks_that_are_not_those_of_the_file_are_said(tmp_path):
     assert tracks.frames == FRAMES - 2
     with decode_video(path) as (_, frames):
         assert [number for number, _, _ in frames] == [*range(5), *range(7, FRAMES)]
+
+
+def box(name, content):
+    """A box of MP4 or MOV."""
+    return struct.pack(">I4s", 8 + len(content), name) + content
+
+
+def with_clap(content, path=(b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd"), shown=(400, 300)):
+    """The boxes of an MP4 file with the part that is shown in the description of its pictures."""
+    made, place = b"", 0
+    while place < len(content):
+        length, name = struct.unpack_from(">I4s", content, place)
+        inner = content[place + 8 : place + length]
+        if name == path[0] == b"stsd":
+            clap = box(b"clap", struct.pack(">8i", shown[0], 1, shown[1], 1, 0, 1, 0, 1))
+            inner = inner[:8] + box(inner[12:16], inner[16:] + clap)
+        elif name == path[0]:
+            inner = with_clap(inner, path[1:], shown)
+        made, place = made + box(name, inner), place + length
+    return made
+
+
+def with_crop(content, left=16, top=8):
+    """A Matroska file with pixels that are not shown, in place of an element that says nothing."""
+    crop = b"\x54\xcc\x81" + bytes([left]) + b"\x54\xbb\x81" + bytes([top])
+    place = content.index(
+        b"\xb0\x82" + struct.pack(">H", SIZE[0])
+    )  # the width, in the element of the video
+    start = content.rindex(b"\xe0", 0, place)
+    length = content[start + 1] & 0x7F
+    video = content[start + 2 : start + 2 + length] + crop
+    grown = content[:start] + b"\xe0" + bytes([0x80 | len(video)]) + video + content[start + 2 + length :]
+    for name in (b"\x16\x54\xae\x6b", b"\xae"):  # the elements around it
+        at = grown.rindex(name, 0, start) + len(name)
+        wide = 9 - grown[at].bit_length()
+        value = int.from_bytes(grown[at : at + wide], "big") + len(crop)
+        grown = grown[:at] + value.to_bytes(wide, "big") + grown[at + wide :]
+    return grown
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv"])
+def test_a_part_that_alone_is_to_be_shown_is_said(suffix, tmp_path):
+    path = write(tmp_path / f"in{suffix}", number=4)
+    zj.undistort_video(path, tmp_path / "whole.mp4", lens=lens(), focal=20.0)
+    left, top = 16, 8
+    content = path.read_bytes()
+    shown = (SIZE[0] - left, SIZE[1] - top)
+    path.write_bytes(with_crop(content) if suffix == ".mkv" else with_clap(content, shown=shown))
+    with pytest.warns(
+        UserWarning, match=f"says to show {shown[0]} x {shown[1]} of its {SIZE[0]} x {SIZE[1]}"
+    ):
+        zj.undistort_video(path, tmp_path / "out.mp4", lens=lens(), focal=20.0)
+    with pytest.warns(UserWarning, match="says to show"), decode_video(path) as (number, frames):
+        assert len(list(frames)) == number == 4
+
+
+def test_the_whole_picture_may_be_marked(tmp_path):
+    path = write(tmp_path / "in.mp4", number=4)
+    path.write_bytes(with_clap(path.read_bytes(), shown=SIZE))
+    assert zj.undistort_video(path, tmp_path / "out.mp4", lens=lens(), focal=20.0).frames == 4
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
+def test_damaged_heads_say_nothing_of_it(suffix, tmp_path, rng):
+    path = write(tmp_path / f"in{suffix}", number=4)
+    content = with_crop(path.read_bytes()) if suffix == ".mkv" else with_clap(path.read_bytes())
+    for _ in range(300):
+        data = np.frombuffer(content, np.uint8).copy()
+        data[rng.integers(0, data.size, 40)] = rng.integers(0, 256, 40)
+        path.write_bytes(data[: rng.integers(0, data.size)].tobytes())
+        found = shown_size(path, SIZE)
+        assert found is None or (0 < found[0] <= SIZE[0] and 0 < found[1] <= SIZE[1])

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from .pyav import av, open_container
+from .video_crop import shown_size
 from .video_hdr import side_data
 
 _MOST_ERRORS = 1000
@@ -232,7 +233,15 @@ def _warn_of_fields() -> None:
 
 
 def warn_of_pixels(video: Any) -> None:
-    """Warn of a video whose pixels are not square."""
+    """Warn of a video whose pixels are not square, or of which its file says to show a part."""
+    size = (video.codec_context.width, video.codec_context.height)
+    if shown := shown_size(Path(video.container.name), size):
+        warnings.warn(
+            f"The video says to show {shown[0]} x {shown[1]} of its {size[0]} x {size[1]} px. All of them "
+            "are taken, as stored, and a result shows all. Pictures that other programs make of it may "
+            "have another size and centre than the lens: crop it first if you need these.",
+            stacklevel=2,
+        )
     if (aspect := video.sample_aspect_ratio) not in (None, 0, 1):
         warnings.warn(
             f"The video has pixels of {aspect.numerator}:{aspect.denominator}, which are not square, but "
