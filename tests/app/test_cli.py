@@ -169,7 +169,7 @@ def test_calibrate_allows_for_uncertain_focal_lengths(calibrated, tmp_path):
     exact = json.loads((calibrated[0] / "summary.json").read_text())
     done = zoomjax("calibrate", calibrated[0] / "lines.npz", "-o", tmp_path, *FORCED, "--focal-sigma", "1%")
     assert done.returncode == 0, done.stderr
-    assert "include those of the focal lengths, 1.00%." in done.stdout
+    assert "include those of the focal lengths, 1.00%," in done.stdout
     told = json.loads((tmp_path / "summary.json").read_text())
     assert [row["focal_sigma"] / row["focal"] for row in told["per_frame"]] == pytest.approx([0.01] * 5)
     assert told["corner_displacement"][0]["std"] > 2 * exact["corner_displacement"][0]["std"]
