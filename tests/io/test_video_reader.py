@@ -1,5 +1,6 @@
 """Videos whose file says more than their pictures: frames that are not shown, pixels, fields, damage."""
 
+import io
 import struct
 from fractions import Fraction
 
@@ -10,7 +11,7 @@ import pytest
 import zoomjax as zj
 from zoomjax.detect import video_frames
 from zoomjax.io import FocalTrack, decode_video
-from zoomjax.io.video_crop import shown_size
+from zoomjax.io.video_crop import _elements, shown_size
 from zoomjax.tracks import track_video
 
 av = pytest.importorskip("av")
@@ -43,7 +44,7 @@ def write(path, encoder="libx264", number=FRAMES, aspect=1, **options):
     with av.open(str(path), "w") as out:
         stream = out.add_stream(encoder, rate=30, options=options)
         stream.width, stream.height = SIZE
-        stream.pix_fmt = "rgb24" if encoder == "png" else "yuv420p"
+        stream.pix_fmt = {"png": "rgb24", "mjpeg": "yuvj420p"}.get(encoder, "yuv420p")
         stream.codec_context.sample_aspect_ratio = Fraction(aspect)
         for i in range(number):
             grey = np.ascontiguousarray(texture[:, 3 * i : 3 * i + SIZE[0]])
@@ -137,21 +138,24 @@ def with_clap(content, path=(b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd
 
 
 def with_crop(content, left=16, top=8):
-    """A Matroska file with pixels that are not shown, in place of an element that says nothing."""
+    """A Matroska file with pixels that are not shown."""
+    file, inside = io.BytesIO(content), []
+    end = len(content)
+    for name in (0x18538067, 0x1654AE6B, 0xAE, 0xE0):  # segment, tracks, track, video
+        end = next(stop for found, stop in _elements(file, end) if found == name)
+        inside.append((file.tell(), end))
     crop = b"\x54\xcc\x81" + bytes([left]) + b"\x54\xbb\x81" + bytes([top])
-    place = content.index(
-        b"\xb0\x82" + struct.pack(">H", SIZE[0])
-    )  # the width, in the element of the video
-    start = content.rindex(b"\xe0", 0, place)
-    length = content[start + 1] & 0x7F
-    video = content[start + 2 : start + 2 + length] + crop
-    grown = content[:start] + b"\xe0" + bytes([0x80 | len(video)]) + video + content[start + 2 + length :]
-    for name in (b"\x16\x54\xae\x6b", b"\xae"):  # the elements around it
-        at = grown.rindex(name, 0, start) + len(name)
-        wide = 9 - grown[at].bit_length()
-        value = int.from_bytes(grown[at : at + wide], "big") + len(crop)
-        grown = grown[:at] + value.to_bytes(wide, "big") + grown[at + wide :]
+    grown = content[:end] + crop + content[end:]
+    for start, stop in inside[1:]:  # their lengths; the segment's has room, for what follows it is skipped
+        wide = next(n for n in range(1, 9) if _told(content, start, n) == 1 << 7 * n | stop - start)
+        told = (1 << 7 * wide | stop - start + len(crop)).to_bytes(wide, "big")
+        grown = grown[: start - wide] + told + grown[start:]
     return grown
+
+
+def _told(content, start, wide):
+    """The length before an element's content, with the mark of its own length."""
+    return int.from_bytes(content[start - wide : start], "big")
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv"])
@@ -186,3 +190,42 @@ def test_damaged_heads_say_nothing_of_it(suffix, tmp_path, rng):
         path.write_bytes(data[: rng.integers(0, data.size)].tobytes())
         found = shown_size(path, SIZE)
         assert found is None or (0 < found[0] <= SIZE[0] and 0 < found[1] <= SIZE[1])
+
+
+def uneven(path, gap=3.0):
+    """A clip without one frame in some seconds, as of cameras that stop for a moment."""
+    times = [number / 25 + (gap if number > 4 else 0) for number in range(10)]
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("libx264", rate=25)
+        (stream.width, stream.height), stream.pix_fmt = SIZE, "yuv420p"
+        stream.codec_context.time_base = Fraction(1, 1000)
+        for number, time in enumerate(times):
+            grey = np.full(SIZE[::-1], 20 * number, np.uint8)
+            frame = av.VideoFrame.from_ndarray(grey, "gray").reformat(format="yuv420p")
+            frame.pts, frame.time_base = round(1000 * time), Fraction(1, 1000)
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+    return times
+
+
+@pytest.mark.parametrize("suffix", [".mkv", ".mp4", ".avi"])
+def test_times_of_frames_stay_where_they_are_uneven(suffix, tmp_path):
+    """In AVI, which fills gaps with chunks without content, and has no order but that of packets."""
+    times = uneven(tmp_path / "in.mkv")
+    done = zj.undistort_video(tmp_path / "in.mkv", tmp_path / f"a{suffix}", lens=lens(), focal=20.0)
+    again = zj.undistort_video(tmp_path / f"a{suffix}", tmp_path / "b.mkv", lens=lens(), focal=20.0)
+    assert (done.frames, done.lost, again.frames, again.lost) == (10, 0, 10, 0)
+    for name in (f"a{suffix}", "b.mkv"):
+        with decode_video(tmp_path / name) as (number, frames):
+            found = [(time, decode().mean()) for _, time, decode in frames]
+        assert number in (0, 10)
+        np.testing.assert_allclose([time for time, _ in found], times, atol=2e-3)
+        assert (np.diff([grey for _, grey in found]) > 0).all()
+
+
+def test_an_avi_file_that_is_cut_off_is_said(tmp_path):
+    path = write(tmp_path / "in.avi", "mjpeg")
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.warns(UserWarning, match=rf"of {FRAMES} frames of .* cannot be decoded"):
+        zj.undistort_video(path, tmp_path / "out.mp4", lens=lens(), focal=20.0)

@@ -5,8 +5,8 @@ FFmpeg's libraries do not apply it, and PyAV does not tell of it: it is read fro
 
 import struct
 from collections.abc import Generator
+from io import BufferedIOBase
 from pathlib import Path
-from typing import BinaryIO
 
 _PATH = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
 _ENTRY = 8 + 78
@@ -39,7 +39,7 @@ def shown_size(path: Path, size: tuple[int, int]) -> tuple[int, int] | None:
     )
 
 
-def _boxes(file: BinaryIO, end: int) -> Generator[tuple[bytes, int], None, None]:
+def _boxes(file: BufferedIOBase, end: int) -> Generator[tuple[bytes, int], None, None]:
     """Name and end of each box up to a place; the file is where its content begins."""
     while (start := file.tell()) + 8 <= end:
         length, name = struct.unpack(">I4s", file.read(8))
@@ -52,14 +52,14 @@ def _boxes(file: BinaryIO, end: int) -> Generator[tuple[bytes, int], None, None]
         file.seek(stop)
 
 
-def _length(file: BinaryIO) -> int:
+def _length(file: BufferedIOBase) -> int:
     here = file.tell()
     length = file.seek(0, 2)
     file.seek(here)
     return length
 
 
-def _of_mov(file: BinaryIO) -> tuple[int, int] | None:
+def _of_mov(file: BufferedIOBase) -> tuple[int, int] | None:
     def inside(end: int, path: tuple[bytes, ...]) -> tuple[int, int] | None:
         for name, stop in _boxes(file, end):
             if name != path[0]:
@@ -72,7 +72,7 @@ def _of_mov(file: BinaryIO) -> tuple[int, int] | None:
     return inside(_length(file), _PATH)
 
 
-def _of_description(file: BinaryIO, stop: int) -> tuple[int, int] | None:
+def _of_description(file: BufferedIOBase, stop: int) -> tuple[int, int] | None:
     """Of the first description of pictures or sound."""
     content = file.read(min(stop - file.tell(), _MOST))[8:]
     place = _ENTRY
@@ -87,7 +87,7 @@ def _of_description(file: BinaryIO, stop: int) -> tuple[int, int] | None:
     return None
 
 
-def _number(file: BinaryIO, *, keep: bool) -> int:
+def _number(file: BufferedIOBase, *, keep: bool) -> int:
     """A number of Matroska's, of a length that it says itself, whose mark the names of elements keep."""
     first = file.read(1)
     if not first or not first[0]:
@@ -100,7 +100,7 @@ def _number(file: BinaryIO, *, keep: bool) -> int:
     return int.from_bytes(bytes([value]) + rest, "big")
 
 
-def _elements(file: BinaryIO, end: int) -> Generator[tuple[int, int], None, None]:
+def _elements(file: BufferedIOBase, end: int) -> Generator[tuple[int, int], None, None]:
     """Name and end of each element up to a place; the file is where its content begins."""
     while file.tell() < end:
         name, length = _number(file, keep=True), _number(file, keep=False)
@@ -109,7 +109,7 @@ def _elements(file: BinaryIO, end: int) -> Generator[tuple[int, int], None, None
         file.seek(stop)
 
 
-def _of_matroska(file: BinaryIO, size: tuple[int, int]) -> tuple[int, int] | None:
+def _of_matroska(file: BufferedIOBase, size: tuple[int, int]) -> tuple[int, int] | None:
     for segment, end in _elements(file, _length(file)):
         if segment != _SEGMENT:
             continue
@@ -124,7 +124,7 @@ def _of_matroska(file: BinaryIO, size: tuple[int, int]) -> tuple[int, int] | Non
     return None
 
 
-def _of_video(file: BinaryIO, end: int, size: tuple[int, int]) -> tuple[int, int] | None:
+def _of_video(file: BufferedIOBase, end: int, size: tuple[int, int]) -> tuple[int, int] | None:
     """What is left of pictures of this size; None for those of another, as of a cover."""
     own, left = [0, 0], [0, 0]
     for name, stop in _elements(file, end):

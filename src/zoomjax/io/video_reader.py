@@ -6,6 +6,7 @@ import functools
 import heapq
 import math
 import os
+import struct
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -107,7 +108,11 @@ def frames_shown(source: str | os.PathLike[str], video: Any) -> int:
     """How many frames a file announces; 0 if it does not.
 
     Of a clip that was cut without encoding it anew, an edit list leaves out frames that are still there.
+    AVI also counts chunks without content, which the index leaves out; a file that is cut off has none.
     """
+    if _is_avi(video.container):
+        indexed = sum(entry.size > 0 for entry in video.index_entries) if _is_whole_avi(source) else 0
+        return indexed or video.frames
     if not (video.frames and video.duration and video.average_rate):
         return video.frames
     hidden = video.frames / video.average_rate - video.duration * video.time_base
@@ -175,6 +180,19 @@ def decoded_items(
 
 def _is_avi(input_: Any) -> bool:
     return input_.format.name == "avi"
+
+
+def _is_whole_avi(source: str | os.PathLike[str]) -> bool:
+    """Whether the parts of an AVI file end where it does, or before."""
+    length, place = os.path.getsize(source), 0
+    with open(source, "rb") as file:
+        while place + 8 <= length:
+            file.seek(place)
+            name, size = struct.unpack("<4sI", file.read(8))
+            if name != b"RIFF":
+                break
+            place += 8 + size + size % 2
+    return 0 < place <= length + 1
 
 
 def frames_expected(input_: Any, video: Any, report: Report) -> int:

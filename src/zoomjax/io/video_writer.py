@@ -45,6 +45,9 @@ _ALPHA_TAG = "alpha_mode"
 _RGB, _MATRIX, _LIMITED, _FULL = 0, 1, 1, 2
 """FFmpeg's numbers for: no matrix, as of red, green and blue; that of BT.709; both ranges of values."""
 
+_REORDER = ("libx264", "libx265")
+"""Encoders whose packets are not in the order in which frames are shown."""
+
 _TELL_RANGE = ("264", "265", "hevc", "vp9", "av1", "mjpeg")
 """Parts of the names of encoders whose pictures themselves tell the range of values."""
 
@@ -234,6 +237,8 @@ class FrameWriter(contextlib.AbstractContextManager):
         rate = source.average_rate or source.guessed_rate or 25
         given = source.codec_context
         chosen = _options(name, given) if options is None else options
+        if options is None and self._output.format.name == "avi" and name in _REORDER:
+            chosen["bf"] = "0"  # AVI tells times in the order of packets
         chosen, kept, lost = with_hdr(name, chosen, like.side)
         self.kept += kept
         self.not_kept += lost
