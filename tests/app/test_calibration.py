@@ -231,6 +231,18 @@ def test_bands_allow_for_uncertain_focal_lengths(calibration):
     assert allowed.next_photo.sentence == calibration.next_photo.sentence
 
 
+def test_frames_of_one_focal_length_err_together():
+    """As photos at one step of the zoom, rounded in EXIF data: its error does not average out."""
+    settings = np.array([22.0, 28.0, 50.0, 105.0])
+    focal = np.repeat(settings, 3)
+    lines = scenes.board_lines(scenes.nikkor_18_200(), focal, spacing=199, noise=0.5)
+    allowed = calibrate(lines, **GIVEN, focal_sigma=0.01 * focal)
+    small, fit = in_image(zj.compress(lines)), calibrate(lines, **GIVEN).fit
+    for shared, same in ((np.repeat(np.arange(4), 3), True), (None, False)):
+        expected = zj.fit.with_focal_sigma(fit, small, focal_sigma=0.01 * focal, shared=shared)
+        assert np.allclose(allowed.fit.covariance, expected.covariance, rtol=1e-6) == same
+
+
 def test_deviations_are_numbers_or_per_cent():
     np.testing.assert_allclose(focal_sigmas("0.3", np.array([20.0, 50.0])), [0.3, 0.3])
     np.testing.assert_allclose(focal_sigmas(" 2 %", np.array([20.0, 50.0])), [0.4, 1.0])

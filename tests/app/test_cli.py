@@ -169,7 +169,7 @@ def test_calibrate_allows_for_uncertain_focal_lengths(calibrated, tmp_path):
     exact = json.loads((calibrated[0] / "summary.json").read_text())
     done = zoomjax("calibrate", calibrated[0] / "lines.npz", "-o", tmp_path, *FORCED, "--focal-sigma", "1%")
     assert done.returncode == 0, done.stderr
-    assert "include those of the focal lengths, 1.00%." in done.stdout
+    assert "include those of the focal lengths, 1.00%," in done.stdout
     told = json.loads((tmp_path / "summary.json").read_text())
     assert [row["focal_sigma"] / row["focal"] for row in told["per_frame"]] == pytest.approx([0.01] * 5)
     assert told["corner_displacement"][0]["std"] > 2 * exact["corner_displacement"][0]["std"]
@@ -534,6 +534,10 @@ WRONG = {
     "a board at infinity": (
         ["a.jpg", "--spacing", "20", "--distance", "inf", "--pixel-pitch", "0.005"],
         "Missing or wrong: --distance",
+    ),
+    "pixels in µm": (
+        ["a.jpg", "--spacing", "20", "--distance", "900", "--pixel-pitch", "3.9"],
+        "--pixel-pitch must be the width of a pixel on the sensor in mm",
     ),
     "digits of another kind": (["a.jpg", "--focal", "35", "--focal-sigma", "1_0"], "such as 0.3, or 1%"),
     "no digits": (["lines.npz", "--focal-sigma", ""], "such as 0.3, or 1%"),

@@ -164,6 +164,14 @@ def test_missing_lines_and_lines_in_pieces_do_not_matter():
     assert gaps == pytest.approx(even, rel=1e-3)
 
 
+@pytest.mark.parametrize("board", [((20.0, 20.0), 1.0), ((0.02, 0.02), 1000.0), ((0.02, 0.02), 1.0)])
+def test_lengths_of_a_board_in_m_are_refused(board):
+    even = upright(100, 200, 300, 400, 500, 600, 700)
+    with pytest.raises(ValueError, match=r"which cannot be\. Check --spacing, --distance"):
+        choose_focals([even], board=Board(*board, 0.01))
+    assert choose_focals([even], board=Board((2.0, 2.0), 100.0, 0.01)).focal  # all in cm is near enough
+
+
 def oblique(focal, tilts, k=(0.05, -0.02)):
     """A grid of 12 x 8 nodes seen obliquely through a lens, a detection each view."""
     lens = zj.Distortion(jnp.array(k), jnp.array(PRINCIPAL), jnp.array(np.hypot(*SIZE) / 2))

@@ -207,6 +207,9 @@ def test_tiff_of_any_orientation_is_corrected_as_stored(tmp_path, rng, orientati
 
 
 def test_colours_of_print_are_refused(tmp_path, rng):
+    Image.fromarray(picture(rng)).convert("LAB").save(tmp_path / "in.tif")
+    with pytest.raises(ValueError, match=r"in\.tif is in Lab colours, .* convert it to RGB first"):
+        zj.undistort_photo(tmp_path / "in.tif", tmp_path / "out.tif", lens=lens(), focal=20.0)
     Image.fromarray(picture(rng)).convert("CMYK").save(tmp_path / "in.jpg")
     with pytest.raises(ValueError, match=r"in\.jpg is in the four colours of print \(CMYK\).* RGB first"):
         zj.undistort_photo(tmp_path / "in.jpg", tmp_path / "out.jpg", lens=lens(), focal=20.0)

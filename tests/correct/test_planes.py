@@ -29,9 +29,12 @@ def coloured(path, encoder, pixels):
     with av.open(str(path), "w") as out:
         video = out.add_stream(encoder, rate=25)
         video.width, video.height = SIZE
-        video.pix_fmt = pixels
+        full = encoder == "ffv1" and pixels.startswith("yuvj")  # which says so in another way
+        video.pix_fmt = pixels.replace("yuvj", "yuv") if full else pixels
+        video.codec_context.color_range = 2 if full else 0
         for number in range(3):
             frame = av.VideoFrame.from_ndarray(shown, "rgba").reformat(format=pixels)
+            frame = frame.reformat(format=video.pix_fmt, dst_color_range=2) if full else frame
             frame.pts, frame.time_base = number, Fraction(1, 25)
             out.mux(video.encode(frame))
         out.mux(video.encode(None))
@@ -59,6 +62,29 @@ def seen(path):
         ("in.mkv", "libx264", "yuv444p", "out.mkv", "libx264rgb"),
         ("in.mkv", "libx264", "yuvj444p", "out.mov", "png"),
         ("in.avi", "rawvideo", "bgr24", "out.avi", None),
+        (
+            "in.mov",
+            "png",
+            "rgba",
+            "out.webm",
+            None,
+        ),  # transparent, in the only format that VP9 has for that
+        ("in.mov", "prores_ks", "yuva444p10le", "out.webm", None),
+        (
+            "in.avi",
+            "rawvideo",
+            "gray",
+            "out.mp4",
+            None,
+        ),  # of machine vision: no range is said, and it is full
+        ("in.avi", "rawvideo", "gray", "out.mov", "prores_ks"),
+        ("in.avi", "rawvideo", "gray", "out.mkv", "ffv1"),
+        ("in.avi", "mjpeg", "yuvj420p", "out.mp4", None),
+        ("in.avi", "mjpeg", "yuvj420p", "out.mov", "prores_ks"),  # whose range players take for limited
+        ("in.avi", "mjpeg", "yuvj420p", "out.mkv", "libvpx"),
+        ("in.mkv", "ffv1", "yuvj420p", "out.mkv", None),
+        ("in.mkv", "ffv1", "yuvj420p", "out.mp4", None),
+        ("in.mkv", "ffv1", "yuvj420p", "out.avi", None),
     ],
 )
 def test_colours_stay(name, encoder, pixels, target, made, tmp_path):
@@ -68,6 +94,28 @@ def test_colours_stay(name, encoder, pixels, target, made, tmp_path):
     undistort_video(source, tmp_path / target, lens=straight(), focal=30.0, encoder=made)
     after, _ = seen(tmp_path / target)
     assert np.abs(after - before).max() <= 6
+
+
+@pytest.mark.parametrize(
+    ("target", "made", "kept"),
+    [("out.mp4", None, True), ("out.mov", "prores_ks", False), ("out.avi", "mpeg4", False)],
+)
+def test_a_range_of_values_that_the_encoder_does_not_tell_is_said(target, made, kept, tmp_path):
+    source = coloured(tmp_path / "in.avi", "mjpeg", "yuvj420p")
+    done = undistort_video(source, tmp_path / target, lens=straight(), focal=30.0, encoder=made)
+    assert ("the full range of values, which became the limited one" in done.not_kept) == (not kept)
+
+
+@pytest.mark.parametrize(("encoder", "pixels"), [("png", "rgba"), ("prores_ks", "yuva444p10le")])
+def test_transparency_is_kept_in_webm(encoder, pixels, tmp_path):
+    source = coloured(tmp_path / "in.mov", encoder, pixels)
+    done = undistort_video(source, tmp_path / "out.webm", lens=straight(), focal=30.0)
+    assert "transparency" not in done.not_kept
+    with av.open(str(tmp_path / "out.webm")) as clip:
+        decoder = av.CodecContext.create("libvpx-vp9", "r")  # FFmpeg's own decodes none
+        frame = next(frame for packet in clip.demux(video=0) for frame in decoder.decode(packet))
+    alpha = frame.to_ndarray(format="rgba")[SIZE[1] // 2, SIZE[0] // 8 :: SIZE[0] // 4, 3]
+    assert (np.abs(alpha.astype(int) - PATCHES[:, 3]) <= 6).all()
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from zoomjax import scenes
 from zoomjax.fit import focal_fit
 from zoomjax.fit.covariance import parameter_covariance
 from zoomjax.fit.energy import linearised
-from zoomjax.fit.focal_lengths import _response
+from zoomjax.fit.focal_lengths import _response, of_equal_focal
 
 ROUNDED = 1 / np.sqrt(12)
 
@@ -97,6 +97,21 @@ def test_what_photos_err_by_is_counted_once(truth, centre):
         np.testing.assert_array_equal(wide.joint[:6, :6], wide.covariance)
         size = np.sqrt(np.diag(wide.joint))
         assert np.linalg.eigvalsh(np.asarray(wide.joint) / size / size[:, None]).min() > -1e-9
+
+
+@pytest.mark.parametrize(
+    ("focal", "shared", "expected"),
+    [
+        ([24.0, 35.0, 24.0, 50.0], None, [0, 1, 0, 3]),
+        ([24.0, 35.0, 24.0, 50.0], [0, 1, 2, 1], [0, 1, 0, 1]),
+        ([24.0, 35.0, 24.000001, 50.0], [5, 1, 5, 2], [0, 1, 0, 3]),
+        ([24.0, 35.0, 24.0, 35.0, 50.0], [0, 1, 2, 2, 4], [0, 0, 0, 0, 4]),  # by way of others
+        ([50.0, 35.0, 24.0], None, [0, 1, 2]),
+    ],
+)
+def test_frames_of_one_focal_length_share_its_error(focal, shared, expected):
+    found = of_equal_focal(np.array(focal), None if shared is None else np.array(shared))
+    assert found.tolist() == expected
 
 
 def test_frames_that_share_an_error_add_up(sweep):

@@ -81,8 +81,8 @@ def test_pitch_alone_gives_equation_14():
     pitch, seen = 40.0, 3.0
     board = np.array([[0.0, 0.0], [0.0, pitch], [0.0, 2 * pitch]])
     image = np.array([[7.0, 5.0], [7.0, 5 + seen], [7.0, 5 + 2 * seen]])
-    estimate = from_board(image, board, distance=1000.0, pixel_pitch=0.5)
-    r_c = seen * 0.5
+    estimate = from_board(image, board, distance=1000.0, pixel_pitch=0.25)
+    r_c = seen * 0.25
     assert estimate.focal == pytest.approx(1000 * r_c / (pitch + r_c))
 
 
@@ -117,6 +117,13 @@ def test_equation_14_under_jit_and_differentiated(truth):
 def test_lengths_must_be_positive(settings):
     with pytest.raises(ValueError, match="must be finite and positive"):
         from_board(PLANE, PLANE, **settings)
+
+
+@pytest.mark.parametrize("pitch", [3.9, 3.9e-6, np.array(5.5), jnp.array(5.5e-6)])
+def test_pixels_in_another_unit_are_refused(pitch):
+    with pytest.raises(ValueError, match="pixel_pitch must be the width of a pixel on the sensor in mm"):
+        from_board(PLANE, PLANE, pixel_pitch=pitch)
+    assert np.isfinite(from_board(PLANE, PLANE, pixel_pitch=1).focal)  # of points in mm
 
 
 def test_lists_are_arrays(truth):

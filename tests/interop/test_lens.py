@@ -123,6 +123,16 @@ def test_focal_lengths_in_mm_tell_the_size_of_pixels_if_they_agree(tmp_path):
     assert zj.interop.read(tmp_path / "a.txt").lens.pixel_pitch is None
 
 
+@pytest.mark.parametrize("unit", [1e3, 1e-3, 1e-6])
+def test_focal_lengths_in_another_unit_than_mm_are_said(unit, tmp_path):
+    rows = "1 SIMPLE_RADIAL 640 480 {} 320 240 -0.1\n"
+    (tmp_path / "a.txt").write_text(rows.format(2000) + rows.format(4000))
+    found = zj.interop.read(tmp_path / "a.txt", focal=[20 * unit, 40 * unit])
+    assert found.lens.pixel_pitch is None
+    assert "are in another unit: it means pixels of" in " ".join(found.report.notes)
+    assert zj.interop.read(tmp_path / "a.txt", focal=[20, 40]).report.notes == ()
+
+
 @pytest.mark.parametrize("name", ["gyroflow", "unreal"])
 def test_a_table_does_between_focal_lengths_as_the_tool(name, tmp_path):
     """Few focal lengths, between which the tool's interpolation and one that is linear in 1/f differ."""

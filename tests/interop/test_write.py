@@ -282,6 +282,8 @@ MISTAKES = {
     "Argument focal must hold positive numbers, but it is True": {"format": "opencv", "focal": True},
     "Argument focal must hold positive numbers, but it is .'24'": {"format": "opencv", "focal": ["24"]},
     "Argument pixel_pitch must be a positive": {"format": "opencv", "focal": 24, "pixel_pitch": True},
+    "Argument pixel_pitch must be the width": {"format": "opencv", "focal": 24, "pixel_pitch": 5.5},
+    "it means pixels of 5.5e-06 mm and a sensor": {"format": "lensfun", "pixel_pitch": 5.5e-6},
     "Argument track must reach over a whole frame, but it": {"format": "nuke", "track": NO_FRAME},
     "Argument tolerance must be a positive": {"format": "lensfun", "tolerance": 0, "pixel_pitch": PITCH},
     "Argument convention must be one of": {"format": "stmap", "focal": 24, "convention": "x"},

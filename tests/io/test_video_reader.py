@@ -1,5 +1,7 @@
 """Videos whose file says more than their pictures: frames that are not shown, pixels, fields, damage."""
 
+import io
+import struct
 from fractions import Fraction
 
 import cv2
@@ -9,6 +11,7 @@ import pytest
 import zoomjax as zj
 from zoomjax.detect import video_frames
 from zoomjax.io import FocalTrack, decode_video
+from zoomjax.io.video_crop import _elements, shown_size
 from zoomjax.tracks import track_video
 
 av = pytest.importorskip("av")
@@ -41,7 +44,7 @@ def write(path, encoder="libx264", number=FRAMES, aspect=1, **options):
     with av.open(str(path), "w") as out:
         stream = out.add_stream(encoder, rate=30, options=options)
         stream.width, stream.height = SIZE
-        stream.pix_fmt = "rgb24" if encoder == "png" else "yuv420p"
+        stream.pix_fmt = {"png": "rgb24", "mjpeg": "yuvj420p"}.get(encoder, "yuv420p")
         stream.codec_context.sample_aspect_ratio = Fraction(aspect)
         for i in range(number):
             grey = np.ascontiguousarray(texture[:, 3 * i : 3 * i + SIZE[0]])
@@ -112,3 +115,117 @@ def test_frames_of_tracks_that_are_not_those_of_the_file_are_said(tmp_path):
     assert tracks.frames == FRAMES - 2
     with decode_video(path) as (_, frames):
         assert [number for number, _, _ in frames] == [*range(5), *range(7, FRAMES)]
+
+
+def box(name, content):
+    """A box of MP4 or MOV."""
+    return struct.pack(">I4s", 8 + len(content), name) + content
+
+
+def with_clap(content, path=(b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd"), shown=(400, 300)):
+    """The boxes of an MP4 file with the part that is shown in the description of its pictures."""
+    made, place = b"", 0
+    while place < len(content):
+        length, name = struct.unpack_from(">I4s", content, place)
+        inner = content[place + 8 : place + length]
+        if name == path[0] == b"stsd":
+            clap = box(b"clap", struct.pack(">8i", shown[0], 1, shown[1], 1, 0, 1, 0, 1))
+            inner = inner[:8] + box(inner[12:16], inner[16:] + clap)
+        elif name == path[0]:
+            inner = with_clap(inner, path[1:], shown)
+        made, place = made + box(name, inner), place + length
+    return made
+
+
+def with_crop(content, left=16, top=8):
+    """A Matroska file with pixels that are not shown."""
+    file, inside = io.BytesIO(content), []
+    end = len(content)
+    for name in (0x18538067, 0x1654AE6B, 0xAE, 0xE0):  # segment, tracks, track, video
+        end = next(stop for found, stop in _elements(file, end) if found == name)
+        inside.append((file.tell(), end))
+    crop = b"\x54\xcc\x81" + bytes([left]) + b"\x54\xbb\x81" + bytes([top])
+    grown = content[:end] + crop + content[end:]
+    for start, stop in inside[1:]:  # their lengths; the segment's has room, for what follows it is skipped
+        wide = next(n for n in range(1, 9) if _told(content, start, n) == 1 << 7 * n | stop - start)
+        told = (1 << 7 * wide | stop - start + len(crop)).to_bytes(wide, "big")
+        grown = grown[: start - wide] + told + grown[start:]
+    return grown
+
+
+def _told(content, start, wide):
+    """The length before an element's content, with the mark of its own length."""
+    return int.from_bytes(content[start - wide : start], "big")
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv"])
+def test_a_part_that_alone_is_to_be_shown_is_said(suffix, tmp_path):
+    path = write(tmp_path / f"in{suffix}", number=4)
+    zj.undistort_video(path, tmp_path / "whole.mp4", lens=lens(), focal=20.0)
+    left, top = 16, 8
+    content = path.read_bytes()
+    shown = (SIZE[0] - left, SIZE[1] - top)
+    path.write_bytes(with_crop(content) if suffix == ".mkv" else with_clap(content, shown=shown))
+    with pytest.warns(
+        UserWarning, match=f"says to show {shown[0]} x {shown[1]} of its {SIZE[0]} x {SIZE[1]}"
+    ):
+        zj.undistort_video(path, tmp_path / "out.mp4", lens=lens(), focal=20.0)
+    with pytest.warns(UserWarning, match="says to show"), decode_video(path) as (number, frames):
+        assert len(list(frames)) == number == 4
+
+
+def test_the_whole_picture_may_be_marked(tmp_path):
+    path = write(tmp_path / "in.mp4", number=4)
+    path.write_bytes(with_clap(path.read_bytes(), shown=SIZE))
+    assert zj.undistort_video(path, tmp_path / "out.mp4", lens=lens(), focal=20.0).frames == 4
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
+def test_damaged_heads_say_nothing_of_it(suffix, tmp_path, rng):
+    path = write(tmp_path / f"in{suffix}", number=4)
+    content = with_crop(path.read_bytes()) if suffix == ".mkv" else with_clap(path.read_bytes())
+    for _ in range(300):
+        data = np.frombuffer(content, np.uint8).copy()
+        data[rng.integers(0, data.size, 40)] = rng.integers(0, 256, 40)
+        path.write_bytes(data[: rng.integers(0, data.size)].tobytes())
+        found = shown_size(path, SIZE)
+        assert found is None or (0 < found[0] <= SIZE[0] and 0 < found[1] <= SIZE[1])
+
+
+def uneven(path, gap=3.0):
+    """A clip without one frame in some seconds, as of cameras that stop for a moment."""
+    times = [number / 25 + (gap if number > 4 else 0) for number in range(10)]
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("libx264", rate=25)
+        (stream.width, stream.height), stream.pix_fmt = SIZE, "yuv420p"
+        stream.codec_context.time_base = Fraction(1, 1000)
+        for number, time in enumerate(times):
+            grey = np.full(SIZE[::-1], 20 * number, np.uint8)
+            frame = av.VideoFrame.from_ndarray(grey, "gray").reformat(format="yuv420p")
+            frame.pts, frame.time_base = round(1000 * time), Fraction(1, 1000)
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+    return times
+
+
+@pytest.mark.parametrize("suffix", [".mkv", ".mp4", ".avi"])
+def test_times_of_frames_stay_where_they_are_uneven(suffix, tmp_path):
+    """In AVI, which fills gaps with chunks without content, and has no order but that of packets."""
+    times = uneven(tmp_path / "in.mkv")
+    done = zj.undistort_video(tmp_path / "in.mkv", tmp_path / f"a{suffix}", lens=lens(), focal=20.0)
+    again = zj.undistort_video(tmp_path / f"a{suffix}", tmp_path / "b.mkv", lens=lens(), focal=20.0)
+    assert (done.frames, done.lost, again.frames, again.lost) == (10, 0, 10, 0)
+    for name in (f"a{suffix}", "b.mkv"):
+        with decode_video(tmp_path / name) as (number, frames):
+            found = [(time, decode().mean()) for _, time, decode in frames]
+        assert number in (0, 10)
+        np.testing.assert_allclose([time for time, _ in found], times, atol=2e-3)
+        assert (np.diff([grey for _, grey in found]) > 0).all()
+
+
+def test_an_avi_file_that_is_cut_off_is_said(tmp_path):
+    path = write(tmp_path / "in.avi", "mjpeg")
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.warns(UserWarning, match=rf"of {FRAMES} frames of .* cannot be decoded"):
+        zj.undistort_video(path, tmp_path / "out.mp4", lens=lens(), focal=20.0)

@@ -51,6 +51,19 @@ def test_a_wrong_pitch_is_refused(pitch):
         lens(pixel_pitch=pitch)
 
 
+@pytest.mark.parametrize("pitch", [5.5, 5.5e-6])
+def test_a_pitch_in_another_unit_is_refused(pitch, tmp_path):
+    with pytest.raises(ValueError, match=r"must be the width of a pixel .*\(3\.9 µm are 0\.0039\)"):
+        lens(pixel_pitch=pitch)
+    with pytest.raises(ValueError, match="pixel_pitch must be the width of a pixel"):
+        Camera(lens(), pixel_pitch=pitch)
+    lens(pixel_pitch=0.0055).save(tmp_path / "lens.json")
+    text = (tmp_path / "lens.json").read_text().replace("0.0055", str(pitch))
+    (tmp_path / "lens.json").write_text(text)
+    with pytest.raises(ValueError, match=r"Cannot read a lens from .*: Argument pixel_pitch must"):
+        zj.load_lens(tmp_path / "lens.json")
+
+
 @pytest.mark.parametrize("about", ["NIKON", {1: "a"}, {"crop": np.nan}, {"crop": None}, {"tele": True}])
 def test_wrong_facts_are_refused(about):
     with pytest.raises(ValueError, match="about must be a dictionary of words and finite numbers"):

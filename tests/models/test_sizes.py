@@ -1,6 +1,7 @@
 """Lenses for images of another size."""
 
 import copy
+import dataclasses
 import gc
 
 import jax
@@ -242,6 +243,16 @@ def test_a_framing_for_another_size_is_refused_and_scaled_for_photos():
 def small_lens():
     zoom = zj.PolynomialZoom(1, jnp.array([[0.02], [0.1]]), jnp.array(20.0))
     return zj.ZoomLens(zoom, jnp.array([63.5, 47.5]), jnp.array([20.0, 80.0]), (128, 96))
+
+
+def test_focal_lengths_in_px_stay_those_of_the_lens_and_this_is_said():
+    whole = dataclasses.replace(small_lens(), focal_unit="px")
+    with pytest.warns(UserWarning, match=r"is scaled to them\. Its focal lengths stay .* 128.* px wide"):
+        half = zj.models.lens_for_size(whole, (64, 48))
+    with pytest.warns(UserWarning, match=r"is scaled to them\. Its focal lengths stay .* 128.* px wide"):
+        zj.models.lens_for_size(half, (32, 24))
+    with pytest.warns(UserWarning, match=r"is scaled to them\.$"):
+        zj.models.lens_for_size(small_lens(), (64, 48))
 
 
 def test_a_lens_takes_its_size_along():

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import functools
 import os
-from collections import Counter
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -15,14 +14,11 @@ import numpy as np
 
 from .._core.executors import arrived, checked_executor, in_order, is_away, sent
 from .._core.files import whole_file
-from .._core.text import listed
 from ..correct.framing import Framing, frame_output
 from ..correct.photo import Correction, corrected_photo
 from ..correct.redistort import check_framed
-from ..io.metadata import straightened_by
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal, lens_for_size
-from .equipment import metadata_of
 
 BAD_FILE = (ValueError, OSError, RuntimeError, MemoryError, cv2.error)
 """Errors of one file that do not stop the others."""
@@ -168,19 +164,6 @@ def _corrected(task: _Task, correction: Correction) -> list[str] | Exception:
     with whole_file(task.target) as part:
         part.write_bytes(content)
     return lost
-
-
-def corrected_before(photos: Sequence[Path]) -> tuple[str, ...]:
-    """That photos say that another program has corrected them before, in a sentence; none if none does."""
-    programs = Counter(straightened_by(metadata_of(photo)) for photo in photos)
-    told = [name for name in programs if name not in (None, "zoomjax")]
-    if not told:
-        return ()
-    number = sum(programs[name] for name in told)
-    return (
-        f"Of {len(photos)} photos {number} say that {listed(told, 3)} has corrected their distortion "
-        "before. Unless the lens was calibrated from such photos, they are corrected twice now.",
-    )
 
 
 def _sent(correction: Correction) -> Correction:

@@ -236,6 +236,7 @@ def unit_of(given: str | None) -> str:
 
 def board_of(spacing: str | None, distance: float | None, pixel_pitch: float | None) -> "Board | None":
     """The board, if one is given."""
+    from .._core.pixels import check_pitch
     from .board_focals import Board
 
     if spacing is distance is pixel_pitch is None:
@@ -252,6 +253,7 @@ def board_of(spacing: str | None, distance: float | None, pixel_pitch: float | N
             "A board needs --spacing (MM, or MMxMM across and down), --distance and --pixel-pitch (of the "
             f"sensor), all positive and in mm. Missing or wrong: {', '.join(bad or ['--spacing'])}."
         )
+    check_pitch(pixel_pitch)
     return Board((spacings[0], spacings[-1]), distance, pixel_pitch)
 
 

@@ -1,7 +1,8 @@
 """The focal length of a board that is parallel to the sensor, at a known distance (eq. 14)."""
 
 import dataclasses
-from collections.abc import Sequence
+import math
+from collections.abc import Collection, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +40,32 @@ class Board:
     spacing: tuple[float, float]
     distance: float
     pixel_pitch: float
+
+
+def check_board(board: Board, focal: Collection[float], image_size: tuple[int, int]) -> None:
+    """Refuse focal lengths that no lens has: a length of the board is in another unit.
+
+    Raises:
+        ValueError: the angle of view is beyond that of any lens, or the board is far larger on the sensor
+            than it is.
+    """
+    if not focal:
+        return
+    shortest, longest = min(focal), max(focal)
+    share = shortest / board.pixel_pitch / math.hypot(*image_size)
+    if share < _SHORTEST or longest > _LARGEST / (1 + _LARGEST) * board.distance:
+        raise ValueError(
+            f"By the board f is {shortest:.3g} to {longest:.3g} mm, which cannot be. Check --spacing, "
+            f"--distance and --pixel-pitch: they are {board.spacing[0]:g} mm, {board.distance:g} mm and "
+            f"{board.pixel_pitch:g} mm."
+        )
+
+
+_SHORTEST = 0.1
+"""Focal length over the sensor's diagonal: half of the least that lenses have."""
+
+_LARGEST = 5.0
+"""Size of a board's image on the sensor over its own, beyond macro lenses."""
 
 
 def focal_of_board(board: Board, detection: Detection, correction: Distortion) -> FocalEstimate | None:

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from .._core.text import percentages, span
 from .._core.types import AnyArray
 from ..fit.energy import line_squares
-from ..fit.focal_lengths import with_focal_sigma
+from ..fit.focal_lengths import of_equal_focal, with_focal_sigma
 from ..fit.image_metric import in_image
 from ..fit.result import RESULTS, FrameFits, ZoomFit
 from ..fit.straightness import frame_rms
@@ -120,8 +120,8 @@ class Calibration:
         if not share.any():
             return ""
         return (
-            f"Standard deviations include those of the focal lengths, {percentages(share)}. What the next "
-            "photo would improve is of the noise alone."
+            f"Standard deviations include those of the focal lengths, {percentages(share)}, one error for "
+            "all of one f. What the next photo would improve is of the noise alone."
         )
 
     def enough(self) -> bool:
@@ -352,7 +352,7 @@ def calibrate(
             from the remaining lines.
         metric: where distances are measured: `in_image`, or `in_corrected` as in the paper.
         focal_sigma: standard deviation of the focal lengths: a number, or one per frame; 0 where exact.
-        shared: for each frame a number: frames of one number share a focal length and its error.
+        shared: for each frame a number: frames of one number share the error of f, as those of one f do.
         widened: adds to the uncertainty of a fit what the lines do not show of it.
         stage: called with a description before each step that takes time.
 
@@ -362,9 +362,8 @@ def calibrate(
     """
     used = fitted(lines, model, centre, robust=robust, metric=metric, stage=stage)
     exact, small, terms = used.fit, used.lines, used.model.terms
-    sigma, zoom = np.broadcast_to(focal_sigma, lines.focal.shape), exact
-    if sigma.any():
-        zoom = with_focal_sigma(exact, small, focal_sigma=sigma, shared=shared)
+    sigma, shared = np.broadcast_to(focal_sigma, lines.focal.shape), of_equal_focal(lines.focal, shared)
+    zoom = with_focal_sigma(exact, small, focal_sigma=sigma, shared=shared) if sigma.any() else exact
     zoom = widened(with_misfit(zoom, used.held, focal_sigma=sigma, shared=shared))
     stage("Checking the fit on lines left out")
     held_out = {"rms_held_out": left_out(small, used.model)}

@@ -29,7 +29,7 @@ from ..lines.compressed import compress
 from ..lines.lines import Lines
 from ..models.distortion import Distortion
 from ..models.zoom import PolynomialZoom
-from .board_focals import NOT_THE_BOARD, Board, focal_of_board
+from .board_focals import NOT_THE_BOARD, Board, check_board, focal_of_board
 from .plane_focals import MOST_UNCERTAIN, FocalGroup, Found, Sharing, focals_from_grids
 
 SOURCES = (
@@ -156,6 +156,7 @@ def choose_focals(
             NOT_THE_BOARD,
             _each(functools.partial(focal_of_board, board)),
         )
+        check_board(board, found.focal.values(), detections[0].image_size)
     elif source == "same":
         return _unknown(detections)
     elif source == "plane" and all(d.nodes is None for d in detections):

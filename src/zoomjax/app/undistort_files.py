@@ -13,13 +13,13 @@ from .._core.files import refuse_existing, refuse_inputs, refuse_links
 from .._core.text import reason
 from ..correct.framing import Framing, check_keep
 from ..correct.image import check_sampling
-from ..correct.photo import Correction, photo_focal
+from ..correct.photo import Correction, corrected_before, photo_focal
 from ..io.focal_table import read_focal_table
 from ..io.metadata import geometry_of, work_of
 from ..io.photo import read_metadata
 from ..models.about import UNKNOWN
 from ..models.lens import ZoomLens, load_lens
-from ._photos import BAD_FILE, SAME, CommonFraming, corrected_before, corrected_photos
+from ._photos import BAD_FILE, SAME, CommonFraming, corrected_photos
 from .equipment import taken_otherwise
 from .plans import files_plan
 from .undistort_inputs import Found, find_inputs, focal_number, targets_of

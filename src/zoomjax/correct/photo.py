@@ -10,13 +10,15 @@ import dataclasses
 import hashlib
 import os
 import warnings
-from collections.abc import Callable, Generator
+from collections import Counter
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
 
 from .._core.files import refuse_inputs, whole_file
+from .._core.text import listed
 from ..io.metadata import Metadata, framing_of, geometry_of, marked, straightened_by
 from ..io.photo import FORMATS, Photo, metadata_focal, open_photo, read_focal, read_metadata, read_pages
 from ..io.photo_writer import check_written, encoded_photo
@@ -123,9 +125,9 @@ def undistort_photo(
     Raises:
         FileNotFoundError: there is no such photo.
         OSError: the target cannot be written; nothing is left of it.
-        ValueError: the photo cannot be decoded, is in the colours of print (CMYK), has no focal length, is
-            corrected already, or has another aspect ratio than the lens; or the target is the photo itself,
-            its suffix is unknown, or its format cannot store such pixels or several pages.
+        ValueError: the photo cannot be decoded, is in the colours of print (CMYK) or Lab, has no focal
+            length, is corrected already, or has another aspect ratio than the lens; or the target is the
+            photo itself, its suffix is unknown, or its format cannot store such pixels or several pages.
 
     Warns:
         UserWarning: as `undistort_image` and `ZoomLens` do; metadata are lost, as IPTC data in PNG; or
@@ -175,15 +177,31 @@ def _convert(
     content, lost = corrected_photo(source, target.suffix, correction, focal)
     if lost:
         warnings.warn(not_kept(source, target.suffix, lost), stacklevel=3)
-    before = None if correction.back else straightened_by(read_metadata(source))
-    if before not in (None, "zoomjax"):
-        warnings.warn(
-            f"{os.fspath(source)} says that {before} has corrected its distortion before. Unless the lens "
-            "was calibrated from such photos, it is corrected twice now.",
-            stacklevel=3,
-        )
+    for told in () if correction.back else corrected_before([source]):
+        warnings.warn(told, stacklevel=3)
     with whole_file(target) as part:
         part.write_bytes(content)
+
+
+def corrected_before(sources: Sequence[str | os.PathLike[str]]) -> tuple[str, ...]:
+    """That photos say that another program has corrected them before, in a sentence; none if none does.
+
+    Photos that cannot be read say nothing.
+    """
+    programs: Counter[str] = Counter()
+    for source in sources:
+        with contextlib.suppress(OSError, ValueError):
+            programs[straightened_by(read_metadata(source)) or ""] += 1
+    told = [name for name in programs if name not in ("", "zoomjax")]
+    if not told:
+        return ()
+    one, number = len(sources) == 1, sum(programs[name] for name in told)
+    who = f"{os.fspath(sources[0])} says" if one else f"Of {len(sources)} photos {number} say"
+    whose, they = ("its", "it is") if one else ("their", "they are")
+    return (
+        f"{who} that {listed(told, 3)} has corrected {whose} distortion before. Unless the lens was "
+        f"calibrated from such photos, {they} corrected twice now.",
+    )
 
 
 def check_target(target: Path) -> None:
@@ -253,10 +271,8 @@ def corrected_photo(
 
 def _check(photo: Photo, source: str | os.PathLike[str], suffix: str, correction: Correction) -> None:
     name = os.fspath(source)
-    if photo.cmyk:
-        raise ValueError(
-            f"{name} is in the four colours of print (CMYK), which are not kept: convert it to RGB first."
-        )
+    if photo.colours:
+        raise ValueError(f"{name} is in {photo.colours}, which are not kept: convert it to RGB first.")
     if not correction.again and geometry_of(photo.pages[0][1]) == correction.geometry:
         raise ValueError(
             f"{name} is {correction.geometry} by zoomjax already. Give the original, or argument again."

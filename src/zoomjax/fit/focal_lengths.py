@@ -119,6 +119,22 @@ def _checked_errors(fit, lines, focal_sigma, shared):
     return sigma, together
 
 
+def of_equal_focal(focal: Focal, shared: Int[AnyArray, "frame"] | None = None) -> np.ndarray:
+    """For each frame a number, the same for those `shared` and for those of one focal length.
+
+    Equal focal lengths are one step of a camera's encoder, one mark of the ring or one measurement: what is
+    wrong with them does not average out. Where frames were zoomed between, bands are too wide.
+    """
+    values = np.asarray(focal)
+    _, first = np.unique(values, return_index=True)
+    number = first[np.searchsorted(values[first], values)]
+    if shared is not None:
+        for group in np.unique(shared):  # also of frames whose focal lengths differ by rounding
+            of = np.isin(number, number[np.asarray(shared) == group])
+            number[of] = number[of].min()
+    return number
+
+
 def with_covariance(fit, covariance, joint):
     """A fit with other covariances: of the parameters, and of these with the centre."""
     return eqx.tree_at(

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Num
 
 from .._core.fields import check_positive
+from .._core.pixels import check_pitch
 from .._core.types import AnyArray, Scalar
 from .estimate import FocalEstimate, as_points_of, check_pairs
 
@@ -29,7 +30,7 @@ def focal_from_board(
         board: the same points on the board, mm, x to the right and y downwards as seen by the camera; its
             position and rotation in its plane do not matter.
         distance: from the projection plane to the board, mm, > 0: eq. 14's d.
-        pixel_pitch: side of a pixel on the sensor, mm, > 0. 1 is for points measured in mm.
+        pixel_pitch: side of a pixel on the sensor, mm. 1 is for points measured in mm.
 
     Returns:
         The focal length in mm. Residuals are treated as independent errors of the points' coordinates.
@@ -37,7 +38,8 @@ def focal_from_board(
         distance.
 
     Raises:
-        ValueError: shapes differ, there are fewer than 3 points, or a length is not positive.
+        ValueError: shapes differ, there are fewer than 3 points, a length is not positive, or
+            pixels are of a width that no sensor has.
         RuntimeError: a length that was not known is not positive, or all points of the board coincide.
 
     References:
@@ -56,6 +58,8 @@ def focal_from_board(
     check_positive(
         "pixel_pitch", np.asarray(pixel_pitch) if isinstance(pixel_pitch, int | float) else pixel_pitch
     )
+    if not (isinstance(pixel_pitch, int | float) and pixel_pitch == 1):
+        check_pitch(pixel_pitch)
     # A similarity is one complex factor: its absolute value is px in the image per mm on the board.
     seen, known = _complex(points), _complex(board)
     seen, known = seen - jnp.mean(seen), known - jnp.mean(known)

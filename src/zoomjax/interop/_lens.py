@@ -36,7 +36,7 @@ from ._forms import Form
 from ._pinhole import pitch_of
 from ._samples import Pairs, distortions
 from ._seen import Seen, against, distance, inside, once, seen_of
-from .base import TOLERANCE, Contents, Node, Sampled
+from .base import TOLERANCE, Contents, Node, Sampled, possible
 from .radial_table import RadialTable, zoom_of_table
 
 _MUCH = 0.5
@@ -187,7 +187,8 @@ def _with_rays(contents: Contents, seen: list[Seen], model: Model) -> tuple[Cont
         seen = [dataclasses.replace(one, any_scale=False) for one in seen]
         return contents, sorted(seen, key=lambda one: one.node.focal)
     pitch, notes = pitch_of([one.node.focal for one in seen], [one.focal_px or math.nan for one in seen])
-    return dataclasses.replace(contents, pixel_pitch=pitch, notes=(*contents.notes, *notes)), seen
+    contents = dataclasses.replace(contents, pixel_pitch=pitch, notes=(*contents.notes, *notes))
+    return possible(contents), seen
 
 
 def _following(

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from .._core.pixels import pitch_problem
 from .._core.text import plain
 from ..models.camera import px_of_focal_px
 from ..models.lens import ZoomLens
@@ -218,6 +219,15 @@ class Contents:
     about: Mapping[str, str | float] = dataclasses.field(default_factory=dict)
     between: Callable[[int, float], Node] | None = None
     table: RadialTable | None = None
+
+
+def possible(contents: Contents) -> Contents:
+    """Without a width of pixels that no sensor has, of which a note tells instead."""
+    problem = pitch_problem(contents.pixel_pitch, contents.image_size)
+    if problem is None:
+        return contents
+    note = f"Its sensor, or focal lengths, are in another unit: {problem}. That of a pixel is left open."
+    return dataclasses.replace(contents, pixel_pitch=None, notes=(*contents.notes, note))
 
 
 def one_size(sizes: list[tuple[int, int]]) -> tuple[int, int]:

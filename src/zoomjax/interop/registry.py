@@ -13,6 +13,7 @@ import numpy as np
 from .._core.arguments import kinds_checked
 from .._core.checks import checked_size
 from .._core.files import refuse_existing, whole_file, whole_folder
+from .._core.pixels import check_pitch
 from ..io.focal_track import FocalTrack
 from ..models.about import UNKNOWN, WIDTH_OF_FOCALS
 from ..models.distortion_model import AbstractDistortionModel
@@ -22,7 +23,18 @@ from ..models.zoom import AbstractLinearZoom
 from ._lens import UnsuitedError, lens_of
 from ._options import check_model, check_options, focal_lengths, positive, positives
 from ._solve import Solution, error_written, solve
-from .base import CONVENTION, TOLERANCE, Export, FolderFormat, Format, Import, Node, NodeFormat, Report
+from .base import (
+    CONVENTION,
+    TOLERANCE,
+    Export,
+    FolderFormat,
+    Format,
+    Import,
+    Node,
+    NodeFormat,
+    Report,
+    possible,
+)
 from .colmap import COLMAP
 from .discorpy import Discorpy
 from .gyroflow import Gyroflow
@@ -135,6 +147,7 @@ def write(
         tolerance=TOLERANCE if tolerance is None else positive("tolerance", tolerance),
         convention=convention or CONVENTION,
     )
+    check_pitch(job.pixel_pitch, lens.image_size)
     folder = isinstance(fmt, FolderFormat)
     several = folder or (fmt.zoom == "one" and job.focal is not None and len(job.focal) > 1)
     if several and path.suffix.lower() in fmt.suffixes:
@@ -262,7 +275,7 @@ def read(
                 raise ValueError(f"its focal length {node.focal} is not a positive number")
             if isinstance(node, Node) and not np.isfinite([*node.theta, *node.centre]).all():
                 raise ValueError(f"its coefficients or centre at {node.focal:g} are not finite numbers")
-        made = lens_of(contents, zoom, terms, distortion_model)
+        made = lens_of(possible(contents), zoom, terms, distortion_model)
     except (FileNotFoundError, UnsuitedError):
         raise
     except _DAMAGED as error:

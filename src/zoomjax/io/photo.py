@@ -24,7 +24,7 @@ from .metadata import Metadata
 from .photo_writer import FORMATS, MAKER_NOTES
 from .png import png_metadata, transparent_grey
 from .raw import RAW_SUFFIXES, decode_raw, raw_metadata, raw_size
-from .tiff import read_tiff, tiff_metadata, tiff_size
+from .tiff import CMYK, read_tiff, tiff_metadata, tiff_size
 from .webp import webp_metadata
 
 SUFFIXES = (*FORMATS, *HEIC_SUFFIXES, *RAW_SUFFIXES)
@@ -38,12 +38,12 @@ class Photo:
     Attributes:
         pages: pixels as stored, as OpenCV has them, and metadata; several in a TIFF file only.
         others: what else the file holds that is not among these, such as "further pictures".
-        cmyk: whether it holds the four colours of print, of which the pixels have three.
+        colours: what the file's colours are called where the pixels have others, as of CMYK; else empty.
     """
 
     pages: tuple[tuple[np.ndarray, Metadata], ...]
     others: tuple[str, ...] = ()
-    cmyk: bool = False
+    colours: str = ""
 
 
 def read_focal(source: str | os.PathLike[str]) -> float | None:
@@ -179,7 +179,7 @@ def _jpeg(content: bytes, most_pages: int) -> Photo:
     if all(mark != _END for mark, _ in jpeg_segments(content)):
         raise ValueError("the file is damaged or cut off")  # OpenCV fills up what is missing with grey
     metadata, others = jpeg_metadata(content)
-    return Photo(((_decoded(content), metadata),), tuple(others), is_cmyk(content))
+    return Photo(((_decoded(content), metadata),), tuple(others), CMYK if is_cmyk(content) else "")
 
 
 def _png(content: bytes, most_pages: int) -> Photo:
@@ -203,8 +203,8 @@ def _tiff(content: bytes, most_pages: int) -> Photo:
     pages = read_tiff(content, most_pages=most_pages)
     notes = [MAKER_NOTES] if any(page.notes for page in pages) else []
     others = tuple(dict.fromkeys([*notes, *(other for page in pages for other in page.others)]))
-    cmyk = any(page.cmyk for page in pages)
-    return Photo(tuple((page.image, page.metadata) for page in pages), others, cmyk)
+    colours = next(filter(None, (page.colours for page in pages)), "")
+    return Photo(tuple((page.image, page.metadata) for page in pages), others, colours)
 
 
 def _heic(content: bytes, most_pages: int) -> Photo:

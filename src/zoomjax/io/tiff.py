@@ -56,7 +56,7 @@ class TiffPage:
         image: the pixels as stored, with blue, green, red and alpha as OpenCV has them.
         metadata: the page's own.
         orientation: 1 to 8, which is not applied to the pixels.
-        cmyk: whether the file holds four colours for print, of which `image` has three.
+        colours: what the file's colours are called, where `image` has others; else empty.
         notes: whether the page holds notes of the camera's maker, which `metadata` lacks.
         others: what else the page holds that is in neither.
     """
@@ -64,7 +64,7 @@ class TiffPage:
     image: np.ndarray
     metadata: Metadata
     orientation: int
-    cmyk: bool
+    colours: str
     notes: bool
     others: tuple[str, ...] = ()
 
@@ -105,7 +105,7 @@ def _page(content: bytes, file: tifffile.TiffFile, number: int) -> TiffPage:
         metadata, orientation = tiff_metadata(content, page)
         image = _plain(page)
         separate = page.planarconfig == 2 and page.samplesperpixel > 1
-        cmyk = getattr(page.photometric, "name", "") == "SEPARATED"
+        kind = getattr(page.photometric, "name", str(page.photometric))
         compression = getattr(page.compression, "name", str(page.compression))
         folder = page.tags.valueof(int(ExifTags.IFD.Exif))
         notes = isinstance(folder, dict) and "MakerNote" in folder
@@ -121,7 +121,18 @@ def _page(content: bytes, file: tifffile.TiffFile, number: int) -> TiffPage:
         raise ValueError(f"it is grey with transparency, and compressed ({compression})")  # OpenCV drops it
     if image is None:
         image = as_stored(_by_opencv(content, number), orientation)  # OpenCV turns TIFF files
-    return TiffPage(image, metadata, orientation, cmyk, notes, others)
+    return TiffPage(image, metadata, orientation, _COLOURS.get(kind, kind), notes, others)
+
+
+CMYK = "the four colours of print (CMYK)"
+
+_COLOURS = {
+    **dict.fromkeys(("MINISWHITE", "MINISBLACK", "RGB", "PALETTE", "YCBCR"), ""),
+    "SEPARATED": CMYK,
+    **dict.fromkeys(("CIELAB", "ICCLAB", "ITULAB"), "Lab colours, many of which RGB does not have"),
+    **dict.fromkeys(("CFA", "LINEAR_RAW"), "the colours of a sensor"),
+}
+"""Names of colours in TIFF files, by tifffile's; empty where the decoded pixels are the same."""
 
 
 def _others(page: Any) -> tuple[str, ...]:

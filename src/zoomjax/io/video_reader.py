@@ -6,6 +6,7 @@ import functools
 import heapq
 import math
 import os
+import struct
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from .pyav import av, open_container
+from .video_crop import shown_size
 from .video_hdr import side_data
 
 _MOST_ERRORS = 1000
@@ -106,7 +108,11 @@ def frames_shown(source: str | os.PathLike[str], video: Any) -> int:
     """How many frames a file announces; 0 if it does not.
 
     Of a clip that was cut without encoding it anew, an edit list leaves out frames that are still there.
+    AVI also counts chunks without content, which the index leaves out; a file that is cut off has none.
     """
+    if _is_avi(video.container):
+        indexed = sum(entry.size > 0 for entry in video.index_entries) if _is_whole_avi(source) else 0
+        return indexed or video.frames
     if not (video.frames and video.duration and video.average_rate):
         return video.frames
     hidden = video.frames / video.average_rate - video.duration * video.time_base
@@ -176,6 +182,19 @@ def _is_avi(input_: Any) -> bool:
     return input_.format.name == "avi"
 
 
+def _is_whole_avi(source: str | os.PathLike[str]) -> bool:
+    """Whether the parts of an AVI file end where it does, or before."""
+    length, place = os.path.getsize(source), 0
+    with open(source, "rb") as file:
+        while place + 8 <= length:
+            file.seek(place)
+            name, size = struct.unpack("<4sI", file.read(8))
+            if name != b"RIFF":
+                break
+            place += 8 + size + size % 2
+    return 0 < place <= length + 1
+
+
 def frames_expected(input_: Any, video: Any, report: Report) -> int:
     """How many frames a file that was read to its end should hold, as far as it tells; 0 if it does not.
 
@@ -232,7 +251,15 @@ def _warn_of_fields() -> None:
 
 
 def warn_of_pixels(video: Any) -> None:
-    """Warn of a video whose pixels are not square."""
+    """Warn of a video whose pixels are not square, or of which its file says to show a part."""
+    size = (video.codec_context.width, video.codec_context.height)
+    if shown := shown_size(Path(video.container.name), size):
+        warnings.warn(
+            f"The video says to show {shown[0]} x {shown[1]} of its {size[0]} x {size[1]} px. All of them "
+            "are taken, as stored, and a result shows all. Pictures that other programs make of it may "
+            "have another size and centre than the lens: crop it first if you need these.",
+            stacklevel=2,
+        )
     if (aspect := video.sample_aspect_ratio) not in (None, 0, 1):
         warnings.warn(
             f"The video has pixels of {aspect.numerator}:{aspect.denominator}, which are not square, but "

@@ -45,6 +45,12 @@ _ALPHA_TAG = "alpha_mode"
 _RGB, _MATRIX, _LIMITED, _FULL = 0, 1, 1, 2
 """FFmpeg's numbers for: no matrix, as of red, green and blue; that of BT.709; both ranges of values."""
 
+_REORDER = ("libx264", "libx265")
+"""Encoders whose packets are not in the order in which frames are shown."""
+
+_TELL_RANGE = ("264", "265", "hevc", "vp9", "av1", "mjpeg")
+"""Parts of the names of encoders whose pictures themselves tell the range of values."""
+
 _PROFILES = {"Proxy": "0", "LT": "1", "Standard": "2", "HQ": "3", "4444": "4", "XQ": "5"}
 """Of ProRes: FFmpeg's names, and the encoder's numbers."""
 
@@ -125,7 +131,7 @@ class FrameWriter(contextlib.AbstractContextManager):
         self.kept, self.not_kept = list(along.kept), list(along.not_kept)
         self._last: int | None = None
         self._moved = 0
-        self._encodes = False
+        self._encodes = self._limits = False
         self._output = open_container(path, "w", format=CONTAINER[named.suffix.lower()])
         try:
             self._output.metadata.update(
@@ -165,6 +171,8 @@ class FrameWriter(contextlib.AbstractContextManager):
     def _in_its_pixels(self, frame: Any) -> Any:
         """A frame in the encoder's pixel format, and red, green and blue by the matrix that is written."""
         wanted = self._stream.codec_context.pix_fmt
+        if self._limits:
+            return frame.reformat(format=wanted, src_color_range=_FULL, dst_color_range=_LIMITED)
         if frame.format.name == wanted:
             return frame
         if frame.format.is_rgb and not av.VideoFormat(wanted, 16, 16).is_rgb:
@@ -229,6 +237,8 @@ class FrameWriter(contextlib.AbstractContextManager):
         rate = source.average_rate or source.guessed_rate or 25
         given = source.codec_context
         chosen = _options(name, given) if options is None else options
+        if options is None and self._output.format.name == "avi" and name in _REORDER:
+            chosen["bf"] = "0"  # AVI tells times in the order of packets
         chosen, kept, lost = with_hdr(name, chosen, like.side)
         self.kept += kept
         self.not_kept += lost
@@ -251,6 +261,11 @@ class FrameWriter(contextlib.AbstractContextManager):
         elif first.format.is_rgb or given.colorspace == _RGB:
             context.colorspace = _MATRIX
             context.color_range = _LIMITED if first.format.is_rgb else given.color_range
+        elif _is_grey(first.format) and not given.color_range:
+            context.color_range = _FULL if _is_grey(made) else _LIMITED
+        elif _is_full(first.format, given) and not _is_grey(made) and not self._tells_range(name):
+            context.color_range, self._limits = _LIMITED, True
+            self.not_kept.append("the full range of values, which became the limited one")
         if (_has_alpha(first.format) or _hides_alpha(source)) and not _has_alpha(made):
             self.not_kept.append("transparency")
         if given.sample_aspect_ratio:
@@ -260,6 +275,11 @@ class FrameWriter(contextlib.AbstractContextManager):
         tags = {k: v for k, v in source.metadata.items() if k.lower() not in (*_OWN_TAGS, _ALPHA_TAG)}
         stream.metadata.update(tags)
         return stream
+
+    def _tells_range(self, encoder: str) -> bool:
+        """Whether a file tells that its values have the full range: players take others for limited."""
+        told = any(part in encoder for part in _TELL_RANGE)
+        return told or (encoder == "ffv1" and self._output.format.name == "matroska")
 
 
 def _refuse_unknown(
@@ -312,6 +332,16 @@ def _has_alpha(pixels: Any) -> bool:
     return any(component.is_alpha for component in pixels.components)
 
 
+def _is_full(pixels: Any, source: Any) -> bool:
+    """Whether values of YUV have the full range, as in JPEG."""
+    return source.color_range == _FULL or pixels.name.startswith("yuvj")
+
+
+def _is_grey(pixels: Any) -> bool:
+    """Whether a pixel format is of grey alone, for which FFmpeg takes all values where no range is said."""
+    return pixels.name.startswith("gray")
+
+
 def _hides_alpha(source: Any) -> bool:
     """Whether a stream has transparency beside its packets, as VP9, which FFmpeg does not decode."""
     return {key.lower(): value for key, value in source.metadata.items()}.get(_ALPHA_TAG) == "1"
@@ -331,6 +361,10 @@ def display_matrix(frame: Any) -> list[int] | None:
 def _encodable(context: Any, name: str) -> str:
     """The pixel format, or the one nearest to it that the encoder knows."""
     known = [each.name for each in context.codec.video_formats or ()]
+    if context.name == "libvpx-vp9":  # which FFmpeg says to know more formats with transparency
+        known = [
+            each for each in known if each == "yuva420p" or not _has_alpha(av.VideoFormat(each, 16, 16))
+        ]
     if name in known or not known:
         return name
     has_alpha = name.startswith(("yuva", "gbra"))

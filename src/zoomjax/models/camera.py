@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Num
 
 from .._core.arrays import aligned, as_array, finite, namespace
 from .._core.fields import check_finite, check_positive, check_shapes, numbers
+from .._core.pixels import check_pitch
 from .._core.types import AnyArray, FocalLike, Points
 from .about import WIDTH_OF_FOCALS
 from .lens import ZoomLens
@@ -68,6 +69,7 @@ class Camera(eqx.Module):
         check_shapes({"principal": (self.principal, (2,)), "pixel_pitch": (self.pixel_pitch, ())})
         check_finite("principal", self.principal)
         check_positive("pixel_pitch", self.pixel_pitch)
+        check_pitch(self.pixel_pitch, self.lens.image_size)
 
     def rays(
         self,

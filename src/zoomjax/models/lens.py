@@ -20,6 +20,7 @@ from .._core.arrays import aligned
 from .._core.checks import checked_size, checked_unit
 from .._core.fields import check_finite, check_positive, check_range, check_shapes, numbers
 from .._core.files import whole_file
+from .._core.pixels import check_pitch
 from .._core.types import AnyArray, FocalLike, Point, Points, traced
 from ._arguments import as_focal, as_points, check_broadcast, check_terms
 from ._known_sizes import with_known_size
@@ -101,6 +102,8 @@ class ZoomLens(eqx.Module):
             }
         )
         check_finite("centre", self.centre)
+        if self.pixel_pitch is not None:
+            check_pitch(self.pixel_pitch, self.image_size)
         check_positive("focal_range", self.focal_range)
         check_range("focal_range", self.focal_range)
         check_range("focus_range", self.focus_range)

@@ -57,16 +57,17 @@ def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
         return lens
     check_aspect(size, lens.image_size)
     (width, height), (old_width, old_height) = size, lens.image_size
+    about, stays = dict(lens.about), ""
+    if lens.focal_unit == "px":
+        own = about.setdefault(WIDTH_OF_FOCALS, float(old_width))
+        stays = f" Its focal lengths stay those in px of images {own:g} px wide."
     _warn_caller(
         f"The lens is for images of {old_width} x {old_height} px, and this one has {width} x {height}: "
-        "its distortion is scaled to them."
+        f"its distortion is scaled to them.{stays}"
     )
     centre = jnp.asarray(lens.centre)
     ratio = jnp.asarray([width / old_width, height / old_height], centre.dtype)
     pitch = None if lens.pixel_pitch is None else lens.pixel_pitch * lens.scale / (math.hypot(*size) / 2)
-    about = dict(lens.about)
-    if lens.focal_unit == "px":
-        about[WIDTH_OF_FOCALS] = about.get(WIDTH_OF_FOCALS, float(old_width))
     return dataclasses.replace(
         lens, centre=(centre + 0.5) * ratio - 0.5, image_size=size, pixel_pitch=pitch, about=about
     )
