@@ -42,6 +42,13 @@ class Board:
     pixel_pitch: float
 
 
+_SHORTEST = 0.1
+"""Focal length over the sensor's diagonal: half of the least that lenses have."""
+
+_LARGEST = 5.0
+"""Size of a board's image on the sensor over its own, beyond macro lenses."""
+
+
 def check_board(board: Board, focal: Collection[float], image_size: tuple[int, int]) -> None:
     """Refuse focal lengths that no lens has: a length of the board is in another unit.
 
@@ -59,13 +66,6 @@ def check_board(board: Board, focal: Collection[float], image_size: tuple[int, i
             f"--distance and --pixel-pitch: they are {board.spacing[0]:g} mm, {board.distance:g} mm and "
             f"{board.pixel_pitch:g} mm."
         )
-
-
-_SHORTEST = 0.1
-"""Focal length over the sensor's diagonal: half of the least that lenses have."""
-
-_LARGEST = 5.0
-"""Size of a board's image on the sensor over its own, beyond macro lenses."""
 
 
 def focal_of_board(board: Board, detection: Detection, correction: Distortion) -> FocalEstimate | None:

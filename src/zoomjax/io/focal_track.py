@@ -134,6 +134,13 @@ def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> Foc
     return track
 
 
+_RECORD, _EVEN = 20, 0.9
+"""Samples, and the share of even steps, from which a track is a record and not a few keys."""
+
+_GAP, _ZOOMED = 10, 0.02
+"""Steps that are missing, and the change of log f across them, from which it is said."""
+
+
 def _warn_of_gap(track: FocalTrack, path: str | os.PathLike[str]) -> None:
     """Warn of a record with a gap, across which f is another: how the lens zoomed there is not known.
 
@@ -155,12 +162,6 @@ def _warn_of_gap(track: FocalTrack, path: str | os.PathLike[str]) -> None:
             stacklevel=3,
         )
 
-
-_RECORD, _EVEN = 20, 0.9
-"""Samples, and the share of even steps, from which a track is a record and not a few keys."""
-
-_GAP, _ZOOMED = 10, 0.02
-"""Steps that are missing, and the change of log f across them, from which it is said."""
 
 _LONGER = 0.05
 """Of a video's length, by which a track in seconds may be longer."""
