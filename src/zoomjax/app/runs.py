@@ -87,13 +87,17 @@ def calibrate_images(
     job: "ImageJob", folder: Path, *, title: str, quiet: bool = False, cluster: str | None = None
 ) -> "ImageCalibration":
     """Calibrate from images, perhaps on a cluster of Dask, and write the results into the folder."""
+    from .._core.ahead import programs_ahead
     from .drawings import drawing
     from .image_calibration import calibrate_images
     from .pictures import pictures
+    from .plans import photo_sizes
     from .report import report
 
     # The cluster stays open: photos that disagree with the lens are searched again.
     with contextlib.ExitStack() as beside:
+        settings = job.detector, job.focal, job.shared_focal, job.centre, job.model
+        beside.enter_context(programs_ahead(f"{settings} {next(photo_sizes(job), None)}"))
         with cluster_executor(cluster, quiet=quiet) as executor, contextlib.ExitStack() as shown:
             progress = shown.enter_context(progress_bar("Detecting lines", quiet=quiet))
 
