@@ -68,7 +68,8 @@ def _pictures(images: "ImageCalibration", frame: int, image: UInt8[np.ndarray, "
     small, scale = shrunk(image, _WIDE)
     look = {"rejected": rejected.tolist(), "rms": rms, "labels": labels, "limit": colour_limit(calibration)}
     before = draw_lines(small, [_at(line, scale) for line in lines], **look)
-    distortion = _resized(calibration.fit.lens(float(calibration.lines.focal[frame])), image, small)
+    focal = float(np.asarray(calibration.lines.focal)[frame])
+    distortion = _resized(calibration.fit.lens(focal), image, small)
     corrected, framing = _corrected(small, distortion)
     origin, enlarged = np.asarray(framing.origin), float(framing.scale)
     joined = np.asarray(distortion.undistort(_at(np.concatenate(lines), scale)))  # all lines at once

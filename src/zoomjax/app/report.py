@@ -350,10 +350,10 @@ def _worst_lines(calibration: Calibration, members: np.ndarray) -> list[dict[str
     """The worst lines of a frame: of those that count, and of the rejected ones."""
     worst = members[np.argsort(-calibration.line_rms[members], kind="stable")]
     rejected = calibration.rejected[worst]
-    points, mask = calibration.lines.points, np.asarray(calibration.lines.mask)
+    points, mask = np.asarray(calibration.lines.points), np.asarray(calibration.lines.mask)
     listed = []
     for line in [*worst[~rejected][:_WORST], *worst[rejected][:_WORST_REJECTED]]:
-        x, y = np.asarray(points[line])[mask[line]].mean(axis=0)
+        x, y = points[line][mask[line]].mean(axis=0)
         text = f"{line} at ({x:.0f}, {y:.0f}): {calibration.line_rms[line]:.2f} px"
         listed.append({"text": text, "rejected": bool(calibration.rejected[line])})
     return listed
