@@ -3,11 +3,13 @@
 import contextlib
 import dataclasses
 import datetime
+import importlib
 import os
 import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -92,11 +94,11 @@ def calibrate_images(
     from .image_calibration import calibrate_images
     from .pictures import pictures
     from .plans import photo_sizes
-    from .report import report
 
     # The cluster stays open: photos that disagree with the lens are searched again.
     with contextlib.ExitStack() as beside:
         settings = job.detector, job.focal, job.shared_focal, job.centre, job.model
+        beside.enter_context(ThreadPoolExecutor(1)).submit(importlib.import_module, f"{__package__}.report")
         beside.enter_context(programs_ahead(f"{settings} {next(photo_sizes(job), None)}"))
         with cluster_executor(cluster, quiet=quiet) as executor, contextlib.ExitStack() as shown:
             progress = shown.enter_context(progress_bar("Detecting lines", quiet=quiet))
@@ -111,6 +113,8 @@ def calibrate_images(
             current: Callable[[str], None] | None = None
             done = calibrate_images(job, progress=progress, stage=stage, executor=executor)
             stage("Making the report")
+            from .report import report
+
             drawn = beside.enter_context(drawing(done, folder / "lines"))
             page = report(done.calibration, done, pictures=pictures(done), run=what_is_run(title, done))
         with progress_bar("Drawing the lines and writing the results", quiet=quiet) as progress:
