@@ -1,9 +1,12 @@
-"""Photos with the lines found in them, drawn while something else is done."""
+"""Pictures of photos: with the lines found in them, and small ones for the report.
 
-import concurrent.futures
+Each photo is read once for all of them, in threads, while something else is done.
+"""
+
 import contextlib
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,8 +14,9 @@ import cv2
 import numpy as np
 
 from ..detect.sources import Source
-from .choice import colour_limit
+from .choice import chosen_frames, colour_limit
 from .overlay import draw_lines
+from .pictures import MOST, Pictures, pictures_of
 
 if TYPE_CHECKING:
     from .image_calibration import ImageCalibration, Progress
@@ -20,50 +24,70 @@ if TYPE_CHECKING:
 _QUALITY = 88
 
 
+class Drawn:
+    """Pictures that are being drawn: of each photo with lines over it, and maybe small ones."""
+
+    def __init__(self, made: Iterator[Pictures | None], number: int):
+        self._made, self._number = made, number
+        self._done: list[Pictures | None] = []
+
+    def wait(self, progress: "Progress" = lambda done, total: None) -> None:
+        """Wait for all of them, and tell of each."""
+        for number in range(1, self._number + 1):
+            if number > len(self._done):
+                self._done.append(next(self._made))
+            progress(number, self._number)
+
+    def pictures(self) -> Iterator[Pictures]:
+        """The small ones, sorted by f; waits for all when the first is asked for."""
+        self.wait()
+        yield from sorted(filter(None, self._done), key=lambda one: (one.focal, one.frame))
+
+
 @contextlib.contextmanager
-def drawing(images: "ImageCalibration", folder: Path) -> Iterator[Callable[["Progress"], None]]:
-    """Draw the lines over some of the images, into a new folder, in threads while the block runs.
+def drawing(images: "ImageCalibration", folder: Path, most: int = MOST) -> Iterator[Drawn]:
+    """Draw photos into a new folder, and small pictures of so many, in threads while the block runs.
 
-    Frames of a video, which come one after another, are drawn when they are waited for.
-
-    Yields:
-        What waits for the pictures, and tells of each.
+    Small ones are of the photos fitted worst, and of others over the zoom. Frames of a video, which come
+    one after another, are drawn when they are waited for.
     """
     folder.mkdir()
-    parts = zip(images.used, images.members(), images.overlays(), strict=True)
-    targets = {one.name: (one.lines, members, folder / name) for one, members, name in parts if name}
-    draw = functools.partial(_drawn, images, targets)
-    sources = (source for source in images.job.sources()[0] if source.name in targets)
-    with concurrent.futures.ThreadPoolExecutor(max(1, images.job.workers)) as pool:
-        begun = [pool.submit(draw, source) for source in sources] if images.job.video is None else []
-
-        def wait(progress: "Progress") -> None:
-            done = (one.result() for one in begun) if begun else map(draw, sources)
-            for number, _ in enumerate(done, start=1):
-                progress(number, len(targets))
-
+    overlays = dict(zip((one.name for one in images.used), images.overlays(), strict=True))
+    targets = {name: folder / target for name, target in overlays.items() if target}
+    chosen = {images.used[frame].name for frame in chosen_frames(images.calibration, most)}
+    frames = {one.name: frame for frame, one in enumerate(images.used) if one.name in {*targets, *chosen}}
+    draw = functools.partial(_drawn, images, images.members(), frames, targets, chosen)
+    sources = (source for source in images.job.sources()[0] if source.name in frames)
+    with ThreadPoolExecutor(max(1, images.job.workers)) as pool:
+        made = map(draw, sources) if images.job.video is not None else pool.map(draw, sources)
         try:
-            yield wait
+            yield Drawn(made, len(frames))
         finally:
             pool.shutdown(cancel_futures=True)
 
 
 def _drawn(
     images: "ImageCalibration",
-    targets: dict[str, tuple[tuple[np.ndarray, ...], np.ndarray, Path]],
+    members: list[np.ndarray],
+    frames: Mapping[str, int],
+    targets: Mapping[str, Path],
+    chosen: set[str],
     source: Source,
-) -> None:
-    """Draw one image's lines, and write the picture."""
-    lines, members, target = targets[source.name]
-    picture = draw_lines(
-        source.read()[0],
-        lines,
-        images.calibration.rejected[members].tolist(),
-        rms=images.calibration.line_rms[members],
-        limit=colour_limit(images.calibration),
-        labels={place: str(line) for place, line in enumerate(members.tolist())},
-        legend=True,
-    )
-    done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    assert done
-    target.write_bytes(content.tobytes())
+) -> Pictures | None:
+    """Draw the lines of one photo, write the picture, and make the small ones."""
+    image, frame = source.read()[0], frames[source.name]
+    if target := targets.get(source.name):
+        own = members[frame]
+        picture = draw_lines(
+            image,
+            images.used[frame].lines,
+            images.calibration.rejected[own].tolist(),
+            rms=images.calibration.line_rms[own],
+            limit=colour_limit(images.calibration),
+            labels={place: str(line) for place, line in enumerate(own.tolist())},
+            legend=True,
+        )
+        done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        assert done
+        target.write_bytes(content.tobytes())
+    return pictures_of(images, frame, image) if source.name in chosen else None

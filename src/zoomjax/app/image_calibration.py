@@ -186,8 +186,8 @@ class ImageCalibration:
         pages: Mapping[str, str] | None = None,
     ) -> None:
         """Write the files of `write` into an empty folder, such as that of a `results_folder`."""
-        with drawing(self, folder / "lines") as drawn:
-            drawn(progress)
+        with drawing(self, folder / "lines", most=0) as drawn:
+            drawn.wait(progress)
         self.calibration.make(folder, about=self.about(), pages=pages)
 
 

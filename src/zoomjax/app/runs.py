@@ -92,7 +92,6 @@ def calibrate_images(
     from .._core.ahead import programs_ahead
     from .drawings import drawing
     from .image_calibration import calibrate_images
-    from .pictures import pictures
     from .plans import photo_sizes
 
     # The cluster stays open: photos that disagree with the lens are searched again.
@@ -116,9 +115,9 @@ def calibrate_images(
             from .report import report
 
             drawn = beside.enter_context(drawing(done, folder / "lines"))
-            page = report(done.calibration, done, pictures=pictures(done), run=what_is_run(title, done))
+            page = report(done.calibration, done, pictures=drawn.pictures(), run=what_is_run(title, done))
         with progress_bar("Drawing the lines and writing the results", quiet=quiet) as progress:
-            drawn(progress)
+            drawn.wait(progress)
             done.calibration.make(folder, about=done.about(), pages={REPORT: page})
     return done
 
