@@ -97,7 +97,7 @@ def in_stages(data: Data, model: Model, *, flat: bool = False) -> tuple[Model, S
 
 def located(data: Data, model: Model, noise: Array, bend: Array) -> tuple[Model, Array]:
     """Poses and own bends of photos, for a lens and a shape that are held, and the residuals, px."""
-    noise = np.maximum(noise, _noise(data, model))
+    noise = as_jax(np.maximum(noise, _noise(data, model)))
     for _ in range(3):
         stage = _arrays(Stage(noise, 1.0, bend, 0.0, change=0.01, damping=1e-6))
         before = noise

@@ -12,6 +12,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
+from .._core.arrays import as_jax
 from .._core.types import Centres, traced
 from ..lines.base import AbstractLines
 from ..lines.buckets import of_frames
@@ -166,12 +167,10 @@ class FrameFits(eqx.Module):
         if not -frames <= frame < frames:
             raise IndexError(f"There is no frame {frame}: the frames fitted are 0 to {frames - 1}.")
         dtype = self.coefficients.dtype
-        return Distortion(
-            self.coefficients[frame],
-            jnp.broadcast_to(jnp.asarray(self.centre, dtype), (frames, 2))[frame],
-            jnp.asarray(self.scale, dtype),
-            self.distortion_model,
-        )
+        xp: Any = jnp if traced(self) else np  # known ones compile nothing
+        centre = xp.broadcast_to(xp.asarray(self.centre, dtype), (frames, 2))[frame]
+        coefficients, scale = xp.asarray(self.coefficients)[frame], xp.asarray(self.scale, dtype)
+        return Distortion(as_jax(coefficients), as_jax(centre), as_jax(scale), self.distortion_model)
 
 
 def described_fit(lines, zoom, result, steps):
