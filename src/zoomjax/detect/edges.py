@@ -138,7 +138,7 @@ class EdgeDetector(AbstractDetector):
         good = np.array([self._is_seen(line, min(size)) for line in lines], bool)
         seen = [line for line, keep in zip(lines, good, strict=True) if keep]
         good[good] = _rms(seen, model) <= _ROUGHEST * max(sigma, 0.25)
-        found = _found(pieces, label, good, min(size))
+        found = _found(pieces, label, lines, good, min(size))
         return dataclasses.replace(found, bend=model.values)
 
     def _is_seen(self, line: np.ndarray, side: int) -> bool:
@@ -181,10 +181,12 @@ def _long(pieces: Fragments, label: np.ndarray, least: float) -> list[np.ndarray
     ]
 
 
-def _found(pieces: Fragments, label: np.ndarray, good: np.ndarray, side: int) -> Edges:
+def _found(
+    pieces: Fragments, label: np.ndarray, lines: Sequence[np.ndarray], good: np.ndarray, side: int
+) -> Edges:
     """The good lines, and what they leave of the strong long pieces."""
     names = np.unique(label)
-    lines = [line for line, keep in zip(border_lines(pieces, label), good, strict=True) if keep]
+    lines = [line for line, keep in zip(lines, good, strict=True) if keep]
     last = pieces.start + pieces.count - 1
     length = np.hypot(*(pieces.points[last] - pieces.points[pieces.start]).T)
     strong = length >= _STRONG * side
