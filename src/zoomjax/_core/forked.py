@@ -6,7 +6,9 @@ stand it, and processes are begun anew.
 """
 
 import atexit
+import contextlib
 import multiprocessing
+import os
 import signal
 import sys
 from multiprocessing import forkserver
@@ -27,13 +29,20 @@ def import_ahead(module: str) -> None:
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, held)
     _SERVED.append(module)
-    server: Any = forkserver
-    atexit.register(server._forkserver._stop)  # which waits, so that its time counts as ours
+    atexit.register(_end)
 
 
 def process_context() -> Any:
     """How processes are begun: forked after `import_ahead`, else anew."""
     return multiprocessing.get_context("forkserver" if _SERVED else "spawn")
+
+
+def _end() -> None:
+    """End the server, which would take its time, and wait for it, so that its time counts as ours."""
+    server: Any = forkserver
+    with contextlib.suppress(ProcessLookupError, TypeError):
+        os.kill(server._forkserver._forkserver_pid, signal.SIGKILL)
+    server._forkserver._stop()
 
 
 _SERVED: list[str] = []
