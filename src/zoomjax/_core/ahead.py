@@ -1,8 +1,8 @@
 """Programs that are read from disk before they are asked for, in a thread.
 
-To read a program takes some 50 ms, and a calibration runs 40 to 80 of them, one after the other. Which they
-are depends on its data, and is known when all photos have been searched for lines. But mostly they are
-those of the last time. So a list of these is kept beside the programs, and they are read in the meantime.
+A calibration runs many programs, one after the other, and each takes its time to be read. Which they are
+depends on its data, and is known when all photos have been searched for lines. But mostly they are those
+of the last time. So a list of these is kept beside the programs, and they are read in the meantime.
 """
 
 import contextlib

@@ -5,10 +5,9 @@ Each photo is read once for all of them, in threads, while something else is don
 
 import contextlib
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,10 +15,7 @@ import numpy as np
 from ..detect.sources import Source
 from .choice import chosen_frames, colour_limit
 from .overlay import draw_lines
-from .pictures import MOST, Pictures, pictures_of
-
-if TYPE_CHECKING:
-    from .image_calibration import ImageCalibration, Progress
+from .pictures import MOST, Photos, Pictures, pictures_of
 
 _QUALITY = 88
 
@@ -31,7 +27,7 @@ class Drawn:
         self._made, self._number = made, number
         self._done: list[Pictures | None] = []
 
-    def wait(self, progress: "Progress" = lambda done, total: None) -> None:
+    def wait(self, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
         """Wait for all of them, and tell of each."""
         for number in range(1, self._number + 1):
             if number > len(self._done):
@@ -45,7 +41,7 @@ class Drawn:
 
 
 @contextlib.contextmanager
-def drawing(images: "ImageCalibration", folder: Path, most: int = MOST) -> Iterator[Drawn]:
+def drawing(images: Photos, folder: Path, most: int = MOST) -> Iterator[Drawn]:
     """Draw photos into a new folder, and small pictures of so many, in threads while the block runs.
 
     Small ones are of the photos fitted worst, and of others over the zoom. Frames of a video, which come
@@ -67,7 +63,7 @@ def drawing(images: "ImageCalibration", folder: Path, most: int = MOST) -> Itera
 
 
 def _drawn(
-    images: "ImageCalibration",
+    images: Photos,
     members: list[np.ndarray],
     frames: Mapping[str, int],
     targets: Mapping[str, Path],

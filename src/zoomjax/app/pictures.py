@@ -5,7 +5,7 @@ Each is a JPEG of some tens of kB.
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -19,7 +19,9 @@ from .choice import colour_limit
 from .overlay import draw_lines
 
 if TYPE_CHECKING:
-    from .image_calibration import ImageCalibration
+    from ..detect.batch import Detection
+    from .calibration import Calibration
+    from .image_job import ImageJob
 
 MOST = 12
 """Photos shown: the page stays small enough to be sent by mail."""
@@ -29,6 +31,34 @@ _LEAST_SCALE = 0.5
 """Of corrected pictures: corners that a strong lens moves far out are cut off, for the rest to be seen."""
 _CROP, _CROP_SIDE = 3, 260  # crops per photo, and px of their side
 _QUALITY = 78
+
+
+@runtime_checkable
+class Photos(Protocol):
+    """What pictures are drawn of: an `ImageCalibration`."""
+
+    @property
+    def job(self) -> "ImageJob":
+        """The settings."""
+        ...
+
+    @property
+    def calibration(self) -> "Calibration":
+        """The fits; one frame for each photo used."""
+        ...
+
+    @property
+    def used(self) -> "tuple[Detection, ...]":
+        """The photos used."""
+        ...
+
+    def members(self) -> list[np.ndarray]:
+        """For each of them, the numbers of its lines."""
+        ...
+
+    def overlays(self) -> list[str]:
+        """For each of them, the name of its picture; empty if it is not drawn."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +79,7 @@ class Pictures:
     crops: dict[int, bytes]
 
 
-def pictures_of(images: "ImageCalibration", frame: int, image: UInt8[np.ndarray, "..."]) -> Pictures:
+def pictures_of(images: "Photos", frame: int, image: UInt8[np.ndarray, "..."]) -> Pictures:
     """Pictures of one photo."""
     calibration = images.calibration
     members = np.flatnonzero(np.asarray(calibration.lines.frame) == frame)
