@@ -19,10 +19,10 @@ import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app import demo
 from zoomjax.app.console import show_images
+from zoomjax.app.drawings import drawing
 from zoomjax.app.image_calibration import calibrate_images
 from zoomjax.app.image_job import ImageJob
 from zoomjax.app.model_choice import WantedModel
-from zoomjax.app.pictures import pictures
 from zoomjax.app.report import report
 from zoomjax.app.undistort_files import Job, undistort_files
 from zoomjax.io.exif import exif_with_focal
@@ -115,8 +115,14 @@ def test_results_are_written_with_the_lines_over_each_image(done, tmp_path):
     assert summary["rms_frames"] <= summary["rms_zoom"] < 0.1 < summary["rms_none"]
 
 
-def test_the_report_shows_photos_before_and_after(done):
-    shown = pictures(done, most=3)
+def pictures(done, folder):
+    """Small pictures of three photos."""
+    with drawing(done, folder / "lines", most=3) as drawn:
+        return list(drawn.pictures())
+
+
+def test_the_report_shows_photos_before_and_after(done, tmp_path):
+    shown = pictures(done, tmp_path)
     focal = [float(done.calibration.lines.focal[one.frame]) for one in shown]
     assert focal == sorted(focal)
     assert len(focal) == 3
@@ -157,7 +163,7 @@ onload = async () => {
 
 def test_under_the_slider_is_the_nearest_photo_before_and_after(done, tmp_path):
     """In a browser, at every fourth place of the slider: by 1/f, with its own pictures, and to be seen."""
-    shown = pictures(done, most=3)
+    shown = pictures(done, tmp_path)
     text = report(done.calibration, done, pictures=shown)
     (tmp_path / "report.html").write_text(text, encoding="utf-8")
     (tmp_path / "probe.html").write_text(SLID, encoding="utf-8")

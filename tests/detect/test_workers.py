@@ -165,3 +165,24 @@ def test_a_program_that_cannot_be_begun_again_is_told_so(tmp_path):
     )
     assert (done.returncode, done.stdout) == (1, "")
     assert "RuntimeError: A detection process cannot be started" in done.stderr
+
+
+@LINUX
+def test_processes_are_forked_from_one_that_has_imported_what_they_need():
+    """In a process of its own, as it is for good: results, deaths and messages are the same."""
+    script = """
+import sys
+from zoomjax._core.forked import import_ahead
+from tests.detect.test_workers import results
+from zoomjax.detect._workers import LostError
+
+if __name__ == "__main__":
+    import_ahead("tests.detect.test_workers")
+    import_ahead("tests.detect.test_workers")
+    found = results([("square", 3), ("die", 9), ("shout", 0), ("interrupted", 0), ("square", 4)])
+    assert isinstance(found[1], LostError), found
+    assert "SIGKILL" in str(found[1])
+    assert [found[0], *found[2:]] == [9, "done", "done", 16], found
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -52,6 +52,11 @@ def held_as_given(array: np.ndarray) -> Any:
     return array
 
 
+def as_jax(values: Any) -> jax.Array:
+    """A JAX array of these numbers, by no program: `jnp.asarray` compiles one for each shape of NumPy's."""
+    return values if isinstance(values, jax.Array) else jax.device_put(values)
+
+
 def finite(values: Any) -> Any:
     """Whether each of the values is finite, as an array even of one."""
     xp = namespace(values)

@@ -21,6 +21,7 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Hashable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,8 @@ _SETTINGS = (
 _FINDING_ERRORS = ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs")
 
 Call = Callable[..., Any]
+Key = tuple[str, tuple]
+"""The name of a program, and the settings of the compiler."""
 
 
 @dataclasses.dataclass
@@ -68,9 +71,16 @@ class _Store:
 
     folder: Path | None = None
     calls: dict[Hashable, Call | None] = dataclasses.field(default_factory=dict)
+    ahead: dict[Key, Future] = dataclasses.field(default_factory=dict)  # of `opened`
+    used: dict[Key, None] = dataclasses.field(default_factory=dict)
 
 
 _STORE = _Store()
+
+
+def store() -> _Store:
+    """Where programs are kept, those that are opened ahead, and those used so far, in order."""
+    return _STORE
 
 
 def keep_programs(folder: Path | None) -> None:
@@ -125,20 +135,38 @@ def _can_keep() -> bool:
 def _looked_up(folder, function, settings, given, arrays):
     """The program as an earlier process kept it, or else traced now, and kept."""
     try:
-        file = folder / f"{_name(function, given, arrays)}{_ENDING}"
+        name = _name(function, given, arrays)
     except UnknownError:
         return None
-    content = _read(file)
+    _STORE.used[name, settings] = None
+    begun = _STORE.ahead.pop((name, settings), None)
+    content = opened(name, settings) if begun is None or begun.cancel() else begun.result()
     if content is None:
         structure, program = _traced(function, given, arrays)
-        _write(file, structure, program)
-        content = structure, _exported(program)
-    structure, exported = content
-    if exported is None:
+        _write(folder / f"{name}{_ENDING}", structure, program)
+        content = structure, _jitted(_exported(program), settings)
+    structure, compiled = content
+    return compiled and (lambda *arrays: put_together(structure, iter(compiled(*arrays))))
+
+
+def opened(name: str, settings: tuple, *, ahead: bool = False) -> tuple[Any, Call | None] | None:
+    """The structure of a program's result, and the program; None if no process has kept it.
+
+    It is ready to run if that is done `ahead`, else when it first runs.
+    """
+    content = None if _STORE.folder is None else _read(_STORE.folder / f"{name}{_ENDING}")
+    if content is None:
         return None
+    structure, exported = content
+    compiled = _jitted(exported, settings)
+    if ahead and compiled is not None:
+        compiled.lower(*(jax.ShapeDtypeStruct(of.shape, of.dtype) for of in exported.in_avals)).compile()
+    return structure, compiled
+
+
+def _jitted(exported, settings) -> Any:
     run = functools.partial(_program.bind, of=_Exported(exported))
-    compiled = jax.jit(run, compiler_options=dict(settings) or None)
-    return lambda *arrays: put_together(structure, iter(compiled(*arrays)))
+    return exported and jax.jit(run, compiler_options=dict(settings) or None)
 
 
 class _Exported:

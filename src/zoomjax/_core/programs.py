@@ -127,6 +127,11 @@ def _settings(unoptimised: bool) -> tuple[tuple[str, Any], ...]:
     return tuple(of for of in wanted.items() if of[0] not in given and of[0] not in _UNKNOWN)
 
 
+def all_settings() -> tuple[tuple[tuple[str, Any], ...], ...]:
+    """The settings of all kinds of programs of this process."""
+    return (), _settings(False), _settings(True)
+
+
 @functools.cache
 def _with_settings(function, settings):
     given: Any = {"compiler_options": dict(settings)}  # for `jax.jit`

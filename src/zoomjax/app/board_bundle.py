@@ -133,7 +133,7 @@ class BoardBundle:
         if not zooms:
             return None
         zoom = zooms.pop()
-        return float(self.fit.focal[zoom]), float(self.fit.focal_std[zoom])
+        return float(np.asarray(self.fit.focal)[zoom]), float(np.asarray(self.fit.focal_std)[zoom])
 
     def _explains(self, group: FocalGroup) -> bool:
         """Whether it explains the photos of a group by one focal length, as well as all others."""
@@ -346,7 +346,7 @@ def _fitted(
     every = np.ones(len(of), bool)
     fit = fitted(every)
     number = np.unique(label, return_inverse=True)[1]
-    kept = np.asarray(fit.focal_std < MOST_UNCERTAIN * fit.focal)[number]
+    kept = (np.asarray(fit.focal_std) < MOST_UNCERTAIN * np.asarray(fit.focal))[number]
     if kept.all() or bool(failed(fit.fit.result)) or not _enough(label[kept]):
         return fit, kept
     return fitted(kept), kept

@@ -14,17 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from .._core.arrays import as_jax
+from .._core.programs import light_program
+from .._core.types import AnyArray
 from ..detect.batch import Detection
 from ..detect.grid import GridDetector
 from ..fit.boards import BoardFit
 from ..fit.energy import line_squares
-from ..fit.result import RESULTS, ZoomFit, failed
+from ..fit.result import RESULTS, ZoomFit, failed, is_status
 from ..fit.zoom import CentreArgument, fit_zoom
 from ..lines.free_centre import compress_any_centre
 from ..lines.lines import Lines
 from ..models.distortion_model import AbstractDistortionModel
 from ..models.lens import ZoomLens
-from ..models.zoom import PolynomialZoom, with_parameters
+from ..models.zoom import PolynomialZoom, number_of_coefficients, with_parameters
 
 _STRAIGHTER = 0.9
 """Deviation of lines of the flat board, in those of the bent one, below which they are taken."""
@@ -78,7 +81,7 @@ def straightness(
 
     Only fits that determine the board's shape count.
     """
-    if bool(failed(fit.fit.result)) or fit.fit.result == RESULTS.undetermined:
+    if bool(failed(fit.fit.result)) or is_status(fit.fit.result, RESULTS.undetermined):
         return None
     degree = min(2, np.unique(np.asarray(seen.focal)).size - 1)
     lenses, deviations = [], []
@@ -104,44 +107,56 @@ def widened(fit: ZoomFit, board: BoardFit) -> ZoomFit:
     """A fit to lines of the flat board with what is uncertain of the board's shape in its bands."""
     misfit = coefficient_covariance(board, fit.lens.distortion_model, fit)
     if fit.misfit is not None:
-        misfit = fit.misfit.at[: len(misfit), : len(misfit)].add(misfit)
-    fit = eqx.tree_at(lambda f: f.misfit, fit, misfit, is_leaf=lambda leaf: leaf is None)
+        misfit = _added(fit.misfit, np.s_[: len(misfit), : len(misfit)], misfit)
+    fit = eqx.tree_at(lambda f: f.misfit, fit, as_jax(misfit), is_leaf=lambda leaf: leaf is None)
     own = board.fit.joint
     if fit.joint is None or own is None or fit.lens.shift is not None:
         return fit
-    return eqx.tree_at(lambda f: f.joint, fit, fit.joint.at[-2:, -2:].add(own[-2:, -2:]))
+    joint = _added(fit.joint, np.s_[-2:, -2:], np.asarray(own)[-2:, -2:])
+    return eqx.tree_at(lambda f: f.joint, fit, as_jax(joint))
+
+
+def _added(whole: AnyArray, where: tuple[slice, ...], part: np.ndarray) -> np.ndarray:
+    """A matrix with a part added to it in a place."""
+    out = np.array(whole)
+    out[where] += part
+    return out
 
 
 def coefficient_covariance(
     board: BoardFit, distortion_model: AbstractDistortionModel, fit: ZoomFit
-) -> jax.Array:
+) -> np.ndarray:
     """Covariance of a distortion model's coefficients that displaces as that of the bundle's lens.
 
     In the mean over the zooms.
     """
-    numbers = np.size(fit.lens.zoom(fit.lens.focal_range[0]))
+    numbers = number_of_coefficients(fit.lens.zoom)
     low, high = (float(f) for f in fit.lens.focal_range)
-    share = (np.asarray(board.label) - board.label.min()) / max(float(np.ptp(board.label)), 1e-9)
+    label = np.asarray(board.label)
+    share = (label - label.min()) / max(float(np.ptp(label)), 1e-9)
     total = np.zeros((numbers, numbers))
     for focal, at in zip(np.asarray(board.focal), low + (high - low) * share, strict=True):
-        moved = np.asarray(_moved(board.lens.zoom, board.lens.distortion_model, jnp.asarray(focal)))
-        own = np.asarray(
-            _columns(distortion_model, jnp.asarray(fit.lens.zoom(at)), jnp.linspace(0, 1, _RADII))
-        )
+        moved = np.asarray(_moved(board.lens.zoom, board.lens.distortion_model, focal))
+        own = np.asarray(_columns_at(fit.lens.zoom, distortion_model, np.asarray(at)))
         gain = np.linalg.pinv(own) @ moved
         total += gain @ np.asarray(board.fit.covariance) @ gain.T / len(board.focal)
-    return jnp.asarray(total)
+    return total
 
 
-@eqx.filter_jit
+@light_program
 def _moved(zoom, distortion_model, focal):
     """How each parameter of a zoom model moves points at some radii."""
     flat, unravel = ravel_pytree(zoom.parameters)
     by_parameter = jax.jacfwd(lambda flat: with_parameters(zoom, unravel(flat))(focal))(flat)
-    return _columns(distortion_model, zoom(focal), jnp.linspace(0, 1, _RADII)) @ by_parameter
+    return _columns_at(zoom, distortion_model, focal) @ by_parameter
 
 
-@eqx.filter_jit
+@light_program
+def _columns_at(zoom, distortion_model, focal):
+    return _columns(distortion_model, zoom(focal), jnp.linspace(0, 1, _RADII))
+
+
+@light_program
 def _columns(distortion_model, k, radii):
     """How each coefficient moves points at some radii along the image's x axis."""
 

@@ -20,13 +20,13 @@ from .._core.types import AnyArray
 from ..fit.energy import line_squares
 from ..fit.focal_lengths import of_equal_focal, with_focal_sigma
 from ..fit.image_metric import in_image
-from ..fit.result import RESULTS, FrameFits, ZoomFit
+from ..fit.result import RESULTS, FrameFits, ZoomFit, is_status
 from ..fit.straightness import frame_rms
 from ..fit.zoom import CentreArgument
 from ..lines.lines import Lines
 from ..models.about import UNKNOWN
 from ..models.registry import distortion_model_name
-from ..models.zoom import PolynomialZoom
+from ..models.zoom import PolynomialZoom, number_of_coefficients
 from ..trust.assessment import NEGLIGIBLE, Assessment, assess
 from ..trust.bands import displacement_std
 from ..trust.cross_validation import cross_validate_frames
@@ -171,7 +171,7 @@ class Calibration:
 
         `names` are the names of the frames; by default their numbers, from 0.
         """
-        warnings = [RESULTS[self.fit.result]] if self.fit.result != RESULTS.successful else []
+        warnings = [] if is_status(result := self.fit.result, RESULTS.successful) else [RESULTS[result]]
         for message in dict.fromkeys(filter(None, messages := self.frames.messages())):
             frames = [
                 names[frame] if names else str(frame)
@@ -272,7 +272,7 @@ class Calibration:
     def coefficient_names(self) -> dict[str, int]:
         """Names of the coefficients, k1, ..., kN and p1, p2, and the powers of 1/px in their units."""
         distortion_model = self.fit.lens.distortion_model
-        size = np.asarray(self.fit.lens(self.fit.lens.focal_range[0]).coefficients).size
+        size = number_of_coefficients(self.fit.lens.zoom)
         radial, orders = size - distortion_model.num_coefficients(0), distortion_model.orders(size).tolist()
         names = [f"k{i + 1}" if i < radial else f"p{i + 1 - radial}" for i in range(size)]
         return dict(zip(names, orders, strict=True))

@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from .._core.files import cache_folder, refuse_inputs
+from .._core.forked import import_ahead
 from ._jax import set_up_jax
 from .arguments import (
     Centre,
@@ -82,6 +83,9 @@ from .plans import check_centre, images_plan, lines_plan, photo_sizes, tell_plan
 from .runs import calibrate_images, calibrate_lines, title_of
 from .shown import Shown, show_outcome
 
+DETECTION = "zoomjax.detect.batch"
+"""What processes that detect lines import."""
+
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",
@@ -121,6 +125,7 @@ def demo(
     lens measured there, a Nikkor 18-200. The photos are calibrated as by
     zoomjax calibrate, and the result is compared with the true lens.
     """
+    import_ahead(DETECTION)
     set_up_jax()
     from ..scenes.board import StripedBoard, nikkor_18_200
     from . import demo
@@ -228,6 +233,10 @@ def calibrate(
     folder are replaced or removed; its lines.npz, tracks.npz and track.csv
     stay until they are written again.
     """
+    inputs = [str(results_of(path) or path) for path in inputs]
+    of_lines = any(path.lower().endswith((".npz", ".csv")) for path in inputs)
+    if not (of_lines or dry_run or cluster):
+        import_ahead(DETECTION)
     set_up_jax()
     show = Shown(strict, quiet, as_json, verbose)
     from .model_choice import WantedModel
@@ -238,8 +247,7 @@ def calibrate(
     wanted.check_centre(about)
     if focal == "same":
         refuse_idle(context, ("focal_sigma",), "with --focal same, for f is not known")
-    inputs = [str(results_of(path) or path) for path in inputs]
-    if any(path.lower().endswith((".npz", ".csv")) for path in inputs):
+    if of_lines:
         refuse_idle(context, IDLE_FOR_LINES, f"for {inputs[0]}, which contains lines")
         from .calibration import FILES
         from .results_folder import OF_A_LENS, results_folder

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,9 @@ IMAGE_SIZE = (2144, 1424)
 """px: half the size of the paper's images, with the same field of view."""
 
 _QUALITY = 92
+
+_THREADS = 4
+"""Photos that are rendered at a time, at most: one of 12 megapixels takes a gigabyte."""
 
 
 def write_photos(
@@ -36,16 +40,23 @@ def write_photos(
     lens = nikkor_18_200(image_size)
     Path(folder).mkdir(parents=True, exist_ok=True)
     paths = [Path(folder) / name for name in photo_names(number)]
-    for index, (path, focal) in enumerate(zip(paths, _focal(number), strict=True)):
-        photo = board_photo(lens, float(focal), blur=0.8, noise=2, vignetting=0.3, seed=seed + index)
-        exif = np.frombuffer(exif_with_focal(float(focal)), np.uint8)
+    focals = _focal(number).tolist()
+
+    def render(index: int) -> None:
+        photo = board_photo(lens, focals[index], blur=0.8, noise=2, vignetting=0.3, seed=seed + index)
+        exif = np.frombuffer(exif_with_focal(focals[index]), np.uint8)
         done, content = cv2.imencodeWithMetadata(
             ".jpg", photo, [cv2.IMAGE_METADATA_EXIF], [exif], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
         )
         assert done
-        with whole_file(path) as part:
+        with whole_file(paths[index]) as part:
             part.write_bytes(content.tobytes())
-        progress(index + 1, number)
+
+    render(0)  # which compiles the program of all
+    progress(1, number)
+    with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+        for done, _ in enumerate(pool.map(render, range(1, number)), start=2):
+            progress(done, number)
     return paths
 
 

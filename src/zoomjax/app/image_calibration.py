@@ -1,15 +1,14 @@
 """Calibration from photos or a video: what ``zoomjax calibrate`` does with images."""
 
-import concurrent.futures
 import contextlib
 import dataclasses
+import functools
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from .._core.text import plain
@@ -20,11 +19,11 @@ from ..trust.assessment import Verdict
 from ._flags import with_flags
 from .board_bundle import BoardBundle, bundle_of, sharing_options
 from .calibration import Calibration, calibrate
-from .choice import chosen_frames, colour_limit
+from .choice import chosen_frames
+from .drawings import drawing
 from .equipment import KnownLens, known_lens, with_equipment, without_focal
 from .focal_sources import GRID, MEASURED, Focals, choose_focals, focal_sigmas, known_focals, lines_of
 from .image_job import ImageJob, overlay_name
-from .overlay import draw_lines
 from .plane_focals import Sharing
 from .results_folder import OF_A_LENS, results_folder
 from .tying import Bend, tied, to_search_again
@@ -90,6 +89,10 @@ class ImageCalibration:
 
     def verdicts(self) -> list[tuple[Verdict, str]]:
         """For each used image the verdict on it, and why it is not good."""
+        return self._verdicts
+
+    @functools.cached_property
+    def _verdicts(self) -> list[tuple[Verdict, str]]:
         parts = enumerate(zip(self.used, self.rejected(), strict=True))
         return [verdict_of_photo(self.calibration, frame, *part) for frame, part in parts]
 
@@ -183,43 +186,9 @@ class ImageCalibration:
         pages: Mapping[str, str] | None = None,
     ) -> None:
         """Write the files of `write` into an empty folder, such as that of a `results_folder`."""
-        (folder / "lines").mkdir()
-        self._draw(folder / "lines", progress)
+        with drawing(self, folder / "lines", most=0) as drawn:
+            drawn.wait(progress)
         self.calibration.make(folder, about=self.about(), pages=pages)
-
-    def _draw(self, folder: Path, progress: Progress) -> None:
-        used = {
-            detection.name: (detection, members, folder / target)
-            for detection, members, target in zip(self.used, self.members(), self.overlays(), strict=True)
-            if target
-        }
-
-        limit = colour_limit(self.calibration)
-
-        def draw(source: Source) -> None:
-            detection, members, target = used[source.name]
-            picture = draw_lines(
-                source.read()[0],
-                detection.lines,
-                self.calibration.rejected[members].tolist(),
-                rms=self.calibration.line_rms[members],
-                limit=limit,
-                labels={place: str(line) for place, line in enumerate(members.tolist())},
-                legend=True,
-            )
-            done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
-            assert done
-            target.write_bytes(content.tobytes())
-
-        sources = (source for source in self.job.sources()[0] if source.name in used)
-        if self.job.video is not None:
-            for done, source in enumerate(sources, start=1):
-                draw(source)
-                progress(done, len(used))
-        else:
-            with concurrent.futures.ThreadPoolExecutor(max(1, self.job.workers)) as pool:
-                for done, _ in enumerate(pool.map(draw, sources), start=1):
-                    progress(done, len(used))
 
 
 def calibrate_images(

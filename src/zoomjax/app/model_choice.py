@@ -315,7 +315,7 @@ class CentreFound:
     def _fitted(cls, found: CentreFit, more: str) -> "CentreFound":
         """A fitted centre, and what else there is to say of it."""
         u, v = (float(value) for value in np.asarray(found.fit.lens.centre))
-        std = (float(found.std[0, 0]), float(found.std[0, 1]))
+        std = (float(np.asarray(found.std)[0, 0]), float(np.asarray(found.std)[0, 1]))
         told = f"The centre of distortion was fitted: {_place(u, v)}, {_spread(std)}{more}"
         return cls((u, v), std, "fitted", told)
 

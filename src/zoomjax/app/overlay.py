@@ -1,5 +1,6 @@
 """Detected lines drawn over their image, for checking: coloured by how far from straight they are."""
 
+import functools
 from collections.abc import Mapping, Sequence
 
 import cv2
@@ -48,7 +49,7 @@ def draw_lines(
     picture, scale = shrunk(image, _LONGEST)
     if picture.ndim == 2:
         picture = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
-    picture = np.ascontiguousarray(picture[..., :3] * dim).astype(np.uint8)
+    picture = cv2.LUT(np.ascontiguousarray(picture[..., :3]), (np.arange(256) * dim).astype(np.uint8))
     width = max(1, round(max(picture.shape[:2]) / 1200))
     shown = [(line + 0.5) * scale - 0.5 for line in lines]
     for index, line in enumerate(shown):
@@ -90,8 +91,9 @@ def _write(picture: np.ndarray, text: str, line: np.ndarray, share: float) -> No
         cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, ink, thickness, cv2.LINE_AA)
 
 
+@functools.lru_cache(maxsize=4)
 def _legend(wide: int, limit: float) -> np.ndarray:
-    """A strip that explains the colours."""
+    """A strip that explains the colours; photos of one size share it."""
     size = float(np.clip(wide / 1600, 0.4, 1.0))
     tall = round(44 * size)
     strip = np.full((tall, wide, 3), 32, np.uint8)

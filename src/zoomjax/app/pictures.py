@@ -1,25 +1,27 @@
 """Small pictures of a calibration's photos for the report: before and after, and crops of the worst lines.
 
-Each is a JPEG of some tens of kB. Read once per chosen photo; nothing is decoded for the others.
+Each is a JPEG of some tens of kB.
 """
 
 import dataclasses
-import warnings
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from ..correct.framing import Framing, frame_output
-from ..correct.image import undistort_image
+from ..correct.image import border_values, checked_image, position_map, remap
 from ..detect.sources import shrunk
 from ..models.distortion import Distortion
-from .choice import chosen_frames, colour_limit
+from .choice import colour_limit
 from .overlay import draw_lines
 
 if TYPE_CHECKING:
-    from .image_calibration import ImageCalibration
+    from ..detect.batch import Detection
+    from .calibration import Calibration
+    from .image_job import ImageJob
 
 MOST = 12
 """Photos shown: the page stays small enough to be sent by mail."""
@@ -31,34 +33,54 @@ _CROP, _CROP_SIDE = 3, 260  # crops per photo, and px of their side
 _QUALITY = 78
 
 
+@runtime_checkable
+class Photos(Protocol):
+    """What pictures are drawn of: an `ImageCalibration`."""
+
+    @property
+    def job(self) -> "ImageJob":
+        """The settings."""
+        ...
+
+    @property
+    def calibration(self) -> "Calibration":
+        """The fits; one frame for each photo used."""
+        ...
+
+    @property
+    def used(self) -> "tuple[Detection, ...]":
+        """The photos used."""
+        ...
+
+    def members(self) -> list[np.ndarray]:
+        """For each of them, the numbers of its lines."""
+        ...
+
+    def overlays(self) -> list[str]:
+        """For each of them, the name of its picture; empty if it is not drawn."""
+        ...
+
+
 @dataclasses.dataclass(frozen=True)
 class Pictures:
     """Pictures of one photo, as JPEG.
 
     Attributes:
         frame: its number among the frames of the calibration.
+        focal: its focal length.
         before, after: the photo and its correction, each with the lines.
         crops: the photo about the middle of its worst lines, by the lines' numbers in ``lines.npz``.
     """
 
     frame: int
+    focal: float
     before: bytes
     after: bytes
     crops: dict[int, bytes]
 
 
-def pictures(images: "ImageCalibration", most: int = MOST) -> list[Pictures]:
-    """Pictures of at most so many photos, sorted by f: those fitted worst, and others over the zoom."""
-    chosen = dict.fromkeys(chosen_frames(images.calibration, most))
-    names = {images.used[frame].name: frame for frame in chosen}
-    found = {}
-    for source in images.job.sources()[0]:
-        if (frame := names.get(source.name)) is not None:
-            found[frame] = _pictures(images, frame, source.read()[0])
-    return [found[frame] for frame in chosen if frame in found]
-
-
-def _pictures(images: "ImageCalibration", frame: int, image: UInt8[np.ndarray, "..."]) -> Pictures:
+def pictures_of(images: "Photos", frame: int, image: UInt8[np.ndarray, "..."]) -> Pictures:
+    """Pictures of one photo."""
     calibration = images.calibration
     members = np.flatnonzero(np.asarray(calibration.lines.frame) == frame)
     rms, rejected = calibration.line_rms[members], calibration.rejected[members]
@@ -68,7 +90,8 @@ def _pictures(images: "ImageCalibration", frame: int, image: UInt8[np.ndarray, "
     small, scale = shrunk(image, _WIDE)
     look = {"rejected": rejected.tolist(), "rms": rms, "labels": labels, "limit": colour_limit(calibration)}
     before = draw_lines(small, [_at(line, scale) for line in lines], **look)
-    distortion = _resized(calibration.fit.lens(float(calibration.lines.focal[frame])), image, small)
+    focal = float(np.asarray(calibration.lines.focal)[frame])
+    distortion = _resized(calibration.fit.lens(focal), image, small)
     corrected, framing = _corrected(small, distortion)
     origin, enlarged = np.asarray(framing.origin), float(framing.scale)
     joined = np.asarray(distortion.undistort(_at(np.concatenate(lines), scale)))  # all lines at once
@@ -77,7 +100,7 @@ def _pictures(images: "ImageCalibration", frame: int, image: UInt8[np.ndarray, "
     known = [points[np.isfinite(points).all(axis=1)] for points in shown]
     after = draw_lines(corrected, known, **look)
     crops = {int(line): _crop(image, lines[place]) for line, place in zip(named, labels, strict=True)}
-    return Pictures(frame, _jpeg(before), _jpeg(after), crops)
+    return Pictures(frame, focal, _jpeg(before), _jpeg(after), crops)
 
 
 def before_after(image: UInt8[np.ndarray, "..."], distortion: Distortion) -> tuple[bytes, bytes]:
@@ -89,13 +112,14 @@ def before_after(image: UInt8[np.ndarray, "..."], distortion: Distortion) -> tup
 def _corrected(small: np.ndarray, distortion: Distortion) -> tuple[np.ndarray, Framing]:
     """A picture, corrected, and how it is framed: all of it, unless that would be too small to see."""
     size = (small.shape[1], small.shape[0])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of folds, which the report states
-        framing = frame_output(distortion, size, keep="all")
-        if framing.scale < _LEAST_SCALE:
-            fixed = np.asarray(distortion.centre)  # stays where it is
-            framing = Framing(np.array(_LEAST_SCALE), fixed - fixed / _LEAST_SCALE, size, size)
-        return undistort_image(small, distortion, keep=framing, border_value=128), framing
+    framing = frame_output(distortion, size, keep="all")
+    if framing.scale < _LEAST_SCALE:
+        fixed = np.asarray(distortion.centre)  # stays where it is
+        framing = Framing(np.array(_LEAST_SCALE), fixed - fixed / _LEAST_SCALE, size, size)
+    # As `undistort_image`, without its warning of a fold, which the report states.
+    x, y = position_map(distortion, framing, size)
+    grey = border_values(128, math.prod(small.shape[2:]), small.dtype)
+    return remap(checked_image(small), x, y, "linear", "constant", grey), framing
 
 
 def _crop(image: np.ndarray, line: np.ndarray) -> bytes:

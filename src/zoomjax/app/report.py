@@ -4,7 +4,7 @@ Its text is in ``templates/report.html``; this module computes the values. Runs 
 of the time is plotting.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,7 +40,7 @@ def report(
     calibration: Calibration,
     images: "ImageCalibration | None" = None,
     *,
-    pictures: Sequence[Pictures] = (),
+    pictures: Iterable[Pictures] = (),
     run: Run | None = None,
 ) -> str:
     """Render the report as HTML.
@@ -49,7 +49,7 @@ def report(
         calibration: the calibration to report.
         images: the images in which the lines were found. The page then lists them by name, with links to
             their pictures in the folder ``lines/`` next to it.
-        pictures: pictures of some of the images, to be embedded.
+        pictures: pictures of some of the images, to be embedded; asked for when all else is done.
         run: what was run.
     """
     lens = calibration.fit.lens
@@ -72,8 +72,6 @@ def report(
         warnings=images.warnings() if images else calibration.warnings(),
         slider=embedded_data(moving),
         slider_times=f"{moving['times']:g}" if moving and moving["times"] > 1 else None,
-        limit=f"{colour_limit(calibration):.2g}" if pictures and images else None,
-        photos=_photos(calibration, images, pictures, verdicts) if images else [],
         straightness=_straightness(calibration),
         coverage=_coverage(calibration),
         lens=_lens(calibration),
@@ -85,21 +83,23 @@ def report(
         run=run.rows,
         files=["lens.json", "summary.json", "lines.npz", "model.png"],
         versions=", ".join(f"{name} {of}" for name, of in versions.items()),
+        **_photos(calibration, images, pictures, verdicts),  # the last: they may be still being drawn
     )
 
 
 def _photos(
     calibration: Calibration,
-    images: "ImageCalibration",
-    pictures: Sequence[Pictures],
+    images: "ImageCalibration | None",
+    pictures: Iterable[Pictures],
     verdicts: Sequence[tuple[Verdict, str]],
-) -> list[dict[str, Any]]:
-    """Photos before and after, each with the verdict on it."""
+) -> dict[str, Any]:
+    """Photos before and after, each with the verdict on it, and the limit of their colours."""
     shown = []
-    for one in pictures:
-        verdict, reason = verdicts[one.frame]
-        shown.append({"verdict": verdict, "reason": reason, **_photo(calibration, images, one)})
-    return shown
+    if images is not None:
+        for one in pictures:
+            verdict, reason = verdicts[one.frame]
+            shown.append({"verdict": verdict, "reason": reason, **_photo(calibration, images, one)})
+    return {"photos": shown, "limit": f"{colour_limit(calibration):.2g}" if shown else None}
 
 
 def _photo(calibration: Calibration, images: "ImageCalibration", one: Pictures) -> dict[str, Any]:
@@ -350,10 +350,10 @@ def _worst_lines(calibration: Calibration, members: np.ndarray) -> list[dict[str
     """The worst lines of a frame: of those that count, and of the rejected ones."""
     worst = members[np.argsort(-calibration.line_rms[members], kind="stable")]
     rejected = calibration.rejected[worst]
-    points, mask = calibration.lines.points, np.asarray(calibration.lines.mask)
+    points, mask = np.asarray(calibration.lines.points), np.asarray(calibration.lines.mask)
     listed = []
     for line in [*worst[~rejected][:_WORST], *worst[rejected][:_WORST_REJECTED]]:
-        x, y = np.asarray(points[line])[mask[line]].mean(axis=0)
+        x, y = points[line][mask[line]].mean(axis=0)
         text = f"{line} at ({x:.0f}, {y:.0f}): {calibration.line_rms[line]:.2f} px"
         listed.append({"text": text, "rejected": bool(calibration.rejected[line])})
     return listed

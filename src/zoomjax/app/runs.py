@@ -3,11 +3,13 @@
 import contextlib
 import dataclasses
 import datetime
+import importlib
 import os
 import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -87,27 +89,36 @@ def calibrate_images(
     job: "ImageJob", folder: Path, *, title: str, quiet: bool = False, cluster: str | None = None
 ) -> "ImageCalibration":
     """Calibrate from images, perhaps on a cluster of Dask, and write the results into the folder."""
+    from .._core.ahead import programs_ahead
+    from .drawings import drawing
     from .image_calibration import calibrate_images
-    from .pictures import pictures
-    from .report import report
+    from .plans import photo_sizes
 
     # The cluster stays open: photos that disagree with the lens are searched again.
-    with cluster_executor(cluster, quiet=quiet) as executor, contextlib.ExitStack() as shown:
-        progress = shown.enter_context(progress_bar("Detecting lines", quiet=quiet))
+    with contextlib.ExitStack() as beside:
+        settings = job.detector, job.focal, job.shared_focal, job.centre, job.model
+        beside.enter_context(ThreadPoolExecutor(1)).submit(importlib.import_module, f"{__package__}.report")
+        beside.enter_context(programs_ahead(f"{settings} {next(photo_sizes(job), None)}"))
+        with cluster_executor(cluster, quiet=quiet) as executor, contextlib.ExitStack() as shown:
+            progress = shown.enter_context(progress_bar("Detecting lines", quiet=quiet))
 
-        def stage(name: str) -> None:
-            nonlocal current
-            if current is None:  # replace the bar by the stages
-                shown.close()
-                current = shown.enter_context(stages(quiet=quiet))
-            current(name)
+            def stage(name: str) -> None:
+                nonlocal current
+                if current is None:  # replace the bar by the stages
+                    shown.close()
+                    current = shown.enter_context(stages(quiet=quiet))
+                current(name)
 
-        current: Callable[[str], None] | None = None
-        done = calibrate_images(job, progress=progress, stage=stage, executor=executor)
-        stage("Making the report")
-        page = report(done.calibration, done, pictures=pictures(done), run=what_is_run(title, done))
-    with progress_bar("Drawing the lines and writing the results", quiet=quiet) as progress:
-        done.make(folder, progress, pages={REPORT: page})
+            current: Callable[[str], None] | None = None
+            done = calibrate_images(job, progress=progress, stage=stage, executor=executor)
+            stage("Making the report")
+            from .report import report
+
+            drawn = beside.enter_context(drawing(done, folder / "lines"))
+            page = report(done.calibration, done, pictures=drawn.pictures(), run=what_is_run(title, done))
+        with progress_bar("Drawing the lines and writing the results", quiet=quiet) as progress:
+            drawn.wait(progress)
+            done.calibration.make(folder, about=done.about(), pages={REPORT: page})
     return done
 
 

@@ -7,17 +7,18 @@ lock whose holder died. Here each process has its own pipe, and a thread that wa
 
 import concurrent.futures
 import contextlib
-import multiprocessing
 import os
 import signal
 import sys
 import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 import cv2
+
+from .._core.forked import process_context
 
 _STARTS = 3
 """Tries to begin a process: another's want of memory may end one, a program that cannot run ends all."""
@@ -41,7 +42,7 @@ class Workers:
         self._threads = concurrent.futures.ThreadPoolExecutor(number, "worker", _leave_interrupts)
         self._own = threading.local()
         self._lock, self._closed = threading.Lock(), False
-        self._processes: set[SpawnProcess] = set()
+        self._processes: set[BaseProcess] = set()
 
     def submit(self, item: Any) -> concurrent.futures.Future:
         """A future of ``task(item)``, computed in a process.
@@ -100,7 +101,7 @@ class Workers:
         )
 
     def _begun(self) -> Connection:
-        context = multiprocessing.get_context("spawn")
+        context = process_context()
         connection, theirs = context.Pipe()
         process = context.Process(target=_serve, args=(theirs, self._task, self._seconds), daemon=True)
         with self._lock:

@@ -133,18 +133,18 @@ class EdgeDetector(AbstractDetector):
                 break
             model = model.fitted(long)
             most = 1.0 if bend is None else _TIED  # lines of arcs are no measure of a model that is known
-            sigma = float(np.clip(2 * np.median([_rms(line, model) for line in long]), _EXACT, most))
-        good = [self._is_good(line, model, sigma, min(size)) for line in border_lines(pieces, label)]
-        found = _found(pieces, label, np.array(good, bool), min(size))
+            sigma = float(np.clip(2 * np.median(_rms(long, model)), _EXACT, most))
+        lines = border_lines(pieces, label)
+        good = np.array([self._is_seen(line, min(size)) for line in lines], bool)
+        seen = [line for line, keep in zip(lines, good, strict=True) if keep]
+        good[good] = _rms(seen, model) <= _ROUGHEST * max(sigma, 0.25)
+        found = _found(pieces, label, lines, good, min(size))
         return dataclasses.replace(found, bend=model.values)
 
-    def _is_good(self, line: np.ndarray, model: OneFrame, sigma: float, side: int) -> bool:
-        """Whether a line is long, visible and straight enough."""
-        if extent(line) < self.least_length * side:
-            return False
-        if len(line) < self.least_cover * np.max(abs(line[-1] - line[0])):
-            return False
-        return _rms(line, model) <= _ROUGHEST * max(sigma, 0.25)
+    def _is_seen(self, line: np.ndarray, side: int) -> bool:
+        """Whether a line is long and visible enough."""
+        long = extent(line) >= self.least_length * side
+        return bool(long and len(line) >= self.least_cover * np.max(abs(line[-1] - line[0])))
 
 
 def as_grey(image: np.ndarray) -> np.ndarray:
@@ -181,10 +181,12 @@ def _long(pieces: Fragments, label: np.ndarray, least: float) -> list[np.ndarray
     ]
 
 
-def _found(pieces: Fragments, label: np.ndarray, good: np.ndarray, side: int) -> Edges:
+def _found(
+    pieces: Fragments, label: np.ndarray, lines: Sequence[np.ndarray], good: np.ndarray, side: int
+) -> Edges:
     """The good lines, and what they leave of the strong long pieces."""
     names = np.unique(label)
-    lines = [line for line, keep in zip(border_lines(pieces, label), good, strict=True) if keep]
+    lines = [line for line, keep in zip(lines, good, strict=True) if keep]
     last = pieces.start + pieces.count - 1
     length = np.hypot(*(pieces.points[last] - pieces.points[pieces.start]).T)
     strong = length >= _STRONG * side
@@ -194,7 +196,9 @@ def _found(pieces: Fragments, label: np.ndarray, good: np.ndarray, side: int) ->
     return Edges(tuple(sorted(lines, key=extent, reverse=True)), left)
 
 
-def _rms(line: np.ndarray, model: OneFrame) -> float:
-    """px of the image about the best line."""
-    some = line[np.linspace(0, len(line) - 1, 64).round().astype(int)]
-    return float(np.sqrt(np.mean(model.errors(some[None]) ** 2)))
+def _rms(lines: Sequence[np.ndarray], model: OneFrame) -> np.ndarray:
+    """(l,), px of the image about the best line, of all lines at once."""
+    if not lines:
+        return np.zeros(0)
+    some = [line[np.linspace(0, len(line) - 1, 64).round().astype(int)] for line in lines]
+    return np.sqrt(np.mean(model.errors(np.stack(some)) ** 2, axis=1))

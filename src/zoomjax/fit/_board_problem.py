@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._core.arrays import as_jax
 from .._core.checks import checked_size
 from .._core.fields import refuse_masked
 from .._core.types import traced
@@ -106,16 +106,16 @@ def data_of(
         smoothness[:zooms, :zooms] = (np.eye(zooms) - curve @ curve.T) / smooth
     extra = corners - len(places)
     return Data(
-        points=jnp.asarray(about),
-        there=jnp.asarray(there),
-        zoom=jnp.asarray(np.pad(number, (0, wide - photos)), jnp.int32),
-        board=jnp.asarray(np.pad(given.board, (0, wide - photos)), jnp.int32),
-        members=jnp.asarray(_members(given.board, boards, wide), jnp.int32),
-        places=jnp.asarray(np.pad(places, ((0, extra), (0, 0)), mode="wrap")),
+        points=as_jax(about),
+        there=as_jax(there),
+        zoom=as_jax(np.pad(number, (0, wide - photos)).astype(np.int32)),
+        board=as_jax(np.pad(given.board, (0, wide - photos)).astype(np.int32)),
+        members=as_jax(_members(given.board, boards, wide).astype(np.int32)),
+        places=as_jax(np.pad(places, ((0, extra), (0, 0)), mode="wrap")),
         basis=shape_basis(places, extra),
-        smooth=jnp.asarray(smoothness),
-        zooms=jnp.asarray(zooms),
-        centre_std=jnp.asarray(centre_std),
+        smooth=as_jax(smoothness),
+        zooms=as_jax(np.asarray(zooms)),
+        centre_std=as_jax(np.asarray(centre_std, float)),
         scale=float(np.hypot(*given.image_size) / 2),
     )
 
@@ -131,4 +131,4 @@ def _members(board, boards, wide):
 
 def padded_to(values: np.ndarray, size: int) -> Array:
     """An array whose last element is repeated."""
-    return jnp.asarray(np.concatenate([values, np.repeat(values[-1:], size - len(values), axis=0)]))
+    return as_jax(np.concatenate([values, np.repeat(values[-1:], size - len(values), axis=0)]))

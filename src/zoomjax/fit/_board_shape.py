@@ -21,6 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.arrays import as_jax
+
 OUT_OF_PLANE, IN_PLANE, OF_A_PHOTO = 12, 10, 4
 """Largest total degrees."""
 
@@ -122,7 +124,7 @@ def shape_basis(places: Float[np.ndarray, "corner 2"], more: int = 0) -> Basis:
         functions(OUT_OF_PLANE, SHAPE_STD[0]),
         functions(OF_A_PHOTO, 1.0),
     )
-    return Basis(*(jnp.asarray(np.pad(np.stack(of, axis=1), ((0, more), (0, 0)))) for of in columns))
+    return Basis(*(as_jax(np.pad(np.stack(of, axis=1), ((0, more), (0, 0)))) for of in columns))
 
 
 def shape_of(

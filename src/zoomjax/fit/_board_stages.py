@@ -5,10 +5,12 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from .._core.arrays import as_jax
 from .._core.programs import optimised_program, program
 from ..models.invertibility import Certificate, certificate_of
 from ._board_rows import (
@@ -28,7 +30,7 @@ from ._board_shape import shape_of
 from ._normal_solver import damped_solver
 from ._views import EXACT, MEDIAN_OF_SIZE
 from .covariance import of_clusters
-from .result import RESULTS
+from .result import RESULTS, is_status
 
 _STAGES = (
     (1e-3, 2.0, Stage(0.0, 0.1, 1e-5, 1.0, change=3.0, damping=1e-3)),
@@ -79,7 +81,7 @@ def in_stages(data: Data, model: Model, *, flat: bool = False) -> tuple[Model, S
     result: Any = RESULTS.successful
     stage = _STAGES[0][2]
     for number, (least, wider, stage) in enumerate(_STAGES):
-        own = jnp.maximum(wider * noise, least * data.scale)
+        own = max(wider * float(noise), least * data.scale)
         stage = stage._replace(noise=own, bend=stage.bend if bend is None else bend)
         stage = _arrays(stage._replace(shape=_FLAT, bend=_FLAT) if flat else stage)
         before = noise
@@ -87,7 +89,7 @@ def in_stages(data: Data, model: Model, *, flat: bool = False) -> tuple[Model, S
         total += int(steps)
         if number > 0:
             bend = _bend_of(data, model)
-            if result == RESULTS.successful and noise > _SAME * before:
+            if is_status(result, RESULTS.successful) and float(noise) > _SAME * float(before):
                 break
     last = stage._replace(noise=noise, bend=stage.bend if flat or bend is None else bend)
     return model, last, result, total
@@ -95,12 +97,12 @@ def in_stages(data: Data, model: Model, *, flat: bool = False) -> tuple[Model, S
 
 def located(data: Data, model: Model, noise: Array, bend: Array) -> tuple[Model, Array]:
     """Poses and own bends of photos, for a lens and a shape that are held, and the residuals, px."""
-    noise = jnp.maximum(noise, _noise(data, model))
+    noise = as_jax(np.maximum(noise, _noise(data, model)))
     for _ in range(3):
         stage = _arrays(Stage(noise, 1.0, bend, 0.0, change=0.01, damping=1e-6))
         before = noise
         model, noise, _, _ = _solved(data, model, stage)
-        if noise > _SAME * before:
+        if float(noise) > _SAME * float(before):
             break
     return model, _residuals(data, model)
 
@@ -108,7 +110,7 @@ def located(data: Data, model: Model, noise: Array, bend: Array) -> tuple[Model,
 def _arrays(tree):
     """Numbers that the compiled program takes, and is not compiled for, whatever they come from."""
     return jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, jnp.float64) if eqx.is_inexact_array_like(leaf) else leaf, tree
+        lambda leaf: as_jax(np.asarray(leaf, np.float64)) if eqx.is_inexact_array_like(leaf) else leaf, tree
     )
 
 

@@ -14,11 +14,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, Num
 
 from .._core.arguments import kinds_checked
+from .._core.arrays import as_jax
 from .._core.checks import check_above
+from .._core.programs import light_program
 from .._core.types import AnyArray
 from ..models.distortion_model import AbstractDistortionModel, checked_terms
 from ..models.lens import ZoomLens
@@ -114,7 +115,7 @@ class BoardFit(eqx.Module):
     @property
     def bend(self) -> Float[np.ndarray, "board"]:
         """How far each board reaches out of its plane, from its deepest to its highest corner, steps."""
-        height = np.asarray(self.shape[..., 2])
+        height = np.asarray(self.shape)[..., 2]
         return height.max(axis=(1, 2)) - height.min(axis=(1, 2))
 
     def locate(
@@ -241,7 +242,7 @@ def fit_boards(
         target", ICCV Workshops 2011: the board's shape as unknowns.
         B. Triggs et al., "Bundle adjustment: a modern synthesis", 2000.
     """
-    if jnp.zeros(()).dtype != jnp.float64:
+    if jnp.result_type(float) != jnp.float64:
         raise ValueError(
             "fit_boards needs float64, and it is not enabled: call "
             'jax.config.update("jax_enable_x64", True) first.'
@@ -280,33 +281,37 @@ def _homographies(data, coefficients, distortion_model):
 
 def _model(data, matrices, focal_px, zoom, distortion_model, boards):
     """Poses from homographies, of a flat board."""
-    focal = padded_to(focal_px, len(data.smooth))
-    rotation, position = poses_of(matrices, focal[data.zoom] / data.scale)
+    focal = np.asarray(padded_to(focal_px, len(data.smooth)))
+    rotation, position = _start_poses(matrices, focal[np.asarray(data.zoom)] / data.scale)
     return Model(
         rotation=rotation,
         position=position,
-        bend=jnp.zeros((len(data.points), data.basis.own.shape[1])),
-        shape=jnp.zeros((boards, data.basis.size)),
-        log_focal=jnp.log(focal),
+        bend=as_jax(np.zeros((len(data.points), data.basis.own.shape[1]))),
+        shape=as_jax(np.zeros((boards, data.basis.size))),
+        log_focal=as_jax(np.log(focal)),
         zoom=zoom,
-        offset=jnp.zeros(2),
+        offset=as_jax(np.zeros(2)),
         distortion_model=distortion_model,
     )
+
+
+_start_poses, _judged = light_program(poses_of), light_program(judged)
 
 
 def _poses(given, data, model, missed):
     """The poses of the photos there are."""
     photos, rows, columns = given.grids.shape[:3]
     unit = grid_places(rows, columns)[1]
-    bend = (model.bend[:photos] @ data.basis.own.T)[:, : rows * columns]
+    own = np.asarray(data.basis.own)[: rows * columns]
+    bend = np.asarray(model.bend)[:photos] @ own.T
     distance = np.linalg.norm(np.asarray(missed), axis=-1)
     distance = np.where(np.asarray(data.there), distance, np.nan)[:photos, : rows * columns]
     known = np.isfinite(given.grids[..., 0]).any(axis=(1, 2))
     return BoardPoses(
-        rotation=jnp.where(known[:, None, None], model.rotation[:photos], jnp.nan),
-        position=jnp.where(known[:, None], model.position[:photos] * unit, jnp.nan),
-        bend=unit * bend.reshape(photos, rows, columns),
-        residual=jnp.asarray(distance.reshape(photos, rows, columns)),
+        rotation=as_jax(np.where(known[:, None, None], np.asarray(model.rotation)[:photos], np.nan)),
+        position=as_jax(np.where(known[:, None], np.asarray(model.position)[:photos] * unit, np.nan)),
+        bend=as_jax(unit * bend.reshape(photos, rows, columns)),
+        residual=as_jax(distance.reshape(photos, rows, columns)),
     )
 
 
@@ -316,9 +321,9 @@ def _described(given, data, solved, label, origin, fitted):
     photos, rows, columns = given.grids.shape[:3]
     zooms, boards, corners = len(label), int(given.board.max()) + 1, rows * columns
     unit = grid_places(rows, columns)[1]
-    focal = np.exp(np.asarray(model.log_focal[:zooms]))
-    centre = jnp.asarray(origin) + (data.scale * model.offset if fitted else 0)
-    focal_range = jnp.asarray([focal.min(), focal.max()])
+    focal = np.exp(np.asarray(model.log_focal)[:zooms])
+    centre = as_jax(np.asarray(origin) + (data.scale * np.asarray(model.offset) if fitted else 0.0))
+    focal_range = as_jax(np.array([focal.min(), focal.max()]))
     known = described(data, model, stage, centre, given.image_size, focal_range)
     all_numbers = np.asarray(known.covariance)
     kept = np.r_[:zooms, len(model.log_focal) : len(all_numbers)]
@@ -331,9 +336,9 @@ def _described(given, data, solved, label, origin, fitted):
     covariance[lost] = covariance[:, lost] = 0
     covariance[lost, lost] = np.inf  # what fits few of its corners says nothing of a zoom
     log_std = np.sqrt(np.diag(covariance)[:zooms])
-    size = ravel_pytree(model.zoom.parameters)[0].size
+    size = sum(leaf.size for leaf in jax.tree.leaves(model.zoom.parameters))
     joint = covariance[zooms:, zooms:]
-    rms = jnp.asarray(np.sqrt(squares.sum() / max(counts.sum(), 1)))
+    rms = as_jax(np.sqrt(squares.sum() / max(counts.sum(), 1)))
     of_photos = np.sqrt(squares.sum(axis=1) / np.maximum(counts, 1))
     lens = ZoomLens(
         zoom=model.zoom,
@@ -344,29 +349,30 @@ def _described(given, data, solved, label, origin, fitted):
         distortion_model=model.distortion_model,
     )
     determined = bool(np.isfinite(covariance).all() and log_std.max() < _UNKNOWN)
+    shape, shape_std = (np.asarray(of)[:boards, :corners] for of in (known.shape, known.shape_std))
     fit = ZoomFit(
         lens=lens,
         rms=rms,
-        frame_rms=jnp.asarray(np.where((2 * counts >= seen) & (seen > 0), of_photos, np.nan)),
-        covariance=jnp.asarray(joint[:size, :size]),
-        result=judged(model.zoom, result, jnp.asarray(determined), known.certificate),
-        steps=jnp.asarray(steps),
+        frame_rms=as_jax(np.where((2 * counts >= seen) & (seen > 0), of_photos, np.nan)),
+        covariance=as_jax(joint[:size, :size]),
+        result=_judged(model.zoom, result, np.asarray(determined), known.certificate),
+        steps=as_jax(np.asarray(steps)),
         certificate=known.certificate,
         rms_unconstrained=rms,
-        joint=jnp.asarray(joint) if fitted else None,
+        joint=as_jax(joint) if fitted else None,
     )
     return BoardFit(
         fit=fit,
-        label=jnp.asarray(label),
-        focal=jnp.asarray(focal),
-        focal_std=jnp.asarray(focal * log_std),
-        frame_focal=jnp.asarray(focal[number]),
-        covariance=jnp.asarray(covariance),
-        board=jnp.asarray(given.board),
-        shape=unit * known.shape[:boards, :corners].reshape(boards, rows, columns, 3),
-        shape_std=unit * known.shape_std[:boards, :corners].reshape(boards, rows, columns, 3),
-        coefficients=model.shape[:boards],
-        bend_std=jnp.asarray(stage.bend),
+        label=as_jax(label),
+        focal=as_jax(focal),
+        focal_std=as_jax(focal * log_std),
+        frame_focal=as_jax(focal[number]),
+        covariance=as_jax(covariance),
+        board=as_jax(given.board),
+        shape=as_jax(unit * shape.reshape(boards, rows, columns, 3)),
+        shape_std=as_jax(unit * shape_std.reshape(boards, rows, columns, 3)),
+        coefficients=as_jax(np.asarray(model.shape)[:boards]),
+        bend_std=as_jax(np.asarray(stage.bend)),
         poses=_poses(given, data, model, known.missed),
         noise=known.noise,
     )

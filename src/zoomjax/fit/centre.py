@@ -16,10 +16,12 @@ from typing import Any, NoReturn
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree, ScalarLike
 
 from .._core.arguments import kinds_checked
+from .._core.arrays import as_jax
 from .._core.programs import light_program, program
 from .._core.types import Coefficients, Focal
 from ..lines.base import AbstractLines
@@ -30,7 +32,7 @@ from ..models.invertibility import certify
 from ..models.lens import ZoomLens
 from ..models.model import Model
 from ..models.requirements import check
-from ..models.zoom import AbstractZoom, PolynomialZoom, with_parameters
+from ..models.zoom import AbstractZoom, PolynomialZoom, number_of_coefficients, with_parameters
 from ._least_squares import Solver, default_solver
 from .compression import compressed_as_measured
 from .covariance import parameter_covariance
@@ -196,9 +198,9 @@ def refit_centre(lines: AbstractLines, found: CentreFit) -> AbstractZoom:
     """
     lens, centre = found.fit.lens, found.fit.lens.shift
     if centre is None:
-        offset = (lens.centre - jnp.asarray(lines.centre))[None] / lens.scale
+        offset = as_jax((np.asarray(lens.centre) - np.asarray(lines.centre))[None] / lens.scale)
         centre = with_parameters(PolynomialZoom(degree=0).prepare(lines.focal, 2), offset)
-    lines = for_terms(bucketed(lines), lens(lens.focal_range[0]).coefficients.shape[-1])
+    lines = for_terms(bucketed(lines), number_of_coefficients(lens.zoom))
     joint, *_ = _search(lines, _both(lens.zoom, centre), default_solver(lines), 256)
     return joint
 

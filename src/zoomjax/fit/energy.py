@@ -155,6 +155,9 @@ def prior_error(lines: AbstractLines, zoom: AbstractPriorZoom) -> Float[Array, "
     return lines.scale * error / jnp.sqrt(number_counted(counted_frames(lines)).astype(error.dtype))
 
 
+size_of_prior = bucketed_jit()(prior_error)
+
+
 def prior_jacobian(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "row parameter"]:
     """Derivatives of `prior_residuals` by the flattened parameters; no rows for a model without a prior."""
     flat, unravel = ravel_pytree(zoom.parameters)

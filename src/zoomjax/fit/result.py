@@ -1,14 +1,18 @@
 """Results of fits, and their status."""
 
+import functools
+import operator
 from typing import Any, NoReturn
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
+from .._core.arrays import as_jax
 from .._core.types import Centres, traced
 from ..lines.base import AbstractLines
 from ..lines.buckets import of_frames
@@ -149,10 +153,9 @@ class FrameFits(eqx.Module):
 
     def messages(self) -> list[str]:
         """For each frame a sentence on its fit's problem; empty if there is none."""
-        return [
-            RESULTS[jax.tree.map(lambda value, frame=frame: value[frame], self.result)]
-            for frame in range(self.coefficients.shape[0])
-        ]
+        (value,) = jax.tree.leaves(jax.tree.map(np.asarray, self.result))
+        each = (jax.tree.map(lambda _, one=one: np.asarray(one), self.result) for one in value)
+        return [RESULTS[result] for result in each]
 
     def distortion(self, frame: int) -> Distortion:
         """The distortion of one frame.
@@ -164,12 +167,10 @@ class FrameFits(eqx.Module):
         if not -frames <= frame < frames:
             raise IndexError(f"There is no frame {frame}: the frames fitted are 0 to {frames - 1}.")
         dtype = self.coefficients.dtype
-        return Distortion(
-            self.coefficients[frame],
-            jnp.broadcast_to(jnp.asarray(self.centre, dtype), (frames, 2))[frame],
-            jnp.asarray(self.scale, dtype),
-            self.distortion_model,
-        )
+        xp: Any = jnp if traced(self) else np  # known ones compile nothing
+        centre = xp.broadcast_to(xp.asarray(self.centre, dtype), (frames, 2))[frame]
+        coefficients, scale = xp.asarray(self.coefficients)[frame], xp.asarray(self.scale, dtype)
+        return Distortion(as_jax(coefficients), as_jax(centre), as_jax(scale), self.distortion_model)
 
 
 def described_fit(lines, zoom, result, steps):
@@ -251,8 +252,14 @@ def is_invertible(fit):
 
 def failed(result):
     """Whether a solver failed. A status about the model is not a failure."""
-    told = (result == RESULTS.undetermined) | (result == RESULTS.folded) | (result == RESULTS.constrained)
-    return (result != RESULTS.successful) & ~told
+    fitted = (RESULTS.successful, RESULTS.undetermined, RESULTS.folded, RESULTS.constrained)
+    return ~functools.reduce(operator.or_, (is_status(result, of) for of in fitted))
+
+
+def is_status(result, other):
+    """Whether both are the same, by NumPy where they are known, which compiles nothing."""
+    one, another = (jax.tree.leaves(of)[0] for of in (result, other))
+    return (one if traced(one) else np.asarray(one)) == another
 
 
 def outcome_of(fit):

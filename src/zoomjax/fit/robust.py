@@ -24,6 +24,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
+from .._core.arrays import as_jax
 from .._core.programs import light_program, program
 from .._core.types import AnyArray, traced
 from ..lines.base import AbstractLines, SomeLines
@@ -210,7 +211,7 @@ def _turns(lines, model, unfitted, narrowing=_NARROWING):
         elif isinstance(model.zoom, AbstractLinearZoom):
             model = algebraic_model(lines, model)
     dtype = jax.dtypes.canonicalize_dtype(lines.focal.dtype)
-    weighted, zoom = _reweighted(lines, model.zoom, jnp.asarray(narrowing, dtype))
+    weighted, zoom = _reweighted(lines, model.zoom, as_jax(np.asarray(narrowing, dtype)))
     return weighted, model.with_zoom(zoom)
 
 

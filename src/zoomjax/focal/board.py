@@ -53,7 +53,7 @@ def focal_from_board(
         50.0
     """
     points, board = as_points_of("points", points), as_points_of("board", board)
-    check_pairs(points, board, fewest=3)
+    check_pairs(points.shape, board.shape, fewest=3)
     check_positive("distance", np.asarray(distance) if isinstance(distance, int | float) else distance)
     check_positive(
         "pixel_pitch", np.asarray(pixel_pitch) if isinstance(pixel_pitch, int | float) else pixel_pitch

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.arrays import as_jax
 from .._core.fields import numbers
 from .homography import matrix_of
 
@@ -90,13 +91,13 @@ def _inverse_square(entries, root, counted):
 
 def as_points_of(name: str, points) -> jax.Array:
     """Points, or lists of them, as an array; ValueError if they hold something else."""
-    return jnp.asarray(numbers(name)(points))
+    return as_jax(numbers(name)(points))
 
 
-def check_pairs(points, plane, *, fewest: int) -> None:
-    """As many points in the image as on the plane, and enough of them."""
-    if points.shape != plane.shape or plane.ndim != 2 or plane.shape[1] != 2 or len(plane) < fewest:
+def check_pairs(points: tuple[int, ...], plane: tuple[int, ...], *, fewest: int) -> None:
+    """As many points in the image as on the plane, and enough of them, by the arrays' shapes."""
+    if points != plane or len(plane) != 2 or plane[1] != 2 or plane[0] < fewest:
         raise ValueError(
             f"Points in the image and on the plane must be arrays (n, 2) of one shape, n >= {fewest}, but "
-            f"their shapes are {points.shape} and {plane.shape}."
+            f"their shapes are {points} and {plane}."
         )

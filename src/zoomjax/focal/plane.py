@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Num
 
+from .._core.arrays import as_jax
 from .._core.products import exact_products
 from .._core.programs import light_program
 from .._core.types import AnyArray, traced
@@ -75,11 +76,11 @@ def focal_from_planes(
             f"{points.shape}."
         )
     if plane.ndim == 3 and len(plane) == len(points):
-        check_pairs(points[0], plane[0], fewest=5)
+        check_pairs(points.shape[1:], plane.shape[1:], fewest=5)
     else:
-        check_pairs(points[0], plane, fewest=5)
+        check_pairs(points.shape[1:], plane.shape, fewest=5)
         plane = jnp.broadcast_to(plane, points.shape)
-    mask = jnp.ones(points.shape[:2], bool) if mask is None else jnp.asarray(mask)
+    mask = as_jax(np.ones(points.shape[:2], bool)) if mask is None else jnp.asarray(mask)
     if mask.shape != points.shape[:2]:
         raise ValueError(
             f"Argument mask must have shape (view, point), here {points.shape[:2]}, but its shape is "

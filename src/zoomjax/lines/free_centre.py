@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.arguments import kinds_checked
+from .._core.arrays import as_jax
 from .._core.checks import checked_integer
 from .._core.products import EXACT
 from .._core.types import Centres, traced
@@ -138,7 +139,7 @@ class AnyCentreLines(AbstractTriangles):
         xp: Any = jnp if traced(centre) else np
         centre = xp.asarray(centre, self.triangle.dtype)
         each = xp.broadcast_to(centre, (self.focal.shape[0], 2))
-        return each, jnp.asarray(centre if centre.ndim == 1 else xp.mean(each, axis=0))
+        return each, as_jax(centre if centre.ndim == 1 else xp.mean(each, axis=0))
 
 
 @kinds_checked

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.arrays import as_jax
 from .._core.checks import checked_integer
 from .._core.types import Focal, traced
 from .zoom import UNFITTED, check_distinct
@@ -19,12 +20,12 @@ def check_knots(what: str, focal: Focal, number: int | None) -> None:
 
 
 def zero_parameters(rows: int, terms: int, dtype: np.dtype) -> Float[Array, "rows terms"]:
-    return jnp.asarray(np.zeros((rows, terms), dtype))
+    return as_jax(np.zeros((rows, terms), dtype))
 
 
 def shortest(focal: Focal) -> Float[Array, ""]:
     """The shortest focal length: where they are known by NumPy, which compiles nothing."""
-    return jnp.min(focal) if traced(focal) else jnp.asarray(np.asarray(focal).min())
+    return jnp.min(focal) if traced(focal) else as_jax(np.asarray(focal).min())
 
 
 def prepared(value):

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core.arrays import as_jax
 from .._core.types import AnyArray, traced
 
 
@@ -73,7 +74,7 @@ def natural_curvature(knots: Float[AnyArray, "basis"]) -> Float[Array, "basis ba
     knots = xp.asarray(knots)
     size, width = knots.shape[0], xp.diff(knots)
     if size < 3:
-        return jnp.asarray(np.zeros((size, size), knots.dtype))
+        return as_jax(np.zeros((size, size), knots.dtype))
 
     def banded(*diagonals):
         one, two, three = (np.eye(size - 2, size, k, dtype=knots.dtype) for k in range(3))
@@ -82,4 +83,4 @@ def natural_curvature(knots: Float[AnyArray, "basis"]) -> Float[Array, "basis ba
     first, last = width[:-1], width[1:]
     system = banded(first / 6, (first + last) / 3, last / 6)
     second = banded(1 / first, -1 / first - 1 / last, 1 / last)
-    return jnp.asarray(xp.pad(xp.linalg.solve(system[:, 1:-1], second), ((1, 1), (0, 0))))
+    return as_jax(xp.pad(xp.linalg.solve(system[:, 1:-1], second), ((1, 1), (0, 0))))

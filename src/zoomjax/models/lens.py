@@ -21,6 +21,7 @@ from .._core.checks import checked_size, checked_unit
 from .._core.fields import check_finite, check_positive, check_range, check_shapes, numbers
 from .._core.files import whole_file
 from .._core.pixels import check_pitch
+from .._core.programs import light_program
 from .._core.types import AnyArray, FocalLike, Point, Points, traced
 from ._arguments import as_focal, as_points, check_broadcast, check_terms
 from ._known_sizes import with_known_size
@@ -149,7 +150,7 @@ class ZoomLens(eqx.Module):
             d = self._distortion(focal, focus, within=traced((self, focal)))
             return with_known_size(d, self.image_size)
         with eval_context():  # what is known stays known inside of ``jit``
-            return with_known_size(self._distortion(focal, focus), self.image_size)
+            return with_known_size(_distortion_at(self, focal, focus), self.image_size)
 
     def undistort(
         self,
@@ -317,6 +318,9 @@ def _at(zoom, focal, focus, dtype):
     for _ in range(focal.ndim):
         function = jax.vmap(function)
     return function(*arguments)
+
+
+_distortion_at = light_program(ZoomLens._distortion)
 
 
 def _bent(operands):

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, ScalarLike
 
+from .._core.arrays import as_jax
 from .._core.checks import checked_integer
 from .._core.fields import check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Coefficients, Focal, Focus, Scalar, traced
@@ -106,6 +107,13 @@ def one_focal(focal: ScalarLike) -> ScalarLike:
         )
     check_positive("focal", focal if hasattr(focal, "dtype") else np.asarray(focal, float))
     return focal
+
+
+def number_of_coefficients(zoom: AbstractZoom) -> int:
+    """How many coefficients a fitted zoom model gives at one focal length; nothing is computed."""
+    one = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    settings = (one, one) if isinstance(zoom, AbstractFocusZoom) else (one,)
+    return jax.eval_shape(lambda *of: zoom(*of), *settings).shape[-1]
 
 
 def _combined(basis, parameters):
@@ -216,9 +224,11 @@ class PolynomialZoom(AbstractLinearZoom):
 
     def in_inverse_focal(self) -> Float[Array, "basis terms"]:
         """The polynomials' coefficients of ``f^(-j)``, as the paper prints them (but normalised)."""
-        parameters = _fitted(self)
-        power = jnp.arange(self.degree + 1, dtype=parameters.dtype)
-        return parameters * jnp.asarray(self.focal_ref) ** power[:, None]
+        parameters, reference = _fitted(self), self.focal_ref
+        if not traced((parameters, reference)):  # by NumPy, which compiles nothing
+            parameters, reference = np.asarray(parameters), np.asarray(reference)
+        power = np.arange(self.degree + 1).astype(parameters.dtype)
+        return as_jax(parameters * reference ** power[:, None])
 
     def prepare(self, focal: Focal, terms: int) -> "PolynomialZoom":
         """Zero polynomials about the shortest focal length."""
@@ -227,8 +237,8 @@ class PolynomialZoom(AbstractLinearZoom):
             focal = np.asarray(focal)  # its minimum then compiles nothing
         return PolynomialZoom(
             degree=self.degree,
-            parameters=jnp.asarray(np.zeros((self.degree + 1, terms), focal.dtype)),
-            focal_ref=jnp.asarray(focal.min()),
+            parameters=as_jax(np.zeros((self.degree + 1, terms), focal.dtype)),
+            focal_ref=as_jax(focal.min()),
         )
 
     def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:

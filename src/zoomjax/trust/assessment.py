@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
-from ..fit.result import RESULTS, ZoomFit
+from ..fit.result import RESULTS, ZoomFit, is_status
 from ..lines.base import AbstractLines
 from ..lines.lines import Lines
 from ..models.polynomial import RadialPolynomial
@@ -198,7 +198,7 @@ def _is_bent(of: Evidence) -> bool:
 def _of_bands(of: Evidence, fit: ZoomFit, places: int) -> Iterator[Finding]:
     more = "Add photos with long straight lines near the edges of the image"
     more += ", at several focal lengths." if of.frames > 1 else "."
-    if bool(fit.result == RESULTS.folded):
+    if is_status(fit.result, RESULTS.folded):
         yield Finding(
             "fold",
             "not determined",

@@ -26,6 +26,7 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float, Num, PyTree, ScalarLike
 
 from .._core.arguments import kinds_checked
+from .._core.arrays import as_jax
 from .._core.fields import check_positive, real_argument
 from .._core.programs import light_program, used_once
 from .._core.types import AnyArray, Coefficients, Focal, Points, traced
@@ -85,7 +86,7 @@ def _in_few_sizes(compiled: Callable[..., Any], given: dict[str, Any]) -> Any:
     found = compiled(**given | {"points": padded_to(points, size), "focal": padded_to(focal, size)})
 
     def cut(of):  # by NumPy, which compiles nothing
-        return jnp.asarray(np.asarray(of)[:number].reshape((*shape, *of.shape[1:])))
+        return as_jax(np.asarray(of)[:number].reshape((*shape, *of.shape[1:])))
 
     return jax.tree.map(cut, found)
 

@@ -34,10 +34,10 @@ from ..fit.energy import (
     frame_energy,
     line_squares,
     linearised,
-    prior_error,
     prior_jacobian,
     prior_of,
     prior_residuals,
+    size_of_prior,
 )
 from ..fit.image_metric import measured_as
 from ..fit.own_weights import counts_of, own_weights
@@ -49,7 +49,7 @@ from ..lines.buckets import bucketed, bucketed_jit, of_lines
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
-from ..models.zoom import AbstractZoom, with_parameters
+from ..models.zoom import AbstractZoom, number_of_coefficients, with_parameters
 from ._bending import bending
 from .bands import displacement_std
 from .vanishing import VanishingPoints, vanishing_points
@@ -157,7 +157,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     lens = fit.lens
     placed: Any = placed_as(lens, lines)
     if compressed is None:
-        terms = np.asarray(lens.zoom(lens.focal_range[0])).size
+        terms = number_of_coefficients(lens.zoom)
         points = data_of(placed)
         compressed = compress_for(points, lens.distortion_model, terms=terms)
     compressed = _same_lines(lines, compressed)
@@ -172,10 +172,10 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     focals = 1 / np.linspace(1 / low, 1 / high, _FOCALS)
     raster = jnp.asarray(_raster(lens), dtype)
     moved, rows = map(np.asarray, _derivatives(lens, raster, jnp.asarray(focals, dtype)))
-    std = np.asarray(displacement_std(fit, raster[None], focal=focals[:, None]))
+    std = np.asarray(displacement_std(fit, _raster(lens)[None], focal=focals[:, None]))
     pulled = _normal_terms(compressed, lens.zoom)
     bent = bending(lines, lens, weight, pulled[0])
-    zero = jax.device_put(np.zeros((len(lines.focal), np.size(lens.zoom(lens.focal_range[0]))), dtype))
+    zero = jax.device_put(np.zeros((len(lines.focal), number_of_coefficients(lens.zoom)), dtype))
     before = np.asarray(frame_energy(compressed, zero))
     rejected = (counts_of(lines) > 2) & (weight == 0)
     harmless = max(UNSEEN_PX, NEGLIGIBLE * 2 * lens.scale)
@@ -262,7 +262,7 @@ def _halves(
     the mean over what it expects, they are apart without noise.
     """
     own = prior_of(fit.lens.zoom)
-    pulled = np.zeros_like(prior) if own is None else float(prior_error(lines, own)) ** 2 * prior
+    pulled = np.zeros_like(prior) if own is None else float(size_of_prior(lines, own)) ** 2 * prior
     for name, first in _partings(lines, fit, weight).items():
         one, other = (
             _half(prior, *(values[half & (weight > 0)] for values in terms)) for half in (first, ~first)

@@ -1,0 +1,89 @@
+"""Pictures of photos: with the lines found in them, and small ones for the report.
+
+Each photo is read once for all of them, in threads, while something else is done.
+"""
+
+import contextlib
+import functools
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..detect.sources import Source
+from .choice import chosen_frames, colour_limit
+from .overlay import draw_lines
+from .pictures import MOST, Photos, Pictures, pictures_of
+
+_QUALITY = 88
+
+
+class Drawn:
+    """Pictures that are being drawn: of each photo with lines over it, and maybe small ones."""
+
+    def __init__(self, made: Iterator[Pictures | None], number: int):
+        self._made, self._number = made, number
+        self._done: list[Pictures | None] = []
+
+    def wait(self, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+        """Wait for all of them, and tell of each."""
+        for number in range(1, self._number + 1):
+            if number > len(self._done):
+                self._done.append(next(self._made))
+            progress(number, self._number)
+
+    def pictures(self) -> Iterator[Pictures]:
+        """The small ones, sorted by f; waits for all when the first is asked for."""
+        self.wait()
+        yield from sorted(filter(None, self._done), key=lambda one: (one.focal, one.frame))
+
+
+@contextlib.contextmanager
+def drawing(images: Photos, folder: Path, most: int = MOST) -> Iterator[Drawn]:
+    """Draw photos into a new folder, and small pictures of so many, in threads while the block runs.
+
+    Small ones are of the photos fitted worst, and of others over the zoom. Frames of a video, which come
+    one after another, are drawn when they are waited for.
+    """
+    folder.mkdir()
+    overlays = dict(zip((one.name for one in images.used), images.overlays(), strict=True))
+    targets = {name: folder / target for name, target in overlays.items() if target}
+    chosen = {images.used[frame].name for frame in chosen_frames(images.calibration, most)}
+    frames = {one.name: frame for frame, one in enumerate(images.used) if one.name in {*targets, *chosen}}
+    draw = functools.partial(_drawn, images, images.members(), frames, targets, chosen)
+    sources = (source for source in images.job.sources()[0] if source.name in frames)
+    with ThreadPoolExecutor(max(1, images.job.workers)) as pool:
+        made = map(draw, sources) if images.job.video is not None else pool.map(draw, sources)
+        try:
+            yield Drawn(made, len(frames))
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _drawn(
+    images: Photos,
+    members: list[np.ndarray],
+    frames: Mapping[str, int],
+    targets: Mapping[str, Path],
+    chosen: set[str],
+    source: Source,
+) -> Pictures | None:
+    """Draw the lines of one photo, write the picture, and make the small ones."""
+    image, frame = source.read()[0], frames[source.name]
+    if target := targets.get(source.name):
+        own = members[frame]
+        picture = draw_lines(
+            image,
+            images.used[frame].lines,
+            images.calibration.rejected[own].tolist(),
+            rms=images.calibration.line_rms[own],
+            limit=colour_limit(images.calibration),
+            labels={place: str(line) for place, line in enumerate(own.tolist())},
+            legend=True,
+        )
+        done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        assert done
+        target.write_bytes(content.tobytes())
+    return pictures_of(images, frame, image) if source.name in chosen else None
