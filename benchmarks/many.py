@@ -1,4 +1,5 @@
-"""Many lenses at once: `zoomjax.fit.many` beside a loop over the fits, on zooms of the lensfun database.
+"""Many lenses at once: `zoomjax.fit.many` and `zoomjax.trust.select_many` beside loops over what they
+do for one, on zooms of the lensfun database.
 
     python -m benchmarks.many [--fit NAME] [--lenses N] [--output FILE]
 
@@ -23,11 +24,31 @@ import numpy as np
 
 import zoomjax as zj
 from zoomjax.fit import many
+from zoomjax.trust import select_many
 
 from .real.lensfun.data import LEVEL, UPRIGHT, make_lines, read_lenses
 from .shared import RESULTS, machine, machine_line, table, write
 
-FITS = {"fit_zoom": zj.fit_zoom, "fit_robust": zj.fit_robust}
+Sets = list[zj.lines.CompressedLines]
+
+
+def fits_of(selections: Iterable[zj.trust.Selection]) -> list[zj.ZoomFit]:
+    """The fits of the models chosen: of selections what is compared here."""
+    return [selection.fit for selection in selections]
+
+
+FITS: dict[str, tuple[Callable[[Sets], object], Callable[[Sets], object]]] = {
+    "fit_zoom": (many, lambda sets: [zj.fit_zoom(lines, throw=False) for lines in sets]),
+    "fit_robust": (
+        lambda sets: many(sets, zj.fit_robust),
+        lambda sets: [zj.fit_robust(lines, throw=False) for lines in sets],
+    ),
+    "select_model": (
+        lambda sets: fits_of(select_many(sets)),
+        lambda sets: fits_of(zj.select_model(lines) for lines in sets),
+    ),
+}
+"""What is done for all at once, and in a loop."""
 
 
 def data_sets(most: int | None) -> list[zj.lines.CompressedLines]:
@@ -77,9 +98,9 @@ def run(most: int | None, names: Iterable[str], kept: dict) -> dict:
     }
     fits = {name: kept[name] for name in FITS if name in kept}
     for name in names:
-        fit, load = FITS[name], os.getloadavg()[0]
-        at_once, own = timed(lambda fit=fit: many(sets, fit))
-        one_by_one, loop = timed(lambda fit=fit: [fit(lines, throw=False) for lines in sets])
+        (together, in_turn), load = FITS[name], os.getloadavg()[0]
+        at_once, own = timed(lambda of=together: of(sets))
+        one_by_one, loop = timed(lambda of=in_turn: of(sets))
         apart = difference(at_once, one_by_one)
         fits[name] = {"many": own, "loop": loop, "difference": apart, "load": load}
     return results | {"fits": fits, "machine": machine()}
@@ -111,7 +132,7 @@ def page(results: dict) -> str:
             "the second call, as the first compiles; and in it the time of the processor for each lens.",
             "",
             *table(
-                ["", "`many`", "a loop", "`many`, a lens", "a loop, a lens", "largest difference"],
+                ["", "at once", "a loop", "at once, a lens", "a loop, a lens", "largest difference"],
                 rows,
             ),
             "",

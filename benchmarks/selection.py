@@ -22,9 +22,10 @@ import numpy as np
 
 import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.trust.comparison import compare
 from zoomjax.trust.cross_validation import cross_validate_frames, cross_validate_zoom
 from zoomjax.trust.folds import HoldOut, folds_of
-from zoomjax.trust.selection import compare, default_candidates
+from zoomjax.trust.selection import default_candidates
 
 from .shared import RESULTS, machine, machine_line, table, write
 

@@ -417,7 +417,7 @@ LEFT_OUT = {
         (
             *("frame_output", "select_model", "cross_validate_zoom", "cross_validate_frames"),
             *("suggest_next", "reject_points", "barrel_crossover", "assess", "evidence", "with_misfit"),
-            *("many", "vanishing_points"),
+            *("many", "select_many", "vanishing_points"),
         ),
         BY_VALUES,
     ),

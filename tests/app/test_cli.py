@@ -26,7 +26,8 @@ from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.runs import calibrate_lines
 from zoomjax.lines.csv import write_lines_csv
 from zoomjax.models import BrownConrady, Model, PolynomialZoom, SmoothZoom, SplineZoom
-from zoomjax.trust.selection import ComparedModel, Selection
+from zoomjax.trust.comparison import ComparedModel
+from zoomjax.trust.selection import Selection
 
 from .._commands import COMMAND, INTERRUPTIBLE, still_earlier, write_earlier
 

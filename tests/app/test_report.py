@@ -20,7 +20,8 @@ from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.page import Run
 from zoomjax.app.report import report
 from zoomjax.models import Model, PolynomialZoom
-from zoomjax.trust.selection import ComparedModel, Selection
+from zoomjax.trust.comparison import ComparedModel
+from zoomjax.trust.selection import Selection
 
 from .._browser import opened
 

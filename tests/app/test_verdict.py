@@ -22,8 +22,8 @@ from zoomjax.app.verdict import (
 )
 from zoomjax.detect.batch import Detection
 from zoomjax.trust.assessment import Finding
+from zoomjax.trust.comparison import compare_errors
 from zoomjax.trust.folds import folds_of
-from zoomjax.trust.selection import compare_errors
 
 from ..io.test_equipment import block
 

@@ -11,6 +11,8 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.trust._lanes import lanes_of, passed
+from zoomjax.trust.comparison import compare, compare_errors
 from zoomjax.trust.cross_validation import (
     _errors_by_fits,
     cross_validate_frames,
@@ -18,7 +20,7 @@ from zoomjax.trust.cross_validation import (
     errors_of,
 )
 from zoomjax.trust.folds import HoldOut, LineErrors, folds_of, shares
-from zoomjax.trust.selection import compare, compare_errors, default_candidates
+from zoomjax.trust.selection import default_candidates
 
 FOCALS = 7
 POLYNOMIALS = [
@@ -456,3 +458,37 @@ def test_in_the_image_the_same_model_is_selected(lines):
     assert image.chosen == paper.chosen
     for one, other in zip(image.compared, paper.compared, strict=True):
         assert one.held_out == pytest.approx(other.held_out, rel=0.1)
+
+
+def test_fits_of_parts_are_the_same_where_not_all_go_into_a_cache(lines, monkeypatch):
+    at_once, best, chosen = compared(lines, POLYNOMIALS)
+    monkeypatch.setattr("zoomjax.trust._linear_folds._TOGETHER", 2 * len(lines.frame))
+    in_turn, *same = compared(lines, POLYNOMIALS)
+    assert same == [best, chosen]
+    for a, b in zip(at_once, in_turn, strict=True):
+        np.testing.assert_allclose(
+            [a.held_out, a.difference_std], [b.held_out, b.difference_std], rtol=1e-9
+        )
+
+
+@pytest.mark.parametrize("metric", ["corrected", "distorted"])
+def test_the_pass_of_several_coefficients_is_that_of_each(lines, metric):
+    measured = zj.fit.in_image(lines) if metric == "distorted" else lines
+    lanes = lanes_of(measured, np.zeros(len(lines.frame), int), np.ones(len(lines.frame)), 3)
+    k = np.random.default_rng(0).normal(0, 0.1, (2, 4, lanes.frames, 3))
+    together = passed(lanes, k)
+    for place in np.ndindex(2, 4):
+        for several, one in zip(together, passed(lanes, k[place]), strict=True):
+            np.testing.assert_allclose(several[place], one, rtol=1e-12, atol=1e-9 * np.abs(one).max())
+
+
+def test_lanes_for_fewer_coefficients_are_those_of_the_first(lines):
+    measured = zj.fit.in_image(lines)
+    of_all, own = np.zeros(len(lines.frame), int), np.ones(len(lines.frame))
+    k = np.random.default_rng(0).normal(0, 0.1, (len(lines.focal), 2))
+    for a, b in zip(
+        passed(lanes_of(measured, of_all, own, 3).cut(2), k),
+        passed(lanes_of(measured, of_all, own, 2), k),
+        strict=True,
+    ):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12 * np.abs(b).max())

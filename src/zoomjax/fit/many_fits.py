@@ -150,7 +150,7 @@ def many(
     options: dict[str, Any] = {"solver": solver, "max_steps": max_steps, "invertible": invertible}
     for number, one in enumerate(sets):
         if fits[number] is None:
-            with _of_set(number):
+            with of_set(number):
                 fits[number] = fit(one, **own, **options, centre=centre, throw=False)
     if throw:
         _raise_failed(fits)
@@ -187,7 +187,7 @@ class _Job(NamedTuple):
 
 
 @contextlib.contextmanager
-def _of_set(number):
+def of_set(number):
     """Errors begin with the number of the data set."""
     try:
         yield
@@ -196,7 +196,7 @@ def _of_set(number):
 
 
 def _job(number, one, own, centre):
-    with _of_set(number):
+    with of_set(number):
         placed, asked = asked_for(one, **own)
         model = ready_model(placed, asked)
         padded = bucketed(placed, closely=True)

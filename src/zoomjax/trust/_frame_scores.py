@@ -16,7 +16,7 @@ from ..fit.image_metric import in_corrected, measured_as
 from ..fit.own_weights import own_weights
 from ..lines.compressed import CompressedLines
 from ..models.polynomial import RadialPolynomial
-from ._linear_folds import Lanes, Pass, lanes_of, passed
+from ._lanes import Lanes, Pass, lanes_of, passed
 from .folds import small_lines
 
 _DEGREE = 6

@@ -15,6 +15,8 @@ NumPy, float64 whatever the lines' dtype: with sums as small as these, compiling
 50 folds of 12 models do.
 """
 
+import collections
+from collections.abc import Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -23,48 +25,43 @@ import numpy as np
 from .._core.programs import light_program
 from ..fit.energy import prior_jacobian, prior_residuals, settings
 from ..fit.image_metric import in_corrected
-from ..fit.own_weights import counts_of
-from ..fit.problem import LEAST_STRETCH
-from ..lines.buckets import bucketed_jit, padded_frames
-from ..models.zoom import (
-    AbstractPriorZoom,
-    with_parameters,
-)
-from .folds import LineErrors
+from ..lines.base import AbstractLines
+from ..lines.buckets import bucketed_jit, padded_frames, padded_to
+from ..models.model import Model
+from ..models.zoom import AbstractPriorZoom, with_parameters
+from ._lanes import Lanes, as_given, lanes_of, passed
+from .folds import Folds, LineErrors
 
 _MOST_STEPS = 40  # of Gauss-Newton: from the fit of all lines it takes 1 to 3, from zero 4 to 8
 
 
-def linear_errors(lines, model, parts):
-    lanes = lanes_of(lines, parts.fold, parts.weight, model.terms)
-    lines = in_corrected(lines)
-    given = [np.asarray(values) for values in settings(model.zoom, lines)]
-    known: dict[bytes, Design | str] = {}
-    designs, problem = [], ""
-    for fold in range(-1, parts.number):
-        left = np.zeros(len(lines.focal), bool)
-        left[lanes.frame[(lanes.weight > 0) & ((lanes.fold != fold) | (fold < 0))]] = True
-        if (key := left.tobytes()) not in known:
-            known[key] = _design(lines, model, given, left)
-        design = known[key]
-        if fold < 0 and isinstance(design, str):  # all lines: too few focal lengths, say
-            raise ValueError(design)
-        if isinstance(design, str):
-            problem, design = problem or design, None
-        designs.append(design)
-    seen, unseen, everything, bad = cross_validated(lanes, designs)
-    if bad:
-        problem = problem or f"{bad} of {parts.number} folds do not converge"
-    matrix = everything.matrix
-    share = np.linalg.pinv(matrix, hermitian=True) @ (matrix - designs[0].precision)
-    return LineErrors(as_given(lines, seen), as_given(lines, unseen), float(np.trace(share)), problem)
-
-
-def as_given(lines, values):
-    """Of the lines in their own order, from `Lanes`."""
-    given = np.empty_like(values)
-    given[np.argsort(np.asarray(lines.frame), kind="stable")] = values
-    return given
+def linear_errors(lines: AbstractLines, models: Sequence[Model], parts: Folds) -> list[LineErrors | str]:
+    """The errors of each model on compressed lines, or why there are none. See `errors_of`."""
+    if not models:
+        return []
+    most, small = max(model.terms for model in models), in_corrected(lines)
+    lanes = lanes_of(lines, parts.fold, parts.weight, most)
+    folds = np.arange(-1, parts.number)[:, None]  # the first: none is left out
+    counts = (lanes.weight > 0) & ((lanes.fold != folds) | (folds < 0))
+    left = np.zeros((len(folds), lanes.frames), bool)
+    left[:, lanes.frame[lanes.starts]] = np.logical_or.reduceat(counts, lanes.starts, axis=1)
+    ready = _Designs(small, left)
+    found: list[LineErrors | str] = [""] * len(models)
+    alike = collections.defaultdict(list)
+    for place, model in enumerate(models):
+        designs, problem = ready.of(model)
+        if designs[0] is None:  # of all lines: too few focal lengths, say
+            found[place] = problem
+        else:
+            alike[model.terms].append((place, designs, problem))
+    for terms, several in alike.items():
+        results = cross_validated(lanes.cut(terms), [designs for _, designs, _ in several])
+        for (place, designs, problem), (seen, unseen, matrix, bad) in zip(several, results, strict=True):
+            told = problem or (f"{bad} of {parts.number} folds do not converge" if bad else "")
+            share = np.linalg.pinv(matrix, hermitian=True) @ (matrix - designs[0].precision)
+            seen, unseen = as_given(small, seen), as_given(small, unseen)
+            found[place] = LineErrors(seen, unseen, float(np.trace(share)), told)
+    return found
 
 
 class Design(NamedTuple):
@@ -76,17 +73,57 @@ class Design(NamedTuple):
     mean: np.ndarray  # (parameter,): of the prior
 
 
-def _design(lines, model, given, left):
-    """The model as made ready for the frames that are left, or why it cannot be."""
+class _Designs:
+    """Zoom models made ready for the frames that are left: for each row of `left`."""
+
+    def __init__(self, lines: AbstractLines, left: np.ndarray):
+        self._lines = lines
+        self._rows, self._which = np.unique(left, axis=0, return_inverse=True)
+        self._known: dict[Hashable, list[Any]] = {}
+
+    def of(self, model: Model) -> tuple[list[Design | None], str]:
+        """The designs, None where it cannot be made ready, and why the first of these cannot."""
+        ready = self._ready(model.zoom, model.terms)
+        made = [
+            None if isinstance(of, str) else _design(self._lines, model.terms, of[0], left, of[1])
+            for of, left in zip(ready, self._rows, strict=True)
+        ]
+        problems = [of for place in self._which.reshape(-1) if isinstance(of := ready[place], str)]
+        return [made[place] for place in self._which.reshape(-1)], problems[0] if problems else ""
+
+    def _ready(self, zoom, terms):
+        """The models, and the values of their bases at all frames; or why there are none.
+
+        Models without a prior have the same for any number of terms.
+        """
+        leaves, structure = jax.tree.flatten(zoom)
+        own = terms if isinstance(zoom, AbstractPriorZoom) else None
+        key = (structure, own, *((np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in leaves))
+        if key not in self._known:
+            try:
+                given = [np.asarray(values) for values in settings(zoom, self._lines)]
+            except ValueError as error:
+                return [str(error)] * len(self._rows)
+            ready = [_prepared(zoom, terms, given, left) for left in self._rows]
+            bare = [with_parameters(each, None) for each in ready if not isinstance(each, str)]
+            values = iter(_values(bare, given))
+            self._known[key] = [each if isinstance(each, str) else (each, next(values)) for each in ready]
+        return self._known[key]
+
+
+def _prepared(zoom, terms, given, left):
+    """The zoom model made ready for the frames that are left, or why it cannot be."""
     try:
         focal, *focus = (values[left] for values in given)
-        zoom = model.zoom.prepare(focal, model.terms, *focus)
+        return zoom.prepare(focal, terms, *focus)
     except ValueError as error:
         return str(error)
-    every = map(padded_frames, given)
-    values = np.asarray(_basis_of(with_parameters(zoom, None), *every), float)[: len(left)]
+
+
+def _design(lines, terms, zoom, left, values):
+    """Of a model made ready, from the values of its basis at all frames."""
     size = values.shape[1]
-    precision, mean = np.zeros((size * model.terms, size * model.terms)), np.zeros(size * model.terms)
+    precision, mean = np.zeros((size * terms, size * terms)), np.zeros(size * terms)
     if isinstance(zoom, AbstractPriorZoom):
         whitener, of_zero = (np.asarray(part, float) for part in _whitener(lines, zoom))
         precision = whitener.T @ whitener
@@ -96,10 +133,31 @@ def _design(lines, model, given, left):
     return Design(values, project, precision, mean)
 
 
+def _values(zooms, given):
+    """The values of each model's basis at all frames; of models that differ in numbers alone, at once."""
+    every, alike = [*map(padded_frames, given)], collections.defaultdict(list)
+    for place, zoom in enumerate(zooms):
+        leaves, structure = jax.tree.flatten(zoom)
+        alike[structure, *((np.shape(leaf), np.asarray(leaf).dtype) for leaf in leaves)].append(place)
+    found: list[Any] = [None] * len(zooms)
+    for places in alike.values():
+        number = 1 << max(_FEWEST, (len(places) - 1).bit_length())
+        several = [zooms[place] for place in places]
+        stack = jax.tree.map(lambda *leaves, to=number: padded_to(np.stack(leaves), to), *several)
+        values = np.asarray(_bases(stack, every, number), float)[:, : len(given[0])]
+        for place, own in zip(places, values, strict=False):
+            found[place] = own
+    return found
+
+
+_FEWEST = 3
+"""Models at once, as a power of two: one compiled program for any number up to it."""
+
+
 @light_program
-def _basis_of(model, *settings):
-    """Of a model without its parameters: one compiled program for any number of terms."""
-    return jax.vmap(model.basis)(*settings)
+def _bases(models, settings, number):
+    """Of models without their parameters: one compiled program for any number of terms."""
+    return jax.vmap(lambda model: jax.vmap(model.basis)(*settings), axis_size=number)(models)
 
 
 @bucketed_jit()
@@ -108,133 +166,137 @@ def _whitener(lines, model):
     return prior_jacobian(lines, model), prior_residuals(lines, model)
 
 
-class Lanes(NamedTuple):
-    """The compressed lines, sorted by frame, float64: the last axis is the lines'."""
-
-    columns: np.ndarray  # (2, terms + 1, rows, line), px: x and y of what goes with 1, k1, ..., kN
-    gram: np.ndarray  # (3, terms + 1, terms + 1, line): xx, xy and yy, summed over rows
-    frame: np.ndarray
-    counts: np.ndarray
-    weight: np.ndarray
-    fold: np.ndarray
-
-    starts: np.ndarray  # where each frame's lines begin
-    frames: int  # how many there are, with or without lines
-    moments: np.ndarray | None = (
-        None  # (2 terms, 3, line): xx, xy and yy of r^(2i) z z^T, means; in the image
-    )
-
-    def total(self, values: np.ndarray) -> np.ndarray:
-        """Sums over the lines of each frame that has some."""
-        return np.add.reduceat(values, self.starts, axis=-1)
-
-
-def lanes_of(lines, fold, weight, terms):
-    """The compressed lines, with the fold and the weight of each."""
-    small: Any = in_corrected(lines)
-    frame = np.asarray(lines.frame)
-    order = np.argsort(frame, kind="stable")
-    whole = np.asarray(small.triangle, float)[order, :, 1 : 3 + 2 * terms]
-    rows = whole[:, 1:] * small.scale
-    columns = rows.reshape(*rows.shape[:2], terms + 1, 2).transpose(3, 2, 1, 0)
-    x, y = columns = np.ascontiguousarray(columns)
-    gram = np.stack([np.einsum("irl,jrl->ijl", one, other) for one, other in ((x, x), (x, y), (y, y))])
-    counts = np.maximum(counts_of(lines), 1)
-    frame, counts, weight, fold = (a[order] for a in (frame, counts, weight, np.asarray(fold)))
-    moments = _moments(whole, terms) / counts if lines.metric == "distorted" else None
-    starts = np.flatnonzero(np.diff(frame, prepend=-1))
-    return Lanes(columns, gram, frame, counts, weight, fold, starts, len(lines.focal), moments)
-
-
-def _moments(rows, terms):
-    """``sum r^(2i) z z^T`` of each line, i = 0 ... 2 N - 1, from the rows of its triangle: (i, 3, line)."""
-    x, y = np.moveaxis(rows.reshape(*rows.shape[:2], terms + 1, 2), (3, 2), (0, 1))
-    pairs = [(i - i // 2, i // 2) for i in range(2 * terms)]
-    products = (x, x), (x, y), (y, y)
-    return np.stack([[np.einsum("lr,lr->l", a[i], b[j]) for a, b in products] for i, j in pairs])
-
-
-class Pass(NamedTuple):
-    """What coefficients of the frames give for each line: the last axis."""
-
-    squares: np.ndarray  # px^2
-    gradient: np.ndarray  # half of it, by k1, ..., kN
-    matrix: np.ndarray  # of Gauss and Newton
-
-
 class _State(NamedTuple):
-    """Some parameters, the energy there, half its gradient, and its Gauss-Newton matrix.
+    """Of each fit: some parameters, the energy there, half its gradient, and its Gauss-Newton matrix.
 
-    And how far a unit of each parameter moves the points, px^2, along their lines and across.
+    And how far a unit of each parameter moves the points, px^2, along their lines and across; and the
+    lines' squares.
     """
 
     parameters: np.ndarray
-    energy: float
+    energy: np.ndarray
     gradient: np.ndarray
     matrix: np.ndarray
     moved: np.ndarray
-    lines: Pass
+    squares: np.ndarray
 
 
-def cross_validated(lanes, designs):
-    """Each line's mean squared distance, seen and unseen; the state of all; the number of bad folds.
+class Validated(NamedTuple):
+    """What cross-validation says of a model: see `cross_validated`."""
 
-    The first of the designs is that of all lines, fitted from zero; fold f has the next, and starts there.
-    A design of None has no fit.
+    seen: np.ndarray
+    unseen: np.ndarray
+    matrix: np.ndarray
+    bad: int
+
+
+def cross_validated(lanes: Lanes, models: Sequence[Sequence[Design | None]]) -> list[Validated]:
+    """Of each model the lines' mean squared distances, seen and unseen; the matrix of all; the bad folds.
+
+    The first of a model's designs is that of all lines, fitted from zero; fold f has the next, and starts
+    there. A design of None has no fit. Fits of all models and folds are made together, as many as go into
+    a cache.
     """
-    first, terms = designs[0], lanes.columns.shape[1] - 1
-    everything, good = _minimised(lanes, lanes.weight, first, np.zeros((first.basis.shape[1], terms)))
-    k = first.basis @ everything.parameters
-    seen = everything.lines.squares / lanes.counts
-    unseen, bad = np.full(seen.shape, np.nan), 0
-    for fold, design in enumerate(designs[1:]):
-        out = lanes.fold == fold
-        if design is None or not out.any():
-            continue
-        start = design.project @ k
-        same = np.allclose(design.basis @ start, k, rtol=1e-12, atol=1e-14)
-        known = everything.lines if same else None
-        state, fold_good = _minimised(lanes, np.where(out, 0, lanes.weight), design, start, known)
-        if good and fold_good:
-            unseen[out] = (state.lines.squares / lanes.counts)[out]
-        else:
-            bad += 1
-    return seen, unseen, everything, bad
+    most = max(1, _TOGETHER // lanes.fold.size)
+    found: list[Validated] = []
+    k, fits = [], []
+    for some in _parted([designs[0] for designs in models], most):
+        design, weight = _stacked(some), np.tile(lanes.weight, (len(some), 1))
+        start = np.zeros((len(some), design.basis.shape[2], lanes.terms))
+        state, good = _minimised(lanes, weight, design, start)
+        for own, squares, matrix in zip(some, state.squares, state.matrix, strict=True):
+            number, seen = own.mean.size, squares / lanes.counts
+            found.append(Validated(seen, np.full(seen.shape, np.nan), matrix[:number, :number], 0))
+        k += list(design.basis @ state.parameters)
+        fits += good.tolist()
+    there = set(lanes.fold.tolist())
+    jobs = [
+        (model, fold, design)
+        for model, designs in enumerate(models)
+        for fold, design in enumerate(designs[1:])
+        if design is not None and fold in there
+    ]
+    bad = [0] * len(models)
+    for some in _parted(jobs, most):
+        design = _stacked([design for _, _, design in some])
+        out = lanes.fold == np.array([fold for _, fold, _ in some])[:, None]
+        start = design.project @ np.stack([k[model] for model, _, _ in some])
+        state, good = _minimised(lanes, np.where(out, 0, lanes.weight), design, start)
+        for (model, _, _), own, squares, fold_fits in zip(some, out, state.squares, good, strict=True):
+            if fits[model] and fold_fits:
+                found[model].unseen[own] = (squares / lanes.counts)[own]
+            else:
+                bad[model] += 1
+    return [of._replace(bad=number) for of, number in zip(found, bad, strict=True)]
 
 
-def _minimised(lanes, weight, design, parameters, known=None):
-    """The state of least energy near these parameters, and whether it is one.
+def _parted(jobs: Sequence[Any], most: int) -> Iterator[Any]:
+    """Jobs in parts of so many."""
+    return (jobs[begin : begin + most] for begin in range(0, len(jobs), most))
+
+
+_TOGETHER = 1 << 16
+"""Lines in as many fits at once: arrays of them all, of some coefficients, are half a megabyte each."""
+
+
+def _stacked(designs: Sequence[Design]) -> Design:
+    """Designs of one number of coefficients side by side; where they have fewer functions, with zeros."""
+    frames, most = len(designs[0].basis), max(design.basis.shape[1] for design in designs)
+    numbers, fits = max(design.mean.size for design in designs), len(designs)
+    stack = Design(
+        np.zeros((fits, frames, most)),
+        np.zeros((fits, most, frames)),
+        np.zeros((fits, numbers, numbers)),
+        np.zeros((fits, numbers)),
+    )
+    for place, design in enumerate(designs):
+        for several, own in zip(stack, design, strict=True):
+            several[(place, *map(slice, own.shape))] = own
+    return stack
+
+
+def _minimised(lanes, weight, design, parameters):
+    """The states of least energy near these parameters, one for each row of weights, and which are ones.
 
     Levenberg-Marquardt without damping, until a step fails. Directions that the lines do not determine are
-    0 then, and not what lines that are left out have made of them. `known` is the pass over the lines at
-    the start, if it has been made.
+    0 then, and not what lines that are left out have made of them.
     """
     in_frame = lanes.total(weight)
-    share = np.zeros(lanes.frames)
+    share = np.zeros((len(weight), lanes.frames))
     # M of eq. 13 as of all lines, those left out included: a prior in `Design` is in the same unit.
     counted = max(np.sum(lanes.total(lanes.weight) > 0), 1)
-    share[lanes.frame[lanes.starts]] = 1 / np.where(in_frame > 0, in_frame, 1) / counted
-    weights = weight * share[lanes.frame] / lanes.counts
+    share[:, lanes.frame[lanes.starts]] = 1 / np.where(in_frame > 0, in_frame, 1) / counted
+    weights = weight * share[:, lanes.frame] / lanes.counts
     eps = np.finfo(float).eps
-    at, damping = _state(lanes, weights, design, parameters, known), 0.0
-    for _ in range(_MOST_STEPS if weight.any() and np.isfinite(at.energy) else 0):
-        move, decrease = _move(at, damping)
-        there = _state(lanes, weights, design, at.parameters + move.reshape(parameters.shape))
-        if there.energy <= at.energy * (1 + 128 * eps):  # rounding must not reject the last step
-            at, damping = there, damping / 10
-            if decrease <= 16 * eps * at.energy:
-                return _without_undetermined(at, lanes, weights, design), True
-        else:
-            damping = max(10 * damping, 1e-3)
-    return at, False
+    at, damping = _state(lanes, weights, design, parameters), np.zeros(len(weight))
+    going, good = weight.any(axis=1) & np.isfinite(at.energy), np.zeros(len(weight), bool)
+    for _ in range(_MOST_STEPS):
+        if not going.any():
+            break
+        on = np.flatnonzero(going)
+        here, own = _of(at, on), _of(design, on)
+        move, decrease = _move(here, damping[on])
+        there = _state(lanes, weights[on], own, here.parameters + move.reshape(here.parameters.shape))
+        better = there.energy <= here.energy * (1 + 128 * eps)  # rounding must not reject the last step
+        damping[on] = np.where(better, damping[on] / 10, np.maximum(10 * damping[on], 1e-3))
+        for of, new in zip(at, there, strict=True):
+            of[on[better]] = new[better]
+        arrived = better & (decrease <= 16 * eps * there.energy)
+        good[on[arrived]], going[on[arrived]] = True, False
+    return _without_undetermined(at, good, lanes, weights, design), good
+
+
+def _of(several, which):
+    """Some of the fits."""
+    return type(several)(*(of[which] for of in several))
 
 
 def _move(at, damping):
-    """The damped Gauss-Newton step, and by how much it should lower the energy."""
+    """The damped Gauss-Newton steps, and by how much they should lower the energy."""
     size, values, vectors, known = _directions(at)
-    inverse = np.where(known, 1 / np.where(known, values + damping, 1), 0)
-    along = vectors.T @ (at.gradient / size)
-    return -(vectors @ (inverse * along)) / size, np.sum(inverse * along**2)
+    inverse = np.where(known, 1 / np.where(known, values + damping[:, None], 1), 0)
+    along = np.einsum("bij,bi->bj", vectors, at.gradient / size)
+    return -np.einsum("bij,bj->bi", vectors, inverse * along) / size, np.sum(inverse * along**2, axis=1)
 
 
 def _directions(at):
@@ -244,93 +306,50 @@ def _directions(at):
     lines: of lines through the centre the matrix holds nothing else.
     """
     eps = np.finfo(float).eps
-    size = np.sqrt(np.maximum(np.diagonal(at.matrix), 0))  # rounding alone may be negative
+    size = np.sqrt(np.maximum(np.diagonal(at.matrix, axis1=1, axis2=2), 0))  # rounding may be negative
     told = size**2 > 4 * eps * at.moved
     size = np.where(told, size, 1)
-    values, vectors = np.linalg.eigh(np.where(told[:, None] & told, at.matrix, 0) / size[:, None] / size)
-    lost = 4 * eps * np.max(at.moved / size**2, where=told, initial=0)
-    return size, values, vectors, values > max(64 * eps * values[-1], lost)
+    kept = np.where(told[:, :, None] & told[:, None], at.matrix, 0)
+    values, vectors = np.linalg.eigh(kept / size[:, :, None] / size[:, None])
+    lost = 4 * eps * np.max(at.moved / size**2, axis=1, where=told, initial=0)
+    return size, values, vectors, values > np.maximum(64 * eps * values[:, -1], lost)[:, None]
 
 
-def _without_undetermined(at, lanes, weights, design):
-    """The state of which nothing is left along directions that the lines do not determine."""
-    size, _, vectors, known = _directions(at)
-    if known.all():
+def _without_undetermined(at, good, lanes, weights, design):
+    """The states of which nothing is left along directions that the lines do not determine."""
+    on = np.flatnonzero(good)
+    here = _of(at, on)
+    size, _, vectors, known = _directions(here)
+    some = ~known.all(axis=1)
+    if not some.any():
         return at
-    along = vectors.T @ (size * at.parameters.reshape(-1))
-    left = vectors @ np.where(known, along, 0) / size
-    return _state(lanes, weights, design, left.reshape(at.parameters.shape))
+    on, here, size, vectors, known = on[some], _of(here, some), size[some], vectors[some], known[some]
+    flat = here.parameters.reshape(len(on), -1)
+    along = np.einsum("bij,bi->bj", vectors, size * flat)
+    left = np.einsum("bij,bj->bi", vectors, np.where(known, along, 0)) / size
+    there = _state(lanes, weights[on], _of(design, on), left.reshape(here.parameters.shape))
+    for of, new in zip(at, there, strict=True):
+        of[on] = new
+    return at
 
 
-def _state(lanes, weights, design, parameters, known=None):
-    """The lines' sums, put together as the model's basis says."""
-    lines = passed(lanes, design.basis @ parameters) if known is None else known
-    gradient, matrix = (lanes.total(weights * a) for a in (lines.gradient, lines.matrix))
-    rows, flat = design.basis[lanes.frame[lanes.starts]], parameters.reshape(-1)
+def _state(lanes, weights, design, parameters):
+    """The lines' sums, put together as each model's basis says."""
+    lines = passed(lanes, design.basis @ parameters)
+    gradient = lanes.total(weights[:, None] * lines.gradient)
+    matrix = lanes.total(weights[:, None, None] * lines.matrix)
+    rows, flat = design.basis[:, lanes.frame[lanes.starts]], parameters.reshape(len(parameters), -1)
     away = flat - design.mean
-    pulled = design.precision @ away
-    terms, size = len(gradient), rows.shape[1]
-    moved = lanes.total(weights * np.einsum("jjl->jl", lanes.gram[0] + lanes.gram[2])[1:])
-    products = (rows[:, :, None] * rows[:, None]).reshape(len(rows), -1)
-    blocks = (matrix.reshape(-1, len(rows)) @ products).reshape(terms, terms, size, size)
+    pulled = np.einsum("bij,bj->bi", design.precision, away)
+    (fits, frames, size), terms = rows.shape, parameters.shape[2]
+    moved = lanes.total(weights[:, None] * np.einsum("jjl->jl", lanes.gram[0] + lanes.gram[2])[1:])
+    products = (rows[..., :, None] * rows[..., None, :]).reshape(fits, frames, -1)
+    blocks = (matrix.reshape(fits, -1, frames) @ products).reshape(fits, terms, terms, size, size)
     return _State(
         parameters,
-        weights @ lines.squares + away @ pulled,
-        (gradient @ rows).T.reshape(-1) + pulled,
-        blocks.transpose(2, 0, 3, 1).reshape(flat.size, flat.size) + design.precision,
-        (moved @ rows**2).T.reshape(-1),
-        lines,
+        np.einsum("bl,bl->b", weights, lines.squares) + np.einsum("bi,bi->b", away, pulled),
+        (gradient @ rows).swapaxes(1, 2).reshape(fits, -1) + pulled,
+        blocks.transpose(0, 3, 1, 4, 2).reshape(fits, flat.shape[1], -1) + design.precision,
+        (moved @ rows**2).swapaxes(1, 2).reshape(fits, -1),
+        lines.squares,
     )
-
-
-def passed(lanes, coefficients):
-    """One pass over the lines.
-
-    With the direction t of a line and its normal n, the residuals are r = n.c and ``sum r (t.c) = 0``. A
-    change of k_j turns the line, by the derivative of that sum, by ``phi_j = sum (t.A_j) r + (t.c)(n.A_j)``
-    over ``sum (t.c)^2 - r^2``, and r changes by ``n.A_j - phi_j (t.c)``. Residuals, and with them energy
-    and gradient, come from the triangles; the rest, which need not be exact, from their Gram matrices.
-    """
-    kappa = np.concatenate([np.ones((1, lanes.frames)), coefficients.T])[:, lanes.frame]
-    (x, y), (xx, xy, yy) = lanes.columns, lanes.gram
-    of_xx, of_xy, of_yy = (np.einsum("ijl,jl->il", gram, kappa) for gram in (xx, xy, yy))
-    of_yx = np.einsum("jil,jl->il", xy, kappa)
-    sxx, sxy, syy = (np.einsum("jl,jl->l", kappa, one) for one in (of_xx, of_xy, of_yy))
-    angle = np.arctan2(2 * sxy, sxx - syy) / 2
-    c, s = np.cos(angle), np.sin(angle)
-    across = np.einsum("jrl,jl->rl", y, c * kappa) - np.einsum("jrl,jl->rl", x, s * kappa)
-    squares = np.einsum("rl,rl->l", across, across)
-    on_x, on_y = (np.einsum("jrl,rl->jl", one[1:], across) for one in (x, y))
-    pull = c * c * of_yx[1:] + c * s * (of_yy[1:] - of_xx[1:]) - s * s * of_xy[1:]
-    length = c * c * sxx + 2 * c * s * sxy + s * s * syy
-    apart = length - squares
-    turn = (c * on_x + s * on_y + pull) / np.where(apart > 0, apart, np.inf)
-    xx, xy, yy = (gram[1:, 1:] for gram in (xx, xy, yy))
-    matrix = c * c * yy - c * s * (xy + xy.swapaxes(0, 1)) + s * s * xx
-    cross = turn[:, None] * (pull - turn / 2 * length)
-    found = Pass(squares, c * on_y - s * on_x, matrix - cross - cross.swapaxes(0, 1))
-    return found if lanes.moments is None else _in_image(found, lanes.moments, kappa, c, s, turn)
-
-
-def _in_image(found, moments, kappa, c, s, turn):
-    """The same of residuals divided by the root of the stretch q: they change by ``(dr - r dq/2q) / q^½``.
-
-    q is that of `image_metric`. It changes with k_j, and with the normal (-s, c), which turns.
-    """
-    xx, xy, yy = moments.swapaxes(0, 1)
-    along_normal = s * s * xx - 2 * s * c * xy + c * c * yy
-    by_angle = 2 * (s * c * (xx - yy) - (c * c - s * s) * xy)
-    i, j = np.indices((len(kappa), len(kappa)))
-    often, place = (2 * i + 2 * j + 4 * i * j)[..., None], np.maximum(i + j - 1, 0)
-    every = (xx + yy)[place] + often * along_normal[place]
-    every[0, 0] = 1
-    q = np.einsum("il,ijl,jl->l", kappa, every, kappa)
-    q_by_angle = np.einsum("il,ijl,jl->l", kappa, often * by_angle[place], kappa)
-    change = 2 * np.einsum("ijl,jl->il", every, kappa)[1:] + q_by_angle * turn
-    free = q > LEAST_STRETCH
-    q = np.where(free, q, LEAST_STRETCH)
-    change = np.where(free, change, 0) / (2 * q)
-    squares, gradient, matrix = (of / q for of in found)
-    cross = gradient[:, None] * change
-    matrix = matrix - cross - cross.swapaxes(0, 1) + squares * change[:, None] * change
-    return Pass(squares, gradient - squares * change, matrix)

@@ -5,6 +5,9 @@ with the model fitted to the others. For models that are linear in their paramet
 others are fitted again for each fold.
 """
 
+import itertools
+from collections.abc import Sequence
+
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
@@ -24,7 +27,8 @@ from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
 from ..models.model import Model
 from ..models.zoom import AbstractLinearZoom, AbstractZoom
-from ._linear_folds import Design, Lanes, as_given, cross_validated, lanes_of, linear_errors
+from ._lanes import Lanes, as_given, lanes_of
+from ._linear_folds import Design, cross_validated, linear_errors
 from .folds import Folds, HoldOut, LineErrors, folds_of, shares, small_lines
 
 
@@ -114,7 +118,7 @@ def cross_validate_frames(
             frames=1,
             moments=None if lanes.moments is None else lanes.moments[..., own],
         )
-        unseen[own] = cross_validated(alone, [one] * (parts.number + 1))[1]
+        unseen[own] = cross_validated(alone, [[one] * (parts.number + 1)])[0].unseen
     return _by_frame(small, as_given(small, unseen))
 
 
@@ -140,9 +144,28 @@ def errors_of(lines: AbstractLines, model: Model, parts: Folds) -> LineErrors:
         model: a model without parameters.
         parts: the folds.
     """
-    if isinstance(model.zoom, AbstractLinearZoom) and is_compressed(lines):
-        return linear_errors(lines, model, parts)
-    return _errors_by_fits(lines, model, parts)
+    found = errors_of_models(lines, [model], parts)[0]
+    if isinstance(found, str):
+        raise ValueError(found)
+    return found
+
+
+def errors_of_models(lines: AbstractLines, models: Sequence[Model], parts: Folds) -> list[LineErrors | str]:
+    """The same of several models, or why there are none. Those that are linear are fitted together."""
+    compressed = is_compressed(lines)
+    linear = [compressed and isinstance(model.zoom, AbstractLinearZoom) for model in models]
+    together = iter(linear_errors(lines, list(itertools.compress(models, linear)), parts))
+    return [
+        next(together) if fast else _errors_or_why(lines, model, parts)
+        for model, fast in zip(models, linear, strict=True)
+    ]
+
+
+def _errors_or_why(lines, model, parts):
+    try:
+        return _errors_by_fits(lines, model, parts)
+    except ValueError as error:
+        return str(error)
 
 
 def _by_frame(lines, of_line):

@@ -13,8 +13,8 @@ simplest of the models whose R is above the best one's by no more than s.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import Literal, get_args
+from collections.abc import Sequence
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
@@ -27,46 +27,15 @@ from ..fit.result import ZoomFit, failed
 from ..fit.zoom import CentreArgument, about_centre, fit_zoom, is_to_be_fitted
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
-from ..models.distortion_model import AbstractDistortionModel
 from ..models.model import Model
 from ..models.requirements import check
 from ..models.smooth import SmoothZoom
 from ..models.zoom import AbstractZoom, PolynomialZoom
-from .cross_validation import errors_of
-from .folds import Folds, HoldOut, LineErrors, folds_of, small_lines
+from .comparison import TIE, ComparedModel, Rule, compare
+from .folds import Folds, HoldOut, folds_of, small_lines
 
 _TERMS = 3  # of the default candidates, at most
 _DEGREES = 4
-
-Rule = Literal["one standard error", "least"]
-
-_TIE = 5e-4
-"""Part of the error: candidates that differ by less are as good as each other, under the rule "least"."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ComparedModel:
-    """The figures of one candidate. All RMS are of the same lines, px; NaN where not available.
-
-    Attributes:
-        candidate: the candidate.
-        parameters: effective number of parameters; a prior makes it smaller than the actual number.
-        rms: RMS of the lines in the fit (in sample).
-        held_out: cross-validated RMS: each line is measured by a fit without it.
-        held_out_std: standard error of `held_out`.
-        difference: difference of `held_out` from that of the best candidate.
-        difference_std: standard error of `difference`, paired.
-        problem: why it was not compared, in a sentence; empty if it was.
-    """
-
-    candidate: Model
-    parameters: float = np.nan
-    rms: float = np.nan
-    held_out: float = np.nan
-    held_out_std: float = np.nan
-    difference: float = np.nan
-    difference_std: float = np.nan
-    problem: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +99,7 @@ class Selection:
         if self.chosen is self.best:
             return ""
         near = (
-            f"no more than {100 * _TIE:g} %, which is nothing,"
+            f"no more than {100 * TIE:g} %, which is nothing,"
             if self.rule == "least"
             else "no more than one standard error of the difference"
         )
@@ -223,15 +192,43 @@ def select_model(
         >>> select_model(compress(scene, terms=2)).chosen.name
         'degree 2, 2 terms'
     """
+    how: Any = {"hold_out": hold_out, "folds": folds, "seed": seed, "rule": rule}
+    if is_to_be_fitted(centre):
+        return _about_fitted(lines, candidates, how)
+    choice = choice_of(about_centre(lines, centre), candidates, **how)
+    return choice.with_fit(fit_zoom(choice.lines, zoom=choice.chosen))
+
+
+class Choice(NamedTuple):
+    """A selection before the model chosen is fitted: its fields, and the lines to fit it to."""
+
+    chosen: Model
+    best: Model
+    compared: tuple[ComparedModel, ...]
+    parts: Folds
+    rule: Rule
+    lines: AbstractLines
+
+    def with_fit(self, fit: ZoomFit) -> Selection:
+        """The selection."""
+        hold_out, folds = self.parts.hold_out, self.parts.number
+        return Selection(self.chosen, self.best, fit, self.compared, hold_out, folds, self.rule)
+
+
+def choice_of(
+    lines: AbstractLines,
+    candidates: Sequence[AbstractZoom | Model] | None,
+    *,
+    hold_out: HoldOut | None,
+    folds: int | None,
+    seed: int,
+    rule: Rule,
+) -> Choice:
+    """The model chosen, of lines about the centre that they have; see `select_model`."""
     if isinstance(candidates, AbstractZoom | Model):
         raise TypeError(
             "Argument candidates must be a list of zoom models, [first, second], not one of them."
         )
-    if is_to_be_fitted(centre):
-        return _about_fitted(
-            lines, candidates, {"hold_out": hold_out, "folds": folds, "seed": seed, "rule": rule}
-        )
-    lines = about_centre(lines, centre)
     plain = in_corrected(lines)
     if candidates is None:
         most = min(_TERMS, plain.terms) if isinstance(plain, CompressedLines) else _TERMS
@@ -250,8 +247,7 @@ def select_model(
     }
     parts = folds_of(small, hold_out, folds, seed)
     compared, best, chosen = compare(small, models, parts, forms, rule)
-    fit = fit_zoom(forms[chosen.distortion_model], zoom=chosen)
-    return Selection(chosen, best, fit, compared, parts.hold_out, parts.number, rule)
+    return Choice(chosen, best, compared, parts, rule, forms[chosen.distortion_model])
 
 
 def _about_fitted(lines, candidates, how):
@@ -278,92 +274,3 @@ def default_candidates(terms: int = _TERMS) -> tuple[Model, ...]:
         for degree in range(_DEGREES)
     ]
     return (*polynomials, *([Model(SmoothZoom(), 2)] if terms > 1 else []))
-
-
-def candidate_errors(lines, candidate, parts):
-    """The errors, or why there are none."""
-    model = candidate.with_parameters(None)
-    try:
-        if isinstance(small := in_corrected(lines), CompressedLines):
-            small.check_terms(model.terms)
-        return errors_of(lines, model, parts)
-    except ValueError as error:
-        return str(error)
-
-
-def compare(
-    lines: CompressedLines,
-    candidates: Sequence[Model],
-    parts: Folds,
-    forms: Mapping[AbstractDistortionModel, AbstractLines] | None = None,
-    rule: Rule = "one standard error",
-) -> tuple[tuple[ComparedModel, ...], Model, Model]:
-    """The figures of each, the best candidate and the chosen one; see `select_model`.
-
-    `forms` are the same lines for distortion models other than the radial polynomial.
-    """
-    errors = [candidate_errors((forms or {}).get(c.distortion_model, lines), c, parts) for c in candidates]
-    return compare_errors(candidates, errors, parts, rule)
-
-
-def compare_errors(candidates, errors, parts, rule):
-    """The same of candidates whose errors, or why there are none, are known."""
-    counted = (parts.unit >= 0) & (parts.share > 0)
-    unit, share = parts.unit[counted], parts.share[counted] / parts.share[counted].sum()
-    weight = np.bincount(unit, share)
-
-    def by_unit(of_line):
-        return np.bincount(unit, share * of_line[counted]) / np.where(weight > 0, weight, 1)
-
-    unseen = {}
-    for i, judged in enumerate(errors):
-        if isinstance(judged, LineErrors) and not judged.problem:
-            unseen[i] = by_unit(judged.unseen)
-    if not unseen:
-        reasons = {e if isinstance(e, str) else e.problem for e in errors}
-        raise ValueError(f"No candidate can be compared. {' '.join(sorted(reasons))}")
-    best = min(unseen, key=lambda i: weight @ unseen[i])
-    compared = [
-        _figures(candidate, judged, unseen.get(i), unseen[best], weight, by_unit)
-        for i, (candidate, judged) in enumerate(zip(candidates, errors, strict=True))
-    ]
-    within = [v for v in compared if not v.problem and v.difference <= _allowed(v, rule)]
-    chosen = min(within, key=lambda v: (round(v.parameters, 6), v.held_out)).candidate
-    return tuple(compared), candidates[best], chosen
-
-
-def _allowed(each, rule):
-    """By how much a candidate may be above the best to be chosen."""
-    return each.difference_std if rule == "one standard error" else _TIE * each.held_out
-
-
-def _figures(candidate, judged, unseen, best, weight, by_unit):
-    if isinstance(judged, str):
-        return ComparedModel(candidate, problem=judged)
-    rms = float(np.sqrt(weight @ by_unit(judged.seen)))
-    if unseen is None:
-        return ComparedModel(candidate, judged.parameters, rms, problem=judged.problem)
-    own, own_part = _root(weight, unseen)
-    least, least_part = _root(weight, best)
-    return ComparedModel(
-        candidate,
-        judged.parameters,
-        rms,
-        own,
-        _standard_error(weight, own_part),
-        own - least,
-        _standard_error(weight, own_part - least_part),
-    )
-
-
-def _root(weight, squares):
-    """The root of the mean, and what each of the squares does to it."""
-    mean = weight @ squares
-    root = float(np.sqrt(mean))
-    return root, (squares - mean) / (2 * root if root > 0 else 1)
-
-
-def _standard_error(weight, deviation):
-    """Of a weighted mean, from the deviations of what it is the mean of."""
-    number = np.sum(weight > 0)
-    return float(np.sqrt(np.sum((weight * deviation) ** 2) * number / max(number - 1, 1)))

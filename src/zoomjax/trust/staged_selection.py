@@ -7,8 +7,9 @@ from ..lines.base import AbstractLines
 from ..models.model import Model
 from ..models.smooth import SmoothZoom
 from ..models.zoom import AbstractZoom
+from .comparison import compare_errors, errors_of_candidates
 from .folds import folds_of
-from .selection import Selection, candidate_errors, compare_errors
+from .selection import Selection
 
 
 def select_in_stages(
@@ -30,10 +31,10 @@ def select_in_stages(
     """
     parts = folds_of(lines, None, folds, 0)
     candidates = [Model(zoom, terms[0]) for zoom in zooms]
-    errors = [candidate_errors(lines, candidate, parts) for candidate in candidates]
+    errors = errors_of_candidates(lines, candidates, parts)
     _, best, chosen = compare_errors(candidates, errors, parts, "least")
     more = [Model(chosen.zoom, number) for number in terms[1:] if not isinstance(chosen.zoom, SmoothZoom)]
-    errors += [candidate_errors(lines, candidate, parts) for candidate in more]
+    errors += errors_of_candidates(lines, more, parts)
     candidates += more
     compared, best, chosen = compare_errors(candidates, errors, parts, "least")
     fit = fit_zoom(lines, zoom=chosen)
