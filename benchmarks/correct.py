@@ -268,7 +268,7 @@ def markdown(r: dict) -> str:
         ("gradient by the lens / forward", verdict(jax_["gradient, lens, of forward"], 4)),
         (
             "gradient by lens and image / forward",
-            verdict(jax_["gradient, lens and image, of forward"], 4),
+            verdict(jax_["gradient, lens and image, of forward"], 6),
         ),
         *(
             (

@@ -21,7 +21,7 @@ from .._core.types import traced
 from ..models.distortion import Distortion
 from ..models.distortion_model import AbstractRadial
 from ..models.sizes import check_channels_last, check_image_size, check_one_image, checked_distortion
-from ._sampling import KERNELS, mixes_border, sample
+from ._sampling import KERNELS, computed_p, mixes_border, sample
 from .framing import Framing, check_framing
 
 _TOLERANCE = 1e-3
@@ -136,7 +136,8 @@ def _warped(image, distortion, framing, interpolation, border_value):
         result = finite + sample(flat - finite, x, y, interpolation).astype(values.dtype)
         mixed = mixes_border(x, y, (width, height), interpolation) & ~jnp.isfinite(border)
         result = jnp.where(mixed[..., None], border, result)
-    result = result.reshape(*x.shape, *image.shape[2:])
+    # Or XLA, on a CPU, would make one slow loop of the samples and whatever sum a loss is of them.
+    result = computed_p.bind(result, x[0, 0]).reshape(*x.shape, *image.shape[2:])
     return result if values is image else _rounded(result, image.dtype)
 
 
