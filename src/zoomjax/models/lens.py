@@ -307,15 +307,12 @@ class ZoomLens(eqx.Module):
 
 def _at(zoom, focal, focus, dtype):
     """The coefficients of a zoom model at focal lengths of any shape, which come first."""
-    focal = jnp.asarray(focal, dtype)
+    function, arguments = zoom, [jnp.asarray(focal, dtype)]
     if isinstance(zoom, AbstractFocusZoom):
         if focus is None:
-            return zoom(focal.reshape(-1)[0], None)  # says what is missing
-        focal, focus = jnp.broadcast_arrays(focal, jnp.asarray(focus, dtype))
-        function, arguments = zoom, (focal, focus)
-    else:
-        function, arguments = zoom, (focal,)
-    for _ in range(focal.ndim):
+            return zoom(arguments[0].reshape(-1)[0], None)  # says what is missing
+        arguments = jnp.broadcast_arrays(*arguments, jnp.asarray(focus, dtype))
+    for _ in range(arguments[0].ndim):
         function = jax.vmap(function)
     return function(*arguments)
 
