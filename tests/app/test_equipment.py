@@ -9,7 +9,14 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from zoomjax import scenes
-from zoomjax.app.equipment import KnownLens, known_lens, taken_otherwise, with_earlier, with_equipment
+from zoomjax.app.equipment import (
+    KnownLens,
+    known_lens,
+    taken_at_others,
+    taken_otherwise,
+    with_earlier,
+    with_equipment,
+)
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.interop import library_lens
 from zoomjax.io.equipment import FILM
@@ -67,6 +74,30 @@ def test_photos_of_several_zooms_by_a_lens_of_one_that_is_not_known_are_told(len
     assert "20 to 80 mm" in told
     assert taken_otherwise(of_one, photos[:1]) == []
     assert taken_otherwise(lens, photos) == []
+
+
+def test_photos_of_other_focal_lengths_than_those_used_are_told(lens, tmp_path):
+    def at(focal, **tags):
+        path = tmp_path / f"{focal}-{len(tags)}.jpg"
+        content = block(of={"Model": "D300"}, FocalLength=focal, **tags)
+        Image.fromarray(np.zeros((8, 12, 3), np.uint8)).save(path, exif=content)
+        return path
+
+    photos, in_px = [at(24.0), at(35.0), at(70.0)], dataclasses.replace(lens, focal_unit="px")
+    own = dict(zip(photos, (24.5, 33.0, 70.0), strict=True)).__getitem__
+    for of in (lens, in_px):
+        (told,) = taken_at_others(of, photos, lambda photo: 50.0)
+        assert "24.0-0.jpg is of 24 mm and 70.0-0.jpg is of 70 mm, and the focal length used is 50" in told
+        assert taken_at_others(of, photos, own) == []
+        assert taken_at_others(of, [bare(tmp_path / "none.jpg")], lambda photo: 50.0) == []
+    # One factor for all: in px, focused near, of equal view on film, or wrong.
+    assert taken_at_others(in_px, photos, lambda photo: 160 * own(photo)) == []
+    assert taken_at_others(lens, photos, lambda photo: 0.85 * own(photo)) == []
+    assert taken_at_others(lens, [at(24.0, FocalLengthIn35mmFilm=36)], lambda photo: 36.0) == []
+    (told,) = taken_at_others(lens, photos[1:2], lambda photo: 50.0)
+    assert told.startswith("By their EXIF data 35.0-0.jpg is of 35 mm, and the focal length used is 50 mm.")
+    of_one = dataclasses.replace(lens, about={"focal": UNKNOWN})
+    assert taken_at_others(of_one, photos[1:2], lambda photo: 1.0) == []
 
 
 def test_photos_that_show_another_part_of_the_sensor_are_told(lens, tmp_path):

@@ -129,6 +129,18 @@ def test_photos_corrected_before_are_counted(folder, tmp_path):
     assert undistort_files(dataclasses.replace(job, output=tmp_path / "other")).notes == ()
 
 
+def test_focal_lengths_that_exif_data_contradict_are_told(folder, tmp_path):
+    """Also where the table has none for a photo, which is skipped."""
+    job = Job(folder / "lens.json", (folder / "a.jpg", folder / "c.jpg"), tmp_path / "one", focal="30")
+    (told,) = undistort_files(job).notes
+    assert "a.jpg is of 20 mm and c.jpg is of 80 mm, and the focal length used is 30 mm" in told
+    photos = (folder / "a.jpg", folder / "b.jpg")
+    job = dataclasses.replace(job, inputs=photos, output=tmp_path / "two", focal=str(folder / "table.csv"))
+    done = undistort_files(job)
+    assert [*done.skipped] == [str(folder / "a.jpg")]
+    assert "b.jpg is of 40 mm, and the focal length used is 30 mm" in done.notes[0]
+
+
 def test_photos_with_a_table_or_one_focal_length(folder):
     for focal, out in (("focal.csv", "table"), ("30", "number")):
         done = run(folder, "a.jpg", "b.jpg", "--focal", focal, "-o", out)

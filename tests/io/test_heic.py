@@ -1,6 +1,8 @@
 """HEIC photographs: pixels as the camera stored them, metadata, and sentences about what is wrong."""
 
 import contextlib
+import io
+import struct
 import sys
 
 import numpy as np
@@ -10,9 +12,10 @@ from PIL.TiffImagePlugin import IFDRational
 
 import zoomjax as zj
 from zoomjax.detect.sources import find_photos
+from zoomjax.io.avif import decode_avif
 from zoomjax.io.exif import exif_with_orientation
 from zoomjax.io.headers import announced_size
-from zoomjax.io.heic import heic_metadata
+from zoomjax.io.heic import _properties, heic_metadata
 from zoomjax.io.photo import read_focal, read_photo
 
 pillow_heif = pytest.importorskip("pillow_heif")
@@ -80,6 +83,43 @@ def test_a_file_without_exif_data_gets_the_orientation(tmp_path):
     exif = Image.Exif()
     exif.load(metadata.exif)
     assert dict(exif) == {ExifTags.Base.Orientation: 6}
+
+
+def with_part(content, wide, high, right, down):
+    """A file whose colour profile, of 28 bytes, becomes the property that a part alone is to be shown."""
+    at = content.index(b"prof") - 8
+    part = struct.pack(">I4s2I2I2i2i", 40, b"clap", wide, 1, high, 1, right, 1, down, 1)
+    assert int.from_bytes(content[at : at + 4]) == len(part)
+    return content[:at] + part + content[at + 40 :]
+
+
+@pytest.mark.parametrize("part", [(96, 64, 0, 0), (180, 128, 6, 0), (192, 120, 0, 4)])
+def test_a_part_of_the_pixels_alone_is_refused(tmp_path, part):
+    """The decoder gives no others."""
+    path = write(tmp_path / "a.heic", gradient(), profile=bytes(28))
+    path.write_bytes(with_part(path.read_bytes(), *part))
+    with pytest.raises(ValueError, match="shows a part of the pixels it holds"):
+        read_photo(path)
+
+
+@pytest.mark.parametrize("shape", [(127, 191), (67, 65), (128, 192)])
+def test_what_encoders_fill_up_is_no_part(tmp_path, shape):
+    image = gradient()[: shape[0], : shape[1]]
+    assert read_photo(write(tmp_path / "a.heic", image, orientation=6))[0].shape[:2] == image.shape[:2]
+
+
+def test_the_mark_of_a_part_is_said_to_be_lost_where_all_pixels_are_taken():
+    image = io.BytesIO()
+    Image.fromarray(gradient()).save(image, "AVIF", icc_profile=bytes(28))
+    content = image.getvalue()
+    assert decode_avif(content)[2] == []
+    at = content.index(b"ipma") + 15  # where the properties of the picture are listed
+    index = [name for name, _ in _properties(content)].index(b"colr") + 1
+    listed = bytes(0x80 | one if one & 0x7F == index else one for one in content[at : at + 5])
+    marked = with_part(content[:at] + listed + content[at + 5 :], 96, 64, 20, 10)
+    pixels, _, others = decode_avif(marked)
+    assert pixels.shape[1::-1] == SIZE
+    assert others == ["that a part of the pixels alone is to be shown"]
 
 
 def test_more_than_eight_bits_are_kept(tmp_path):

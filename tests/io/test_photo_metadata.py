@@ -144,6 +144,21 @@ def test_planes_of_a_tiff_file_one_after_the_other_are_colours(tmp_path, image, 
     np.testing.assert_array_equal(read_photo(tmp_path / "a.tif")[0][..., ::-1], image)
 
 
+def test_transparency_that_a_bmp_file_has_no_place_for_is_named(tmp_path, rng):
+    """As Pillow writes it; OpenCV writes a header that has a place."""
+    colours = rng.integers(0, 255, (9, 13, 4)).astype(np.uint8)
+    opaque = np.dstack([colours[..., :3], np.full((9, 13), 255, np.uint8)])
+    for picture, others in ((colours, ("transparency",)), (opaque, ()), (colours[..., :3], ())):
+        Image.fromarray(picture).save(tmp_path / "a.bmp")
+        photo = read_pages(tmp_path / "a.bmp")
+        np.testing.assert_array_equal(photo.pages[0][0], picture[..., 2::-1])
+        assert photo.others == others
+    cv2.imwrite(str(tmp_path / "a.bmp"), colours)
+    photo = read_pages(tmp_path / "a.bmp")
+    np.testing.assert_array_equal(photo.pages[0][0], colours)
+    assert photo.others == ()
+
+
 def test_alpha_does_not_darken_colours(tmp_path, image):
     clear = np.dstack([image, np.full(image.shape[:2], 90, np.uint8)])
     Image.fromarray(clear).save(tmp_path / "a.tif")

@@ -116,6 +116,53 @@ def test_grey_with_transparency_becomes_colours_with_it(rng, tmp_path, dtype):
     np.testing.assert_array_equal(back, image[..., [0, 0, 0, 1]])
 
 
+@pytest.mark.parametrize("compression", ["tiff_lzw", "packbits"])
+def test_colours_are_not_multiplied_by_transparency(rng, tmp_path, compression):
+    """OpenCV does so, with 8 bits, and decodes what is compressed by LZW."""
+    image = picture(rng, np.uint8, 4)
+    Image.fromarray(image).save(tmp_path / "a.tif", compression=compression)
+    np.testing.assert_array_equal(read_photo(tmp_path / "a.tif")[0], image[..., [2, 1, 0, 3]])
+
+
+@pytest.mark.parametrize("dtype", [bool, np.uint8, np.uint16, np.uint32])
+def test_grey_in_which_white_is_0_does_not_become_a_negative(rng, tmp_path, dtype):
+    most = 1 if dtype is bool else np.iinfo(dtype).max
+    image = rng.integers(0, most, (30, 48), endpoint=True).astype(dtype)
+    tifffile.imwrite(tmp_path / "a.tif", image, photometric="miniswhite")
+    back, _ = read_photo(tmp_path / "a.tif")
+    np.testing.assert_array_equal(back, 255 * (1 - image.astype(np.uint8)) if most == 1 else most - image)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.int16])
+def test_white_that_is_0_of_numbers_without_a_black_is_refused(tmp_path, dtype):
+    tifffile.imwrite(tmp_path / "a.tif", np.ones((30, 50), dtype), photometric="miniswhite")
+    with pytest.raises(ValueError, match=f"white is 0, and what black is in {np.dtype(dtype)}"):
+        read_photo(tmp_path / "a.tif")
+
+
+def test_half_precision_becomes_single(rng, tmp_path):
+    image = rng.uniform(0, 1, (30, 50, 3)).astype(np.float16)
+    tifffile.imwrite(tmp_path / "a.tif", image, photometric="rgb", compression="zlib")
+    back, _ = read_photo(tmp_path / "a.tif")
+    assert back.dtype == np.float32
+    np.testing.assert_array_equal(back[..., ::-1], image)
+
+
+OTHERS = [
+    (np.ones((30, 50, 5), np.uint8), "it has 5 channels, and photos have up to 4"),
+    (np.ones((5, 30, 50), np.uint8), "it has 5 channels, and photos have up to 4"),
+    (np.ones((30, 50), np.complex64), "its numbers .complex64, compressed by NONE. cannot be decoded"),
+]
+
+
+@pytest.mark.parametrize(("image", "told"), OTHERS)
+def test_what_cannot_be_decoded_is_not_called_damaged(tmp_path, image, told):
+    planes = "separate" if image.shape[0] == 5 else "contig"
+    tifffile.imwrite(tmp_path / "a.tif", image, photometric="minisblack", planarconfig=planes)
+    with pytest.raises(ValueError, match=told):
+        read_photo(tmp_path / "a.tif")
+
+
 def test_compressed_grey_with_transparency_that_opencv_would_drop_is_refused(rng, tmp_path):
     path = tmp_path / "a.tif"
     Image.fromarray(picture(rng, np.uint8, 2)).save(path, compression="tiff_lzw")

@@ -1,6 +1,7 @@
 """Zoom and focus: the tensor product against its factors, and a lens that breathes."""
 
 import json
+import warnings
 
 import equinox as eqx
 import jax
@@ -146,6 +147,35 @@ def test_files_keep_the_focus(seen, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_focus_beyond_those_fitted_is_told(model):
+    """As a distance where lines had its inverse; so is a focal length beyond."""
+    lens = zj.ZoomLens(
+        model,
+        np.array([319.5, 213.5]),
+        np.array([18.0, 200.0]),
+        (640, 428),
+        focus_range=np.array([0.0, 2.5]),
+    )
+    points = np.full((3, 2), 100.0)
+    told = "The focus 4 is not within the range on which the lens was fitted, 0 to 2.5"
+    for call in (
+        lambda focus: lens(35.0, focus).coefficients,
+        lambda focus: lens([35.0, 50.0], [1.0, focus]).coefficients,
+        lambda focus: lens.at_focus(focus)(35.0).coefficients,
+        lambda focus: lens.undistort(points, 35.0, focus),
+        lambda focus: lens.distort(points, 35.0, [0.0, 2.5, focus]),
+    ):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert np.isfinite(call(2.5)).all()
+        with pytest.warns(UserWarning, match=told) as caught:
+            call(4.0)
+        assert [warning.filename for warning in caught] == [__file__]
+        with pytest.raises(ValueError, match="Argument focus must be finite"):
+            call(np.nan)
+    assert np.isfinite(jax.jit(lambda focus: lens(35.0, focus).coefficients)(4.0)).all()
+
+
 def test_a_missing_focus_says_what_to_do(small, seen, model, truth):
     with pytest.raises(ValueError, match="needs the focus of each frame"):
         zj.fit_zoom(small, zoom=zj.models.FocusSplineZoom())

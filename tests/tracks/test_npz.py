@@ -36,7 +36,7 @@ def test_what_is_saved_is_loaded(dtype, tmp_path):
     assert_same(load_tracks(tmp_path / "tracks.npz"), tracks)
 
 
-@pytest.mark.filterwarnings("ignore:.*lie outside of the image")
+@pytest.mark.filterwarnings("ignore:.*lie outside of the image", "ignore:.*they are copies of others")
 @given(st.lists(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=5), min_size=1, max_size=6))
 def test_any_tracks_come_back(tmp_path_factory, ragged):
     path = tmp_path_factory.getbasetemp() / "any.npz"

@@ -23,6 +23,16 @@ def test_views_come_back_in_any_order(data):
     assert tracks.frames == frame.max() + 1
 
 
+def test_copies_of_tracks_under_other_names_are_dropped():
+    """They count as independent: focal lengths of a fit of each track twice are told √2 too narrowly."""
+    track, frame = [5, 5, 2, 2, 9, 9, 9, 7, 7], [0, 1, 1, 0, 0, 1, 2, 1, 2]
+    points = [[1.5, 2], [2, 2], [2, 2], [1.5, 2], [1.5, 2], [2, 2], [3, 2], [1.5, 2], [2, 2]]
+    with pytest.warns(UserWarning, match=r"Dropped 1 of 4 tracks: .* as 5 is, and would count twice"):
+        tracks = Tracks.from_arrays(track, frame, points, image_size=(8, 6))
+    assert tracks.number.tolist() == [2, 7, 9]
+    assert tracks.views()[2].tolist() == [[1.5, 2], [2, 2], [1.5, 2], [2, 2], *points[4:7]]
+
+
 def test_tracks_of_one_view_are_dropped():
     with pytest.warns(UserWarning, match="Dropped 1 of 2 tracks"):
         tracks = Tracks.from_arrays([3, 3, 4], [0, 1, 0], np.zeros((3, 2)), image_size=(8, 6))

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -174,6 +174,43 @@ def taken_otherwise(lens: ZoomLens, photos: Iterable[Path]) -> list[str]:
             f"of {min(focal):.4g} to {max(focal):.4g} mm: some are of another zoom."
         )
     return told
+
+
+def taken_at_others(lens: ZoomLens, photos: Iterable[Path], focal_of: Callable[[Path], float]) -> list[str]:
+    """That photos' EXIF data contradict the focal lengths that they are corrected at.
+
+    One factor common to all says nothing where the lens counts in px, or where it makes them those of equal
+    view on film. In mm it counts from a quarter on: less may be how the lens is focused.
+    """
+    found = {photo: one for photo in photos if (one := equipment_of(photo)).focal}
+    used = {photo: focal_of(photo) for photo in found}
+    ratio = {photo: (one.focal or np.nan) / used[photo] for photo, one in found.items()}
+    if not ratio:
+        return []
+    low, high = min(ratio, key=lambda photo: ratio[photo]), max(ratio, key=lambda photo: ratio[photo])
+    if not _apart(ratio[low], ratio[high], _OTHER_ZOOM):
+        film = [(one.crop_factor(lens.image_size) or 1) * ratio[photo] for photo, one in found.items()]
+        in_mm = lens.focal_unit == "mm" and lens.about.get("focal") != UNKNOWN
+        if not in_mm or any(min(_off(ratio[low]), _off(of)) <= _OTHER_FOCAL for of in film):
+            return []
+    pair = (low,) if len(ratio) == 1 else (low, high)
+    told = [f"{plain(photo.name)} is of {found[photo].focal:.4g} mm" for photo in pair]
+    counts = dict.fromkeys(f"{used[photo]:.4g}" for photo in pair)
+    return [
+        f"By their EXIF data {' and '.join(told)}, and the focal length used is {' and '.join(counts)} "
+        f"{lens.focal_unit}. Check --focal, or leave it out: then the EXIF data count."
+    ]
+
+
+def _off(ratio: float) -> float:
+    return max(ratio, 1 / ratio)
+
+
+_OTHER_ZOOM = 1.1
+"""Ratio of ratios of focal lengths that differ by more than EXIF data are rounded to, or measured."""
+
+_OTHER_FOCAL = 1.25
+"""Ratio up to which all focal lengths may be apart from those in EXIF data: those at near things are."""
 
 
 def _parts_taken(lens: ZoomLens, found: Sequence[Equipment]) -> list[str]:

@@ -20,7 +20,7 @@ from ..io.photo import read_metadata
 from ..models.about import UNKNOWN
 from ..models.lens import ZoomLens, load_lens
 from ._photos import BAD_FILE, SAME, CommonFraming, corrected_photos
-from .equipment import taken_otherwise
+from .equipment import taken_at_others, taken_otherwise
 from .plans import files_plan
 from .undistort_inputs import Found, find_inputs, focal_number, targets_of
 
@@ -252,6 +252,8 @@ def undistort_photos(
     ]
     given = [source for source, _ in wanted]
     before = () if job.redistort else (*corrected_before(given), *taken_otherwise(lens, given))
+    corrected = [source for source in given if source not in skipped]
+    before += () if job.focal is None else tuple(taken_at_others(lens, corrected, focal_of))
     notes = (*_losses(lost), *_unmarked(unmarked), *before)
     sentence, files = (
         _counted(written, len(sources), earlier, job, "photo"),

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from PIL import Image, features
 
-from .heic import metadata_in
+from .heic import metadata_in, shows_a_part
 from .metadata import Metadata
 
 _QUALITY = 95
@@ -51,6 +51,7 @@ def decode_avif(content: bytes) -> tuple[np.ndarray, Metadata, list[str]]:
     except Exception as error:  # of whatever kind the decoders' are
         raise ValueError("the file is damaged or cut off") from error
     more = ["further pictures"] if getattr(picture, "n_frames", 1) > 1 else []
+    more += ["that a part of the pixels alone is to be shown"] if shows_a_part(content) else []
     return np.ascontiguousarray(image), metadata_in(picture.info), more
 
 

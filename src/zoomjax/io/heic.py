@@ -7,7 +7,8 @@ files of other formats it is what viewers follow.
 
 import dataclasses
 import io
-from collections.abc import Mapping
+import struct
+from collections.abc import Iterator, Mapping
 from types import ModuleType
 from typing import Any
 
@@ -49,9 +50,14 @@ def decode_heic(content: bytes) -> tuple[np.ndarray, Metadata]:
     """The pixels as stored, as OpenCV has them, all their bits kept; and the metadata.
 
     Raises:
-        ValueError: as `heic_size`, or it is damaged.
+        ValueError: as `heic_size`, or it is damaged, or shows a part of its pixels alone.
     """
     picture, metadata = _opened(content), heic_metadata(content)
+    if shows_a_part(content, picture.size):  # which alone the decoder gives
+        raise ValueError(
+            "it shows a part of the pixels it holds (clap), in which the lens's centre is elsewhere: give "
+            "it as the camera wrote it, or save all of it in another format"
+        )
     try:
         image = np.array(picture)  # a copy: the memory goes with the picture
     except Exception as error:  # of whatever kind libheif's are
@@ -64,20 +70,57 @@ def orientation_in(content: bytes) -> int | None:
 
     They are all in one box (ISO/IEC 23008-12, 6.5.10 and 6.5.12). Turns come before reflections (MIAF).
     """
-    at = content.find(b"ipco")
-    end = at - 4 + int.from_bytes(content[at - 4 : at]) if at >= 4 else 0
     turns, mirrors = set[int](), set[int]()
-    at += 4
-    while at + 8 < end <= len(content):
-        size, name, first = int.from_bytes(content[at : at + 4]), content[at + 4 : at + 8], content[at + 8]
+    for name, block in _properties(content):
         if name == b"irot":
-            turns.add(first & 3)
+            turns.add(block[0] & 3)
         elif name == b"imir":
-            mirrors.add(first & 1)
-        at += max(size, 8)
+            mirrors.add(block[0] & 1)
     if len(turns) > 1 or len(mirrors) > 1:
         return None
     return _ORIENTATIONS[next(iter(turns), 0)][next(iter(mirrors), -1) + 1]
+
+
+def shows_a_part(content: bytes, size: tuple[int, int] | None = None) -> bool:
+    """Whether a file says to show a part of its pixels, beyond what encoders fill up, or less than 2 %.
+
+    That is a property of the file, too (6.5.9), with the width and height of the part and its offset from
+    the middle. Of several pictures, the one of this `size`, perhaps turned, counts; None: any.
+    """
+    properties = list(_properties(content))
+    whole = [
+        struct.unpack_from(">4x2I", block) for name, block in properties if (name, len(block)) == _SIZE
+    ]
+    for name, block in properties:
+        if (name, len(block)) != _PART:
+            continue
+        numbers = struct.unpack(">2I2I2i2i", block)
+        wide, high, right, down = (numbers[n] / (numbers[n + 1] or 1) for n in (0, 2, 4, 6))
+        of = min((full for full in whole if full[0] >= wide and full[1] >= high), default=None)
+        if of is None or (size is not None and sorted(size) != sorted((round(wide), round(high)))):
+            continue
+        for full, part, offset in ((of[0], wide, right), (of[1], high, down)):
+            before, after = (full - part) / 2 + offset, (full - part) / 2 - offset
+            if before > _SMALL * full or after > max(_SMALL * full, _FILLED):
+                return True
+    return False
+
+
+_SIZE, _PART = (b"ispe", 12), (b"clap", 32)
+"""Properties of a picture: its size; the part to be shown."""
+
+_SMALL, _FILLED = 0.02, 64
+
+
+def _properties(content: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """The properties of a file's pictures, which are all in one box: names and contents."""
+    at = content.find(b"ipco")
+    end = at - 4 + int.from_bytes(content[at - 4 : at]) if at >= 4 else 0
+    at += 4
+    while at + 8 < end <= len(content):
+        size = max(int.from_bytes(content[at : at + 4]), 8)
+        yield content[at + 4 : at + 8], content[at + 8 : at + max(size, 9)]
+        at += size
 
 
 _ORIENTATIONS = ((1, 4, 2), (8, 5, 7), (3, 2, 4), (6, 7, 5))

@@ -224,7 +224,21 @@ def _bmp_metadata(content: bytes) -> Metadata:
 
 
 def _plain(content: bytes, most_pages: int) -> Photo:
-    return Photo(((_decoded(content), _bmp_metadata(content)),))
+    image = _decoded(content)
+    lost = ("transparency",) if _has_fourth(content, image) else ()
+    return Photo(((image, _bmp_metadata(content)),), lost)
+
+
+def _has_fourth(content: bytes, image: np.ndarray) -> bool:
+    """Whether a BMP file has a fourth channel that was not decoded, and that is not one number.
+
+    Some programs keep transparency there, where the format has nothing.
+    """
+    if len(content) < 34 or image.shape[2:] != (3,) or struct.unpack_from("<H", content, 28)[0] != 32:
+        return False
+    start, (height, width) = struct.unpack_from("<I", content, 10)[0], image.shape[:2]
+    fourth = np.frombuffer(content[start : start + 4 * width * height], np.uint8)[3::4]
+    return bool(fourth.size and np.ptp(fourth))
 
 
 _DECODERS: dict[str, Callable[[bytes, int], Photo]] = {

@@ -114,13 +114,21 @@ def _page(content: bytes, file: tifffile.TiffFile, number: int) -> TiffPage:
         raise
     except Exception as error:  # as above
         raise ValueError("the file is damaged or cut off") from error
+    if not 1 <= page.samplesperpixel <= 4:
+        raise ValueError(
+            f"it has {page.samplesperpixel} channels, and photos have up to 4, of colours and "
+            "transparency: save each channel as a page, in grey"
+        )
     if image is None and separate and page.dtype != np.uint8:
         # OpenCV takes its planes for interleaved, and shows noise.
         raise ValueError(f"its colours are stored one after the other and compressed ({compression})")
     if image is None and page.samplesperpixel == 2:
         raise ValueError(f"it is grey with transparency, and compressed ({compression})")  # OpenCV drops it
+    if image is None and (page.dtype is None or page.dtype == np.float16 or page.dtype.kind not in "biuf"):
+        raise ValueError(f"its numbers ({page.dtype}, compressed by {compression}) cannot be decoded")
     if image is None:
-        image = as_stored(_by_opencv(content, number), orientation)  # OpenCV turns TIFF files
+        image = as_stored(_by_opencv(_as_it_is(content, page), number), orientation)  # which it turns
+        image = _white_up(image, page) if kind == "MINISWHITE" else image
     return TiffPage(image, metadata, orientation, _COLOURS.get(kind, kind), notes, others)
 
 
@@ -153,7 +161,7 @@ def _plain(page: Any) -> np.ndarray | None:
     if (
         page.compression.name not in _PLAIN
         or page.photometric.name not in ("MINISBLACK", "RGB")
-        or page.dtype not in (np.uint8, np.uint16, np.float32, np.float64)
+        or page.dtype not in (np.uint8, np.uint16, np.float16, np.float32, np.float64)
         or page.bitspersample != 8 * np.dtype(page.dtype).itemsize
         or page.samplesperpixel not in (1, 2, 3, 4)
         or page.predictor not in (1, 2)
@@ -167,7 +175,30 @@ def _plain(page: Any) -> np.ndarray | None:
     if values.ndim == 3:
         # Grey with transparency becomes colours with it, as of PNG files.
         values = values[..., [0, 0, 0, 1] if values.shape[2] == 2 else [2, 1, 0, 3][: values.shape[2]]]
-    return np.ascontiguousarray(values.astype(values.dtype.newbyteorder("="), copy=False))
+    native = values.dtype.newbyteorder("=") if values.dtype != np.float16 else np.float32  # OpenCV lacks it
+    return np.ascontiguousarray(values.astype(native, copy=False))
+
+
+def _as_it_is(content: bytes, page: Any) -> bytes:
+    """The file with transparency that OpenCV does not know as such: it would multiply colours by it."""
+    tag = page.tags.get(_EXTRA_SAMPLES)
+    if page.samplesperpixel != 4 or tag is None or tag.valueoffset + 2 > len(content):
+        return content
+    return content[: tag.valueoffset] + bytes(2) + content[tag.valueoffset + 2 :]
+
+
+_EXTRA_SAMPLES = 338
+"""The tag of what the channels beyond the colours are; 0 is unspecified."""
+
+
+def _white_up(image: np.ndarray, page: Any) -> np.ndarray:
+    """An image in which white is 0, with black as 0; OpenCV does it with 8 bits and fewer."""
+    if page.dtype.kind in "bu" and page.bitspersample <= 8:
+        return image
+    if image.dtype.kind != "u" or page.bitspersample != 8 * image.dtype.itemsize:
+        numbers = f"{page.dtype} numbers of {page.bitspersample} bits"
+        raise ValueError(f"in it white is 0, and what black is in {numbers} is not known: save it as RGB")
+    return np.iinfo(image.dtype).max - image
 
 
 def _by_opencv(content: bytes, number: int) -> np.ndarray:

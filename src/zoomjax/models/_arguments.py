@@ -1,5 +1,6 @@
 """What distortions are made of and act on: shapes, and values where they are known."""
 
+import warnings
 from typing import Any
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 
 from .._core.arguments import check_kind
 from .._core.fields import check_finite, check_positive, refuse_masked
+from .._core.types import traced
 from .distortion_model import AbstractDistortionModel
 
 _NAN = "give an array with NaN in place of what is masked, .filled(np.nan)"
@@ -50,6 +52,26 @@ def as_focal(focal: Any) -> Any:
     except (TypeError, ValueError) as error:
         raise ValueError(f"Argument focal must be a number or an array, but it is {focal!r}.") from error
     raise ValueError(f"Argument focal must be a number or an array, but it is {focal!r}.")
+
+
+def check_focus(focus: Any, fitted: Any, *, stacklevel: int) -> None:
+    """Warn where a focus is outside of the range `fitted`, where both are known: in another unit, say.
+
+    Raises:
+        ValueError: it is not finite.
+    """
+    if focus is None or fitted is None or traced((focus, fitted)):
+        return
+    values, (low, high) = np.ravel(np.asarray(focus, float)), np.asarray(fitted, float).tolist()
+    if not np.isfinite(values).all():
+        raise ValueError(f"Argument focus must be finite, but it is {values[~np.isfinite(values)][0]}.")
+    slack = 1e-6 * max(abs(low), abs(high))
+    if outside := values[(values < low - slack) | (values > high + slack)].tolist():
+        warnings.warn(
+            f"The focus {outside[0]:g} is not within the range on which the lens was fitted, {low:g} to "
+            f"{high:g}, in the unit of its lines: beyond it the distortion of its end is taken.",
+            stacklevel=stacklevel,
+        )
 
 
 def check_broadcast(points: tuple[Any, ...], focal: tuple[Any, ...]) -> None:

@@ -23,7 +23,7 @@ from .._core.files import whole_file
 from .._core.pixels import check_pitch
 from .._core.programs import light_program
 from .._core.types import AnyArray, FocalLike, Point, Points, traced
-from ._arguments import as_focal, as_points, check_broadcast, check_terms
+from ._arguments import as_focal, as_points, check_broadcast, check_focus, check_terms
 from ._known_sizes import with_known_size
 from .about import About, checked_about, checked_pitch
 from .distortion import Distortion, compiled, mapped
@@ -139,13 +139,13 @@ class ZoomLens(eqx.Module):
         lengths outside of the fitted range give NaN; see `extended`.
 
         Warns:
-            UserWarning: `focal` is outside of the fitted range, so the distortion is extrapolated.
+            UserWarning: `focal` or `focus` is outside of the fitted range.
 
         Raises:
-            ValueError: `focal` is not positive and finite, or the zoom model depends on the focus and
-                `focus` is missing.
+            ValueError: `focal` is not positive and finite, `focus` is not finite, or it is missing and the
+                zoom model depends on it.
         """
-        focal = self._checked(focal, stacklevel=4)
+        focal = self._checked(focal, focus, stacklevel=4)
         if traced((self, focal, focus)):
             d = self._distortion(focal, focus, within=traced((self, focal)))
             return with_known_size(d, self.image_size)
@@ -189,7 +189,7 @@ class ZoomLens(eqx.Module):
 
     def _mapped(self, method, points, focal, focus):
         points = as_points(points)
-        focal = self._checked(focal, stacklevel=5)
+        focal = self._checked(focal, focus, stacklevel=5)
         check_broadcast(points.shape[:-1], focal.shape)
         if isinstance(points, np.ndarray) and not traced((self, focal, focus)):
             d = self._distortion(focal, focus)
@@ -198,10 +198,10 @@ class ZoomLens(eqx.Module):
         operands = (self, jnp.asarray(focal, points.dtype), focus, traced((self, focal)))
         return compiled(method, _bent, points, operands)
 
-    def _checked(self, focal, stacklevel):
-        """Focal lengths as an array, looked at where they are known."""
-        focal = as_focal(focal)
-        self.check_range(focal, stacklevel=stacklevel)
+    def _checked(self, focal, focus, stacklevel):
+        """Focal lengths as an array; these and the focus are looked at where they are known."""
+        self.check_range(focal := as_focal(focal), stacklevel=stacklevel)
+        check_focus(focus, self.focus_range, stacklevel=stacklevel)
         return focal
 
     def _distortion(self, focal, focus, within=False):
@@ -238,6 +238,7 @@ class ZoomLens(eqx.Module):
             raise TypeError(
                 f"A {type(self.zoom).__name__} does not depend on the focus: use the lens as it is."
             )
+        check_focus(focus, self.focus_range, stacklevel=3)
         return dataclasses.replace(self, zoom=self.zoom.at_focus(focus), focus_range=None)
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -99,8 +99,8 @@ class Tracks(eqx.Module):
                 views in one frame, or no track has two views.
 
         Warns:
-            UserWarning: tracks of one view are dropped; the message counts them. Or points lie outside of
-                the image.
+            UserWarning: tracks of one view, or with the views of another one, are dropped; the message
+                counts them. Or points lie outside of the image.
 
         Example:
             >>> tracks = Tracks.from_arrays(
@@ -131,6 +131,13 @@ class Tracks(eqx.Module):
                 f"Dropped {single.sum()} of {len(count)} tracks: they have one view.", stacklevel=2
             )
             number, count, first = number[~single], count[~single], first[~single]
+        if (copies := _copies(moments, places, first, count)).any():
+            warnings.warn(
+                f"Dropped {copies.sum()} of {len(count)} tracks: they are copies of others, with the same "
+                f"views, as {number[copies][0]} is, and would count twice.",
+                stacklevel=2,
+            )
+            number, count, first = number[~copies], count[~copies], first[~copies]
         view = np.arange(count.max())
         mask = view < count[:, None]
         entry = np.where(mask, first[:, None] + view, first[:, None])  # padding repeats the first view
@@ -173,6 +180,14 @@ class Tracks(eqx.Module):
     def scale(self) -> float:
         """The length in px that is radius 1: half the image diagonal."""
         return math.hypot(*self.image_size) / 2
+
+
+def _copies(moments, places, first, count):
+    """Which tracks have the very views of one before them."""
+    of = zip(first.tolist(), count.tolist(), strict=True)
+    keys = [(moments[at : at + n].tobytes(), places[at : at + n].tobytes()) for at, n in of]
+    before = dict(reversed([(key, place) for place, key in enumerate(keys)]))
+    return np.array([before[key] < place for place, key in enumerate(keys)])
 
 
 def _views(track, frame, points):
