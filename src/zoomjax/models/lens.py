@@ -1,7 +1,6 @@
 """ZoomLens: a fitted zoom model, which gives the distortion at any focal length, and its file format."""
 
 import dataclasses
-import functools
 import json
 import math
 import os
@@ -24,6 +23,7 @@ from .._core.pixels import check_pitch
 from .._core.programs import light_program
 from .._core.types import AnyArray, FocalLike, Point, Points, traced
 from ._arguments import as_focal, as_points, check_broadcast, check_focus, check_terms
+from ._known_number import known_number
 from ._known_sizes import with_known_size
 from .about import About, checked_about, checked_pitch
 from .distortion import Distortion, compiled, mapped
@@ -32,14 +32,13 @@ from .model import Model
 from .polynomial import RadialPolynomial
 from .registry import (
     array_of,
-    coefficients_shape,
     described,
     distortion_model_from,
     distortion_model_name,
     once,
     zoom_from,
 )
-from .zoom import AbstractFocusZoom, AbstractLinearZoom, AbstractZoom
+from .zoom import AbstractFocusZoom, AbstractZoom
 
 _FORMAT, _VERSION = "zoomjax.lens", 3
 _UNREADABLE = ValueError, TypeError, KeyError, AttributeError, ArithmeticError, RecursionError, OSError
@@ -109,7 +108,7 @@ class ZoomLens(eqx.Module):
         check_range("focal_range", self.focal_range)
         check_range("focus_range", self.focus_range)
         one = getattr(self.centre, "ndim", 0) == 1  # or it is a batch of lenses, or stands in for one
-        size, shift = (_coefficients(model) if one else None for model in (self.zoom, self.shift))
+        size, shift = (known_number(model) if one else None for model in (self.zoom, self.shift))
         if shift not in (None, 2):
             raise ValueError(
                 f"Argument shift must give two numbers, the offset of the centre, but it gives {shift}."
@@ -150,7 +149,7 @@ class ZoomLens(eqx.Module):
             d = self._distortion(focal, focus, within=traced((self, focal)))
             return with_known_size(d, self.image_size)
         with eval_context():  # what is known stays known inside of ``jit``
-            return with_known_size(_distortion_at(self, focal, focus), self.image_size)
+            return with_known_size(_known_distortion(self, focal, focus), self.image_size)
 
     def undistort(
         self,
@@ -321,32 +320,17 @@ def _at(zoom, focal, focus, dtype):
 _distortion_at = light_program(ZoomLens._distortion)
 
 
+def _known_distortion(lens, focal, focus):
+    try:
+        return _distortion_at(lens, focal, focus)
+    except jax.errors.JAXTypeError:
+        return lens._distortion(focal, focus)  # of a zoom model of your own, which branches on values
+
+
 def _bent(operands):
     lens, focal, focus, within = operands
     d = lens._distortion(focal, focus, within)
     return d.distortion_model, d.coefficients, d.centre, d.scale
-
-
-def _coefficients(zoom: AbstractZoom | None) -> int | None:
-    """How many coefficients a zoom model gives; None where its arrays are not there, or a batch."""
-    leaves = jax.tree.leaves(zoom)
-    if not isinstance(zoom, AbstractZoom) or not all(eqx.is_array(leaf) for leaf in leaves):
-        return None
-    if isinstance(zoom, AbstractLinearZoom) and zoom.parameters is not None:
-        return zoom.parameters.shape[1] if zoom.parameters.ndim == 2 else None
-    kinds = tuple((leaf.shape, np.dtype(leaf.dtype)) for leaf in leaves)
-    return _number_of(jax.tree.structure(zoom), kinds, jnp.result_type(float))
-
-
-@functools.lru_cache(maxsize=1024)
-def _number_of(structure, kinds, _):
-    """How many coefficients there are, of a model known by its shapes: to trace it takes milliseconds."""
-    zoom = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*kind) for kind in kinds])
-    try:
-        shape = coefficients_shape(zoom)
-    except (jax.errors.JAXTypeError, IndexError, TypeError):  # that cannot be traced, or is a batch
-        return None
-    return shape[0] if len(shape) == 1 else None
 
 
 def _pair(content, name):
