@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from zoomjax.fit._schur import Rows, Schur, Unknowns, columns, covariances, reduced
+from zoomjax.fit import _columns
+from zoomjax.fit._columns import Rows, Unknowns, columns
+from zoomjax.fit._schur import Schur, covariances, reduced
 from zoomjax.fit._structure import structure_of
 
 
@@ -49,6 +51,20 @@ def test_steps_are_those_of_dense_least_squares(rng, frames, longest, levers):
     solver = Schur(structure, lambda at: columns(jacobian, at))
     found = jax.jit(lambda rows: solver.step(like, jacobian, rows, jnp.asarray(damping)))(rows)
     np.testing.assert_allclose(ravel_pytree(found)[0], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("chunk", [16, 7])
+def test_chunks_of_views_change_no_step(rng, monkeypatch, chunk):
+    jacobian, rows, like, structure = problem(rng, 17, 40, 8, levers=True)
+    assert len(structure.track) % chunk > 0
+
+    def step():
+        solver = Schur(structure, lambda at: columns(jacobian, at))
+        return jax.jit(lambda rows: solver.step(like, jacobian, rows, jnp.asarray(0.3)))(rows)
+
+    expected = ravel_pytree(step())[0]
+    monkeypatch.setattr(_columns, "CHUNK", chunk)
+    np.testing.assert_allclose(ravel_pytree(step())[0], expected, atol=1e-10)
 
 
 @pytest.mark.parametrize("levers", [False, True])

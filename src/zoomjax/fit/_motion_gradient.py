@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.sparse.linalg import cg
 
+from ._columns import Unknowns
 from ._motion_model import Data, Model, Noise, Stage, moved, units_of
-from ._motion_rows import rows_of
+from ._motion_rows import columns_of, rows_of
 from ._motion_stages import STAGES
-from ._schur import Unknowns, reduced, solution_of
+from ._schur import reduced_of, solution_of
 
 _TOLERANCE = 1e-10
 _MOST_STEPS = 100
@@ -41,8 +42,9 @@ def sensitive(data: Data, model: Model, noise: Noise) -> Model:
     def times(vector: Unknowns) -> Unknowns:
         return jax.jvp(lambda x: gradient(here, x), (zeros,), (vector,))[1]
 
-    rows, jacobian = jax.linearize(lambda x: rows_of(x, (here, model, noise, stage)), zeros)
-    matrix = reduced(jacobian, rows, zeros, data.structure, jnp.asarray(_LITTLE))
+    args = here, model, noise, stage
+    rows = rows_of(zeros, args)
+    matrix = reduced_of(columns_of(args, zeros), rows, zeros, data.structure, jnp.asarray(_LITTLE))
 
     def nearly(vector: Unknowns) -> Unknowns:
         return solution_of(matrix, vector, data.structure)

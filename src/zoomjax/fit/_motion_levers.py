@@ -9,16 +9,18 @@ levers have their long tail. So that is guessed, as far as the tail is seen, and
 by how much the guess may be off.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from ._columns import Columns, Rows, Unknowns
 from ._motion_model import Levers, Model
 from ._motion_parallax import Spread
-from ._schur import Reduced, Unknowns, reduced, solution
+from ._schur import Reduced, reduced_of, solution
 from ._structure import Structure
 
 COMMON, COMMON_STD = 2.5, 1.25
@@ -51,12 +53,19 @@ def told_levers(model: Model, matrix: Reduced, units: Unknowns) -> Float[Array, 
     return jnp.sum(1 - jnp.minimum(variance / model.levers.std**2, 1))
 
 
-def common_lever(model: Model, jacobian: Any, units: Unknowns, structure: Structure) -> Common:
+def common_lever(
+    model: Model,
+    rows_at: Callable[[Unknowns], Rows],
+    of_rows: Columns,
+    units: Unknowns,
+    structure: Structure,
+) -> Common:
     """What the covariance lacks, as what levers have in common is a guess; 0 without levers.
 
     Args:
         model: the fitted one.
-        jacobian: of the rows by the unknowns.
+        rows_at: the rows, by the unknowns.
+        of_rows: their columns.
         units: of the unknowns.
         structure: which track and frame each view belongs to.
     """
@@ -65,8 +74,9 @@ def common_lever(model: Model, jacobian: Any, units: Unknowns, structure: Struct
     if model.levers is None:
         return Common(jnp.zeros(len(units.frames)), jnp.zeros_like(of_lens))
     equal = model.levers.mean_std / units.rays[:, 2]
-    seen = jacobian(still._replace(rays=still.rays.at[:, 2].set(equal)))
+    along = still._replace(rays=still.rays.at[:, 2].set(equal))
+    seen = jax.jvp(rows_at, (still,), (along,))[1]
     seen = seen._replace(rays=jnp.zeros_like(seen.rays))  # the prior is of what levers differ by
-    moved = solution(reduced(jacobian, seen, still, structure, jnp.zeros(())), still, structure)
+    moved = solution(reduced_of(of_rows, seen, still, structure, jnp.zeros(())), still, structure)
     lens = ravel_pytree(moved.lens)[0] * of_lens
     return Common(moved.frames[:, 0] * units.frames[:, 0] + lens[-1], lens)

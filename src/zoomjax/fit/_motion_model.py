@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 from ..lines.free_centre import AnyCentreLines
 from ..models.distortion_model import AbstractDistortionModel
 from ..models.zoom import AbstractZoom, with_parameters
+from ._columns import Unknowns
 from ._motion_start import Path, rotation_vector, shrunk_ray, turned
-from ._schur import Unknowns
 from ._structure import Structure
 
 

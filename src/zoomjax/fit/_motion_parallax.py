@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ._columns import Unknowns
 from ._motion_model import Data, Model, Noise, moved, units_of
 from ._motion_rows import residuals_of
-from ._schur import Unknowns
 from ._views import FAR
 
 _WILD = 5.0  # standard deviations, of a slope that is no chance: of a thing that moves

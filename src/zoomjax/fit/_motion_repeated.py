@@ -15,8 +15,6 @@ Views of a track may have errors in common, too: the track drifts, its point is 
 on a thing that moves. The same mean, of the scores of tracks, is then what variances are too small by.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,9 +24,11 @@ import scipy.sparse.csgraph
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
+from ._columns import Columns, Rows, over_views
 from ._motion_model import Data, Model, Noise, Stage, units_of
-from ._motion_rows import line_planes_of, rows_of
-from ._schur import Reduced, Rows, Unknowns, columns, lens_equations, reduced
+from ._motion_rows import columns_of, line_planes_of, rows_of
+from ._schur import Reduced, lens_equations, reduced_of
+from ._small_matrices import products
 from ._structure import Structure
 
 _NEAR = 0.01
@@ -58,10 +58,11 @@ def repeated(
 ) -> Float[Array, ""]:
     """How many points of lines count as one, beside what `noise` says of that; 1 if there is no line."""
     zeros = jax.tree.map(jnp.zeros_like, units_of(data, model, noise))
-    rows, jacobian = jax.linearize(lambda x: rows_of(x, (data, model, noise, stage)), zeros)
-    matrix = reduced(jacobian, rows, zeros, data.structure, jnp.asarray(_LITTLE))
+    args = data, model, noise, stage
+    rows, of_rows = rows_of(zeros, args), columns_of(args, zeros)
+    matrix = reduced_of(of_rows, rows, zeros, data.structure, jnp.asarray(_LITTLE))
     information, by_lens = lens_equations(matrix)
-    by_frame, _, of_lens = columns(jacobian, zeros)
+    by_frame, of_lens = of_rows.by_frame, of_rows.by_lens
     answer = by_lens.reshape(-1, 4, by_lens.shape[-1])[data.structure.line_frame]
     effect = of_lens.lines - jnp.einsum("lrf,lfp->lrp", by_frame.lines, answer)
     score = jnp.einsum("lrp,lr->lp", effect, rows.lines)
@@ -71,35 +72,38 @@ def repeated(
 
 
 def common_errors_of(
-    jacobian: Any, pull: Rows, matrix: Reduced, like: Unknowns, structure: Structure
+    of_rows: Columns, pull: Rows, matrix: Reduced, structure: Structure
 ) -> Float[Array, ""]:
     """The mean square of how tracks pull at the lens, over what independent views of noise 1 would do.
 
     Args:
-        jacobian: of the rows by the unknowns.
+        of_rows: the Jacobian's columns.
         pull: of each view, and of what is known of each ray, the derivative of its loss by its residual.
         matrix: the normal equations.
-        like: the unknowns' shapes.
         structure: which track and frame each view belongs to.
     """
     information, by_lens = lens_equations(matrix)
-    by_frame, by_ray, of_lens = columns(jacobian, like)
-    answer = by_lens.reshape(-1, 4, by_lens.shape[-1])[structure.frame]
-    effect = of_lens.views - jnp.einsum("vrf,vfp->vrp", by_frame.views, answer)
+    answer = by_lens.reshape(-1, 4, by_lens.shape[-1])
+    of_known, size, own = of_rows.by_ray.rays, by_lens.shape[-1], matrix.rays[0].shape[-1]
 
-    def of_tracks(one, other):
-        products = jnp.einsum("vri,vrj->vij", one, other)
-        return jax.ops.segment_sum(products, structure.track, structure.tracks)
+    def step(sums, number, there):
+        by_frame, by_ray, of_lens = of_rows.split(number, there)
+        of_frame = answer[structure.frame[number]]
+        effect = of_lens - sum(by_frame[..., i, None] * of_frame[:, None, i] for i in range(4))
+        beside = jnp.concatenate([effect, pull.views[number][..., None]], axis=-1)
+        track = structure.track[number]
+        found = products(effect, beside), products(by_ray, beside)
+        return tuple(
+            of.at[track].add(new, indices_are_sorted=True) for of, new in zip(sums, found, strict=True)
+        ), None
 
-    with_rays = jnp.einsum("tpi,tij->tpj", of_tracks(effect, by_ray.views), matrix.rays[0])
-    pull_ray = of_tracks(by_ray.views, pull.views[..., None])
-    if by_ray.rays is not None and pull.rays is not None:
-        pull_ray = pull_ray + jnp.einsum("tki,tk->ti", by_ray.rays, pull.rays)[..., None]
-    of_rays = jnp.concatenate([of_tracks(by_ray.views, effect), pull_ray], -1)
-    less = with_rays @ of_rays
-    told = of_tracks(effect, effect) - less[..., :-1]
-    score = of_tracks(effect, pull.views[..., None])[..., 0] - less[..., -1]
-    return _more_than_chance(score, told, information)
+    start = tuple(jnp.zeros((structure.tracks, n, size + 1)) for n in (size, own))
+    (told, of_rays), _ = over_views(len(structure.track), step, start)
+    with_rays = jnp.einsum("tip,tij->tpj", of_rays[..., :-1], matrix.rays[0])
+    if of_known is not None and pull.rays is not None:
+        of_rays = of_rays.at[..., -1].add(jnp.einsum("tki,tk->ti", of_known, pull.rays))
+    told = told - with_rays @ of_rays
+    return _more_than_chance(told[..., -1], told[..., :-1], information)
 
 
 def _more_than_chance(score, told, information):

@@ -15,27 +15,31 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..lines.best_line import line_normal
 from ..lines.stretch import radial_stretch
 from ..models.zoom import AbstractPriorZoom
+from ._columns import Columns, Rows, Unknowns, columns, derivatives, of_each
 from ._motion_model import Data, Model, Noise, Stage, moved, units_of
 from ._motion_start import turned
-from ._schur import Rows, Unknowns, columns, derivatives
 from ._views import CAUCHY, corrected, flattened, product, view_residual
 
 WRONG_LINE = 3.0
 """Times the noise: the RMS of a line's distances where its loss begins to flatten."""
-
-_CHUNK = 1024
-"""Views whose derivatives are computed together: what that takes stays in a core's cache."""
 
 _PIN = 1e3
 """Weight of what is redundant: log f of one frame beside the common factor is 0."""
 
 
 Args = tuple[Data, Model, Noise, Stage]
+
+
+class Counted(NamedTuple):
+    """What counts, in full. Otherwise there is a loss."""
+
+    views: Bool[Array, "view"]
+    lines: Bool[Array, "line"]
 
 
 class _Rows(NamedTuple):
@@ -73,13 +77,18 @@ def residuals_of(
     lever = jnp.zeros(data.structure.tracks) if lever is None else lever
     lever = lever if model.levers is None else lever + model.levers.value
 
-    def view(point, frame, track):
+    def view(number):
+        point, frame, track = (
+            data.points[number],
+            data.structure.frame[number],
+            data.structure.track[number],
+        )
         log_focal, coefficients, turning = rows.at(frame, point)
         ahead = product(model.path.rotation[frame], model.path.rays[track])
         given = log_focal, coefficients, rows.offset[frame], ahead, turning, lever[track]
         return _missed(data, model, point, *given)
 
-    views = jax.vmap(view)(data.points, data.structure.frame, data.structure.track)
+    views = of_each(len(data.points), jax.vmap(view))
     return jnp.where(data.there[:, None], views, 0)
 
 
@@ -149,25 +158,34 @@ def averaged(data: Data, model: Model) -> Float[Array, "track 3"]:
     """Each ray as the mean of the directions in which its views see it: a start, and near the best."""
     rows = _rows_of_frames(data, model)
 
-    def direction(point, frame):
+    def direction(number):
+        point, frame = data.points[number], data.structure.frame[number]
         log_focal, coefficients, turning = rows.at(frame, point)
         straight = corrected(point, coefficients, rows.offset[frame], model.distortion_model, data.scale)
         ahead = turned(jnp.concatenate([straight / jnp.exp(log_focal), jnp.ones(1)]), -turning)
         return product(model.path.rotation[frame].T, ahead) / jnp.linalg.norm(ahead)
 
-    seen = jax.vmap(direction)(data.points, data.structure.frame)
+    seen = of_each(len(data.points), jax.vmap(direction))
     rays = jax.ops.segment_sum(seen, data.structure.track, data.structure.tracks)
     length = jnp.linalg.norm(rays, axis=1, keepdims=True)
     return jnp.where(length > 0, rays / jnp.where(length > 0, length, 1), jnp.array([0.0, 0.0, 1.0]))
 
 
-def rows_of(unknowns: Unknowns, args: Args) -> Rows:
-    """All residuals, robust, in units of the noise; `unknowns` are steps in their `units_of`."""
+def rows_of(unknowns: Unknowns, args: Args, counted: Counted | None = None) -> Rows:
+    """All residuals, robust, in units of the noise; `unknowns` are steps in their `units_of`.
+
+    Without the loss if it is given which of them count.
+    """
     data, _, noise, _ = args
-    there = _there(unknowns, args)
-    views = residuals_of(data, there) / noise.points
-    squared = jnp.sum(views**2, axis=-1) / CAUCHY**2
-    return _other_rows(unknowns, args)._replace(views=views * flattened(squared)[:, None])
+    views = _with_loss(residuals_of(data, _there(unknowns, args)) / noise.points, counted and counted.views)
+    return _other_rows(unknowns, args, counted)._replace(views=views)
+
+
+def _with_loss(views, counted):
+    """Residuals of views, in units of the noise, with the loss or only those that count."""
+    if counted is not None:
+        return jnp.where(counted[..., None], views, 0)
+    return views * flattened(jnp.sum(views**2, axis=-1) / CAUCHY**2)[..., None]
 
 
 def _there(unknowns, args):
@@ -176,35 +194,35 @@ def _there(unknowns, args):
     return moved(model, jax.tree.map(jnp.multiply, unknowns, units_of(data, model, noise)))
 
 
-def _other_rows(unknowns, args):
+def _other_rows(unknowns, args, counted=None):
     """`rows_of` without the views."""
     data, model, noise, stage = args
     steps = jax.tree.map(jnp.multiply, unknowns, units_of(data, model, noise))
     there = moved(model, steps)
     lines = line_residuals_of(data, there)
-    of_lines = jnp.nan_to_num(line_squares_of(data, lines)) / (noise.lines * WRONG_LINE) ** 2
+    if counted is None:
+        of_lines = jnp.nan_to_num(line_squares_of(data, lines)) / (noise.lines * WRONG_LINE) ** 2
+        lines = lines * flattened(of_lines)[:, None]
+    else:
+        lines = jnp.where(counted.lines[:, None], lines, 0)
     return Rows(
         jnp.zeros((0, 2)),
-        weighed(data, noise, lines * flattened(of_lines)[:, None]),
+        weighed(data, noise, lines),
         about_frames(data, there.path, unknowns, steps, stage),
         about_lens(data, there, unknowns, stage),
         about_rays(there),
     )
 
 
-def columns_of(args: Args, unknowns: Unknowns) -> tuple[Rows, Rows, Rows]:
+def columns_of(args: Args, unknowns: Unknowns, counted: Counted | None = None) -> Columns:
     """The Jacobian's `columns` of `rows_of`.
 
     A view depends on the lens by way of its frame, and on rotation and ray by way of where its point is. So
     its derivatives by these few numbers are multiplied by what the unknowns do to them, which is known once
     for each frame and each ray.
     """
-    others = columns(jax.linearize(lambda x: _other_rows(x, args), unknowns)[1], unknowns)
-    views = _view_columns(unknowns, args)
-    ends = 4, 4 + unknowns.rays.shape[1]
-    parts = jnp.split(views, ends, axis=-1)
-    by_frame, by_ray, by_lens = (of._replace(views=part) for of, part in zip(others, parts, strict=True))
-    return by_frame, by_ray, by_lens
+    others = columns(jax.linearize(lambda x: _other_rows(x, args, counted), unknowns)[1], unknowns)
+    return others._replace(of_views=_view_columns(unknowns, args, counted))
 
 
 class _Cameras(NamedTuple):
@@ -217,8 +235,8 @@ class _Cameras(NamedTuple):
     rotation: Array
 
 
-def _view_columns(unknowns, args):
-    """(view, 2, unknown): the numbers of the frame, of the ray and of the lens."""
+def _view_columns(unknowns, args, counted):
+    """What gives those of views, by their numbers."""
     data, model, noise, _ = args
 
     def what_is_seen_by(unknowns):
@@ -232,8 +250,13 @@ def _view_columns(unknowns, args):
     parts = derivatives(change, unknowns)
     changes = jax.tree.map(lambda *of: jnp.concatenate(of, axis=-1), *parts)
 
-    def view(own):
-        point, there, frame, track = own
+    def view(number):
+        point, frame, track = (
+            data.points[number],
+            data.structure.frame[number],
+            data.structure.track[number],
+        )
+        counts = None if counted is None else counted.views[number]
         of_frames, of_rays, readout = zip(known, changes, strict=True)
         camera, by_camera = (jax.tree.map(lambda leaf: leaf[frame], of) for of in of_frames)
         (ray, lever), (by_ray, by_lever) = (jax.tree.map(lambda leaf: leaf[track], of) for of in of_rays)
@@ -244,8 +267,7 @@ def _view_columns(unknowns, args):
         gone, faster = jax.jvp(since_the_middle, (readout[0],), (jnp.ones(()),))
 
         def missed(*given):
-            views = _missed(data, model, point, *given) / noise.points
-            return views * flattened(jnp.sum(views**2) / CAUCHY**2)
+            return _with_loss(_missed(data, model, point, *given) / noise.points, counts)
 
         given = (
             camera.log_focal + gone[0],
@@ -273,10 +295,9 @@ def _view_columns(unknowns, args):
         )
         if model.levers is not None:
             found = found + by[5][:, None] * by_lever[None]
-        return jnp.where(there, found, 0)
+        return jnp.where(data.there[number], found, 0)
 
-    views = data.points, data.there, data.structure.frame, data.structure.track
-    return jax.lax.map(view, views, batch_size=_CHUNK)
+    return jax.vmap(view)
 
 
 def _combined(by, changes):

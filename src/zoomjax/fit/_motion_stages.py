@@ -12,26 +12,24 @@ from jax.flatten_util import ravel_pytree
 
 from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
+from ._columns import Unknowns
 from ._motion_levers import common_lever, guessed_levers, told_levers
 from ._motion_model import Model, Noise, Speed, Stage, moved, speed_of, units_of
 from ._motion_parallax import is_seen, parallax_of, spread_of
 from ._motion_repeated import common_errors_of, groups_of, repeated
 from ._motion_rows import (
     WRONG_LINE,
-    about_frames,
-    about_lens,
-    about_rays,
+    Counted,
     averaged,
     columns_of,
     line_residuals_of,
     line_squares_of,
     residuals_of,
     rows_of,
-    weighed,
 )
 from ._motion_start import STARTS, disagreement
 from ._normal_solver import damped_solver
-from ._schur import Rows, Schur, Unknowns, covariances, reduced
+from ._schur import Schur, covariances, reduced_of
 from ._views import CAUCHY, EXACT, MEDIAN_OF_SIZE, core_median
 from .result import RESULTS, ZoomFit, judged
 
@@ -201,25 +199,17 @@ def _described(data, model, noise, stage, result, steps):
     units = units_of(data, model, noise)
     zeros = jax.tree.map(jnp.zeros_like, units)
 
-    def plain(unknowns):  # without the loss: its efficiency is in `inflation`
-        steps = jax.tree.map(jnp.multiply, unknowns, units)
-        there = moved(model, steps)
-        views = residuals_of(data, there) / noise.points
-        lines = line_residuals_of(data, there)
-        return Rows(
-            jnp.where(inlier[:, None], views, 0),
-            weighed(data, noise, jnp.where(good[:, None], lines, 0)),
-            about_frames(data, there.path, unknowns, steps, stage),
-            about_lens(data, there, unknowns, stage),
-            about_rays(there),
-        )
-
     missed = residuals_of(data, model)
     squared = jnp.sum(missed**2, axis=-1) / (noise.points * CAUCHY) ** 2
     good = line_squares_of(data, line_residuals_of(data, model)) < (3 * WRONG_LINE * noise.lines) ** 2
     inlier = data.there & (squared < 9)  # beyond, the loss nearly ignores a view
-    rows, jacobian = jax.linearize(plain, zeros)
-    matrix = reduced(jacobian, rows, zeros, data.structure, jnp.asarray(0.0))
+    args, counted = (data, model, noise, stage), Counted(inlier, good)  # the loss is in `inflation`
+
+    def plain(unknowns):
+        return rows_of(unknowns, args, counted)
+
+    rows, of_rows = plain(zeros), columns_of(args, zeros, counted)
+    matrix = reduced_of(of_rows, rows, zeros, data.structure, jnp.asarray(0.0))
     own, lens, both = covariances(matrix, frames)
     of_lens = ravel_pytree(units.lens)[0]
     lens = lens * jnp.outer(of_lens, of_lens)
@@ -229,13 +219,13 @@ def _described(data, model, noise, stage, result, steps):
     free = count / (count - data.unknowns - len(lens) - told_levers(model, matrix, units))
     flat = jnp.where(inlier, 1 / (1 + squared), 0)  # of the loss: its slope over the residual
     pull = flat[:, None] * missed / noise.points
-    common = common_errors_of(jacobian, rows._replace(views=pull), matrix, zeros, data.structure)
+    common = common_errors_of(of_rows, rows._replace(views=pull), matrix, data.structure)
     common = common / jnp.mean(flat**2, where=inlier) ** 2 / (_INFLATION * free)
     inflation = _INFLATION * free * jnp.where(common > _AS_GOOD, common, 1)
     zoom_size = ravel_pytree(model.zoom.parameters)[0].size
     lens, log_variance = lens * inflation, log_variance * inflation
     if model.levers is not None:
-        common = common_lever(model, jacobian, units, data.structure)
+        common = common_lever(model, plain, of_rows, units, data.structure)
         lens = lens + jnp.outer(common.lens, common.lens)
         log_variance = log_variance + common.log_focal**2
     joint, log_std = lens[:-2, :-2], jnp.sqrt(log_variance)

@@ -16,43 +16,12 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
+from ._columns import Columns, Rows, Unknowns, columns, over_views
 from ._normal_solver import AbstractNormalSolver
 from ._small_matrices import gram, inverses, line_products, products, times
 from ._structure import Structure
-
-
-class Unknowns(NamedTuple):
-    """What is solved for.
-
-    Attributes:
-        frames: four numbers a frame: log f, and a rotation vector.
-        rays: two numbers a ray, or three: the third is its lever.
-        lens: a tree of arrays.
-    """
-
-    frames: Float[Array, "frame 4"]
-    rays: Float[Array, "track own"]
-    lens: PyTree
-
-
-class Rows(NamedTuple):
-    """Residuals: of the views, and of what is known beforehand of frames and lens.
-
-    Attributes:
-        views: of each view; they depend on its frame, its ray and the lens.
-        lines: of each line; they depend on its frame and the lens.
-        frames: of each frame, a number for each of its own; each depends on that one and the lens.
-        lens: of the lens alone.
-        rays: of each ray alone; None if nothing is known beforehand.
-    """
-
-    views: Float[Array, "view 2"]
-    lines: Float[Array, "line some"]
-    frames: Float[Array, "frame 4"]
-    lens: Float[Array, "row"]
-    rays: Float[Array, "track known"] | None = None
 
 
 class Reduced(NamedTuple):
@@ -90,118 +59,108 @@ def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, dam
 
 
 def reduced_of(
-    of_rows: tuple[Rows, Rows, Rows], rows: Rows, like: Unknowns, structure: Structure, damping: Array
+    of_rows: Columns, rows: Rows, like: Unknowns, structure: Structure, damping: Array
 ) -> Reduced:
     """The same of the Jacobian's `columns`."""
-    by_frame, by_ray, by_lens = of_rows
-    views, by_track = rows.views[..., None], structure.track
-
-    def summed(of_views):
-        return jax.ops.segment_sum(of_views, by_track, structure.tracks, indices_are_sorted=True)
-
-    of_rays = summed(products(by_ray.views, by_ray.views)) + damping * jnp.eye(like.rays.shape[1])[None]
-    coupling = products(by_frame.views, by_ray.views)
-    to_lens = summed(products(by_lens.views, by_ray.views))
-    right_ray = summed(products(by_ray.views, views))
+    _, by_frame, by_ray, by_lens = of_rows
+    own, size = like.rays.shape[1], by_lens.lens.shape[1]
+    of_frames, of_rays, of_lens, coupling = _of_views(of_rows, rows, own, size, structure)
+    of_rays, to_lens, right_ray = jnp.split(of_rays, (own, own + size), axis=-1)
+    of_rays = of_rays + damping * jnp.eye(own)[None]
     if by_ray.rays is not None and rows.rays is not None:
         of_rays = of_rays + jnp.einsum("tki,tkj->tij", by_ray.rays, by_ray.rays)
         right_ray = right_ray + jnp.einsum("tki,tk->ti", by_ray.rays, rows.rays)[..., None]
     inverse, root = inverses(of_rays)
-    solved, lens_solved = times(inverse, right_ray), times(inverse, to_lens.swapaxes(1, 2))
+    beside_rays = jnp.concatenate([to_lens, right_ray], axis=-1).swapaxes(1, 2)
+    less = jnp.einsum("tik,tjk->ij", times(beside_rays, inverse)[:, :size], beside_rays)
 
-    border = products(by_frame.views, by_lens.views) - times(coupling, lens_solved[by_track])
-    right = (products(by_frame.views, views) - times(coupling, solved[by_track]))[..., 0]
-    extra = jnp.eye(4)[None] * (by_frame.frames**2 + damping)[:, :, None]
-    extra = extra.at[structure.line_frame].add(line_products(by_frame.lines, by_frame.lines))
-    line_border = line_products(by_frame.lines, by_lens.lines)
-    line_right = line_products(by_frame.lines, rows.lines[..., None])[..., 0]
-    own = products(by_frame.views, by_frame.views)
-    diagonal, above = _frame_blocks(own, times(coupling, root[by_track]), extra, structure)
-    corner = by_lens.lens.T @ by_lens.lens + damping * jnp.eye(by_lens.lens.shape[1])
-    for part in (by_lens.views, by_lens.lines, by_lens.frames):
+    known = _padded(by_frame.frames**2 + damping, structure, 1.0)  # where there is no frame
+    known = jnp.eye(4)[None] * known.reshape(-1, 1, 4)
+    of_lines = jnp.concatenate([by_frame.lines, by_lens.lines, rows.lines[..., None]], axis=-1)
+    of_lines = line_products(by_frame.lines, of_lines)
+    of_frames = of_frames.at[structure.line_frame].add(of_lines).at[..., :4].add(known)
+    diagonal, above, beside = _frame_blocks(of_frames, coupling, root, beside_rays, structure)
+    about = jnp.concatenate([by_lens.frames, rows.frames[..., None]], axis=-1)
+    beside = beside + _padded(by_frame.frames[..., None] * about, structure)
+
+    corner = by_lens.lens.T @ by_lens.lens + damping * jnp.eye(size)
+    corner = corner + of_lens[:, :size] - less[:, :size]
+    right_lens = by_lens.lens.T @ rows.lens + of_lens[:, size] - less[:, size]
+    for part, of in ((by_lens.lines, rows.lines), (by_lens.frames, rows.frames)):
         corner = corner + jnp.einsum("vri,vrj->ij", part, part)
-    corner = corner - jnp.einsum("tik,tkj->ij", to_lens, lens_solved)
-    right_lens = by_lens.lens.T @ rows.lens - jnp.einsum("tij,tj->i", to_lens, solved[..., 0])
-    for part, of in zip((by_lens.views, by_lens.lines, by_lens.frames), rows[:3], strict=True):
         right_lens = right_lens + jnp.einsum("vri,vr->i", part, of)
-    right = _by_block(right, structure.frame, structure)
-    right = right + _by_block(line_right, structure.line_frame, structure)
-    own_right = right + _padded(by_frame.frames * rows.frames, structure)
-    border = _by_block(border, structure.frame, structure)
-    known = _padded(by_frame.frames[..., None] * by_lens.frames, structure)
     return Reduced(
         diagonal,
         above,
-        border + _by_block(line_border, structure.line_frame, structure) + known,
+        beside[..., :size],
         corner,
-        own_right,
+        beside[..., size],
         right_lens,
-        (inverse, coupling, to_lens, right_ray[..., 0]),
+        (inverse, coupling, to_lens.swapaxes(1, 2), right_ray[..., 0]),
     )
 
 
-def columns(jacobian: Any, like: Unknowns) -> tuple[Rows, Rows, Rows]:
-    """The Jacobian's columns of each row: by its frame, by its ray and by the lens; the last axis."""
-    by_frame, by_ray, by_lens = derivatives(jacobian, like)
-    own = jnp.diagonal(by_frame.frames, axis1=1, axis2=2)
-    return by_frame._replace(frames=own), by_ray, by_lens
+def _of_views(of_rows, rows, own, size, structure):
+    """What views add to frames, rays and lens, each beside lens and right-hand side; and their coupling."""
+    frames = structure.block * structure.blocks
+    shapes = (frames, 4, 4 + size + 1), (structure.tracks, own, own + size + 1), (size, size + 1)
 
-
-def derivatives(jacobian: Any, like: Unknowns) -> tuple[Any, Any, Any]:
-    """What each number of all frames, each of all rays, and each of the lens does; the last axis.
-
-    That is enough for what belongs to one frame and one ray, at most.
-    """
-    lens, unravel = ravel_pytree(like.lens)
-    ray = slice(4, 4 + like.rays.shape[1])
-
-    def column(along):
-        frames, rays = (
-            jnp.broadcast_to(along[part], of.shape)
-            for part, of in ((slice(4), like.frames), (ray, like.rays))
+    def step(sums, number, there):
+        by_frame, by_ray, by_lens = of_rows.split(number, there)
+        beside = jnp.concatenate([by_lens, rows.views[number][..., None]], axis=-1)
+        frame, track = structure.frame[number], structure.track[number]
+        of_frame, of_ray = (
+            products(of, jnp.concatenate([of, beside], axis=-1)) for of in (by_frame, by_ray)
         )
-        return jacobian(Unknowns(frames, rays, unravel(along[ray.stop :])))
+        sums = (
+            sums[0].at[frame].add(of_frame),
+            sums[1].at[track].add(of_ray, indices_are_sorted=True),
+            sums[2] + jnp.einsum("vri,vrj->ij", by_lens, beside),
+        )
+        return sums, products(by_frame, by_ray)
 
-    # One after the other: all at once take longer, as what they need does not fit a cache.
-    out = jax.lax.map(column, jnp.eye(ray.stop + lens.size))
-
-    def those(part):
-        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf[part], 0, -1), out)
-
-    return those(slice(4)), those(ray), those(slice(ray.stop, None))
+    sums, coupling = over_views(len(structure.track), step, tuple(jnp.zeros(shape) for shape in shapes))
+    return *sums, coupling
 
 
-def _frame_blocks(own, halves, extra, structure):
-    """The frames' matrix by blocks: their own parts, less what the eliminated rays couple.
+def _frame_blocks(of_frames, coupling, root, beside_rays, structure):
+    """The frames' matrix and what is beside it, by blocks: their own parts, less what rays couple.
 
     A track begins in a block and ends in it or in the next: it couples frames of these two, by the products
-    of its `halves`.
+    of its halves: what couples each of its views, times the `root` of its ray.
     """
-    size, blocks, n = structure.block, structure.blocks, 4 * structure.block
-    each = jnp.zeros((blocks * size, 4, 4), own.dtype).at[structure.frame].add(own)
-    filled = jnp.broadcast_to(jnp.eye(4), (blocks * size - len(extra), 4, 4))  # no frames there
-    each = (each + jnp.concatenate([extra, filled])).reshape(blocks, size, 4, 4)
-    place = jnp.arange(size)
-    diagonal = jnp.zeros((blocks, size, 4, size, 4), own.dtype)
-    diagonal = diagonal.at[:, place, :, place].set(each.swapaxes(0, 1)).reshape(blocks, n, n)
+    size, blocks, most, own = structure.block, structure.blocks, structure.most, root.shape[2]
+    n, reach, place = 4 * size, size if blocks == 1 else 2 * size, jnp.arange(size)
     within = structure.frame - structure.begin * size
-    reach = size if blocks == 1 else 2 * size
 
-    def of_block(members):
-        def there(values, other):
+    def step(before, block):
+        members, starting, of_frames = block
+
+        def there(values, other=0):
             return values.at[members].get(mode="fill", fill_value=other)
 
-        rows = jnp.zeros((reach, 4, structure.most, halves.shape[2]), own.dtype)
-        here = there(structure.place, structure.most)  # where there is none, it is dropped
-        rows = rows.at[there(within, 0), :, here].set(there(halves, 0), mode="drop")
-        return gram(rows.reshape(4 * reach, -1))
+        halves = times(there(coupling), root[there(structure.track)])
+        here = there(structure.place, most)  # where there is none, it is dropped
+        rows = jnp.zeros((reach, 4, most, own), root.dtype)
+        rows = rows.at[there(within), :, here].set(halves, mode="drop").reshape(4 * reach, -1)
+        of_rays = (of.at[starting].get(mode="fill", fill_value=0) for of in (beside_rays, root))
+        of_rays = times(*of_rays).swapaxes(1, 2).reshape(most * own, -1)
+        matrix, beside = gram(rows), rows @ of_rays
+        left = jnp.zeros((size, 4, size, 4), root.dtype)
+        left = left.at[place, :, place].set(of_frames[..., :4]).reshape(n, n) - before[0]
+        right = of_frames[..., 4:].reshape(n, -1) - before[1]
+        found = left - matrix[:n, :n], -matrix[:n, n:], right - beside[:n]
+        return (matrix[n:, n:], beside[n:]), found
 
-    coupled = jax.lax.map(of_block, structure.members)
-    diagonal = diagonal - coupled[:, :n, :n]
+    by_block = of_frames.reshape(blocks, size, *of_frames.shape[1:])
+    parts = structure.members, structure.starting, by_block
+    columns = beside_rays.shape[1]
     if blocks == 1:
-        return diagonal, 0 * diagonal  # no constant, which XLA would fold for seconds
-    diagonal = diagonal.at[1:].add(-coupled[:-1, n:, n:])
-    return diagonal, -coupled[:, :n, n:]
+        _, (diagonal, _, beside) = step((0.0, 0.0), jax.tree.map(lambda leaf: leaf[0], parts))
+        above = 0 * diagonal  # no constant, which XLA would fold for seconds
+        return diagonal[None], above[None], beside[None]
+    start = jnp.zeros((n, n), root.dtype), jnp.zeros((n, columns), root.dtype)
+    return jax.lax.scan(step, start, parts)[1]
 
 
 def _by_block(values, frame, structure):
@@ -211,10 +170,11 @@ def _by_block(values, frame, structure):
     return total.reshape(structure.blocks, 4 * structure.block, *values.shape[2:])
 
 
-def _padded(values, structure):
+def _padded(values, structure, filling=0.0):
     """Numbers of frames, by blocks."""
     more = ((0, structure.block * structure.blocks - len(values)), *((0, 0),) * (values.ndim - 1))
-    return jnp.pad(values, more).reshape(structure.blocks, 4 * structure.block, *values.shape[2:])
+    values = jnp.pad(values, more, constant_values=filling)
+    return values.reshape(structure.blocks, 4 * structure.block, *values.shape[2:])
 
 
 def _factored(matrix):
@@ -330,7 +290,7 @@ class Schur(AbstractNormalSolver):
     """
 
     structure: Structure
-    columns_at: Callable[[Unknowns], tuple[Rows, Rows, Rows]]
+    columns_at: Callable[[Unknowns], Columns]
 
     def step(self, at: Unknowns, jacobian: Any, rows: Rows, damping: Array) -> Unknowns:
         """The unknowns of least squares."""

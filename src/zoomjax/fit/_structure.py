@@ -19,6 +19,7 @@ class Structure(eqx.Module):
         place: of each view's track, among those that begin in the same block.
         begin: the block in which its track begins.
         members: the views of the tracks that begin in each block; `NONE` pads.
+        starting: these tracks, by their places.
         line_frame: the frame of each line.
         tracks: their number.
         block: frames in a block: at least as many as a track is long, from its first to its last.
@@ -31,6 +32,7 @@ class Structure(eqx.Module):
     place: Int[Array, "view"]
     begin: Int[Array, "view"]
     members: Int[Array, "block some"]
+    starting: Int[Array, "block track"]
     line_frame: Int[Array, "line"]
     tracks: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
@@ -57,9 +59,10 @@ def structure_of(
     count = np.bincount(begin, minlength=-(-frames // block))
     place = np.empty(len(tracks), int)
     place[order] = places(count)
-    of_views = track, frame, place[track], begin[track], _members(begin[track], len(count))
+    of_views = track, frame, place[track], begin[track]
+    of_blocks = (_members(of, len(count)) for of in (begin[track], begin))
     return Structure(
-        *(jnp.asarray(a, jnp.int32) for a in (*of_views, line_frame)),
+        *(jnp.asarray(a, jnp.int32) for a in (*of_views, *of_blocks, line_frame)),
         tracks=len(tracks),
         block=block,
         blocks=len(count),
@@ -68,7 +71,7 @@ def structure_of(
 
 
 def _members(begin, blocks):
-    """The numbers of the views of each block."""
+    """The numbers of the views, or of the tracks, of each block."""
     count = np.bincount(begin, minlength=blocks)
     order = np.argsort(begin, kind="stable")
     members = np.full((blocks, count.max()), NONE)
@@ -89,7 +92,11 @@ def padded(structure: Structure) -> Structure:
     """The structure with more views, which belong to no block, and more tracks, to which these belong."""
     more = bucket(len(structure.track)) - len(structure.track)
     last = structure.tracks  # at least one more
-    wider = bucket(structure.members.shape[1]) - structure.members.shape[1]
+
+    def wider(members):
+        more = bucket(members.shape[1]) - members.shape[1]
+        return jnp.asarray(np.pad(members, ((0, 0), (0, more)), constant_values=NONE))
+
     return Structure(
         *(
             jnp.asarray(np.pad(values, (0, more), constant_values=filling))
@@ -100,7 +107,8 @@ def padded(structure: Structure) -> Structure:
                 (structure.begin, structure.blocks),
             )
         ),
-        members=jnp.asarray(np.pad(structure.members, ((0, 0), (0, wider)), constant_values=NONE)),
+        members=wider(structure.members),
+        starting=wider(structure.starting),
         line_frame=structure.line_frame,
         tracks=bucket(structure.tracks + 1),
         block=structure.block,
