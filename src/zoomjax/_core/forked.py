@@ -18,7 +18,8 @@ from typing import Any
 def import_ahead(module: str) -> None:
     """Begin to import a module for processes that `process_context` will begin: for programs of ours alone.
 
-    It does not wait. The server ends with this process.
+    It does not wait. The server ends with this process. Where it cannot begin, as without a folder for
+    temporary files whose path is short enough for a socket, processes are begun anew.
     """
     if sys.platform != "linux" or _SERVED:
         return
@@ -26,6 +27,8 @@ def import_ahead(module: str) -> None:
     held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is for this process
     try:
         forkserver.ensure_running()
+    except OSError:
+        return
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, held)
     _SERVED.append(module)
