@@ -20,11 +20,11 @@ import numpy as np
 import psutil
 
 from zoomjax.app.demo import write_photos
+from zoomjax.app.drawings import drawing
 from zoomjax.app.focal_sources import lines_of
 from zoomjax.app.image_calibration import ImageCalibration, calibrate_images
 from zoomjax.app.image_job import ImageJob
 from zoomjax.app.model_choice import WantedModel
-from zoomjax.app.pictures import pictures
 from zoomjax.app.report import report
 from zoomjax.io.exif import exif_with_focal
 from zoomjax.io.photo import read_focal
@@ -92,9 +92,12 @@ def run(photos: Path, cache: Path, out: Path) -> tuple[ImageCalibration, Watch]:
     job = ImageJob((str(photos),), workers=workers, cache=cache, model=WantedModel("polynomial"))
     done = calibrate_images(job, stage=watch.stage)
     watch.stage("Making the report")
-    page = report(done.calibration, done, pictures=pictures(done))
-    watch.stage("Drawing the lines and writing the results")
-    done.write(out, pages={"report.html": page}, overwrite=True)
+    out.mkdir()
+    with drawing(done, out / "lines") as drawn:
+        page = report(done.calibration, done, pictures=drawn.pictures())
+        watch.stage("Drawing the lines and writing the results")
+        drawn.wait()
+    done.calibration.make(out, about=done.about(), pages={"report.html": page})
     watch.end()
     return done, watch
 
