@@ -126,6 +126,8 @@ def test_colours_are_not_multiplied_by_transparency(rng, tmp_path, compression):
 
 @pytest.mark.parametrize("dtype", [bool, np.uint8, np.uint16, np.uint32])
 def test_grey_in_which_white_is_0_does_not_become_a_negative(rng, tmp_path, dtype):
+    if dtype is np.uint32 and int(cv2.__version__.partition(".")[0]) < 5:
+        pytest.skip("OpenCV cannot read 32-bit whole numbers before version 5")
     most = 1 if dtype is bool else np.iinfo(dtype).max
     image = rng.integers(0, most, (30, 48), endpoint=True).astype(dtype)
     tifffile.imwrite(tmp_path / "a.tif", image, photometric="miniswhite")
