@@ -8,7 +8,7 @@ from jax.flatten_util import ravel_pytree
 
 from zoomjax.fit import _columns
 from zoomjax.fit._columns import Rows, Unknowns, columns
-from zoomjax.fit._schur import Schur, covariances, reduced
+from zoomjax.fit._schur import Schur, covariances, reduced_of
 from zoomjax.fit._structure import structure_of
 
 
@@ -73,7 +73,8 @@ def test_covariances_are_blocks_of_the_dense_inverse(rng, levers):
     flat, unravel = ravel_pytree(like)
     dense = np.asarray(jax.jacfwd(lambda x: ravel_pytree(jacobian(unravel(x)))[0])(flat))
     inverse = np.linalg.inv(dense.T @ dense)
-    matrix = jax.jit(lambda: reduced(jacobian, rows, like, structure, jnp.asarray(0.0)))()
+    of_rows = columns(jacobian, like)
+    matrix = jax.jit(lambda: reduced_of(of_rows, rows, like, structure, jnp.asarray(0.0)))()
     own, lens, both = covariances(matrix, 21)
     for frame in range(21):
         here = slice(4 * frame, 4 * frame + 4)

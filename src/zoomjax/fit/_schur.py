@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
-from ._columns import Columns, Rows, Unknowns, columns, over_views
+from ._columns import Columns, Rows, Unknowns, over_views
 from ._normal_solver import AbstractNormalSolver
 from ._small_matrices import gram, inverses, line_products, products, times
 from ._structure import Structure
@@ -45,23 +45,18 @@ class Reduced(NamedTuple):
     rays: tuple[Array, Array, Array, Array]
 
 
-def reduced(jacobian: Any, rows: Rows, like: Unknowns, structure: Structure, damping: Array) -> Reduced:
-    """The normal equations of ``jacobian x = rows``, with `damping` added to the diagonal.
+def reduced_of(
+    of_rows: Columns, rows: Rows, like: Unknowns, structure: Structure, damping: Array
+) -> Reduced:
+    """The normal equations of a Jacobian's columns times x being the rows.
 
     Args:
-        jacobian: maps `Unknowns` to `Rows`.
+        of_rows: the Jacobian's columns.
         rows: the right-hand side.
         like: the unknowns' shapes.
         structure: which frame each view belongs to.
         damping: added to each unknown's diagonal entry.
     """
-    return reduced_of(columns(jacobian, like), rows, like, structure, damping)
-
-
-def reduced_of(
-    of_rows: Columns, rows: Rows, like: Unknowns, structure: Structure, damping: Array
-) -> Reduced:
-    """The same of the Jacobian's `columns`."""
     _, by_frame, by_ray, by_lens = of_rows
     own, size = like.rays.shape[1], by_lens.lens.shape[1]
     of_frames, of_rays, of_lens, coupling = _of_views(of_rows, rows, own, size, structure)
