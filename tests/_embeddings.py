@@ -104,7 +104,7 @@ def fit():
 
 def squared(small):
     """R^T R: what is differentiable of compressed lines; R itself is one of many roots."""
-    return jnp.einsum("lri,lrj->lij", small.triangle, small.triangle)
+    return jnp.einsum("lri,lrj->lij", small.triangle, small.triangle, precision="highest")
 
 
 def numbers(fit):

@@ -8,17 +8,6 @@ from zoomjax._core.products import EXACT
 
 from .. import _embeddings
 
-EXACT_ROWS = (
-    "warp_image",
-    "residuals",
-    "frame_energy",
-    "global_energy",
-    "frame_rms",
-    "focal_from_planes",
-    "focal_from_lines",
-)
-"""Those whose own tests would not notice, as they are in float64."""
-
 
 def products(jaxpr):
     """All products of matrices in a program, and in those that it calls."""
@@ -50,9 +39,7 @@ def test_a_product_that_is_rounded_is_found():
     assert not rounded(lambda a: jnp.matmul(a, a, precision=EXACT), matrix)
 
 
-@pytest.mark.parametrize(
-    "row", [row for row in _embeddings.ROWS if row.name in EXACT_ROWS], ids=lambda row: row.name
-)
+@pytest.mark.parametrize("row", _embeddings.ROWS, ids=lambda row: row.name)
 def test_products_are_exact(row):
     subject, x = row.subject(), row.x()
     assert not rounded(lambda x: row.function(subject, x), x)

@@ -22,6 +22,7 @@ import jax.extend.core
 from jax.core import eval_context
 
 from .kept import kept
+from .products import exact_products
 
 _PLAINLY = {
     "xla_cpu_use_fusion_emitters": False,
@@ -63,12 +64,14 @@ def program(
 
     Inside of ``jit``, ``vmap`` and ``grad`` the function is a part of another program, with the settings of
     that one. XLA's own hold on a GPU, and where ``XLA_FLAGS`` or the version of JAX says otherwise.
+    Products of float32 matrices have all digits everywhere.
 
     Args:
         function: what to compile.
         light: whether its work is small for small arguments.
         optimised: whether its work is so much that XLA's own settings pay.
     """
+    function = exact_products(function)
     plain = eqx.filter_jit(function)
 
     @functools.wraps(function)

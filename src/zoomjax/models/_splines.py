@@ -52,7 +52,8 @@ def natural_basis(
     """The cardinal natural splines at x, between the first and the last knot."""
     index, share, width = place(knots, x)
     bent = at_ends(knots, index, (1 - share) ** 3 - (1 - share), share**3 - share)
-    return at_ends(knots, index, 1 - share, share) + width**2 / 6 * (bent @ curvature)
+    bend = width**2 / 6 * jnp.matmul(bent, curvature, precision="highest")
+    return at_ends(knots, index, 1 - share, share) + bend
 
 
 def natural_controls(

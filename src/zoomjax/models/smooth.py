@@ -201,7 +201,8 @@ class SmoothZoom(AbstractPriorZoom):
         powers = inverse_powers(self.focal_ref, focal_range, self.degree)
         legendre = jnp.asarray(_in_powers(self.degree), powers.controls.dtype)
         controls = jnp.einsum("pcj,bj->pcb", powers.controls, legendre, precision="highest")
-        return Pieces(controls, powers.ends, powers.focal_of, jnp.abs(legendre) @ powers.size)
+        size = jnp.matmul(jnp.abs(legendre), powers.size, precision="highest")
+        return Pieces(controls, powers.ends, powers.focal_of, size)
 
     def standardised(self) -> Float[Array, "row"]:
         """The parameters, whitened by their prior."""

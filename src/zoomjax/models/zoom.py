@@ -92,7 +92,8 @@ class AbstractLinearZoom(AbstractZoom):
             return None
         parameters = jnp.asarray(_fitted(self))
         controls = jnp.einsum("pcb,bt->pct", basis.controls, parameters, precision="highest")
-        return Pieces(controls, basis.ends, basis.focal_of, (1 + basis.size) @ jnp.abs(parameters))
+        size = jnp.matmul(1 + basis.size, jnp.abs(parameters), precision="highest")
+        return Pieces(controls, basis.ends, basis.focal_of, size)
 
 
 def one_focal(focal: ScalarLike) -> ScalarLike:
@@ -119,7 +120,7 @@ def number_of_coefficients(zoom: AbstractZoom) -> int:
 def _combined(basis, parameters):
     """``basis @ parameters``; few functions are written out, which XLA fuses with what uses them."""
     if basis.shape[0] > _WRITTEN_OUT:
-        return basis @ parameters
+        return jnp.matmul(basis, parameters, precision="highest")
     coefficients = basis[0] * parameters[0]
     for value, row in zip(basis[1:], parameters[1:], strict=True):
         coefficients = coefficients + value * row

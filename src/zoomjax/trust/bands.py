@@ -28,6 +28,7 @@ from jaxtyping import Array, Float, Num, PyTree, ScalarLike
 from .._core.arguments import kinds_checked
 from .._core.arrays import as_jax
 from .._core.fields import check_positive, real_argument
+from .._core.products import exact_products
 from .._core.programs import light_program, used_once
 from .._core.types import AnyArray, Coefficients, Focal, Points, traced
 from ..fit.result import ZoomFit
@@ -99,6 +100,7 @@ Focals = Num[AnyArray | ScalarLike, "*focal"]
 
 
 @kinds_checked
+@exact_products
 def std_of(fit: ZoomFit, function: Callable[[ZoomLens], PyTree]) -> PyTree:
     """Standard deviations of anything computed from a fitted lens.
 
