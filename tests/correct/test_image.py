@@ -129,6 +129,28 @@ def test_against_an_opencv_camera(rng):
     assert difference.max() <= 1
 
 
+@pytest.mark.parametrize("rows", [1, 25, 50])  # of 100: the last band of 108 overlaps that before it
+@pytest.mark.parametrize("border", ["constant", "replicate"])
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+@pytest.mark.parametrize(
+    ("dtype", "channels"), [("float64", (3,)), ("uint8", (3,)), ("float16", (2,)), ("int16", ())]
+)
+def test_bands_of_rows_are_parts_of_one_image(
+    rng, monkeypatch, rows, border, interpolation, dtype, channels
+):
+    image = smooth(rng, (*SIZE[::-1], *channels), dtype)
+    how = {"keep": "all", "size": (100, 108), "interpolation": interpolation, "border": border}
+    whole = zj.undistort_image(image, PINCUSHION, **how)
+    monkeypatch.setattr("zoomjax.correct.image._BAND", 100 * rows)
+    parts = zj.undistort_image(image, PINCUSHION, **how)
+    assert parts.dtype == dtype
+    assert parts.shape == (108, 100, *channels)
+    unit = 1 if np.dtype(dtype).kind == "f" else np.iinfo(dtype).max
+    difference = np.abs(parts.astype(float) - whole.astype(float)) / unit
+    assert difference.max() <= 0.005  # 1/32 px, where a rounding of a position decides
+    assert (difference > 1e-5).mean() < 0.02
+
+
 @pytest.mark.parametrize("d", [bent(0.15, -0.05, size=(960, 540)), bent(-0.08, 0.01, size=(960, 540))])
 def test_lines_come_out_straight(d):
     width, height = 960, 540

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from .._core.files import refuse_existing, refuse_inputs
 from .._core.text import plain
 from ..correct.framing import check_keep
-from ..correct.image import check_sampling
+from ..correct.sampler import check_sampling
 from ..interop.database import LensTable, find_lenses, one_named
 from ..interop.library import library_lens, table_for
 from ..interop.matching import match_lens

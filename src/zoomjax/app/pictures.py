@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ..correct.framing import Framing, frame_output
-from ..correct.image import border_values, checked_image, position_map, remap
+from ..correct.image import checked_image, position_map
+from ..correct.sampler import border_values, remap
 from ..detect.sources import shrunk
 from ..models.distortion import Distortion
 from .choice import colour_limit

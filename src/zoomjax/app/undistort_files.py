@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 from .._core.files import refuse_existing, refuse_inputs, refuse_links
 from .._core.text import reason
 from ..correct.framing import Framing, check_keep
-from ..correct.image import check_sampling
 from ..correct.photo import Correction, corrected_before, photo_focal
+from ..correct.sampler import check_sampling
 from ..io.focal_table import read_focal_table
 from ..io.metadata import geometry_of, work_of
 from ..io.photo import read_metadata

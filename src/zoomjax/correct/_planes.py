@@ -14,9 +14,10 @@ from ..io.pyav import av
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
 from .framing import Framing
-from .image import position_map, remap
+from .image import position_map
 from .maps import OUTSIDE, Plane
 from .redistort import redistortion_map
+from .sampler import remap
 
 _PACKED = {
     **{"nv12": "yuv420p", "nv21": "yuv420p", "p010le": "yuv420p10le", "p012le": "yuv420p12le"},

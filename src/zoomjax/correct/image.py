@@ -1,16 +1,16 @@
 """Correction of images with OpenCV: a map of source positions, made cheaply, and `cv2.remap`.
 
 Per image: the polynomial for the inverse radial function (`_inverse_polynomial.fit_inverse`), or the exact
-inverse where that is not accurate to 0.01 px; one pass over the output's pixels for the map; one
-`cv2.remap`.
+inverse where that is not accurate to 0.01 px; then, for one band of rows after the other, a map and
+`cv2.remap`, so that no map is larger than a cache.
 Maps are float32: fixed-point ones take longer to make than they save, and round to 1/32 px.
 """
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import TypeVar
 
-import cv2
 import numpy as np
 from jaxtyping import Shaped
 
@@ -24,31 +24,18 @@ from ..models.sizes import (
     checked_distortion,
     lens_for_size,
 )
-from ._inverse_polynomial import fit_inverse, fold_radius
+from ._inverse_polynomial import RadialInverse, fit_inverse, fold_radius
 from .framing import LARGEST, Framing, check_framing, frame_output
 from .maps import OUTSIDE, Plane, source_positions
+from .sampler import KNOWN, WIDE, WORKING, border_values, check_sampling, sampler
 
-_INTERPOLATION = {
-    "nearest": cv2.INTER_NEAREST,
-    "linear": cv2.INTER_LINEAR,
-    "cubic": cv2.INTER_CUBIC,
-    "lanczos": cv2.INTER_LANCZOS4,
-}
-_WIDE = ("cubic", "lanczos")
-"""Interpolations that reach over more than the pixels next to a position."""
+Item = TypeVar("Item")
 
-_BORDER = {
-    "constant": cv2.BORDER_CONSTANT,
-    "replicate": cv2.BORDER_REPLICATE,
-    "reflect": cv2.BORDER_REFLECT_101,
-}
 _MARGIN = 8.0
 """px beyond the image's corner that an interpolation (Lanczos: 4) may still reach back from."""
 
-_WORKING = {"bool": "uint8", "int8": "int16", "int32": "float64", "uint32": "float64", "float16": "float32"}
-"""What `cv2.remap` does not know is computed in a type that holds all of its values."""
-
-_KNOWN = ("uint8", "uint16", "int16", "float32", "float64")
+_BAND = 2**19
+"""Pixels of a band of rows, whose positions stay in a cache."""
 
 
 def undistort_image(
@@ -114,17 +101,41 @@ def undistort_image(
     if max(keep.size) > LARGEST:
         raise ValueError(f"Argument size must be at most {LARGEST} px a side, but it is {keep.size}.")
     folded = warn_of_fold(distortion, (width, height))
-    x, y = position_map(distortion, keep, (width, height), extend=border != "constant")
     fill = border_values(border_value, math.prod(image.shape[2:]), image.dtype)
-    corrected = remap(image, x, y, interpolation, border, fill)
-    if folded and border != "constant":
-        corrected[x == OUTSIDE] = fill if image.ndim > 2 else fill[0]
+    sample = sampler(image, interpolation, border, fill)
+    inverse = _inverse(distortion, keep, (width, height), extend=border != "constant")
+    whole = interpolation in WIDE and border == "constant"  # the border depends on all positions
+    corrected = np.empty((*keep.size[::-1], *image.shape[2:]), image.dtype)
+    bands = _bands(keep, keep.size[1] if whole else max(_BAND // keep.size[0], 1))
+    maps = ((rows, source_positions(distortion, band, inverse)) for rows, band in bands)
+    for rows, positions in _one_ahead(maps):
+        x, y = map(np.asarray, positions)
+        sample(x, y, corrected[rows])
+        if folded and border != "constant":
+            corrected[rows][x == OUTSIDE] = fill if image.ndim > 2 else fill[0]
     return corrected
 
 
-def _all_within(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> bool:
-    """Whether every pixel of the output is within the middles of an image's outermost pixels."""
-    return all(p.min() >= 0 and p.max() <= side - 1 for p, side in zip((x, y), size, strict=True))
+def _bands(framing: Framing, rows: int) -> Iterator[tuple[slice, Framing]]:
+    """Parts of an output: so many of its rows each, and their framing.
+
+    The last begins earlier if it would have fewer: one number of rows, one program.
+    """
+    width, height = framing.size
+    rows = min(rows, height)
+    for first in range(0, height, rows):
+        first = min(first, height - rows)
+        origin = framing.origin + np.array([0, first]) / framing.scale
+        yield slice(first, first + rows), Framing(framing.scale, origin, (width, rows))
+
+
+def _one_ahead(items: Iterator[Item]) -> Iterator[Item]:
+    """The items, each once the next one is begun: JAX computes that one meanwhile."""
+    before = next(items)
+    for item in items:
+        yield before
+        before = item
+    yield before
 
 
 def _distortion(
@@ -162,93 +173,19 @@ def position_map(
         plane: the sampling of both images; by default every pixel.
         extend: whether positions off the image matter, for borders that continue it.
     """
-    centre = np.asarray(distortion.centre, float)
-    radius = _farthest(centre, np.asarray(framing.origin, float), framing.size, float(framing.scale))
-    seen = math.inf if extend else _farthest(centre, np.zeros(2), image_size, 1.0) + _MARGIN
-    inverse = fit_inverse(distortion, radius + _MARGIN, seen=seen)
+    inverse = _inverse(distortion, framing, image_size, extend)
     x, y = source_positions(distortion, framing, inverse, plane)
     return np.asarray(x), np.asarray(y)
 
 
-def remap(
-    image: np.ndarray,
-    x: np.ndarray,
-    y: np.ndarray,
-    interpolation: str,
-    border: str,
-    fill: np.ndarray,
-    out: np.ndarray | None = None,
-) -> np.ndarray:
-    """`cv2.remap` for any dtype and number of channels.
-
-    Where nothing beyond the image is shown, wide kernels do not mix a constant border in either. `out` may
-    be given for the dtypes that OpenCV knows, with up to 4 channels.
-    """
-    if interpolation in _WIDE and border == "constant" and _all_within(x, y, image.shape[1::-1]):
-        border = "replicate"
-    working = np.dtype(_WORKING.get(image.dtype.name, image.dtype))
-    if working != image.dtype:
-        scaled = image.astype(working) * (255 if image.dtype == bool else 1)
-        result = remap(scaled, x, y, interpolation, border, fill * (255 if image.dtype == bool else 1))
-        return _cast(result, image.dtype)
-    flags = {"interpolation": _INTERPOLATION[interpolation], "borderMode": _BORDER[border]}
-    flat = image.reshape(*image.shape[:2], -1) if image.ndim > 2 else image
-    channels = 1 if flat.ndim == 2 else flat.shape[2]
-    if channels not in (1, 3, 4):
-        groups = np.split(np.arange(channels), _cuts(channels))
-        parts = [
-            remap(np.ascontiguousarray(flat[..., some]), x, y, interpolation, border, fill[some])
-            for some in groups
-        ]
-        result = np.concatenate(parts, axis=2)
-    elif channels == 3 and image.dtype == np.uint8 and interpolation == "linear" and out is None:
-        result = _remap_colour_bytes(flat, x, y, (*fill.tolist(), 0), flags)
-    else:
-        result = cv2.remap(flat, x, y, borderValue=fill.tolist(), dst=out, **flags)
-    return result.reshape(*result.shape[:2], *image.shape[2:])
-
-
-def _cuts(channels: int) -> list[int]:
-    """Where to cut channels into groups of 4, 3 or 1: for 2, OpenCV 5 has slow and coarser code only."""
-    whole, rest = divmod(channels, 4)
-    ends = [4 * i for i in range(1, whole + 1)] + ([4 * whole + 1] if rest == 2 else [])
-    return [end for end in ends if end < channels]
-
-
-def _remap_colour_bytes(image, x, y, fill, flags) -> np.ndarray:
-    """Linear `cv2.remap` of three channels of bytes by way of four, for which OpenCV 5 has faster code.
-
-    In strips of 1 MiB that stay in the cache, both conversions included, it is faster than three channels.
-    The other interpolations are slower so.
-    """
-    four = cv2.cvtColor(image, cv2.COLOR_BGR2BGRA)
-    height, width = x.shape
-    result = np.empty((height, width, 3), np.uint8)
-    rows = max(1, min(height, 2**18 // width))
-    strip = np.empty((rows, width, 4), np.uint8)
-    for top in range(0, height, rows):
-        part = slice(top, min(top + rows, height))
-        corrected = strip[: part.stop - top]
-        cv2.remap(four, x[part], y[part], borderValue=fill, dst=corrected, **flags)
-        cv2.cvtColor(corrected, cv2.COLOR_BGRA2BGR, dst=result[part])
-    return result
-
-
-def border_values(value: float | int | Sequence[float | int], channels: int, dtype: np.dtype) -> np.ndarray:
-    """One border value a channel, in float64.
-
-    Raises:
-        ValueError: there are neither one nor as many as channels, or the dtype cannot hold them.
-    """
-    given = np.atleast_1d(np.asarray(value, np.float64))
-    if given.ndim != 1 or given.size not in (1, channels):
-        raise ValueError(
-            f"Argument border_value must be one number, or one for each of the {channels} channels, "
-            f"but it is {value!r}."
-        )
-    if dtype.kind in "iu" and not ((given >= np.iinfo(dtype).min) & (given <= np.iinfo(dtype).max)).all():
-        raise ValueError(f"Argument border_value must be a value of {dtype}, but it is {value!r}.")
-    return np.broadcast_to(given, channels).copy()
+def _inverse(
+    distortion: Distortion, framing: Framing, image_size: tuple[int, int], extend: bool
+) -> RadialInverse | None:
+    """The polynomial for all of an output; None where none is accurate."""
+    centre = np.asarray(distortion.centre, float)
+    radius = _farthest(centre, np.asarray(framing.origin, float), framing.size, float(framing.scale))
+    seen = math.inf if extend else _farthest(centre, np.zeros(2), image_size, 1.0) + _MARGIN
+    return fit_inverse(distortion, radius + _MARGIN, seen=seen)
 
 
 def warn_of_fold(distortion: Distortion, image_size: tuple[int, int], stacklevel: int = 3) -> bool:
@@ -273,20 +210,6 @@ def _farthest(centre: np.ndarray, origin: np.ndarray, size: tuple[int, int], sca
     return float(np.hypot(*np.maximum(abs(origin - centre), abs(last - centre))))
 
 
-def check_sampling(interpolation: str, border: str) -> None:
-    """Refuse names that are not known.
-
-    Raises:
-        ValueError: an argument is none of those that `undistort_image` takes.
-    """
-    for name, value, known in (
-        ("interpolation", interpolation, _INTERPOLATION),
-        ("border", border, _BORDER),
-    ):
-        if value not in known:
-            raise ValueError(f"Argument {name} must be one of {', '.join(known)}, but it is {value!r}.")
-
-
 def checked_image(image) -> np.ndarray:
     """The image, in this machine's order of bytes, if it is one that OpenCV can warp.
 
@@ -303,7 +226,7 @@ def checked_image(image) -> np.ndarray:
         raise ValueError("Argument image is a masked array, and masks are not kept: give its data alone.")
     check_channels_last(image.shape)
     check_one_image(image.shape, "one call for each")
-    if image.dtype.name not in (*_KNOWN, *_WORKING):
+    if image.dtype.name not in (*KNOWN, *WORKING):
         raise ValueError(
             "Argument image must be boolean, integer of up to 32 bits or floating, but its dtype is "
             f"{image.dtype}. Convert it with image.astype(...)."
@@ -313,14 +236,3 @@ def checked_image(image) -> np.ndarray:
             f"Argument image must be at most {LARGEST} px a side, but its shape is {image.shape}."
         )
     return native(image)
-
-
-def _cast(values: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """Rounded and clipped to a dtype."""
-    if dtype.kind == "b":
-        return values >= 128
-    if dtype.kind == "f":
-        clipped = np.clip(values, np.finfo(dtype).min, np.finfo(dtype).max)
-        return np.where(np.isfinite(values), clipped, values).astype(dtype)
-    limits = np.iinfo(dtype)
-    return np.clip(np.rint(values), limits.min, limits.max).astype(dtype)

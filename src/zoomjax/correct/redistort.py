@@ -15,8 +15,9 @@ from ..models.lens import ZoomLens
 from ..models.sizes import check_image_size, checked_distortion, lens_for_size
 from ._inverse_polynomial import fold_radius
 from .framing import Framing, check_keep, frame_output
-from .image import border_values, check_sampling, checked_image, remap, warn_of_fold
+from .image import checked_image, warn_of_fold
 from .maps import OUTSIDE, Plane
+from .sampler import border_values, check_sampling, remap
 
 _ROWS = 64  # at a time: what is computed of them stays in the cache
 

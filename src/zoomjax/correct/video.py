@@ -39,8 +39,9 @@ from ._planes import FrameWarper
 from ._prefetch import ahead
 from ._segments import Segment, Work, cut, encoded_segments, with_others
 from .framing import Framing, check_keep, frame_output, framing_for_size
-from .image import check_sampling, warn_of_fold
+from .image import warn_of_fold
 from .redistort import check_framed
+from .sampler import check_sampling
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from .._core.checks import check_between, checked_focal, checked_integer
-from ..correct.image import remap
+from ..correct.sampler import remap
 from ..models.lens import ZoomLens
 from .motion import camera_between
 
