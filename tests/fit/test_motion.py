@@ -8,11 +8,11 @@ import optimistix as optx
 import pytest
 
 from zoomjax import Lines, PolynomialZoom, ZoomLens
-from zoomjax.fit import RESULTS, fit_motion
+from zoomjax.fit import RESULTS, _motion_problem, fit_motion, motion
 from zoomjax.fit._motion_gradient import sensitive
 from zoomjax.fit._motion_levers import guessed_levers
 from zoomjax.fit._motion_parallax import Spread
-from zoomjax.fit._motion_problem import Asked, Given, problem_of
+from zoomjax.fit._motion_problem import Asked, Given, problem_of, thinned
 from zoomjax.fit._motion_start import rotation_vector, shrunk_ray, turned
 from zoomjax.fit.motion import _fitted, thrown_motion
 from zoomjax.lines import compress_any_centre
@@ -502,6 +502,63 @@ def test_tracks_of_short_clips_stay_whole_and_of_long_ones_do_not(frames, life, 
     problem = problem_of(Given(tracks, None, None, None, None), asked)
     assert (problem.data.structure.blocks == 1) == whole
     assert len(np.unique(problem.piece)) == (3 if life <= 48 or whole else 9)
+
+
+def test_some_tracks_of_a_long_clip_are_drawn_and_enough_in_each_frame(noisy, monkeypatch):
+    given = Given(noisy.tracks, None, None, None, None)
+    assert thinned(given) is None  # a short one
+    monkeypatch.setattr(_motion_problem, "_MANY_VIEWS", 100)
+    assert thinned(given) is None  # it has fewer than twice what is enough
+    monkeypatch.setattr(_motion_problem, "_ENOUGH", 15)
+    some, all_ = thinned(given).tracks, noisy.tracks
+    counts = [np.bincount(t.frame[t.mask], minlength=FRAMES) for t in (some, all_)]
+    assert (counts[0] >= np.minimum(15, counts[1])).all()
+    assert counts[0].sum() < counts[1].sum() / 2
+    place = np.searchsorted(all_.number, some.number)
+    np.testing.assert_array_equal(some.points, np.asarray(all_.points)[place])
+    assert (some.frames, some.image_size) == (all_.frames, all_.image_size)
+
+
+def test_going_the_way_with_some_tracks_ends_at_the_same_fit(noisy, fit, monkeypatch):
+    views = []
+    begun = motion.begun
+
+    def watched(data, *rest):
+        views.append(int(data.there.sum()))
+        return begun(data, *rest)
+
+    monkeypatch.setattr(motion, "begun", watched)
+    monkeypatch.setattr(_motion_problem, "_MANY_VIEWS", 100)
+    monkeypatch.setattr(_motion_problem, "_ENOUGH", 20)
+    other = fit_motion(noisy.tracks)
+    assert views[0] < noisy.tracks.mask.sum() / 2
+    tenth = 0.1 * np.asarray(fit.focal_std)
+    np.testing.assert_array_less(np.abs(other.focal - fit.focal), tenth)
+    np.testing.assert_allclose(other.focal_std, fit.focal_std, rtol=0.01)
+    np.testing.assert_allclose(other.noise, fit.noise, rtol=1e-3)
+    off = np.abs(np.asarray(other.residual) - np.asarray(fit.residual))[np.asarray(noisy.tracks.mask)]
+    assert (off > 0.02).mean() < 0.01  # rays of views that disagree are not where the loss is least
+
+
+def test_tracks_that_alone_link_two_parts_of_a_shot_are_not_left_out(monkeypatch):
+    """One of 41 goes from frame 9 to frame 10, and drawing leaves it out."""
+    track = np.repeat(np.arange(41), 10)
+    frame = np.concatenate([np.tile(np.arange(10), 20), np.tile(np.arange(10, 20), 20), np.arange(5, 15)])
+    points = np.random.default_rng(0).uniform(0, 700, (len(track), 2))
+    tracks = Tracks.from_arrays(track, frame, points, image_size=SIZE, frames=20)
+    views = []
+    monkeypatch.setattr(_motion_problem, "_MANY_VIEWS", 100)
+    monkeypatch.setattr(_motion_problem, "_ENOUGH", 1)
+
+    def stop(data, *_):
+        views.append(int(data.there.sum()))
+        raise RuntimeError
+
+    monkeypatch.setattr(motion, "begun", stop)
+    assert 40 not in thinned(Given(tracks, None, None, None, None)).tracks.number
+    with pytest.raises(RuntimeError):
+        fit_motion(tracks)
+    assert views == [410]
 
 
 @pytest.mark.slow

@@ -32,6 +32,13 @@ LONGEST_LOOP = 256
 looked before then closes a loop. The frames' matrix is full, and its cost of little account."""
 
 
+_MANY_VIEWS = 100_000
+"""From so many on, the way to the minimum is gone with fewer of them."""
+
+_ENOUGH = 60
+"""Tracks in each frame for that."""
+
+
 class Given(NamedTuple):
     """What a fit is made from."""
 
@@ -108,6 +115,33 @@ def problem_of(given: Given, asked: Asked) -> Problem:
         size=tracks.image_size,
     )
     return Problem(data, track, view, moment, piece, shot)
+
+
+def thinned(given: Given) -> Given | None:
+    """The same with some of the tracks, drawn by chance, enough in each frame; None if that is not less."""
+    tracks = given.tracks
+    mask = np.asarray(tracks.mask)
+    if mask.sum() < _MANY_VIEWS:
+        return None
+    track, view = np.nonzero(mask)
+    moment = np.asarray(tracks.frame)[track, view]
+    ends = np.cumsum(np.sum(mask, axis=1))
+    kept, count = np.zeros(len(mask), bool), np.zeros(tracks.frames, int)
+    for number in np.random.default_rng(0).permutation(len(mask)):
+        seen = moment[ends[number - 1] if number else 0 : ends[number]]
+        kept[number] = np.any(count[seen] < _ENOUGH)
+        count[seen] += kept[number]
+    if count.sum() > len(moment) / 2:
+        return None
+    some = Tracks(
+        np.asarray(tracks.points)[kept],
+        np.asarray(tracks.frame)[kept],
+        mask[kept],
+        tracks.image_size,
+        tracks.frames,
+        np.asarray(tracks.number)[kept],
+    )
+    return given._replace(tracks=some)
 
 
 def _known_focal(focal, focal_std, frames):

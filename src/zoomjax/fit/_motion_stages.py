@@ -65,8 +65,8 @@ _UNKNOWN_SCALE = 0.1
 """Standard deviation of log f from which the focal lengths have no scale."""
 
 
-def in_stages(data, paths, spreads, zoom, shift, distortion_model, terms, shot):
-    """The fit, with a prior of the lens that widens from stage to stage: the program is the same.
+def begun(data, paths, spreads, zoom, shift, distortion_model, terms):
+    """A model near the best and its noise, after stages whose program is the same.
 
     The first stage goes from all starts. The one that most views follow best goes on.
 
@@ -74,11 +74,6 @@ def in_stages(data, paths, spreads, zoom, shift, distortion_model, terms, shot):
         data: tracks and lines.
         paths, spreads: starts, and the medians of their residuals, px.
         zoom, shift, distortion_model, terms: as for `fit_motion`.
-        shot: number of each frame's shot.
-
-    Returns:
-        The parts of a `MotionFit` by name, the sizes of the residuals of all views, the model, and the
-        noise that residuals were weighted by last.
     """
     tried = []
     for path, spread in zip(_each(paths), spreads, strict=True):
@@ -91,6 +86,32 @@ def in_stages(data, paths, spreads, zoom, shift, distortion_model, terms, shot):
         tried.append(_solved(data, *_arrays((model, noise, STAGES[0]))))
     model, noise, *_ = _best(tried, data.there)
     model, noise, *_ = _solved(data, *_arrays((model, noise.wider(STAGES[1].wider), STAGES[1])))
+    return model, noise
+
+
+def with_all(few, data, model, noise):
+    """A model fitted to some of the tracks, and its noise, with rays of all of them."""
+    model, noise, *_ = _settled(few, model, noise)
+    rays = jnp.zeros((data.structure.tracks, 3))
+    model = eqx.tree_at(lambda m: m.path.rays, model, rays)
+    return eqx.tree_at(lambda m: m.path.rays, model, _averaged(data, model)), noise
+
+
+_averaged = eqx.filter_jit(averaged)
+
+
+def in_stages(data, model, noise, shot):
+    """The last stage, until nothing changes, and what is known about the fit.
+
+    Args:
+        data: tracks and lines.
+        model, noise: of `begun`.
+        shot: number of each frame's shot.
+
+    Returns:
+        The parts of a `MotionFit` by name, the sizes of the residuals of all views, the model, and the
+        noise that residuals were weighted by last.
+    """
     model, noise, weighted_by, result, steps = _settled(data, model, noise)
     for _ in range(_MOST_COUNTS if data.lines is not None else 0):
         group = groups_of(data, model, shot)
@@ -164,7 +185,7 @@ def _solved(data, model, noise, stage):
     steps = Schur(data.structure, eqx.Partial(columns_of, args))
     solution = optx.least_squares(
         jax.checkpoint(rows_of),  # what derivatives need is made again: it is much
-        damped_solver(steps, Unknowns, stage.change, stage.damping),
+        damped_solver(steps, Unknowns, stage.change, stage.damping, eqx.Partial(_size_of_change, data)),
         jax.tree.map(jnp.zeros_like, units),
         args=args,
         max_steps=_MOST_STEPS,
@@ -175,7 +196,7 @@ def _solved(data, model, noise, stage):
     views = residuals_of(data, model)
     size = jnp.linalg.norm(views, axis=-1)
     near = (size < 3 * CAUCHY * noise.points)[:, None]
-    change = optx.two_norm(jnp.where(near, views - first, 0)) / noise.points
+    change = _size_of_views(data, jnp.where(near, views - first, 0)) / noise.points
     points = core_median(size, data.there) / MEDIAN_OF_SIZE
     rays = model.path.rays / jnp.linalg.norm(model.path.rays, axis=1, keepdims=True)
     model = eqx.tree_at(lambda m: m.path.rays, model, rays)
@@ -184,6 +205,24 @@ def _solved(data, model, noise, stage):
     good: Any = RESULTS.successful
     result = RESULTS.where((change < _SETTLED) & spent, good, RESULTS.promote(solution.result))
     return model, noise, result, solution.stats["num_steps"], change, size
+
+
+def _size_of_change(data, rows):
+    """How much residuals change in all: the root of the sum of squares, but for `_size_of_views`."""
+    others = optx.two_norm(rows._replace(views=jnp.zeros(0)))
+    return jnp.hypot(_size_of_views(data, rows.views), others)
+
+
+def _size_of_views(data, change):
+    """The root of the sum of squares that changes of views have, if those of each frame are alike.
+
+    What moves all views of a frame counts as it is. A ray moves one view of each, and counts next to
+    nothing: where its views disagree, the loss has it wander for dozens of steps, and nothing else moves.
+    """
+    length = jnp.where(data.there, jnp.linalg.norm(change, axis=-1), 0)
+    both = jnp.stack([length, 1.0 * data.there], axis=1)
+    total, count = jax.ops.segment_sum(both, data.structure.frame, len(data.log_focal)).T
+    return jnp.sqrt(jnp.sum(total**2 / jnp.maximum(count, 1)))
 
 
 def _line_noise(data, model):

@@ -1,6 +1,7 @@
 """Steps of a damped Gauss-Newton method by normal equations of a known structure, for optimistix."""
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -99,8 +100,22 @@ class RoundingTrustRegion(optx.AbstractSearch):
         return step_size, accept | still, result, new_state
 
 
+class _OfResiduals(eqx.Module):
+    """The size of a change of the residuals; none of a change of the unknowns."""
+
+    size: Callable[[PyTree], Any]
+    unknowns: type = eqx.field(static=True)
+
+    def __call__(self, change: PyTree) -> Any:
+        return jnp.zeros(()) if isinstance(change, self.unknowns) else self.size(change)
+
+
 def damped_solver(
-    steps: AbstractNormalSolver, unknowns: type, change: Any, damping: Any
+    steps: AbstractNormalSolver,
+    unknowns: type,
+    change: Any,
+    damping: Any,
+    size: Callable[[PyTree], Any] = optx.two_norm,
 ) -> optx.LevenbergMarquardt:
     """Levenberg-Marquardt with these steps, which ends with a step that moves the residuals by less.
 
@@ -110,12 +125,9 @@ def damped_solver(
             little.
         change: of the residuals, in all.
         damping: of the first step.
+        size: of changes of the residuals.
     """
-
-    def of_residuals(moved):
-        return jnp.zeros(()) if isinstance(moved, unknowns) else optx.two_norm(moved)
-
-    solver = optx.LevenbergMarquardt(rtol=0.0, atol=change, norm=of_residuals)
+    solver = optx.LevenbergMarquardt(rtol=0.0, atol=change, norm=_OfResiduals(size, unknowns))
     return eqx.tree_at(
         lambda s: (s.descent, s.search),
         solver,

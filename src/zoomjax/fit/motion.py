@@ -3,7 +3,8 @@
 What is minimised says `_motion_rows`. The solver is optimistix' Levenberg-Marquardt with a linear solver
 made for this problem (`_schur`), in time that is linear in the number of frames. The start needs no guess
 (`_motion_start`); from there the loss narrows, and the lens joins by a prior that widens
-(`_motion_stages`).
+(`_motion_stages`). In a long clip that way is gone with a part of the tracks, and all of them join at its
+end.
 """
 
 from typing import Any, NoReturn
@@ -29,8 +30,8 @@ from ..models.zoom import (
 from ..tracks.tracks import Tracks
 from ._motion_gradient import sensitive
 from ._motion_model import Model, Noise, scaled
-from ._motion_problem import LONGEST_LOOP, Asked, Given, Problem, problem_of
-from ._motion_stages import in_stages
+from ._motion_problem import LONGEST_LOOP, Asked, Given, Problem, problem_of, thinned
+from ._motion_stages import begun, in_stages, with_all
 from ._motion_start import starts_of, views_by_frame
 from .defaults import zoom_or_default
 from .result import RESULTS, ZoomFit, failed
@@ -233,18 +234,16 @@ def _fitted(given: Given, asked: Asked, throw: bool) -> tuple[MotionFit, Model, 
 def _solved_motion(given, asked):
     """The fit, the model that it is of, and the noise."""
     problem, frames = problem_of(given, asked), given.tracks.frames
-    by_frame = views_by_frame(problem.piece, problem.moment, len(problem.data.log_focal))
-    paths, spreads = _started(problem.data, by_frame)
-    parts, missed, model, noise = in_stages(
-        problem.data,
-        paths,
-        spreads,
-        asked.zoom,
-        asked.shift,
-        asked.distortion_model,
-        asked.terms,
-        problem.shot,
-    )
+    fewer = thinned(given)
+    few = problem if fewer is None else problem_of(fewer, asked)
+    if not np.array_equal(few.shot, problem.shot):  # what links two parts of a shot is missing
+        few = problem
+    by_frame = views_by_frame(few.piece, few.moment, len(few.data.log_focal))
+    paths, spreads = _started(few.data, by_frame)
+    found = begun(few.data, paths, spreads, asked.zoom, asked.shift, asked.distortion_model, asked.terms)
+    if few is not problem:
+        found = with_all(few.data, problem.data, *found)
+    parts, missed, model, noise = in_stages(problem.data, *found, problem.shot)
     parts["fit"] = eqx.tree_at(lambda fit: fit.frame_rms, parts["fit"], parts["fit"].frame_rms[:frames])
     residual = jnp.full(np.shape(given.tracks.mask), jnp.nan)
     fit = MotionFit(
