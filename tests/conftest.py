@@ -21,6 +21,9 @@ from zoomjax._core.programs import use_once
 
 SEED = 2012
 
+LAST_BITS = 0 if jax.default_backend() == "cpu" else 1e-13
+"""Of numbers that are to be the same. A GPU adds up lines in any order, another one in each run."""
+
 # What the command line compiles, and finds in images, is kept between the tests of all workers, and not
 # beyond them. Workers inherit the folder.
 if "PYTEST_XDIST_WORKER" not in os.environ:

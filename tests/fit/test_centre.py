@@ -11,7 +11,7 @@ from zoomjax import scenes
 from zoomjax.models import BrownConrady, Model
 from zoomjax.trust import selection
 
-from ..conftest import NOISE, SEED
+from ..conftest import LAST_BITS, NOISE, SEED
 
 AWAY = np.array([20.0, -12.0])  # px from the image's centre
 FOCAL = scenes.focal_sweep(4)
@@ -175,7 +175,8 @@ def test_a_given_centre_is_taken_by_all_fits(name, lines, aside):
     np.testing.assert_array_equal(given.lens.centre, aside.centre)
     image = fit(lines, centre="image")
     np.testing.assert_array_equal(image.lens.centre, (np.array(lines.image_size) - 1) / 2)
-    np.testing.assert_array_equal(image.lens(30.0).coefficients, fit(lines).lens(30.0).coefficients)
+    plain = fit(lines).lens(30.0).coefficients
+    np.testing.assert_allclose(image.lens(30.0).coefficients, plain, rtol=LAST_BITS)
     assert given.rms < 0.99 * image.rms
     with pytest.raises(ValueError, match='must be "fit", "image" or two coordinates'):
         fit(lines, centre=(np.nan, 1.0))
@@ -184,8 +185,9 @@ def test_a_given_centre_is_taken_by_all_fits(name, lines, aside):
 @pytest.mark.parametrize("name", TAKEN)
 def test_a_fitted_centre_is_that_of_fit_centre(name, lines, found):
     own = TAKEN[name](lines, centre="fit")
-    tolerance = 0.2 if "robust" in name else 1e-9  # weights make a difference
-    np.testing.assert_allclose(own.lens.centre, found.fit.lens.centre, atol=tolerance)
+    # Weights make a difference, next to that which noise makes.
+    tolerance = 0.3 * np.asarray(found.std[0]) if "robust" in name else 1e-9
+    assert (np.abs(own.lens.centre - found.fit.lens.centre) < tolerance).all()
     assert own.joint is not None
 
 
@@ -194,8 +196,8 @@ def test_frames_have_the_given_centre_or_each_its_own(lines, aside):
     np.testing.assert_array_equal(given.centre, np.broadcast_to(aside.centre, given.centre.shape))
     assert given.rms < zj.fit_frames(lines, centre="image").rms
     own, known = zj.fit_frames(lines, centre="fit"), zj.fit.fit_frame_centres(lines)
-    np.testing.assert_array_equal(own.centre, known.each.centre)
-    np.testing.assert_array_equal(own.coefficients, known.each.coefficients)
+    np.testing.assert_allclose(own.centre, known.each.centre, rtol=LAST_BITS)
+    np.testing.assert_allclose(own.coefficients, known.each.coefficients, rtol=LAST_BITS)
     with pytest.raises(RuntimeError, match="The fit failed"):
         zj.fit_frames(lines, centre="fit", max_steps=1)
     assert np.isfinite(zj.fit_frames(lines, centre="fit", max_steps=1, throw=False).centre).all()

@@ -13,7 +13,7 @@ from zoomjax.fit.constrained import LEAST_SLOPE
 from zoomjax.models.invertibility import slope_controls
 
 from .._reference import assert_derivatives_agree
-from ..conftest import moved
+from ..conftest import LAST_BITS, moved
 from ..models.test_invertibility import SomeZoom
 from .test_zoom import CENTRE, SIZE, distorted_lines, parameters
 
@@ -97,10 +97,6 @@ def test_there_is_no_better_one(terms, folding):
     assert solution.success
     assert float(best.rms) ** 2 == pytest.approx(solution.fun, rel=1e-8)
     assert slack(zoom.parameters.ravel()).min() > 0
-
-
-LAST_BITS = 0 if jax.default_backend() == "cpu" else 1e-14
-"""Of numbers that are to be the same. A GPU adds up lines in any order, another one in each run."""
 
 
 def test_a_good_fit_stays_as_it_is_to_the_last_bit(small, fit):
