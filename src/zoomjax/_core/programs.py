@@ -71,10 +71,10 @@ def program(
         light: whether its work is small for small arguments.
         optimised: whether its work is so much that XLA's own settings pay.
     """
-    function = exact_products(function)
     plain = eqx.filter_jit(function)
 
     @functools.wraps(function)
+    @exact_products
     def call(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
         if not _at_once():
             return plain(*args, **kwargs)
