@@ -183,6 +183,20 @@ def test_known_focal_lengths_give_the_scale(lens, path):
     assert (abs(off) < 4 * std).all()
 
 
+def test_a_frame_whose_tracks_are_all_wrong_is_as_one_without(path, noisy, fit):
+    tracks, bad = noisy.tracks, 12
+    points = np.array(tracks.points)
+    of_it = np.asarray(tracks.mask) & (np.asarray(tracks.frame) == bad)
+    points[of_it, 1] = 300 + 0.2 * points[of_it, 0]  # some of them are near where they should be
+    found = fit_motion(eqx.tree_at(lambda t: t.points, tracks, jnp.asarray(points)))
+    focal = np.asarray(found.focal)
+    assert np.flatnonzero(np.isnan(focal)).tolist() == [bad]
+    assert np.flatnonzero(np.isnan(np.asarray(found.focal_std))).tolist() == [bad]
+    others = np.arange(FRAMES) != bad
+    assert abs(focal / np.asarray(fit.focal) - 1)[others].max() < 0.004
+    assert found.fit.result == RESULTS.successful
+
+
 def test_a_frame_without_tracks_does_not_matter(noisy, fit):
     tracks = noisy.tracks
     track, view = np.nonzero(np.asarray(tracks.mask))

@@ -174,6 +174,10 @@ def test_files_up_to_version_2_call_it_family(tmp_path):
     content |= {"version": 2, "family": content.pop("distortion_model")}
     (tmp_path / "older.json").write_text(json.dumps(content))
     assert zj.load_lens(tmp_path / "older.json").distortion_model == zj.models.Division()
+    del content["family"]  # and are not of the polynomial
+    (tmp_path / "older.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="distortion model, None, is unknown"):
+        zj.load_lens(tmp_path / "older.json")
 
 
 def test_files_of_unknown_models_and_too_few_coefficients_are_refused(tmp_path):

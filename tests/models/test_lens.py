@@ -322,3 +322,37 @@ def test_a_name_that_stands_twice_in_a_file_is_refused(truth, tmp_path):
         zj.load_lens(path)
     path.write_text(text, encoding="utf-8-sig")  # as some editors save it
     assert zj.load_lens(path).focal_unit == "mm"
+
+
+@pytest.mark.parametrize(
+    ("within", "wrong", "meant"),
+    [
+        ((), "shft", "shift"),
+        ((), "Shift", "shift"),
+        ((), "pixel_pich", "pixel_pitch"),
+        ((), "focus-range", "focus_range"),
+        ((), "distortionModel", "distortion_model"),
+        (("zoom",), "Mean", "mean"),
+    ],
+)
+def test_an_optional_entry_that_is_misspelled_is_refused(within, wrong, meant, content, tmp_path):
+    table = content
+    for name in within:
+        table = table[name]
+    load(content | {"comment": "of 2012", "camera": "D90"}, tmp_path)  # others may say what they like
+    table[wrong] = table.pop(meant, [1, 2])
+    with pytest.raises(ValueError, match=f"its '{wrong}' would not count: '{meant}'"):
+        load(content, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["centre", "focal_range"])
+def test_numbers_of_a_file_are_no_words_and_no_booleans(name, content, tmp_path):
+    for values in (["1", "2"], [True, True], [1, None]):
+        with pytest.raises(ValueError, match=f"numbers of its '{name}'"):
+            load(content | {name: values}, tmp_path)
+
+
+@pytest.mark.parametrize("size", [["640", "480"], [True, True], "64"])
+def test_an_image_size_is_two_numbers(size, content, tmp_path):
+    with pytest.raises(ValueError, match="image_size must be two positive integers"):
+        load(content | {"image_size": size}, tmp_path)

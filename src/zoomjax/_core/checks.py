@@ -52,7 +52,7 @@ def _is_finite(value: Any) -> bool:
 def checked_size(size: Any, name: str = "image_size") -> tuple[int, int]:
     """(width, height) px."""
     try:
-        width, height = (float(side) for side in size)
+        width, height = (math.nan if isinstance(side, str | bytes | bool) else float(side) for side in size)
     except (TypeError, ValueError):
         width = height = math.nan
     if not all(math.isfinite(side) and side == int(side) and side >= 1 for side in (width, height)):

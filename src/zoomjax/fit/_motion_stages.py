@@ -61,6 +61,9 @@ _INFLATION = 1 / 0.95  # of variances, by what the loss loses
 
 _FREE = 10.0  # standard deviation of a frame's log f, beside the common factor, of which nothing is said
 
+_FOLLOWED = 0.2
+"""Share of a frame's views that have to follow the model: fewer may do so by chance, at any f."""
+
 _UNKNOWN_SCALE = 0.1
 """Standard deviation of log f from which the focal lengths have no scale."""
 
@@ -269,7 +272,10 @@ def _described(data, model, noise, stage, result, steps):
         log_variance = log_variance + common.log_focal**2
     joint, log_std = lens[:-2, :-2], jnp.sqrt(log_variance)
     focal = jnp.exp(model.path.log_focal)
-    unseen = jnp.zeros(frames).at[data.structure.frame].add(1.0 * data.there) == 0
+    kept = jnp.where(inlier, jnp.sum(missed**2, axis=-1), 0)
+    of_views = kept, 1.0 * inlier, 1.0 * data.there
+    in_frame = [jnp.zeros(frames).at[data.structure.frame].add(leaf) for leaf in of_views]
+    unseen = in_frame[1] <= _FOLLOWED * in_frame[2]
     fitted = ZoomLens(
         zoom=model.zoom,
         centre=(jnp.asarray(data.size, jnp.float64) - 1) / 2,
@@ -290,8 +296,6 @@ def _described(data, model, noise, stage, result, steps):
         distortion_model=model.distortion_model,
         shift=model.shift,
     )
-    kept = jnp.where(inlier, jnp.sum(missed**2, axis=-1), 0)
-    in_frame = [jnp.zeros(frames).at[data.structure.frame].add(leaf) for leaf in (kept, 1.0 * inlier)]
     rms = jnp.sqrt(jnp.sum(kept) / jnp.sum(inlier))
     fit = ZoomFit(
         lens=fitted,

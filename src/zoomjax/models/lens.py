@@ -36,12 +36,16 @@ from .registry import (
     distortion_model_from,
     distortion_model_name,
     once,
+    refuse_misspelled,
     zoom_from,
 )
 from .zoom import AbstractFocusZoom, AbstractZoom
 
 _FORMAT, _VERSION = "zoomjax.lens", 3
 _UNREADABLE = ValueError, TypeError, KeyError, AttributeError, ArithmeticError, RecursionError, OSError
+
+_ENTRIES = ("image_size", "centre", "scale", "focal_unit", "focal_range", "radial", "zoom", "shift_meaning")
+_OPTIONAL = ("distortion_model", "family", "focus_range", "shift", "pixel_pitch", "about")
 
 _SLACK = 1e-6
 """Share of a focal length by which it may be beyond the range: the end itself, through a float32."""
@@ -334,7 +338,7 @@ def _bent(operands):
 
 
 def _pair(content, name):
-    return array_of(name, np.asarray(content[name], np.float64), (2,))
+    return array_of(name, np.asarray(content[name]), (2,)).astype(float)
 
 
 @kinds_checked
@@ -357,6 +361,7 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
                 f"its format version is {content['version']!r} and this zoomjax reads up to {_VERSION}; "
                 "update zoomjax"
             )
+        refuse_misspelled(content, _ENTRIES, _OPTIONAL)
         lens = ZoomLens(
             zoom=zoom_from(content["zoom"]),
             centre=_pair(content, "centre"),

@@ -6,9 +6,10 @@ user-defined classes.
 """
 
 import dataclasses
+import difflib
 import functools
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar, cast, overload
 
 import equinox as eqx
@@ -129,8 +130,10 @@ def distortion_model_name(distortion_model: AbstractDistortionModel) -> str:
 
 
 def distortion_model_from(content: dict[str, Any]) -> AbstractDistortionModel:
-    """The distortion model of a file: the polynomial if it names none; ValueError if it is unknown."""
-    name = content.get("distortion_model", content.get("family", "RadialPolynomial"))  # up to version 2
+    """The distortion model of a file: of version 1 the polynomial; ValueError if it is unknown."""
+    name = content.get("distortion_model", content.get("family"))  # up to version 2
+    if name is None and content["version"] == 1:
+        name = "RadialPolynomial"
     return _class_named(name, _DISTORTION_MODELS, "distortion model")()
 
 
@@ -141,6 +144,14 @@ def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
         raise ValueError(f"it has {twice!r} twice")
     return found
+
+
+def refuse_misspelled(content: dict[str, Any], known: Iterable[str], optional: Iterable[str]) -> None:
+    """Raise ValueError for an entry whose name is nearly that of an optional one that is not there."""
+    missing = {name for name in optional if name not in content}
+    for name in content.keys() - {*known, *optional}:
+        for meant in difflib.get_close_matches(name.lower(), missing, n=1, cutoff=0.75):
+            raise ValueError(f"its {name!r} would not count: {meant!r} is what it is called")
 
 
 def described(model: AbstractZoom) -> dict[str, Any]:
@@ -161,6 +172,7 @@ def zoom_from(content: Any, numbers: int | None = None) -> AbstractZoom:
     """The zoom model that is described so, of so many coefficients; ValueError where it is none."""
     model = _class_named(content["model"], _ZOOMS, "zoom model")
     fields = {}
+    refuse_misspelled(content, [field.name for field in dataclasses.fields(model)], _LATER)
     for field in dataclasses.fields(model):
         value = content.get(field.name) if field.name in _LATER else content[field.name]
         if field.metadata.get("static"):
