@@ -183,6 +183,14 @@ def test_known_focal_lengths_give_the_scale(lens, path):
     assert (abs(off) < 4 * std).all()
 
 
+def test_a_known_focal_length_that_contradicts_the_tracks_is_told(path, noisy):
+    """One is 1.3 times too long: the scale of all is between it and that of the tracks."""
+    focal = np.full(FRAMES, np.nan)
+    focal[5] = 1.3 * path[0][5]
+    with pytest.warns(UserWarning, match=r"1 of 1 known focal lengths contradict the tracks: of frame 5 "):
+        fit_motion(noisy.tracks, focal=focal, focal_std=0.01 * focal[5])
+
+
 def test_a_frame_whose_tracks_are_all_wrong_is_as_one_without(path, noisy, fit):
     tracks, bad = noisy.tracks, 12
     points = np.array(tracks.points)

@@ -7,6 +7,7 @@ made for this problem (`_schur`), in time that is linear in the number of frames
 end.
 """
 
+import warnings
 from typing import Any, NoReturn
 
 import equinox as eqx
@@ -41,6 +42,9 @@ LOOPS = LONGEST_LOOP
 
 _FAILED = "The fit failed: turn and zoom farther, or fit fewer coefficients about the image's centre."
 
+
+_FAR_OFF = 5.0
+"""Standard deviations from a known focal length to the one fitted that are no chance."""
 
 _UNSETTLED = "It did not settle within its steps."
 
@@ -197,6 +201,9 @@ def fit_motion(
             the lines are of other frames or images, or the distortion model is not radial.
         RuntimeError: the fit failed (see `throw`).
 
+    Warns:
+        UserWarning: known focal lengths are far from those that the tracks say.
+
     References:
         L. de Agapito, E. Hayman, I. Reid, "Self-calibration of rotating and zooming cameras", IJCV 2001.
         M. Brown, D. Lowe, "Automatic panoramic image stitching using invariant features", IJCV 2007.
@@ -255,7 +262,26 @@ def _solved_motion(given, asked):
         lever_std=jnp.zeros(()) if model.levers is None else model.levers.std,
         lever_mean=jnp.zeros(()) if model.levers is None else model.levers.mean,
     )
+    _warn_of_contradiction(given, fit)
     return fit, model, noise
+
+
+def _warn_of_contradiction(given, fit):
+    """Known focal lengths far from those fitted are not those of the tracks, or not that well known."""
+    if given.focal is None:
+        return
+    known, std = np.asarray(given.focal, float), np.asarray(given.focal_std, float)
+    off = np.abs(np.log(np.asarray(fit.focal) / known)) / (std / known)
+    far = np.flatnonzero(np.nan_to_num(off) > _FAR_OFF)
+    if len(far):
+        worst = far[np.argmax(off[far])]
+        warnings.warn(
+            f"{len(far)} of {np.sum(np.isfinite(known))} known focal lengths contradict the tracks: of "
+            f"frame {worst} {known[worst]:.5g} px is given and {float(fit.focal[worst]):.5g} px is fitted, "
+            f"{off[worst]:.2g} of its standard deviations away. Such errors take all focal lengths along: "
+            "leave out those that are wrong, or give them a larger focal_std.",
+            stacklevel=2,
+        )
 
 
 def _rays_of(model, problem, tracks):
