@@ -15,7 +15,7 @@ EXACT = jax.lax.Precision.HIGHEST
 def exact_products(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """The function, in which products of matrices have all their digits unless they say otherwise.
 
-    Below ``jit``, so that it holds where the function is traced, in whatever thread that is.
+    It holds while the function is called: of one that is compiled, for what it traces then.
     """
 
     @functools.wraps(function)

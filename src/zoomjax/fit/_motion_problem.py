@@ -31,7 +31,6 @@ LONGEST_LOOP = 256
 """Frames of a clip whose tracks stay whole if there are longer ones: a camera that comes back to where it
 looked before then closes a loop. The frames' matrix is full, and its cost of little account."""
 
-
 _MANY_VIEWS = 100_000
 """From so many on, the way to the minimum is gone with fewer of them."""
 

@@ -92,15 +92,15 @@ def begun(data, paths, spreads, zoom, shift, distortion_model, terms):
     return model, noise
 
 
+_averaged = eqx.filter_jit(averaged)
+
+
 def with_all(few, data, model, noise):
     """A model fitted to some of the tracks, and its noise, with rays of all of them."""
     model, noise, *_ = _settled(few, model, noise)
     rays = jnp.zeros((data.structure.tracks, 3))
     model = eqx.tree_at(lambda m: m.path.rays, model, rays)
     return eqx.tree_at(lambda m: m.path.rays, model, _averaged(data, model)), noise
-
-
-_averaged = eqx.filter_jit(averaged)
 
 
 def in_stages(data, model, noise, shot):
