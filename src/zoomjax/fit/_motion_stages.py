@@ -40,6 +40,12 @@ STAGES = (
 )
 """They widen the prior of the lens and narrow the loss; the last is repeated until it changes nothing."""
 
+_GLANCE = 0.1
+"""Of the noise: a step that moves views by less, in the mean, does not make a bad try the best."""
+
+_HOPELESS = 2.0
+"""Times the noise of the best try, and after a glance: what has more will not become the best."""
+
 _MOST_REPEATS = 12
 
 _SAME = 0.99  # of the noise before a stage: one that leaves less was not the last
@@ -71,14 +77,16 @@ _UNKNOWN_SCALE = 0.1
 def begun(data, paths, spreads, zoom, shift, distortion_model, terms):
     """A model near the best and its noise, after stages whose program is the same.
 
-    The first stage goes from all starts. The one that most views follow best goes on.
+    The first stage goes from all starts, from the first one to its end, and from others as long as there
+    is hope. The one that most views follow best goes on.
 
     Args:
         data: tracks and lines.
         paths, spreads: starts, and the medians of their residuals, px.
         zoom, shift, distortion_model, terms: as for `fit_motion`.
     """
-    tried = []
+    tried: list[Any] = []
+    glance = STAGES[0]._replace(change=_GLANCE * np.sqrt(np.sum(data.there)))
     for path, spread in zip(_each(paths), spreads, strict=True):
         focal = np.exp(np.asarray(path.log_focal))
         prepared = None if shift is None else shift.prepare(focal, 2)
@@ -86,7 +94,13 @@ def begun(data, paths, spreads, zoom, shift, distortion_model, terms):
         prepared_zoom = zoom.prepare(focal, distortion_model.num_coefficients(terms))
         model = Model(path, prepared_zoom, prepared, data.readout[0], nothing, distortion_model)
         noise = Noise(spread / MEDIAN_OF_SIZE, jnp.asarray(jnp.nan)).wider(STAGES[0].wider)
-        tried.append(_solved(data, *_arrays((model, noise, STAGES[0]))))
+        if not tried:
+            tried.append(_solved(data, *_arrays((model, noise, STAGES[0]))))
+            continue
+        found = _solved(data, *_arrays((model, noise, glance)))
+        if found[1].points < _HOPELESS * min(noise.points for _, noise, *_ in tried):
+            found = _solved(data, *_arrays((found[0], noise, STAGES[0]._replace(fresh=0.0))))
+        tried.append(found)
     model, noise, *_ = _best(tried, data.there)
     model, noise, *_ = _solved(data, *_arrays((model, noise.wider(STAGES[1].wider), STAGES[1])))
     return model, noise
@@ -185,7 +199,7 @@ def _solved(data, model, noise, stage):
     of_lines = stage.wider * _line_noise(data, model)
     noise = noise._replace(lines=jnp.where(jnp.isnan(noise.lines), of_lines, noise.lines))
     units, args = units_of(data, model, noise), (data, model, noise, stage)
-    steps = Schur(data.structure, eqx.Partial(columns_of, args))
+    steps = Schur(data.structure, eqx.Partial(columns_of, args), eqx.Partial(rows_of, args=args))
     solution = optx.least_squares(
         jax.checkpoint(rows_of),  # what derivatives need is made again: it is much
         damped_solver(steps, Unknowns, stage.change, stage.damping, eqx.Partial(_size_of_change, data)),
@@ -219,13 +233,13 @@ def _size_of_change(data, rows):
 def _size_of_views(data, change):
     """The root of the sum of squares that changes of views have, if those of each frame are alike.
 
-    What moves all views of a frame counts as it is. A ray moves one view of each, and counts next to
-    nothing: where its views disagree, the loss has it wander for dozens of steps, and nothing else moves.
+    What moves all views of a frame counts as it is. A ray moves one view of each, and counts nothing: where
+    its views disagree, the loss has it wander for dozens of steps, and nothing else moves.
     """
     length = jnp.where(data.there, jnp.linalg.norm(change, axis=-1), 0)
-    both = jnp.stack([length, 1.0 * data.there], axis=1)
+    both = jnp.stack([jnp.sqrt(length), 1.0 * data.there], axis=1)
     total, count = jax.ops.segment_sum(both, data.structure.frame, len(data.log_focal)).T
-    return jnp.sqrt(jnp.sum(total**2 / jnp.maximum(count, 1)))
+    return jnp.sqrt(jnp.sum(total**4 / jnp.maximum(count, 1) ** 3))
 
 
 def _line_noise(data, model):

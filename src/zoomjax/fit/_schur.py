@@ -23,6 +23,9 @@ from ._normal_solver import AbstractNormalSolver
 from ._small_matrices import gram, inverses, line_products, products, times
 from ._structure import Structure
 
+_SHARES = (1.0, 0.25, 0.0)
+"""Of the step of a ray, that are tried."""
+
 
 class Reduced(NamedTuple):
     """The normal equations without the rays.
@@ -281,14 +284,39 @@ def covariances(
 class Schur(AbstractNormalSolver):
     """Steps of a damped Gauss-Newton method for `Unknowns` and `Rows`, by `reduced` and `solution`.
 
-    `columns_at` gives the Jacobian's `columns` where the unknowns are.
+    Where a ray's views disagree, a flat loss makes its step too long. All others would then wait until the
+    damping is so high that it is not. So each ray goes only as far as its own rows like it, beside the full
+    steps of frames and lens.
+
+    Attributes:
+        structure: which frame each view belongs to.
+        columns_at: gives the Jacobian's `columns` where the unknowns are.
+        rows_at: gives the rows there; None if all steps are taken as they are.
     """
 
     structure: Structure
     columns_at: Callable[[Unknowns], Columns]
+    rows_at: Callable[[Unknowns], Rows] | None = None
 
     def step(self, at: Unknowns, jacobian: Any, rows: Rows, damping: Array) -> Unknowns:
         """The unknowns of least squares."""
         del jacobian
         matrix = reduced_of(self.columns_at(at), rows, at, self.structure, damping)
-        return solution(matrix, at, self.structure)
+        found = solution(matrix, at, self.structure)
+        return found if self.rows_at is None else self._held(at, found)
+
+    def _held(self, at, found):
+        """The step, shorter for rays whose rows are less with a shorter one."""
+
+        def shorter(share):
+            return found._replace(rays=share * found.rays)
+
+        def squares(share):
+            rows = self.rows_at(jax.tree.map(jnp.subtract, at, shorter(share)))
+            of_views = jnp.sum(rows.views**2, axis=-1)
+            total = jax.ops.segment_sum(of_views, self.structure.track, self.structure.tracks)
+            return total if rows.rays is None else total + jnp.sum(rows.rays**2, axis=-1)
+
+        shares = jnp.array(_SHARES)
+        best = jnp.argmin(jnp.nan_to_num(jax.lax.map(squares, shares), nan=jnp.inf), axis=0)
+        return shorter(shares[best][:, None])
