@@ -81,3 +81,40 @@ def test_covariances_are_blocks_of_the_dense_inverse(rng, levers):
         np.testing.assert_allclose(own[frame], inverse[here, here], atol=1e-10)
         np.testing.assert_allclose(both[frame], inverse[here, -3:], atol=1e-10)
     np.testing.assert_allclose(lens, inverse[-3:, -3:], atol=1e-10)
+
+
+def test_a_ray_goes_only_as_far_as_its_own_rows_like_it(rng):
+    """Rows of ray 5 rise steeply where it goes far, of ray 7 in any way; all others are linear."""
+    jacobian, rows, like, structure = problem(rng, 17, 40, 8)
+    at = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), like)
+    full = Schur(structure, lambda at: columns(jacobian, at)).step(at, jacobian, rows, jnp.asarray(1e-6))
+    far = jnp.linalg.norm(full.rays, axis=1)
+    limit = jnp.full(40, jnp.inf).at[5].set(0.5 * far[5]).at[7].set(0.0)
+
+    def rows_at(x):
+        change = jax.tree.map(jnp.subtract, x, at)
+        beyond = jnp.maximum(jnp.linalg.norm(change.rays, axis=1) - limit, 0)
+        linear = jax.tree.map(jnp.add, rows, jacobian(change))
+        return linear._replace(views=linear.views + 1e3 * beyond[jnp.asarray(structure.track)][:, None])
+
+    held = Schur(structure, lambda at: columns(jacobian, at), rows_at)
+    found = jax.jit(lambda rows: held.step(at, jacobian, rows, jnp.asarray(1e-6)))(rows)
+    share = np.linalg.norm(found.rays, axis=1) / np.asarray(far)
+    np.testing.assert_allclose(share[[5, 7]], [0.25, 0.0])
+    np.testing.assert_allclose(np.delete(share, [5, 7]), 1.0)
+    np.testing.assert_allclose(found.frames, full.frames, rtol=1e-9)
+    np.testing.assert_allclose(found.lens[0], full.lens[0], rtol=1e-9)
+
+
+def test_a_lever_that_is_known_beforehand_holds_its_ray_too(rng):
+    jacobian, rows, like, structure = problem(rng, 17, 40, 8, levers=True)
+    full = Schur(structure, lambda at: columns(jacobian, at)).step(like, jacobian, rows, jnp.asarray(1e-6))
+
+    def rows_at(x):
+        linear = jax.tree.map(jnp.add, rows, jacobian(x))
+        return linear._replace(rays=linear.rays + 1e3 * x.rays[:, 2:] * (jnp.arange(40) == 3)[:, None])
+
+    held = Schur(structure, lambda at: columns(jacobian, at), rows_at)
+    found = held.step(like, jacobian, rows, jnp.asarray(1e-6))
+    share = np.linalg.norm(found.rays, axis=1) / np.linalg.norm(full.rays, axis=1)
+    np.testing.assert_allclose(share, jnp.where(jnp.arange(40) == 3, 0.0, 1.0))

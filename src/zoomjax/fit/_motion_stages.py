@@ -50,6 +50,9 @@ _MOST_REPEATS = 12
 
 _SAME = 0.99  # of the noise before a stage: one that leaves less was not the last
 
+_EVEN = 0.25
+"""Power by which changes of a frame's views are averaged: the less it is, the less do single ones count."""
+
 _SETTLED = 3.0
 """Change of the residuals over a whole stage, in all and in units of the noise, that is as good as none."""
 
@@ -236,10 +239,11 @@ def _size_of_views(data, change):
     What moves all views of a frame counts as it is. A ray moves one view of each, and counts nothing: where
     its views disagree, the loss has it wander for dozens of steps, and nothing else moves.
     """
-    length = jnp.where(data.there, jnp.linalg.norm(change, axis=-1), 0)
-    both = jnp.stack([jnp.sqrt(length), 1.0 * data.there], axis=1)
+    squared = jnp.where(data.there, jnp.sum(change**2, axis=-1), 0)
+    both = jnp.stack([squared ** (_EVEN / 2), 1.0 * data.there], axis=1)
     total, count = jax.ops.segment_sum(both, data.structure.frame, len(data.log_focal)).T
-    return jnp.sqrt(jnp.sum(total**4 / jnp.maximum(count, 1) ** 3))
+    mean = (total / jnp.maximum(count, 1)) ** (1 / _EVEN)
+    return jnp.sqrt(jnp.sum(count * mean**2))
 
 
 def _line_noise(data, model):

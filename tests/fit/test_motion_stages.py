@@ -1,0 +1,84 @@
+"""The stages of `fit_motion`: which start goes on, and when a stage ends."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from zoomjax import PolynomialZoom, ZoomLens
+from zoomjax.fit import _motion_stages
+from zoomjax.fit._motion_problem import Asked, Given, problem_of
+from zoomjax.fit._motion_stages import _size_of_views, begun
+from zoomjax.fit._motion_start import starts_of, views_by_frame
+from zoomjax.models import RadialPolynomial
+from zoomjax.scenes import motion_tracks, pan_and_zoom
+
+SIZE, FRAMES = (1280, 720), 24
+
+
+@pytest.fixture(scope="module")
+def problem():
+    zoom = PolynomialZoom(2, jnp.array([[0.02, 0.0], [-0.05, 0.01], [-0.15, 0.05]]), jnp.array(800.0))
+    lens = ZoomLens(zoom, jnp.array([645.0, 356.0]), jnp.array([800.0, 2400.0]), SIZE, "px")
+    path = pan_and_zoom(lens, FRAMES, pan=25, tilt=6)
+    tracks = motion_tracks(lens, *path, views=50, life=12, noise=0.3, seed=3).tracks
+    return problem_of(Given(tracks, None, None, None, None), asked())
+
+
+def asked():
+    return Asked(PolynomialZoom(), RadialPolynomial(), 2, PolynomialZoom(degree=1), None)
+
+
+@pytest.fixture(scope="module")
+def starts(problem):
+    by_frame = views_by_frame(problem.piece, problem.moment, len(problem.data.log_focal))
+    return starts_of(problem.data.points, problem.data.structure.tracks, float(SIZE[0]), by_frame)
+
+
+def chosen(problem, starts):
+    to = asked()
+    return begun(problem.data, *starts, to.zoom, to.shift, to.distortion_model, to.terms)
+
+
+@pytest.fixture
+def steps(monkeypatch):
+    """Steps of the solver, call by call."""
+    taken = []
+    solved = _motion_stages._solved
+
+    def counted(*args):
+        found = solved(*args)
+        taken.append(int(found[3]))
+        return found
+
+    monkeypatch.setattr(_motion_stages, "_solved", counted)
+    return taken
+
+
+def test_a_start_without_hope_is_given_up_and_the_same_one_goes_on(problem, starts, steps, monkeypatch):
+    model, noise = chosen(problem, starts)
+    quick = sum(steps)
+    steps.clear()
+    monkeypatch.setattr(_motion_stages, "_HOPELESS", np.inf)
+    whole, noise_of_whole = chosen(problem, starts)
+    assert quick < sum(steps)
+    np.testing.assert_array_equal(model.path.log_focal, whole.path.log_focal)
+    np.testing.assert_array_equal(noise.points, noise_of_whole.points)
+
+
+def test_the_best_start_goes_on_wherever_it_is_among_them(problem, starts):
+    model, noise = chosen(problem, starts)
+    turned, noise_of_turned = chosen(problem, jax.tree.map(lambda leaf: leaf[::-1], starts))
+    np.testing.assert_allclose(turned.path.log_focal, model.path.log_focal, atol=0.03)
+    np.testing.assert_allclose(noise_of_turned.points, noise.points, rtol=0.02)
+
+
+def test_what_moves_all_views_counts_in_full_and_a_single_ray_hardly(problem):
+    data = problem.data
+    views = int(data.there.sum())
+    change = jnp.broadcast_to(jnp.array([0.03, -0.04]), data.points.shape)
+    np.testing.assert_allclose(_size_of_views(data, change), 0.05 * np.sqrt(views))
+    alone = jnp.where((data.structure.track == 2)[:, None], change, 0)
+    count = int(np.sum(np.asarray(data.structure.track)[:views] == 2))
+    assert count > 5
+    assert _size_of_views(data, alone) < 0.01 * 0.05 * np.sqrt(count)
