@@ -1,8 +1,8 @@
 """Correction of images with OpenCV: a map of source positions, made cheaply, and `cv2.remap`.
 
 Per image: the polynomial for the inverse radial function (`_inverse_polynomial.fit_inverse`), or the exact
-inverse where that is not accurate to 0.01 px; then, for one band of rows after the other, a map and
-`cv2.remap`, so that no map is larger than a cache.
+inverse where that is not accurate to 0.01 px; then a map and `cv2.remap`, in large images for one band of
+rows after the other, so that no map is larger than a cache.
 Maps are float32: fixed-point ones take longer to make than they save, and round to 1/32 px.
 """
 
@@ -36,6 +36,9 @@ _MARGIN = 8.0
 
 _BAND = 2**19
 """Pixels of a band of rows, whose positions stay in a cache."""
+
+_WHOLE = 2**22
+"""Pixels up to which a single map takes less time than bands do to wait for one another."""
 
 
 def undistort_image(
@@ -105,6 +108,7 @@ def undistort_image(
     sample = sampler(image, interpolation, border, fill)
     inverse = _inverse(distortion, keep, (width, height), extend=border != "constant")
     whole = interpolation in WIDE and border == "constant"  # the border depends on all positions
+    whole |= math.prod(keep.size) <= _WHOLE
     corrected = np.empty((*keep.size[::-1], *image.shape[2:]), image.dtype)
     bands = _bands(keep, keep.size[1] if whole else max(_BAND // keep.size[0], 1))
     maps = ((rows, source_positions(distortion, band, inverse)) for rows, band in bands)
