@@ -191,8 +191,9 @@ def test_a_known_focal_length_that_contradicts_the_tracks_is_told(path, noisy):
         fit_motion(noisy.tracks, focal=focal, focal_std=0.01 * focal[5])
 
 
-def test_a_frame_whose_tracks_are_all_wrong_is_as_one_without(path, noisy, fit):
-    tracks, bad = noisy.tracks, 12
+@pytest.mark.parametrize("bad", [0, 12])
+def test_a_frame_whose_tracks_are_all_wrong_is_as_one_without(path, noisy, fit, bad):
+    tracks = noisy.tracks
     points = np.array(tracks.points)
     of_it = np.asarray(tracks.mask) & (np.asarray(tracks.frame) == bad)
     points[of_it, 1] = 300 + 0.2 * points[of_it, 0]  # some of them are near where they should be

@@ -1,14 +1,15 @@
 """The stages of `fit_motion`: which start goes on, and when a stage ends."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from zoomjax import PolynomialZoom, ZoomLens
-from zoomjax.fit import _motion_stages
+from zoomjax.fit import RESULTS, _motion_stages
 from zoomjax.fit._motion_problem import Asked, Given, problem_of
-from zoomjax.fit._motion_stages import _size_of_views, begun
+from zoomjax.fit._motion_stages import STAGES, _size_of_views, begun, in_stages
 from zoomjax.fit._motion_start import starts_of, views_by_frame
 from zoomjax.models import RadialPolynomial
 from zoomjax.scenes import motion_tracks, pan_and_zoom
@@ -82,3 +83,17 @@ def test_what_moves_all_views_counts_in_full_and_a_single_ray_hardly(problem):
     count = int(np.sum(np.asarray(data.structure.track)[:views] == 2))
     assert count > 5
     assert _size_of_views(data, alone) < 0.01 * 0.05 * np.sqrt(count)
+
+
+def test_a_first_frame_that_does_not_fit_the_others_finds_its_way(problem, starts, monkeypatch):
+    """All others would have to move back: too dear in a long clip, or in a short one with less freedom."""
+    model, noise = chosen(problem, starts)
+    expected, *_ = in_stages(problem.data, model, noise, problem.shot)
+    path = model.path._replace(log_focal=model.path.log_focal.at[0].add(-0.12))
+    model = eqx.tree_at(lambda m: m.path, model, path)
+    monkeypatch.setattr(_motion_stages, "STAGES", (*STAGES[:2], STAGES[2]._replace(own=0.005)))
+    parts, *_ = in_stages(problem.data, model, noise, problem.shot)
+    std = np.asarray(expected["focal_std"])[:FRAMES]
+    off = np.abs(np.asarray(parts["focal"]) - np.asarray(expected["focal"]))[:FRAMES]
+    np.testing.assert_array_less(off, 0.3 * std)
+    assert parts["fit"].result == RESULTS.successful

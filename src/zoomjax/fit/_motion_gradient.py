@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jax.scipy.sparse.linalg import cg
 
 from ._columns import Unknowns
-from ._motion_model import Data, Model, Noise, Stage, moved, units_of
-from ._motion_rows import columns_of, rows_of
+from ._motion_model import Data, Model, Noise, Stage, moved, pinned, units_of
+from ._motion_rows import columns_of, residuals_of, rows_of
 from ._motion_stages import STAGES
 from ._schur import reduced_of, solution_of
 
@@ -34,6 +34,8 @@ def sensitive(data: Data, model: Model, noise: Noise) -> Model:
     units = units_of(data, model, noise)
     zeros = jax.tree.map(jnp.zeros_like, units)
     here = jax.tree.map(jax.lax.stop_gradient, data)
+    here = pinned(here, residuals_of(here, model), noise)
+    data = eqx.tree_at(lambda data: data.pinned, data, here.pinned)
 
     def gradient(data: Data, unknowns: Unknowns) -> Unknowns:
         rows, back = jax.vjp(lambda x: rows_of(x, (data, model, noise, stage)), unknowns)

@@ -18,6 +18,7 @@ from ..models.zoom import AbstractZoom, with_parameters
 from ._columns import Unknowns
 from ._motion_start import Path, rotation_vector, shrunk_ray, turned
 from ._structure import Structure
+from ._views import FAR
 
 
 class Stage(NamedTuple):
@@ -71,7 +72,7 @@ class Data(eqx.Module):
         there: which views there are; others pad.
         structure: which track and frame each view belongs to.
         fixed: frames whose rotation is given: the first of each shot, and those that no track sees.
-        pinned: the frame whose log f moves by the common factor alone; none where all are known.
+        pinned: the frame whose log f moves by the common factor alone (`pinned`); none where all are known.
         log_focal, log_std: what is known of log f beforehand; infinite standard deviations.
         neighbours: of each frame, the frames before and after it in the same shot, or itself.
         readout: what is known of the readout, and its standard deviation.
@@ -95,6 +96,25 @@ class Data(eqx.Module):
     moments: Float[Array, "line moment 2 2"] | None
     scale: float = eqx.field(static=True)
     size: tuple[int, int] = eqx.field(static=True)
+
+
+def pinned(data: Data, missed: Float[Array, "view 2"], noise: Noise) -> Data:
+    """The same, with that frame pinned which most views follow.
+
+    One that does not fit the others would keep its f: to move it by the common factor, all others have to
+    move back, and in a long clip that is too dear.
+
+    Args:
+        data: tracks and lines.
+        missed: residuals of all views, px.
+        noise: of those that follow.
+    """
+    near = jnp.linalg.norm(missed, axis=-1) < FAR * noise.points
+    follows = jnp.where(data.there & near, 1.0, 0.0)
+    count = jax.ops.segment_sum(follows, data.structure.frame, len(data.log_focal))
+    best = jnp.argmax(jnp.where(jnp.isinf(data.log_std), count, -1))
+    only = (jnp.arange(len(count)) == best) & jnp.any(data.pinned)
+    return eqx.tree_at(lambda data: data.pinned, data, only)
 
 
 class Speed(NamedTuple):

@@ -25,8 +25,8 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
 from ._columns import Columns, Rows, over_views
-from ._motion_model import Data, Model, Noise, Stage, units_of
-from ._motion_rows import columns_of, line_planes_of, rows_of
+from ._motion_model import Data, Model, Noise, Stage, pinned, units_of
+from ._motion_rows import columns_of, line_planes_of, residuals_of, rows_of
 from ._schur import Reduced, lens_equations, reduced_of
 from ._small_matrices import products
 from ._structure import Structure
@@ -57,6 +57,7 @@ def repeated(
     data: Data, model: Model, noise: Noise, stage: Stage, group: Int[Array, "line"]
 ) -> Float[Array, ""]:
     """How many points of lines count as one, beside what `noise` says of that; 1 if there is no line."""
+    data = pinned(data, residuals_of(data, model), noise)
     zeros = jax.tree.map(jnp.zeros_like, units_of(data, model, noise))
     args = data, model, noise, stage
     rows, of_rows = rows_of(zeros, args), columns_of(args, zeros)

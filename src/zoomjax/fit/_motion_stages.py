@@ -14,7 +14,7 @@ from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
 from ._columns import Unknowns
 from ._motion_levers import common_lever, guessed_levers, told_levers
-from ._motion_model import Model, Noise, Speed, Stage, moved, speed_of, units_of
+from ._motion_model import Model, Noise, Speed, Stage, moved, pinned, speed_of, units_of
 from ._motion_parallax import is_seen, parallax_of, spread_of
 from ._motion_repeated import common_errors_of, groups_of, repeated
 from ._motion_rows import (
@@ -30,7 +30,7 @@ from ._motion_rows import (
 from ._motion_start import STARTS, disagreement
 from ._normal_solver import damped_solver
 from ._schur import Schur, covariances, reduced_of
-from ._views import CAUCHY, EXACT, MEDIAN_OF_SIZE, core_median
+from ._views import CAUCHY, EXACT, FAR, MEDIAN_OF_SIZE, core_median
 from .result import RESULTS, ZoomFit, judged
 
 STAGES = (
@@ -49,6 +49,9 @@ _HOPELESS = 2.0
 _MOST_REPEATS = 12
 
 _SAME = 0.99  # of the noise before a stage: one that leaves less was not the last
+
+_PART = 150
+"""Frames of a part of a long clip. More of them make no change larger, nor an error."""
 
 _EVEN = 0.25
 """Power by which changes of a frame's views are averaged: the less it is, the less do single ones count."""
@@ -89,7 +92,7 @@ def begun(data, paths, spreads, zoom, shift, distortion_model, terms):
         zoom, shift, distortion_model, terms: as for `fit_motion`.
     """
     tried: list[Any] = []
-    glance = STAGES[0]._replace(change=_GLANCE * np.sqrt(np.sum(data.there)))
+    glance = STAGES[0]._replace(change=_GLANCE * np.sqrt(np.sum(data.there) / _parts(data)))
     for path, spread in zip(_each(paths), spreads, strict=True):
         focal = np.exp(np.asarray(path.log_focal))
         prepared = None if shift is None else shift.prepare(focal, 2)
@@ -201,6 +204,8 @@ def _solved(data, model, noise, stage):
     model = eqx.tree_at(lambda m: m.path.rays, model, rays)
     of_lines = stage.wider * _line_noise(data, model)
     noise = noise._replace(lines=jnp.where(jnp.isnan(noise.lines), of_lines, noise.lines))
+    first = residuals_of(data, model)
+    data = pinned(data, first, noise)
     units, args = units_of(data, model, noise), (data, model, noise, stage)
     steps = Schur(data.structure, eqx.Partial(columns_of, args), eqx.Partial(rows_of, args=args))
     solution = optx.least_squares(
@@ -211,12 +216,12 @@ def _solved(data, model, noise, stage):
         max_steps=_MOST_STEPS,
         throw=False,
     )
-    first = residuals_of(data, model)
     model = moved(model, jax.tree.map(jnp.multiply, solution.value, units))
     views = residuals_of(data, model)
     size = jnp.linalg.norm(views, axis=-1)
-    near = (size < 3 * CAUCHY * noise.points)[:, None]
+    near = (size < FAR * noise.points)[:, None]
     change = _size_of_views(data, jnp.where(near, views - first, 0)) / noise.points
+    change = change / jnp.sqrt(_parts(data))
     points = core_median(size, data.there) / MEDIAN_OF_SIZE
     rays = model.path.rays / jnp.linalg.norm(model.path.rays, axis=1, keepdims=True)
     model = eqx.tree_at(lambda m: m.path.rays, model, rays)
@@ -228,9 +233,17 @@ def _solved(data, model, noise, stage):
 
 
 def _size_of_change(data, rows):
-    """How much residuals change in all: the root of the sum of squares, but for `_size_of_views`."""
+    """How much residuals change in all: the root of the sum of squares, but for `_size_of_views`.
+
+    In a long clip it is that of a part in the mean: the way to the minimum ends where each part's would.
+    """
     others = optx.two_norm(rows._replace(views=jnp.zeros(0)))
-    return jnp.hypot(_size_of_views(data, rows.views), others)
+    return jnp.hypot(_size_of_views(data, rows.views), others) / jnp.sqrt(_parts(data))
+
+
+def _parts(data):
+    """How many clips of a common length a clip is as long as; at least 1."""
+    return max(len(data.log_focal) / _PART, 1.0)
 
 
 def _size_of_views(data, change):
@@ -260,6 +273,7 @@ def _described(data, model, noise, stage, result, steps):
     zeros = jax.tree.map(jnp.zeros_like, units)
 
     missed = residuals_of(data, model)
+    data = pinned(data, missed, noise)
     squared = jnp.sum(missed**2, axis=-1) / (noise.points * CAUCHY) ** 2
     good = line_squares_of(data, line_residuals_of(data, model)) < (3 * WRONG_LINE * noise.lines) ** 2
     inlier = data.there & (squared < 9)  # beyond, the loss nearly ignores a view

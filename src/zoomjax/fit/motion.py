@@ -61,7 +61,7 @@ class MotionFit(eqx.Module):
         focal: focal length of each frame, px; NaN for a frame without tracks.
         focal_std: its standard deviation, px. Nearly all of it is a factor common to all frames.
         covariance: of the zoom model's parameters, of those of the centre's offset, of the readout, and of
-            the logarithm of that factor: that of the first frame.
+            the logarithm of that factor: that of the frame whose views follow best.
         rotation: of each frame, from the scene to the camera, whose axes are x right, y down and z
             forward. The first frame's is the identity. So is that of the first frame after a cut, across
             which no track goes: how the camera turned between them is not known.
