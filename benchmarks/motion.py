@@ -26,7 +26,7 @@ tells; --panorama FILE writes what they look like put together.
 
 `rivals`: OpenCV's and Hugin's own estimates, on the same simulated tracks.
 
-`time`: seconds of a second fit in the process, tracking apart, and the memory of the process.
+`time`: seconds of fits, tracking apart, and the most memory of a process that reads the tracks and fits them.
 
 Results go to benchmarks/results/motion.md and motion.json after each row. With --only, other rows stay.
 With --resume, rows go on after the clips and draws that are stored, which are those of the first seeds.
@@ -114,10 +114,11 @@ SECTIONS = {
     ),
     "time": Section(
         "Time",
-        ("first fit, s", "second, s", "GB", "f, %", "lens, px"),
+        ("first fit, s", "second, s", "GB", "f, %", "bound", "lens, px", "bound", "successful"),
         lambda r: [
             *(f"{r['first']:.1f}", f"{r['second']:.1f}", f"{r['GB']:.1f}"),
-            *(_percent(r["f"]), f"{r['lens']:.3f}"),
+            *(_percent(r["f"]), _percent(r["f_bound"]), f"{r['lens']:.3f}", f"{r['lens_bound']:.3f}"),
+            "yes" if r["result"] else "no",
         ],
     ),
 }

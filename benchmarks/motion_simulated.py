@@ -1,8 +1,11 @@
 """Simulated tracks of `benchmarks/motion.py`: errors beside the bound, and times."""
 
 import resource
+import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import equinox as eqx
@@ -16,10 +19,12 @@ from zoomjax.app.motion_calibration import MotionCalibration
 from zoomjax.fit import RESULTS, MotionFit, fit_motion
 from zoomjax.models import certify
 from zoomjax.scenes import MotionScene, motion_tracks, pan_and_zoom
+from zoomjax.tracks import load_tracks
 
 SIZE = (1920, 1080)
 SHOWN = np.stack(np.meshgrid(*(np.linspace(0, n - 1, 9) for n in SIZE)), -1).reshape(-1, 2)
 _DRAWS = 60
+_LENS = {"low": 1200.0, "ratio": 4.0}
 
 KINDS: dict[str, tuple[dict, dict]] = {
     "pan 30°, zoom 1:4": ({}, {}),
@@ -59,7 +64,7 @@ def random_lens(seed: int, low: float, ratio: float) -> ZoomLens:
 
 def random_scene(seed: int, path: dict, tracks: dict, frames: int = 150) -> tuple[ZoomLens, MotionScene]:
     """A random lens, and tracks of it on a random path."""
-    given = {"low": 1200.0, "ratio": 4.0, "pan": 30, "tilt": 5} | path
+    given = _LENS | {"pan": 30, "tilt": 5} | path
     lens = random_lens(seed, given["low"], given["ratio"])
     where = pan_and_zoom(lens, frames, pan=given["pan"], tilt=given["tilt"], seed=seed)
     options = {"views": 200, "life": 40, "noise": 0.3} | tracks
@@ -96,11 +101,11 @@ def bounds(fit: MotionFit, frames: np.ndarray, rng: np.random.Generator) -> tupl
     return float(np.sqrt(0.95 * np.nanmean(std**2))), float(np.sqrt(np.mean(np.square(sizes))))
 
 
-def errors(lens: ZoomLens, scene: MotionScene, fit: MotionFit, frames: np.ndarray) -> tuple[float, float]:
+def errors(lens: ZoomLens, focal: np.ndarray, fit: MotionFit, frames: np.ndarray) -> tuple[float, float]:
     """Of all focal lengths, relative, and of the lens, px: RMS."""
     own = np.asarray(fit.focal)
-    return float(np.sqrt(np.nanmean((own / scene.focal - 1) ** 2))), displaced(
-        lens, wide(fit.lens), scene.focal[frames], own[frames]
+    return float(np.sqrt(np.nanmean((own / focal - 1) ** 2))), displaced(
+        lens, wide(fit.lens), focal[frames], own[frames]
     )
 
 
@@ -129,7 +134,7 @@ def simulated(clips: int, only: str, stored: dict[str, list[dict]]) -> Rows:
             seconds = time.perf_counter() - begin
             frames = np.arange(0, len(scene.focal), 15)
             own, bound = (
-                errors(wide(lens), scene, fit, frames),
+                errors(wide(lens), scene.focal, fit, frames),
                 bounds(fit, frames, np.random.default_rng(0)),
             )
             good = bool(fit.fit.result == RESULTS.successful)
@@ -177,20 +182,28 @@ def _doubted(found: list[dict]) -> int | None:
 
 
 def timed(only: str) -> Rows:
-    """Seconds of a fit, the second in the process, and the most memory that the process has had."""
+    """Seconds of a fit, the second in the process, and the most memory that the process has had.
+
+    It reads the tracks of a file, which another process has written.
+    """
     for frames in (150, 1500, 10_000):
         if only not in f"{frames:,}":
             continue
-        lens, scene = random_scene(0, {}, {}, frames)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "tracks.npz"
+            with ProcessPoolExecutor(1, get_context("spawn")) as other:
+                focal = other.submit(_written, path, frames).result()
+            tracks = load_tracks(path)
         begin = time.perf_counter()
-        fit_motion(scene.tracks, throw=False)
+        fit_motion(tracks, throw=False)
         first = time.perf_counter()
-        fit = fit_motion(scene.tracks, throw=False)
+        fit = fit_motion(tracks, throw=False)
         jax.block_until_ready(fit.focal)
         seconds = [first - begin, time.perf_counter() - first]
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
         shown = np.arange(0, frames, max(frames // 10, 1))
-        own = errors(wide(lens), scene, fit, shown)
+        own = errors(wide(random_lens(0, **_LENS)), focal, fit, shown)
+        bound = bounds(fit, shown, np.random.default_rng(0))
         yield (
             f"{frames:,} frames",
             {
@@ -199,5 +212,16 @@ def timed(only: str) -> Rows:
                 "GB": memory,
                 "f": own[0],
                 "lens": own[1],
+                "f_bound": bound[0],
+                "lens_bound": bound[1],
+                "result": bool(fit.fit.result == RESULTS.successful),
             },
         )
+
+
+def _written(path: Path, frames: int) -> np.ndarray:
+    """Write the tracks of a clip, and return its focal lengths."""
+    jax.config.update("jax_enable_x64", True)
+    scene = random_scene(0, {}, {}, frames)[1]
+    scene.tracks.save(path)
+    return scene.focal

@@ -24,7 +24,7 @@ import scipy.sparse.csgraph
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
-from ._columns import Columns, Rows, over_views
+from ._columns import CHUNK, Columns, Rows, over_views
 from ._motion_model import Data, Model, Noise, Stage, pinned, units_of
 from ._motion_rows import columns_of, line_planes_of, residuals_of, rows_of
 from ._schur import Reduced, lens_equations, reduced_of
@@ -69,7 +69,7 @@ def repeated(
     score = jnp.einsum("lrp,lr->lp", effect, rows.lines)
     told = jnp.einsum("lrp,lrq->lpq", effect, effect)
     score, told = (jax.ops.segment_sum(of, group, len(group)) for of in (score, told))
-    return _more_than_chance(score, told, information)
+    return _more_than_chance((score, told), lambda group: group, information)
 
 
 def common_errors_of(
@@ -100,17 +100,31 @@ def common_errors_of(
 
     start = tuple(jnp.zeros((structure.tracks, n, size + 1)) for n in (size, own))
     (told, of_rays), _ = over_views(len(structure.track), step, start)
-    with_rays = jnp.einsum("tip,tij->tpj", of_rays[..., :-1], matrix.rays[0])
     if of_known is not None and pull.rays is not None:
         of_rays = of_rays.at[..., -1].add(jnp.einsum("tki,tk->ti", of_known, pull.rays))
-    told = told - with_rays @ of_rays
-    return _more_than_chance(told[..., -1], told[..., :-1], information)
+
+    def without_ray(track):
+        told, of_ray, inverse = track
+        told = told - of_ray[:, :-1].T @ inverse @ of_ray
+        return told[:, -1], told[:, :-1]
+
+    return _more_than_chance((told, of_rays, matrix.rays[0]), without_ray, information)
 
 
-def _more_than_chance(score, told, information):
-    """The mean of ``g^T V g`` over its expectation; 1 if nothing is expected."""
+def _more_than_chance(groups, of_group, information):
+    """The mean of ``g^T V g`` over its expectation; 1 if nothing is expected.
+
+    Args:
+        groups: what each group has, in arrays.
+        of_group: gives a group's score g and what it tells.
+        information: the inverse of V.
+    """
     covariance = jnp.linalg.inv(information)
-    own = jnp.einsum("gpq,qr->gpr", told, covariance)  # H V
-    expected = jnp.einsum("gpp->", own) - jnp.einsum("gpq,gqp->", own, own)
-    found = jnp.einsum("gp,pq,gq->", score, covariance, score)
+
+    def one(group):
+        score, told = of_group(group)
+        own = told @ covariance  # H V
+        return score @ covariance @ score, jnp.trace(own) - jnp.sum(own * own.T)
+
+    found, expected = (jnp.sum(of) for of in jax.lax.map(one, groups, batch_size=CHUNK))
     return jnp.where(expected > 0, found / jnp.where(expected > 0, expected, 1), 1.0)
