@@ -26,7 +26,7 @@ tells; --panorama FILE writes what they look like put together.
 
 `rivals`: OpenCV's and Hugin's own estimates, on the same simulated tracks.
 
-`time`: seconds of fits, tracking apart, and the most memory of a process that reads the tracks and fits them.
+`time`: seconds of fits, tracking apart, and the most memory of a process that reads tracks and fits them.
 
 Results go to benchmarks/results/motion.md and motion.json after each row. With --only, other rows stay.
 With --resume, rows go on after the clips and draws that are stored, which are those of the first seeds.

@@ -8,8 +8,9 @@ import pytest
 
 from zoomjax import PolynomialZoom, ZoomLens
 from zoomjax.fit import RESULTS, _motion_stages
+from zoomjax.fit._columns import Rows
 from zoomjax.fit._motion_problem import Asked, Given, problem_of
-from zoomjax.fit._motion_stages import STAGES, _size_of_views, begun, in_stages
+from zoomjax.fit._motion_stages import STAGES, _size_of_change, _size_of_views, begun, in_stages
 from zoomjax.fit._motion_start import starts_of, views_by_frame
 from zoomjax.models import RadialPolynomial
 from zoomjax.scenes import motion_tracks, pan_and_zoom
@@ -37,8 +38,9 @@ def starts(problem):
 
 
 def chosen(problem, starts):
+    paths, spreads = starts
     to = asked()
-    return begun(problem.data, *starts, to.zoom, to.shift, to.distortion_model, to.terms)
+    return begun(problem.data, paths, spreads, to.zoom, to.shift, to.distortion_model, to.terms)
 
 
 @pytest.fixture
@@ -69,7 +71,8 @@ def test_a_start_without_hope_is_given_up_and_the_same_one_goes_on(problem, star
 
 def test_the_best_start_goes_on_wherever_it_is_among_them(problem, starts):
     model, noise = chosen(problem, starts)
-    turned, noise_of_turned = chosen(problem, jax.tree.map(lambda leaf: leaf[::-1], starts))
+    worst_first = jax.tree.map(lambda leaf: leaf[::-1], starts)
+    turned, noise_of_turned = chosen(problem, worst_first)
     np.testing.assert_allclose(turned.path.log_focal, model.path.log_focal, atol=0.03)
     np.testing.assert_allclose(noise_of_turned.points, noise.points, rtol=0.02)
 
@@ -83,6 +86,15 @@ def test_what_moves_all_views_counts_in_full_and_a_single_ray_hardly(problem):
     count = int(np.sum(np.asarray(data.structure.track)[:views] == 2))
     assert count > 5
     assert _size_of_views(data, alone) < 0.01 * 0.05 * np.sqrt(count)
+
+
+def test_changes_in_a_long_clip_are_those_of_its_parts_in_the_mean(problem):
+    data = problem.data
+    longer = eqx.tree_at(lambda data: data.log_focal, data, jnp.zeros(600))
+    others = jnp.zeros((12, 5)), jnp.full((FRAMES, 4), 0.1), jnp.full(3, 0.1)
+    rows = Rows(jnp.broadcast_to(jnp.array([0.03, -0.04]), data.points.shape), *others)
+    size, in_parts = _size_of_change(data, rows), _size_of_change(longer, rows)
+    np.testing.assert_allclose(in_parts, size / 2)
 
 
 def test_a_first_frame_that_does_not_fit_the_others_finds_its_way(problem, starts, monkeypatch):

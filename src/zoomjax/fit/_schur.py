@@ -303,16 +303,16 @@ class Schur(AbstractNormalSolver):
         del jacobian
         matrix = reduced_of(self.columns_at(at), rows, at, self.structure, damping)
         found = solution(matrix, at, self.structure)
-        return found if self.rows_at is None else self._held(at, found)
+        return found if self.rows_at is None else self._held(self.rows_at, at, found)
 
-    def _held(self, at, found):
+    def _held(self, rows_at, at, found):
         """The step, shorter for rays whose rows are less with a shorter one."""
 
         def shorter(share):
             return found._replace(rays=share * found.rays)
 
         def squares(share):
-            rows = self.rows_at(jax.tree.map(jnp.subtract, at, shorter(share)))
+            rows = rows_at(jax.tree.map(jnp.subtract, at, shorter(share)))
             of_views = jnp.sum(rows.views**2, axis=-1)
             total = jax.ops.segment_sum(of_views, self.structure.track, self.structure.tracks)
             return total if rows.rays is None else total + jnp.sum(rows.rays**2, axis=-1)
