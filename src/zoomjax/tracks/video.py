@@ -51,8 +51,8 @@ def track_video(
             it can be followed.
 
     Warns:
-        UserWarning: the clip is interlaced, its pixels are not square, or some of its frames do not decode:
-            frames of the tracks are numbered without these.
+        UserWarning: the clip is interlaced, its pixels are not square, it is one of several in its file, or
+            some of its frames do not decode: frames of the tracks are numbered without these.
     """
     with decode_video(clip) as (announced, items):
         numbers = []
