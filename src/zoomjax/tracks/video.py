@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from .._core.checks import checked_integer
+from .._core.fields import refuse_masked_image
 from ..io.video_reader import decode_video
 from ._follow import Follower
 from .tracks import Tracks
@@ -112,6 +113,7 @@ def track_frames(
 
 def grey_frame(image: np.ndarray) -> np.ndarray:
     """A frame as (height, width) bytes; ValueError if it is no image of 8 bits."""
+    refuse_masked_image("frames", image)
     shape = np.shape(image)
     flat = len(shape) == 2 or shape[2:] in ((1,), (3,), (4,))
     if getattr(image, "dtype", None) != np.uint8 or not flat:
