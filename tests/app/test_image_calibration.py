@@ -17,7 +17,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app import demo
+from zoomjax.app import demo, image_calibration
 from zoomjax.app.board_focals import Board
 from zoomjax.app.console import show_images
 from zoomjax.app.drawings import drawing
@@ -28,6 +28,7 @@ from zoomjax.app.report import report
 from zoomjax.app.undistort_files import Job, undistort_files
 from zoomjax.io.exif import exif_with_focal
 from zoomjax.io.video_reader import decode_video
+from zoomjax.trust.assessment import Finding
 
 from .. import _clips as clips
 from .._browser import opened
@@ -218,6 +219,18 @@ def test_focal_lengths_in_mm_that_are_all_off_by_one_factor_are_doubtful(done, s
     assessment = _with_findings(off).calibration.assessment
     assert assessment.verdict == verdict
     assert ("by their EXIF data" in "".join(f.found for f in assessment.findings)) == (verdict != "good")
+
+
+def test_photos_that_seem_turned_count_in_the_verdict(done, monkeypatch):
+    turned = Finding("turned photos", "doubtful", "some were turned.", "Turn them back.", cause=True)
+    asked = []
+    monkeypatch.setattr(
+        image_calibration, "findings_of_turned", lambda *args: [asked.append(args), turned][1:]
+    )
+    assert _with_findings(done).calibration.assessment.verdict == "doubtful"
+    [(lines, lens, names)] = asked
+    assert len(names) == len(lines.focal) == len(done.used)
+    assert lens is done.calibration.fit.lens
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ from .focal_sources import GRID, MEASURED, Focals, choose_focals, focal_sigmas, 
 from .image_job import ImageJob, overlay_name
 from .plane_focals import Sharing
 from .results_folder import OF_A_LENS, results_folder
+from .turned import findings_of_turned
 from .tying import Bend, tied, to_search_again
 from .undetermined import told_undetermined
 from .usable import OTHER_SIZE, usable_of
@@ -358,6 +359,9 @@ def _with_findings(done: ImageCalibration) -> ImageCalibration:
         found += findings_of_photos([Path(d.file) for d in done.used], done.used[0].image_size)
         others = sum(why.startswith(OTHER_SIZE) for why in done.unused.values())
         found += findings_of_sizes(others, len(done.used)) + _findings_of_exif(done)
+        found += findings_of_turned(
+            done.calibration.lines, done.calibration.fit.lens, [d.name for d in done.used]
+        )
     assessment = done.calibration.assessment.joined_by(found)
     options = sharing_options(done.used, done.focals, done.job.other_sharing)
     assessment = assessment.joined_by(findings_of_own_focals(options, assessment.verdict))
