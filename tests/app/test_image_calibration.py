@@ -17,16 +17,18 @@ from PIL.TiffImagePlugin import IFDRational
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app import demo
+from zoomjax.app import demo, image_calibration
+from zoomjax.app.board_focals import Board
 from zoomjax.app.console import show_images
 from zoomjax.app.drawings import drawing
-from zoomjax.app.image_calibration import calibrate_images
+from zoomjax.app.image_calibration import _with_findings, calibrate_images
 from zoomjax.app.image_job import ImageJob
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.report import report
 from zoomjax.app.undistort_files import Job, undistort_files
 from zoomjax.io.exif import exif_with_focal
 from zoomjax.io.video_reader import decode_video
+from zoomjax.trust.assessment import Finding
 
 from .. import _clips as clips
 from .._browser import opened
@@ -200,6 +202,35 @@ def test_of_many_photos_some_are_drawn(done, monkeypatch):
 
 def test_the_verdict_is_good(done):
     assert done.calibration.assessment.verdict == "good"
+
+
+@pytest.mark.parametrize(
+    ("source", "unit", "verdict"), [("board", "mm", "doubtful"), ("plane", "px", "good")]
+)
+def test_focal_lengths_in_mm_that_are_all_off_by_one_factor_are_doubtful(done, source, unit, verdict):
+    """As of a board whose spacing is wrong: `undistort` would take those of the EXIF data."""
+    focals = dataclasses.replace(
+        done.focals, unit=unit, focal={name: 1.5 * f for name, f in done.focals.focal.items()}
+    )
+    board = Board((20.0, 20.0), 1000.0, 0.01)
+    off = dataclasses.replace(
+        done, focals=focals, job=dataclasses.replace(done.job, focal=source, board=board)
+    )
+    assessment = _with_findings(off).calibration.assessment
+    assert assessment.verdict == verdict
+    assert ("by their EXIF data" in "".join(f.found for f in assessment.findings)) == (verdict != "good")
+
+
+def test_photos_that_seem_turned_count_in_the_verdict(done, monkeypatch):
+    turned = Finding("turned photos", "doubtful", "some were turned.", "Turn them back.", cause=True)
+    asked = []
+    monkeypatch.setattr(
+        image_calibration, "findings_of_turned", lambda *args: [asked.append(args), turned][1:]
+    )
+    assert _with_findings(done).calibration.assessment.verdict == "doubtful"
+    [(lines, lens, names)] = asked
+    assert len(names) == len(lines.focal) == len(done.used)
+    assert lens is done.calibration.fit.lens
 
 
 @pytest.mark.slow

@@ -207,21 +207,37 @@ def test_the_verdict_on_one_photo_is_that_on_its_lens(noisy):
 
 
 @pytest.mark.parametrize(
-    ("exif", "used", "told"),
+    ("exif", "used", "in_mm", "measured", "told"),
     [
-        ([18.0, 35.0, 200.0], [1.0, 1.0, 1.0], "a.jpg 18 mm and c.jpg 200 mm are of other zooms"),
-        ([18.0, 35.0, 200.0], [18.3, 35.2, 190.0], ""),
-        ([18.0, 35.0, 200.0], [3600.0, 7000.0, 39000.0], ""),
-        ([18.0, 35.0, 200.0], [18.0, 200.0, 35.0], "b.jpg 35 mm and c.jpg 200 mm"),
-        ([None, 35.0, None], [1.0, 1.0, 1.0], ""),
+        ([18, 35, 200], [1, 1, 1], False, False, "a.jpg 18 mm and c.jpg 200 mm are of other zooms"),
+        ([18, 35, 200], [18.3, 35.2, 190], True, False, ""),
+        ([18, 35, 200], [3600, 7000, 39000], False, False, ""),
+        ([18, 35, 200], [18, 200, 35], True, False, "b.jpg 35 mm and c.jpg 200 mm"),
+        ([None, 35, None], [1, 1, 1], False, False, ""),
+        (
+            [18, 35, 200],
+            [27, 52.5, 300],
+            True,
+            False,
+            "a.jpg 18 mm and c.jpg 200 mm are of other zooms",
+        ),
+        ([18, 35, 200], [14.7, 29, 170], True, True, ""),
+        ([18, 35, 200], [17, 33, 140], True, True, ""),
+        ([18, 35, 200], [12, 24, 90], True, True, "a.jpg 18 mm and c.jpg 200 mm are of other zooms"),
+        ([None, 35, None], [50, 50, 50], True, False, "b.jpg 35 mm is of another zoom"),
     ],
-    ids=["taken as one", "rounded", "in px", "rows in another order", "one known"],
+    ids=[
+        *("taken as one", "rounded", "in px", "rows in another order", "one known", "equal view on film"),
+        *("near things", "a zoom that shortens for near things", "a board of another size", "one in mm"),
+    ],
 )
-def test_focal_lengths_that_contradict_exif_data_are_doubtful(exif, used, told):
+def test_focal_lengths_that_contradict_exif_data_are_doubtful(exif, used, in_mm, measured, told):
     names = ["a.jpg", "b.jpg", "c.jpg"]
     found = findings_of_exif(
-        [Detection(name, focal=f) for name, f in zip(names, exif, strict=True)],
-        dict(zip(names, used, strict=True)),
+        [Detection(name, focal=f and float(f)) for name, f in zip(names, exif, strict=True)],
+        dict(zip(names, map(float, used), strict=True)),
+        in_mm=in_mm,
+        measured=measured,
     )
     assert [finding.verdict for finding in found] == ["doubtful"] * bool(told)
     assert told in "".join(finding.found for finding in found)

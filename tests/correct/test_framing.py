@@ -99,3 +99,14 @@ def test_bad_arguments(arguments, message):
     distortions, size, keep = arguments
     with pytest.raises(ValueError, match=message):
         zj.correct.frame_output(distortions, size, keep=keep)
+
+
+@pytest.mark.parametrize("size", [(1, 64), (64, 1), (1, 1)])
+def test_all_of_images_one_pixel_wide(size):
+    """They have no width between the centres of their pixels."""
+    d = zj.Distortion(jnp.array([0.05]), (jnp.array(size) - 1) / 2, jnp.array(40.0))
+    framing = zj.correct.frame_output(d, size, keep="all")
+    assert np.isfinite(framing.scale)
+    assert np.isfinite(framing.origin).all()
+    shown = zj.undistort_image(np.full(size[::-1], 9, np.uint8), d, keep="all")
+    assert (shown[0] if isinstance(shown, tuple) else shown).shape == size[::-1]

@@ -1,7 +1,9 @@
 """Videos whose file says more than their pictures: frames that are not shown, pixels, fields, damage."""
 
+import contextlib
 import io
 import struct
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 
 import cv2
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
+from zoomjax.correct import _segments
 from zoomjax.detect import video_frames
 from zoomjax.io import FocalTrack, decode_video
 from zoomjax.io.video_crop import _elements, shown_size
@@ -95,6 +98,97 @@ def test_pixels_that_are_not_square_are_said(work, tmp_path):
         WORKS[work](path)
 
 
+def between_keys(path, before=6):
+    """A clip of a broadcast, cut anywhere: its first frames have no key frame, and are no pictures."""
+    write(path.with_name("whole.ts"), number=2 * FRAMES, g="10", keyint_min="10", sc_threshold="0")
+    with av.open(str(path.with_name("whole.ts"))) as given, av.open(str(path), "w") as out:
+        stream = out.add_stream_from_template(given.streams.video[0])
+        packets = [packet for packet in given.demux(video=0) if packet.size]
+        kept = packets[10 - before :]
+        first = min(packet.dts for packet in kept)
+        for packet in kept:
+            packet.pts, packet.dts, packet.stream = packet.pts - first, packet.dts - first, stream
+            out.mux(packet)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".ts", ".mkv", ".mp4"])
+@pytest.mark.parametrize("work", WORKS)
+def test_frames_before_the_first_key_frame_are_said(work, suffix, tmp_path):
+    """They were left out without a word; a track of all frames was then used six frames late."""
+    path = between_keys(tmp_path / f"in{suffix}")
+    with pytest.warns(UserWarning, match="first 6 frames of the video cannot be decoded") as warned:
+        WORKS[work](path)
+    assert len(warned) == 1
+    with pytest.warns(UserWarning, match="first 6"), decode_video(path) as (announced, frames):
+        assert [number for number, _, _ in frames] == list(range(announced)) == list(range(2 * FRAMES - 10))
+
+
+def test_frames_are_numbered_alike_by_segments(tmp_path, monkeypatch):
+    """Of a clip without its first key frame; frames before were counted by an executor alone."""
+    path, numbers = between_keys(tmp_path / "in.mkv"), {}
+    monkeypatch.setattr(_segments, "_LEAST", 8)
+    at = FocalTrack.at
+    for executor in (None, ThreadPoolExecutor(1)):
+        asked = numbers.setdefault(executor, [])
+
+        def asking(track, number, time, asked=asked):
+            asked.append((number, round(time, 3)))
+            return at(track, number, time)
+
+        monkeypatch.setattr(FocalTrack, "at", asking)
+        track = FocalTrack(np.arange(60.0), np.full(60, 20.0), by_time=False)
+        with pytest.warns(UserWarning, match="first 6 frames"):
+            done = zj.undistort_video(
+                path, tmp_path / "out.mkv", lens=lens(), focal=track, executor=executor
+            )
+        assert (done.frames, done.lost) == (2 * FRAMES - 10, 6)
+    one, several = numbers.values()
+    assert one == sorted(set(several))
+
+
+def put_together(path, *streams):
+    """A file of several streams of pictures, of which each is a clip and its disposition."""
+    with contextlib.ExitStack() as stack:
+        out = stack.enter_context(av.open(str(path), "w"))
+        taken = []
+        for source, disposition in streams:
+            given = stack.enter_context(av.open(str(source)))
+            stream = out.add_stream_from_template(given.streams.video[0])
+            stream.disposition = disposition
+            taken.append((stream, [packet for packet in given.demux(video=0) if packet.size]))
+        for stream, packets in taken:
+            for packet in packets:
+                packet.stream = stream
+                out.mux(packet)
+    return path
+
+
+@pytest.mark.parametrize("work", WORKS)
+def test_further_streams_of_pictures_are_said_and_covers_are_not_taken(work, tmp_path):
+    disposition = av.stream.Disposition
+    one, other = write(tmp_path / "one.mp4", number=4), write(tmp_path / "other.mp4", number=4)
+    both = put_together(tmp_path / "both.mp4", (one, disposition.default), (other, disposition.default))
+    with pytest.warns(UserWarning, match="2 streams of pictures: the one of 320 x 192 px, number"):
+        WORKS[work](both)
+    cover = write(tmp_path / "cover.mp4", "mjpeg", number=1)
+    told = disposition.attached_pic
+    WORKS[work](put_together(tmp_path / "cover-first.mp4", (cover, told), (one, disposition.default)))
+    alone = put_together(tmp_path / "alone.mp4", (cover, told))
+    with pytest.raises(ValueError, match="it has no video stream"):
+        WORKS[work](alone)
+
+
+def test_the_shape_of_pixels_that_the_container_alone_tells_stays(tmp_path):
+    """As ``ffmpeg -c copy -aspect`` writes it: the result was shown in another shape."""
+    path = write(tmp_path / "in.mp4", number=4)
+    path.write_bytes(with_box(path.read_bytes(), box(b"pasp", struct.pack(">2I", 4, 3))))
+    with pytest.warns(UserWarning, match="not square"):
+        zj.undistort_video(path, tmp_path / "out.mp4", lens=lens(), focal=20.0)
+    with av.open(str(tmp_path / "out.mp4")) as made:
+        assert made.streams.video[0].sample_aspect_ratio == Fraction(4, 3)
+
+
 def test_fields_that_begin_later_are_said(tmp_path):
     """Of a broadcast some parts may be of fields, and others of frames."""
     parts = [
@@ -122,19 +216,23 @@ def box(name, content):
     return struct.pack(">I4s", 8 + len(content), name) + content
 
 
-def with_clap(content, path=(b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd"), shown=(400, 300)):
-    """The boxes of an MP4 file with the part that is shown in the description of its pictures."""
+def with_box(content, added, path=(b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")):
+    """The boxes of an MP4 file with one more in the description of its pictures."""
     made, place = b"", 0
     while place < len(content):
         length, name = struct.unpack_from(">I4s", content, place)
         inner = content[place + 8 : place + length]
         if name == path[0] == b"stsd":
-            clap = box(b"clap", struct.pack(">8i", shown[0], 1, shown[1], 1, 0, 1, 0, 1))
-            inner = inner[:8] + box(inner[12:16], inner[16:] + clap)
+            inner = inner[:8] + box(inner[12:16], inner[16:] + added)
         elif name == path[0]:
-            inner = with_clap(inner, path[1:], shown)
+            inner = with_box(inner, added, path[1:])
         made, place = made + box(name, inner), place + length
     return made
+
+
+def with_clap(content, shown=(400, 300)):
+    """The boxes of an MP4 file with the part that is shown in the description of its pictures."""
+    return with_box(content, box(b"clap", struct.pack(">8i", shown[0], 1, shown[1], 1, 0, 1, 0, 1)))
 
 
 def with_crop(content, left=16, top=8):

@@ -187,6 +187,7 @@ BAD = {
     "only short lines": ({"points": [ROW[:2], ROW[:0]]}, "none of the 2 lines has 3"),
     "unit": ({"focal_unit": "inch"}, "focal_unit must be"),
     "image without height": ({"image_size": (6, 0)}, "image_size must be two positive integers"),
+    "text as image size": ({"image_size": b"64"}, "two positive integers"),
     "no image size": ({"image_size": None}, "two positive integers"),
     "one number as image size": ({"image_size": 640}, "two positive integers"),
     "image size that is not finite": ({"image_size": (6.0, np.nan)}, "two positive integers"),
@@ -194,6 +195,12 @@ BAD = {
     "complex points": ({"points": [ROW, ROW + 1j]}, "real numbers, but line 1 .* complex"),
     "focal lengths as a word": ({"focal": "24"}, "one number a frame"),
 }
+
+
+@pytest.mark.parametrize("weight", [["1", "2"], [b"1", b"2"], [1j, 2], [None, 1.0], ["3", 1]])
+def test_weights_that_are_no_numbers_are_refused(weight, unchecked):
+    with pytest.raises(ValueError, match="weight must hold real numbers"):
+        make().weighted(weight)
 
 
 @pytest.mark.parametrize(("argument", "message"), BAD.values(), ids=BAD)

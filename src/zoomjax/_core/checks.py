@@ -52,6 +52,8 @@ def _is_finite(value: Any) -> bool:
 def checked_size(size: Any, name: str = "image_size") -> tuple[int, int]:
     """(width, height) px."""
     try:
+        if isinstance(size, str | bytes | bytearray):
+            raise TypeError
         width, height = (math.nan if isinstance(side, str | bytes | bool) else float(side) for side in size)
     except (TypeError, ValueError):
         width = height = math.nan

@@ -30,6 +30,11 @@ def refuse_masked(name: str, values: Any, instead: str = "leave out what is mask
         raise ValueError(f"Argument {name} is a masked array, and masks are not kept: {instead}.")
 
 
+def refuse_masked_image(name: str, image: Any) -> None:
+    """Raise ValueError for an image with a mask, as `refuse_masked`."""
+    refuse_masked(name, image, "give its .data, or .filled(0), with black where it is masked")
+
+
 def numbers(name: str) -> Callable[[Any], Any]:
     """A converter for a field of real numbers: lists and integers become arrays of floats."""
     return _converter(name, "real numbers")

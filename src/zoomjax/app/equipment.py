@@ -191,7 +191,7 @@ def taken_at_others(lens: ZoomLens, photos: Iterable[Path], focal_of: Callable[[
     if not _apart(ratio[low], ratio[high], _OTHER_ZOOM):
         film = [(one.crop_factor(lens.image_size) or 1) * ratio[photo] for photo, one in found.items()]
         in_mm = lens.focal_unit == "mm" and lens.about.get("focal") != UNKNOWN
-        if not in_mm or any(min(_off(ratio[low]), _off(of)) <= _OTHER_FOCAL for of in film):
+        if not in_mm or any(min(_off(ratio[low]), _off(of)) <= OTHER_FOCAL for of in film):
             return []
     pair = (low,) if len(ratio) == 1 else (low, high)
     told = [f"{plain(photo.name)} is of {found[photo].focal:.4g} mm" for photo in pair]
@@ -209,7 +209,7 @@ def _off(ratio: float) -> float:
 _OTHER_ZOOM = 1.1
 """Ratio of ratios of focal lengths that differ by more than EXIF data are rounded to, or measured."""
 
-_OTHER_FOCAL = 1.25
+OTHER_FOCAL = 1.25
 """Ratio up to which all focal lengths may be apart from those in EXIF data: those at near things are."""
 
 

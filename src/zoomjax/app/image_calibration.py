@@ -15,7 +15,7 @@ from .._core.text import plain
 from ..detect.batch import DETECTORS, NO_LINES, Detection, detect
 from ..detect.sources import Source
 from ..models.smooth import SmoothZoom
-from ..trust.assessment import Verdict
+from ..trust.assessment import Finding, Verdict
 from ._flags import with_flags
 from .board_bundle import BoardBundle, bundle_of, sharing_options
 from .calibration import Calibration, calibrate
@@ -26,6 +26,7 @@ from .focal_sources import GRID, MEASURED, Focals, choose_focals, focal_sigmas, 
 from .image_job import ImageJob, overlay_name
 from .plane_focals import Sharing
 from .results_folder import OF_A_LENS, results_folder
+from .turned import findings_of_turned
 from .tying import Bend, tied, to_search_again
 from .undetermined import told_undetermined
 from .usable import OTHER_SIZE, usable_of
@@ -357,13 +358,21 @@ def _with_findings(done: ImageCalibration) -> ImageCalibration:
     if done.job.video is None:
         found += findings_of_photos([Path(d.file) for d in done.used], done.used[0].image_size)
         others = sum(why.startswith(OTHER_SIZE) for why in done.unused.values())
-        told = {} if done.job.focal in (None, *MEASURED) else done.focals.focal  # measured ones may differ
-        found += findings_of_sizes(others, len(done.used)) + findings_of_exif(done.used, told)
+        found += findings_of_sizes(others, len(done.used)) + _findings_of_exif(done)
+        found += findings_of_turned(
+            done.calibration.lines, done.calibration.fit.lens, [d.name for d in done.used]
+        )
     assessment = done.calibration.assessment.joined_by(found)
     options = sharing_options(done.used, done.focals, done.job.other_sharing)
     assessment = assessment.joined_by(findings_of_own_focals(options, assessment.verdict))
     calibration = dataclasses.replace(done.calibration, assessment=assessment)
     return dataclasses.replace(done, calibration=calibration)
+
+
+def _findings_of_exif(done: ImageCalibration) -> list[Finding]:
+    focals, used = done.focals, done.used
+    in_mm = focals.known and focals.unit == "mm"
+    return findings_of_exif(used, focals.focal, in_mm=in_mm, measured=done.job.focal in (None, *MEASURED))
 
 
 _NONE_AGREES = "none of its lines is straight under the lens of the other images. Check its focal length"

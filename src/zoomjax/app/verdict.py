@@ -14,7 +14,7 @@ from ..io.metadata import Metadata, squeezed, straightened_by
 from ..trust.assessment import Finding, Verdict
 from ..trust.evidence import NEGLIGIBLE
 from .calibration import Calibration
-from .equipment import OTHER_CROP, equipment_of, metadata_of
+from .equipment import OTHER_CROP, OTHER_FOCAL, equipment_of, metadata_of
 from .plane_focals import FocalGroup
 from .tying import APART, bend_at
 
@@ -66,21 +66,42 @@ def findings_of_sizes(left_out: int, used: int) -> list[Finding]:
     ]
 
 
-def findings_of_exif(detections: Iterable[Detection], focal: Mapping[str, float]) -> list[Finding]:
-    """That focal lengths are not those of the photos' EXIF data, up to a common factor: as in px."""
+def findings_of_exif(
+    detections: Iterable[Detection], focal: Mapping[str, float], *, in_mm: bool, measured: bool
+) -> list[Finding]:
+    """That focal lengths are not those of the photos' EXIF data.
+
+    One factor common to all says nothing of those in px. In mm it counts from a quarter on, for photos are
+    corrected at those of the EXIF data; less may be how the lens is focused.
+
+    Args:
+        detections: of the photos used.
+        focal: what is used for them, by name.
+        in_mm: whether it is known, and in mm.
+        measured: whether it was measured from the photos: then how it differs among them says nothing.
+    """
     ratio = {d.name: d.focal / focal[d.name] for d in detections if d.focal and d.name in focal}
-    if len(ratio) < 2 or max(ratio.values()) < _OTHER_ZOOM * min(ratio.values()):
+    if not ratio:
         return []
     low, high = min(ratio, key=lambda name: ratio[name]), max(ratio, key=lambda name: ratio[name])
-    told = [f"{plain(name)} {ratio[name] * focal[name]:.4g} mm" for name in (low, high)]
-    used = f"{focal[low]:.4g}" if focal[low] == focal[high] else f"{focal[low]:.4g} and {focal[high]:.4g}"
+    apart = not measured and ratio[high] >= _OTHER_ZOOM * ratio[low]
+    scaled = in_mm and (ratio[low] > OTHER_FOCAL or ratio[high] * OTHER_FOCAL < 1)
+    if not apart and not scaled:
+        return []
+    known = sorted(ratio, key=lambda name: focal[name])
+    pair = dict.fromkeys((low, high) if apart else (known[0], known[-1]))
+    told = " and ".join(f"{plain(name)} {ratio[name] * focal[name]:.4g} mm" for name in pair)
+    counts = " and ".join(dict.fromkeys(f"{focal[name]:.4g}" for name in pair))
+    are = "are of other zooms" if len(pair) > 1 else "is of another zoom"
+    do = "Check --focal, or leave it out: then the EXIF data count."
+    if measured:
+        do = "Check the board's measures: photos are corrected at the focal lengths of their EXIF data."
     return [
         Finding(
             "EXIF data",
             "doubtful",
-            f"by their EXIF data {told[0]} and {told[1]} are of other zooms than the focal lengths used "
-            f"say, {used}.",
-            "Check --focal, or leave it out: then the EXIF data count.",
+            f"by their EXIF data {told} {are} than the focal lengths used say, {counts}.",
+            do,
             cause=True,
         )
     ]

@@ -25,7 +25,7 @@ import cv2
 from .._core.executors import arrived, checked_executor, in_order, is_away, sent
 from ..io.focal_track import FocalTrack
 from ..io.pyav import av
-from ..io.video_reader import Report, opened_video
+from ..io.video_reader import Report, opened_video, picture_stream
 from ..io.video_streams import Carried
 from ..io.video_writer import FirstFrame, FrameWriter, Picture
 from ..models.lens import ZoomLens
@@ -88,7 +88,7 @@ def cut(source: str | os.PathLike[str], others: Sequence[int], report: Report) -
     keys: list[int] = []
     sizes: list[tuple[int, int]] = []
     with opened_video(source) as input_:
-        video = input_.streams.best("video")
+        video = picture_stream(input_)
         if input_.format.name == "avi":  # which has times of decoding alone
             return []
         packets = input_.demux([video, *(input_.streams[index] for index in others)])
@@ -130,6 +130,25 @@ def _segments(stamps: list[int], keys: list[int], sizes: list[tuple[int, int]]) 
         )
         for first, last, size in zip(starts, ends, taken, strict=True)
     ]
+
+
+def from_first(segments: Sequence[Segment], stamp: int | None, skipped: int) -> list[Segment]:
+    """The segments without frames before the first that can be decoded, from which others are counted.
+
+    Args:
+        segments: of the whole video.
+        stamp: time of the first frame that can be decoded.
+        skipped: how many are before it, for want of a key frame.
+    """
+    if stamp is None or not skipped:
+        return list(segments)
+    left = []
+    for segment in segments:
+        place = bisect.bisect_left(segment.stamps, stamp)
+        if place < len(segment.stamps):
+            number = max(segment.number + place - skipped, 0)
+            left.append(segment._replace(stamps=segment.stamps[place:], number=number))
+    return left
 
 
 def encoded_segments(
@@ -178,7 +197,7 @@ def _encode(work: Work, segment: Segment) -> Encoded:
         lens, framing, interpolation=work.interpolation, border=work.border, back=work.back
     )
     with opened_video(work.source) as input_, contextlib.ExitStack() as stack:
-        video = input_.streams.best("video")
+        video = picture_stream(input_)
         writer: FrameWriter | None = None
         for frame in _frames(input_, video, segment, report):
             number = segment.number + bisect.bisect_left(segment.stamps, frame.pts)

@@ -113,7 +113,8 @@ def frame_output(
         )
     if keep == "all":
         middle = (low + high) / 2
-        scale = float(np.min(reach / np.maximum((high - low) / 2, 1e-6)))
+        least = np.where(reach > 0, 1e-6, 0.5)  # one pixel shows what is within half a pixel
+        scale = float(np.min(np.maximum(reach, 0.5) / np.maximum((high - low) / 2, least)))
     else:
         # An outline encloses what can be seen, so that a rectangle about a seen point holds no unseen one
         # exactly if the outline stays outside of it.

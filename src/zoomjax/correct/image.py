@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from .._core.arrays import native
+from .._core.fields import refuse_masked_image
 from ..models.distortion import Distortion
 from ..models.lens import ZoomLens
 from ..models.sizes import (
@@ -226,8 +227,7 @@ def checked_image(image) -> np.ndarray:
             "Argument image must be a NumPy array (height, width[, channels]) with pixels, but it is "
             f"{shape}. cv2.imread gives None where it cannot read a file."
         )
-    if isinstance(image, np.ma.MaskedArray):
-        raise ValueError("Argument image is a masked array, and masks are not kept: give its data alone.")
+    refuse_masked_image("image", image)
     check_channels_last(image.shape)
     check_one_image(image.shape, "one call for each")
     if image.dtype.name not in (*KNOWN, *WORKING):

@@ -29,6 +29,7 @@ from ..io.video_reader import (
     frames_shown,
     numbered,
     opened_video,
+    picture_stream,
     warn_of_pixels,
 )
 from ..io.video_streams import CONTAINER, Carried, carried
@@ -37,7 +38,7 @@ from ..models.lens import ZoomLens
 from ..models.sizes import at_focal, lens_for_size
 from ._planes import FrameWarper
 from ._prefetch import ahead
-from ._segments import Segment, Work, cut, encoded_segments, with_others
+from ._segments import Segment, Work, cut, encoded_segments, from_first, with_others
 from .framing import Framing, check_keep, frame_output, framing_for_size
 from .image import warn_of_fold
 from .redistort import check_framed
@@ -50,7 +51,8 @@ class CorrectedVideo:
 
     Attributes:
         frames: number of frames written.
-        lost: number of announced frames that cannot be decoded, or only with errors.
+        lost: number of frames that cannot be decoded, as no key frame comes before them, or only with
+            errors.
         scale: output pixels per corrected pixel, the same for all frames.
         kept: names of what went over beside the pictures: sound, subtitles, chapters, metadata.
         not_kept: names of what did not.
@@ -115,9 +117,10 @@ def undistort_video(
             or an option of it is unknown, or not suitable for these frames.
 
     Warns:
-        UserWarning: frames cannot be decoded, or are interlaced; pixels are not square; focal lengths are
-            outside of the fitted range; the track goes on after the video's end; the lens is for another
-            size, or folds within the frames.
+        UserWarning: frames cannot be decoded, or are interlaced; pixels are not square; the file has
+            several streams of pictures, of which one is corrected; focal lengths are outside of the fitted
+            range; the track goes on after the video's end; the lens is for another size, or folds within
+            the frames.
     """
     how = _Work(lens, keep, interpolation, border, encoder, options, progress, executor)
     return _convert(source, target, focal, how)
@@ -172,7 +175,7 @@ def _convert(
     refuse_inputs([target], [source])
     track = focal if isinstance(focal, FocalTrack) else _constant(focal)
     with opened_video(source) as input_, whole_file(target) as part:
-        video = input_.streams.best("video")
+        video = picture_stream(input_)
         size = (video.codec_context.width, video.codec_context.height)
         report = Report(frames_shown(source, video))
         warn_of_pixels(video)
@@ -197,8 +200,9 @@ def _convert(
                     items, part, target, input_, video, how.encoder, how.options, along, report, progress
                 )
         report.announced = frames_expected(input_, video, report)
-    lost = max(report.corrupt, report.announced - report.written if report.announced else 0)
-    if lost:
+    missing = report.announced - report.written if report.announced else 0
+    lost = max(report.corrupt + report.skipped, missing)
+    if lost > report.skipped:
         warnings.warn(
             f"{lost} of {max(report.announced, report.written)} frames of {os.fspath(source)} cannot "
             f"be decoded ({report.error or 'the file ends early'}): {report.written} were written.",
@@ -362,7 +366,8 @@ def _write_segments(
         break
     else:
         raise ValueError(f"Cannot read a video from {input_.name}: none of its frames can be decoded.")
-    report.first = first_frame(frame, own.side)
+    report.first, report.skipped = first_frame(frame, own.side), own.skipped
+    segments = from_first(segments, frame.pts, own.skipped)
     work = dataclasses.replace(work, like=report.first, zero=frame.time or 0.0)
     made = warper(frame, work.track.at(number, time))
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float, Num, ScalarLike
 
+from .._core.fields import refuse_masked_image
 from .._core.products import EXACT
 from .._core.types import traced
 from ..models.distortion import Distortion
@@ -73,6 +74,7 @@ def warp_image(
         >>> jax.grad(lambda d: warp_image(image, d).sum())(d).coefficients.shape
         (1,)
     """
+    refuse_masked_image("image", image)
     if not hasattr(image, "ndim"):
         raise ValueError(
             f"Argument image must be an array, but it is a {type(image).__name__}: jnp.asarray(image)."

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from .._core.fields import refuse_masked_image
 from ._collinear import collinear, thin_bars
 from ._edge_points import edge_points
 from ._frame_model import OneFrame, extent
@@ -153,6 +154,7 @@ def as_grey(image: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: it is not (height, width[, 3]) bytes, or smaller than 32 px a side.
     """
+    refuse_masked_image("image", image)
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
         kind = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
         raise ValueError(

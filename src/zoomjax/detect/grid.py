@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from .._core.checks import checked_integer
+from .._core.fields import refuse_masked_image
 from ._growth import as_grid, largest_grid, nearest_of
 from ._saddles import grown_board
 from .base import AbstractDetector
@@ -169,6 +170,7 @@ def find_dots(
 
 def _grey(image: np.ndarray) -> np.ndarray:
     """One channel of bytes."""
+    refuse_masked_image("image", image)
     if not isinstance(image, np.ndarray):
         raise ValueError(
             f"Argument image must be an array of bytes (uint8), but it is {type(image).__name__}. "

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .._core.checks import checked_size
+from .._core.fields import refuse_masked
 from .._core.types import AnyArray
 from ._markings import find_markings
 from .estimate import FocalEstimate
@@ -131,6 +132,7 @@ def name_pitch_lines(
         >>> sorted(named) == sorted(name for name, seen in zip(names, lines) if len(seen) > 1)
         True
     """
+    refuse_masked("principal", principal)
     principal, size = np.asarray(principal, float), np.array(checked_size(image_size))
     unit = float(np.hypot(*size)) / 2
     points = [_positions(f"line {number}", line) for number, line in enumerate(lines)]
@@ -159,6 +161,7 @@ def _ends(line: np.ndarray) -> np.ndarray:
 
 
 def _positions(name: str, points: ArrayLike) -> np.ndarray:
+    refuse_masked(name, points)
     try:
         positions: np.ndarray = np.asarray(points, float)
     except ValueError:  # rows of different lengths, or words

@@ -204,4 +204,10 @@ def load_yaml(path: Path) -> Any:
 
 def data_of(value: Any) -> np.ndarray:
     """A matrix: OpenCV's or ROS's with its data, or lists."""
-    return np.asarray(value["data"] if isinstance(value, dict) else value, float)
+    if not isinstance(value, dict):
+        return np.asarray(value, float)
+    data = np.asarray(value["data"], float)
+    sides = [int(value[side]) for side in ("rows", "cols") if side in value]
+    if len(sides) == 2 and data.size != sides[0] * sides[1]:
+        raise ValueError(f"a matrix of {sides[0]} x {sides[1]} has {data.size} numbers")
+    return data

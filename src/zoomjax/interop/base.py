@@ -8,7 +8,8 @@ how the tool interpolates between focal lengths. Which focal lengths and coeffic
 
 import abc
 import dataclasses
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -256,6 +257,31 @@ def refuse_others(told: Mapping[str, Any], read: Mapping[str, Any]) -> None:
             same = np.allclose(np.asarray(value, float), only, rtol=1e-6, atol=1e-12)
         if not same:
             raise ValueError(f"its {name} is {plain(str(value))}, and only {only} is read")
+
+
+def not_alike(entries: Iterable[tuple[float, Any]]) -> tuple[str, ...]:
+    """What is said of entries of one focal length, mm, that differ, where the first of each is read."""
+    first: dict[float, Any] = {}
+    for focal, values in entries:
+        if first.setdefault(focal, values) != values:
+            return (f"Entries of one focal length are not alike, as at {focal:g} mm: the first is read.",)
+    return ()
+
+
+_FAR = 0.2
+"""Of half the diagonal, by which centres are off the middle in crops and by mistake alone."""
+
+
+def off_middle(nodes: Iterable["Node | Sampled"], size: tuple[int, int]) -> tuple[str, ...]:
+    """What is said of a centre so far from the middle that the size may be that of other images."""
+    middle = (np.array(size) - 1) / 2
+    off = max((math.dist(node.centre, middle) for node in nodes if node.centre is not None), default=0.0)
+    if off < _FAR * math.hypot(*size) / 2:
+        return ()
+    return (
+        f"Its centre is up to {off:.3g} px from the middle of images of {size[0]} x {size[1]} px: unless "
+        "these were cropped, its numbers are of images of another size.",
+    )
 
 
 def read_text(path: Path) -> str:

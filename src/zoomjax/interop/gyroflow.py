@@ -8,6 +8,7 @@ ends.
 import dataclasses
 import json
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from .base import Contents, Export, Import, Node, one_size, read_text, refuse_ot
 
 _MOST = 8
 """Coefficients that are read."""
+
+_SAME = 0.05
+"""Share by which the focal length of an entry may differ from that of its name, which may be rounded."""
 
 _NEUTRAL = {"input_horizontal_stretch": 1, "input_vertical_stretch": 1, "digital_lens": "none"}
 """What Gyroflow does besides to pictures, and where it does nothing; so it is with 0 and null."""
@@ -72,15 +76,12 @@ class Gyroflow(Pinholes):
     def read(self, job: Import) -> Contents:
         """The entries, or the base of a profile without them."""
         table = json.loads(read_text(job.paths[0]))
-        model = table.get("distortion_model", "opencv_fisheye")
-        if model != "opencv_standard":
-            raise ValueError(f"its distortion model {model!r} is not opencv_standard")
-        refuse_others({name: table[name] for name in _NEUTRAL if table.get(name)}, _NEUTRAL)
         nodes, sizes, numbers = [], [], []
         entries = table.get("interpolations") or {}
         mm = bool(entries) or bool(table.get("focal_length"))
         for key, own in (entries or {table.get("focal_length"): {}}).items():
             entry = {**table, **own}
+            _check(key, entry)
             size = job.size((int(entry["calib_dimension"]["w"]), int(entry["calib_dimension"]["h"])))
             parameters = {**table["fisheye_params"], **own.get("fisheye_params", {}), **own}
             matrix = np.array(parameters["camera_matrix"], float)
@@ -94,6 +95,17 @@ class Gyroflow(Pinholes):
         found = contents(nodes, size, job, px=[float(row[0]) for row in numbers], mm=mm)
         at = {node.focal: row for node, row in zip(found.nodes[::-1], numbers[::-1], strict=True)}
         return dataclasses.replace(found, between=_linear(at, size) if entries else None)
+
+
+def _check(key: Any, entry: dict[str, Any]) -> None:
+    """Refuse an entry of another model, or whose focal length is not that of its name."""
+    model = entry.get("distortion_model", "opencv_fisheye")
+    if model != "opencv_standard":
+        raise ValueError(f"its distortion model {model!r} is not opencv_standard")
+    refuse_others({name: entry[name] for name in _NEUTRAL if entry.get(name)}, _NEUTRAL)
+    told = entry.get("focal_length")
+    if key is not None and told and abs(float(told) / float(key) - 1) > _SAME:
+        raise ValueError(f"its entry of {key} mm says that its focal length is {told}")
 
 
 def _linear(numbers: dict[float, np.ndarray], size: tuple[int, int]) -> Callable[[int, float], Node]:

@@ -2,9 +2,9 @@
 
 Radial coefficients 1 to 3 are OpenCV's k1, k2, k3, for radii in focal lengths; ``FocalLengthX`` is the
 focal length as a share of the image's longer side, ``FocalLengthY`` the same for y, and the centre a share
-of its width and height. Between entries all are linear in log f. Of entries at one focal length, that of
-the farthest focus counts. Whether centres count from pixel centres or corners is not documented: here from
-corners.
+of its width and height. Without the first, ``SensorFormatFactor``, the crop factor, tells the share.
+Between entries all are linear in log f. Of entries at one focal length, that of the farthest focus counts.
+Whether centres count from pixel centres or corners is not documented: here from corners.
 """
 
 import math
@@ -16,6 +16,9 @@ import numpy as np
 from ..io.equipment import FILM
 from ._pinhole import Pinhole, focal_px, node_of, pitch_of
 from .base import Contents, Format, Import, Node, one_size
+
+_SAME = 1.1
+"""Ratio of crop factors of one camera's entries, which are rounded."""
 
 _CAMERA = "{http://ns.adobe.com/photoshop/1.0/camera-profile}"
 
@@ -34,7 +37,7 @@ class LCP(Format):
     def read(self, job: Import) -> Contents:
         """All entries with a perspective model."""
         found: dict[float, tuple[float, np.ndarray]] = {}
-        sizes = []
+        sizes, factors = [], set[float]()
         for profile, model in _profiles(ET.parse(job.paths[0]).getroot()):
             stated = (
                 (int(profile["ImageWidth"]), int(profile["ImageLength"]))
@@ -42,12 +45,16 @@ class LCP(Format):
                 else None
             )
             sizes.append(size := job.size(stated))
+            factors.add(factor := float(profile.get("SensorFormatFactor", 1)))
             focal = float(profile["FocalLength"])
             far = float(profile.get("FocusDistance", "inf"))
             if focal not in found or far > found[focal][0]:
-                found[focal] = far, _numbers(focal, model, size)
+                found[focal] = far, _numbers(focal * factor, model, size)
         if not found:
             raise ValueError("it has no perspective model with a focal length")
+        if not (min(factors) > 0 and max(factors) < _SAME * min(factors)):
+            told = ", ".join(f"{factor:g}" for factor in sorted(factors))
+            raise ValueError(f"it has entries of cameras of other sensors, SensorFormatFactor {told}")
         size, focal = one_size(sizes), sorted(found)
         rows = [found[f][1] for f in focal]
 
@@ -89,9 +96,12 @@ def _values(element: ET.Element) -> dict[str, str]:
     return {name.removeprefix(_CAMERA): value for name, value in pairs if name.startswith(_CAMERA)}
 
 
-def _numbers(focal: float, model: dict[str, str], size: tuple[int, int]) -> np.ndarray:
-    """Focal lengths and centre as shares of sides, three radial and two tangential coefficients."""
-    usual = focal / FILM * math.hypot(*size) / max(size)
+def _numbers(on_film: float, model: dict[str, str], size: tuple[int, int]) -> np.ndarray:
+    """Focal lengths and centre as shares of sides, three radial and two tangential coefficients.
+
+    Where the first are not there, they follow from the focal length of equal view on film, mm.
+    """
+    usual = on_film / FILM * math.hypot(*size) / max(size)
     share = float(model.get("FocalLengthX", 0)) or usual
     place = [float(model.get(name, 0.5)) for name in ("ImageXCenter", "ImageYCenter")]
     k = [float(model.get(f"RadialDistortParam{i}", 0)) for i in (1, 2, 3)]

@@ -27,7 +27,7 @@ import numpy as np
 from .._core.text import plain
 from ..io.equipment import FILM
 from ._forms import AbstractForm, Form, minimax
-from .base import Contents, Export, Import, InterpolatedFormat, Node, refuse_others
+from .base import Contents, Export, Import, InterpolatedFormat, Node, not_alike, refuse_others
 from .radial_table import SPARE, RadialTable
 
 
@@ -191,7 +191,8 @@ class Lensfun(InterpolatedFormat):
             return Contents((), size, "mm")
         kinds = dict.fromkeys(entry.attrib["model"] for entry in entries)
         entries = [entry for entry in entries if entry.attrib["model"] == next(iter(kinds))]
-        found = {float(entry.attrib["focal"]): _read_terms(entry.attrib) for entry in reversed(entries)}
+        pairs = [(float(entry.attrib["focal"]), _read_terms(entry.attrib)) for entry in entries]
+        found = dict(reversed(pairs))
         focal = np.array(sorted(found))
         terms = np.array([found[f] for f in focal]).reshape(len(focal), -1)
         ratio = math.hypot(*size) / 2 / unit
@@ -212,7 +213,7 @@ class Lensfun(InterpolatedFormat):
             nodes,
             size,
             "mm",
-            (*_others(kinds), *(_SCALED,) * scaled),
+            (*_others(kinds), *not_alike(pairs), *(_SCALED,) * scaled),
             pixel_pitch=FILM / ((job.crop or crop) * math.hypot(*size)),
             about={
                 "lens": plain(lens.findtext("model", "")),

@@ -4,6 +4,7 @@ Files written hold no poses: copy the entries of each frame into your own. Keys 
 those of all frames there. Principal points count from the corner of the top-left pixel.
 """
 
+import dataclasses
 import json
 
 import numpy as np
@@ -49,12 +50,14 @@ class Nerfstudio(NodeFormat):
     def read(self, job: Import) -> Contents:
         """All frames, or the one camera of all."""
         table = json.loads(read_text(job.paths[0]))
-        if (model := table.get("camera_model", "OPENCV")) not in _MODELS:
-            raise ValueError(f"its camera model {model!r} is not one of {', '.join(_MODELS)}")
-        refuse_others(table, {"is_fisheye": False})
         common = {key: table[key] for key in (*_KEYS, "k4") if key in table}
-        nodes, sizes, px, units = [], [], [], set()
+        nodes, sizes, px, units, overruled = [], [], [], set(), dict[str, None]()
         for frame in table["frames"] or [{}]:
+            for told in (table, frame):
+                if (model := told.get("camera_model", "OPENCV")) not in _MODELS:
+                    raise ValueError(f"its camera model {model!r} is not one of {', '.join(_MODELS)}")
+                refuse_others(told, {"is_fisheye": False})
+            overruled |= {key: None for key in common if frame.get(key, common[key]) != common[key]}
             values = {**frame, **common}
             size = job.size((int(values["w"]), int(values["h"])))
             f, stretch = focal_px(values["fl_x"], values.get("fl_y", values["fl_x"]))
@@ -71,4 +74,6 @@ class Nerfstudio(NodeFormat):
             units.add(mm)
         if len(units) > 1 and job.focal is None:
             raise ValueError("some of its focal lengths are in mm and some in px: give argument focal")
-        return contents(nodes, one_size(sizes), job, px=px, mm=units == {True})
+        found = contents(nodes, one_size(sizes), job, px=px, mm=units == {True})
+        note = (f"Frames have other values of {', '.join(overruled)} than the top, which count.",)
+        return dataclasses.replace(found, notes=(*found.notes, *note * bool(overruled)))

@@ -23,6 +23,7 @@ _SLOTS = np.array([0, 2, 4, 1, 3, 5])
 
 _OFFSET = "Its projectionOffset is left out: the rays of the lens are about its centre of distortion."
 
+_SEVERAL = f"It has several distortions of the model {_MODEL}, which differ: the first is read."
 _SQUARE = 0.01
 """Share by which the sides of pixels may differ: sensors' sizes are rounded."""
 
@@ -88,7 +89,8 @@ class OpenTrackIO(NodeFormat):
 
     def read(self, job: Import) -> Contents:
         """Samples, one a line, in an array, or one alone; what is static may be in the first of them."""
-        nodes, camera, sizes, pitches, notes = [], {}, [], [], ()
+        nodes, camera, sizes, pitches = [], {}, [], []
+        notes: dict[str, None] = {}
         for sample in _samples(read_text(job.paths[0])):
             camera = {**camera, **sample.get("static", {}).get("camera", {})}
             resolution = camera.get("activeSensorResolution")
@@ -98,9 +100,12 @@ class OpenTrackIO(NodeFormat):
             nodes.append(_node(sample["lens"], pitch, size))
             pitches.append(pitch)
             if any(sample["lens"].get("projectionOffset", {}).values()):
-                notes = (_OFFSET,)
+                notes |= {_OFFSET: None}
+            first, *others = _chosen(sample["lens"])
+            if any(other != first for other in others):
+                notes |= {_SEVERAL: None}
         pitch = pitches[0] if len(set(pitches)) == 1 else None
-        return Contents(tuple(nodes), one_size(sizes), "mm", notes, pixel_pitch=pitch)
+        return Contents(tuple(nodes), one_size(sizes), "mm", tuple(notes), pixel_pitch=pitch)
 
 
 def _pitch(camera: dict, size: tuple[int, int]) -> float:
@@ -134,11 +139,17 @@ def _first(number: int, values: list) -> np.ndarray:
     return found[:number]
 
 
-def _node(lens: dict, pitch: float, size: tuple[int, int]) -> Node:
+def _chosen(lens: dict) -> list[dict]:
+    """The distortions of our model, of which there must be one."""
     chosen = [entry for entry in lens["distortion"] if entry.get("model", _MODEL) == _MODEL]
     if not chosen:
         models = ", ".join(repr(entry["model"]) for entry in lens["distortion"])
         raise ValueError(f"its distortion model {models} is not {_MODEL!r}")
+    return chosen
+
+
+def _node(lens: dict, pitch: float, size: tuple[int, int]) -> Node:
+    chosen = _chosen(lens)
     radial = _first(6, chosen[0]["radial"])
     tangential = _first(2, chosen[0].get("tangential", []))
     theta = np.concatenate([radial[_SLOTS], tangential])

@@ -33,6 +33,7 @@ from .base import (
     Node,
     NodeFormat,
     Report,
+    off_middle,
     possible,
 )
 from .colmap import COLMAP
@@ -281,7 +282,8 @@ def read(
     except _DAMAGED as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
         raise ValueError(f"Cannot read a {fmt.name} lens from {path}: {reason}.") from error
-    report = Report(fmt.name, made.focal, made.at_nodes, made.between, made.notes, tuple(paths))
+    notes = (*made.notes, *off_middle(contents.nodes, contents.image_size))
+    report = Report(fmt.name, made.focal, made.at_nodes, made.between, notes, tuple(paths))
     return Reading(made.lens, report)
 
 

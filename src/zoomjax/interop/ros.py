@@ -4,6 +4,8 @@ Written for ``camera_info_manager``. ROS's zoom manager reads files named by who
 the weights of its interpolation: write every level that is used, as ``focal=range(18, 201)``.
 """
 
+import numpy as np
+
 from ._pinhole import (
     contents,
     data_of,
@@ -57,6 +59,8 @@ class ROS(NodeFormat):
             matrix, coefficients = (
                 data_of(table[name]) for name in ("camera_matrix", "distortion_coefficients")
             )
+            if table["distortion_model"] == "plumb_bob" and np.any(np.ravel(coefficients)[5:]):
+                raise ValueError("it has more coefficients than the five of its model, plumb_bob")
             nodes.append(from_opencv(None, matrix, coefficients, size))
             sizes.append(size)
         return contents(nodes, one_size(sizes), job)

@@ -19,6 +19,9 @@ from .opentrackio import OpenTrackIO
 _END = 0.01
 """Length of the first and last interval, as a share of their neighbours'."""
 
+_SQUARE = 0.01
+"""Share by which sensor and image may differ in shape: sizes are rounded."""
+
 _TABLES = {
     "DistortionTable": "FocusEncoder, ZoomEncoder, K1, K2, K3, P1, P2",
     "FocalLengthTable": "FocusEncoder, ZoomEncoder, Fx, Fy",
@@ -109,10 +112,11 @@ class Unreal(Pinholes):
         tables = {entry["parameterName"]: _rows(entry) for entry in table["cameraParameterTables"]}
         if len({row["FocusEncoder"] for row in tables["DistortionTable"]}) > 1:
             raise ValueError("it has entries at more than one focus, and zoomjax reads files of one")
-        rows = {row["ZoomEncoder"]: _numbers(tables, row) for row in reversed(tables["DistortionTable"])}
+        at = {row["ZoomEncoder"] for row in tables["DistortionTable"]}
+        rows = {zoom: _numbers(tables, zoom) for zoom in at}
         zooms = np.array(sorted(rows))
         numbers = np.array([rows[zoom] for zoom in zooms])
-        width = _width_mm(table.get("sensorDimensions", {}))
+        width, notes = _width_mm(table.get("sensorDimensions", {}), size)
         mm = width is not None and job.focal is None
 
         def node(row: np.ndarray) -> Node:
@@ -126,22 +130,30 @@ class Unreal(Pinholes):
 
         found = contents([node(row) for row in numbers], size, job, mm=mm)
         if mm and width is not None:
-            found = dataclasses.replace(found, pixel_pitch=width / size[0])
+            pitch = None if notes else width / size[0]
+            found = dataclasses.replace(found, pixel_pitch=pitch, notes=(*found.notes, *notes))
         return found if job.focal is not None else dataclasses.replace(found, between=between)
 
 
-def _numbers(tables: dict[str, list[dict[str, float]]], row: dict[str, float]) -> list[float]:
-    """Fx, Fy, Cx, Cy, K1 to K3, P1 and P2 at the zoom of a row of the distortions."""
-    names = ("FocalLengthTable", "ImageCenterTable")
-    focal, middle = (_at(tables[name], row["ZoomEncoder"]) for name in names)
+def _numbers(tables: dict[str, list[dict[str, float]]], zoom: float) -> list[float]:
+    """Fx, Fy, Cx, Cy, K1 to K3, P1 and P2 at a zoom."""
+    names = ("FocalLengthTable", "ImageCenterTable", "DistortionTable")
+    focal, middle, row = (_at(name, tables[name], zoom) for name in names)
     own = [row[name] for name in ("K1", "K2", "K3", "P1", "P2")]
     return [focal["Fx"], focal["Fy"], middle["Cx"], middle["Cy"], *own]
 
 
-def _width_mm(sensor: dict) -> float | None:
-    """The width of the sensor; None if it is not there, or not in mm."""
-    width = float(sensor.get("width", 0))
-    return width if sensor.get("units") == "Millimeters" and width > 0 else None
+def _width_mm(sensor: dict, size: tuple[int, int]) -> tuple[float | None, tuple[str, ...]]:
+    """The width of the sensor, None if it is not there in mm; and that its height contradicts it."""
+    width, height = (float(sensor.get(side, 0)) for side in ("width", "height"))
+    if sensor.get("units") != "Millimeters" or not width > 0:
+        return None, ()
+    if not height > 0 or abs(height * size[0] / (width * size[1]) - 1) < _SQUARE:
+        return width, ()
+    return width, (
+        f"Its sensor of {width:g} x {height:g} mm has another shape than images of {size[0]} x {size[1]} "
+        "px: focal lengths in mm go by the width, and the size of a pixel is left open.",
+    )
 
 
 def _data(nodes: list[Node], rows: list[list[float]]) -> str:
@@ -159,9 +171,15 @@ def _rows(entry: dict) -> list[dict[str, float]]:
     ]
 
 
-def _at(rows: list[dict[str, float]], zoom: float) -> dict[str, float]:
-    """The entry at a zoom, which the table must have."""
-    for row in rows:
-        if np.isclose(row["ZoomEncoder"], zoom, rtol=1e-9):
-            return row
-    raise ValueError(f"its tables are not at the same zooms: one has no entry at {zoom:g}")
+def _at(name: str, rows: list[dict[str, float]], zoom: float) -> dict[str, float]:
+    """The entry at a zoom, of which the table must have one."""
+    encoders = ("FocusEncoder", "ZoomEncoder")
+    found = [row for row in rows if np.isclose(row["ZoomEncoder"], zoom, rtol=1e-9)]
+    if not found:
+        raise ValueError(f"its tables are not at the same zooms: one has no entry at {zoom:g}")
+    if len({tuple(value for key, value in row.items() if key not in encoders) for row in found}) > 1:
+        raise ValueError(
+            f"its {name} has several entries at the zoom {zoom:g}, as at more than one focus, and zoomjax "
+            "reads files of one"
+        )
+    return found[0]

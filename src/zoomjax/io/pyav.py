@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     import av.error
     import av.logging
     import av.sidedata.sidedata
+    import av.stream
 else:
 
     class _PyAV:

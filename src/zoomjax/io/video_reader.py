@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import heapq
+import itertools
 import math
 import os
 import struct
@@ -40,25 +41,27 @@ def decode_video(
         ValueError: the source is no video, or none of its frames decodes.
     """
     with opened_video(source) as input_:
-        video = input_.streams.best("video")
+        video = picture_stream(input_)
         report = Report(frames_shown(source, video))
         warn_of_pixels(video)
+        items = numbered(decoded_items(input_, video, report), report, source)
+        first = list(itertools.islice(items, 1))  # before which some may be left out
 
         def frames() -> Iterator[tuple[int, float, Callable[[], np.ndarray]]]:
-            for item, number, time in numbered(decoded_items(input_, video, report), report, source):
-                if isinstance(item, av.VideoFrame):
-                    yield number, time, functools.partial(item.to_ndarray, format="bgr24")
+            for item, number, time in itertools.chain(first, items):
+                yield number, time, functools.partial(item.to_ndarray, format="bgr24")
 
-        yield report.announced or _counted(source), frames()
+        yield (report.announced or _counted(source)) - report.skipped, frames()
 
 
 @dataclasses.dataclass
 class Report:
     """What happened on the way, in threads: counts of frames, where packets end, s, and what the first
-    frame carries."""
+    frame carries. Those that are skipped are before the first that can be decoded alone."""
 
     announced: int
     written: int = 0
+    skipped: int = 0
     corrupt: int = 0
     failed: int = 0
     error: str = ""
@@ -84,7 +87,7 @@ def opened_video(source: str | os.PathLike[str]) -> Any:
         raise ValueError(
             f"Cannot read a video from {path}: {error.strerror}. The file is damaged, cut off, or no video."
         ) from error
-    video = container.streams.best("video")
+    video = picture_stream(container)
     context = video and video.codec_context  # none of a codec that FFmpeg does not know
     if not (context and context.width and context.height):
         container.close()
@@ -94,11 +97,26 @@ def opened_video(source: str | os.PathLike[str]) -> Any:
     return container
 
 
+def picture_stream(container: Any) -> Any:
+    """The stream of pictures that is used: the one that FFmpeg takes for the best, but no cover.
+
+    None if there is none.
+    """
+    moving, best = moving_streams(container), container.streams.best("video")
+    return best if best in moving else next(iter(moving), None)
+
+
+def moving_streams(container: Any) -> list[Any]:
+    """The streams of pictures that are no covers."""
+    cover = av.stream.Disposition.attached_pic
+    return [stream for stream in container.streams.video if not stream.disposition & cover]
+
+
 def _counted(source: str | os.PathLike[str]) -> int:
     """How many frames there are, where the file does not tell: by reading, without decoding."""
     with opened_video(source) as input_, contextlib.suppress(av.error.FFmpegError):
         number = 0
-        for packet in input_.demux(input_.streams.best("video")):
+        for packet in input_.demux(picture_stream(input_)):
             number += packet.size > 0 and not packet.is_discard
         return number
     return 0
@@ -124,7 +142,7 @@ def _frame_numbers(source: str | os.PathLike[str]) -> dict[int, int]:
     stamps = set()
     with opened_video(source) as input_, contextlib.suppress(av.error.FFmpegError):
         avi = _is_avi(input_)
-        for packet in input_.demux(input_.streams.best("video")):
+        for packet in input_.demux(picture_stream(input_)):
             stamp = packet.dts if avi else packet.pts
             if stamp is not None and not packet.is_discard:
                 stamps.add(stamp)
@@ -141,9 +159,10 @@ def decoded_items(
     packets, the earliest first, are those of frames.
     """
     packets, avi, steps = input_.demux([video, *others]), _is_avi(input_), list[int]()
+    early, begun = list[int](), False
     ordered = avi or input_.format.name == "mxf"
     while report.corrupt < _MOST_ERRORS:
-        step = None
+        step, before = None, False
         try:
             packet = next(packets, None)
             if packet is None:
@@ -160,8 +179,14 @@ def decoded_items(
             step = (packet.dts if avi else packet.pts) if ordered else None
             if step is not None:
                 heapq.heappush(steps, step)
+            begun = begun or packet.is_keyframe
+            if not begun and packet.pts is not None and not packet.is_discard:
+                early.append(packet.pts)
+                before = True
             frames = packet.decode()
         except av.error.FFmpegError as error:
+            if before:  # there is no key frame yet
+                continue
             report.corrupt += 1
             report.failed += 1
             report.error = error.strerror or str(error)
@@ -172,6 +197,9 @@ def decoded_items(
         for frame in frames:
             if report.side is None:
                 report.side = side_data(frame, video.codec_context)  # here, where the decoder is at rest
+            if early and frame.pts is not None and not ordered:
+                report.skipped = sum(stamp < frame.pts for stamp in early)
+                early.clear()
             if steps:
                 frame.pts = heapq.heappop(steps)
             report.corrupt += bool(frame.is_corrupt)
@@ -223,7 +251,8 @@ def numbered(
 ) -> Iterator[tuple[Any, int, float]]:
     """Each frame with its number and time since the first, s, NaN if unknown; other packets as they are.
 
-    Frames are counted. Once some did not decode, time stamps tell the numbers of the others.
+    Frames are counted from the first that can be decoded, where a clip begins between key frames. Once
+    others did not decode, time stamps tell the numbers.
     """
     number, first, stamps, fields = 0, None, None, False
     for item in items:
@@ -232,14 +261,24 @@ def numbered(
             continue
         if first is None:
             first = item.time or 0.0
+            _warn_of_skipped(report.skipped)
         if item.interlaced_frame and not fields:
             fields = True
             _warn_of_fields()
         if report.failed and item.pts is not None:
             stamps = _frame_numbers(source) if stamps is None else stamps
-            number = stamps.get(item.pts, number)
+            number = stamps.get(item.pts, number + report.skipped) - report.skipped
         yield item, number, math.nan if item.time is None else item.time - first
         number += 1
+
+
+def _warn_of_skipped(number: int) -> None:
+    if number:
+        warnings.warn(
+            f"The first {number} frames of the video cannot be decoded, as no key frame comes before them: "
+            "the video was cut there. Frames and times of a track count from the first that can.",
+            stacklevel=3,
+        )
 
 
 def _warn_of_fields() -> None:
@@ -251,8 +290,15 @@ def _warn_of_fields() -> None:
 
 
 def warn_of_pixels(video: Any) -> None:
-    """Warn of a video whose pixels are not square, or of which its file says to show a part."""
+    """Warn of a video whose pixels are not square, of which its file says to show a part, or that is one of
+    several in its file."""
     size = (video.codec_context.width, video.codec_context.height)
+    if (number := len(moving_streams(video.container))) > 1:
+        warnings.warn(
+            f"The file has {number} streams of pictures: the one of {size[0]} x {size[1]} px, number "
+            f"{video.index}, is taken. Give a file with the other one alone if that is meant.",
+            stacklevel=2,
+        )
     if shown := shown_size(Path(video.container.name), size):
         warnings.warn(
             f"The video says to show {shown[0]} x {shown[1]} of its {size[0]} x {size[1]} px. All of them "

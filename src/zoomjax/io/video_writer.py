@@ -268,8 +268,8 @@ class FrameWriter(contextlib.AbstractContextManager):
             self.not_kept.append("the full range of values, which became the limited one")
         if (_has_alpha(first.format) or _hides_alpha(source)) and not _has_alpha(made):
             self.not_kept.append("transparency")
-        if given.sample_aspect_ratio:
-            context.sample_aspect_ratio = given.sample_aspect_ratio
+        if source.sample_aspect_ratio:  # of the container or of the stream in it
+            context.sample_aspect_ratio = source.sample_aspect_ratio
         if name == "libx265" and self._output.format.name in ("mp4", "mov"):
             context.codec_tag = "hvc1"  # the tag that Apple's players ask for
         tags = {k: v for k, v in source.metadata.items() if k.lower() not in (*_OWN_TAGS, _ALPHA_TAG)}

@@ -157,7 +157,10 @@ class AbstractLines(eqx.Module):
         if isinstance(weight, jax.Array) or traced(weight):
             values = jnp.asarray(weight, dtype)
         else:
-            values = jax.device_put(np.asarray(weight, dtype))  # unlike jnp.asarray this compiles nothing
+            given = np.asarray(weight)
+            if given.dtype.kind not in "biuf":
+                raise ValueError(f"Argument weight must hold real numbers, but its dtype is {given.dtype}.")
+            values = jax.device_put(given.astype(dtype))  # unlike jnp.asarray this compiles nothing
         if values.shape != self.frame.shape:
             raise ValueError(
                 f"Argument weight must hold one number for each of the {self.frame.shape[0]} lines, but "

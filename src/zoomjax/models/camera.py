@@ -18,7 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Bool, Float, Num
 
 from .._core.arrays import aligned, as_array, finite, namespace
-from .._core.fields import check_finite, check_positive, check_shapes, numbers
+from .._core.fields import check_finite, check_positive, check_shapes, numbers, refuse_masked
 from .._core.pixels import check_pitch
 from .._core.types import AnyArray, FocalLike, Points
 from .about import WIDTH_OF_FOCALS
@@ -114,6 +114,7 @@ class Camera(eqx.Module):
             Positions in the distorted image, px, inside of it or not, and a mask of the points that have
             one. Points not in front of the camera, or without an inverse, are NaN with derivatives of zero.
         """
+        refuse_masked("points", points)
         space: Any = points if isinstance(points, jax.Array) else as_array(np.asarray(points))
         xp = namespace(space)
         if space.shape[-1:] != (3,):

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from .._core.checks import checked_integer
+from .._core.fields import refuse_masked_image
 from ..io.video_reader import decode_video
 from ._follow import Follower
 from .tracks import Tracks
@@ -51,8 +52,8 @@ def track_video(
             it can be followed.
 
     Warns:
-        UserWarning: the clip is interlaced, its pixels are not square, or some of its frames do not decode:
-            frames of the tracks are numbered without these.
+        UserWarning: the clip is interlaced, its pixels are not square, it is one of several in its file, or
+            some of its frames do not decode: frames of the tracks are numbered without these.
     """
     with decode_video(clip) as (announced, items):
         numbers = []
@@ -112,6 +113,7 @@ def track_frames(
 
 def grey_frame(image: np.ndarray) -> np.ndarray:
     """A frame as (height, width) bytes; ValueError if it is no image of 8 bits."""
+    refuse_masked_image("frames", image)
     shape = np.shape(image)
     flat = len(shape) == 2 or shape[2:] in ((1,), (3,), (4,))
     if getattr(image, "dtype", None) != np.uint8 or not flat:

@@ -1,0 +1,171 @@
+"""Files whose fields contradict each other: refused, or said, and none taken without a word."""
+
+import json
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+import zoomjax as zj
+from benchmarks.mutations import LCP
+from zoomjax.models import TableZoom
+
+from ._lenses import LENSES, PITCH
+from .test_base import DATABASE, FRAMES, PROFILE, SAMPLE, YAML
+
+ENTRIES = PROFILE.replace(
+    "@",
+    '"interpolations": {"24": {"focal_length": 24.2, "input_horizontal_stretch": 1}, "50": '
+    '{"camera_matrix": [[500, 0, 179.5], [0, 500, 119.5], [0, 0, 1]], "focal_length": 50, '
+    '"distortion_model": "opencv_standard"}},',
+)
+TWO = FRAMES.replace("@", "").replace("[{}]", '[{"k1": -0.1, "camera_model": "OPENCV"}]')
+INFO = (
+    "image_width: 360\nimage_height: 240\ndistortion_model: plumb_bob\n"
+    "camera_matrix: {rows: 3, cols: 3, data: [500,0,180,0,500,120,0,0,1]}\n"
+    "distortion_coefficients: {rows: 1, cols: 5, data: [-0.1,0.01,0,0,0]}\n"
+)
+CASES = {
+    "gyroflow, focal": (
+        "a.json",
+        ENTRIES,
+        '"focal_length": 24.2',
+        '"focal_length": 35',
+    ),
+    "gyroflow, model": (
+        "a.json",
+        ENTRIES,
+        '"opencv_standard"}}',
+        '"opencv_fisheye"}}',
+    ),
+    "gyroflow, stretch": ("a.json", ENTRIES, 'stretch": 1', 'stretch": 1.33'),
+    "nerfstudio, model": ("a.json", TWO, '"camera_model": "OPENCV"', '"camera_model": "OPENCV_FISHEYE"'),
+    "nerfstudio, fisheye": ("a.json", TWO, '"camera_model": "OPENCV"', '"is_fisheye": true'),
+    "opencv, matrix": ("a.yaml", YAML.replace("@", ""), "500.,0.,180.", "500.,0."),
+    "ros, coefficients": ("a.yaml", INFO, "[-0.1,0.01,0,0,0]", "[-0.1,0.01,0,0]"),
+    "ros, model": (
+        "a.yaml",
+        INFO,
+        "cols: 5, data: [-0.1,0.01,0,0,0]",
+        "cols: 6, data: [-0.1,0.01,0,0,0,1]",
+    ),
+}
+TOLD = {
+    "gyroflow, focal": "entry of 24 mm says that its focal length is 35",
+    "gyroflow, model": "its distortion model 'opencv_fisheye'",
+    "gyroflow, stretch": "its input_horizontal_stretch is 1.33",
+    "nerfstudio, model": "its camera model 'OPENCV_FISHEYE'",
+    "nerfstudio, fisheye": "its is_fisheye is True",
+    "opencv, matrix": "a matrix of 3 x 3 has 8 numbers",
+    "ros, coefficients": "a matrix of 1 x 5 has 4 numbers",
+    "ros, model": "more coefficients than the five of its model, plumb_bob",
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_contradicts_itself_is_refused(case, tmp_path):
+    name, text, old, new = CASES[case]
+    assert text.count(old) == 1
+    (tmp_path / name).write_text(text)
+    zj.interop.read(tmp_path / name)
+    (tmp_path / name).write_text(text.replace(old, new))
+    with pytest.raises(ValueError, match=TOLD[case]):
+        zj.interop.read(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "old", "new", "note"),
+    [
+        (
+            "a.json",
+            TWO,
+            '"frames": [{"k1": -0.1',
+            '"frames": [{"k1": -0.2',
+            "values of k1 than",
+        ),
+        ("a.json", PROFILE.replace("@", ""), '"w": 360, "h": 240', '"w": 720, "h": 480', "of another size"),
+        ("a.yaml", YAML.replace("@", ""), "height: 240", "height: 640", "of images of another size"),
+        (
+            "a.jsonl",
+            SAMPLE,
+            '"distortion": [{',
+            '"distortion": [{"radial": [2e-4, 0], "tangential": [0, 0]}, {',
+            "several distortions of the model Brown-Conrady D-U, which differ",
+        ),
+        (
+            "a.xml",
+            DATABASE.replace("@", ""),
+            "<calibration>",
+            '<calibration><distortion model="poly5" focal="24" k1="-0.1" k2="0"/>',
+            "not alike, as at 24 mm: the first is read",
+        ),
+    ],
+)
+def test_what_contradicts_itself_is_said(name, text, old, new, note, tmp_path):
+    told: dict[str, Any] = {"image_size": (360, 240)} if name == "a.xml" else {}
+    assert text.count(old) == 1
+    (tmp_path / name).write_text(text)
+    assert not any(note in each for each in zj.interop.read(tmp_path / name, **told).report.notes)
+    (tmp_path / name).write_text(text.replace(old, new))
+    assert any(note in each for each in zj.interop.read(tmp_path / name, **told).report.notes)
+
+
+def unreal(path, change):
+    zj.interop.write(LENSES["landscape"](), path, focal=[24, 35, 50], pixel_pitch=PITCH, overwrite=True)
+    table = json.loads(path.read_text())
+    change(table, {entry["parameterName"]: entry for entry in table["cameraParameterTables"]})
+    path.write_text(json.dumps(table))
+    return zj.interop.read(path)
+
+
+def test_a_sensor_of_another_shape_than_the_image_is_said(tmp_path):
+    def higher(table, _):
+        table["sensorDimensions"]["height"] *= 1.2
+
+    back = unreal(tmp_path / "a.ulens", higher)
+    assert back.lens.pixel_pitch is None
+    assert any("has another shape than images of" in note for note in back.report.notes)
+    assert unreal(tmp_path / "a.ulens", lambda *_: None).lens.pixel_pitch == pytest.approx(PITCH)
+
+
+@pytest.mark.parametrize("name", ["FocalLengthTable", "ImageCenterTable", "DistortionTable"])
+def test_several_entries_of_one_zoom_are_refused(name, tmp_path):
+    """As of a lens that breathes, and whose distortion does not change with the focus."""
+
+    def again(_, tables):
+        first, rest = tables[name]["data"].split(";", 1)
+        words = first.split(",")
+        tables[name]["data"] = ", ".join([words[0], words[1], "0.7", *words[3:]]) + ";" + first + ";" + rest
+
+    with pytest.raises(ValueError, match=f"its {name} has several entries at the zoom 24"):
+        unreal(tmp_path / "a.ulens", again)
+
+
+def test_a_profile_without_focal_lengths_in_px_goes_by_the_crop_factor(tmp_path):
+    """Coefficients are for radii in focal lengths, of 1.5 times as many px at a crop factor of 1.5."""
+    bare = re.sub(r'\s*stCamera:FocalLength[XY]="[^"]*"', "", LCP)
+    assert bare != LCP
+    found = {}
+    for factor in (1.0, 1.5):
+        (tmp_path / "a.lcp").write_text(with_factor(bare, factor))
+        found[factor] = zj.interop.read(tmp_path / "a.lcp", zoom=TableZoom()).lens
+    pitch = {factor: lens.pixel_pitch for factor, lens in found.items()}
+    assert pitch[1.0] == pytest.approx(1.5 * pitch[1.5])
+    k = [np.asarray(lens(float(lens.focal_range[0])).coefficients)[0] for lens in found.values()]
+    assert k[0] / k[1] == pytest.approx(1.5**2, rel=0.1)
+
+
+def with_factor(text, factor):
+    told = f'stCamera:SensorFormatFactor="{factor}" '
+    return text.replace("stCamera:FocalLength=", f"{told}stCamera:FocalLength=")
+
+
+def test_a_profile_of_cameras_with_other_sensors_is_refused(tmp_path):
+    entry = LCP[LCP.index("<rdf:li") : LCP.index("</rdf:Seq>")]
+    other = entry.replace('stCamera:FocalLength="18"', 'stCamera:FocalLength="72"')
+    assert other != entry
+    both = with_factor(entry, 1.0) + with_factor(other, 1.5)
+    (tmp_path / "a.lcp").write_text(LCP.replace(entry, both))
+    with pytest.raises(ValueError, match=r"cameras of other sensors, SensorFormatFactor 1, 1\.5"):
+        zj.interop.read(tmp_path / "a.lcp")
