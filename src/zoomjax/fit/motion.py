@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import eval_context
 from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
@@ -233,7 +234,7 @@ def _fitted(given: Given, asked: Asked, throw: bool) -> tuple[MotionFit, Model, 
             "Arguments of fit_motion must have known values, because its control flow depends on them, but "
             "some are traced: call it outside of jit and vmap. grad and jvp of it work there."
         )
-    with jax.ensure_compile_time_eval():
+    with eval_context():  # ensure_compile_time_eval makes zeros and ranges of programs constants of them
         found = _solved_motion(given, asked)
     return (thrown_motion(found[0]), *found[1:]) if throw else found
 
