@@ -10,6 +10,7 @@ import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 
+from .._core.memory import give_back
 from ..models.invertibility import certificate_of
 from ..models.lens import ZoomLens
 from ._columns import Unknowns
@@ -118,6 +119,7 @@ _averaged = eqx.filter_jit(averaged)
 def with_all(few, data, model, noise):
     """A model fitted to some of the tracks, and its noise, with rays of all of them."""
     model, noise, *_ = _settled(few, model, noise)
+    give_back()  # here and below: what compiling took is not there beside what a long clip takes
     rays = jnp.zeros((data.structure.tracks, 3))
     model = eqx.tree_at(lambda m: m.path.rays, model, rays)
     return eqx.tree_at(lambda m: m.path.rays, model, _averaged(data, model)), noise
@@ -144,6 +146,7 @@ def in_stages(data, model, noise, shot):
         noise = noise._replace(repeated=jnp.maximum(noise.repeated * more, 1.0))
         model, noise, weighted_by, result, steps = _settled(data, model, noise)
     free = _arrays(STAGES[-1]._replace(own=_FREE))
+    give_back()
     parts, missed = _described(data, model, noise, free, result, steps)
     if is_seen(parts["parallax"], parts["parallax_score"]):
         spread = spread_of(data, model, _arrays(noise), missed, parts["parallax"])
