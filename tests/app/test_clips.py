@@ -6,6 +6,7 @@ import subprocess
 
 import av
 import cv2
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ import pytest
 import zoomjax as zj
 from zoomjax.app.clips import ClipJob, wants_motion
 from zoomjax.app.model_choice import WantedModel
-from zoomjax.app.motion_calibration import FILES
+from zoomjax.app.motion_calibration import FILES, MotionCalibration
+from zoomjax.app.panorama import write_panorama
 from zoomjax.fit.motion import fit_motion
 from zoomjax.scenes import motion_clip, motion_tracks, pan_and_zoom
 
@@ -121,6 +123,28 @@ def test_the_panorama_is_as_sharp_as_the_frames(calibrated):
 
 
 @pytest.mark.slow
+def test_frames_whose_f_is_not_known_are_told_and_left_out_of_the_panorama(clip, tmp_path):
+    tracks = motion_tracks(lens(), *path(), views=60, life=12, noise=0.3, seed=1).tracks
+    fit = fit_motion(tracks)
+    gone = [12, 13, 14]
+    unknown = eqx.tree_at(
+        lambda fit: (fit.focal, fit.focal_std),
+        fit,
+        tuple(of.at[jnp.array(gone)].set(jnp.nan) for of in (fit.focal, fit.focal_std)),
+    )
+    times = np.column_stack([np.arange(FRAMES), np.arange(FRAMES) / 25])
+    MotionCalibration(clip, tracks, unknown, times).write_track(tmp_path / "track.csv")
+    with (tmp_path / "track.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    sigma, focal = (np.array([float(row[name]) for row in rows]) for name in ("sigma", "focal"))
+    others = np.isin(np.arange(FRAMES), gone, invert=True)
+    np.testing.assert_allclose(sigma[others], np.asarray(fit.focal_std)[others], atol=1e-3)
+    assert sigma[13] > sigma[12] > 2 * sigma[11]
+    assert (abs(focal - np.asarray(fit.focal))[gone] < 2 * sigma[gone]).all()
+    write_panorama(clip, unknown, tmp_path / "panorama.jpg")
+    assert (tmp_path / "panorama.jpg").stat().st_size > 10_000
+
+
 def test_options_have_their_effect(clip, calibrated):
     folder, _ = calibrated
     options = ["--focal", "motion", "--centre", "image", "--degree", "1", "--quiet"]

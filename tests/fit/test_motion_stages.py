@@ -77,6 +77,20 @@ def test_the_best_start_goes_on_wherever_it_is_among_them(problem, starts):
     np.testing.assert_allclose(noise_of_turned.points, noise.points, rtol=0.02)
 
 
+def test_a_fit_that_still_moves_after_all_its_turns_has_not_settled(problem, starts, monkeypatch):
+    model, noise = chosen(problem, starts)
+    solved = _motion_stages._solved
+
+    def restless(*args):
+        *found, _, size = solved(*args)
+        return *found, jnp.asarray(50.0), size
+
+    monkeypatch.setattr(_motion_stages, "_solved", restless)
+    monkeypatch.setattr(_motion_stages, "_MOST_REPEATS", 2)
+    parts, *_ = in_stages(problem.data, model, noise, problem.shot)
+    assert parts["fit"].result == RESULTS.nonlinear_max_steps_reached
+
+
 def test_what_moves_all_views_counts_in_full_and_a_single_ray_hardly(problem):
     data = problem.data
     views = int(data.there.sum())

@@ -265,12 +265,20 @@ class MotionCalibration:
         }
 
     def write_track(self, path: Path) -> None:
-        """Write ``frame,seconds,focal,sigma``, which `undistort` takes; focal and sigma in px."""
+        """Write ``frame,seconds,focal,sigma``, which `undistort` takes; focal and sigma in px.
+
+        Between frames of which f is known 1/f is interpolated. The farther from these, the less is that
+        known: f may have changed as fast as in the fastest tenth of the frames.
+        """
         focal, std = (np.asarray(values) for values in (self.fit.focal, self.fit.focal_std))
         known = np.flatnonzero(np.isfinite(focal))
         every = np.arange(len(focal))
+        far = np.min(np.abs(every[:, None] - known[None]), axis=1)
+        changes = np.abs(np.diff(focal))
+        changes = changes[np.isfinite(changes)]
+        fast = np.quantile(changes, 0.9) if len(changes) else 0.0
         focal = 1 / np.interp(every, known, 1 / focal[known])
-        std = np.interp(every, known, std[known])
+        std = np.hypot(np.interp(every, known, std[known]), far * fast)
         with path.open("w", newline="") as file:
             table = csv.writer(file)
             table.writerow(["frame", "seconds", "focal", "sigma"])

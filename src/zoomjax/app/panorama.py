@@ -22,7 +22,7 @@ def write_panorama(clip: str | os.PathLike[str], fit: MotionFit, path: Path) -> 
     """
     shot, focal = np.asarray(fit.shot), np.asarray(fit.focal)
     longest = np.argmax(np.bincount(shot[shot >= 0]))
-    members = np.flatnonzero(shot == longest)
+    members = np.flatnonzero((shot == longest) & np.isfinite(focal))
     chosen = members[np.unique(np.linspace(0, len(members) - 1, _FRAMES).astype(int))]
     rotation = np.asarray(fit.rotation)
     rays = _sphere(fit, chosen)

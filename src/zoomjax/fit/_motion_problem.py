@@ -95,7 +95,8 @@ def problem_of(given: Given, asked: Asked) -> Problem:
     wide = padded(structure)
     points = jnp.asarray(tracks.points, float)[track, view] - (np.array([tracks.image_size]) - 1) / 2
     views = len(wide.track) - len(points)
-    new = (shot < 0) | (np.diff(shot, prepend=-1) > 0)
+    new = shot < 0
+    new[np.unique(shot, return_index=True)[1]] = True  # the first of each shot, and no other after a gap
     open_ = (shot >= 0) & jnp.isinf(std)
     data = Data(
         points=jnp.pad(points, ((0, views), (0, 0))),

@@ -175,9 +175,11 @@ def _settled(data, model, noise):
         weighted_by = noise.wider(STAGES[-1].wider)
         model, noise, result, steps, change, _ = _solved(data, *_arrays((model, weighted_by, STAGES[-1])))
         same = noise.points > _SAME * weighted_by.points
-        still = result == RESULTS.successful and same and change < _STILL
+        successful = result == RESULTS.successful
         turns += 1
-        if still or turns == _MOST_REPEATS:
+        if turns == _MOST_REPEATS and successful and not change < _SETTLED:
+            result = RESULTS.nonlinear_max_steps_reached
+        if turns == _MOST_REPEATS or (successful and same and change < _STILL):
             return model, noise, weighted_by, result, steps
 
 
