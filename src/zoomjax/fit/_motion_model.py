@@ -80,6 +80,7 @@ class Data(eqx.Module):
         moments: second moments of the lines' points, as seen.
         unknowns: how many numbers of frames and rays are fitted.
         scale: half the image diagonal, px.
+        size: (width, height) of the image, px.
     """
 
     points: Float[Array, "view 2"]

@@ -282,7 +282,7 @@ def covariances(
 
 
 class Schur(AbstractNormalSolver):
-    """Steps of a damped Gauss-Newton method for `Unknowns` and `Rows`, by `reduced` and `solution`.
+    """Steps of a damped Gauss-Newton method for `Unknowns` and `Rows`, by `reduced_of` and `solution`.
 
     Where a ray's views disagree, a flat loss makes its step too long. All others would then wait until the
     damping is so high that it is not. So each ray goes only as far as its own rows like it, beside the full

@@ -6,7 +6,7 @@ camera's motion bends it (Shi, Tomasi 1994). So errors do not add up along a tra
 not like that patch any more, when its scale has changed by 1.4, or after its life; others begin.
 
 Captions and logos stay in their place while the camera moves: such tracks are left out. Nothing is linked
-across a cut. Memory holds two frames, whatever the clip's length.
+across a cut. Memory holds two frames and the places of all points, whatever the clip's length.
 """
 
 import os
