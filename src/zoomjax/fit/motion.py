@@ -194,7 +194,8 @@ def fit_motion(
             `folded` never raise.
 
     What no track tells is near what is usual: parameters of the zoom model have a prior of mean 0 and
-    standard deviation 1, those of the centre's offset of 0.05 half diagonals, and the readout of 0.5 frames.
+    standard deviation 1, those of the centre's offset of 0.05 half diagonals, and the readout of half a
+    frame.
 
     Focal lengths, rotations, rays and lens are differentiable with respect to points, lines and known focal
     lengths by ``grad``, ``jvp`` and their kin, outside of ``jit`` and ``vmap``: by the implicit function
