@@ -273,7 +273,9 @@ class MotionCalibration:
         focal, std = (np.asarray(values) for values in (self.fit.focal, self.fit.focal_std))
         known = np.flatnonzero(np.isfinite(focal))
         every = np.arange(len(focal))
-        far = np.min(np.abs(every[:, None] - known[None]), axis=1)
+        place = np.searchsorted(known, every)
+        beside = known[np.clip([place - 1, place], 0, len(known) - 1)]
+        far = np.min(np.abs(beside - every), axis=0)
         changes = np.abs(np.diff(focal))
         changes = changes[np.isfinite(changes)]
         fast = np.quantile(changes, 0.9) if len(changes) else 0.0
