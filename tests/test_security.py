@@ -27,8 +27,11 @@ MODULES |= {
 }
 MODULES |= {"subprocess", "pty", "webbrowser", "xmlrpc", "socketserver", "imaplib", "poplib", "runpy"}
 HARMLESS = {"urllib.parse"}
-ALLOWED = {"app/cluster.py": ["imports socket"]}
-"""A cluster is reached where the command line is given its address, and nothing else is."""
+ALLOWED = {"app/cluster.py": ["imports socket"], "_core/memory.py": ["imports ctypes"]}
+"""A cluster is reached where the command line is given its address, and nothing else is.
+
+One function of the C library is called, without data: `malloc_trim`.
+"""
 CALLS = {"eval", "exec", "compile", "__import__"}
 METHODS = {
     "os": {"system", "popen", "fork", "forkpty", "startfile"},

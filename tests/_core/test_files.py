@@ -1,6 +1,8 @@
 """Writing whole files, and only where nothing is lost."""
 
 import os
+import signal
+import tempfile
 
 import pytest
 
@@ -13,6 +15,7 @@ from zoomjax._core.files import (
     whole_file,
     whole_folder,
 )
+from zoomjax.app.results_folder import results_folder
 
 
 def test_what_is_there_is_not_replaced_unless_that_is_given(tmp_path):
@@ -117,3 +120,29 @@ def test_a_folder_in_place_of_a_file_is_told_before_any_is_replaced(tmp_path):
     with pytest.raises(IsADirectoryError, match="folder"), whole_folder(tmp_path / "out") as part:
         fill(part)
     assert (tmp_path / "out" / "a").read_text() == "mine"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a signal there ends the process")
+@pytest.mark.parametrize("maker", [whole_file, whole_folder, results_folder])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_as_something_is_made_leaves_nothing(maker, number, tmp_path, monkeypatch):
+    """It comes when the temporary file is there, and nobody else knows its name yet."""
+    name = "mkstemp" if maker is whole_file else "mkdtemp"
+    make = getattr(tempfile, name)
+
+    def disturbed(**options):
+        made = make(**options)
+        os.kill(os.getpid(), number)
+        return made
+
+    def end(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tempfile, name, disturbed)
+    before = signal.signal(number, end)
+    try:
+        with pytest.raises(KeyboardInterrupt), maker(tmp_path / "new"):
+            pytest.fail("the signal comes before")
+    finally:
+        signal.signal(number, before)
+    assert not list(tmp_path.iterdir())

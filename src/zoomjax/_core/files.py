@@ -11,11 +11,14 @@ import functools
 import os
 import re
 import shutil
+import signal
 import stat
 import tempfile
+import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from types import FrameType
 
 import platformdirs
 
@@ -81,24 +84,13 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     if path.exists() and not path.is_file():
         raise FileExistsError(errno.EEXIST, "cannot write a file in place of a device", str(path))
     _remove_left_once(path.parent.absolute())
-    with unfinished(path):
-        try:
-            handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=".part")
-        except OSError as error:
-            raise type(error)(
-                error.errno, f"cannot write in the folder {path.parent}: {error.strerror}"
-            ) from error
-        os.close(handle)
-        part = Path(name)
-        try:
-            with locked(part):
-                yield part
-            umask = os.umask(0)
-            os.umask(umask)
-            part.chmod(0o666 & ~umask)  # mkstemp's 0600 is for secrets; a result is an ordinary file
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+    with unfinished(path), removed(lambda: _file_beside(path)) as part:
+        with locked(part):
+            yield part
+        umask = os.umask(0)
+        os.umask(umask)
+        part.chmod(0o666 & ~umask)  # mkstemp's 0600 is for secrets; a result is an ordinary file
+        part.replace(path)
 
 
 @contextlib.contextmanager
@@ -114,26 +106,81 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     if path.exists() and not path.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, "cannot make a folder where there is a file", str(path))
     _remove_left_once(path.parent.absolute())
-    with unfinished(path):
-        try:
-            part = Path(tempfile.mkdtemp(dir=path.parent, prefix=TEMPORARY))
-        except OSError as error:
-            raise type(error)(
-                error.errno, f"cannot write in the folder {path.parent}: {error.strerror}"
-            ) from error
-        try:
-            with locked(part):
-                yield part
-            path.mkdir(exist_ok=True)
-            for file in sorted(part.iterdir()):
-                if (path / file.name).is_dir():
-                    raise IsADirectoryError(
-                        errno.EISDIR, "cannot write a file where there is a folder", str(path / file.name)
-                    )
-            for file in sorted(part.iterdir()):
-                file.replace(path / file.name)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
+    with unfinished(path), removed(lambda: _folder_beside(path)) as part:
+        with locked(part):
+            yield part
+        path.mkdir(exist_ok=True)
+        for file in sorted(part.iterdir()):
+            if (path / file.name).is_dir():
+                raise IsADirectoryError(
+                    errno.EISDIR, "cannot write a file where there is a folder", str(path / file.name)
+                )
+        for file in sorted(part.iterdir()):
+            file.replace(path / file.name)
+
+
+@contextlib.contextmanager
+def removed(make: Callable[[], Path]) -> Iterator[Path]:
+    """Yield the temporary file or folder that `make` makes, and remove what is left of it in the end.
+
+    No signal comes between: it would leave something behind that no `finally` knows of yet.
+    """
+    part: Path | None = None
+    try:
+        with undisturbed():
+            part = make()
+        yield part
+    finally:
+        if part is not None:
+            with undisturbed():
+                _remove(part)
+
+
+def _remove(part: Path) -> None:
+    if part.is_dir():
+        shutil.rmtree(part, ignore_errors=True)
+    else:
+        part.unlink(missing_ok=True)
+
+
+def _file_beside(path: Path) -> Path:
+    with _told(path.parent):
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=".part")
+    os.close(handle)
+    return Path(name)
+
+
+def _folder_beside(path: Path) -> Path:
+    with _told(path.parent):
+        return Path(tempfile.mkdtemp(dir=path.parent, prefix=TEMPORARY))
+
+
+@contextlib.contextmanager
+def _told(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise type(error)(error.errno, f"cannot write in the folder {folder}: {error.strerror}") from error
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Delay signals that end a run until the (short) block is done."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread handles signals
+        yield
+        return
+    came: list[tuple[signal.Signals, FrameType | None]] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: handler for number, handler in handlers.items() if callable(handler)}
+    try:
+        for number in handlers:
+            signal.signal(number, lambda number, frame: came.append((signal.Signals(number), frame)))
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number, frame in came[:1]:
+            handlers[number](number, frame)
 
 
 def settled(path: Path) -> Path:

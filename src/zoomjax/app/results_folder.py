@@ -12,16 +12,12 @@ import fnmatch
 import hashlib
 import json
 import os
-import shutil
-import signal
 import stat
 import tempfile
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
-from types import FrameType
 
-from .._core.files import TEMPORARY, locked, remove_left, unfinished
+from .._core.files import TEMPORARY, locked, remove_left, removed, undisturbed, unfinished
 
 LIST = ".zoomjax.json"
 """The name of the list."""
@@ -68,16 +64,12 @@ def results_folder(
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     with unfinished(folder):
         try:
-            part = _begun(folder)
-            try:
-                with locked(part):
-                    with locked(folder, wait=True):  # else another process may be changing the list
-                        _check(folder, names, overwrite)
-                    (part / "new").mkdir()
-                    yield part / "new"
-                    _publish(part, folder, clears, overwrite)
-            finally:
-                shutil.rmtree(part, ignore_errors=True)
+            with removed(lambda: _begun(folder)) as part, locked(part):
+                with locked(folder, wait=True):  # else another process may be changing the list
+                    _check(folder, names, overwrite)
+                (part / "new").mkdir()
+                yield part / "new"
+                _publish(part, folder, clears, overwrite)
         except BaseException:
             with contextlib.suppress(OSError):  # missing or not empty
                 for path in made:
@@ -155,7 +147,7 @@ def _publish(part: Path, folder: Path, clears: Sequence[str], overwrite: bool) -
         both = {name: known.get(name, []) + after.get(name, []) for name in (known | after)}
         (part / "both").write_text(_written(both))
         (part / "after").write_text(_written(after))
-        with _undisturbed(), _Moves(part) as moves:
+        with undisturbed(), _Moves(part) as moves:
             moves.put(part / "both", folder / LIST)
             for parent in sorted({(folder / name).parent for name in new} - {folder}):
                 moves.make_folder(parent)
@@ -271,23 +263,3 @@ def _is_within(name: str) -> bool:
 
 def _written(files: dict[str, _Prints]) -> str:
     return json.dumps({"zoomjax results": 1, "files": files}, indent=1) + "\n"
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Delay interrupts until the (short) block is done."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread handles signals
-        yield
-        return
-    came: list[tuple[signal.Signals, FrameType | None]] = []
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    handlers = {number: handler for number, handler in handlers.items() if callable(handler)}
-    for number in handlers:
-        signal.signal(number, lambda number, frame: came.append((signal.Signals(number), frame)))
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-    for number, frame in came[:1]:
-        handlers[number](number, frame)
