@@ -2,14 +2,13 @@
 
 Per image: the polynomial for the inverse radial function (`_inverse_polynomial.fit_inverse`), or the exact
 inverse where that is not accurate to 0.01 px; then a map and `cv2.remap`, in large images for one band of
-rows after the other, so that no map is larger than a cache.
+rows after the other, in the same memory.
 Maps are float32: fixed-point ones take longer to make than they save, and round to 1/32 px.
 """
 
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Shaped
@@ -30,13 +29,11 @@ from .framing import LARGEST, Framing, check_framing, frame_output
 from .maps import OUTSIDE, Plane, source_positions
 from .sampler import KNOWN, WIDE, WORKING, border_values, check_sampling, sampler
 
-Item = TypeVar("Item")
-
 _MARGIN = 8.0
 """px beyond the image's corner that an interpolation (Lanczos: 4) may still reach back from."""
 
-_BAND = 2**19
-"""Pixels of a band of rows, whose positions stay in a cache."""
+_BAND = 2**20
+"""Pixels of a band of rows. Its positions are written where those of the band before were."""
 
 _WHOLE = 2**22
 """Pixels up to which a single map takes less time than bands do to wait for one another."""
@@ -112,12 +109,14 @@ def undistort_image(
     whole |= math.prod(keep.size) <= _WHOLE
     corrected = np.empty((*keep.size[::-1], *image.shape[2:]), image.dtype)
     bands = _bands(keep, keep.size[1] if whole else max(_BAND // keep.size[0], 1))
-    maps = ((rows, source_positions(distortion, band, inverse)) for rows, band in bands)
-    for rows, positions in _one_ahead(maps):
+    positions = None
+    for rows, band in bands:
+        positions = source_positions(distortion, band, inverse, into=positions)
         x, y = map(np.asarray, positions)
         sample(x, y, corrected[rows])
         if folded and border != "constant":
             corrected[rows][x == OUTSIDE] = fill if image.ndim > 2 else fill[0]
+        del x, y  # their memory is used again
     return corrected
 
 
@@ -132,15 +131,6 @@ def _bands(framing: Framing, rows: int) -> Iterator[tuple[slice, Framing]]:
         first = min(first, height - rows)
         origin = framing.origin + np.array([0, first]) / framing.scale
         yield slice(first, first + rows), Framing(framing.scale, origin, (width, rows))
-
-
-def _one_ahead(items: Iterator[Item]) -> Iterator[Item]:
-    """The items, each once the next one is begun: JAX computes that one meanwhile."""
-    before = next(items)
-    for item in items:
-        yield before
-        before = item
-    yield before
 
 
 def _distortion(

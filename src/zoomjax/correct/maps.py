@@ -37,7 +37,11 @@ class Plane:
 
 
 def source_positions(
-    distortion: Distortion, framing: Framing, inverse: RadialInverse | None, plane: Plane | None = None
+    distortion: Distortion,
+    framing: Framing,
+    inverse: RadialInverse | None,
+    plane: Plane | None = None,
+    into: tuple[Array, Array] | None = None,
 ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
     """For each output pixel the x and y, px, in the distorted image of what it shows.
 
@@ -49,6 +53,8 @@ def source_positions(
         inverse: from `fit_inverse`, for a radius that holds the whole output; None computes
             `Distortion.distort` instead: exact, and some hundred times slower.
         plane: the sampling of both images; by default every pixel.
+        into: what an earlier call for as many pixels returned: its memory is used again if it can be, and
+            these arrays are then gone. The system takes longer to give new memory than the map to compute.
     """
     plane = Plane(framing.size) if plane is None else plane
     step, offset = np.array(plane.step), np.array(plane.offset)
@@ -67,11 +73,11 @@ def source_positions(
             scale / step,
         ]
     )
-    reach = np.float32(inverse.reach)
     return _positions(
+        into,
         inverse.powers,
         inverse.coefficients,
-        reach,
+        np.float32(inverse.reach),
         geometry.astype(np.float32),
         inverse.steps,
         inverse.distortion_model,
@@ -79,8 +85,13 @@ def source_positions(
     )
 
 
-@functools.partial(jax.jit, static_argnames=("steps", "distortion_model", "size"))
-def _positions(powers, k, reach, geometry, steps, distortion_model, size):
+@functools.partial(
+    jax.jit,
+    static_argnames=("steps", "distortion_model", "size"),
+    donate_argnames="into",
+    keep_unused=True,
+)
+def _positions(into, powers, k, reach, geometry, steps, distortion_model, size):
     start, step, centre, scale = geometry
     x = start[0] + step[0] * jax.lax.broadcasted_iota(jnp.float32, size[::-1], 1)
     y = start[1] + step[1] * jax.lax.broadcasted_iota(jnp.float32, size[::-1], 0)
