@@ -21,6 +21,7 @@ ENTRIES = PROFILE.replace(
     '"distortion_model": "opencv_standard"}},',
 )
 TWO = FRAMES.replace("@", "").replace("[{}]", '[{"k1": -0.1, "camera_model": "OPENCV"}]')
+ANGLE = TWO.replace('"camera_model": "OPENCV"', '"camera_model": "OPENCV", "camera_angle_x": 0.691')
 INFO = (
     "image_width: 360\nimage_height: 240\ndistortion_model: plumb_bob\n"
     "camera_matrix: {rows: 3, cols: 3, data: [500,0,180,0,500,120,0,0,1]}\n"
@@ -42,6 +43,7 @@ CASES = {
     "gyroflow, stretch": ("a.json", ENTRIES, 'stretch": 1', 'stretch": 1.33'),
     "nerfstudio, model": ("a.json", TWO, '"camera_model": "OPENCV"', '"camera_model": "OPENCV_FISHEYE"'),
     "nerfstudio, fisheye": ("a.json", TWO, '"camera_model": "OPENCV"', '"is_fisheye": true'),
+    "nerfstudio, angle": ("a.json", ANGLE, '"camera_angle_x": 0.691', '"camera_angle_x": 0.9'),
     "opencv, matrix": ("a.yaml", YAML.replace("@", ""), "500.,0.,180.", "500.,0."),
     "ros, coefficients": ("a.yaml", INFO, "[-0.1,0.01,0,0,0]", "[-0.1,0.01,0,0]"),
     "ros, model": (
@@ -57,6 +59,7 @@ TOLD = {
     "gyroflow, stretch": "its input_horizontal_stretch is 1.33",
     "nerfstudio, model": "its camera model 'OPENCV_FISHEYE'",
     "nerfstudio, fisheye": "its is_fisheye is True",
+    "nerfstudio, angle": "its camera_angle_x is that of f = 372.6.. px, and its fl_x is 500",
     "opencv, matrix": "a matrix of 3 x 3 has 8 numbers",
     "ros, coefficients": "a matrix of 1 x 5 has 4 numbers",
     "ros, model": "more coefficients than the five of its model, plumb_bob",
@@ -86,6 +89,8 @@ def test_what_contradicts_itself_is_refused(case, tmp_path):
         ),
         ("a.json", PROFILE.replace("@", ""), '"w": 360, "h": 240', '"w": 720, "h": 480', "of another size"),
         ("a.yaml", YAML.replace("@", ""), "height: 240", "height: 640", "of images of another size"),
+        ("a.yaml", INFO + "binning_x: 0\n", "binning_x: 0", "binning_x: 2", "cropped or binned"),
+        ("a.yaml", INFO + "roi: {width: 0}\n", "roi: {width: 0}", "roi: {width: 180}", "cropped or binned"),
         (
             "a.jsonl",
             SAMPLE,

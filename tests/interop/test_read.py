@@ -258,6 +258,25 @@ def forget(path):
 TOLD = ("zoomjaxDirection", "zoomjaxConvention", "channels")
 
 
+@pytest.mark.parametrize("direction", ["undistort", "redistort"])
+def test_black_in_a_map_shows_nothing(direction, tmp_path):
+    """Else it would be the image's lower left corner, which lies within it."""
+    lens = LENSES["portrait"]()
+    zj.interop.write(lens, tmp_path / "m", format="stmap", focal=24)
+    path = tmp_path / "m" / f"{direction}.24.exr"
+    whole = zj.interop.read(path)
+    with OpenEXR.File(str(path)) as file:
+        header, pixels = dict(file.header()), file.channels()["RGB"].pixels.copy()
+    pixels[:, : pixels.shape[1] // 4] = 0
+    with OpenEXR.File(header, {"RGB": pixels}) as file:
+        file.write(str(path))
+    black = zj.interop.read(path)
+    assert black.report.worst < whole.report.worst + 1e-3
+    assert np.asarray(black.lens(24.0).coefficients) == pytest.approx(
+        np.asarray(whole.lens(24.0).coefficients), abs=1e-4
+    )
+
+
 @pytest.mark.parametrize("foreign", [False, True])
 def test_an_argument_that_contradicts_a_map_is_refused(foreign, tmp_path):
     lens = LENSES["portrait"]()

@@ -32,6 +32,19 @@ def test_none_where_there_is_none(block):
     assert exif_focal(block) is None
 
 
+@pytest.mark.parametrize(("kind", "code"), [(11, "f"), (12, "d"), (3, "H"), (4, "I")])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_focal_length_of_another_type_is_read(kind, code, order):
+    """The standard's type is RATIONAL; some programs write FLOAT, DOUBLE, SHORT or LONG."""
+    block = bytearray(exif(order=order))
+    place = len(block) - 8  # of the fraction, and its entry before
+    value = struct.pack(f"{order}{code}", 35)
+    where = value.ljust(4, b"\0") if len(value) <= 4 else struct.pack(f"{order}I", place)
+    block[place - 4 - 12 : place - 4] = struct.pack(f"{order}HHI", 0x920A, kind, 1) + where
+    block[place:] = value.ljust(8, b"\0")
+    assert exif_focal(bytes(block)) == 35.0
+
+
 @pytest.mark.parametrize("focal", [20.56, 35.0, 600.0, 4.25])
 def test_a_written_focal_length_is_read_back(focal):
     assert exif_focal(exif_with_focal(focal)) == pytest.approx(focal, abs=1e-4)

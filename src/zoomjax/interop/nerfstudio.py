@@ -6,6 +6,9 @@ those of all frames there. Principal points count from the corner of the top-lef
 
 import dataclasses
 import json
+import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +17,9 @@ from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_tex
 
 _MODELS = ("OPENCV", "RADIAL", "SIMPLE_RADIAL", "PINHOLE", "SIMPLE_PINHOLE")
 """That nerfstudio takes for one and the same, coefficients that are not there for 0."""
+
+_ALIKE = 0.01
+"""Relative difference up to which two focal lengths are one, with other digits."""
 
 _KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "p1", "p2")
 
@@ -61,6 +67,7 @@ class Nerfstudio(NodeFormat):
             values = {**frame, **common}
             size = job.size((int(values["w"]), int(values["h"])))
             f, stretch = focal_px(values["fl_x"], values.get("fl_y", values["fl_x"]))
+            _check_angle({**frame, **table}, f, size)
             if values.get("k4"):
                 raise ValueError("it has a fourth radial coefficient, which is not supported")
             k = np.array([values.get(key, 0.0) for key in ("k1", "k2", "k3")], float)
@@ -77,3 +84,11 @@ class Nerfstudio(NodeFormat):
         found = contents(nodes, one_size(sizes), job, px=px, mm=units == {True})
         note = (f"Frames have other values of {', '.join(overruled)} than the top, which count.",)
         return dataclasses.replace(found, notes=(*found.notes, *note * bool(overruled)))
+
+
+def _check_angle(told: Mapping[str, Any], f: float, size: tuple[int, int]) -> None:
+    """Raise ValueError where the field of view, which some tools take, is that of another focal length."""
+    for name, side in zip(("camera_angle_x", "camera_angle_y"), size, strict=True):
+        other = side / 2 / math.tan(told[name] / 2) if name in told else f
+        if not math.isclose(other, f, rel_tol=_ALIKE):
+            raise ValueError(f"its {name} is that of f = {other:.6g} px, and its fl_x is {f:.6g}")

@@ -51,7 +51,9 @@ class PFTrack(NodeFormat):
         number = int(lines[7])
         if job.focal is None or len(job.focal) != number:
             raise ValueError(f"it holds no focal lengths: give argument focal, {number} of them{IN_PX}")
-        values = np.array(lines[8 : 8 + 5 * number], float).reshape(number, 5)
+        if (more := len(lines) - 8) != 5 * number:
+            raise ValueError(f"its {number} keys have five lines each, but there are {more} lines of keys")
+        values = np.array(lines[8:], float).reshape(number, 5)
         size = job.size((width, height))
         nodes = [
             Node(

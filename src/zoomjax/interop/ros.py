@@ -4,6 +4,10 @@ Written for ``camera_info_manager``. ROS's zoom manager reads files named by who
 the weights of its interpolation: write every level that is used, as ``focal=range(18, 201)``.
 """
 
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from ._pinhole import (
@@ -50,9 +54,10 @@ class ROS(NodeFormat):
 
     def read(self, job: Import) -> Contents:
         """One file or several; focal lengths in px, unless others are given."""
-        nodes, sizes = [], []
+        nodes, sizes, cut = [], [], False
         for path in job.paths:
             table = load_yaml(path)
+            cut |= _is_cut(table)
             if table["distortion_model"] not in ("plumb_bob", "rational_polynomial"):
                 raise ValueError(f"its distortion model {table['distortion_model']!r} is not supported")
             size = job.size((int(table["image_width"]), int(table["image_height"])))
@@ -63,7 +68,16 @@ class ROS(NodeFormat):
                 raise ValueError("it has more coefficients than the five of its model, plumb_bob")
             nodes.append(from_opencv(None, matrix, coefficients, size))
             sizes.append(size)
-        return contents(nodes, one_size(sizes), job)
+        found = contents(nodes, one_size(sizes), job)
+        note = ("Its images are cropped or binned: the lens is of whole ones, as its matrix is.",) * cut
+        return dataclasses.replace(found, notes=(*found.notes, *note))
+
+
+def _is_cut(table: Mapping[str, Any]) -> bool:
+    """Whether images are a part of what the sensor sees, or have fewer pixels."""
+    roi = table.get("roi") or {}
+    binned = max(float(table.get(name) or 1) for name in ("binning_x", "binning_y")) > 1
+    return binned or any(float(roi.get(name) or 0) for name in ("x_offset", "y_offset", "width", "height"))
 
 
 def _matrix(name: str, rows: int, columns: int, values: object) -> list[str]:

@@ -325,6 +325,7 @@ def _pairs(
     distorted, corrected = (other, grid) if direction == "undistort" else (grid, other)
     inside = np.all((distorted >= -0.5) & (distorted <= np.array(size) - 0.5), axis=-1)
     inside &= np.all(np.isfinite(corrected), axis=-1)
+    inside &= np.any(values != 0, axis=-1)  # black, as programs fill what shows nothing
     if inside.mean() < _LEAST:
         raise ValueError("hardly any of its pixels lies within the image: is the convention right?")
     return distorted[inside], corrected[inside]

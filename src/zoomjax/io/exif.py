@@ -5,6 +5,7 @@ Pillow decodes a PNG to find what is behind its pixels, and takes the memory of 
 """
 
 import io
+import math
 import struct
 import warnings
 from collections.abc import Callable
@@ -26,9 +27,11 @@ def exif_focal(block: bytes) -> float | None:
     """The focal length, mm, in EXIF data or at the start of a TIFF file; None if they hold none."""
     exif = parse_exif(io.BytesIO(block.removeprefix(_PREFIX)))
     focal = None if exif is None else exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
-    if not isinstance(focal, IFDRational) or not focal.denominator or focal.numerator == _UNKNOWN:
+    if isinstance(focal, IFDRational) and (not focal.denominator or focal.numerator == _UNKNOWN):
         return None
-    return float(focal) if focal > 0 else None
+    if not isinstance(focal, IFDRational | float | int):  # the standard's type, or one that some write
+        return None
+    return float(focal) if math.isfinite(focal) and focal > 0 else None
 
 
 def exif_with_focal(focal: float) -> bytes:
