@@ -45,8 +45,8 @@ class Common(NamedTuple):
     lens: Float[Array, "lens"]
 
 
-def told_levers(model: Model, matrix: Reduced, units: Unknowns) -> Float[Array, ""] | int:
-    """How many levers the tracks tell: of each, the share that is not the prior's; 0 without levers."""
+def determined_levers(model: Model, matrix: Reduced, units: Unknowns) -> Float[Array, ""] | int:
+    """How many levers the tracks determine: of each, the share that is not the prior's."""
     if model.levers is None:
         return 0
     variance = matrix.rays[0][:, 2, 2] * units.rays[:, 2] ** 2

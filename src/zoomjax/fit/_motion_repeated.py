@@ -67,9 +67,9 @@ def repeated(
     answer = by_lens.reshape(-1, 4, by_lens.shape[-1])[data.structure.line_frame]
     effect = of_lens.lines - jnp.einsum("lrf,lfp->lrp", by_frame.lines, answer)
     score = jnp.einsum("lrp,lr->lp", effect, rows.lines)
-    told = jnp.einsum("lrp,lrq->lpq", effect, effect)
-    score, told = (jax.ops.segment_sum(of, group, len(group)) for of in (score, told))
-    return _more_than_chance((score, told), lambda group: group, information)
+    fisher = jnp.einsum("lrp,lrq->lpq", effect, effect)
+    score, fisher = (jax.ops.segment_sum(of, group, len(group)) for of in (score, fisher))
+    return _more_than_chance((score, fisher), lambda group: group, information)
 
 
 def common_errors_of(
@@ -99,16 +99,16 @@ def common_errors_of(
         ), None
 
     start = tuple(jnp.zeros((structure.tracks, n, size + 1)) for n in (size, own))
-    (told, of_rays), _ = over_views(len(structure.track), step, start)
+    (fisher, of_rays), _ = over_views(len(structure.track), step, start)
     if of_known is not None and pull.rays is not None:
         of_rays = of_rays.at[..., -1].add(jnp.einsum("tki,tk->ti", of_known, pull.rays))
 
     def without_ray(track):
-        told, of_ray, inverse = track
-        told = told - of_ray[:, :-1].T @ inverse @ of_ray
-        return told[:, -1], told[:, :-1]
+        fisher, of_ray, inverse = track
+        fisher = fisher - of_ray[:, :-1].T @ inverse @ of_ray
+        return fisher[:, -1], fisher[:, :-1]
 
-    return _more_than_chance((told, of_rays, matrix.rays[0]), without_ray, information)
+    return _more_than_chance((fisher, of_rays, matrix.rays[0]), without_ray, information)
 
 
 def _more_than_chance(groups, of_group, information):
@@ -116,14 +116,14 @@ def _more_than_chance(groups, of_group, information):
 
     Args:
         groups: what each group has, in arrays.
-        of_group: gives a group's score g and what it tells.
+        of_group: gives a group's score g and its Fisher information.
         information: the inverse of V.
     """
     covariance = jnp.linalg.inv(information)
 
     def one(group):
-        score, told = of_group(group)
-        own = told @ covariance  # H V
+        score, fisher = of_group(group)
+        own = fisher @ covariance  # H V
         return score @ covariance @ score, jnp.trace(own) - jnp.sum(own * own.T)
 
     found, expected = (jnp.sum(of) for of in jax.lax.map(one, groups, batch_size=CHUNK))

@@ -8,19 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.flatten_util import ravel_pytree
 
 from .._core.memory import give_back
-from ..models.invertibility import certificate_of
-from ..models.lens import ZoomLens
 from ._columns import Unknowns
-from ._motion_levers import common_lever, guessed_levers, told_levers
+from ._motion_estimate import AS_GOOD, described
+from ._motion_levers import guessed_levers
 from ._motion_model import Model, Noise, Speed, Stage, moved, pinned, speed_of, units_of
-from ._motion_parallax import is_seen, parallax_of, spread_of
-from ._motion_repeated import common_errors_of, groups_of, repeated
+from ._motion_parallax import is_seen, spread_of
+from ._motion_repeated import groups_of, repeated
 from ._motion_rows import (
-    WRONG_LINE,
-    Counted,
     averaged,
     columns_of,
     line_residuals_of,
@@ -30,9 +26,9 @@ from ._motion_rows import (
 )
 from ._motion_start import STARTS, disagreement
 from ._normal_solver import damped_solver
-from ._schur import Schur, covariances, reduced_of
+from ._schur import Schur
 from ._views import CAUCHY, EXACT, FAR, MEDIAN_OF_SIZE, core_median
-from .result import RESULTS, ZoomFit, judged
+from .result import RESULTS
 
 STAGES = (
     Stage(0.3, 0.01, 0.05, 4.0, change=1.0, damping=1e-3, own=0.05, fresh=1.0),
@@ -65,20 +61,9 @@ _STILL = 1.0
 
 _MOST_STEPS = 30  # of a stage
 
-_AS_GOOD = 1.3
-"""Times as much of errors that views or lines have in common: what is less may be chance."""
-
 _MOST_COUNTS = 4
 
-_INFLATION = 1 / 0.95  # of variances, by what the loss loses
-
 _FREE = 10.0  # standard deviation of a frame's log f, beside the common factor, of which nothing is said
-
-_FOLLOWED = 0.2
-"""Share of a frame's views that have to follow the model: fewer may do so by chance, at any f."""
-
-_UNKNOWN_SCALE = 0.1
-"""Standard deviation of log f from which the focal lengths have no scale."""
 
 
 def begun(data, paths, spreads, zoom, shift, distortion_model, terms):
@@ -141,19 +126,19 @@ def in_stages(data, model, noise, shot):
     for _ in range(_MOST_COUNTS if data.lines is not None else 0):
         group = groups_of(data, model, shot)
         more = repeated(data, model, *_arrays((noise, STAGES[-1])), group=jnp.asarray(group))
-        if 1 / _AS_GOOD < more < _AS_GOOD or (more <= 1 and noise.repeated == 1):
+        if 1 / AS_GOOD < more < AS_GOOD or (more <= 1 and noise.repeated == 1):
             break
         noise = noise._replace(repeated=jnp.maximum(noise.repeated * more, 1.0))
         model, noise, weighted_by, result, steps = _settled(data, model, noise)
     free = _arrays(STAGES[-1]._replace(own=_FREE))
     give_back()
-    parts, missed = _described(data, model, noise, free, result, steps)
+    parts, missed = described(data, model, noise, free, result, steps)
     if is_seen(parts["parallax"], parts["parallax_score"]):
         spread = spread_of(data, model, _arrays(noise), missed, parts["parallax"])
         model = dataclasses.replace(model, levers=guessed_levers(spread, data.structure.tracks))
         model, noise, weighted_by, result, steps = _settled(data, model, noise)
-        described, missed = _described(data, model, noise, free, result, steps)
-        parts = parts | described
+        again, missed = described(data, model, noise, free, result, steps)
+        parts = parts | again
     return parts, missed, *_arrays((model, weighted_by))
 
 
@@ -268,96 +253,3 @@ def _line_noise(data, model):
     """The median of the RMS distances of lines, px; 1 where there are none."""
     squares = line_squares_of(data, line_residuals_of(data, model))
     return jnp.maximum(jnp.sqrt(jnp.nanmedian(squares)), EXACT) if len(squares) else jnp.ones(())
-
-
-@eqx.filter_jit
-def _described(data, model, noise, stage, result, steps):
-    """The fit with its residuals, covariance and status."""
-    frames = len(model.path.log_focal)
-    units = units_of(data, model, noise)
-    zeros = jax.tree.map(jnp.zeros_like, units)
-
-    missed = residuals_of(data, model)
-    data = pinned(data, missed, noise)
-    squared = jnp.sum(missed**2, axis=-1) / (noise.points * CAUCHY) ** 2
-    good = line_squares_of(data, line_residuals_of(data, model)) < (3 * WRONG_LINE * noise.lines) ** 2
-    inlier = data.there & (squared < 9)  # beyond, the loss nearly ignores a view
-    args, counted = (data, model, noise, stage), Counted(inlier, good)  # the loss is in `inflation`
-
-    def plain(unknowns):
-        return rows_of(unknowns, args, counted)
-
-    rows, of_rows = plain(zeros), columns_of(args, zeros, counted)
-    matrix = reduced_of(of_rows, rows, zeros, data.structure, jnp.asarray(0.0))
-    own, lens, both = covariances(matrix, frames)
-    of_lens = ravel_pytree(units.lens)[0]
-    lens = lens * jnp.outer(of_lens, of_lens)
-    unit = units.frames[:, 0]
-    log_variance = own[:, 0, 0] * unit**2 + 2 * both[:, 0, -1] * unit * of_lens[-1] + lens[-1, -1]
-    count = 2 * jnp.sum(inlier)
-    free = count / (count - data.unknowns - len(lens) - told_levers(model, matrix, units))
-    flat = jnp.where(inlier, 1 / (1 + squared), 0)  # of the loss: its slope over the residual
-    pull = flat[:, None] * missed / noise.points
-    common = common_errors_of(of_rows, rows._replace(views=pull), matrix, data.structure)
-    common = common / jnp.mean(flat**2, where=inlier) ** 2 / (_INFLATION * free)
-    inflation = _INFLATION * free * jnp.where(common > _AS_GOOD, common, 1)
-    zoom_size = ravel_pytree(model.zoom.parameters)[0].size
-    lens, log_variance = lens * inflation, log_variance * inflation
-    if model.levers is not None:
-        common = common_lever(model, plain, of_rows, units, data.structure)
-        lens = lens + jnp.outer(common.lens, common.lens)
-        log_variance = log_variance + common.log_focal**2
-    joint, log_std = lens[:-2, :-2], jnp.sqrt(log_variance)
-    focal = jnp.exp(model.path.log_focal)
-    kept = jnp.where(inlier, jnp.sum(missed**2, axis=-1), 0)
-    of_views = kept, 1.0 * inlier, 1.0 * data.there
-    in_frame = [jnp.zeros(frames).at[data.structure.frame].add(leaf) for leaf in of_views]
-    unseen = in_frame[1] <= _FOLLOWED * in_frame[2]
-    fitted = ZoomLens(
-        zoom=model.zoom,
-        centre=(jnp.asarray(data.size, jnp.float64) - 1) / 2,
-        focal_range=jnp.stack(
-            [jnp.min(focal, where=~unseen, initial=jnp.inf), jnp.max(focal, where=~unseen, initial=0)]
-        ),
-        image_size=data.size,
-        focal_unit="px",
-        shift=model.shift,
-        distortion_model=model.distortion_model,
-    )
-    known = jnp.min(jnp.where(unseen, jnp.inf, log_std)) < _UNKNOWN_SCALE
-    certificate = certificate_of(
-        fitted.zoom,
-        fitted.centre,
-        fitted.focal_range,
-        data.size,
-        distortion_model=model.distortion_model,
-        shift=model.shift,
-    )
-    rms = jnp.sqrt(jnp.sum(kept) / jnp.sum(inlier))
-    fit = ZoomFit(
-        lens=fitted,
-        rms=rms,
-        frame_rms=jnp.sqrt(in_frame[0] / in_frame[1]),
-        covariance=joint[:zoom_size, :zoom_size],
-        result=judged(fitted.zoom, result, known, certificate),
-        steps=steps,
-        certificate=certificate,
-        rms_unconstrained=rms,
-        joint=None if model.shift is None else joint,
-    )
-    parts = {
-        "fit": fit,
-        "focal": jnp.where(unseen, jnp.nan, focal),
-        "focal_std": jnp.where(unseen, jnp.nan, focal * log_std),
-        "covariance": lens,
-        "rotation": model.path.rotation,
-        "noise": noise.points * jnp.sqrt(free),
-        "line_noise": noise.lines if len(good) else jnp.asarray(jnp.nan),
-        "readout": model.readout,
-        "readout_std": jnp.sqrt(lens[-2, -2]),
-    }
-    if model.levers is None:
-        parallax, parallax_std = parallax_of(data, model, noise, inlier)
-        parts["parallax"] = jnp.sqrt(jnp.maximum(parallax, 0))
-        parts["parallax_score"] = parallax / parallax_std
-    return parts, jnp.linalg.norm(missed, axis=-1)

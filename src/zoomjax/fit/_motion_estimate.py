@@ -1,0 +1,197 @@
+"""What is known about a path and a lens that were fitted: a `MotionFit`'s parts, with their uncertainty."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
+
+from ..models.invertibility import certificate_of
+from ..models.lens import ZoomLens
+from ._motion_levers import common_lever, determined_levers
+from ._motion_model import Data, Model, Noise, Stage, pinned, units_of
+from ._motion_parallax import parallax_of
+from ._motion_repeated import common_errors_of
+from ._motion_rows import (
+    WRONG_LINE,
+    Counted,
+    columns_of,
+    line_residuals_of,
+    line_squares_of,
+    residuals_of,
+    rows_of,
+)
+from ._schur import covariances, reduced_of
+from ._views import CAUCHY
+from .result import ZoomFit, judged
+
+AS_GOOD = 1.3
+"""Times as much of errors that views or lines have in common: what is less may be chance."""
+
+_INFLATION = 1 / 0.95  # of variances, by what the loss loses
+
+_IGNORED = 9.0  # squares of where the loss begins to flatten: beyond, it nearly ignores a view
+
+_FOLLOWED = 0.2
+"""Share of a frame's views that have to follow the model: fewer may do so by chance, at any f."""
+
+_UNKNOWN_SCALE = 0.1
+"""Standard deviation of log f from which the focal lengths have no scale."""
+
+
+class _Uncertainty(NamedTuple):
+    """Of what is estimated.
+
+    Attributes:
+        lens: covariance of the lens's parameters, its offset's, the readout and the common log f.
+        log_focal: variance of the logarithm of each frame's focal length.
+        inflation: of the variance of points, by the unknowns that were fitted to them.
+    """
+
+    lens: Float[Array, "lens lens"]
+    log_focal: Float[Array, "frame"]
+    inflation: Float[Array, ""]
+
+
+@eqx.filter_jit
+def described(
+    data: Data, model: Model, noise: Noise, stage: Stage, result: Any, steps: Any
+) -> tuple[dict[str, Any], Float[Array, "view"]]:
+    """The parts of a `MotionFit` by name, and the sizes of the residuals of all views, px.
+
+    Args:
+        data: tracks and lines.
+        model, noise: the fitted ones.
+        stage: the last one, without what holds focal lengths to their neighbours.
+        result, steps: of the solver.
+    """
+    missed = residuals_of(data, model)
+    data = pinned(data, missed, noise)
+    squared = jnp.sum(missed**2, axis=-1)
+    inlier = data.there & (squared < _IGNORED * (noise.points * CAUCHY) ** 2)
+    known = _uncertainty(data, model, noise, stage, missed, inlier)
+    focal, log_std = jnp.exp(model.path.log_focal), jnp.sqrt(known.log_focal)
+    of_views = jnp.where(inlier, squared, 0), 1.0 * inlier, 1.0 * data.there
+    squares, followed, there = (
+        jnp.zeros(len(focal)).at[data.structure.frame].add(leaf) for leaf in of_views
+    )
+    unseen = followed <= _FOLLOWED * there
+    scaled = jnp.min(jnp.where(unseen, jnp.inf, log_std)) < _UNKNOWN_SCALE
+    lens = _lens_of(data, model, jnp.where(unseen, jnp.nan, focal))
+    parts = {
+        "fit": _fit_of(lens, known.lens[:-2, :-2], squares, followed, judge=(result, scaled), steps=steps),
+        "focal": jnp.where(unseen, jnp.nan, focal),
+        "focal_std": jnp.where(unseen, jnp.nan, focal * log_std),
+        "covariance": known.lens,
+        "rotation": model.path.rotation,
+        "noise": noise.points * jnp.sqrt(known.inflation),
+        "line_noise": jnp.asarray(jnp.nan) if data.lines is None else noise.lines,
+        "readout": model.readout,
+        "readout_std": jnp.sqrt(known.lens[-2, -2]),
+    }
+    if model.levers is None:
+        parallax, parallax_std = parallax_of(data, model, noise, inlier)
+        parts["parallax"] = jnp.sqrt(jnp.maximum(parallax, 0))
+        parts["parallax_score"] = parallax / parallax_std
+    return parts, jnp.linalg.norm(missed, axis=-1)
+
+
+def _uncertainty(
+    data: Data,
+    model: Model,
+    noise: Noise,
+    stage: Stage,
+    missed: Float[Array, "view 2"],
+    inlier: Bool[Array, "view"],
+) -> _Uncertainty:
+    """By the rows of what follows the model, with what the loss loses and what tracks have in common."""
+    units = units_of(data, model, noise)
+    zeros = jax.tree.map(jnp.zeros_like, units)
+    good = line_squares_of(data, line_residuals_of(data, model)) < (3 * WRONG_LINE * noise.lines) ** 2
+    args, counted = (data, model, noise, stage), Counted(inlier, good)  # the loss is in the inflation
+
+    def rows_at(unknowns):
+        return rows_of(unknowns, args, counted)
+
+    rows, of_rows = rows_at(zeros), columns_of(args, zeros, counted)
+    matrix = reduced_of(of_rows, rows, zeros, data.structure, jnp.asarray(0.0))
+    own, lens, both = covariances(matrix, len(model.path.log_focal))
+    of_lens = ravel_pytree(units.lens)[0]
+    lens = lens * jnp.outer(of_lens, of_lens)
+    unit = units.frames[:, 0]
+    log_focal = own[:, 0, 0] * unit**2 + 2 * both[:, 0, -1] * unit * of_lens[-1] + lens[-1, -1]
+    count = 2 * jnp.sum(inlier)
+    free = count / (count - data.unknowns - len(lens) - determined_levers(model, matrix, units))
+    squared = jnp.sum(missed**2, axis=-1) / (noise.points * CAUCHY) ** 2
+    flat = jnp.where(inlier, 1 / (1 + squared), 0)  # of the loss: its slope over the residual
+    pull = flat[:, None] * missed / noise.points
+    common = common_errors_of(of_rows, rows._replace(views=pull), matrix, data.structure)
+    common = common / jnp.mean(flat**2, where=inlier) ** 2 / (_INFLATION * free)
+    inflation = _INFLATION * free * jnp.where(common > AS_GOOD, common, 1)
+    lens, log_focal = lens * inflation, log_focal * inflation
+    if model.levers is not None:
+        guessed = common_lever(model, rows_at, of_rows, units, data.structure)
+        lens = lens + jnp.outer(guessed.lens, guessed.lens)
+        log_focal = log_focal + guessed.log_focal**2
+    return _Uncertainty(lens, log_focal, free)
+
+
+def _lens_of(data: Data, model: Model, focal: Float[Array, "frame"]) -> ZoomLens:
+    """The fitted lens, over the focal lengths that are known."""
+    return ZoomLens(
+        zoom=model.zoom,
+        centre=(jnp.asarray(data.size, jnp.float64) - 1) / 2,
+        focal_range=jnp.stack(
+            [
+                jnp.min(focal, where=~jnp.isnan(focal), initial=jnp.inf),
+                jnp.max(focal, where=~jnp.isnan(focal), initial=0),
+            ]
+        ),
+        image_size=data.size,
+        focal_unit="px",
+        shift=model.shift,
+        distortion_model=model.distortion_model,
+    )
+
+
+def _fit_of(
+    lens: ZoomLens,
+    joint: Float[Array, "parameter parameter"],
+    squares: Float[Array, "frame"],
+    followed: Float[Array, "frame"],
+    *,
+    judge: tuple[Any, Bool[Array, ""]],
+    steps: Any,
+) -> ZoomFit:
+    """The lens's own part.
+
+    Args:
+        lens: the lens.
+        joint: covariance of its parameters and of its offset's.
+        squares, followed: of each frame, the sum of squares of the views that follow, and their number.
+        judge: the solver's result, and whether the focal lengths have a scale.
+        steps: of the solver.
+    """
+    certificate = certificate_of(
+        lens.zoom,
+        lens.centre,
+        lens.focal_range,
+        lens.image_size,
+        distortion_model=lens.distortion_model,
+        shift=lens.shift,
+    )
+    rms = jnp.sqrt(jnp.sum(squares) / jnp.sum(followed))
+    own = ravel_pytree(lens.zoom.parameters)[0].size
+    return ZoomFit(
+        lens=lens,
+        rms=rms,
+        frame_rms=jnp.sqrt(squares / followed),
+        covariance=joint[:own, :own],
+        result=judged(lens.zoom, *judge, certificate),
+        steps=steps,
+        certificate=certificate,
+        rms_unconstrained=rms,
+        joint=None if lens.shift is None else joint,
+    )
