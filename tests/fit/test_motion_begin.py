@@ -64,6 +64,7 @@ def test_it_ends_where_one_from_nothing_does(tracks, fit, earlier, monkeypatch):
     assert found.fit.result == fit.fit.result == RESULTS.successful
 
 
+@pytest.mark.slow
 def test_what_tracks_do_not_determine_is_not_determined_by_the_earlier_fit(lens, fit):
     focal, rotation = pan_and_zoom(lens, FRAMES, pan=25, tilt=6)
     still = np.broadcast_to(rotation[0], rotation.shape)
