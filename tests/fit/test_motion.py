@@ -512,8 +512,8 @@ def test_points_are_carried_to_where_other_frames_show_them(lens, path, noisy, f
     assert behind.shape == (1, 2)
 
 
-def test_nothing_is_carried_across_a_cut(fit):
-    cut = eqx.tree_at(lambda fit: fit.shot, fit, (jnp.arange(FRAMES) > 11).astype(jnp.int32))
+def test_nothing_is_carried_from_one_scene_to_another(fit):
+    cut = eqx.tree_at(lambda fit: fit.scene, fit, (jnp.arange(FRAMES) > 11).astype(jnp.int32))
     assert np.isnan(cut.carried(np.array([3]), np.array([[640.0, 360.0]]), 12)).all()
     assert np.isfinite(cut.carried(np.array([3]), np.array([[640.0, 360.0]]), 4)).all()
 

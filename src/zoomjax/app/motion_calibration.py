@@ -13,7 +13,9 @@ import numpy as np
 
 from .._core.text import with_std
 from ..detect.batch import Detection
-from ..fit.motion import LOOPS, MotionFit, fit_motion
+from ..fit.joining import joined
+from ..fit.motion import LOOPS, fit_motion
+from ..fit.motion_fit import MotionFit
 from ..fit.result import RESULTS
 from ..fit.zoom import CentreArgument
 from ..io.video_reader import decode_video
@@ -23,6 +25,7 @@ from ..tracks.again import find_again
 from ..tracks.tracks import Tracks
 from ..trust.assessment import VERDICTS, Finding, Verdict
 from ..trust.bands import displacement_std
+from .joined_shots import linked_well, turns_of_shots
 from .model_choice import WantedModel
 from .outward import outward
 
@@ -168,13 +171,18 @@ class MotionCalibration:
             )
 
     def _of_frames(self) -> Iterator[Finding]:
-        shots = int(np.max(np.asarray(self.fit.shot))) + 1
+        shots, scenes = (int(np.max(np.asarray(of))) + 1 for of in (self.fit.shot, self.fit.scene))
         if shots > 1:
+            told = "All shots show one scene, and are joined. They share one lens."
+            if scenes > 1:
+                told = (
+                    f"Its {shots} shots show {scenes} scenes. They share one lens, but how the camera "
+                    "turned between scenes is not known; the panorama is of the longest."
+                )
             yield Finding(
                 "cuts",
                 "good",
-                f"the clip has {shots - 1} cut{'s' * (shots > 2)}. The shots share one lens; the panorama "
-                "is of the longest.",
+                f"the clip has {shots - 1} cut{'s' * (shots > 2)}. {told}",
                 "Check that all of them were filmed with the same lens.",
             )
         if missing := int(np.sum(~np.isfinite(np.asarray(self.fit.focal)))):
@@ -255,6 +263,7 @@ class MotionCalibration:
             "focal_scale_std": self.scale_std(),
             "turned": np.ptp(np.asarray(self.fit.pan_and_tilt), axis=0).tolist(),
             "shots": int(np.max(np.asarray(fit.shot))) + 1,
+            "scenes": int(np.max(np.asarray(fit.scene))) + 1,
             "image_size": list(lens.image_size),
             "result": RESULTS[fit.fit.result] or "successful",
             "corner_displacement": [{"focal": f, "px": px, "std": std} for f, px, std in self.corner()],
@@ -333,9 +342,10 @@ def calibrate_motion(
     shift = PolynomialZoom(degree=1) if centre == "fit" else None
     lines, line_frames = _lines_of(found, times)
 
-    def fitted(tracks):
+    def fitted(tracks, begin=None):
         fit = fit_motion(
             tracks,
+            begin=begin,
             zoom=candidate.zoom,
             terms=candidate.terms,
             shift=shift,
@@ -344,13 +354,18 @@ def calibrate_motion(
         )
         return jax.block_until_ready(fit)
 
-    fit = fitted(tracks)
+    fit = begin = fitted(tracks)
+    turns = []
+    if fit.shot.max() > 0 and fit.fit.result == RESULTS.successful:
+        stage("Joining shots of the same scene")
+        turns = turns_of_shots(clip, fit, tracks)
+        fit, begin = (joined(fit, tracks, turns, scaled=scaled) for scaled in (False, True))
     if tracks.frames <= LOOPS and fit.fit.result == RESULTS.successful:
         stage("Finding points again where the camera comes back")
-        more = find_again(clip, tracks, carry=fit.carried)
-        if np.sum(more.mask) > (1 + _WORTH) * np.sum(tracks.mask):
+        more = linked_well(find_again(clip, tracks, carry=begin.carried), fit)
+        if np.sum(more.mask) > (1 + (0 if turns else _WORTH)) * np.sum(tracks.mask):
             stage("Fitting the path that is closed")
-            tracks, fit = more, fitted(more)
+            tracks, fit = more, fitted(more, begin)
     return MotionCalibration(clip, tracks, fit, times, lines)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..fit.motion import MotionFit
+from ..fit.motion_fit import MotionFit
 from ..trust.bands import displacement_std
 from .colours import FRAMES, MODEL, PALE
 from .outward import outward

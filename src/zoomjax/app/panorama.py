@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ..fit.motion import MotionFit
+from ..fit.motion_fit import MotionFit
 from ..io.video_reader import decode_video
 
 _WIDTH = 1600  # px, at most
@@ -15,14 +15,14 @@ _MARGIN = 0.05  # least cosine of an angle to the camera's axis
 
 
 def write_panorama(clip: str | os.PathLike[str], fit: MotionFit, path: Path) -> None:
-    """Write the mean of frames, evenly over the longest shot, on a sphere about the camera.
+    """Write the mean of frames, evenly over the longest scene, on a sphere about the camera.
 
     A point that frames put to different places is blurred, and shows an error to anyone. So are things
     that move.
     """
-    shot, focal = np.asarray(fit.shot), np.asarray(fit.focal)
-    longest = np.argmax(np.bincount(shot[shot >= 0]))
-    members = np.flatnonzero((shot == longest) & np.isfinite(focal))
+    scene, focal = np.asarray(fit.scene), np.asarray(fit.focal)
+    longest = np.argmax(np.bincount(scene[scene >= 0]))
+    members = np.flatnonzero((scene == longest) & np.isfinite(focal))
     chosen = members[np.unique(np.linspace(0, len(members) - 1, _FRAMES).astype(int))]
     rotation = np.asarray(fit.rotation)
     rays = _sphere(fit, chosen)

@@ -22,8 +22,8 @@ from .focal_lengths import with_focal_sigma as with_focal_sigma
 from .frames import fit_frames as fit_frames
 from .image_metric import in_image as in_image
 from .many_fits import many as many
-from .motion import MotionFit as MotionFit
 from .motion import fit_motion as fit_motion
+from .motion_fit import MotionFit as MotionFit
 from .outlier_points import PointRejection as PointRejection
 from .outlier_points import reject_points as reject_points
 from .problem import Problem as Problem

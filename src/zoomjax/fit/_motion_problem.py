@@ -17,6 +17,7 @@ from ..models.zoom import AbstractZoom
 from ..tracks.tracks import Tracks
 from ._motion_model import Data
 from ._structure import bucket, padded, structure_of
+from .motion_fit import MotionFit
 
 _READOUT = (0.0, 0.5)
 """What is known of the readout before there is any data, and its standard deviation, in frames."""
@@ -30,6 +31,10 @@ other are coupled: time is then linear in the frames."""
 LONGEST_LOOP = 256
 """Frames of a clip whose tracks stay whole if there are longer ones: a camera that comes back to where it
 looked before then closes a loop. The frames' matrix is full, and its cost of little account."""
+
+_NEAR = 4
+"""Frames with views from one view of a track to the next, at most, that are of one shot: tracks are found
+again after more (`find_again`), and maybe beyond a cut."""
 
 _MANY_VIEWS = 100_000
 """From so many on, the way to the minimum is gone with fewer of them."""
@@ -46,6 +51,7 @@ class Given(NamedTuple):
     line_frames: Int[AnyArray, "some"] | None
     focal: Float[AnyArray, "frame"] | None
     focal_std: float | int | Float[AnyArray, "frame"] | None
+    begin: MotionFit | None = None
 
 
 class Asked(NamedTuple):
@@ -66,7 +72,9 @@ class Problem(NamedTuple):
         track, view: of each view, its place in the tracks.
         moment: its frame.
         piece: its track, cut into pieces.
-        shot: of each frame.
+        linked: of each frame, the number of the group that tracks link; -1 for frames without views.
+        shot: of each frame, so: parts of such a group that follow each other without a cut.
+        scene: of each frame, so: such groups, joined as in the fit from which this one begins.
     """
 
     data: Data
@@ -74,7 +82,9 @@ class Problem(NamedTuple):
     view: np.ndarray
     moment: np.ndarray
     piece: np.ndarray
+    linked: np.ndarray
     shot: np.ndarray
+    scene: np.ndarray
 
 
 def problem_of(given: Given, asked: Asked) -> Problem:
@@ -83,7 +93,7 @@ def problem_of(given: Given, asked: Asked) -> Problem:
     focal, std = _known_focal(given.focal, given.focal_std, tracks.frames)
     track, view = np.nonzero(np.asarray(tracks.mask))
     moment = np.asarray(tracks.frame)[track, view]
-    shot = _shots(track, moment, tracks.frames)
+    linked, shot, scene = _groups(track, moment, tracks.frames, given.begin)
     frames = bucket(tracks.frames)
     more = frames - tracks.frames
     lines, line_frame = _ready_lines(
@@ -95,9 +105,9 @@ def problem_of(given: Given, asked: Asked) -> Problem:
     wide = padded(structure)
     points = jnp.asarray(tracks.points, float)[track, view] - (np.array([tracks.image_size]) - 1) / 2
     views = len(wide.track) - len(points)
-    new = shot < 0
-    new[np.unique(shot, return_index=True)[1]] = True  # the first of each shot, and no other after a gap
-    open_ = (shot >= 0) & jnp.isinf(std)
+    new = linked < 0
+    new[np.unique(linked, return_index=True)[1]] = True  # the first of each, and no other after a gap
+    open_ = (linked >= 0) & jnp.isinf(std)
     data = Data(
         points=jnp.pad(points, ((0, views), (0, 0))),
         there=jnp.arange(len(wide.track)) < len(points),
@@ -106,7 +116,7 @@ def problem_of(given: Given, asked: Asked) -> Problem:
         pinned=jnp.pad((np.arange(tracks.frames) == jnp.argmax(open_)) & jnp.any(open_), (0, more)),
         log_focal=jnp.pad(jnp.log(focal), (0, more)),
         log_std=jnp.pad(std / focal, (0, more), constant_values=np.inf),
-        unknowns=jnp.asarray(4.0 * np.sum(shot >= 0) + 2 * structure.tracks),
+        unknowns=jnp.asarray(4.0 * np.sum(linked >= 0) + 2 * structure.tracks),
         neighbours=jnp.asarray(_neighbours(np.pad(shot, (0, more), constant_values=-1))),
         readout=jnp.asarray(_known_readout(asked.readout)),
         lines=lines,
@@ -114,7 +124,7 @@ def problem_of(given: Given, asked: Asked) -> Problem:
         scale=tracks.scale,
         size=tracks.image_size,
     )
-    return Problem(data, track, view, moment, piece, shot)
+    return Problem(data, track, view, moment, piece, linked, shot, scene)
 
 
 def thinned(given: Given) -> Given | None:
@@ -247,18 +257,33 @@ def _neighbours(shot):
     return np.stack([np.where(shot[to] == shot, to, frame) for to in (before, after)], axis=1)
 
 
-def _shots(track, moment, frames):
-    """The number of each frame's shot; -1 for frames without views. A track goes through no cut."""
-    same = track[1:] == track[:-1]
-    links = scipy.sparse.coo_array(
-        (np.ones(same.sum()), (moment[:-1][same], moment[1:][same])), (frames,) * 2
-    )
-    _, names = scipy.sparse.csgraph.connected_components(links, directed=False)
+def _groups(track, moment, frames, begin):
+    """Of each frame the numbers of what tracks link, of its shot and of its scene; -1 without views.
+
+    A track that is found again may go across a cut, but not from a frame to one that is near.
+    """
     seen = np.bincount(moment, minlength=frames) > 0
+    same = track[1:] == track[:-1]
+    links = np.stack([moment[:-1][same], moment[1:][same]])
+    apart = np.diff(np.cumsum(seen)[links], axis=0)[0]  # in frames with views: none is seen in the dark
+    near, joined = apart <= _NEAR, links
+    if begin is not None:
+        shot, scene = np.asarray(begin.shot), np.asarray(begin.scene)
+        near &= shot[links[0]] == shot[links[1]]
+        order = np.argsort(scene, kind="stable")
+        follows = (np.diff(scene[order]) == 0) & (scene[order[1:]] >= 0)
+        joined = np.concatenate([links, np.stack([order[:-1], order[1:]])[:, follows]], axis=1)
+    return [_numbers(of, seen) for of in (links, links[:, near], joined)]
+
+
+def _numbers(links, seen):
+    """Numbers of the groups of frames that links join, in the order of their first; -1 where not seen."""
+    matrix = scipy.sparse.coo_array((np.ones(links.shape[1]), (links[0], links[1])), (len(seen),) * 2)
+    _, names = scipy.sparse.csgraph.connected_components(matrix, directed=False)
     _, first, place = np.unique(names[seen], return_index=True, return_inverse=True)
-    shot = np.full(frames, -1)
-    shot[seen] = np.argsort(np.argsort(first))[place]
-    return shot
+    number = np.full(len(seen), -1)
+    number[seen] = np.argsort(np.argsort(first))[place]
+    return number
 
 
 def _block(track, moment, frames):

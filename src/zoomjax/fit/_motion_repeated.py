@@ -37,12 +37,12 @@ _NEAR = 0.01
 _LITTLE = 1e-9  # added to the diagonal: unknowns that no view sees
 
 
-def groups_of(data: Data, model: Model, shot: Int[np.ndarray, "frame"]) -> Int[np.ndarray, "line"]:
+def groups_of(data: Data, model: Model, scene: Int[np.ndarray, "frame"]) -> Int[np.ndarray, "line"]:
     """The number of the line of the scene that each line shows."""
     plane, frame = np.asarray(line_planes_of(data, model)), np.asarray(data.structure.line_frame)
-    # Cameras of different shots have no rotation in common.
+    # Cameras of different scenes have no rotation in common.
     place = np.column_stack(
-        [plane, np.where(frame < len(shot), shot[np.minimum(frame, len(shot) - 1)], -1)]
+        [plane, np.where(frame < len(scene), scene[np.minimum(frame, len(scene) - 1)], -1)]
     )
     tree = KDTree(place)
     other = KDTree(place * [-1, -1, -1, 1])  # a plane has two normals

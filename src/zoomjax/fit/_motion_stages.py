@@ -110,13 +110,32 @@ def with_all(few, data, model, noise):
     return eqx.tree_at(lambda m: m.path.rays, model, _averaged(data, model)), noise
 
 
-def in_stages(data, model, noise, shot):
+def continued(data, path, lens, readout, noise):
+    """A model near the best and its noise, from the path and the lens of an earlier fit.
+
+    Where shots have been joined since, their views disagree by more than noise: the loss is wide at first.
+
+    Args:
+        data: tracks and lines.
+        path: that of the earlier fit, of any rays.
+        lens: its zoom model, its distortion model, and the zoom model of its centre's offset.
+        readout, noise: those of the earlier fit.
+    """
+    zoom, distortion_model, shift = lens
+    still = Speed(*2 * (jnp.zeros((len(path.log_focal), 4)),))
+    model = Model(path, zoom, shift, readout, still, distortion_model)
+    wide = noise.wider(STAGES[0].wider)
+    model, noise, *_ = _solved(data, *_arrays((model, wide, STAGES[1]._replace(fresh=1.0))))
+    return model, noise
+
+
+def in_stages(data, model, noise, scene):
     """The last stage, until nothing changes, and what is known about the fit.
 
     Args:
         data: tracks and lines.
         model, noise: of `begun`.
-        shot: number of each frame's shot.
+        scene: number of each frame's scene.
 
     Returns:
         The parts of a `MotionFit` by name, the sizes of the residuals of all views, the model, and the
@@ -124,7 +143,7 @@ def in_stages(data, model, noise, shot):
     """
     model, noise, weighted_by, result, steps = _settled(data, model, noise)
     for _ in range(_MOST_COUNTS if data.lines is not None else 0):
-        group = groups_of(data, model, shot)
+        group = groups_of(data, model, scene)
         more = repeated(data, model, *_arrays((noise, STAGES[-1])), group=jnp.asarray(group))
         if 1 / AS_GOOD < more < AS_GOOD or (more <= 1 and noise.repeated == 1):
             break

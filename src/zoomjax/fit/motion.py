@@ -8,150 +8,36 @@ end.
 """
 
 import warnings
-from typing import Any, NoReturn
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import eval_context
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from .._core.arguments import kinds_checked
 from .._core.types import AnyArray, traced
 from ..lines.free_centre import AnyCentreLines
 from ..lines.lines import Lines
 from ..models.distortion_model import AbstractDistortionModel, checked_terms
-from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ..models.requirements import check
-from ..models.zoom import (
-    AbstractZoom,
-    PolynomialZoom,
-)
+from ..models.zoom import AbstractZoom, PolynomialZoom
 from ..tracks.tracks import Tracks
 from ._motion_gradient import sensitive
 from ._motion_model import Model, Noise, scaled
 from ._motion_problem import LONGEST_LOOP, Asked, Given, Problem, problem_of, thinned
-from ._motion_stages import begun, in_stages, with_all
-from ._motion_start import starts_of, views_by_frame
+from ._motion_stages import begun, continued, in_stages, with_all
+from ._motion_start import Path, starts_of, views_by_frame
 from .defaults import zoom_or_default
-from .result import RESULTS, ZoomFit, failed
+from .motion_fit import MotionFit, thrown_motion
 
 LOOPS = LONGEST_LOOP
 """The most frames of a clip in which a camera that comes back closes a loop: tracks stay whole."""
 
-_FAILED = "The fit failed: turn and zoom farther, or fit fewer coefficients about the image's centre."
-
-
 _FAR_OFF = 5.0
 """Standard deviations from a known focal length to the one fitted that are no chance."""
-
-_UNSETTLED = "It did not settle within its steps."
-
-
-class MotionFit(eqx.Module):
-    """The lens and the path of a camera that turns and zooms.
-
-    Attributes:
-        fit: the lens, with focal lengths in px, and its uncertainty. `ZoomFit.rms` is of the distances
-            between views and where the model puts them, px of the image, without those that it takes for
-            mistakes; `ZoomFit.joint` includes the centre. Its result `undetermined` says that the tracks do
-            not determine the scale of the focal lengths, as where the camera zooms and does not turn: only
-            their ratios are known then, and the distortion straightens lines all the same.
-        focal: focal length of each frame, px; NaN for a frame without tracks.
-        focal_std: its standard deviation, px. Nearly all of it is a factor common to all frames.
-        covariance: of the zoom model's parameters, of those of the centre's offset, of the readout, and of
-            the logarithm of that factor: that of the frame whose views follow best.
-        rotation: of each frame, from the scene to the camera, whose axes are x right, y down and z
-            forward. The first frame's is the identity. So is that of the first frame after a cut, across
-            which no track goes: how the camera turned between them is not known.
-        shot: number of the shot that each frame belongs to, from 0: a new one begins with each cut; -1 for
-            a frame without tracks.
-        rays: direction of each track in the scene, of length 1.
-        residual: distance between each view and where the model puts it, px; NaN for padding.
-        noise: standard deviation of a coordinate of a point, px, from the median of the residuals.
-        line_noise: standard deviation of points of lines from these, px of the image; NaN without lines.
-        readout: time that a rolling shutter takes from the first row to the last, in frames.
-        readout_std: its standard deviation. A large one says that nothing is known: the camera was too slow
-            to determine it, and it does no harm.
-        parallax: distance of the entrance pupil before the axis of rotation, over that of a point of the
-            scene: its standard deviation from point to point, by a test of a fit without it, and at least.
-            What all points have in common looks like a lens, and cannot be determined; it is likely a few
-            times as large, and so is the relative error of f that it makes. 0 if none is seen, NaN with
-            few tracks.
-        parallax_score: its square in standard deviations of chance: above 3 or so it is seen.
-        lever: that of each track, less what all have in common, where a parallax is seen; 0 elsewhere.
-        lever_std: its standard deviation from track to track, to which levers are held; 0 if none is seen.
-        lever_mean: what all are taken to have in common, which no track determines: 2.5 of these standard
-            deviations, less where it is not sure whether the pupil is before the axis or behind it.
-            `focal_std` and `covariance` have in them by how much that may be off.
-    """
-
-    fit: ZoomFit
-    focal: Float[Array, "frame"]
-    focal_std: Float[Array, "frame"]
-    covariance: Float[Array, "all all"]
-    rotation: Float[Array, "frame 3 3"]
-    shot: Int[Array, "frame"]
-    rays: Float[Array, "track 3"]
-    residual: Float[Array, "track view"]
-    noise: Float[Array, ""]
-    line_noise: Float[Array, ""]
-    readout: Float[Array, ""]
-    readout_std: Float[Array, ""]
-    parallax: Float[Array, ""]
-    parallax_score: Float[Array, ""]
-    lever: Float[Array, "track"]
-    lever_std: Float[Array, ""]
-    lever_mean: Float[Array, ""]
-
-    @property
-    def lens(self) -> ZoomLens:
-        """The zoom lens."""
-        return self.fit.lens
-
-    @property
-    def pan_and_tilt(self) -> Float[Array, "frame 2"]:
-        """Angles of each frame to the right and up, degrees, from where the first of its shot looks."""
-        x, y, z = self.rotation[:, 2].T
-        return jnp.degrees(jnp.stack([jnp.arctan2(x, z), -jnp.arcsin(jnp.clip(y, -1, 1))], axis=1))
-
-    def carried(
-        self, frame: Int[AnyArray, "point"], points: Float[AnyArray, "point 2"], other: int
-    ) -> Float[np.ndarray, "point 2"]:
-        """Where a frame shows what others show, px; NaN behind the camera, and beyond a cut.
-
-        Args:
-            frame: for each point the number of the frame that it is in.
-            points: the points, px.
-            other: the number of the frame in which they are looked for.
-        """
-        known = np.nan_to_num(np.asarray(self.focal), nan=float(self.lens.focal_range[0]))
-        turn = np.asarray(self.rotation)
-        frame = np.asarray(frame)
-        seen = _carried(
-            self.lens, known[frame], turn[frame], jnp.asarray(points), known[other], turn[other]
-        )
-        same = np.asarray(self.shot)[frame] == np.asarray(self.shot)[other]
-        return np.where(same[:, None], np.asarray(seen), np.nan)
-
-    def __call__(self, *_: Any, **__: Any) -> NoReturn:
-        """Raise TypeError: call the lens of the fit instead."""
-        raise TypeError("A MotionFit is not a lens: use fit.lens, as in fit.lens(2400.0).")
-
-
-@eqx.filter_jit
-def _carried(lens, focal, rotation, points, other_focal, other_rotation):
-    """Points of frames in another one, px, without what a rolling shutter does to them."""
-
-    def one(f, turn, point):
-        flat = (lens(f).undistort(point) - lens.centre_at(f)) / f
-        ahead = other_rotation @ (turn.T @ jnp.append(flat, 1))
-        straight = lens.centre_at(other_focal) + other_focal * ahead[:2] / jnp.maximum(ahead[2], 1e-3)
-        return jnp.where(ahead[2] > 1e-3, lens(other_focal).distort(straight), jnp.nan)
-
-    return jax.vmap(one)(focal, rotation, points)
 
 
 @kinds_checked
@@ -167,6 +53,7 @@ def fit_motion(
     readout: float | int | None = None,
     focal: Float[AnyArray, "frame"] | None = None,
     focal_std: float | int | Float[AnyArray, "frame"] | None = None,
+    begin: MotionFit | None = None,
     throw: bool = True,
 ) -> MotionFit:
     """Fit focal lengths, rotations and a zoom lens to tracks of points that are far away or do not move.
@@ -190,6 +77,9 @@ def fit_motion(
             default.
         focal: focal lengths that are known beforehand, px; NaN where not.
         focal_std: their standard deviations, px, above 0; needed if `focal` is given.
+        begin: an earlier fit of the same models to other tracks of the clip, from which it begins in place
+            of from nothing: it ends at the same fit, and sooner. Its shots stay shots where tracks go from
+            one to the other, and its scenes stay scenes where none do.
         throw: whether to raise if the fit fails. Otherwise see `ZoomFit.result`. `undetermined` and
             `folded` never raise.
 
@@ -202,8 +92,9 @@ def fit_motion(
     theorem, with the noise by which residuals are weighted held as it is.
 
     Raises:
-        ValueError: float64 is not enabled; the number of known focal lengths is not that of the frames; or
-            the lines are of other frames or images, or the distortion model is not radial.
+        ValueError: float64 is not enabled; the number of known focal lengths is not that of the frames; the
+            lines are of other frames or images, or the distortion model is not radial; or `begin` is of
+            another clip or other models.
         RuntimeError: the fit failed (see `throw`).
 
     Warns:
@@ -222,7 +113,7 @@ def fit_motion(
     check("fit_motion", zoom=zoom)
     distortion_model = RadialPolynomial() if distortion_model is None else distortion_model
     terms = checked_terms(terms, distortion_model.most_terms)
-    given = Given(tracks, lines, line_frames, focal, focal_std)
+    given = Given(tracks, lines, line_frames, focal, focal_std, begin)
     asked = Asked(zoom, distortion_model, terms, shift, readout)
     if not traced(given):
         return _fitted(given, asked, throw)[0]
@@ -246,16 +137,8 @@ def _fitted(given: Given, asked: Asked, throw: bool) -> tuple[MotionFit, Model, 
 def _solved_motion(given, asked):
     """The fit, the model that it is of, and the noise."""
     problem, frames = problem_of(given, asked), given.tracks.frames
-    fewer = thinned(given)
-    few = problem if fewer is None else problem_of(fewer, asked)
-    if not np.array_equal(few.shot, problem.shot):  # what links two parts of a shot is missing
-        few = problem
-    by_frame = views_by_frame(few.piece, few.moment, len(few.data.log_focal))
-    paths, spreads = _started(few.data, by_frame)
-    found = begun(few.data, paths, spreads, asked.zoom, asked.shift, asked.distortion_model, asked.terms)
-    if few is not problem:
-        found = with_all(few.data, problem.data, *found)
-    parts, missed, model, noise = in_stages(problem.data, *found, problem.shot)
+    found = _from_nothing(given, asked, problem) if given.begin is None else _from(given, asked, problem)
+    parts, missed, model, noise = in_stages(problem.data, *found, problem.scene)
     parts["fit"] = eqx.tree_at(lambda fit: fit.frame_rms, parts["fit"], parts["fit"].frame_rms[:frames])
     residual = jnp.full(np.shape(given.tracks.mask), jnp.nan)
     fit = MotionFit(
@@ -263,12 +146,57 @@ def _solved_motion(given, asked):
         rays=_rays_of(model, problem, len(given.tracks.mask)),
         residual=residual.at[problem.track, problem.view].set(missed[: len(problem.track)]),
         shot=jnp.asarray(problem.shot, jnp.int32),
+        scene=jnp.asarray(problem.scene, jnp.int32),
         lever=_levers_of(model, problem, len(given.tracks.mask)),
         lever_std=jnp.zeros(()) if model.levers is None else model.levers.std,
         lever_mean=jnp.zeros(()) if model.levers is None else model.levers.mean,
     )
     _warn_of_contradiction(given, fit)
     return fit, model, noise
+
+
+def _from_nothing(given, asked, problem):
+    """A model near the best and its noise, from tracks alone."""
+    fewer = thinned(given)
+    few = problem if fewer is None else problem_of(fewer, asked)
+    if not all(np.array_equal(getattr(few, of), getattr(problem, of)) for of in ("shot", "linked")):
+        few = problem  # what links two parts of a shot is missing
+    by_frame = views_by_frame(few.piece, few.moment, len(few.data.log_focal))
+    paths, spreads = _started(few.data, by_frame)
+    found = begun(few.data, paths, spreads, asked.zoom, asked.shift, asked.distortion_model, asked.terms)
+    return found if few is problem else with_all(few.data, problem.data, *found)
+
+
+def _from(given, asked, problem):
+    """A model near the best and its noise, from an earlier fit."""
+    earlier, data = given.begin, problem.data
+    log_focal = np.log(np.asarray(earlier.focal))
+    known = np.flatnonzero(np.isfinite(log_focal))
+    alike = (len(log_focal), earlier.lens.image_size) == (given.tracks.frames, given.tracks.image_size)
+    if not alike or not len(known):
+        raise ValueError(
+            "Argument begin must be an earlier fit of the same clip, but its frames are not as many or not "
+            "as large as those of the tracks, or it has found no focal length."
+        )
+    log_focal = np.interp(np.arange(len(log_focal)), known, log_focal[known])
+    size = asked.distortion_model.num_coefficients(asked.terms)
+    wanted = asked.zoom.prepare(np.exp(log_focal), size), asked.distortion_model
+    wanted += (None if asked.shift is None else asked.shift.prepare(np.exp(log_focal), 2),)
+    lens = earlier.lens.zoom, earlier.lens.distortion_model, earlier.lens.shift
+    if jax.tree.structure(lens) != jax.tree.structure(wanted) or [
+        np.shape(leaf) for leaf in jax.tree.leaves(lens)
+    ] != [np.shape(leaf) for leaf in jax.tree.leaves(wanted)]:
+        raise ValueError(
+            "Argument begin must be an earlier fit of the same models, but it has another zoom model, "
+            "distortion model, shift, or number of terms."
+        )
+    more = (0, len(data.log_focal) - len(log_focal))
+    path = Path(
+        jnp.asarray(np.pad(log_focal, more, mode="edge")),
+        jnp.asarray(np.pad(np.asarray(earlier.rotation), (more, (0, 0), (0, 0)), mode="edge")),
+        jnp.zeros((data.structure.tracks, 3)),
+    )
+    return continued(data, path, lens, earlier.readout, Noise(earlier.noise, jnp.asarray(jnp.nan)))
 
 
 def _warn_of_contradiction(given, fit):
@@ -338,14 +266,6 @@ def _with_model(fit: MotionFit, model: Model, problem: Problem) -> MotionFit:
             _levers_of(model, problem, len(fit.rays)),
         ),
     )
-
-
-def thrown_motion(fit: MotionFit) -> MotionFit:
-    """The fit, raising RuntimeError where its solver failed."""
-    if bool(failed(fit.fit.result)):
-        spent = fit.fit.result == RESULTS.nonlinear_max_steps_reached
-        raise RuntimeError(f"{_FAILED} {_UNSETTLED if spent else RESULTS[fit.fit.result]}")
-    return fit
 
 
 @eqx.filter_jit

@@ -1,0 +1,76 @@
+"""Shots of a clip that show one scene from one place, found and joined."""
+
+import itertools
+import os
+from collections.abc import Callable
+
+import numpy as np
+
+from ..fit.joining import Matches, Turn, joined, key_frames, turn_between
+from ..fit.motion_fit import MotionFit
+from ..tracks.key_frames import KeyFrames
+from ..tracks.tracks import Tracks
+
+_SHOTS = 30
+"""That are compared, the longest ones: all are compared with all."""
+
+_FRAMES = 48
+"""That are compared in all, if each shot has as many as `_OF_A_SHOT` allow."""
+
+_OF_A_SHOT = (2, 6)
+
+_LINKS = 20
+"""Tracks that go from one shot to another, at least: fewer do not hold the one to the other."""
+
+
+def turns_of_shots(clip: str | os.PathLike[str], fit: MotionFit, tracks: Tracks) -> list[Turn]:
+    """How the camera turned between shots of a clip that show the same from the same place."""
+    shot = np.asarray(fit.shot)
+    counts = np.bincount(shot[np.isfinite(np.asarray(fit.focal)) & (shot >= 0)])
+    longest = np.sort(np.argsort(-counts, kind="stable")[:_SHOTS])
+    if len(longest) < 2:
+        return []
+    most = int(np.clip(_FRAMES // len(longest), *_OF_A_SHOT))
+    frames = {number: key_frames(fit, number, most) for number in longest.tolist()}
+    pairs = list(itertools.combinations(frames, 2))
+    compared = sum(len(frames[one]) * len(frames[other]) for one, other in pairs)
+    seen = KeyFrames(clip, itertools.chain(*frames.values()))
+    turns = []
+    for pair in pairs:
+        both = itertools.product(*(frames[number] for number in pair))
+        matches = [Matches((one, other), seen.matches(one, other)) for one, other in both]
+        turn = turn_between(fit, matches, compared)
+        if turn is not None and seen.alike(*_carry(joined(fit, tracks, [turn], scaled=True), turn)):
+            turns.append(turn)
+    return turns
+
+
+def _carry(
+    fit: MotionFit, turn: Turn
+) -> tuple[int, int, Callable[[np.ndarray], np.ndarray], tuple[int, int]]:
+    """The frame with the shorter f and the other one, and where the one shows the points of the other."""
+    one, other = sorted(turn.frames, key=lambda frame: float(fit.focal[frame]))
+
+    def carry(points: np.ndarray) -> np.ndarray:
+        return fit.carried(np.full(len(points), other), points, one)
+
+    return one, other, carry, fit.lens.image_size
+
+
+def linked_well(tracks: Tracks, fit: MotionFit) -> Tracks:
+    """The tracks without views in shots to which few of the shot where they begin go."""
+    shot = np.asarray(fit.shot)
+    number, frame, points = tracks.views()
+    _, first, track = np.unique(number, return_index=True, return_inverse=True)
+    begun, there = shot[frame[first]][track], shot[frame]
+    links = np.unique(np.stack([track, begun, there]), axis=1)
+    size = shot.max() + 2  # of a frame without tracks, -1, the last
+    count = np.zeros((size, size), int)
+    np.add.at(count, (links[1], links[2]), 1)
+    both = count + count.T
+    good = (begun == there) | (both[begun, there] >= _LINKS)
+    if good.all():
+        return tracks
+    return Tracks.from_arrays(
+        number[good], frame[good], points[good], image_size=tracks.image_size, frames=tracks.frames
+    )

@@ -1,0 +1,122 @@
+"""Rendered clips with a cut: shots of one scene are joined, and others are not."""
+
+import cv2
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import zoomjax as zj
+from zoomjax.app.joined_shots import linked_well, turns_of_shots
+from zoomjax.app.motion_calibration import calibrate_motion
+from zoomjax.app.panorama import write_panorama
+from zoomjax.scenes import leaves, motion_clip
+from zoomjax.tracks import Tracks, track_video
+
+from .._clips import write_frames
+
+SIZE, CUT, FRAMES = (640, 360), 20, 40
+
+
+def lens():
+    zoom = zj.PolynomialZoom(2, jnp.array([[0.02, 0.0], [-0.05, 0.01], [-0.1, 0.03]]), jnp.array(500.0))
+    return zj.ZoomLens(zoom, jnp.array([322.0, 178.0]), jnp.array([500.0, 1200.0]), SIZE, "px")
+
+
+def shot(pan, tilt, focal):
+    """Focal lengths and rotations of half of the clip, between these ends."""
+    number = FRAMES // 2
+    angles = np.column_stack([np.linspace(*tilt, number), np.linspace(*pan, number)])
+    return np.geomspace(*focal, number), Rotation.from_euler("xy", -angles, degrees=True).as_matrix()
+
+
+def shots():
+    return shot((-15, 10), (0, 3), (520, 800)), shot((30, 2), (5, 2), (640, 1100))
+
+
+def rendered(path, seeds, *, caption=False, shutter=0.0):
+    """A clip of both shots, before panoramas of these seeds."""
+    frames = []
+    for part, seed in zip(shots(), seeds, strict=True):
+        texture = leaves(seed=seed)
+        made = motion_clip(
+            lens(), *part, texture=texture, noise=2, caption=caption, shutter=shutter, density=1200.0
+        )
+        frames += list(made.frames())
+    return write_frames(path, frames)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("cuts")
+
+
+@pytest.fixture(scope="module")
+def done(folder):
+    clip = rendered(folder / "clip.mp4", (0, 0), caption=True, shutter=0.4)
+    stages = []
+    found = calibrate_motion(clip, track_video(clip), stage=stages.append)
+    assert "Joining shots of the same scene" in stages
+    assert "Fitting the path that is closed" in stages
+    return found
+
+
+def test_shots_of_one_scene_are_joined(done):
+    focal, rotation = (np.concatenate(part) for part in zip(*shots(), strict=True))
+    fit = done.fit
+    np.testing.assert_array_equal(fit.shot, np.arange(FRAMES) >= CUT)
+    np.testing.assert_array_equal(fit.scene, 0)
+    assert abs(np.asarray(fit.focal) / focal - 1).max() < 0.003
+    true = rotation @ rotation[0].T
+    off = Rotation.from_matrix(np.asarray(fit.rotation) @ np.swapaxes(true, 1, 2)).magnitude()
+    assert np.degrees(off).max() < 0.06
+    assert fit.readout == pytest.approx(0.4, abs=0.05)  # no row has its time from beyond the cut
+    assert done.verdict == "good"
+    assert "1 cut. All shots show one scene" in " ".join(map(str, done.findings))
+    assert (done.summary()["shots"], done.summary()["scenes"]) == (2, 1)
+
+
+def test_tracks_go_across_the_cut_and_hold_the_shots(done):
+    number, frame, _ = done.tracks.views()
+    _, first, track = np.unique(number, return_index=True, return_inverse=True)
+    across = np.unique(track[(frame[first][track] < CUT) & (frame >= CUT)])
+    assert len(across) > 30
+    log_std = np.asarray(done.fit.focal_std) / np.asarray(done.fit.focal)
+    assert np.ptp([log_std[:CUT].mean(), log_std[CUT:].mean()]) < 0.1 * log_std.mean()
+
+
+def test_the_panorama_shows_both_shots_and_is_sharp(done, folder):
+    write_panorama(done.clip, done.fit, folder / "panorama.jpg")
+    panorama = cv2.imread(str(folder / "panorama.jpg"), cv2.IMREAD_GRAYSCALE)
+    assert panorama is not None
+    height, width = panorama.shape
+    seen = np.flatnonzero(panorama[height // 2] > 0)
+    pan = np.ptp(np.asarray(done.fit.pan_and_tilt)[:, 0])
+    assert pan == pytest.approx(45, abs=1)
+    assert np.ptp(seen) > 0.95 * width
+    middle = panorama[height // 3 : -height // 3, width // 3 : -width // 3].astype(float)
+    assert np.abs(np.diff(middle, axis=1)).mean() > 4
+
+
+@pytest.mark.parametrize("caption", [False, True])
+def test_shots_of_different_scenes_are_not_joined(done, folder, caption):
+    clip = rendered(folder / f"other-{caption}.mp4", (0, 5), caption=caption)
+    apart = eqx.tree_at(lambda fit: fit.scene, done.fit, done.fit.shot)
+    assert len(turns_of_shots(done.clip, apart, done.tracks)) == 1
+    assert turns_of_shots(clip, apart, done.tracks) == []
+
+
+def test_few_tracks_do_not_hold_one_shot_to_another(done):
+    number, frame, points = done.tracks.views()
+    _, first, track = np.unique(number, return_index=True, return_inverse=True)
+    across = (frame[first][track] < CUT) & (frame >= CUT)
+    few = ~across | (track < np.unique(track[across])[9])
+
+    def kept(which):
+        return Tracks.from_arrays(
+            number[which], frame[which], points[which], image_size=SIZE, frames=FRAMES
+        )
+
+    np.testing.assert_array_equal(linked_well(done.tracks, done.fit).frame, done.tracks.frame)
+    np.testing.assert_array_equal(linked_well(kept(few), done.fit).frame, kept(~across).frame)
