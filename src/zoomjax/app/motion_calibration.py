@@ -4,7 +4,7 @@ import csv
 import dataclasses
 import importlib.metadata
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,30 +24,17 @@ from ..tracks.tracks import Tracks
 from ..trust.assessment import VERDICTS, Finding, Verdict
 from ..trust.bands import displacement_std
 from .model_choice import WantedModel
+from .motion_findings import findings_of_motion, following, scale_std
 from .outward import outward
 
 FILES = ("lens.json", "track.csv", "tracks.npz", "summary.json", "motion.png", "panorama.jpg")
 """What `MotionCalibration.make` writes."""
 
-_LOOSE_SCALE = 0.01
-"""Standard deviation of the common factor of focal lengths, relative, from which it is worth a word."""
-
 _TOLD_SHUTTER = 0.1
 """Standard deviation of the readout, in frames, below which it is told."""
 
-_ROUGH, _WRONG = 0.8, 1.2
-"""px, of the noise of points: two and three times what the way of a point there and back may miss, so that
-more is hardly noise. Much moves by itself, or what is seen is no camera that turns."""
-
-_MISSED = 9.0  # times the noise, squared: views beyond do not follow the model
-_FEW = 0.3  # of the views that do follow it: below, most of what is seen may move by itself
-# Of the views that follow, the share for which the loss hardly flattens: 0.94 of noise alone. Where four of
-# five points are on things that move, what these are off is taken for noise, and the share is 0.7 to 0.76.
-_CLOSE = 0.77
 _MANY = 9.0  # focal lengths, more than any model needs
-_HARMLESS = 5e-4  # of the pupil's offset over distances: its standard deviation, by the test
 _WORTH = 0.03  # share of more views for which it is fitted again
-_LEAST_ZOOM = 1.2  # between the ends of the focal lengths
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,12 +57,7 @@ class MotionCalibration:
 
     def following(self) -> float:
         """The share of the views that follow the model: the rest are on things that move, or mistakes."""
-        return float(np.mean(self._missed() < _MISSED))
-
-    def _missed(self) -> np.ndarray:
-        """Of each view, the square of what it is off over where the loss begins to flatten."""
-        residual = np.asarray(self.fit.residual)[np.asarray(self.tracks.mask)]
-        return (residual / (2.3849 * float(self.fit.noise))) ** 2
+        return following(self.fit, self.tracks)
 
     def corner(self) -> list[tuple[float, float, float]]:
         """Displacement of the image's corner, px, and its standard deviation, at some focal lengths."""
@@ -88,102 +70,12 @@ class MotionCalibration:
 
     def scale_std(self) -> float:
         """Standard deviation of the factor common to all focal lengths, relative."""
-        return float(np.sqrt(self.fit.covariance[-1, -1]))
+        return scale_std(self.fit)
 
     @property
     def findings(self) -> list[Finding]:
         """What the clip cannot tell, with what to do about it: the worst first; empty if all is good."""
-        found = [*self._of_turning(), *self._of_zooming(), *self._of_points(), *self._of_frames()]
-        return sorted(found, key=lambda of: -VERDICTS.index(of.verdict))
-
-    def _of_turning(self) -> Iterator[Finding]:
-        if self.fit.fit.result == RESULTS.undetermined:
-            yield Finding(
-                "turning",
-                "not determined",
-                "the camera hardly turns, so the scale of the focal lengths is not determined: only their "
-                "ratios are. The lens straightens lines all the same.",
-                "Film again and turn the camera by some 10 degrees or more while it zooms.",
-            )
-        elif self.fit.fit.result != RESULTS.successful:
-            message = RESULTS[self.fit.fit.result]
-            again = "Film a scene at rest again, and turn slowly."
-            yield Finding("fit", "not determined", message[:1].lower() + message[1:], again)
-        elif self.scale_std() > _LOOSE_SCALE:
-            yield Finding(
-                "scale",
-                "doubtful",
-                f"all focal lengths have a common factor that is known to {self.scale_std():.1%} only.",
-                "Turn the camera farther while it zooms.",
-            )
-
-    def _of_zooming(self) -> Iterator[Finding]:
-        low, high = (float(f) for f in self.fit.lens.focal_range)
-        if high < _LEAST_ZOOM * low:
-            yield Finding(
-                "zoom",
-                "good",
-                f"the focal length hardly changes, {low:.0f} to {high:.0f} px: this is one zoom only.",
-                "Zoom while you film, if the lens is to be known at other focal lengths.",
-            )
-
-    def _of_points(self) -> Iterator[Finding]:
-        missed = self._missed()
-        if (share := self.following()) < _FEW:
-            yield Finding(
-                "moving things",
-                "not determined",
-                f"only {share:.0%} of the tracked points move as a camera that turns makes them: much in "
-                "the clip moves by itself, or the camera does not stand still.",
-                "Use a tripod, and film a scene at rest.",
-            )
-        elif (close := float(np.mean(missed[missed < _MISSED] < 1))) < _CLOSE:
-            yield Finding(
-                "moving things",
-                "doubtful",
-                f"only {close:.0%} of the points that follow the camera do so as closely as noise lets "
-                "them: many may be on things that move.",
-                "Use a tripod, and film a scene at rest.",
-            )
-        yield from self._of_parallax()
-        if (noise := float(self.fit.noise)) > _ROUGH:
-            yield Finding(
-                "noise",
-                "doubtful" if noise <= _WRONG else "not determined",
-                f"points are off the model by {noise:.2f} px: the clip is blurred, much in it moves by "
-                "itself, or things near the camera shift as it turns.",
-                "Turn more slowly, and film a scene at rest.",
-            )
-
-    def _of_parallax(self) -> Iterator[Finding]:
-        if (spread := float(self.fit.lever_std)) > 0:
-            yield Finding(
-                "parallax",
-                "doubtful" if float(self.fit.parallax) > _HARMLESS else "good",
-                "near points move differently from far ones as the camera turns, by a share of "
-                f"{spread:.2%}: its entrance pupil is off the axis of rotation. That is modelled, but the "
-                "part that all points share looks like a lens, and is assumed: focal lengths may be off by "
-                "once or twice that share, and the lens with them. The bands allow for that.",
-                "Turn the camera about its entrance pupil, or film what is farther away.",
-            )
-
-    def _of_frames(self) -> Iterator[Finding]:
-        shots = int(np.max(np.asarray(self.fit.shot))) + 1
-        if shots > 1:
-            yield Finding(
-                "cuts",
-                "good",
-                f"the clip has {shots - 1} cut{'s' * (shots > 2)}. The shots share one lens; the panorama "
-                "is of the longest.",
-                "Check that all of them were filmed with the same lens.",
-            )
-        if missing := int(np.sum(~np.isfinite(np.asarray(self.fit.focal)))):
-            yield Finding(
-                "frames without points",
-                "good",
-                f"{missing} frames show nothing that can be followed: their f is interpolated.",
-                "Look at these frames in the corrected clip.",
-            )
+        return findings_of_motion(self.fit, self.tracks)
 
     @property
     def verdict(self) -> Verdict:

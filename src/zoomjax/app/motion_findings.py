@@ -1,0 +1,141 @@
+"""What a clip cannot tell, with what to do about it: the findings of a calibration from motion."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ..fit.motion import MotionFit
+from ..fit.result import RESULTS
+from ..tracks.tracks import Tracks
+from ..trust.assessment import VERDICTS, Finding
+
+_LOOSE_SCALE = 0.01
+"""Standard deviation of the common factor of focal lengths, relative, from which it is worth a word."""
+
+_ROUGH, _WRONG = 0.8, 1.2
+"""px, of the noise of points: two and three times what the way of a point there and back may miss, so that
+more is hardly noise. Much moves by itself, or what is seen is no camera that turns."""
+
+_MISSED = 9.0  # times the noise, squared: views beyond do not follow the model
+_FEW = 0.3  # of the views that do follow it: below, most of what is seen may move by itself
+# Of the views that follow, the share for which the loss hardly flattens: 0.94 of noise alone. Where four of
+# five points are on things that move, what these are off is taken for noise, and the share is 0.7 to 0.76.
+_CLOSE = 0.77
+_HARMLESS = 5e-4  # of the pupil's offset over distances: its standard deviation, by the test
+_LEAST_ZOOM = 1.2  # between the ends of the focal lengths
+
+
+def findings_of_motion(fit: MotionFit, tracks: Tracks) -> list[Finding]:
+    """What the clip cannot tell, with what to do about it: the worst first; empty if all is good."""
+    found = [*_of_turning(fit), *_of_zooming(fit), *_of_points(fit, tracks), *_of_frames(fit)]
+    return sorted(found, key=lambda of: -VERDICTS.index(of.verdict))
+
+
+def following(fit: MotionFit, tracks: Tracks) -> float:
+    """The share of the views that follow the model: the rest are on things that move, or mistakes."""
+    return float(np.mean(_missed(fit, tracks) < _MISSED))
+
+
+def scale_std(fit: MotionFit) -> float:
+    """Standard deviation of the factor common to all focal lengths, relative."""
+    return float(np.sqrt(fit.covariance[-1, -1]))
+
+
+def _missed(fit: MotionFit, tracks: Tracks) -> np.ndarray:
+    """Of each view, the square of what it is off over where the loss begins to flatten."""
+    residual = np.asarray(fit.residual)[np.asarray(tracks.mask)]
+    return (residual / (2.3849 * float(fit.noise))) ** 2
+
+
+def _of_turning(fit: MotionFit) -> Iterator[Finding]:
+    if fit.fit.result == RESULTS.undetermined:
+        yield Finding(
+            "turning",
+            "not determined",
+            "the camera hardly turns, so the scale of the focal lengths is not determined: only their "
+            "ratios are. The lens straightens lines all the same.",
+            "Film again and turn the camera by some 10 degrees or more while it zooms.",
+        )
+    elif fit.fit.result != RESULTS.successful:
+        message = RESULTS[fit.fit.result]
+        again = "Film a scene at rest again, and turn slowly."
+        yield Finding("fit", "not determined", message[:1].lower() + message[1:], again)
+    elif scale_std(fit) > _LOOSE_SCALE:
+        yield Finding(
+            "scale",
+            "doubtful",
+            f"all focal lengths have a common factor that is known to {scale_std(fit):.1%} only.",
+            "Turn the camera farther while it zooms.",
+        )
+
+
+def _of_zooming(fit: MotionFit) -> Iterator[Finding]:
+    low, high = (float(f) for f in fit.lens.focal_range)
+    if high < _LEAST_ZOOM * low:
+        yield Finding(
+            "zoom",
+            "good",
+            f"the focal length hardly changes, {low:.0f} to {high:.0f} px: this is one zoom only.",
+            "Zoom while you film, if the lens is to be known at other focal lengths.",
+        )
+
+
+def _of_points(fit: MotionFit, tracks: Tracks) -> Iterator[Finding]:
+    missed = _missed(fit, tracks)
+    if (share := following(fit, tracks)) < _FEW:
+        yield Finding(
+            "moving things",
+            "not determined",
+            f"only {share:.0%} of the tracked points move as a camera that turns makes them: much in "
+            "the clip moves by itself, or the camera does not stand still.",
+            "Use a tripod, and film a scene at rest.",
+        )
+    elif (close := float(np.mean(missed[missed < _MISSED] < 1))) < _CLOSE:
+        yield Finding(
+            "moving things",
+            "doubtful",
+            f"only {close:.0%} of the points that follow the camera do so as closely as noise lets "
+            "them: many may be on things that move.",
+            "Use a tripod, and film a scene at rest.",
+        )
+    yield from _of_parallax(fit)
+    if (noise := float(fit.noise)) > _ROUGH:
+        yield Finding(
+            "noise",
+            "doubtful" if noise <= _WRONG else "not determined",
+            f"points are off the model by {noise:.2f} px: the clip is blurred, much in it moves by "
+            "itself, or things near the camera shift as it turns.",
+            "Turn more slowly, and film a scene at rest.",
+        )
+
+
+def _of_parallax(fit: MotionFit) -> Iterator[Finding]:
+    if (spread := float(fit.lever_std)) > 0:
+        yield Finding(
+            "parallax",
+            "doubtful" if float(fit.parallax) > _HARMLESS else "good",
+            "near points move differently from far ones as the camera turns, by a share of "
+            f"{spread:.2%}: its entrance pupil is off the axis of rotation. That is modelled, but the "
+            "part that all points share looks like a lens, and is assumed: focal lengths may be off by "
+            "once or twice that share, and the lens with them. The bands allow for that.",
+            "Turn the camera about its entrance pupil, or film what is farther away.",
+        )
+
+
+def _of_frames(fit: MotionFit) -> Iterator[Finding]:
+    shots = int(np.max(np.asarray(fit.shot))) + 1
+    if shots > 1:
+        yield Finding(
+            "cuts",
+            "good",
+            f"the clip has {shots - 1} cut{'s' * (shots > 2)}. The shots share one lens; the panorama "
+            "is of the longest.",
+            "Check that all of them were filmed with the same lens.",
+        )
+    if missing := int(np.sum(~np.isfinite(np.asarray(fit.focal)))):
+        yield Finding(
+            "frames without points",
+            "good",
+            f"{missing} frames show nothing that can be followed: their f is interpolated.",
+            "Look at these frames in the corrected clip.",
+        )
