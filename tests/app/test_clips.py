@@ -13,6 +13,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax.app.clips import ClipJob, wants_motion
+from zoomjax.app.known_focals import known_focals
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.motion_calibration import FILES, MotionCalibration
 from zoomjax.app.panorama import write_panorama
@@ -159,6 +160,62 @@ def test_options_have_their_effect(clip, calibrated):
     assert json.loads(done.stdout)["frames"] == FRAMES
 
 
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    """A clip that zooms and does not turn, calibrated alone and with the focal length of a frame."""
+    folder = tmp_path_factory.mktemp("still")
+    focal, rotation = path()
+    rotation = np.broadcast_to(rotation[0], rotation.shape)
+    write_clip(folder / "clip.mp4", motion_clip(lens(), focal, rotation, noise=2).frames())
+    told = ["--known-focal", f"{focal[9] * 0.008:.4f}@9", "--pixel-pitch", 0.008, "--focal-sigma", "0.5%"]
+    done = {}
+    for name, options in {"alone": [], "told": told}.items():
+        done[name] = zoomjax("calibrate", "clip.mp4", *options, "-o", name, cwd=folder)
+        assert done[name].returncode == 0, done[name].stderr
+    return folder, done
+
+
+def summary_of(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
+@pytest.mark.slow
+def test_one_known_focal_length_gives_the_scale_that_a_still_camera_leaves_open(still):
+    folder, done = still
+    before, after = summary_of(folder / "alone"), summary_of(folder / "told")
+    assert before["verdict"] == "not determined"
+    assert "--known-focal 24@0 --pixel-pitch 0.0055 if it is 24 mm in frame 0" in done["alone"].stdout
+    assert before["focal_scale_std"] > 0.1
+    assert after["verdict"] == "good", after["findings"]
+    assert after["focal_scale_std"] == pytest.approx(0.005, rel=0.2)
+    assert after["known_focal"] == [
+        {
+            "frame": 9,
+            "focal": pytest.approx(path()[0][9], rel=1e-3),
+            "sigma": pytest.approx(path()[0][9] / 200),
+        }
+    ]
+    found, focal = track(folder / "told"), path()[0]
+    assert (abs(found["focal"] - focal) < 4 * found["sigma"]).all()
+    assert abs(found["focal"] / focal - 1).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--known-focal", "24@0"], "give --pixel-pitch"),
+        (["--known-focal", "700@36", "--focal-unit", "px"], "frame 36, which the clip does not have"),
+        (["--focal-sigma", "1%"], "--focal-sigma has no effect with --focal motion"),
+        (["--focal", "30", "--known-focal", "24@0"], "--known-focal has no effect without --focal motion"),
+    ],
+)
+def test_a_known_focal_length_that_makes_no_sense_is_refused(clip, options, sentence):
+    done = zoomjax("calibrate", clip.name, *options, "-o", "no", cwd=clip.parent)
+    assert done.returncode == 2
+    assert sentence in done.stderr
+    assert not (clip.parent / "no").exists()
+
+
 def draw_bars(image, index):
     """Dark bars that stand in the scene, straight in the world."""
     focal, rotation = (leaf[index] for leaf in path())
@@ -247,7 +304,7 @@ def test_motion_is_tried_where_nothing_else_is_given():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Dropped")
+@pytest.mark.filterwarnings("ignore:Dropped", "ignore:.*known focal lengths contradict")
 @pytest.mark.parametrize(
     ("kind", "verdict", "finding"),
     [
@@ -258,10 +315,10 @@ def test_motion_is_tried_where_nothing_else_is_given():
         ("pupil", "doubtful", "its entrance pupil is off the axis"),
         ("little turning", "doubtful", "have a common factor that is known to"),
         ("dark", "good", "3 frames show nothing"),
+        ("wrong f", "doubtful", "px is given"),
     ],
 )
 def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
-    from zoomjax.app.motion_calibration import MotionCalibration
     from zoomjax.tracks import Tracks
 
     focal, rotation = path()
@@ -285,8 +342,16 @@ def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
         tracks = Tracks.from_arrays(
             2 * track + (frame >= FRAMES // 2), frame, points, image_size=SIZE, frames=FRAMES
         )
-    fit = fit_motion(tracks, throw=False)
-    done = MotionCalibration(tmp_path / "clip.mp4", tracks, fit, np.zeros((FRAMES, 2)))
+    known = None
+    if kind == "wrong f":
+        known = known_focals([f"{focal[5]}@5", f"{1.1 * focal[30]}@30"], unit="px")
+    if known is None:
+        fit = fit_motion(tracks, throw=False)
+    else:
+        of_frames = known.of_frames(np.arange(FRAMES))
+        fit = fit_motion(tracks, focal=of_frames[0], focal_std=of_frames[1], throw=False)
+    times = np.column_stack([np.arange(FRAMES), np.arange(FRAMES) / 25])
+    done = MotionCalibration(tmp_path / "clip.mp4", tracks, fit, times, known=known)
     assert any(finding in sentence for sentence in map(str, done.findings)), done.findings
     assert done.verdict == verdict
 
@@ -296,8 +361,6 @@ def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
 @pytest.mark.parametrize("seed", [3, 4])
 def test_things_that_move_and_pass_for_noise_are_told(tmp_path, seed):
     """Four of five points are on things that move slowly: most of them follow by that little."""
-    from zoomjax.app.motion_calibration import MotionCalibration
-
     long_lens = zj.ZoomLens(
         zj.PolynomialZoom(2, jnp.array([[0.02, 0.0], [-0.05, 0.01], [-0.15, 0.05]]), jnp.array(800.0)),
         jnp.array([645.0, 356.0]),

@@ -10,6 +10,7 @@ import typer
 
 from .._core.text import plain
 from .console import REPORT, print_verdict, progress_bar, stages
+from .options import IDLE_FOR_MOTION, refuse_idle
 from .plans import tell_plan
 from .runs import what_is_run
 from .shown import NOT_GOOD, Shown
@@ -17,6 +18,7 @@ from .shown import NOT_GOOD, Shown
 if TYPE_CHECKING:
     from ..detect.batch import Detection
     from ..fit.zoom import CentreArgument
+    from .known_focals import KnownFocals
     from .model_choice import WantedModel
     from .motion_calibration import MotionCalibration
 
@@ -30,6 +32,8 @@ class ClipJob:
         output: folder of the results.
         model: the zoom model.
         centre: of distortion: "fit" or "image".
+        known: focal lengths of some frames, as `known_focals` takes them, and what it takes with them:
+        focal_unit, focal_sigma, pixel_pitch: their unit, standard deviation, and px in it.
         lines: whether straight lines in the frames are fitted, too; then also:
         detector: of lines, by name.
         frames: the most frames in which they are searched for.
@@ -42,6 +46,10 @@ class ClipJob:
     output: Path
     model: "WantedModel"
     centre: "CentreArgument"
+    known: tuple[str, ...] = ()
+    focal_unit: str | None = None
+    focal_sigma: str | None = None
+    pixel_pitch: float | None = None
     lines: bool = False
     detector: str = "edges"
     frames: int = 60
@@ -61,6 +69,14 @@ class ClipJob:
             raise ValueError("--focal motion is for one video: its motion determines the focal lengths.")
         if self.centre not in ("fit", "image"):
             raise ValueError("With --focal motion, --centre is fit or image: it moves along the zoom.")
+        self.known_focals()
+
+    def known_focals(self) -> "KnownFocals | None":
+        """The focal lengths that are known; None if none are."""
+        from .known_focals import known_focals
+
+        of = {"unit": self.focal_unit, "sigma": self.focal_sigma, "pitch": self.pixel_pitch}
+        return known_focals(self.known, **of) if self.known else None
 
 
 def wants_motion(inputs: Sequence[str], focal: str | None, spacing: str | None) -> bool:
@@ -71,15 +87,31 @@ def wants_motion(inputs: Sequence[str], focal: str | None, spacing: str | None) 
     return focal == "motion" or alone
 
 
+def refuse_idle_for_clips(context: typer.Context) -> None:
+    """Refuse options that have no effect on a clip whose motion gives its focal lengths."""
+    idle, given = IDLE_FOR_MOTION, context.params
+    if not given["known_focal"]:
+        idle = (*idle, "focal_sigma", "focal_unit", "pixel_pitch")
+    refuse_idle(context, idle, "with --focal motion")
+    if not given["with_lines"]:
+        refuse_idle(context, ("detector", "frames", "jobs", "cache"), "without --lines")
+
+
 def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
     """Calibrate from a clip, write the results and show them."""
     from .clip_report import clip_report
-    from .motion_calibration import FILES, calibrate_motion
+    from .motion_calibration import FILES, calibrate_motion, frames_of
     from .results_folder import OF_A_LENS, results_folder
 
-    clip = Path(job.inputs[0])
+    clip, known = Path(job.inputs[0]), job.known_focals()
+    if known is not None:
+        known.of_frames(frames_of(clip)[:, 0])  # before any work
     if dry_run:
         besides = f", and from lines in up to {job.frames} frames" * job.lines
+        if known is not None:
+            besides = (
+                f", from {len(known.frame)} known focal length{'s' * (len(known.frame) > 1)}" + besides
+            )
         tell_plan([f"Focal lengths and lens from how {plain(str(clip))} moves{besides}."], job.output)
         return
     with results_folder(job.output, [*FILES, REPORT], clears=OF_A_LENS, overwrite=job.overwrite) as folder:
@@ -90,7 +122,13 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
         found = _lines(job, show) if job.lines else ()
         with stages(quiet=show.quiet) as stage:
             done = calibrate_motion(
-                clip, tracks, found=found, model=job.model, centre=job.centre, stage=stage
+                clip,
+                tracks,
+                found=found,
+                known=known,
+                model=job.model,
+                centre=job.centre,
+                stage=stage,
             )
             done.make(folder, stage)
             stage("Making the report")

@@ -23,6 +23,7 @@ from ..tracks.again import find_again
 from ..tracks.tracks import Tracks
 from ..trust.assessment import VERDICTS, Finding, Verdict
 from ..trust.bands import displacement_std
+from .known_focals import KnownFocals
 from .model_choice import WantedModel
 from .motion_findings import findings_of_motion, following, scale_std
 from .outward import outward
@@ -47,6 +48,7 @@ class MotionCalibration:
         fit: the lens and the path.
         times: of each frame, its number in the file and its time, s; NaN where the file has none.
         lines: straight lines in its frames that were fitted, too.
+        known: focal lengths that were known beforehand.
     """
 
     clip: Path
@@ -54,6 +56,7 @@ class MotionCalibration:
     fit: MotionFit
     times: np.ndarray
     lines: Lines | None = None
+    known: KnownFocals | None = None
 
     def following(self) -> float:
         """The share of the views that follow the model: the rest are on things that move, or mistakes."""
@@ -68,6 +71,10 @@ class MotionCalibration:
         std = np.asarray(displacement_std(self.fit.fit, corner, focal=np.array(focal)))
         return list(zip(focal, outward(lens, corner, focal).tolist(), std.tolist(), strict=True))
 
+    def known_of_frames(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Of each frame the focal length that was known and its standard deviation; None if none was."""
+        return None if self.known is None else self.known.of_frames(self.times[:, 0])
+
     def scale_std(self) -> float:
         """Standard deviation of the factor common to all focal lengths, relative."""
         return scale_std(self.fit)
@@ -75,7 +82,7 @@ class MotionCalibration:
     @property
     def findings(self) -> list[Finding]:
         """What the clip cannot tell, with what to do about it: the worst first; empty if all is good."""
-        return findings_of_motion(self.fit, self.tracks)
+        return findings_of_motion(self.fit, self.tracks, self.known_of_frames())
 
     @property
     def verdict(self) -> Verdict:
@@ -145,6 +152,7 @@ class MotionCalibration:
             "focal_range": [float(f) for f in lens.focal_range],
             "focal_unit": lens.focal_unit,
             "focal_scale_std": self.scale_std(),
+            "known_focal": [] if self.known is None else self.known.rows(),
             "turned": np.ptp(np.asarray(self.fit.pan_and_tilt), axis=0).tolist(),
             "shots": int(np.max(np.asarray(fit.shot))) + 1,
             "image_size": list(lens.image_size),
@@ -200,6 +208,7 @@ def calibrate_motion(
     tracks: Tracks,
     *,
     found: Sequence[Detection] = (),
+    known: KnownFocals | None = None,
     model: WantedModel = WantedModel(),  # noqa: B008, it is frozen
     centre: CentreArgument = "fit",
     stage: Callable[[str], None] = lambda _: None,
@@ -210,16 +219,17 @@ def calibrate_motion(
         clip: the clip.
         tracks: of `track_video`.
         found: lines in frames of the clip, by `video_frames` and `detect`.
+        known: focal lengths that are known beforehand.
         model: the zoom model; by default a polynomial of degree 2 in 1/f with two coefficients.
         centre: the centre of distortion: "fit", linear in 1/f, or "image".
         stage: called with a description before each step that takes time.
 
     Raises:
-        ValueError: float64 is not enabled.
+        ValueError: float64 is not enabled, or a known focal length is of a frame that is not there.
         RuntimeError: the fit failed.
     """
-    with decode_video(clip) as (_, frames):
-        times = np.array([(number, time) for number, time, _ in frames], float)
+    times = frames_of(clip)
+    focal, focal_std = (None, None) if known is None else known.of_frames(times[:, 0])
     stage("Fitting the camera's path and the lens")
     candidate = model.base(np.arange(1.0, _MANY))
     shift = PolynomialZoom(degree=1) if centre == "fit" else None
@@ -233,6 +243,8 @@ def calibrate_motion(
             shift=shift,
             lines=lines,
             line_frames=line_frames,
+            focal=focal,
+            focal_std=focal_std,
         )
         return jax.block_until_ready(fit)
 
@@ -243,7 +255,13 @@ def calibrate_motion(
         if np.sum(more.mask) > (1 + _WORTH) * np.sum(tracks.mask):
             stage("Fitting the path that is closed")
             tracks, fit = more, fitted(more)
-    return MotionCalibration(clip, tracks, fit, times, lines)
+    return MotionCalibration(clip, tracks, fit, times, lines, known)
+
+
+def frames_of(clip: Path) -> np.ndarray:
+    """Of each frame that can be decoded its number in the file and its time, s; NaN where it has none."""
+    with decode_video(clip) as (_, frames):
+        return np.array([(number, time) for number, time, _ in frames], float)
 
 
 def _lines_of(found, times):

@@ -22,12 +22,28 @@ _FEW = 0.3  # of the views that do follow it: below, most of what is seen may mo
 # five points are on things that move, what these are off is taken for noise, and the share is 0.7 to 0.76.
 _CLOSE = 0.77
 _HARMLESS = 5e-4  # of the pupil's offset over distances: its standard deviation, by the test
+_FAR_OFF = 4.0  # standard deviations of a known focal length that are no chance
 _LEAST_ZOOM = 1.2  # between the ends of the focal lengths
 
 
-def findings_of_motion(fit: MotionFit, tracks: Tracks) -> list[Finding]:
-    """What the clip cannot tell, with what to do about it: the worst first; empty if all is good."""
-    found = [*_of_turning(fit), *_of_zooming(fit), *_of_points(fit, tracks), *_of_frames(fit)]
+def findings_of_motion(
+    fit: MotionFit, tracks: Tracks, known: tuple[np.ndarray, np.ndarray] | None = None
+) -> list[Finding]:
+    """What the clip cannot tell, with what to do about it: the worst first; empty if all is good.
+
+    Args:
+        fit: the lens and the path.
+        tracks: what was followed.
+        known: of each frame the focal length that was known, NaN where it was not, and its standard
+            deviation.
+    """
+    found = [
+        *_of_turning(fit, known is not None),
+        *_of_known(fit, known),
+        *_of_zooming(fit),
+        *_of_points(fit, tracks),
+        *_of_frames(fit),
+    ]
     return sorted(found, key=lambda of: -VERDICTS.index(of.verdict))
 
 
@@ -47,14 +63,22 @@ def _missed(fit: MotionFit, tracks: Tracks) -> np.ndarray:
     return (residual / (2.3849 * float(fit.noise))) ** 2
 
 
-def _of_turning(fit: MotionFit) -> Iterator[Finding]:
+_TURN = "turn the camera by some 10 degrees or more while it zooms."
+
+_TELL = (
+    "Give the focal length of one frame: --known-focal 24@0 --pixel-pitch 0.0055 if it is 24 mm in frame 0 "
+    f"and pixels are 0.0055 mm apart, or --known-focal 4364@0 --focal-unit px. Or film again and {_TURN}"
+)
+
+
+def _of_turning(fit: MotionFit, told: bool) -> Iterator[Finding]:
     if fit.fit.result == RESULTS.undetermined:
         yield Finding(
             "turning",
             "not determined",
             "the camera hardly turns, so the scale of the focal lengths is not determined: only their "
             "ratios are. The lens straightens lines all the same.",
-            "Film again and turn the camera by some 10 degrees or more while it zooms.",
+            f"Give known focal lengths a smaller sigma, or film again and {_TURN}" if told else _TELL,
         )
     elif fit.fit.result != RESULTS.successful:
         message = RESULTS[fit.fit.result]
@@ -65,7 +89,33 @@ def _of_turning(fit: MotionFit) -> Iterator[Finding]:
             "scale",
             "doubtful",
             f"all focal lengths have a common factor that is known to {scale_std(fit):.1%} only.",
-            "Turn the camera farther while it zooms.",
+            "Give a focal length that is known better, or turn the camera farther while it zooms."
+            if told
+            else "Turn the camera farther while it zooms, or give the f of a frame with --known-focal.",
+        )
+
+
+def _of_known(fit: MotionFit, known: tuple[np.ndarray, np.ndarray] | None) -> Iterator[Finding]:
+    if known is None:
+        return
+    focal, given, std = np.asarray(fit.focal), *known
+    unseen = np.flatnonzero(np.isfinite(given) & ~np.isfinite(focal))
+    if len(unseen):
+        yield Finding(
+            "known focal lengths",
+            "good",
+            f"{len(unseen)} of the frames whose f is given show nothing that can be followed.",
+            "Give the f of another frame: theirs has no effect.",
+        )
+    off = np.nan_to_num(np.abs(np.log(focal / given)) / (std / given))
+    if off.max() > _FAR_OFF:
+        worst = int(np.argmax(off))
+        yield Finding(
+            "known focal lengths",
+            "doubtful",
+            f"motion and lines say {focal[worst]:.5g} px where {given[worst]:.5g} px is given, "
+            f"{off[worst]:.2g} of its standard deviations away: it takes all focal lengths along.",
+            "Leave out known focal lengths that are wrong, or give them a larger sigma (--focal-sigma).",
         )
 
 
