@@ -18,6 +18,7 @@ from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.motion_calibration import FILES, MotionCalibration
 from zoomjax.app.panorama import write_panorama
 from zoomjax.fit.motion import fit_motion
+from zoomjax.io.focal_track import read_focal_track
 from zoomjax.scenes import motion_clip, motion_tracks, pan_and_zoom
 
 from .._commands import COMMAND, still_earlier, write_earlier
@@ -214,6 +215,51 @@ def test_a_known_focal_length_that_makes_no_sense_is_refused(clip, options, sent
     assert done.returncode == 2
     assert sentence in done.stderr
     assert not (clip.parent / "no").exists()
+
+
+@pytest.mark.slow
+def test_relative_focal_lengths_are_told_wherever_they_are(still):
+    folder, done = still
+    out = folder / "alone"
+    assert summary_of(out)["focal_scale"] == "relative"
+    assert (out / "track.csv").read_text().startswith("# Relative focal lengths: ")
+    assert zj.load_lens(out / "lens.json").about["focal"] == "relative"
+    assert "Focal lengths are relative" in done["alone"].stdout
+    assert ", relative ·" in (out / "report.html").read_text(encoding="utf-8")
+    assert summary_of(folder / "told")["focal_scale"] == "absolute"
+    assert (folder / "told" / "track.csv").read_text().startswith("frame,seconds,")
+    assert "focal" not in zj.load_lens(folder / "told" / "lens.json").about
+    assert "relative" not in done["told"].stdout
+
+
+@pytest.mark.slow
+def test_relative_focal_lengths_straighten_their_own_clip(still):
+    folder, _ = still
+    arguments = ["undistort", "alone/lens.json", "clip.mp4", "--focal"]
+    done = zoomjax(*arguments, "alone/track.csv", "-o", "corrected.mp4", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    found, true = read_focal_track(folder / "alone" / "track.csv"), lens()
+    made = zj.load_lens(folder / "alone" / "lens.json")
+    straight = np.stack([np.linspace(-60, 700, 60), np.linspace(10, 60, 60)], axis=-1)
+    for frame in (0, 9, 20, FRAMES - 1):
+        bent = np.asarray(true(float(path()[0][frame])).distort(straight))
+        own = np.asarray(made(found.at(frame, 0.0)).undistort(bent))
+        assert off_straight(bent) > 3 * off_straight(own) or off_straight(bent) < 0.1
+        assert off_straight(own) < 0.1
+    done = zoomjax(*arguments, "900", "-o", "other.mp4", cwd=folder)
+    assert "Warning: The focal lengths of this lens are relative" in done.stderr
+    done = zoomjax(
+        "undistort", "told/lens.json", "clip.mp4", "--focal", "alone/track.csv", "-o", "x.mp4", cwd=folder
+    )
+    assert "Warning: The focal lengths of alone/track.csv are relative" in done.stderr
+    export = ["export", "alone/lens.json", "--to", "opencv", "--focal", "900", "-o", "a.yaml"]
+    assert "focal lengths of this lens are relative" in zoomjax(*export, cwd=folder).stderr
+
+
+def off_straight(points):
+    """RMS distance of points from a straight line, px."""
+    return np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(points))
 
 
 def draw_bars(image, index):

@@ -18,6 +18,8 @@ from ..fit.result import RESULTS
 from ..fit.zoom import CentreArgument
 from ..io.video_reader import decode_video
 from ..lines.lines import Lines
+from ..models.about import RELATIVE
+from ..models.lens import ZoomLens
 from ..models.zoom import PolynomialZoom
 from ..tracks.again import find_again
 from ..tracks.tracks import Tracks
@@ -25,8 +27,9 @@ from ..trust.assessment import VERDICTS, Finding, Verdict
 from ..trust.bands import displacement_std
 from .known_focals import KnownFocals
 from .model_choice import WantedModel
-from .motion_findings import findings_of_motion, following, scale_std
+from .motion_findings import findings_of_motion, following, is_relative, scale_std
 from .outward import outward
+from .relative import NOTE, SENTENCE
 
 FILES = ("lens.json", "track.csv", "tracks.npz", "summary.json", "motion.png", "panorama.jpg")
 """What `MotionCalibration.make` writes."""
@@ -79,6 +82,18 @@ class MotionCalibration:
         """Standard deviation of the factor common to all focal lengths, relative."""
         return scale_std(self.fit)
 
+    def is_relative(self) -> bool:
+        """Whether only the ratios of focal lengths are known."""
+        return is_relative(self.fit)
+
+    @property
+    def lens(self) -> ZoomLens:
+        """The lens, which says so where its focal lengths are relative."""
+        lens = self.fit.lens
+        if not self.is_relative():
+            return lens
+        return dataclasses.replace(lens, about={**lens.about, "focal": RELATIVE})
+
     @property
     def findings(self) -> list[Finding]:
         """What the clip cannot tell, with what to do about it: the worst first; empty if all is good."""
@@ -124,7 +139,9 @@ class MotionCalibration:
         return [
             f"\n{views:,} views of {len(self.tracks.number):,} points in {self.tracks.frames:,} frames",
             *more,
-            f"Standard deviation of the common scale of the focal lengths: {self.scale_std():.2%}",
+            SENTENCE
+            if self.is_relative()
+            else f"Standard deviation of the common scale of the focal lengths: {self.scale_std():.2%}",
             f"Centre of distortion: ({where[0][0]:.1f}, {where[0][1]:.1f}) px at {low:.0f} px, "
             f"({where[1][0]:.1f}, {where[1][1]:.1f}) px at {high:.0f} px",
             f"The correction moves a corner by {', '.join(corner)}.",
@@ -151,6 +168,7 @@ class MotionCalibration:
             "rms": float(fit.fit.rms),
             "focal_range": [float(f) for f in lens.focal_range],
             "focal_unit": lens.focal_unit,
+            "focal_scale": "relative" if self.is_relative() else "absolute",
             "focal_scale_std": self.scale_std(),
             "known_focal": [] if self.known is None else self.known.rows(),
             "turned": np.ptp(np.asarray(self.fit.pan_and_tilt), axis=0).tolist(),
@@ -167,6 +185,8 @@ class MotionCalibration:
     def write_track(self, path: Path) -> None:
         """Write ``frame,seconds,focal,sigma``, which `undistort` takes; focal and sigma in px.
 
+        Where focal lengths are relative, a comment before that says so.
+
         Between frames of which f is known 1/f is interpolated. The farther from these, the less is that
         known: f may have changed as fast as in the fastest tenth of the frames.
         """
@@ -182,6 +202,8 @@ class MotionCalibration:
         focal = 1 / np.interp(every, known, 1 / focal[known])
         std = np.hypot(np.interp(every, known, std[known]), far * fast)
         with path.open("w", newline="") as file:
+            if self.is_relative():
+                file.write(NOTE + "\n")
             table = csv.writer(file)
             table.writerow(["frame", "seconds", "focal", "sigma"])
             for (number, seconds), f, sigma in zip(self.times.tolist(), focal, std, strict=True):
@@ -194,7 +216,7 @@ class MotionCalibration:
         from .plot import save_plot
 
         stage("Writing the results")
-        self.fit.lens.save(folder / "lens.json")
+        self.lens.save(folder / "lens.json")
         self.tracks.save(folder / "tracks.npz")
         self.write_track(folder / "track.csv")
         (folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n")

@@ -12,6 +12,9 @@ from ..trust.assessment import VERDICTS, Finding
 _LOOSE_SCALE = 0.01
 """Standard deviation of the common factor of focal lengths, relative, from which it is worth a word."""
 
+_NO_SCALE = 0.1
+"""From here on it is not known."""
+
 _ROUGH, _WRONG = 0.8, 1.2
 """px, of the noise of points: two and three times what the way of a point there and back may miss, so that
 more is hardly noise. Much moves by itself, or what is seen is no camera that turns."""
@@ -57,6 +60,11 @@ def scale_std(fit: MotionFit) -> float:
     return float(np.sqrt(fit.covariance[-1, -1]))
 
 
+def is_relative(fit: MotionFit) -> bool:
+    """Whether the factor common to all focal lengths is not known, so that only their ratios are."""
+    return fit.fit.result == RESULTS.undetermined or not scale_std(fit) < _NO_SCALE
+
+
 def _missed(fit: MotionFit, tracks: Tracks) -> np.ndarray:
     """Of each view, the square of what it is off over where the loss begins to flatten."""
     residual = np.asarray(fit.residual)[np.asarray(tracks.mask)]
@@ -72,7 +80,11 @@ _TELL = (
 
 
 def _of_turning(fit: MotionFit, told: bool) -> Iterator[Finding]:
-    if fit.fit.result == RESULTS.undetermined:
+    if fit.fit.result not in (RESULTS.successful, RESULTS.undetermined):
+        message = RESULTS[fit.fit.result]
+        again = "Film a scene at rest again, and turn slowly."
+        yield Finding("fit", "not determined", message[:1].lower() + message[1:], again)
+    elif is_relative(fit):
         yield Finding(
             "turning",
             "not determined",
@@ -80,10 +92,6 @@ def _of_turning(fit: MotionFit, told: bool) -> Iterator[Finding]:
             "ratios are. The lens straightens lines all the same.",
             f"Give known focal lengths a smaller sigma, or film again and {_TURN}" if told else _TELL,
         )
-    elif fit.fit.result != RESULTS.successful:
-        message = RESULTS[fit.fit.result]
-        again = "Film a scene at rest again, and turn slowly."
-        yield Finding("fit", "not determined", message[:1].lower() + message[1:], again)
     elif scale_std(fit) > _LOOSE_SCALE:
         yield Finding(
             "scale",
