@@ -3,6 +3,7 @@
 import csv
 import json
 import subprocess
+import warnings
 
 import av
 import cv2
@@ -13,6 +14,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax.app.clips import ClipJob, wants_motion
+from zoomjax.app.heard import heard
 from zoomjax.app.known_focals import known_focals
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.motion_calibration import FILES, MotionCalibration
@@ -21,6 +23,7 @@ from zoomjax.fit.motion import fit_motion
 from zoomjax.io.focal_track import read_focal_track
 from zoomjax.scenes import motion_clip, motion_tracks, pan_and_zoom
 
+from .._clips import write_frames
 from .._commands import COMMAND, still_earlier, write_earlier
 
 SIZE, FRAMES = (640, 360), 36
@@ -101,6 +104,7 @@ def test_nothing_about_an_earlier_lens_stays(calibrated):
 def test_its_summary_says_what_it_found(calibrated):
     summary = json.loads((calibrated[0] / "summary.json").read_text())
     assert summary["verdict"] == "good"
+    assert summary["warnings"] == []
     assert summary["frames"] == FRAMES
     assert summary["views_that_follow"] > 0.95
     assert summary["turned"][0] == pytest.approx(20, abs=1)
@@ -157,8 +161,41 @@ def test_options_have_their_effect(clip, calibrated):
     assert other.shift is None
     assert first.shift is not None
     assert np.shape(other.zoom.parameters)[0] == 2
-    done = zoomjax("calibrate", clip.name, "--json", "-o", "third", cwd=clip.parent)
-    assert json.loads(done.stdout)["frames"] == FRAMES
+    assert "No focal lengths" not in done.stderr
+
+
+TRIED = "No focal lengths are given (--focal): they and the lens are found from how clip.mp4 moves.\n"
+
+
+def test_that_motion_is_tried_is_said_at_the_start(calibrated):
+    assert calibrated[1].stderr.startswith(TRIED)
+
+
+def test_what_is_wrong_with_the_file_is_in_all_results(clip):
+    """Of fields, and not alone in its file."""
+    with av.open(str(clip)) as given:
+        frames = [frame.to_ndarray(format="bgr24") for frame in given.decode(video=0)]
+    options = {"flags": "+ildct", "x264-params": "tff=1"}
+    write_frames(clip.with_name("fields.mp4"), frames, options=options)
+    done = zoomjax("calibrate", "fields.mp4", "--json", "-o", "third", cwd=clip.parent)
+    summary = json.loads(done.stdout)
+    assert summary["frames"] == FRAMES
+    [warning] = summary["warnings"]
+    assert warning.startswith("The video is interlaced")
+    assert done.stderr.count(f"Warning: {warning}") == 1
+    assert TRIED.partition(" (")[0] not in done.stderr
+    page = (clip.parent / "third" / "report.html").read_text(encoding="utf-8")
+    assert page.count("<aside><strong>Warning: </strong>The video is interlaced") == 1
+
+
+def test_warnings_are_kept_and_shown_once():
+    with warnings.catch_warnings(record=True) as shown, heard() as kept:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            warnings.warn("Argument focal is odd.", stacklevel=1)
+        warnings.warn("Soon gone.", DeprecationWarning, stacklevel=1)
+    assert kept == ["--focal is odd."]
+    assert [str(one.message) for one in shown if one.category is UserWarning] == ["Argument focal is odd."]
 
 
 @pytest.fixture(scope="module")
@@ -361,6 +398,8 @@ def test_motion_is_tried_where_nothing_else_is_given():
         ("pupil", "doubtful", "its entrance pupil is off the axis"),
         ("little turning", "doubtful", "have a common factor that is known to"),
         ("dark", "good", "3 frames show nothing"),
+        ("darker", "doubtful", "12 of 36 frames show nothing"),
+        ("middle", "doubtful", "moves a corner of the image by up to"),
         ("wrong f", "doubtful", "px is given"),
     ],
 )
@@ -379,9 +418,13 @@ def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
     )
     options = {"views": 80, "life": 15, "noise": 0.1} | more
     tracks = motion_tracks(lens(), focal, rotation, **options).tracks
-    if kind == "dark":
+    if kind in ("dark", "darker", "middle"):
         track, frame, points = tracks.views()
-        seen = (frame < 20) | (frame > 22)
+        seen = {
+            "dark": (frame < 20) | (frame > 22),
+            "darker": frame % 3 != 1,
+            "middle": np.hypot(*(points - np.array(SIZE) / 2).T) < 130,
+        }[kind]
         tracks = Tracks.from_arrays(track[seen], frame[seen], points[seen], image_size=SIZE, frames=FRAMES)
     if kind == "cut":
         track, frame, points = tracks.views()

@@ -43,7 +43,7 @@ def clip_report(done: MotionCalibration, panorama: Path, *, run: Run) -> str:
         ],
         verdict=done,
         cards=_cards(done),
-        warnings=[],
+        warnings=done.warnings,
         panorama=data_url(panorama.read_bytes(), "jpeg"),
         path=embedded_plot(plot_motion(done.fit), "Focal length and direction of each frame"),
         slider=embedded_data(moving),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ import typer
 
 from .._core.text import plain
 from .console import REPORT, print_verdict, progress_bar, stages
+from .heard import heard
 from .options import IDLE_FOR_MOTION, refuse_idle
 from .plans import tell_plan
 from .runs import what_is_run
@@ -40,6 +42,7 @@ class ClipJob:
         workers: number of processes that search.
         cache: folder of what was found in frames before; None for none.
         overwrite: whether to replace files that zoomjax did not write.
+        by_default: whether motion is tried as nothing else is given.
     """
 
     inputs: Sequence[str]
@@ -56,6 +59,7 @@ class ClipJob:
     workers: int = 1
     cache: Path | None = None
     overwrite: bool = False
+    by_default: bool = False
 
     def __post_init__(self):
         """Check the settings before any work.
@@ -114,7 +118,14 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
             )
         tell_plan([f"Focal lengths and lens from how {plain(str(clip))} moves{besides}."], job.output)
         return
-    with results_folder(job.output, [*FILES, REPORT], clears=OF_A_LENS, overwrite=job.overwrite) as folder:
+    if job.by_default and not (show.quiet or show.as_json):
+        found = f"they and the lens are found from how {plain(str(clip))} moves"
+        print(f"No focal lengths are given (--focal): {found}.", file=sys.stderr)
+    names = [*FILES, REPORT]
+    with (
+        heard() as told,
+        results_folder(job.output, names, clears=OF_A_LENS, overwrite=job.overwrite) as folder,
+    ):
         with progress_bar("Following points", quiet=show.quiet) as progress:
             from ..tracks.video import track_video
 
@@ -130,6 +141,7 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
                 centre=job.centre,
                 stage=stage,
             )
+            done = dataclasses.replace(done, warnings=tuple(told))
             done.make(folder, stage)
             stage("Making the report")
             page = clip_report(done, folder / "panorama.jpg", run=what_is_run(clip.name))

@@ -301,6 +301,7 @@ def calibrate(
             workers=jobs or number_of_cores(),
             cache=cache_folder("detections") if cache else None,
             overwrite=overwrite,
+            by_default=focal is None and not known_focal,
         )
         return calibrate_clip(clip, show, dry_run=dry_run)
     refuse_idle(context, ("with_lines",), "without --focal motion: all else is calibrated from lines")

@@ -52,6 +52,7 @@ class MotionCalibration:
         times: of each frame, its number in the file and its time, s; NaN where the file has none.
         lines: straight lines in its frames that were fitted, too.
         known: focal lengths that were known beforehand.
+        warnings: what the user was warned of on the way.
     """
 
     clip: Path
@@ -60,6 +61,7 @@ class MotionCalibration:
     times: np.ndarray
     lines: Lines | None = None
     known: KnownFocals | None = None
+    warnings: tuple[str, ...] = ()
 
     def following(self) -> float:
         """The share of the views that follow the model: the rest are on things that move, or mistakes."""
@@ -155,6 +157,7 @@ class MotionCalibration:
             "verdict": self.verdict,
             "verdict_sentence": self.sentence,
             "findings": [dataclasses.asdict(finding) for finding in self.findings],
+            "warnings": list(self.warnings),
             "clip": self.clip.name,
             "frames": self.tracks.frames,
             "tracks": len(self.tracks.number),

@@ -2,12 +2,19 @@
 
 from collections.abc import Iterator
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
 
 from ..fit.motion import MotionFit
 from ..fit.result import RESULTS
+from ..models.lens import ZoomLens
 from ..tracks.tracks import Tracks
-from ..trust.assessment import VERDICTS, Finding
+from ..trust.assessment import NEGLIGIBLE, VERDICTS, Finding
+from ..trust.evidence import UNSEEN_PX
 
 _LOOSE_SCALE = 0.01
 """Standard deviation of the common factor of focal lengths, relative, from which it is worth a word."""
@@ -18,6 +25,15 @@ _NO_SCALE = 0.1
 _ROUGH, _WRONG = 0.8, 1.2
 """px, of the noise of points: two and three times what the way of a point there and back may miss, so that
 more is hardly noise. Much moves by itself, or what is seen is no camera that turns."""
+
+_UNCERTAIN = 0.1
+"""How uncertain a good lens may be in what it does to a corner, beside that."""
+
+_MOST = 5e-4
+"""And beside the diagonal of the image, however strong the lens is: 1.1 px of 1080p."""
+
+_BLIND = 0.2
+"""Share of the frames that may show nothing: there f is interpolated, which is right for moments alone."""
 
 _MISSED = 9.0  # times the noise, squared: views beyond do not follow the model
 _FEW = 0.3  # of the views that do follow it: below, most of what is seen may move by itself
@@ -45,6 +61,7 @@ def findings_of_motion(
         *_of_known(fit, known),
         *_of_zooming(fit),
         *_of_points(fit, tracks),
+        *_of_lens(fit),
         *_of_frames(fit),
     ]
     return sorted(found, key=lambda of: -VERDICTS.index(of.verdict))
@@ -180,6 +197,59 @@ def _of_parallax(fit: MotionFit) -> Iterator[Finding]:
         )
 
 
+def _of_lens(fit: MotionFit) -> Iterator[Finding]:
+    if is_relative(fit) or fit.fit.result != RESULTS.successful:  # which is said
+        return
+    moved, std = (float(np.max(np.abs(of))) for of in own_corner(fit))
+    diagonal = float(np.hypot(*fit.lens.image_size))
+    unseen, most = max(UNSEEN_PX, NEGLIGIBLE * diagonal), _MOST * diagonal
+    if std <= max(unseen, min(_UNCERTAIN * moved, most)):
+        return
+    yield Finding(
+        "lens",
+        "doubtful" if std <= max(moved, most) else "not determined",
+        f"the correction moves a corner of the image by up to {moved:.2g} px, but is uncertain by "
+        f"{std:.2g} px there.",
+        "Film a scene with detail up to the corners of the image, turn farther, or try --lines.",
+    )
+
+
+def own_corner(fit: MotionFit) -> tuple[np.ndarray, np.ndarray]:
+    """How far the correction moves a corner outwards at both ends of the zoom and in its middle, px.
+
+    Returns:
+        The displacements and their standard deviations: those of frames with such an f, which has errors
+        in common with the lens. Where all f are too long by a factor, so are those that the lens is for.
+    """
+    low, high = (float(f) for f in fit.lens.focal_range)
+    covariance = np.delete(np.delete(np.asarray(fit.covariance), -2, 0), -2, 1)  # without the readout
+    moved, by = _corner(fit.lens, jnp.array([low, np.sqrt(low * high), high]))
+    return np.asarray(moved), np.sqrt(np.einsum("fi,ij,fj->f", by, covariance, by))
+
+
+@eqx.filter_jit
+def _corner(lens: ZoomLens, focal: Float[Array, "focal"]) -> tuple[Array, Array]:
+    """Displacements, and their derivatives by the lens's parameters and by the logarithm of all f."""
+    parts = lens.zoom.parameters, None if lens.shift is None else lens.shift.parameters
+    start, unravel = ravel_pytree(parts)
+
+    def moved(flat):
+        zoom, shift = unravel(flat[:-1])
+        other = eqx.tree_at(lambda lens: lens.zoom.parameters, lens, zoom)
+        if lens.shift is not None:
+            other = eqx.tree_at(lambda lens: lens.shift.parameters, other, shift)
+
+        def one(f):
+            distortion = other(f)
+            ahead = distortion.undistort(jnp.zeros(2)) - distortion.centre
+            return jnp.linalg.norm(ahead) - jnp.linalg.norm(distortion.centre)
+
+        return jax.vmap(one)(focal * jnp.exp(flat[-1]))
+
+    flat = jnp.append(start, 0.0)
+    return moved(flat), jax.jacfwd(moved)(flat)
+
+
 def _of_frames(fit: MotionFit) -> Iterator[Finding]:
     shots = int(np.max(np.asarray(fit.shot))) + 1
     if shots > 1:
@@ -191,9 +261,13 @@ def _of_frames(fit: MotionFit) -> Iterator[Finding]:
             "Check that all of them were filmed with the same lens.",
         )
     if missing := int(np.sum(~np.isfinite(np.asarray(fit.focal)))):
+        few = missing <= _BLIND * len(fit.focal)
         yield Finding(
             "frames without points",
-            "good",
-            f"{missing} frames show nothing that can be followed: their f is interpolated.",
-            "Look at these frames in the corrected clip.",
+            "good" if few else "doubtful",
+            f"{missing} {'' if few else f'of {len(fit.focal)} '}frames show nothing that can be followed: "
+            "their f is interpolated.",
+            "Look at these frames in the corrected clip."
+            if few
+            else "Film a scene with detail everywhere, without blur, or cut these frames off.",
         )

@@ -12,7 +12,7 @@ NOTE = (
 """The first line of a track of such focal lengths."""
 
 SENTENCE = (
-    "Focal lengths are relative: they have a common factor that is not known, in lens.json as in track.csv. "
+    "Focal lengths are relative: their common factor is not known, in lens.json as in track.csv. "
     "Both together straighten the clip; with other focal lengths the lens is wrong."
 )
 
