@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
+from zoomjax import scenes
 from zoomjax.app.clips import ClipJob, wants_motion
 from zoomjax.app.heard import heard
 from zoomjax.app.known_focals import known_focals
@@ -109,6 +110,32 @@ def test_its_summary_says_what_it_found(calibrated):
     assert summary["views_that_follow"] > 0.95
     assert summary["turned"][0] == pytest.approx(20, abs=1)
     assert summary["corner_displacement"][0]["px"] < -10
+
+
+@pytest.mark.slow
+def test_its_summary_has_the_entries_of_that_of_photos(calibrated, tmp_path):
+    summary = summary_of(calibrated[0])
+    scenes.board_lines(scenes.nikkor_18_200(), scenes.focal_sweep(5), spacing=60).save(tmp_path / "l.npz")
+    done = zoomjax("calibrate", "l.npz", "--degree", 2, "--centre", "image", "-o", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    others = summary_of(tmp_path / "out")
+    of_lines_alone = {
+        *("evidence", "rms_algebraic", "rms_frames", "rms_held_out", "rms_frames_held_out"),
+        *("rejected_lines", "rejected", "points", "frames_without_a_model", "next_photo", "earlier"),
+    }
+    assert others.keys() - summary.keys() == of_lines_alone
+    for name in others.keys() & summary.keys() - {"line_noise"}:
+        kinds = {type(of[name]) for of in (others, summary)}
+        assert len(kinds) == 1, name
+    assert others["centre"].keys() == summary["centre"].keys()
+    assert others["certificate"].keys() == summary["certificate"].keys()
+    assert summary["rms_none"] > 20 * summary["rms_zoom"] > 0
+    assert summary["focal_known"]
+    frames = summary["per_frame"]
+    assert [row["frame"] for row in frames] == list(range(FRAMES))
+    np.testing.assert_allclose([row["focal"] for row in frames], track(calibrated[0])["focal"], atol=1e-3)
+    assert np.ptp([row["pan"] for row in frames]) == pytest.approx(summary["turned"][0])
+    assert sum(row["views"] for row in frames) == summary["views"]
 
 
 def test_the_track_corrects_the_clip(clip, calibrated):
@@ -330,8 +357,33 @@ def test_lines_of_the_frames_join_if_wanted(tmp_path):
     assert summary["line_noise"] < 0.3
     assert summary["verdict"] == "good"
     assert f"{summary['lines']} straight lines in 9 of them" in done.stdout
+    assert summary["detector"] == "edges"
+    assert without["detector"] is None
     assert summary["focal_scale_std"] < without["focal_scale_std"]
     assert abs(track(tmp_path / "lined")["focal"] / path()[0] - 1).max() < 0.005
+    lines_and_pictures_are_those_of_photos(tmp_path / "lined", summary)
+    done = zoomjax("calibrate", "lined", "--degree", 2, "--centre", "image", "-o", "again", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    again = summary_of(tmp_path / "again")
+    assert again["lines"] == summary["lines"]
+    assert again["per_frame"][0]["focal_sigma"] == pytest.approx(summary["images"][0]["focal_sigma"])
+
+
+def lines_and_pictures_are_those_of_photos(folder, summary):
+    lines = zj.lines.load_lines(folder / "lines.npz")
+    assert len(lines.frame) == summary["lines"]
+    found, frames = track(folder), [0, 4, 9, 13, 18, 22, 26, 31, 35]
+    np.testing.assert_allclose(lines.focal, found["focal"][frames], rtol=1e-5)
+    names = [f"clip-{number:06d}.jpg" for number in frames]
+    assert [row["name"] for row in summary["images"]] == names
+    assert [row["focal"] for row in summary["images"]] == pytest.approx(np.asarray(lines.focal))
+    assert sum(row["lines"] for row in summary["images"]) == summary["lines"]
+    pictures = sorted(path.name for path in (folder / "lines").iterdir())
+    assert pictures == [f"{place:04d}-{name}" for place, name in enumerate(names, start=1)]
+    picture = cv2.imread(str(folder / "lines" / pictures[0]))
+    assert picture is not None
+    assert picture.shape[0] > SIZE[1]  # there is a legend below
+    assert 0 <= summary["rejected_lines"] == len(summary["rejected"]) < summary["lines"] / 10
 
 
 def test_lines_are_an_option_of_motion_alone(clip):

@@ -59,7 +59,7 @@ def clip_report(done: MotionCalibration, panorama: Path, *, run: Run) -> str:
             "A straight grid, distorted, and the displacement of pixels, at both ends of the zoom",
         ),
         run=run.rows,
-        files=FILES,
+        files=[*FILES, *["lines.npz"] * (done.lines is not None)],
         versions=", ".join(f"{name} {of}" for name, of in done.summary()["versions"].items()),
     )
 

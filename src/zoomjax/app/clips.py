@@ -41,6 +41,7 @@ class ClipJob:
         frames: the most frames in which they are searched for.
         workers: number of processes that search.
         cache: folder of what was found in frames before; None for none.
+        overlays: which frames are drawn with their lines: "some", "all" or "none".
         overwrite: whether to replace files that zoomjax did not write.
         by_default: whether motion is tried as nothing else is given.
     """
@@ -58,6 +59,7 @@ class ClipJob:
     frames: int = 60
     workers: int = 1
     cache: Path | None = None
+    overlays: str = "some"
     overwrite: bool = False
     by_default: bool = False
 
@@ -96,6 +98,8 @@ def refuse_idle_for_clips(context: typer.Context) -> None:
     idle, given = IDLE_FOR_MOTION, context.params
     if not given["known_focal"]:
         idle = (*idle, "focal_sigma", "focal_unit", "pixel_pitch")
+    if not given["with_lines"]:
+        idle = (*idle, "overlays")
     refuse_idle(context, idle, "with --focal motion")
     if not given["with_lines"]:
         refuse_idle(context, ("detector", "frames", "jobs", "cache"), "without --lines")
@@ -121,7 +125,7 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
     if job.by_default and not (show.quiet or show.as_json):
         found = f"they and the lens are found from how {plain(str(clip))} moves"
         print(f"No focal lengths are given (--focal): {found}.", file=sys.stderr)
-    names = [*FILES, REPORT]
+    names = [*FILES, REPORT, *["lines.npz"] * job.lines]
     with (
         heard() as told,
         results_folder(job.output, names, clears=OF_A_LENS, overwrite=job.overwrite) as folder,
@@ -142,7 +146,13 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
                 stage=stage,
             )
             done = dataclasses.replace(done, warnings=tuple(told))
-            done.make(folder, stage)
+            about = {"detector": job.detector if job.lines else None}
+            done.make(
+                folder,
+                stage,
+                overlays=job.overlays,
+                about=about,
+            )
             stage("Making the report")
             page = clip_report(done, folder / "panorama.jpg", run=what_is_run(clip.name))
             (folder / REPORT).write_text(page, encoding="utf-8")
@@ -185,7 +195,11 @@ def _show(done: "MotionCalibration", job: ClipJob, show: Shown) -> None:
         console.print(line, highlight=False)
     from .motion_calibration import FILES
 
-    print(f"\nWritten to {plain(str(job.output))}: {', '.join([REPORT, *FILES])}")
+    if job.lines:
+        where = plain(str(job.output / "lines"))
+        print(f"\nCheck the detected lines, drawn over each frame, in {where}." * (job.overlays != "none"))
+    files = [REPORT, *FILES, *["lines.npz", "lines/"] * job.lines]
+    print(f"\nWritten to {plain(str(job.output))}: {', '.join(files)}")
     lens, track = job.output / "lens.json", job.output / "track.csv"
     print(
         f"Correct the clip with zoomjax undistort {plain(str(lens))} {plain(job.inputs[0])} "

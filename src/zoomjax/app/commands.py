@@ -300,6 +300,7 @@ def calibrate(
             frames=frames,
             workers=jobs or number_of_cores(),
             cache=cache_folder("detections") if cache else None,
+            overlays=overlays,
             overwrite=overwrite,
             by_default=focal is None and not known_focal,
         )

@@ -2,12 +2,14 @@
 
 import csv
 import dataclasses
+import functools
 import importlib.metadata
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -20,19 +22,24 @@ from ..io.video_reader import decode_video
 from ..lines.lines import Lines
 from ..models.about import RELATIVE
 from ..models.lens import ZoomLens
+from ..models.registry import distortion_model_name
 from ..models.zoom import PolynomialZoom
 from ..tracks.again import find_again
 from ..tracks.tracks import Tracks
 from ..trust.assessment import VERDICTS, Finding, Verdict
 from ..trust.bands import displacement_std
+from ._flags import with_flags
+from .clip_lines import MOST, draw_frames, frames_with_lines, image_rows, lines_of_frames
+from .coefficients import coefficient_rows, finite, pixel_polynomials
 from .known_focals import KnownFocals
 from .model_choice import WantedModel
-from .motion_findings import findings_of_motion, following, is_relative, scale_std
+from .motion_figures import WRONG_LINE, all_focals, centre_summary, frame_rows, line_rms, rms_uncorrected
+from .motion_findings import findings_of_motion, following, follows, is_relative, scale_std
 from .outward import outward
 from .relative import NOTE, SENTENCE
 
 FILES = ("lens.json", "track.csv", "tracks.npz", "summary.json", "motion.png", "panorama.jpg")
-"""What `MotionCalibration.make` writes."""
+"""What `MotionCalibration.make` writes; where lines were fitted, too, also lines.npz and lines/."""
 
 _TOLD_SHUTTER = 0.1
 """Standard deviation of the readout, in frames, below which it is told."""
@@ -50,7 +57,8 @@ class MotionCalibration:
         tracks: what was followed in it.
         fit: the lens and the path.
         times: of each frame, its number in the file and its time, s; NaN where the file has none.
-        lines: straight lines in its frames that were fitted, too.
+        found: what was found in frames in which lines were searched for.
+        lines: the lines, each frame with its f; None if none were.
         known: focal lengths that were known beforehand.
         warnings: what the user was warned of on the way.
     """
@@ -59,6 +67,7 @@ class MotionCalibration:
     tracks: Tracks
     fit: MotionFit
     times: np.ndarray
+    found: tuple[Detection, ...] = ()
     lines: Lines | None = None
     known: KnownFocals | None = None
     warnings: tuple[str, ...] = ()
@@ -95,6 +104,21 @@ class MotionCalibration:
         if not self.is_relative():
             return lens
         return dataclasses.replace(lens, about={**lens.about, "focal": RELATIVE})
+
+    @functools.cached_property
+    def line_rms(self) -> np.ndarray:
+        """RMS distance of each line's points from straight under the lens, px of the image."""
+        return np.zeros(0) if self.lines is None else line_rms(self.fit, self.lines)
+
+    @property
+    def rejected(self) -> np.ndarray:
+        """Which lines are too far from straight to count."""
+        return self.line_rms > WRONG_LINE * float(self.fit.line_noise)
+
+    @functools.cached_property
+    def rms_uncorrected(self) -> float:
+        """RMS distance, px, of views that follow from where the path alone puts them, without a lens."""
+        return rms_uncorrected(self.fit, self.tracks, follows(self.fit, self.tracks))
 
     @property
     def findings(self) -> list[Finding]:
@@ -146,13 +170,16 @@ class MotionCalibration:
             else f"Standard deviation of the common scale of the focal lengths: {self.scale_std():.2%}",
             f"Centre of distortion: ({where[0][0]:.1f}, {where[0][1]:.1f}) px at {low:.0f} px, "
             f"({where[1][0]:.1f}, {where[1][1]:.1f}) px at {high:.0f} px",
+            f"Distance of points that follow: {self.rms_uncorrected:.2f} px without a correction, "
+            f"{float(self.fit.fit.rms):.2f} px with it (RMS)",
             f"The correction moves a corner by {', '.join(corner)}.",
             "Check panorama.jpg: where things that do not move are blurred, there are errors.",
         ]
 
     def summary(self) -> dict[str, Any]:
-        """All figures as plain numbers and strings, for JSON."""
+        """All figures as plain numbers and strings, for JSON: under the names of `Calibration.summary`."""
         fit, lens = self.fit, self.fit.lens
+        readout, readout_std, scale = finite([float(fit.readout), float(fit.readout_std), self.scale_std()])
         return {
             "verdict": self.verdict,
             "verdict_sentence": self.sentence,
@@ -160,50 +187,73 @@ class MotionCalibration:
             "warnings": list(self.warnings),
             "clip": self.clip.name,
             "frames": self.tracks.frames,
+            "frames_without_points": int(np.sum(~np.isfinite(np.asarray(fit.focal)))),
             "tracks": len(self.tracks.number),
             "views": int(np.sum(np.asarray(self.tracks.mask))),
             "views_that_follow": self.following(),
             "noise": float(fit.noise),
-            "lines": 0 if self.lines is None else len(self.lines.frame),
-            "line_noise": None if self.lines is None else float(fit.line_noise),
-            "readout": float(fit.readout),
-            "readout_std": float(fit.readout_std),
+            **self._of_lines(),
+            "readout": readout,
+            "readout_std": readout_std,
+            "distances": "distorted image",
+            "rms_none": self.rms_uncorrected,
+            "rms_zoom": float(fit.fit.rms),
             "rms": float(fit.fit.rms),
+            "rms_unconstrained": float(fit.fit.rms_unconstrained),
             "focal_range": [float(f) for f in lens.focal_range],
             "focal_unit": lens.focal_unit,
+            "focal_source": "motion",
+            "focal_known": not self.is_relative(),
             "focal_scale": "relative" if self.is_relative() else "absolute",
-            "focal_scale_std": self.scale_std(),
+            "focal_scale_std": scale,
             "known_focal": [] if self.known is None else self.known.rows(),
             "turned": np.ptp(np.asarray(self.fit.pan_and_tilt), axis=0).tolist(),
             "shots": int(np.max(np.asarray(fit.shot))) + 1,
             "image_size": list(lens.image_size),
             "result": RESULTS[fit.fit.result] or "successful",
-            "corner_displacement": [{"focal": f, "px": px, "std": std} for f, px, std in self.corner()],
+            "certificate": {k: np.asarray(v).item() for k, v in vars(fit.fit.certificate).items()},
+            "model": type(lens.zoom).__name__,
+            "distortion_model": distortion_model_name(lens.distortion_model),
+            "centre": centre_summary(fit),
+            "pixel_polynomials": pixel_polynomials(lens).tolist(),
+            "coefficients": coefficient_rows(lens),
             "parameters": np.asarray(lens.zoom.parameters).tolist(),
+            "parameter_sigma": finite(np.sqrt(np.diag(np.asarray(fit.fit.covariance)))),
+            "corner_displacement": [
+                {"focal": f, "px": moved, "std": finite([std])[0]} for f, moved, std in self.corner()
+            ],
+            "per_frame": frame_rows(fit, self.tracks, self.times),
             "versions": {
                 name: importlib.metadata.version(name) for name in ("zoomjax", "jax", "optimistix")
             },
+        }
+
+    def _of_lines(self) -> dict[str, Any]:
+        """What the summary says of lines."""
+        if self.lines is None:
+            return {"lines": 0, "line_noise": None}
+        frame = np.asarray(self.lines.frame)
+        std = all_focals(self.fit)[1][frames_with_lines(self.found, self.times[:, 0])]
+        worst = np.flatnonzero(self.rejected)[np.argsort(-self.line_rms[self.rejected])]
+        return {
+            "lines": len(frame),
+            "line_noise": float(self.fit.line_noise),
+            "rejected_lines": int(self.rejected.sum()),
+            "rejected": [
+                {"line": int(line), "frame": int(frame[line]), "rms": float(self.line_rms[line])}
+                for line in worst
+            ],
+            "points": int(np.sum(np.asarray(self.lines.mask))),
+            "images": image_rows(self.found, self.lines, std, self.rejected),
+            "unused": {of.name: with_flags(of.problem) for of in self.found if not of.lines},
         }
 
     def write_track(self, path: Path) -> None:
         """Write ``frame,seconds,focal,sigma``, which `undistort` takes; focal and sigma in px.
 
         Where focal lengths are relative, a comment before that says so.
-
-        Between frames of which f is known 1/f is interpolated. The farther from these, the less is that
-        known: f may have changed as fast as in the fastest tenth of the frames.
         """
-        focal, std = (np.asarray(values) for values in (self.fit.focal, self.fit.focal_std))
-        known = np.flatnonzero(np.isfinite(focal))
-        every = np.arange(len(focal))
-        place = np.searchsorted(known, every)
-        beside = known[np.clip([place - 1, place], 0, len(known) - 1)]
-        far = np.min(np.abs(beside - every), axis=0)
-        changes = np.abs(np.diff(focal))
-        changes = changes[np.isfinite(changes)]
-        fast = np.quantile(changes, 0.9) if len(changes) else 0.0
-        focal = 1 / np.interp(every, known, 1 / focal[known])
-        std = np.hypot(np.interp(every, known, std[known]), far * fast)
+        focal, std = all_focals(self.fit)
         with path.open("w", newline="") as file:
             if self.is_relative():
                 file.write(NOTE + "\n")
@@ -212,8 +262,22 @@ class MotionCalibration:
             for (number, seconds), f, sigma in zip(self.times.tolist(), focal, std, strict=True):
                 table.writerow([int(number), f"{seconds:.4f}", f"{f:.4f}", f"{sigma:.4f}"])
 
-    def make(self, folder: Path, stage: Callable[[str], None] = lambda _: None) -> None:
-        """Write the files of `FILES` into an empty folder."""
+    def make(
+        self,
+        folder: Path,
+        stage: Callable[[str], None] = lambda _: None,
+        *,
+        overlays: str = "some",
+        about: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Write the files of `FILES`, and of lines lines.npz and pictures in lines/, into an empty folder.
+
+        Args:
+            folder: the folder.
+            stage: called with a description before each step that takes time.
+            overlays: which frames to draw with their lines: "some", "all" or "none".
+            about: more entries of summary.json.
+        """
         from .motion_plot import plot_motion  # so that the rest does not need Matplotlib
         from .panorama import write_panorama
         from .plot import save_plot
@@ -222,10 +286,16 @@ class MotionCalibration:
         self.lens.save(folder / "lens.json")
         self.tracks.save(folder / "tracks.npz")
         self.write_track(folder / "track.csv")
-        (folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n")
+        summary = self.summary() | dict(about or {})
+        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
         save_plot(plot_motion(self.fit), folder / "motion.png")
         stage("Joining frames into a panorama")
         write_panorama(self.clip, self.fit, folder / "panorama.jpg")
+        if self.lines is not None:
+            stage("Drawing the lines")
+            self.lines.save(folder / "lines.npz")
+            of_lines = self.lines, self.line_rms, self.rejected
+            draw_frames(self.clip, self.found, *of_lines, folder / "lines", most=MOST[overlays])
 
 
 def calibrate_motion(
@@ -258,7 +328,7 @@ def calibrate_motion(
     stage("Fitting the camera's path and the lens")
     candidate = model.base(np.arange(1.0, _MANY))
     shift = PolynomialZoom(degree=1) if centre == "fit" else None
-    lines, line_frames = _lines_of(found, times)
+    lines, line_frames = lines_of_frames(found, times[:, 0])
 
     def fitted(tracks):
         fit = fit_motion(
@@ -280,26 +350,12 @@ def calibrate_motion(
         if np.sum(more.mask) > (1 + _WORTH) * np.sum(tracks.mask):
             stage("Fitting the path that is closed")
             tracks, fit = more, fitted(more)
-    return MotionCalibration(clip, tracks, fit, times, lines, known)
+    if lines is not None:
+        lines = eqx.tree_at(lambda lines: lines.focal, lines, all_focals(fit)[0][line_frames])
+    return MotionCalibration(clip, tracks, fit, times, tuple(found), lines, known)
 
 
 def frames_of(clip: Path) -> np.ndarray:
     """Of each frame that can be decoded its number in the file and its time, s; NaN where it has none."""
     with decode_video(clip) as (_, frames):
         return np.array([(number, time) for number, time, _ in frames], float)
-
-
-def _lines_of(found, times):
-    """All lines, and the numbers of their frames among those of the tracks."""
-    seen = [detection for detection in found if detection.lines]
-    if not seen:
-        return None, None
-    number = [int(Path(detection.name).stem.rpartition("-")[2]) for detection in seen]  # of `video_frames`
-    lines = Lines.from_ragged(
-        [line for detection in seen for line in detection.lines],
-        np.repeat(np.arange(len(seen)), [len(detection.lines) for detection in seen]),
-        np.ones(len(seen)),
-        image_size=seen[0].image_size,
-        focal_unit="px",
-    )
-    return lines, np.searchsorted(times[:, 0], number)

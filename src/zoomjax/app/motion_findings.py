@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..fit.motion import MotionFit
 from ..fit.result import RESULTS
@@ -69,7 +69,12 @@ def findings_of_motion(
 
 def following(fit: MotionFit, tracks: Tracks) -> float:
     """The share of the views that follow the model: the rest are on things that move, or mistakes."""
-    return float(np.mean(_missed(fit, tracks) < _MISSED))
+    return float(np.mean(follows(fit, tracks)))
+
+
+def follows(fit: MotionFit, tracks: Tracks) -> Bool[np.ndarray, "view"]:
+    """Which of the views follow the model."""
+    return _missed(fit, tracks) < _MISSED
 
 
 def scale_std(fit: MotionFit) -> float:

@@ -272,7 +272,7 @@ IDLE_FOR_LINES = (
 """Parameters of calibrate that say nothing about a file of lines."""
 
 IDLE_FOR_MOTION = (
-    *("spacing", "distance", "robust", "overlays"),
+    *("spacing", "distance", "robust"),
     *("shared_focal", "distortion_model", "cluster", "verbose"),
 )
 """And about a clip whose motion gives its focal lengths."""
