@@ -288,6 +288,8 @@ Examples:
 
   zoomjax calibrate zoom.mp4 --focal track.csv -o mylens
 
+  zoomjax calibrate still.mp4 --known-focal 24@0 --pixel-pitch 0.0055 -o mylens
+
   zoomjax calibrate fisheye/ --distortion-model division -o mylens
 
   zoomjax calibrate mylens --exclude 15,17 -o mylens
