@@ -227,15 +227,17 @@ def test_warnings_are_kept_and_shown_once():
 
 @pytest.fixture(scope="module")
 def still(tmp_path_factory):
-    """A clip that zooms and does not turn, calibrated alone and with the focal length of a frame."""
+    """A clip that zooms and does not turn, calibrated with its lines alone, and with an f as well."""
     folder = tmp_path_factory.mktemp("still")
     focal, rotation = path()
-    rotation = np.broadcast_to(rotation[0], rotation.shape)
-    write_clip(folder / "clip.mp4", motion_clip(lens(), focal, rotation, noise=2).frames())
+    still = focal, np.broadcast_to(rotation[0], rotation.shape)
+    frames = motion_clip(lens(), *still, noise=2).frames()
+    write_clip(folder / "clip.mp4", [draw_bars(image, i, still) for i, image in enumerate(frames)])
     told = ["--known-focal", f"{focal[9] * 0.008:.4f}@9", "--pixel-pitch", 0.008, "--focal-sigma", "0.5%"]
     done = {}
     for name, options in {"alone": [], "told": told}.items():
-        done[name] = zoomjax("calibrate", "clip.mp4", *options, "-o", name, cwd=folder)
+        lines = ["--lines", "--frames", 9, "--overlays", "none"]
+        done[name] = zoomjax("calibrate", "clip.mp4", *options, *lines, "-o", name, cwd=folder)
         assert done[name].returncode == 0, done[name].stderr
     return folder, done
 
@@ -249,20 +251,19 @@ def test_one_known_focal_length_gives_the_scale_that_a_still_camera_leaves_open(
     folder, done = still
     before, after = summary_of(folder / "alone"), summary_of(folder / "told")
     assert before["verdict"] == "not determined"
-    assert "--known-focal 24@0 --pixel-pitch 0.0055 if it is 24 mm in frame 0" in done["alone"].stdout
+    advice = "--known-focal 24@0 --pixel-pitch 0.0055 if it is 24 mm in frame 0"
+    assert advice in " ".join(done["alone"].stdout.split())
     assert before["focal_scale_std"] > 0.1
-    assert after["verdict"] == "good", after["findings"]
-    assert after["focal_scale_std"] == pytest.approx(0.005, rel=0.2)
-    assert after["known_focal"] == [
-        {
-            "frame": 9,
-            "focal": pytest.approx(path()[0][9], rel=1e-3),
-            "sigma": pytest.approx(path()[0][9] / 200),
-        }
-    ]
+    assert {of["about"] for of in after["findings"]} == {"lens"}
+    assert after["verdict"] == "doubtful"  # for lines are few at the corners
+    assert after["focal_scale_std"] < 0.015
+    [known] = after["known_focal"]
+    assert known["frame"] == 9
+    assert known["focal"] == pytest.approx(path()[0][9], rel=1e-4)
+    assert known["sigma"] == pytest.approx(path()[0][9] / 200, rel=1e-4)
     found, focal = track(folder / "told"), path()[0]
     assert (abs(found["focal"] - focal) < 4 * found["sigma"]).all()
-    assert abs(found["focal"] / focal - 1).max() < 0.01
+    assert abs(found["focal"] / focal - 1).max() < 0.005
 
 
 @pytest.mark.parametrize(
@@ -305,12 +306,11 @@ def test_relative_focal_lengths_straighten_their_own_clip(still):
     assert done.stderr == ""
     found, true = read_focal_track(folder / "alone" / "track.csv"), lens()
     made = zj.load_lens(folder / "alone" / "lens.json")
-    straight = np.stack([np.linspace(-60, 700, 60), np.linspace(10, 60, 60)], axis=-1)
+    straight = np.stack([np.linspace(0, 640, 60), np.linspace(20, 70, 60)], axis=-1)
     for frame in (0, 9, 20, FRAMES - 1):
         bent = np.asarray(true(float(path()[0][frame])).distort(straight))
         own = np.asarray(made(found.at(frame, 0.0)).undistort(bent))
-        assert off_straight(bent) > 3 * off_straight(own) or off_straight(bent) < 0.1
-        assert off_straight(own) < 0.1
+        assert off_straight(own) < max(0.15 * off_straight(bent), 0.1)
     done = zoomjax(*arguments, "900", "-o", "other.mp4", cwd=folder)
     assert "Warning: The focal lengths of this lens are relative" in done.stderr
     done = zoomjax(
@@ -326,9 +326,9 @@ def off_straight(points):
     return np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(points))
 
 
-def draw_bars(image, index):
+def draw_bars(image, index, where=None):
     """Dark bars that stand in the scene, straight in the world."""
-    focal, rotation = (leaf[index] for leaf in path())
+    focal, rotation = (leaf[index] for leaf in where or path())
     distortion = lens()(float(focal))
     rng = np.random.default_rng(7)
     for ends in np.concatenate([rng.uniform(-0.6, 0.6, (30, 2, 2)), np.ones((30, 2, 1))], axis=2):
@@ -444,6 +444,7 @@ def test_motion_is_tried_where_nothing_else_is_given():
     ("kind", "verdict", "finding"),
     [
         ("still", "not determined", "hardly turns"),
+        ("still, an f", "not determined", "moves a corner of the image by up to"),
         ("one zoom", "good", "hardly changes"),
         ("moving", "not determined", "moves by itself"),
         ("cut", "good", "1 cut"),
@@ -459,7 +460,7 @@ def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
     from zoomjax.tracks import Tracks
 
     focal, rotation = path()
-    if kind == "still":
+    if kind.startswith("still"):
         rotation = np.broadcast_to(rotation[0], rotation.shape)
     if kind == "one zoom":
         focal = np.full(FRAMES, 600.0)
@@ -483,9 +484,8 @@ def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
         tracks = Tracks.from_arrays(
             2 * track + (frame >= FRAMES // 2), frame, points, image_size=SIZE, frames=FRAMES
         )
-    known = None
-    if kind == "wrong f":
-        known = known_focals([f"{focal[5]}@5", f"{1.1 * focal[30]}@30"], unit="px")
+    told = {"wrong f": [f"{focal[5]}@5", f"{1.1 * focal[30]}@30"], "still, an f": [f"{focal[5]}@5"]}
+    known = known_focals(told[kind], unit="px") if kind in told else None
     if known is None:
         fit = fit_motion(tracks, throw=False)
     else:

@@ -3,6 +3,7 @@
 import dataclasses
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -48,7 +49,7 @@ class KnownFocals:
         focal[place], std[place] = self.focal, self.std
         return focal, std
 
-    def rows(self) -> list[dict[str, float]]:
+    def rows(self) -> list[dict[str, Any]]:
         """Each frame with what is known of it, for JSON."""
         return [
             {"frame": frame, "focal": focal, "sigma": std}
@@ -68,7 +69,7 @@ def known_focals(
             as the track.csv of another run.
         unit: of all of them, "mm" or "px"; by default mm.
         sigma: their standard deviation, in their unit or as a percentage; by default that of the file, or
-            else 1 %.
+            else `USUAL_STD`.
         pitch: the distance between pixels on the sensor, mm, which those in mm need.
 
     Raises:

@@ -19,6 +19,10 @@ from ..trust.evidence import UNSEEN_PX
 _LOOSE_SCALE = 0.01
 """Standard deviation of the common factor of focal lengths, relative, from which it is worth a word."""
 
+_NO_WORSE = 3.0
+"""Times the standard deviation of a known focal length, up to which the scale is as good as that: it grows
+with all others where residuals are not those of noise alone."""
+
 _NO_SCALE = 0.1
 """From here on it is not known."""
 
@@ -30,7 +34,7 @@ _UNCERTAIN = 0.1
 """How uncertain a good lens may be in what it does to a corner, beside that."""
 
 _MOST = 5e-4
-"""And beside the diagonal of the image, however strong the lens is: 1.1 px of 1080p."""
+"""And beside the diagonal of the image, however strong the lens is: a pixel of 1080p."""
 
 _BLIND = 0.2
 """Share of the frames that may show nothing: there f is interpolated, which is right for moments alone."""
@@ -57,7 +61,7 @@ def findings_of_motion(
             deviation.
     """
     found = [
-        *_of_turning(fit, known is not None),
+        *_of_turning(fit, known),
         *_of_known(fit, known),
         *_of_zooming(fit),
         *_of_points(fit, tracks),
@@ -84,7 +88,7 @@ def scale_std(fit: MotionFit) -> float:
 
 def is_relative(fit: MotionFit) -> bool:
     """Whether the factor common to all focal lengths is not known, so that only their ratios are."""
-    return fit.fit.result == RESULTS.undetermined or not scale_std(fit) < _NO_SCALE
+    return bool(fit.fit.result == RESULTS.undetermined) or not scale_std(fit) < _NO_SCALE
 
 
 def _missed(fit: MotionFit, tracks: Tracks) -> np.ndarray:
@@ -101,27 +105,31 @@ _TELL = (
 )
 
 
-def _of_turning(fit: MotionFit, told: bool) -> Iterator[Finding]:
+def _of_turning(fit: MotionFit, known: tuple[np.ndarray, np.ndarray] | None) -> Iterator[Finding]:
+    given = 0.0 if known is None else float(np.nanmin(known[1] / known[0]))
     if fit.fit.result not in (RESULTS.successful, RESULTS.undetermined):
         message = RESULTS[fit.fit.result]
         again = "Film a scene at rest again, and turn slowly."
         yield Finding("fit", "not determined", message[:1].lower() + message[1:], again)
     elif is_relative(fit):
+        straight = " Lens and track together straighten the clip all the same." * (not [*_of_lens(fit)])
         yield Finding(
             "turning",
             "not determined",
             "the camera hardly turns, so the scale of the focal lengths is not determined: only their "
-            "ratios are. The lens straightens lines all the same.",
-            f"Give known focal lengths a smaller sigma, or film again and {_TURN}" if told else _TELL,
+            f"ratios are.{straight}",
+            _TELL
+            if known is None
+            else f"Give known focal lengths a smaller sigma, or film again and {_TURN}",
         )
-    elif scale_std(fit) > _LOOSE_SCALE:
+    elif scale_std(fit) > max(_LOOSE_SCALE, _NO_WORSE * given):
         yield Finding(
             "scale",
             "doubtful",
             f"all focal lengths have a common factor that is known to {scale_std(fit):.1%} only.",
-            "Give a focal length that is known better, or turn the camera farther while it zooms."
-            if told
-            else "Turn the camera farther while it zooms, or give the f of a frame with --known-focal.",
+            "Turn the camera farther while it zooms, or give the f of a frame with --known-focal."
+            if known is None
+            else "Turn the camera farther while it zooms, or give a focal length that is known better.",
         )
 
 
@@ -190,7 +198,7 @@ def _of_points(fit: MotionFit, tracks: Tracks) -> Iterator[Finding]:
 
 
 def _of_parallax(fit: MotionFit) -> Iterator[Finding]:
-    if (spread := float(fit.lever_std)) > 0:
+    if (spread := float(fit.lever_std)) > 0 and not is_relative(fit):  # else it may be the lens
         yield Finding(
             "parallax",
             "doubtful" if float(fit.parallax) > _HARMLESS else "good",
@@ -202,8 +210,12 @@ def _of_parallax(fit: MotionFit) -> Iterator[Finding]:
         )
 
 
+_LINES = "Let straight lines in the frames help (--lines)"
+_MORE_LINES = "Film more and longer straight lines near the borders of the image"
+
+
 def _of_lens(fit: MotionFit) -> Iterator[Finding]:
-    if is_relative(fit) or fit.fit.result != RESULTS.successful:  # which is said
+    if fit.fit.result not in (RESULTS.successful, RESULTS.undetermined):  # which is said
         return
     moved, std = (float(np.max(np.abs(of))) for of in own_corner(fit))
     diagonal = float(np.hypot(*fit.lens.image_size))
@@ -212,10 +224,11 @@ def _of_lens(fit: MotionFit) -> Iterator[Finding]:
         return
     yield Finding(
         "lens",
-        "doubtful" if std <= max(moved, most) else "not determined",
+        "doubtful" if std <= max(moved, most) else "not determined",  # or NaN
         f"the correction moves a corner of the image by up to {moved:.2g} px, but is uncertain by "
-        f"{std:.2g} px there.",
-        "Film a scene with detail up to the corners of the image, turn farther, or try --lines.",
+        f"{f'{std:.2g} px' if np.isfinite(std) else 'more than that'} there.",
+        f"{_LINES if np.isnan(float(fit.line_noise)) else _MORE_LINES}, or turn farther before detail up "
+        "to the corners.",
     )
 
 

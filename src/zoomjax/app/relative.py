@@ -12,8 +12,8 @@ NOTE = (
 """The first line of a track of such focal lengths."""
 
 SENTENCE = (
-    "Focal lengths are relative: their common factor is not known, in lens.json as in track.csv. "
-    "Both together straighten the clip; with other focal lengths the lens is wrong."
+    "Focal lengths are relative: their common factor is not known, in lens.json as in track.csv. Use both "
+    "together: with other focal lengths the lens is wrong."
 )
 
 
