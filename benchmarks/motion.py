@@ -70,13 +70,23 @@ def _px(value: float, digits: int = 3) -> str:
 
 _BESIDE_BOUNDS = ("f, %", "bound", "ratio", "lens, px", "bound", "ratio")
 
+
+def _beside_bounds(row: dict) -> list[str]:
+    """Errors, bounds and ratios; dashes where all fits say that they failed: these mean nothing."""
+    if row["told"] == row["clips"]:
+        return ["–"] * len(_BESIDE_BOUNDS)
+    return [
+        *(_percent(row["f"]), _percent(row["f_bound"]), f"{row['f'] / row['f_bound']:.2f}"),
+        *(_px(row["lens"]), _px(row["lens_bound"]), _px(row["lens"] / row["lens_bound"], 2)),
+    ]
+
+
 SECTIONS = {
     "simulated": Section(
         "Simulated tracks",
         (*_BESIDE_BOUNDS, "clips", "refused", "doubted", "diverged", "silent"),
         lambda r: [
-            *(_percent(r["f"]), _percent(r["f_bound"]), f"{r['f'] / r['f_bound']:.2f}"),
-            *(_px(r["lens"]), _px(r["lens_bound"]), _px(r["lens"] / r["lens_bound"], 2)),
+            *_beside_bounds(r),
             *(str(r["clips"]), str(r["told"]), "–" if r.get("doubted") is None else str(r["doubted"])),
             *(str(r["diverged"]), str(r.get("silent", r["diverged"]))),
         ],

@@ -86,6 +86,7 @@ def given(tmp_path_factory):
     with Image.open(photos[0]) as photo:
         photo.save(folder / "plate.tif", exif=photo.getexif())
     write_clip(folder / "turning.mp4", turning_frames())
+    write_clip(folder / "still.mp4", turning_frames(pan=0, tilt=0))
     (folder / "views").mkdir()
     for f, *views in zip(FOCAL, grid_views(), grid_views(0.5), strict=True):
         cv2.imwrite(str(folder / "views" / f"{FOCAL.index(f)}.png"), views[0])
@@ -149,12 +150,12 @@ def pitch_frames():
     return frames
 
 
-def turning_frames():
-    """What a camera sees that turns and zooms."""
+def turning_frames(**angles):
+    """What a camera sees that zooms and turns, by 20 degrees if nothing else is said."""
     size, focal = (536, 356), jnp.array([400.0, 900.0])
     zoom = zj.PolynomialZoom(1, jnp.array([[0.0, 0.0], [-0.1, 0.02]]), focal[0])
     lens = zj.ZoomLens(zoom, (jnp.array(size) - 1) / 2, focal, size, "px")
-    clip = scenes.motion_clip(lens, *scenes.pan_and_zoom(lens, TURNING, pan=20))
+    clip = scenes.motion_clip(lens, *scenes.pan_and_zoom(lens, TURNING, **{"pan": 20} | angles))
     return [frame[..., ::-1] for frame in clip.frames()]
 
 

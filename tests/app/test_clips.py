@@ -3,6 +3,7 @@
 import csv
 import json
 import subprocess
+import warnings
 
 import av
 import cv2
@@ -12,13 +13,18 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
+from zoomjax import scenes
 from zoomjax.app.clips import ClipJob, wants_motion
+from zoomjax.app.heard import heard
+from zoomjax.app.known_focals import known_focals
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.motion_calibration import FILES, MotionCalibration
 from zoomjax.app.panorama import write_panorama
 from zoomjax.fit.motion import fit_motion
+from zoomjax.io.focal_track import read_focal_track
 from zoomjax.scenes import motion_clip, motion_tracks, pan_and_zoom
 
+from .._clips import write_frames
 from .._commands import COMMAND, still_earlier, write_earlier
 
 SIZE, FRAMES = (640, 360), 36
@@ -99,10 +105,37 @@ def test_nothing_about_an_earlier_lens_stays(calibrated):
 def test_its_summary_says_what_it_found(calibrated):
     summary = json.loads((calibrated[0] / "summary.json").read_text())
     assert summary["verdict"] == "good"
+    assert summary["warnings"] == []
     assert summary["frames"] == FRAMES
     assert summary["views_that_follow"] > 0.95
     assert summary["turned"][0] == pytest.approx(20, abs=1)
     assert summary["corner_displacement"][0]["px"] < -10
+
+
+@pytest.mark.slow
+def test_its_summary_has_the_entries_of_that_of_photos(calibrated, tmp_path):
+    summary = summary_of(calibrated[0])
+    scenes.board_lines(scenes.nikkor_18_200(), scenes.focal_sweep(5), spacing=60).save(tmp_path / "l.npz")
+    done = zoomjax("calibrate", "l.npz", "--degree", 2, "--centre", "image", "-o", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    others = summary_of(tmp_path / "out")
+    of_lines_alone = {
+        *("evidence", "rms_algebraic", "rms_frames", "rms_held_out", "rms_frames_held_out"),
+        *("rejected_lines", "rejected", "points", "frames_without_a_model", "next_photo", "earlier"),
+    }
+    assert others.keys() - summary.keys() == of_lines_alone
+    for name in others.keys() & summary.keys() - {"line_noise"}:
+        kinds = {type(of[name]) for of in (others, summary)}
+        assert len(kinds) == 1, name
+    assert others["centre"].keys() == summary["centre"].keys()
+    assert others["certificate"].keys() == summary["certificate"].keys()
+    assert summary["rms_none"] > 20 * summary["rms_zoom"] > 0
+    assert summary["focal_known"]
+    frames = summary["per_frame"]
+    assert [row["frame"] for row in frames] == list(range(FRAMES))
+    np.testing.assert_allclose([row["focal"] for row in frames], track(calibrated[0])["focal"], atol=1e-3)
+    assert np.ptp([row["pan"] for row in frames]) == pytest.approx(summary["turned"][0])
+    assert sum(row["views"] for row in frames) == summary["views"]
 
 
 def test_the_track_corrects_the_clip(clip, calibrated):
@@ -155,13 +188,147 @@ def test_options_have_their_effect(clip, calibrated):
     assert other.shift is None
     assert first.shift is not None
     assert np.shape(other.zoom.parameters)[0] == 2
-    done = zoomjax("calibrate", clip.name, "--json", "-o", "third", cwd=clip.parent)
-    assert json.loads(done.stdout)["frames"] == FRAMES
+    assert "No focal lengths" not in done.stderr
 
 
-def draw_bars(image, index):
+TRIED = "No focal lengths are given (--focal): they and the lens are found from how clip.mp4 moves.\n"
+
+
+def test_that_motion_is_tried_is_said_at_the_start(calibrated):
+    assert calibrated[1].stderr.startswith(TRIED)
+
+
+def test_what_is_wrong_with_the_file_is_in_all_results(clip):
+    """Of fields, and not alone in its file."""
+    with av.open(str(clip)) as given:
+        frames = [frame.to_ndarray(format="bgr24") for frame in given.decode(video=0)]
+    options = {"flags": "+ildct", "x264-params": "tff=1"}
+    write_frames(clip.with_name("fields.mp4"), frames, options=options)
+    done = zoomjax("calibrate", "fields.mp4", "--json", "-o", "third", cwd=clip.parent)
+    summary = json.loads(done.stdout)
+    assert summary["frames"] == FRAMES
+    [warning] = summary["warnings"]
+    assert warning.startswith("The video is interlaced")
+    assert done.stderr.count(f"Warning: {warning}") == 1
+    assert TRIED.partition(" (")[0] not in done.stderr
+    page = (clip.parent / "third" / "report.html").read_text(encoding="utf-8")
+    assert page.count("<aside><strong>Warning: </strong>The video is interlaced") == 1
+
+
+def test_warnings_are_kept_and_shown_once():
+    with warnings.catch_warnings(record=True) as shown, heard() as kept:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            warnings.warn("Argument focal is odd.", stacklevel=1)
+        warnings.warn("Soon gone.", DeprecationWarning, stacklevel=1)
+    assert kept == ["--focal is odd."]
+    assert [str(one.message) for one in shown if one.category is UserWarning] == ["Argument focal is odd."]
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    """A clip that zooms and does not turn, calibrated with its lines alone, and with an f as well."""
+    folder = tmp_path_factory.mktemp("still")
+    focal, rotation = path()
+    still = focal, np.broadcast_to(rotation[0], rotation.shape)
+    frames = motion_clip(lens(), *still, noise=2).frames()
+    write_clip(folder / "clip.mp4", [draw_bars(image, i, still) for i, image in enumerate(frames)])
+    told = ["--known-focal", f"{focal[9] * 0.008:.4f}@9", "--pixel-pitch", 0.008, "--focal-sigma", "0.5%"]
+    done = {}
+    for name, options in {"alone": [], "told": told}.items():
+        lines = ["--lines", "--frames", 9, "--overlays", "none"]
+        done[name] = zoomjax("calibrate", "clip.mp4", *options, *lines, "-o", name, cwd=folder)
+        assert done[name].returncode == 0, done[name].stderr
+    return folder, done
+
+
+def summary_of(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
+@pytest.mark.slow
+def test_one_known_focal_length_gives_the_scale_that_a_still_camera_leaves_open(still):
+    folder, done = still
+    before, after = summary_of(folder / "alone"), summary_of(folder / "told")
+    assert before["verdict"] == "not determined"
+    advice = "--known-focal 24@0 --pixel-pitch 0.0055 if it is 24 mm in frame 0"
+    assert advice in " ".join(done["alone"].stdout.split())
+    assert before["focal_scale_std"] > 0.1
+    assert {of["about"] for of in after["findings"]} == {"lens"}
+    assert after["verdict"] == "doubtful"  # for lines are few at the corners
+    assert after["focal_scale_std"] < 0.015
+    [known] = after["known_focal"]
+    assert known["frame"] == 9
+    assert known["focal"] == pytest.approx(path()[0][9], rel=1e-4)
+    assert known["sigma"] == pytest.approx(path()[0][9] / 200, rel=1e-4)
+    found, focal = track(folder / "told"), path()[0]
+    assert (abs(found["focal"] - focal) < 4 * found["sigma"]).all()
+    assert abs(found["focal"] / focal - 1).max() < 0.005
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--known-focal", "24@0"], "give --pixel-pitch"),
+        (["--known-focal", "700@36", "--focal-unit", "px"], "frame 36, which the clip does not have"),
+        (["--focal-sigma", "1%"], "--focal-sigma has no effect with --focal motion"),
+        (["--focal", "30", "--known-focal", "24@0"], "--known-focal has no effect without --focal motion"),
+    ],
+)
+def test_a_known_focal_length_that_makes_no_sense_is_refused(clip, options, sentence):
+    done = zoomjax("calibrate", clip.name, *options, "-o", "no", cwd=clip.parent)
+    assert done.returncode == 2
+    assert sentence in done.stderr
+    assert not (clip.parent / "no").exists()
+
+
+@pytest.mark.slow
+def test_relative_focal_lengths_are_told_wherever_they_are(still):
+    folder, done = still
+    out = folder / "alone"
+    assert summary_of(out)["focal_scale"] == "relative"
+    assert (out / "track.csv").read_text().startswith("# Relative focal lengths: ")
+    assert zj.load_lens(out / "lens.json").about["focal"] == "relative"
+    assert "Focal lengths are relative" in done["alone"].stdout
+    assert ", relative ·" in (out / "report.html").read_text(encoding="utf-8")
+    assert summary_of(folder / "told")["focal_scale"] == "absolute"
+    assert (folder / "told" / "track.csv").read_text().startswith("frame,seconds,")
+    assert "focal" not in zj.load_lens(folder / "told" / "lens.json").about
+    assert "relative" not in done["told"].stdout
+
+
+@pytest.mark.slow
+def test_relative_focal_lengths_straighten_their_own_clip(still):
+    folder, _ = still
+    arguments = ["undistort", "alone/lens.json", "clip.mp4", "--focal"]
+    done = zoomjax(*arguments, "alone/track.csv", "-o", "corrected.mp4", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    found, true = read_focal_track(folder / "alone" / "track.csv"), lens()
+    made = zj.load_lens(folder / "alone" / "lens.json")
+    straight = np.stack([np.linspace(0, 640, 60), np.linspace(20, 70, 60)], axis=-1)
+    for frame in (0, 9, 20, FRAMES - 1):
+        bent = np.asarray(true(float(path()[0][frame])).distort(straight))
+        own = np.asarray(made(found.at(frame, 0.0)).undistort(bent))
+        assert off_straight(own) < max(0.15 * off_straight(bent), 0.1)
+    done = zoomjax(*arguments, "900", "-o", "other.mp4", cwd=folder)
+    assert "Warning: The focal lengths of this lens are relative" in done.stderr
+    done = zoomjax(
+        "undistort", "told/lens.json", "clip.mp4", "--focal", "alone/track.csv", "-o", "x.mp4", cwd=folder
+    )
+    assert "Warning: The focal lengths of alone/track.csv are relative" in done.stderr
+    export = ["export", "alone/lens.json", "--to", "opencv", "--focal", "900", "-o", "a.yaml"]
+    assert "focal lengths of this lens are relative" in zoomjax(*export, cwd=folder).stderr
+
+
+def off_straight(points):
+    """RMS distance of points from a straight line, px."""
+    return np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(points))
+
+
+def draw_bars(image, index, where=None):
     """Dark bars that stand in the scene, straight in the world."""
-    focal, rotation = (leaf[index] for leaf in path())
+    focal, rotation = (leaf[index] for leaf in where or path())
     distortion = lens()(float(focal))
     rng = np.random.default_rng(7)
     for ends in np.concatenate([rng.uniform(-0.6, 0.6, (30, 2, 2)), np.ones((30, 2, 1))], axis=2):
@@ -190,8 +357,33 @@ def test_lines_of_the_frames_join_if_wanted(tmp_path):
     assert summary["line_noise"] < 0.3
     assert summary["verdict"] == "good"
     assert f"{summary['lines']} straight lines in 9 of them" in done.stdout
+    assert summary["detector"] == "edges"
+    assert without["detector"] is None
     assert summary["focal_scale_std"] < without["focal_scale_std"]
     assert abs(track(tmp_path / "lined")["focal"] / path()[0] - 1).max() < 0.005
+    lines_and_pictures_are_those_of_photos(tmp_path / "lined", summary)
+    done = zoomjax("calibrate", "lined", "--degree", 2, "--centre", "image", "-o", "again", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    again = summary_of(tmp_path / "again")
+    assert again["lines"] == summary["lines"]
+    assert again["per_frame"][0]["focal_sigma"] == pytest.approx(summary["images"][0]["focal_sigma"])
+
+
+def lines_and_pictures_are_those_of_photos(folder, summary):
+    lines = zj.lines.load_lines(folder / "lines.npz")
+    assert len(lines.frame) == summary["lines"]
+    found, frames = track(folder), [0, 4, 9, 13, 18, 22, 26, 31, 35]
+    np.testing.assert_allclose(lines.focal, found["focal"][frames], rtol=1e-5)
+    names = [f"clip-{number:06d}.jpg" for number in frames]
+    assert [row["name"] for row in summary["images"]] == names
+    assert [row["focal"] for row in summary["images"]] == pytest.approx(np.asarray(lines.focal))
+    assert sum(row["lines"] for row in summary["images"]) == summary["lines"]
+    pictures = sorted(path.name for path in (folder / "lines").iterdir())
+    assert pictures == [f"{place:04d}-{name}" for place, name in enumerate(names, start=1)]
+    picture = cv2.imread(str(folder / "lines" / pictures[0]))
+    assert picture is not None
+    assert picture.shape[0] > SIZE[1]  # there is a legend below
+    assert 0 <= summary["rejected_lines"] == len(summary["rejected"]) < summary["lines"] / 10
 
 
 def test_lines_are_an_option_of_motion_alone(clip):
@@ -247,25 +439,28 @@ def test_motion_is_tried_where_nothing_else_is_given():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Dropped")
+@pytest.mark.filterwarnings("ignore:Dropped", "ignore:.*known focal lengths contradict")
 @pytest.mark.parametrize(
     ("kind", "verdict", "finding"),
     [
         ("still", "not determined", "hardly turns"),
+        ("still, an f", "not determined", "moves a corner of the image by up to"),
         ("one zoom", "good", "hardly changes"),
         ("moving", "not determined", "moves by itself"),
         ("cut", "good", "1 cut"),
         ("pupil", "doubtful", "its entrance pupil is off the axis"),
         ("little turning", "doubtful", "have a common factor that is known to"),
         ("dark", "good", "3 frames show nothing"),
+        ("darker", "doubtful", "12 of 36 frames show nothing"),
+        ("middle", "doubtful", "moves a corner of the image by up to"),
+        ("wrong f", "doubtful", "px is given"),
     ],
 )
 def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
-    from zoomjax.app.motion_calibration import MotionCalibration
     from zoomjax.tracks import Tracks
 
     focal, rotation = path()
-    if kind == "still":
+    if kind.startswith("still"):
         rotation = np.broadcast_to(rotation[0], rotation.shape)
     if kind == "one zoom":
         focal = np.full(FRAMES, 600.0)
@@ -276,17 +471,28 @@ def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
     )
     options = {"views": 80, "life": 15, "noise": 0.1} | more
     tracks = motion_tracks(lens(), focal, rotation, **options).tracks
-    if kind == "dark":
+    if kind in ("dark", "darker", "middle"):
         track, frame, points = tracks.views()
-        seen = (frame < 20) | (frame > 22)
+        seen = {
+            "dark": (frame < 20) | (frame > 22),
+            "darker": frame % 3 != 1,
+            "middle": np.hypot(*(points - np.array(SIZE) / 2).T) < 130,
+        }[kind]
         tracks = Tracks.from_arrays(track[seen], frame[seen], points[seen], image_size=SIZE, frames=FRAMES)
     if kind == "cut":
         track, frame, points = tracks.views()
         tracks = Tracks.from_arrays(
             2 * track + (frame >= FRAMES // 2), frame, points, image_size=SIZE, frames=FRAMES
         )
-    fit = fit_motion(tracks, throw=False)
-    done = MotionCalibration(tmp_path / "clip.mp4", tracks, fit, np.zeros((FRAMES, 2)))
+    told = {"wrong f": [f"{focal[5]}@5", f"{1.1 * focal[30]}@30"], "still, an f": [f"{focal[5]}@5"]}
+    known = known_focals(told[kind], unit="px") if kind in told else None
+    if known is None:
+        fit = fit_motion(tracks, throw=False)
+    else:
+        of_frames = known.of_frames(np.arange(FRAMES))
+        fit = fit_motion(tracks, focal=of_frames[0], focal_std=of_frames[1], throw=False)
+    times = np.column_stack([np.arange(FRAMES), np.arange(FRAMES) / 25])
+    done = MotionCalibration(tmp_path / "clip.mp4", tracks, fit, times, known=known)
     assert any(finding in sentence for sentence in map(str, done.findings)), done.findings
     assert done.verdict == verdict
 
@@ -296,8 +502,6 @@ def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
 @pytest.mark.parametrize("seed", [3, 4])
 def test_things_that_move_and_pass_for_noise_are_told(tmp_path, seed):
     """Four of five points are on things that move slowly: most of them follow by that little."""
-    from zoomjax.app.motion_calibration import MotionCalibration
-
     long_lens = zj.ZoomLens(
         zj.PolynomialZoom(2, jnp.array([[0.02, 0.0], [-0.05, 0.01], [-0.15, 0.05]]), jnp.array(800.0)),
         jnp.array([645.0, 356.0]),

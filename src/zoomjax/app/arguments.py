@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from .options import FIT, OUTPUT
+from .options import FIT, FOCAL, OUTPUT
 
 if TYPE_CHECKING:
     from ..lines.lines import Lines
@@ -68,6 +68,18 @@ Centre = Annotated[
         help="Centre of distortion: fit (where the lines determine it, else the image's), image, or its "
         "coordinates in px. Default: fit, but image with --distortion-model brown-conrady.",
         rich_help_panel=FIT,
+    ),
+]
+
+KnownFocal = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--known-focal",
+        metavar="F@FRAME|CSV",
+        help="With --focal motion: the focal length of a frame, counted from 0, such as 24@0, or a CSV "
+        "file with frame,focal[,sigma] of some frames; may be repeated. In mm it needs --pixel-pitch; or "
+        "give --focal-unit px. One is needed where the camera zooms without turning.",
+        rich_help_panel=FOCAL,
     ),
 ]
 

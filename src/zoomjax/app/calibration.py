@@ -7,7 +7,7 @@ import dataclasses
 import importlib.metadata
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from ..fit.zoom import CentreArgument
 from ..lines.lines import Lines
 from ..models.about import UNKNOWN
 from ..models.registry import distortion_model_name
-from ..models.zoom import PolynomialZoom, number_of_coefficients
+from ..models.zoom import PolynomialZoom
 from ..trust.assessment import NEGLIGIBLE, Assessment, assess
 from ..trust.bands import displacement_std
 from ..trust.cross_validation import cross_validate_frames
@@ -34,6 +34,7 @@ from ..trust.misfit import with_misfit
 from ..trust.next_photo import Suggestion, suggest_next
 from ..trust.own_centres import OwnCentres, own_centres
 from ..trust.selection import Selection
+from .coefficients import coefficient_names, coefficient_rows, finite, pixel_polynomials
 from .fitting import Metric, algebraic_rms, fitted, left_out
 from .model_choice import CentreFound, WantedModel
 from .outward import outward
@@ -195,11 +196,11 @@ class Calibration:
             "focal": np.asarray(self.lines.focal).tolist(),
             "focal_sigma": self.focal_sigma.tolist(),
             "lines": np.bincount(frame, minlength=len(self.rms_uncorrected)).tolist(),
-            "rms_none": _finite(self.rms_uncorrected),
-            "rms_frames": _finite(np.asarray(self.frames.frame_rms)),
-            "rms_zoom": _finite(np.asarray(self.fit.frame_rms)),
-            "rms_held_out": _finite(self.rms_held_out),
-            "rms_frames_held_out": _finite(self.rms_frames_held_out),
+            "rms_none": finite(self.rms_uncorrected),
+            "rms_frames": finite(np.asarray(self.frames.frame_rms)),
+            "rms_zoom": finite(np.asarray(self.fit.frame_rms)),
+            "rms_held_out": finite(self.rms_held_out),
+            "rms_frames_held_out": finite(self.rms_frames_held_out),
         }
         return (
             self.assessment.summary()
@@ -209,8 +210,8 @@ class Calibration:
                 "rms_algebraic": None if (of := self.rms_algebraic) is None else rms_over_frames(of),
                 "rms_frames": float(self.frames.rms),
                 "rms_zoom": float(self.fit.rms),
-                "rms_held_out": _finite([rms_over_frames(self.rms_held_out)])[0],
-                "rms_frames_held_out": _finite([rms_over_frames(self.rms_frames_held_out)])[0],
+                "rms_held_out": finite([rms_over_frames(self.rms_held_out)])[0],
+                "rms_frames_held_out": finite([rms_over_frames(self.rms_frames_held_out)])[0],
                 "frames": len(self.rms_uncorrected),
                 "lines": len(frame),
                 "rejected_lines": int(self.rejected.sum()),
@@ -235,18 +236,18 @@ class Calibration:
                 "coefficients": self.coefficient_rows(),
                 "parameters": np.asarray(lens.zoom.parameters).tolist(),
                 "corner_displacement": [
-                    {"focal": f, "px": moved, "std": _finite([std])[0]} for f, moved, std in self.corner()
+                    {"focal": f, "px": moved, "std": finite([std])[0]} for f, moved, std in self.corner()
                 ],
                 "next_photo": {
                     "focal": self.next_photo.focal,
                     "direction": self.next_photo.direction,
                     "region": self.next_photo.region,
-                    "displacement_std": _finite([self.next_photo.before])[0],
-                    "displacement_std_with_it": _finite([self.next_photo.after])[0],
+                    "displacement_std": finite([self.next_photo.before])[0],
+                    "displacement_std_with_it": finite([self.next_photo.after])[0],
                     "enough": self.enough(),
                     "sentence": self.advice(),
                 },
-                "parameter_sigma": _finite(np.sqrt(np.diag(np.asarray(self.fit.covariance)))),
+                "parameter_sigma": finite(np.sqrt(np.diag(np.asarray(self.fit.covariance)))),
                 "per_frame": [
                     dict(zip(fits, row, strict=True)) for row in zip(*fits.values(), strict=True)
                 ],
@@ -258,31 +259,16 @@ class Calibration:
         )
 
     def pixel_polynomials(self) -> np.ndarray:
-        """Coefficients of ``f^(-j)`` (rows) of each coefficient (columns) in px, as printed in the paper.
-
-        None, of shape (0, 0), for another model.
-        """
-        model = self.fit.lens.zoom
-        if not isinstance(model, PolynomialZoom):
-            return np.zeros((0, 0))
-        normalised = np.asarray(model.in_inverse_focal())
-        orders = self.fit.lens.distortion_model.orders(normalised.shape[1])
-        return normalised / self.fit.lens.scale**orders
+        """As `coefficients.pixel_polynomials`, of the lens."""
+        return pixel_polynomials(self.fit.lens)
 
     def coefficient_names(self) -> dict[str, int]:
-        """Names of the coefficients, k1, ..., kN and p1, p2, and the powers of 1/px in their units."""
-        distortion_model = self.fit.lens.distortion_model
-        size = number_of_coefficients(self.fit.lens.zoom)
-        radial, orders = size - distortion_model.num_coefficients(0), distortion_model.orders(size).tolist()
-        names = [f"k{i + 1}" if i < radial else f"p{i + 1 - radial}" for i in range(size)]
-        return dict(zip(names, orders, strict=True))
+        """As `coefficients.coefficient_names`, of the lens."""
+        return coefficient_names(self.fit.lens)
 
     def coefficient_rows(self) -> list[list[float]]:
-        """Focal length and k1, ..., kN, px, at some focal lengths over the range, evenly in 1/f."""
-        lens = self.fit.lens
-        low, high = (float(f) for f in lens.focal_range)
-        focal = np.unique(1 / np.linspace(1 / low, 1 / high, 5))
-        return [[f, *np.asarray(lens(f).pixel_coefficients).tolist()] for f in focal.tolist()]
+        """As `coefficients.coefficient_rows`, of the lens."""
+        return coefficient_rows(self.fit.lens)
 
     def write(
         self,
@@ -392,8 +378,3 @@ def rms_over_frames(frame_rms: Float[AnyArray, "frame"]) -> float:
     """Root of the mean of the frames' squared RMS: eq. 13 from eq. 3. NaN frames are ignored."""
     known = np.asarray(frame_rms)[~np.isnan(frame_rms)]
     return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
-
-
-def _finite(values: Iterable[float]) -> list[float | None]:
-    """Values for JSON, which has no infinity: None means that a value is not determined."""
-    return [float(v) if np.isfinite(v) else None for v in values]

@@ -36,14 +36,14 @@ def clip_report(done: MotionCalibration, panorama: Path, *, run: Run) -> str:
         "clip.html",
         title=run.title,
         about=[
-            f"f = {span(low, high, lens.focal_unit)}",
+            f"f = {span(low, high, lens.focal_unit)}{', relative' * done.is_relative()}",
             f"{lens.image_size[0]} × {lens.image_size[1]} px",
             counted(done.tracks.frames, "frame"),
             f"{counted(views, 'view')} of {counted(len(done.tracks.number), 'point')}",
         ],
         verdict=done,
         cards=_cards(done),
-        warnings=[],
+        warnings=done.warnings,
         panorama=data_url(panorama.read_bytes(), "jpeg"),
         path=embedded_plot(plot_motion(done.fit), "Focal length and direction of each frame"),
         slider=embedded_data(moving),
@@ -59,7 +59,7 @@ def clip_report(done: MotionCalibration, panorama: Path, *, run: Run) -> str:
             "A straight grid, distorted, and the displacement of pixels, at both ends of the zoom",
         ),
         run=run.rows,
-        files=FILES,
+        files=[*FILES, *["lines.npz"] * (done.lines is not None)],
         versions=", ".join(f"{name} {of}" for name, of in done.summary()["versions"].items()),
     )
 
@@ -74,8 +74,10 @@ def _cards(done: MotionCalibration) -> list[tuple[str, str]]:
         (f"{short(float(done.fit.noise))} px", "distance of these from the model"),
         (f"{pan:.0f}° × {tilt:.0f}°", "how far the camera turned"),
         (
-            f"± {scale:.2%}" if np.isfinite(scale) else "unknown",
-            "uncertainty of all focal lengths together",
+            "relative" if done.is_relative() else f"± {scale:.2%}",
+            "only the ratios of focal lengths are known"
+            if done.is_relative()
+            else "uncertainty of all focal lengths together",
         ),
         (
             f"{moved:+.3g} ± {short(std)} px" if np.isfinite(std) else f"{moved:+.3g} px",

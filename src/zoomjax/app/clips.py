@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,8 @@ import typer
 
 from .._core.text import plain
 from .console import REPORT, print_verdict, progress_bar, stages
+from .heard import heard
+from .options import IDLE_FOR_MOTION, refuse_idle
 from .plans import tell_plan
 from .runs import what_is_run
 from .shown import NOT_GOOD, Shown
@@ -17,6 +20,7 @@ from .shown import NOT_GOOD, Shown
 if TYPE_CHECKING:
     from ..detect.batch import Detection
     from ..fit.zoom import CentreArgument
+    from .known_focals import KnownFocals
     from .model_choice import WantedModel
     from .motion_calibration import MotionCalibration
 
@@ -30,24 +34,34 @@ class ClipJob:
         output: folder of the results.
         model: the zoom model.
         centre: of distortion: "fit" or "image".
+        known: focal lengths of some frames, as `known_focals` takes them, and what it takes with them:
+        focal_unit, focal_sigma, pixel_pitch: their unit, standard deviation, and px in it.
         lines: whether straight lines in the frames are fitted, too; then also:
         detector: of lines, by name.
         frames: the most frames in which they are searched for.
         workers: number of processes that search.
         cache: folder of what was found in frames before; None for none.
+        overlays: which frames are drawn with their lines: "some", "all" or "none".
         overwrite: whether to replace files that zoomjax did not write.
+        by_default: whether motion is tried as nothing else is given.
     """
 
     inputs: Sequence[str]
     output: Path
     model: "WantedModel"
     centre: "CentreArgument"
+    known: tuple[str, ...] = ()
+    focal_unit: str | None = None
+    focal_sigma: str | None = None
+    pixel_pitch: float | None = None
     lines: bool = False
     detector: str = "edges"
     frames: int = 60
     workers: int = 1
     cache: Path | None = None
+    overlays: str = "some"
     overwrite: bool = False
+    by_default: bool = False
 
     def __post_init__(self):
         """Check the settings before any work.
@@ -61,6 +75,14 @@ class ClipJob:
             raise ValueError("--focal motion is for one video: its motion determines the focal lengths.")
         if self.centre not in ("fit", "image"):
             raise ValueError("With --focal motion, --centre is fit or image: it moves along the zoom.")
+        self.known_focals()
+
+    def known_focals(self) -> "KnownFocals | None":
+        """The focal lengths that are known; None if none are."""
+        from .known_focals import known_focals
+
+        of = {"unit": self.focal_unit, "sigma": self.focal_sigma, "pitch": self.pixel_pitch}
+        return known_focals(self.known, **of) if self.known else None
 
 
 def wants_motion(inputs: Sequence[str], focal: str | None, spacing: str | None) -> bool:
@@ -71,18 +93,43 @@ def wants_motion(inputs: Sequence[str], focal: str | None, spacing: str | None) 
     return focal == "motion" or alone
 
 
+def refuse_idle_for_clips(context: typer.Context) -> None:
+    """Refuse options that have no effect on a clip whose motion gives its focal lengths."""
+    idle, given = IDLE_FOR_MOTION, context.params
+    if not given["known_focal"]:
+        idle = (*idle, "focal_sigma", "focal_unit", "pixel_pitch")
+    if not given["with_lines"]:
+        idle = (*idle, "overlays")
+    refuse_idle(context, idle, "with --focal motion")
+    if not given["with_lines"]:
+        refuse_idle(context, ("detector", "frames", "jobs", "cache"), "without --lines")
+
+
 def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
     """Calibrate from a clip, write the results and show them."""
     from .clip_report import clip_report
-    from .motion_calibration import FILES, calibrate_motion
+    from .motion_calibration import FILES, calibrate_motion, frames_of
     from .results_folder import OF_A_LENS, results_folder
 
-    clip = Path(job.inputs[0])
+    clip, known = Path(job.inputs[0]), job.known_focals()
+    if known is not None:
+        known.of_frames(frames_of(clip)[:, 0])  # before any work
     if dry_run:
         besides = f", and from lines in up to {job.frames} frames" * job.lines
+        if known is not None:
+            besides = (
+                f", from {len(known.frame)} known focal length{'s' * (len(known.frame) > 1)}" + besides
+            )
         tell_plan([f"Focal lengths and lens from how {plain(str(clip))} moves{besides}."], job.output)
         return
-    with results_folder(job.output, [*FILES, REPORT], clears=OF_A_LENS, overwrite=job.overwrite) as folder:
+    if job.by_default and not (show.quiet or show.as_json):
+        found = f"they and the lens are found from how {plain(str(clip))} moves"
+        print(f"No focal lengths are given (--focal): {found}.", file=sys.stderr)
+    names = [*FILES, REPORT, *["lines.npz"] * job.lines]
+    with (
+        heard() as told,
+        results_folder(job.output, names, clears=OF_A_LENS, overwrite=job.overwrite) as folder,
+    ):
         with progress_bar("Following points", quiet=show.quiet) as progress:
             from ..tracks.video import track_video
 
@@ -90,9 +137,22 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
         found = _lines(job, show) if job.lines else ()
         with stages(quiet=show.quiet) as stage:
             done = calibrate_motion(
-                clip, tracks, found=found, model=job.model, centre=job.centre, stage=stage
+                clip,
+                tracks,
+                found=found,
+                known=known,
+                model=job.model,
+                centre=job.centre,
+                stage=stage,
             )
-            done.make(folder, stage)
+            done = dataclasses.replace(done, warnings=tuple(told))
+            about = {"detector": job.detector if job.lines else None}
+            done.make(
+                folder,
+                stage,
+                overlays=job.overlays,
+                about=about,
+            )
             stage("Making the report")
             page = clip_report(done, folder / "panorama.jpg", run=what_is_run(clip.name))
             (folder / REPORT).write_text(page, encoding="utf-8")
@@ -135,7 +195,11 @@ def _show(done: "MotionCalibration", job: ClipJob, show: Shown) -> None:
         console.print(line, highlight=False)
     from .motion_calibration import FILES
 
-    print(f"\nWritten to {plain(str(job.output))}: {', '.join([REPORT, *FILES])}")
+    if job.lines:
+        where = plain(str(job.output / "lines"))
+        print(f"\nCheck the detected lines, drawn over each frame, in {where}." * (job.overlays != "none"))
+    files = [REPORT, *FILES, *["lines.npz", "lines/"] * job.lines]
+    print(f"\nWritten to {plain(str(job.output))}: {', '.join(files)}")
     lens, track = job.output / "lens.json", job.output / "track.csv"
     print(
         f"Correct the clip with zoomjax undistort {plain(str(lens))} {plain(job.inputs[0])} "

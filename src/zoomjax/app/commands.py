@@ -18,6 +18,7 @@ from .arguments import (
     Centre,
     Degree,
     DistortionModel,
+    KnownFocal,
     ModelName,
     Overwrite,
     Terms,
@@ -31,13 +32,12 @@ from .arguments import (
     split_lens,
     unit_of,
 )
-from .clips import ClipJob, calibrate_clip, wants_motion
+from .clips import ClipJob, calibrate_clip, refuse_idle_for_clips, wants_motion
 from .console import REPORT, progress_bar, show_calibration, show_images, stages
 from .options import (
     CALIBRATE_EXAMPLES,
     FIT,
     IDLE_FOR_LINES,
-    IDLE_FOR_MOTION,
     INPUT,
     UNDISTORT_EXAMPLES,
     Again,
@@ -191,6 +191,7 @@ def calibrate(
     focal_unit: FocalUnits = None,
     focal_sigma: FocalSigma = None,
     shared_focal: SharedFocal = None,
+    known_focal: KnownFocal = None,
     spacing: Spacing = None,
     distance: Distance = None,
     pixel_pitch: PixelPitch = None,
@@ -284,23 +285,28 @@ def calibrate(
     from .results_folder import OF_A_LENS, results_folder
 
     if wants_motion(inputs, focal, spacing):
-        refuse_idle(context, IDLE_FOR_MOTION, "with --focal motion")
-        if not with_lines:
-            refuse_idle(context, ("detector", "frames", "jobs", "cache"), "without --lines")
+        refuse_idle_for_clips(context)
         clip = ClipJob(
             inputs,
             output,
             wanted,
             about,
+            known=tuple(known_focal or ()),
+            focal_unit=focal_unit,
+            focal_sigma=focal_sigma,
+            pixel_pitch=pixel_pitch,
             lines=with_lines,
             detector=detector,
             frames=frames,
             workers=jobs or number_of_cores(),
             cache=cache_folder("detections") if cache else None,
+            overlays=overlays,
             overwrite=overwrite,
+            by_default=focal is None and not known_focal,
         )
         return calibrate_clip(clip, show, dry_run=dry_run)
     refuse_idle(context, ("with_lines",), "without --focal motion: all else is calibrated from lines")
+    refuse_idle(context, ("known_focal",), "without --focal motion")
     refuse_idle_sources(context, focal)
     job = ImageJob(
         tuple(inputs),

@@ -5,7 +5,7 @@ Each photo is read once for all of them, in threads, while something else is don
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -73,17 +73,48 @@ def _drawn(
     """Draw the lines of one photo, write the picture, and make the small ones."""
     image, frame = source.read()[0], frames[source.name]
     if target := targets.get(source.name):
-        own = members[frame]
-        picture = draw_lines(
+        write_overlay(
+            target,
             image,
             images.used[frame].lines,
-            images.calibration.rejected[own].tolist(),
-            rms=images.calibration.line_rms[own],
+            members[frame],
+            rms=images.calibration.line_rms,
+            rejected=images.calibration.rejected,
             limit=colour_limit(images.calibration),
-            labels={place: str(line) for place, line in enumerate(own.tolist())},
-            legend=True,
         )
-        done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-        assert done
-        target.write_bytes(content.tobytes())
     return pictures_of(images, frame, image) if source.name in chosen else None
+
+
+def write_overlay(
+    target: Path,
+    image: np.ndarray,
+    points: Sequence[np.ndarray],
+    own: np.ndarray,
+    *,
+    rms: np.ndarray,
+    rejected: np.ndarray,
+    limit: float,
+) -> None:
+    """Write a picture with its lines, each with its number.
+
+    Args:
+        target: the file.
+        image: the picture.
+        points: of each of its lines.
+        own: their numbers among all lines.
+        rms: of all lines, px.
+        rejected: whether each one does not count.
+        limit: the RMS, px, from which on a line has the last colour.
+    """
+    picture = draw_lines(
+        image,
+        points,
+        rejected[own].tolist(),
+        rms=rms[own],
+        limit=limit,
+        labels={place: str(line) for place, line in enumerate(own.tolist())},
+        legend=True,
+    )
+    done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    assert done
+    target.write_bytes(content.tobytes())

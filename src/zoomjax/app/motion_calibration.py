@@ -2,12 +2,14 @@
 
 import csv
 import dataclasses
+import functools
 import importlib.metadata
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -20,37 +22,33 @@ from ..fit.result import RESULTS
 from ..fit.zoom import CentreArgument
 from ..io.video_reader import decode_video
 from ..lines.lines import Lines
+from ..models.about import RELATIVE
+from ..models.lens import ZoomLens
+from ..models.registry import distortion_model_name
 from ..models.zoom import PolynomialZoom
 from ..tracks.again import find_again
 from ..tracks.tracks import Tracks
 from ..trust.assessment import VERDICTS, Finding, Verdict
 from ..trust.bands import displacement_std
+from ._flags import with_flags
+from .clip_lines import MOST, draw_frames, frames_with_lines, image_rows, lines_of_frames
+from .coefficients import coefficient_rows, finite, pixel_polynomials
 from .joined_shots import linked_well, turns_of_shots
+from .known_focals import KnownFocals
 from .model_choice import WantedModel
+from .motion_figures import WRONG_LINE, all_focals, centre_summary, frame_rows, line_rms, rms_uncorrected
+from .motion_findings import findings_of_motion, following, follows, is_relative, scale_std
 from .outward import outward
+from .relative import NOTE, SENTENCE
 
 FILES = ("lens.json", "track.csv", "tracks.npz", "summary.json", "motion.png", "panorama.jpg")
-"""What `MotionCalibration.make` writes."""
-
-_LOOSE_SCALE = 0.01
-"""Standard deviation of the common factor of focal lengths, relative, from which it is worth a word."""
+"""What `MotionCalibration.make` writes; where lines were fitted, too, also lines.npz and lines/."""
 
 _TOLD_SHUTTER = 0.1
 """Standard deviation of the readout, in frames, below which it is told."""
 
-_ROUGH, _WRONG = 0.8, 1.2
-"""px, of the noise of points: two and three times what the way of a point there and back may miss, so that
-more is hardly noise. Much moves by itself, or what is seen is no camera that turns."""
-
-_MISSED = 9.0  # times the noise, squared: views beyond do not follow the model
-_FEW = 0.3  # of the views that do follow it: below, most of what is seen may move by itself
-# Of the views that follow, the share for which the loss hardly flattens: 0.94 of noise alone. Where four of
-# five points are on things that move, what these are off is taken for noise, and the share is 0.7 to 0.76.
-_CLOSE = 0.77
 _MANY = 9.0  # focal lengths, more than any model needs
-_HARMLESS = 5e-4  # of the pupil's offset over distances: its standard deviation, by the test
 _WORTH = 0.03  # share of more views for which it is fitted again
-_LEAST_ZOOM = 1.2  # between the ends of the focal lengths
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,23 +60,24 @@ class MotionCalibration:
         tracks: what was followed in it.
         fit: the lens and the path.
         times: of each frame, its number in the file and its time, s; NaN where the file has none.
-        lines: straight lines in its frames that were fitted, too.
+        found: what was found in frames in which lines were searched for.
+        lines: the lines, each frame with its f; None if none were.
+        known: focal lengths that were known beforehand.
+        warnings: what the user was warned of on the way.
     """
 
     clip: Path
     tracks: Tracks
     fit: MotionFit
     times: np.ndarray
+    found: tuple[Detection, ...] = ()
     lines: Lines | None = None
+    known: KnownFocals | None = None
+    warnings: tuple[str, ...] = ()
 
     def following(self) -> float:
         """The share of the views that follow the model: the rest are on things that move, or mistakes."""
-        return float(np.mean(self._missed() < _MISSED))
-
-    def _missed(self) -> np.ndarray:
-        """Of each view, the square of what it is off over where the loss begins to flatten."""
-        residual = np.asarray(self.fit.residual)[np.asarray(self.tracks.mask)]
-        return (residual / (2.3849 * float(self.fit.noise))) ** 2
+        return following(self.fit, self.tracks)
 
     def corner(self) -> list[tuple[float, float, float]]:
         """Displacement of the image's corner, px, and its standard deviation, at some focal lengths."""
@@ -89,109 +88,45 @@ class MotionCalibration:
         std = np.asarray(displacement_std(self.fit.fit, corner, focal=np.array(focal)))
         return list(zip(focal, outward(lens, corner, focal).tolist(), std.tolist(), strict=True))
 
+    def known_of_frames(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Of each frame the focal length that was known and its standard deviation; None if none was."""
+        return None if self.known is None else self.known.of_frames(self.times[:, 0])
+
     def scale_std(self) -> float:
         """Standard deviation of the factor common to all focal lengths, relative."""
-        return float(np.sqrt(self.fit.covariance[-1, -1]))
+        return scale_std(self.fit)
+
+    def is_relative(self) -> bool:
+        """Whether only the ratios of focal lengths are known."""
+        return is_relative(self.fit)
+
+    @property
+    def lens(self) -> ZoomLens:
+        """The lens, which says so where its focal lengths are relative."""
+        lens = self.fit.lens
+        if not self.is_relative():
+            return lens
+        return dataclasses.replace(lens, about={**lens.about, "focal": RELATIVE})
+
+    @functools.cached_property
+    def line_rms(self) -> np.ndarray:
+        """RMS distance of each line's points from straight under the lens, px of the image."""
+        return np.zeros(0) if self.lines is None else line_rms(self.fit, self.lines)
+
+    @property
+    def rejected(self) -> np.ndarray:
+        """Which lines are too far from straight to count."""
+        return self.line_rms > WRONG_LINE * float(self.fit.line_noise)
+
+    @functools.cached_property
+    def rms_uncorrected(self) -> float:
+        """RMS distance, px, of views that follow from where the path alone puts them, without a lens."""
+        return rms_uncorrected(self.fit, self.tracks, follows(self.fit, self.tracks))
 
     @property
     def findings(self) -> list[Finding]:
         """What the clip cannot tell, with what to do about it: the worst first; empty if all is good."""
-        found = [*self._of_turning(), *self._of_zooming(), *self._of_points(), *self._of_frames()]
-        return sorted(found, key=lambda of: -VERDICTS.index(of.verdict))
-
-    def _of_turning(self) -> Iterator[Finding]:
-        if self.fit.fit.result == RESULTS.undetermined:
-            yield Finding(
-                "turning",
-                "not determined",
-                "the camera hardly turns, so the scale of the focal lengths is not determined: only their "
-                "ratios are. The lens straightens lines all the same.",
-                "Film again and turn the camera by some 10 degrees or more while it zooms.",
-            )
-        elif self.fit.fit.result != RESULTS.successful:
-            message = RESULTS[self.fit.fit.result]
-            again = "Film a scene at rest again, and turn slowly."
-            yield Finding("fit", "not determined", message[:1].lower() + message[1:], again)
-        elif self.scale_std() > _LOOSE_SCALE:
-            yield Finding(
-                "scale",
-                "doubtful",
-                f"all focal lengths have a common factor that is known to {self.scale_std():.1%} only.",
-                "Turn the camera farther while it zooms.",
-            )
-
-    def _of_zooming(self) -> Iterator[Finding]:
-        low, high = (float(f) for f in self.fit.lens.focal_range)
-        if high < _LEAST_ZOOM * low:
-            yield Finding(
-                "zoom",
-                "good",
-                f"the focal length hardly changes, {low:.0f} to {high:.0f} px: this is one zoom only.",
-                "Zoom while you film, if the lens is to be known at other focal lengths.",
-            )
-
-    def _of_points(self) -> Iterator[Finding]:
-        missed = self._missed()
-        if (share := self.following()) < _FEW:
-            yield Finding(
-                "moving things",
-                "not determined",
-                f"only {share:.0%} of the tracked points move as a camera that turns makes them: much in "
-                "the clip moves by itself, or the camera does not stand still.",
-                "Use a tripod, and film a scene at rest.",
-            )
-        elif (close := float(np.mean(missed[missed < _MISSED] < 1))) < _CLOSE:
-            yield Finding(
-                "moving things",
-                "doubtful",
-                f"only {close:.0%} of the points that follow the camera do so as closely as noise lets "
-                "them: many may be on things that move.",
-                "Use a tripod, and film a scene at rest.",
-            )
-        yield from self._of_parallax()
-        if (noise := float(self.fit.noise)) > _ROUGH:
-            yield Finding(
-                "noise",
-                "doubtful" if noise <= _WRONG else "not determined",
-                f"points are off the model by {noise:.2f} px: the clip is blurred, much in it moves by "
-                "itself, or things near the camera shift as it turns.",
-                "Turn more slowly, and film a scene at rest.",
-            )
-
-    def _of_parallax(self) -> Iterator[Finding]:
-        if (spread := float(self.fit.lever_std)) > 0:
-            yield Finding(
-                "parallax",
-                "doubtful" if float(self.fit.parallax) > _HARMLESS else "good",
-                "near points move differently from far ones as the camera turns, by a share of "
-                f"{spread:.2%}: its entrance pupil is off the axis of rotation. That is modelled, but the "
-                "part that all points share looks like a lens, and is assumed: focal lengths may be off by "
-                "once or twice that share, and the lens with them. The bands allow for that.",
-                "Turn the camera about its entrance pupil, or film what is farther away.",
-            )
-
-    def _of_frames(self) -> Iterator[Finding]:
-        shots, scenes = (int(np.max(np.asarray(of))) + 1 for of in (self.fit.shot, self.fit.scene))
-        if shots > 1:
-            told = "All shots show one scene, and are joined. They share one lens."
-            if scenes > 1:
-                told = (
-                    f"Its {shots} shots show {scenes} scenes. They share one lens, but how the camera "
-                    "turned between scenes is not known; the panorama is of the longest."
-                )
-            yield Finding(
-                "cuts",
-                "good",
-                f"the clip has {shots - 1} cut{'s' * (shots > 2)}. {told}",
-                "Check that all of them were filmed with the same lens.",
-            )
-        if missing := int(np.sum(~np.isfinite(np.asarray(self.fit.focal)))):
-            yield Finding(
-                "frames without points",
-                "good",
-                f"{missing} frames show nothing that can be followed: their f is interpolated.",
-                "Look at these frames in the corrected clip.",
-            )
+        return findings_of_motion(self.fit, self.tracks, self.known_of_frames())
 
     @property
     def verdict(self) -> Verdict:
@@ -233,83 +168,138 @@ class MotionCalibration:
         return [
             f"\n{views:,} views of {len(self.tracks.number):,} points in {self.tracks.frames:,} frames",
             *more,
-            f"Standard deviation of the common scale of the focal lengths: {self.scale_std():.2%}",
+            SENTENCE
+            if self.is_relative()
+            else f"Standard deviation of the common scale of the focal lengths: {self.scale_std():.2%}",
             f"Centre of distortion: ({where[0][0]:.1f}, {where[0][1]:.1f}) px at {low:.0f} px, "
             f"({where[1][0]:.1f}, {where[1][1]:.1f}) px at {high:.0f} px",
+            f"Distance of points that follow: {self.rms_uncorrected:.2f} px without a correction, "
+            f"{float(self.fit.fit.rms):.2f} px with it (RMS)",
             f"The correction moves a corner by {', '.join(corner)}.",
             "Check panorama.jpg: where things that do not move are blurred, there are errors.",
         ]
 
     def summary(self) -> dict[str, Any]:
-        """All figures as plain numbers and strings, for JSON."""
+        """All figures as plain numbers and strings, for JSON: under the names of `Calibration.summary`."""
         fit, lens = self.fit, self.fit.lens
+        readout, readout_std, scale = finite([float(fit.readout), float(fit.readout_std), self.scale_std()])
         return {
             "verdict": self.verdict,
             "verdict_sentence": self.sentence,
             "findings": [dataclasses.asdict(finding) for finding in self.findings],
+            "warnings": list(self.warnings),
             "clip": self.clip.name,
             "frames": self.tracks.frames,
+            "frames_without_points": int(np.sum(~np.isfinite(np.asarray(fit.focal)))),
             "tracks": len(self.tracks.number),
             "views": int(np.sum(np.asarray(self.tracks.mask))),
             "views_that_follow": self.following(),
             "noise": float(fit.noise),
-            "lines": 0 if self.lines is None else len(self.lines.frame),
-            "line_noise": None if self.lines is None else float(fit.line_noise),
-            "readout": float(fit.readout),
-            "readout_std": float(fit.readout_std),
+            **self._of_lines(),
+            "readout": readout,
+            "readout_std": readout_std,
+            "distances": "distorted image",
+            "rms_none": self.rms_uncorrected,
+            "rms_zoom": float(fit.fit.rms),
             "rms": float(fit.fit.rms),
+            "rms_unconstrained": float(fit.fit.rms_unconstrained),
             "focal_range": [float(f) for f in lens.focal_range],
             "focal_unit": lens.focal_unit,
-            "focal_scale_std": self.scale_std(),
+            "focal_source": "motion",
+            "focal_known": not self.is_relative(),
+            "focal_scale": "relative" if self.is_relative() else "absolute",
+            "focal_scale_std": scale,
+            "known_focal": [] if self.known is None else self.known.rows(),
             "turned": np.ptp(np.asarray(self.fit.pan_and_tilt), axis=0).tolist(),
             "shots": int(np.max(np.asarray(fit.shot))) + 1,
             "scenes": int(np.max(np.asarray(fit.scene))) + 1,
             "image_size": list(lens.image_size),
             "result": RESULTS[fit.fit.result] or "successful",
-            "corner_displacement": [{"focal": f, "px": px, "std": std} for f, px, std in self.corner()],
+            "certificate": {k: np.asarray(v).item() for k, v in vars(fit.fit.certificate).items()},
+            "model": type(lens.zoom).__name__,
+            "distortion_model": distortion_model_name(lens.distortion_model),
+            "centre": centre_summary(fit),
+            "pixel_polynomials": pixel_polynomials(lens).tolist(),
+            "coefficients": coefficient_rows(lens),
             "parameters": np.asarray(lens.zoom.parameters).tolist(),
+            "parameter_sigma": finite(np.sqrt(np.diag(np.asarray(fit.fit.covariance)))),
+            "corner_displacement": [
+                {"focal": f, "px": moved, "std": finite([std])[0]} for f, moved, std in self.corner()
+            ],
+            "per_frame": frame_rows(fit, self.tracks, self.times),
             "versions": {
                 name: importlib.metadata.version(name) for name in ("zoomjax", "jax", "optimistix")
             },
         }
 
+    def _of_lines(self) -> dict[str, Any]:
+        """What the summary says of lines."""
+        if self.lines is None:
+            return {"lines": 0, "line_noise": None}
+        frame = np.asarray(self.lines.frame)
+        std = all_focals(self.fit)[1][frames_with_lines(self.found, self.times[:, 0])]
+        worst = np.flatnonzero(self.rejected)[np.argsort(-self.line_rms[self.rejected])]
+        return {
+            "lines": len(frame),
+            "line_noise": float(self.fit.line_noise),
+            "rejected_lines": int(self.rejected.sum()),
+            "rejected": [
+                {"line": int(line), "frame": int(frame[line]), "rms": float(self.line_rms[line])}
+                for line in worst
+            ],
+            "points": int(np.sum(np.asarray(self.lines.mask))),
+            "images": image_rows(self.found, self.lines, std, self.rejected),
+            "unused": {of.name: with_flags(of.problem) for of in self.found if not of.lines},
+        }
+
     def write_track(self, path: Path) -> None:
         """Write ``frame,seconds,focal,sigma``, which `undistort` takes; focal and sigma in px.
 
-        Between frames of which f is known 1/f is interpolated. The farther from these, the less is that
-        known: f may have changed as fast as in the fastest tenth of the frames.
+        Where focal lengths are relative, a comment before that says so.
         """
-        focal, std = (np.asarray(values) for values in (self.fit.focal, self.fit.focal_std))
-        known = np.flatnonzero(np.isfinite(focal))
-        every = np.arange(len(focal))
-        place = np.searchsorted(known, every)
-        beside = known[np.clip([place - 1, place], 0, len(known) - 1)]
-        far = np.min(np.abs(beside - every), axis=0)
-        changes = np.abs(np.diff(focal))
-        changes = changes[np.isfinite(changes)]
-        fast = np.quantile(changes, 0.9) if len(changes) else 0.0
-        focal = 1 / np.interp(every, known, 1 / focal[known])
-        std = np.hypot(np.interp(every, known, std[known]), far * fast)
+        focal, std = all_focals(self.fit)
         with path.open("w", newline="") as file:
+            if self.is_relative():
+                file.write(NOTE + "\n")
             table = csv.writer(file)
             table.writerow(["frame", "seconds", "focal", "sigma"])
             for (number, seconds), f, sigma in zip(self.times.tolist(), focal, std, strict=True):
                 table.writerow([int(number), f"{seconds:.4f}", f"{f:.4f}", f"{sigma:.4f}"])
 
-    def make(self, folder: Path, stage: Callable[[str], None] = lambda _: None) -> None:
-        """Write the files of `FILES` into an empty folder."""
+    def make(
+        self,
+        folder: Path,
+        stage: Callable[[str], None] = lambda _: None,
+        *,
+        overlays: str = "some",
+        about: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Write the files of `FILES`, and of lines lines.npz and pictures in lines/, into an empty folder.
+
+        Args:
+            folder: the folder.
+            stage: called with a description before each step that takes time.
+            overlays: which frames to draw with their lines: "some", "all" or "none".
+            about: more entries of summary.json.
+        """
         from .motion_plot import plot_motion  # so that the rest does not need Matplotlib
         from .panorama import write_panorama
         from .plot import save_plot
 
         stage("Writing the results")
-        self.fit.lens.save(folder / "lens.json")
+        self.lens.save(folder / "lens.json")
         self.tracks.save(folder / "tracks.npz")
         self.write_track(folder / "track.csv")
-        (folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n")
+        summary = self.summary() | dict(about or {})
+        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
         save_plot(plot_motion(self.fit), folder / "motion.png")
         stage("Joining frames into a panorama")
         write_panorama(self.clip, self.fit, folder / "panorama.jpg")
+        if self.lines is not None:
+            stage("Drawing the lines")
+            self.lines.save(folder / "lines.npz")
+            of_lines = self.lines, self.line_rms, self.rejected
+            draw_frames(self.clip, self.found, *of_lines, folder / "lines", most=MOST[overlays])
 
 
 def calibrate_motion(
@@ -317,6 +307,7 @@ def calibrate_motion(
     tracks: Tracks,
     *,
     found: Sequence[Detection] = (),
+    known: KnownFocals | None = None,
     model: WantedModel = WantedModel(),  # noqa: B008, it is frozen
     centre: CentreArgument = "fit",
     stage: Callable[[str], None] = lambda _: None,
@@ -327,20 +318,21 @@ def calibrate_motion(
         clip: the clip.
         tracks: of `track_video`.
         found: lines in frames of the clip, by `video_frames` and `detect`.
+        known: focal lengths that are known beforehand.
         model: the zoom model; by default a polynomial of degree 2 in 1/f with two coefficients.
         centre: the centre of distortion: "fit", linear in 1/f, or "image".
         stage: called with a description before each step that takes time.
 
     Raises:
-        ValueError: float64 is not enabled.
+        ValueError: float64 is not enabled, or a known focal length is of a frame that is not there.
         RuntimeError: the fit failed.
     """
-    with decode_video(clip) as (_, frames):
-        times = np.array([(number, time) for number, time, _ in frames], float)
+    times = frames_of(clip)
+    focal, focal_std = (None, None) if known is None else known.of_frames(times[:, 0])
     stage("Fitting the camera's path and the lens")
     candidate = model.base(np.arange(1.0, _MANY))
     shift = PolynomialZoom(degree=1) if centre == "fit" else None
-    lines, line_frames = _lines_of(found, times)
+    lines, line_frames = lines_of_frames(found, times[:, 0])
 
     def fitted(tracks, begin=None):
         fit = fit_motion(
@@ -351,6 +343,8 @@ def calibrate_motion(
             shift=shift,
             lines=lines,
             line_frames=line_frames,
+            focal=focal,
+            focal_std=focal_std,
         )
         return jax.block_until_ready(fit)
 
@@ -366,20 +360,12 @@ def calibrate_motion(
         if np.sum(more.mask) > (1 + (0 if turns else _WORTH)) * np.sum(tracks.mask):
             stage("Fitting the path that is closed")
             tracks, fit = more, fitted(more, begin)
-    return MotionCalibration(clip, tracks, fit, times, lines)
+    if lines is not None:
+        lines = eqx.tree_at(lambda lines: lines.focal, lines, all_focals(fit)[0][line_frames])
+    return MotionCalibration(clip, tracks, fit, times, tuple(found), lines, known)
 
 
-def _lines_of(found, times):
-    """All lines, and the numbers of their frames among those of the tracks."""
-    seen = [detection for detection in found if detection.lines]
-    if not seen:
-        return None, None
-    number = [int(Path(detection.name).stem.rpartition("-")[2]) for detection in seen]  # of `video_frames`
-    lines = Lines.from_ragged(
-        [line for detection in seen for line in detection.lines],
-        np.repeat(np.arange(len(seen)), [len(detection.lines) for detection in seen]),
-        np.ones(len(seen)),
-        image_size=seen[0].image_size,
-        focal_unit="px",
-    )
-    return lines, np.searchsorted(times[:, 0], number)
+def frames_of(clip: Path) -> np.ndarray:
+    """Of each frame that can be decoded its number in the file and its time, s; NaN where it has none."""
+    with decode_video(clip) as (_, frames):
+        return np.array([(number, time) for number, time, _ in frames], float)

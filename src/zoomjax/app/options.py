@@ -133,7 +133,7 @@ FocalSigma = Annotated[
         metavar="STD",
         help="Standard deviation of the focal lengths, in their unit or per cent, e.g. 0.3 or 1%. "
         "Standard deviations of the results include it. Default: what plane, board or pitch estimate, "
-        "the CSV column sigma, or else 0.",
+        "the CSV column sigma, or else 0; of --known-focal 1%.",
         rich_help_panel=FOCAL,
     ),
 ]
@@ -166,7 +166,7 @@ PixelPitch = Annotated[
     float | None,
     typer.Option(
         metavar="MM",
-        help="For --focal board: distance between pixels on the sensor.",
+        help="For --focal board, and --known-focal in mm: distance between pixels on the sensor.",
         rich_help_panel=FOCAL,
     ),
 ]
@@ -267,12 +267,12 @@ JsonOfWork = Annotated[
 
 IDLE_FOR_LINES = (
     *("spacing", "distance", "pixel_pitch", "jobs", "detector", "frames", "cache", "overlays"),
-    *("with_lines", "shared_focal", "cluster"),
+    *("with_lines", "known_focal", "shared_focal", "cluster"),
 )
 """Parameters of calibrate that say nothing about a file of lines."""
 
 IDLE_FOR_MOTION = (
-    *("focal_sigma", "focal_unit", "spacing", "distance", "pixel_pitch", "robust", "overlays"),
+    *("spacing", "distance", "robust"),
     *("shared_focal", "distortion_model", "cluster", "verbose"),
 )
 """And about a clip whose motion gives its focal lengths."""
@@ -287,6 +287,8 @@ Examples:
   zoomjax calibrate zoom/*mm/ --focal plane --shared-focal folder -o mylens
 
   zoomjax calibrate zoom.mp4 --focal track.csv -o mylens
+
+  zoomjax calibrate still.mp4 --known-focal 24@0 --pixel-pitch 0.0055 -o mylens
 
   zoomjax calibrate fisheye/ --distortion-model division -o mylens
 

@@ -22,6 +22,7 @@ from ..models.lens import ZoomLens, load_lens
 from ._photos import BAD_FILE, SAME, CommonFraming, corrected_photos
 from .equipment import taken_at_others, taken_otherwise
 from .plans import files_plan
+from .relative import warn_of_relative
 from .undistort_inputs import Found, find_inputs, focal_number, targets_of
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ def undistort_files(
     check_keep(job.keep)
     if job.lens is None:
         raise ValueError("Argument lens must be the file of a lens.")
-    lens = load_lens(job.lens)
+    warn_of_relative(lens := load_lens(job.lens), job.focal)
     found = photos_or_videos(job)
     work = functools.partial(_videos, dict(found.videos)) if found.videos else undistort_photos
     files = found.videos or found.photos

@@ -33,6 +33,10 @@ SURE = 3.0
 NEARLY_NONE = 1e-4
 """e/D, the standard deviation over tracks below which nothing comes of a parallax."""
 
+MOST = 0.1
+"""e/D, the standard deviation over tracks from which it is none, as points would be as near as the pupil.
+Tracks of a camera that does not turn tell no parallax, and what is off in them makes one of any size."""
+
 
 def is_seen(parallax: float | Array, score: float | Array) -> bool:
     """Whether the tracks tell a parallax that is worth a word."""

@@ -14,7 +14,7 @@ from ._columns import Unknowns
 from ._motion_estimate import AS_GOOD, described
 from ._motion_levers import guessed_levers
 from ._motion_model import Model, Noise, Speed, Stage, moved, pinned, speed_of, units_of
-from ._motion_parallax import is_seen, spread_of
+from ._motion_parallax import MOST, is_seen, spread_of
 from ._motion_repeated import groups_of, repeated
 from ._motion_rows import (
     averaged,
@@ -152,8 +152,10 @@ def in_stages(data, model, noise, scene):
     free = _arrays(STAGES[-1]._replace(own=_FREE))
     give_back()
     parts, missed = described(data, model, noise, free, result, steps)
-    if is_seen(parts["parallax"], parts["parallax_score"]):
-        spread = spread_of(data, model, _arrays(noise), missed, parts["parallax"])
+    open_scale = bool(parts["fit"].result == RESULTS.undetermined)  # then the lens is, and looks like one
+    seen = not open_scale and is_seen(parts["parallax"], parts["parallax_score"])
+    spread = spread_of(data, model, _arrays(noise), missed, parts["parallax"]) if seen else None
+    if spread is not None and spread.std < MOST:
         model = dataclasses.replace(model, levers=guessed_levers(spread, data.structure.tracks))
         model, noise, weighted_by, result, steps = _settled(data, model, noise)
         again, missed = described(data, model, noise, free, result, steps)

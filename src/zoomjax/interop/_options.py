@@ -1,6 +1,7 @@
 """Checks of the arguments of `write` and `read`, before a file is looked at."""
 
 import math
+import warnings
 from collections import Counter
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from .._core.checks import real_numbers
 from ..io.focal_track import FocalTrack
+from ..models.about import RELATIVE
 from ..models.brown_conrady import BrownConrady
 from ..models.distortion_model import AbstractDistortionModel, checked_terms
 from ..models.division import Division
@@ -37,6 +39,16 @@ def check_options(fmt: Format, given: dict[str, Any]) -> None:
             raise ValueError(
                 f"Argument {name} must be one of {', '.join(_CHOICES[name])}, but it is {value!r}."
             )
+
+
+def warn_of_relative(lens: ZoomLens) -> None:
+    """Warn of a lens of whose focal lengths only the ratios are known."""
+    if lens.about.get("focal") == RELATIVE:
+        warnings.warn(
+            "The focal lengths of this lens are relative: only their ratios are known, and so are those of "
+            "what is written. Calibrate again with a known focal length if their scale matters.",
+            stacklevel=4,
+        )
 
 
 def positive(name: str, value: Any) -> float:

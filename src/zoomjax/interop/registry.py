@@ -21,7 +21,7 @@ from ..models.lens import ZoomLens
 from ..models.requirements import check
 from ..models.zoom import AbstractLinearZoom
 from ._lens import UnsuitedError, lens_of
-from ._options import check_model, check_options, focal_lengths, positive, positives
+from ._options import check_model, check_options, focal_lengths, positive, positives, warn_of_relative
 from ._solve import Solution, error_written, solve
 from .base import (
     CONVENTION,
@@ -141,6 +141,7 @@ def write(
     check("interop.write", zoom=lens.zoom)
     if lens.about.get("focal") == UNKNOWN:
         lens = _labelled(lens, focal)
+    warn_of_relative(lens)
     job = Export(
         lens,
         *focal_lengths(fmt, lens, focal, track),

@@ -13,6 +13,10 @@ WIDTH_OF_FOCALS = "width_of_focal_px"
 UNKNOWN = "not known"
 """What ``about["focal"]`` says of a lens of one focal length that nobody knows: its number is arbitrary."""
 
+RELATIVE = "relative"
+"""What it says of a zoom lens whose focal lengths have a common factor that is not known: they are right
+beside one another, and with the track that they were found with."""
+
 
 class About(Mapping[str, str | float]):
     """Words and numbers by name, which do not change: a mapping that can be hashed.

@@ -1,0 +1,42 @@
+"""Focal lengths of which only the ratios are known, as those of a clip that zooms without turning."""
+
+import warnings
+from pathlib import Path
+
+from ..models.about import RELATIVE
+from ..models.lens import ZoomLens
+
+NOTE = (
+    "# Relative focal lengths: only their ratios are known. They belong to the lens.json beside this file."
+)
+"""The first line of a track of such focal lengths."""
+
+SENTENCE = (
+    "Focal lengths are relative: their common factor is not known, in lens.json as in track.csv. Use both "
+    "together: with other focal lengths the lens is wrong."
+)
+
+
+def warn_of_relative(lens: ZoomLens, focal: str | None) -> None:
+    """Warn of a lens with relative focal lengths, and others given for it; or the other way round."""
+    of_lens, of_track = lens.about.get("focal") == RELATIVE, focal is not None and _is_relative(Path(focal))
+    if of_lens and not of_track:
+        warnings.warn(
+            "The focal lengths of this lens are relative: only their ratios are known. Give argument focal "
+            "the track.csv of its own calibration, or calibrate again with a known focal length.",
+            stacklevel=3,
+        )
+    if of_track and not of_lens:
+        warnings.warn(
+            f"The focal lengths of {focal} are relative: only their ratios are known. Use them with the "
+            "lens.json of their own calibration, or calibrate again with a known focal length.",
+            stacklevel=3,
+        )
+
+
+def _is_relative(path: Path) -> bool:
+    """Whether a file is a track of relative focal lengths."""
+    if not path.is_file():
+        return False
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return file.readline().lstrip("\ufeff").startswith(NOTE.partition(":")[0])

@@ -1,0 +1,70 @@
+"""Focal lengths of some frames that the user knows, for a calibration from motion."""
+
+import numpy as np
+import pytest
+
+from zoomjax.app.known_focals import USUAL_STD, known_focals
+
+
+def test_a_focal_length_and_its_frame():
+    known = known_focals(["70@149", " 24 @ 0"], pitch=0.005)
+    assert known.frame.tolist() == [0, 149]
+    np.testing.assert_allclose(known.focal, [4800, 14000])
+    np.testing.assert_allclose(known.std, USUAL_STD * known.focal)
+
+
+def test_a_track_of_another_run(tmp_path):
+    (tmp_path / "track.csv").write_text(
+        "# a comment\nframe,seconds,focal,sigma\n3,0.12,900,2\n7,0.28,950,\n"
+    )
+    known = known_focals([str(tmp_path / "track.csv"), "800@1"], unit="px")
+    assert known.rows() == [
+        {"frame": 1, "focal": 800.0, "sigma": 8.0},
+        {"frame": 3, "focal": 900.0, "sigma": 2.0},
+        {"frame": 7, "focal": 950.0, "sigma": 9.5},
+    ]
+
+
+@pytest.mark.parametrize(("sigma", "std"), [("0.5%", 24.0), ("0.1", 20.0)])
+def test_a_standard_deviation_for_all(tmp_path, sigma, std):
+    (tmp_path / "f.csv").write_text("frame,focal,sigma\n0,24,3\n")
+    known = known_focals([str(tmp_path / "f.csv")], sigma=sigma, pitch=0.005)
+    np.testing.assert_allclose(known.std, std)
+
+
+def test_frames_are_found_by_their_numbers_in_the_file():
+    known = known_focals(["800@1", "900@4"], unit="px", sigma="5")
+    focal, std = known.of_frames(np.array([0.0, 1.0, 3.0, 4.0]))  # frame 2 cannot be decoded
+    np.testing.assert_array_equal(focal, [np.nan, 800, np.nan, 900])
+    np.testing.assert_array_equal(std, [np.inf, 5, np.inf, 5])
+    for other in ([0.0, 1.0, 3.0], [0.0, 1.0], [2.0, 4.0]):
+        with pytest.raises(
+            ValueError, match=r"--known-focal is of frame [14], which the clip does not have"
+        ):
+            known.of_frames(np.array(other))
+
+
+@pytest.mark.parametrize(
+    ("given", "options", "message"),
+    [
+        (["24@0"], {}, "--known-focal is in mm, .* give --pixel-pitch"),
+        (["24@0"], {"unit": "mm"}, "give --pixel-pitch"),
+        (["24@0"], {"unit": "px", "pitch": 0.005}, "--pixel-pitch has no effect with --focal-unit px"),
+        (["24@0"], {"pitch": 0.0}, "--pixel-pitch must be a positive number of mm, but it is 0"),
+        (["24"], {"unit": "px"}, "--known-focal is '24'. Give a focal length and the number of its frame"),
+        (["24@-1"], {"unit": "px"}, "--known-focal is '24@-1'"),
+        (["24@1.5"], {"unit": "px"}, "--known-focal is '24@1.5'"),
+        (["24mm@0"], {"unit": "px"}, "--known-focal is '24mm@0'"),
+        (["24@99999999999999999999"], {"unit": "px"}, "--known-focal is '24@9"),
+        (["0@3"], {"unit": "px"}, "--known-focal must be a positive focal length, but it is 0@3"),
+        (["8@3", "9@3"], {"unit": "px"}, "--known-focal is given twice for frame 3"),
+        (["8@3"], {"unit": "px", "sigma": "0"}, "--focal-sigma of known focal lengths must be above 0"),
+        (["8@3"], {"unit": "px", "sigma": "-1%"}, "Argument focal_sigma must be a number such as 0.3"),
+        (["f.csv"], {"unit": "px"}, "sigma in row 2 must be a positive number, but it is 0"),
+    ],
+)
+def test_mistakes_are_told(tmp_path, monkeypatch, given, options, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "f.csv").write_text("frame,focal,sigma\n0,24,0\n")
+    with pytest.raises(ValueError, match=message):
+        known_focals(given, **options)
