@@ -28,7 +28,7 @@ class MotionFit(eqx.Module):
             between views and where the model puts them, px of the image, without those that it takes for
             mistakes; `ZoomFit.joint` includes the centre. Its result `undetermined` says that the tracks do
             not determine the scale of the focal lengths, as where the camera zooms and does not turn: only
-            their ratios are known then, and the distortion straightens lines all the same.
+            their ratios are known then, and of the distortion only what lines tell.
         focal: focal length of each frame, px; NaN for a frame without tracks.
         focal_std: its standard deviation, px. Nearly all of it is a factor common to all frames.
         covariance: of the zoom model's parameters, of those of the centre's offset, of the readout, and of
