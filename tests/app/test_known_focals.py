@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from zoomjax.app.known_focals import USUAL_STD, known_focals
+from zoomjax.app.relative import NOTE, is_relative_track
 
 
 def test_a_focal_length_and_its_frame():
@@ -68,3 +69,13 @@ def test_mistakes_are_told(tmp_path, monkeypatch, given, options, message):
     (tmp_path / "f.csv").write_text("frame,focal,sigma\n0,24,0\n")
     with pytest.raises(ValueError, match=message):
         known_focals(given, **options)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_relative_focal_lengths_are_none_that_are_known(tmp_path, encoding):
+    (tmp_path / "track.csv").write_text(f"{NOTE}\nframe,focal,sigma\n0,900,2\n", encoding=encoding)
+    with pytest.raises(ValueError, match=r"track\.csv are relative: only their ratios are known"):
+        known_focals([str(tmp_path / "track.csv")], unit="px")
+    assert is_relative_track(tmp_path)
+    (tmp_path / "track.csv").write_text("frame,focal,sigma\n0,900,2\n", encoding=encoding)
+    assert not is_relative_track(tmp_path)

@@ -35,6 +35,7 @@ def fit(tracks):
 
 def made(track, frame, points):
     """Tracks of those that have two views or more."""
+    track = np.unique(track, return_inverse=True)[1]
     twice = np.bincount(track)[track] > 1
     return Tracks.from_arrays(track[twice], frame[twice], points[twice], image_size=SIZE, frames=FRAMES)
 
@@ -62,6 +63,45 @@ def test_it_ends_where_one_from_nothing_does(tracks, fit, earlier, monkeypatch):
     np.testing.assert_allclose(found.noise, fit.noise, rtol=1e-3)
     np.testing.assert_allclose(found.rotation, fit.rotation, atol=2e-5)
     assert found.fit.result == fit.fit.result == RESULTS.successful
+
+
+def test_frames_that_the_earlier_fit_did_not_see_are_of_the_shot_around_them(tracks, earlier):
+    unseen = np.isin(np.arange(FRAMES), [9, 10, 15])
+    begin = eqx.tree_at(
+        lambda fit: (fit.shot, fit.scene),
+        earlier,
+        tuple(jnp.where(unseen, -1, of) for of in (earlier.shot, earlier.scene)),
+    )
+    asked = Asked(PolynomialZoom(2), RadialPolynomial(), 2, None, None)
+    problem = problem_of(Given(tracks, None, None, None, None, begin), asked)
+    np.testing.assert_array_equal(problem.shot, 0)
+
+
+def test_an_earlier_fit_of_another_scale_is_no_start(tracks, fit, monkeypatch):
+    """Its lens is another one, and the way from it to the known focal lengths is long."""
+    other = eqx.tree_at(lambda fit: fit.focal, fit, 1.5 * fit.focal)
+    known = {"focal": np.where(np.arange(FRAMES) == 3, fit.focal, np.nan), "focal_std": 1.0}
+    found = fit_motion(tracks, begin=other, **known)
+    np.testing.assert_allclose(found.focal, fit.focal, rtol=1e-3)
+    monkeypatch.setattr(motion, "begun", None)
+    near = fit_motion(tracks, begin=fit, **known)
+    np.testing.assert_allclose(near.focal, found.focal, rtol=1e-4)
+
+
+def test_shots_that_nothing_links_have_the_scales_of_their_own_known_focal_lengths(lens):
+    """Both are still, and zoom."""
+    focal, rotation = pan_and_zoom(lens, FRAMES, pan=0, tilt=0)
+    parts = []
+    for number, (seed, rows) in enumerate([(3, slice(0, 12)), (4, slice(12, 24))]):
+        of = motion_tracks(lens, focal[rows], rotation[rows], views=50, life=12, noise=0.1, seed=seed)
+        track, frame, points = of.tracks.views()
+        parts.append((track + 10_000 * number, frame + 12 * number, points))
+    tracks = made(*(np.concatenate(of) for of in zip(*parts, strict=True)))
+    known = np.full(FRAMES, np.nan)
+    known[[2, 20]] = focal[[2, 20]]
+    found = fit_motion(tracks, focal=known, focal_std=0.002 * focal, readout=0.0)
+    assert found.shot.tolist() == [0] * 12 + [1] * 12
+    np.testing.assert_allclose(found.focal, focal, rtol=0.02)
 
 
 @pytest.mark.slow

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from ..detect.batch import Detection
-from ..detect.sources import video_frames
+from ..io.video_reader import decode_video
 from ..lines.lines import Lines
+from .coefficients import finite
 from .drawings import write_overlay
 from .image_job import overlay_name
 
@@ -40,8 +41,12 @@ def lines_of_frames(
 
 def frames_with_lines(found: Sequence[Detection], numbers: np.ndarray) -> np.ndarray:
     """The place of each frame that has lines among the frames of these numbers in the file."""
-    names = (Path(detection.name).stem for detection in with_lines(found))  # of `video_frames`
-    return np.searchsorted(numbers, [int(name.rpartition("-")[2]) for name in names])
+    return np.searchsorted(numbers, [_number(detection.name) for detection in with_lines(found)])
+
+
+def _number(name: str) -> int:
+    """The number in the file of a frame with a name by `video_frames`."""
+    return int(Path(name).stem.rpartition("-")[2])
 
 
 def members(lines: Lines) -> list[np.ndarray]:
@@ -57,7 +62,7 @@ def image_rows(
         {
             "name": detection.name,
             "focal": float(focal),
-            "focal_sigma": float(std),
+            "focal_sigma": finite([std])[0],
             "lines": len(own),
             "rejected": int(rejected[own].sum()),
         }
@@ -93,17 +98,21 @@ def draw_frames(
     if most is not None and len(names) > most:
         names = [names[place] for place in np.linspace(0, len(names) - 1, most).round().astype(int)]
     limit = 4 * float(np.median(rms[~rejected])) if not rejected.all() else 1.0
-    number = {detection.name: place for place, detection in enumerate(found, start=1)}
+    if not names:
+        return
+    place = {detection.name: place for place, detection in enumerate(found, start=1)}
     points = {detection.name: detection.lines for detection in found}
+    wanted = {_number(name): name for name in names}
     folder.mkdir()
-    for source in video_frames(clip, 1.0, len(found)):
-        if source.name in names:
-            write_overlay(
-                folder / overlay_name(number[source.name], source.name),
-                source.read()[0],
-                points[source.name],
-                own[source.name],
-                rms=rms,
-                rejected=rejected,
-                limit=limit,
-            )
+    with decode_video(clip) as (_, frames):
+        for number, _, image in frames:
+            if name := wanted.get(number):
+                write_overlay(
+                    folder / overlay_name(place[name], name),
+                    image(),
+                    points[name],
+                    own[name],
+                    rms=rms,
+                    rejected=rejected,
+                    limit=limit,
+                )

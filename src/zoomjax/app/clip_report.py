@@ -11,6 +11,7 @@ import numpy as np
 from .._core.text import span
 from ..io.video_reader import decode_video
 from .motion_calibration import FILES, MotionCalibration
+from .motion_figures import turned
 from .motion_plot import plot_motion
 from .page import Run, counted, data_url, embedded_data, embedded_plot, rendered, short
 from .pictures import before_after
@@ -66,7 +67,7 @@ def clip_report(done: MotionCalibration, panorama: Path, *, run: Run) -> str:
 
 def _cards(done: MotionCalibration) -> list[tuple[str, str]]:
     """The key figures at the top of the page."""
-    pan, tilt = np.ptp(np.asarray(done.fit.pan_and_tilt), axis=0)
+    pan, tilt = turned(done.fit)
     _, moved, std = done.corner()[0]
     scale = done.scale_std()
     return [
@@ -94,10 +95,12 @@ def _frames(done: MotionCalibration) -> list[dict[str, Any]]:
     chosen = {int(known[np.argmin(abs(1 / focal[known] - at))]) for at in wanted}
     shown = []
     with decode_video(done.clip) as (_, frames):
-        for place, (_, _, image) in enumerate(frames):
+        for place, (number, _, image) in enumerate(frames):
             if place not in chosen:
                 continue
             pair = before_after(image(), done.fit.lens(float(focal[place])))
             before, after = (data_url(picture, "jpeg") for picture in pair)
-            shown.append({"frame": place, "focal": f"{focal[place]:.5g}", "before": before, "after": after})
+            shown.append(
+                {"frame": number, "focal": f"{focal[place]:.5g}", "before": before, "after": after}
+            )
     return sorted(shown, key=lambda one: float(one["focal"]))

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -113,7 +114,9 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
 
     clip, known = Path(job.inputs[0]), job.known_focals()
     if known is not None:
-        known.of_frames(frames_of(clip)[:, 0])  # before any work
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # they are said as its points are followed
+            known.of_frames(frames_of(clip)[:, 0])  # before any work
     if dry_run:
         besides = f", and from lines in up to {job.frames} frames" * job.lines
         if known is not None:
@@ -197,8 +200,14 @@ def _show(done: "MotionCalibration", job: ClipJob, show: Shown) -> None:
 
     if job.lines:
         where = plain(str(job.output / "lines"))
-        print(f"\nCheck the detected lines, drawn over each frame, in {where}." * (job.overlays != "none"))
-    files = [REPORT, *FILES, *["lines.npz", "lines/"] * job.lines]
+        if job.overlays != "none":
+            print(f"\nCheck the detected lines, drawn over each frame, in {where}.")
+    files = [
+        REPORT,
+        *FILES,
+        *["lines.npz"] * job.lines,
+        *["lines/"] * (job.lines and job.overlays != "none"),
+    ]
     print(f"\nWritten to {plain(str(job.output))}: {', '.join(files)}")
     lens, track = job.output / "lens.json", job.output / "track.csv"
     print(

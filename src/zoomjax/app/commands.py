@@ -230,9 +230,10 @@ def calibrate(
     Writes lens.json, summary.json, report.html, model.png and lines.npz. From
     images it also writes lines/: each image with its detected lines. From a
     video without focal lengths it writes track.csv, the focal length of each
-    frame, and panorama.jpg instead. Results of an earlier run in the same
-    folder are replaced or removed; its lines.npz, tracks.npz and track.csv
-    stay until they are written again.
+    frame, tracks.npz, motion.png and panorama.jpg; with --lines also lines.npz
+    and lines/. Results of an earlier run in the same folder are replaced or
+    removed; its lines.npz, tracks.npz and track.csv stay until they are
+    written again.
     """
     inputs = [str(results_of(path) or path) for path in inputs]
     of_lines = any(path.lower().endswith((".npz", ".csv")) for path in inputs)

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from ..io.text_table import plain_number, read_text_table
 from .focal_sources import focal_sigmas
+from .relative import is_relative_track
 
 USUAL_STD = 0.01
 """Relative standard deviation of a known focal length where none is given: that of the rings of lenses."""
@@ -65,8 +66,7 @@ def known_focals(
     """Focal lengths from the words of the option.
 
     Args:
-        given: each one a focal length and its frame, ``24@0``, or a CSV file ``frame,focal[,sigma]``, such
-            as the track.csv of another run.
+        given: each one a focal length and its frame, ``24@0``, or a CSV file ``frame,focal[,sigma]``.
         unit: of all of them, "mm" or "px"; by default mm.
         sigma: their standard deviation, in their unit or as a percentage; by default that of the file, or
             else `USUAL_STD`.
@@ -122,6 +122,11 @@ def _of_word(text: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _of_file(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    if is_relative_track(path):
+        raise ValueError(
+            f"The focal lengths of {path} are relative: only their ratios are known, and --known-focal "
+            "needs one that is measured."
+        )
     table = read_text_table(
         path, "known focal lengths", numbers=("frame", "focal"), optional=("sigma",), gaps=("sigma",)
     )

@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import importlib.metadata
 import json
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,13 +37,24 @@ from .coefficients import coefficient_rows, finite, pixel_polynomials
 from .joined_shots import linked_well, turns_of_shots
 from .known_focals import KnownFocals
 from .model_choice import WantedModel
-from .motion_figures import WRONG_LINE, all_focals, centre_summary, frame_rows, line_rms, rms_uncorrected
+from .motion_figures import (
+    WRONG_LINE,
+    all_focals,
+    centre_summary,
+    frame_rows,
+    line_rms,
+    rms_uncorrected,
+    turned,
+)
 from .motion_findings import findings_of_motion, following, follows, is_relative, scale_std
 from .outward import outward
 from .relative import NOTE, SENTENCE
 
 FILES = ("lens.json", "track.csv", "tracks.npz", "summary.json", "motion.png", "panorama.jpg")
 """What `MotionCalibration.make` writes; where lines were fitted, too, also lines.npz and lines/."""
+
+_CONTRADICTION = ".* known focal lengths contradict the tracks"
+"""A warning of `fit_motion`, of which a finding tells."""
 
 _TOLD_SHUTTER = 0.1
 """Standard deviation of the readout, in frames, below which it is told."""
@@ -139,7 +151,7 @@ class MotionCalibration:
         if self.verdict != "good":
             return f"{self.verdict.capitalize()}: {self.findings[0].found}"
         low, high = (float(f) for f in self.fit.lens.focal_range)
-        pan, tilt = np.ptp(np.asarray(self.fit.pan_and_tilt), axis=0)
+        pan, tilt = turned(self.fit)
         return (
             f"Good: {self.following():.0%} of the tracked points follow a camera that turns by {pan:.1f} "
             f"by {tilt:.1f} degrees and zooms from {low:.0f} to {high:.0f} px, within "
@@ -210,7 +222,7 @@ class MotionCalibration:
             "focal_scale": "relative" if self.is_relative() else "absolute",
             "focal_scale_std": scale,
             "known_focal": [] if self.known is None else self.known.rows(),
-            "turned": np.ptp(np.asarray(self.fit.pan_and_tilt), axis=0).tolist(),
+            "turned": list(turned(fit)),
             "shots": int(np.max(np.asarray(fit.shot))) + 1,
             "scenes": int(np.max(np.asarray(fit.scene))) + 1,
             "image_size": list(lens.image_size),
@@ -264,7 +276,8 @@ class MotionCalibration:
             table = csv.writer(file)
             table.writerow(["frame", "seconds", "focal", "sigma"])
             for (number, seconds), f, sigma in zip(self.times.tolist(), focal, std, strict=True):
-                table.writerow([int(number), f"{seconds:.4f}", f"{f:.4f}", f"{sigma:.4f}"])
+                time = f"{seconds:.4f}" if np.isfinite(seconds) else ""
+                table.writerow([int(number), time, f"{f:.4f}", f"{sigma:.4f}"])
 
     def make(
         self,
@@ -335,17 +348,19 @@ def calibrate_motion(
     lines, line_frames = lines_of_frames(found, times[:, 0])
 
     def fitted(tracks, begin=None):
-        fit = fit_motion(
-            tracks,
-            begin=begin,
-            zoom=candidate.zoom,
-            terms=candidate.terms,
-            shift=shift,
-            lines=lines,
-            line_frames=line_frames,
-            focal=focal,
-            focal_std=focal_std,
-        )
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", _CONTRADICTION)  # a finding says so
+            fit = fit_motion(
+                tracks,
+                begin=begin,
+                zoom=candidate.zoom,
+                terms=candidate.terms,
+                shift=shift,
+                lines=lines,
+                line_frames=line_frames,
+                focal=focal,
+                focal_std=focal_std,
+            )
         return jax.block_until_ready(fit)
 
     fit = begin = fitted(tracks)
@@ -353,7 +368,9 @@ def calibrate_motion(
     if fit.shot.max() > 0 and fit.fit.result == RESULTS.successful:
         stage("Joining shots of the same scene")
         turns = turns_of_shots(clip, fit, tracks)
-        fit, begin = (joined(fit, tracks, turns, scaled=scaled) for scaled in (False, True))
+    if turns:
+        begin = joined(fit, tracks, turns, scaled=True)
+        fit = joined(fit, tracks, turns)
     if tracks.frames <= LOOPS and fit.fit.result == RESULTS.successful:
         stage("Finding points again where the camera comes back")
         more = linked_well(find_again(clip, tracks, carry=begin.carried), fit)

@@ -40,6 +40,17 @@ def all_focals(fit: MotionFit) -> tuple[Float[np.ndarray, "frame"], Float[np.nda
     )
 
 
+def turned(fit: MotionFit) -> tuple[float, float]:
+    """How far the camera panned and tilted, degrees, in the scene that most frames show."""
+    known = np.isfinite(np.asarray(fit.focal)) & (np.asarray(fit.scene) >= 0)
+    if not known.any():
+        return 0.0, 0.0
+    scene = np.asarray(fit.scene)[known]
+    angles = np.asarray(fit.pan_and_tilt)[known][scene == np.argmax(np.bincount(scene))]
+    pan, tilt = np.ptp(np.unwrap(angles, period=360, axis=0), axis=0).tolist()
+    return pan, tilt
+
+
 def rms_uncorrected(fit: MotionFit, tracks: Tracks, follows: Bool[np.ndarray, "view"]) -> float:
     """RMS distance, px, of views from where the path alone puts their tracks, without a correction.
 

@@ -62,6 +62,7 @@ def findings_of_motion(
     """
     found = [
         *_of_turning(fit, known),
+        *_of_parts(fit),
         *_of_known(fit, known),
         *_of_zooming(fit),
         *_of_points(fit, tracks),
@@ -87,8 +88,16 @@ def scale_std(fit: MotionFit) -> float:
 
 
 def is_relative(fit: MotionFit) -> bool:
-    """Whether the factor common to all focal lengths is not known, so that only their ratios are."""
-    return bool(fit.fit.result == RESULTS.undetermined) or not scale_std(fit) < _NO_SCALE
+    """Whether no focal length has a scale, so that only their ratios are known."""
+    return (
+        bool(fit.fit.result == RESULTS.undetermined) or not _own_scales(fit).min(initial=np.inf) < _NO_SCALE
+    )
+
+
+def _own_scales(fit: MotionFit) -> Float[np.ndarray, "known"]:
+    """Standard deviations of the focal lengths that are known, relative."""
+    ratio = np.asarray(fit.focal_std) / np.asarray(fit.focal)
+    return ratio[np.isfinite(ratio)]
 
 
 def _missed(fit: MotionFit, tracks: Tracks) -> np.ndarray:
@@ -120,7 +129,7 @@ def _of_turning(fit: MotionFit, known: tuple[np.ndarray, np.ndarray] | None) -> 
             f"ratios are.{straight}",
             _TELL
             if known is None
-            else f"Give known focal lengths a smaller sigma, or film again and {_TURN}",
+            else f"Give a focal length that is known better, one in each shot, or film again and {_TURN}",
         )
     elif scale_std(fit) > max(_LOOSE_SCALE, _NO_WORSE * given):
         yield Finding(
@@ -131,6 +140,25 @@ def _of_turning(fit: MotionFit, known: tuple[np.ndarray, np.ndarray] | None) -> 
             if known is None
             else "Turn the camera farther while it zooms, or give a focal length that is known better.",
         )
+
+
+def _of_parts(fit: MotionFit) -> Iterator[Finding]:
+    """Scenes whose focal lengths have no scale, beside others that have one: none links them."""
+    focal, std, scene = (np.asarray(of) for of in (fit.focal, fit.focal_std, fit.scene))
+    seen = np.isfinite(focal) & (scene >= 0)
+    numbers = np.unique(scene[seen]).tolist()
+    own = [np.median((std / focal)[seen & (scene == number)]) for number in numbers]
+    loose = [number for number, of in zip(numbers, own, strict=True) if not of < _NO_SCALE]
+    if not loose or len(loose) == len(numbers):
+        return
+    frames = np.flatnonzero(seen & np.isin(scene, loose))
+    yield Finding(
+        "turning",
+        "doubtful" if len(frames) <= _BLIND * np.sum(seen) else "not determined",
+        f"in {len(frames)} of the frames, the first of them {frames[0]}, the camera hardly turns, and "
+        "nothing joins them to the others: the scale of their focal lengths is not determined.",
+        "Cut these frames off, or give the focal length of one in each such shot (--known-focal).",
+    )
 
 
 def _of_known(fit: MotionFit, known: tuple[np.ndarray, np.ndarray] | None) -> Iterator[Finding]:

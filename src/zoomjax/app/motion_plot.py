@@ -34,8 +34,9 @@ def _focal(axes: Axes, fit: MotionFit) -> None:
 
 def _direction(axes: Axes, fit: MotionFit) -> None:
     angles, shot = np.asarray(fit.pan_and_tilt), np.asarray(fit.shot)
-    for number in range(shot.max() + 1):
-        of_shot = angles[shot == number]
+    seen = np.isfinite(np.asarray(fit.focal))
+    for number in np.unique(shot[seen & (shot >= 0)]).tolist():
+        of_shot = angles[seen & (shot == number)]
         axes.plot(of_shot[:, 0], of_shot[:, 1], color=FRAMES, lw=1)
         axes.plot(*of_shot[0], "o", color=MODEL, ms=5)
     axes.set(

@@ -19,7 +19,7 @@ SENTENCE = (
 
 def warn_of_relative(lens: ZoomLens, focal: str | None) -> None:
     """Warn of a lens with relative focal lengths, and others given for it; or the other way round."""
-    of_lens, of_track = lens.about.get("focal") == RELATIVE, focal is not None and _is_relative(Path(focal))
+    of_lens, of_track = lens.about.get("focal") == RELATIVE, focal is not None and is_relative_track(focal)
     if of_lens and not of_track:
         warnings.warn(
             "The focal lengths of this lens are relative: only their ratios are known. Give argument focal "
@@ -34,9 +34,14 @@ def warn_of_relative(lens: ZoomLens, focal: str | None) -> None:
         )
 
 
-def _is_relative(path: Path) -> bool:
-    """Whether a file is a track of relative focal lengths."""
+def is_relative_track(path: str | Path) -> bool:
+    """Whether a file is a track of relative focal lengths, or a folder with such tracks."""
+    path = Path(path)
+    if path.is_dir():
+        return any(is_relative_track(each) for each in path.glob("*.csv") if each.is_file())
     if not path.is_file():
         return False
-    with path.open(encoding="utf-8", errors="replace") as file:
-        return file.readline().lstrip("\ufeff").startswith(NOTE.partition(":")[0])
+    with path.open("rb") as file:
+        head = file.read(4 * len(NOTE))
+    text = head.decode("utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8", errors="replace")
+    return text.lstrip('\ufeff"').startswith(NOTE.partition(":")[0])

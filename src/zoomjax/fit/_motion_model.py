@@ -229,7 +229,9 @@ def moved(model, steps):
     the direction that tracks determine worst: along it, the other unknowns change little.
     """
     parameters, offsets, readout, factor = jax.tree.map(jnp.add, _lens_parameters(model), steps.lens)
-    path = scaled(model.path, factor)
+    path = scaled(
+        model.path, *(jnp.full(len(of), factor) for of in (model.path.log_focal, model.path.rays))
+    )
 
     def ray(ray, start, step):
         return ray + step @ _tangents(start)
@@ -253,16 +255,21 @@ def moved(model, steps):
     )
 
 
-def scaled(path, factor):
-    """A path with all focal lengths larger by a factor, whose logarithm is given, and smaller angles."""
-    shrunk = jnp.exp(-factor)
+def scaled(path, factor, of_ray):
+    """A path with focal lengths larger by factors, whose logarithms are given, and smaller angles.
 
-    def rotation(matrix):
+    Args:
+        path: the path.
+        factor: of each frame.
+        of_ray: of each track.
+    """
+
+    def rotation(matrix, shrunk):
         extra = (shrunk - 1) * rotation_vector(matrix)  # about the same axis
         return jax.vmap(lambda column: turned(column, extra), 1, 1)(matrix)
 
-    rays = jax.vmap(shrunk_ray, (0, None))(path.rays, shrunk)
-    return Path(path.log_focal + factor, jax.vmap(rotation)(path.rotation), rays)
+    rays = jax.vmap(shrunk_ray)(path.rays, jnp.exp(-of_ray))
+    return Path(path.log_focal + factor, jax.vmap(rotation)(path.rotation, jnp.exp(-factor)), rays)
 
 
 def _tangents(ray):

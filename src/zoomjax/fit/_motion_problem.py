@@ -269,7 +269,8 @@ def _groups(track, moment, frames, begin):
     near, joined = apart <= _NEAR, links
     if begin is not None:
         shot, scene = np.asarray(begin.shot), np.asarray(begin.scene)
-        near &= shot[links[0]] == shot[links[1]]
+        one, other = shot[links]
+        near &= (one == other) | (one < 0) | (other < 0)  # what it did not see is of no shot of its
         order = np.argsort(scene, kind="stable")
         follows = (np.diff(scene[order]) == 0) & (scene[order[1:]] >= 0)
         joined = np.concatenate([links, np.stack([order[:-1], order[1:]])[:, follows]], axis=1)

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -19,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from scipy.special import gammaln
 
 from ..tracks.tracks import Tracks
-from ._motion_start import shrunk_ray
 from ._structure import bucket
 from .motion_fit import MotionFit
 
@@ -277,6 +275,8 @@ def _moved(fit, first, poses, scaled):
     log_std = np.nan_to_num(np.asarray(fit.focal_std) / focal, nan=_LOOSE)
     for into in {pose.scene for pose in poses.values()}:
         shots = [number for number, pose in poses.items() if pose.scene == into]
+        if len(shots) == 1:
+            continue
         std = [np.clip(np.median(log_std[shot == number]), _SURE, _LOOSE) for number in shots]
         factors = np.array([poses[number].factor for number in shots])
         mean = np.average(factors, weights=1 / np.square(std))
@@ -286,8 +286,7 @@ def _moved(fit, first, poses, scaled):
             turn = _powered(base.T @ poses[number].rotation, mean)
             frames, tracks = shot == number, shot[first] == number
             rotation[frames] = _powered(rotation[frames], -factor) @ turn.T
-            shrunk = jax.vmap(shrunk_ray, (0, None))(jnp.asarray(rays[tracks]), jnp.exp(-factor))
-            rays[tracks] = np.asarray(shrunk) @ turn.T
+            rays[tracks] = _shrunk(rays[tracks], np.exp(-factor)) @ turn.T
             focal[frames] *= np.exp(factor)
             scene[frames] = np.asarray(fit.scene)[shot == shots[0]][0]
     scene[scene >= 0] = np.unique(scene[scene >= 0], return_inverse=True)[1]
@@ -313,6 +312,14 @@ def _ahead(flat):
     """Directions of length 1 of points on the plane before the camera."""
     ahead = np.concatenate([flat, np.ones((*flat.shape[:-1], 1))], axis=-1)
     return ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
+
+
+def _shrunk(rays, factor):
+    """Directions at `factor` times their angles to the z axis."""
+    across = np.linalg.norm(rays[:, :2], axis=1)
+    angle = factor * np.arctan2(across, rays[:, 2])
+    sides = rays[:, :2] * (np.sin(angle) / np.maximum(across, 1e-12))[:, None]
+    return np.column_stack([sides, np.cos(angle)])
 
 
 def _basis(one, other):

@@ -36,6 +36,9 @@ from .motion_fit import MotionFit, thrown_motion
 LOOPS = LONGEST_LOOP
 """The most frames of a clip in which a camera that comes back closes a loop: tracks stay whole."""
 
+_NEAR = 0.05
+"""Of log f: an earlier fit that is farther from known focal lengths is no start, as its lens is another."""
+
 _FAR_OFF = 5.0
 """Standard deviations from a known focal length to the one fitted that are no chance."""
 
@@ -137,7 +140,7 @@ def _fitted(given: Given, asked: Asked, throw: bool) -> tuple[MotionFit, Model, 
 def _solved_motion(given, asked):
     """The fit, the model that it is of, and the noise."""
     problem, frames = problem_of(given, asked), given.tracks.frames
-    found = _from_nothing(given, asked, problem) if given.begin is None else _from(given, asked, problem)
+    found = (_from if _begins_near(given) else _from_nothing)(given, asked, problem)
     parts, missed, model, noise = in_stages(problem.data, *found, problem.scene)
     parts["fit"] = eqx.tree_at(lambda fit: fit.frame_rms, parts["fit"], parts["fit"].frame_rms[:frames])
     residual = jnp.full(np.shape(given.tracks.mask), jnp.nan)
@@ -162,9 +165,17 @@ def _from_nothing(given, asked, problem):
     if not all(np.array_equal(getattr(few, of), getattr(problem, of)) for of in ("shot", "linked")):
         few = problem  # what links two parts of a shot is missing
     by_frame = views_by_frame(few.piece, few.moment, len(few.data.log_focal))
-    paths, spreads = _started(few.data, by_frame)
+    paths, spreads = _started(few.data, by_frame, jnp.asarray(_parts_of(few)))
     found = begun(few.data, paths, spreads, asked.zoom, asked.shift, asked.distortion_model, asked.terms)
     return found if few is problem else with_all(few.data, problem.data, *found)
+
+
+def _begins_near(given):
+    """Whether there is an earlier fit, and known focal lengths do not say that its scale is another."""
+    if given.begin is None or given.focal is None or len(given.focal) != len(given.begin.focal):
+        return given.begin is not None
+    off = np.log(np.asarray(given.focal, float) / np.asarray(given.begin.focal))
+    return not np.isfinite(off).any() or abs(np.nanmedian(off)) < _NEAR
 
 
 def _from(given, asked, problem):
@@ -269,12 +280,26 @@ def _with_model(fit: MotionFit, model: Model, problem: Problem) -> MotionFit:
 
 
 @eqx.filter_jit
-def _started(data, by_frame):
-    """The best chains of frames, scaled to focal lengths that are known, and their residuals' medians."""
+def _started(data, by_frame, part):
+    """The best chains of frames, scaled to focal lengths that are known, and their residuals' medians.
+
+    Each part that tracks link is scaled to those of its own frames; others as all of them are.
+    """
     paths, spreads = starts_of(data.points, data.structure.tracks, 1.6 * data.scale, by_frame)
+    track, frame = data.structure.track, data.structure.frame
+    of_track = jnp.zeros(data.structure.tracks, int).at[track].max(jnp.where(data.there, part[frame], 0))
 
     def to_known(path):
         off = jnp.where(jnp.isinf(data.log_std), jnp.nan, data.log_focal - path.log_focal)
-        return scaled(path, jnp.nan_to_num(jnp.nanmedian(off)))
+        seen = jnp.isfinite(off)
+        sums = [jax.ops.segment_sum(of, part, len(part)) for of in (jnp.where(seen, off, 0), 1.0 * seen)]
+        mean = jnp.where(sums[1] > 0, sums[0] / sums[1], jnp.nan_to_num(jnp.nanmedian(off)))
+        return scaled(path, mean[part], mean[of_track])
 
     return jax.vmap(to_known)(paths), spreads
+
+
+def _parts_of(problem):
+    """The number of each frame's part, as tracks link them, of all frames with those that fill up."""
+    more = len(problem.data.log_focal) - len(problem.linked)
+    return np.pad(np.maximum(problem.linked, 0), (0, more))
