@@ -143,20 +143,23 @@ def _of_turning(fit: MotionFit, known: tuple[np.ndarray, np.ndarray] | None) -> 
 
 
 def _of_parts(fit: MotionFit) -> Iterator[Finding]:
-    """Scenes whose focal lengths have no scale, beside others that have one: none links them."""
+    """Scenes whose focal lengths have a looser scale than others, as nothing but the lens links them."""
     focal, std, scene = (np.asarray(of) for of in (fit.focal, fit.focal_std, fit.scene))
     seen = np.isfinite(focal) & (scene >= 0)
-    numbers = np.unique(scene[seen]).tolist()
-    own = [np.median((std / focal)[seen & (scene == number)]) for number in numbers]
-    loose = [number for number, of in zip(numbers, own, strict=True) if not of < _NO_SCALE]
-    if not loose or len(loose) == len(numbers):
+    numbers = np.unique(scene[seen])
+    own = np.array([np.median((std / focal)[seen & (scene == number)]) for number in numbers.tolist()])
+    loose = ~(own <= _LOOSE_SCALE)
+    if is_relative(fit) or not loose.any() or loose.all():
         return
-    frames = np.flatnonzero(seen & np.isin(scene, loose))
+    frames = np.flatnonzero(seen & np.isin(scene, numbers[loose]))
+    worst = float(np.max(np.nan_to_num(own, nan=np.inf)))
+    open_ = not worst < _NO_SCALE
+    known = "is not determined" if open_ else f"is known to {worst:.1%} only"
     yield Finding(
         "turning",
-        "doubtful" if len(frames) <= _BLIND * np.sum(seen) else "not determined",
-        f"in {len(frames)} of the frames, the first of them {frames[0]}, the camera hardly turns, and "
-        "nothing joins them to the others: the scale of their focal lengths is not determined.",
+        "not determined" if open_ and len(frames) > _BLIND * np.sum(seen) else "doubtful",
+        f"in {len(frames)} of the frames, the first of them {frames[0]}, the camera hardly turns, and cuts "
+        f"part them from the others: the scale of their focal lengths {known}.",
         "Cut these frames off, or give the focal length of one in each such shot (--known-focal).",
     )
 
