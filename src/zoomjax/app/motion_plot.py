@@ -77,6 +77,6 @@ def _residuals(axes: Axes, fit: MotionFit) -> None:
     axes.set(
         xlabel="distance of a tracked point from the model, px",
         ylabel="share of points",
-        title=f"Residuals of tracked points (dashed: noise of {noise:.2f} px alone)",
+        title=f"Residuals (dashed: noise of {noise:.2f} px alone)",
         ylim=(0, 1),
     )
