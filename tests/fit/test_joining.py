@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from zoomjax import PolynomialZoom, ZoomLens
 from zoomjax.fit import fit_motion
-from zoomjax.fit.joining import Matches, joined, key_frames, turn_between
+from zoomjax.fit.joining import Matches, frames_apart, join_shots, turn_between
 from zoomjax.scenes import motion_tracks
 from zoomjax.tracks import Tracks
 
@@ -103,7 +103,7 @@ def test_a_shot_is_turned_to_where_it_looks(tracks, real):
     assert turn is not None
     assert turn.shots == (0, 1)
     assert turn.agree > 60
-    found = joined(fit, tracks, [turn])
+    found = join_shots(fit, tracks, [turn])
     assert off(found).max() < 0.03
     np.testing.assert_array_equal(found.scene, 0)
     np.testing.assert_array_equal(found.shot, fit.shot)
@@ -120,10 +120,10 @@ def test_a_shot_whose_f_is_off_is_joined_and_its_f_made_to_agree(tracks, real, f
     turn = turn_between(fit, [matched(*pair) for pair in FAR_APART], 36)
     assert turn is not None
     assert turn.factor == pytest.approx(-factor, abs=0.004)
-    start = joined(fit, tracks, [turn], scaled=True)
+    start = join_shots(fit, tracks, [turn], scaled=True)
     np.testing.assert_allclose(start.focal, truth()[0], rtol=0.004)
     assert off(start).max() < 0.1
-    np.testing.assert_array_equal(joined(fit, tracks, [turn]).focal, fit.focal)
+    np.testing.assert_array_equal(join_shots(fit, tracks, [turn]).focal, fit.focal)
 
 
 def test_shots_are_joined_by_way_of_others(tracks, real):
@@ -131,9 +131,49 @@ def test_shots_are_joined_by_way_of_others(tracks, real):
     turn = turn_between(fit, [matched(*pair) for pair in FAR_APART], 36)
     back = turn._replace(shots=(1, 0), rotation=turn.rotation.T, factor=-turn.factor)
     for turns in ([turn], [back], [back, turn._replace(agree=1, rotation=np.eye(3))]):
-        found = joined(fit, tracks, turns)
+        found = join_shots(fit, tracks, turns)
         assert off(found).max() < 0.03
         np.testing.assert_allclose(found.rotation[0], np.eye(3), atol=1e-12)
+
+
+MIDDLE = 16
+
+
+def in_three_shots(tracks, real, factor):
+    """A fit with another cut, from where directions and, by a factor, f are unknown; and its tracks."""
+    fit = fitted(real, factor, std=0.03)
+    shot = np.digitize(np.arange(FRAMES), [CUT, MIDDLE])
+    rotation = np.array(fit.rotation)
+    rotation[MIDDLE:] = rotation[MIDDLE:] @ rotation[MIDDLE].T
+    number, frame, points = tracks.views()
+    number = 3 * number + (frame >= MIDDLE)
+    twice = np.unique(number, return_inverse=True, return_counts=True)
+    kept = twice[2][twice[1]] > 1
+    parted = Tracks.from_arrays(number[kept], frame[kept], points[kept], image_size=SIZE, frames=FRAMES)
+    values = jnp.asarray(rotation), jnp.asarray(shot), jnp.asarray(shot), jnp.ones((len(parted.mask), 3))
+    of = lambda fit: (fit.rotation, fit.shot, fit.scene, fit.rays)  # noqa: E731
+    return eqx.tree_at(of, fit, values), parted
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.03])
+@pytest.mark.parametrize("order", [1, -1])
+def test_three_shots_are_joined_one_after_the_other(tracks, real, factor, order):
+    fit, parted = in_three_shots(tracks, real, factor)
+    pairs = [FAR_APART[:2], ((13, 17), (15, 16), (14, 18))]
+    turns = [turn_between(fit, [matched(*pair) for pair in some], 36) for some in pairs]
+    assert [turn.shots for turn in turns] == [(0, 1), (1, 2)]
+    found = join_shots(fit, parted, turns[::order], scaled=True)
+    np.testing.assert_array_equal(found.scene, 0)
+    assert off(found).max() < 0.15
+    np.testing.assert_allclose(found.focal, truth()[0], rtol=0.006)
+    alone = join_shots(fit, parted, turns[1:])
+    np.testing.assert_array_equal(alone.scene, fit.shot > 0)
+
+
+def test_a_turn_of_another_fit_is_refused(tracks, real):
+    turn = turn_between(fitted(real), [matched(*pair) for pair in FAR_APART], 36)
+    with pytest.raises(ValueError, match="give what shot_turns finds for this fit"):
+        join_shots(fitted(real), tracks, [turn._replace(shots=(0, 2))])
 
 
 def still(number=120):
@@ -163,10 +203,10 @@ def test_what_says_nothing_joins_nothing(real, kind):
     assert turn_between(fitted(real), matches, 36) is None
 
 
-def test_key_frames_are_far_apart(real):
+def test_frames_that_are_compared_are_far_apart(real):
     fit = fitted(real)
-    frames = key_frames(fit, 0, 4)
+    frames = frames_apart(fit, 0, 4)
     assert len(frames) == 4
     assert {0, 11} <= set(frames)
     assert np.diff(frames).min() > 1
-    assert set(key_frames(fit, 1, 100)) == set(range(CUT, FRAMES))
+    assert set(frames_apart(fit, 1, 100)) == set(range(CUT, FRAMES))

@@ -16,10 +16,11 @@ import numpy as np
 
 from .._core.text import with_std
 from ..detect.batch import Detection
-from ..fit.joining import joined
+from ..fit.joining import join_shots
 from ..fit.motion import LOOPS, fit_motion
 from ..fit.motion_fit import MotionFit
 from ..fit.result import RESULTS
+from ..fit.shots import linked_well, shot_turns
 from ..fit.zoom import CentreArgument
 from ..io.video_reader import decode_video
 from ..lines.lines import Lines
@@ -28,13 +29,13 @@ from ..models.lens import ZoomLens
 from ..models.registry import distortion_model_name
 from ..models.zoom import PolynomialZoom
 from ..tracks.again import find_again
+from ..tracks.key_frames import KeyFrames
 from ..tracks.tracks import Tracks
 from ..trust.assessment import VERDICTS, Finding, Verdict
 from ..trust.bands import displacement_std
 from ._flags import with_flags
 from .clip_lines import MOST, draw_frames, frames_with_lines, image_rows, lines_of_frames
 from .coefficients import coefficient_rows, finite, pixel_polynomials
-from .joined_shots import linked_well, turns_of_shots
 from .known_focals import KnownFocals
 from .model_choice import WantedModel
 from .motion_figures import (
@@ -367,10 +368,10 @@ def calibrate_motion(
     turns = []
     if fit.shot.max() > 0 and fit.fit.result == RESULTS.successful:
         stage("Joining shots of the same scene")
-        turns = turns_of_shots(clip, fit, tracks)
+        turns = shot_turns(fit, tracks, functools.partial(KeyFrames, clip))
     if turns:
-        begin = joined(fit, tracks, turns, scaled=True)
-        fit = joined(fit, tracks, turns)
+        begin = join_shots(fit, tracks, turns, scaled=True)
+        fit = join_shots(fit, tracks, turns)
     if tracks.frames <= LOOPS and fit.fit.result == RESULTS.successful:
         stage("Finding points again where the camera comes back")
         more = linked_well(find_again(clip, tracks, carry=begin.carried), fit)

@@ -21,6 +21,8 @@ from .focal_fit import fit_focal as fit_focal
 from .focal_lengths import with_focal_sigma as with_focal_sigma
 from .frames import fit_frames as fit_frames
 from .image_metric import in_image as in_image
+from .joining import Turn as Turn
+from .joining import join_shots as join_shots
 from .many_fits import many as many
 from .motion import fit_motion as fit_motion
 from .motion_fit import MotionFit as MotionFit
@@ -32,5 +34,6 @@ from .result import FrameFits as FrameFits
 from .result import ZoomFit as ZoomFit
 from .robust import RobustFit as RobustFit
 from .robust import fit_robust as fit_robust
+from .shots import shot_turns as shot_turns
 from .straightness import frame_rms as frame_rms
 from .zoom import fit_zoom as fit_zoom

@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaln
 
+from .._core.arguments import kinds_checked
 from ..tracks.tracks import Tracks
 from ._structure import bucket
 from .motion_fit import MotionFit
@@ -76,7 +77,7 @@ class Turn(NamedTuple):
     factor: float
 
 
-def key_frames(fit: MotionFit, shot: int, most: int) -> list[int]:
+def frames_apart(fit: MotionFit, shot: int, most: int) -> list[int]:
     """Some frames of a shot that differ most in where the camera looks and in zoom."""
     focal = np.asarray(fit.focal)
     members = np.flatnonzero((np.asarray(fit.shot) == shot) & np.isfinite(focal))
@@ -111,15 +112,19 @@ def turn_between(fit: MotionFit, matches: Sequence[Matches], compared: int) -> T
     return Turn((numbers[0], numbers[1]), pair.frames, int(agree), rotation, float(factor))
 
 
-def joined(fit: MotionFit, tracks: Tracks, turns: Sequence[Turn], *, scaled: bool = False) -> MotionFit:
+@kinds_checked
+def join_shots(fit: MotionFit, tracks: Tracks, turns: Sequence[Turn], *, scaled: bool = False) -> MotionFit:
     """The fit with shots in one scene between which turns lead, by those in which most points agree.
 
     Args:
         fit: of the clip.
         tracks: to which it was fitted.
-        turns: between shots.
+        turns: between shots, by `shot_turns`.
         scaled: whether f of the shots are made to agree, too: as a start of another fit, as neither the
             lens nor a standard deviation is changed.
+
+    Raises:
+        ValueError: a turn is of a shot that the fit does not have.
     """
     shot, scene = np.asarray(fit.shot), np.asarray(fit.scene)
     numbers, first = np.unique(shot, return_index=True)
@@ -129,6 +134,11 @@ def joined(fit: MotionFit, tracks: Tracks, turns: Sequence[Turn], *, scaled: boo
         if number >= 0
     }
     for turn in sorted(turns, key=lambda turn: -turn.agree):
+        if not poses.keys() >= set(turn.shots):
+            raise ValueError(
+                f"Argument turns is of shots {turn.shots}, but those of the fit are {sorted(poses)}: give "
+                "what shot_turns finds for this fit."
+            )
         one, other = (poses[number] for number in turn.shots)
         if one.scene == other.scene:
             continue

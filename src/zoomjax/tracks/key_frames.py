@@ -41,10 +41,19 @@ Points = Float[np.ndarray, "point 2"]
 
 
 class KeyFrames:
-    """Some frames of a clip, and what is found in them; the images are kept small."""
+    """Some frames of a clip, and what is found in them; the images are kept small.
+
+    Args:
+        clip: a video that PyAV decodes.
+        frames: the numbers of some of those that can be decoded, from 0, as tracks number them.
+
+    Raises:
+        FileNotFoundError: there is no such clip.
+        ValueError: it is no video, or does not have these frames.
+    """
 
     def __init__(self, clip: str | os.PathLike[str], frames: Iterable[int]):
-        """Of a clip, the frames of these numbers, from 0."""
+        """Decode the frames and look for points in them."""
         wanted, sift = set(frames), cv2.SIFT_create(nfeatures=_MOST)  # pyright: ignore[reportAttributeAccessIssue]
         self._points: dict[int, Points] = {}
         self._looks: dict[int, np.ndarray] = {}
@@ -63,6 +72,11 @@ class KeyFrames:
                 self._points[frame] = (points + 0.5) * factor - 0.5
                 self._looks[frame] = np.zeros((0, 128), np.float32) if looks is None else looks
                 self._images[frame] = small
+        if missing := sorted(wanted - self._images.keys()):
+            raise ValueError(
+                f"Argument frames has {missing[0]}, but {os.fspath(clip)} has no such frame, or it cannot "
+                "be decoded."
+            )
 
     def matches(self, one: int, other: int) -> tuple[Points, Points]:
         """Points of one frame and points of another that look like them, px."""

@@ -1,5 +1,7 @@
 """Rendered clips with a cut: shots of one scene are joined, and others are not."""
 
+from functools import partial
+
 import cv2
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,11 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import zoomjax as zj
-from zoomjax.app.joined_shots import linked_well, turns_of_shots
 from zoomjax.app.motion_calibration import calibrate_motion
 from zoomjax.app.panorama import write_panorama
+from zoomjax.fit import RESULTS, shot_turns
+from zoomjax.fit.shots import linked_well
 from zoomjax.scenes import leaves, motion_clip
-from zoomjax.tracks import Tracks, track_video
+from zoomjax.tracks import KeyFrames, Tracks, track_video
 
 from .._clips import write_frames
 
@@ -103,8 +106,43 @@ def test_the_panorama_shows_both_shots_and_is_sharp(done, folder):
 def test_shots_of_different_scenes_are_not_joined(done, folder, caption):
     clip = rendered(folder / f"other-{caption}.mp4", (0, 5), caption=caption)
     apart = eqx.tree_at(lambda fit: fit.scene, done.fit, done.fit.shot)
-    assert len(turns_of_shots(done.clip, apart, done.tracks)) == 1
-    assert turns_of_shots(clip, apart, done.tracks) == []
+    assert len(shot_turns(apart, done.tracks, partial(KeyFrames, done.clip))) == 1
+    assert shot_turns(apart, done.tracks, partial(KeyFrames, clip)) == []
+
+
+class Nothing:
+    """What frames show in which nothing is found; keeps their numbers."""
+
+    def __init__(self, frames):
+        self.frames = list(frames)
+
+    def matches(self, one, other):
+        assert {one, other} <= set(self.frames)
+        return np.zeros((0, 2)), np.zeros((0, 2))
+
+    def alike(self, *_):
+        raise AssertionError("nothing matches")
+
+
+def test_of_many_shots_the_longest_are_compared(done):
+    shot = np.repeat(np.arange(45), np.where(np.arange(45) % 3 == 0, 1, 4))
+    fit, number = done.fit, len(shot)
+    values = fit.focal[0], fit.focal_std[0], fit.rotation[0]
+    values = [jnp.broadcast_to(of, (number, *jnp.shape(of))) for of in values]
+    values[0] = values[0] * jnp.linspace(1, 2, number)
+    of = lambda fit: (fit.focal, fit.focal_std, fit.rotation, fit.shot, fit.scene)  # noqa: E731
+    fit = eqx.tree_at(of, fit, (*values, jnp.asarray(shot), jnp.asarray(shot)))
+    looks = []
+    assert shot_turns(fit, done.tracks, lambda frames: looks.append(Nothing(frames)) or looks[0]) == []
+    compared = shot[looks[0].frames]
+    assert np.unique(compared).tolist() == [n for n in range(45) if n % 3]
+    assert np.bincount(compared).max() == 2
+
+
+def test_without_a_scale_nothing_is_compared(done):
+    of = lambda fit: fit.fit.result  # noqa: E731
+    fit = eqx.tree_at(of, done.fit, RESULTS.undetermined)
+    assert shot_turns(fit, done.tracks, lambda _: pytest.fail("compared")) == []
 
 
 def test_few_tracks_do_not_hold_one_shot_to_another(done):
