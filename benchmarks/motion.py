@@ -21,6 +21,11 @@ frames, and the error over its standard deviation is the RMS over the draws.
 `rendered`: clips of 1080p and 150 frames, rendered from photographs and encoded as H.264, through the
 command line alone, `zoomjax calibrate clip.mp4`.
 
+`shots`: clips with a cut, rendered: f of the second shot, fitted by itself and as the command line fits it,
+which joins shots of one scene; and by how much the turn across the cut is off.
+
+`tracking`: frames a second of `track_video`, and of decoding alone.
+
 `broadcast`: the real frames of a broadcast in the shared data, beside the focal lengths that the pitch
 tells; --panorama FILE writes what they look like put together.
 
@@ -44,8 +49,9 @@ import jax
 
 from .motion_broadcast import broadcast
 from .motion_cameras import real
-from .motion_clips import rendered
+from .motion_clips import rendered, tracking
 from .motion_rivals import rivals
+from .motion_shots import shots
 from .motion_simulated import Rows, simulated, timed
 from .shared import RESULTS as FOLDER
 from .shared import machine, machine_line, table, write
@@ -108,6 +114,23 @@ SECTIONS = {
             *(f"{r['noise']:.2f}", f"{100 * r['follow']:.0f}"),
         ],
     ),
+    "shots": Section(
+        "Shots across a cut",
+        ("frames", "joined", "f alone, %", "its sd", "f, %", "its sd", "turn across the cut, °"),
+        lambda r: [
+            *(str(r["frames"]), "yes" if r["scenes"] == 1 else "no"),
+            *(_percent(r["alone_f"]), _percent(r["alone_f_bound"])),
+            *(_percent(r["f"]), _percent(r["f_bound"]), _px(r["rotation"])),
+        ],
+    ),
+    "tracking": Section(
+        "Tracking",
+        ("frames", "seconds", "frames a second", "decoding alone", "tracks", "views"),
+        lambda r: [
+            *(str(r["frames"]), f"{r['seconds']:.1f}", f"{r['frames'] / r['seconds']:.1f}"),
+            *(f"{r['frames'] / r['decoding']:.0f}", f"{r['tracks']:,}", f"{r['views']:,}"),
+        ],
+    ),
     "broadcast": Section(
         "Frames of a broadcast",
         ("frames", "turned, °", "f, px", "sd", "from the pitch, px", "sd", "frames with it", "in bands, %"),
@@ -157,6 +180,8 @@ def _measured(name: str, options: argparse.Namespace, found: dict[str, list[dict
         "simulated": lambda: simulated(options.clips, options.only, found),
         "real": lambda: real(options.data, options.only, options.draws, found),
         "rendered": lambda: rendered(options.only),
+        "shots": lambda: shots(options.only),
+        "tracking": lambda: tracking(options.only),
         "broadcast": lambda: broadcast(options.data, options.only, options.panorama),
         "rivals": lambda: rivals(options.only),
         "time": lambda: timed(options.only),

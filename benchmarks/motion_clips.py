@@ -16,7 +16,9 @@ import skimage.data
 import skimage.util
 
 from zoomjax import ZoomLens, load_lens
+from zoomjax.io.video_reader import decode_video
 from zoomjax.scenes import MotionClip, motion_clip, pan_and_zoom
+from zoomjax.tracks import track_video
 
 from .motion_simulated import Rows, displaced, random_lens, wide
 
@@ -44,6 +46,39 @@ def rendered(only: str, frames: int = 150) -> Rows:
             place = Path(folder)
             write_video(place / "clip.mp4", clip.frames())
             yield kind, _calibrated(place, clip)
+
+
+def tracking(only: str, frames: int = 150) -> Rows:
+    """Seconds in which points are followed through a rendered clip: the median of three runs."""
+    name = "1080p, photographs"
+    if only not in name:
+        return
+    lens = random_lens(0, 1200.0, 4.0)
+    focal, rotation = pan_and_zoom(lens, frames, pan=30, tilt=5, seed=0)
+    clip = motion_clip(lens, focal, rotation, texture=photographs(), noise=2)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "clip.mp4"
+        write_video(path, clip.frames())
+        seconds, decoding = [], []
+        for _ in range(3):
+            begin = time.perf_counter()
+            tracks = track_video(path)
+            middle = time.perf_counter()
+            with decode_video(path) as (_, items):
+                for _, _, image in items:
+                    image()
+            seconds.append(middle - begin)
+            decoding.append(time.perf_counter() - middle)
+    yield (
+        name,
+        {
+            "frames": frames,
+            "seconds": float(np.median(seconds)),
+            "decoding": float(np.median(decoding)),
+            "tracks": len(tracks.number),
+            "views": int(np.sum(np.asarray(tracks.mask))),
+        },
+    )
 
 
 def photographs() -> np.ndarray:

@@ -458,6 +458,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "motion-rendered": motion("Rendered clips"),
     "motion-broadcast": motion("Frames of a broadcast"),
     "motion-rivals": motion("Rivals"),
+    "motion-shots": motion("Shots across a cut"),
+    "motion-tracking": motion("Tracking"),
     "motion-time": motion("Time"),
 }
 """What makes each table, by the name in its marker."""

@@ -191,6 +191,21 @@ def test_options_have_their_effect(clip, calibrated):
     assert "No focal lengths" not in done.stderr
 
 
+def test_a_clip_takes_another_distortion_model(clip, calibrated):
+    options = ["--distortion-model", "division", "--terms", "1", "--degree", "1", "--quiet"]
+    done = zoomjax("calibrate", clip.name, *options, "-o", "division", cwd=clip.parent)
+    assert done.returncode == 0, done.stderr
+    first, other = (zj.load_lens(clip.parent / place / "lens.json") for place in ("out", "division"))
+    assert other.distortion_model == zj.models.Division()
+    assert json.loads((clip.parent / "division" / "summary.json").read_text())["distortion_model"] == (
+        "division"
+    )
+    points = np.array([[0, 0], [639, 0], [100, 300]])
+    moved = [np.asarray(of(600.0).undistort(points)) - points for of in (first, other)]
+    np.testing.assert_allclose(*moved, atol=1.5)
+    assert np.hypot(*moved[1].T).max() > 5
+
+
 TRIED = "No focal lengths are given (--focal): they and the lens are found from how clip.mp4 moves.\n"
 
 
@@ -266,9 +281,72 @@ def test_one_known_focal_length_gives_the_scale_that_a_still_camera_leaves_open(
     assert abs(found["focal"] / focal - 1).max() < 0.005
 
 
+def draw_board(image, focal, rotation):
+    """A checkerboard of 9 x 6 squares that stands in the scene, turned by 35 degrees about the vertical."""
+    x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    distortion = lens()(float(focal))
+    straight = np.asarray(distortion.undistort(np.stack([x, y], -1).reshape(-1, 2).astype(float)))
+    ahead = np.column_stack([(straight - np.asarray(distortion.centre)) / focal, np.ones(len(straight))])
+    rays = ahead @ rotation
+    across = np.array([np.cos(np.radians(35)), 0, np.sin(np.radians(35))])
+    normal = np.array([-across[2], 0, across[0]])
+    board = rays * (normal[2] / (rays @ normal))[:, None] - [0, 0, 1]
+    u, v = board @ across / 0.037, board[:, 1] / 0.037
+    dark = (np.floor(u) + np.floor(v)) % 2 == 1
+    inside = (abs(u + 0.5) < 4.5) & (abs(v) < 3)
+    near = (abs(u + 0.5) < 5) & (abs(v) < 3.5)
+    grey = np.where(inside & dark, 20, 230)[:, None]
+    drawn = np.where(near[:, None], grey, image.reshape(-1, 3)).reshape(image.shape)
+    return cv2.GaussianBlur(drawn.astype(np.uint8), (0, 0), 0.7)
+
+
+@pytest.mark.slow
+def test_a_board_in_the_frames_gives_the_scale_that_a_still_camera_leaves_open(tmp_path):
+    focal, rotation = path()[0], np.broadcast_to(np.eye(3), (FRAMES, 3, 3))
+    frames = motion_clip(lens(), focal, rotation, noise=2).frames()
+    write_clip(
+        tmp_path / "clip.mp4", [draw_board(im, f, np.eye(3)) for im, f in zip(frames, focal, strict=True)]
+    )
+    lines = [
+        "--lines",
+        "--detector",
+        "grid",
+        "--frames",
+        12,
+        "--overlays",
+        "none",
+        "--known-focal",
+        "plane",
+    ]
+    plan = zoomjax("calibrate", "clip.mp4", *lines, "--dry-run", "-o", "out", cwd=tmp_path)
+    assert "whose plane tells f" in " ".join(plan.stdout.split())
+    done = zoomjax("calibrate", "clip.mp4", *lines, "-o", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    summary = summary_of(tmp_path / "out")
+    assert summary["focal_scale"] == "absolute"
+    assert len(summary["known_focal"]) > 6
+    assert summary["focal_scale_std"] < 0.03
+    found = track(tmp_path / "out")
+    assert abs(found["focal"] / focal - 1).max() < 0.03
+    assert (abs(found["focal"] - focal) < 4 * found["sigma"]).all()
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
+        (["--known-focal", "plane"], "--known-focal plane needs --lines --detector grid"),
+        (
+            ["--known-focal", "pitch", "--lines", "--detector", "grid"],
+            "--known-focal pitch needs --lines --detector pitch",
+        ),
+        (
+            ["--known-focal", "plane", "--known-focal", "9@0", "--lines", "--detector", "grid"],
+            "--known-focal plane stands by itself",
+        ),
+        (
+            ["--known-focal", "plane", "--lines", "--detector", "grid", "--pixel-pitch", "0.01"],
+            "have no effect with --known-focal plane",
+        ),
         (["--known-focal", "24@0"], "give --pixel-pitch"),
         (["--known-focal", "700@36", "--focal-unit", "px"], "frame 36, which the clip does not have"),
         (["--focal-sigma", "1%"], "--focal-sigma has no effect with --focal motion"),
@@ -422,6 +500,12 @@ def test_a_dry_run_writes_nothing(clip):
         (["a.jpg"], {}, "one video"),
         (["a.mp4", "b.mp4"], {}, "one video"),
         (["a.mp4"], {"centre": (3.0, 4.0)}, "--centre is fit or image"),
+        (["a.mp4"], {"model": WantedModel(distortion_model="auto")}, "--distortion-model names one"),
+        (
+            ["a.mp4"],
+            {"model": WantedModel(distortion_model="brown-conrady"), "lines": True},
+            "With --lines, --distortion-model is radial or division",
+        ),
     ],
 )
 def test_mistakes_are_told(tmp_path, inputs, options, message):

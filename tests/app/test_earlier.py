@@ -1,5 +1,6 @@
 """Another fit to the lines of a folder of results: what its summary knows of them."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -113,6 +114,30 @@ def test_focal_lengths_of_other_lines_are_not_taken(results):
         lines.to_ragged(), lines.frame, [24.0, 25.0, 60.0], image_size=lines.image_size
     )
     assert earlier_of([folder / "lines.npz"], other).sigma is None
+
+
+def test_that_focal_lengths_are_relative_stays_with_the_lens(results):
+    folder, lines, _ = results
+    lens = zj.load_lens(folder / "lens.json")
+    dataclasses.replace(lens, about={"focal": "relative"}).save(folder / "lens.json")
+    for name in ("lens.json", "summary.json", "lines.npz"):
+        assert (folder / name).exists()
+    (folder / "out").mkdir()
+    done = calibrate_lines(
+        lines,
+        folder / "out",
+        lambda _: None,
+        model=WantedModel("polynomial", degree=1),
+        centre="image",
+        focal_sigma=None,
+        robust=False,
+        files=[folder / "lines.npz"],
+        names=[],
+    )
+    assert done.assessment.verdict == "not determined"
+    assert zj.load_lens(folder / "out" / "lens.json").about["focal"] == "relative"
+    assert json.loads((folder / "out" / "summary.json").read_text())["focal_scale"] == "relative"
+    assert "whose focal lengths are relative" in (folder / "out" / "report.html").read_text("utf-8")
 
 
 @pytest.mark.slow

@@ -245,6 +245,14 @@ def test_a_lens_beside_lines_that_is_not_theirs_says_nothing(lens, tmp_path):
         assert with_earlier(lens, files) is lens, files
 
 
+def test_relative_focal_lengths_stay_so_and_are_not_mixed_with_others(lens, tmp_path):
+    relative = dataclasses.replace(lens, about={"focal": "relative"})
+    files = [results(tmp_path / "a", relative), results(tmp_path / "b", lens)]
+    assert with_earlier(lens, files[:1]).about == {"focal": "relative"}
+    with pytest.raises(ValueError, match=r"lines\.npz is of a clip whose focal lengths are relative"):
+        with_earlier(lens, files)
+
+
 def test_a_focal_length_that_is_not_known_stays_so(lens, tmp_path):
     one = dataclasses.replace(lens, focal_range=np.ones(2))
     unknown = dataclasses.replace(one, about={"focal": "not known"})

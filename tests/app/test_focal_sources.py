@@ -11,6 +11,7 @@ from zoomjax import scenes
 from zoomjax.app.board_focals import Board
 from zoomjax.app.focal_sources import check_source, choose_focals
 from zoomjax.app.image_job import ImageJob
+from zoomjax.app.relative import NOTE
 from zoomjax.detect.batch import Detection, detect
 from zoomjax.detect.sources import Source
 
@@ -235,3 +236,10 @@ def test_a_pitch_is_a_source_that_needs_its_detector(video):
         ImageJob(("a.mp4" if video else "a.jpg",), detector="edges", focal="pitch")
     job = ImageJob(("a.mp4" if video else "a.jpg",), detector="pitch", focal="pitch" if video else None)
     assert job.grid == "none"
+
+
+@pytest.mark.parametrize("video", [False, True])
+def test_a_track_of_relative_focal_lengths_is_refused(tmp_path, video):
+    (tmp_path / "track.csv").write_text(f"{NOTE}\nframe,seconds,focal,sigma\n0,0,900,2\n")
+    with pytest.raises(ValueError, match=r"track\.csv are relative: .* --lines, or give it a known focal"):
+        check_source(str(tmp_path / "track.csv"), None, video=video)

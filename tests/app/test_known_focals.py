@@ -1,10 +1,14 @@
 """Focal lengths of some frames that the user knows, for a calibration from motion."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from zoomjax.app.known_focals import USUAL_STD, known_focals
+from zoomjax.app.focal_sources import choose_focals
+from zoomjax.app.known_focals import USUAL_STD, known_focals, measured_focals
 from zoomjax.app.relative import NOTE, is_relative_track
+from zoomjax.detect import Detection, GridDetector
 
 
 def test_a_focal_length_and_its_frame():
@@ -79,3 +83,28 @@ def test_relative_focal_lengths_are_none_that_are_known(tmp_path, encoding):
     assert is_relative_track(tmp_path)
     (tmp_path / "track.csv").write_text("frame,focal,sigma\n0,900,2\n", encoding=encoding)
     assert not is_relative_track(tmp_path)
+
+
+def view(number, focal, tilt):
+    """A grid seen obliquely, without distortion, in a frame of this number."""
+    row, column = np.mgrid[:8, :12].astype(float)
+    x, y = (column - 5.5) / 12, (row - 3.5) / 12
+    depth = 1.3 * focal / 1000 + np.sin(tilt) * x
+    seen = np.array([535.5, 355.5]) + focal * np.stack([np.cos(tilt) * x, y], -1) / depth[..., None]
+    name = f"a-clip-{number:06d}.jpg"
+    return Detection(name, name, (1072, 712), tuple(GridDetector.lines(seen)), None, seen)
+
+
+def test_frames_of_a_board_count_as_one_measurement():
+    rng = np.random.default_rng(0)
+    seen = [view(n, f, tilt) for n, f, tilt in ((30, 1500.0, -0.6), (4, 1000.0, 0.5), (12, 1200.0, 0.6))]
+    noisy = [dataclasses.replace(of, nodes=of.nodes + rng.normal(0, 0.3, of.nodes.shape)) for of in seen]
+    empty = Detection("a-clip-000020.jpg", "a-clip-000020.jpg", (1072, 712), ())
+    known = measured_focals([*noisy, empty], "plane")
+    np.testing.assert_array_equal(known.frame, [4, 12, 30])
+    np.testing.assert_allclose(known.focal, [1000, 1200, 1500], rtol=0.03)
+    single = choose_focals(noisy, "plane").deviation
+    own = [single[f"a-clip-{number:06d}.jpg"] for number in (4, 12, 30)]
+    np.testing.assert_allclose(known.std, np.sqrt(3) * np.array(own), rtol=1e-9)
+    with pytest.raises(ValueError, match="No focal length found for any image"):
+        measured_focals([view(1, 1000.0, 0.0)], "plane")

@@ -75,10 +75,11 @@ KnownFocal = Annotated[
     list[str] | None,
     typer.Option(
         "--known-focal",
-        metavar="F@FRAME|CSV",
+        metavar="F@FRAME|CSV|plane|pitch",
         help="With --focal motion: the focal length of a frame, counted from 0, such as 24@0, or a CSV "
         "file with frame,focal[,sigma] of some frames; may be repeated. In mm it needs --pixel-pitch; or "
-        "give --focal-unit px. One is needed where the camera zooms without turning.",
+        "give --focal-unit px. Or what tells it in the frames of --lines: plane, a flat grid seen "
+        "obliquely, or pitch. One is needed where the camera zooms without turning.",
         rich_help_panel=FOCAL,
     ),
 ]

@@ -24,7 +24,7 @@ from ..fit.result import RESULTS, FrameFits, ZoomFit, is_status
 from ..fit.straightness import frame_rms
 from ..fit.zoom import CentreArgument
 from ..lines.lines import Lines
-from ..models.about import UNKNOWN
+from ..models.about import RELATIVE, UNKNOWN
 from ..models.registry import distortion_model_name
 from ..models.zoom import PolynomialZoom
 from ..trust.assessment import NEGLIGIBLE, Assessment, assess
@@ -222,6 +222,7 @@ class Calibration:
                 "points": int(np.sum(np.asarray(self.lines.mask))),
                 "focal_range": [low, high],
                 "focal_known": self.focal_known,
+                "focal_scale": "relative" if lens.about.get("focal") == RELATIVE else "absolute",
                 "focal_unit": lens.focal_unit,
                 "image_size": list(lens.image_size),
                 "result": RESULTS[self.fit.result] or "successful",

@@ -41,10 +41,10 @@ def lines_of_frames(
 
 def frames_with_lines(found: Sequence[Detection], numbers: np.ndarray) -> np.ndarray:
     """The place of each frame that has lines among the frames of these numbers in the file."""
-    return np.searchsorted(numbers, [_number(detection.name) for detection in with_lines(found)])
+    return np.searchsorted(numbers, [frame_number(detection.name) for detection in with_lines(found)])
 
 
-def _number(name: str) -> int:
+def frame_number(name: str) -> int:
     """The number in the file of a frame with a name by `video_frames`."""
     return int(Path(name).stem.rpartition("-")[2])
 
@@ -102,7 +102,7 @@ def draw_frames(
         return
     place = {detection.name: place for place, detection in enumerate(found, start=1)}
     points = {detection.name: detection.lines for detection in found}
-    wanted = {_number(name): name for name in names}
+    wanted = {frame_number(name): name for name in names}
     folder.mkdir()
     with decode_video(clip) as (_, frames):
         for number, _, image in frames:

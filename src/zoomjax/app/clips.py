@@ -33,9 +33,10 @@ class ClipJob:
     Attributes:
         inputs: the clip.
         output: folder of the results.
-        model: the zoom model.
+        model: the zoom model, and the distortion model.
         centre: of distortion: "fit" or "image".
-        known: focal lengths of some frames, as `known_focals` takes them, and what it takes with them:
+        known: focal lengths of some frames, as `known_focals` takes them, or one of its `MEASURED`; and
+            what it takes with them:
         focal_unit, focal_sigma, pixel_pitch: their unit, standard deviation, and px in it.
         lines: whether straight lines in the frames are fitted, too; then also:
         detector: of lines, by name.
@@ -70,18 +71,50 @@ class ClipJob:
         Raises:
             ValueError: there is not one video, or an option has no effect here.
         """
+        from ..models.brown_conrady import BrownConrady
         from .image_job import is_video
 
         if len(self.inputs) != 1 or not is_video(self.inputs[0]):
             raise ValueError("--focal motion is for one video: its motion determines the focal lengths.")
         if self.centre not in ("fit", "image"):
             raise ValueError("With --focal motion, --centre is fit or image: it moves along the zoom.")
+        if self.model.distortion_model == "auto":
+            raise ValueError("With --focal motion, --distortion-model names one: none are compared.")
+        if self.lines and self.model.first_distortion_model == BrownConrady():
+            raise ValueError("With --lines, --distortion-model is radial or division.")
+        self._check_measured()
         self.known_focals()
 
+    def _check_measured(self) -> None:
+        from .known_focals import MEASURED
+
+        asked = [word for word in self.known if word in MEASURED]
+        if not asked:
+            return
+        if len(self.known) > 1:
+            raise ValueError(f"--known-focal {asked[0]} stands by itself: leave the others out.")
+        wanted = MEASURED[asked[0]]
+        if not self.lines or self.detector != wanted:
+            raise ValueError(f"--known-focal {asked[0]} needs --lines --detector {wanted}.")
+        if (self.focal_unit, self.focal_sigma, self.pixel_pitch) != (None, None, None):
+            raise ValueError(
+                "--focal-unit, --focal-sigma and --pixel-pitch have no effect with --known-focal "
+                f"{asked[0]}, which measures px: leave them out."
+            )
+
+    @property
+    def measured(self) -> str | None:
+        """What the frames tell focal lengths by, if they are to."""
+        from .known_focals import MEASURED
+
+        return next((word for word in self.known if word in MEASURED), None)
+
     def known_focals(self) -> "KnownFocals | None":
-        """The focal lengths that are known; None if none are."""
+        """The focal lengths that are known beforehand; None if none are."""
         from .known_focals import known_focals
 
+        if self.measured:
+            return None
         of = {"unit": self.focal_unit, "sigma": self.focal_sigma, "pitch": self.pixel_pitch}
         return known_focals(self.known, **of) if self.known else None
 
@@ -123,6 +156,8 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
             besides = (
                 f", from {len(known.frame)} known focal length{'s' * (len(known.frame) > 1)}" + besides
             )
+        if job.measured:
+            besides += f", whose {job.measured} tells f"
         tell_plan([f"Focal lengths and lens from how {plain(str(clip))} moves{besides}."], job.output)
         return
     if job.by_default and not (show.quiet or show.as_json):
@@ -138,6 +173,10 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
 
             tracks = track_video(clip, progress=progress)
         found = _lines(job, show) if job.lines else ()
+        if job.measured:
+            from .known_focals import measured_focals
+
+            known = measured_focals(found, job.measured)
         with stages(quiet=show.quiet) as stage:
             done = calibrate_motion(
                 clip,

@@ -12,7 +12,7 @@ from ..interop.matching import crop_factor
 from ..io.equipment import FILM, Equipment, read_equipment
 from ..io.metadata import Metadata
 from ..io.photo import read_metadata
-from ..models.about import UNKNOWN
+from ..models.about import RELATIVE, UNKNOWN
 from ..models.lens import ZoomLens, load_lens
 from ..models.smooth import SmoothZoom
 from .earlier import is_of_results
@@ -100,10 +100,11 @@ def with_equipment(lens: ZoomLens, photos: Iterable[Path]) -> ZoomLens:
 def with_earlier(lens: ZoomLens, files: Sequence[Path]) -> ZoomLens:
     """The lens of lines of earlier results, with what those know of it beside its numbers.
 
-    Camera, lens, crop factor and pixel pitch, as far as all agree, and that its focal length is not known.
+    Camera, lens, crop factor and pixel pitch, as far as all agree, and that its focal length is not known,
+    or that its focal lengths are relative.
 
     Raises:
-        ValueError: there are several files, and the focal length of one is not known.
+        ValueError: there are several files, and the focal length of one is not known, or relative.
     """
     found = [_earlier(file, lens) for file in files]
     for file, one in zip(files, found, strict=True):
@@ -111,6 +112,11 @@ def with_earlier(lens: ZoomLens, files: Sequence[Path]) -> ZoomLens:
             raise ValueError(
                 f"{file} is of photos whose focal length is not known: leave it out, or calibrate its "
                 "photo again together with the others, with --focal."
+            )
+        if len(files) > 1 and one is not None and one.about.get("focal") == RELATIVE:
+            raise ValueError(
+                f"{file} is of a clip whose focal lengths are relative: leave it out, or calibrate the "
+                "clip again with a known focal length (--known-focal)."
             )
     known = [one for one in found if one is not None]
     if len(known) < len(files) or not _spans(known, lens):

@@ -31,6 +31,7 @@ from ..models.distortion import Distortion
 from ..models.zoom import PolynomialZoom
 from .board_focals import NOT_THE_BOARD, Board, check_board, focal_of_board
 from .plane_focals import MOST_UNCERTAIN, FocalGroup, Found, Sharing, focals_from_grids
+from .relative import is_relative_track
 
 SOURCES = (
     "one focal length for all (--focal 24), which need not be known (--focal same); a CSV file with the "
@@ -106,6 +107,11 @@ def check_source(source: str | None, board: Board | None, *, video: bool) -> Non
             raise ValueError(
                 f"--focal is {source!r}, which is not a source of focal lengths. Give "
                 f"{_VIDEO_SOURCES if video else SOURCES}."
+            )
+        if is_relative_track(source):
+            raise ValueError(
+                f"The focal lengths of {source} are relative: only their ratios are known. Calibrate the "
+                "clip that they are of with --lines, or give it a known focal length (--known-focal)."
             )
         read_focal_track(source) if video else read_focal_table(source)
 

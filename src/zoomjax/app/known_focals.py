@@ -8,12 +8,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..detect.batch import Detection
 from ..io.text_table import plain_number, read_text_table
-from .focal_sources import focal_sigmas
+from .clip_lines import frame_number
+from .focal_sources import choose_focals, focal_sigmas
 from .relative import is_relative_track
 
 USUAL_STD = 0.01
 """Relative standard deviation of a known focal length where none is given: that of the rings of lenses."""
+
+MEASURED = {"plane": "grid", "pitch": "pitch"}
+"""What the frames themselves tell f by, and the detector that finds it."""
 
 _ONE = re.compile(r"\s*([^@]*?)\s*@\s*([0-9]{1,9})\s*")
 
@@ -58,6 +63,26 @@ class KnownFocals:
                 self.frame.tolist(), self.focal.tolist(), self.std.tolist(), strict=True
             )
         ]
+
+
+def measured_focals(found: Sequence[Detection], source: str) -> KnownFocals:
+    """Focal lengths of frames of a clip from a flat board that they show, or the markings of a pitch.
+
+    Frames have errors in common, as those of the correction, which is not known yet. So all of them count
+    as one: n of them have each the square root of n times its own deviation.
+
+    Args:
+        found: in frames by `video_frames`.
+        source: one of `MEASURED`.
+
+    Raises:
+        ValueError: no frame tells its focal length.
+    """
+    told = choose_focals([detection for detection in found if detection.lines], source)
+    numbers = np.array([frame_number(name) for name in told.focal])
+    focal, std = (np.array([of[name] for name in told.focal]) for of in (told.focal, told.deviation))
+    order = np.argsort(numbers)
+    return KnownFocals(numbers[order], focal[order], np.sqrt(len(focal)) * std[order])
 
 
 def known_focals(
@@ -114,7 +139,7 @@ def _of_word(text: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if found is None or focal is None:
         raise ValueError(
             f"--known-focal is {text!r}. Give a focal length and the number of its frame, from 0, such as "
-            "24@0, or a CSV file with the columns frame,focal or frame,focal,sigma."
+            "24@0; a CSV file with the columns frame,focal or frame,focal,sigma; or plane or pitch."
         )
     if focal <= 0:
         raise ValueError(f"--known-focal must be a positive focal length, but it is {text}.")

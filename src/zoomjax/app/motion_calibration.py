@@ -333,7 +333,8 @@ def calibrate_motion(
         tracks: of `track_video`.
         found: lines in frames of the clip, by `video_frames` and `detect`.
         known: focal lengths that are known beforehand.
-        model: the zoom model; by default a polynomial of degree 2 in 1/f with two coefficients.
+        model: the zoom and distortion model; by default polynomials of degree 2 in 1/f for two radial
+            coefficients.
         centre: the centre of distortion: "fit", linear in 1/f, or "image".
         stage: called with a description before each step that takes time.
 
@@ -355,6 +356,7 @@ def calibrate_motion(
                 tracks,
                 begin=begin,
                 zoom=candidate.zoom,
+                distortion_model=candidate.distortion_model,
                 terms=candidate.terms,
                 shift=shift,
                 lines=lines,

@@ -25,9 +25,11 @@ def plot_motion(fit: MotionFit) -> Figure:
 
 def _focal(axes: Axes, fit: MotionFit) -> None:
     focal, std = np.asarray(fit.focal), np.asarray(fit.focal_std)
-    frame = np.arange(len(focal))
-    axes.fill_between(frame, focal - _BAND * std, focal + _BAND * std, color=MODEL, alpha=0.25, lw=0)
-    axes.plot(frame, focal, color=MODEL)
+    frame, cuts = np.arange(len(focal)), np.flatnonzero(np.diff(np.asarray(fit.shot))) + 1
+    for part in np.split(frame, cuts):  # so that no line leads from shot to shot
+        of = focal[part], _BAND * std[part]
+        axes.fill_between(part, of[0] - of[1], of[0] + of[1], color=MODEL, alpha=0.25, lw=0)
+        axes.plot(part, of[0], color=MODEL, marker="." if len(part) == 1 else "")
     axes.set(xlabel="frame", ylabel="focal length, px", title="How the camera zoomed")
     axes.margins(x=0)
 

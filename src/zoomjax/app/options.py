@@ -273,7 +273,7 @@ IDLE_FOR_LINES = (
 
 IDLE_FOR_MOTION = (
     *("spacing", "distance", "robust"),
-    *("shared_focal", "distortion_model", "cluster", "verbose"),
+    *("shared_focal", "cluster", "verbose"),
 )
 """And about a clip whose motion gives its focal lengths."""
 

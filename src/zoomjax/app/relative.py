@@ -5,6 +5,7 @@ from pathlib import Path
 
 from ..models.about import RELATIVE
 from ..models.lens import ZoomLens
+from ..trust.assessment import Finding
 
 NOTE = (
     "# Relative focal lengths: only their ratios are known. They belong to the lens.json beside this file."
@@ -15,6 +16,21 @@ SENTENCE = (
     "Focal lengths are relative: their common factor is not known, in lens.json as in track.csv. Use both "
     "together: with other focal lengths the lens is wrong."
 )
+
+
+def findings_of_relative(lens: ZoomLens) -> list[Finding]:
+    """For a lens of lines of a clip whose focal lengths are relative: that it has such, too."""
+    if lens.about.get("focal") != RELATIVE:
+        return []
+    return [
+        Finding(
+            "focal lengths",
+            "not determined",
+            "the lines are of a clip whose focal lengths are relative: their common factor is not known, "
+            "and with other focal lengths than those of its track.csv the lens is wrong.",
+            "Calibrate the clip again with a known focal length (--known-focal 24@0).",
+        )
+    ]
 
 
 def warn_of_relative(lens: ZoomLens, focal: str | None) -> None:

@@ -55,6 +55,7 @@ def calibrate_lines(
     from .earlier import earlier_of
     from .equipment import with_earlier, without_focal
     from .focal_sources import focal_sigmas
+    from .relative import findings_of_relative
     from .report import report
 
     known = earlier_of(files, lines)
@@ -73,11 +74,10 @@ def calibrate_lines(
         robust=robust,
         stage=stage,
     )
-    assessment = calibration.assessment.joined_by(known.findings())
-    calibration = dataclasses.replace(calibration, assessment=assessment)
     lens = with_earlier(calibration.fit.lens, files)
+    assessment = calibration.assessment.joined_by([*known.findings(), *findings_of_relative(lens)])
     zoom = dataclasses.replace(calibration.fit, lens=lens if focal_known else without_focal(lens))
-    calibration = dataclasses.replace(calibration, fit=zoom)
+    calibration = dataclasses.replace(calibration, assessment=assessment, fit=zoom)
     stage("Writing the results")
     pages = {REPORT: report(calibration, run=what_is_run(title_of(list(map(str, files)))))}
     about = {"earlier": known.about()}
