@@ -12,7 +12,7 @@ from benchmarks.mutations import LCP
 from zoomjax.models import TableZoom
 
 from ._lenses import LENSES, PITCH
-from .test_base import DATABASE, FRAMES, PROFILE, SAMPLE, YAML
+from .test_base import CHAIN, DATABASE, FRAMES, PROFILE, SAMPLE, YAML
 
 ENTRIES = PROFILE.replace(
     "@",
@@ -27,6 +27,11 @@ INFO = (
     "camera_matrix: {rows: 3, cols: 3, data: [500,0,180,0,500,120,0,0,1]}\n"
     "distortion_coefficients: {rows: 1, cols: 5, data: [-0.1,0.01,0,0,0]}\n"
 )
+MODEL = (
+    "{'lensmodel': 'LENSMODEL_OPENCV4', 'intrinsics': [500, 500, 180, 120, -0.1, 0, 0, 0], "
+    "'extrinsics': [0, 0, 0, 0, 0, 0], 'imagersize': [360, 240]}"
+)
+PROJECT = '# hugin project file\np f0 w360 h240 v50\ni w360 h240 f0 r0 p0 v50 a0 b0.01 c0 d0 e0 n"a.jpg"\n'
 CASES = {
     "gyroflow, focal": (
         "a.json",
@@ -52,8 +57,48 @@ CASES = {
         "cols: 5, data: [-0.1,0.01,0,0,0]",
         "cols: 6, data: [-0.1,0.01,0,0,0,1]",
     ),
+    "nerfstudio, twice": ("a.json", TWO, '"fl_y": 500', '"fl_y": 500, "k1": -0.2'),
+    "nerfstudio, size": ("a.json", TWO, '"w": 360', '"w": 360.7'),
+    "gyroflow, twice": ("a.json", ENTRIES, '"asymmetrical": true', '"focal_length": 35'),
+    "gyroflow, size": ("a.json", ENTRIES, '"w": 360', '"w": 360.7'),
+    "opentrackio, twice": (
+        "a.jsonl",
+        SAMPLE,
+        '"projectionOffset"',
+        '"pinholeFocalLength": 24, "projectionOffset"',
+    ),
+    "opentrackio, size": ("a.jsonl", SAMPLE, '"width": 360', '"width": 360.7'),
+    "opencv, twice": ("a.yaml", YAML.replace("@", ""), "   dt: d", "   rows: 3"),
+    "opencv, size": ("a.yaml", YAML.replace("@", ""), "image_height: 240", "image_height: 0"),
+    "ros, twice": ("a.yaml", INFO, "image_height: 240", "image_height: 240\ndistortion_model: plumb_bob"),
+    "kalibr, twice": (
+        "a.yaml",
+        CHAIN.replace("@", ""),
+        "resolution: [360, 240]",
+        "resolution: [360, 240]\ncam0: {}",
+    ),
+    "kalibr, size": ("a.yaml", CHAIN.replace("@", ""), "[360, 240]", "[360, 240.5]"),
+    "mrcal, twice": ("a.cameramodel", MODEL, "'extrinsics'", "'intrinsics'"),
+    "mrcal, size": ("a.cameramodel", MODEL, "360, 240", "360.7, 240"),
+    "hugin, twice": ("a.pto", PROJECT, "r0", "v30"),
+    "lcp, size": ("a.lcp", LCP, '"1" stCamera:ImageWidth="600"', '"1" stCamera:ImageWidth="600.5"'),
 }
 TOLD = {
+    "nerfstudio, twice": "it has 'k1' twice",
+    "gyroflow, twice": "it has 'focal_length' twice",
+    "opentrackio, twice": "it has 'pinholeFocalLength' twice",
+    "opencv, twice": "it has 'rows' twice",
+    "ros, twice": "it has 'distortion_model' twice",
+    "kalibr, twice": "it has 'cam0' twice",
+    "mrcal, twice": "it has 'intrinsics' twice",
+    "hugin, twice": "it has 'v' twice",
+    **dict.fromkeys(
+        ("nerfstudio, size", "gyroflow, size", "opentrackio, size", "mrcal, size"),
+        r"360\.7 px wide or high",
+    ),
+    "opencv, size": "its images are 0 px wide or high",
+    "kalibr, size": r"240\.5 px wide or high",
+    "lcp, size": r"600\.5 px wide or high",
     "gyroflow, focal": "entry of 24 mm says that its focal length is 35",
     "gyroflow, model": "its distortion model 'opencv_fisheye'",
     "gyroflow, stretch": "its input_horizontal_stretch is 1.33",

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..models.distortion_model import AbstractRadial
 from ..models.lens import ZoomLens
+from ..models.registry import once
 from ._forms import Form
 from .base import Contents, Export, Import, InterpolatedFormat, Node, read_text
 
@@ -187,6 +188,11 @@ def load_yaml(path: Path) -> Any:
 
     class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # pyright: ignore[reportGeneralTypeIssues]
         """Safe, and knows OpenCV's matrices."""
+
+        def construct_mapping(self, node, deep=False):
+            """Of different names: readers differ in which of two they take."""
+            once([(key.value, None) for key, _ in node.value])
+            return super().construct_mapping(node, deep=deep)
 
     def matrix(loader, node):
         return loader.construct_mapping(node, deep=True)

@@ -8,6 +8,7 @@ how the tool interpolates between focal lengths. Which focal lengths and coeffic
 
 import abc
 import dataclasses
+import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -19,6 +20,7 @@ from .._core.pixels import pitch_problem
 from .._core.text import plain
 from ..models.camera import px_of_focal_px
 from ..models.lens import ZoomLens
+from ..models.registry import once
 from ._forms import AbstractForm
 from .radial_table import RadialTable
 
@@ -186,14 +188,26 @@ class Import:
     direction: str | None = None
     convention: str | None = None
 
-    def size(self, found: tuple[int, int] | None = None) -> tuple[int, int]:
-        """The image size, found in the file or given; ValueError if neither, or both and unlike."""
+    def size(self, told: tuple[Any, Any] | None = None) -> tuple[int, int]:
+        """The image size, told in the file or given; ValueError if neither, or both and unlike.
+
+        Told as numbers or words of them, which have to be whole and positive.
+        """
+        found = None if told is None else (_whole(told[0]), _whole(told[1]))
         if found is None and self.image_size is None:
             raise ValueError("it holds no image size: give argument image_size, (width, height) in px")
         if found is not None and self.image_size not in (None, found):
             here, given = ("x".join(map(str, size)) for size in (found, self.image_size or found))
             raise ValueError(f"its images are {here} px: leave out argument image_size, which is {given}")
         return found or self.image_size or (0, 0)
+
+
+def _whole(side: Any) -> int:
+    """A side of an image, px."""
+    value = math.nan if isinstance(side, bool) else float(side)
+    if not (value >= 1 and value == math.floor(value) < math.inf):
+        raise ValueError(f"its images are {side} px wide or high, which is no whole number of them")
+    return int(value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -287,6 +301,11 @@ def off_middle(nodes: Iterable["Node | Sampled"], size: tuple[int, int]) -> tupl
 def read_text(path: Path) -> str:
     """The text of a file in UTF-8, without the mark that some programs put before it."""
     return path.read_text(encoding="utf-8-sig")
+
+
+def load_json(text: str) -> Any:
+    """Values of JSON, no name of which is given twice: readers differ in which of two they take."""
+    return json.loads(text, object_pairs_hook=once)
 
 
 class Format(abc.ABC):

@@ -68,7 +68,7 @@ class COLMAP(NodeFormat):
             if model not in _ORDER:
                 raise ValueError(f"its camera model {model} is not one of {', '.join(_ORDER)}")
             values = dict(zip(_ORDER[model].split(), map(float, words), strict=True))
-            size = job.size((int(width), int(height)))
+            size = job.size((width, height))
             nodes.append(_node(model, values, size))
             sizes.append(size)
         return contents(nodes, one_size(sizes), job)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ._pinhole import Pinholes, contents, formula, from_opencv, matrix_rows, pinhole
-from .base import Contents, Export, Import, Node, one_size, read_text, refuse_others
+from .base import Contents, Export, Import, Node, load_json, one_size, read_text, refuse_others
 
 _MOST = 8
 """Coefficients that are read."""
@@ -75,14 +75,14 @@ class Gyroflow(Pinholes):
 
     def read(self, job: Import) -> Contents:
         """The entries, or the base of a profile without them."""
-        table = json.loads(read_text(job.paths[0]))
+        table = load_json(read_text(job.paths[0]))
         nodes, sizes, numbers = [], [], []
         entries = table.get("interpolations") or {}
         mm = bool(entries) or bool(table.get("focal_length"))
         for key, own in (entries or {table.get("focal_length"): {}}).items():
             entry = {**table, **own}
             _check(key, entry)
-            size = job.size((int(entry["calib_dimension"]["w"]), int(entry["calib_dimension"]["h"])))
+            size = job.size((entry["calib_dimension"]["w"], entry["calib_dimension"]["h"]))
             parameters = {**table["fisheye_params"], **own.get("fisheye_params", {}), **own}
             matrix = np.array(parameters["camera_matrix"], float)
             if not table.get("asymmetrical"):

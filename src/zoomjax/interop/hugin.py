@@ -14,6 +14,7 @@ import re
 
 import numpy as np
 
+from ..models.registry import once
 from ._pinhole import contents
 from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text
 from .lensfun import PtLens, of_unit_slope, radius_of_one
@@ -54,9 +55,9 @@ class Hugin(NodeFormat):
         for line in lines:
             words = _WORD.findall(line[2:])
             images.append(
-                {name: images[int(value)][name] if same else value for name, same, value in words}
+                once([(name, images[int(value)][name] if same else value) for name, same, value in words])
             )
-        sizes = [job.size((int(words["w"]), int(words["h"]))) for words in images]
+        sizes = [job.size((words["w"], words["h"])) for words in images]
         nodes = [_node(words, size) for words, size in zip(images, sizes, strict=True)]
         return contents(nodes, one_size(sizes), job)
 

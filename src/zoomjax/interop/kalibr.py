@@ -49,7 +49,7 @@ class Kalibr(NodeFormat):
                 raise ValueError("its first camera is not pinhole with radtan")
             width, height = camera["resolution"]
             fx, fy, cx, cy = camera["intrinsics"]
-            size = job.size((int(width), int(height)))
+            size = job.size((width, height))
             matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float)
             nodes.append(from_opencv(None, matrix, camera["distortion_coeffs"], size))
             sizes.append(size)

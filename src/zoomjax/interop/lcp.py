@@ -39,11 +39,7 @@ class LCP(Format):
         found: dict[float, tuple[float, np.ndarray]] = {}
         sizes, factors = [], set[float]()
         for profile, model in _profiles(ET.parse(job.paths[0]).getroot()):
-            stated = (
-                (int(profile["ImageWidth"]), int(profile["ImageLength"]))
-                if "ImageWidth" in profile
-                else None
-            )
+            stated = (profile["ImageWidth"], profile["ImageLength"]) if "ImageWidth" in profile else None
             sizes.append(size := job.size(stated))
             factors.add(factor := float(profile.get("SensorFormatFactor", 1)))
             focal = float(profile["FocalLength"])

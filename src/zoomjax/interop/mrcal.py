@@ -4,6 +4,7 @@ import ast
 
 import numpy as np
 
+from ..models.registry import once
 from ._pinhole import contents, formula, from_opencv, numbers, pinhole
 from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text
 
@@ -49,12 +50,12 @@ class Mrcal(NodeFormat):
         """Plain values of Python, and no code."""
         nodes, sizes = [], []
         for path in job.paths:
-            table = ast.literal_eval(read_text(path))
+            table = _values(read_text(path))
             model = table["lensmodel"]
             if model not in _COEFFICIENTS:
                 raise ValueError(f"its lens model {model!r} is not one of {', '.join(_COEFFICIENTS)}")
             width, height = table["imagersize"]
-            size = job.size((int(width), int(height)))
+            size = job.size((width, height))
             fx, fy, cx, cy, *k = table["intrinsics"]
             if len(k) != _COEFFICIENTS[model]:
                 raise ValueError(f"it has {len(k)} coefficients, and {model} has {_COEFFICIENTS[model]}")
@@ -62,3 +63,12 @@ class Mrcal(NodeFormat):
             nodes.append(from_opencv(None, matrix, k, size))
             sizes.append(size)
         return contents(nodes, one_size(sizes), job)
+
+
+def _values(text: str) -> dict:
+    """Plain values of Python, no name of which is given twice."""
+    tree = ast.parse(text.strip(), mode="eval")
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Dict):
+            once([(key.value, None) for key in node.keys if isinstance(key, ast.Constant)])
+    return ast.literal_eval(tree)

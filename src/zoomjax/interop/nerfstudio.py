@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ._pinhole import Pinhole, contents, focal_px, formula, node_of, pinhole
-from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text, refuse_others
+from .base import Contents, Export, Import, Node, NodeFormat, load_json, one_size, read_text, refuse_others
 
 _MODELS = ("OPENCV", "RADIAL", "SIMPLE_RADIAL", "PINHOLE", "SIMPLE_PINHOLE")
 """That nerfstudio takes for one and the same, coefficients that are not there for 0."""
@@ -55,7 +55,7 @@ class Nerfstudio(NodeFormat):
 
     def read(self, job: Import) -> Contents:
         """All frames, or the one camera of all."""
-        table = json.loads(read_text(job.paths[0]))
+        table = load_json(read_text(job.paths[0]))
         common = {key: table[key] for key in (*_KEYS, "k4") if key in table}
         nodes, sizes, px, units, overruled = [], [], [], set(), dict[str, None]()
         for frame in table["frames"] or [{}]:
@@ -65,7 +65,7 @@ class Nerfstudio(NodeFormat):
                 refuse_others(told, {"is_fisheye": False})
             overruled |= {key: None for key in common if frame.get(key, common[key]) != common[key]}
             values = {**frame, **common}
-            size = job.size((int(values["w"]), int(values["h"])))
+            size = job.size((values["w"], values["h"]))
             f, stretch = focal_px(values["fl_x"], values.get("fl_y", values["fl_x"]))
             _check_angle({**frame, **table}, f, size)
             if values.get("k4"):

@@ -57,7 +57,7 @@ class OpenCV(NodeFormat):
             table = load_yaml(path)
             refuse_others(table, {"fisheye_model": 0})
             size = job.size(
-                (int(table["image_width"]), int(table["image_height"])) if "image_width" in table else None
+                (table["image_width"], table["image_height"]) if "image_width" in table else None
             )
             mm = table.get("focal_unit") == "mm"
             coefficients = table.get("distortion_coefficients", table.get("dist_coeffs"))

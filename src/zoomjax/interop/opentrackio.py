@@ -14,7 +14,7 @@ import numpy as np
 
 from ..models.distortion_model import AbstractRadial
 from ._forms import Form
-from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text, refuse_others
+from .base import Contents, Export, Import, Node, NodeFormat, load_json, one_size, read_text, refuse_others
 
 _MODEL = "Brown-Conrady D-U"
 _FORM = Form(3, 3, tangential=True, corrects=True)
@@ -94,7 +94,7 @@ class OpenTrackIO(NodeFormat):
         for sample in _samples(read_text(job.paths[0])):
             camera = {**camera, **sample.get("static", {}).get("camera", {})}
             resolution = camera.get("activeSensorResolution")
-            found = None if resolution is None else (int(resolution["width"]), int(resolution["height"]))
+            found = None if resolution is None else (resolution["width"], resolution["height"])
             sizes.append(size := job.size(found))
             pitch = _pitch(camera, size)
             nodes.append(_node(sample["lens"], pitch, size))
@@ -122,9 +122,9 @@ def _pitch(camera: dict, size: tuple[int, int]) -> float:
 
 def _samples(text: str) -> list[dict]:
     try:
-        found = json.loads(text)
+        found = load_json(text)
     except json.JSONDecodeError:
-        found = [json.loads(line) for line in text.splitlines() if line.strip()]
+        found = [load_json(line) for line in text.splitlines() if line.strip()]
     found = [found] if isinstance(found, dict) else found
     if not found:
         raise ValueError("it is empty")

@@ -60,7 +60,7 @@ class ROS(NodeFormat):
             cut |= _is_cut(table)
             if table["distortion_model"] not in ("plumb_bob", "rational_polynomial"):
                 raise ValueError(f"its distortion model {table['distortion_model']!r} is not supported")
-            size = job.size((int(table["image_width"]), int(table["image_height"])))
+            size = job.size((table["image_width"], table["image_height"]))
             matrix, coefficients = (
                 data_of(table[name]) for name in ("camera_matrix", "distortion_coefficients")
             )

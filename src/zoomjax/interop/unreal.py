@@ -13,7 +13,7 @@ import numpy as np
 from ._pinhole import Pinhole, Pinholes, contents, focal_px, formula, node_of, pinhole
 from ._samples import distortions
 from ._solve import same
-from .base import Contents, Export, Import, Node, read_text, refuse_others
+from .base import Contents, Export, Import, Node, load_json, read_text, refuse_others
 from .opentrackio import OpenTrackIO
 
 _END = 0.01
@@ -104,11 +104,11 @@ class Unreal(Pinholes):
 
     def read(self, job: Import) -> Contents:
         """The tables, at one focus."""
-        table = json.loads(read_text(job.paths[0]))
+        table = load_json(read_text(job.paths[0]))
         about = table["metadata"]
         refuse_others(about["lensInfo"], {"distortionModel": "Spherical"})
         refuse_others(about, {"fxFyUnits": "Normalized", "cxCyUnits": "Normalized"})
-        size = job.size((int(table["imageDimensions"]["width"]), int(table["imageDimensions"]["height"])))
+        size = job.size((table["imageDimensions"]["width"], table["imageDimensions"]["height"]))
         tables = {entry["parameterName"]: _rows(entry) for entry in table["cameraParameterTables"]}
         if len({row["FocusEncoder"] for row in tables["DistortionTable"]}) > 1:
             raise ValueError("it has entries at more than one focus, and zoomjax reads files of one")
