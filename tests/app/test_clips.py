@@ -197,9 +197,7 @@ def test_a_clip_takes_another_distortion_model(clip, calibrated):
     assert done.returncode == 0, done.stderr
     first, other = (zj.load_lens(clip.parent / place / "lens.json") for place in ("out", "division"))
     assert other.distortion_model == zj.models.Division()
-    assert json.loads((clip.parent / "division" / "summary.json").read_text())["distortion_model"] == (
-        "division"
-    )
+    assert summary_of(clip.parent / "division")["distortion_model"] == "Division"
     points = np.array([[0, 0], [639, 0], [100, 300]])
     moved = [np.asarray(of(600.0).undistort(points)) - points for of in (first, other)]
     np.testing.assert_allclose(*moved, atol=1.5)

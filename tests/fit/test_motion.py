@@ -183,6 +183,20 @@ def test_known_focal_lengths_give_the_scale(lens, path):
     assert (abs(off) < 4 * std).all()
 
 
+def test_the_scale_is_as_uncertain_as_the_best_f_where_all_are_known(lens, path):
+    focal, rotation = path
+    still = (focal, np.broadcast_to(rotation[0], rotation.shape))
+    tracks = tracked(lens, still, noise=0.3).tracks
+    but_one = np.where(np.arange(FRAMES) == 3, np.nan, focal)
+    found = [fit_motion(tracks, focal=known, focal_std=0.01 * focal) for known in (focal, but_one)]
+    std = [np.sqrt(np.diag(np.asarray(fit.covariance))) for fit in found]
+    assert std[0][-1] == pytest.approx(np.min(np.asarray(found[0].focal_std / found[0].focal)))
+    assert 0.01 / np.sqrt(FRAMES) < std[0][-1] < 0.01
+    np.testing.assert_allclose(std[0], std[1], rtol=0.2)
+    joint = [np.asarray(fit.covariance)[0, -1] for fit in found]
+    assert joint[0] == pytest.approx(joint[1], rel=0.3, abs=0.05 * std[0][0] * std[0][-1])
+
+
 def test_a_known_focal_length_that_contradicts_the_tracks_is_told(path, noisy):
     """One is 1.3 times too long: the scale of all is between it and that of the tracks."""
     focal = np.full(FRAMES, np.nan)

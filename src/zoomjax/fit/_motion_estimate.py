@@ -124,6 +124,7 @@ def _uncertainty(
     lens = lens * jnp.outer(of_lens, of_lens)
     unit = units.frames[:, 0]
     log_focal = own[:, 0, 0] * unit**2 + 2 * both[:, 0, -1] * unit * of_lens[-1] + lens[-1, -1]
+    lens = _with_scale(data, lens, both[:, 0] * jnp.outer(unit, of_lens), log_focal)
     levers = determined_levers(model, matrix, units)
     if data.root is None or data.redundant is None:
         count = 2 * jnp.sum(inlier)
@@ -146,6 +147,14 @@ def _uncertainty(
         lens = lens + jnp.outer(guessed.lens, guessed.lens)
         log_focal = log_focal + guessed.log_focal**2
     return _Uncertainty(lens, log_focal, free)
+
+
+def _with_scale(data, lens, both, log_focal):
+    """The covariance of the lens and the scale, which is that of the best known f where all are known."""
+    best = jnp.argmin(jnp.where(jnp.isinf(data.log_std), jnp.inf, log_focal))
+    row = (lens[-1] + both[best]).at[-1].set(log_focal[best])
+    told = lens.at[-1].set(row).at[:, -1].set(row)
+    return jnp.where(jnp.any(data.pinned), lens, told)
 
 
 def _mean(values, weight):

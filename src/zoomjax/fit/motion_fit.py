@@ -33,7 +33,8 @@ class MotionFit(eqx.Module):
         focal: focal length of each frame, px; NaN for a frame without tracks.
         focal_std: its standard deviation, px. Nearly all of it is a factor common to all frames.
         covariance: of the zoom model's parameters, of those of the centre's offset, of the readout, and of
-            the logarithm of that factor: that of the frame whose views follow best.
+            the logarithm of that factor: that of the frame whose views follow best, or, where all focal
+            lengths are known beforehand, whose f is known best.
         rotation: of each frame, from the scene to the camera, whose axes are x right, y down and z
             forward. That of the first frame of each scene is the identity.
         shot: number of the shot that each frame belongs to, from 0: a new one begins with each cut; -1 for

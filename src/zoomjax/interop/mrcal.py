@@ -70,5 +70,5 @@ def _values(text: str) -> dict:
     tree = ast.parse(text.strip(), mode="eval")
     for node in ast.walk(tree):
         if isinstance(node, ast.Dict):
-            once([(key.value, None) for key in node.keys if isinstance(key, ast.Constant)])
+            once([(str(key.value), None) for key in node.keys if isinstance(key, ast.Constant)])
     return ast.literal_eval(tree)
