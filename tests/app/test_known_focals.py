@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from zoomjax import scenes
 from zoomjax.app.focal_sources import choose_focals
 from zoomjax.app.known_focals import USUAL_STD, known_focals, measured_focals
 from zoomjax.app.relative import NOTE, is_relative_track
@@ -105,6 +106,21 @@ def test_frames_of_a_board_count_as_one_measurement():
     np.testing.assert_allclose(known.focal, [1000, 1200, 1500], rtol=0.03)
     single = choose_focals(noisy, "plane").deviation
     own = [single[f"a-clip-{number:06d}.jpg"] for number in (4, 12, 30)]
-    np.testing.assert_allclose(known.std, np.sqrt(3) * np.array(own), rtol=1e-9)
+    np.testing.assert_allclose(known.std, np.sqrt(3) * np.hypot(own, 0.01 * known.focal), rtol=1e-9)
     with pytest.raises(ValueError, match="No focal length found for any image"):
         measured_focals([view(1, 1000.0, 0.0)], "plane")
+
+
+def test_the_scale_that_a_pitch_tells_is_as_far_off_as_said():
+    lens, focal = scenes.broadcast_zoom(), np.geomspace(47, 110, 12)
+    lines = scenes.broadcast_lines(lens, focal, spacing=12, noise=0.3)
+    points, frame = lines.to_ragged(), np.asarray(lines.frame)
+    seen = [tuple(points[line] for line in np.flatnonzero(frame == number)) for number in range(12)]
+    found = [Detection(f"a-{n:06d}.jpg", "", lens.image_size, of) for n, of in enumerate(seen)]
+    known = measured_focals(found, "pitch")
+    off = np.log(known.focal / (focal[known.frame] / 36 * lens.image_size[0]))
+    std = known.std / known.focal
+    assert len(off) > 6
+    assert abs(off).max() < 2 * std.min()
+    assert abs(np.average(off, weights=std**-2)) < 1.5 * np.sum(std**-2) ** -0.5
+    assert abs(off).max() > 0.01  # so that nobody takes away what was added without a look

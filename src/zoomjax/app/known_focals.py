@@ -68,8 +68,10 @@ class KnownFocals:
 def measured_focals(found: Sequence[Detection], source: str) -> KnownFocals:
     """Focal lengths of frames of a clip from a flat board that they show, or the markings of a pitch.
 
-    Frames have errors in common, as those of the correction, which is not known yet. So all of them count
-    as one: n of them have each the square root of n times its own deviation.
+    Frames have errors in common, as those of the correction, which is not known yet: focal lengths of a
+    simulated pitch are off by up to 3 %, where the points' noise explains 0.3 %, and by 0.6 % in the mean.
+    So each has a deviation of `USUAL_STD` more, and all of them count as one: times the square root of
+    their number.
 
     Args:
         found: in frames by `video_frames`.
@@ -82,7 +84,8 @@ def measured_focals(found: Sequence[Detection], source: str) -> KnownFocals:
     numbers = np.array([frame_number(name) for name in told.focal])
     focal, std = (np.array([of[name] for name in told.focal]) for of in (told.focal, told.deviation))
     order = np.argsort(numbers)
-    return KnownFocals(numbers[order], focal[order], np.sqrt(len(focal)) * std[order])
+    std = np.sqrt(len(focal)) * np.hypot(std, USUAL_STD * focal)
+    return KnownFocals(numbers[order], focal[order], std[order])
 
 
 def known_focals(

@@ -7,17 +7,14 @@ distortion. Files order the coefficients k1 k2 p1 p2 k3 k4 k5 k6, and count pixe
 
 import dataclasses
 import math
-import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..models.distortion_model import AbstractRadial
 from ..models.lens import ZoomLens
-from ..models.registry import once
 from ._forms import Form
-from .base import Contents, Export, Import, InterpolatedFormat, Node, read_text
+from .base import Contents, Export, Import, InterpolatedFormat, Node
 
 _SQUARE = 0.01
 """Share by which fx and fy may differ."""
@@ -180,32 +177,6 @@ def matrix_rows(camera: Pinhole) -> list[list[float]]:
 def numbers(values: Any) -> str:
     """Numbers with all digits, separated by commas."""
     return ", ".join(repr(float(value)) for value in np.ravel(values))
-
-
-def load_yaml(path: Path) -> Any:
-    """A YAML file of plain values, or of OpenCV's matrices; no code can be in it."""
-    import yaml
-
-    class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # pyright: ignore[reportGeneralTypeIssues]
-        """Safe, and knows OpenCV's matrices."""
-
-        def construct_mapping(self, node, deep=False):
-            """Of different names: readers differ in which of two they take."""
-            once([(key.value, None) for key, _ in node.value])
-            return super().construct_mapping(node, deep=deep)
-
-    def matrix(loader, node):
-        return loader.construct_mapping(node, deep=True)
-
-    Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix)
-    text = read_text(path)
-    try:
-        found = yaml.load(re.sub(r"\A%YAML:1\.0", "%YAML 1.1", text), Loader)
-    except yaml.YAMLError as error:
-        raise ValueError(f"it is no YAML: {' '.join(str(error).split())[:200]}") from error
-    if not isinstance(found, dict):
-        raise ValueError("it is no table of names and values")
-    return found
 
 
 def data_of(value: Any) -> np.ndarray:

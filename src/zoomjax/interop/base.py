@@ -8,7 +8,6 @@ how the tool interpolates between focal lengths. Which focal lengths and coeffic
 
 import abc
 import dataclasses
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -20,7 +19,6 @@ from .._core.pixels import pitch_problem
 from .._core.text import plain
 from ..models.camera import px_of_focal_px
 from ..models.lens import ZoomLens
-from ..models.registry import once
 from ._forms import AbstractForm
 from .radial_table import RadialTable
 
@@ -301,11 +299,6 @@ def off_middle(nodes: Iterable["Node | Sampled"], size: tuple[int, int]) -> tupl
 def read_text(path: Path) -> str:
     """The text of a file in UTF-8, without the mark that some programs put before it."""
     return path.read_text(encoding="utf-8-sig")
-
-
-def load_json(text: str) -> Any:
-    """Values of JSON, no name of which is given twice: readers differ in which of two they take."""
-    return json.loads(text, object_pairs_hook=once)
 
 
 class Format(abc.ABC):

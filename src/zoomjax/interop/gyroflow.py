@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from ._documents import load_json
 from ._pinhole import Pinholes, contents, formula, from_opencv, matrix_rows, pinhole
-from .base import Contents, Export, Import, Node, load_json, one_size, read_text, refuse_others
+from .base import Contents, Export, Import, Node, one_size, read_text, refuse_others
 
 _MOST = 8
 """Coefficients that are read."""

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 
 from .._core.text import plain
-from ._pinhole import contents, formula, from_opencv, load_yaml, numbers, pinhole
+from ._documents import load_yaml
+from ._pinhole import contents, formula, from_opencv, numbers, pinhole
 from .base import Contents, Export, Import, Node, NodeFormat, one_size
 
 

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from ._documents import load_json
 from ._pinhole import Pinhole, contents, focal_px, formula, node_of, pinhole
-from .base import Contents, Export, Import, Node, NodeFormat, load_json, one_size, read_text, refuse_others
+from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text, refuse_others
 
 _MODELS = ("OPENCV", "RADIAL", "SIMPLE_RADIAL", "PINHOLE", "SIMPLE_PINHOLE")
 """That nerfstudio takes for one and the same, coefficients that are not there for 0."""

@@ -6,12 +6,12 @@ and `cv2.initUndistortRectifyMap` then do as the lens; `cv2.undistortPoints` sto
 
 import numpy as np
 
+from ._documents import load_yaml
 from ._pinhole import (
     contents,
     data_of,
     formula,
     from_opencv,
-    load_yaml,
     matrix_rows,
     numbers,
     pinhole,

@@ -13,8 +13,9 @@ import math
 import numpy as np
 
 from ..models.distortion_model import AbstractRadial
+from ._documents import load_json
 from ._forms import Form
-from .base import Contents, Export, Import, Node, NodeFormat, load_json, one_size, read_text, refuse_others
+from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text, refuse_others
 
 _MODEL = "Brown-Conrady D-U"
 _FORM = Form(3, 3, tangential=True, corrects=True)

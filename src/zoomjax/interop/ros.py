@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from ._documents import load_yaml
 from ._pinhole import (
     contents,
     data_of,
     formula,
     from_opencv,
-    load_yaml,
     matrix_rows,
     numbers,
     pinhole,

@@ -10,10 +10,11 @@ import json
 
 import numpy as np
 
+from ._documents import load_json
 from ._pinhole import Pinhole, Pinholes, contents, focal_px, formula, node_of, pinhole
 from ._samples import distortions
 from ._solve import same
-from .base import Contents, Export, Import, Node, load_json, read_text, refuse_others
+from .base import Contents, Export, Import, Node, read_text, refuse_others
 from .opentrackio import OpenTrackIO
 
 _END = 0.01
