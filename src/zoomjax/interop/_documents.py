@@ -1,4 +1,4 @@
-"""JSON and YAML of other tools. No name is given twice in them: readers differ in which of two they take."""
+"""JSON and YAML of other tools, no name given twice in them: readers differ in which of two they take."""
 
 import json
 import re
