@@ -112,6 +112,14 @@ class Follower:
             self._views.append((active, np.full(len(active), self.frame), self._active.point))
         self._small = small
 
+    @property
+    def moves(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points in the frame that were in the one before it, too, and how they moved, px."""
+        if self._active is None:
+            return np.zeros((0, 2)), np.zeros((0, 2))
+        older = self._active.begun < self.frame
+        return self._active.point[older], self._active.speed[older]
+
     def views(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Track, frame and point of each view, of tracks on the scene that have two views or more."""
         if self._active is not None:

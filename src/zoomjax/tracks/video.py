@@ -19,7 +19,8 @@ from jaxtyping import UInt8
 
 from .._core.checks import checked_integer
 from .._core.fields import refuse_masked_image
-from ..io.video_reader import decode_video
+from ..io.video_reader import INTERLACED, decode_video, says_interlaced
+from ._fields import Fields
 from ._follow import Follower
 from .tracks import Tracks
 
@@ -65,7 +66,7 @@ def track_video(
                 progress(len(numbers), announced)
 
         try:
-            tracks = track_frames(images(), most=most, life=life)
+            tracks, has_fields = _followed(images(), most, life)
         except ValueError as error:
             raise ValueError(f"Cannot track points in {os.fspath(clip)}: {error}") from error
     if lost := numbers[-1] + 1 - len(numbers):
@@ -74,6 +75,8 @@ def track_video(
             "frames without them.",
             stacklevel=2,
         )
+    if has_fields and not says_interlaced(clip):  # which is warned of
+        warnings.warn(INTERLACED, stacklevel=2)
     return tracks
 
 
@@ -90,9 +93,20 @@ def track_frames(
     Raises:
         ValueError: there are fewer than two frames, one is no such image, they differ in size, or nothing
             can be followed.
+
+    Warns:
+        UserWarning: frames are interlaced.
     """
+    tracks, has_fields = _followed(frames, most, life)
+    if has_fields:
+        warnings.warn(INTERLACED, stacklevel=2)
+    return tracks
+
+
+def _followed(frames, most, life) -> tuple[Tracks, bool]:
+    """The tracks, and whether frames are woven of fields."""
     most, life = checked_integer("most", most, 1), checked_integer("life", life, 2)
-    follower = None
+    follower, fields = None, Fields()
     for image in frames:
         grey = grey_frame(image)
         size = (grey.shape[1], grey.shape[0])
@@ -100,6 +114,7 @@ def track_frames(
         if size != follower.size:
             raise ValueError(f"Frames of {follower.size} and of {size} px follow each other.")
         follower.add(grey)
+        fields.add(follower.frame, grey, *follower.moves)
     number = 0 if follower is None else follower.frame + 1
     if follower is None or number < 2:
         raise ValueError("It has fewer than two frames.")
@@ -108,7 +123,7 @@ def track_frames(
         raise ValueError(
             "Nothing in it can be followed: it shows no corners, or nothing but what stays in its place."
         )
-    return Tracks.from_arrays(track, frame, points, image_size=follower.size, frames=number)
+    return Tracks.from_arrays(track, frame, points, image_size=follower.size, frames=number), fields.found
 
 
 def grey_frame(image: np.ndarray) -> np.ndarray:
