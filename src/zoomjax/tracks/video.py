@@ -24,6 +24,9 @@ from ._fields import Fields
 from ._follow import Follower
 from .tracks import Tracks
 
+_FEWEST = 4
+"""Views of a frame that say anything: it has a focal length and three angles."""
+
 
 def track_video(
     clip: str | os.PathLike[str],
@@ -118,12 +121,20 @@ def _followed(frames, most, life) -> tuple[Tracks, bool]:
     number = 0 if follower is None else follower.frame + 1
     if follower is None or number < 2:
         raise ValueError("It has fewer than two frames.")
-    track, frame, points = follower.views()
+    track, frame, points = _enough(*follower.views())
     if not len(track):
         raise ValueError(
             "Nothing in it can be followed: it shows no corners, or nothing but what stays in its place."
         )
     return Tracks.from_arrays(track, frame, points, image_size=follower.size, frames=number), fields.found
+
+
+def _enough(track, frame, points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The views in frames that have some: fewer tell no focal length, as in the dark end of a fade."""
+    kept = np.bincount(frame)[frame] >= _FEWEST if len(frame) else np.zeros(0, bool)
+    again = np.bincount(track[kept], minlength=track.max(initial=-1) + 1) > 1
+    kept &= again[track]
+    return track[kept], frame[kept], points[kept]
 
 
 def grey_frame(image: np.ndarray) -> np.ndarray:
