@@ -210,31 +210,37 @@ def lines_values(lines: zj.Lines) -> bytes:
         lines.image_size,
         lines.weight,
     )
-    return b"".join(np.asarray(field).tobytes() for field in used)
+    return b"".join(np.asarray(field).tobytes() for field in used if field is not None)
 
 
 def _tracks_files(folder: Path) -> list[bytes]:
     rng = np.random.default_rng(0)
     track, frame = np.repeat(np.arange(4), 3), np.tile(np.arange(3), 4)
     points = rng.uniform(0, 60, (12, 2))
-    zj.tracks.Tracks.from_arrays(track, frame, points, image_size=(64, 64)).save(folder / "tracks.npz")
-    return [(folder / "tracks.npz").read_bytes()]
+    files = []
+    for weight in (None, rng.uniform(0, 2, 12)):
+        tracks = zj.tracks.Tracks.from_arrays(track, frame, points, image_size=(64, 64), weight=weight)
+        tracks.save(folder / "tracks.npz")
+        files.append((folder / "tracks.npz").read_bytes())
+    return files
 
 
 def sound_tracks(tracks: zj.tracks.Tracks) -> None:
-    """Finite points, two a track, each in a frame of its own that there is."""
+    """Finite points, two a track, each in a frame of its own that there is, and weights of at least 0."""
     mask, frame = np.asarray(tracks.mask), np.asarray(tracks.frame)
     assert np.isfinite(np.asarray(tracks.points)[mask]).all()
     assert (mask.sum(1) >= 2).all()
     assert frame[mask].min() >= 0
     assert frame[mask].max() < tracks.frames
+    weight = tracks.view_weights()
+    assert weight is None or (np.isfinite(weight) & (weight >= 0)).all()
     assert all(len(set(row[there])) == there.sum() for row, there in zip(frame, mask, strict=True))
 
 
 def tracks_values(tracks: zj.tracks.Tracks) -> bytes:
     """All that a fit uses."""
-    used = (tracks.points, tracks.mask, tracks.frame, tracks.frames, tracks.image_size)
-    return b"".join(np.asarray(field).tobytes() for field in used)
+    used = (tracks.points, tracks.mask, tracks.frame, tracks.frames, tracks.image_size, tracks.weight)
+    return b"".join(np.asarray(field).tobytes() for field in used if field is not None)
 
 
 def read_tracks_csv(path: Path) -> zj.tracks.Tracks:

@@ -340,6 +340,9 @@ TAKERS = {
     "weights": lambda: zj.Lines(**lines_fields()).weighted(_masked(2)),
     "deviations": lambda: zj.fit.fit_focal(zj.Lines(**lines_fields()), _masked(2)),
     "tracks": lambda: zj.tracks.Tracks.from_arrays([0, 0], [0, 1], _masked(2, 2), image_size=SIZE),
+    "weights of views": lambda: zj.tracks.Tracks.from_arrays(
+        [0, 0], [0, 1], np.arange(4.0).reshape(2, 2), image_size=SIZE, weight=_masked(2)
+    ),
     "focal tracks": lambda: zj.io.FocalTrack(_masked(2), [20.0, 60.0]),
     "zoom models": lambda: zj.PolynomialZoom(1, _masked(2, 2), 20.0),
     "lenses": lambda: zj.ZoomLens(**lens_fields() | {"centre": _masked(2)}),

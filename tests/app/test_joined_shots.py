@@ -113,10 +113,13 @@ def test_few_tracks_do_not_hold_one_shot_to_another(done):
     across = (frame[first][track] < CUT) & (frame >= CUT)
     few = ~across | (track < np.unique(track[across])[9])
 
-    def kept(which):
+    def kept(which, weight=None):
         return Tracks.from_arrays(
-            number[which], frame[which], points[which], image_size=SIZE, frames=FRAMES
+            number[which], frame[which], points[which], image_size=SIZE, frames=FRAMES, weight=weight
         )
 
     np.testing.assert_array_equal(linked_well(done.tracks, done.fit).frame, done.tracks.frame)
     np.testing.assert_array_equal(linked_well(kept(few), done.fit).frame, kept(~across).frame)
+    weight = 1.0 + np.arange(len(number)) % 5
+    weighted = linked_well(kept(few, weight[few]), done.fit)
+    np.testing.assert_array_equal(weighted.view_weights(), kept(~across, weight[~across]).view_weights())

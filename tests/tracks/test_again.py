@@ -71,6 +71,19 @@ def test_every_says_in_which_frames(clip, video, tracks):
     assert all(moment % 5 == 0 for _, moment in new)
 
 
+def test_new_views_have_the_mean_weight_of_their_track(clip, video, tracks):
+    number, frame, _ = tracks.views()
+    weight = 1 + number % 3 + 0.1 * (frame % 2)
+    given = Tracks.from_arrays(*tracks.views(), image_size=tracks.image_size, frames=FRAMES, weight=weight)
+    more = find_again(video, given, carry=carried(clip), every=5)
+    known = dict(zip(zip(number.tolist(), frame.tolist(), strict=True), weight, strict=True))
+    of_track = np.bincount(number, weight) / np.maximum(np.bincount(number), 1)
+    pairs = [(int(track), int(moment)) for track, moment, _ in zip(*more.views(), strict=True)]
+    expected = [known.get((track, moment), of_track[track]) for track, moment in pairs]
+    assert len(pairs) > len(known)
+    np.testing.assert_allclose(more.view_weights(), expected)
+
+
 def test_what_is_not_there_is_not_found(clip, video, tracks):
     count = len(tracks.views()[0])
     wrong = find_again(video, tracks, carry=carried(clip, 40.0))

@@ -48,7 +48,22 @@ def test_columns_and_rows_in_any_order(tmp_path):
     assert points.tolist() == [[4, 3], [8, 7], [6, 5], [2.5, 1]]
 
 
+def test_weights_are_one_more_column(tmp_path, rng):
+    text = "weight,x,y,track,frame\n1,2,3,9,3\n0,4,5,9,1\n0.25,6,7,-1,0\n1e-3,8,9,-1,1\n"
+    tracks = read_tracks_csv(write(tmp_path / "t.csv", text), image_size=SIZE)
+    assert tracks.view_weights().tolist() == [0.25, 1e-3, 0, 1]
+    track, frame, points = tracks.views()
+    weight = rng.uniform(0, 2, 4).astype(np.float32)
+    tracks = Tracks.from_arrays(track, frame, points, image_size=SIZE, weight=weight)
+    write_tracks_csv(tracks, tmp_path / "t.csv")
+    assert (tmp_path / "t.csv").read_text().startswith("track,frame,x,y,weight\n")
+    read = read_tracks_csv(tmp_path / "t.csv", image_size=SIZE)
+    np.testing.assert_array_equal(read.view_weights().astype(np.float32), weight)
+    np.testing.assert_array_equal(read.views()[2], points)
+
+
 HEAD = "track,frame,x,y\n"
+WEIGHED = "track,frame,x,y,weight\n"
 REFUSED = {
     "empty": ("", 'must name the columns "track,frame,x,y"'),
     "column missing": ("track,frame,x\n0,0,1\n", 'must name the columns "track,frame,x,y"'),
@@ -60,6 +75,9 @@ REFUSED = {
     "negative frame": (f"{HEAD}0,-1,1,1\n0,1,1,1\n", "from 0, but it has -1"),
     "enormous track": (f"{HEAD}9e12,0,1,1\n", "integers of 32 bits"),
     "two views": (f"{HEAD}4,0,1,1\n4,0,2,2\n", "Track 4 has two views in frame 0"),
+    "weight below 0": (f"{WEIGHED}0,0,1,1,1\n0,1,2,2,-3\n", "at least 0 .* it has -3"),
+    "no weight": (f"{WEIGHED}0,0,1,1,1\n0,1,2,2,\n", "weight in row 3 is empty"),
+    "weights of 0": (f"{WEIGHED}0,0,1,1,0\n0,1,2,2,0\n", "0 for all"),
     "one view": (f"{HEAD}0,0,1,1\n1,0,2,2\n", "No track has two views"),
 }
 

@@ -14,10 +14,10 @@ from zoomjax.tracks import Tracks, load_tracks
 SIZE = (64, 48)
 
 
-def make(dtype=np.float64, frames=9):
+def make(dtype=np.float64, frames=9, weight=None):
     points = np.random.default_rng(3).uniform(0, 40, (9, 2)).astype(dtype)
     track, frame = [7, 7, 7, 3, 3, -5, -5, -5, -5], [0, 1, 4, 2, 3, 4, 5, 6, 7]
-    return Tracks.from_arrays(track, frame, points, image_size=SIZE, frames=frames)
+    return Tracks.from_arrays(track, frame, points, image_size=SIZE, frames=frames, weight=weight)
 
 
 def assert_same(got, tracks):
@@ -34,6 +34,22 @@ def test_what_is_saved_is_loaded(dtype, tmp_path):
     tracks = make(dtype)
     tracks.save(tmp_path / "tracks.npz")
     assert_same(load_tracks(tmp_path / "tracks.npz"), tracks)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_weights_come_back_from_a_file_that_older_readers_refuse(dtype, tmp_path):
+    """They would take all weights as equal."""
+    path, weight = tmp_path / "tracks.npz", np.linspace(0, 1, 9).astype(dtype)
+    versions = []
+    for tracks in (make(), make(weight=weight)):
+        tracks.save(path)
+        loaded = load_tracks(path)
+        assert_same(loaded, tracks)
+        with np.load(path) as file:
+            versions.append(int(file["version"]))
+    assert versions == [1, 2]
+    np.testing.assert_array_equal(loaded.view_weights(), tracks.view_weights())
+    assert loaded.view_weights().dtype == dtype
 
 
 @pytest.mark.filterwarnings("ignore:.*lie outside of the image", "ignore:.*they are copies of others")
@@ -91,6 +107,8 @@ SPOILED = {
     "image size": (lambda path: rewrite(path, image_size=np.array([6])), "image_size"),
     "frames": (lambda path: rewrite(path, frames=np.array([6, 7])), "Cannot read"),
     "padding": (bomb, "GB of memory"),
+    "too few weights": (lambda path: rewrite(path, weight=np.ones(8)), "each of the 9 views"),
+    "weights below 0": (lambda path: rewrite(path, weight=-np.ones(9)), "at least 0"),
 }
 
 

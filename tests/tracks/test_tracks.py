@@ -72,3 +72,58 @@ def test_frames_increase_across_views_that_are_not_there(frame):
     with pytest.raises(ValueError, match=r"frame must increase along a track, but frame\[0\] does not"):
         Tracks(frame=np.array([frame]), mask=np.array([[True, False, True]]), **given)
     Tracks(frame=np.array([[0, 0, 1]]), mask=np.array([[True, False, True]]), **given)
+
+
+def weighted(weight, **options):
+    track, frame = [7, 3, 7, 3, 3], [1, 0, 0, 4, 2]
+    points = np.arange(10.0).reshape(5, 2) / 2
+    return Tracks.from_arrays(track, frame, points, image_size=(8, 6), weight=weight, **options)
+
+
+def test_weights_go_with_their_views():
+    tracks = weighted([0.5, 1, 2, 0, 3])
+    assert tracks.mask.tolist() == [[True, True, True], [True, True, False]]
+    assert np.asarray(tracks.weight)[np.asarray(tracks.mask)].tolist() == [1, 3, 0, 2, 0.5]
+    assert tracks.view_weights().tolist() == [1, 3, 0, 2, 0.5]
+    again = Tracks.from_arrays(*tracks.views(), image_size=(8, 6), weight=tracks.view_weights())
+    np.testing.assert_array_equal(again.weight, tracks.weight)
+    assert weighted(None).weight is None
+    assert weighted(None).view_weights() is None
+
+
+def test_weights_of_tracks_that_are_dropped_go_with_them():
+    with pytest.warns(UserWarning, match="Dropped 1 of 2 tracks"):
+        tracks = Tracks.from_arrays(
+            [3, 4, 3], [0, 0, 1], np.zeros((3, 2)), image_size=(8, 6), weight=[1, 5, 2]
+        )
+    assert tracks.view_weights().tolist() == [1, 2]
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("weight", "message"),
+    [
+        ([1, 1, 1, 1], r"one real number for each of the 5 views, but its shape is \(4,\)"),
+        (1.0, r"one real number for each of the 5 views, but its shape is \(\)"),
+        (["a"] * 5, "one real number for each of the 5 views, but it is"),
+        ([1, 1, -0.5, 1, 1], r"at least 0 .* it has -0.5: give views that must not count weight 0"),
+        ([1, 1, np.nan, 1, 1], "it has nan: give views that must not count weight 0"),
+        ([1, 1, np.inf, 1, 1], "it has inf"),
+        ([0] * 5, "0 for all: leave it out for equal weights"),
+    ],
+)
+def test_what_is_no_weight_is_told(weight, message):
+    with pytest.raises(ValueError, match=message):
+        weighted(weight)
+
+
+def test_weights_of_padding_do_not_matter():
+    good = weighted([0.5, 1, 2, 0, 3])
+    fields = [np.asarray(of) for of in (good.points, good.frame, good.mask)]
+    weight = np.where(good.mask, good.weight, np.nan)
+    Tracks(*fields, (8, 6), 5, good.number, weight)
+    weight[0, 0] = -1
+    with pytest.raises(ValueError, match="weight must be finite and at least 0"):
+        Tracks(*fields, (8, 6), 5, good.number, weight)
+    with pytest.raises(ValueError, match="weight must have shape"):
+        Tracks(*fields, (8, 6), 5, good.number, weight[:, :1])

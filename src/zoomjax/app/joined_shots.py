@@ -71,6 +71,12 @@ def linked_well(tracks: Tracks, fit: MotionFit) -> Tracks:
     good = (begun == there) | (both[begun, there] >= _LINKS)
     if good.all():
         return tracks
+    weight = tracks.view_weights()
     return Tracks.from_arrays(
-        number[good], frame[good], points[good], image_size=tracks.image_size, frames=tracks.frames
+        number[good],
+        frame[good],
+        points[good],
+        image_size=tracks.image_size,
+        frames=tracks.frames,
+        weight=None if weight is None else weight[good],
     )

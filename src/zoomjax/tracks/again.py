@@ -59,7 +59,8 @@ def find_again(
         seed: of the choice, where there are more than are looked for.
 
     Returns:
-        The same tracks, of which some have more views, after some frames without.
+        The same tracks, of which some have more views, after some frames without. Where views have weights,
+        new ones have the mean of those of their track.
     """
     every = checked_integer("every", every, 1)
     first = np.asarray(tracks.frame)[:, 0]
@@ -123,10 +124,15 @@ def _with(tracks, more):
     if not more:
         return tracks
     which, frames, places = (np.concatenate(parts) for parts in zip(*more, strict=True))
+    weight = tracks.view_weights()
+    if weight is not None:
+        mean = np.mean(np.asarray(tracks.weight), axis=1, where=np.asarray(tracks.mask))
+        weight = np.concatenate([weight, mean[which]])
     return Tracks.from_arrays(
         np.concatenate([number, np.asarray(tracks.number)[which]]),
         np.concatenate([frame, frames]),
         np.concatenate([points, places]),
         image_size=tracks.image_size,
         frames=tracks.frames,
+        weight=weight,
     )

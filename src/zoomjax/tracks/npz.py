@@ -30,4 +30,5 @@ def _tracks(stored: dict[str, np.ndarray]) -> Tracks:
         stored["points"],
         image_size=stored["image_size"].tolist(),
         frames=stored["frames"].item(),
+        weight=stored.get("weight"),
     )

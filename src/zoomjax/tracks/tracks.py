@@ -4,6 +4,7 @@ import math
 import os
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ from .._core.fields import (
 from .._core.files import whole_file
 from .._core.types import AnyArray
 
-FORMAT, VERSION = "zoomjax.tracks", 1
+FORMAT, VERSION = "zoomjax.tracks", 2
 
 
 class Tracks(eqx.Module):
@@ -41,6 +42,9 @@ class Tracks(eqx.Module):
         image_size: (width, height) px.
         frames: number of frames of the clip. A frame without views is allowed.
         number: the name that each track was given, an integer.
+        weight: weight of each view relative to all others, at least 0; None for equal weights. The variance
+            of a view's noise is that of a view of weight 1, over its weight. A view of weight 0 is there
+            and counts for nothing.
     """
 
     points: Float[AnyArray, "track view 2"] = eqx.field(converter=numbers("points"))
@@ -49,6 +53,7 @@ class Tracks(eqx.Module):
     image_size: tuple[int, int] = eqx.field(static=True, converter=checked_size)
     frames: int = eqx.field(static=True, converter=lambda frames: checked_integer("frames", frames, 1))
     number: Int[AnyArray, "track"] = eqx.field(converter=integers("number"))
+    weight: Float[AnyArray, "track view"] | None = eqx.field(default=None, converter=numbers("weight"))
 
     def __check_init__(self):
         """Check that the shapes agree, that frames exist, and that views are numbers."""
@@ -58,12 +63,16 @@ class Tracks(eqx.Module):
                 "frame": (self.frame, ("track", "view")),
                 "mask": (self.mask, ("track", "view")),
                 "number": (self.number, ("track",)),
+                "weight": (self.weight, ("track", "view")),
             }
         )
         check_indices("frame", self.frame, self.frames, "the frames of the clip")
         points, mask = known(self.points), known(self.mask)
         if points is not None and mask is not None and not np.isfinite(points[mask]).all():
             raise ValueError("Argument points must be finite where mask is set: clear the mask there.")
+        weight = known(self.weight)
+        if weight is not None and mask is not None:
+            _check_weights(weight[mask])
         frame = known(self.frame)
         if frame is not None and mask is not None and frame.ndim == 2:
             before = np.maximum.accumulate(np.where(mask, frame, -1), axis=1)[:, :-1]
@@ -84,6 +93,7 @@ class Tracks(eqx.Module):
         *,
         image_size: Sequence[int],
         frames: int | None = None,
+        weight: ArrayLike | None = None,
     ) -> "Tracks":
         """Make tracks from one entry per view, in any order.
 
@@ -93,10 +103,12 @@ class Tracks(eqx.Module):
             points: for each view ``(x, y)``, px.
             image_size: (width, height) px.
             frames: number of frames of the clip; by default one more than the last frame with a view.
+            weight: for each view its weight relative to the others, at least 0; None for equal weights.
 
         Raises:
-            ValueError: shapes do not agree, a frame does not exist, a point is not finite, a track has two
-                views in one frame, or no track has two views.
+            ValueError: shapes do not agree, a frame does not exist, a point is not finite, a weight is not
+                finite or below 0, or all are 0, a track has two views in one frame, or no track has two
+                views.
 
         Warns:
             UserWarning: tracks of one view, or with the views of another one, are dropped; the message
@@ -111,6 +123,7 @@ class Tracks(eqx.Module):
         """
         size = checked_size(image_size)
         names, moments, places = _views(track, frame, points)
+        weights = None if weight is None else _weights(weight, places)
         frames = int(moments.max()) + 1 if frames is None else checked_integer("frames", frames, 1)
         if moments.max() >= frames:
             raise ValueError(
@@ -149,6 +162,7 @@ class Tracks(eqx.Module):
             image_size=size,
             frames=frames,
             number=jnp.asarray(number, jnp.int32),
+            weight=None if weights is None else held_as_given(weights[order][entry]),
         )
 
     def views(
@@ -159,15 +173,22 @@ class Tracks(eqx.Module):
         names = np.repeat(np.asarray(self.number), mask.sum(axis=1))
         return names, np.asarray(self.frame)[mask], np.asarray(self.points)[mask]
 
+    def view_weights(self) -> Float[np.ndarray, "entry"] | None:
+        """Each view's weight, in the order of `views`; None for equal weights."""
+        return None if self.weight is None else np.asarray(self.weight)[np.asarray(self.mask)]
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all fields, in their dtypes, to a ``.npz`` file that `load_tracks` reads."""
         check_kind("path", path, (str, os.PathLike))
         _, frame, points = self.views()
+        weight = self.view_weights()
+        optional: dict[str, Any] = {} if weight is None else {"weight": weight}
         with whole_file(path) as part, part.open("wb") as file:
             np.savez(
                 file,
+                **optional,
                 format=FORMAT,
-                version=VERSION,
+                version=1 if weight is None else VERSION,  # older readers take all weights as equal
                 points=points,
                 frame=frame,
                 counts=np.asarray(self.mask).sum(axis=1),
@@ -180,6 +201,20 @@ class Tracks(eqx.Module):
     def scale(self) -> float:
         """The length in px that is radius 1: half the image diagonal."""
         return math.hypot(*self.image_size) / 2
+
+
+def _check_weights(weight):
+    """Raise ValueError where weights of views are no weights."""
+    if (bad := ~(np.isfinite(weight) & (weight >= 0))).any():
+        raise ValueError(
+            "Argument weight must be finite and at least 0 where there is a view, but it has "
+            f"{weight[bad][0]}: give views that must not count weight 0."
+        )
+    if weight.size and not weight.any():
+        raise ValueError(
+            "Argument weight must be above 0 for some views, but it is 0 for all: leave it out for equal "
+            "weights."
+        )
 
 
 def _copies(moments, places, first, count):
@@ -214,3 +249,16 @@ def _views(track, frame, points):
         bad = int(np.argmin(np.isfinite(places).all(axis=1)))
         raise ValueError(f"Argument points must be finite, but points[{bad}] is {places[bad]}.")
     return names, moments, places
+
+
+def _weights(weight, places):
+    """Each view's weight as an array, checked; in the dtype of the points unless it has its own."""
+    refuse_masked("weight", weight)
+    values = real_numbers(weight)
+    if values is None or values.shape != (len(places),):
+        raise ValueError(
+            f"Argument weight must hold one real number for each of the {len(places)} views, but "
+            + (f"it is {weight!r}." if values is None else f"its shape is {values.shape}.")
+        )
+    _check_weights(values)
+    return values if np.asarray(weight).dtype.kind == "f" else values.astype(places.dtype)
