@@ -5,10 +5,10 @@ import pytest
 
 from zoomjax.scenes import motion_clip, motion_tracks, pan_and_zoom
 from zoomjax.tracks import Tracks, track_frames, track_video
-from zoomjax.tracks.repeats import copies, originals, without_rests
+from zoomjax.tracks.repeats import copies, counted_once, originals, without_rests
 
 from .._clips import write_frames
-from .test_video import FRAMES, encoded, lens, make, plain, texture
+from .test_video import FRAMES, SIZE, encoded, lens, make, plain, texture
 
 __all__ = ["encoded", "plain", "texture"]
 
@@ -109,6 +109,30 @@ def test_the_copies_of_each_view_are_counted():
     number = copies(first, tracks)
     assert np.sum(1 / number) == pytest.approx(np.sum(np.asarray(scene.tracks.mask)))
     assert set(number.tolist()) == {1.0, 2.0}
+
+
+def test_copies_count_once(plain):
+    tracks = track_frames([plain[1][n] for n in np.repeat(np.arange(12), AT_30[:12])])
+    weight = tracks.view_weights()
+    assert weight is not None
+    track, frame, _ = tracks.views()
+    first = shown_first(AT_30[:12])[frame]
+    for name in track[:: len(track) // 20]:
+        for number in np.unique(first[track == name]):
+            assert weight[(track == name) & (first == number)].sum() == pytest.approx(1)
+
+
+def test_tracks_without_copies_have_no_weights(plain):
+    assert track_frames(plain[1][:6]).weight is None
+
+
+def test_weights_of_their_own_are_shared_among_copies():
+    scene = motion_tracks(lens(), *pan_and_zoom(lens(), 20, pan=10), views=30, life=8, noise=0.2)
+    track, frame, points = repeated(scene.tracks, AT_30[:20]).views()
+    tracks = Tracks.from_arrays(track, frame, points, image_size=SIZE, weight=np.full(len(track), 3.0))
+    weight = counted_once(tracks).view_weights()
+    assert weight is not None
+    assert np.sum(weight) == pytest.approx(3 * np.sum(np.asarray(scene.tracks.mask)))
 
 
 def test_points_of_few_tracks_tell_nothing():

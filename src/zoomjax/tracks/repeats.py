@@ -67,6 +67,26 @@ def originals(tracks: Tracks) -> Int[np.ndarray, "frame"]:
     return first
 
 
+def counted_once(tracks: Tracks) -> Tracks:
+    """The same, with weights by which all views of a track in frames that show the same count as one.
+
+    Tracks without such views are returned as they are.
+    """
+    number = copies(originals(tracks), tracks)
+    if not (number > 1).any():
+        return tracks
+    weight = tracks.view_weights()
+    track, frame, points = tracks.views()
+    return Tracks.from_arrays(
+        track,
+        frame,
+        points,
+        image_size=tracks.image_size,
+        frames=tracks.frames,
+        weight=(1 if weight is None else weight) / number,
+    )
+
+
 def without_rests(first: Int[np.ndarray, "frame"], tracks: Tracks) -> Int[np.ndarray, "frame"]:
     """The same, but frames of a camera that rests are their own: it stops slowly, and for longer.
 

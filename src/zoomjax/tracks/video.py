@@ -22,6 +22,7 @@ from .._core.fields import refuse_masked_image
 from ..io.video_reader import INTERLACED, decode_video, says_interlaced
 from ._fields import Fields
 from ._follow import Follower
+from .repeats import counted_once
 from .tracks import Tracks
 
 _FEWEST = 4
@@ -48,7 +49,8 @@ def track_video(
 
     Returns:
         The tracks, of two views at least. The error of a point is some 0.1 px at sharp corners; that of its
-        track's first point is 0 by definition.
+        track's first point is 0 by definition. Where frames repeat the one before, views have weights by
+        which those of one point in them count as one.
 
     Raises:
         FileNotFoundError: there is no such clip.
@@ -126,7 +128,8 @@ def _followed(frames, most, life) -> tuple[Tracks, bool]:
         raise ValueError(
             "Nothing in it can be followed: it shows no corners, or nothing but what stays in its place."
         )
-    return Tracks.from_arrays(track, frame, points, image_size=follower.size, frames=number), fields.found
+    tracks = Tracks.from_arrays(track, frame, points, image_size=follower.size, frames=number)
+    return counted_once(tracks), fields.found
 
 
 def _enough(track, frame, points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
