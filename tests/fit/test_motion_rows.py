@@ -1,5 +1,7 @@
 """The derivatives by which `fit_motion` steps, beside those of automatic differentiation."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,9 +33,14 @@ def scene():
     return path, tracks, motion_lines(lens, path[0], noise=0.5)
 
 
-def made(scene, zoom, distortion_model, terms, shift, *, levers=False, with_lines=False):
+def made(
+    scene, zoom, distortion_model, terms, shift, *, levers=False, with_lines=False, with_weights=False
+):
     """What rows are made of: a model at random, near the path."""
     (focal, rotation), tracks, lines = scene
+    if with_weights:
+        weight = np.random.default_rng(4).uniform(0.1, 3, tracks.mask.shape)
+        tracks = dataclasses.replace(tracks, weight=weight)
     given = Given(tracks, lines if with_lines else None, None, None, None)
     data = problem_of(given, Asked(zoom, distortion_model, terms, shift, None)).data
     rng, more = np.random.default_rng(3), len(data.log_focal) - FRAMES
@@ -81,10 +88,11 @@ def made(scene, zoom, distortion_model, terms, shift, *, levers=False, with_line
         {"shift": None},
         {"levers": True},
         {"with_lines": True},
+        {"with_weights": True, "levers": True},
         {"distortion_model": Division(), "terms": 1},
         {"distortion_model": BrownConrady(), "zoom": PolynomialZoom(1)},
     ],
-    ids=["default", "centred", "levers", "lines", "division", "Brown-Conrady"],
+    ids=["default", "centred", "levers", "lines", "weights", "division", "Brown-Conrady"],
 )
 def test_columns_are_those_of_automatic_differentiation(scene, options):
     default = {"zoom": PolynomialZoom(2), "distortion_model": RadialPolynomial(), "terms": 2}

@@ -6,7 +6,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax.scenes import leaves, motion_clip, pan_and_zoom
-from zoomjax.tracks import find_again, track_video
+from zoomjax.tracks import Tracks, find_again, track_video
 
 from .._clips import write_frames
 

@@ -57,7 +57,7 @@ def rms_uncorrected(fit: MotionFit, tracks: Tracks, follows: Bool[np.ndarray, "v
     Args:
         fit: the lens and the path.
         tracks: the tracks.
-        follows: which of their views follow the model, and count.
+        follows: which of their views follow the model, and count, by their weights.
     """
     mask = np.asarray(tracks.mask)
     track, moment = np.nonzero(mask)[0], np.asarray(tracks.frame)[mask]
@@ -73,7 +73,9 @@ def rms_uncorrected(fit: MotionFit, tracks: Tracks, follows: Bool[np.ndarray, "v
     np.add.at(total, track, rays)
     seen = np.einsum("vij,vj->vi", turn, total[track])
     missed = centre + focal[:, None] * seen[:, :2] / seen[:, 2:] - points
-    return float(np.sqrt(np.mean(np.sum(missed**2, axis=1))))
+    weight = tracks.view_weights()
+    weight = None if weight is None else weight[counts]
+    return float(np.sqrt(np.average(np.sum(missed**2, axis=1), weights=weight)))
 
 
 def line_rms(fit: MotionFit, lines: Lines) -> Float[np.ndarray, "line"]:

@@ -79,8 +79,12 @@ def findings_of_motion(
 
 
 def following(fit: MotionFit, tracks: Tracks) -> float:
-    """The share of the views that follow the model: the rest are on things that move, or mistakes."""
-    return float(np.mean(follows(fit, tracks)))
+    """The share of the views that follow the model: the rest are on things that move, or mistakes.
+
+    Views of weight 0 do not count.
+    """
+    weight = tracks.view_weights()
+    return float(np.mean(follows(fit, tracks), where=True if weight is None else weight > 0))
 
 
 def follows(fit: MotionFit, tracks: Tracks) -> Bool[np.ndarray, "view"]:
@@ -107,8 +111,9 @@ def _own_scales(fit: MotionFit) -> Float[np.ndarray, "known"]:
 
 
 def _missed(fit: MotionFit, tracks: Tracks) -> np.ndarray:
-    """Of each view, the square of what it is off over where the loss begins to flatten."""
-    residual = np.asarray(fit.residual)[np.asarray(tracks.mask)]
+    """Of each view, the square of what it is off over where the loss begins to flatten; NaN of weight 0."""
+    residual, weight = np.asarray(fit.residual)[np.asarray(tracks.mask)], tracks.view_weights()
+    residual = residual if weight is None else np.sqrt(weight) * residual
     return (residual / (2.3849 * float(fit.noise))) ** 2
 
 

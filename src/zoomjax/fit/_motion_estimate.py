@@ -61,6 +61,8 @@ def described(
 ) -> tuple[dict[str, Any], Float[Array, "view"]]:
     """The parts of a `MotionFit` by name, and the sizes of the residuals of all views, px.
 
+    The latter, and the mean squares, are of residuals times the roots of their weights.
+
     Args:
         data: tracks and lines.
         model, noise: the fitted ones.
@@ -73,7 +75,7 @@ def described(
     inlier = data.there & (squared < _IGNORED * (noise.points * CAUCHY) ** 2)
     known = _uncertainty(data, model, noise, stage, missed, inlier)
     focal, log_std = jnp.exp(model.path.log_focal), jnp.sqrt(known.log_focal)
-    of_views = jnp.where(inlier, squared, 0), 1.0 * inlier, 1.0 * data.there
+    of_views = jnp.where(inlier, squared, 0), data.counted(inlier), data.counted(data.there)
     squares, followed, there = (
         jnp.zeros(len(focal)).at[data.structure.frame].add(leaf) for leaf in of_views
     )
@@ -122,13 +124,21 @@ def _uncertainty(
     lens = lens * jnp.outer(of_lens, of_lens)
     unit = units.frames[:, 0]
     log_focal = own[:, 0, 0] * unit**2 + 2 * both[:, 0, -1] * unit * of_lens[-1] + lens[-1, -1]
-    count = 2 * jnp.sum(inlier)
-    free = count / (count - data.unknowns - len(lens) - determined_levers(model, matrix, units))
+    levers = determined_levers(model, matrix, units)
+    if data.root is None or data.redundant is None:
+        count = 2 * jnp.sum(inlier)
+        free = count / (count - data.unknowns - len(lens) - levers)
+    else:  # the noise is a mean by weights, and what is fitted takes from views by theirs
+        weight = data.counted(inlier)
+        telling = weight * data.redundant
+        count = 2 * jnp.sum(telling)
+        free = count / (count - data.unknowns - (len(lens) + levers) * _mean(telling, weight))
     squared = jnp.sum(missed**2, axis=-1) / (noise.points * CAUCHY) ** 2
     flat = jnp.where(inlier, 1 / (1 + squared), 0)  # of the loss: its slope over the residual
     pull = flat[:, None] * missed / noise.points
     common = common_errors_of(of_rows, rows._replace(views=pull), matrix, data.structure)
-    common = common / jnp.mean(flat**2, where=inlier) ** 2 / (_INFLATION * free)
+    kept = jnp.mean(flat**2, where=inlier) if data.root is None else _mean(flat**2, data.counted(inlier))
+    common = common / kept**2 / (_INFLATION * free)
     inflation = _INFLATION * free * jnp.where(common > AS_GOOD, common, 1)
     lens, log_focal = lens * inflation, log_focal * inflation
     if model.levers is not None:
@@ -136,6 +146,10 @@ def _uncertainty(
         lens = lens + jnp.outer(guessed.lens, guessed.lens)
         log_focal = log_focal + guessed.log_focal**2
     return _Uncertainty(lens, log_focal, free)
+
+
+def _mean(values, weight):
+    return jnp.sum(weight * values) / jnp.sum(weight)
 
 
 def _lens_of(data: Data, model: Model, focal: Float[Array, "frame"]) -> ZoomLens:
@@ -170,7 +184,7 @@ def _fit_of(
     Args:
         lens: the lens.
         joint: covariance of its parameters and of its offset's.
-        squares, followed: of each frame, the sum of squares of the views that follow, and their number.
+        squares, followed: of each frame, the sum of squares of the views that follow, and of their weights.
         judge: the solver's result, and whether the focal lengths have a scale.
         steps: of the solver.
     """

@@ -50,7 +50,7 @@ class Noise(NamedTuple):
     """Standard deviations, px, and how many points of lines count as one.
 
     Attributes:
-        points: of a coordinate of a track's points.
+        points: of a coordinate of a track's points, of a view of weight 1.
         lines: of a line's points across it.
         repeated: points of lines that say no more than one (`_motion_repeated`).
     """
@@ -78,9 +78,12 @@ class Data(eqx.Module):
         readout: what is known of the readout, and its standard deviation.
         lines: about the centre of the image; None if there are none. `structure` has their frames.
         moments: second moments of the lines' points, as seen.
-        unknowns: how many numbers of frames and rays are fitted.
+        unknowns: how many numbers of frames and rays are fitted, by the weights of their views.
         scale: half the image diagonal, px.
         size: (width, height) of the image, px.
+        root: root of the weight of each view, above 0, 1 for those that pad; None for equal weights.
+        redundant: what each view's ray leaves of its residual's variance, over what it does with equal
+            weights; None for these.
     """
 
     points: Float[Array, "view 2"]
@@ -97,6 +100,12 @@ class Data(eqx.Module):
     moments: Float[Array, "line moment 2 2"] | None
     scale: float = eqx.field(static=True)
     size: tuple[int, int] = eqx.field(static=True)
+    root: Float[Array, "view"] | None = None
+    redundant: Float[Array, "view"] | None = None
+
+    def counted(self, views: Bool[Array, "view"]) -> Float[Array, "view"]:
+        """How much each view counts: its weight, 1 if there are none; 0 for all but these views."""
+        return 1.0 * views if self.root is None else jnp.where(views, self.root**2, 0)
 
 
 def pinned(data: Data, missed: Float[Array, "view 2"], noise: Noise) -> Data:
@@ -107,11 +116,11 @@ def pinned(data: Data, missed: Float[Array, "view 2"], noise: Noise) -> Data:
 
     Args:
         data: tracks and lines.
-        missed: residuals of all views, px.
+        missed: residuals of all views, px, times the roots of their weights.
         noise: of those that follow.
     """
     near = jnp.linalg.norm(missed, axis=-1) < FAR * noise.points
-    follows = jnp.where(data.there & near, 1.0, 0.0)
+    follows = data.counted(data.there & near)
     count = jax.ops.segment_sum(follows, data.structure.frame, len(data.log_focal))
     best = jnp.argmax(jnp.where(jnp.isinf(data.log_std), count, -1))
     only = (jnp.arange(len(count)) == best) & jnp.any(data.pinned)
@@ -190,10 +199,10 @@ def units_of(data, model, noise):
     """
     structure, half = data.structure, data.scale / 2
     focal = jnp.exp(model.path.log_focal)
-    ones = data.there.astype(float)
+    ones = data.counted(data.there)
     in_frame = jnp.zeros(len(focal)).at[structure.frame].add(ones)
     in_ray = jax.ops.segment_sum(ones, structure.track, structure.tracks)
-    in_ray = jnp.maximum(in_ray, 1)
+    in_ray = jnp.where(in_ray > 0, in_ray, 1)
     focal_of_ray = jax.ops.segment_sum(ones * focal[structure.frame], structure.track, structure.tracks)
     focal_of_ray = jnp.maximum(focal_of_ray / in_ray, 1.0)
     reach = jnp.stack([jnp.full(len(focal), half), focal, focal, jnp.full(len(focal), half)], axis=1)
@@ -210,7 +219,7 @@ def units_of(data, model, noise):
     zoom, shift, _, factor = _lens_parameters(model)
     zoom, shift, factor = jax.tree.map(lambda leaf: jnp.full(leaf.shape, of_lens), (zoom, shift, factor))
     return Unknowns(
-        noise.points / (reach * jnp.sqrt(jnp.maximum(in_frame, 1))[:, None]),
+        noise.points / (reach * jnp.sqrt(jnp.where(in_frame > 0, in_frame, 1))[:, None]),
         of_rays,
         (zoom, shift, of_readout, factor),
     )

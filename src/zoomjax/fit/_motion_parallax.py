@@ -102,7 +102,7 @@ def spread_of(
         data: the tracks.
         model: fitted to them without levers.
         noise: of the residuals.
-        missed: sizes of the residuals, px.
+        missed: sizes of the residuals, px, times the roots of their weights.
         least: the test's standard deviation.
     """
     inlier = data.there & (missed < FAR * noise.points)

@@ -2,11 +2,12 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse.csgraph
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from .._core.types import AnyArray, traced
 from ..lines.free_centre import AnyCentreLines, compress_any_centre
@@ -44,8 +45,16 @@ _ENOUGH = 60
 """Tracks in each frame for that."""
 
 
+_LEAST = 1e-9
+"""Share of its variance that is left of a residual, where rounding leaves less."""
+
+
 class Given(NamedTuple):
-    """What a fit is made from."""
+    """What a fit is made from.
+
+    `unit` is the root of the mean weight, by which `relative` has divided all: times this, the noise of the
+    fit is that of a view of weight 1.
+    """
 
     tracks: Tracks
     lines: Lines | AnyCentreLines | None
@@ -53,6 +62,7 @@ class Given(NamedTuple):
     focal: Float[AnyArray, "frame"] | None
     focal_std: float | int | Float[AnyArray, "frame"] | None
     begin: MotionFit | None = None
+    unit: float | Array = 1.0
 
 
 class Asked(NamedTuple):
@@ -109,6 +119,8 @@ def problem_of(given: Given, asked: Asked) -> Problem:
     new = linked < 0
     new[np.unique(linked, return_index=True)[1]] = True  # the first of each, and no other after a gap
     open_ = (linked >= 0) & jnp.isinf(std)
+    weight = None if tracks.weight is None else jnp.asarray(tracks.weight)[track, view]
+    redundant = None if weight is None else _redundant(weight, piece)
     data = Data(
         points=jnp.pad(points, ((0, views), (0, 0))),
         there=jnp.arange(len(wide.track)) < len(points),
@@ -117,15 +129,65 @@ def problem_of(given: Given, asked: Asked) -> Problem:
         pinned=jnp.pad((np.arange(tracks.frames) == jnp.argmax(open_)) & jnp.any(open_), (0, more)),
         log_focal=jnp.pad(jnp.log(focal), (0, more)),
         log_std=jnp.pad(std / focal, (0, more), constant_values=np.inf),
-        unknowns=jnp.asarray(4.0 * np.sum(linked >= 0) + 2 * structure.tracks),
+        unknowns=jnp.asarray(4.0 * np.sum(linked >= 0) + 2 * structure.tracks)
+        if weight is None
+        else _unknowns(weight, redundant, moment, piece),
         neighbours=jnp.asarray(_neighbours(np.pad(shot, (0, more), constant_values=-1), _first(tracks))),
         readout=jnp.asarray(_known_readout(asked.readout)),
         lines=lines,
         moments=None if lines is None else lines.second_moments(2 * lines.terms),
         scale=tracks.scale,
         size=tracks.image_size,
+        root=None if weight is None else _widened(jnp.sqrt(weight), views),
+        redundant=None if redundant is None else _widened(redundant, views),
     )
     return Problem(data, track, view, moment, piece, linked, shot, scene)
+
+
+def relative(given: Given) -> Given:
+    """The same with weights whose mean is 1, of views that count, and no others.
+
+    Views of weight 0 do not count, nor does what is left of a track if that is one view. Which these are is
+    known; weights may be traced.
+    """
+    tracks = given.tracks
+    if tracks.weight is None or traced((tracks.mask, jnp.asarray(tracks.weight) > 0)):
+        return given  # in the latter case to be refused
+    weight = jnp.asarray(tracks.weight, float)
+    mask = np.asarray(tracks.mask) & np.asarray(weight > 0)
+    mask = mask & (np.sum(mask, axis=1, keepdims=True) > 1)
+    if not mask.any():
+        raise ValueError(
+            "Argument tracks has no track with two views of a weight above 0: give more views a weight, or "
+            "leave weight out for equal weights."
+        )
+    mean = jnp.mean(weight, where=jnp.asarray(mask))
+    weight = jnp.where(mask, weight / mean, 1)
+    tracks = eqx.tree_at(lambda t: (t.mask, t.weight), tracks, (jnp.asarray(mask), weight))
+    return given._replace(tracks=tracks, unit=jnp.sqrt(mean))
+
+
+def _widened(values, more):
+    """Numbers of views, and 1 for so many that pad."""
+    return jnp.pad(values, (0, more), constant_values=1)
+
+
+def _redundant(weight, piece):
+    """What a view's ray leaves of its residual's variance, over what it leaves where weights are equal.
+
+    A view with most of its track's weight draws the ray to where it is, and says nothing of the noise.
+    """
+    pieces = piece.max() + 1
+    total, count = (jax.ops.segment_sum(of, piece, pieces)[piece] for of in (weight, jnp.ones(len(piece))))
+    left = jnp.maximum((total - weight) / total, _LEAST)
+    return jnp.where(count > 1, left * count / jnp.maximum(count - 1, 1), 1.0)
+
+
+def _unknowns(weight, redundant, moment, piece):
+    """How many numbers of frames and rays are fitted, in the mean over views by which noise is found."""
+    total = jax.ops.segment_sum(weight, moment, moment.max() + 1)[moment]
+    count = np.bincount(piece)[piece]
+    return jnp.sum(weight * redundant * (4 * weight / total + 2 / count))
 
 
 def thinned(given: Given) -> Given | None:
@@ -151,6 +213,7 @@ def thinned(given: Given) -> Given | None:
         tracks.image_size,
         tracks.frames,
         np.asarray(tracks.number)[kept],
+        None if tracks.weight is None else np.asarray(tracks.weight)[kept],
     )
     return given._replace(tracks=some)
 

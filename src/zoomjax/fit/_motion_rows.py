@@ -1,7 +1,8 @@
 """What `fit_motion` minimises: residuals of views in the image, and what is known beforehand.
 
 The unknowns are those of `_motion_model`. A ray X is ahead of frame t as ``R_t X``, less its lever along
-the axis of the camera, and its residual that of `_views`, in the image, with a Cauchy loss.
+the axis of the camera, and its residual that of `_views`, in the image, with a Cauchy loss. Where views
+have weights, residuals are times their roots: all have the noise of a view of weight 1.
 
 With a rolling shutter a row is seen before or after the middle of the image. f and R are then those of that
 time, by a parabola through the frame and its neighbours.
@@ -69,7 +70,7 @@ def _rows_of_frames(data, model):
 def residuals_of(
     data: Data, model: Model, lever: Float[Array, "track"] | None = None
 ) -> Float[Array, "view 2"]:
-    """Residuals of all views, px.
+    """Residuals of all views, px, times the roots of their weights.
 
     `lever` is beside those of the model.
     """
@@ -86,10 +87,15 @@ def residuals_of(
         log_focal, coefficients, turning = rows.at(frame, point)
         ahead = product(model.path.rotation[frame], model.path.rays[track])
         given = log_focal, coefficients, rows.offset[frame], ahead, turning, lever[track]
-        return _missed(data, model, point, *given)
+        return _weighted(data, number, _missed(data, model, point, *given))
 
     views = of_each(len(data.points), jax.vmap(view))
     return jnp.where(data.there[:, None], views, 0)
+
+
+def _weighted(data, number, missed):
+    """The residual of a view, px, times the root of its weight."""
+    return missed if data.root is None else data.root[number] * missed
 
 
 def _missed(data, model, point, log_focal, coefficients, offset, ahead, turning, lever):
@@ -163,7 +169,8 @@ def averaged(data: Data, model: Model) -> Float[Array, "track 3"]:
         log_focal, coefficients, turning = rows.at(frame, point)
         straight = corrected(point, coefficients, rows.offset[frame], model.distortion_model, data.scale)
         ahead = turned(jnp.concatenate([straight / jnp.exp(log_focal), jnp.ones(1)]), -turning)
-        return product(model.path.rotation[frame].T, ahead) / jnp.linalg.norm(ahead)
+        seen = product(model.path.rotation[frame].T, ahead) / jnp.linalg.norm(ahead)
+        return seen if data.root is None else data.root[number] ** 2 * seen
 
     seen = of_each(len(data.points), jax.vmap(direction))
     rays = jax.ops.segment_sum(seen, data.structure.track, data.structure.tracks)
@@ -267,7 +274,8 @@ def _view_columns(unknowns, args, counted):
         gone, faster = jax.jvp(since_the_middle, (readout[0],), (jnp.ones(()),))
 
         def missed(*given):
-            return _with_loss(_missed(data, model, point, *given) / noise.points, counts)
+            missed = _weighted(data, number, _missed(data, model, point, *given))
+            return _with_loss(missed / noise.points, counts)
 
         given = (
             camera.log_focal + gone[0],

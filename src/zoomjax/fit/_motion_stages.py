@@ -93,7 +93,7 @@ def begun(data, paths, spreads, zoom, shift, distortion_model, terms):
         if found[1].points < _HOPELESS * min(noise.points for _, noise, *_ in tried):
             found = _solved(data, *_arrays((found[0], noise, STAGES[0]._replace(fresh=0.0))))
         tried.append(found)
-    model, noise, *_ = _best(tried, data.there)
+    model, noise, *_ = _best(tried, data)
     model, noise, *_ = _solved(data, *_arrays((model, noise.wider(STAGES[1].wider), STAGES[1])))
     return model, noise
 
@@ -138,8 +138,8 @@ def in_stages(data, model, noise, scene):
         scene: number of each frame's scene.
 
     Returns:
-        The parts of a `MotionFit` by name, the sizes of the residuals of all views, the model, and the
-        noise that residuals were weighted by last.
+        The parts of a `MotionFit` by name, the sizes of the residuals of all views, times the roots of
+        their weights, the model, and the noise that residuals were weighted by last.
     """
     model, noise, weighted_by, result, steps = _settled(data, model, noise)
     for _ in range(_MOST_COUNTS if data.lines is not None else 0):
@@ -163,11 +163,12 @@ def in_stages(data, model, noise, scene):
     return parts, missed, *_arrays((model, weighted_by))
 
 
-def _best(tried, there):
+def _best(tried, data):
     """The one of `_solved`'s that most views follow best: what has the least noise may be of few views."""
     noises = [np.nan_to_num(noise.points, nan=np.inf) for _, noise, *_ in tried]
-    sizes = [jnp.where(there, size, jnp.nan) for *_, size in tried]
-    costs = [float(disagreement(size, CAUCHY * min(noises))) for size in sizes]
+    sizes = [jnp.where(data.there, size, jnp.nan) for *_, size in tried]
+    weight = None if data.root is None else data.root**2
+    costs = [float(disagreement(size, CAUCHY * min(noises), weight)) for size in sizes]
     return tried[int(np.argmin(np.nan_to_num(costs, nan=np.inf)))]
 
 
@@ -205,7 +206,8 @@ def _arrays(tree):
 def _solved(data, model, noise, stage):
     """The path and the lens of least energy, the noise, the solver's status, its steps, and two more.
 
-    They are the change of the residuals, in all and in units of the noise, and the size of each, px.
+    They are the change of the residuals, in all and in units of the noise, and the size of each, px, times
+    the root of its weight.
 
     A stage whose steps are spent is successful if all of them moved the residuals by less than their noise
     does: with heavy tails the last steps are many and small.
@@ -233,7 +235,11 @@ def _solved(data, model, noise, stage):
     near = (size < FAR * noise.points)[:, None]
     change = _size_of_views(data, jnp.where(near, views - first, 0)) / noise.points
     change = change / jnp.sqrt(_parts(data))
-    points = core_median(size, data.there) / MEDIAN_OF_SIZE
+    if data.root is None or data.redundant is None:
+        points = core_median(size, data.there) / MEDIAN_OF_SIZE
+    else:
+        counted = data.root**2 * data.redundant
+        points = core_median(size / jnp.sqrt(data.redundant), data.there, counted) / MEDIAN_OF_SIZE
     rays = model.path.rays / jnp.linalg.norm(model.path.rays, axis=1, keepdims=True)
     model = eqx.tree_at(lambda m: m.path.rays, model, rays)
     noise = Noise(jnp.maximum(points, EXACT), _line_noise(data, model), noise.repeated)

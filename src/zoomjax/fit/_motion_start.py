@@ -87,18 +87,25 @@ def shrunk_ray(ray: Float[Array, "3"], factor: Float[Array, ""]) -> Float[Array,
 
 
 def starts_of(
-    points: Float[Array, "view 2"], tracks: int, width: float, by_frame: tuple
+    points: Float[Array, "view 2"],
+    tracks: int,
+    width: float,
+    by_frame: tuple,
+    root: Float[Array, "view"] | None = None,
 ) -> tuple[Path, Array]:
     """The best `STARTS` chains of all guesses, best first, and the medians of their frames' residuals, px.
+
+    Where views have weights, residuals are times their roots.
 
     Args:
         points: of each view, about the centre of the image, px.
         tracks: their number.
         width: of the image, px.
         by_frame: of `views_by_frame`.
+        root: of each view's weight; None for equal ones.
     """
     track, view, present = by_frame
-    seen = points[view]
+    seen, roots = points[view], None if root is None else root[view]
     guesses = width / 2 / np.tan(np.radians(FIELDS_OF_VIEW) / 2)
     drawn = np.random.default_rng(0).uniform(size=(1, _PAIRS, 2))
     drawn = (drawn + 0.618 * jnp.arange(len(track))[:, None, None]) % 1  # other ones in each frame
@@ -110,30 +117,38 @@ def starts_of(
             state = _next(state, *frame, near=_AGREES * width)
             return state, (state.log_focal, state.rotation, state.residual)
 
-        frames = (track, present, seen, drawn)
+        frames = (track, present, seen, drawn, roots)
         final, (log_focal, rotation, residual) = jax.lax.scan(step, state, frames)
         norm = jnp.linalg.norm(final.rays, axis=1, keepdims=True)
         rays = jnp.where(norm > 0, final.rays / jnp.where(norm > 0, norm, 1), jnp.array([[0.0, 0.0, 1.0]]))
         return Path(log_focal, rotation, rays), jnp.nanmean(residual)
 
     def missed(path):
-        def frame(log_focal, rotation, track, present, seen):
-            errors = _errors(path.rays[track] @ rotation.T, log_focal, seen)
+        def frame(log_focal, rotation, track, present, seen, root):
+            errors = _errors(path.rays[track] @ rotation.T, log_focal, seen, root)
             return jnp.where(present, jnp.linalg.norm(errors, axis=1), jnp.nan)
 
-        return jax.vmap(frame)(path.log_focal, path.rotation, track, present, seen)
+        return jax.vmap(frame)(path.log_focal, path.rotation, track, present, seen, roots)
 
     paths, residuals = jax.vmap(chain)(jnp.asarray(guesses, points.dtype))
     residuals = jnp.where(jnp.isfinite(residuals), residuals, jnp.inf)
     near = CAUCHY * jnp.min(residuals) / MEDIAN_OF_SIZE
-    costs = jax.lax.map(lambda path: disagreement(missed(path), near), paths)
+    weight = None if roots is None else roots**2
+    costs = jax.lax.map(lambda path: disagreement(missed(path), near, weight), paths)
     best = jnp.argsort(jnp.where(jnp.isfinite(residuals), costs, jnp.inf))[:STARTS]
     return jax.tree.map(lambda leaf: leaf[best], paths), residuals[best]
 
 
-def disagreement(size: Float[Array, "*some"], near: Float[Array, ""] | float) -> Float[Array, ""]:
+def disagreement(
+    size: Float[Array, "*some"],
+    near: Float[Array, ""] | float,
+    weight: Float[Array, "*some"] | None = None,
+) -> Float[Array, ""]:
     """How far views are off, in all, where those far off count little more: a mean; NaN is no view."""
-    return jnp.nanmean(jnp.log1p((size / near) ** 2))
+    cost = jnp.log1p((size / near) ** 2)
+    if weight is None:
+        return jnp.nanmean(cost)
+    return jnp.nansum(weight * cost) / jnp.sum(jnp.where(jnp.isnan(cost), 0, weight))
 
 
 def views_by_frame(
@@ -147,21 +162,26 @@ def views_by_frame(
     return padded[0], padded[1], np.arange(padded.shape[2]) < count[:, None]
 
 
-def _errors(ahead, log_focal, seen):
-    """How far points ahead of a camera without distortion are from where they were seen, px."""
-    return jnp.exp(log_focal) * ahead[:, :2] / jnp.maximum(ahead[:, 2:], 0.05) - seen
+def _errors(ahead, log_focal, seen, root):
+    """How far points ahead of a camera without distortion are from where they were seen, px.
+
+    Times the roots of their weights, if there are any.
+    """
+    errors = jnp.exp(log_focal) * ahead[:, :2] / jnp.maximum(ahead[:, 2:], 0.05) - seen
+    return errors if root is None else root[:, None] * errors
 
 
-def _next(state, track, present, seen, drawn, *, near):
+def _next(state, track, present, seen, drawn, root, *, near):
     """The state after one more frame: its focal length and rotation, and the rays with its views."""
     known = present & (jnp.sum(state.rays[track] ** 2, axis=1) > 0)
     directions = state.rays[track]
     directions = directions / jnp.maximum(jnp.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
     enough = jnp.sum(known) >= _LEAST_VIEWS
+    own = None if root is None else root**2
 
     def residuals(unknown):
         ahead = jax.vmap(lambda ray: turned(state.rotation @ ray, unknown[1:]))(directions)
-        return _errors(ahead, state.log_focal + unknown[0], seen)
+        return _errors(ahead, state.log_focal + unknown[0], seen, root)
 
     def change(error, jacobian, weight):
         normal = jnp.einsum("vri,vrj,v->ij", jacobian, jacobian, weight)
@@ -174,10 +194,10 @@ def _next(state, track, present, seen, drawn, *, near):
 
     def cost(unknown):
         size = jnp.linalg.norm(residuals(unknown), axis=1)
-        return disagreement(jnp.where(known, size, jnp.nan), near)
+        return disagreement(jnp.where(known, size, jnp.nan), near, own)
 
     def spread(unknown):
-        size = core_median(jnp.linalg.norm(residuals(unknown), axis=1), known)
+        size = core_median(jnp.linalg.norm(residuals(unknown), axis=1), known, own)
         return jnp.maximum(jnp.nan_to_num(size), 0.1)
 
     def turn(unknown, _):
@@ -200,6 +220,7 @@ def _next(state, track, present, seen, drawn, *, near):
     direction = ahead @ rotation / jnp.linalg.norm(ahead, axis=1, keepdims=True)
     size = jnp.linalg.norm(residuals(unknown), axis=1)
     weight = jnp.where(known, 1 / (1 + (size / (3 * spread(unknown))) ** 2), 1.0)
+    weight = weight if own is None else own * weight
     rays = state.rays.at[track].add(jnp.where(present, weight, 0)[:, None] * direction)
     residual = jnp.where(enough, spread(unknown), jnp.nan)
     return _State(jnp.log(focal), rotation, rays, residual)

@@ -28,6 +28,9 @@ _QUARTER = 1.5522
 
 _ROUNDS = 8
 
+_TIE = 1e-9
+"""Of a sum of weights: what is nearer to a half than rounding may be is a half."""
+
 
 def corrected(
     point: Float[Array, "2"],
@@ -75,12 +78,19 @@ def flattened(squared: Float[Array, "*some"]) -> Float[Array, "*some"]:
     return jnp.where(squared > 1e-8, jnp.sqrt(jnp.log1p(safe) / safe), 1 - squared / 4)
 
 
-def core_median(size: Float[Array, "*some"], there: Bool[Array, "*some"]) -> Float[Array, ""]:
+def core_median(
+    size: Float[Array, "*some"],
+    there: Bool[Array, "*some"],
+    weight: Float[Array, "*some"] | None = None,
+) -> Float[Array, ""]:
     """The median of the sizes of residuals that are no mistakes; NaN if none is there.
 
     More than half of all points may be on things that move, and then the median of all is none of the
     noise. So it begins with the lower quartile, and goes on with the median of those that the loss counts.
+    With weights both are of these: what hardly weighs hardly moves them.
     """
+    if weight is not None:
+        return _weighted_core_median(size, there, weight)
     ordered = jnp.sort(jnp.where(there, size, jnp.inf).ravel())
     number = jnp.sum(there)
 
@@ -95,3 +105,25 @@ def core_median(size: Float[Array, "*some"], there: Bool[Array, "*some"]) -> Flo
     start = _QUARTER * ordered[number // 4]
     median, _ = jax.lax.scan(again, start, None, length=_ROUNDS)
     return jnp.where(number > 0, median, jnp.nan)
+
+
+def _weighted_core_median(size, there, weight):
+    """That of weights; equal ones give what none do."""
+    size = jnp.where(there, size, jnp.inf).ravel()
+    order = jnp.argsort(size)
+    ordered, total = size[order], jnp.cumsum(jnp.where(there, weight, 0).ravel()[order])
+
+    def at(share):
+        return ordered[jnp.minimum(jnp.searchsorted(total, share), len(ordered) - 1)]
+
+    def median_of_first(count):
+        half = total[jnp.maximum(count - 1, 0)] / 2
+        return (at(half * (1 - _TIE)) + at(half * (1 + _TIE))) / 2
+
+    def again(median, _):
+        limit = jnp.maximum(FAR / MEDIAN_OF_SIZE * median, EXACT)
+        return median_of_first(jnp.searchsorted(ordered, limit, side="right")), None
+
+    start = _QUARTER * at(total[-1] / 4 * (1 + _TIE))
+    median, _ = jax.lax.scan(again, start, None, length=_ROUNDS)
+    return jnp.where(total[-1] > 0, median, jnp.nan)

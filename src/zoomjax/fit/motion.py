@@ -27,7 +27,7 @@ from ..models.zoom import AbstractZoom, PolynomialZoom
 from ..tracks.tracks import Tracks
 from ._motion_gradient import sensitive
 from ._motion_model import Model, Noise, scaled
-from ._motion_problem import LONGEST_LOOP, Asked, Given, Problem, problem_of, thinned
+from ._motion_problem import LONGEST_LOOP, Asked, Given, Problem, problem_of, relative, thinned
 from ._motion_stages import begun, continued, in_stages, with_all
 from ._motion_start import Path, starts_of, views_by_frame
 from .defaults import zoom_or_default
@@ -86,18 +86,25 @@ def fit_motion(
         throw: whether to raise if the fit fails. Otherwise see `ZoomFit.result`. `undetermined` and
             `folded` never raise.
 
+    Weights of views (`Tracks.weight`) are relative: times one factor, they change nothing but
+    `MotionFit.noise`, which is that of a view of weight 1. Residuals count in units of their own noise,
+    which is this over the root of the weight: in the loss, the estimate of the noise (a weighted median),
+    the start and all standard deviations. Beside others of weight 1, a view of weight 1/2 tells half as
+    much as they do, and one of weight 0 nothing: the fit is that without it. Equal weights are as none:
+    they do not say that views repeat one another.
+
     What no track tells is near what is usual: parameters of the zoom model have a prior of mean 0 and
     standard deviation 1, those of the centre's offset of 0.05 half diagonals, and the readout of half a
     frame.
 
-    Focal lengths, rotations, rays and lens are differentiable with respect to points, lines and known focal
-    lengths by ``grad``, ``jvp`` and their kin, outside of ``jit`` and ``vmap``: by the implicit function
-    theorem, with the noise by which residuals are weighted held as it is.
+    Focal lengths, rotations, rays and lens are differentiable with respect to points, weights above 0,
+    lines and known focal lengths by ``grad``, ``jvp`` and their kin, outside of ``jit`` and ``vmap``: by
+    the implicit function theorem, with the noise by which residuals are weighted held as it is.
 
     Raises:
-        ValueError: float64 is not enabled; the number of known focal lengths is not that of the frames; the
-            lines are of other frames or images, or the distortion model is not radial; or `begin` is of
-            another clip or other models.
+        ValueError: float64 is not enabled; no track has two views of a weight above 0; the number of known
+            focal lengths is not that of the frames; the lines are of other frames or images, or the
+            distortion model is not radial; or `begin` is of another clip or other models.
         RuntimeError: the fit failed (see `throw`).
 
     Warns:
@@ -116,7 +123,7 @@ def fit_motion(
     check("fit_motion", zoom=zoom)
     distortion_model = RadialPolynomial() if distortion_model is None else distortion_model
     terms = checked_terms(terms, distortion_model.most_terms)
-    given = Given(tracks, lines, line_frames, focal, focal_std, begin)
+    given = relative(Given(tracks, lines, line_frames, focal, focal_std, begin))
     asked = Asked(zoom, distortion_model, terms, shift, readout)
     if not traced(given):
         return _fitted(given, asked, throw)[0]
@@ -143,6 +150,9 @@ def _solved_motion(given, asked):
     found = (_from if _begins_near(given) else _from_nothing)(given, asked, problem)
     parts, missed, model, noise = in_stages(problem.data, *found, problem.scene)
     parts["fit"] = eqx.tree_at(lambda fit: fit.frame_rms, parts["fit"], parts["fit"].frame_rms[:frames])
+    if problem.data.root is not None:
+        missed = missed / problem.data.root
+        parts["noise"] = given.unit * parts["noise"]
     residual = jnp.full(np.shape(given.tracks.mask), jnp.nan)
     fit = MotionFit(
         **parts | {name: parts[name][:frames] for name in ("focal", "focal_std", "rotation")},
@@ -207,7 +217,9 @@ def _from(given, asked, problem):
         jnp.asarray(np.pad(np.asarray(earlier.rotation), (more, (0, 0), (0, 0)), mode="edge")),
         jnp.zeros((data.structure.tracks, 3)),
     )
-    return continued(data, path, lens, earlier.readout, Noise(earlier.noise, jnp.asarray(jnp.nan)))
+    return continued(
+        data, path, lens, earlier.readout, Noise(earlier.noise / given.unit, jnp.asarray(jnp.nan))
+    )
 
 
 def _warn_of_contradiction(given, fit):
@@ -229,9 +241,13 @@ def _warn_of_contradiction(given, fit):
 
 
 def _rays_of(model, problem, tracks):
-    """The direction of each track: the mean of those of its pieces."""
+    """The direction of each track: the mean of those of its pieces; NaN where no view counts."""
     rays = jnp.zeros((tracks, 3)).at[problem.track].add(model.path.rays[problem.piece])
-    return rays / jnp.linalg.norm(rays, axis=1, keepdims=True)
+    seen = np.bincount(problem.track, minlength=tracks)[:, None] > 0
+    if not seen.all():
+        rays = jnp.where(seen, rays, 1.0)  # with derivatives of 0
+    rays = rays / jnp.linalg.norm(rays, axis=1, keepdims=True)
+    return rays if seen.all() else jnp.where(seen, rays, jnp.nan)
 
 
 def _levers_of(model, problem, tracks):
@@ -285,7 +301,8 @@ def _started(data, by_frame, part):
 
     Each part that tracks link is scaled to those of its own frames; others as all of them are.
     """
-    paths, spreads = starts_of(data.points, data.structure.tracks, 1.6 * data.scale, by_frame)
+    tracks, width = data.structure.tracks, 1.6 * data.scale
+    paths, spreads = starts_of(data.points, tracks, width, by_frame, data.root)
     track, frame = data.structure.track, data.structure.frame
     of_track = jnp.zeros(data.structure.tracks, int).at[track].max(jnp.where(data.there, part[frame], 0))
 

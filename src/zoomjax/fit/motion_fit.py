@@ -26,9 +26,10 @@ class MotionFit(eqx.Module):
     Attributes:
         fit: the lens, with focal lengths in px, and its uncertainty. `ZoomFit.rms` is of the distances
             between views and where the model puts them, px of the image, without those that it takes for
-            mistakes; `ZoomFit.joint` includes the centre. Its result `undetermined` says that the tracks do
-            not determine the scale of the focal lengths, as where the camera zooms and does not turn: only
-            their ratios are known then, and of the distortion only what lines tell.
+            mistakes, and weighted as the views are; `ZoomFit.joint` includes the centre. Its result
+            `undetermined` says that the tracks do not determine the scale of the focal lengths, as where
+            the camera zooms and does not turn: only their ratios are known then, and of the distortion only
+            what lines tell.
         focal: focal length of each frame, px; NaN for a frame without tracks.
         focal_std: its standard deviation, px. Nearly all of it is a factor common to all frames.
         covariance: of the zoom model's parameters, of those of the centre's offset, of the readout, and of
@@ -40,9 +41,12 @@ class MotionFit(eqx.Module):
         scene: number of the scene of each frame, from 0; -1 for a frame without tracks. Shots are of one
             scene if tracks go from one to the other, or if `begin` of `fit_motion` has them in one. How
             the camera turned between scenes is not known.
-        rays: direction of each track in the scene, of length 1.
-        residual: distance between each view and where the model puts it, px; NaN for padding.
-        noise: standard deviation of a coordinate of a point, px, from the median of the residuals.
+        rays: direction of each track in the scene, of length 1; NaN where no two of its views have a weight
+            above 0.
+        residual: distance between each view and where the model puts it, px; NaN for padding and for views
+            that do not count, of weight 0 or the only ones of their tracks that are not.
+        noise: standard deviation of a coordinate of a point, px, from the median of the residuals; where
+            views have weights, of one of weight 1.
         line_noise: standard deviation of points of lines from these, px of the image; NaN without lines.
         readout: time that a rolling shutter takes from the first row to the last, in frames.
         readout_std: its standard deviation. A large one says that nothing is known: the camera was too slow
