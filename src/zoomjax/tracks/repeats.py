@@ -70,12 +70,15 @@ def originals(tracks: Tracks) -> Int[np.ndarray, "frame"]:
 def counted_once(tracks: Tracks) -> Tracks:
     """The same, with weights by which all views of a track in frames that show the same count as one.
 
-    Tracks without such views are returned as they are.
+    The mean of the weights stays, so that the noise by which they are fitted is that of a view. Tracks
+    without such views are returned as they are.
     """
     number = copies(originals(tracks), tracks)
     if not (number > 1).any():
         return tracks
-    weight = tracks.view_weights()
+    before = tracks.view_weights()
+    before = np.ones(len(number)) if before is None else before
+    weight = before / number
     track, frame, points = tracks.views()
     return Tracks.from_arrays(
         track,
@@ -83,7 +86,7 @@ def counted_once(tracks: Tracks) -> Tracks:
         points,
         image_size=tracks.image_size,
         frames=tracks.frames,
-        weight=(1 if weight is None else weight) / number,
+        weight=weight * (np.mean(before) / np.mean(weight)),
     )
 
 
