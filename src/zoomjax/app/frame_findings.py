@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from ..fit.motion import MotionFit
 from ..tracks.repeats import originals, without_rests
@@ -12,6 +12,9 @@ from ..trust.assessment import Finding
 
 BLIND = 0.2
 """Share of the frames that may show nothing: there f is interpolated, which is right for moments alone."""
+
+_LOOSE = 0.2
+"""Of the points of two frames that follow: where fewer are seen in both, these are not linked."""
 
 _RANGES = 4
 """Of frames that are named; the number of others is told."""
@@ -64,3 +67,38 @@ def ranges(numbers: Int[np.ndarray, "some"]) -> str:
         told = [*told[:_RANGES], f"{left} others"]
     words = ", ".join(told[:-1]) + " and " * (len(told) > 1) + told[-1]
     return f"frame{'s' * (len(numbers) > 1)} {words}"
+
+
+def of_dissolves(
+    tracks: Tracks,
+    follows: Bool[np.ndarray, "view"],
+    shot: Int[np.ndarray, "frame"],
+    numbers: Int[np.ndarray, "frame"],
+) -> Iterator[Finding]:
+    """Frames of a shot that no point that follows the camera links to those before them.
+
+    Args:
+        tracks: what was followed.
+        follows: which of their views follow the model.
+        shot: number of each frame's shot, -1 for frames without points.
+        numbers: of frames.
+    """
+    track, frame = np.nonzero(np.asarray(tracks.mask))[0][follows], np.asarray(tracks.frame)
+    frame = frame[np.asarray(tracks.mask)][follows]
+    first, last = np.full(len(tracks.number), tracks.frames), np.zeros(len(tracks.number), int)
+    np.minimum.at(first, track, frame)
+    np.maximum.at(last, track, frame)
+    seen = first < last
+    ends = [np.bincount(of[seen], minlength=tracks.frames) for of in (first, last)]
+    linked = np.cumsum(ends[0] - ends[1])[:-1]
+    there = np.bincount(frame, minlength=tracks.frames)
+    loose = (shot[:-1] == shot[1:]) & (shot[1:] >= 0)
+    loose &= linked < _LOOSE * np.minimum(there[:-1], there[1:])
+    if loose.any():
+        yield Finding(
+            "dissolves",
+            "doubtful",
+            f"next to nothing is seen both before and after {ranges(numbers[1:][loose])}: one picture may "
+            "dissolve into another there, and focal lengths near it be of either.",
+            "Cut the clip there, and leave out frames in which both are seen.",
+        )

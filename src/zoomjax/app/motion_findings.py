@@ -15,7 +15,7 @@ from ..models.lens import ZoomLens
 from ..tracks.tracks import Tracks
 from ..trust.assessment import NEGLIGIBLE, VERDICTS, Finding
 from ..trust.evidence import UNSEEN_PX
-from .frame_findings import BLIND, of_blind, of_repeated
+from .frame_findings import BLIND, of_blind, of_dissolves, of_repeated
 
 _LOOSE_SCALE = 0.01
 """Standard deviation of the common factor of focal lengths, relative, from which it is worth a word."""
@@ -72,6 +72,7 @@ def findings_of_motion(
         *_of_points(fit, tracks),
         *_of_lens(fit),
         *_of_cuts(fit),
+        *of_dissolves(tracks, follows(fit, tracks), np.asarray(fit.shot), numbers),
         *of_repeated(tracks),
         *of_blind(fit, numbers),
     ]

@@ -331,7 +331,7 @@ def _neighbours(shot, first):
     frame = np.arange(len(shot))
     first = np.concatenate([first, frame[len(first) :]])
     last = np.searchsorted(first, first, side="right") - 1
-    before, after = np.maximum(first - 1, 0), np.minimum(last + 1, len(shot) - 1)
+    before, after = np.where(first > 0, first - 1, frame), np.where(last + 1 < len(shot), last + 1, frame)
     return np.stack([np.where(shot[to] == shot, to, frame) for to in (before, after)], axis=1)
 
 

@@ -100,12 +100,8 @@ def without_rests(first: Int[np.ndarray, "frame"], tracks: Tracks) -> Int[np.nda
     ends = np.append(begins[1:], len(first))
     around = steps[np.stack([begins + 1, begins + 2, ends + 2, ends + 3])]
     fastest = np.max(np.where(np.isfinite(around), around, 0), axis=0)
-    into, out = around[1], around[2]
-    moves = (
-        np.isfinite(into)
-        & np.isfinite(out)
-        & (np.minimum(into, out) > np.maximum(_SLOWING * fastest, _LEAST))
-    )
+    least = np.minimum(around[1], around[2])  # one of them is not known at the ends of a clip and at cuts
+    moves = np.isfinite(least) & (least > np.maximum(_SLOWING * fastest, _LEAST))
     short = ends - begins <= _LONGEST
     return np.where((moves & short)[np.searchsorted(begins, first)], first, np.arange(len(first)))
 
