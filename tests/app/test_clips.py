@@ -212,20 +212,28 @@ def test_that_motion_is_tried_is_said_at_the_start(calibrated):
 
 
 def test_what_is_wrong_with_the_file_is_in_all_results(clip):
-    """Of fields, and not alone in its file."""
+    """Of fields, and at another rate than it was filmed at: every fifth frame is there twice."""
     with av.open(str(clip)) as given:
         frames = [frame.to_ndarray(format="bgr24") for frame in given.decode(video=0)]
+    frames = [frames[n] for n in np.repeat(np.arange(FRAMES), [1, 1, 1, 1, 2] * 7 + [1])]
     options = {"flags": "+ildct", "x264-params": "tff=1"}
     write_frames(clip.with_name("fields.mp4"), frames, options=options)
     done = zoomjax("calibrate", "fields.mp4", "--json", "-o", "third", cwd=clip.parent)
     summary = json.loads(done.stdout)
-    assert summary["frames"] == FRAMES
+    assert (summary["frames"], summary["repeated_frames"]) == (FRAMES + 7, 7)
+    assert summary["verdict"] == "good"
+    [finding] = summary["findings"]
+    assert finding["found"].startswith("7 of 43 frames repeat the one before")
+    found = track(clip.parent / "third")
+    shown = path()[0][np.repeat(np.arange(FRAMES), [1, 1, 1, 1, 2] * 7 + [1])]
+    assert abs(found["focal"] / shown - 1).max() < 0.005
     [warning] = summary["warnings"]
     assert warning.startswith("The video is interlaced")
     assert done.stderr.count(f"Warning: {warning}") == 1
     assert TRIED.partition(" (")[0] not in done.stderr
     page = (clip.parent / "third" / "report.html").read_text(encoding="utf-8")
     assert page.count("<aside><strong>Warning: </strong>The video is interlaced") == 1
+    assert page.count("7 of 43 frames repeat the one before") == 1
 
 
 def test_warnings_are_kept_and_shown_once():
@@ -533,7 +541,7 @@ def test_motion_is_tried_where_nothing_else_is_given():
         ("cut, then at rest", "doubtful", "cuts part them from the others: the scale"),
         ("pupil", "doubtful", "its entrance pupil is off the axis"),
         ("little turning", "doubtful", "have a common factor that is known to"),
-        ("dark", "good", "3 frames show nothing"),
+        ("dark", "good", "3 frames show nothing that can be followed: frames 20 to 22."),
         ("darker", "doubtful", "12 of 36 frames show nothing"),
         ("middle", "not determined", "moves a corner of the image by up to"),
         ("wrong f", "doubtful", "px is given"),

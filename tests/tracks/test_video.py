@@ -1,5 +1,6 @@
 """Tracks found in clips whose truth is known: how exact they are, and what they leave out."""
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -176,9 +177,27 @@ def test_fades_and_black_frames_may_have_no_tracks(plain):
     assert tracks.frames == 15
     assert (per_frame(tracks)[6:8] == 0).all()
     assert per_frame(tracks)[1] > 60
+    track, frame, _ = tracks.views()
+    assert len(set(track[frame == 0]) & set(track[frame == 3])) > 40  # where it has faded by half
     assert per_frame(tracks)[-1] > 60
     age, error = errors(tracks, plain[0])
     assert np.mean(np.abs(error[age > 0]).max(axis=1) < 0.5) > 0.95
+
+
+def test_frames_with_next_to_no_points_have_none(plain):
+    """Three corners tell no focal length and no rotation."""
+    frames = [np.full_like(frame, 128) for frame in plain[1][:9]]
+    for n, (frame, seen) in enumerate(zip(frames, plain[1], strict=False)):
+        if n < 6:
+            frame[:] = seen
+        else:
+            for x, y in ((60, 60), (200, 90), (330, 150)):
+                cv2.rectangle(frame, (x + n, y), (x + n + 30, y + 30), (250, 250, 250), -1)
+            frame[120:] = 128
+    tracks = track_frames(frames)
+    counts = per_frame(tracks)
+    assert counts[5] > 60
+    assert ((counts == 0) | (counts >= 4)).all()
 
 
 def test_interlaced_clips_are_warned_of(plain, tmp_path):

@@ -36,6 +36,7 @@ from ..trust.bands import displacement_std
 from ._flags import with_flags
 from .clip_lines import MOST, draw_frames, frames_with_lines, image_rows, lines_of_frames
 from .coefficients import coefficient_rows, finite, pixel_polynomials
+from .frame_findings import repeated_frames
 from .known_focals import KnownFocals
 from .model_choice import WantedModel
 from .motion_figures import (
@@ -139,7 +140,8 @@ class MotionCalibration:
     @property
     def findings(self) -> list[Finding]:
         """What the clip cannot tell, with what to do about it: the worst first; empty if all is good."""
-        return findings_of_motion(self.fit, self.tracks, self.known_of_frames())
+        numbers = self.times[:, 0].astype(int)
+        return findings_of_motion(self.fit, self.tracks, self.known_of_frames(), numbers=numbers)
 
     @property
     def verdict(self) -> Verdict:
@@ -203,6 +205,7 @@ class MotionCalibration:
             "warnings": list(self.warnings),
             "clip": self.clip.name,
             "frames": self.tracks.frames,
+            "repeated_frames": repeated_frames(self.tracks),
             "frames_without_points": int(np.sum(~np.isfinite(np.asarray(fit.focal)))),
             "tracks": len(self.tracks.number),
             "views": int(np.sum(np.asarray(self.tracks.mask))),

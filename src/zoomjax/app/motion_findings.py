@@ -15,6 +15,7 @@ from ..models.lens import ZoomLens
 from ..tracks.tracks import Tracks
 from ..trust.assessment import NEGLIGIBLE, VERDICTS, Finding
 from ..trust.evidence import UNSEEN_PX
+from .frame_findings import BLIND, of_blind, of_dissolves, of_repeated
 
 _LOOSE_SCALE = 0.01
 """Standard deviation of the common factor of focal lengths, relative, from which it is worth a word."""
@@ -36,9 +37,6 @@ _UNCERTAIN = 0.1
 _MOST = 5e-4
 """And beside the diagonal of the image, however strong the lens is: a pixel of 1080p."""
 
-_BLIND = 0.2
-"""Share of the frames that may show nothing: there f is interpolated, which is right for moments alone."""
-
 _MISSED = 9.0  # times the noise, squared: views beyond do not follow the model
 _FEW = 0.3  # of the views that do follow it: below, most of what is seen may move by itself
 # Of the views that follow, the share for which the loss hardly flattens: 0.94 of noise alone. Where four of
@@ -50,7 +48,11 @@ _LEAST_ZOOM = 1.2  # between the ends of the focal lengths
 
 
 def findings_of_motion(
-    fit: MotionFit, tracks: Tracks, known: tuple[np.ndarray, np.ndarray] | None = None
+    fit: MotionFit,
+    tracks: Tracks,
+    known: tuple[np.ndarray, np.ndarray] | None = None,
+    *,
+    numbers: np.ndarray | None = None,
 ) -> list[Finding]:
     """What the clip cannot tell, with what to do about it: the worst first; empty if all is good.
 
@@ -59,7 +61,9 @@ def findings_of_motion(
         tracks: what was followed.
         known: of each frame the focal length that was known, NaN where it was not, and its standard
             deviation.
+        numbers: of frames, in the file; by default they are counted.
     """
+    numbers = np.arange(tracks.frames) if numbers is None else numbers
     found = [
         *_of_turning(fit, known),
         *_of_parts(fit),
@@ -67,7 +71,10 @@ def findings_of_motion(
         *_of_zooming(fit),
         *_of_points(fit, tracks),
         *_of_lens(fit),
-        *_of_frames(fit),
+        *_of_cuts(fit),
+        *of_dissolves(tracks, follows(fit, tracks), np.asarray(fit.shot), numbers),
+        *of_repeated(tracks),
+        *of_blind(fit, numbers),
     ]
     return sorted(found, key=lambda of: -VERDICTS.index(of.verdict))
 
@@ -162,7 +169,7 @@ def _of_parts(fit: MotionFit) -> Iterator[Finding]:
     known = "is not determined" if open_ else f"is known to {worst:.1%} only"
     yield Finding(
         "turning",
-        "not determined" if open_ and len(frames) > _BLIND * np.sum(seen) else "doubtful",
+        "not determined" if open_ and len(frames) > BLIND * np.sum(seen) else "doubtful",
         f"in {len(frames)} of the frames, the first of them {frames[0]}, the camera hardly turns, and cuts "
         f"part them from the others: the scale of their focal lengths {known}.",
         "Cut these frames off, or give the focal length of one in each such shot (--known-focal).",
@@ -304,7 +311,7 @@ def _corner(lens: ZoomLens, focal: Float[Array, "focal"]) -> tuple[Array, Array]
     return moved(flat), jax.jacfwd(moved)(flat)
 
 
-def _of_frames(fit: MotionFit) -> Iterator[Finding]:
+def _of_cuts(fit: MotionFit) -> Iterator[Finding]:
     shots, scenes = (int(np.max(np.asarray(of))) + 1 for of in (fit.shot, fit.scene))
     if shots > 1:
         told = "All shots show one scene, and are joined. They share one lens."
@@ -318,15 +325,4 @@ def _of_frames(fit: MotionFit) -> Iterator[Finding]:
             "good",
             f"the clip has {shots - 1} cut{'s' * (shots > 2)}. {told}",
             "Check that all of them were filmed with the same lens.",
-        )
-    if missing := int(np.sum(~np.isfinite(np.asarray(fit.focal)))):
-        few = missing <= _BLIND * len(fit.focal)
-        yield Finding(
-            "frames without points",
-            "good" if few else "doubtful",
-            f"{missing} {'' if few else f'of {len(fit.focal)} '}frames show nothing that can be followed: "
-            "their f is interpolated.",
-            "Look at these frames in the corrected clip."
-            if few
-            else "Film a scene with detail everywhere, without blur, or cut these frames off.",
         )

@@ -15,6 +15,7 @@ from ..lines.lines import Lines
 from ..models.distortion_model import AbstractDistortionModel
 from ..models.requirements import check
 from ..models.zoom import AbstractZoom
+from ..tracks.repeats import originals, without_rests
 from ..tracks.tracks import Tracks
 from ._motion_model import Data
 from ._structure import bucket, padded, structure_of
@@ -131,7 +132,7 @@ def problem_of(given: Given, asked: Asked) -> Problem:
         unknowns=jnp.asarray(4.0 * np.sum(linked >= 0) + 2 * structure.tracks)
         if weight is None
         else _unknowns(weight, redundant, moment, piece),
-        neighbours=jnp.asarray(_neighbours(np.pad(shot, (0, more), constant_values=-1))),
+        neighbours=jnp.asarray(_neighbours(np.pad(shot, (0, more), constant_values=-1), _first(tracks))),
         readout=jnp.asarray(_known_readout(asked.readout)),
         lines=lines,
         moments=None if lines is None else lines.second_moments(2 * lines.terms),
@@ -313,10 +314,24 @@ def _relative_weights(lines):
     return lines.weight / jnp.where(mean > 0, mean, 1)
 
 
-def _neighbours(shot):
-    """Of each frame, the frames before and after it in the same shot, or itself."""
+def _first(tracks):
+    """Of each frame the first that shows the same moment. Where points are traced, all is fitted before."""
+    if traced(tracks.points):
+        return np.arange(tracks.frames)
+    return without_rests(originals(tracks), tracks)
+
+
+def _neighbours(shot, first):
+    """Of each frame, the frames before and after it that show something else in the same shot, or itself.
+
+    Args:
+        shot: number of each frame's shot.
+        first: of each frame the first that shows the same moment.
+    """
     frame = np.arange(len(shot))
-    before, after = np.maximum(frame - 1, 0), np.minimum(frame + 1, len(shot) - 1)
+    first = np.concatenate([first, frame[len(first) :]])
+    last = np.searchsorted(first, first, side="right") - 1
+    before, after = np.where(first > 0, first - 1, frame), np.where(last + 1 < len(shot), last + 1, frame)
     return np.stack([np.where(shot[to] == shot, to, frame) for to in (before, after)], axis=1)
 
 

@@ -22,6 +22,12 @@ from .video_hdr import side_data
 _MOST_ERRORS = 1000
 """Of one file: a demuxer may fail for ever."""
 
+INTERLACED = (
+    "The video is interlaced: each frame holds two moments in alternate rows, which are taken for one. "
+    "Deinterlace it first."
+)
+"""What is wrong with a video of fields, and what to do."""
+
 
 @contextlib.contextmanager
 def decode_video(
@@ -264,7 +270,7 @@ def numbered(
             _warn_of_skipped(report.skipped)
         if item.interlaced_frame and not fields:
             fields = True
-            _warn_of_fields()
+            warnings.warn(INTERLACED, stacklevel=2)
         if report.failed and item.pts is not None:
             stamps = _frame_numbers(source) if stamps is None else stamps
             number = stamps.get(item.pts, number + report.skipped) - report.skipped
@@ -281,12 +287,11 @@ def _warn_of_skipped(number: int) -> None:
         )
 
 
-def _warn_of_fields() -> None:
-    warnings.warn(
-        "The video is interlaced: each frame holds two moments in alternate rows, which are taken for one. "
-        "Deinterlace it first.",
-        stacklevel=3,
-    )
+def says_interlaced(source: str | os.PathLike[str]) -> bool:
+    """Whether the first frame that decodes says so, of a video that was read before."""
+    with opened_video(source) as input_:
+        items = decoded_items(input_, video := picture_stream(input_), Report(video.frames))
+        return any(item.interlaced_frame for item in itertools.islice(items, 1))
 
 
 def warn_of_pixels(video: Any) -> None:

@@ -18,6 +18,10 @@ _COARSE = 160
 """px: about the width of the images whose jump is looked for."""
 
 
+_FADED = 0.04
+"""Relative change of contrast, and of brightness beside white, that is one of the whole image."""
+
+
 def followed(
     before: Grey, after: Grey, points: Points, guess: Points, *, back: float
 ) -> tuple[Points, Bool[np.ndarray, "point"]]:
@@ -36,6 +40,21 @@ def followed(
         found = np.where((better & ~good)[:, None], others, found)
         good |= better
     return found, good
+
+
+def as_bright(image: Grey, other: Grey) -> Grey:
+    """An image with the mean and the contrast of another, if they differ much, as where a clip is faded.
+
+    What is darker at the same place would be taken for another place.
+    """
+    (mean, spread), (wanted, contrast) = (
+        (float(of[0, 0]) for of in cv2.meanStdDev(one)) for one in (image, other)
+    )
+    gain = contrast / max(spread, 1.0)
+    if abs(np.log(max(gain, 0.01))) < _FADED and abs(wanted - gain * mean) < _FADED * 255:
+        return image
+    table = np.clip(wanted + gain * (np.arange(256) - mean), 0, 255)
+    return cv2.LUT(image, np.rint(table).astype(np.uint8))
 
 
 def _there_and_back(before, after, points, guess, back):

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from ._camera import camera_motion, carried, local_shape
 from ._corners import best_corners
-from ._flow import Grey, followed
+from ._flow import Grey, as_bright, followed
 from ._patches import HALF, Patches
 
 _BACK = 0.4
@@ -112,6 +112,14 @@ class Follower:
             self._views.append((active, np.full(len(active), self.frame), self._active.point))
         self._small = small
 
+    @property
+    def moves(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points in the frame that were in the one before it, too, and how they moved, px."""
+        if self._active is None:
+            return np.zeros((0, 2)), np.zeros((0, 2))
+        older = self._active.begun < self.frame
+        return self._active.point[older], self._active.speed[older]
+
     def views(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Track, frame and point of each view, of tracks on the scene that have two views or more."""
         if self._active is not None:
@@ -160,7 +168,8 @@ class Follower:
         half = (self.shrunk - 1) / 2  # from the middle of the first pixel of the one to that of the other
         before = (active.point - half) / self.shrunk
         guess = before + active.speed / self.shrunk
-        after, good = followed(self._small, small, before, guess, back=_BACK / self.shrunk)
+        earlier = as_bright(self._small, small)
+        after, good = followed(earlier, small, before, guess, back=_BACK / self.shrunk)
         after = self.shrunk * after + half
         return after, good & self._inside(after)
 

@@ -19,9 +19,14 @@ from jaxtyping import UInt8
 
 from .._core.checks import checked_integer
 from .._core.fields import refuse_masked_image
-from ..io.video_reader import decode_video
+from ..io.video_reader import INTERLACED, decode_video, says_interlaced
+from ._fields import Fields
 from ._follow import Follower
+from .repeats import counted_once
 from .tracks import Tracks
+
+_FEWEST = 4
+"""Views of a frame that say anything: it has a focal length and three angles."""
 
 
 def track_video(
@@ -44,7 +49,8 @@ def track_video(
 
     Returns:
         The tracks, of two views at least. The error of a point is some 0.1 px at sharp corners; that of its
-        track's first point is 0 by definition.
+        track's first point is 0 by definition. Where frames repeat the one before, views have weights by
+        which those of one point in them count as one.
 
     Raises:
         FileNotFoundError: there is no such clip.
@@ -65,7 +71,7 @@ def track_video(
                 progress(len(numbers), announced)
 
         try:
-            tracks = track_frames(images(), most=most, life=life)
+            tracks, has_fields = _followed(images(), most, life)
         except ValueError as error:
             raise ValueError(f"Cannot track points in {os.fspath(clip)}: {error}") from error
     if lost := numbers[-1] + 1 - len(numbers):
@@ -74,6 +80,8 @@ def track_video(
             "frames without them.",
             stacklevel=2,
         )
+    if has_fields and not says_interlaced(clip):  # which is warned of
+        warnings.warn(INTERLACED, stacklevel=2)
     return tracks
 
 
@@ -90,9 +98,20 @@ def track_frames(
     Raises:
         ValueError: there are fewer than two frames, one is no such image, they differ in size, or nothing
             can be followed.
+
+    Warns:
+        UserWarning: frames are interlaced.
     """
+    tracks, has_fields = _followed(frames, most, life)
+    if has_fields:
+        warnings.warn(INTERLACED, stacklevel=2)
+    return tracks
+
+
+def _followed(frames, most, life) -> tuple[Tracks, bool]:
+    """The tracks, and whether frames are woven of fields."""
     most, life = checked_integer("most", most, 1), checked_integer("life", life, 2)
-    follower = None
+    follower, fields = None, Fields()
     for image in frames:
         grey = grey_frame(image)
         size = (grey.shape[1], grey.shape[0])
@@ -100,15 +119,25 @@ def track_frames(
         if size != follower.size:
             raise ValueError(f"Frames of {follower.size} and of {size} px follow each other.")
         follower.add(grey)
+        fields.add(follower.frame, grey, *follower.moves)
     number = 0 if follower is None else follower.frame + 1
     if follower is None or number < 2:
         raise ValueError("It has fewer than two frames.")
-    track, frame, points = follower.views()
+    track, frame, points = _enough(*follower.views())
     if not len(track):
         raise ValueError(
             "Nothing in it can be followed: it shows no corners, or nothing but what stays in its place."
         )
-    return Tracks.from_arrays(track, frame, points, image_size=follower.size, frames=number)
+    tracks = Tracks.from_arrays(track, frame, points, image_size=follower.size, frames=number)
+    return counted_once(tracks), fields.found
+
+
+def _enough(track, frame, points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The views in frames that have some: fewer tell no focal length, as in the dark end of a fade."""
+    kept = np.bincount(frame)[frame] >= _FEWEST if len(frame) else np.zeros(0, bool)
+    again = np.bincount(track[kept], minlength=track.max(initial=-1) + 1) > 1
+    kept &= again[track]
+    return track[kept], frame[kept], points[kept]
 
 
 def grey_frame(image: np.ndarray) -> np.ndarray:

@@ -1,0 +1,61 @@
+"""What is said of single frames of a clip."""
+
+import numpy as np
+import pytest
+
+from zoomjax.app.frame_findings import of_dissolves, of_repeated, ranges, repeated_frames
+from zoomjax.scenes import motion_tracks, pan_and_zoom
+from zoomjax.tracks import Tracks
+
+from ..tracks.test_repeats import repeated
+from ..tracks.test_video import lens
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ([7], "frame 7"),
+        ([3, 4, 5], "frames 3 to 5"),
+        ([3, 4, 9], "frames 3 to 4 and 9"),
+        ([0, 2, 4, 6, 8], "frames 0, 2, 4, 6 and 8"),
+        ([0, 2, 3, 4, 6, 8, 10, 12, 13], "frames 0, 2 to 4, 6, 8 and 3 others"),
+    ],
+)
+def test_frames_are_named_in_ranges(numbers, words):
+    assert ranges(np.array(numbers)) == words
+
+
+def test_frames_that_repeat_others_are_counted_and_told():
+    scene = motion_tracks(lens(), *pan_and_zoom(lens(), 20, pan=10), views=30, life=8, noise=0.2)
+    assert repeated_frames(scene.tracks) == 0
+    assert not [*of_repeated(scene.tracks)]
+    tracks = repeated(scene.tracks, [1, 2, 1, 1] * 5)
+    assert repeated_frames(tracks) == 5
+    [finding] = of_repeated(tracks)
+    assert finding.verdict == "good"
+    assert finding.found.startswith("5 of 25 frames repeat the one before, ")
+    assert "frame rate that it was filmed at" in finding.advice
+
+
+@pytest.mark.filterwarnings("ignore:Dropped")
+def test_a_dissolve_is_told_where_it_is():
+    """Two scenes of which both are seen in three frames, where the fit follows the second."""
+    scene = motion_tracks(lens(), *pan_and_zoom(lens(), 20, pan=10), views=30, life=15, noise=0.2)
+    track, frame, points = scene.tracks.views()
+    before, after = frame < 11, frame >= 8
+    tracks = Tracks.from_arrays(
+        np.concatenate([2 * track[before], 2 * track[after] + 1]),
+        np.concatenate([frame[before], frame[after]]),
+        np.concatenate([points[before], points[after] + 0.5]),
+        image_size=scene.tracks.image_size,
+        frames=20,
+    )
+    name, moment, _ = tracks.views()
+    numbers, one_shot = np.arange(20), np.zeros(20, int)
+    follows = (name % 2 == 1) | (moment < 8)
+    [finding] = of_dissolves(tracks, follows, one_shot, numbers)
+    assert finding.verdict == "doubtful"
+    assert "before and after frame 8:" in finding.found
+    assert not [*of_dissolves(tracks, follows, np.where(numbers < 8, 0, 1), numbers)]  # a cut is told
+    all_follow = np.ones(np.sum(np.asarray(scene.tracks.mask)), bool)
+    assert not [*of_dissolves(scene.tracks, all_follow, one_shot, numbers)]
