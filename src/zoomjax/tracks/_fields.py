@@ -59,7 +59,7 @@ def _displaced(image: Grey, points: np.ndarray) -> np.ndarray:
     even, odd = (np.ascontiguousarray(image[first:rows:2]) for first in (0, 1))
     places = (points / np.array([1, 2])).astype(np.float32)
     options = {"winSize": _WINDOW, "maxLevel": 3}
-    there, good, _ = cv2.calcOpticalFlowPyrLK(even, odd, places, None, **options)
-    back, fine, _ = cv2.calcOpticalFlowPyrLK(odd, even, there, None, **options)
+    there, good, _ = cv2.calcOpticalFlowPyrLK(even, odd, places, places.copy(), **options)
+    back, fine, _ = cv2.calcOpticalFlowPyrLK(odd, even, there, there.copy(), **options)
     found = (good.ravel() > 0) & (fine.ravel() > 0) & (np.abs(back - places).max(axis=1) < 0.5)
     return np.where(found, (there - places)[:, 0], np.nan)

@@ -1,6 +1,6 @@
-"""Frames that repeat the one before them, as conversions from 25 to 30 frames/s make them.
+"""Frames that repeat the one before them, as conversions of the frame rate make them.
 
-A copy has the errors of its original: its points are where they were, to the last thousandths of a px. To
+A copy has the errors of its original: its points are where they were, to next to nothing. To
 count both would say the same thing twice. It is the points that are compared, not the pixels: a copy that
 was encoded anew differs in its pixels, and another picture of a thing at rest may not.
 """
