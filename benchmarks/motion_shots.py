@@ -8,13 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from zoomjax.app.motion_calibration import calibrate_motion
 from zoomjax.fit import MotionFit, fit_motion
-from zoomjax.scenes import motion_clip
+from zoomjax.scenes import leaves, motion_clip
 from zoomjax.tracks import track_video
 
-from .motion_clips import photographs, write_video
+from .motion_clips import write_video
 from .motion_simulated import Rows, random_lens
 
-_CUT = 40
+_CUT, _PANORAMA = 40, (8192, 4096)
 
 
 def shots(only: str) -> Rows:
@@ -24,15 +24,14 @@ def shots(only: str) -> Rows:
     kinds = {
         "two shots of 40 frames": (_shot((28, 0), (6, 2), (1500, 2900), _CUT), 0),
         "the second of 12 frames, turning 1.5°": (_shot((4, 5.5), (2, 2), (1700, 1950), 12), 0),
-        "the second of another scene": (_shot((28, 0), (6, 2), (1500, 2900), _CUT), 2048),
+        "the second of another scene": (_shot((28, 0), (6, 2), (1500, 2900), _CUT), 1),
     }
-    texture = photographs()
-    for name, (second, shift) in kinds.items():
+    for name, (second, scene) in kinds.items():
         if only not in name:
             continue
         frames = []
-        for part, picture in ((first, texture), (second, np.roll(texture, (shift // 2, shift), (0, 1)))):
-            frames += motion_clip(lens, *part, texture=picture, noise=2).frames()
+        for part, seed in ((first, 0), (second, scene)):
+            frames += motion_clip(lens, *part, texture=leaves(_PANORAMA, seed=seed), noise=2).frames()
         focal, rotation = (np.concatenate(both) for both in zip(first, second, strict=True))
         with tempfile.TemporaryDirectory() as folder:
             clip = Path(folder) / "clip.mp4"
