@@ -14,7 +14,7 @@ from zoomjax.tracks import track_video
 from .motion_clips import write_video
 from .motion_simulated import Rows, random_lens
 
-_CUT, _PANORAMA = 40, (8192, 4096)
+_CUT, _DENSITY = 40, 2000.0
 
 
 def shots(only: str) -> Rows:
@@ -31,7 +31,9 @@ def shots(only: str) -> Rows:
             continue
         frames = []
         for part, seed in ((first, 0), (second, scene)):
-            frames += motion_clip(lens, *part, texture=leaves(_PANORAMA, seed=seed), noise=2).frames()
+            frames += motion_clip(
+                lens, *part, texture=leaves(seed=seed), density=_DENSITY, noise=2
+            ).frames()
         focal, rotation = (np.concatenate(both) for both in zip(first, second, strict=True))
         with tempfile.TemporaryDirectory() as folder:
             clip = Path(folder) / "clip.mp4"

@@ -17,6 +17,7 @@ import numpy as np
 from .._core.text import with_std
 from ..detect.batch import Detection
 from ..fit.joining import join_shots
+from ..fit.losses import IGNORED_LINE
 from ..fit.motion import LOOPS, fit_motion
 from ..fit.motion_fit import MotionFit
 from ..fit.result import RESULTS
@@ -40,7 +41,6 @@ from .frame_findings import repeated_frames
 from .known_focals import KnownFocals
 from .model_choice import WantedModel
 from .motion_figures import (
-    WRONG_LINE,
     all_focals,
     centre_summary,
     frame_rows,
@@ -130,7 +130,7 @@ class MotionCalibration:
     @property
     def rejected(self) -> np.ndarray:
         """Which lines are too far from straight to count."""
-        return self.line_rms > WRONG_LINE * float(self.fit.line_noise)
+        return self.line_rms > IGNORED_LINE * float(self.fit.line_noise)
 
     @functools.cached_property
     def rms_uncorrected(self) -> float:

@@ -16,9 +16,6 @@ from ..tracks.tracks import Tracks
 from ..trust.bands import std_of
 from .coefficients import finite
 
-WRONG_LINE = 9.0
-"""Times the noise of lines, from where `fit_motion` hardly counts one."""
-
 
 def all_focals(fit: MotionFit) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
     """Focal lengths of all frames and their standard deviations, px.

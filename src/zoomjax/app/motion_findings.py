@@ -9,6 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
+from ..fit.losses import CAUCHY, IGNORED
 from ..fit.motion import MotionFit
 from ..fit.result import RESULTS
 from ..models.lens import ZoomLens
@@ -37,7 +38,6 @@ _UNCERTAIN = 0.1
 _MOST = 5e-4
 """And beside the diagonal of the image, however strong the lens is: a pixel of 1080p."""
 
-_MISSED = 9.0  # times the noise, squared: views beyond do not follow the model
 _FEW = 0.3  # of the views that do follow it: below, most of what is seen may move by itself
 # Of the views that follow, the share for which the loss hardly flattens: 0.94 of noise alone. Where four of
 # five points are on things that move, what these are off is taken for noise, and the share is 0.7 to 0.76.
@@ -90,7 +90,7 @@ def following(fit: MotionFit, tracks: Tracks) -> float:
 
 def follows(fit: MotionFit, tracks: Tracks) -> Bool[np.ndarray, "view"]:
     """Which of the views follow the model."""
-    return _missed(fit, tracks) < _MISSED
+    return _missed(fit, tracks) < IGNORED
 
 
 def scale_std(fit: MotionFit) -> float:
@@ -112,10 +112,10 @@ def _own_scales(fit: MotionFit) -> Float[np.ndarray, "known"]:
 
 
 def _missed(fit: MotionFit, tracks: Tracks) -> np.ndarray:
-    """Of each view, the square of what it is off over where the loss begins to flatten; NaN of weight 0."""
+    """Of each view, what it is off over where the loss begins to flatten; NaN of weight 0."""
     residual, weight = np.asarray(fit.residual)[np.asarray(tracks.mask)], tracks.view_weights()
     residual = residual if weight is None else np.sqrt(weight) * residual
-    return (residual / (2.3849 * float(fit.noise))) ** 2
+    return residual / (CAUCHY * float(fit.noise))
 
 
 _TURN = "turn the camera by some 10 degrees or more while it zooms."
@@ -221,7 +221,7 @@ def _of_points(fit: MotionFit, tracks: Tracks) -> Iterator[Finding]:
             "the clip moves by itself, or the camera does not stand still.",
             "Use a tripod, and film a scene at rest.",
         )
-    elif (close := float(np.mean(missed[missed < _MISSED] < 1))) < _CLOSE:
+    elif (close := float(np.mean(missed[missed < IGNORED] < 1))) < _CLOSE:
         yield Finding(
             "moving things",
             "doubtful",

@@ -15,7 +15,6 @@ from ._motion_model import Data, Model, Noise, Stage, pinned, units_of
 from ._motion_parallax import parallax_of
 from ._motion_repeated import common_errors_of
 from ._motion_rows import (
-    WRONG_LINE,
     Counted,
     columns_of,
     line_residuals_of,
@@ -24,7 +23,7 @@ from ._motion_rows import (
     rows_of,
 )
 from ._schur import covariances, reduced_of
-from ._views import CAUCHY
+from .losses import CAUCHY, IGNORED, IGNORED_LINE
 from .result import ZoomFit, judged
 
 AS_GOOD = 1.3
@@ -32,7 +31,6 @@ AS_GOOD = 1.3
 
 _INFLATION = 1 / 0.95  # of variances, by what the loss loses
 
-_IGNORED = 9.0  # squares of where the loss begins to flatten: beyond, it nearly ignores a view
 
 _FOLLOWED = 0.2
 """Share of a frame's views that have to follow the model: fewer may do so by chance, at any f."""
@@ -72,7 +70,7 @@ def described(
     missed = residuals_of(data, model)
     data = pinned(data, missed, noise)
     squared = jnp.sum(missed**2, axis=-1)
-    inlier = data.there & (squared < _IGNORED * (noise.points * CAUCHY) ** 2)
+    inlier = data.there & (squared < (IGNORED * CAUCHY * noise.points) ** 2)
     known = _uncertainty(data, model, noise, stage, missed, inlier)
     focal, log_std = jnp.exp(model.path.log_focal), jnp.sqrt(known.log_focal)
     of_views = jnp.where(inlier, squared, 0), data.counted(inlier), data.counted(data.there)
@@ -111,7 +109,7 @@ def _uncertainty(
     """By the rows of what follows the model, with what the loss loses and what tracks have in common."""
     units = units_of(data, model, noise)
     zeros = jax.tree.map(jnp.zeros_like, units)
-    good = line_squares_of(data, line_residuals_of(data, model)) < (3 * WRONG_LINE * noise.lines) ** 2
+    good = line_squares_of(data, line_residuals_of(data, model)) < (IGNORED_LINE * noise.lines) ** 2
     args, counted = (data, model, noise, stage), Counted(inlier, good)  # the loss is in the inflation
 
     def rows_at(unknowns):

@@ -24,10 +24,8 @@ from ..models.zoom import AbstractPriorZoom
 from ._columns import Columns, Rows, Unknowns, columns, derivatives, of_each
 from ._motion_model import Data, Model, Noise, Stage, moved, units_of
 from ._motion_start import turned
-from ._views import CAUCHY, corrected, flattened, product, view_residual
-
-WRONG_LINE = 3.0
-"""Times the noise: the RMS of a line's distances where its loss begins to flatten."""
+from ._views import corrected, flattened, product, view_residual
+from .losses import CAUCHY, LINE
 
 _PIN = 1e3
 """Weight of what is redundant: log f of one frame beside the common factor is 0."""
@@ -208,7 +206,7 @@ def _other_rows(unknowns, args, counted=None):
     there = moved(model, steps)
     lines = line_residuals_of(data, there)
     if counted is None:
-        of_lines = jnp.nan_to_num(line_squares_of(data, lines)) / (noise.lines * WRONG_LINE) ** 2
+        of_lines = jnp.nan_to_num(line_squares_of(data, lines)) / (noise.lines * LINE) ** 2
         lines = lines * flattened(of_lines)[:, None]
     else:
         lines = jnp.where(counted.lines[:, None], lines, 0)

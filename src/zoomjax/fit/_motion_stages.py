@@ -27,7 +27,8 @@ from ._motion_rows import (
 from ._motion_start import STARTS, disagreement
 from ._normal_solver import damped_solver
 from ._schur import Schur
-from ._views import CAUCHY, EXACT, FAR, MEDIAN_OF_SIZE, core_median
+from ._views import EXACT, FAR, MEDIAN_OF_SIZE, core_median
+from .losses import CAUCHY
 from .result import RESULTS
 
 STAGES = (

@@ -18,7 +18,8 @@ from jaxtyping import Array, Float, Int
 
 from .._core.arrays import places
 from ._structure import bucket
-from ._views import CAUCHY, MEDIAN_OF_SIZE, core_median
+from ._views import MEDIAN_OF_SIZE, core_median
+from .losses import CAUCHY
 
 FIELDS_OF_VIEW = (70.0, 45.0, 28.0, 17.0, 10.0, 5.0)
 """Guesses, degrees across the image."""

@@ -10,9 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..models.distortion_model import AbstractDistortionModel
-
-CAUCHY = 2.3849
-"""Of the noise: where the loss begins to flatten; of normal errors it wastes a twentieth."""
+from .losses import CAUCHY, IGNORED
 
 MEDIAN_OF_SIZE = 1.1774
 """Of the length of a vector of two normal numbers."""
@@ -20,7 +18,7 @@ MEDIAN_OF_SIZE = 1.1774
 EXACT = 1e-6
 """px: the least noise, of points without any."""
 
-FAR = 3 * CAUCHY
+FAR = IGNORED * CAUCHY
 """Of the noise: beyond, the loss nearly ignores a view."""
 
 _QUARTER = 1.5522
