@@ -192,3 +192,17 @@ def test_large_files_go_the_fast_way(path, rng):
         np.testing.assert_array_equal(found[0]["a"], values[:, 0])
         np.testing.assert_array_equal(found[0]["d"], values[:, 3])
         np.testing.assert_array_equal(found[1], np.arange(2, 1002))
+
+
+@pytest.mark.parametrize("name", ["weights", "Weight_of_view", "weightt"])
+def test_a_column_that_is_called_nearly_as_an_optional_one_is_refused(path, name):
+    path.write_text(f"a,{name}\n1,2\n")
+    with pytest.raises(ValueError, match=r"its column .* would not count: weight is what it is called"):
+        read_text_table(path, "numbers", numbers=("a",), optional=("weight",))
+
+
+@pytest.mark.parametrize("header", ["a,height,width", "a,weight,weights"])
+def test_other_columns_are_ignored_all_the_same(path, header):
+    path.write_text(f"{header}\n1,2,3\n")
+    found = read_text_table(path, "numbers", numbers=("a",), optional=("weight",)).numbers
+    assert set(found) == {"a", "weight"} & set(header.split(","))

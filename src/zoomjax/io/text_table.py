@@ -13,13 +13,18 @@ row by row by `csv.reader`, which defines the result and the error messages.
 import codecs
 import csv
 import dataclasses
+import difflib
 import io
+import itertools
 import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+
+_ALIKE = 0.85
+"""Of two names, from 0 to 1: from here on one is meant for the other; of weight and height it is less."""
 
 _SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 
@@ -108,6 +113,8 @@ def read_text_table(
 ) -> TextTable:
     """Read the named columns of a text file, in any order and case; others are ignored.
 
+    But one that is called nearly as an optional column that is not there is refused.
+
     Text is UTF-8, or UTF-16 or UTF-32 with a byte-order mark. Columns are separated by commas, semicolons
     or tabs; cells may be quoted. Between semicolons numbers may have decimal commas, and between tabs where
     that is certain. Empty lines, and lines that begin with ``#``, do not count.
@@ -133,6 +140,7 @@ def read_text_table(
         for name in wanted:
             if names.count(name) > 1:
                 raise ValueError(f"its first line names the column {name} twice")
+        _refuse_misspelled(names, wanted, optional)
         if len(chosen := [n for n in one_of if n in names]) > 1:
             raise ValueError(f"it has the columns {' and '.join(chosen)}: keep one of them")
         fast = None if texts else _fast(body, separator, names, wanted, line)
@@ -193,6 +201,13 @@ def _split_header(text: str) -> tuple[int, str, str]:
         if plain.strip(",;\t ") and plain[0] != "#" and not plain.lower().startswith("sep="):
             return number, line, text[start:]
     return number, "", ""
+
+
+def _refuse_misspelled(names, wanted, optional):
+    """ValueError for a column whose name is nearly that of an optional one: it would not count."""
+    for name, meant in itertools.product(set(names) - set(wanted), set(optional) - set(names)):
+        if name.startswith(meant) or difflib.SequenceMatcher(None, name, meant).ratio() > _ALIKE:
+            raise ValueError(f"its column {name} would not count: {meant} is what it is called")
 
 
 def _header(line: str, required: Sequence[str], one_of: Sequence[str]) -> tuple[str, list[str]]:
