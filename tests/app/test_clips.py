@@ -22,6 +22,7 @@ from zoomjax.app.motion_calibration import FILES, MotionCalibration
 from zoomjax.app.panorama import write_panorama
 from zoomjax.fit.motion import fit_motion
 from zoomjax.io.focal_track import read_focal_track
+from zoomjax.io.video_reader import decode_video
 from zoomjax.scenes import motion_clip, motion_tracks, pan_and_zoom
 
 from .._clips import write_frames
@@ -492,6 +493,16 @@ def test_an_option_without_effect_is_refused(clip, options, sentence):
     done = zoomjax("calibrate", clip.name, *options.split(), "-o", "no", cwd=clip.parent)
     assert done.returncode == 2
     assert sentence in done.stderr
+
+
+def test_a_clip_that_does_not_move_is_refused(clip, tmp_path):
+    with decode_video(clip) as (_, frames):
+        first = next(iter(frames))[2]()
+    write_clip(tmp_path / "still.mp4", [first] * 8)
+    done = zoomjax("calibrate", "still.mp4", "-o", "out", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "still.mp4 shows 1 frame and copies: f is found from how it moves" in done.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_dry_run_writes_nothing(clip):

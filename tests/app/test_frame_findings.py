@@ -1,9 +1,12 @@
 """What is said of single frames of a clip."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from zoomjax.app.frame_findings import of_dissolves, of_repeated, ranges, repeated_frames
+from zoomjax.app.motion_findings import _of_known
+from zoomjax.fit import MotionFit
 from zoomjax.scenes import motion_tracks, pan_and_zoom
 from zoomjax.tracks import Tracks
 
@@ -59,3 +62,21 @@ def test_a_dissolve_is_told_where_it_is():
     assert not [*of_dissolves(tracks, follows, np.where(numbers < 8, 0, 1), numbers)]  # a cut is told
     all_follow = np.ones(np.sum(np.asarray(scene.tracks.mask)), bool)
     assert not [*of_dissolves(scene.tracks, all_follow, one_shot, numbers)]
+
+
+def findings_of_known(off, std):
+    """What is said of ten known focal lengths by which f is off by such a share."""
+    focal = np.linspace(900, 1800, 10)
+    fit = object.__new__(MotionFit)
+    object.__setattr__(fit, "focal", jnp.append(focal * (1 + off), jnp.nan))
+    given, sigma = np.append(focal, 700), np.append(std * focal, 0.01)
+    return [of.found for of in _of_known(fit, (given, sigma)) if of.verdict != "good"]
+
+
+def test_known_focal_lengths_that_contradict_only_together_are_told():
+    alone = findings_of_known(0.3, 0.06)
+    assert len(alone) == 1
+    assert "of its standard deviations away" in alone[0]
+    [together] = findings_of_known(0.09, 0.06)
+    assert together.startswith("motion and lines say that f is 8.6% longer than what is known of 11 frames")
+    assert findings_of_known(0.03, 0.06) == []

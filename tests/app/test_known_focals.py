@@ -107,7 +107,7 @@ def test_frames_of_a_board_count_as_one_measurement():
     single = choose_focals(noisy, "plane").deviation
     own = [single[f"a-clip-{number:06d}.jpg"] for number in (4, 12, 30)]
     np.testing.assert_allclose(known.std, np.sqrt(3) * np.hypot(own, 0.01 * known.focal), rtol=1e-9)
-    with pytest.raises(ValueError, match="No focal length found for any image"):
+    with pytest.raises(ValueError, match="No frame tells its focal length by the plane"):
         measured_focals([view(1, 1000.0, 0.0)], "plane")
 
 

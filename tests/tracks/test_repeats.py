@@ -119,7 +119,7 @@ def test_copies_count_once(plain):
     first = shown_first(AT_30[:12])[frame]
     _, place = np.unique(np.stack([track, first]), axis=1, return_inverse=True)
     np.testing.assert_allclose(np.bincount(place.ravel(), weights=weight), weight.max(), rtol=1e-6)
-    assert np.mean(weight) == pytest.approx(1)
+    assert np.sum(weight**2) / np.sum(weight) == pytest.approx(1)
 
 
 def test_tracks_without_copies_have_no_weights(plain):
@@ -132,8 +132,29 @@ def test_weights_of_their_own_are_shared_among_copies():
     tracks = Tracks.from_arrays(track, frame, points, image_size=SIZE, weight=np.full(len(track), 3.0))
     weight = counted_once(tracks).view_weights()
     assert weight is not None
-    np.testing.assert_allclose(np.mean(weight), 3)
+    assert np.sum(weight**2) / np.sum(weight) == pytest.approx(3)
     assert set(np.round(weight / weight.min(), 6).tolist()) == {1.0, 2.0}
+
+
+def test_views_that_are_no_copies_keep_their_weight_beside_a_long_rest():
+    """Else the noise, which is that of weight 1, would be too large by the length of the rest."""
+    scene = motion_tracks(lens(), *pan_and_zoom(lens(), 20, pan=10), views=30, life=8, noise=0.2)
+    held = repeated(scene.tracks, [60, *[1] * 19])
+    weight = counted_once(held).view_weights()
+    assert weight is not None
+    frame = held.views()[1]
+    np.testing.assert_allclose(weight[frame >= 60], 1, rtol=0.1)
+    np.testing.assert_allclose(weight[frame < 60], 1 / 60, rtol=0.1)
+
+
+def test_the_names_and_the_order_of_tracks_do_not_matter():
+    scene = motion_tracks(lens(), *pan_and_zoom(lens(), 20, pan=10), views=30, life=8, noise=0.2)
+    tracks = repeated(scene.tracks, AT_30[:20])
+    order = np.random.default_rng(0).permutation(len(tracks.mask))
+    fields = (np.asarray(of)[order] for of in (tracks.points, tracks.frame, tracks.mask))
+    other = Tracks(*fields, tracks.image_size, tracks.frames, np.zeros(len(order), int))
+    np.testing.assert_array_equal(originals(other), originals(tracks))
+    np.testing.assert_array_equal(originals(other), shown_first(AT_30[:20]))
 
 
 def test_points_of_few_tracks_tell_nothing():

@@ -8,6 +8,7 @@ import pytest
 import zoomjax as zj
 from zoomjax.scenes import leaves, motion_clip, pan_and_zoom
 from zoomjax.tracks import track_frames, track_video
+from zoomjax.tracks.video import _enough
 
 from .._clips import write_frames, write_still
 
@@ -222,7 +223,7 @@ def test_what_cannot_be_tracked_is_told_in_one_sentence(plain, tmp_path):
     with pytest.raises(FileNotFoundError):
         track_video(tmp_path / "none.mp4")
     with pytest.raises(ValueError, match="Argument most"):
-        track_frames(plain[1], most=0)
+        track_frames(plain[1], most=3)
     with pytest.raises(ValueError, match="follow each other"):
         track_frames([plain[1][0], plain[1][1][:-2]])
     with pytest.raises(ValueError, match="fewer than two frames"):
@@ -273,3 +274,14 @@ def test_a_zooming_broadcast_with_moving_things_and_captions(tmp_path):
 def test_what_is_no_image_is_refused(frame, what):
     with pytest.raises(ValueError, match=rf"frames must hold images .* of uint8, .* but one is .*{what}"):
         track_frames([frame, frame])
+
+
+def test_frames_have_four_views_or_none_and_tracks_two():
+    track = np.array([0, 0, 0, 1, 1, 2, 2, 3, 3, 4, 4])
+    frame = np.array([0, 1, 2, 0, 1, 0, 1, 0, 1, 2, 3])
+    kept = _enough(track, frame, np.zeros((len(track), 2)))
+    np.testing.assert_array_equal(kept[0], [0, 0, 1, 1, 2, 2, 3, 3])
+    np.testing.assert_array_equal(kept[1], [0, 1] * 4)
+    fewer = frame[track > 0], track[track > 0]
+    assert len(_enough(fewer[1], fewer[0], np.zeros((len(fewer[0]), 2)))[0]) == 0
+    assert len(_enough(track[:0], frame[:0], np.zeros((0, 2)))[0]) == 0

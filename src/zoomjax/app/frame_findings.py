@@ -99,6 +99,6 @@ def of_dissolves(
             "dissolves",
             "doubtful",
             f"next to nothing is seen both before and after {ranges(numbers[1:][loose])}: one picture may "
-            "dissolve into another there, and focal lengths near it be of either.",
-            "Cut the clip there, and leave out frames in which both are seen.",
+            "dissolve into another there, or blur or a near thing hide it, and f near it be wrong.",
+            "Look at the clip there. If it dissolves, cut it, and leave out frames in which both are seen.",
         )

@@ -80,7 +80,13 @@ def measured_focals(found: Sequence[Detection], source: str) -> KnownFocals:
     Raises:
         ValueError: no frame tells its focal length.
     """
-    told = choose_focals([detection for detection in found if detection.lines], source)
+    try:
+        told = choose_focals([detection for detection in found if detection.lines], source)
+    except ValueError as error:
+        raise ValueError(
+            f"No frame tells its focal length by the {source}: leave --known-focal {source} out, or give "
+            "one that you know, such as --known-focal 24@0."
+        ) from error
     numbers = np.array([frame_number(name) for name in told.focal])
     focal, std = (np.array([of[name] for name in told.focal]) for of in (told.focal, told.deviation))
     order = np.argsort(numbers)

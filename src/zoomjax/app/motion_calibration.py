@@ -31,6 +31,7 @@ from ..models.registry import distortion_model_name
 from ..models.zoom import PolynomialZoom
 from ..tracks.again import find_again
 from ..tracks.key_frames import KeyFrames
+from ..tracks.repeats import originals
 from ..tracks.tracks import Tracks
 from ..trust.assessment import VERDICTS, Finding, Verdict
 from ..trust.bands import displacement_std
@@ -62,6 +63,7 @@ _TOLD_SHUTTER = 0.1
 """Standard deviation of the readout, in frames, below which it is told."""
 
 _MANY = 9.0  # focal lengths, more than any model needs
+_FEWEST = 4  # different frames, as a polynomial of degree 2 takes three
 _WORTH = 0.03  # share of more views for which it is fitted again
 
 
@@ -137,7 +139,7 @@ class MotionCalibration:
         """RMS distance, px, of views that follow from where the path alone puts them, without a lens."""
         return rms_uncorrected(self.fit, self.tracks, follows(self.fit, self.tracks))
 
-    @property
+    @functools.cached_property
     def findings(self) -> list[Finding]:
         """What the clip cannot tell, with what to do about it: the worst first; empty if all is good."""
         numbers = self.times[:, 0].astype(int)
@@ -342,10 +344,15 @@ def calibrate_motion(
         stage: called with a description before each step that takes time.
 
     Raises:
-        ValueError: float64 is not enabled, or a known focal length is of a frame that is not there.
+        ValueError: float64 is not enabled, the clip does not move, or a known focal length is of a frame
+            that is not there.
         RuntimeError: the fit failed.
     """
     times = frames_of(clip)
+    if (moments := len(np.unique(originals(tracks)))) < _FEWEST:
+        raise ValueError(
+            f"{clip} shows {moments} frame{'s' * (moments > 1)} and copies: f is found from how it moves."
+        )
     focal, focal_std = (None, None) if known is None else known.of_frames(times[:, 0])
     stage("Fitting the camera's path and the lens")
     candidate = model.base(np.arange(1.0, _MANY))

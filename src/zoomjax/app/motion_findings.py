@@ -66,7 +66,7 @@ def findings_of_motion(
     numbers = np.arange(tracks.frames) if numbers is None else numbers
     found = [
         *_of_turning(fit, known),
-        *_of_parts(fit),
+        *_of_parts(fit, numbers),
         *_of_known(fit, known),
         *_of_zooming(fit),
         *_of_points(fit, tracks),
@@ -82,10 +82,10 @@ def findings_of_motion(
 def following(fit: MotionFit, tracks: Tracks) -> float:
     """The share of the views that follow the model: the rest are on things that move, or mistakes.
 
-    Views of weight 0 do not count.
+    Views that did not count in the fit, as of weight 0, do not count here.
     """
-    weight = tracks.view_weights()
-    return float(np.mean(follows(fit, tracks), where=True if weight is None else weight > 0))
+    missed = _missed(fit, tracks)
+    return float(np.mean(missed < IGNORED, where=np.isfinite(missed)))
 
 
 def follows(fit: MotionFit, tracks: Tracks) -> Bool[np.ndarray, "view"]:
@@ -95,7 +95,8 @@ def follows(fit: MotionFit, tracks: Tracks) -> Bool[np.ndarray, "view"]:
 
 def scale_std(fit: MotionFit) -> float:
     """Standard deviation of the factor common to all focal lengths, relative."""
-    return float(np.sqrt(fit.covariance[-1, -1]))
+    variance = float(fit.covariance[-1, -1])
+    return float(np.sqrt(variance)) if variance >= 0 else np.nan
 
 
 def is_relative(fit: MotionFit) -> bool:
@@ -127,7 +128,7 @@ _TELL = (
 
 
 def _of_turning(fit: MotionFit, known: tuple[np.ndarray, np.ndarray] | None) -> Iterator[Finding]:
-    given = 0.0 if known is None else float(np.nanmin(known[1] / known[0]))
+    given = 0.0 if known is None else _together(fit, known)[1]
     if fit.fit.result not in (RESULTS.successful, RESULTS.undetermined):
         message = RESULTS[fit.fit.result]
         again = "Film a scene at rest again, and turn slowly."
@@ -154,24 +155,24 @@ def _of_turning(fit: MotionFit, known: tuple[np.ndarray, np.ndarray] | None) -> 
         )
 
 
-def _of_parts(fit: MotionFit) -> Iterator[Finding]:
+def _of_parts(fit: MotionFit, numbers: np.ndarray) -> Iterator[Finding]:
     """Scenes whose focal lengths have a looser scale than others, as nothing but the lens links them."""
     focal, std, scene = (np.asarray(of) for of in (fit.focal, fit.focal_std, fit.scene))
     seen = np.isfinite(focal) & (scene >= 0)
-    numbers = np.unique(scene[seen])
-    own = np.array([np.median((std / focal)[seen & (scene == number)]) for number in numbers.tolist()])
+    scenes = np.unique(scene[seen])
+    own = np.array([np.median((std / focal)[seen & (scene == number)]) for number in scenes.tolist()])
     loose = ~(own <= _LOOSE_SCALE)
     if is_relative(fit) or not loose.any() or loose.all():
         return
-    frames = np.flatnonzero(seen & np.isin(scene, numbers[loose]))
+    frames = np.flatnonzero(seen & np.isin(scene, scenes[loose]))
     worst = float(np.max(np.nan_to_num(own, nan=np.inf)))
     open_ = not worst < _NO_SCALE
     known = "is not determined" if open_ else f"is known to {worst:.1%} only"
     yield Finding(
         "turning",
         "not determined" if open_ and len(frames) > BLIND * np.sum(seen) else "doubtful",
-        f"in {len(frames)} of the frames, the first of them {frames[0]}, the camera hardly turns, and cuts "
-        f"part them from the others: the scale of their focal lengths {known}.",
+        f"in {len(frames)} of the frames, the first of them {numbers[frames[0]]}, the camera hardly turns, "
+        f"and cuts part them from the others: the scale of their focal lengths {known}.",
         "Cut these frames off, or give the focal length of one in each such shot (--known-focal).",
     )
 
@@ -198,6 +199,28 @@ def _of_known(fit: MotionFit, known: tuple[np.ndarray, np.ndarray] | None) -> It
             f"{off[worst]:.2g} of its standard deviations away: it takes all focal lengths along.",
             "Leave out known focal lengths that are wrong, or give them a larger sigma (--focal-sigma).",
         )
+
+    mean, sigma = _together(fit, known)
+    if abs(mean) > _FAR_OFF * sigma and off.max() <= _FAR_OFF:
+        yield Finding(
+            "known focal lengths",
+            "doubtful",
+            f"motion and lines say that f is {abs(mean):.1%} {'longer' if mean > 0 else 'shorter'} than "
+            f"what is known of {np.sum(np.isfinite(given))} frames, {abs(mean) / sigma:.2g} standard "
+            "deviations of all of it together: it takes all focal lengths along.",
+            "Leave out known focal lengths, or give them a larger sigma (--focal-sigma).",
+        )
+
+
+def _together(fit: MotionFit, known: tuple[np.ndarray, np.ndarray]) -> tuple[float, float]:
+    """The mean of log f over what is known of it, by its weights, and the deviation of what is known."""
+    focal, given, std = np.asarray(fit.focal), *known
+    off, weight = np.log(focal / given), (given / std) ** 2
+    seen = np.isfinite(off) & (weight > 0)
+    if not seen.any():
+        return 0.0, np.inf
+    total = float(np.sum(weight[seen]))
+    return float(np.sum((weight * off)[seen])) / total, total**-0.5
 
 
 def _of_zooming(fit: MotionFit) -> Iterator[Finding]:
@@ -285,7 +308,8 @@ def own_corner(fit: MotionFit) -> tuple[np.ndarray, np.ndarray]:
     low, high = (float(f) for f in fit.lens.focal_range)
     covariance = np.delete(np.delete(np.asarray(fit.covariance), -2, 0), -2, 1)  # without the readout
     moved, by = _corner(fit.lens, jnp.array([low, np.sqrt(low * high), high]))
-    return np.asarray(moved), np.sqrt(np.einsum("fi,ij,fj->f", by, covariance, by))
+    variance = np.einsum("fi,ij,fj->f", by, covariance, by)
+    return np.asarray(moved), np.sqrt(np.where(variance >= 0, variance, np.nan))
 
 
 @eqx.filter_jit

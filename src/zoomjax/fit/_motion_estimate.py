@@ -31,6 +31,9 @@ AS_GOOD = 1.3
 
 _INFLATION = 1 / 0.95  # of variances, by what the loss loses
 
+_LITTLE = 1e-9
+"""Added to the diagonal: where one track alone links frames to others, they may turn about its ray."""
+
 
 _FOLLOWED = 0.2
 """Share of a frame's views that have to follow the model: fewer may do so by chance, at any f."""
@@ -71,13 +74,14 @@ def described(
     data = pinned(data, missed, noise)
     squared = jnp.sum(missed**2, axis=-1)
     inlier = data.there & (squared < (IGNORED * CAUCHY * noise.points) ** 2)
-    known = _uncertainty(data, model, noise, stage, missed, inlier)
-    focal, log_std = jnp.exp(model.path.log_focal), jnp.sqrt(known.log_focal)
+    focal = jnp.exp(model.path.log_focal)
     of_views = jnp.where(inlier, squared, 0), data.counted(inlier), data.counted(data.there)
     squares, followed, there = (
         jnp.zeros(len(focal)).at[data.structure.frame].add(leaf) for leaf in of_views
     )
     unseen = followed <= _FOLLOWED * there
+    known = _uncertainty(data, model, noise, stage, missed, inlier, unseen)
+    log_std = jnp.sqrt(known.log_focal)
     scaled = jnp.min(jnp.where(unseen, jnp.inf, log_std)) < _UNKNOWN_SCALE
     lens = _lens_of(data, model, jnp.where(unseen, jnp.nan, focal))
     parts = {
@@ -105,6 +109,7 @@ def _uncertainty(
     stage: Stage,
     missed: Float[Array, "view 2"],
     inlier: Bool[Array, "view"],
+    unseen: Bool[Array, "frame"],
 ) -> _Uncertainty:
     """By the rows of what follows the model, with what the loss loses and what tracks have in common."""
     units = units_of(data, model, noise)
@@ -116,13 +121,13 @@ def _uncertainty(
         return rows_of(unknowns, args, counted)
 
     rows, of_rows = rows_at(zeros), columns_of(args, zeros, counted)
-    matrix = reduced_of(of_rows, rows, zeros, data.structure, jnp.asarray(0.0))
+    matrix = reduced_of(of_rows, rows, zeros, data.structure, jnp.asarray(_LITTLE))
     own, lens, both = covariances(matrix, len(model.path.log_focal))
     of_lens = ravel_pytree(units.lens)[0]
     lens = lens * jnp.outer(of_lens, of_lens)
     unit = units.frames[:, 0]
     log_focal = own[:, 0, 0] * unit**2 + 2 * both[:, 0, -1] * unit * of_lens[-1] + lens[-1, -1]
-    lens = _with_scale(data, lens, both[:, 0] * jnp.outer(unit, of_lens), log_focal)
+    lens = _with_scale(data, lens, both[:, 0] * jnp.outer(unit, of_lens), log_focal, unseen)
     levers = determined_levers(model, matrix, units)
     if data.root is None or data.redundant is None:
         count = 2 * jnp.sum(inlier)
@@ -147,9 +152,9 @@ def _uncertainty(
     return _Uncertainty(lens, log_focal, free)
 
 
-def _with_scale(data, lens, both, log_focal):
+def _with_scale(data, lens, both, log_focal, unseen):
     """The covariance of the lens and the scale, which is that of the best known f where all are known."""
-    best = jnp.argmin(jnp.where(jnp.isinf(data.log_std), jnp.inf, log_focal))
+    best = jnp.argmin(jnp.where(jnp.isinf(data.log_std) | unseen, jnp.inf, log_focal))
     row = (lens[-1] + both[best]).at[-1].set(log_focal[best])
     told = lens.at[-1].set(row).at[:, -1].set(row)
     return jnp.where(jnp.any(data.pinned), lens, told)

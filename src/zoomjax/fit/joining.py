@@ -148,7 +148,9 @@ def join_shots(fit: MotionFit, tracks: Tracks, turns: Sequence[Turn], *, scaled:
             if pose.scene == other.scene:
                 turned = step @ _powered(pose.rotation, -more)
                 poses[number] = _Pose(one.scene, turned, pose.factor + more)
-    return _moved(fit, np.asarray(tracks.frame)[:, 0], poses, scaled)
+    begins = np.argmax(np.asarray(tracks.mask), axis=1)
+    first = np.asarray(tracks.frame)[np.arange(len(begins)), begins]
+    return _moved(fit, first, poses, scaled)
 
 
 class _Pose(NamedTuple):

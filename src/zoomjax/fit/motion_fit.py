@@ -112,7 +112,8 @@ class MotionFit(eqx.Module):
         more = (0, size - len(frame))
         wide = np.pad(frame, more), np.pad(points, (more, (0, 0)))
         seen = _carried(self.lens, known[wide[0]], turn[wide[0]], wide[1], known[other], turn[other])
-        return np.where((scene[frame] == scene[other])[:, None], np.asarray(seen)[: len(frame)], np.nan)
+        same = (scene[frame] == scene[other]) & (scene[other] >= 0)
+        return np.where(same[:, None], np.asarray(seen)[: len(frame)], np.nan)
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
         """Raise TypeError: call the lens of the fit instead."""

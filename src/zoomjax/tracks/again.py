@@ -17,6 +17,7 @@ from .._core.checks import checked_integer
 from ..io.video_reader import decode_video
 from ._follow import ALIKE, GROWTH
 from ._patches import HALF, Patches
+from .repeats import originals
 from .tracks import Tracks
 from .video import grey_frame
 
@@ -60,23 +61,24 @@ def find_again(
 
     Returns:
         The same tracks, of which some have more views, after some frames without. Where views have weights,
-        new ones have the mean of those of their track.
+        new ones have the largest of those of their track.
     """
     every = checked_integer("every", every, 1)
-    first = np.asarray(tracks.frame)[:, 0]
-    counts = np.asarray(tracks.mask).sum(axis=1)
-    last = np.asarray(tracks.frame)[np.arange(len(counts)), counts - 1]
-    anchors = np.asarray(tracks.points)[:, 0].astype(float)
+    mask, row = np.asarray(tracks.mask), np.arange(len(tracks.number))
+    begins, counts = np.argmax(mask, axis=1), mask.sum(axis=1)
+    first, anchors = np.asarray(tracks.frame)[row, begins], np.asarray(tracks.points, float)[row, begins]
+    last = np.max(np.where(mask, np.asarray(tracks.frame), -1), axis=1)
+    looked = set(originals(tracks)[::every].tolist())  # in none twice
     kept: _Kept | None = None
     more: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     rng = np.random.default_rng(seed)
     with decode_video(clip) as (_, items):
         for frame, (_, _, image) in enumerate(items):
             begun = np.flatnonzero((first == frame) & (counts >= _VIEWS))
-            if not len(begun) and (frame % every or kept is None):
+            if not len(begun) and (frame not in looked or kept is None):
                 continue
             grey = cv2.GaussianBlur(grey_frame(image()), (5, 5), 0.8)
-            if kept is not None and frame % every == 0:
+            if kept is not None and frame in looked:
                 ended = np.flatnonzero(kept.last < frame - _AWAY)
                 found, points = _found(grey, frame, kept, ended, first, anchors, carry, rng)
                 more.append((found, np.full(len(found), frame), points))
@@ -126,8 +128,8 @@ def _with(tracks, more):
     which, frames, places = (np.concatenate(parts) for parts in zip(*more, strict=True))
     weight = tracks.view_weights()
     if weight is not None:
-        mean = np.mean(np.asarray(tracks.weight), axis=1, where=np.asarray(tracks.mask))
-        weight = np.concatenate([weight, mean[which]])
+        most = np.max(np.asarray(tracks.weight), axis=1, where=np.asarray(tracks.mask), initial=0)
+        weight = np.concatenate([weight, most[which]])
     return Tracks.from_arrays(
         np.concatenate([number, np.asarray(tracks.number)[which]]),
         np.concatenate([frame, frames]),

@@ -43,8 +43,7 @@ def originals(tracks: Tracks) -> Int[np.ndarray, "frame"]:
     Frames of a camera at rest are copies, too, where encoding has left nothing of their noise. Where each
     has noise of its own they are not.
     """
-    track, frame, points = tracks.views()
-    points = points.astype(float)
+    track, frame, points = _views(tracks)
     steps = _steps(tracks)
     limits = _limits(steps)
     ends = np.searchsorted(np.sort(frame), np.arange(tracks.frames + 1))
@@ -70,8 +69,8 @@ def originals(tracks: Tracks) -> Int[np.ndarray, "frame"]:
 def counted_once(tracks: Tracks) -> Tracks:
     """The same, with weights by which all views of a track in frames that show the same count as one.
 
-    The mean of the weights stays, so that the noise by which they are fitted is that of a view. Tracks
-    without such views are returned as they are.
+    Weights are scaled so that the noise by which they are fitted is that of a view, however many there are
+    in copies. Tracks without such views are returned as they are.
     """
     number = copies(originals(tracks), tracks)
     if not (number > 1).any():
@@ -86,7 +85,7 @@ def counted_once(tracks: Tracks) -> Tracks:
         points,
         image_size=tracks.image_size,
         frames=tracks.frames,
-        weight=weight * (np.mean(before) / np.mean(weight)),
+        weight=weight * (np.sum(before * weight) / np.sum(weight**2)),
     )
 
 
@@ -106,11 +105,17 @@ def without_rests(first: Int[np.ndarray, "frame"], tracks: Tracks) -> Int[np.nda
     return np.where((moves & short)[np.searchsorted(begins, first)], first, np.arange(len(first)))
 
 
+def _views(tracks):
+    """Of each view the row of its track, which is its own whatever the track is called, frame and point."""
+    mask = np.asarray(tracks.mask)
+    return np.nonzero(mask)[0], np.asarray(tracks.frame)[mask], np.asarray(tracks.points, float)[mask]
+
+
 def _steps(tracks) -> Float[np.ndarray, "frame"]:
     """How far most points have moved to each frame from the one before, px; infinite where few tell."""
-    track, frame, points = tracks.views()
+    track, frame, points = _views(tracks)
     follows = (np.diff(track) == 0) & (np.diff(frame) == 1)
-    moved = np.linalg.norm(np.diff(points.astype(float), axis=0), axis=1)[follows]
+    moved = np.linalg.norm(np.diff(points, axis=0), axis=1)[follows]
     return _most(moved, frame[1:][follows], tracks.frames)
 
 
@@ -140,7 +145,7 @@ def copies(first: Int[np.ndarray, "frame"], tracks: Tracks) -> Float[np.ndarray,
         first: of `originals`.
         tracks: the tracks.
     """
-    track, frame, _ = tracks.views()
+    track, frame, _ = _views(tracks)
     _, place, count = np.unique(
         np.stack([track, first[frame]]), axis=1, return_inverse=True, return_counts=True
     )

@@ -43,7 +43,7 @@ def track_video(
 
     Args:
         clip: a video that PyAV decodes, of any length.
-        most: number of tracks at a time, at most.
+        most: number of tracks at a time, at most; 4 or more.
         life: the most frames that a track is followed.
         progress: called after each frame with the number of frames done and announced (0 if unknown).
 
@@ -92,7 +92,7 @@ def track_frames(
 
     Args:
         frames: grey, or blue, green, red; all of one size.
-        most: number of tracks at a time, at most.
+        most: number of tracks at a time, at most; 4 or more.
         life: the most frames that a track is followed.
 
     Raises:
@@ -110,7 +110,7 @@ def track_frames(
 
 def _followed(frames, most, life) -> tuple[Tracks, bool]:
     """The tracks, and whether frames are woven of fields."""
-    most, life = checked_integer("most", most, 1), checked_integer("life", life, 2)
+    most, life = checked_integer("most", most, _FEWEST), checked_integer("life", life, 2)
     follower, fields = None, Fields()
     for image in frames:
         grey = grey_frame(image)
@@ -126,7 +126,8 @@ def _followed(frames, most, life) -> tuple[Tracks, bool]:
     track, frame, points = _enough(*follower.views())
     if not len(track):
         raise ValueError(
-            "Nothing in it can be followed: it shows no corners, or nothing but what stays in its place."
+            "Nothing in it can be followed: it shows fewer than four corners at a time, or nothing but "
+            "what stays in its place."
         )
     tracks = Tracks.from_arrays(track, frame, points, image_size=follower.size, frames=number)
     return counted_once(tracks), fields.found
@@ -134,9 +135,13 @@ def _followed(frames, most, life) -> tuple[Tracks, bool]:
 
 def _enough(track, frame, points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The views in frames that have some: fewer tell no focal length, as in the dark end of a fade."""
-    kept = np.bincount(frame)[frame] >= _FEWEST if len(frame) else np.zeros(0, bool)
-    again = np.bincount(track[kept], minlength=track.max(initial=-1) + 1) > 1
-    kept &= again[track]
+    kept = np.ones(len(frame), bool)
+    while kept.any():
+        few = np.bincount(frame[kept], minlength=frame.max() + 1)[frame] < _FEWEST
+        few |= np.bincount(track[kept & ~few], minlength=track.max() + 1)[track] < 2
+        if not few[kept].any():
+            break
+        kept &= ~few
     return track[kept], frame[kept], points[kept]
 
 
