@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zoomjax.app.frame_findings import of_dissolves, of_repeated, ranges, repeated_frames
+from zoomjax.app.frame_findings import of_blind, of_dissolves, of_repeated, ranges, repeated_frames
 from zoomjax.app.motion_findings import _of_known
 from zoomjax.fit import MotionFit
 from zoomjax.scenes import motion_tracks, pan_and_zoom
@@ -62,6 +62,41 @@ def test_a_dissolve_is_told_where_it_is():
     assert not [*of_dissolves(tracks, follows, np.where(numbers < 8, 0, 1), numbers)]  # a cut is told
     all_follow = np.ones(np.sum(np.asarray(scene.tracks.mask)), bool)
     assert not [*of_dissolves(scene.tracks, all_follow, one_shot, numbers)]
+
+
+@pytest.mark.parametrize(
+    ("blind", "verdict", "words"),
+    [
+        ([], None, ""),
+        ([3], "good", "1 frame shows nothing that can be followed: frame 13. It may be black"),
+        ([3, 4], "good", "2 frames show nothing that can be followed: frames 13 to 14. They"),
+        (
+            [0, 3, 4, 9],
+            "doubtful",
+            "4 of 10 frames show nothing that can be followed: frames 10, 13",
+        ),
+    ],
+)
+def test_frames_that_show_nothing_are_named(blind, verdict, words):
+    fit = object.__new__(MotionFit)
+    focal = np.full(10, 900.0)
+    focal[blind] = np.nan
+    object.__setattr__(fit, "focal", jnp.asarray(focal))
+    found = list(of_blind(fit, np.arange(10, 20)))
+    assert [of.verdict for of in found] == [verdict] * (verdict is not None)
+    assert all(of.found.startswith(words) for of in found)
+
+
+@pytest.mark.parametrize("least", [0.0, 0.3, 0.5])
+def test_the_end_of_a_zoom_is_no_repeated_frame(least):
+    """Frames on both sides of the end are alike, and beside them it moves half as fast as farther on."""
+    frame = np.arange(20)
+    place = 2.0 * (frame - 9.5 + least) ** 2 / 10
+    points = np.stack([np.add.outer(20 * np.arange(30), place)] * 2, axis=-1)
+    points = points + np.random.default_rng(0).normal(0, 0.05, points.shape)
+    track = np.repeat(np.arange(30), 20)
+    tracks = Tracks.from_arrays(track, np.tile(frame, 30), points.reshape(-1, 2), image_size=(900, 600))
+    assert repeated_frames(tracks) == 0
 
 
 def findings_of_known(off, std):

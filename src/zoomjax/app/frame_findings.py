@@ -44,7 +44,7 @@ def of_blind(fit: MotionFit, numbers: Int[np.ndarray, "frame"]) -> Iterator[Find
     if not blind.any():
         return
     few = np.mean(blind) <= BLIND
-    one = np.sum(blind) == 1
+    one = int(np.sum(blind)) == 1
     yield Finding(
         "frames without points",
         "good" if few else "doubtful",

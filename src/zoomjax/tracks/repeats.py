@@ -29,9 +29,10 @@ _SHARE = 0.75
 _LONGEST = 6
 """Frames that a conversion makes of one, at most."""
 
-_SLOWING, _LEAST = 0.25, 0.05
+_SLOWING, _TURNING, _LEAST = 0.25, 0.6, 0.05
 """The step into such frames or out of them, beside the larger ones next to it, and in px: less is a camera
-that stops or starts."""
+that stops or starts. About the end of a pan or of a zoom it is half of these, and if the frames are not the
+same it has to be more."""
 
 _FEWEST = 4
 """Points that tell."""
@@ -100,7 +101,10 @@ def without_rests(first: Int[np.ndarray, "frame"], tracks: Tracks) -> Int[np.nda
     around = steps[np.stack([begins + 1, begins + 2, ends + 2, ends + 3])]
     fastest = np.max(np.where(np.isfinite(around), around, 0), axis=0)
     least = np.minimum(around[1], around[2])  # one of them is not known at the ends of a clip and at cuts
-    moves = np.isfinite(least) & (least > np.maximum(_SLOWING * fastest, _LEAST))
+    inner = steps[2:-2].copy()
+    inner[begins] = 0
+    same = np.maximum.reduceat(inner, begins) < _SAME
+    moves = np.isfinite(least) & (least > np.maximum(np.where(same, _SLOWING, _TURNING) * fastest, _LEAST))
     short = ends - begins <= _LONGEST
     return np.where((moves & short)[np.searchsorted(begins, first)], first, np.arange(len(first)))
 
