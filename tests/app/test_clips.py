@@ -276,7 +276,8 @@ def test_one_known_focal_length_gives_the_scale_that_a_still_camera_leaves_open(
     advice = "--known-focal 24@0 --pixel-pitch 0.0055 if it is 24 mm in frame 0"
     assert advice in " ".join(done["alone"].stdout.split())
     assert before["focal_scale_std"] > 0.1
-    assert {of["about"] for of in after["findings"]} == {"lens"}
+    about = {of["about"] for of in after["findings"]}
+    assert about - {"repeated frames"} == {"lens"}  # the two frames at the end of the zoom are the same
     assert after["verdict"] == "doubtful"  # for lines are few at the corners
     assert after["focal_scale_std"] < 0.015
     [known] = after["known_focal"]
