@@ -142,7 +142,8 @@ def refuse_idle_for_clips(context: typer.Context) -> None:
 def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
     """Calibrate from a clip, write the results and show them."""
     from .clip_report import clip_report
-    from .motion_calibration import FILES, calibrate_motion, frames_of
+    from .frame_findings import frames_of
+    from .motion_calibration import FILES, calibrate_motion
     from .results_folder import OF_A_LENS, results_folder
 
     clip, known = Path(job.inputs[0]), job.known_focals()

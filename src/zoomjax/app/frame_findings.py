@@ -1,11 +1,13 @@
-"""Findings about single frames of a clip: those that repeat others, and those that show nothing."""
+"""Single frames of a clip: their times, and findings about those that repeat others or show nothing."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Int
 
 from ..fit.motion import MotionFit
+from ..io.video_reader import decode_video
 from ..tracks.repeats import originals, without_rests
 from ..tracks.tracks import Tracks
 from ..trust.assessment import Finding
@@ -18,6 +20,12 @@ _LOOSE = 0.2
 
 _RANGES = 4
 """Of frames that are named; the number of others is told."""
+
+
+def frames_of(clip: Path) -> np.ndarray:
+    """Of each frame that can be decoded its number in the file and its time, s; NaN where it has none."""
+    with decode_video(clip) as (_, frames):
+        return np.array([(number, time) for number, time, _ in frames], float)
 
 
 def repeated_frames(tracks: Tracks) -> int:

@@ -23,7 +23,6 @@ from ..fit.motion_fit import MotionFit
 from ..fit.result import RESULTS
 from ..fit.shots import linked_well, shot_turns
 from ..fit.zoom import CentreArgument
-from ..io.video_reader import decode_video
 from ..lines.lines import Lines
 from ..models.about import RELATIVE
 from ..models.lens import ZoomLens
@@ -38,7 +37,7 @@ from ..trust.bands import displacement_std
 from ._flags import with_flags
 from .clip_lines import MOST, draw_frames, frames_with_lines, image_rows, lines_of_frames
 from .coefficients import coefficient_rows, finite, pixel_polynomials
-from .frame_findings import repeated_frames
+from .frame_findings import frames_of, repeated_frames
 from .known_focals import KnownFocals
 from .model_choice import WantedModel
 from .motion_figures import (
@@ -393,9 +392,3 @@ def calibrate_motion(
     if lines is not None:
         lines = eqx.tree_at(lambda lines: lines.focal, lines, all_focals(fit)[0][line_frames])
     return MotionCalibration(clip, tracks, fit, times, tuple(found), lines, known)
-
-
-def frames_of(clip: Path) -> np.ndarray:
-    """Of each frame that can be decoded its number in the file and its time, s; NaN where it has none."""
-    with decode_video(clip) as (_, frames):
-        return np.array([(number, time) for number, time, _ in frames], float)
