@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zoomjax import PolynomialZoom, ZoomLens
+from zoomjax import PolynomialZoom
 from zoomjax.fit import fit_motion
 from zoomjax.fit._motion_gradient import sensitive
 from zoomjax.fit._motion_problem import Asked, Given, problem_of, relative, thinned
@@ -15,13 +15,12 @@ from zoomjax.models import RadialPolynomial
 from zoomjax.scenes import motion_tracks, pan_and_zoom
 from zoomjax.tracks import Tracks
 
-SIZE, FRAMES = (1280, 720), 24
+from ._turning import FRAMES, SIZE, turning_lens
 
 
 @pytest.fixture(scope="module")
 def lens():
-    zoom = PolynomialZoom(2, jnp.array([[0.02, 0.0], [-0.05, 0.01], [-0.15, 0.05]]), jnp.array(800.0))
-    return ZoomLens(zoom, jnp.array([645.0, 356.0]), jnp.array([800.0, 2400.0]), SIZE, "px")
+    return turning_lens()
 
 
 @pytest.fixture(scope="module")
