@@ -617,10 +617,6 @@ _BOARD = ("--spacing", "30", "--distance", "1185", "--pixel-pitch", "0.0055")
         (["lines.npz", "--overlays", "all", "--frames", "3"], "--frames and --overlays have no effect"),
         (["a.png", "--frames", "3"], "--frames has no effect for photos"),
         (["lines.npz", "--shared-focal", "exif"], "--shared-focal has no effect for lines.npz"),
-        (
-            ["a.mp4", "--distortion-model", "division"],
-            "--distortion-model has no effect with --focal motion",
-        ),
         (["a.png", "--focal-unit", "px"], "--focal-unit has no effect without --focal"),
         (
             ["a.png", "--focal", "exif", "--focal-unit", "px"],

@@ -103,7 +103,7 @@ def test_a_shot_is_turned_to_where_it_looks(tracks, real):
     assert turn is not None
     assert turn.shots == (0, 1)
     assert turn.agree > 60
-    found = join_shots(fit, tracks, [turn])
+    found = join_shots(fit, [turn], tracks=tracks)
     assert off(found).max() < 0.03
     np.testing.assert_array_equal(found.scene, 0)
     np.testing.assert_array_equal(found.shot, fit.shot)
@@ -120,10 +120,10 @@ def test_a_shot_whose_f_is_off_is_joined_and_its_f_made_to_agree(tracks, real, f
     turn = turn_between(fit, [matched(*pair) for pair in FAR_APART], 36)
     assert turn is not None
     assert turn.factor == pytest.approx(-factor, abs=0.004)
-    start = join_shots(fit, tracks, [turn], scaled=True)
+    start = join_shots(fit, [turn], tracks=tracks, scaled=True)
     np.testing.assert_allclose(start.focal, truth()[0], rtol=0.004)
     assert off(start).max() < 0.1
-    np.testing.assert_array_equal(join_shots(fit, tracks, [turn]).focal, fit.focal)
+    np.testing.assert_array_equal(join_shots(fit, [turn], tracks=tracks).focal, fit.focal)
 
 
 def test_shots_are_joined_by_way_of_others(tracks, real):
@@ -131,7 +131,7 @@ def test_shots_are_joined_by_way_of_others(tracks, real):
     turn = turn_between(fit, [matched(*pair) for pair in FAR_APART], 36)
     back = turn._replace(shots=(1, 0), rotation=turn.rotation.T, factor=-turn.factor)
     for turns in ([turn], [back], [back, turn._replace(agree=1, rotation=np.eye(3))]):
-        found = join_shots(fit, tracks, turns)
+        found = join_shots(fit, turns, tracks=tracks)
         assert off(found).max() < 0.03
         np.testing.assert_allclose(found.rotation[0], np.eye(3), atol=1e-12)
 
@@ -162,18 +162,18 @@ def test_three_shots_are_joined_one_after_the_other(tracks, real, factor, order)
     pairs = [FAR_APART[:2], ((13, 17), (15, 16), (14, 18))]
     turns = [turn_between(fit, [matched(*pair) for pair in some], 36) for some in pairs]
     assert [turn.shots for turn in turns] == [(0, 1), (1, 2)]
-    found = join_shots(fit, parted, turns[::order], scaled=True)
+    found = join_shots(fit, turns[::order], tracks=parted, scaled=True)
     np.testing.assert_array_equal(found.scene, 0)
     assert off(found).max() < 0.15
     np.testing.assert_allclose(found.focal, truth()[0], rtol=0.006)
-    alone = join_shots(fit, parted, turns[1:])
+    alone = join_shots(fit, turns[1:], tracks=parted)
     np.testing.assert_array_equal(alone.scene, fit.shot > 0)
 
 
 def test_a_turn_of_another_fit_is_refused(tracks, real):
     turn = turn_between(fitted(real), [matched(*pair) for pair in FAR_APART], 36)
     with pytest.raises(ValueError, match="give what shot_turns finds for this fit"):
-        join_shots(fitted(real), tracks, [turn._replace(shots=(0, 2))])
+        join_shots(fitted(real), [turn._replace(shots=(0, 2))], tracks=tracks)
 
 
 def still(number=120):

@@ -106,8 +106,8 @@ def test_the_panorama_shows_both_shots_and_is_sharp(done, folder):
 def test_shots_of_different_scenes_are_not_joined(done, folder, caption):
     clip = rendered(folder / f"other-{caption}.mp4", (0, 5), caption=caption)
     apart = eqx.tree_at(lambda fit: fit.scene, done.fit, done.fit.shot)
-    assert len(shot_turns(apart, done.tracks, partial(KeyFrames, done.clip))) == 1
-    assert shot_turns(apart, done.tracks, partial(KeyFrames, clip)) == []
+    assert len(shot_turns(apart, done.tracks, look=partial(KeyFrames, done.clip))) == 1
+    assert shot_turns(apart, done.tracks, look=partial(KeyFrames, clip)) == []
 
 
 class Nothing:
@@ -133,7 +133,7 @@ def test_of_many_shots_the_longest_are_compared(done):
     of = lambda fit: (fit.focal, fit.focal_std, fit.rotation, fit.shot, fit.scene)  # noqa: E731
     fit = eqx.tree_at(of, fit, (*values, jnp.asarray(shot), jnp.asarray(shot)))
     looks = []
-    assert shot_turns(fit, done.tracks, lambda frames: looks.append(Nothing(frames)) or looks[0]) == []
+    assert shot_turns(fit, done.tracks, look=lambda frames: looks.append(Nothing(frames)) or looks[0]) == []
     compared = shot[looks[0].frames]
     assert np.unique(compared).tolist() == [n for n in range(45) if n % 3]
     assert np.bincount(compared).max() == 2
@@ -142,7 +142,7 @@ def test_of_many_shots_the_longest_are_compared(done):
 def test_without_a_scale_nothing_is_compared(done):
     of = lambda fit: fit.fit.result  # noqa: E731
     fit = eqx.tree_at(of, done.fit, RESULTS.undetermined)
-    assert shot_turns(fit, done.tracks, lambda _: pytest.fail("compared")) == []
+    assert shot_turns(fit, done.tracks, look=lambda _: pytest.fail("compared")) == []
 
 
 def test_few_tracks_do_not_hold_one_shot_to_another(done):

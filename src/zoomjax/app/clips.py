@@ -71,7 +71,7 @@ class ClipJob:
         Raises:
             ValueError: there is not one video, or an option has no effect here.
         """
-        from ..models.brown_conrady import BrownConrady
+        from ..models.requirements import refusal
         from .image_job import is_video
 
         if len(self.inputs) != 1 or not is_video(self.inputs[0]):
@@ -80,7 +80,8 @@ class ClipJob:
             raise ValueError("With --focal motion, --centre is fit or image: it moves along the zoom.")
         if self.model.distortion_model == "auto":
             raise ValueError("With --focal motion, --distortion-model names one: none are compared.")
-        if self.lines and self.model.first_distortion_model == BrownConrady():
+        distortion_model = self.model.first_distortion_model
+        if self.lines and refusal("fit_motion with lines", distortion_model=distortion_model):
             raise ValueError("With --lines, --distortion-model is radial or division.")
         self._check_measured()
         self.known_focals()

@@ -379,10 +379,10 @@ def calibrate_motion(
     turns = []
     if fit.shot.max() > 0 and fit.fit.result == RESULTS.successful:
         stage("Joining shots of the same scene")
-        turns = shot_turns(fit, tracks, functools.partial(KeyFrames, clip))
+        turns = shot_turns(fit, tracks, look=functools.partial(KeyFrames, clip))
     if turns:
-        begin = join_shots(fit, tracks, turns, scaled=True)
-        fit = join_shots(fit, tracks, turns)
+        begin = join_shots(fit, turns, tracks=tracks, scaled=True)
+        fit = join_shots(fit, turns, tracks=tracks)
     if tracks.frames <= LOOPS and fit.fit.result == RESULTS.successful:
         stage("Finding points again where the camera comes back")
         more = linked_well(find_again(clip, tracks, carry=begin.carried), fit)

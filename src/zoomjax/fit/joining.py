@@ -113,13 +113,13 @@ def turn_between(fit: MotionFit, matches: Sequence[Matches], compared: int) -> T
 
 
 @kinds_checked
-def join_shots(fit: MotionFit, tracks: Tracks, turns: Sequence[Turn], *, scaled: bool = False) -> MotionFit:
+def join_shots(fit: MotionFit, turns: Sequence[Turn], *, tracks: Tracks, scaled: bool = False) -> MotionFit:
     """The fit with shots in one scene between which turns lead, by those in which most points agree.
 
     Args:
         fit: of the clip.
-        tracks: to which it was fitted.
         turns: between shots, by `shot_turns`.
+        tracks: to which it was fitted.
         scaled: whether f of the shots are made to agree, too: as a start of another fit, as neither the
             lens nor a standard deviation is changed.
 

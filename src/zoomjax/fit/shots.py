@@ -40,7 +40,7 @@ class Look(Protocol):
 
 
 @kinds_checked
-def shot_turns(fit: MotionFit, tracks: Tracks, look: Callable[[Iterable[int]], Look]) -> list[Turn]:
+def shot_turns(fit: MotionFit, tracks: Tracks, *, look: Callable[[Iterable[int]], Look]) -> list[Turn]:
     """How the camera turned between shots of a clip that show the same from the same place.
 
     Some frames of each shot, those that differ most in direction and zoom, are compared with those of the
@@ -74,7 +74,9 @@ def shot_turns(fit: MotionFit, tracks: Tracks, look: Callable[[Iterable[int]], L
         both = itertools.product(*(frames[number] for number in pair))
         matches = [Matches((one, other), seen.matches(one, other)) for one, other in both]
         turn = turn_between(fit, matches, compared)
-        if turn is not None and seen.alike(*_carry(join_shots(fit, tracks, [turn], scaled=True), turn)):
+        if turn is not None and seen.alike(
+            *_carry(join_shots(fit, [turn], tracks=tracks, scaled=True), turn)
+        ):
             turns.append(turn)
     return turns
 
