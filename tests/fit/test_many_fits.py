@@ -143,7 +143,7 @@ def test_arguments_are_checked(sets):
         data_sets([sets[0], "lines.npz"])
     with pytest.raises(TypeError, match="must be fit_zoom or fit_robust"):
         many(sets, zj.fit_frames)  # pyright: ignore[reportCallIssue, reportArgumentType]
-    with pytest.raises(ValueError, match=r"Data set 1: .* needs lines at 5 or more distinct"):
+    with pytest.raises(ValueError, match=r"Data set 1: .* needs 5 or more distinct"):
         many([sets[2], sets[1]], zoom=zj.PolynomialZoom(degree=4))
     with pytest.raises(ValueError, match="must have known values"):
         jax.jit(lambda lines: many([lines]))(sets[0])

@@ -160,6 +160,25 @@ def test_a_thing_that_the_camera_follows_is_not_taken_for_the_scene(lens, seed):
     assert displaced(lens, fit, path[0]) < 0.8
 
 
+@pytest.mark.parametrize("throw", [True, False])
+@pytest.mark.parametrize(
+    ("models", "frames", "wanted"),
+    [
+        ({}, 2, "degree 2 in 1/f needs 3 or more distinct focal lengths, but there are 2"),
+        ({"zoom": PolynomialZoom(1)}, 1, "degree 1 in 1/f needs 2 or more"),
+        ({"zoom": PolynomialZoom(0), "shift": PolynomialZoom(3)}, 3, "degree 3 in 1/f needs 4 or more"),
+    ],
+)
+def test_fewer_frames_than_a_model_needs_are_told(noisy, models, frames, wanted, throw):
+    number, frame, points = noisy.tracks.views()
+    first = frame < frames + (frames == 1)
+    few = Tracks.from_arrays(number[first], frame[first], points[first], image_size=SIZE, frames=FRAMES)
+    if frames == 1:  # a view each counts, of two
+        few = eqx.tree_at(lambda t: t.mask, few, few.mask & (few.frame == 0))
+    with pytest.raises(ValueError, match=f"tracks has views in {frames} frames: A polynomial of {wanted}"):
+        fit_motion(few, throw=throw, **models)
+
+
 def test_a_camera_that_does_not_turn_has_no_scale(lens, path):
     focal, rotation = path
     still = (focal, np.broadcast_to(rotation[0], rotation.shape))

@@ -427,9 +427,7 @@ def test_lens_that_folds_within_the_image_is_said_to(lens):
 
 
 def test_too_few_focal_lengths_raise(tiny):
-    with pytest.raises(
-        ValueError, match="needs lines at 3 or more distinct focal lengths, but there are 2"
-    ):
+    with pytest.raises(ValueError, match="needs 3 or more distinct focal lengths, but there are 2"):
         zj.fit_zoom(tiny)
 
 

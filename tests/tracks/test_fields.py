@@ -61,6 +61,20 @@ def test_a_file_that_says_so_is_warned_of_once(leaf_fields, tmp_path):
     assert len(told) == 1
 
 
+def test_a_file_that_says_so_later_is_warned_of_once(leaf_fields, tmp_path):
+    """As where something else comes before a film."""
+    options = {"flags": "+ildct", "x264-params": "tff=1"}
+    parts = [
+        write_frames(tmp_path / "whole.h264", leaf_fields[:3]),
+        write_frames(tmp_path / "woven.h264", woven(leaf_fields), options=options),
+    ]
+    (tmp_path / "later.h264").write_bytes(b"".join(part.read_bytes() for part in parts))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        track_video(tmp_path / "later.h264")
+    assert ["interlaced" in str(one.message) for one in told] == [True]
+
+
 @pytest.mark.parametrize(
     ("texture", "motion"),
     [(leaves, {}), (stripes, {}), (stripes, {"pan": 1.0, "tilt": 10.0})],

@@ -97,6 +97,19 @@ def test_weights_of_tracks_that_are_dropped_go_with_them():
             [3, 4, 3], [0, 0, 1], np.zeros((3, 2)), image_size=(8, 6), weight=[1, 5, 2]
         )
     assert tracks.view_weights().tolist() == [1, 2]
+    with pytest.raises(ValueError, match="No track of two views has a weight above 0"):
+        Tracks.from_arrays([3, 4, 3], [0, 0, 1], np.zeros((3, 2)), image_size=(8, 6), weight=[0, 5, 0])
+
+
+@pytest.mark.parametrize(("weight", "stays"), [([1, 1, 1, 1], 3), ([0, 1, 0, 0.5], 4), ([2, 1, 0, 0.5], 3)])
+def test_of_copies_the_heaviest_stays(weight, stays):
+    given = [3, 4, 3, 4], [0, 0, 1, 1], [[1, 2], [1, 2], [3, 2], [3, 2]]
+    with pytest.warns(UserWarning, match=f"copies of others, with the same views, as {7 - stays} is"):
+        tracks = Tracks.from_arrays(*given, image_size=(8, 6), weight=weight)
+    assert tracks.number.tolist() == [stays]
+    assert tracks.view_weights().tolist() == [
+        of for of, track in zip(weight, given[0], strict=True) if track == stays
+    ]
 
 
 @pytest.mark.usefixtures("unchecked")

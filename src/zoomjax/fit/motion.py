@@ -102,9 +102,10 @@ def fit_motion(
     the implicit function theorem, with the noise by which residuals are weighted held as it is.
 
     Raises:
-        ValueError: float64 is not enabled; no track has two views of a weight above 0; the number of known
-            focal lengths is not that of the frames; the lines are of other frames or images, or the
-            distortion model is not radial; or `begin` is of another clip or other models.
+        ValueError: float64 is not enabled; no track has two views of a weight above 0, or they are in fewer
+            frames than a model needs; the number of known focal lengths is not that of the frames; the
+            lines are of other frames or images, or the distortion model is not radial; or `begin` is of
+            another clip or other models.
         RuntimeError: the fit failed (see `throw`).
 
     Warns:
@@ -125,11 +126,24 @@ def fit_motion(
     terms = checked_terms(terms, distortion_model.most_terms)
     given = relative(Given(tracks, lines, line_frames, focal, focal_std, begin))
     asked = Asked(zoom, distortion_model, terms, shift, readout)
+    _check_frames(given.tracks, asked)
     if not traced(given):
         return _fitted(given, asked, throw)[0]
     fit, model, noise = _constant(given, asked, throw)
     problem = problem_of(given, asked)
     return _with_model(fit, sensitive(problem.data, model, noise), problem)
+
+
+def _check_frames(tracks: Tracks, asked: Asked) -> None:
+    """Raise ValueError where the models need more focal lengths than there are frames with views."""
+    seen = len(np.unique(np.asarray(tracks.frame)[np.asarray(tracks.mask)]))
+    focal = np.arange(1.0, seen + 1)
+    try:
+        asked.zoom.prepare(focal, asked.distortion_model.num_coefficients(asked.terms))
+        if asked.shift is not None:
+            asked.shift.prepare(focal, 2)
+    except ValueError as error:
+        raise ValueError(f"Argument tracks has views in {seen} frames: {error}") from error
 
 
 def _fitted(given: Given, asked: Asked, throw: bool) -> tuple[MotionFit, Model, Noise]:

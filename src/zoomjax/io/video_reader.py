@@ -288,10 +288,10 @@ def _warn_of_skipped(number: int) -> None:
 
 
 def says_interlaced(source: str | os.PathLike[str]) -> bool:
-    """Whether the first frame that decodes says so, of a video that was read before."""
+    """Whether any frame says so, of a video that was read before."""
     with opened_video(source) as input_:
         items = decoded_items(input_, video := picture_stream(input_), Report(video.frames))
-        return any(item.interlaced_frame for item in itertools.islice(items, 1))
+        return any(item.interlaced_frame for item in items)
 
 
 def warn_of_pixels(video: Any) -> None:

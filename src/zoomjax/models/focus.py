@@ -95,8 +95,8 @@ class FocusSplineZoom(AbstractFocusZoom):
             raise ValueError(_NO_FOCUS)
         if not traced(focus) and (distinct := np.unique(np.asarray(focus)).size) < self.focus_number:
             raise ValueError(
-                f"A spline with {self.focus_number} knots in the focus needs lines at as many distinct "
-                f"focuses, but there are {distinct}. Choose a smaller focus_number."
+                f"A spline with {self.focus_number} knots in the focus needs as many distinct focuses, but "
+                f"there are {distinct}. Choose a smaller focus_number."
             )
         in_zoom = SplineZoom(number=self.number).prepare(focal, terms)
         focus_knots = jnp.asarray(spread(focus, self.focus_number))

@@ -108,11 +108,12 @@ class Tracks(eqx.Module):
         Raises:
             ValueError: shapes do not agree, a frame does not exist, a point is not finite, a weight is not
                 finite or below 0, or all are 0, a track has two views in one frame, or no track has two
-                views.
+                views, or none of these a weight above 0.
 
         Warns:
-            UserWarning: tracks of one view, or with the views of another one, are dropped; the message
-                counts them. Or points lie outside of the image.
+            UserWarning: tracks of one view are dropped, or with the views of another one, of which that
+                with the greatest weights stays; the message counts them. Or points lie outside of the
+                image.
 
         Example:
             >>> tracks = Tracks.from_arrays(
@@ -144,7 +145,8 @@ class Tracks(eqx.Module):
                 f"Dropped {single.sum()} of {len(count)} tracks: they have one view.", stacklevel=2
             )
             number, count, first = number[~single], count[~single], first[~single]
-        if (copies := _copies(moments, places, first, count)).any():
+        weights = None if weights is None else weights[order]
+        if (copies := _copies(moments, places, weights, first, count)).any():
             warnings.warn(
                 f"Dropped {copies.sum()} of {len(count)} tracks: they are copies of others, with the same "
                 f"views, as {number[copies][0]} is, and would count twice.",
@@ -154,6 +156,11 @@ class Tracks(eqx.Module):
         view = np.arange(count.max())
         mask = view < count[:, None]
         entry = np.where(mask, first[:, None] + view, first[:, None])  # padding repeats the first view
+        if weights is not None and not weights[entry].any():
+            raise ValueError(
+                "No track of two views has a weight above 0: give some of them one, or leave weight out for "
+                "equal weights."
+            )
         warn_of_points_outside(places[entry], mask, size)
         return cls(
             points=held_as_given(places[entry]),
@@ -162,7 +169,7 @@ class Tracks(eqx.Module):
             image_size=size,
             frames=frames,
             number=jnp.asarray(number, jnp.int32),
-            weight=None if weights is None else held_as_given(weights[order][entry]),
+            weight=None if weights is None else held_as_given(weights[entry]),
         )
 
     def views(
@@ -217,12 +224,13 @@ def _check_weights(weight):
         )
 
 
-def _copies(moments, places, first, count):
-    """Which tracks have the very views of one before them."""
-    of = zip(first.tolist(), count.tolist(), strict=True)
-    keys = [(moments[at : at + n].tobytes(), places[at : at + n].tobytes()) for at, n in of]
-    before = dict(reversed([(key, place) for place, key in enumerate(keys)]))
-    return np.array([before[key] < place for place, key in enumerate(keys)])
+def _copies(moments, places, weights, first, count):
+    """Which tracks have the very views of another one that stays: the heaviest, the first of equals."""
+    views = [slice(at, at + n) for at, n in zip(first.tolist(), count.tolist(), strict=True)]
+    keys = [(moments[of].tobytes(), places[of].tobytes()) for of in views]
+    weight = np.array([0 if weights is None else weights[of].sum() for of in views])
+    stays = {keys[place]: place for place in np.lexsort((-np.arange(len(keys)), weight))}  # the last counts
+    return np.array([stays[key] != place for place, key in enumerate(keys)])
 
 
 def _views(track, frame, points):
