@@ -689,7 +689,7 @@ def test_what_is_wrong_with_a_model_is_told_on_stderr(tmp_path):
         "calibrate", "lines.npz", "-o", "out", "--degree", "2", "--centre", "image", cwd=tmp_path
     )
     assert done.returncode == 0
-    assert "Warning: The lines do not determine" in " ".join(done.stderr.split())
+    assert "Warning: The points do not determine" in " ".join(done.stderr.split())
 
 
 def test_an_output_folder_that_cannot_be_written_is_told_before_the_work(wrong_files):

@@ -179,7 +179,7 @@ def test_what_is_not_determined_is_said(calibration):
         (jnp.full_like(calibration.fit.covariance, jnp.inf), RESULTS.undetermined),
     )
     page = Page(report(dataclasses.replace(calibration, fit=zoom)))
-    assert "Warning: The lines do not determine" in page.text
+    assert "Warning: The points do not determine" in page.text
     assert "not determined" in page.text
 
 

@@ -53,9 +53,10 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """Status of a fit: the results of optimistix, and three about the fitted model."""
 
     undetermined = (
-        "The data do not determine all parameters: some can change and miss no point by more than the noise. "
-        "Their variance is reported as infinite. Add lines far from the centre of distortion or at more "
-        "focal lengths (in a clip, turn the camera further), or lower the degree or the number of terms."
+        "The points do not determine all parameters: some can change without missing any point by more "
+        "than the noise. Their variance is reported as infinite. Add lines far from the centre of "
+        "distortion or at more focal lengths (in a clip, turn the camera further), or lower the degree or "
+        "the number of terms."
     )
     folded = (
         "The fitted distortion is not invertible over the whole image and the range of focal lengths: see "

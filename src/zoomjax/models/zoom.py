@@ -293,8 +293,8 @@ def check_distinct(what: str, focal: Focal, least: int) -> None:
     distinct = np.unique(np.asarray(focal)).size
     if distinct < least:
         raise ValueError(
-            f"{what} needs {least} or more distinct focal lengths, but there are {distinct}. Choose a model "
-            "with fewer parameters (a lower degree, say), or add images at other focal lengths."
+            f"{what} needs {least} or more distinct focal lengths, but there are {distinct}. Choose a "
+            "model with fewer parameters (a lower degree, say), or add images at other focal lengths."
         )
 
 

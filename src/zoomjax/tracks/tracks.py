@@ -158,8 +158,8 @@ class Tracks(eqx.Module):
         entry = np.where(mask, first[:, None] + view, first[:, None])  # padding repeats the first view
         if weights is not None and not weights[entry].any():
             raise ValueError(
-                "No track of two views has a weight above 0: give some of them one, or leave weight out for "
-                "equal weights."
+                "No track of two views has a weight above 0: give some of them one, or leave weight out "
+                "for equal weights."
             )
         warn_of_points_outside(places[entry], mask, size)
         return cls(
