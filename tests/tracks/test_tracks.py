@@ -97,7 +97,10 @@ def test_weights_of_tracks_that_are_dropped_go_with_them():
             [3, 4, 3], [0, 0, 1], np.zeros((3, 2)), image_size=(8, 6), weight=[1, 5, 2]
         )
     assert tracks.view_weights().tolist() == [1, 2]
-    with pytest.raises(ValueError, match="No track of two views has a weight above 0"):
+    with (
+        pytest.warns(UserWarning, match="Dropped 1 of 2 tracks"),
+        pytest.raises(ValueError, match="No track of two views has a weight above 0"),
+    ):
         Tracks.from_arrays([3, 4, 3], [0, 0, 1], np.zeros((3, 2)), image_size=(8, 6), weight=[0, 5, 0])
 
 
