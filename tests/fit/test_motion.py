@@ -215,6 +215,18 @@ def test_the_scale_is_as_uncertain_as_the_best_f_where_all_are_known(lens, path)
     assert joint[0] == pytest.approx(joint[1], rel=0.3, abs=0.05 * std[0][0] * std[0][-1])
 
 
+def test_a_frame_without_views_does_not_tell_the_scale(lens, path):
+    """However well its f is known."""
+    focal, rotation = path
+    still = (focal, np.broadcast_to(rotation[0], rotation.shape))
+    tracks = tracked(lens, still, noise=0.3).tracks
+    tracks = eqx.tree_at(lambda tracks: tracks.mask, tracks, tracks.mask & (tracks.frame != 5))
+    relative = np.where(np.arange(FRAMES) == 5, 1e-6, 0.01)
+    fit = fit_motion(tracks, focal=focal, focal_std=relative * focal)
+    assert np.isnan(fit.focal[5])
+    assert 0.01 / np.sqrt(FRAMES) < np.sqrt(np.asarray(fit.covariance)[-1, -1]) < 0.01
+
+
 def test_a_known_focal_length_that_contradicts_the_tracks_is_told(path, noisy):
     """One is 1.3 times too long: the scale of all is between it and that of the tracks."""
     focal = np.full(FRAMES, np.nan)

@@ -71,6 +71,22 @@ def test_every_says_in_which_frames(clip, video, tracks):
     assert all(moment % 5 == 0 for _, moment in new)
 
 
+def test_points_are_looked_for_in_no_copies(clip, tmp_path):
+    """Every frame is there twice: the second says nothing that the first does not."""
+    path = write_frames(tmp_path / "twice.mp4", np.repeat(list(clip.frames()), 2, axis=0))
+    tracks = track_video(path, life=16)
+    truth = carried(clip)
+    more = find_again(
+        path, tracks, carry=lambda frame, points, other: truth(frame // 2, points, other // 2)
+    )
+    known, found = (
+        set(zip(number.tolist(), frame.tolist(), strict=True))
+        for number, frame, _ in (tracks.views(), more.views())
+    )
+    assert found > known
+    assert {moment % 2 for _, moment in found - known} == {0}
+
+
 def test_new_views_have_the_largest_weight_of_their_track(clip, video, tracks):
     number, frame, _ = tracks.views()
     weight = 1 + number % 3 + 0.1 * (frame % 2)

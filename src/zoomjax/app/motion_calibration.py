@@ -178,8 +178,8 @@ class MotionCalibration:
             )
         if float(self.fit.readout_std) < _TOLD_SHUTTER:
             more.append(
-                f"Time from the first row to the last: {float(self.fit.readout):.2f} ± "
-                f"{float(self.fit.readout_std):.2g} of a frame"
+                "Time from the first row to the last: "
+                + with_std(float(self.fit.readout), float(self.fit.readout_std), "of a frame")
             )
         return [
             f"\n{views:,} views of {len(self.tracks.number):,} points in {self.tracks.frames:,} frames",
