@@ -422,7 +422,7 @@ LEFT_OUT = {
         BY_VALUES,
     ),
     "fit_motion": OUTSIDE_OF_JIT,
-    **dict.fromkeys(("shot_turns", "join_shots"), BY_VALUES),
+    **dict.fromkeys(("shot_turns", "join_shots", "linked_well"), BY_VALUES),
     "fit_boards": BY_VALUES,
     **dict.fromkeys(
         (

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 import zoomjax as zj
 from zoomjax.app.motion_calibration import calibrate_motion
 from zoomjax.app.panorama import write_panorama
-from zoomjax.fit import RESULTS, shot_turns
-from zoomjax.fit.shots import linked_well
+from zoomjax.fit import RESULTS, linked_well, shot_turns
 from zoomjax.scenes import leaves, motion_clip
 from zoomjax.tracks import KeyFrames, Tracks, track_video
 
@@ -161,3 +160,6 @@ def test_few_tracks_do_not_hold_one_shot_to_another(done):
     weight = 1.0 + np.arange(len(number)) % 5
     weighted = linked_well(kept(few, weight[few]), done.fit)
     np.testing.assert_array_equal(weighted.view_weights(), kept(~across, weight[~across]).view_weights())
+    longer = Tracks.from_arrays(number, frame, points, image_size=SIZE, frames=FRAMES + 1)
+    with pytest.raises(ValueError, match=f"has {FRAMES} frames and they have {FRAMES + 1}"):
+        linked_well(longer, done.fit)

@@ -34,6 +34,7 @@ from .result import FrameFits as FrameFits
 from .result import ZoomFit as ZoomFit
 from .robust import RobustFit as RobustFit
 from .robust import fit_robust as fit_robust
+from .shots import linked_well as linked_well
 from .shots import shot_turns as shot_turns
 from .straightness import frame_rms as frame_rms
 from .zoom import fit_zoom as fit_zoom

@@ -91,8 +91,28 @@ def _carry(fit: MotionFit, turn: Turn) -> tuple[int, int, Callable[[Points], Poi
     return one, other, carry, fit.lens.image_size
 
 
+@kinds_checked
 def linked_well(tracks: Tracks, fit: MotionFit) -> Tracks:
-    """The tracks without views in shots to which few of the shot where they begin go."""
+    """The tracks without views in shots to which few of those that begin in the same shot go.
+
+    Fewer than twenty, which may all be mistakes, do not hold one shot to another; a fit would take them
+    for a link.
+
+    Args:
+        tracks: of which some go from shot to shot, by `zoomjax.tracks.find_again`.
+        fit: of the same clip, which says what its shots are.
+
+    Raises:
+        ValueError: the fit is of another number of frames.
+
+    Warns:
+        UserWarning: tracks of which one view is left are dropped.
+    """
+    if len(fit.shot) != tracks.frames:
+        raise ValueError(
+            f"Argument fit must be of the clip of the tracks, but it has {len(fit.shot)} frames and they "
+            f"have {tracks.frames}."
+        )
     shot = np.asarray(fit.shot)
     number, frame, points = tracks.views()
     _, first, track = np.unique(number, return_index=True, return_inverse=True)
