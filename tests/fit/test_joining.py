@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from zoomjax import PolynomialZoom, ZoomLens
-from zoomjax.fit import fit_motion
-from zoomjax.fit.joining import Matches, frames_apart, join_shots, turn_between
+from zoomjax.fit import fit_motion, shot_turns
+from zoomjax.fit.joining import Matches, Turn, frames_apart, join_shots, turn_between
 from zoomjax.scenes import motion_tracks
 from zoomjax.tracks import Tracks
 
@@ -151,7 +151,8 @@ def in_three_shots(tracks, real, factor):
     kept = twice[2][twice[1]] > 1
     parted = Tracks.from_arrays(number[kept], frame[kept], points[kept], image_size=SIZE, frames=FRAMES)
     values = jnp.asarray(rotation), jnp.asarray(shot), jnp.asarray(shot), jnp.ones((len(parted.mask), 3))
-    of = lambda fit: (fit.rotation, fit.shot, fit.scene, fit.rays)  # noqa: E731
+    values += (jnp.where(parted.mask, 0.0, jnp.nan),)
+    of = lambda fit: (fit.rotation, fit.shot, fit.scene, fit.rays, fit.residual)  # noqa: E731
     return eqx.tree_at(of, fit, values), parted
 
 
@@ -210,3 +211,22 @@ def test_frames_that_are_compared_are_far_apart(real):
     assert {0, 11} <= set(frames)
     assert np.diff(frames).min() > 1
     assert set(frames_apart(fit, 1, 100)) == set(range(CUT, FRAMES))
+
+
+def test_tracks_of_another_clip_are_refused(tracks, real):
+    """They gave the rays of one shot to tracks of the other, without a word."""
+    turn = Turn((0, 1), (0, CUT), 30, TURN, 0.0)
+    track, frame, points = tracks.views()
+    fewer = track[frame < CUT], frame[frame < CUT], points[frame < CUT]
+    renamed = track.max() - track, frame, points
+    others = [
+        Tracks.from_arrays(*of, image_size=SIZE, frames=frames)
+        for of, frames in ((fewer, FRAMES), (renamed, FRAMES), (tracks.views(), 50))
+    ]
+    others.append(Tracks.from_arrays(*tracks.views(), image_size=(SIZE[0] + 20, SIZE[1]), frames=FRAMES))
+    for other in others:
+        with pytest.raises(ValueError, match="tracks must be those of the fit"):
+            join_shots(real, [turn], tracks=other)
+        with pytest.raises(ValueError, match="tracks must be those of the fit"):
+            shot_turns(real, other, look=lambda frames: pytest.fail("looked"))
+    assert np.unique(join_shots(real, [turn], tracks=tracks).scene).tolist() == [0]

@@ -104,12 +104,29 @@ def test_shots_that_nothing_links_have_the_scales_of_their_own_known_focal_lengt
     np.testing.assert_allclose(found.focal, focal, rtol=0.02)
 
 
+def test_an_earlier_fit_of_another_clip_is_refused(lens, tracks, fit):
+    """As many frames of the same camera: a frame had no f, and in another clip all f were off."""
+    for number, path in enumerate(({"pan": 25, "seed": 1}, {"pan": 60, "tilt": 20, "seed": 2})):
+        other = motion_tracks(
+            lens, *pan_and_zoom(lens, FRAMES, **path), views=50, life=12, noise=0.3, seed=number
+        )
+        with pytest.raises(ValueError, match=r"same clip, but by it most points would be \d+ px or more"):
+            fit_motion(other.tracks, begin=fit)
+    backwards = made(*(of(part) for of, part in zip(_BACKWARDS, tracks.views(), strict=True)))
+    with pytest.raises(ValueError, match="same clip, but by it most points"):
+        fit_motion(backwards, begin=fit)
+
+
+_BACKWARDS = (np.array, lambda frame: FRAMES - 1 - frame, np.array)
+
+
 @pytest.mark.slow
 def test_what_tracks_do_not_determine_is_not_determined_by_the_earlier_fit(lens, fit):
     focal, rotation = pan_and_zoom(lens, FRAMES, pan=25, tilt=6)
     still = np.broadcast_to(rotation[0], rotation.shape)
     scene = motion_tracks(lens, focal, still, views=50, life=12, noise=0.3, seed=3)
-    assert fit_motion(scene.tracks, begin=fit).fit.result == RESULTS.undetermined
+    begin = eqx.tree_at(lambda fit: fit.rotation, fit, jnp.broadcast_to(jnp.eye(3), rotation.shape))
+    assert fit_motion(scene.tracks, begin=begin).fit.result == RESULTS.undetermined
 
 
 def test_a_fit_of_something_else_is_refused(tracks, fit):

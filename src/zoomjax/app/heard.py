@@ -1,8 +1,9 @@
 """Warnings that are raised on the way, for the results."""
 
 import contextlib
+import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from .._core.text import plain
@@ -28,3 +29,12 @@ def heard() -> Iterator[list[str]]:
 
         warnings.showwarning = hear
         yield found
+
+
+def passed_on(caught: Sequence[warnings.WarningMessage], *, but: str) -> list[str]:
+    """Raise warnings again that were caught, but those that a pattern fits, which are returned."""
+    kept = [str(one.message) for one in caught if re.match(but, str(one.message))]
+    for one in caught:
+        if str(one.message) not in kept:
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    return kept

@@ -18,7 +18,7 @@ from .._core.text import with_std
 from ..detect.batch import Detection
 from ..fit.joining import join_shots
 from ..fit.losses import IGNORED_LINE
-from ..fit.motion import LOOPS, fit_motion
+from ..fit.motion import CONTRADICTED, LOOPS, fit_motion
 from ..fit.motion_fit import MotionFit
 from ..fit.result import RESULTS
 from ..fit.shots import linked_well, shot_turns
@@ -38,26 +38,26 @@ from ._flags import with_flags
 from .clip_lines import MOST, draw_frames, frames_with_lines, image_rows, lines_of_frames
 from .coefficients import coefficient_rows, finite, pixel_polynomials
 from .frame_findings import frames_of, repeated_frames
+from .heard import passed_on
 from .known_focals import KnownFocals
 from .model_choice import WantedModel
-from .motion_figures import (
-    all_focals,
-    centre_summary,
-    frame_rows,
-    line_rms,
-    rms_uncorrected,
-    turned,
+from .motion_figures import all_focals, centre_summary, frame_rows, line_rms, rms_uncorrected, turned
+from .motion_findings import (
+    findings_of_motion,
+    following,
+    follows,
+    is_relative,
+    scale_std,
+    with_contradictions,
 )
-from .motion_findings import findings_of_motion, following, follows, is_relative, scale_std
 from .outward import outward
 from .relative import NOTE, SENTENCE
 
 FILES = ("lens.json", "track.csv", "tracks.npz", "summary.json", "motion.png", "panorama.jpg")
 """What `MotionCalibration.make` writes; where lines were fitted, too, also lines.npz and lines/."""
 
-_CONTRADICTION = ".* known focal lengths contradict the tracks"
-"""A warning of `fit_motion`, of which a finding tells."""
-
+_CONTRADICTION = rf"(.* known focal lengths contradict the tracks|{CONTRADICTED} known focal lengths)"
+"""Warnings of `fit_motion`, of which findings tell."""
 _TOLD_SHUTTER = 0.1
 """Standard deviation of the readout, in frames, below which it is told."""
 
@@ -79,6 +79,7 @@ class MotionCalibration:
         lines: the lines, each frame with its f; None if none were.
         known: focal lengths that were known beforehand.
         warnings: what the user was warned of on the way.
+        contradicted: how tracks contradict the scale of what was known.
     """
 
     clip: Path
@@ -89,6 +90,7 @@ class MotionCalibration:
     lines: Lines | None = None
     known: KnownFocals | None = None
     warnings: tuple[str, ...] = ()
+    contradicted: tuple[str, ...] = ()
 
     def following(self) -> float:
         """The share of the views that follow the model: the rest are on things that move, or mistakes."""
@@ -142,7 +144,8 @@ class MotionCalibration:
     def findings(self) -> list[Finding]:
         """What the clip cannot tell, with what to do about it: the worst first; empty if all is good."""
         numbers = self.times[:, 0].astype(int)
-        return findings_of_motion(self.fit, self.tracks, self.known_of_frames(), numbers=numbers)
+        found = findings_of_motion(self.fit, self.tracks, self.known_of_frames(), numbers=numbers)
+        return with_contradictions(found, self.contradicted)
 
     @property
     def verdict(self) -> Verdict:
@@ -359,8 +362,8 @@ def calibrate_motion(
     lines, line_frames = lines_of_frames(found, times[:, 0])
 
     def fitted(tracks, begin=None):
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", _CONTRADICTION)  # a finding says so
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.filterwarnings("always", _CONTRADICTION)
             fit = fit_motion(
                 tracks,
                 begin=begin,
@@ -373,8 +376,11 @@ def calibrate_motion(
                 focal=focal,
                 focal_std=focal_std,
             )
+        told = passed_on(caught, but=_CONTRADICTION)
+        contradicted.extend(of for of in told if of.startswith(CONTRADICTED))
         return jax.block_until_ready(fit)
 
+    contradicted: list[str] = []
     fit = begin = fitted(tracks)
     turns = []
     if fit.shot.max() > 0 and fit.fit.result == RESULTS.successful:
@@ -391,4 +397,4 @@ def calibrate_motion(
             tracks, fit = more, fitted(more, begin)
     if lines is not None:
         lines = eqx.tree_at(lambda lines: lines.focal, lines, all_focals(fit)[0][line_frames])
-    return MotionCalibration(clip, tracks, fit, times, tuple(found), lines, known)
+    return MotionCalibration(clip, tracks, fit, times, tuple(found), lines, known, (), tuple(contradicted))

@@ -1,6 +1,6 @@
 """What a clip cannot tell, with what to do about it: the findings of a calibration from motion."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import equinox as eqx
 import jax
@@ -77,6 +77,15 @@ def findings_of_motion(
         *of_blind(fit, numbers),
     ]
     return sorted(found, key=lambda of: -VERDICTS.index(of.verdict))
+
+
+def with_contradictions(found: Sequence[Finding], contradicted: Sequence[str]) -> list[Finding]:
+    """Findings, and that known focal lengths give all another scale, as warnings of `fit_motion` say."""
+    todo = "Check --known-focal, --focal-unit and --pixel-pitch, or leave them out."
+    told = [
+        Finding("known focal lengths", "doubtful", of.partition(" Check")[0], todo) for of in contradicted
+    ]
+    return sorted([*told, *found], key=lambda of: -VERDICTS.index(of.verdict))
 
 
 def following(fit: MotionFit, tracks: Tracks) -> float:

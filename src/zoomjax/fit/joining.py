@@ -21,6 +21,7 @@ from .._core.arguments import kinds_checked
 from ..tracks.tracks import Tracks
 from ._structure import bucket
 from .motion_fit import MotionFit
+from .same_camera import check_tracks_of
 
 _WITHIN = 1 / 300
 """Diagonals of the image, in the frame with the shorter f: matches that are farther off do not agree."""
@@ -124,8 +125,9 @@ def join_shots(fit: MotionFit, turns: Sequence[Turn], *, tracks: Tracks, scaled:
             lens nor a standard deviation is changed.
 
     Raises:
-        ValueError: a turn is of a shot that the fit does not have.
+        ValueError: a turn is of a shot that the fit does not have, or tracks are of another fit.
     """
+    check_tracks_of(fit, tracks)
     shot, scene = np.asarray(fit.shot), np.asarray(fit.scene)
     numbers, first = np.unique(shot, return_index=True)
     poses = {

@@ -39,6 +39,16 @@ LOOPS = LONGEST_LOOP
 _NEAR = 0.05
 """Of log f: an earlier fit that is farther from known focal lengths is no start, as its lens is another."""
 
+_FOLLOW, _LIKE, _WITHIN = 0.25, 0.3, 0.01
+"""Share of the tracks that follow an earlier fit of their clip, at least; and how far off these may be,
+over how far tracks move, or in half image diagonals."""
+
+CONTRADICTED = "Without"
+"""The first word of a warning that known focal lengths give all results another scale than tracks do."""
+
+_CLOSER, _OTHER = 1.1, 0.03
+"""From where on it is given: noise over that without known focal lengths, and these apart in log f."""
+
 _FAR_OFF = 5.0
 """Standard deviations from a known focal length to the one fitted that are no chance."""
 
@@ -109,7 +119,8 @@ def fit_motion(
         RuntimeError: the fit failed (see `throw`).
 
     Warns:
-        UserWarning: known focal lengths are far from those that the tracks say.
+        UserWarning: known focal lengths are far from those that the tracks say, by the fit or by one
+            without them, which is made if `begin` is not given.
 
     References:
         L. de Agapito, E. Hayman, I. Reid, "Self-calibration of rotating and zooming cameras", IJCV 2001.
@@ -179,6 +190,7 @@ def _solved_motion(given, asked):
         lever_mean=jnp.zeros(()) if model.levers is None else model.levers.mean,
     )
     _warn_of_contradiction(given, fit)
+    _warn_of_other_scale(given, asked, fit, noise)
     return fit, model, noise
 
 
@@ -213,6 +225,7 @@ def _from(given, asked, problem):
             "Argument begin must be an earlier fit of the same clip, but its frames are not as many or not "
             "as large as those of the tracks, or it has found no focal length."
         )
+    _check_same_clip(given)
     log_focal = np.interp(np.arange(len(log_focal)), known, log_focal[known])
     size = asked.distortion_model.num_coefficients(asked.terms)
     wanted = asked.zoom.prepare(np.exp(log_focal), size), asked.distortion_model
@@ -236,6 +249,29 @@ def _from(given, asked, problem):
     )
 
 
+def _check_same_clip(given):
+    """Refuse an earlier fit whose camera moves otherwise than the points of most tracks do."""
+    mask, earlier = np.asarray(given.tracks.mask), given.begin
+    track = np.flatnonzero(np.sum(mask, axis=1) > 1)
+    ends = np.argmax(mask[track], axis=1), mask.shape[1] - 1 - np.argmax(mask[track, ::-1], axis=1)
+    (first, last), (seen, there) = (
+        [np.asarray(of)[track, end] for end in ends] for of in (given.tracks.frame, given.tracks.points)
+    )
+    focal, carried = np.asarray(earlier.focal), np.full(seen.shape, np.nan)
+    for frame in np.unique(last[np.isfinite(focal[first]) & np.isfinite(focal[last])]).tolist():
+        carried[last == frame] = earlier.carried(first[last == frame], seen[last == frame], frame)
+    off, moved = (np.linalg.norm(of, axis=1) for of in (carried - there, there - seen))
+    told = np.isfinite(off)
+    if told.any():
+        least, usual = np.quantile(off[told], _FOLLOW), np.median(moved[told])
+        if least > max(_LIKE * usual, _WITHIN * given.tracks.scale):
+            raise ValueError(
+                "Argument begin must be an earlier fit of the same clip, but by it most points would be "
+                f"{least:.3g} px or more from where the tracks have them, which move by {usual:.3g} px: "
+                "leave it out, or give the fit of this clip."
+            )
+
+
 def _warn_of_contradiction(given, fit):
     """Known focal lengths far from those fitted are not those of the tracks, or not that well known."""
     if given.focal is None:
@@ -250,6 +286,34 @@ def _warn_of_contradiction(given, fit):
             f"frame {worst} {known[worst]:.5g} px is given and {float(fit.focal[worst]):.5g} px is fitted, "
             f"{off[worst]:.2g} of its standard deviations away. Such errors take all focal lengths along: "
             "leave out those that are wrong, or give them a larger focal_std.",
+            stacklevel=2,
+        )
+
+
+def _warn_of_other_scale(given, asked, fit, noise):
+    """Known focal lengths that a fit follows, far from those without which it follows the tracks closer."""
+    if given.focal is None or given.begin is not None:  # of which the earlier fit has told
+        return
+    known = np.asarray(given.focal, float)
+    there = np.flatnonzero(np.isfinite(known))
+    if not len(there):
+        return
+    free = given._replace(focal=None, focal_std=None)
+    model, without = _from_nothing(free, asked, problem_of(free, asked))
+    focal = np.exp(np.asarray(model.path.log_focal))[there]
+    off = np.log(focal / known[there])
+    std = np.broadcast_to(np.asarray(given.focal_std, float), known.shape)[there] / known[there]
+    within = [float(given.unit) * float(of.points) for of in (without, noise)]
+    lost = (np.isnan(np.asarray(fit.focal)) & (np.asarray(fit.shot) >= 0))[there].any()
+    if (within[1] > _CLOSER * within[0] or lost) and np.median(
+        np.abs(off) / np.maximum(std, _OTHER / _FAR_OFF)
+    ) > _FAR_OFF:
+        worst = int(np.argmax(np.abs(off)))
+        warnings.warn(
+            f"{CONTRADICTED} known focal lengths tracks are followed within {within[0]:.3g} px in place of "
+            f"{within[1]:.3g} px: of frame {there[worst]} {known[there[worst]]:.5g} px is given and "
+            f"{focal[worst]:.5g} px is fitted then. Check what is given, and that it is in px: "
+            "its scale may be that of all results.",
             stacklevel=2,
         )
 

@@ -1,14 +1,17 @@
-"""Lines and the lens or fit that they are those of: of the same images, frames and unit."""
+"""Lines and tracks, and the lens or fit that they are those of: of the same images, frames and unit."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_jit, of_frames
 from ..models.lens import ZoomLens
+from ..tracks.tracks import Tracks
 from .distortion_models import with_distortion_model
+from .motion_fit import MotionFit
 from .result import ZoomFit
 
 
@@ -41,6 +44,21 @@ def check_lines_of(fit: ZoomFit, lines: AbstractLines) -> None:
     if own != given:
         raise ValueError(
             f"The fit is of {own} frames, but the lines are of {given}: pass the lines that were fitted."
+        )
+
+
+def check_tracks_of(fit: MotionFit, tracks: Tracks) -> None:
+    """Refuse other tracks than those of a fit, as far as one can tell: by which views there are.
+
+    Raises:
+        ValueError: they are of other images, of another number of frames, or have other views.
+    """
+    seen, mask = np.isfinite(np.asarray(fit.residual)), np.asarray(tracks.mask)
+    alike = (fit.lens.image_size, len(fit.focal)) == (tracks.image_size, tracks.frames)
+    if not alike or seen.shape != mask.shape or (seen & ~mask).any():
+        raise ValueError(
+            "Argument tracks must be those of the fit, but their images, frames or views are others: give "
+            "the tracks that were fitted."
         )
 
 

@@ -12,6 +12,7 @@ from ..tracks.tracks import Tracks
 from .joining import Matches, Turn, frames_apart, join_shots, turn_between
 from .motion_fit import MotionFit
 from .result import RESULTS
+from .same_camera import check_tracks_of
 
 _SHOTS = 30
 """That are compared, the longest ones: all are compared with all."""
@@ -56,7 +57,11 @@ def shot_turns(fit: MotionFit, tracks: Tracks, *, look: Callable[[Iterable[int]]
         A turn for each pair of shots that show the same: `join_shots` takes them. None leads to shots that
         show something else, or that look in one direction at one zoom, where a caption would do the same.
         There are none if the fit is not successful, as without a scale of f.
+
+    Raises:
+        ValueError: tracks are of another fit.
     """
+    check_tracks_of(fit, tracks)
     if fit.fit.result != RESULTS.successful:
         return []
     shot = np.asarray(fit.shot)
