@@ -170,11 +170,7 @@ def test_a_thing_that_the_camera_follows_is_not_taken_for_the_scene(lens, seed):
     ],
 )
 def test_fewer_frames_than_a_model_needs_are_told(noisy, models, frames, wanted, throw):
-    number, frame, points = noisy.tracks.views()
-    first = frame < frames + (frames == 1)
-    few = Tracks.from_arrays(number[first], frame[first], points[first], image_size=SIZE, frames=FRAMES)
-    if frames == 1:  # a view each counts, of two
-        few = eqx.tree_at(lambda t: t.mask, few, few.mask & (few.frame == 0))
+    few = eqx.tree_at(lambda t: t.mask, noisy.tracks, noisy.tracks.mask & (noisy.tracks.frame < frames))
     with pytest.raises(ValueError, match=f"tracks has views in {frames} frames: A polynomial of {wanted}"):
         fit_motion(few, throw=throw, **models)
 
