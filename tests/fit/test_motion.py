@@ -236,14 +236,14 @@ def test_a_known_focal_length_that_contradicts_the_tracks_is_told(path, noisy):
 def test_known_focal_lengths_of_another_scale_are_told(path, noisy, factor):
     """In mm for px, of another sensor, or of a lens with an extender: the fit follows them all."""
     focal = factor * path[0]
-    with pytest.warns(UserWarning, match="Without known focal lengths tracks are followed"):
+    with pytest.warns(UserWarning, match="have another scale than the tracks: points are followed within"):
         fit_motion(noisy.tracks, focal=focal, focal_std=0.01 * focal, throw=False)
 
 
 @pytest.mark.parametrize("factor", [0.01, 4.0])
 def test_one_known_focal_length_of_another_scale_is_told(path, noisy, factor):
     focal = np.where(np.arange(FRAMES) == 0, factor * path[0], np.nan)
-    with pytest.warns(UserWarning, match="focal lengths (tracks|contradict the tracks)"):
+    with pytest.warns(UserWarning, match="focal lengths (have another scale|contradict the tracks)"):
         fit_motion(noisy.tracks, focal=focal, focal_std=0.01 * focal[0], throw=False)
 
 

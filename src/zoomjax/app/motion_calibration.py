@@ -16,9 +16,10 @@ import numpy as np
 
 from .._core.text import with_std
 from ..detect.batch import Detection
+from ..fit.contradiction import CONTRADICTED
 from ..fit.joining import join_shots
 from ..fit.losses import IGNORED_LINE
-from ..fit.motion import CONTRADICTED, LOOPS, fit_motion
+from ..fit.motion import LOOPS, fit_motion
 from ..fit.motion_fit import MotionFit
 from ..fit.result import RESULTS
 from ..fit.shots import linked_well, shot_turns
@@ -56,7 +57,7 @@ from .relative import NOTE, SENTENCE
 FILES = ("lens.json", "track.csv", "tracks.npz", "summary.json", "motion.png", "panorama.jpg")
 """What `MotionCalibration.make` writes; where lines were fitted, too, also lines.npz and lines/."""
 
-_CONTRADICTION = rf"(.* known focal lengths contradict the tracks|{CONTRADICTED} known focal lengths)"
+_CONTRADICTION = rf".* known focal lengths contradict the tracks|{CONTRADICTED}"
 """Warnings of `fit_motion`, of which findings tell."""
 _TOLD_SHUTTER = 0.1
 """Standard deviation of the readout, in frames, below which it is told."""
@@ -380,9 +381,8 @@ def calibrate_motion(
         contradicted.extend(of for of in told if of.startswith(CONTRADICTED))
         return jax.block_until_ready(fit)
 
-    contradicted: list[str] = []
+    contradicted, turns = list[str](), []
     fit = begin = fitted(tracks)
-    turns = []
     if fit.shot.max() > 0 and fit.fit.result == RESULTS.successful:
         stage("Joining shots of the same scene")
         turns = shot_turns(fit, tracks, look=functools.partial(KeyFrames, clip))

@@ -82,9 +82,8 @@ def findings_of_motion(
 def with_contradictions(found: Sequence[Finding], contradicted: Sequence[str]) -> list[Finding]:
     """Findings, and that known focal lengths give all another scale, as warnings of `fit_motion` say."""
     todo = "Check --known-focal, --focal-unit and --pixel-pitch, or leave them out."
-    told = [
-        Finding("known focal lengths", "doubtful", of.partition(" Check")[0], todo) for of in contradicted
-    ]
+    sentences = [of.partition(" Check")[0] for of in contradicted]
+    told = [Finding("known focal lengths", "doubtful", of[0].lower() + of[1:], todo) for of in sentences]
     return sorted([*told, *found], key=lambda of: -VERDICTS.index(of.verdict))
 
 

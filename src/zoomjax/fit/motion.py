@@ -7,8 +7,6 @@ made for this problem (`_schur`), in time that is linear in the number of frames
 end.
 """
 
-import warnings
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -25,32 +23,18 @@ from ..models.polynomial import RadialPolynomial
 from ..models.requirements import check
 from ..models.zoom import AbstractZoom, PolynomialZoom
 from ..tracks.tracks import Tracks
+from ._motion_begin import begins_near, from_earlier
 from ._motion_gradient import sensitive
 from ._motion_model import Model, Noise, scaled
 from ._motion_problem import LONGEST_LOOP, Asked, Given, Problem, problem_of, relative, thinned
-from ._motion_stages import begun, continued, in_stages, with_all
-from ._motion_start import Path, starts_of, views_by_frame
+from ._motion_stages import begun, in_stages, with_all
+from ._motion_start import starts_of, views_by_frame
+from .contradiction import warn_of_contradiction, warn_of_other_scale
 from .defaults import zoom_or_default
 from .motion_fit import MotionFit, thrown_motion
 
 LOOPS = LONGEST_LOOP
 """The most frames of a clip in which a camera that comes back closes a loop: tracks stay whole."""
-
-_NEAR = 0.05
-"""Of log f: an earlier fit that is farther from known focal lengths is no start, as its lens is another."""
-
-_FOLLOW, _LIKE, _WITHIN = 0.25, 0.3, 0.01
-"""Share of the tracks that follow an earlier fit of their clip, at least; and how far off these may be,
-over how far tracks move, or in half image diagonals."""
-
-CONTRADICTED = "Without"
-"""The first word of a warning that known focal lengths give all results another scale than tracks do."""
-
-_CLOSER, _OTHER = 1.1, 0.03
-"""From where on it is given: noise over that without known focal lengths, and these apart in log f."""
-
-_FAR_OFF = 5.0
-"""Standard deviations from a known focal length to the one fitted that are no chance."""
 
 
 @kinds_checked
@@ -172,7 +156,7 @@ def _fitted(given: Given, asked: Asked, throw: bool) -> tuple[MotionFit, Model, 
 def _solved_motion(given, asked):
     """The fit, the model that it is of, and the noise."""
     problem, frames = problem_of(given, asked), given.tracks.frames
-    found = (_from if _begins_near(given) else _from_nothing)(given, asked, problem)
+    found = (from_earlier if begins_near(given) else _from_nothing)(given, asked, problem)
     parts, missed, model, noise = in_stages(problem.data, *found, problem.scene)
     parts["fit"] = eqx.tree_at(lambda fit: fit.frame_rms, parts["fit"], parts["fit"].frame_rms[:frames])
     if problem.data.root is not None:
@@ -189,8 +173,11 @@ def _solved_motion(given, asked):
         lever_std=jnp.zeros(()) if model.levers is None else model.levers.std,
         lever_mean=jnp.zeros(()) if model.levers is None else model.levers.mean,
     )
-    _warn_of_contradiction(given, fit)
-    _warn_of_other_scale(given, asked, fit, noise)
+    if given.focal is not None:
+        warn_of_contradiction(given, fit)
+        if given.begin is None and np.isfinite(given.focal).any():  # else the earlier fit has told
+            free = given._replace(focal=None, focal_std=None)
+            warn_of_other_scale(given, fit, noise, _from_nothing(free, asked, problem_of(free, asked)))
     return fit, model, noise
 
 
@@ -204,118 +191,6 @@ def _from_nothing(given, asked, problem):
     paths, spreads = _started(few.data, by_frame, jnp.asarray(_parts_of(few)))
     found = begun(few.data, paths, spreads, asked.zoom, asked.shift, asked.distortion_model, asked.terms)
     return found if few is problem else with_all(few.data, problem.data, *found)
-
-
-def _begins_near(given):
-    """Whether there is an earlier fit, and known focal lengths do not say that its scale is another."""
-    if given.begin is None or given.focal is None or len(given.focal) != len(given.begin.focal):
-        return given.begin is not None
-    off = np.log(np.asarray(given.focal, float) / np.asarray(given.begin.focal))
-    return not np.isfinite(off).any() or abs(np.nanmedian(off)) < _NEAR
-
-
-def _from(given, asked, problem):
-    """A model near the best and its noise, from an earlier fit."""
-    earlier, data = given.begin, problem.data
-    log_focal = np.log(np.asarray(earlier.focal))
-    known = np.flatnonzero(np.isfinite(log_focal))
-    alike = (len(log_focal), earlier.lens.image_size) == (given.tracks.frames, given.tracks.image_size)
-    if not alike or not len(known):
-        raise ValueError(
-            "Argument begin must be an earlier fit of the same clip, but its frames are not as many or not "
-            "as large as those of the tracks, or it has found no focal length."
-        )
-    _check_same_clip(given)
-    log_focal = np.interp(np.arange(len(log_focal)), known, log_focal[known])
-    size = asked.distortion_model.num_coefficients(asked.terms)
-    wanted = asked.zoom.prepare(np.exp(log_focal), size), asked.distortion_model
-    wanted += (None if asked.shift is None else asked.shift.prepare(np.exp(log_focal), 2),)
-    lens = earlier.lens.zoom, earlier.lens.distortion_model, earlier.lens.shift
-    if jax.tree.structure(lens) != jax.tree.structure(wanted) or [
-        np.shape(leaf) for leaf in jax.tree.leaves(lens)
-    ] != [np.shape(leaf) for leaf in jax.tree.leaves(wanted)]:
-        raise ValueError(
-            "Argument begin must be an earlier fit of the same models, but it has another zoom model, "
-            "distortion model, shift, or number of terms."
-        )
-    more = (0, len(data.log_focal) - len(log_focal))
-    path = Path(
-        jnp.asarray(np.pad(log_focal, more, mode="edge")),
-        jnp.asarray(np.pad(np.asarray(earlier.rotation), (more, (0, 0), (0, 0)), mode="edge")),
-        jnp.zeros((data.structure.tracks, 3)),
-    )
-    return continued(
-        data, path, lens, earlier.readout, Noise(earlier.noise / given.unit, jnp.asarray(jnp.nan))
-    )
-
-
-def _check_same_clip(given):
-    """Refuse an earlier fit whose camera moves otherwise than the points of most tracks do."""
-    mask, earlier = np.asarray(given.tracks.mask), given.begin
-    track = np.flatnonzero(np.sum(mask, axis=1) > 1)
-    ends = np.argmax(mask[track], axis=1), mask.shape[1] - 1 - np.argmax(mask[track, ::-1], axis=1)
-    (first, last), (seen, there) = (
-        [np.asarray(of)[track, end] for end in ends] for of in (given.tracks.frame, given.tracks.points)
-    )
-    focal, carried = np.asarray(earlier.focal), np.full(seen.shape, np.nan)
-    for frame in np.unique(last[np.isfinite(focal[first]) & np.isfinite(focal[last])]).tolist():
-        carried[last == frame] = earlier.carried(first[last == frame], seen[last == frame], frame)
-    off, moved = (np.linalg.norm(of, axis=1) for of in (carried - there, there - seen))
-    told = np.isfinite(off)
-    if told.any():
-        least, usual = np.quantile(off[told], _FOLLOW), np.median(moved[told])
-        if least > max(_LIKE * usual, _WITHIN * given.tracks.scale):
-            raise ValueError(
-                "Argument begin must be an earlier fit of the same clip, but by it most points would be "
-                f"{least:.3g} px or more from where the tracks have them, which move by {usual:.3g} px: "
-                "leave it out, or give the fit of this clip."
-            )
-
-
-def _warn_of_contradiction(given, fit):
-    """Known focal lengths far from those fitted are not those of the tracks, or not that well known."""
-    if given.focal is None:
-        return
-    known, std = np.asarray(given.focal, float), np.asarray(given.focal_std, float)
-    off = np.abs(np.log(np.asarray(fit.focal) / known)) / (std / known)
-    far = np.flatnonzero(np.nan_to_num(off) > _FAR_OFF)
-    if len(far):
-        worst = far[np.argmax(off[far])]
-        warnings.warn(
-            f"{len(far)} of {np.sum(np.isfinite(known))} known focal lengths contradict the tracks: of "
-            f"frame {worst} {known[worst]:.5g} px is given and {float(fit.focal[worst]):.5g} px is fitted, "
-            f"{off[worst]:.2g} of its standard deviations away. Such errors take all focal lengths along: "
-            "leave out those that are wrong, or give them a larger focal_std.",
-            stacklevel=2,
-        )
-
-
-def _warn_of_other_scale(given, asked, fit, noise):
-    """Known focal lengths that a fit follows, far from those without which it follows the tracks closer."""
-    if given.focal is None or given.begin is not None:  # of which the earlier fit has told
-        return
-    known = np.asarray(given.focal, float)
-    there = np.flatnonzero(np.isfinite(known))
-    if not len(there):
-        return
-    free = given._replace(focal=None, focal_std=None)
-    model, without = _from_nothing(free, asked, problem_of(free, asked))
-    focal = np.exp(np.asarray(model.path.log_focal))[there]
-    off = np.log(focal / known[there])
-    std = np.broadcast_to(np.asarray(given.focal_std, float), known.shape)[there] / known[there]
-    within = [float(given.unit) * float(of.points) for of in (without, noise)]
-    lost = (np.isnan(np.asarray(fit.focal)) & (np.asarray(fit.shot) >= 0))[there].any()
-    if (within[1] > _CLOSER * within[0] or lost) and np.median(
-        np.abs(off) / np.maximum(std, _OTHER / _FAR_OFF)
-    ) > _FAR_OFF:
-        worst = int(np.argmax(np.abs(off)))
-        warnings.warn(
-            f"{CONTRADICTED} known focal lengths tracks are followed within {within[0]:.3g} px in place of "
-            f"{within[1]:.3g} px: of frame {there[worst]} {known[there[worst]]:.5g} px is given and "
-            f"{focal[worst]:.5g} px is fitted then. Check what is given, and that it is in px: "
-            "its scale may be that of all results.",
-            stacklevel=2,
-        )
 
 
 def _rays_of(model, problem, tracks):
