@@ -22,7 +22,7 @@ def begins_near(given: Given) -> bool:
     if given.begin is None or given.focal is None or len(given.focal) != len(given.begin.focal):
         return given.begin is not None
     off = np.log(np.asarray(given.focal, float) / np.asarray(given.begin.focal))
-    return not np.isfinite(off).any() or abs(np.nanmedian(off)) < _NEAR
+    return bool(not np.isfinite(off).any() or abs(np.nanmedian(off)) < _NEAR)
 
 
 def from_earlier(given: Given, asked: Asked, problem: Problem) -> tuple[Model, Noise]:
