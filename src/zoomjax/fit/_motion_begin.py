@@ -28,6 +28,7 @@ def begins_near(given: Given) -> bool:
 def from_earlier(given: Given, asked: Asked, problem: Problem) -> tuple[Model, Noise]:
     """A model near the best and its noise, from an earlier fit."""
     earlier, data = given.begin, problem.data
+    assert earlier is not None
     log_focal = np.log(np.asarray(earlier.focal))
     known = np.flatnonzero(np.isfinite(log_focal))
     alike = (len(log_focal), earlier.lens.image_size) == (given.tracks.frames, given.tracks.image_size)
