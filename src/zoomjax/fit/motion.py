@@ -121,12 +121,22 @@ def fit_motion(
     terms = checked_terms(terms, distortion_model.most_terms)
     given = relative(Given(tracks, lines, line_frames, focal, focal_std, begin))
     asked = Asked(zoom, distortion_model, terms, shift, readout)
+    _check_known((given.tracks.frame, given.tracks.mask))
     _check_frames(given.tracks, asked)
     if not traced(given):
         return _fitted(given, asked, throw)[0]
     fit, model, noise = _constant(given, asked, throw)
     problem = problem_of(given, asked)
     return _with_model(fit, sensitive(problem.data, model, noise), problem)
+
+
+def _check_known(given) -> None:
+    """Raise ValueError if some values of what is given are traced."""
+    if traced(given):
+        raise ValueError(
+            "Arguments of fit_motion must have known values, because its control flow depends on them, but "
+            "some are traced: call it outside of jit and vmap. grad and jvp of it work there."
+        )
 
 
 def _check_frames(tracks: Tracks, asked: Asked) -> None:
@@ -143,11 +153,7 @@ def _check_frames(tracks: Tracks, asked: Asked) -> None:
 
 def _fitted(given: Given, asked: Asked, throw: bool) -> tuple[MotionFit, Model, Noise]:
     """The fit, and what derivatives of it are found from."""
-    if traced(given):
-        raise ValueError(
-            "Arguments of fit_motion must have known values, because its control flow depends on them, but "
-            "some are traced: call it outside of jit and vmap. grad and jvp of it work there."
-        )
+    _check_known(given)
     with eval_context():  # ensure_compile_time_eval makes zeros and ranges of programs constants of them
         found = _solved_motion(given, asked)
     return (thrown_motion(found[0]), *found[1:]) if throw else found
