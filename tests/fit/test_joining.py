@@ -177,6 +177,21 @@ def test_a_turn_of_another_fit_is_refused(tracks, real):
         join_shots(fitted(real), [turn._replace(shots=(0, 2))], tracks=tracks)
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"rotation": np.full((3, 3), np.nan)},
+        {"rotation": np.diag([1.0, 1.0, -1.0])},
+        {"rotation": 2 * np.eye(3)},
+        {"factor": np.inf},
+    ],
+)
+def test_a_turn_by_what_is_no_rotation_is_refused(tracks, real, wrong):
+    turn = Turn((0, 1), (0, CUT), 30, np.eye(3), 0.0)
+    with pytest.raises(ValueError, match="from shot 0 to 1 no rotation and factor of f"):
+        join_shots(fitted(real), [turn._replace(**wrong)], tracks=tracks)
+
+
 def still(number=120):
     """A caption, a logo and another one."""
     rng = np.random.default_rng(2)

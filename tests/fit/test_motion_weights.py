@@ -85,10 +85,11 @@ def test_weights_of_1_are_as_none(tracks, fit):
     assert_same(fit_motion(weighted(tracks, np.ones(len(tracks.views()[0])))), fit)
 
 
-def test_a_common_factor_changes_nothing_but_the_noise(tracks, fit, weight, uneven):
-    larger = fit_motion(weighted(tracks, 7e4 * weight))
+@pytest.mark.parametrize("factor", [7e4, 1e307, 1e-305])
+def test_a_common_factor_changes_nothing_but_the_noise(tracks, fit, weight, uneven, factor):
+    larger = fit_motion(weighted(tracks, factor * weight))
     assert_same(larger, uneven, rtol=1e-7, without=["noise"])
-    np.testing.assert_allclose(larger.noise, np.sqrt(7e4) * uneven.noise, rtol=1e-7)
+    np.testing.assert_allclose(larger.noise, np.sqrt(factor) * uneven.noise, rtol=1e-7)
     assert abs(np.asarray(uneven.focal) / np.asarray(fit.focal) - 1).max() > 1e-5
 
 

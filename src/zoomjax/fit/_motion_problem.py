@@ -161,10 +161,11 @@ def relative(given: Given) -> Given:
             "Argument tracks has no track with two views of a weight above 0: give more views a weight, or "
             "leave weight out for equal weights."
         )
-    mean = jnp.mean(weight, where=jnp.asarray(mask))
-    weight = jnp.where(mask, weight / mean, 1)
+    top = np.max(jax.lax.stop_gradient(weight), where=mask, initial=0)  # whose sum may be infinite
+    mean = jnp.mean(weight / top, where=jnp.asarray(mask))
+    weight = jnp.where(mask, weight / top / mean, 1)
     tracks = eqx.tree_at(lambda t: (t.mask, t.weight), tracks, (jnp.asarray(mask), weight))
-    return given._replace(tracks=tracks, unit=jnp.sqrt(mean))
+    return given._replace(tracks=tracks, unit=jnp.sqrt(mean) * np.sqrt(top))
 
 
 def _widened(values, more):

@@ -125,7 +125,8 @@ def join_shots(fit: MotionFit, turns: Sequence[Turn], *, tracks: Tracks, scaled:
             lens nor a standard deviation is changed.
 
     Raises:
-        ValueError: a turn is of a shot that the fit does not have, or tracks are of another fit.
+        ValueError: a turn is of a shot that the fit does not have, or by no rotation or factor; or tracks
+            are of another fit.
     """
     check_tracks_of(fit, tracks)
     shot, scene = np.asarray(fit.shot), np.asarray(fit.scene)
@@ -141,6 +142,7 @@ def join_shots(fit: MotionFit, turns: Sequence[Turn], *, tracks: Tracks, scaled:
                 f"Argument turns is of shots {turn.shots}, but those of the fit are {sorted(poses)}: give "
                 "what shot_turns finds for this fit."
             )
+        _check_turn(turn)
         one, other = (poses[number] for number in turn.shots)
         if one.scene == other.scene:
             continue
@@ -153,6 +155,17 @@ def join_shots(fit: MotionFit, turns: Sequence[Turn], *, tracks: Tracks, scaled:
     begins = np.argmax(np.asarray(tracks.mask), axis=1)
     first = np.asarray(tracks.frame)[np.arange(len(begins)), begins]
     return _moved(fit, first, poses, scaled)
+
+
+def _check_turn(turn: Turn) -> None:
+    """Refuse a turn by what is no rotation, or by a factor that is no number."""
+    turned = np.asarray(turn.rotation, float)
+    whole = turned.shape == (3, 3) and np.allclose(turned @ turned.T, np.eye(3), atol=1e-6)
+    if not whole or np.linalg.det(turned) < 0 or not np.isfinite(turn.factor):
+        raise ValueError(
+            f"Argument turns has from shot {turn.shots[0]} to {turn.shots[1]} no rotation and factor of f: "
+            "the one must be a 3 x 3 rotation matrix and the other a finite logarithm."
+        )
 
 
 class _Pose(NamedTuple):

@@ -228,7 +228,7 @@ def _copies(moments, places, weights, first, count):
     """Which tracks have the very views of another one that stays: the heaviest, the first of equals."""
     views = [slice(at, at + n) for at, n in zip(first.tolist(), count.tolist(), strict=True)]
     keys = [(moments[of].tobytes(), places[of].tobytes()) for of in views]
-    weight = np.array([0 if weights is None else weights[of].sum() for of in views])
+    weight = np.array([0 if weights is None else (weights[of] / weights.max()).sum() for of in views])
     stays = {keys[place]: place for place in np.lexsort((-np.arange(len(keys)), weight))}  # the last counts
     return np.array([stays[key] != place for place, key in enumerate(keys)])
 
