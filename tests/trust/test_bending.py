@@ -54,6 +54,58 @@ def test_it_is_the_error_that_noise_makes():
     assert 0.6 * true < np.median(said) < 1.7 * true
 
 
+@pytest.fixture(scope="module")
+def told():
+    """Lines that tell a weak lens nearly exactly, and a fit to them whose covariance is 0."""
+    _, lines = photo(-0.02, CENTRE, noise=1e-4)
+    fit = zj.fit.fit_centre(lines, zoom=ONE, terms=2).fit
+    nothing = np.zeros((2, 2)), np.zeros((4, 4))
+    return lines, eqx.tree_at(lambda fit: (fit.covariance, fit.joint), fit, nothing)
+
+
+@pytest.mark.parametrize(
+    ("name", "by"),
+    [
+        ("misfit", [0.004, -0.003]),
+        ("misfit", [0.004, -0.003, 0.005]),
+        ("off_centre", [0.0, 0.0, 0.0, 0.02, -0.03]),
+        ("off_centre", [0.004, 0.0, 0.002, 0.02, 0.01]),
+        ("joint", [0.004, -0.003, 0.02, 0.01]),
+    ],
+)
+def test_what_the_bands_include_counts(told, name, by):
+    """If the lens may be off in one direction, by as much as that bends beyond a homography."""
+    lines, fit = told
+    assert evidence(lines, fit).bent_std < 0.02
+    covariance = np.outer(by, by)
+    wider = eqx.tree_at(lambda f: getattr(f, name), fit, covariance, is_leaf=lambda leaf: leaf is None)
+    more = np.array(by if name == "misfit" else by[:-2])
+    k = np.pad(np.ravel(fit.lens.zoom.parameters), (0, max(len(more) - 2, 0)))
+    k[: len(more)] += more
+    moved = np.zeros(2) if name == "misfit" else fit.lens.scale * np.array(by[-2:])
+    other = zj.Distortion(k, fit.lens.centre + moved, fit.lens.scale)
+    expected = apart(other, fit.lens(1.0))
+    assert expected > 0.06
+    assert evidence(lines, wider).bent_std == pytest.approx(expected, rel=0.1)
+
+
+def test_a_centre_that_may_move_along_the_zoom_counts():
+    """By all the numbers that say where it is."""
+    lens, focal = scenes.nikkor_18_200(), scenes.focal_sweep(4)
+    lines = scenes.board_lines(lens, focal, spacing=99, noise=1e-3)
+    fit = zj.fit.fit_centre(lines, terms=2, centre=zj.PolynomialZoom(degree=1)).fit
+
+    def bent_std(centre):
+        joint = np.zeros(fit.joint.shape)
+        joint[-4:, -4:] = np.outer(centre, centre)
+        wider = eqx.tree_at(lambda fit: (fit.covariance, fit.joint), fit, (joint[:6, :6], joint))
+        return evidence(lines, wider).bent_std
+
+    still, moves = bent_std([0.05, 0.03, 0.0, 0.0]), bent_std([0.0, 0.0, 0.05, 0.03])
+    assert still > 4 * bent_std(np.zeros(4))
+    assert moves == pytest.approx(still, rel=1e-3)  # at the shortest f, where u is 1
+
+
 def test_what_is_moved_is_no_homography():
     lens, lines = photo(-0.3, CENTRE, noise=0.01)
     found = evidence(lines, zj.fit_zoom(lines, zoom=ONE, distortion_model=Division(), terms=1))

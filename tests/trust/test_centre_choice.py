@@ -1,11 +1,14 @@
 """Whether to fit the centre of distortion: how far from the middle few images may put it."""
 
+import dataclasses
+
 import equinox as eqx
 import numpy as np
 import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.app.calibration import calibrate
 from zoomjax.app.model_choice import CentreFound
 from zoomjax.trust.centre_choice import choose_centre
 
@@ -29,10 +32,33 @@ def test_few_images_put_the_centre_near_the_middle_or_nowhere(away, frames, fitt
     assert choice.fitted < choice.given
     assert choice.better is fitted
     assert (choice.far is None) is fitted
-    told = CentreFound.of(held, choice, choice.found if choice.better else None).sentence
+    centre = CentreFound.of(held, choice, choice.found if choice.better else None)
+    told = centre.sentence
     if fitted:
+        assert not centre.findings()
         assert told.startswith("The centre of distortion was fitted")
     else:
         assert choice.far == pytest.approx(60, abs=5)
         assert f"is {choice.far:.0f} px away" in told
         assert "give --centre X,Y" in told
+        (finding,) = centre.findings()
+        assert finding.verdict == "doubtful"
+        assert f"a centre that is {choice.far:.0f} px away" in finding.found
+
+
+def test_a_far_centre_about_which_nothing_is_straighter_is_no_finding():
+    held, choice = chosen(60, 1)
+    not_straighter = dataclasses.replace(choice, fitted=2 * choice.given)
+    assert not CentreFound.of(held, not_straighter, None).findings()
+
+
+def test_a_calibration_whose_lines_want_another_centre_is_doubtful():
+    """Unless it is given: then lines are straight about it."""
+    lens = scenes.nikkor_18_200(SIZE)
+    aside = eqx.tree_at(lambda of: of.centre, lens, lens.centre + np.array([60.0, 0.0]))
+    lines = scenes.board_lines(aside, np.full(1, 24.0), spacing=20, noise=0.05).about(MIDDLE)
+    found = calibrate(lines).assessment
+    assert found.verdict != "good"
+    assert "centre of distortion" in [finding.about for finding in found.findings]
+    given = calibrate(lines, centre=tuple(np.asarray(aside.centre).tolist())).assessment
+    assert given.verdict == "good"

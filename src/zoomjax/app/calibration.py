@@ -368,7 +368,7 @@ def calibrate(
         focal_sigma=sigma,
         **held_out,
         centre=used.centre.as_uncertain_as(zoom),
-        assessment=assess(lines, zoom, compressed=small, **held_out),
+        assessment=assess(lines, zoom, compressed=small, **held_out).joined_by(used.centre.findings()),
         selection=used.selection,
         own_centres=own_centres(exact, used.held),
         in_image=small.metric == "distorted",

@@ -20,6 +20,7 @@ from ..models.requirements import refusal
 from ..models.smooth import SmoothZoom
 from ..models.spline import SplineZoom
 from ..models.zoom import AbstractZoom, PolynomialZoom
+from ..trust.assessment import Finding
 from ..trust.between import FEWEST_CHECKED, zoom_places
 from ..trust.centre_choice import CentreChoice
 from ..trust.folds import focals_there
@@ -265,12 +266,30 @@ class CentreFound:
         std: its standard deviations, px; None where it was not fitted.
         how: "fitted", "image" or "given".
         sentence: how it was found, in words.
+        straighter: how far from it, px, the one is about which lines that were not fitted are straighter,
+            where that is farther than so few frames can tell; otherwise None.
     """
 
     centre: tuple[float, float]
     std: tuple[float, float] | None
     how: str
     sentence: str
+    straighter: float | None = None
+
+    def findings(self) -> list[Finding]:
+        """What speaks against it: that lines are straightest about another one, far away."""
+        if self.straighter is None:
+            return []
+        return [
+            Finding(
+                "centre of distortion",
+                "doubtful",
+                f"the lines are straightest about a centre that is {self.straighter:.0f} px away, as bent "
+                "lines and cropped images are.",
+                "Check that what was photographed is straight and flat, and photograph more of it; or give "
+                "--centre X,Y if the centre is there.",
+            )
+        ]
 
     @classmethod
     def of(
@@ -309,7 +328,8 @@ class CentreFound:
                 f"the one about which lines would be straightest is {choice.far:.0f} px away. With so "
                 "few images that may also come from bent lines. If it is there, give --centre X,Y"
             )
-        return cls((x, y), None, how, f"The centre of distortion was kept at {place}: {why}.")
+        told = f"The centre of distortion was kept at {place}: {why}."
+        return cls((x, y), None, how, told, choice.far if choice.fitted < choice.given else None)
 
     @classmethod
     def _fitted(cls, found: CentreFit, more: str) -> "CentreFound":

@@ -6,9 +6,11 @@ corners of the corrected image, is judged like a weak one.
 
 Of one photo of a strong lens another distortion model may follow the lines as well: see `_rival`.
 
-Lines are taken as independent, as in the bands: see `zoomjax.fit.covariance`. Unlike there, the centre of
-distortion is free in any case, within what is usual of cameras: where lines do not determine it, it was
-kept where it was assumed, and a lens about a wrong one is right along the lines and wrong beside them.
+Two estimates are made, and the larger one counts. That of the bands: the covariance of the fit, with all
+that was added to it, as the model's misfit or the shape of a board. And one of lines that are independent,
+in which the centre of distortion is free in any case, within what is usual of cameras: where lines do not
+determine it, it was kept where it was assumed, and a lens about a wrong one is right along the lines and
+wrong beside them.
 
 In NumPy, without a program to compile: 24 points of at most 2000 lines, once per fit.
 """
@@ -21,6 +23,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ..fit.energy import coefficients_by
+from ..fit.result import ZoomFit
 from ..lines.buckets import bucketed_jit, of_frames
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
@@ -53,17 +56,18 @@ class Bending:
     std: float
 
 
-def bending(lines: Lines, lens: ZoomLens, weight: np.ndarray, prior: np.ndarray) -> Bending:
+def bending(lines: Lines, fit: ZoomFit, weight: np.ndarray, prior: np.ndarray) -> Bending:
     """What lines of a fit tell of the part of a lens that is no homography.
 
     Args:
         lines: the lines.
-        lens: fitted to them.
+        fit: to them, with all that its bands include.
         weight: of each line in the fit; 0 for those that do not count.
         prior: (p, p), the normal matrix of the zoom model's prior, in the units of the energy.
     """
-    frame, distortion_model = np.asarray(lines.frame), lens.distortion_model
-    k, by_parameter, centre = (np.asarray(of, float) for of in _coefficients(lines, lens))
+    lens, frame = fit.lens, np.asarray(lines.frame)
+    distortion_model = lens.distortion_model
+    k, by_parameter, centre, by_centre = (np.asarray(of, float) for of in _coefficients(lines, lens))
     share = weight / np.bincount(frame, weight, len(k))[frame].clip(1e-300)
     counted = np.flatnonzero(weight > 0)
     chosen = counted[np.unique(np.linspace(0, len(counted) - 1, _MOST_LINES).astype(int))]
@@ -85,6 +89,8 @@ def bending(lines: Lines, lens: ZoomLens, weight: np.ndarray, prior: np.ndarray)
     for at in np.unique(there[[0, len(there) // 2, -1]]):
         moved, rows = _over_image(lens, centre[at], k[at], by_parameter[at])
         std = np.sqrt(np.sum((rows @ root) ** 2) / len(rows)) if len(rows) else np.inf
+        covariance = _of_bands(fit, by_parameter[at], by_centre[at])
+        std = max(std, _spread(lens, centre[at], k[at], covariance))
         found.append(Bending(moved * lens.scale, float(std) * lens.scale))
     worst = max(found, key=lambda of: of.std)
     strong = worst.moved > _STRONG * 2 * lens.scale
@@ -94,15 +100,24 @@ def bending(lines: Lines, lens: ZoomLens, weight: np.ndarray, prior: np.ndarray)
     return Bending(worst.moved, float(np.hypot(worst.std, other)))
 
 
-@bucketed_jit(returns=[of_frames] * 3)
+@bucketed_jit(returns=[of_frames] * 4)
 def _coefficients(lines, lens):
-    """Each frame's coefficients, their derivatives by the parameters, and its centre."""
+    """Each frame's coefficients, their derivatives by the parameters, its centre, and the derivatives of
+    that, in half diagonals, by the numbers that say where the centre is."""
     flat, unravel = ravel_pytree(lens.zoom.parameters)
 
     def at(flat):
         return coefficients_by(with_parameters(lens.zoom, unravel(flat)), lines)
 
-    return at(flat), jax.jacfwd(at)(flat), jax.vmap(lens.centre_at)(jnp.asarray(lines.focal))
+    focal = jnp.asarray(lines.focal)
+    if lens.shift is None:
+        by_centre = jnp.broadcast_to(jnp.eye(2), (*focal.shape, 2, 2))
+    else:
+        place, again = ravel_pytree(lens.shift.parameters)
+        by_centre = jax.vmap(jax.jacfwd(lambda q, f: with_parameters(lens.shift, again(q))(f)), (None, 0))(
+            place, focal
+        )
+    return at(flat), jax.jacfwd(at)(flat), jax.vmap(lens.centre_at)(focal), by_centre
 
 
 def _some(points: np.ndarray) -> np.ndarray:
@@ -141,6 +156,40 @@ def _root(error: np.ndarray, slope: np.ndarray, share: np.ndarray, prior: np.nda
     shape = vectors * np.sqrt(values.clip(0))
     assumed = back @ back.T[:, -2:] * (together * each * centre[-1])
     return np.concatenate([back @ score.T / np.sqrt(2), back @ shape / np.sqrt(2), assumed], axis=1)
+
+
+def _of_bands(fit: ZoomFit, by_parameter: np.ndarray, by_centre: np.ndarray) -> np.ndarray:
+    """The covariance of a frame's coefficients, and maybe the next one, and of the centre, by the bands.
+
+    Args:
+        fit: the fit.
+        by_parameter: (n, p), derivatives of the coefficients.
+        by_centre: (2, q), those of the centre by the numbers that say where it is.
+    """
+    own = np.asarray(fit.covariance if fit.joint is None else fit.joint, float)
+    terms, parameters = by_parameter.shape
+    misfit, elsewhere = (np.zeros((0, 0)) if of is None else of for of in (fit.misfit, fit.off_centre))
+    numbers = max(terms, len(misfit), len(elsewhere) - 2)
+    slope = np.zeros((numbers + 2, len(own)))
+    slope[:terms, :parameters] = by_parameter
+    slope[numbers:, parameters:] = by_centre[:, : len(own) - parameters]
+    unknown = np.isinf(np.diagonal(own))
+    total = slope @ np.where(np.isinf(own), 0, own) @ slope.T
+    total[np.diag_indices_from(total)] += np.where(slope[:, unknown].any(axis=1), np.inf, 0)
+    total[: len(misfit), : len(misfit)] += misfit
+    if len(elsewhere):
+        at = np.r_[: len(elsewhere) - 2, numbers, numbers + 1]
+        total[np.ix_(at, at)] += elsewhere
+    return total
+
+
+def _spread(lens: ZoomLens, centre: np.ndarray, k: np.ndarray, covariance: np.ndarray) -> float:
+    """The standard deviation beyond a homography, half diagonals of the image, RMS over it."""
+    numbers = len(covariance) - 2
+    _, rows = _over_image(lens, centre, np.pad(k, (0, numbers - len(k))), np.eye(numbers))
+    if not len(rows) or np.isinf(np.diagonal(covariance)).any():
+        return np.inf
+    return float(np.sqrt(np.einsum("scp,pq,scq->", rows, covariance, rows).clip(0) / len(rows)))
 
 
 def _over_image(

@@ -174,7 +174,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     moved, rows = map(np.asarray, _derivatives(lens, raster, jnp.asarray(focals, dtype)))
     std = np.asarray(displacement_std(fit, _raster(lens)[None], focal=focals[:, None]))
     pulled = _normal_terms(compressed, lens.zoom)
-    bent = bending(lines, lens, weight, pulled[0])
+    bent = bending(lines, fit, weight, pulled[0])
     zero = jax.device_put(np.zeros((len(lines.focal), number_of_coefficients(lens.zoom)), dtype))
     before = np.asarray(frame_energy(compressed, zero))
     rejected = (counts_of(lines) > 2) & (weight == 0)
