@@ -284,8 +284,8 @@ class CentreFound:
             Finding(
                 "centre of distortion",
                 "doubtful",
-                f"the lines are straightest about a centre that is {self.straighter:.0f} px away, as bent "
-                "lines and cropped images are.",
+                f"the lines are straightest about a centre that is {self.straighter:.0f} px away, as where "
+                "they are bent or the image is cropped.",
                 "Check that what was photographed is straight and flat, and photograph more of it; or give "
                 "--centre X,Y if the centre is there.",
             )
