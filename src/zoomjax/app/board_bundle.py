@@ -20,7 +20,7 @@ from ..fit.zoom import CentreArgument
 from ..models.lens import ZoomLens
 from .board_lines import Straightness, flat_detections, straightness, widened
 from .focal_sources import GRID, Focals, lines_of
-from .plane_focals import MOST_UNCERTAIN, FocalGroup
+from .plane_focals import MOST_UNCERTAIN, FocalGroup, may_be_of_one_zoom
 
 _CORNERS = 12
 """Corners of a photo that `fit_boards` asks for."""
@@ -44,6 +44,8 @@ _UNDETERMINED = (
     "The shape of the board was not fitted, and it counts as flat: beside its shape, the photos do not "
     "determine their focal lengths. Take more of them, oblique and from several sides."
 )
+
+_NO_MINIMUM = "The shape of the board was not fitted: the bundle adjustment found no minimum."
 
 _NO_FOCAL = (
     "the bundle adjustment of all photos does not determine its focal length: the board is seen too "
@@ -238,10 +240,20 @@ class Made(NamedTuple):
     Attributes:
         bundle: the bundle adjustment; None if there is none.
         told: why there is none, or what would make it better, in a sentence; empty if nothing.
+        contradicts: whether the photos, of one focal length each as was said, fit no board.
     """
 
     bundle: BoardBundle | None
     told: str
+    contradicts: bool = False
+
+    def of_one_zoom(self, groups: Sequence[FocalGroup]) -> bool:
+        """Whether photos that are supposed to share a focal length may do so."""
+        if self.bundle is None:
+            return may_be_of_one_zoom(groups) and not self.contradicts
+        fit, number = self.bundle.fit, len(self.bundle.names)
+        precision = float(np.max(fit.focal_std / fit.focal))
+        return not self.bundle.lost and may_be_of_one_zoom(groups, number, precision)
 
 
 def bundle_of(
@@ -274,10 +286,10 @@ def bundle_of(
         return Made(None, _too_few(of, label, focals, sharing))
     fit, kept = _fitted(of, [np.rot90(np.asarray(d.nodes), _turn(d, shape)) for d in of], label, centre)
     if bool(failed(fit.fit.result)) or not np.isfinite(float(fit.fit.rms)):
-        return Made(None, "The shape of the board was not fitted: the bundle adjustment found no minimum.")
+        return Made(None, _NO_MINIMUM, True)
     if not _enough(label[kept]):
         if focals.origin == GRID:
-            return Made(None, _UNDETERMINED)
+            return Made(None, _UNDETERMINED, True)
         kept = np.ones(len(of), bool)  # their focal lengths are known
     lost = tuple(d.name for d, there in zip(of, kept, strict=True) if not there)
     keeping = _keeping(used, of, focals)
@@ -370,10 +382,11 @@ def sharing_options(of: Sequence[Detection], focals: Focals, sharing: Collection
     They end in a comma.
     """
     exif, folders = Counter(d.focal for d in of if d.focal), Counter(Path(d.file).parent for d in of)
-    if focals.origin != GRID or len(of) < 2:
+    one_folder = len(of) < _IN_ALL and focals.one_zoom is None
+    if focals.origin != GRID or focals.one_zoom or len(of) < 2:
         return ""
     if "exif" in sharing and max(exif.values(), default=0) > 1:
         return "--focal plane --shared-focal exif, for photos of one focal length in their EXIF data,"
-    if "folder" in sharing and max(folders.values()) > 1 and (len(folders) > 1 or len(of) < _IN_ALL):
+    if "folder" in sharing and max(folders.values()) > 1 and (len(folders) > 1 or one_folder):
         return "--focal plane --shared-focal folder, if the photos of a folder are of one zoom,"
     return "--focal plane --shared-focal similarity," if "similarity" in sharing else ""

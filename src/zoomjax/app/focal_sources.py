@@ -30,7 +30,7 @@ from ..lines.lines import Lines
 from ..models.distortion import Distortion
 from ..models.zoom import PolynomialZoom
 from .board_focals import NOT_THE_BOARD, Board, check_board, focal_of_board
-from .plane_focals import MOST_UNCERTAIN, FocalGroup, Found, Sharing, focals_from_grids
+from .plane_focals import MOST_UNCERTAIN, ONE_ZOOM, FocalGroup, Found, Sharing, focals_from_grids
 from .relative import is_relative_track
 
 SOURCES = (
@@ -62,6 +62,8 @@ class Focals:
         deviation: standard deviations by name, where known: estimated from images, or given.
         groups: the images that share a focal length.
         known: whether they are: of one zoom alone, one millimetre may stand for what nobody knows.
+        one_zoom: whether all images are of one zoom, where nothing says so: True where that is supposed,
+            False where they contradict it, None where it is not asked.
     """
 
     focal: dict[str, float]
@@ -71,6 +73,7 @@ class Focals:
     deviation: dict[str, float] = dataclasses.field(default_factory=dict)
     groups: tuple[FocalGroup, ...] = ()
     known: bool = True
+    one_zoom: bool | None = None
 
     def deviating_by(self, deviation: dict[str, float]) -> "Focals":
         """The same with other standard deviations."""
@@ -136,7 +139,8 @@ def choose_focals(
         source: the source: "exif", "board", "plane", "pitch", a number, a CSV file, or "same" for one that
             nobody knows. None for the best
             available one: the `board` if it is given, else EXIF data, else an oblique grid; else, of one
-            image alone, none: one millimetre stands for its focal length.
+            image alone, none: one millimetre stands for its focal length. Grids are then supposed to be of
+            one zoom, if `sharing` does not say.
         unit: unit of a number or of the focal lengths in a CSV file.
         board: the board, for "board".
         sharing: which images share a focal length, for "plane".
@@ -168,14 +172,8 @@ def choose_focals(
     elif source == "plane" and all(d.nodes is None for d in detections):
         found = Focals({}, "px", GRID, _NO_PLANE)
     elif source == "plane":
-        found = _estimated(
-            detections,
-            "px",
-            GRID,
-            _NO_PLANE,
-            functools.partial(focals_from_grids, sharing=sharing),
-            zooms=sharing.known(detections) if sharing else None,
-        )
+        one = _of_one_zoom(detections) if whole is None and sharing is None else None
+        found = one or _from_grids(detections, sharing)
     elif source == "pitch":
         found = _estimated(
             detections, "px", "the markings of the pitch", _NO_PITCH, _each(_from_pitch), few=True
@@ -220,6 +218,27 @@ def known_focals(detections: Sequence[Detection], source: str | None, others: Fo
         return choose_focals(detections, source, unit=others.unit).focal
     except ValueError:  # a table without them
         return {}
+
+
+def _of_one_zoom(detections: Sequence[Detection]) -> Focals | None:
+    """One focal length for all images; None where not even two grids give one by themselves."""
+    if len(detections) < 2:
+        return None
+    found = _from_grids(detections, Sharing(ONE_ZOOM))
+    several = any(group.spread() > 1 for group in found.groups)
+    return dataclasses.replace(found, one_zoom=True) if several else None
+
+
+def _from_grids(detections: Sequence[Detection], sharing: Sharing | None) -> Focals:
+    """Focal lengths from grids seen obliquely."""
+    return _estimated(
+        detections,
+        "px",
+        GRID,
+        _NO_PLANE,
+        functools.partial(focals_from_grids, sharing=sharing),
+        zooms=sharing.known(detections) if sharing else None,
+    )
 
 
 _EXIF, _TRACK = "EXIF data", "the track of the video"

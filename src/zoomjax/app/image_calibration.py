@@ -138,12 +138,15 @@ class ImageCalibration:
 
     def shared(self) -> list[str]:
         """Which images share a focal length, in sentences; none where that was not asked for."""
-        if self.job.shared_focal is None:
+        if self.focals.one_zoom is False:
+            return [_OF_SEVERAL]
+        if self.job.shared_focal is None and not self.focals.one_zoom:
             return []
         groups = [group.sentence(self.focals.unit) for group in self.focals.groups]
         rest = len(groups) - _MOST_GROUPS
         more = [f"{rest} more groups are listed in summary.json."] if rest > 0 else []
-        return [*groups[:_MOST_GROUPS], *more] or ["No two photos share a focal length."]
+        supposed = [_SUPPOSED] if self.focals.one_zoom else []
+        return [*supposed, *groups[:_MOST_GROUPS], *more] or ["No two photos share a focal length."]
 
     def warnings(self) -> list[str]:
         """User-facing warnings: images that were not used, and those of the calibration."""
@@ -281,20 +284,24 @@ def _calibrated(
     if source is None and job.detector == "pitch" and not job.board and not any(d.focal for d in usable):
         source = "pitch"
     focals = choose_focals(usable, source, unit=job.focal_unit, board=job.board, sharing=_sharing(job))
+    made = None
+    if job.detector == "grid":
+        stage("Fitting the shape of the board")
+        made = bundle_of(_having(usable, focals), focals, job.centre, job.other_sharing)
+        if focals.one_zoom and not made.of_one_zoom(focals.groups):
+            focals = dataclasses.replace(choose_focals(usable, "plane"), one_zoom=False)
+            made = bundle_of(_having(usable, focals), focals, job.centre, job.other_sharing)
     unused |= {d.name: focals.absence(d) for d in usable if d.name not in focals.focal}
-    used = tuple(d for d in usable if d.name in focals.focal)
+    used = _having(usable, focals)
     known = None
     if job.video is None and focals.known and focals.unit == "mm":
         photos = [Path(d.file) for d in used]
         known = known_lens(photos, [focals.focal[d.name] for d in used], used[0].image_size)
-    bundle, told = None, ""
-    if job.detector == "grid":
-        stage("Fitting the shape of the board")
-        bundle, told = bundle_of(used, focals, job.centre, job.other_sharing)
-        if bundle is not None and focals.origin == GRID:
-            focals = bundle.measured(focals)
-            unused |= {d.name: focals.absence(d) for d in used if d.name not in focals.focal}
-            used = tuple(d for d in used if d.name in focals.focal)
+    bundle, told = (None, "") if made is None else (made.bundle, made.told)
+    if bundle is not None and focals.origin == GRID:
+        focals = bundle.measured(focals)
+        unused |= {d.name: focals.absence(d) for d in used if d.name not in focals.focal}
+        used = _having(used, focals)
     if job.focal_sigma is not None:
         sigma = focal_sigmas(job.focal_sigma, np.array(list(focals.focal.values())))
         focals = focals.deviating_by(dict(zip(focals.focal, sigma.tolist(), strict=True)))
@@ -320,6 +327,11 @@ def _calibrated(
             return _with_findings(_with_equipment(done))
         unused = unused | dict.fromkeys(sorted(hopeless), _NONE_AGREES)
         used = tuple(d for d in used if d.name not in hopeless)
+
+
+def _having(detections: Sequence[Detection], focals: Focals) -> tuple[Detection, ...]:
+    """The images that have a focal length."""
+    return tuple(d for d in detections if d.name in focals.focal)
 
 
 def _sharing(job: ImageJob) -> Sharing | None:
@@ -374,5 +386,12 @@ def _findings_of_exif(done: ImageCalibration) -> list[Finding]:
     in_mm = focals.known and focals.unit == "mm"
     return findings_of_exif(used, focals.focal, in_mm=in_mm, measured=done.job.focal in (None, *MEASURED))
 
+
+_SUPPOSED = (
+    "All photos are taken to be of one zoom: nothing says otherwise, and one focal length explains them. "
+    "If they are of several, give --focal."
+)
+
+_OF_SEVERAL = "The photos are not all of one zoom: one focal length for all does not explain them."
 
 _NONE_AGREES = "none of its lines is straight under the lens of the other images. Check its focal length"

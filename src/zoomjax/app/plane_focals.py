@@ -30,8 +30,19 @@ from ..models.distortion import Distortion
 SHARED_BY = ("exif", "folder", "similarity")
 """How photos of one zoom are known or found."""
 
+ONE_ZOOM = "one zoom"
+"""All photos are of one, where nothing says which are: supposed, never asked for."""
+
 MOST_UNCERTAIN = 0.2
 """Largest standard deviation, relative to the focal length, of an estimate that is used."""
+
+_ALIKE, _SEVERAL = 1.3, 6
+"""Ratio of the focal lengths that photos of one zoom have alone, from a board that may be bent; and the
+number of photos from which it is not asked for."""
+
+_OF_ONE_ZOOM = 0.012
+"""Standard deviation of a common focal length, by photos, relative to it, up to which they may share it.
+Six or more of one zoom leave 0.1 to 1 %, and 2 to 16 % if several are at 1.3 times the focal length."""
 
 _LEAST_DEPTH = 0.01
 """Part by which the depth of a grid's nodes differs where it tells a focal length. What the correction and
@@ -88,7 +99,7 @@ class Sharing:
     """Which photos share a focal length.
 
     Attributes:
-        how: one of `SHARED_BY`.
+        how: one of `SHARED_BY`, or `ONE_ZOOM`.
         sigma: the standard deviations of focal lengths; None for those of the estimates.
     """
 
@@ -99,6 +110,8 @@ class Sharing:
         """A number for each image, the same for those of one zoom; None where that is to be found."""
         if self.how == "similarity":
             return None
+        if self.how == ONE_ZOOM:
+            return np.zeros(len(detections), int)
         numbers: dict[object, int] = {}
         keys = (
             (d.focal or d.name) if self.how == "exif" else (Path(d.file).parent if d.file else d.name)
@@ -161,6 +174,20 @@ def focals_from_grids(
             )
         )
     return Found(found, tuple(sorted(groups, key=lambda group: group.focal)))
+
+
+def may_be_of_one_zoom(groups: Sequence[FocalGroup], number: int = 0, precision: float = 0.0) -> bool:
+    """Whether photos of which nothing is known may share a focal length.
+
+    Where they are of several zooms, photos pull a common one apart, and few photos differ by themselves.
+
+    Args:
+        groups: with the focal lengths that photos have alone.
+        number: of photos in a bundle adjustment with one focal length for all.
+        precision: its standard deviation, relative to it.
+    """
+    alike = all(group.spread() < _ALIKE for group in groups)
+    return precision < _OF_ONE_ZOOM and (alike or number >= _SEVERAL)
 
 
 def similar(focal: np.ndarray, std: np.ndarray) -> np.ndarray:

@@ -55,7 +55,8 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
 
     Below each coefficient stands by how much the frames differ from the model, with bars of one standard
     deviation of the frame's own fit; frames whose lines do not determine it have no dot. Around the model
-    are shaded one and two of its standard deviations, where the lines determine it.
+    are shaded one and two of its standard deviations, where the lines determine it. Frames of one focal
+    length stand side by side.
 
     Args:
         zoom: the fitted zoom model.
@@ -67,28 +68,32 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
     orders = lens.distortion_model.orders(terms)
     to_pixel = lens.scale ** (-1.0 * orders)
     focal = np.asarray(lines.focal)
-    grid = np.linspace(1 / focal.max(), 1 / focal.min(), 200)
+    one = bool(np.ptp(focal) == 0)
+    place = np.arange(1, len(focal) + 1) if one else 1 / focal
+    margin, of = (0.5, "common") if one else (0.0, "zoom")
+    grid = np.linspace(place.min() - margin, place.max() + margin, 200)
+    along = np.full(200, focal[0]) if one else 1 / grid
     frames = np.asarray(each.coefficients) * to_pixel
     sigma = np.sqrt(np.diagonal(np.asarray(each.covariance), axis1=1, axis2=2)) * to_pixel
 
     def model(focal: np.ndarray) -> np.ndarray:
         return np.stack([d.coefficients for d in distortions_at(lens, focal)]) * to_pixel
 
-    curve, expected = model(1 / grid), model(focal)
-    spread = np.asarray(coefficient_std(zoom, 1 / grid)) * to_pixel
+    curve, expected = model(along), model(focal)
+    spread = np.asarray(coefficient_std(zoom, along)) * to_pixel
     figure = Figure(figsize=(4.8 * terms, 5.2), layout="constrained")
     figure.suptitle(
-        f"RMS {float(zoom.rms):.3f} px by the zoom model, {float(each.rms):.3f} px frame by frame",
+        f"RMS {float(zoom.rms):.3f} px by the {of} model, {float(each.rms):.3f} px frame by frame",
         fontsize=10,
     )
     axes = figure.subplots(2, terms, sharex=True, squeeze=False, height_ratios=[2.2, 1])
     for i, (above, below) in enumerate(axes.T):
         known = np.isfinite(sigma[:, i])
-        x, unit = 1 / focal[known], f"px$^{{-{orders[i]}}}$"
+        x, unit = place[known], f"px$^{{-{orders[i]}}}$"
         above.plot(
             x, frames[known, i], "o", markersize=3.5, color=FRAMES, label="separate fit of each frame"
         )
-        above.plot(grid, curve[:, i], color=MODEL, linewidth=1.8, label="zoom model")
+        above.plot(grid, curve[:, i], color=MODEL, linewidth=1.8, label=f"{of} model")
         _shade(above, grid, curve[:, i], spread[:, i])
         name = f"k_{i + 1}" if orders[i] > 1 else f"p_{i + 1 - np.sum(orders > 1)}"
         _label(above, f"${name}$", unit, curve[:, i])
@@ -97,9 +102,10 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
         _shade(below, grid, 0.0, spread[:, i])
         _label(below, "frame − model", unit, np.append(difference, sigma[known, i]))
         below.axhline(0, color=MODEL, linewidth=1.2, zorder=0)
-        below.set_xlabel(f"$1/f$  (1/{lens.focal_unit})")
-        below.locator_params(axis="x", nbins=6)  # labels of focal lengths in px are long
-        _show_focal_lengths(above, focal, lens.focal_unit)
+        below.set_xlabel("frame" if one else f"$1/f$  (1/{lens.focal_unit})")
+        below.locator_params(axis="x", nbins=6, integer=one)  # labels of focal lengths in px are long
+        if not one:
+            _show_focal_lengths(above, focal, lens.focal_unit)
     figure.axes[0].legend(frameon=False)
     return figure
 

@@ -47,8 +47,8 @@ _UNREADABLE = ValueError, TypeError, KeyError, AttributeError, ArithmeticError, 
 _ENTRIES = ("image_size", "centre", "scale", "focal_unit", "focal_range", "radial", "zoom", "shift_meaning")
 _OPTIONAL = ("distortion_model", "family", "focus_range", "shift", "pixel_pitch", "about")
 
-_SLACK = 1e-6
-"""Share of a focal length by which it may be beyond the range: the end itself, through a float32."""
+_SLACK = 5e-4
+"""Share of a focal length by which it may be beyond the range: the end itself, written with four digits."""
 
 
 class ZoomLens(eqx.Module):
