@@ -1,5 +1,7 @@
 """The command line in a process of its own, as users run it."""
 
+import json
+import subprocess
 import sys
 
 from zoomjax.app.results_folder import results_folder
@@ -53,3 +55,16 @@ for folder, words in json.load(sys.stdin):
 print(json.dumps(told))
 """
 """Run [folder, words] after each other in one process, which compiles what they share once."""
+
+
+def one_after_another(folder, commands):
+    """Status and output of commands, given as words, run in a folder after each other in one process."""
+    done = subprocess.run(
+        [sys.executable, "-c", SEVERAL],
+        input=json.dumps([(str(folder), ["zoomjax", *map(str, words)]) for words in commands]),
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    return [tuple(told) for told in json.loads(done.stdout.splitlines()[-1])]

@@ -103,6 +103,7 @@ def test_a_flat_board_s_lines_stay_as_they_are_seen():
     assert "as they are seen" in bundle.sentences()[1]
 
 
+@pytest.mark.slow
 def test_calibration_has_the_board_s_uncertainty_in_bands_and_centre(of_bent):
     used, _, bundle = of_bent
     lines = lines_of(bundle.lines_used(used), np.asarray(bundle.fit.frame_focal), "px")

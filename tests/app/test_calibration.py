@@ -209,6 +209,7 @@ def test_zoomcam_gives_the_reference_figures(data):
     np.testing.assert_allclose(last, [-0.0491, -0.0057], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_known_errors_of_focal_lengths_are_no_misfit():
     """Of twelve frames whose focal lengths are off by 1 %: told so, bands are narrower than without."""
     focal = scenes.focal_sweep(12)
@@ -219,6 +220,7 @@ def test_known_errors_of_focal_lengths_are_no_misfit():
     assert np.trace(told.fit.misfit) < 0.5 * np.trace(without.fit.misfit)
 
 
+@pytest.mark.slow
 def test_bands_allow_for_uncertain_focal_lengths(calibration):
     sigma = 0.01 * np.asarray(calibration.lines.focal)
     allowed = calibrate(calibration.lines, **GIVEN, focal_sigma=focal_sigmas("1%", calibration.lines.focal))

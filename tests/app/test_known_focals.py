@@ -111,6 +111,7 @@ def test_frames_of_a_board_count_as_one_measurement():
         measured_focals([view(1, 1000.0, 0.0)], "plane")
 
 
+@pytest.mark.slow
 def test_the_scale_that_a_pitch_tells_is_as_far_off_as_said():
     lens, focal = scenes.broadcast_zoom(), np.geomspace(47, 110, 12)
     lines = scenes.broadcast_lines(lens, focal, spacing=12, noise=0.3)

@@ -58,6 +58,7 @@ def steps(monkeypatch):
     return taken
 
 
+@pytest.mark.slow
 def test_a_start_without_hope_is_given_up_and_the_same_one_goes_on(problem, starts, steps, monkeypatch):
     model, noise = chosen(problem, starts)
     quick = sum(steps)
@@ -77,6 +78,7 @@ def test_the_best_start_goes_on_wherever_it_is_among_them(problem, starts):
     np.testing.assert_allclose(noise_of_turned.points, noise.points, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_a_fit_that_still_moves_after_all_its_turns_has_not_settled(problem, starts, monkeypatch):
     model, noise = chosen(problem, starts)
     solved = _motion_stages._solved

@@ -84,6 +84,7 @@ def rippled(folder):
     return entry("Canon RF-S 18-150mm F3.5-6.3 IS STM", folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [off_centre, rippled])
 def test_the_error_that_is_said_is_the_greatest_of_all_radii(made, tmp_path):
     """Of many points on the way to the farthest corner, at the magnification that is best for them."""
@@ -118,6 +119,7 @@ def test_a_table_that_turns_back_says_where(tmp_path):
     assert any("turns back before the border of the image at 11 mm" in note for note in found.report.notes)
 
 
+@pytest.mark.slow
 def test_the_model_that_is_asked_for_is_taken(tmp_path):
     path = entry(NAMES[3], tmp_path)
     assert isinstance(zj.interop.read(path, image_size=SIZE).lens.zoom, zj.SmoothZoom)

@@ -75,6 +75,7 @@ def test_a_file_that_says_so_later_is_warned_of_once(leaf_fields, tmp_path):
     assert ["interlaced" in str(one.message) for one in told] == [True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("texture", "motion"),
     [(leaves, {}), (stripes, {}), (stripes, {"pan": 1.0, "tilt": 10.0})],

@@ -69,6 +69,7 @@ def test_a_flat_board_is_good(lines):
     assert all(halves.excess < 4 for halves in found.evidence.halves)
 
 
+@pytest.mark.slow
 def test_halves_are_as_far_apart_as_fits_of_their_lines(lines):
     """Against two fits of their own, of steep and of flat lines of a bent board."""
     steep = np.array([np.ptp(p[:, 1]) > np.ptp(p[:, 0]) for p in lines.to_ragged()])
@@ -121,6 +122,7 @@ def test_curved_things_are_not_good(lines, rng):
     assert "crooked lines" in about(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("curved", [True, False])
 def test_a_photo_of_curved_things_alone_determines_no_lens(lens, rng, curved):
     """Half a dozen arcs, which no lens straightens together: lines left out gain nothing."""

@@ -42,6 +42,7 @@ def apart(one, other):
     return float(np.sqrt(np.nanmean(np.sum((back - points) ** 2, axis=-1))))
 
 
+@pytest.mark.slow
 def test_it_is_the_error_that_noise_makes():
     """Of new noise, the fits scatter about the true lens as far as is said; with the centre fitted."""
     errors, said = [], []
@@ -89,6 +90,7 @@ def test_what_the_bands_include_counts(told, name, by):
     assert evidence(lines, wider).bent_std == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_centre_that_may_move_along_the_zoom_counts():
     """By all the numbers that say where it is."""
     lens, focal = scenes.nikkor_18_200(), scenes.focal_sweep(4)

@@ -118,6 +118,7 @@ def test_other_distortion_models_are_judged_alike(lens):
     assert by_distortion_model[1] == pytest.approx(by_distortion_model[0], rel=0.3)
 
 
+@pytest.mark.slow
 def test_a_prior_for_other_lenses_is_doubtful(lens):
     """That of the division model is that of the polynomial to first order."""
     lines = lines_at(lens, 21.0, 120.0)

@@ -25,6 +25,7 @@ def chosen(away, frames):
     return held, choose_centre(held, zj.models.Model(zj.PolynomialZoom(degree=0), 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("away", "frames", "fitted"), [(10, 1, True), (60, 1, False), (60, 5, True)])
 def test_few_images_put_the_centre_near_the_middle_or_nowhere(away, frames, fitted):
     held, choice = chosen(away, frames)
@@ -52,6 +53,7 @@ def test_a_far_centre_about_which_nothing_is_straighter_is_no_finding():
     assert not CentreFound.of(held, not_straighter, None).findings()
 
 
+@pytest.mark.slow
 def test_a_calibration_whose_lines_want_another_centre_is_doubtful():
     """Unless it is given: then lines are straight about it."""
     lens = scenes.nikkor_18_200(SIZE)

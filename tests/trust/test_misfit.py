@@ -42,6 +42,7 @@ def test_few_frames_have_no_estimate(truth):
     assert zj.trust.with_misfit(fit, few).misfit is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", [lambda lines: lines, zj.fit.in_image])
 def test_a_coefficient_that_the_model_lacks_is_in_the_bands(truth, metric):
     """Of a lens of three coefficients, fitted with two: its corner is off by many standard deviations."""
@@ -140,6 +141,7 @@ def test_a_lens_that_differs_at_single_focal_lengths_has_that_in_its_bands(truth
     assert (np.abs(after) < 1.96).mean() >= 0.9
 
 
+@pytest.mark.slow
 def test_photos_of_one_focal_length_that_differ_are_no_other_lens(truth):
     """A board that is bent in each photo makes lenses of single photos differ, but not the lens."""
     several = np.sort(np.concatenate([FOCAL * (1 + 1e-4 * i) for i in range(4)]))
