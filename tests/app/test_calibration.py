@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import warnings
+from types import SimpleNamespace
 
 import equinox as eqx
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app.calibration import calibrate, rms_over_frames
+from zoomjax.app.calibration import Calibration, calibrate, rms_over_frames
 from zoomjax.app.coverage import _residuals
 from zoomjax.app.focal_sources import focal_sigmas
 from zoomjax.app.model_choice import WantedModel
@@ -274,3 +275,12 @@ def test_a_frame_whose_lines_are_all_rejected_has_no_figures():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert ">nan<" not in report(spoiled)
+
+
+@pytest.mark.parametrize(("number", "told"), [(7, True), (8, False)])
+def test_what_few_photos_cannot_tell_is_said(truth, number, told):
+    lines = scenes.board_lines(truth, scenes.focal_sweep(number), spacing=200)
+    known = SimpleNamespace(lines=lines, focal_sigma=np.zeros(number))
+    assert ("errors of the model" in Calibration.allowed_for(known)) is told
+    known = SimpleNamespace(lines=lines, focal_sigma=0.01 * np.asarray(lines.focal))
+    assert "include those of the focal lengths, 1.00%" in Calibration.allowed_for(known)

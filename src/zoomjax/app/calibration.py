@@ -30,7 +30,7 @@ from ..models.zoom import PolynomialZoom
 from ..trust.assessment import NEGLIGIBLE, Assessment, assess
 from ..trust.bands import displacement_std
 from ..trust.cross_validation import cross_validate_frames
-from ..trust.misfit import with_misfit
+from ..trust.misfit import FEWEST, with_misfit
 from ..trust.next_photo import Suggestion, suggest_next
 from ..trust.own_centres import OwnCentres, own_centres
 from ..trust.selection import Selection
@@ -116,14 +116,19 @@ class Calibration:
         return f"f = {span(low, high, self.fit.lens.focal_unit)}"
 
     def allowed_for(self) -> str:
-        """A sentence on the uncertainty of focal lengths in the bands; empty if they are exact."""
-        share = self.focal_sigma / np.asarray(self.lines.focal)
-        if not share.any():
-            return ""
-        return (
-            f"Standard deviations include those of the focal lengths, {percentages(share)}, one error for "
-            "all of one f. What the next photo would improve is of the noise alone."
-        )
+        """Sentences on what the bands include and what not; empty if there is nothing to say."""
+        share, told = self.focal_sigma / np.asarray(self.lines.focal), []
+        if np.unique(np.asarray(self.lines.frame)).size < FEWEST:
+            told = [
+                "Standard deviations do not include errors of the model and of its centre, which take "
+                f"{FEWEST} photos to tell."
+            ]
+        if share.any():
+            told.append(
+                f"Standard deviations include those of the focal lengths, {percentages(share)}, one error "
+                "for all of one f. What the next photo would improve is of the noise alone."
+            )
+        return " ".join(told)
 
     def enough(self) -> bool:
         """Whether a further photo could improve nothing that can be seen."""

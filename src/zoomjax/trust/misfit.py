@@ -52,7 +52,7 @@ from ..models.requirements import check
 from ._frame_scores import RCOND, Followed, Frames, by_residuals, followed, of_frames, passes_of
 from ._strengths import of_focal_lengths
 
-_FEWEST = 8
+FEWEST = 8
 """Frames: with fewer, the misfit cannot be told from errors of single photos, and counts as these."""
 
 _LINEAR = 2
@@ -109,7 +109,7 @@ def with_misfit(
     effects = np.zeros((*k.shape, 0))
     if np.any(checked_sigma(focal_sigma, lines.focal)):
         effects = effects_of_focal(fit, placed, focal_sigma, shared)
-    if len(frames.focal) < _FEWEST:
+    if len(frames.focal) < FEWEST:
         return fit
     follows = followed(frames, effects[frames.there])
     misfit, off_centre = _common(frames, follows), None
