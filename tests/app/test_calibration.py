@@ -38,6 +38,7 @@ def test_stages_are_told(calibration):
     assert len(told) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", [in_image, in_corrected])
 def test_distances_are_measured_where_the_metric_says(calibration, metric):
     """By default in the distorted image; both are the fits that the library makes."""

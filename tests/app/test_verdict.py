@@ -131,6 +131,7 @@ def test_photos_of_other_sizes_are_remarked_on():
     assert found.found == "2 of 11 photos are of another size than most and were left out."
 
 
+@pytest.mark.slow
 def test_two_lenses_are_to_be_parted_before_another_photo_is_taken(noisy, tmp_path):
     done = calibrate(noisy, model=WantedModel("polynomial"), centre=None)
     photos = [photo(tmp_path / f"{n}.jpg", lens=f"lens {n % 2}") for n in range(4)]

@@ -251,6 +251,7 @@ def test_standard_deviations_are_the_scatter_of_fits_to_noise(exact):
     assert 0.5 < np.sqrt(np.mean(np.var(shapes, axis=0, ddof=1))) / said < 2
 
 
+@pytest.mark.slow
 def test_standard_deviations_hold_for_a_focal_length_a_photo(exact):
     """A photo that alone tells its focal length leaves no score in it, which is not certainty."""
     _, grids, _ = exact

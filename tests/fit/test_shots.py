@@ -65,6 +65,7 @@ def done(folder):
     return found
 
 
+@pytest.mark.slow
 def test_shots_of_one_scene_are_joined(done):
     focal, rotation = (np.concatenate(part) for part in zip(*shots(), strict=True))
     fit = done.fit
@@ -89,6 +90,7 @@ def test_tracks_go_across_the_cut_and_hold_the_shots(done):
     assert np.ptp([log_std[:CUT].mean(), log_std[CUT:].mean()]) < 0.1 * log_std.mean()
 
 
+@pytest.mark.slow
 def test_the_panorama_shows_both_shots_and_is_sharp(done, folder):
     write_panorama(done.clip, done.fit, folder / "panorama.jpg")
     panorama = cv2.imread(str(folder / "panorama.jpg"), cv2.IMREAD_GRAYSCALE)
@@ -102,6 +104,7 @@ def test_the_panorama_shows_both_shots_and_is_sharp(done, folder):
     assert np.abs(np.diff(middle, axis=1)).mean() > 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("caption", [False, True])
 def test_shots_of_different_scenes_are_not_joined(done, folder, caption):
     clip = rendered(folder / f"other-{caption}.mp4", (0, 5), caption=caption)

@@ -187,6 +187,7 @@ def test_positions_that_are_none_are_refused():
         named([np.zeros((3, 2)), np.full((3, 2), np.nan)])
 
 
+@pytest.mark.slow
 def test_real_annotations_get_their_names(frames):
     """Frames of 2 to 9 lines: two in three are named, all of those with 7 lines or more, none wrongly."""
     bend = zj.Distortion(np.array([-0.0416]), PRINCIPAL, np.array(np.hypot(1280, 720) / 2))

@@ -42,6 +42,7 @@ def assert_same(got, wanted):
 LINES = {"hold_out": "line", "folds": 3, "seed": 1, "rule": "least"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [{}, LINES], ids=["default", "lines, least"])
 def test_each_selection_is_that_of_its_data_set_alone(sets, how):
     found = select_many(sets, CANDIDATES, **how)
