@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from zoomjax._core import programs
-from zoomjax._core.programs import light_program, program
+from zoomjax._core.programs import light_program, program, program_of_steps
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +24,7 @@ def spread(values, *, power):
     return jnp.sum(jnp.sin(values) ** power)
 
 
-@pytest.mark.parametrize("make", [program, light_program])
+@pytest.mark.parametrize("make", [program, light_program, program_of_steps])
 def test_program_gives_what_the_function_gives(make):
     values = np.linspace(0, 1, 9)
     compiled = make(spread)
@@ -46,21 +46,34 @@ def test_few_numbers_are_not_worth_optimisation():
     assert programs._few(((few, "name"), {"more": jnp.zeros(())}))
     assert not programs._few(((few, long), {}))
     assert not programs._few(((few, many), {}))
-    assert dict(programs._settings(True))["xla_backend_optimization_level"] == 0
-    assert dict(programs._settings(False))["xla_backend_optimization_level"] == 1
+    small, larger = (dict(programs._settings(programs._kind(False, False, few))) for few in (True, False))
+    assert small["xla_backend_optimization_level"] == 0
+    assert larger["xla_backend_optimization_level"] == 1
+
+
+def test_many_steps_are_compiled_without_emitters_by_a_process_that_runs_once(monkeypatch):
+    def of(in_steps):
+        return dict(programs._settings(programs._kind(True, in_steps, False)))
+
+    assert of(True) == of(False) == {}
+    monkeypatch.setattr(programs._USE, "once", True)
+    assert of(True) == {"xla_cpu_use_fusion_emitters": False}
+    assert of(False) == {}
+    assert tuple(of(True).items()) in programs.all_settings()
 
 
 def test_settings_of_the_environment_come_first(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=2")
     programs._settings.cache_clear()
-    assert "xla_backend_optimization_level" not in dict(programs._settings(True))
+    assert "xla_backend_optimization_level" not in dict(programs._settings(2))
 
 
 def test_settings_that_xla_does_not_know_are_left_away(monkeypatch):
-    monkeypatch.setattr(programs, "_PLAINLY", {"xla_no_such_setting": True, **programs._PLAINLY})
+    kinds = tuple({"xla_no_such_setting": True, **kind} for kind in programs._KINDS)
+    monkeypatch.setattr(programs, "_KINDS", kinds)
     assert float(program(lambda x: x + 1)(jnp.ones(()))) == 2
     assert "xla_no_such_setting" in programs._UNKNOWN  # others are, too, in some versions
-    assert "xla_backend_optimization_level" in dict(programs._settings(False))
+    assert "xla_backend_optimization_level" in dict(programs._settings(1))
 
 
 def test_other_errors_are_raised():
@@ -71,4 +84,4 @@ def test_other_errors_are_raised():
 
 def test_nothing_is_set_on_other_devices(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert programs._settings(True) == ()
+    assert [*programs.all_settings()] == [()] * 4

@@ -31,6 +31,7 @@ _PLAINLY = {
     "xla_cpu_parallel_codegen_split_count": 4,  # parts that are compiled side by side; each costs
 }
 _UNOPTIMISED = {**_PLAINLY, "xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1}
+_WITHOUT_EMITTERS = {"xla_cpu_use_fusion_emitters": False}  # a tenth slower steps, in half of the time
 
 _ROWS, _NUMBERS = 1024, 3 * 2**19
 """Of the arguments of a light program, up to which it is not optimised: the longest, and all in all."""
@@ -58,7 +59,11 @@ _Result = TypeVar("_Result")
 
 
 def program(
-    function: Callable[_Given, _Result], *, light: bool = False, optimised: bool = False
+    function: Callable[_Given, _Result],
+    *,
+    light: bool = False,
+    optimised: bool = False,
+    in_steps: bool = False,
 ) -> Callable[_Given, _Result]:
     """As ``equinox.filter_jit``, with settings of the compiler that save its time.
 
@@ -70,6 +75,7 @@ def program(
         function: what to compile.
         light: whether its work is small for small arguments.
         optimised: whether its work is so much that XLA's own settings pay.
+        in_steps: whether it is many small steps, for which emitters do not pay in a process that runs once.
     """
     plain = eqx.filter_jit(function)
 
@@ -78,7 +84,7 @@ def program(
     def call(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
         if not _at_once():
             return plain(*args, **kwargs)
-        settings = () if optimised else _settings(light and _few((args, kwargs)))
+        settings = _settings(_kind(optimised, in_steps, light and _few((args, kwargs))))
         try:
             if (run := kept(function, settings, args, kwargs)) is not None:
                 return run()
@@ -112,6 +118,11 @@ def optimised_program(function: Callable[_Given, _Result]) -> Callable[_Given, _
     return program(function, optimised=True)
 
 
+def program_of_steps(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
+    """`program` of a function with much work, in many small steps."""
+    return program(function, optimised=True, in_steps=True)
+
+
 def light_program(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
     """`program` of a function whose work is small for small arguments."""
     return program(function, light=True)
@@ -120,19 +131,28 @@ def light_program(function: Callable[_Given, _Result]) -> Callable[_Given, _Resu
 _UNKNOWN: set[str] = set()  # settings that this version of XLA does not have
 
 
+def _kind(optimised: bool, in_steps: bool, small: bool) -> int:
+    """Which of `_KINDS` a program is of."""
+    if optimised:
+        return 3 if in_steps and _USE.once else 0
+    return 2 if small else 1
+
+
+_KINDS: tuple[dict[str, Any], ...] = ({}, _PLAINLY, _UNOPTIMISED, _WITHOUT_EMITTERS)
+
+
 @functools.cache
-def _settings(unoptimised: bool) -> tuple[tuple[str, Any], ...]:
+def _settings(kind: int) -> tuple[tuple[str, Any], ...]:
     """The compiler's settings that are not given by the environment; none but on a processor."""
     if jax.default_backend() != "cpu":
         return ()
-    given = os.environ.get("XLA_FLAGS", "")
-    wanted = _UNOPTIMISED if unoptimised else _PLAINLY
+    given, wanted = os.environ.get("XLA_FLAGS", ""), _KINDS[kind]
     return tuple(of for of in wanted.items() if of[0] not in given and of[0] not in _UNKNOWN)
 
 
 def all_settings() -> tuple[tuple[tuple[str, Any], ...], ...]:
     """The settings of all kinds of programs of this process."""
-    return (), _settings(False), _settings(True)
+    return tuple(map(_settings, range(len(_KINDS))))
 
 
 @functools.cache

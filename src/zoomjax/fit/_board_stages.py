@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._core.arrays import as_jax
-from .._core.programs import optimised_program, program
+from .._core.programs import light_program, program, program_of_steps
 from ..models.invertibility import Certificate, certificate_of
 from ._board_rows import (
     LOSS,
@@ -136,7 +136,7 @@ def _bend_of(data, model):
     return jnp.maximum(jnp.sqrt(squares / (jnp.sum(photos) * model.bend.shape[1])), _LEAST_BEND)
 
 
-@optimised_program  # whose steps that makes a quarter faster
+@program_of_steps
 def _solved(data, model, stage):
     """Poses, board and lens of least energy, the noise, the solver's status and its steps."""
     units = units_of(data, model, stage.noise)
@@ -155,7 +155,7 @@ def _solved(data, model, stage):
     return model, noise, RESULTS.promote(solution.result), steps
 
 
-@program
+@light_program
 def described(
     data: Data, model: Model, stage: Stage, centre: Array, size: tuple[int, int], focal_range: Array
 ) -> Described:
