@@ -41,8 +41,8 @@ _ALIKE, _SEVERAL = 1.3, 6
 number of photos from which it is not asked for."""
 
 _OF_ONE_ZOOM = 0.012
-"""Standard deviation of a common focal length, by photos, relative to it, up to which they may share it.
-Six or more of one zoom leave 0.1 to 1 %, and 2 to 16 % if several are at 1.3 times the focal length."""
+"""Standard deviation of a common focal length, by photos, relative to it, up to which they may share it:
+more than photos of one zoom of a real camera leave, and less than those with several at a longer one."""
 
 _LEAST_DEPTH = 0.01
 """Part by which the depth of a grid's nodes differs where it tells a focal length. What the correction and
