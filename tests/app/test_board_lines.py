@@ -155,7 +155,7 @@ def each_apart(used, rng):
 def test_photos_each_at_its_own_focal_length_tell_them_and_the_board_s_shape():
     used, _ = photos(0.1)
     focals = each_apart(used, np.random.default_rng(1))
-    bundle, told = bundle_of(used, focals, sharing=("folder",))
+    bundle, told, _ = bundle_of(used, focals, sharing=("folder",))
     assert bundle is not None
     assert bundle.bent
     assert told == ""  # all are of one folder, whose zooms differ

@@ -219,7 +219,7 @@ def test_groups_are_told_in_terminal_report_and_summary(folder, tmp_path, capsys
 
 def test_few_photos_make_no_bundle_and_say_what_would(detections):
     focals = Focals({d.name: 1.0 for d in detections}, "px", "", "")
-    bundle, told = bundle_of(detections[:3], focals)
+    bundle, told, _ = bundle_of(detections[:3], focals)
     assert bundle is None
     assert told == (
         "The board counts as flat: 3 photos at 1 focal length cannot separate its shape from the lens. "

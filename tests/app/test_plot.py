@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app.coverage import plot_coverage
-from zoomjax.app.plot import plot_distortion, plot_model, save_plot
+from zoomjax.app.plot import plot_distortion, plot_model, plot_residues, save_plot
 
 
 @pytest.mark.parametrize("kind", ["svg", "png"])
@@ -36,6 +36,23 @@ def test_plots_are_drawn_once_and_are_the_same_to_the_last_byte(kind, layout):
     other, _ = written(lambda figure, *of, **about: figure.savefig(*of, dpi=150, **about))
     assert number == 1
     assert once == other
+
+
+@pytest.mark.slow
+def test_frames_of_one_focal_length_stand_side_by_side():
+    lens = scenes.nikkor_18_200()
+    lines = scenes.board_lines(lens, np.full(3, 24.0), spacing=150, noise=0.1)
+    small = zj.compress(lines)
+    fit, each = zj.fit_zoom(small, zoom=zj.PolynomialZoom(degree=0)), zj.fit_frames(small)
+    own, common = np.asarray(each.frame_rms), np.asarray(fit.frame_rms)
+    residues = plot_residues(lines, own, own, common)
+    for axes in (plot_model(fit, each, lines).axes[0], residues.axes[0]):
+        dots = next(line for line in axes.lines if "frame" in str(line.get_label()))
+        assert np.asarray(dots.get_xdata()).tolist() == [1, 2, 3]
+        names = axes.get_legend_handles_labels()[1] or [str(line.get_label()) for line in axes.lines]
+        assert "common model" in names
+        assert not axes.child_axes  # no focal lengths above
+    assert residues.axes[0].get_xlabel() == "frame"
 
 
 @pytest.mark.slow

@@ -237,6 +237,15 @@ def test_a_failure_while_the_results_appear_is_undone(failing, links, tmp_path, 
     assert files(tmp_path) == NEW
 
 
+@pytest.fixture
+def interruptible():
+    """As in a terminal: what runs in the background of a shell inherits that Ctrl-C is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_while_the_results_appear_waits(tmp_path, monkeypatch):
     write(tmp_path, OLD)
     replace = os.replace

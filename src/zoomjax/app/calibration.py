@@ -161,9 +161,11 @@ class Calibration:
 
     @property
     def kind(self) -> str:
-        """What the zoom model is called in tables."""
+        """What the model is called in tables."""
         if len(self.rms_uncorrected) == 1:
             return "corrected"
+        if np.unique(np.asarray(self.lines.focal)).size == 1:
+            return "one for all frames"
         return "zoom polynomial" if isinstance(self.fit.lens.zoom, PolynomialZoom) else "zoom model"
 
     def held_out_rows(self) -> dict[str, np.ndarray]:
@@ -171,6 +173,15 @@ class Calibration:
         if len(self.rms_uncorrected) == 1:
             return {self.kind: self.rms_frames_held_out}
         return {"frame by frame": self.rms_frames_held_out, self.kind: self.rms_held_out}
+
+    @property
+    def held_out(self) -> str:
+        """What `held_out_rows` are of, in a sentence."""
+        if len(self.rms_uncorrected) == 1:
+            return "Held out: each tenth of the lines, under the model of the others."
+        return (
+            "Held out: each frame, under the model of the others; frame by frame, each tenth of its lines."
+        )
 
     def warnings(self, names: Sequence[str] | None = None) -> list[str]:
         """User-facing warnings about the zoom model, and about frames without a good fit.

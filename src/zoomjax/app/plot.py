@@ -68,8 +68,7 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
     orders = lens.distortion_model.orders(terms)
     to_pixel = lens.scale ** (-1.0 * orders)
     focal = np.asarray(lines.focal)
-    one = bool(np.ptp(focal) == 0)
-    place = np.arange(1, len(focal) + 1) if one else 1 / focal
+    place, along_what, one = _along(focal, lens.focal_unit)
     margin, of = (0.5, "common") if one else (0.0, "zoom")
     grid = np.linspace(place.min() - margin, place.max() + margin, 200)
     along = np.full(200, focal[0]) if one else 1 / grid
@@ -102,7 +101,7 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
         _shade(below, grid, 0.0, spread[:, i])
         _label(below, "frame − model", unit, np.append(difference, sigma[known, i]))
         below.axhline(0, color=MODEL, linewidth=1.2, zorder=0)
-        below.set_xlabel("frame" if one else f"$1/f$  (1/{lens.focal_unit})")
+        below.set_xlabel(along_what)
         below.locator_params(axis="x", nbins=6, integer=one)  # labels of focal lengths in px are long
         if not one:
             _show_focal_lengths(above, focal, lens.focal_unit)
@@ -120,26 +119,31 @@ def plot_residues(
 ) -> Figure:
     """Plot each frame's RMS against 1/f: uncorrected, frame by frame, zoom model (Figures 9 and 10).
 
+    Frames of one focal length stand side by side.
+
     Args:
         lines: only their focal lengths are used.
         none, each, zoom: each frame's RMS without correction, frame by frame, and with the zoom model.
         unit: unit of the RMS values.
     """
     focal = np.asarray(lines.focal)
+    place, along_what, one = _along(focal, lines.focal_unit)
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = figure.subplots()
     size = 4 if len(focal) < 100 else 2.5
-    axes.plot(1 / focal, none, "x", color="0.55", markersize=size + 1, label="no correction")
-    axes.plot(
-        1 / focal, each, "o", color=FRAMES, markersize=size + 2, fillstyle="none", label="frame by frame"
-    )
-    axes.plot(1 / focal, zoom, "o", color=MODEL, markersize=size, label="zoom model")
+    axes.plot(place, none, "x", color="0.55", markersize=size + 1, label="no correction")
+    axes.plot(place, each, "o", color=FRAMES, markersize=size + 2, fillstyle="none", label="frame by frame")
+    label = "common model" if one else "zoom model"
+    axes.plot(place, zoom, "o", color=MODEL, markersize=size, label=label)
     axes.set_ylim(0)
     axes.set_ylabel(f"RMS distance to the lines  ({unit})")
-    axes.set_xlabel(f"$1/f$  (1/{lines.focal_unit})")
+    axes.set_xlabel(along_what)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False)
-    _show_focal_lengths(axes, focal, lines.focal_unit)
+    if one:
+        axes.locator_params(axis="x", integer=True)
+    else:
+        _show_focal_lengths(axes, focal, lines.focal_unit)
     return figure
 
 
@@ -335,6 +339,14 @@ def _raster(lens: ZoomLens) -> np.ndarray:
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:
     return np.hypot(vectors[..., 0], vectors[..., 1])
+
+
+def _along(focal: np.ndarray, unit: str) -> tuple[np.ndarray, str, bool]:
+    """Where frames are along an axis and what it is called; side by side where all are of one f."""
+    one = bool(np.ptp(focal) == 0)
+    if one:
+        return np.arange(1, len(focal) + 1), "frame", one
+    return 1 / focal, f"$1/f$  (1/{unit})", one
 
 
 def _shade(axes: Axes, x: np.ndarray, middle: np.ndarray | float, std: np.ndarray) -> None:

@@ -67,6 +67,7 @@ def report(
             counted(int(np.sum(np.asarray(calibration.lines.mask))), "point"),
         ],
         several=len(calibration.rms_uncorrected) > 1,
+        zooms=_zooms(calibration) > 1,
         verdict=calibration.assessment,
         cards=_cards(calibration),
         warnings=images.warnings() if images else calibration.warnings(),
@@ -128,7 +129,7 @@ def _cards(calibration: Calibration) -> list[tuple[str, str]]:
     )
     none, zoom = (rms_over_frames(of) for of in (calibration.rms_uncorrected, calibration.fit.frame_rms))
     after = left_out if np.isfinite(left_out) else zoom
-    where = " at the zoom where it is largest" if len(calibration.rms_uncorrected) > 1 else ""
+    where = " at the zoom where it is largest" if _zooms(calibration) > 1 else ""
     cards = [
         (
             f"{short(none)} → {short(after)} px",
@@ -162,6 +163,11 @@ def _coverage(calibration: Calibration) -> list[dict[str, Any]]:
     return [*plots, embedded_plot(plot_radius(calibration.lines, lens, weight), label, class_="box plot")]
 
 
+def _zooms(calibration: Calibration) -> int:
+    """The number of focal lengths."""
+    return np.unique(np.asarray(calibration.lines.focal)).size
+
+
 def _straightness(calibration: Calibration) -> dict[str, Any]:
     each = rms_over_frames(calibration.frames.frame_rms)
     held_out = {name: rms_over_frames(frames) for name, frames in calibration.held_out_rows().items()}
@@ -171,7 +177,7 @@ def _straightness(calibration: Calibration) -> dict[str, Any]:
         np.asarray(calibration.frames.frame_rms),
         np.asarray(calibration.fit.frame_rms),
     )
-    chosen = calibration.selection
+    chosen, along = calibration.selection, " against 1/f" if _zooms(calibration) > 1 else ""
     return {
         "against": "vs. frame by frame" if len(calibration.rms_uncorrected) > 1 else "vs. corrected",
         "rows": [
@@ -186,7 +192,7 @@ def _straightness(calibration: Calibration) -> dict[str, Any]:
         "unit": f"px of the {'distorted' if calibration.in_image else 'corrected'} image",
         "choice": chosen
         and {"title": chosen.title, "columns": COLUMNS, "rows": chosen.rows(), "why": chosen.why},
-        "plot": embedded_plot(figure, "Residual RMS of each frame against 1/f", class_="box plot"),
+        "plot": embedded_plot(figure, f"Residual RMS of each frame{along}", class_="box plot"),
     }
 
 
@@ -209,7 +215,9 @@ def _lens(calibration: Calibration) -> dict[str, Any]:
         "certificate": _certificate(calibration),
         "plot": embedded_plot(
             plot_model(calibration.fit, calibration.frames, calibration.lines),
-            "Distortion coefficients against 1/f: separate fits of the frames, and the zoom model",
+            "Distortion coefficients against 1/f: separate fits of the frames, and the zoom model"
+            if _zooms(calibration) > 1
+            else "Distortion coefficients: separate fits of the frames, and the common model",
             kind="svg" if len(calibration.rms_uncorrected) <= _MOST_FRAMES else "png",
         ),
     }
