@@ -118,17 +118,14 @@ class Calibration:
     def allowed_for(self) -> str:
         """Sentences on what the bands include and what not; empty if there is nothing to say."""
         share, told = self.focal_sigma / np.asarray(self.lines.focal), []
-        if np.unique(np.asarray(self.lines.frame)).size < FEWEST:
-            told = [
-                "Standard deviations do not include errors of the model and of its centre, which take "
-                f"{FEWEST} photos to tell."
-            ]
         if share.any():
+            told = [f"include those of the focal lengths, {percentages(share)}, one error for all of one f"]
+        if np.unique(np.asarray(self.lines.frame)).size < FEWEST:
             told.append(
-                f"Standard deviations include those of the focal lengths, {percentages(share)}, one error "
-                "for all of one f. What the next photo would improve is of the noise alone."
+                f"do not include errors of the model and of its centre, which take {FEWEST} photos to tell"
             )
-        return " ".join(told)
+        noise = " What the next photo would improve is of the noise alone." if share.any() else ""
+        return f"Standard deviations {', and '.join(told)}.{noise}" if told else ""
 
     def enough(self) -> bool:
         """Whether a further photo could improve nothing that can be seen."""
