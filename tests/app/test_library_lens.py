@@ -1,6 +1,5 @@
 """``zoomjax undistort --lens`` and ``zoomjax lens``: photos with EXIF data, corrected by the library."""
 
-import json
 import shlex
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from zoomjax.app.undistort_files import Job
 from zoomjax.interop.database import one_named
 from zoomjax.io import read_photo
 
-from .._commands import SEVERAL
+from .._commands import one_after_another
 from ..io.test_equipment import block
 
 SIZE = (300, 200)
@@ -143,16 +142,8 @@ def test_the_commands_list_write_and_say_what_to_give(tmp_path):
         tmp_path / "canon.png", {"Make": "Canon", "Model": "Canon EOS 600D"}, "EF-S18-55mm f/3.5-5.6 IS II"
     )
     (tmp_path / "mine.json").write_text("mine")
-    done = subprocess.run(
-        [sys.executable, "-c", SEVERAL],
-        input=json.dumps([(str(tmp_path), ["zoomjax", *words]) for words in jobs]),
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
     (listed, table), (made, said), (asked, question), (refused, hint), (kept, exists), (both, each) = (
-        json.loads(done.stdout.splitlines()[-1])
+        one_after_another(tmp_path, jobs)
     )
     assert both == 0
     assert [line.split(",")[0] for line in each.splitlines() if "its table" in line] == [
