@@ -82,6 +82,7 @@ def test_what_was_edited_is_replaced_only_when_that_is_asked_for(folder):
     assert "edited" not in (folder / "out" / "lens.json").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["demo", "reproduce"])
 def test_commands_refuse_what_is_not_theirs_before_the_work(command, tmp_path):
     (tmp_path / "photos").mkdir()
@@ -179,6 +180,7 @@ def test_a_full_disk_is_told(folder, mounted):
     assert not (disk / "out").exists()
 
 
+@pytest.mark.slow
 @posix
 def test_a_read_only_folder_is_told_before_the_work(folder, mounted):
     mounted(folder / "disk", "ro")

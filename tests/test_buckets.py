@@ -80,6 +80,7 @@ def test_padding_repeats_no_line_and_no_frame():
     np.testing.assert_array_equal(padded.focal[7:], LINES.focal[-1])
 
 
+@pytest.mark.slow
 def test_commands_have_fewer_sizes():
     small = zj.compress(LINES)
     use_once()
@@ -138,6 +139,7 @@ def without_steps(fit):
     return eqx.tree_at(lambda fit: fit.steps, fit, 0) if hasattr(fit, "steps") else fit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 def test_fits_are_those_of_the_lines_alone(form):
     """Inside ``jit`` nothing is padded."""
@@ -150,6 +152,7 @@ def test_fits_are_those_of_the_lines_alone(form):
     assert_same(frame_energy(lines, k), eqx.filter_jit(frame_energy)(lines, k), 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["compressed", "weighted"])
 def test_fits_of_frames_are_those_of_the_lines_alone(form):
     lines = FORMS[form]()
@@ -170,6 +173,7 @@ def test_zoom_models_are_made_ready_for_the_frames_there_are(zoom):
     assert_same(own.lens, again.lens, 1e-7)
 
 
+@pytest.mark.slow
 def test_robust_fits_and_centres_are_those_of_the_lines_alone():
     lines = weighted(zj.compress(LINES))
     robust = zj.fit_robust(lines)

@@ -112,6 +112,7 @@ def test_cell(row, way, dtype):
     assert wrong is None, wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slow", [False, pytest.param(True, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("dtype", [pytest.param("float32", marks=pytest.mark.exhaustive), "float64"])
 def test_over_four_devices(dtype, slow):

@@ -92,6 +92,7 @@ def test_the_order_of_lines_and_frames_does_not_matter(scene, random):
     same(fitted(lines_of(points, focal)), fitted(moved), focal)
 
 
+@pytest.mark.slow
 @few
 @hypothesis.given(scenes())
 def test_padding_does_not_matter(scene):

@@ -138,6 +138,7 @@ def test_held_out_errors_are_one_a_frame_and_both(given, photos, unchecked):
         zj.trust.assess(*photos, rms_held_out=held_out, rms_frames_held_out=each)
 
 
+@pytest.mark.slow
 def test_a_model_with_parameters_tells_the_number_of_coefficients(photos):
     lines, _ = photos
     small = zj.compress(lines, terms=3)

@@ -92,6 +92,7 @@ def test_the_reference_and_the_knots_of_models(board, zoom, wrong):
     np.testing.assert_allclose(std, expected, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_reference_of_a_centre_that_moves(board):
     points, frame = board.to_ragged(), np.asarray(board.frame)
     far = zj.Lines.from_ragged(

@@ -293,6 +293,7 @@ def test_inside_of_other_programs_nothing_is_kept(folder, traced):
     assert traced == []
 
 
+@pytest.mark.slow
 def test_fits_are_the_same_to_the_last_bit(small, folder, traced, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(kept, "_STORE", kept._Store())

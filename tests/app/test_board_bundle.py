@@ -41,6 +41,7 @@ def calibrated(detections):
     return _calibrated(ImageJob((".",), detector="grid", model=model), detections, lambda _: None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("focal", "expected"), [(OF_ONE, True), (FOCAL[3:9], False)])
 def test_photos_of_several_zooms_pull_a_common_focal_length_apart(focal, expected, photos):
     detections = photos(focal)

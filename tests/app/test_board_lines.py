@@ -234,6 +234,7 @@ def test_given_deviations_hold_for_focal_lengths_of_the_bundle_adjustment_and_ph
     assert done.calibration.focal_sigma.tolist() == pytest.approx([0.02 * f for f in focal])
 
 
+@pytest.mark.slow
 def test_photos_of_one_zoom_that_nobody_knows_tell_the_board_s_shape():
     used, _ = photos(0.1)
     unknown = choose_focals(used[:6], "same")

@@ -235,6 +235,7 @@ def test_bands_allow_for_uncertain_focal_lengths(calibration):
     assert allowed.next_photo.sentence == calibration.next_photo.sentence
 
 
+@pytest.mark.slow
 def test_frames_of_one_focal_length_err_together():
     """As photos at one step of the zoom, rounded in EXIF data: its error does not average out."""
     settings = np.array([22.0, 28.0, 50.0, 105.0])

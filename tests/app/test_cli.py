@@ -56,6 +56,7 @@ def calibrated(few_lines, tmp_path_factory):
     return folder / "out", done
 
 
+@pytest.mark.slow
 def test_nothing_about_an_earlier_lens_stays_beside_a_new_one(calibrated, tmp_path):
     """A report, or a panorama, of another lens would be taken for that of this one."""
     folder, _ = calibrated
@@ -239,6 +240,7 @@ def test_calibrate_reads_csv(calibrated, few_lines, tmp_path):
     assert of_csv["rms_zoom"] == pytest.approx(of_npz["rms_zoom"], rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("given", "unit", "known", "focal"),
     [("35", None, True, 35.0), ("1200", "px", True, 1200.0), ("same", None, False, 1.0)],

@@ -82,6 +82,7 @@ def zip_rows(rows):
     return {name: [row[name] for row in rows] for name in rows[0]}
 
 
+@pytest.mark.slow
 def test_a_clip_alone_gives_its_focal_lengths_and_its_lens(calibrated):
     folder, done = calibrated
     assert {file.name for file in folder.iterdir()} >= set(FILES)
@@ -99,10 +100,12 @@ def test_a_clip_alone_gives_its_focal_lengths_and_its_lens(calibrated):
     assert np.asarray(made(510.0).centre) == pytest.approx(np.array([322, 178]), abs=1)
 
 
+@pytest.mark.slow
 def test_nothing_about_an_earlier_lens_stays(calibrated):
     assert still_earlier(calibrated[0]) == {"lines.npz"}
 
 
+@pytest.mark.slow
 def test_its_summary_says_what_it_found(calibrated):
     summary = json.loads((calibrated[0] / "summary.json").read_text())
     assert summary["verdict"] == "good"
@@ -139,6 +142,7 @@ def test_its_summary_has_the_entries_of_that_of_photos(calibrated, tmp_path):
     assert sum(row["views"] for row in frames) == summary["views"]
 
 
+@pytest.mark.slow
 def test_the_track_corrects_the_clip(clip, calibrated):
     arguments = ["undistort", "out/lens.json", clip.name, "--focal", "out/track.csv"]
     done = zoomjax(*arguments, "-o", "corrected.mp4", cwd=clip.parent)
@@ -147,6 +151,7 @@ def test_the_track_corrects_the_clip(clip, calibrated):
         assert sum(1 for _ in video.decode(video=0)) == FRAMES
 
 
+@pytest.mark.slow
 def test_the_panorama_is_as_sharp_as_the_frames(calibrated):
     """The mean of frames that were put beside one another wrongly would be smooth."""
     panorama = cv2.imread(str(calibrated[0] / "panorama.jpg"), cv2.IMREAD_GRAYSCALE)
@@ -210,6 +215,7 @@ def test_a_clip_takes_another_distortion_model(clip, calibrated):
 TRIED = "No focal lengths are given (--focal): they and the lens are found from how clip.mp4 moves.\n"
 
 
+@pytest.mark.slow
 def test_that_motion_is_tried_is_said_at_the_start(calibrated):
     assert calibrated[1].stderr.startswith(TRIED)
 
@@ -505,6 +511,7 @@ def test_an_option_without_effect_is_refused(clip, options, sentence):
     assert sentence in done.stderr
 
 
+@pytest.mark.slow
 def test_a_clip_that_does_not_move_is_refused(clip, tmp_path):
     with decode_video(clip) as (_, frames):
         first = next(iter(frames))[2]()

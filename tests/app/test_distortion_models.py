@@ -219,6 +219,7 @@ def test_lines_that_the_first_model_cannot_follow_are_judged_again_by_the_one_ch
     assert farthest(done.fit.lens, lens) < 1.0
 
 
+@pytest.mark.slow
 def test_a_centre_is_one_about_which_lines_are_straighter(clean):
     found = zj.fit.fit_centre(clean, zoom=zj.PolynomialZoom(degree=1))
 

@@ -116,6 +116,7 @@ def test_focal_lengths_of_other_lines_are_not_taken(results):
     assert earlier_of([folder / "lines.npz"], other).sigma is None
 
 
+@pytest.mark.slow
 def test_that_focal_lengths_are_relative_stays_with_the_lens(results):
     folder, lines, _ = results
     lens = zj.load_lens(folder / "lens.json")

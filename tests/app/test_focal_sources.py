@@ -134,6 +134,7 @@ def test_the_pitch_of_a_board_gives_the_focal_length_within_a_thousandth(striped
         assert 0 < found.deviation[d.name] < 1e-3 * f
 
 
+@pytest.mark.slow
 def test_a_board_whose_directions_disagree_is_refused(striped):
     """As the paper's board does, taken for one of square fields."""
     _, detections = striped  # of the first, only borders across are found evenly spaced
@@ -198,6 +199,7 @@ def test_oblique_views_of_a_grid_give_focal_lengths():
     assert len(found.focal) == len(detections)
 
 
+@pytest.mark.slow
 def test_a_square_view_tells_nothing():
     detections = [*oblique(1000.0, [(0.5, 0.0), (0.0, 0.5), (0.0, 0.0)])]
     found = choose_focals(detections, "plane")
@@ -206,6 +208,7 @@ def test_a_square_view_tells_nothing():
     assert "no flat grid" in found.absence(of("without.png"))
 
 
+@pytest.mark.slow
 def test_markings_of_a_pitch_tell_the_focal_lengths_of_frames():
     lens, focal = scenes.broadcast_zoom(), np.array([47.0, 60.0, 80.0, 110.0])
     lines = scenes.broadcast_lines(lens, focal, spacing=12, noise=0.3)

@@ -123,6 +123,7 @@ def pictures(done, folder):
         return list(drawn.pictures())
 
 
+@pytest.mark.slow
 def test_the_report_shows_photos_before_and_after(done, tmp_path):
     shown = pictures(done, tmp_path)
     focal = [float(done.calibration.lines.focal[one.frame]) for one in shown]
@@ -163,6 +164,7 @@ onload = async () => {
 </script>"""
 
 
+@pytest.mark.slow
 def test_under_the_slider_is_the_nearest_photo_before_and_after(done, tmp_path):
     """In a browser, at every fourth place of the slider: by 1/f, with its own pictures, and to be seen."""
     shown = pictures(done, tmp_path)
@@ -345,6 +347,7 @@ def write_exif(path, image, focal):
     path.write_bytes(content.tobytes())
 
 
+@pytest.mark.slow
 def test_several_photos_need_focal_lengths(folder, tmp_path):
     image = cv2.imread(str(folder / "no-exif.png"), cv2.IMREAD_GRAYSCALE)
     for shift, name in enumerate("ab"):

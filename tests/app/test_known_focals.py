@@ -96,6 +96,7 @@ def view(number, focal, tilt):
     return Detection(name, name, (1072, 712), tuple(GridDetector.lines(seen)), None, seen)
 
 
+@pytest.mark.slow
 def test_frames_of_a_board_count_as_one_measurement():
     rng = np.random.default_rng(0)
     seen = [view(n, f, tilt) for n, f, tilt in ((30, 1500.0, -0.6), (4, 1000.0, 0.5), (12, 1200.0, 0.6))]

@@ -128,6 +128,7 @@ def test_what_an_earlier_run_wrote_about_another_lens_is_removed(tmp_path):
     assert zj.load_lens(tmp_path / "lens.json").about["lens"] == NIKKOR
 
 
+@pytest.mark.slow
 def test_the_commands_list_write_and_say_what_to_give(tmp_path):
     jobs = [
         ["lens", "nikkor 18-200"],

@@ -156,6 +156,7 @@ def test_photos_without_a_focal_length_in_exif_data_stay_alone(detections):
     assert len({found.focal[d.name] for d in some[:3]}) == 3
 
 
+@pytest.mark.slow
 def test_photos_that_disagree_are_told_and_widen_the_deviation(detections):
     """As where a folder holds two zooms."""
     mixed = [dataclasses.replace(d, focal=24.0 if d.focal == 35 else d.focal) for d in detections]

@@ -227,6 +227,7 @@ def test_the_verdict_leads(page, calibration):
     assert "before → after correction, in photos left out of the fit" in page.text
 
 
+@pytest.mark.slow
 def test_frames_are_sorted_by_focal_length(noisy):
     mixed = eqx.tree_at(lambda lines: lines.focal, noisy, noisy.focal[::-1])
     page = Page(report(calibrate(mixed, **GIVEN)))
@@ -255,6 +256,7 @@ def test_what_was_run_is_said(calibration):
     assert "Command zoomjax calibrate 'a b' -o out" in page.text
 
 
+@pytest.mark.slow
 def test_enough_is_said_when_a_further_photo_shows_nothing(clean):
     exact = calibrate(clean, **GIVEN)
     assert exact.enough()

@@ -33,6 +33,7 @@ def found(off, turned):
     return findings_of_turned(lines, lens, NAMES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turned", [[0, 2], [1, 3, 5, 7], [0]])
 def test_turned_photos_are_said(turned):
     """With a centre 54 px off the middle. At long focal lengths there is nothing to see, and no harm."""

@@ -61,6 +61,7 @@ def test_video(folder):
     assert max(bend(frame) for frame in luma(folder / "out.mp4")[0][::6]) <= 0.2
 
 
+@pytest.mark.slow
 def test_a_folder_of_results_stands_for_its_lens(folder, tmp_path):
     (tmp_path / "mylens").mkdir()
     lens().save(tmp_path / "mylens/lens.json")
@@ -78,6 +79,7 @@ def test_a_folder_of_results_stands_for_its_lens(folder, tmp_path):
     assert "has no lens.json: give that of zoomjax calibrate" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_dry_run_says_what_would_be_written(folder):
     photos = ("a.jpg", "b.jpg", "picture.gif")
     done = run(folder, *photos, "--focal", "table.csv", "-o", "planned", "--dry-run")
@@ -94,6 +96,7 @@ def test_a_dry_run_says_what_would_be_written(folder):
     assert not [*folder.glob("planned*")]
 
 
+@pytest.mark.slow
 def test_results_as_json_and_in_silence(folder):
     done = run(folder, "a.jpg", "b.jpg", "picture.gif", "-o", "json", "--json")
     assert done.returncode == 1
@@ -141,6 +144,7 @@ def test_focal_lengths_that_exif_data_contradict_are_told(folder, tmp_path):
     assert "b.jpg is of 40 mm, and the focal length used is 30 mm" in done.notes[0]
 
 
+@pytest.mark.slow
 def test_photos_with_a_table_or_one_focal_length(folder):
     for focal, out in (("focal.csv", "table"), ("30", "number")):
         done = run(folder, "a.jpg", "b.jpg", "--focal", focal, "-o", out)
@@ -264,6 +268,7 @@ def test_what_is_there_is_replaced_only_if_that_is_said(folder, tmp_path, name):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
+@pytest.mark.slow
 def test_one_file_that_is_there_is_found_before_any_work(folder, tmp_path):
     (tmp_path / "b.jpg").write_text("mine")
     done = run(folder, "a.jpg", "b.jpg", "c.jpg", "-o", tmp_path)
@@ -288,6 +293,7 @@ def test_names_that_some_systems_take_for_one_are_refused(folder, tmp_path, name
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keep", ["same", "valid"])
 def test_bad_photos_are_named_and_skipped(folder, tmp_path, keep):
     good = (folder / "a.jpg").read_bytes()
@@ -336,6 +342,7 @@ def test_a_signal_leaves_no_file(tmp_path, number):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["lens.json", "long.mkv"]
 
 
+@pytest.mark.slow
 def test_memory_stays_flat(folder):
     """The peak of 24 and of 240 frames: the same, and not 240 frames of 92 kB more."""
     probe = (

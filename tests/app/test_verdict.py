@@ -177,6 +177,7 @@ def test_selection_still_says_what_that_is_told_by(noisy):
         compare_errors([object()], ["it failed"], parts, "least")
 
 
+@pytest.mark.slow
 def test_the_photo_at_an_end_of_the_zoom_is_told_from_the_others(noisy):
     """By the lens of the others beyond their focal lengths, or by nothing."""
     done = calibrate(noisy, model=WantedModel("polynomial"), centre=None)

@@ -355,6 +355,7 @@ def test_strict_promotion_of_dtypes(image):
         jax.grad(lambda d: zj.warp_image(image, d).sum())(LENSES[0])
 
 
+@pytest.mark.slow
 def test_a_focal_length_out_of_range_gives_the_border_and_derivatives_of_zero(image):
     zoom = zj.PolynomialZoom(1, jnp.array([[-0.1], [0.05]]), jnp.array(20.0))
     lens = zj.ZoomLens(zoom, jnp.array([23.7, 14.6]), jnp.array([20.0, 80.0]), SIZE)

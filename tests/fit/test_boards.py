@@ -54,6 +54,7 @@ def test_flat_boards_are_worse_and_say_other_focal_lengths(lens, exact):
     assert abs(np.asarray(flat.focal) / [1000, 1600, 2600] - 1).max() > 2e-3
 
 
+@pytest.mark.slow
 def test_the_same_photos_are_located_as_they_were_fitted(exact):
     fit, grids, _ = exact
     poses = fit.locate(grids[:5], LABEL[:5])
@@ -116,6 +117,7 @@ def test_a_rigid_board_is_found_to_be_rigid(exact):
     assert np.sqrt(np.mean(np.square(fit.poses.bend))) < 0.01  # steps of the grid
 
 
+@pytest.mark.slow
 def test_outliers_and_missing_corners_do_little(exact):
     _, grids, _ = exact
     rng = np.random.default_rng(1)
@@ -162,6 +164,7 @@ def problem(grids, boards=2):
     return data, eqx.tree_at(lambda model: model.shape, model, shape), stage
 
 
+@pytest.mark.slow
 def test_steps_solve_the_least_squares_of_the_dense_jacobian(exact):
     problem_of_two = problem(exact[1])
     data, model, stage = problem_of_two
@@ -184,6 +187,7 @@ def test_steps_solve_the_least_squares_of_the_dense_jacobian(exact):
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * abs(expected).max())
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_finite_differences(exact):
     data, model, stage = problem(exact[1])
     zeros = jax.tree.map(jnp.zeros_like, units_of(data, model, jnp.asarray(stage.noise)))
@@ -230,6 +234,7 @@ def test_smooth_focal_lengths_are_drawn_to_a_parabola_alone(exact):
     assert not np.asarray(free.smooth).any()
 
 
+@pytest.mark.slow
 def test_standard_deviations_are_the_scatter_of_fits_to_noise(exact):
     """Within a factor: 8 draws tell a standard deviation to 25 %, and focal lengths are correlated."""
     _, grids, _ = exact

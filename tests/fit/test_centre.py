@@ -191,6 +191,7 @@ def test_a_fitted_centre_is_that_of_fit_centre(name, lines, found):
     assert own.joint is not None
 
 
+@pytest.mark.slow
 def test_frames_have_the_given_centre_or_each_its_own(lines, aside):
     given = zj.fit_frames(lines, centre=np.asarray(aside.centre))
     np.testing.assert_array_equal(given.centre, np.broadcast_to(aside.centre, given.centre.shape))

@@ -148,6 +148,7 @@ def test_rivals_become_invertible_too(model, terms, folding):
     assert free.rms < best.rms < (1.05 if terms == 2 else 5) * free.rms
 
 
+@pytest.mark.slow
 def test_models_without_pieces_are_left_as_they_are(folding):
     lines = zj.compress(folding, 1)
     fit = zj.fit_zoom(lines, zoom=SomeZoom(), terms=1)

@@ -114,6 +114,7 @@ def test_frames_of_one_focal_length_share_its_error(focal, shared, expected):
     assert found.tolist() == expected
 
 
+@pytest.mark.slow
 def test_frames_that_share_an_error_add_up(sweep):
     fit = zj.fit_zoom(sweep)
 
@@ -192,6 +193,7 @@ def test_the_joint_minimum_is_one(rounded, refined):
             assert energy(refined.focal.at[frame].add(moved * refined.std[frame])) > least
 
 
+@pytest.mark.slow
 def test_known_focal_lengths_stay(rounded):
     sigma = np.where(np.arange(10) % 3 == 0, 0.0, 0.3)
     found = zj.fit.fit_focal(rounded, sigma)
@@ -221,6 +223,7 @@ def test_without_noise_rounding_is_undone_but_for_scale_and_shift(truth):
     assert np.abs(left[:5]).max() < 0.02 * np.abs(given[:5]).max()
 
 
+@pytest.mark.slow
 def test_float32_bands_agree_and_refining_wants_float64(sweep):
     single = jax.tree.map(
         lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a, sweep
@@ -277,6 +280,7 @@ def test_a_frame_whose_lines_weigh_nothing_keeps_its_focal_length_and_sigma(swee
     assert zj.RESULTS[found.fit.result] == ""
 
 
+@pytest.mark.slow
 def test_a_focal_length_of_no_effect_is_not_determined(sweep):
     sigma = np.where(np.arange(10) == 3, np.inf, 0.3)
     found = zj.fit.fit_focal(sweep, sigma, zoom=zj.PolynomialZoom(degree=0))
@@ -284,6 +288,7 @@ def test_a_focal_length_of_no_effect_is_not_determined(sweep):
     assert np.isfinite(found.fit.covariance).all()  # the lens is the same for all
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [3, 4])
 def test_a_focal_length_that_goes_with_any_lens_is_not_determined(truth, number):
     """With a model through every frame each focal length that is not known makes lines as straight."""

@@ -35,6 +35,7 @@ def test_stretch_is_that_of_the_jacobian(ragged):
     assert np.ptp(expected) > 0.02
 
 
+@pytest.mark.slow
 def test_the_stretch_of_a_model_that_is_not_radial_too(ragged):
     distortion_model = zj.models.BrownConrady()
     expected = [stretch(ragged, DECENTRED, index, distortion_model) for index in range(len(ragged.frame))]

@@ -46,6 +46,7 @@ def assert_same(got, wanted):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_each_fit_is_that_of_its_data_set_alone(sets):
     fits = many(sets)
     assert isinstance(fits[0].covariance, jax.Array)

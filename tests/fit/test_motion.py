@@ -175,6 +175,7 @@ def test_fewer_frames_than_a_model_needs_are_told(noisy, models, frames, wanted,
         fit_motion(few, throw=throw, **models)
 
 
+@pytest.mark.slow
 def test_a_camera_that_does_not_turn_has_no_scale(lens, path):
     focal, rotation = path
     still = (focal, np.broadcast_to(rotation[0], rotation.shape))
@@ -197,6 +198,7 @@ def test_known_focal_lengths_give_the_scale(lens, path):
     assert (abs(off) < 4 * std).all()
 
 
+@pytest.mark.slow
 def test_the_scale_is_as_uncertain_as_the_best_f_where_all_are_known(lens, path):
     focal, rotation = path
     still = (focal, np.broadcast_to(rotation[0], rotation.shape))
@@ -231,6 +233,7 @@ def test_a_known_focal_length_that_contradicts_the_tracks_is_told(path, noisy):
         fit_motion(noisy.tracks, focal=focal, focal_std=0.01 * focal[5])
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*known focal lengths contradict")  # which some of them do, too
 @pytest.mark.parametrize("factor", [0.3, 0.5, 2.0, 10.0])
 def test_known_focal_lengths_of_another_scale_are_told(path, noisy, factor):
@@ -240,6 +243,7 @@ def test_known_focal_lengths_of_another_scale_are_told(path, noisy, factor):
         fit_motion(noisy.tracks, focal=focal, focal_std=0.01 * focal, throw=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.01, 4.0])
 def test_one_known_focal_length_of_another_scale_is_told(path, noisy, factor):
     focal = np.where(np.arange(FRAMES) == 0, factor * path[0], np.nan)
@@ -262,6 +266,7 @@ def test_a_frame_whose_tracks_are_all_wrong_is_as_one_without(path, noisy, fit, 
     assert found.fit.result == RESULTS.successful
 
 
+@pytest.mark.slow
 def test_frames_without_tracks_do_not_matter(noisy, fit):
     tracks, dark = noisy.tracks, [6, 10, 11, 17]
     track, view = np.nonzero(np.asarray(tracks.mask))
@@ -317,6 +322,7 @@ def with_lines(noisy, lines):
     return fit_motion(noisy.tracks, lines=lines)
 
 
+@pytest.mark.slow
 def test_lines_of_no_weight_are_as_if_they_were_not_there(lens, noisy, lines, with_lines):
     other = eqx.tree_at(lambda lens: lens.zoom.parameters, lens, -3 * lens.zoom.parameters)
     wrong = motion_lines(other, np.asarray(lines.focal), noise=0.2, seed=2)

@@ -38,6 +38,7 @@ def test_terms_are_those_asked_for(ragged, terms):
     np.testing.assert_array_equal(small.counts, ragged.counts)
 
 
+@pytest.mark.slow
 def test_what_more_terms_need_is_left_out_for_fewer(ragged, small):
     """And searches for the centre do so."""
     wide = zj.lines.compress_any_centre(ragged, 3)

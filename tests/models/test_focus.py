@@ -118,6 +118,7 @@ def test_points_and_triangles_give_one_answer(seen):
     np.testing.assert_allclose(full.lens.zoom.parameters, small.lens.zoom.parameters, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_models_of_the_focal_length_alone_ignore_the_focus(seen):
     without = eqx.tree_at(lambda lines: lines.focus, seen, None)
     with_it, plain = (zj.fit_zoom(zj.compress(lines)) for lines in (seen, without))
@@ -135,6 +136,7 @@ def test_robust_fits_and_frames_and_centres_keep_the_focus(seen):
     assert zj.fit.in_image(small).focus is small.focus
 
 
+@pytest.mark.slow
 def test_files_keep_the_focus(seen, tmp_path):
     seen.save(tmp_path / "lines.npz")
     np.testing.assert_array_equal(zj.load_lines(tmp_path / "lines.npz").focus, seen.focus)

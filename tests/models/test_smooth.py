@@ -198,6 +198,7 @@ def drawn(zoom, seed):
     return lens, scenes.board_lines(lens, focal, spacing=60.0)
 
 
+@pytest.mark.slow
 def test_a_lens_like_others_of_its_kind_is_predicted_better_if_its_kind_is_known():
     """Lenses as the database has them, of which both ends are photographed."""
     worse = []
@@ -214,6 +215,7 @@ def test_a_lens_like_others_of_its_kind_is_predicted_better_if_its_kind_is_known
     assert known < 0.9 * unknown
 
 
+@pytest.mark.slow
 def test_gradient_with_respect_to_the_mean(small):
     def corner(step):
         zoom = dataclasses.replace(NIKKOR, mean=NIKKOR.mean + step)

@@ -53,6 +53,7 @@ def test_rows_of_a_rolling_shutter_are_seen_one_after_the_other(lens):
         np.testing.assert_allclose(there, straight, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_points_of_a_map_are_the_same_track_when_they_come_back(lens):
     focal, rotation = pan_and_zoom(lens, 40, pan=60)
     once, kept = (motion_tracks(lens, focal, rotation, views=20, life=5, returns=r) for r in (False, True))

@@ -44,6 +44,7 @@ def carried(clip, off=0.0):
     return carry
 
 
+@pytest.mark.slow
 def test_points_are_found_again_where_the_camera_comes_back(clip, video, tracks):
     more = find_again(video, tracks, carry=carried(clip, 1.0), every=2)
     number, frame, points = more.views()
@@ -71,6 +72,7 @@ def test_every_says_in_which_frames(clip, video, tracks):
     assert all(moment % 5 == 0 for _, moment in new)
 
 
+@pytest.mark.slow
 def test_points_are_looked_for_in_no_copies(clip, tmp_path):
     """Every frame is there twice: the second says nothing that the first does not."""
     path = write_frames(tmp_path / "twice.mp4", np.repeat(list(clip.frames()), 2, axis=0))

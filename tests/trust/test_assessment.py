@@ -87,6 +87,7 @@ def test_halves_are_as_far_apart_as_fits_of_their_lines(lines):
     assert halves.apart == pytest.approx(max(apart), rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_bent_board_is_not_good(lens, lines):
     """A cylinder: the middle of the board is nearer to the camera, or farther, by 2 % of its distance."""
     found = assessed(through(lens, lines, lambda z: z / (1 - 0.03 * z[..., :1] ** 2)))

@@ -36,6 +36,7 @@ def test_bands_hold_the_truth_as_often_as_they_say(correlation, draws, slack):
     assert 95 - slack[1] < 100 * np.mean(ratio < 1.96) < 98 + slack[1]
 
 
+@pytest.mark.slow
 def test_a_photo_whose_lines_go_through_the_centre_tells_nothing_of_the_others():
     """Three photos decide all, and the fourth shows two lines there: noise makes all that it says."""
     from benchmarks.trust import SCENES, board

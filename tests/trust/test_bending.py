@@ -108,6 +108,7 @@ def test_a_centre_that_may_move_along_the_zoom_counts():
     assert moves == pytest.approx(still, rel=1e-3)  # at the shortest f, where u is 1
 
 
+@pytest.mark.slow
 def test_what_is_moved_is_no_homography():
     lens, lines = photo(-0.3, CENTRE, noise=0.01)
     found = evidence(lines, zj.fit_zoom(lines, zoom=ONE, distortion_model=Division(), terms=1))
@@ -146,6 +147,7 @@ def test_of_one_photo_a_homography_is_no_harm():
     assert found.verdict == "good"
 
 
+@pytest.mark.slow
 def test_frames_and_a_moving_centre_are_each_at_their_own_place():
     """A zoom whose centre moves: as uncertain as the same lines about the true centres."""
     lens = scenes.nikkor_18_200((1072, 712))

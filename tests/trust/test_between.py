@@ -47,6 +47,7 @@ def test_photos_of_one_zoom_are_at_one_place():
     np.testing.assert_array_equal(zoom_places(focal), [23.8, 69.0])
 
 
+@pytest.mark.slow
 def test_a_line_of_inverse_focal_length_is_not_good_between_two(lens):
     """The lens is far from it there, by about as much as is said."""
     lines = lines_at(lens, 21.0, 120.0)
@@ -72,6 +73,7 @@ def test_what_is_said_does_not_depend_on_the_unit_of_focal_lengths(lens):
     assert other[1] == pytest.approx(150 * own[1], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_bands_of_the_prior_are_told_in_its_place(lens):
     lines = lines_at(lens, 21.0, 120.0)
     found = said(lines, fitted(lines, zj.SmoothZoom()))

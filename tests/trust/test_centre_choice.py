@@ -47,6 +47,7 @@ def test_few_images_put_the_centre_near_the_middle_or_nowhere(away, frames, fitt
         assert f"a centre that is {choice.far:.0f} px away" in finding.found
 
 
+@pytest.mark.slow
 def test_a_far_centre_about_which_nothing_is_straighter_is_no_finding():
     held, choice = chosen(60, 1)
     not_straighter = dataclasses.replace(choice, fitted=2 * choice.given)

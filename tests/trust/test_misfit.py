@@ -92,6 +92,7 @@ def off_centre(truth):
     return eqx.tree_at(lambda lens: lens.centre, truth, truth.centre + np.array([60.0, -40.0]))
 
 
+@pytest.mark.slow
 def test_a_centre_that_is_elsewhere_is_in_the_bands(off_centre):
     lines = noisy(off_centre)
     middle = (np.array(lines.image_size) - 1) / 2
@@ -213,6 +214,7 @@ def test_known_errors_of_focal_lengths_are_no_misfit(truth, seed):
     assert np.mean(known) < 1.2 * np.mean(before)
 
 
+@pytest.mark.slow
 def test_beside_known_errors_a_misfit_is_found(truth):
     model = zj.PolynomialZoom(degree=1)
     fit, lines, sigma = with_wrong_focal_lengths(truth, 0.005, model=model)
@@ -220,6 +222,7 @@ def test_beside_known_errors_a_misfit_is_found(truth):
     assert float(jnp.trace(beside)) == pytest.approx(float(jnp.trace(alone)), rel=0.3)
 
 
+@pytest.mark.slow
 def test_errors_may_be_shared(truth):
     """Four photos at each focal length, wrong for all four: that is more than errors of single photos."""
     off = np.exp(0.01 * np.random.default_rng(2).standard_normal(len(FOCAL)))

@@ -115,6 +115,7 @@ def photographed(line, distortion, number):
     return np.asarray(distortion.distort(start + np.linspace(0, 1, number)[:, None] * (end - start)))
 
 
+@pytest.mark.slow
 def test_compressed_or_not_is_the_same(central):
     fit, small = fitted(central)
     np.testing.assert_allclose(

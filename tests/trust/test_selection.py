@@ -161,6 +161,7 @@ def test_lines_left_out_are_measured_by_the_fit_of_the_others(lines):
         np.testing.assert_allclose(found, expected, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_frames_by_themselves_are_the_fits_of_their_other_lines(lines):
     parts = folds_of(lines, "line", 5, 0)
     squares = np.zeros(len(lines.focal))
