@@ -7,7 +7,9 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.models.brown_conrady import BrownConrady
 from zoomjax.models.division import Division
+from zoomjax.models.polynomial import RadialPolynomial
 from zoomjax.trust._rival import apart_from_division
 from zoomjax.trust.assessment import assess
 from zoomjax.trust.evidence import evidence
@@ -128,6 +130,30 @@ def test_a_centre_that_lines_do_not_tell_counts():
     assert (
         evidence(lines, zj.fit_zoom(lines, zoom=ONE, distortion_model=Division(), terms=1)).bent_std < 0.2
     )
+
+
+@pytest.mark.parametrize("distortion_model", [RadialPolynomial(), BrownConrady()], ids=str)
+def test_a_centre_about_which_lines_are_straighter_counts(truth, distortion_model):
+    """What noise alone makes uncertain about a given centre was a tenth of the error."""
+    elsewhere = eqx.tree_at(lambda lens: lens.centre, truth, truth.centre + 200.0)
+    found = []
+    for lens in (truth, elsewhere):
+        lines = scenes.board_lines(lens, np.array([24.0]), spacing=99, noise=0.3)
+        fit = zj.fit_zoom(lines, zoom=ONE, distortion_model=distortion_model)
+        x, y = np.meshgrid(*(np.linspace(0, side - 1, 12) for side in lens.image_size))
+        points = np.stack([x, y], axis=-1).reshape(-1, 2)
+        first, second = (np.asarray(one(24.0).undistort(points)) for one in (fit.lens, lens))
+        mapped = cv2.perspectiveTransform(first[:, None], cv2.findHomography(first, second, 0)[0])[:, 0]
+        error = np.asarray(lens(24.0).distort(mapped)) - points
+        found.append((assess(lines, fit), np.sqrt(np.mean(np.sum(error**2, axis=-1)))))
+    (right, _), (found, error) = found
+    assert right.verdict == "good"
+    assert right.evidence.to_centre == 0
+    assert error > 3
+    assert 0.5 * error < found.evidence.bent_std < 1.2 * error
+    assert found.evidence.to_centre == pytest.approx(200 * np.sqrt(2), rel=0.6)
+    assert found.verdict != "good"
+    assert "centre of distortion" in found.sentence
 
 
 def test_a_strong_lens_that_is_uncertain_in_px_is_doubtful():

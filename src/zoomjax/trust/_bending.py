@@ -10,7 +10,7 @@ Two estimates are made, and the larger one counts. That of the bands: the covari
 that was added to it, as the model's misfit or the shape of a board. And one of lines that are independent,
 in which the centre of distortion is free in any case, within what is usual of cameras: where lines do not
 determine it, it was kept where it was assumed, and a lens about a wrong one is right along the lines and
-wrong beside them.
+wrong beside them. Where they do, and are straighter about another one, the Gauss-Newton step there counts.
 
 In NumPy, without a program to compile: 24 points of at most 2000 lines, once per fit.
 """
@@ -39,6 +39,7 @@ _STRONG = 0.01
 """Of the diagonal: the least that a strong lens bends. The series of models of weaker ones are alike."""
 
 _MOST_LINES, _POINTS = 2000, 24
+_SURE = 2.0  # standard deviations, by which a step exceeds what noise makes of it
 _SINGULAR = 1e-12  # eigenvalues, of the largest
 _TURNS = 3
 
@@ -50,10 +51,13 @@ class Bending:
     Attributes:
         moved: px of the image, RMS over it.
         std: its standard deviation, likewise.
+        to_centre: how far off the centre of distortion is, px, if it is that which makes `std` what it is;
+            else 0.
     """
 
     moved: float
     std: float
+    to_centre: float = 0.0
 
 
 def bending(lines: Lines, fit: ZoomFit, weight: np.ndarray, prior: np.ndarray) -> Bending:
@@ -82,22 +86,24 @@ def bending(lines: Lines, fit: ZoomFit, weight: np.ndarray, prior: np.ndarray) -
     chosen, z, error, slope, share = chosen[sound], z[sound], error[sound], slope[sound], share[sound]
     wanted = np.zeros((slope.shape[-1],) * 2)
     wanted[:-2, :-2] = prior / lens.scale**2
-    root = _root(error, slope, share, wanted)
+    root, step = _root(error, slope, share, wanted)
     there = np.unique(frame[chosen])
     there = there[np.argsort(np.asarray(lines.focal)[there], kind="stable")]
-    found = []
+    found, to_centre = [], float(np.linalg.norm(step[-2:])) * lens.scale
     for at in np.unique(there[[0, len(there) // 2, -1]]):
         moved, rows = _over_image(lens, centre[at], k[at], by_parameter[at])
-        std = np.sqrt(np.sum((rows @ root) ** 2) / len(rows)) if len(rows) else np.inf
-        covariance = _of_bands(fit, by_parameter[at], by_centre[at])
-        std = max(std, _spread(lens, centre[at], k[at], covariance))
-        found.append(Bending(moved * lens.scale, float(std) * lens.scale))
+        by_lines, off = (np.sqrt(np.sum((rows @ of) ** 2) / max(len(rows), 1)) for of in (root, step))
+        by_bands = _spread(lens, centre[at], k[at], _of_bands(fit, by_parameter[at], by_centre[at]))
+        std = max(by_lines, by_bands) if len(rows) else np.inf
+        elsewhere = off > max(_SURE * by_lines, std)
+        std = float(off if elsewhere else std) * lens.scale
+        found.append(Bending(moved * lens.scale, std, to_centre if elsewhere else 0.0))
     worst = max(found, key=lambda of: of.std)
     strong = worst.moved > _STRONG * 2 * lens.scale
     if len(there) > 1 or not strong or not isinstance(distortion_model, RadialPolynomial):
         return worst
     other = apart_from_division(z, k[there[0]], centre[there[0]], lens.image_size)
-    return Bending(worst.moved, float(np.hypot(worst.std, other)))
+    return dataclasses.replace(worst, std=float(np.hypot(worst.std, other)))
 
 
 @bucketed_jit(returns=[of_frames] * 4)
@@ -124,12 +130,16 @@ def _some(points: np.ndarray) -> np.ndarray:
     return points[np.linspace(0, len(points) - 1, _POINTS).round().astype(int)]
 
 
-def _root(error: np.ndarray, slope: np.ndarray, share: np.ndarray, prior: np.ndarray) -> np.ndarray:
+def _root(
+    error: np.ndarray, slope: np.ndarray, share: np.ndarray, prior: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """A root of the covariance of the parameters: lines err each by itself, and the centre is as usual.
 
     Of two estimates the mean: the sandwich of the lines' scores, which of few lines knows its shape badly,
     and that of independent points, of which as many count as one as the size of the sandwich says. How
     surely the centre is where it is assumed, beside what the lines say, follows from that number, too.
+
+    Also the Gauss-Newton step: next to none, but where the lines are straighter about another centre.
     """
     own = np.einsum("l,lsp,lsq->pq", share, slope, slope)
     lost = float(share @ np.einsum("ls,ls->l", error, error))
@@ -155,7 +165,8 @@ def _root(error: np.ndarray, slope: np.ndarray, share: np.ndarray, prior: np.nda
     values, vectors = np.linalg.eigh(together * alone)
     shape = vectors * np.sqrt(values.clip(0))
     assumed = back @ back.T[:, -2:] * (together * each * centre[-1])
-    return np.concatenate([back @ score.T / np.sqrt(2), back @ shape / np.sqrt(2), assumed], axis=1)
+    root = np.concatenate([back @ score.T / np.sqrt(2), back @ shape / np.sqrt(2), assumed], axis=1)
+    return root, -back @ (back.T @ np.einsum("l,lsp,ls->p", share, slope, error))
 
 
 def _of_bands(fit: ZoomFit, by_parameter: np.ndarray, by_centre: np.ndarray) -> np.ndarray:

@@ -219,12 +219,22 @@ def _of_bands(of: Evidence, fit: ZoomFit, places: int) -> Iterator[Finding]:
             )
         yield Finding("bands", verdict, found, more)
     elif _is_bent(of):
+        but = f"is uncertain by {_px(of.bent_std)} px in that."
+        if of.to_centre:
+            but = (
+                f"lines are straighter about a centre of distortion that is {_px(of.to_centre)} px away, "
+                f"which changes {_px(of.bent_std)} px of that."
+            )
+            more = (
+                "Have the centre fitted, with a radial or the division model: cropped images have it off "
+                "their middle. If it comes out nowhere near, the lines are bent."
+            )
         yield Finding(
             "bending",
             "doubtful" if of.bent_std <= _UNDETERMINED * of.bent else "not determined",
-            f"the correction straightens what is bent by {_px(of.bent)} px (RMS), but is uncertain by "
-            f"{_px(of.bent_std)} px in that.",
+            f"the correction straightens what is bent by {_px(of.bent)} px (RMS), but {but}",
             more,
+            cause=of.to_centre > 0,
         )
     if of.lines < _FEW_LINES * of.frames:
         yield Finding(

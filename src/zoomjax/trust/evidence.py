@@ -104,7 +104,9 @@ class Evidence:
             largest.
         bent: how far the correction moves points beyond a homography of the corrected image, px of the
             image, RMS over it, at the frame's focal length where `bent_std` is largest.
-        bent_std: the standard deviation of that.
+        bent_std: the standard deviation of that, or what the centre of distortion would change about which
+            lines are straighter, if that is more.
+        to_centre: how far away this centre is, px; 0 if there is none.
         halves: the agreement of halves of the lines, as far as halves determine a lens.
         diagonal: of the image.
         vanishing: whether lines that are parallel in the scene meet.
@@ -122,6 +124,7 @@ class Evidence:
     std: float
     bent: float
     bent_std: float
+    to_centre: float
     halves: tuple[Halves, ...]
     diagonal: float
     vanishing: VanishingPoints
@@ -193,6 +196,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
         std=float(np.max(_over_image(std))),
         bent=bent.moved,
         bent_std=bent.std,
+        to_centre=bent.to_centre,
         halves=tuple(_halves(compressed, fit, weight, rows, *pulled)),
         diagonal=2 * lens.scale,
         vanishing=vanishing_points(lines, lens),
