@@ -162,6 +162,16 @@ def test_the_commands_list_write_and_say_what_to_give(tmp_path):
     assert "--lens auto" in hint
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_a_lens_of_ones_own_is_no_lens_of_the_library(there, tmp_path):
+    """Said before the library is looked for, which may not be installed."""
+    if there:
+        (tmp_path / "lens.json").write_text("{}")
+    job = Job(None, (tmp_path / "photo.jpg",), tmp_path / "out")
+    with pytest.raises(ValueError, match="lens.json names a file or folder: give it first"):
+        undistort_by_library(job, str(tmp_path / "lens.json"))
+
+
 def test_without_lensfunpy_the_command_says_what_to_install():
     blocked = "import sys; sys.modules['lensfunpy'] = None; from zoomjax.app.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", blocked, "lens", "nikkor"], capture_output=True, text=True)

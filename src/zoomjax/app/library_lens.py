@@ -126,8 +126,13 @@ def undistort_by_library(
 
     Raises:
         ValueError: as `undistort_files`; or no lens fits a single photo, or several do; or the inputs are
-            videos.
+            videos; or the name is that of a file or folder.
     """
+    if name != AUTO and (name.lower().endswith(".json") or Path(name).exists()):
+        raise ValueError(
+            f"--lens is for a lens of the library, by its name, but {name} names a file or folder: give it "
+            "first, as in zoomjax undistort lens.json photo.jpg -o corrected."
+        )
     check_sampling(job.interpolation, job.border)
     check_keep(job.keep)
     found = photos_or_videos(job)
