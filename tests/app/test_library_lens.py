@@ -168,7 +168,7 @@ def test_a_lens_of_ones_own_is_no_lens_of_the_library(there, tmp_path):
     if there:
         (tmp_path / "lens.json").write_text("{}")
     job = Job(None, (tmp_path / "photo.jpg",), tmp_path / "out")
-    with pytest.raises(ValueError, match="lens.json names a file or folder: give it first"):
+    with pytest.raises(ValueError, match="names a file or folder: give it first"):
         undistort_by_library(job, str(tmp_path / "lens.json"))
 
 
