@@ -139,7 +139,8 @@ def _root(
     and that of independent points, of which as many count as one as the size of the sandwich says. How
     surely the centre is where it is assumed, beside what the lines say, follows from that number, too.
 
-    Also the Gauss-Newton step: next to none, but where the lines are straighter about another centre.
+    Also the Gauss-Newton step to a centre about which lines are straighter, less that of a given centre,
+    which is none but for what the fit measured or weighed in another way.
     """
     own = np.einsum("l,lsp,lsq->pq", share, slope, slope)
     lost = float(share @ np.einsum("ls,ls->l", error, error))
@@ -166,7 +167,10 @@ def _root(
     shape = vectors * np.sqrt(values.clip(0))
     assumed = back @ back.T[:, -2:] * (together * each * centre[-1])
     root = np.concatenate([back @ score.T / np.sqrt(2), back @ shape / np.sqrt(2), assumed], axis=1)
-    return root, -back @ (back.T @ np.einsum("l,lsp,ls->p", share, slope, error))
+    gradient = np.einsum("l,lsp,ls->p", share, slope, error)
+    step = -back @ (back.T @ gradient)
+    step[:-2] += np.linalg.lstsq((own + prior)[:-2, :-2], gradient[:-2], rcond=_SINGULAR)[0]
+    return root, step
 
 
 def _of_bands(fit: ZoomFit, by_parameter: np.ndarray, by_centre: np.ndarray) -> np.ndarray:
