@@ -65,15 +65,15 @@ def test_many_steps_are_compiled_without_emitters_by_a_process_that_runs_once(mo
 def test_settings_of_the_environment_come_first(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=2")
     programs._settings.cache_clear()
-    assert "xla_backend_optimization_level" not in dict(programs._settings(2))
+    assert "xla_backend_optimization_level" not in dict(programs._settings("small"))
 
 
 def test_settings_that_xla_does_not_know_are_left_away(monkeypatch):
-    kinds = tuple({"xla_no_such_setting": True, **kind} for kind in programs._KINDS)
+    kinds = {name: {"xla_no_such_setting": True, **kind} for name, kind in programs._KINDS.items()}
     monkeypatch.setattr(programs, "_KINDS", kinds)
     assert float(program(lambda x: x + 1)(jnp.ones(()))) == 2
     assert "xla_no_such_setting" in programs._UNKNOWN  # others are, too, in some versions
-    assert "xla_backend_optimization_level" in dict(programs._settings(1))
+    assert "xla_backend_optimization_level" in dict(programs._settings("plain"))
 
 
 def test_other_errors_are_raised():

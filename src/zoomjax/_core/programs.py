@@ -131,18 +131,23 @@ def light_program(function: Callable[_Given, _Result]) -> Callable[_Given, _Resu
 _UNKNOWN: set[str] = set()  # settings that this version of XLA does not have
 
 
-def _kind(optimised: bool, in_steps: bool, small: bool) -> int:
+def _kind(optimised: bool, in_steps: bool, small: bool) -> str:
     """Which of `_KINDS` a program is of."""
     if optimised:
-        return 3 if in_steps and _USE.once else 0
-    return 2 if small else 1
+        return "in steps" if in_steps and _USE.once else "optimised"
+    return "small" if small else "plain"
 
 
-_KINDS: tuple[dict[str, Any], ...] = ({}, _PLAINLY, _UNOPTIMISED, _WITHOUT_EMITTERS)
+_KINDS: dict[str, dict[str, Any]] = {
+    "optimised": {},
+    "plain": _PLAINLY,
+    "small": _UNOPTIMISED,
+    "in steps": _WITHOUT_EMITTERS,
+}
 
 
 @functools.cache
-def _settings(kind: int) -> tuple[tuple[str, Any], ...]:
+def _settings(kind: str) -> tuple[tuple[str, Any], ...]:
     """The compiler's settings that are not given by the environment; none but on a processor."""
     if jax.default_backend() != "cpu":
         return ()
@@ -152,7 +157,7 @@ def _settings(kind: int) -> tuple[tuple[str, Any], ...]:
 
 def all_settings() -> tuple[tuple[tuple[str, Any], ...], ...]:
     """The settings of all kinds of programs of this process."""
-    return tuple(map(_settings, range(len(_KINDS))))
+    return tuple(map(_settings, _KINDS))
 
 
 @functools.cache

@@ -93,7 +93,7 @@ def bending(lines: Lines, fit: ZoomFit, weight: np.ndarray, prior: np.ndarray) -
     for at in np.unique(there[[0, len(there) // 2, -1]]):
         moved, rows = _over_image(lens, centre[at], k[at], by_parameter[at])
         by_lines, off = (np.sqrt(np.sum((rows @ of) ** 2) / max(len(rows), 1)) for of in (root, step))
-        by_bands = _spread(lens, centre[at], k[at], _of_bands(fit, by_parameter[at], by_centre[at]))
+        by_bands = _std_beyond(lens, centre[at], k[at], _of_bands(fit, by_parameter[at], by_centre[at]))
         std = max(by_lines, by_bands) if len(rows) else np.inf
         elsewhere = off > max(_SURE * by_lines, std)
         std = float(off if elsewhere else std) * lens.scale
@@ -198,7 +198,7 @@ def _of_bands(fit: ZoomFit, by_parameter: np.ndarray, by_centre: np.ndarray) -> 
     return total
 
 
-def _spread(lens: ZoomLens, centre: np.ndarray, k: np.ndarray, covariance: np.ndarray) -> float:
+def _std_beyond(lens: ZoomLens, centre: np.ndarray, k: np.ndarray, covariance: np.ndarray) -> float:
     """The standard deviation beyond a homography, half diagonals of the image, RMS over it."""
     numbers = len(covariance) - 2
     _, rows = _over_image(lens, centre, np.pad(k, (0, numbers - len(k))), np.eye(numbers))
