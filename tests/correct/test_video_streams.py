@@ -83,6 +83,55 @@ def test_what_a_container_does_not_hold_is_said(tmp_path):
     assert done.not_kept == ("subtitles (srt, eng)", "the attachment font.ttf", "chapters (2)")
 
 
+APPLE = {f"com.apple.quicktime.{name}": name for name in ("make", "model", "location.ISO6709")}
+
+
+@pytest.mark.parametrize(
+    ("tags", "suffix", "lost"),
+    [
+        (APPLE | {"title": "Match"}, ".mov", ()),
+        (APPLE, ".mp4", ()),
+        (APPLE, ".mkv", ()),
+        ({"title": "Match", "camera": "7"}, ".mp4", ("the tag camera",)),
+        ({"title": "Match", "artist": "A"}, ".ts", ("the tags title, artist",)),
+    ],
+)
+def test_tags_that_a_container_does_not_hold_are_said(tmp_path, tags, suffix, lost):
+    source = clip(tmp_path / "plain.mp4")
+    made = av.open(str(tmp_path / "in.mov"), "w", container_options={"movflags": "use_metadata_tags"})
+    with av.open(str(source)) as plain, made as out:
+        out.metadata.update(tags)
+        stream = out.add_stream_from_template(plain.streams.video[0])
+        for packet in plain.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                out.mux(packet)
+    done = undistort_video(tmp_path / "in.mov", tmp_path / f"out{suffix}", lens=lens(), focal=20.0)
+    assert done.not_kept == lost
+    with av.open(str(tmp_path / f"out{suffix}")) as out:
+        there = {name.lower(): value for name, value in out.metadata.items()}
+    missing = [name for name in tags if there.get(name.lower()) != tags[name]]
+    assert len(missing) == sum(name.count(",") + 1 for name in lost)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "told"), [(".mp4", True), (".mkv", True), (".avi", False), (".ts", False)]
+)
+def test_an_orientation_that_a_container_does_not_tell_is_said(tmp_path, suffix, told):
+    source, quarter = clip(tmp_path / "plain.mp4"), [0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30]
+    with av.open(str(source)) as plain, av.open(str(tmp_path / "in.mp4"), "w") as out:
+        stream = out.add_stream_from_template(plain.streams.video[0])
+        stream.set_display_matrix(quarter)
+        for packet in plain.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                out.mux(packet)
+    done = undistort_video(tmp_path / "in.mp4", tmp_path / f"out{suffix}", lens=lens(), focal=20.0)
+    assert done.not_kept == (() if told else ("the orientation: players show it as it is stored",))
+    with av.open(str(tmp_path / f"out{suffix}")) as out:
+        assert (next(out.decode(video=0)).rotation != 0) == told
+
+
 def test_data_of_transport_streams_go_over(tmp_path):
     with av.open(str(tmp_path / "in.ts"), "w", format="mpegts") as out:
         video, data = out.add_stream("libx264", rate=25), out.add_data_stream("klv")
@@ -254,7 +303,8 @@ def test_mxf_is_written(tmp_path, encoder, expected):
     with av.open(str(tmp_path / "out.mxf")) as out:
         assert out.format.name == "mxf"
         assert out.streams.video[0].codec_context.name == expected
-    before, after = (luma(tmp_path / name)[0] for name in ("in.mov", "out.mxf"))
+    (before, times), (after, those) = (luma(tmp_path / name) for name in ("in.mov", "out.mxf"))
+    np.testing.assert_allclose(those, times, atol=1e-6)
     assert np.median(abs(after[0].astype(int) - zj.undistort_image(before[0], lens()(20.0)))) <= 2
 
 

@@ -82,6 +82,11 @@ def test_frames_without_times_have_no_place_in_seconds(hold):
     assert zj.io.FocalTrack(*samples, by_time=False, hold=hold).at(2, np.nan) == 40
 
 
+def test_one_focal_length_that_is_held_needs_no_times():
+    """As of a video without time stamps, corrected at one number."""
+    assert zj.io.FocalTrack(np.zeros(1), np.array([25.0]), hold=True).at(7, np.nan) == 25
+
+
 @pytest.mark.parametrize(
     ("by_time", "position", "focal", "warns"),
     [

@@ -16,7 +16,7 @@ from zoomjax.io.avif import decode_avif
 from zoomjax.io.exif import exif_with_orientation
 from zoomjax.io.headers import announced_size
 from zoomjax.io.heic import _properties, heic_metadata
-from zoomjax.io.photo import read_focal, read_photo
+from zoomjax.io.photo import read_focal, read_pages, read_photo, read_size
 
 pillow_heif = pytest.importorskip("pillow_heif")
 
@@ -132,6 +132,22 @@ def test_more_than_eight_bits_are_kept(tmp_path):
 def test_the_size_is_known_before_pixels_are_decoded(tmp_path):
     content = write(tmp_path / "a.heic", gradient()).read_bytes()
     assert announced_size(content) == ("HEIC", *SIZE)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_the_size_is_that_of_the_pixels_as_stored(tmp_path, orientation):
+    """And not as they are shown: lenses are matched with it, and centres are checked."""
+    path = write(tmp_path / "a.heic", gradient(), orientation)
+    assert read_size(path) == SIZE == read_photo(path)[0].shape[1::-1]
+
+
+def test_further_pictures_are_named(tmp_path):
+    file = pillow_heif.from_bytes("BGR", SIZE, gradient().tobytes())
+    file.save(tmp_path / "one.heic", quality=-1)
+    file.add_frombytes("BGR", SIZE, (255 - gradient()).tobytes())
+    file.save(tmp_path / "two.heic", quality=-1, save_all=True)
+    assert read_pages(tmp_path / "one.heic").others == ()
+    assert read_pages(tmp_path / "two.heic").others == ("further pictures",)
 
 
 def test_corrected_with_its_metadata(tmp_path):

@@ -111,6 +111,20 @@ def test_what_pillow_writes_is_read(tmp_path, image):
         assert opened.text["Title"] == "Edges"
 
 
+def test_the_film_of_a_motion_photo_is_named_and_no_longer_announced(tmp_path, image):
+    """Phones append it to the picture, and say so in the XMP."""
+    told = b'<x GCamera:MicroVideo="1" GCamera:MotionPhoto="1" GCamera:MotionPhotoVersion="1"/>'
+    Image.fromarray(image).save(tmp_path / "a.jpg", xmp=told)
+    still = (tmp_path / "a.jpg").read_bytes()
+    (tmp_path / "b.jpg").write_bytes(still + b"\0\0\0\x18ftypmp42" + bytes(range(256)))
+    (tmp_path / "c.jpg").write_bytes(still + bytes(64))
+    for name, others in (("a.jpg", ()), ("b.jpg", ("the film of a motion photo",)), ("c.jpg", ())):
+        assert read_pages(tmp_path / name).others == others
+        assert (read_metadata(tmp_path / name).xmp == told) == (not others)
+    silent = read_metadata(tmp_path / "b.jpg").xmp
+    assert silent == b'<x GCamera:MicroVideo="0" GCamera:MotionPhoto="0" GCamera:MotionPhotoVersion="1"/>'
+
+
 def test_further_pictures_are_named(tmp_path, image):
     pictures = [Image.fromarray(image), Image.fromarray(255 - image)]
     for name, form in (("a.jpg", "MPO"), ("a.png", "PNG"), ("a.webp", "WEBP")):

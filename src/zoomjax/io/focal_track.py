@@ -61,10 +61,11 @@ class FocalTrack:
 
         Raises:
             ValueError: the frame is outside of the track and `hold` is False; or the frame has no time
-            (NaN)
-                and the track is in seconds.
+                (NaN) and the track is in seconds, and not of one focal length that is held.
         """
         position = time if self.by_time else float(frame)
+        if self.hold and len(self.position) == 1:
+            position = float(self.position[0])
         if not np.isfinite(position):
             raise ValueError(
                 "The frames of the video have no times, and the focal track is in seconds. Give a track of "

@@ -22,12 +22,22 @@ HEIC_SUFFIXES = (".heic", ".heif")
 
 
 def heic_size(content: bytes) -> tuple[int, int]:
-    """Width and height. No pixel is decoded.
+    """Width and height of the pixels as stored, as `decode_heic` gives them. None is decoded.
 
     Raises:
         ValueError: pillow-heif is not installed, or cannot read it.
     """
-    return _opened(content).size
+    width, height = _opened(content).size
+    return (height, width) if _orientation(heic_metadata(content)) in _ON_THE_SIDE else (width, height)
+
+
+def heic_pictures(content: bytes) -> int:
+    """How many pictures a file holds, of which the main one is decoded.
+
+    Raises:
+        ValueError: as `heic_size`.
+    """
+    return len(_opened(content))
 
 
 def heic_metadata(content: bytes) -> Metadata:
@@ -105,6 +115,9 @@ def shows_a_part(content: bytes, size: tuple[int, int] | None = None) -> bool:
                 return True
     return False
 
+
+_ON_THE_SIDE = range(5, 9)
+"""Orientations of pictures that are shown with width and height exchanged."""
 
 _SIZE, _PART = (b"ispe", 12), (b"clap", 32)
 """Properties of a picture: its size; the part to be shown."""

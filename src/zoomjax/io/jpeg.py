@@ -1,5 +1,6 @@
 """Metadata of JPEG files: the segments before the picture, read and written as they are."""
 
+import re
 import struct
 from collections.abc import Iterable, Iterator
 
@@ -9,10 +10,14 @@ from .metadata import Metadata
 _EXIF, _XMP, _ICC = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0", b"ICC_PROFILE\0"
 _PHOTOSHOP, _MORE_XMP = b"Photoshop 3.0\0", b"http://ns.adobe.com/xmp/extension/\0"
 _JFIF, _PICTURES = b"JFIF\0", b"MPF\0"
-_APP0, _APP1, _APP2, _APP13, _APP14, _COMMENT, _SCAN = 0xE0, 0xE1, 0xE2, 0xED, 0xEE, 0xFE, 0xDA
+_APP0, _APP1, _APP2, _APP13, _APP14, _COMMENT, _SCAN, _EOI = 0xE0, 0xE1, 0xE2, 0xED, 0xEE, 0xFE, 0xDA, 0xD9
 
 MOST = 65533
 """Bytes of a segment's content."""
+
+_FILM = b"ftyp"
+_ANNOUNCED = re.compile(rb"""((?:MotionPhoto|MicroVideo)=["'])1(?=["'])""")
+"""How XMP says that a film follows the picture, as phones append it."""
 
 _PART = MOST - len(_ICC) - 2  # of a colour profile
 _INCHES = {1: 1.0, 2: 2.54}
@@ -43,7 +48,15 @@ def jpeg_metadata(content: bytes) -> tuple[Metadata, list[str]]:
         elif mark in range(0xE0, 0xF0) and mark not in (_APP0, _APP14):
             others.append(f"the segment APP{mark - 0xE0}")
     found["icc"] = b"".join(profile[number] for number in sorted(profile))
+    if _FILM in content[_end(content) :]:
+        others.append("the film of a motion photo")
+        found["xmp"] = _ANNOUNCED.sub(rb"\g<1>0", found.get("xmp", b""))
     return Metadata(**found, dpi=dpi, shape=shape, chunks=tuple(chunks)), list(dict.fromkeys(others))
+
+
+def _end(content: bytes) -> int:
+    """Where the picture ends."""
+    return next((start for mark, start in jpeg_segments(content) if mark == _EOI), len(content))
 
 
 def is_cmyk(content: bytes) -> bool:

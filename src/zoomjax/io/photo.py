@@ -18,7 +18,7 @@ import numpy as np
 from .avif import avif_metadata, decode_avif
 from .exif import exif_focal, find_exif
 from .headers import announced_format, announced_size, jpeg_segments
-from .heic import HEIC_SUFFIXES, decode_heic, heic_metadata
+from .heic import HEIC_SUFFIXES, decode_heic, heic_metadata, heic_pictures
 from .jpeg import is_cmyk, jpeg_metadata
 from .metadata import Metadata
 from .photo_writer import FORMATS, MAKER_NOTES
@@ -208,7 +208,7 @@ def _tiff(content: bytes, most_pages: int) -> Photo:
 
 
 def _heic(content: bytes, most_pages: int) -> Photo:
-    return Photo((decode_heic(content),))
+    return Photo((decode_heic(content),), ("further pictures",) if heic_pictures(content) > 1 else ())
 
 
 def _avif(content: bytes, most_pages: int) -> Photo:

@@ -5,11 +5,12 @@ Sound, subtitles and data go over packet by packet; chapters, attachments and ti
 
 import dataclasses
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .pyav import av
+from .._core.text import plain
+from .pyav import av, open_container
 
 CONTAINER = {
     ".mp4": "mp4",
@@ -28,6 +29,11 @@ _DATA = {"mpegts": ("klv", "timed_id3", "scte_35"), "mov": ("klv",)}
 
 _TRANSPORT = ("dvbsub", "dvb_subtitle", "dvb_teletext", "libzvbi_teletextdec")
 """Subtitles of transport streams, of which FFmpeg takes any, and makes data of the others."""
+
+_APPLES = "com.apple.quicktime."
+"""How keys begin by which phones tell place and camera."""
+
+_ANEW = "give the sound another format first: ffmpeg -i SOURCE -c:v copy -c:a aac NEW.mkv."
 
 _CHAPTERS = ("mp4", "mov", "matroska", "webm")
 _TIME_CODES = ("mp4", "mov", "mxf")
@@ -137,12 +143,41 @@ def _copied(output: Any, source: Any, named: Path) -> Any:
     except ValueError as error:
         raise ValueError(
             f"Cannot keep the {_name(source)} in a {named.suffix} file. Choose the suffix of the source, "
-            "or .mkv."
+            f".mkv, or {_ANEW}"
         ) from error
     stream.metadata.update(source.metadata)
     if source.type != "data":
         stream.disposition = source.disposition
     return stream
+
+
+def mux(output: Any, named: Path, packets: Any) -> None:
+    """Write packets to a container.
+
+    Raises:
+        ValueError: it does not take them, such as sound whose packets it wants in another order.
+    """
+    try:
+        output.mux(packets)
+    except av.error.FFmpegError as error:
+        raise ValueError(
+            f"A {named.suffix} file does not take these pictures or this sound ({error.strerror}). Choose "
+            f".mkv, or {_ANEW}"
+        ) from error
+
+
+def tag_options(container: str, tags: Mapping[str, str]) -> dict[str, str]:
+    """Options of a container with which it holds such tags; by default MP4 has those of music players."""
+    apples = container in ("mp4", "mov") and any(name.startswith(_APPLES) for name in tags)
+    return {"movflags": "use_metadata_tags"} if apples else {}
+
+
+def lost_tags(path: Path, tags: Mapping[str, str]) -> list[str]:
+    """The names of tags that a finished file does not have, as one entry."""
+    with open_container(path) as made:
+        there = {name.lower() for name in made.metadata}
+    lost = [name for name in tags if name.lower() not in there]
+    return [f"the tag{'s' * (len(lost) > 1)} {', '.join(map(plain, lost))}"] if lost else []
 
 
 def starts(output: Any, named: Path, copied: Sequence[Any]) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import re
 import threading
 from collections.abc import Generator, Mapping
@@ -13,7 +14,7 @@ import numpy as np
 
 from .pyav import av, open_container
 from .video_hdr import with_hdr
-from .video_streams import CONTAINER, Carried, put, starts
+from .video_streams import CONTAINER, Carried, lost_tags, mux, put, starts, tag_options
 
 _ENCODER = {
     "h264": "libx264",
@@ -132,11 +133,15 @@ class FrameWriter(contextlib.AbstractContextManager):
         self._last: int | None = None
         self._moved = 0
         self._encodes = self._limits = False
-        self._output = open_container(path, "w", format=CONTAINER[named.suffix.lower()])
+        self._path, self._like = path, like
+        self._tags = {key: value for key, value in input_.metadata.items() if key.lower() not in _OWN_TAGS}
+        container = CONTAINER[named.suffix.lower()]
+        self._output = open_container(
+            path, "w", format=container, container_options=tag_options(container, self._tags)
+        )
+        self._mux = functools.partial(mux, self._output, named)
         try:
-            self._output.metadata.update(
-                {key: value for key, value in input_.metadata.items() if key not in _OWN_TAGS}
-            )
+            self._output.metadata.update(self._tags)
             name = encoder or self._encoder(video.codec_context.codec.canonical_name, named)
             self._stream = self._pictures(name, video, first, like, options, free=encoder is None)
             self._stream.set_display_matrix(like.orientation)
@@ -153,7 +158,7 @@ class FrameWriter(contextlib.AbstractContextManager):
 
     def encode(self, frame: Any) -> None:
         """Write a frame, at its own time, or just after one that has the same time."""
-        self._output.mux(self.encoded(frame))
+        self._mux(self.encoded(frame))
 
     def encoded(self, frame: Any) -> list[Any]:
         """Packets that are ready once the encoder has a frame as well, or None at the end; not written."""
@@ -188,12 +193,12 @@ class FrameWriter(contextlib.AbstractContextManager):
             packet.dts = self._last + 1  # before a cut an encoder looks less far back than after it
         self._last = packet.dts
         packet.is_keyframe, packet.stream = picture.key, self._stream
-        self._output.mux(packet)
+        self._mux(packet)
 
     def copy(self, packet: Any) -> None:
         """Write a packet of another of the source's streams as it is."""
         packet.stream = self._copies[packet.stream.index]
-        self._output.mux(packet)
+        self._mux(packet)
 
     def drop(self) -> None:
         """Let go of the file, which nobody reads."""
@@ -206,10 +211,14 @@ class FrameWriter(contextlib.AbstractContextManager):
             self.not_kept.append(f"times of {self._moved} frames, which others had before them")
         try:
             if kind is None and self._encodes:
-                self._output.mux(self.encoded(None))
+                self._mux(self.encoded(None))
         finally:
             with contextlib.nullcontext() if kind is None else contextlib.suppress(Exception):
                 self._output.close()
+        if kind is None:
+            self.not_kept += lost_tags(self._path, self._tags)
+            if self._like.orientation is not None and _is_upright(self._path):
+                self.not_kept.append("the orientation: players show it as it is stored")
 
     def _encoder(self, source: str, named: Path) -> str:
         """The first of the source's own encoder, H.264 and VP9 that the container takes."""
@@ -237,8 +246,8 @@ class FrameWriter(contextlib.AbstractContextManager):
         rate = source.average_rate or source.guessed_rate or 25
         given = source.codec_context
         chosen = _options(name, given) if options is None else options
-        if options is None and self._output.format.name == "avi" and name in _REORDER:
-            chosen["bf"] = "0"  # AVI tells times in the order of packets
+        if options is None and self._output.format.name in ("avi", "mxf") and name in _REORDER:
+            chosen["bf"] = "0"  # they tell times in the order of packets
         chosen, kept, lost = with_hdr(name, chosen, like.side)
         self.kept += kept
         self.not_kept += lost
@@ -356,6 +365,13 @@ def display_matrix(frame: Any) -> list[int] | None:
     """How players turn and mirror this frame: FFmpeg's nine fixed-point numbers; None if they do not."""
     matrix = frame.side_data.get(av.sidedata.sidedata.Type.DISPLAYMATRIX)
     return None if matrix is None else np.frombuffer(matrix, "<i4").tolist()
+
+
+def _is_upright(path: Path) -> bool:
+    """Whether a finished file has no orientation, where its source has."""
+    with open_container(path) as made:
+        frame = next(made.decode(video=0), None)
+        return frame is not None and display_matrix(frame) is None
 
 
 def _encodable(context: Any, name: str) -> str:
