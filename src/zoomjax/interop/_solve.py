@@ -29,7 +29,7 @@ _FEW = 5
 _NUMBERS = (2, 3, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97, 129)
 """Of focal lengths that are tried."""
 
-_BETWEEN = (0.2, 0.5, 0.8)
+_BETWEEN = (0.12, 0.31, 0.5, 0.69, 0.88)
 """Where errors are looked at, between two focal lengths."""
 
 _IDLE, _GAIN, _ENOUGH = 2, 0.95, 17
