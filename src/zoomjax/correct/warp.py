@@ -80,7 +80,7 @@ def warp_image(
             f"Argument image must be an array, but it is a {type(image).__name__}: jnp.asarray(image)."
         )
     if isinstance(image, np.ndarray):
-        image = np.asarray(image, image.dtype.newbyteorder("="))  # JAX takes no others
+        image = jnp.asarray(np.asarray(image, image.dtype.newbyteorder("=")))  # JAX takes no others
     if image.ndim < 2 or 0 in image.shape:
         raise ValueError(
             f"Argument image must have shape (height, width, ...) with pixels, but it is {image.shape}."
