@@ -10,8 +10,10 @@ import subprocess
 
 import pytest
 
+import zoomjax as zj
 from zoomjax import scenes
 
+from ._clips import lens, write_clip
 from ._commands import COMMAND
 
 posix = pytest.mark.skipif(os.name != "posix", reason="needs POSIX")
@@ -178,6 +180,18 @@ def test_a_full_disk_is_told(folder, mounted):
     assert "No space left on device" in told
     assert contents(folder) == before
     assert not (disk / "out").exists()
+
+
+@posix
+@pytest.mark.parametrize("suffix", [".mkv", ".mp4"])
+def test_a_video_on_a_full_disk_is_told(suffix, tmp_path, mounted):
+    """And not as one that the container does not take."""
+    source = write_clip(tmp_path / "in.mkv", encoder="ffv1", sound=False)
+    disk = mounted(tmp_path / "disk", "size=64k")
+    (disk / "mine").write_bytes(bytes(60_000))
+    with pytest.raises(OSError, match="No space left on device"):
+        zj.undistort_video(source, disk / f"out{suffix}", lens=lens(), focal=20.0)
+    assert [path.name for path in disk.iterdir()] == ["mine"]
 
 
 @pytest.mark.slow

@@ -156,10 +156,11 @@ def mux(output: Any, named: Path, packets: Any) -> None:
 
     Raises:
         ValueError: it does not take them, such as sound whose packets it wants in another order.
+        OSError: they cannot be written.
     """
     try:
         output.mux(packets)
-    except av.error.FFmpegError as error:
+    except av.error.ArgumentError as error:  # and no full disk
         raise ValueError(
             f"A {named.suffix} file does not take these pictures or this sound ({error.strerror}). Choose "
             f".mkv, or {_ANEW}"
