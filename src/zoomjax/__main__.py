@@ -6,9 +6,12 @@ Processes that detect lines import this module anew, as Python does on all syste
 
 def main() -> None:
     """Run the command line."""
-    from .app.cli import main as run
+    from .app.ending import ending_at_once
 
-    run()
+    with ending_at_once():
+        from .app.cli import main as run
+
+        run()
 
 
 if __name__ == "__main__":

@@ -18,6 +18,18 @@ def test_a_line_is_drawn_where_it_is_in_a_colour():
     assert image.min() == 200
 
 
+@pytest.mark.parametrize("points", [2, 3, 5000])
+def test_a_bent_line_is_drawn_along_all_its_points(points):
+    image = np.zeros((600, 800, 3), np.uint8)
+    along = np.linspace(0, 1, points)
+    bent = np.stack([30 + 700 * along, 100 + 300 * along**2], axis=1)
+    y, x = np.nonzero(draw_lines(image, [bent], [False]).any(axis=2))
+    if points > 3:
+        assert abs(y - 100 - 300 * ((x - 30) / 700) ** 2).max() < 2.5
+    assert abs(x.min() - 30) <= 2
+    assert abs(x.max() - 730) <= 2
+
+
 def test_rejected_lines_are_dashed_and_red():
     picture = draw_lines(np.zeros((100, 100, 3), np.uint8), [LINE], [True]).astype(int)
     red = (picture[..., 2] > 150) & (picture[..., 0] < 100)

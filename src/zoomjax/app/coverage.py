@@ -11,7 +11,7 @@ from .outward import distortions_at
 
 _CELLS, _RINGS = 16, 12
 _LEAST_STRETCH = 0.01  # beyond a fold, where it may vanish, residuals tell nothing
-_MOST_POINTS = 200_000  # are enough to average over
+_MOST_POINTS = 50_000  # are enough to average over in the rings
 
 
 def plot_coverage(lines: Lines, weight: np.ndarray) -> Figure:

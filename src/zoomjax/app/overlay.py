@@ -17,6 +17,9 @@ _SCALE = np.array([(255, 200, 0), (80, 230, 120), (0, 220, 255), (0, 120, 255)],
 
 _REJECTED = (40, 40, 255)
 
+_APART = 16.0
+"""px between points of the picture that are drawn: lines bend little, and each piece takes its time."""
+
 _WHITE, _BLACK = (255, 255, 255), (0, 0, 0)
 
 
@@ -72,8 +75,17 @@ def colour(share: float) -> tuple[int, int, int]:
 
 def _draw(picture: np.ndarray, line: np.ndarray, colour: tuple[int, int, int], width: int) -> None:
     bits = 4
-    points = np.rint(np.clip(line, -1e4, 1e4) * 2**bits).astype(np.int32)
+    points = np.rint(np.clip(_thinned(line), -1e4, 1e4) * 2**bits).astype(np.int32)
     cv2.polylines(picture, [points], False, colour, width, cv2.LINE_AA, bits)
+
+
+def _thinned(line: np.ndarray) -> np.ndarray:
+    """Its ends, and of the points between them some that are apart."""
+    if len(line) < 3:
+        return line
+    steps = np.hypot(*np.diff(line, axis=0).T)
+    kept = np.diff(np.cumsum(steps) // _APART, prepend=0.0) > 0
+    return line[np.concatenate([[True], kept[:-1], [True]])]
 
 
 def _write(picture: np.ndarray, text: str, line: np.ndarray, share: float) -> None:
