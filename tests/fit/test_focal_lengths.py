@@ -12,6 +12,8 @@ from zoomjax.fit import focal_fit
 from zoomjax.fit.covariance import parameter_covariance
 from zoomjax.fit.energy import linearised
 from zoomjax.fit.focal_lengths import _response, of_equal_focal
+from zoomjax.lines import compress_any_centre
+from zoomjax.models.zoom import with_parameters
 
 ROUNDED = 1 / np.sqrt(12)
 
@@ -363,12 +365,28 @@ def test_sigma_that_is_none_raises(rounded, sigma, message, unchecked):
         zj.fit.fit_focal(rounded, sigma)
 
 
-def test_a_centre_that_moves_raises(sweep):
-    fit = zj.fit_zoom(sweep)
-    lens = zj.ZoomLens(**vars(fit.lens) | {"shift": fit.lens.zoom})
-    moving = eqx.tree_at(lambda fit: fit.lens, fit, lens)
-    with pytest.raises(ValueError, match="a centre that moves along the zoom"):
-        zj.fit.with_focal_sigma(moving, sweep, focal_sigma=0.1)
+@pytest.mark.slow
+@pytest.mark.parametrize("moves", [0.0, 40.0])
+def test_errors_of_f_are_those_of_a_lens_whose_centre_moves(moves):
+    """Fits to focal lengths that are wrong scatter as is said, wherever the centre goes."""
+    focal, size = scenes.focal_sweep(6), (1072, 712)
+    lens = scenes.nikkor_18_200(size)
+    way = np.array([[0.02, -0.01], [moves / float(lens.scale), 0.0]])
+    shift = with_parameters(zj.PolynomialZoom(degree=1).prepare(focal, 2), way)
+    lens = zj.ZoomLens(**vars(lens) | {"shift": shift})
+    held = compress_any_centre(scenes.board_lines(lens, focal, spacing=12, noise=0.001).about(lens.centre))
+    along, sigma = zj.PolynomialZoom(degree=1), 0.02 * focal
+    exact = zj.fit.fit_centre(held, centre=along).fit
+    wide = zj.fit.with_focal_sigma(exact, held, focal_sigma=sigma)
+    points, at = np.array([[0.0, 0.0], [1071.0, 0.0], [1071.0, 711.0], [0.0, 711.0]]), (25.0, 40.0)
+    told = np.stack([np.asarray(zj.displacement_std(wide, points, focal=f)) for f in at])
+    rng, off = np.random.default_rng(0), []
+    for _ in range(40):
+        wrong = eqx.tree_at(lambda lines: lines.focal, held, rng.normal(focal, sigma))
+        other = zj.fit.fit_centre(wrong, centre=along).fit.lens
+        off.append([np.asarray(other(f).undistort(points) - exact.lens(f).undistort(points)) for f in at])
+    scatter = np.sqrt((np.array(off) ** 2).sum(axis=-1).mean(axis=0))
+    assert np.mean(scatter / told) == pytest.approx(1.08, abs=0.2)
 
 
 # Focal lengths that are kept

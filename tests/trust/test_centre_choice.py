@@ -9,7 +9,7 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app.calibration import calibrate
-from zoomjax.app.model_choice import CentreFound
+from zoomjax.app.centre_found import CentreFound
 from zoomjax.trust.centre_choice import choose_centre
 
 SIZE = (1072, 712)

@@ -64,8 +64,9 @@ DistortionModel = Annotated[
 Centre = Annotated[
     str | None,
     typer.Option(
-        metavar="fit|image|X,Y",
-        help="Centre of distortion: fit (where the lines determine it, else the image's), image, or its "
+        metavar="fit|moving|image|X,Y",
+        help="Centre of distortion: fit (where the lines determine it, else the image's), moving (along "
+        "the zoom, as a line of 1/f, where lines left out are no less straight), image, or its "
         "coordinates in px. Default: fit, but image with --distortion-model brown-conrady.",
         rich_help_panel=FIT,
     ),
@@ -184,17 +185,17 @@ def _focal_of_lines(path: Path, focal: str | None) -> "dict[int, float] | float 
     return number
 
 
-def centre_of(text: str) -> Literal["fit", "image"] | tuple[float, float]:
+def centre_of(text: str) -> Literal["fit", "moving", "image"] | tuple[float, float]:
     """The centre of distortion as `calibrate` takes it."""
     from ..io.text_table import plain_number
 
-    if text == "fit" or text == "image":
+    if text == "fit" or text == "moving" or text == "image":
         return text
     numbers = [plain_number(part) for part in text.split(",")]
     x, y = numbers if len(numbers) == 2 else (None, None)
     if x is None or y is None:
         raise ValueError(
-            f"--centre must be fit, image, or X,Y in px as in 959.5,539.5, but it is {text!r}."
+            f"--centre must be fit, moving, image, or X,Y in px as in 959.5,539.5, but it is {text!r}."
         )
     return x, y
 

@@ -22,7 +22,6 @@ from ..fit.focal_lengths import of_equal_focal, with_focal_sigma
 from ..fit.image_metric import in_image
 from ..fit.result import RESULTS, FrameFits, ZoomFit, is_status
 from ..fit.straightness import frame_rms
-from ..fit.zoom import CentreArgument
 from ..lines.lines import Lines
 from ..models.about import RELATIVE, UNKNOWN
 from ..models.registry import distortion_model_name
@@ -34,9 +33,10 @@ from ..trust.misfit import FEWEST, with_misfit
 from ..trust.next_photo import Suggestion, suggest_next
 from ..trust.own_centres import OwnCentres, own_centres
 from ..trust.selection import Selection
+from .centre_found import CentreFound
 from .coefficients import coefficient_names, coefficient_rows, finite, pixel_polynomials
 from .fitting import Metric, algebraic_rms, fitted, left_out
-from .model_choice import CentreFound, WantedModel
+from .model_choice import WantedCentre, WantedModel
 from .outward import outward
 from .results_folder import OF_A_LENS, results_folder
 
@@ -332,7 +332,7 @@ def calibrate(
     lines: Lines,
     *,
     model: WantedModel = WantedModel(),  # noqa: B008, it is frozen
-    centre: CentreArgument | None = "fit",
+    centre: WantedCentre | None = "fit",
     robust: bool = False,
     metric: Metric = in_image,
     focal_sigma: float | Float[np.ndarray, "frame"] = 0.0,
@@ -347,7 +347,7 @@ def calibrate(
         model: the zoom model; by default the one of least cross-validation error.
         centre: the centre of distortion: "fit", "image", its coordinates, px, or None for that of the
             lines. With "fit" it is that of the lines where they do not determine another, or where lines
-            that were not fitted are not straighter about it.
+            that were not fitted are not straighter about it. "moving": it may move along the zoom.
         robust: whether to reject lines that are not straight in the scene. All figures are then computed
             from the remaining lines.
         metric: where distances are measured: `in_image`, or `in_corrected` as in the paper.
@@ -363,7 +363,8 @@ def calibrate(
     used = fitted(lines, model, centre, robust=robust, metric=metric, stage=stage)
     exact, small, terms = used.fit, used.lines, used.model.terms
     sigma, shared = np.broadcast_to(focal_sigma, lines.focal.shape), of_equal_focal(lines.focal, shared)
-    zoom = with_focal_sigma(exact, small, focal_sigma=sigma, shared=shared) if sigma.any() else exact
+    placed = small if exact.lens.shift is None else used.held
+    zoom = with_focal_sigma(exact, placed, focal_sigma=sigma, shared=shared) if sigma.any() else exact
     zoom = widened(with_misfit(zoom, used.held, focal_sigma=sigma, shared=shared))
     stage("Checking the fit on lines left out")
     held_out = {"rms_held_out": left_out(small, used.model)}
@@ -377,13 +378,13 @@ def calibrate(
         rms_algebraic=algebraic_rms(small, used.model),
         rejected=(np.ones(len(lines.frame)) if lines.weight is None else np.asarray(lines.weight)) == 0,
         line_rms=np.sqrt(line_squares(small, zoom.lens.zoom)),
-        next_photo=suggest_next(exact, small),  # from the noise alone, without focal_sigma
+        next_photo=suggest_next(*used.one),  # from the noise alone, without focal_sigma
         focal_sigma=sigma,
         **held_out,
         centre=used.centre.as_uncertain_as(zoom),
         assessment=assess(lines, zoom, compressed=small, **held_out).joined_by(used.centre.findings()),
         selection=used.selection,
-        own_centres=own_centres(exact, used.held),
+        own_centres=own_centres(used.one[0], used.held),
         in_image=small.metric == "distorted",
     )
 

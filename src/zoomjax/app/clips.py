@@ -20,9 +20,8 @@ from .shown import NOT_GOOD, Shown
 
 if TYPE_CHECKING:
     from ..detect.batch import Detection
-    from ..fit.zoom import CentreArgument
     from .known_focals import KnownFocals
-    from .model_choice import WantedModel
+    from .model_choice import WantedCentre, WantedModel
     from .motion_calibration import MotionCalibration
 
 
@@ -51,7 +50,7 @@ class ClipJob:
     inputs: Sequence[str]
     output: Path
     model: "WantedModel"
-    centre: "CentreArgument"
+    centre: "WantedCentre"
     known: tuple[str, ...] = ()
     focal_unit: str | None = None
     focal_sigma: str | None = None
@@ -144,6 +143,7 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
     """Calibrate from a clip, write the results and show them."""
     from .clip_report import clip_report
     from .frame_findings import frames_of
+    from .model_choice import one_centre
     from .motion_calibration import FILES, calibrate_motion
     from .results_folder import OF_A_LENS, results_folder
 
@@ -186,7 +186,7 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
                 found=found,
                 known=known,
                 model=job.model,
-                centre=job.centre,
+                centre=one_centre(job.centre),
                 stage=stage,
             )
             done = dataclasses.replace(done, warnings=tuple(told))

@@ -33,7 +33,8 @@ from ..trust.between import FEWEST_CHECKED
 from ..trust.centre_choice import choose_centre
 from ..trust.cross_validation import cross_validate_zoom
 from ..trust.selection import Selection
-from .model_choice import STRONG, CentreFound, WantedModel
+from .centre_found import CentreFound
+from .model_choice import STRONG, WantedCentre, WantedModel, one_centre
 
 _TURNS = 2
 """How often centre and weights of the lines are found in turn, at most."""
@@ -54,6 +55,7 @@ class Fitted(NamedTuple):
         model: its zoom model, not fitted.
         centre: its centre of distortion, and how it was found.
         selection: how the model was chosen; None where it was given.
+        one: the fit about one centre, and its lines: the same unless the centre moves along the zoom.
     """
 
     fit: ZoomFit
@@ -63,12 +65,13 @@ class Fitted(NamedTuple):
     model: Model
     centre: CentreFound
     selection: Selection | None
+    one: tuple[ZoomFit, AbstractLines]
 
 
 def fitted(
     lines: Lines,
     wanted: WantedModel,
-    centre: CentreArgument | None,
+    centre: WantedCentre | None,
     *,
     robust: bool,
     metric: Metric,
@@ -81,11 +84,15 @@ def fitted(
     model than the radial polynomial starts from there, and has its own centre and weights of lines.
     """
     wanted.check_centre(centre)
+    moves = isinstance(centre, str) and centre == "moving"
+    about = None if centre is None else one_centre(centre)
+    if moves and np.unique(np.asarray(lines.focal)).size < 2:
+        raise ValueError('Argument centre "moving" needs several focal lengths, not one: give "fit".')
     radial = dataclasses.replace(wanted, distortion_model="radial")
     model = radial.base(lines.focal)
     ready_model(lines, model)  # raises if there are too few focal lengths, before any work
     stage("Compressing the lines")
-    held = metric(_compressed(lines, centre, radial.most_terms(lines)))
+    held = metric(_compressed(lines, about, radial.most_terms(lines)))
     found = _about_centre(
         held, radial, model, robust, wanted.distortion_model in (None, "radial", "auto"), stage
     )
@@ -94,19 +101,35 @@ def fitted(
         found = found._replace(fit=fit_zoom(found.lines, zoom=found.model, throw=False))
     strong = found.fit is not None and wanted.is_beyond(found.fit)
     if strong or wanted.distortion_model not in (None, "radial"):
-        found = _under_distortion_model(metric(_widest(lines)), held, wanted, found, centre, robust, stage)
+        found = _under_distortion_model(metric(_widest(lines)), held, wanted, found, about, robust, stage)
     small, model, fit = found.lines, found.model, found.fit
     if fit is None or failed(fit.result):
         stage("Fitting the zoom model")
         fit = fit_zoom(small, zoom=model)  # or says why not
+    held, one, how = found.held, (fit, small), found.centre
+    if isinstance(fit.lens.distortion_model, RadialPolynomial) and not _for_any_centre(held):
+        placed: Any = about_centre(_widest(lines), about)
+        held = metric(compress_any_centre(placed, radial.most_terms(lines)))
+        held = held if small.weight is None else held.weighted(small.weight)
+    if moves:
+        stage("Fitting how the centre moves")
+        fit, small, how = _moving(held, model, how, one)
     stage("Fitting each frame separately")
     each = fit_frames(small, terms=model.terms, throw=False)
-    held = found.held
-    if isinstance(fit.lens.distortion_model, RadialPolynomial) and not _for_any_centre(held):
-        about: Any = about_centre(_widest(lines), centre)
-        held = metric(compress_any_centre(about, radial.most_terms(lines)))
-        held = held if small.weight is None else held.weighted(small.weight)
-    return Fitted(fit, each, small, held, model, found.centre, found.selection)
+    return Fitted(fit, each, small, held, model, how, found.selection, one)
+
+
+def _moving(
+    held: AbstractLines, model: Model, centre: CentreFound, still: tuple[ZoomFit, AbstractLines]
+) -> tuple[ZoomFit, AbstractLines, CentreFound]:
+    """The fit about a centre that moves, if lines left out are no less straight, its lines and centre."""
+    if not _for_any_centre(held):
+        return *still, centre.still("that is tried under the radial polynomial alone")
+    along = choose_centre(held, model, along=PolynomialZoom(degree=1))
+    how = centre.moving(choose_centre(held, model), along)
+    if how.how != "moving":
+        return *still, how
+    return along.found.fit, held.about(along.found.centre), how
 
 
 class _Centred(NamedTuple):

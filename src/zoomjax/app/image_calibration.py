@@ -24,6 +24,7 @@ from .drawings import drawing
 from .equipment import KnownLens, known_lens, with_equipment, without_focal
 from .focal_sources import GRID, MEASURED, Focals, choose_focals, focal_sigmas, known_focals, lines_of
 from .image_job import ImageJob, overlay_name
+from .model_choice import one_centre
 from .plane_focals import Sharing
 from .results_folder import OF_A_LENS, results_folder
 from .turned import findings_of_turned
@@ -287,10 +288,10 @@ def _calibrated(
     made = None
     if job.detector == "grid":
         stage("Fitting the shape of the board")
-        made = bundle_of(_having(usable, focals), focals, job.centre, job.other_sharing)
+        made = bundle_of(_having(usable, focals), focals, one_centre(job.centre), job.other_sharing)
         if focals.one_zoom and not made.of_one_zoom(focals.groups):
             focals = dataclasses.replace(choose_focals(usable, "plane"), one_zoom=False)
-            made = bundle_of(_having(usable, focals), focals, job.centre, job.other_sharing)
+            made = bundle_of(_having(usable, focals), focals, one_centre(job.centre), job.other_sharing)
     unused |= {d.name: focals.absence(d) for d in usable if d.name not in focals.focal}
     used = _having(usable, focals)
     known = None

@@ -10,14 +10,13 @@ import numpy as np
 from .._core.text import numbered_name
 from ..detect.batch import DETECTORS
 from ..detect.sources import VIDEO_SUFFIXES, Source, find_photos, video_frames
-from ..fit.zoom import CentreArgument
 from ..io.focal_track import FocalTrack, read_focal_track
 from ..io.photo import read_focal
 from ..io.text_table import plain_number
 from .board_focals import Board
 from .calibration import FILES
 from .focal_sources import MEASURED, check_source, focal_sigmas
-from .model_choice import WantedModel
+from .model_choice import WantedCentre, WantedModel
 from .plane_focals import SHARED_BY
 
 
@@ -36,7 +35,7 @@ class ImageJob:
         shared_focal: for ``focal="plane"``, which images share a focal length: those of one EXIF focal
             length ("exif"), of one "folder", or of focal lengths that agree ("similarity"); None: none.
         model: the zoom model.
-        centre: centre of distortion: "fit", "image" or its coordinates, px.
+        centre: centre of distortion: "fit", "moving", "image" or its coordinates, px.
         frames: maximum number of frames used from a video.
         workers: number of processes.
         cache: folder for cached detections; None: no cache.
@@ -53,7 +52,7 @@ class ImageJob:
     board: Board | None = None
     shared_focal: str | None = None
     model: WantedModel = WantedModel()  # noqa: RUF009, it is frozen
-    centre: CentreArgument = "fit"
+    centre: WantedCentre = "fit"
     frames: int = 60
     workers: int = 1
     cache: Path | None = None

@@ -1,12 +1,11 @@
-"""Which zoom model and which centre of distortion `zoomjax calibrate` fits, and why."""
+"""Which zoom model and which centre of distortion `zoomjax calibrate` is to fit."""
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from ..fit.centre import CentreFit
 from ..fit.result import ZoomFit
 from ..fit.zoom import CentreArgument
 from ..lines.base import AbstractLines
@@ -20,14 +19,15 @@ from ..models.requirements import refusal
 from ..models.smooth import SmoothZoom
 from ..models.spline import SplineZoom
 from ..models.zoom import AbstractZoom, PolynomialZoom
-from ..trust.assessment import Finding
 from ..trust.between import FEWEST_CHECKED, zoom_places
-from ..trust.centre_choice import CentreChoice
 from ..trust.folds import focals_there
 from ..trust.selection import Selection, select_model
 from ..trust.staged_selection import select_in_stages
 from .equipment import KnownLens
 from .outward import outward
+
+WantedCentre = CentreArgument | Literal["moving"]
+"""The centre of distortion asked for. One that moves along the zoom is fitted as a line of 1/f."""
 
 MODELS = ("auto", "polynomial", "smooth", "spline")
 """Zoom models by the names that `calibrate` takes; "auto" chooses."""
@@ -56,6 +56,13 @@ _KNOTS = (4, 6, 8)
 _FOLDS = 10
 _MANY_LINES = 300
 """From so many lines on three coefficients compete."""
+
+
+def one_centre(centre: WantedCentre) -> CentreArgument:
+    """The centre of distortion asked for, where it cannot move, as in a bundle adjustment."""
+    if isinstance(centre, str):
+        return "image" if centre == "image" else "fit"
+    return centre
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,16 +131,23 @@ class WantedModel:
         """The centre of distortion where none is asked for."""
         return "image" if refusal("fit_centre", distortion_model=self.first_distortion_model) else "fit"
 
-    def check_centre(self, centre: CentreArgument | None) -> None:
-        """Refuse to fit the centre of a model that has none of its own.
+    def check_centre(self, centre: WantedCentre | None) -> None:
+        """Refuse to fit the centre of a model that has none of its own, or one that moves of others.
 
         Raises:
             ValueError: it is to be fitted nevertheless.
         """
-        if isinstance(centre, str) and centre == "fit" and self.usual_centre != "fit":
+        fits = isinstance(centre, str) and centre in ("fit", "moving")
+        if fits and self.usual_centre != "fit":
             raise ValueError(
-                f'Argument centre cannot be "fit" with argument distortion_model {self.distortion_model}: '
-                'give "image" or coordinates. (Its decentering does nearly the same as another centre.)'
+                f'Argument centre cannot be "{centre}" with argument distortion_model '
+                f'{self.distortion_model}: give "image" or coordinates. (Its decentering does nearly the '
+                "same as another centre.)"
+            )
+        if isinstance(centre, str) and centre == "moving" and self.distortion_model not in (None, "radial"):
+            raise ValueError(
+                'Argument centre "moving" is for the radial polynomial: leave out argument '
+                "distortion_model."
             )
 
     def base(self, focal: Any) -> Model:
@@ -255,110 +269,3 @@ def _selected(lines: AbstractLines, candidates: Sequence[Model]) -> Selection:
     if lines.weight is None:
         lines = lines.weighted(np.ones(lines.frame.shape))  # as in every fold: one compiled program
     return select_model(lines, candidates, folds=folds, rule="least")
-
-
-@dataclasses.dataclass(frozen=True)
-class CentreFound:
-    """The centre of distortion of a calibration.
-
-    Attributes:
-        centre: px.
-        std: its standard deviations, px; None where it was not fitted.
-        how: "fitted", "image" or "given".
-        sentence: how it was found, in words.
-        straighter: how far from it, px, the one is about which lines that were not fitted are straighter,
-            where that is farther than so few frames can tell; otherwise None.
-    """
-
-    centre: tuple[float, float]
-    std: tuple[float, float] | None
-    how: str
-    sentence: str
-    straighter: float | None = None
-
-    def findings(self) -> list[Finding]:
-        """What speaks against it: that lines are straightest about another one, far away."""
-        if self.straighter is None:
-            return []
-        return [
-            Finding(
-                "centre of distortion",
-                "doubtful",
-                f"the lines are straightest about a centre that is {self.straighter:.0f} px away, as where "
-                "they are bent or the image is cropped.",
-                "Check that what was photographed is straight and flat, and photograph more of it; or give "
-                "--centre X,Y if the centre is there.",
-            )
-        ]
-
-    @classmethod
-    def of(
-        cls, lines: AbstractLines, choice: CentreChoice | None, found: CentreFit | None
-    ) -> "CentreFound":
-        """The centre of a calibration.
-
-        Args:
-            lines: about the centre that was given.
-            choice: its comparison with a fitted one; None where there is none.
-            found: the fitted one, if that is better.
-        """
-        x, y = (float(value) for value in np.asarray(lines.centre))
-        middle = np.allclose((np.array(lines.image_size) - 1) / 2, (x, y), atol=1e-6)
-        how, place = (
-            ("image", f"the middle of the image, {_place(x, y)}") if middle else ("given", _place(x, y))
-        )
-        if choice is None and found is not None and found.determined:
-            return cls._fitted(found, ".")
-        if choice is None:
-            return cls((x, y), None, how, f"The centre of distortion is taken as given: {place}.")
-        if found is not None and found.determined:
-            more = (
-                f". Lines that were not fitted are {choice.fitted:.4f} px off straight about it, and "
-                f"{choice.given:.4f} px about {place}."
-            )
-            return cls._fitted(found, more)
-        why = "the lines do not determine another one"
-        if found is None and choice.found.determined:
-            why = (
-                f"lines that were not fitted are {choice.fitted:.4f} px off straight about the fitted one, "
-                f"and {choice.given:.4f} px about this"
-            )
-        if found is None and choice.found.determined and choice.far is not None:
-            why = (
-                f"the one about which lines would be straightest is {choice.far:.0f} px away. With so "
-                "few images that may also come from bent lines. If it is there, give --centre X,Y"
-            )
-        told = f"The centre of distortion was kept at {place}: {why}."
-        return cls((x, y), None, how, told, choice.far if choice.fitted < choice.given else None)
-
-    @classmethod
-    def _fitted(cls, found: CentreFit, more: str) -> "CentreFound":
-        """A fitted centre, and what else there is to say of it."""
-        u, v = (float(value) for value in np.asarray(found.fit.lens.centre))
-        std = (float(np.asarray(found.std)[0, 0]), float(np.asarray(found.std)[0, 1]))
-        told = f"The centre of distortion was fitted: {_place(u, v)}, {_spread(std)}{more}"
-        return cls((u, v), std, "fitted", told)
-
-    def as_uncertain_as(self, fit: ZoomFit) -> "CentreFound":
-        """The same with the standard deviations that a fit gives it, where it was fitted."""
-        if self.std is None or fit.joint is None or fit.lens.shift is not None:
-            return self
-        x, y = fit.lens.scale * np.sqrt(np.diag(np.asarray(fit.joint))[-2:])
-        std = (float(x), float(y))
-        return dataclasses.replace(
-            self, std=std, sentence=self.sentence.replace(_spread(self.std), _spread(std))
-        )
-
-    def summary(self) -> dict[str, Any]:
-        """The same for JSON."""
-        x, y = self.centre
-        std = None if self.std is None else list(self.std)
-        return {"x": x, "y": y, "std": std, "how": self.how, "sentence": self.sentence}
-
-
-def _spread(std: tuple[float, float]) -> str:
-    return f"\u00b1 {std[0]:.2g} and \u00b1 {std[1]:.2g} px"
-
-
-def _place(x: float, y: float) -> str:
-    return f"({x:.1f}, {y:.1f}) px"

@@ -11,16 +11,16 @@ from .._core.text import listed, plain, span
 
 if TYPE_CHECKING:
     from ..detect.sources import Source
-    from ..fit.zoom import CentreArgument
     from ..lines.lines import Lines
     from .image_job import ImageJob
+    from .model_choice import WantedCentre
 
 _LISTED, _NAMED = 20, 6
 
 _UNKNOWN = "all at one f, which is not known"
 
 
-def check_centre(centre: "CentreArgument", sizes: Iterable[tuple[int, int]]) -> None:
+def check_centre(centre: "WantedCentre", sizes: Iterable[tuple[int, int]]) -> None:
     """Warn of a centre of distortion outside of the images, as a fit would.
 
     Args:

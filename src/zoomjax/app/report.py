@@ -197,11 +197,10 @@ def _straightness(calibration: Calibration) -> dict[str, Any]:
 
 
 def _lens(calibration: Calibration) -> dict[str, Any]:
-    x, y = (float(value) for value in np.asarray(calibration.fit.lens.centre))
     names = calibration.coefficient_names()
     return {
         "unit": calibration.fit.lens.focal_unit,
-        "centre": f"{x:.6g}, {y:.6g}",
+        "centre": _centre(calibration),
         "centre_found": calibration.centre.sentence,
         "centres": _own_centres(calibration),
         "coefficients": _coefficients(calibration),
@@ -221,6 +220,15 @@ def _lens(calibration: Calibration) -> dict[str, Any]:
             kind="svg" if len(calibration.rms_uncorrected) <= _MOST_FRAMES else "png",
         ),
     }
+
+
+def _centre(calibration: Calibration) -> str:
+    """Where radii are measured from."""
+    lens = calibration.fit.lens
+    if lens.shift is not None:
+        return ", which moves along the zoom"
+    x, y = (float(value) for value in np.asarray(lens.centre))
+    return f" ({x:.6g}, {y:.6g})"
 
 
 def _own_centres(calibration: Calibration) -> Any:

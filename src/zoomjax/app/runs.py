@@ -20,12 +20,11 @@ from .cluster import cluster_executor
 from .console import REPORT, progress_bar, stages
 
 if TYPE_CHECKING:
-    from ..fit.zoom import CentreArgument
     from ..lines.lines import Lines
     from .calibration import Calibration
     from .image_calibration import ImageCalibration
     from .image_job import ImageJob
-    from .model_choice import WantedModel
+    from .model_choice import WantedCentre, WantedModel
     from .page import Run
 
 _MOST = 4
@@ -38,7 +37,7 @@ def calibrate_lines(
     stage: Callable[[str], None],
     *,
     model: "WantedModel",
-    centre: "CentreArgument",
+    centre: "WantedCentre",
     focal_sigma: str | None,
     robust: bool,
     files: Sequence[Path],
@@ -59,7 +58,7 @@ def calibrate_lines(
     from .report import report
 
     known = earlier_of(files, lines)
-    if known.centre and centre == "fit":
+    if known.centre and centre in ("fit", "moving"):
         lines = lines.about((np.array(lines.image_size) - 1) / 2)
     sigma = focal_sigmas("0" if focal_sigma is None else focal_sigma, lines.focal)
     if focal_sigma is None and known.sigma is not None:

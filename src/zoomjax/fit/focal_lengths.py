@@ -27,13 +27,11 @@ from .._core.fields import integers, real_argument
 from .._core.types import AnyArray, Focal, traced
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_jit
-from ..models.requirements import check
 from ..models.zoom import with_parameters
 from .covariance import KnownErrors, parameter_covariance
-from .distortion_models import with_distortion_model
 from .energy import coefficients_by, linearised, prior_residuals, residuals
 from .result import ZoomFit
-from .same_camera import check_lines_of
+from .same_camera import check_lines_of, placed_as
 
 Sigma = ScalarLike | Num[AnyArray, "frame"]
 Shared = Int[AnyArray, "frame"] | None
@@ -57,11 +55,12 @@ def with_focal_sigma(
     Returns:
         The fit whose `covariance` includes them, to first order. A fit that does not know of the errors
         allows for photos that scatter more than their lines: what the errors explain of that is taken out.
+        A fitted centre is held where it is in each frame, also one that moves along the zoom.
 
     Raises:
         ValueError: `focal_sigma` does not hold finite numbers of at least 0, one or one a frame; `shared`
-            is not one number a frame; the lens has a centre that moves along the zoom; or the lines are
-            not those of the fit: of another image size, unit or number of frames.
+            is not one number a frame; or the lines are not those of the fit: of another image size, unit
+            or number of frames.
 
     Example:
         >>> from zoomjax import compress, displacement_std, fit_zoom, scenes
@@ -73,9 +72,8 @@ def with_focal_sigma(
         >>> bool(wide[0] < wide[1])
         True
     """
-    check("with_focal_sigma", shift=fit.lens.shift)
     sigma, together = _checked_errors(fit, lines, focal_sigma, shared)
-    lines = with_distortion_model(lines, fit.lens.distortion_model).about(fit.lens.centre)
+    lines = placed_as(fit.lens, lines)
     own = (fit.lens.zoom, fit.covariance, fit.joint)
     return with_covariance(fit, *_widened_by(lines, *own, sigma, together))
 

@@ -45,7 +45,6 @@ REQUIREMENTS: dict[str, dict[str, Requirement]] = {
     "fit_motion": {"zoom": FOCAL_ALONE._replace(instead="Tracks have no focus.")},
     "fit_boards": {"zoom": FOCAL_ALONE._replace(instead="Photos of boards have no focus.")},
     "fit_motion with lines": {"distortion_model": RADIAL},
-    "with_focal_sigma": {"shift": STILL_CENTRE},
     "with_misfit": {"zoom": FOCAL_ALONE._replace(instead="")},
     "suggest_next": {"zoom": FOCAL_ALONE._replace(instead=""), "shift": STILL_CENTRE},
     "cramer_rao": {"zoom": FOCAL_ALONE},

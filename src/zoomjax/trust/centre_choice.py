@@ -9,6 +9,7 @@ from ..fit.energy import line_squares
 from ..fit.own_weights import own_weights
 from ..lines.base import AbstractLines
 from ..models.model import Model
+from ..models.zoom import AbstractZoom
 from .cross_validation import errors_of
 from .folds import folds_of
 
@@ -45,8 +46,8 @@ class CentreChoice:
         return bool(self.found.determined) and self.fitted <= self.given and self.far is None
 
 
-def choose_centre(lines: AbstractLines, model: Model) -> CentreChoice:
-    """Fit the centre of distortion, one for all focal lengths, and cross-validate it.
+def choose_centre(lines: AbstractLines, model: Model, *, along: AbstractZoom | None = None) -> CentreChoice:
+    """Fit the centre of distortion and cross-validate it.
 
     A fifth of the frames is left out at a time, or, with fewer than five, of the lines of each frame. These
     few do not tell a centre that is far from the given one.
@@ -54,13 +55,14 @@ def choose_centre(lines: AbstractLines, model: Model) -> CentreChoice:
     Args:
         lines: the lines, compressed for any centre, in either metric.
         model: the zoom model, without parameters, and its number of coefficients.
+        along: how the centre depends on the focal length, as for `fit_centre`; by default it is one.
 
     Raises:
         ValueError, RuntimeError: as for `fit_centre`.
     """
     if lines.weight is None:
         lines = lines.weighted(np.ones(lines.frame.shape))  # as in every fold: one compiled program
-    found = fit_centre(lines, zoom=model)
+    found = fit_centre(lines, zoom=model, centre=along)
     small = lines.about(lines.centre)
     own = own_weights(small)
     frames = np.unique(np.asarray(small.frame)[own > 0]).size
@@ -74,7 +76,7 @@ def choose_centre(lines: AbstractLines, model: Model) -> CentreChoice:
     share = np.where(np.isfinite(given) & np.isfinite(fitted), parts.share, 0)
     if not share.any():
         return CentreChoice(found, np.nan, np.nan)
-    away = float(np.linalg.norm(np.asarray(found.fit.lens.centre) - np.asarray(lines.centre)))
+    away = float(np.max(np.linalg.norm(np.asarray(found.centre) - np.asarray(lines.centre), axis=1)))
     far = away if frames < _FOLDS and away > _FAR * float(found.fit.lens.scale) else None
     fitted, given = (float(np.sqrt(np.average(np.nan_to_num(of), weights=share))) for of in (fitted, given))
     return CentreChoice(found, fitted, given, far)
