@@ -162,7 +162,7 @@ def test_calibrate_is_told_centre_and_model(calibrated, tmp_path):
 def test_centres_are_read():
     assert [centre_of(text) for text in ("fit", "image", "959.5,-1e1")] == ["fit", "image", (959.5, -10.0)]
     for text in ("", "1", "1,2,3", "nan,1", "a,b"):
-        with pytest.raises(ValueError, match="must be fit, image, or X,Y"):
+        with pytest.raises(ValueError, match="must be fit, moving, image, or X,Y"):
             centre_of(text)
 
 
@@ -517,7 +517,7 @@ WRONG = {
     "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),
     "a degree of another model": (["lines.npz", "--model", "spline", "--degree", "1"], "for polynomials"),
     "no such model": (["lines.npz", "--model", "best"], "--model must be one of auto, polynomial"),
-    "a centre that is none": (["lines.npz", "--centre", "middle"], "--centre must be fit, image, or X,Y"),
+    "a centre that is none": (["lines.npz", "--centre", "middle"], "--centre must be fit, moving, image, or X,Y"),
     "no such distortion model": (
         ["lines.npz", "--distortion-model", "fisheye"],
         "'radial', 'division', 'brown-conrady'",
