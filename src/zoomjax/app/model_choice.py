@@ -1,6 +1,7 @@
 """Which zoom model and which centre of distortion `zoomjax calibrate` fits, and why."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -323,6 +324,8 @@ class CentreFound:
                 f"lines that were not fitted are {choice.fitted:.4f} px off straight about the fitted one, "
                 f"and {choice.given:.4f} px about this"
             )
+            if not math.isfinite(choice.fitted + choice.given):
+                why = "not all points have a corrected position about this one and the fitted one"
         if found is None and choice.found.determined and choice.far is not None:
             why = (
                 f"the one about which lines would be straightest is {choice.far:.0f} px away. With so "
