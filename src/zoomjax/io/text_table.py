@@ -162,6 +162,19 @@ def read_text_table(
     )
 
 
+def has_columns(path: str | os.PathLike[str], names: Sequence[str]) -> bool:
+    """Whether a file names all of these columns, as `read_text_table` reads it.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    try:
+        _header(_split_header(_decoded(Path(path).read_bytes()))[1], names, ())
+    except ValueError:
+        return False
+    return True
+
+
 def _error(path: str, what: str, reason: str) -> ValueError:
     return ValueError(f"Cannot read {what} from {path}: {reason.rstrip('.')}.")
 
