@@ -97,7 +97,8 @@ class TextTable:
             ValueError: a number is none; the message names the row.
         """
         values = self.numbers[name]
-        self.check(name, (abs(values) < 2**53) & (values == np.floor(values)), "an integer")
+        self.check(name, values == np.floor(values), "an integer")
+        self.check(name, abs(values) < 2**53, "below 2^53 (number from 0 what has time stamps as names)")
         return values.astype(np.int64)
 
 

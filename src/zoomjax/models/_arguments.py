@@ -43,6 +43,8 @@ def as_focal(focal: Any) -> Any:
         ValueError: they are not numbers.
     """
     if isinstance(focal, jax.Array):
+        if not jnp.issubdtype(focal.dtype, jnp.integer) and not jnp.issubdtype(focal.dtype, jnp.floating):
+            raise ValueError(f"Argument focal must hold real numbers, but its dtype is {focal.dtype}.")
         return focal
     refuse_masked("focal", focal, _NAN)
     try:
