@@ -19,9 +19,11 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app import console
+from zoomjax.app._flags import with_flags
 from zoomjax.app.arguments import centre_of, read_lines
 from zoomjax.app.console import show_choice, stages
 from zoomjax.app.demo import write_photos
+from zoomjax.app.image_job import ImageJob
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.runs import calibrate_lines
 from zoomjax.lines.csv import write_lines_csv
@@ -227,6 +229,31 @@ def test_files_of_lines_are_read_one_after_the_other(few_lines, tmp_path):
         ValueError, match=r"The files of lines must hold .* size of .*a\.npz is .*c\.npz is"
     ):
         read_lines([tmp_path / "a.npz", tmp_path / "b.npz", tmp_path / "c.npz"], None, None, None)
+
+
+@pytest.mark.parametrize("place", ["the lines", "a table of focal lengths", "the track of a video"])
+def test_a_column_of_standard_deviations_that_would_not_count_is_refused(place, tmp_path):
+    rows = [f"0,{line},{x},{40 * line},24,0.5" for line in (1, 2) for x in range(5)]
+    beside, lines, focal = tmp_path / "f.csv", tmp_path / "lines.csv", tmp_path / "f.csv"
+    beside.write_text("Frame;FOCAL; Sigma\n0;24;0,5\n")
+    if place == "the lines":
+        lines.write_text("\n".join(["frame,line,x,y,focal,sigma", *rows]))
+        focal = None
+    else:
+        lines.write_text("\n".join(["frame,line,x,y", *(row.rsplit(",", 2)[0] for row in rows)]))
+
+    def read(sigma):
+        given = None if focal is None else str(focal)
+        if place == "the track of a video":
+            return ImageJob((str(tmp_path / "a.mp4"),), focal=given, focal_sigma=sigma)
+        return read_lines([lines], given, "640x480", None, sigma)
+
+    with pytest.raises(ValueError, match=r"The column sigma of .*\.csv would not count") as refused:
+        read(None)
+    assert with_flags(str(refused.value)).endswith(
+        "Give --focal-sigma, one for all, such as 0.3 or 1%, or 0 for focal lengths that are exact."
+    )
+    assert read("0") is not None
 
 
 @pytest.mark.slow
@@ -517,7 +544,7 @@ WRONG = {
     "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),
     "a degree of another model": (["lines.npz", "--model", "spline", "--degree", "1"], "for polynomials"),
     "no such model": (["lines.npz", "--model", "best"], "--model must be one of auto, polynomial"),
-    "a centre that is none": (["lines.npz", "--centre", "middle"], "--centre must be fit, moving, image, or X,Y"),
+    "a centre that is none": (["lines.npz", "--centre", "middle"], "fit, moving, image, or X,Y"),
     "no such distortion model": (
         ["lines.npz", "--distortion-model", "fisheye"],
         "'radial', 'division', 'brown-conrady'",

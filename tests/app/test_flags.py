@@ -52,6 +52,7 @@ def test_every_flag_is_an_option():
             "Hold its ends (argument hold), or give argument focal.",
             "Hold its ends (--hold), or give --focal.",
         ),
+        ("Argument target must end in .mp4.", "--output must end in .mp4."),
         ("Argument focal_range must increase.", "Argument focal_range must increase."),
         ("Cannot read a.npz: Argument focal must hold", "Cannot read a.npz: Argument focal must hold"),
     ],

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app.coverage import plot_coverage
+from zoomjax.app.coverage import plot_coverage, plot_radius
 from zoomjax.app.plot import plot_distortion, plot_model, plot_residues, save_plot
 
 
@@ -137,6 +137,18 @@ def test_a_fold_leaves_a_gap_in_the_distortion_plot(folding):
     assert "folded over" in field.get_title()
     assert not any(path.contains_point((0, 0)) for path in filled.get_paths())
     figure.savefig(io.BytesIO(), format="png")
+
+
+@pytest.mark.parametrize("beyond", [slice(-1, None), slice(0, None)], ids=["one point", "all of a line"])
+def test_points_beyond_a_fold_are_left_out_of_residuals(folding, beyond):
+    rows = [np.stack([np.linspace(100, 500, 9), np.full(9, y)], axis=1) for y in (100.0, 240.0, 400.0)]
+    far = rows[0].copy()
+    far[beyond, 0] += 3000
+    lines = zj.Lines.from_ragged([*rows, far], [0] * 4, [20.0], image_size=(4000, 4000))
+    figure = plot_radius(lines, folding, np.ones(4))
+    [dots] = figure.axes[0].lines
+    assert dots.get_xdata().max() < float(folding(20.0).monotone_radius)
+    assert np.isfinite(dots.get_ydata()).all()
 
 
 def test_a_lens_without_distortion_can_be_drawn(folding):

@@ -82,6 +82,10 @@ REFUSED = {
         "frame,line,x,y,focal\n0.5,0,1,1,20\n",
         "frame in row 2 must be an integer, but it is 0.5",
     ),
+    "frame a time stamp": (
+        "frame,line,x,y,focal\n1762000000000000001,0,1,1,20\n",
+        r"frame in row 2 must be below 2\^53 \(number from 0",
+    ),
     "focal changes": ("frame,line,x,y,focal\n0,0,1,1,20\n0,0,1,2,30\n", "two focal lengths"),
     "no focal": ("frame,line,x,y\n0,0,1,1\n", "no focal lengths"),
     "not finite": (

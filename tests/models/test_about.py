@@ -70,6 +70,18 @@ def test_wrong_facts_are_refused(about):
         lens(about=about)
 
 
+@pytest.mark.parametrize("width", ["640", "wide", 0.0, -640.0])
+def test_a_width_of_focal_lengths_that_is_none_is_refused(width, tmp_path):
+    """By it focal lengths in px are multiplied, in cameras and exports."""
+    with pytest.raises(ValueError, match="about must hold a positive number as width_of_focal_px"):
+        lens(about={"width_of_focal_px": width})
+    lens(about={"width_of_focal_px": 640.0}).save(tmp_path / "lens.json")
+    text = (tmp_path / "lens.json").read_text()
+    (tmp_path / "lens.json").write_text(text.replace('_px": 640.0', f'_px": {json.dumps(width)}'))
+    with pytest.raises(ValueError, match=r"Cannot read a lens from .*: Argument about must hold"):
+        zj.load_lens(tmp_path / "lens.json")
+
+
 def test_facts_do_not_change_with_the_dictionary_they_came_from():
     given = dict(FACTS)
     one = lens(about=given)

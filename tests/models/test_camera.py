@@ -109,6 +109,16 @@ def test_float32_stays(camera, pixels):
 
 
 @pytest.mark.parametrize("kind", [np, jnp], ids=["numpy", "jax"])
+@pytest.mark.parametrize("dtype", ["float16", "int8", "uint16"])
+def test_points_in_space_of_few_bits_are_projected_in_more(camera, kind, dtype):
+    """Half precision has steps of a px at 2,000."""
+    points = np.array([[1, 0, 7], [1, 1, 9], [0, 1, 11]])
+    pixels, _ = camera.project(kind.asarray(points, dtype), FOCAL)
+    assert pixels.dtype == (np.float32 if dtype == "float16" else np.float64)
+    np.testing.assert_allclose(pixels, camera.project(points.astype(float), FOCAL)[0], rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("kind", [np, jnp], ids=["numpy", "jax"])
 def test_the_principal_point_moves_with_the_centre(kind):
     """By default it is the centre of distortion, also of a lens whose centre moves along the zoom."""
     zoom, shift = (zj.PolynomialZoom(1, k, 20.0) for k in ([[0.0], [0.1]], [[0.0, 0.0], [0.1, -0.05]]))

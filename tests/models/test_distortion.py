@@ -382,6 +382,32 @@ def test_a_focal_length_without_a_value_takes_no_part_in_derivatives(method, ter
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_points_that_come_from_next_to_a_pole_have_derivatives(dtype):
+    """There no digit of the divisor is known: derivatives of the inverse were NaN beside a number."""
+
+    def distorted(k, point):
+        return zj.Distortion(k, jnp.zeros(2, dtype), jnp.ones((), dtype), zj.models.Division()).distort(
+            point
+        )
+
+    k, direction = jnp.asarray([-0.2], dtype), np.array([0.6, 0.8])
+    near, eps = True, np.finfo(dtype).eps
+    for rho in np.logspace(1, 18, 35):
+        point = jnp.asarray(rho * direction, dtype)
+        by_k, by_point = (np.asarray(each) for each in jax.jacrev(distorted, argnums=(0, 1))(k, point))
+        # r = rho (1 - r^2 / 5), so dr/dk = rho r^2 / (1 + 2 rho r / 5), and across, r / rho.
+        r = 2 * rho / (1 + np.sqrt(1 + 0.8 * rho * rho))
+        slope = r / rho / (1 + 0.4 * rho * r)
+        exact = slope * np.outer(direction, direction) + r / rho * np.outer([0.8, -0.6], [0.8, -0.6])
+        np.testing.assert_allclose(
+            by_k[:, 0], rho * r * r / (1 + 0.4 * rho * r) * direction, rtol=20 * np.sqrt(eps)
+        )
+        np.testing.assert_allclose(by_point, exact, rtol=0, atol=2 * np.sqrt(eps))
+        near = near and by_point.any()
+    assert not near  # the last ones are those of the pole
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("case", ["paper's", "Division"])
 def test_the_residual_is_two_last_digits_of_the_radius(case, dtype, truth, rng):
     """Of normalised points, as in benchmarks/results/pipeline.md, in long double; NumPy and compiled."""

@@ -295,12 +295,18 @@ def test_a_centre_that_moves(lens, tmp_path):
     np.testing.assert_allclose(batched.centre[1], moving(40.0).centre)
 
 
-@pytest.mark.parametrize("focal", ["35", True, [True], None, [30.0, "35"], {}, b"35"])
+@pytest.mark.parametrize(
+    "focal",
+    ["35", True, [True], None, [30.0, "35"], {}, b"35", 35 + 0j, jnp.array(35 + 3j), jnp.array(True)],
+)
 def test_a_focal_length_is_a_number(focal):
     lens = zj.scenes.nikkor_18_200()
     for call in (lens, lambda f: lens.undistort([0.0, 0.0], f)):
         with pytest.raises((ValueError, TypeError), match="focal"):
             call(focal)
+        if isinstance(focal, jax.Array):
+            with pytest.raises((ValueError, TypeError), match="focal"):
+                jax.jit(lambda f, call=call: call(f))(focal)
 
 
 def test_masks_are_refused_and_not_dropped():

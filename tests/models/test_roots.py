@@ -163,6 +163,31 @@ def test_a_divisor_that_is_nothing_but_rounding_gives_no_number(dtype, array):
     )
 
 
+@pytest.mark.parametrize("kind", [np.asarray, jnp.asarray], ids=["NumPy", "JAX"])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize(
+    ("k", "distortion_model"),
+    [
+        ((0.1, 0.02), "RadialPolynomial"),
+        ((-0.15, 0.1), "RadialPolynomial"),
+        ((0.1, 0.02, 0.03, 0.01), "RadialPolynomial"),
+        ((0.1, 0.02, 0.001, 0.001), "BrownConrady"),
+    ],
+)
+def test_points_whose_powers_overflow_have_their_inverse_or_none(k, distortion_model, dtype, kind):
+    """An error that is infinite, beside a slope that is, too, is not one of rounding."""
+    model = getattr(zj.models, distortion_model)()
+    exponent = 0.99 * np.log10(float(np.finfo(dtype).max))
+    rho = np.logspace(1, exponent, 200, dtype=dtype)
+    found = np.asarray(unit(k, dtype, model).distort(kind(on_axis(rho))), np.float64)
+    near = rho < 10 ** min(exponent / 4, 17)
+    assert np.isfinite(found[near]).all()
+    again = unit(k, np.float64, model).undistort(found[near])
+    assert (np.linalg.norm(again - on_axis(rho[near]), axis=1) < 50 * np.finfo(dtype).eps * rho[near]).all()
+    # Farther away some have none, but none is its own inverse: that is far nearer to the centre.
+    assert not (np.linalg.norm(found, axis=1) > 0.2 * rho)[rho > 100].any()
+
+
 def test_nan_ends_the_search():
     points = on_axis(np.array([0.5, 1.0]))
     d = eqx.tree_at(lambda d: d.coefficients, unit([0.0, 0.1]), np.array([np.nan, 0.1]))  # as under jit

@@ -52,6 +52,9 @@ def test_a_far_centre_about_which_nothing_is_straighter_is_no_finding():
     held, choice = chosen(60, 1)
     not_straighter = dataclasses.replace(choice, fitted=2 * choice.given)
     assert not CentreFound.of(held, not_straighter, None).findings()
+    # Of points beyond a fold, neither is known.
+    unknown = dataclasses.replace(choice, fitted=np.nan, given=np.nan, far=None)
+    assert "nan" not in CentreFound.of(held, unknown, None).sentence
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ FLAGS = {
         *("focal_unit", "hold", "image_size", "interpolation", "keep", "lens", "model", "name"),
         *("overwrite", "pixel_pitch", "shared_focal", "terms", "tolerance"),
     )
-} | {"format": "--to", "track": "--focal"}
+} | {"format": "--to", "track": "--focal", "target": "--output"}
 """Options of the command line by the names of the library's arguments."""
 
 # Within a message, a capital letter marks the content of a file: "Cannot read a.npz: Argument focal ..."

@@ -1,6 +1,7 @@
 """Which centre of distortion `zoomjax calibrate` found, and why."""
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -78,6 +79,8 @@ class CentreFound:
                 f"lines that were not fitted are {choice.fitted:.4f} px off straight about the fitted one, "
                 f"and {choice.given:.4f} px about this"
             )
+            if not math.isfinite(choice.fitted + choice.given):
+                why = "not all points have a corrected position about this one and the fitted one"
         if found is None and choice.found.determined and choice.far is not None:
             why = (
                 f"the one about which lines would be straightest is {choice.far:.0f} px away. With so "
@@ -106,6 +109,8 @@ class CentreFound:
             return self.still("the lines do not determine how it moves")
         if along.far is not None:
             return self.still(f"it would be up to {along.far:.0f} px away, which so few images do not tell")
+        if not math.isfinite(along.fitted + still):
+            return self.still("not all points have a corrected position about this one and one that moves")
         if not along.fitted <= still:
             return self.still(
                 "lines that were not fitted are no straighter about one that moves "

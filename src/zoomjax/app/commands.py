@@ -259,12 +259,14 @@ def calibrate(
         refuse_inputs([output / name for name in names], inputs)
         results = results_folder(output, [*names, REPORT], clears=OF_A_LENS, overwrite=overwrite)
         if dry_run:
-            lines = read_lines(files, focal, image_size, focal_unit)
+            lines = read_lines(files, focal, image_size, focal_unit, focal_sigma)
             check_centre(about, [lines.image_size])
             return tell_plan(lines_plan(lines, excluded(exclude), focal_known=focal != "same"), output)
         with results as folder, stages(quiet=quiet) as stage:
             stage("Reading the lines")
-            lines = without(read_lines(files, focal, image_size, focal_unit), excluded(exclude))
+            lines = without(
+                read_lines(files, focal, image_size, focal_unit, focal_sigma), excluded(exclude)
+            )
             calibration = calibrate_lines(
                 lines,
                 folder,

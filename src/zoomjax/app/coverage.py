@@ -64,6 +64,8 @@ def _by_focal(right, lines, weight):
 def plot_radius(lines: Lines, lens: ZoomLens, weight: np.ndarray) -> Figure:
     """Plot the RMS residual of points against their distance from the centre of distortion.
 
+    Points beyond the fold of the lens, which have no corrected position, are left out.
+
     Args:
         lines: the lines.
         lens: the lens that corrects them.
@@ -72,7 +74,7 @@ def plot_radius(lines: Lines, lens: ZoomLens, weight: np.ndarray) -> Figure:
     kept = np.flatnonzero(weight > 0)
     step = max(1, int(np.asarray(lines.mask)[kept].sum() / _MOST_POINTS))
     radius, residual = _residuals(lines, lens, kept[::step])
-    edges = np.linspace(0, radius.max() + 1e-9, _RINGS + 1)
+    edges = np.linspace(0, radius.max(initial=0) + 1e-9, _RINGS + 1)
     ring = np.digitize(radius, edges) - 1
     number = np.bincount(ring, minlength=_RINGS)[:_RINGS]
     squares = np.bincount(ring, residual**2, minlength=_RINGS)[:_RINGS]
@@ -82,7 +84,7 @@ def plot_radius(lines: Lines, lens: ZoomLens, weight: np.ndarray) -> Figure:
     middle = (edges[1:] + edges[:-1]) / 2
     rms = np.sqrt(squares[known] / number[known])
     axes.plot(middle[known], rms, "o", color=MODEL, markersize=5)
-    axes.set(ylim=(0, 1.15 * rms.max() or 1), xlim=(0, edges[-1]))
+    axes.set(ylim=(0, 1.15 * rms.max(initial=0) or 1), xlim=(0, edges[-1]))
     axes.set_xlabel("distance from the centre of distortion  (px)")
     axes.set_ylabel("RMS residual  (px)")
     axes.spines[["top", "right"]].set_visible(False)
@@ -101,9 +103,11 @@ def _residuals(lines: Lines, lens: ZoomLens, chosen: np.ndarray) -> tuple[np.nda
         corrected[own] = distortion.undistort(points[own])
         for axis, step in enumerate(np.eye(2) / 2):
             ends = (np.asarray(distortion.undistort(points[own] + way)) for way in (step, -step))
-            stretch[own, axis] = next(ends) - next(ends)
+            stretch[own, axis] = np.nan_to_num(next(ends) - next(ends))
         away[own] = points[own] - np.asarray(distortion.centre)
-    mean = corrected.sum(axis=1) / mask.sum(axis=1)[:, None]
+    mask = mask & np.isfinite(corrected).all(axis=-1)
+    corrected = np.where(mask[..., None], corrected, 0)
+    mean = corrected.sum(axis=1) / np.maximum(mask.sum(axis=1), 1)[:, None]
     rows = np.where(mask[..., None], corrected - mean[:, None], 0)
     normal = np.linalg.eigh(np.einsum("lpc,lpd->lcd", rows, rows))[1][..., 0]
     across = np.linalg.norm(np.einsum("lpac,lc->lpa", stretch, normal), axis=-1)

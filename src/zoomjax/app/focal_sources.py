@@ -24,7 +24,7 @@ from ..focal.estimate import FocalEstimate
 from ..focal.pitch import focal_from_pitch, name_pitch_lines
 from ..io.focal_table import read_focal_table
 from ..io.focal_track import read_focal_track
-from ..io.text_table import plain_number
+from ..io.text_table import has_columns, plain_number
 from ..lines.compressed import compress
 from ..lines.lines import Lines
 from ..models.distortion import Distortion
@@ -373,3 +373,15 @@ def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray
     if rest or value is None or value < 0:
         raise ValueError(f"Argument focal_sigma must be a number such as 0.3, or 1%, but it is {text!r}.")
     return value / 100 * np.asarray(focal) if percent else np.full(np.shape(focal), value)
+
+
+def refuse_sigma_column(file: str | Path, focal_sigma: str | None) -> None:
+    """Refuse standard deviations beside focal lengths of lines or of a video: they would not count.
+
+    Unless `focal_sigma` tells what does.
+    """
+    if focal_sigma is None and has_columns(file, ("focal", "sigma")):
+        raise ValueError(
+            f"The column sigma of {file} would not count: such a column is for photos. Give argument "
+            "focal_sigma, one for all, such as 0.3 or 1%, or 0 for focal lengths that are exact."
+        )

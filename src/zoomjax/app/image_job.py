@@ -15,7 +15,7 @@ from ..io.photo import read_focal
 from ..io.text_table import plain_number
 from .board_focals import Board
 from .calibration import FILES
-from .focal_sources import MEASURED, check_source, focal_sigmas
+from .focal_sources import MEASURED, check_source, focal_sigmas, refuse_sigma_column
 from .model_choice import WantedCentre, WantedModel
 from .plane_focals import SHARED_BY
 
@@ -78,6 +78,8 @@ class ImageJob:
                 'Argument focal "pitch" needs the markings of a pitch: give argument detector "pitch", too.'
             )
         focal_sigmas("0" if self.focal_sigma is None else self.focal_sigma, np.ones(1))
+        if self.video is not None and self.focal is not None and self.focal.lower().endswith(".csv"):
+            refuse_sigma_column(self.focal, self.focal_sigma)
         self.model.check_centre(self.centre)
         if self.shared_focal is not None:
             self._check_sharing(self.shared_focal)

@@ -133,7 +133,7 @@ FocalSigma = Annotated[
         metavar="STD",
         help="Standard deviation of the focal lengths, in their unit or per cent, e.g. 0.3 or 1%. "
         "Standard deviations of the results include it. Default: what plane, board or pitch estimate, "
-        "the CSV column sigma, or else 0; of --known-focal 1%.",
+        "for photos the CSV column sigma, or else 0; of --known-focal 1%.",
         rich_help_panel=FOCAL,
     ),
 ]

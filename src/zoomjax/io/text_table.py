@@ -97,7 +97,8 @@ class TextTable:
             ValueError: a number is none; the message names the row.
         """
         values = self.numbers[name]
-        self.check(name, (abs(values) < 2**53) & (values == np.floor(values)), "an integer")
+        self.check(name, values == np.floor(values), "an integer")
+        self.check(name, abs(values) < 2**53, "below 2^53 (number from 0 what has time stamps as names)")
         return values.astype(np.int64)
 
 
@@ -160,6 +161,19 @@ def read_text_table(
         {name: list(columns[name]) for name in texts},
         rows,
     )
+
+
+def has_columns(path: str | os.PathLike[str], names: Sequence[str]) -> bool:
+    """Whether a file names all of these columns, as `read_text_table` reads it.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    try:
+        _header(_split_header(_decoded(Path(path).read_bytes()))[1], names, ())
+    except ValueError:
+        return False
+    return True
 
 
 def _error(path: str, what: str, reason: str) -> ValueError:

@@ -15,20 +15,21 @@ from .distortion_model import AbstractDistortionModel
 _NAN = "give an array with NaN in place of what is masked, .filled(np.nan)"
 
 
-def as_points(points: Any) -> Any:
-    """Points as an array (..., 2) of float32 or float64.
+def as_points(points: Any, size: int = 2) -> Any:
+    """Points as an array (..., size) of float32 or float64.
 
     Raises:
         ValueError: they are not real numbers, or of another shape.
     """
+    shape = f"(..., {size})"
     if not isinstance(points, jax.Array):
         refuse_masked("points", points, _NAN)
         try:
             points = np.asarray(points)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"Argument points must be an array of shape (..., 2): {error}.") from error
-    if points.shape[-1:] != (2,):
-        raise ValueError(f"Argument points must have shape (..., 2), but its shape is {points.shape}.")
+            raise ValueError(f"Argument points must be an array of shape {shape}: {error}.") from error
+    if points.shape[-1:] != (size,):
+        raise ValueError(f"Argument points must have shape {shape}, but its shape is {points.shape}.")
     if not jnp.issubdtype(points.dtype, jnp.integer) and not jnp.issubdtype(points.dtype, jnp.floating):
         raise ValueError(f"Argument points must hold real numbers, but its dtype is {points.dtype}.")
     if jnp.issubdtype(points.dtype, jnp.integer):
@@ -43,6 +44,8 @@ def as_focal(focal: Any) -> Any:
         ValueError: they are not numbers.
     """
     if isinstance(focal, jax.Array):
+        if not jnp.issubdtype(focal.dtype, jnp.integer) and not jnp.issubdtype(focal.dtype, jnp.floating):
+            raise ValueError(f"Argument focal must hold real numbers, but its dtype is {focal.dtype}.")
         return focal
     refuse_masked("focal", focal, _NAN)
     try:

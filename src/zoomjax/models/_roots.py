@@ -211,9 +211,12 @@ def increasing_root(
 
 
 def _rounding(size, dtype):
-    """The residual of an exact root, as rounded."""
+    """The residual of an exact root, as rounded.
+
+    Never infinite: where the function overflows its slope does, too, and that is no root.
+    """
     eps = np.finfo(dtype).eps
-    return lambda q, slope: eps * (size + q * abs(slope))
+    return lambda q, slope: eps * (size + namespace(q).minimum(q * abs(slope), 1 / eps))
 
 
 def _in_bracket(xp, equation, rounding, q, high):

@@ -56,6 +56,12 @@ def checked_about(value: Any) -> About:
         raise ValueError(
             f"Argument about must be a dictionary of words and finite numbers by name, but it is {value!r}."
         )
+    if WIDTH_OF_FOCALS in value:
+        width = value[WIDTH_OF_FOCALS]
+        if isinstance(width, str) or width <= 0:
+            raise ValueError(
+                f"Argument about must hold a positive number as {WIDTH_OF_FOCALS}, but it is {width!r}."
+            )
     return About(value)
 
 

@@ -11,16 +11,16 @@ points, focal lengths and the lens.
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Bool, Float, Num
 
-from .._core.arrays import aligned, as_array, finite, namespace
-from .._core.fields import check_finite, check_positive, check_shapes, numbers, refuse_masked
+from .._core.arrays import aligned, finite, namespace
+from .._core.fields import check_finite, check_positive, check_shapes, numbers
 from .._core.pixels import check_pitch
 from .._core.types import AnyArray, FocalLike, Points
+from ._arguments import as_points
 from .about import WIDTH_OF_FOCALS
 from .lens import ZoomLens
 
@@ -114,11 +114,8 @@ class Camera(eqx.Module):
             Positions in the distorted image, px, inside of it or not, and a mask of the points that have
             one. Points not in front of the camera, or without an inverse, are NaN with derivatives of zero.
         """
-        refuse_masked("points", points)
-        space: Any = points if isinstance(points, jax.Array) else as_array(np.asarray(points))
+        space = as_points(points, 3)
         xp = namespace(space)
-        if space.shape[-1:] != (3,):
-            raise ValueError(f"Argument points must have shape (..., 3), but its shape is {space.shape}.")
         before = space[..., 2] > 0
         depth = xp.where(before, space[..., 2], 1)
         flat, principal, length = self._aligned(space[..., :2] / depth[..., None], focal)

@@ -348,6 +348,8 @@ def _distorted_jvp(distortion_of, primals, tangents):
     distortion_model = distortion_of(primals[1])[0]
     (_, k, centre, scale), (y_dot, k_dot, centre_dot, scale_dot) = jax.jvp(normal, primals, tangents)
     z = tuple(jnp.where(exists, (w[..., i] - centre[i]) / scale, 0) for i in (0, 1))
+    z, far = distortion_model.before_pole(z, k)
+    y_dot = tuple(jnp.where(far, 0, side) for side in y_dot)
     squared = z[0] * z[0] + z[1] * z[1]
     # dF/dz dz = dy - dF/dk dk.
     by_k = jax.jvp(lambda k: distortion_model.correct(z, squared, k), (k,), (k_dot,))[1]

@@ -140,6 +140,15 @@ class AbstractDistortionModel(eqx.Module):
         """
         return squared <= (self.monotone_radius(k) * (1 + digits * np.finfo(squared.dtype).eps)) ** 2
 
+    def before_pole(self, z: Pair, k: Elements) -> tuple[Pair, Bool[AnyArray, "..."]]:
+        """The point itself; of one next to a pole, another one nearby, at which `correct` gives numbers.
+
+        For derivatives of the inverse: by k they go on smoothly to the pole. Also whether it is another
+        one: what is corrected to there is so far away that the inverse hardly depends on it.
+        """
+        del k
+        return z, namespace(*z).zeros(z[0].shape, bool)
+
     @abc.abstractmethod
     def conditions(self, number: int) -> np.ndarray:
         """Rows m such that it is invertible up to R where ``1 + sum_i m_i k_i r^o_i > 0`` for r up to R.

@@ -4,11 +4,11 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._core.arrays import namespace
 from .._core.types import AnyArray, Elements
-from .distortion_model import AbstractRadial, radial_factor, radial_orders, radial_rest, times
+from .distortion_model import AbstractRadial, Pair, radial_factor, radial_orders, radial_rest, times
 
 
 class Division(AbstractRadial):
@@ -44,6 +44,13 @@ class Division(AbstractRadial):
         xp, divisor = namespace(squared, k), radial_factor(squared, k)
         known = abs(divisor) > np.sqrt(np.finfo(divisor.dtype).eps)
         return xp.where(known, 1 / xp.where(known, divisor, 1), np.nan)
+
+    def before_pole(self, z: Pair, k: Elements) -> tuple[Pair, Bool[AnyArray, "..."]]:
+        """A point nearer to the centre by some roots of eps, where L is NaN."""
+        xp, eps = namespace(*z, k), np.finfo(z[0].dtype).eps
+        next_to = xp.isnan(self.factor(z[0] * z[0] + z[1] * z[1], k))
+        nearer = xp.where(next_to, 1 - 4 * np.sqrt(eps), 1).astype(z[0].dtype)
+        return (z[0] * nearer, z[1] * nearer), next_to
 
     def slope(self, squared: Float[AnyArray, "..."], k: Elements) -> Float[AnyArray, "..."]:
         """``(1 - k1 t - 3 k2 t^2 - ...) / (1 + k1 t + ...)^2``."""
