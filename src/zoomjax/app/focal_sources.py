@@ -24,7 +24,7 @@ from ..focal.estimate import FocalEstimate
 from ..focal.pitch import focal_from_pitch, name_pitch_lines
 from ..io.focal_table import read_focal_table
 from ..io.focal_track import read_focal_track
-from ..io.text_table import has_columns, plain_number
+from ..io.text_table import has_columns, plain_number, read_text_table
 from ..lines.compressed import compress
 from ..lines.lines import Lines
 from ..models.distortion import Distortion
@@ -380,8 +380,13 @@ def refuse_sigma_column(file: str | Path, focal_sigma: str | None) -> None:
 
     Unless `focal_sigma` tells what does.
     """
-    if focal_sigma is None and has_columns(file, ("focal", "sigma")):
-        raise ValueError(
-            f"The column sigma of {file} would not count: such a column is for photos. Give argument "
-            "focal_sigma, one for all, such as 0.3 or 1%, or 0 for focal lengths that are exact."
-        )
+    if focal_sigma is not None or not has_columns(file, ("focal", "sigma")):
+        return
+    table = read_text_table(file, "focal lengths", numbers=("focal", "sigma"), gaps=("focal", "sigma"))
+    share = 100 * table.numbers["sigma"] / table.numbers["focal"]
+    share = share[np.isfinite(share) & (share > 0)]
+    usual = f"{np.median(share):.2g}%, as most of it says," if len(share) else "1%"
+    raise ValueError(
+        f"The column sigma of {file} would not count: such a column is for photos. Give argument "
+        f"focal_sigma, one for all, such as {usual} or 0 for focal lengths that are exact."
+    )
