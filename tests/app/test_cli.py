@@ -251,8 +251,7 @@ def test_a_column_of_standard_deviations_that_would_not_count_is_refused(place, 
     with pytest.raises(ValueError, match=r"The column sigma of .*\.csv would not count") as refused:
         read(None)
     assert with_flags(str(refused.value)).endswith(
-        "Give --focal-sigma, one for all, such as 2.1%, as most of it says, or 0 for focal lengths that are "
-        "exact."
+        "such as 2.1%, as most of it says, or 0 for focal lengths that are exact."
     )
     assert read("0") is not None
 
