@@ -596,6 +596,7 @@ WRONG = {
         ["a.jpg", "--focal", "same", "--focal-sigma", "1%"],
         "--focal-sigma has no effect with --focal same",
     ),
+    "a size of nothing": (["lines.csv", "--image-size", "0x480"], "--image-size must be like"),
     "a size in other digits": (["lines.csv", "--image-size", "²x3"], "--image-size must be like"),
     "csv without image size": (["lines.csv"], "--image-size"),
     "csv with a bad image size": (["lines.csv", "--image-size", "big"], "1920x1080"),

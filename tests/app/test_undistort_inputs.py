@@ -58,6 +58,16 @@ def test_what_is_not_there_is_said_so(folder):
             undistort_files(job(folder, "in", name))
 
 
+@pytest.mark.parametrize("out", ["lens.json", "in/notes.txt", "in/a.jpg"])
+@pytest.mark.parametrize("inputs", [["in/day/a.jpg"], ["in"]])
+def test_an_output_that_is_another_file_is_refused_and_kept(inputs, out, folder):
+    before = (folder / out).read_bytes()
+    if (inputs, out) != (["in/day/a.jpg"], "in/a.jpg"):  # which would be replaced, as is asked for
+        with pytest.raises(ValueError, match="must be a folder"):
+            undistort_files(job(folder, *inputs, out=out, overwrite=True))
+    assert (folder / out).read_bytes() == before
+
+
 def test_a_pattern_keeps_the_structure_below_its_fixed_part(folder):
     undistort_files(job(folder, "in/**/*.jpg"))
     assert files(folder / "out") == ["a.jpg", "day/a.jpg"]

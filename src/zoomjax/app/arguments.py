@@ -242,7 +242,7 @@ def size_of(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     width, _, height = text.lower().partition("x")
-    if not all(side.isascii() and side.isdigit() for side in (width, height)):
+    if not all(side.isascii() and side.isdigit() and int(side) for side in (width, height)):
         raise ValueError(f"--image-size must be like 1920x1080, but it is {text!r}.")
     return int(width), int(height)
 

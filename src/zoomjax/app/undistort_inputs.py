@@ -168,12 +168,14 @@ def targets_of(found: Sequence[tuple[Path, Path]], output: Path, inputs: Sequenc
     """Where each result goes: into the folder `output`, or for a single input to the file of that name.
 
     Raises:
-        ValueError: a file is given for several results, or its suffix is unknown.
+        ValueError: a file is given for several results, its suffix is unknown, or it is another file.
     """
     is_photo = found[0][0].suffix.lower() in SUFFIXES
     known = tuple(FORMATS) if is_photo else VIDEO_SUFFIXES
     single = len(found) == 1 and not any(path.is_dir() for path in inputs)
     if output.is_dir() or (output.suffix.lower() not in known and not _is_media(output)):
+        if output.is_file():
+            raise ValueError(f"The output must be a folder, a photo or a video, but {output} is a file.")
         return [output / name for _, name in found]
     if not single:
         raise ValueError(
