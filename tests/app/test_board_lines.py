@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import zoomjax as zj
 from tests._boards import COLUMNS, FOCAL, LABEL, ROWS, SIZE, bent, displaced, seen_through, true_lens
 from zoomjax import fit_zoom
 from zoomjax.app.board_bundle import bundle_of
@@ -20,10 +21,11 @@ from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.plane_focals import FocalGroup
 from zoomjax.detect import GridDetector
 from zoomjax.detect.batch import Detection
+from zoomjax.fit import fit_centre
 from zoomjax.fit._board_shape import grid_places
 from zoomjax.lines import compress_any_centre
 from zoomjax.models import Division, RadialPolynomial
-from zoomjax.trust import displacement_std
+from zoomjax.trust import displacement_std, std_of
 
 TRUE = [1000.0, 1600.0, 2600.0]
 
@@ -75,6 +77,18 @@ def test_bands_of_a_straightened_board_hold_the_truth_and_are_wider(of_bent):
     ]
     assert (std > 1.1 * narrow).all()
     assert (np.array(missed) < 3 * std).all()
+
+
+def test_a_centre_that_moves_is_as_uncertain_as_one_by_the_shape_of_the_board(of_bent):
+    used, _, bundle = of_bent
+    lines = lines_of(bundle.lines_used(used), np.asarray(bundle.fit.frame_focal), "px")
+    fit = fit_centre(lines, centre=zj.PolynomialZoom(degree=1)).fit
+    more = float(fit.lens.scale) ** 2 * np.diag(bundle.fit.fit.joint)[-2:]
+    for f in np.asarray(bundle.fit.focal)[[0, -1]]:
+        narrow, wide = (
+            np.asarray(std_of(of, lambda lens, f=f: lens.centre_at(f))) for of in (fit, bundle.widened(fit))
+        )
+        np.testing.assert_allclose(wide**2, narrow**2 + more, rtol=1e-6)
 
 
 def test_boards_seen_on_their_side_are_the_same_board(of_bent):

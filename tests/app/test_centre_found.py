@@ -10,10 +10,12 @@ from zoomjax import scenes
 from zoomjax.app.calibration import calibrate
 from zoomjax.app.centre_found import CentreFound
 from zoomjax.app.model_choice import WantedModel, one_centre
+from zoomjax.app.outward import outward
 from zoomjax.app.report import report
 from zoomjax.lines import compress_any_centre
 from zoomjax.models import Model
 from zoomjax.models.zoom import with_parameters
+from zoomjax.trust.bands import std_of
 from zoomjax.trust.centre_choice import choose_centre
 
 SIZE = (1072, 712)
@@ -56,6 +58,13 @@ def test_a_centre_that_moves_is_found_where_it_is():
     assert abs(off).max() < 4
     assert found.assessment.verdict == "good"
     assert found.centre.sentence.startswith("The centre of distortion was fitted, and moves along the zoom")
+    middle = 2 / (1 / float(FOCAL.min()) + 1 / float(FOCAL.max()))
+    assert np.allclose(found.centre.centre, found.fit.lens.centre_at(middle))
+    expected = std_of(found.fit, lambda lens: lens.centre_at(middle))
+    assert found.centre.std == pytest.approx(np.asarray(expected).tolist())
+    f, moved, _ = found.corner()[0]
+    corners = np.array([[0.0, 0.0], [1071.0, 0.0], [1071.0, 711.0], [0.0, 711.0]])
+    assert abs(moved) == pytest.approx(abs(outward(found.fit.lens, corners, [f])).max())
     assert found.summary()["centre"]["how"] == "moving"
     page = report(found)
     assert "which moves along the zoom" in page

@@ -37,8 +37,10 @@ def results(tmp_path):
     return tmp_path, lines, summary
 
 
-def test_deviations_groups_centre_and_board_are_those_of_the_summary(results):
-    folder, lines, _ = results
+@pytest.mark.parametrize("how", ["fitted", "moving"])
+def test_deviations_groups_centre_and_board_are_those_of_the_summary(how, results):
+    folder, lines, summary = results
+    (folder / "summary.json").write_text(json.dumps(summary | {"centre": {"how": how}}))
     known = earlier_of([folder / "lines.npz"], lines)
     np.testing.assert_array_equal(known.sigma, SIGMA)
     assert known.shared[0] == known.shared[1] != known.shared[2]

@@ -110,9 +110,12 @@ def widened(fit: ZoomFit, board: BoardFit) -> ZoomFit:
         misfit = _added(fit.misfit, np.s_[: len(misfit), : len(misfit)], misfit)
     fit = eqx.tree_at(lambda f: f.misfit, fit, as_jax(misfit), is_leaf=lambda leaf: leaf is None)
     own = board.fit.joint
-    if fit.joint is None or own is None or fit.lens.shift is not None:
+    if fit.joint is None or own is None:
         return fit
-    joint = _added(fit.joint, np.s_[-2:, -2:], np.asarray(own)[-2:, -2:])
+    # Of a centre that moves, of the two numbers that are the same at all focal lengths: they come first.
+    first = -2 if fit.lens.shift is None else -np.size(fit.lens.shift.parameters)
+    centre = slice(first, first + 2 or None)
+    joint = _added(fit.joint, (centre, centre), np.asarray(own)[-2:, -2:])
     return eqx.tree_at(lambda f: f.joint, fit, as_jax(joint))
 
 

@@ -37,7 +37,7 @@ from .centre_found import CentreFound
 from .coefficients import coefficient_names, coefficient_rows, finite, pixel_polynomials
 from .fitting import Metric, algebraic_rms, fitted, left_out
 from .model_choice import WantedCentre, WantedModel
-from .outward import outward
+from .outward import middle_centre, outward
 from .results_folder import OF_A_LENS, results_folder
 
 FILES = ("lens.json", "lines.npz", "summary.json", "model.png")
@@ -96,7 +96,7 @@ class Calibration:
         """
         lens = self.fit.lens
         low, high = (float(f) for f in lens.focal_range)
-        centre = np.asarray(lens.centre)
+        centre = middle_centre(lens)
         last = np.array(lens.image_size) - 1
         corner = np.where(centre > last / 2, 0.0, last)
         focal = [low, *([float(np.sqrt(low * high)), high] if high > low else [])]

@@ -10,7 +10,11 @@ from ..fit.centre import CentreFit
 from ..fit.result import ZoomFit
 from ..lines.base import AbstractLines
 from ..trust.assessment import Finding
+from ..trust.bands import std_of
 from ..trust.centre_choice import CentreChoice
+
+_BESIDE = ". Lines that"
+"""After where a centre that moves goes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,19 +120,12 @@ class CentreFound:
                 "lines that were not fitted are no straighter about one that moves "
                 f"({along.fitted:.4f} px, and {still:.4f} px about this)"
             )
-        lens = along.found.fit.lens
-        low, high = (float(f) for f in np.asarray(lens.focal_range))
-        ends = [_place(*np.asarray(lens.centre_at(f)).tolist()) for f in (low, high)]
-        x, y = np.asarray(lens.centre_at(2 / (1 / low + 1 / high))).tolist()
-        sentence = (
-            f"The centre of distortion was fitted, and moves along the zoom: from {ends[0]} at f = "
-            f"{low:.4g} {lens.focal_unit} to {ends[1]} at f = {high:.4g} {lens.focal_unit}. Lines that "
-            f"were not fitted are {along.fitted:.4f} px off straight about it, {still:.4f} px about one "
-            "for all focal lengths."
+        place, std, way = _way(along.found.fit)
+        told = (
+            f"{_BESIDE} were not fitted are {along.fitted:.4f} px off straight about it, and {still:.4f} "
+            "px about one for all focal lengths."
         )
-        away = np.linalg.norm(np.asarray(along.found.centre) - [x, y], axis=1)
-        u, v = np.asarray(along.found.std)[int(np.argmin(away))].tolist()
-        return CentreFound((x, y), (u, v), "moving", sentence)
+        return CentreFound(place, std, "moving", way + told)
 
     def still(self, why: str) -> "CentreFound":
         """The same, and why it was not found to move."""
@@ -136,8 +133,12 @@ class CentreFound:
 
     def as_uncertain_as(self, fit: ZoomFit) -> "CentreFound":
         """The same with the standard deviations that a fit gives it, where it was fitted."""
-        if self.std is None or fit.joint is None or fit.lens.shift is not None:
+        if self.std is None or fit.joint is None:
             return self
+        if self.how == "moving":
+            place, std, way = _way(fit)
+            told = self.sentence[self.sentence.index(_BESIDE) :]
+            return CentreFound(place, std, "moving", way + told)
         x, y = fit.lens.scale * np.sqrt(np.diag(np.asarray(fit.joint))[-2:])
         std = (float(x), float(y))
         return dataclasses.replace(
@@ -149,6 +150,22 @@ class CentreFound:
         x, y = self.centre
         std = None if self.std is None else list(self.std)
         return {"x": x, "y": y, "std": std, "how": self.how, "sentence": self.sentence}
+
+
+def _way(fit: ZoomFit) -> tuple[tuple[float, float], tuple[float, float], str]:
+    """The centre in the middle of the zoom, px, its standard deviations, and where it goes, in words."""
+    lens = fit.lens
+    low, high = (float(f) for f in np.asarray(lens.focal_range))
+    at = np.array([low, 2 / (1 / low + 1 / high), high])
+    places = np.asarray(lens.centre_at(at)).tolist()
+    stds = np.asarray(std_of(fit, lambda lens: lens.centre_at(at))).tolist()
+    ends = [
+        f"{_place(*places[end])}, {_spread((stds[end][0], stds[end][1]))}, at f = {at[end]:.4g} "
+        f"{lens.focal_unit}"
+        for end in (0, 2)
+    ]
+    way = f"The centre of distortion was fitted, and moves along the zoom: from {ends[0]} to {ends[1]}"
+    return (places[1][0], places[1][1]), (stds[1][0], stds[1][1]), way
 
 
 def _spread(std: tuple[float, float]) -> str:

@@ -124,7 +124,7 @@ def _of_file(file: Path) -> _Part | None:
 
 
 def _of_summary(summary: dict[str, Any]) -> _Part:
-    centre = summary["centre"]["how"] == "fitted"
+    centre = summary["centre"]["how"] in ("fitted", "moving")
     if before := summary.get("earlier"):
         focal = np.array([float(row["focal"]) for row in summary["per_frame"]])
         sigma, shared = before["focal_sigma"], before["shared"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..fit.result import ZoomFit
 from ..trust.bands import displacement_std
-from .outward import distortions_at, outward
+from .outward import distortions_at, middle_centre, outward
 
 _STEPS, _RADII, _CELLS, _PER_CELL = 41, 25, 12, 3
 _VISIBLE = 0.03  # of the longer side: how far the grid is bent at least, where that is most
@@ -29,7 +29,7 @@ def slider(fit: ZoomFit) -> dict[str, Any] | None:
     if not low < high:
         return None
     focals = 1 / np.linspace(1 / low, 1 / high, _STEPS)
-    centre, size = np.asarray(lens.centre), np.array(lens.image_size)
+    centre, size = middle_centre(lens), np.array(lens.image_size)
     straight = _grid(size)
     joints = np.concatenate(straight)
     off = np.stack([np.asarray(d.distort(joints)) - joints for d in distortions_at(lens, focals)])
