@@ -100,7 +100,7 @@ def read_lines(
         if path.resolve() in [other.resolve() for other in inputs[:index]]:
             raise ValueError(f"{path} is given twice: its lines would count twice.")
     parts = [_read_lines(path, focal, image_size, focal_unit) for path in inputs]
-    for path in filter(_is_csv, [*inputs, *([] if focal is None else [focal])]):
+    for path in [*inputs, *([] if focal is None else [focal])]:
         refuse_sigma_column(path, focal_sigma)
     if len(parts) == 1:
         return parts[0]
@@ -114,10 +114,6 @@ def read_lines(
         for index, path in reversed([*enumerate(inputs)]):
             told = told.replace(f"parts[{index}]", str(path))
         raise ValueError(told) from error
-
-
-def _is_csv(path: Path | str) -> bool:
-    return str(path).lower().endswith(".csv")
 
 
 def _refuse_frames_again(inputs: list[Path], parts: "list[Lines]") -> None:
@@ -184,7 +180,7 @@ def _focal_of_lines(path: Path, focal: str | None) -> "dict[int, float] | float 
     from ..io.text_table import plain_number
     from ..lines.csv import read_focal_csv
 
-    if focal is None or _is_csv(focal):
+    if focal is None or focal.lower().endswith(".csv"):
         return None if focal is None else read_focal_csv(Path(focal))
     if focal == "same":
         return 1.0  # it stands for what nobody knows

@@ -12,6 +12,7 @@ from ..lines.base import AbstractLines
 from ..trust.assessment import Finding
 from ..trust.bands import std_of
 from ..trust.centre_choice import CentreChoice
+from .outward import middle_focal
 
 _BESIDE = ". Lines that"
 """After where a centre that moves goes."""
@@ -156,7 +157,7 @@ def _way(fit: ZoomFit) -> tuple[tuple[float, float], tuple[float, float], str]:
     """The centre in the middle of the zoom, px, its standard deviations, and where it goes, in words."""
     lens = fit.lens
     low, high = (float(f) for f in np.asarray(lens.focal_range))
-    at = np.array([low, 2 / (1 / low + 1 / high), high])
+    at = np.array([low, middle_focal(lens), high])
     places = np.asarray(lens.centre_at(at)).tolist()
     stds = np.asarray(std_of(fit, lambda lens: lens.centre_at(at))).tolist()
     ends = [

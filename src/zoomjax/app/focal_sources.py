@@ -378,12 +378,13 @@ def focal_sigmas(text: str, focal: Float[AnyArray, "frame"]) -> Float[np.ndarray
 def refuse_sigma_column(file: str | Path, focal_sigma: str | None) -> None:
     """Refuse standard deviations beside focal lengths of lines or of a video: they would not count.
 
-    Unless `focal_sigma` tells what does.
+    Unless `focal_sigma` tells what does. What is no CSV file has none.
     """
-    if focal_sigma is not None or not has_columns(file, ("focal", "sigma")):
+    table = str(file).lower().endswith(".csv")
+    if focal_sigma is not None or not table or not has_columns(file, ("focal", "sigma")):
         return
-    table = read_text_table(file, "focal lengths", numbers=("focal", "sigma"), gaps=("focal", "sigma"))
-    share = 100 * table.numbers["sigma"] / table.numbers["focal"]
+    told = read_text_table(file, "focal lengths", numbers=("focal", "sigma"), gaps=("focal", "sigma"))
+    share = 100 * told.numbers["sigma"] / told.numbers["focal"]
     share = share[np.isfinite(share) & (share > 0)]
     usual = f"{np.median(share):.2g}%, as most of it says," if len(share) else "1%"
     raise ValueError(

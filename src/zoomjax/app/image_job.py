@@ -78,7 +78,7 @@ class ImageJob:
                 'Argument focal "pitch" needs the markings of a pitch: give argument detector "pitch", too.'
             )
         focal_sigmas("0" if self.focal_sigma is None else self.focal_sigma, np.ones(1))
-        if self.video is not None and self.focal is not None and self.focal.lower().endswith(".csv"):
+        if self.video is not None and self.focal is not None:
             refuse_sigma_column(self.focal, self.focal_sigma)
         self.model.check_centre(self.centre)
         if self.shared_focal is not None:

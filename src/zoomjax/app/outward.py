@@ -34,8 +34,13 @@ def distortions_at(lens: ZoomLens, focal: Iterable[float]) -> list[Distortion]:
 
 def middle_centre(lens: ZoomLens) -> np.ndarray:
     """The centre of distortion, px: in the middle of the zoom, in 1/f, if it moves along it."""
+    return np.asarray(lens.centre_at(middle_focal(lens)))
+
+
+def middle_focal(lens: ZoomLens) -> float:
+    """The focal length in the middle of the zoom, in 1/f."""
     low, high = (float(f) for f in np.asarray(lens.focal_range))
-    return np.asarray(lens.centre_at(2 / (1 / low + 1 / high)))
+    return 2 / (1 / low + 1 / high)
 
 
 def outward(lens: ZoomLens, points: np.ndarray, focal: Iterable[float]) -> np.ndarray:
