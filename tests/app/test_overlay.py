@@ -36,6 +36,16 @@ def test_rejected_lines_are_dashed_and_red():
     assert 0.3 < red[15:85, 30].mean() < 0.8
 
 
+@pytest.mark.parametrize("points", [2, 5, 22, 700])
+def test_dashes_go_from_end_to_end_however_many_points_there_are(points):
+    line = np.stack([np.linspace(20, 620, points), np.full(points, 50.0)], axis=1)
+    row = draw_lines(np.zeros((100, 640), np.uint8), [line], [True])[50, :, 2] > 0
+    assert row[20:40].any()
+    assert row[600:622].any()
+    assert 0.4 < row[20:621].mean() < 0.7
+    assert (np.diff(row[20:621].astype(int)) == 1).sum() > 10
+
+
 def test_lines_are_coloured_by_how_far_they_are_from_straight():
     lines = [LINE + np.array([20.0 * i, 0]) for i in range(3)]
     picture = draw_lines(np.zeros((100, 100), np.uint8), lines, [False] * 3, rms=[0.0, 0.5, 9.0], limit=1.0)

@@ -57,7 +57,7 @@ def draw_lines(
     shown = [(line + 0.5) * scale - 0.5 for line in lines]
     for index, line in enumerate(shown):
         if rejected[index]:
-            for dash in np.array_split(line, max(2, len(line) // 8))[::2]:
+            for dash in _dashes(line):
                 _draw(picture, dash, _REJECTED, width + 1)
         else:
             _draw(picture, line, colour(rms[index] / limit if len(rms) and limit > 0 else 0.0), width)
@@ -86,6 +86,16 @@ def _thinned(line: np.ndarray) -> np.ndarray:
     steps = np.hypot(*np.diff(line, axis=0).T)
     kept = np.diff(np.cumsum(steps) // _APART, prepend=0.0) > 0
     return line[np.concatenate([[True], kept[:-1], [True]])]
+
+
+def _dashes(line: np.ndarray) -> Sequence[np.ndarray]:
+    """Pieces of a line, all as long as the gaps between them, from end to end."""
+    if len(line) < 2:
+        return [line]
+    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
+    number = max(1, round(along[-1] / (2 * _APART)))
+    ends = np.linspace(0, along[-1], 2 * number)
+    return list(np.stack([np.interp(ends, along, side) for side in line.T], axis=1).reshape(number, 2, 2))
 
 
 def _write(picture: np.ndarray, text: str, line: np.ndarray, share: float) -> None:
