@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from zoomjax._core import programs
-from zoomjax._core.programs import light_program, program, program_of_steps
+from zoomjax._core.programs import light_program, program, program_of_steps, rare_program
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +24,7 @@ def spread(values, *, power):
     return jnp.sum(jnp.sin(values) ** power)
 
 
-@pytest.mark.parametrize("make", [program, light_program, program_of_steps])
+@pytest.mark.parametrize("make", [program, light_program, program_of_steps, rare_program])
 def test_program_gives_what_the_function_gives(make):
     values = np.linspace(0, 1, 9)
     compiled = make(spread)
@@ -60,6 +60,23 @@ def test_many_steps_are_compiled_without_emitters_by_a_process_that_runs_once(mo
     assert of(True) == {"xla_cpu_use_fusion_emitters": False}
     assert of(False) == {}
     assert tuple(of(True).items()) in programs.all_settings()
+
+
+def test_rare_programs_are_not_optimised_by_a_process_that_runs_once(monkeypatch):
+    levels, settings_of = [], programs._settings
+
+    def noted(kind):
+        levels.append(dict(settings_of(kind))["xla_backend_optimization_level"])
+        return settings_of(kind)
+
+    few, many = np.ones(9), np.ones(programs._LARGER * programs._ROWS + 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(programs, "_settings", noted)
+        rare_program(spread)(few, power=2)
+        patch.setattr(programs._USE, "once", True)
+        rare_program(spread)(few, power=2)
+        rare_program(spread)(many, power=2)
+    assert levels == [1, 0, 1]
 
 
 def test_settings_of_the_environment_come_first(monkeypatch):

@@ -123,7 +123,7 @@ def test_calibration_has_the_board_s_uncertainty_in_bands_and_centre(of_bent):
     lines = lines_of(bundle.lines_used(used), np.asarray(bundle.fit.frame_focal), "px")
     model = WantedModel(model="polynomial", degree=2)
     plain, wide = (calibrate(lines, model=model, widened=w) for w in (lambda fit: fit, bundle.widened))
-    for at, other in zip(plain.corner(), wide.corner(), strict=True):
+    for at, other in zip(plain.corner, wide.corner, strict=True):
         assert other[1] == pytest.approx(at[1])
         assert other[2] > at[2]
     assert (np.array(wide.centre.std) > plain.centre.std).all()

@@ -229,7 +229,7 @@ def test_bands_allow_for_uncertain_focal_lengths(calibration):
     small = in_image(zj.compress(calibration.lines))
     expected = zj.fit.with_focal_sigma(calibration.fit, small, focal_sigma=sigma)
     np.testing.assert_allclose(allowed.fit.covariance, expected.covariance, rtol=1e-6)
-    assert all(a[2] > b[2] for a, b in zip(allowed.corner(), calibration.corner(), strict=True))
+    assert all(a[2] > b[2] for a, b in zip(allowed.corner, calibration.corner, strict=True))
     told = [row["focal_sigma"] for row in allowed.summary()["per_frame"]]
     np.testing.assert_allclose(told, sigma)
     assert allowed.next_photo.sentence == calibration.next_photo.sentence

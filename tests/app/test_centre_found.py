@@ -62,7 +62,7 @@ def test_a_centre_that_moves_is_found_where_it_is():
     assert np.allclose(found.centre.centre, found.fit.lens.centre_at(middle))
     expected = std_of(found.fit, lambda lens: lens.centre_at(middle))
     assert found.centre.std == pytest.approx(np.asarray(expected).tolist())
-    f, moved, _ = found.corner()[0]
+    f, moved, _ = found.corner[0]
     corners = np.array([[0.0, 0.0], [1071.0, 0.0], [1071.0, 711.0], [0.0, 711.0]])
     assert abs(moved) == pytest.approx(abs(outward(found.fit.lens, corners, [f])).max())
     assert found.summary()["centre"]["how"] == "moving"

@@ -168,7 +168,7 @@ def test_bands_of_another_fit_have_them_and_of_one_after_that(results):
     assert summary["centre"]["how"] == "fitted"  # from the middle of the image, not kept where it was
     again, _ = fitted()
     assert again.focal_sigma.tolist() == SIGMA
-    assert again.corner() == first.corner()
+    assert again.corner == first.corner
     exact, _ = fitted("0")
     assert exact.focal_sigma.tolist() == [0, 0, 0]
-    assert all(there[2] < of[2] for there, of in zip(exact.corner(), first.corner(), strict=True))
+    assert all(there[2] < of[2] for there, of in zip(exact.corner, first.corner, strict=True))

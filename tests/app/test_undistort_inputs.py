@@ -51,6 +51,16 @@ def test_a_folder_keeps_its_structure(folder):
     np.testing.assert_array_equal(after, zj.undistort_image(before, lens()(40.0)))
 
 
+def test_videos_beside_photos_are_said(folder):
+    assert undistort_files(job(folder, "in", out="before")).notes == ()
+    write_clip(folder / "in/zoom.mp4")
+    done = undistort_files(job(folder, "in"))
+    assert done.sentence == f"3 photos corrected: {folder / 'out'}"
+    assert done.notes == (
+        f"In the folder {folder / 'in'}, one file is left out: zoom.mp4. Give videos by name.",
+    )
+
+
 def test_what_is_not_there_is_said_so(folder):
     """And not taken for a video, which needs focal lengths."""
     for name in ("shoot", "shoot/day.v2"):

@@ -34,6 +34,25 @@ def test_a_folder_holds_its_photographs_in_order(tmp_path, image):
     assert names(find_photos([tmp_path])) == ["a.JPG", "b.png", "c.tif"]
 
 
+def test_videos_and_unread_pictures_of_a_folder_are_said(tmp_path, image):
+    (tmp_path / "sub").mkdir()
+    for name in ("a.png", "sub/b.png"):
+        cv2.imwrite(str(tmp_path / name), image)
+    for name in ("notes.txt", ".hidden.mp4"):
+        (tmp_path / name).write_bytes(b"")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        find_photos([tmp_path])
+    (tmp_path / "sub/c.GIF").write_bytes(b"")
+    with pytest.warns(UserWarning, match=r"one file is left out: sub/c\.GIF\.$"):
+        assert names(find_photos([tmp_path])) == ["a.png", "b.png"]
+    (tmp_path / "\x1bd.mp4").write_bytes(b"")
+    with pytest.warns(
+        UserWarning, match=r"2 files are left out: \\x1bd\.mp4, sub/c\.GIF\. Give videos by name"
+    ):
+        find_photos([tmp_path])
+
+
 def test_patterns_are_expanded(tmp_path, image):
     for name in ("a.png", "b.png", "c.jpg"):
         cv2.imwrite(str(tmp_path / name), image)

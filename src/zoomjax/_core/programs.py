@@ -64,6 +64,7 @@ def program(
     light: bool = False,
     optimised: bool = False,
     in_steps: bool = False,
+    rare: bool = False,
 ) -> Callable[_Given, _Result]:
     """As ``equinox.filter_jit``, with settings of the compiler that save its time.
 
@@ -76,6 +77,7 @@ def program(
         light: whether its work is small for small arguments.
         optimised: whether its work is so much that XLA's own settings pay.
         in_steps: whether it is many small steps, for which emitters do not pay in a process that runs once.
+        rare: whether such a process runs it once, and it is `light` there.
     """
     plain = eqx.filter_jit(function)
 
@@ -84,7 +86,8 @@ def program(
     def call(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
         if not _at_once():
             return plain(*args, **kwargs)
-        settings = _settings(_kind(optimised, in_steps, light and _few((args, kwargs))))
+        small = (light or (rare and _USE.once)) and _few((args, kwargs))
+        settings = _settings(_kind(optimised, in_steps, small))
         try:
             if (run := kept(function, settings, args, kwargs)) is not None:
                 return run()
@@ -126,6 +129,11 @@ def program_of_steps(function: Callable[_Given, _Result]) -> Callable[_Given, _R
 def light_program(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
     """`program` of a function whose work is small for small arguments."""
     return program(function, light=True)
+
+
+def rare_program(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
+    """`program` of a function that a process which does each thing once or twice runs once."""
+    return program(function, rare=True)
 
 
 _UNKNOWN: set[str] = set()  # settings that this version of XLA does not have

@@ -4,11 +4,11 @@ The command line runs this. It prints nothing; plots are made by `plot`.
 """
 
 import dataclasses
+import functools
 import importlib.metadata
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -87,12 +87,12 @@ class Calibration:
     own_centres: OwnCentres | None = None
     in_image: bool = True
 
+    @functools.cached_property
     def corner(self) -> list[tuple[float, float, float]]:
         """Displacement of the farthest corner at both ends of the focal range and in its middle.
 
-        Returns:
-            For each focal length: the focal length, the displacement away from the centre, px, of the
-            corner farthest from it, and the standard deviation of the displacement, px.
+        For each focal length: the focal length, the displacement away from the centre, px, of the corner
+        farthest from it, and the standard deviation of the displacement, px.
         """
         lens = self.fit.lens
         low, high = (float(f) for f in lens.focal_range)
@@ -139,7 +139,9 @@ class Calibration:
             return f"{causes[0]} That comes before another photo."
         photo = self.next_photo
         if not self.enough():
-            return photo.sentence if self.focal_known else replace(photo, focal_unit="").sentence
+            return (
+                photo.sentence if self.focal_known else dataclasses.replace(photo, focal_unit="").sentence
+            )
         return (
             "Enough: the standard deviation that noise gives the displacement, in the geometric mean over "
             f"image and focal range, is {photo.before:.2g} px, {photo.after:.2g} px with the best photo."
@@ -200,7 +202,11 @@ class Calibration:
         return warnings
 
     def summary(self) -> dict[str, Any]:
-        """All figures as plain numbers and strings, for JSON."""
+        """All figures as plain numbers and strings, for JSON; computed once."""
+        return dict(self._summary)
+
+    @functools.cached_property
+    def _summary(self) -> dict[str, Any]:
         lens = self.fit.lens
         low, high = (float(f) for f in lens.focal_range)
         frame = np.asarray(self.lines.frame)
@@ -250,7 +256,7 @@ class Calibration:
                 "coefficients": self.coefficient_rows(),
                 "parameters": np.asarray(lens.zoom.parameters).tolist(),
                 "corner_displacement": [
-                    {"focal": f, "px": moved, "std": finite([std])[0]} for f, moved, std in self.corner()
+                    {"focal": f, "px": moved, "std": finite([std])[0]} for f, moved, std in self.corner
                 ],
                 "next_photo": {
                     "focal": self.next_photo.focal,

@@ -205,7 +205,7 @@ def show_calibration(
     console.print(f"\n{calibration.centre.sentence}", highlight=False)
     corner = [
         with_std(moved, std, "px") + f" at {f:.4g} {unit}" * calibration.focal_known
-        for f, moved, std in calibration.corner()
+        for f, moved, std in calibration.corner
     ]
     console.print(f"\nThe correction moves a corner by {', '.join(corner)}.", highlight=False)
     if allowed_for := calibration.allowed_for():

@@ -286,7 +286,7 @@ def _distortion(calibration: Calibration) -> dict[str, Any]:
                 f"{moved:+.2f}".replace("-", "−"),
                 _uncertainty(std),
             )
-            for f, moved, std in calibration.corner()
+            for f, moved, std in calibration.corner
         ],
         "allowed_for": calibration.allowed_for(),
         "grid": embedded_plot(

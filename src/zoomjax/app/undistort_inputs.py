@@ -9,7 +9,7 @@ import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..detect.sources import VIDEO_SUFFIXES, files_within, once, twice
+from ..detect.sources import VIDEO_SUFFIXES, files_within, left_out, once, twice
 from ..io.headers import announced_format, unknown
 from ..io.heic import HEIC_SUFFIXES
 from ..io.photo import FORMATS, SUFFIXES, open_photo
@@ -45,8 +45,8 @@ class Found:
 def find_inputs(inputs: Sequence[Path], output: Path) -> Found:
     """Find photos and videos in files, folders (also nested ones) and patterns.
 
-    A folder stands for its photos, or for its videos if it has none; folders within it are kept in the
-    names of the results, and what lies in `output` is left out.
+    A folder stands for its photos, or for its videos if it has none; what else it has of them is said.
+    Folders within it are kept in the names of the results, and what lies in `output` is left out.
 
     Raises:
         FileNotFoundError: no file fits a pattern, or there is no file or folder of a name.
@@ -59,7 +59,10 @@ def find_inputs(inputs: Sequence[Path], output: Path) -> Found:
     photos = [path for path in files if path not in refused and path.suffix.lower() in SUFFIXES]
     videos = [path for path in files if path not in refused and path.suffix.lower() not in SUFFIXES]
     named = _distinct([(path, names[path]) for path in [*photos, *videos]])
-    return Found(named[: len(photos)], named[len(photos) :], refused, (twice(again),) if again else ())
+    notes = [twice(again)] if again else []
+    used = SUFFIXES if photos else VIDEO_SUFFIXES
+    notes += filter(None, (left_out(folder, used) for folder in inputs if folder.is_dir()))
+    return Found(named[: len(photos)], named[len(photos) :], refused, tuple(notes))
 
 
 def _expanded(given: Path, output: Path) -> list[tuple[Path, Path]]:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from .._core.text import listed, plain
 from ..io.focal_track import FocalTrack
 from ..io.photo import SUFFIXES, metadata_focal, open_photo, read_photo
 from ..io.raw import RAW_SUFFIXES
@@ -21,6 +22,9 @@ VIDEO_SUFFIXES = (
     *(".3gp", ".flv", ".wmv", ".vob", ".ogv"),
 )
 """Of files that count as videos."""
+
+_NOT_READ = (".gif", ".jp2", ".j2k", ".jxl", ".psd", ".exr", ".hdr", ".tga")
+"""Of pictures in formats that are not read."""
 
 RESULTS = ("lines", "model.png", "before-after.jpg", "motion.png", "panorama.jpg")
 """What a calibration puts beside its ``lens.json`` that might be taken for photographs."""
@@ -107,14 +111,16 @@ def find_photos(inputs: Iterable[str | os.PathLike[str]]) -> list[Source]:
         ValueError: an input is not a photo, or a folder has none.
 
     Warns:
-        UserWarning: a photo is given twice, perhaps through a link; it is used once.
+        UserWarning: a photo is given twice, perhaps through a link; it is used once. A folder has videos,
+            or pictures in formats that are not read; they are left out.
     """
     paths: list[Path] = []
     for given in inputs:
         paths += _expanded(os.fspath(given))
     paths, again = once(paths)
-    if again:
-        warnings.warn(twice(again), stacklevel=2)
+    folders = (given for given in map(Path, inputs) if given.is_dir())
+    for note in (*([twice(again)] if again else []), *filter(None, map(left_out, folders))):
+        warnings.warn(note, stacklevel=2)
     return [Source(name, path) for name, path in zip(_names(paths), paths, strict=True)]
 
 
@@ -132,6 +138,18 @@ def twice(again: dict[Path, Path]) -> str:
     what = "is given twice" if path == same else f"is the same file as {same}"
     more = f", and {len(again) - 1} more are like it" if len(again) > 1 else ""
     return f"{path} {what}{more}: it is used once."
+
+
+def left_out(folder: Path, used: Sequence[str] = SUFFIXES) -> str:
+    """A sentence about videos and pictures in a folder that have other suffixes; empty if there are none."""
+    suffixes = {*VIDEO_SUFFIXES, *SUFFIXES, *_NOT_READ}.difference(used)
+    others = files_within(folder, sorted(suffixes))
+    if not others:
+        return ""
+    names = listed((plain(str(path.relative_to(folder))) for path in others), 3)
+    number = "one file is" if len(others) == 1 else f"{len(others)} files are"
+    give = " Give videos by name." if any(path.suffix.lower() in VIDEO_SUFFIXES for path in others) else ""
+    return f"In the folder {plain(str(folder))}, {number} left out: {names}.{give}"
 
 
 def _expanded(given: str) -> list[Path]:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from .._core.arguments import kinds_checked
-from .._core.programs import light_program, program
+from .._core.programs import light_program, program, rare_program
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_frames
 from ..lines.lines import Lines
@@ -84,7 +84,7 @@ def _starts(lines, frames, model):
     return jax.vmap(start)(frames.chosen, frames.present)
 
 
-@program
+@rare_program
 def _minima(lines, frames, model, parameters, solver, max_steps):
     """The parameters of each frame at the minimum, how the solver ended, and after how many steps."""
 

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.arguments import kinds_checked
 from .._core.arrays import as_jax
-from .._core.programs import light_program, program
+from .._core.programs import light_program, rare_program
 from .._core.types import AnyArray, traced
 from ..lines.base import AbstractLines, SomeLines
 from ..lines.best_line import line_residuals
@@ -219,7 +219,7 @@ def _own_weights(lines):
     return jnp.ones_like(lines.counts) if lines.weight is None else lines.weight
 
 
-@program
+@rare_program
 def _reweighted(lines, start, narrowing):
     """The lines with their weights, and the model that goes with them: a Gauss-Newton step a turn."""
     own = _own_weights(lines)

@@ -37,8 +37,10 @@ from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
 from ..models.zoom import AbstractZoom, with_parameters
 
-_SIZES = (16, 512, 8192)
-"""Numbers of points that functions of points are compiled for; larger ones are four to each doubling."""
+_SIZES, _ONCE = (16, 512, 8192), (512, 2048, 8192)
+"""Numbers of points that functions of points are compiled for, and those where programs run once or twice;
+larger ones are four to each doubling.
+"""
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
@@ -83,7 +85,7 @@ def _in_few_sizes(compiled: Callable[..., Any], given: dict[str, Any]) -> Any:
         return compiled(**given)
     points = np.broadcast_to(points, (*shape, 2)).reshape(number, 2)
     focal = np.broadcast_to(focal, shape).reshape(number)
-    size = bucket(number, _SIZES[1:] if used_once() else _SIZES)
+    size = bucket(number, _ONCE if used_once() else _SIZES)
     found = compiled(**given | {"points": padded_to(points, size), "focal": padded_to(focal, size)})
 
     def cut(of):  # by NumPy, which compiles nothing
