@@ -141,7 +141,7 @@ def twice(again: dict[Path, Path]) -> str:
 
 
 def left_out(folder: Path, used: Sequence[str] = SUFFIXES) -> str:
-    """A sentence about videos and pictures in a folder that have other suffixes; empty if there are none."""
+    """A sentence about videos and pictures in a folder with other suffixes; empty if there are none."""
     suffixes = {*VIDEO_SUFFIXES, *SUFFIXES, *_NOT_READ}.difference(used)
     others = files_within(folder, sorted(suffixes))
     if not others:
