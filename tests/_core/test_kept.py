@@ -129,10 +129,24 @@ def test_what_cannot_be_read_is_traced_anew(folder, traced, content):
     file.write_bytes(content)
     again()
     equal(function(np.ones(3)), first)
-    if content != zlib.compress(b"null"):  # that says: it cannot be kept
-        assert traced == ["plain", "plain"]
-        assert kept._read(file) is not None
-        assert len(file.read_bytes()) > len(whole) / 2
+    assert traced == ["plain", "plain"]
+    assert kept._read(file) is not None
+    assert len(file.read_bytes()) > len(whole) / 2
+
+
+def test_a_program_under_the_name_of_another_is_traced_anew(folder, traced):
+    function, x = program(plain), jnp.arange(3.0)
+    wanted = [function(x, y) for y in (1, 2)]
+    first, second = sorted(folder.iterdir())
+    kept_first = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(kept_first)
+    again()
+    equal([function(x, y) for y in (1, 2)], wanted)
+    assert traced == ["plain"] * 4
+    again()
+    equal([function(x, y) for y in (1, 2)], wanted)
+    assert len(traced) == 4
 
 
 def test_files_cut_off_anywhere_are_no_harm(folder):

@@ -543,6 +543,7 @@ WRONG = {
     "options for another kind": (["lines.npz", "--image-size", "640x480"], "for CSV files"),
     "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),
     "a degree of another model": (["lines.npz", "--model", "spline", "--degree", "1"], "for polynomials"),
+    "an empty model": (["lines.npz", "--model", ""], "--model must be one of auto, polynomial"),
     "no such model": (["lines.npz", "--model", "best"], "--model must be one of auto, polynomial"),
     "a centre that is none": (["lines.npz", "--centre", "middle"], "fit, moving, image, or X,Y"),
     "no such distortion model": (

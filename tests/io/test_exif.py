@@ -21,6 +21,15 @@ def test_focal_length_of_both_byte_orders(order, prefix):
     assert exif_focal(prefix + exif(order=order)) == 35.0
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_what_is_no_block_and_no_focal_length_is_refused():
+    with pytest.raises(TypeError, match="Argument block must be bytes"):
+        exif_focal("photo.jpg")  # type: ignore[arg-type]
+    for focal in (0, -35.0, np.nan, np.inf, "35"):
+        with pytest.raises(ValueError, match="Argument focal must be a finite number above 0"):
+            exif_with_focal(focal)
+
+
 @pytest.mark.parametrize(
     "block",
     [

@@ -206,3 +206,8 @@ def test_other_columns_are_ignored_all_the_same(path, header):
     path.write_text(f"{header}\n1,2,3\n")
     found = read_text_table(path, "numbers", numbers=("a",), optional=("weight",)).numbers
     assert set(found) == {"a", "weight"} & set(header.split(","))
+
+
+def test_a_folder_is_no_table(tmp_path):
+    with pytest.raises(IsADirectoryError, match="cannot read focal lengths where there is a folder"):
+        read_text_table(tmp_path, "focal lengths", numbers=("focal",))

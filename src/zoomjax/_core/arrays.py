@@ -44,6 +44,11 @@ def native(array: np.ndarray) -> np.ndarray:
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
+def numeric(array: np.ndarray) -> np.ndarray:
+    """As `native`; long doubles, which JAX does not have, as doubles."""
+    return array.astype(float) if array.dtype.char == "g" else native(array)
+
+
 def held_as_given(array: np.ndarray) -> Any:
     """A JAX array, unless that would change the values' dtype."""
     array = native(array)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import native
+from .arrays import numeric
 from .fields import refuse_masked
 
 
@@ -210,7 +210,7 @@ def real_numbers(values: Any) -> np.ndarray | None:
     except ValueError:  # rows of different lengths
         return None
     if np.issubdtype(array.dtype, np.floating):
-        return array.astype(np.float32) if array.dtype.itemsize < 4 else native(array)
-    if np.issubdtype(array.dtype, np.integer):
+        return array.astype(np.float32) if array.dtype.itemsize < 4 else numeric(array)
+    if array.dtype.kind in "iu":  # not spans of time, which are integers to NumPy
         return array.astype(np.float64)
     return array.astype(np.float64) if array.size == 0 else None

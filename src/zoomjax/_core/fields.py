@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from .arrays import native
+from .arrays import numeric
 
 _FEW = 2**16
 """Elements of a JAX array up to which its values are looked at: more would be waited for."""
@@ -76,9 +76,11 @@ def _converter(name: str, kind: str, make: Callable[[Any], Any] = jnp.array) -> 
             array = _array(value, make) if isinstance(value, int | float | list | tuple) else None
             if array is None:
                 raise ValueError(f"Argument {name} must hold {kind}, but it is {_shown(value)}.")
-        elif isinstance(value, np.generic):
+        elif isinstance(value, np.generic) or _is_foreign(value):
             array = np.asarray(value)
-        array = native(array) if isinstance(array, np.ndarray) else array
+        array = numeric(array) if isinstance(array, np.ndarray) else array
+        if array.dtype.kind == "m":  # spans of time, which are integers to NumPy
+            raise ValueError(f"Argument {name} must hold {kind}, but its dtype is {array.dtype}.")
         if jnp.issubdtype(array.dtype, _KINDS[kind]):
             return array
         if kind == "real numbers" and jnp.issubdtype(array.dtype, jnp.integer) and hasattr(array, "astype"):
@@ -86,6 +88,11 @@ def _converter(name: str, kind: str, make: Callable[[Any], Any] = jnp.array) -> 
         raise ValueError(f"Argument {name} must hold {kind}, but its dtype is {array.dtype}.")
 
     return convert
+
+
+def _is_foreign(value: Any) -> bool:
+    """Whether it is an array of another library, such as a column of pandas, that NumPy can read."""
+    return hasattr(value, "__array__") and not isinstance(value, np.ndarray | jax.Array)
 
 
 def _array(value: Any, make: Callable[[Any], Any]) -> Any:

@@ -269,7 +269,10 @@ def _exported(program: bytes) -> Any:
 
 
 def _read(file: Path) -> tuple[Any, Any] | None:
-    """The structure and the program in a file; None if there is no file, or none that can be read."""
+    """The structure and the program in a file; None if there is no file, or none that can be read.
+
+    Every program says its name, lest one is run for another, as after files were renamed or copied.
+    """
     try:
         packed = file.read_bytes()
     except OSError:
@@ -278,7 +281,10 @@ def _read(file: Path) -> tuple[Any, Any] | None:
         os.utime(file)  # it is in use
     try:
         head, _, program = zlib.decompress(packed).partition(b"\n")
-        return json.loads(head), _exported(program)
+        name, structure = json.loads(head)
+        if name != file.stem:
+            raise ValueError("the file was renamed: it is another program")
+        return structure, _exported(program)
     except Exception:  # whatever the bytes of a file that somebody else wrote make of the readers
         with contextlib.suppress(OSError):
             file.unlink()
@@ -287,7 +293,8 @@ def _read(file: Path) -> tuple[Any, Any] | None:
 
 def _write(file: Path, structure: Any, program: bytes) -> None:
     with contextlib.suppress(OSError), whole_file(file) as part:
-        part.write_bytes(zlib.compress(json.dumps(structure).encode() + b"\n" + program, 1))
+        head = json.dumps([file.stem, structure]).encode()
+        part.write_bytes(zlib.compress(head + b"\n" + program, 1))
 
 
 def _remove_oldest(folder: Path) -> None:

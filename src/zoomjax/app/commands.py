@@ -244,7 +244,7 @@ def calibrate(
     from .model_choice import WantedModel
 
     refuse_auto(model, degree)
-    wanted = WantedModel(model or "auto", degree, terms, distortion_model)
+    wanted = WantedModel("auto" if model is None else model, degree, terms, distortion_model)
     about = wanted.usual_centre if centre is None else centre_of(centre)
     wanted.check_centre(about)
     if focal == "same":

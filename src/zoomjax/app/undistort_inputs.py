@@ -202,7 +202,8 @@ def focal_number(text: str) -> float | None:
         ValueError: it is neither.
     """
     number = plain_number(text)
-    if number is None and not Path(text).exists() and not text.lower().endswith(".csv"):
+    there = text.strip() and Path(text).exists()  # an empty path is the present folder
+    if number is None and not there and not text.lower().endswith(".csv"):
         raise ValueError(
             "Argument focal must be a positive number, with a decimal point, or a CSV file, "
             f"but it is {text!r}."

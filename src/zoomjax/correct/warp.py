@@ -75,17 +75,18 @@ def warp_image(
         (1,)
     """
     refuse_masked_image("image", image)
-    if not hasattr(image, "ndim"):
+    if not isinstance(image, np.ndarray | jax.Array):
         raise ValueError(
             f"Argument image must be an array, but it is a {type(image).__name__}: jnp.asarray(image)."
         )
-    if isinstance(image, np.ndarray):
+    if isinstance(image, np.ndarray) and image.dtype.kind in "fiu" and image.dtype.char != "g":
         image = jnp.asarray(np.asarray(image, image.dtype.newbyteorder("=")))  # JAX takes no others
     if image.ndim < 2 or 0 in image.shape:
         raise ValueError(
             f"Argument image must have shape (height, width, ...) with pixels, but it is {image.shape}."
         )
-    if image.dtype == bool or jnp.issubdtype(image.dtype, jnp.complexfloating):
+    real = jnp.issubdtype(image.dtype, jnp.integer) or jnp.issubdtype(image.dtype, jnp.floating)
+    if not real or image.dtype.kind == "m" or image.dtype.char == "g":
         raise ValueError(
             f"Argument image must hold real numbers, but its dtype is {image.dtype}: image.astype(float)."
         )

@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.arguments import kinds_checked
-from .._core.fields import numbers
+from .._core.fields import real_argument
 from .._core.products import EXACT
 from .._core.programs import light_program
 from .._core.types import AnyArray
@@ -76,7 +76,8 @@ def residuals(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -
         lines: the lines, or their compressed form.
         coefficients: normalised (k1, ..., kN) of each frame.
     """
-    return weighted_distances(about_own_centre(lines), coefficients)
+    k = jnp.asarray(real_argument("coefficients", coefficients))
+    return weighted_distances(about_own_centre(lines), k)
 
 
 def weighted_distances(
@@ -167,12 +168,16 @@ def prior_jacobian(lines: AbstractLines, zoom: AbstractZoom) -> Float[Array, "ro
 
 
 @kinds_checked
-@bucketed_jit(frames=["coefficients"], returns=of_frames)
 def frame_energy(lines: AbstractLines, coefficients: Float[Array, "frame terms"]) -> Float[Array, "frame"]:
     """The error of each frame, px^2: mean over its lines of the mean squared distance (eq. 3).
 
     NaN for a frame of which no line counts: its error is not known.
     """
+    return _frame_energy(lines, jnp.asarray(real_argument("coefficients", coefficients)))
+
+
+@bucketed_jit(frames=["coefficients"], returns=of_frames)
+def _frame_energy(lines, coefficients):
     return energy_by_frame(lines, residuals(lines, coefficients))
 
 
@@ -209,13 +214,16 @@ def _line_squares(lines, coefficients):
 
 
 @kinds_checked
-@light_program
 def global_energy(
     lines: AbstractLines, coefficients: Float[AnyArray, "frame terms"] | list
 ) -> Float[Array, ""]:
     """The global energy, px^2: the mean of the frames' errors (eq. 13)."""
-    k = jnp.asarray(numbers("coefficients")(coefficients))
-    return jnp.sum(residuals(lines, k) ** 2)
+    return _global_energy(lines, jnp.asarray(real_argument("coefficients", coefficients)))
+
+
+@light_program
+def _global_energy(lines, coefficients):
+    return jnp.sum(residuals(lines, coefficients) ** 2)
 
 
 def by_own_coefficients(

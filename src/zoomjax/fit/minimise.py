@@ -6,6 +6,7 @@ the certificate; per iteration one pass over the lines' rows, of which the solve
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import optimistix as optx
 
 from .._core.programs import light_program, program
@@ -61,8 +62,15 @@ def minimise(lines, zoom, solver, max_steps):
         return frame_residuals(lines, coefficients_by(zoom, lines)), prior_residuals(lines, zoom)
 
     start = jax.tree.map(jax.lax.stop_gradient, zoom.parameters)
+    adjoint = optx.ImplicitAdjoint(lx.AutoLinearSolver(well_posed=False))  # the undetermined does not move
     solution = optx.least_squares(
-        function, solver, start, args=(lines, zoom), max_steps=max_steps, throw=False
+        function,
+        solver,
+        start,
+        args=(lines, zoom),
+        max_steps=max_steps,
+        adjoint=adjoint,
+        throw=False,
     )
     steps = jnp.asarray(solution.stats["num_steps"])
     return with_parameters(zoom, solution.value), solution.result, steps.astype(steps.dtype)  # not weak

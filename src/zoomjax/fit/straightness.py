@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from .._core.arguments import kinds_checked
 from .._core.arrays import as_jax
+from .._core.fields import real_argument
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_jit, of_frames
@@ -54,7 +55,7 @@ def frame_rms(
         lens = np.zeros(
             (lines.focal.shape[0], lines.distortion_model.num_coefficients(1)), lines.focal.dtype
         )
-    return _frame_rms(lines, None, as_jax(lens))
+    return _frame_rms(lines, None, as_jax(real_argument("lens", lens)))
 
 
 @bucketed_jit(frames=["coefficients"], returns=of_frames)

@@ -14,6 +14,9 @@ from PIL import ExifTags, Image
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.TiffImagePlugin import IFDRational
 
+from .._core.arguments import check_kind
+from .._core.checks import check_above
+
 File = io.BytesIO | io.BufferedReader
 """What is read, at its beginning."""
 
@@ -25,6 +28,7 @@ _SHORT = 3  # the type of whole numbers of 16 bits
 
 def exif_focal(block: bytes) -> float | None:
     """The focal length, mm, in EXIF data or at the start of a TIFF file; None if they hold none."""
+    check_kind("block", block, (bytes, bytearray))
     exif = parse_exif(io.BytesIO(block.removeprefix(_PREFIX)))
     focal = None if exif is None else exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
     if isinstance(focal, IFDRational) and (not focal.denominator or focal.numerator == _UNKNOWN):
@@ -36,6 +40,7 @@ def exif_focal(block: bytes) -> float | None:
 
 def exif_with_focal(focal: float) -> bytes:
     """EXIF data that hold a focal length, mm, and nothing else."""
+    check_above(0, focal=focal)
     exif = Image.Exif()
     fraction = IFDRational(round(focal * _FINENESS), _FINENESS)
     exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLength: fraction}

@@ -14,6 +14,7 @@ import codecs
 import csv
 import dataclasses
 import difflib
+import errno
 import io
 import itertools
 import os
@@ -133,6 +134,8 @@ def read_text_table(
         ValueError: the file is not such a table, or is ambiguous; the message names file and row.
     """
     source = os.fspath(path)
+    if os.path.isdir(source):
+        raise IsADirectoryError(errno.EISDIR, f"cannot read {what} where there is a folder", source)
     try:
         text = _decoded(Path(path).read_bytes())
         line, first, body = _split_header(text)

@@ -30,7 +30,8 @@ def as_points(points: Any, size: int = 2) -> Any:
             raise ValueError(f"Argument points must be an array of shape {shape}: {error}.") from error
     if points.shape[-1:] != (size,):
         raise ValueError(f"Argument points must have shape {shape}, but its shape is {points.shape}.")
-    if not jnp.issubdtype(points.dtype, jnp.integer) and not jnp.issubdtype(points.dtype, jnp.floating):
+    real = jnp.issubdtype(points.dtype, jnp.integer) or jnp.issubdtype(points.dtype, jnp.floating)
+    if not real or points.dtype.kind == "m":  # spans of time are integers to NumPy
         raise ValueError(f"Argument points must hold real numbers, but its dtype is {points.dtype}.")
     if jnp.issubdtype(points.dtype, jnp.integer):
         return points.astype(float)

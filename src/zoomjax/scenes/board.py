@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, ScalarLike, UInt8
 
-from .._core.checks import check_above, check_between, checked_focal, checked_integer
+from .._core.checks import check_above, check_between, checked_focal, checked_integer, checked_size
 from .._core.types import AnyArray
 from ..lines.lines import Lines
 from ..models.distortion import Distortion
@@ -39,7 +39,7 @@ def nikkor_18_200(image_size: tuple[int, int] = (4288, 2848)) -> ZoomLens:
     Args:
         image_size: (width, height) px of its images, of which the width always covers the whole sensor.
     """
-    width, height = image_size
+    width, height = checked_size(image_size)
     scale = np.hypot(width, height) / 2 * _SENSOR[1] / width  # half the diagonal, in the paper's pixels
     focal_range = jnp.array([20.56, 127.36])
     return ZoomLens(

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from .._core.checks import check_between, checked_focal, checked_integer
+from .._core.checks import check_between, checked_focal, checked_integer, checked_size
 from ..correct.sampler import remap
 from ..models.lens import ZoomLens
 from .motion import camera_between
@@ -198,7 +198,7 @@ def leaves(size: tuple[int, int] = (2048, 1024), *, seed: int = 0) -> UInt8[np.n
         seed: of everything random.
     """
     rng = np.random.default_rng(seed)
-    width, height = size
+    width, height = size = checked_size(size, "size")
     image = np.full((height, width, 3), 110, np.uint8)
     radius, share = min(size) // 4, 1.5
     while radius >= 6:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from .._core.arguments import check_kind
 from .._core.checks import check_above, check_between, checked_focal, checked_integer
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
@@ -49,6 +50,7 @@ def pan_and_zoom(
         pan, tilt: angles from end to end, degrees.
         seed: of where the camera begins its to and fro; by default always the same.
     """
+    check_kind("lens", lens, (ZoomLens,))
     checked_integer("frames", frames, 1)
     check_between(-math.inf, math.inf, pan=pan, tilt=tilt)
     t = np.linspace(0, 1, frames)
