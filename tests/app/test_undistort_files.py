@@ -159,8 +159,11 @@ WRONG = {
     "no focal length": (["zoom.mp4"], "A video needs --focal"),
     "no such track": (["zoom.mp4", "--focal", "none.csv"], "none.csv"),
     "short track": (["zoom.mp4", "--focal", "short.csv"], "or hold its ends (--hold)"),
-    "nothing": (["a.jpg", "--focal", ""], "--focal must be a positive number"),
-    "a folder for a photo": (["a.jpg", "--focal", "."], "cannot read focal lengths where there is a folder"),
+    "an empty word": (["a.jpg", "--focal", ""], "--focal must be a positive number"),
+    "a folder for a photo": (
+        ["a.jpg", "--focal", "."],
+        "cannot read focal lengths where there is a folder",
+    ),
     "negative": (["zoom.mp4", "--focal", "-3"], "--focal must be a positive"),
     "two videos": (["zoom.mp4", "copy.mp4", "--focal", "30"], "of 2 videos must be a folder"),
     "both kinds": (["zoom.mp4", "a.jpg"], "not both"),

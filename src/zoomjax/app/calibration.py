@@ -208,7 +208,6 @@ class Calibration:
     @functools.cached_property
     def _summary(self) -> dict[str, Any]:
         lens = self.fit.lens
-        low, high = (float(f) for f in lens.focal_range)
         frame = np.asarray(self.lines.frame)
         fits = {
             "frame": range(len(self.rms_uncorrected)),
@@ -239,7 +238,7 @@ class Calibration:
                     for line in np.flatnonzero(self.rejected)[np.argsort(-self.line_rms[self.rejected])]
                 ],
                 "points": int(np.sum(np.asarray(self.lines.mask))),
-                "focal_range": [low, high],
+                "focal_range": np.asarray(lens.focal_range).tolist(),
                 "focal_known": self.focal_known,
                 "focal_scale": "relative" if lens.about.get("focal") == RELATIVE else "absolute",
                 "focal_unit": lens.focal_unit,
