@@ -13,6 +13,7 @@ import time
 import tomllib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -744,6 +745,17 @@ def test_what_is_wrong_with_a_model_is_told_on_stderr(tmp_path):
     )
     assert done.returncode == 0
     assert "Warning: The points do not determine" in " ".join(done.stderr.split())
+
+
+def test_a_warning_of_files_that_are_looked_for_again_is_told_once(tmp_path):
+    """Also where no line can be found in them."""
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((80, 120), 128, np.uint8))
+    (tmp_path / "film.gif").write_bytes(b"GIF89a")
+    done = zoomjax("calibrate", tmp_path, tmp_path / "grey.png", "--focal", 30, "-o", tmp_path / "out")
+    assert done.returncode
+    told = " ".join(done.stderr.split())
+    assert told.count("one file is left out: film.gif.") == 1, told
+    assert told.count("is given twice: it is used once.") == 1
 
 
 def test_an_output_folder_that_cannot_be_written_is_told_before_the_work(wrong_files):

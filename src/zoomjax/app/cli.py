@@ -3,6 +3,7 @@
 Errors go to stderr with exit status 2, and leave no partial result.
 """
 
+import functools
 import io
 import os
 import signal
@@ -35,7 +36,7 @@ USAGE: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kin
 
 def main() -> None:
     """Run the command line. An error that the user can fix is one message on stderr, with exit status 2."""
-    warnings.showwarning = _print_warning
+    warnings.showwarning = functools.partial(_print_warning, set())
     sys.unraisablehook = swallowed
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -86,9 +87,12 @@ def _options() -> set[str] | None:
     return options_of(typer.main.get_command(app), sys.argv[1:])
 
 
-def _print_warning(message, category, filename, lineno, file=None, line=None) -> None:
+def _print_warning(told: set[str], message, *_) -> None:
+    """Print a warning, unless one with this text was told: files may be looked for again."""
     unkept = UNKEPT.match(str(message))
     if unkept and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         forget_compiled(unkept[1])
         return
-    print(f"Warning: {plain(with_flags(str(message), _options()))}", file=sys.stderr)
+    if str(message) not in told:
+        told.add(str(message))
+        print(f"Warning: {plain(with_flags(str(message), _options()))}", file=sys.stderr)
