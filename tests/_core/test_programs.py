@@ -63,20 +63,19 @@ def test_many_steps_are_compiled_without_emitters_by_a_process_that_runs_once(mo
 
 
 def test_rare_programs_are_not_optimised_by_a_process_that_runs_once(monkeypatch):
-    levels, settings_of = [], programs._settings
+    kinds, kind_of = [], programs._kind
 
-    def noted(kind):
-        levels.append(dict(settings_of(kind))["xla_backend_optimization_level"])
-        return settings_of(kind)
+    def kind_for(size):
+        rare_program(spread)(np.ones(size), power=2)
+        return kinds[-1]  # a version that does not know a setting asks again
 
-    few, many = np.ones(9), np.ones(programs._LARGER * programs._ROWS + 1)
+    few, many = 9, programs._LARGER * programs._ROWS + 1
     with monkeypatch.context() as patch:
-        patch.setattr(programs, "_settings", noted)
-        rare_program(spread)(few, power=2)
+        patch.setattr(programs, "_kind", lambda *of: kinds.append(kind_of(*of)) or kinds[-1])
+        assert kind_for(few) == "plain"
         patch.setattr(programs._USE, "once", True)
-        rare_program(spread)(few, power=2)
-        rare_program(spread)(many, power=2)
-    assert levels == [1, 0, 1]
+        assert kind_for(few) == "small"
+        assert kind_for(many) == "plain"
 
 
 def test_settings_of_the_environment_come_first(monkeypatch):
