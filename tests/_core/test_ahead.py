@@ -44,6 +44,20 @@ def test_what_was_used_the_last_time_is_ready(folder, monkeypatch, kind):
         equal(kind(doubled)(jnp.arange(4.0) + 1), doubled(np.arange(4.0) + 1))
 
 
+@pytest.mark.parametrize("kind", [program, light_program, optimised_program])
+def test_what_is_ready_is_not_compiled_again(folder, monkeypatch, compilations, kind):
+    values = jnp.arange(4.0) + 1
+    with programs_ahead("a test"):
+        kind(doubled)(values)
+    again(folder, monkeypatch)
+    with programs_ahead("a test"):
+        (begun,) = kept._STORE.ahead.values()
+        begun.result()
+        assert compilations() > 0
+        kind(doubled)(values)
+        assert compilations() == 0
+
+
 def test_other_occasions_have_other_programs(folder, monkeypatch):
     with programs_ahead("a test"):
         program(doubled)(jnp.arange(4.0))

@@ -33,6 +33,7 @@ import numpy as np
 from jax.interpreters import mlir
 
 from .files import whole_file
+from .products import exact_products
 from .structure import UnknownError, put_together, taken_apart, wrapped_name
 
 _BEGAN = time.time()
@@ -160,7 +161,8 @@ def opened(name: str, settings: tuple, *, ahead: bool = False) -> tuple[Any, Cal
     structure, exported = content
     compiled = _jitted(exported, settings)
     if ahead and compiled is not None:
-        compiled.lower(*(jax.ShapeDtypeStruct(of.shape, of.dtype) for of in exported.in_avals)).compile()
+        shapes = (jax.ShapeDtypeStruct(of.shape, of.dtype) for of in exported.in_avals)
+        exact_products(compiled.lower)(*shapes).compile()  # in the context of `program`, else anew there
     return structure, compiled
 
 
