@@ -221,11 +221,26 @@ def everything(frames: int, lines: int, points: int) -> None:
 
 @pytest.mark.slow
 def test_other_sizes_compile_nothing(compilations):
-    everything(10, 9, 30)
+    everything(9, 9, 30)
     assert compilations() > 20
     everything(12, 14, 23)
     everything(17, 5, 31)
     assert compilations() == 0
+
+
+@pytest.mark.slow
+def test_judging_longer_lines_compiles_nothing(compilations):
+    """Numbers of points that other programs are compiled for."""
+    judged = []
+    for sizes in ((9, 9, 70), (17, 12, 250)):
+        given = scene(*sizes)
+        small = zj.compress(given)
+        judged.append((given, zj.fit_zoom(small), small))
+    assert len({bucketed(given).points.shape for given, *_ in judged}) == 2
+    compilations()
+    for number, (given, fit, small) in enumerate(judged):
+        assess(given, fit, compressed=small)
+        assert (compilations() > 0) == (number == 0)
 
 
 def test_other_lines_and_frames_compile_nothing(compilations):

@@ -22,9 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ..fit.energy import coefficients_by
+from .._core.programs import light_program
+from ..fit.energy import settings
 from ..fit.result import ZoomFit
-from ..lines.buckets import bucketed_jit, of_frames
+from ..lines.buckets import padded_frames
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
@@ -71,7 +72,7 @@ def bending(lines: Lines, fit: ZoomFit, weight: np.ndarray, prior: np.ndarray) -
     """
     lens, frame = fit.lens, np.asarray(lines.frame)
     distortion_model = lens.distortion_model
-    k, by_parameter, centre, by_centre = (np.asarray(of, float) for of in _coefficients(lines, lens))
+    k, by_parameter, centre, by_centre = _at_frames(lines, lens)
     share = weight / np.bincount(frame, weight, len(k))[frame].clip(1e-300)
     counted = np.flatnonzero(weight > 0)
     chosen = counted[np.unique(np.linspace(0, len(counted) - 1, _MOST_LINES).astype(int))]
@@ -106,16 +107,21 @@ def bending(lines: Lines, fit: ZoomFit, weight: np.ndarray, prior: np.ndarray) -
     return dataclasses.replace(worst, std=float(np.hypot(worst.std, other)))
 
 
-@bucketed_jit(returns=[of_frames] * 4)
-def _coefficients(lines, lens):
+def _at_frames(lines: Lines, lens: ZoomLens) -> list[np.ndarray]:
     """Each frame's coefficients, their derivatives by the parameters, its centre, and the derivatives of
     that, in half diagonals, by the numbers that say where the centre is."""
+    given = [padded_frames(of) for of in (lines.focal, *settings(lens.zoom, lines))]
+    return [np.asarray(of, float)[: len(lines.focal)] for of in _coefficients(given, lens)]
+
+
+@light_program
+def _coefficients(given, lens):
     flat, unravel = ravel_pytree(lens.zoom.parameters)
 
     def at(flat):
-        return coefficients_by(with_parameters(lens.zoom, unravel(flat)), lines)
+        return jax.vmap(with_parameters(lens.zoom, unravel(flat)))(*given[1:])
 
-    focal = jnp.asarray(lines.focal)
+    focal = given[0]
     if lens.shift is None:
         by_centre = jnp.broadcast_to(jnp.eye(2), (*focal.shape, 2, 2))
     else:

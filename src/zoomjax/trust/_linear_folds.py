@@ -150,7 +150,7 @@ def _values(zooms, given):
     return found
 
 
-_FEWEST = 3
+_FEWEST = 5
 """Models at once, as a power of two: one compiled program for any number up to it."""
 
 

@@ -1,8 +1,8 @@
 """Evidence about a fit, in px: what it explains, what it leaves, and whether its parts agree.
 
-- *Noise* is how far points scatter about a smooth curve through their own line: polynomials of degree
-  `_CURVE` along each corrected line. A line that is bent as a whole is smooth, so the noise is that of the
-  edges alone, and an RMS far above it says that lines are not straight or that the model is too simple.
+- *Noise* is how far points scatter about a smooth curve through their own line, once corrected. A line
+  that is bent as a whole is smooth, so the noise is that of the edges alone, and an RMS far above it says
+  that lines are not straight or that the model is too simple.
 - *Displacement and its standard deviation* are averaged over the image at several focal lengths.
 - *Bending* is the part of both that is no homography, in px of the image: see `_bending`.
 - *Halves*: the model is fitted to one half of the lines and to the other, by a Gauss-Newton step from the
@@ -11,7 +11,7 @@
   evenly, by direction, by frame.
 - *Vanishing points* of corrected lines, which no fit asks for: see `vanishing_points`.
 
-Once per fit: a pass over the points of at most `_MOST_LINES` lines, and a Jacobian of the compressed ones.
+Once per fit: a pass over the points of some lines, and a Jacobian of the compressed ones.
 """
 
 import dataclasses
@@ -45,23 +45,21 @@ from ..fit.problem import about_own_centre, data_of
 from ..fit.result import ZoomFit
 from ..fit.same_camera import check_lines_of, placed_as
 from ..lines.base import AbstractLines
-from ..lines.buckets import bucketed, bucketed_jit, of_lines
+from ..lines.buckets import bucketed_jit, of_lines
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
 from ..models.zoom import AbstractZoom, number_of_coefficients, with_parameters
 from ._bending import bending
+from ._noise import noise
 from .bands import displacement_std
 from .vanishing import VanishingPoints, vanishing_points
 
 NEGLIGIBLE, UNSEEN_PX = 2.5e-4, 0.25
 """Errors that do no harm: as a part of the image's diagonal, and, of small images, px."""
 
-_CURVE = 5
 _FOCALS = 3  # over the range, evenly in 1/f
 _GRID = 9  # points a side of the image
-_MOST_LINES, _LINES_AT_ONCE = 2000, 256  # enough to average over, and a few MB of memory
-_LEAST_POINTS = 12  # of a line whose noise counts
 _LEAST_SHARE = 0.2  # of the lines, that each direction needs
 _SCATTER = 2.7  # noises, by which lines that are not straight exceed it
 _STRAIGHT = 0.01  # px: no line of a photo is straighter
@@ -191,7 +189,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
         focals=np.unique(np.asarray(lines.focal)[frames]).size,
         rms=float(fit.rms),
         rms_uncorrected=float(np.sqrt(np.nanmean(before))),
-        noise=_noise(measured_as(placed, compressed), lens, np.flatnonzero(weight)),
+        noise=noise(measured_as(placed, compressed), lens, np.flatnonzero(weight)),
         displacement=float(np.max(_over_image(np.linalg.norm(moved, axis=-1)))),
         std=float(np.max(_over_image(std))),
         bent=bent.moved,
@@ -221,35 +219,6 @@ def _same_lines(lines: Lines, compressed: AbstractLines) -> AbstractLines:
             "points differ: leave it out."
         )
     return about_own_centre(compressed)
-
-
-def _noise(lines: AbstractLines, lens: ZoomLens, counted: np.ndarray) -> float:
-    """RMS distance, px, of corrected points to smooth curves through their lines."""
-    chosen = counted[np.unique(np.linspace(0, len(counted) - 1, _MOST_LINES).astype(int))]
-    counts, lines = counts_of(lines), bucketed(lines)
-    squares = []
-    for part in np.array_split(chosen, -(-len(chosen) // _LINES_AT_ONCE)):
-        rows = np.asarray(_corrected(lines, np.resize(part, _LINES_AT_ONCE), lens.zoom))
-        pairs = zip(rows[: len(part)], counts[part].astype(int), strict=True)
-        squares += [_roughness(points[:count]) for points, count in pairs if count >= _LEAST_POINTS]
-    return float(np.sqrt(np.mean(squares))) if squares else np.nan
-
-
-@light_program
-def _corrected(lines, index, zoom):
-    def one(line, k):
-        return lines.take(line[None], jnp.ones(1, bool)).corrected(k[None])[0]
-
-    return jax.vmap(one)(index, coefficients_by(zoom, lines)[lines.frame[index]])
-
-
-def _roughness(points: np.ndarray) -> float:
-    """Variance, px^2, of points about a polynomial along the line through them."""
-    points = points - points.mean(axis=0)
-    along, across = (points @ np.linalg.eigh(points.T @ points)[1]).T[::-1]
-    basis = np.polynomial.chebyshev.chebvander(along / (np.abs(along).max() or 1), _CURVE)
-    rest = across - basis @ np.linalg.lstsq(basis, across, rcond=None)[0]
-    return float(rest @ rest) / (len(across) - _CURVE - 1)
 
 
 def _halves(
