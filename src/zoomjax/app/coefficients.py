@@ -6,6 +6,7 @@ import numpy as np
 
 from ..models.lens import ZoomLens
 from ..models.zoom import PolynomialZoom, number_of_coefficients
+from .outward import distortion_at
 
 
 def pixel_polynomials(lens: ZoomLens) -> np.ndarray:
@@ -34,7 +35,8 @@ def coefficient_rows(lens: ZoomLens) -> list[list[float]]:
     """Focal length and k1, ..., kN, px, at some focal lengths over the range, evenly in 1/f."""
     low, high = (float(f) for f in lens.focal_range)
     focal = np.unique(1 / np.linspace(1 / low, 1 / high, 5))
-    return [[f, *np.asarray(lens(f).pixel_coefficients).tolist()] for f in focal.tolist()]
+    k = np.asarray(distortion_at(lens, focal).pixel_coefficients)
+    return np.concatenate([focal[:, None], k], axis=1).tolist()
 
 
 def finite(values: Iterable[float]) -> list[float | None]:

@@ -14,20 +14,27 @@ _FOCALS = (32, 128)
 """Numbers of focal lengths that a program is compiled for; larger ones are four to each doubling."""
 
 
+def distortion_at(lens: ZoomLens, focal: Iterable[float]) -> Distortion:
+    """The distortion at all focal lengths, the first axis, in NumPy's arrays."""
+    focal = np.asarray(list(focal), float)
+    both = at_focal(lens, padded_to(focal, bucket(len(focal), _FOCALS)))
+    k, centre, scale = (np.asarray(of) for of in (both.coefficients, both.centre, both.scale))
+    centre = centre if centre.ndim == 1 else centre[: len(focal)]
+    return dataclasses.replace(both, coefficients=k[: len(focal)], centre=centre, scale=scale)
+
+
 def distortions_at(lens: ZoomLens, focal: Iterable[float]) -> list[Distortion]:
     """The distortion at each focal length, in NumPy's arrays.
 
     As ``[lens(f) for f in focal]``, which runs an operation of JAX after the other for each.
     """
-    focal = np.asarray(list(focal), float)
-    if not len(focal):
+    focal = list(focal)
+    if not focal:
         return []
-    both = at_focal(lens, padded_to(focal, bucket(len(focal), _FOCALS)))
-    k, centre, scale = (np.asarray(of) for of in (both.coefficients, both.centre, both.scale))
+    every = distortion_at(lens, focal)
+    k, centre = every.coefficients, np.broadcast_to(every.centre, (len(focal), 2))
     return [
-        dataclasses.replace(
-            both, coefficients=k[place], centre=centre if centre.ndim == 1 else centre[place], scale=scale
-        )
+        dataclasses.replace(every, coefficients=k[place], centre=centre[place])
         for place in range(len(focal))
     ]
 
@@ -49,9 +56,8 @@ def outward(lens: ZoomLens, points: np.ndarray, focal: Iterable[float]) -> np.nd
     The centre is that at the focal length, if it moves along the zoom.
     """
 
-    def moved(distortion):
-        centre = np.asarray(distortion.centre)
-        before, after = points - centre, np.asarray(distortion.undistort(points)) - centre
-        return np.hypot(after[..., 0], after[..., 1]) - np.hypot(before[..., 0], before[..., 1])
-
-    return np.stack([moved(distortion) for distortion in distortions_at(lens, focal)])
+    every = distortion_at(lens, focal)
+    points = np.broadcast_to(points, (len(every.coefficients), *np.shape(points)))
+    centre = np.asarray(every.centre).reshape(-1, *[1] * (points.ndim - 2), 2)
+    before, after = points - centre, np.asarray(every.undistort(points)) - centre
+    return np.hypot(after[..., 0], after[..., 1]) - np.hypot(before[..., 0], before[..., 1])

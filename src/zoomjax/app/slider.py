@@ -9,7 +9,7 @@ import numpy as np
 
 from ..fit.result import ZoomFit
 from ..trust.bands import displacement_std
-from .outward import distortions_at, middle_centre, outward
+from .outward import distortion_at, middle_centre, outward
 
 _STEPS, _RADII, _CELLS, _PER_CELL = 41, 25, 12, 3
 _VISIBLE = 0.03  # of the longer side: how far the grid is bent at least, where that is most
@@ -32,7 +32,8 @@ def slider(fit: ZoomFit) -> dict[str, Any] | None:
     centre, size = middle_centre(lens), np.array(lens.image_size)
     straight = _grid(size)
     joints = np.concatenate(straight)
-    off = np.stack([np.asarray(d.distort(joints)) - joints for d in distortions_at(lens, focals)])
+    bent = distortion_at(lens, focals).distort(np.broadcast_to(joints, (len(focals), *joints.shape)))
+    off = np.asarray(bent) - joints
     far = float(np.nanmax(np.hypot(*np.moveaxis(off, -1, 0)), initial=0.0))
     enough = _EXAGGERATIONS[_EXAGGERATIONS * far >= _VISIBLE * max(size)]
     times = float(enough[0]) if len(enough) else 1.0
@@ -48,7 +49,7 @@ def slider(fit: ZoomFit) -> dict[str, Any] | None:
         "times": times,
         "focal": [float(f"{f:.5g}") for f in focals],
         "straight": [_rounded(line, 0) for line in straight],
-        "grid": [[_rounded(line, 0) for line in np.split(joints + times * bent, ends)] for bent in off],
+        "grid": [[_rounded(line, 0) for line in np.split(joints + times * of, ends)] for of in off],
         "radius": _rounded(np.hypot(*(along - centre).T), 0),
         "moved": [_rounded(row, 3) for row in moved],
         "std": [_rounded(row, 3) for row in std],
