@@ -84,6 +84,10 @@ def calibrate_lines(
     return calibration
 
 
+_USED_LATER = ("scipy.optimize", f"{__package__}.report")
+"""Modules that take their time to be read: that is done while photos are searched."""
+
+
 def calibrate_images(
     job: "ImageJob", folder: Path, *, title: str, quiet: bool = False, cluster: str | None = None
 ) -> "ImageCalibration":
@@ -96,7 +100,7 @@ def calibrate_images(
     # The cluster stays open: photos that disagree with the lens are searched again.
     with contextlib.ExitStack() as beside:
         settings = job.detector, job.focal, job.shared_focal, job.centre, job.model
-        beside.enter_context(ThreadPoolExecutor(1)).submit(importlib.import_module, f"{__package__}.report")
+        beside.enter_context(ThreadPoolExecutor(1)).map(importlib.import_module, _USED_LATER)
         beside.enter_context(programs_ahead(f"{settings} {next(photo_sizes(job), None)}"))
         with cluster_executor(cluster, quiet=quiet) as executor, contextlib.ExitStack() as shown:
             progress = shown.enter_context(progress_bar("Detecting lines", quiet=quiet))

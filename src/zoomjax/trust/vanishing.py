@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import least_squares
 from scipy.special import bdtrc
 
 from .._core.arguments import kinds_checked
@@ -251,6 +250,8 @@ def _best_factor(
 
 def _robust(function: Any, start: np.ndarray, bounds: Any = (-np.inf, np.inf)) -> tuple[np.ndarray, float]:
     """The unknowns of least residuals under a Cauchy loss, and its scale, from the residuals themselves."""
+    from scipy.optimize import least_squares  # which takes its time to be read
+
     scale = 1.0
     for _ in range(3):
         scale = max(_CAUCHY * _scale(function(start)), 1e-9)
