@@ -24,8 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import zoomjax as zj
-from zoomjax.fit.energy import frame_normal_equations
 from zoomjax.models.zoom import with_parameters
+from zoomjax.trust._linearised import frame_normal_equations
 
 from .coverage import clip_lines
 from .lensfun.data import QUANTILES, Frames, families, halves, read
@@ -157,7 +157,7 @@ def clip_errors(clip: Clip, draw: int) -> dict[str, dict[str, list[float]]]:
     found: dict[str, dict[str, list[float]]] = {}
     for metric, lines in {"corrected": small, "distorted": zj.fit.in_image(small)}.items():
         start = jax.vmap(zj.fit_zoom(lines).lens.zoom)(jnp.asarray(focal))
-        score, second = map(np.asarray, frame_normal_equations(lines, jnp.asarray(start)))
+        score, second = frame_normal_equations(lines, np.asarray(start))
         k = np.asarray(start) - np.linalg.solve(second, score[..., None])[..., 0]
         variance = (SCALE * float(own.error)) ** 2
         basis = basis_of(focal.min(), focal)

@@ -259,19 +259,3 @@ def linearised(lines, zoom):
         triangles = jax.vmap(triangle)(columns)
         weighted, own = triangles[..., 0], triangles[..., 1:]
     return weighted, jnp.einsum("lrk,lkp->lrp", own, by_parameter[lines.frame], precision=EXACT)
-
-
-@bucketed_jit(frames=["coefficients"], returns=[of_frames, of_frames])
-def frame_normal_equations(
-    lines: AbstractLines, coefficients: Float[Array, "frame size"]
-) -> tuple[Float[Array, "frame size"], Float[Array, "frame size size"]]:
-    """Half the gradient of each frame's error (eq. 3) by its own coefficients, and the Gauss-Newton matrix.
-
-    Of lines for any centre, coefficients end with the centre's offset.
-    """
-    weighted, jacobian = by_own_coefficients(lines, coefficients)
-    number = number_counted(counted_frames(lines)).astype(coefficients.dtype)
-    gradient = number * jnp.einsum("lr,lri->li", weighted, jacobian)
-    matrix = number * jnp.einsum("lri,lrj->lij", jacobian, jacobian)
-    sums = [jax.ops.segment_sum(of, lines.frame, coefficients.shape[0]) for of in (gradient, matrix)]
-    return sums[0], sums[1]

@@ -6,17 +6,16 @@ A polynomial of higher degree in 1/f takes away what the scores of all frames ha
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from ..fit.compression import compressed_as_measured
-from ..fit.energy import frame_normal_equations
 from ..fit.image_metric import in_corrected, measured_as
 from ..fit.own_weights import own_weights
 from ..lines.compressed import CompressedLines
 from ..models.polynomial import RadialPolynomial
 from ._lanes import Lanes, Pass, lanes_of, passed
+from ._linearised import frame_normal_equations
 from .folds import small_lines
 
 _DEGREE = 6
@@ -104,8 +103,7 @@ def _noise(passes: Passes, matrix: Float[np.ndarray, "frame coefficients coeffic
 def by_residuals(lines, k, distortion_model):
     """Of any distortion model and metric."""
     small = compressed_as_measured(lines, k.shape[1] - distortion_model.num_coefficients(0))
-    dtype = jnp.asarray(small.focal).dtype
-    score, matrix = map(np.asarray, frame_normal_equations(small, jnp.asarray(k, dtype)))
+    score, matrix = frame_normal_equations(small, k)
     number = np.bincount(np.asarray(small.frame), own_weights(small) > 0, minlength=len(k))
     used = np.flatnonzero(number > 0)
     return Frames(score[used], matrix[used], number[used], np.asarray(small.focal)[used], used, 0.0)

@@ -37,10 +37,11 @@ from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
 from ..models.zoom import AbstractZoom, with_parameters
 
-_SIZES, _ONCE = (16, 512, 8192), (512, 2048, 8192)
-"""Numbers of points that functions of points are compiled for, and those where programs run once or twice;
-larger ones are four to each doubling.
-"""
+_SIZES = (16, 512, 8192)
+"""Numbers of points that functions of points are compiled for; larger ones are four to each doubling."""
+
+_ONCE = 2048
+"""The one where programs run once or twice: more points are passed in so many at a time."""
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
@@ -85,13 +86,17 @@ def _in_few_sizes(compiled: Callable[..., Any], given: dict[str, Any]) -> Any:
         return compiled(**given)
     points = np.broadcast_to(points, (*shape, 2)).reshape(number, 2)
     focal = np.broadcast_to(focal, shape).reshape(number)
-    size = bucket(number, _ONCE if used_once() else _SIZES)
-    found = compiled(**given | {"points": padded_to(points, size), "focal": padded_to(focal, size)})
+    size = _ONCE if used_once() else bucket(number, _SIZES)
+    parts = []
+    for start in range(0, number, size):
+        some = (padded_to(of[start : start + size], size) for of in (points, focal))
+        parts.append(compiled(**given | dict(zip(("points", "focal"), some, strict=True))))
 
-    def cut(of):  # by NumPy, which compiles nothing
-        return as_jax(np.asarray(of)[:number].reshape((*shape, *of.shape[1:])))
+    def cut(*of):  # by NumPy, which compiles nothing
+        found = np.concatenate([np.asarray(part) for part in of])[:number]
+        return as_jax(found.reshape((*shape, *found.shape[1:])))
 
-    return jax.tree.map(cut, found)
+    return jax.tree.map(cut, *parts)
 
 
 def _is_number(value: Any) -> bool:

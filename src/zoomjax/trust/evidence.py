@@ -33,10 +33,7 @@ from ..fit.energy import (
     coefficients_by,
     frame_energy,
     line_squares,
-    linearised,
-    prior_jacobian,
     prior_of,
-    prior_residuals,
     size_of_prior,
 )
 from ..fit.image_metric import measured_as
@@ -51,6 +48,7 @@ from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
 from ..models.zoom import AbstractZoom, number_of_coefficients, with_parameters
 from ._bending import bending
+from ._linearised import by_parameters
 from ._noise import noise
 from .bands import displacement_std
 from .vanishing import VanishingPoints, vanishing_points
@@ -282,19 +280,10 @@ def _normal_terms(
     lines: AbstractLines, zoom: AbstractZoom
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """The normal matrix of the prior; that of each line, and its gradient with a share of the prior's."""
-    residuals, jacobian, prior, prior_gradient = map(np.asarray, _linearised(lines, zoom))
+    residuals, jacobian, prior, prior_gradient = map(np.asarray, by_parameters(lines, zoom))
     gram = np.einsum("lrp,lrq->lpq", jacobian, jacobian)
     gradient = np.einsum("lrp,lr->lp", jacobian, residuals) + 2 * prior_gradient / len(residuals)
     return prior.T @ prior, (gram, gradient)
-
-
-@bucketed_jit(returns=[of_lines, of_lines, None, None])
-def _linearised(lines, zoom):
-    weighted, jacobian = linearised(lines, zoom)
-    prior = prior_jacobian(lines, zoom)
-    pulled = prior_residuals(lines, zoom)
-    pull = jnp.zeros(prior.shape[1], prior.dtype) if pulled is None else prior.T @ pulled
-    return weighted, jacobian, prior, pull
 
 
 def _partings(lines: AbstractLines, fit: ZoomFit, weight: np.ndarray) -> dict[str, np.ndarray]:

@@ -38,7 +38,7 @@ from jaxtyping import Float
 from .._core.arguments import kinds_checked
 from .._core.types import of_known_values
 from ..fit.distortion_models import with_distortion_model
-from ..fit.energy import frame_coefficients, frame_normal_equations
+from ..fit.energy import frame_coefficients
 from ..fit.focal_lengths import Shared, Sigma, checked_sigma, effects_of_focal
 from ..fit.moved_centre import for_terms
 from ..fit.own_weights import own_weights
@@ -50,6 +50,7 @@ from ..lines.free_centre import AnyCentreLines
 from ..models.polynomial import RadialPolynomial
 from ..models.requirements import check
 from ._frame_scores import RCOND, Followed, Frames, by_residuals, followed, of_frames, passes_of
+from ._linearised import frame_normal_equations
 from ._strengths import of_focal_lengths
 
 FEWEST = 8
@@ -180,11 +181,11 @@ def _lacking(
 
 def _off_centre(fit, lines, k, frames, follows) -> Float[np.ndarray, "both both"]:
     """The covariance of what coefficients and centre are off, since the centre may be elsewhere."""
-    lens, dtype = fit.lens, jnp.asarray(lines.focal).dtype
+    lens = fit.lens
     offset = (np.asarray(lens.centre) - np.asarray(lines.centre)) / lens.scale
     both = np.concatenate([k, np.broadcast_to(offset, (len(k), 2))], axis=1)
     few = for_terms(with_distortion_model(lines, lens.distortion_model), k.shape[1])
-    score, matrix = map(np.asarray, frame_normal_equations(few, jnp.asarray(both, dtype)))
+    score, matrix = frame_normal_equations(few, both)
     used = np.flatnonzero(np.bincount(np.asarray(lines.frame), own_weights(lines) > 0, minlength=len(k)))
     seen = Frames(score[used], matrix[used], frames.number, frames.focal, used, frames.noise)
     first = 0 if fit.joint is None else 1  # a fitted centre is where it is best, in the mean

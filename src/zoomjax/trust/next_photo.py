@@ -11,7 +11,7 @@ be compared there too. The cost is one small Jacobian per candidate; nothing is 
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,9 +21,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
+from .._core.programs import light_program
 from .._core.types import of_known_values
 from ..fit.distortion_models import with_distortion_model
-from ..fit.energy import counted_frames, line_weights, linearised, number_counted
+from ..fit.energy import line_weights
 from ..fit.own_weights import own_weights
 from ..fit.result import ZoomFit
 from ..fit.same_camera import check_lines_of
@@ -33,6 +34,7 @@ from ..lines.buckets import bucketed_jit, of_lines
 from ..models.requirements import check
 from ..models.sizes import at_focal
 from ..models.zoom import with_parameters
+from ._linearised import by_parameters
 from .bands import displacement_std
 
 _FOCALS = 5  # over the range, evenly in 1/f
@@ -135,11 +137,13 @@ def suggest_next(
             "Argument lines must have a usable line, but all have a weight of 0 or too few points."
         )
     focals = np.unique(1 / np.linspace(1 / low, 1 / high, _FOCALS))
-    number, length, counts = _typical(lines)
+    weights, counts, squares = map(np.asarray, _sizes(lines))
+    number, length, points_each = _typical(lines, weights, counts, squares)
     dtype = fit.covariance.dtype
     candidates = jnp.asarray(candidate_lines(fit.lens.image_size, length), dtype)
     grid = jnp.asarray(focals, dtype)
-    now, table = _bands(lines, fit.lens, candidates, grid, jnp.asarray(number), jnp.asarray(counts))
+    known = _known(lines, fit.lens.zoom, weights, counts)
+    now, table = _bands(known, fit.lens, candidates, grid, jnp.asarray(number), jnp.asarray(points_each))
     points = _image_grid(fit.lens.image_size).astype(dtype)[:, None]
     before = np.asarray(displacement_std(fit, points, focal=grid))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -176,9 +180,8 @@ def _named(stds, region):
     return _REGIONS[region]
 
 
-def _typical(lines):
+def _typical(lines, weights, counts, squares):
     """Of the lines there are: how many a frame, how long (px) and of how many points, the medians."""
-    weights, counts, squares = (np.asarray(array) for array in _sizes(lines))
     there = weights > 0
     per_frame = np.bincount(np.asarray(lines.frame)[there])
     length = np.sqrt(12 * squares[there] / counts[there])  # of points spread evenly
@@ -215,24 +218,52 @@ def candidate_lines(
     return lines
 
 
-@bucketed_jit(returns=[None, None])
-def _bands(lines, lens, candidates, focals, number, counts):
+class _Known(NamedTuple):
+    """What the lines tell.
+
+    Attributes:
+        information, noise: sums of their squared derivatives, as eq. 13 weighs them and with its weights
+            squared.
+        variance: of the points, px^2.
+        points, frames: how many count.
+    """
+
+    information: Any
+    noise: Any
+    variance: Any
+    points: Any
+    frames: Any
+
+
+def _known(lines, zoom, weights, counts) -> _Known:
+    weighted, jacobian, *_ = map(np.asarray, by_parameters(lines, zoom))
+    information = np.einsum("lri,lrj->lij", jacobian, jacobian)
+    freedom = np.sum(weights * (counts - 2))
+    counted = weights > 0
+    of = _Known(
+        information.sum(axis=0),
+        np.einsum("l,lij->ij", weights, information),
+        np.sum(weighted**2) / (freedom if freedom > 0 else 1),
+        counts[counted].sum(),
+        np.unique(np.asarray(lines.frame)[counted]).size,
+    )
+    return jax.tree.map(lambda value: jnp.asarray(value, jacobian.dtype), of)
+
+
+@light_program
+def _bands(known, lens, candidates, focals, number, counts):
     """The mean standard deviation of the displacement now, and with each candidate.
 
     For independent points, and candidates with so many lines of so many points.
     """
+    information, noise, variance, points_counted, frames = known
     zoom = lens.zoom
     flat, unravel = ravel_pytree(zoom.parameters)
-    weights, frames = line_weights(lines), number_counted(counted_frames(lines)).astype(flat.dtype)
-    weighted, jacobian = linearised(lines, zoom)
-    information = jnp.einsum("lri,lrj->ij", jacobian, jacobian)
-    noise = jnp.einsum("l,lri,lrj->ij", weights, jacobian, jacobian)
-    variance = jnp.sum(weighted**2) / _positive(jnp.sum(weights * (lines.counts - 2)))
     rows = _displacement_rows(lens, flat, unravel, focals)
 
     def typical(information, noise):
         """Of the estimate with the prior: a variance of 1 for each parameter, weighed as a point is."""
-        ridge = variance / jnp.sum(jnp.where(weights > 0, lines.counts, 0))
+        ridge = variance / points_counted
         eps = jnp.finfo(flat.dtype).eps
         rounding = 64 * eps * jnp.trace(information)
         ridge = jnp.maximum(ridge, rounding)  # lines without noise would leave nothing
@@ -289,7 +320,3 @@ def _image_grid(image_size):
     """Points all over the image, its corners among them, and not its centre, which is always certain."""
     x, y = (np.linspace(0, side - 1, 6) for side in image_size)
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-
-
-def _positive(value):
-    return jnp.where(value > 0, value, 1)

@@ -12,16 +12,16 @@ import numpy as np
 from jaxtyping import Float
 
 from ..fit.distortion_models import with_distortion_model
-from ..fit.energy import by_own_coefficients, frame_coefficients
+from ..fit.energy import frame_coefficients
 from ..fit.moved_centre import for_terms
 from ..fit.own_weights import own_weights
 from ..fit.problem import data_of
 from ..fit.result import ZoomFit
 from ..fit.same_camera import placed_as
 from ..lines.base import AbstractLines
-from ..lines.buckets import bucketed_jit, of_lines
 from ..lines.free_centre import AnyCentreLines
 from ..models.polynomial import RadialPolynomial
+from ._linearised import by_coefficients
 
 _SINGULAR = 1e-10  # eigenvalues, of the largest
 _CERTAIN = 0.05
@@ -65,7 +65,8 @@ def own_centres(fit: ZoomFit, lines: AbstractLines) -> OwnCentres | None:
     offset = (np.asarray(lens.centre) - np.asarray(lines.centre)) / lens.scale
     both = np.concatenate([k, np.broadcast_to(offset, (len(k), 2))], axis=1)
     few = for_terms(with_distortion_model(lines, lens.distortion_model), k.shape[1])
-    rows, by_own = map(np.asarray, _linearised(few, jnp.asarray(both, jnp.asarray(lines.focal).dtype)))
+    dtype = jnp.asarray(lines.focal).dtype
+    rows, by_own = map(np.asarray, by_coefficients(few, np.asarray(both, dtype)))
     score, matrix = np.einsum("lri,lr->li", by_own, rows), np.einsum("lri,lrj->lij", by_own, by_own)
     used = own_weights(lines) > 0
     frame, centre, std = np.asarray(lines.frame), *np.full((2, len(k), 2), np.nan)
@@ -84,8 +85,3 @@ def own_centres(fit: ZoomFit, lines: AbstractLines) -> OwnCentres | None:
             centre[number] = np.asarray(lens.centre) - lens.scale * step[-2:]
             std[number] = lens.scale * own
     return OwnCentres(centre, std)
-
-
-@bucketed_jit(frames=["coefficients"], returns=[of_lines, of_lines])
-def _linearised(lines, coefficients):
-    return by_own_coefficients(lines, coefficients)
