@@ -379,7 +379,7 @@ def calibrate(
         lines=lines,
         fit=zoom,
         frames=used.each,
-        rms_uncorrected=np.asarray(frame_rms(small, None)),
+        rms_uncorrected=np.asarray(frame_rms(small, np.zeros(used.each.coefficients.shape))),
         rms_algebraic=algebraic_rms(small, used.model),
         rejected=(np.ones(len(lines.frame)) if lines.weight is None else np.asarray(lines.weight)) == 0,
         line_rms=np.sqrt(line_squares(small, zoom.lens.zoom)),

@@ -8,11 +8,10 @@ from jaxtyping import Array, Float
 from .._core.arguments import kinds_checked
 from .._core.arrays import as_jax
 from .._core.fields import real_argument
-from .._core.types import AnyArray
+from .._core.types import AnyArray, traced
 from ..lines.base import AbstractLines
-from ..lines.buckets import bucketed_jit, of_frames
 from ..models.lens import ZoomLens
-from .energy import coefficients_by, frame_energy
+from .energy import frame_coefficients, frame_energy
 from .problem import about_own_centre
 from .same_camera import check_camera, placed_as
 
@@ -50,16 +49,10 @@ def frame_rms(
         )
     lines = about_own_centre(lines)
     if isinstance(lens, ZoomLens):
-        return _frame_rms(lines, lens.zoom, None)
-    if lens is None:
+        lens = frame_coefficients(lines, lens.zoom)
+    elif lens is None:
         lens = np.zeros(
             (lines.focal.shape[0], lines.distortion_model.num_coefficients(1)), lines.focal.dtype
         )
-    return _frame_rms(lines, None, as_jax(real_argument("lens", lens)))
-
-
-@bucketed_jit(frames=["coefficients"], returns=of_frames)
-def _frame_rms(lines, zoom, coefficients):
-    """By a zoom model, or, without, by coefficients of each frame."""
-    coefficients = coefficients if zoom is None else coefficients_by(zoom, lines)
-    return jnp.sqrt(frame_energy(lines, coefficients))
+    squares = frame_energy(lines, as_jax(real_argument("lens", lens)))
+    return jnp.sqrt(squares) if traced(squares) else as_jax(np.sqrt(np.asarray(squares)))
