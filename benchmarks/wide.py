@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 import zoomjax as zj
-from zoomjax.app.calibration import calibrate
+from zoomjax.app.calibrating import calibrate
 from zoomjax.detect.edges import EdgeDetector
 from zoomjax.detect.grid import GridDetector
 from zoomjax.fit.centre import fit_centre

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 import zoomjax as zj
-from zoomjax.app.calibration import calibrate
+from zoomjax.app.calibrating import calibrate
 from zoomjax.detect.batch import detect
 from zoomjax.detect.edges import EdgeDetector
 from zoomjax.detect.sources import find_photos

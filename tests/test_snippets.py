@@ -21,7 +21,7 @@ from sybil.parsers.markdown import CodeBlockParser, PythonCodeBlockParser
 import zoomjax as zj
 from docs.make.tables import ROOT, pages
 from zoomjax import scenes
-from zoomjax.app.calibration import calibrate
+from zoomjax.app.calibrating import calibrate
 from zoomjax.app.demo import write_photos
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.undistort_files import Job, undistort_files

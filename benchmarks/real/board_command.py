@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 import zoomjax as zj
-from zoomjax.app.calibration import Calibration, calibrate, rms_over_frames
+from zoomjax.app.calibrating import calibrate
+from zoomjax.app.calibration import Calibration, rms_over_frames
 from zoomjax.app.focal_sources import lines_of
 from zoomjax.app.image_calibration import calibrate_images
 from zoomjax.app.image_job import ImageJob

@@ -24,7 +24,8 @@ from typing import Literal
 import numpy as np
 
 import zoomjax as zj
-from zoomjax.app.calibration import Calibration, calibrate
+from zoomjax.app.calibrating import calibrate
+from zoomjax.app.calibration import Calibration
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.models.registry import distortion_model_name
 

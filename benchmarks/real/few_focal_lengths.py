@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import zoomjax as zj
-from zoomjax.app.calibration import calibrate
+from zoomjax.app.calibrating import calibrate
 from zoomjax.app.model_choice import WantedModel
 
 from ..shared import RESULTS

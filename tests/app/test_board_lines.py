@@ -13,7 +13,7 @@ from tests._boards import COLUMNS, FOCAL, LABEL, ROWS, SIZE, bent, displaced, se
 from zoomjax import fit_zoom
 from zoomjax.app.board_bundle import bundle_of
 from zoomjax.app.board_lines import _columns, coefficient_covariance
-from zoomjax.app.calibration import calibrate
+from zoomjax.app.calibrating import calibrate
 from zoomjax.app.focal_sources import GRID, Focals, choose_focals, lines_of
 from zoomjax.app.image_calibration import _calibrated
 from zoomjax.app.image_job import ImageJob

@@ -11,7 +11,8 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app.calibration import Calibration, calibrate, rms_over_frames
+from zoomjax.app.calibrating import calibrate
+from zoomjax.app.calibration import Calibration, rms_over_frames
 from zoomjax.app.coverage import _residuals
 from zoomjax.app.focal_sources import focal_sigmas
 from zoomjax.app.model_choice import WantedModel

@@ -7,7 +7,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app.calibration import calibrate
+from zoomjax.app.calibrating import calibrate
 from zoomjax.app.centre_found import CentreFound
 from zoomjax.app.model_choice import WantedModel, one_centre
 from zoomjax.app.outward import outward

@@ -9,7 +9,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app.calibration import calibrate
+from zoomjax.app.calibrating import calibrate
 from zoomjax.app.fitting import _gains, fitted
 from zoomjax.app.model_choice import DISTORTION_MODELS, WantedModel
 from zoomjax.app.report import report

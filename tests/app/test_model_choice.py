@@ -5,7 +5,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app.calibration import calibrate
+from zoomjax.app.calibrating import calibrate
 from zoomjax.app.model_choice import WantedModel
 
 LENS = scenes.nikkor_18_200((1072, 712))

@@ -15,7 +15,7 @@ import pytest
 
 import zoomjax.app.report
 from zoomjax import RESULTS
-from zoomjax.app.calibration import calibrate
+from zoomjax.app.calibrating import calibrate
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.page import Run
 from zoomjax.app.report import report

@@ -8,7 +8,7 @@ from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
 from zoomjax import compress
-from zoomjax.app.calibration import calibrate
+from zoomjax.app.calibrating import calibrate
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.plane_focals import FocalGroup
 from zoomjax.app.verdict import (

@@ -8,7 +8,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app.calibration import calibrate
+from zoomjax.app.calibrating import calibrate
 from zoomjax.app.centre_found import CentreFound
 from zoomjax.trust.centre_choice import choose_centre
 

@@ -23,21 +23,24 @@ _LINE = re.compile(r"([0-9a-f]{64}) (\d)")
 
 
 @contextlib.contextmanager
-def programs_ahead(occasion: str) -> Iterator[None]:
+def programs_ahead(occasion: str) -> Iterator[bool]:
     """Read the programs that were used on such an occasion the last time; note those of this time.
 
     The thread ends with the block, and they are noted if it ends well.
+
+    Yields:
+        Whether programs are kept, and none are known of such an occasion: they are all to be compiled.
     """
     kept = store()
     if kept.folder is None:
-        yield
+        yield False
         return
     file = kept.folder / f"{hashlib.sha256(occasion.encode()).hexdigest()}.used"
     begun = set(kept.used)
     with ThreadPoolExecutor(1, "programs") as pool:
         kept.ahead.update({key: pool.submit(opened, *key, ahead=True) for key in _listed(file)})
         try:
-            yield
+            yield not kept.ahead
         finally:
             kept.ahead.clear()
             pool.shutdown(cancel_futures=True)

@@ -8,35 +8,28 @@ import functools
 import importlib.metadata
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from .._core.text import percentages, span
 from .._core.types import AnyArray
-from ..fit.energy import line_squares
-from ..fit.focal_lengths import of_equal_focal, with_focal_sigma
-from ..fit.image_metric import in_image
 from ..fit.result import RESULTS, FrameFits, ZoomFit, is_status
-from ..fit.straightness import frame_rms
 from ..lines.lines import Lines
 from ..models.about import RELATIVE, UNKNOWN
 from ..models.registry import distortion_model_name
 from ..models.zoom import PolynomialZoom
-from ..trust.assessment import NEGLIGIBLE, Assessment, assess
+from ..trust.assessment import NEGLIGIBLE, Assessment
 from ..trust.bands import displacement_std
-from ..trust.cross_validation import cross_validate_frames
-from ..trust.misfit import FEWEST, with_misfit
-from ..trust.next_photo import Suggestion, suggest_next
-from ..trust.own_centres import OwnCentres, own_centres
+from ..trust.misfit import FEWEST
+from ..trust.next_photo import Suggestion
+from ..trust.own_centres import OwnCentres
 from ..trust.selection import Selection
 from .centre_found import CentreFound
 from .coefficients import coefficient_names, coefficient_rows, finite, pixel_polynomials
-from .fitting import Metric, algebraic_rms, fitted, left_out
-from .model_choice import WantedCentre, WantedModel
 from .outward import middle_centre, outward
 from .results_folder import OF_A_LENS, results_folder
 
@@ -331,67 +324,6 @@ class Calibration:
         save_plot(plot_model(self.fit, self.frames, self.lines), folder / "model.png")
         for name, text in (pages or {}).items():
             (folder / name).write_text(text, encoding="utf-8")
-
-
-def calibrate(
-    lines: Lines,
-    *,
-    model: WantedModel = WantedModel(),  # noqa: B008, it is frozen
-    centre: WantedCentre | None = "fit",
-    robust: bool = False,
-    metric: Metric = in_image,
-    focal_sigma: float | Float[np.ndarray, "frame"] = 0.0,
-    shared: Int[np.ndarray, "frame"] | None = None,
-    widened: Callable[[ZoomFit], ZoomFit] = lambda fit: fit,
-    stage: Callable[[str], None] = lambda _: None,
-) -> Calibration:
-    """Fit the zoom model, and the models it is compared with.
-
-    Args:
-        lines: the lines; computed in float64 if that is enabled, whatever their dtype.
-        model: the zoom model; by default the one of least cross-validation error.
-        centre: the centre of distortion: "fit", "image", its coordinates, px, or None for that of the
-            lines. With "fit" it is that of the lines where they do not determine another, or where lines
-            that were not fitted are not straighter about it. "moving": it may move along the zoom.
-        robust: whether to reject lines that are not straight in the scene. All figures are then computed
-            from the remaining lines.
-        metric: where distances are measured: `in_image`, or `in_corrected` as in the paper.
-        focal_sigma: standard deviation of the focal lengths: a number, or one per frame; 0 where exact.
-        shared: for each frame a number: frames of one number share the error of f, as those of one f do.
-        widened: adds to the uncertainty of a fit what the lines do not show of it.
-        stage: called with a description before each step that takes time.
-
-    Raises:
-        ValueError: an argument is not one of these, or there are too few focal lengths for the model.
-        RuntimeError: the solver failed.
-    """
-    used = fitted(lines, model, centre, robust=robust, metric=metric, stage=stage)
-    exact, small, terms = used.fit, used.lines, used.model.terms
-    sigma, shared = np.broadcast_to(focal_sigma, lines.focal.shape), of_equal_focal(lines.focal, shared)
-    placed = small if exact.lens.shift is None else used.held
-    zoom = with_focal_sigma(exact, placed, focal_sigma=sigma, shared=shared) if sigma.any() else exact
-    zoom = widened(with_misfit(zoom, used.held, focal_sigma=sigma, shared=shared))
-    stage("Checking the fit on lines left out")
-    held_out = {"rms_held_out": left_out(small, used.model)}
-    held_out["rms_frames_held_out"] = cross_validate_frames(small, terms=terms)
-    lines = (lines.weighted(np.asarray(small.weight)) if robust else lines).about(np.asarray(small.centre))
-    return Calibration(
-        lines=lines,
-        fit=zoom,
-        frames=used.each,
-        rms_uncorrected=np.asarray(frame_rms(small, np.zeros(used.each.coefficients.shape))),
-        rms_algebraic=algebraic_rms(small, used.model),
-        rejected=(np.ones(len(lines.frame)) if lines.weight is None else np.asarray(lines.weight)) == 0,
-        line_rms=np.sqrt(line_squares(small, zoom.lens.zoom)),
-        next_photo=suggest_next(*used.one),  # from the noise alone, without focal_sigma
-        focal_sigma=sigma,
-        **held_out,
-        centre=used.centre.as_uncertain_as(zoom),
-        assessment=assess(lines, zoom, compressed=small, **held_out).joined_by(used.centre.findings()),
-        selection=used.selection,
-        own_centres=own_centres(used.one[0], used.held),
-        in_image=small.metric == "distorted",
-    )
 
 
 def rms_over_frames(frame_rms: Float[AnyArray, "frame"]) -> float:

@@ -92,7 +92,7 @@ def fitted(
     model = radial.base(lines.focal)
     ready_model(lines, model)  # raises if there are too few focal lengths, before any work
     stage("Compressing the lines")
-    held = metric(_compressed(lines, about, radial.most_terms(lines)))
+    held = metric(compressed_about(lines, about, radial.most_terms(lines)))
     found = _about_centre(
         held, radial, model, robust, wanted.distortion_model in (None, "radial", "auto"), stage
     )
@@ -354,7 +354,7 @@ def _widest(lines: Lines) -> Lines:
     )
 
 
-def _compressed(
+def compressed_about(
     lines: Lines, centre: CentreArgument | None, terms: int
 ) -> CompressedLines | AnyCentreLines:
     """The lines in the widest numbers, compressed about their centre, or for any if it is to be fitted."""

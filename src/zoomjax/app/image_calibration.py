@@ -18,7 +18,8 @@ from ..models.smooth import SmoothZoom
 from ..trust.assessment import Finding, Verdict
 from ._flags import with_flags
 from .board_bundle import BoardBundle, bundle_of, sharing_options
-from .calibration import Calibration, calibrate
+from .calibrating import calibrate
+from .calibration import Calibration
 from .choice import chosen_frames
 from .drawings import drawing
 from .equipment import KnownLens, known_lens, with_equipment, without_focal
@@ -26,6 +27,7 @@ from .focal_sources import GRID, MEASURED, Focals, choose_focals, focal_sigmas, 
 from .image_job import ImageJob, overlay_name
 from .model_choice import one_centre
 from .plane_focals import Sharing
+from .rehearsal import Part
 from .results_folder import OF_A_LENS, results_folder
 from .turned import findings_of_turned
 from .tying import Bend, tied, to_search_again
@@ -202,6 +204,7 @@ def calibrate_images(
     progress: Progress = lambda done, total: None,
     stage: Callable[[str], None] = lambda _: None,
     executor: Executor | None = None,
+    begun: Callable[[Part], None] = lambda _: None,
 ) -> ImageCalibration:
     """Detect lines in images, find focal lengths, reject lines that are not straight, and fit the model.
 
@@ -210,6 +213,7 @@ def calibrate_images(
         progress: called after each image.
         stage: called with a description before each later step.
         executor: where lines are detected, instead of the job's processes: see `zoomjax.detect.detect`.
+        begun: called with what is calibrated before it is.
 
     Raises:
         FileNotFoundError: an input does not exist.
@@ -218,7 +222,7 @@ def calibrate_images(
     """
     sources, total = job.sources()
     detections = _detected(job, sources, lambda done: progress(done, total), executor)
-    done = _calibrated(job, detections, stage)
+    done = _calibrated(job, detections, stage, begun)
     known = _disagreeing(done, detections) if job.tied and job.detector == "edges" else {}
     if not known:
         return done
@@ -228,7 +232,7 @@ def calibrate_images(
     )
     if not replaced:
         return done
-    done = _calibrated(job, detections, stage)
+    done = _calibrated(job, detections, stage, begun)
     return dataclasses.replace(done, tied=tuple(replaced))
 
 
@@ -269,7 +273,10 @@ def _disagreeing(done: ImageCalibration, detections: Sequence[Detection]) -> dic
 
 
 def _calibrated(
-    job: ImageJob, detections: Sequence[Detection], stage: Callable[[str], None]
+    job: ImageJob,
+    detections: Sequence[Detection],
+    stage: Callable[[str], None],
+    begun: Callable[[Part], None],
 ) -> ImageCalibration:
     """The calibration from what was found in all images."""
     images = tuple(d.name for d in detections)
@@ -310,17 +317,11 @@ def _calibrated(
         shown = used if bundle is None else bundle.lines_used(used)
         lines = lines_of(shown, np.array([focals.focal[d.name] for d in used]), focals.unit)
         sigma = np.array([focals.deviation.get(d.name, 0.0) for d in used])
+        model = dataclasses.replace(job.model, lens=known)
+        begun(part := Part(lines, model, job.centre, sigma, _shared(used, focals)))
+        widened = (lambda fit: fit) if bundle is None else bundle.widened
         with told_undetermined(job, images, used, unused):
-            calibration = calibrate(
-                lines,
-                model=dataclasses.replace(job.model, lens=known),
-                centre=job.centre,
-                robust=True,
-                focal_sigma=sigma,
-                shared=_shared(used, focals),
-                widened=(lambda fit: fit) if bundle is None else bundle.widened,
-                stage=stage,
-            )
+            calibration = calibrate(**part.arguments(), widened=widened, stage=stage)
         done = ImageCalibration(job, calibration, used, focals, images, unused)
         done = dataclasses.replace(done, bundle=bundle, board_note=told, lens=known)
         hopeless = {d.name for d, rejected in zip(used, done.rejected(), strict=True) if rejected.all()}

@@ -25,7 +25,8 @@ from ..models.lens import ZoomLens
 from ..scenes.board import StripedBoard, board_lines, focal_sweep, nikkor_18_200
 from ..scenes.broadcast import broadcast_lines, broadcast_zoom
 from . import plot
-from .calibration import Calibration, calibrate, rms_over_frames
+from .calibrating import calibrate
+from .calibration import Calibration, rms_over_frames
 from .model_choice import WantedModel
 
 NOTES = (

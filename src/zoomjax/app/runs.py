@@ -50,7 +50,7 @@ def calibrate_lines(
     folder of results the summary tells how uncertain focal lengths are, unless that is given; and where
     their centre was fitted, it is fitted again from the middle of the image.
     """
-    from .calibration import calibrate
+    from .calibrating import calibrate
     from .earlier import earlier_of
     from .equipment import with_earlier, without_focal
     from .focal_sources import focal_sigmas
@@ -96,12 +96,14 @@ def calibrate_images(
     from .drawings import drawing
     from .image_calibration import calibrate_images
     from .plans import photo_sizes
+    from .rehearsal import rehearsing
 
     # The cluster stays open: photos that disagree with the lens are searched again.
     with contextlib.ExitStack() as beside:
         settings = job.detector, job.focal, job.shared_focal, job.centre, job.model
         beside.enter_context(ThreadPoolExecutor(1)).map(importlib.import_module, _USED_LATER)
-        beside.enter_context(programs_ahead(f"{settings} {next(photo_sizes(job), None)}"))
+        first = beside.enter_context(programs_ahead(f"{settings} {next(photo_sizes(job), None)}"))
+        begin = beside.enter_context(rehearsing(first and job.workers > 1))
         with cluster_executor(cluster, quiet=quiet) as executor, contextlib.ExitStack() as shown:
             progress = shown.enter_context(progress_bar("Detecting lines", quiet=quiet))
 
@@ -113,7 +115,7 @@ def calibrate_images(
                 current(name)
 
             current: Callable[[str], None] | None = None
-            done = calibrate_images(job, progress=progress, stage=stage, executor=executor)
+            done = calibrate_images(job, progress=progress, stage=stage, executor=executor, begun=begin)
             stage("Making the report")
             from .report import report
 
