@@ -103,12 +103,43 @@ def _measure() -> dict:
     return found
 
 
-def _in_a_process(source: Path | None, cache: str) -> dict:
+def _solver_alone() -> dict:
+    """Seconds of a Levenberg-Marquardt on the residuals of `fit_zoom`, in a process that did nothing else.
+
+    Without a start, a covariance, a certificate and a status, from no distortion, under ``jax.jit``.
+    """
+    import equinox as eqx
+    import jax
+    import numpy as np
+    import optimistix as optx
+
+    import zoomjax as zj
+    from zoomjax.fit import residuals
+
+    jax.config.update("jax_enable_x64", True)
+    small = zj.compress(_lines(*SIZES[0]))
+    zoom = zj.PolynomialZoom(degree=2).prepare(np.asarray(small.focal), 2)
+
+    def function(parameters, lines):
+        model = eqx.tree_at(lambda of: of.parameters, zoom, parameters)
+        return residuals(lines, jax.vmap(model)(lines.focal))
+
+    @eqx.filter_jit
+    def solved(lines):
+        solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
+        return optx.least_squares(function, solver, zoom.parameters, args=lines).value
+
+    begin, processor = time.perf_counter(), time.process_time()
+    jax.block_until_ready(solved(small))
+    return {"seconds": time.perf_counter() - begin, "processor": time.process_time() - processor}
+
+
+def _in_a_process(source: Path | None, cache: str, what: str = "_measure") -> dict:
     """The measurement in a process of its own, of this or another checkout."""
     own = {**os.environ, "ZOOMJAX_BENCH_CACHE": cache}
     if source is not None:
         own["PYTHONPATH"] = str(source / "src")
-    script = "import json; from benchmarks.compiling import _measure; print(json.dumps(_measure()))"
+    script = f"import json; from benchmarks.compiling import {what}; print(json.dumps({what}()))"
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", script], env=own, capture_output=True, text=True
     )
@@ -141,6 +172,8 @@ def page(results: dict) -> str:
     }
     rows.append(["all", *(_cell(sums[column]) for column in columns)])
     first, other = SIZES
+    alone, asked = results["alone"], ("fit_zoom", "fit_frames", "fit_robust")
+    clock = ", ".join(f"`{step}` {results['now'][step]['first']['seconds']:.2f} s" for step in asked)
     return "\n".join(
         [
             "# What is compiled",
@@ -154,6 +187,10 @@ def page(results: dict) -> str:
             "both sizes are compiled, and other data sets between them then compile nothing.",
             "",
             *table(["function", *(head for run in runs for head in heads[run])], rows),
+            "",
+            f"By the clock, the first time: {clock}. A Levenberg-Marquardt of optimistix alone, on the "
+            "residuals of `fit_zoom` and under `jax.jit`, without a start, a covariance, a certificate and "
+            f"a status: {alone['seconds']:.2f} s, {alone['processor']:.2f} s of the processor.",
             "",
             machine_line(results["machine"]),
             "",
@@ -173,6 +210,7 @@ def main() -> None:
     if options.against is not None:
         results["before"] = _in_a_process(options.against.resolve(), "")
     results["now"] = _in_a_process(None, "")
+    results["alone"] = _in_a_process(None, "", "_solver_alone")
     with tempfile.TemporaryDirectory() as cache:
         _in_a_process(None, cache)
         results["kept"] = _in_a_process(None, cache)
