@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from zoomjax.app.results_folder import LIST
 from zoomjax.detect.sources import as_bytes, find_photos, video_frames
 from zoomjax.io.focal_track import FocalTrack
 from zoomjax.io.video_reader import decode_video
@@ -100,7 +101,21 @@ def test_of_a_raw_file_and_the_photo_made_from_it_the_photo_is_used(tmp_path, im
     cv2.imwrite(str(tmp_path / "a.jpg"), image)
     for name in ("a.NEF", "b.NEF"):
         (tmp_path / name).write_bytes(b"as a camera writes it")
-    assert names(find_photos([tmp_path])) == ["a.jpg", "b.NEF"]
+    told = r"one file is left out: a\.NEF, as a photo of that name counts for each\.$"
+    with pytest.warns(UserWarning, match=told):
+        assert names(find_photos([tmp_path])) == ["a.jpg", "b.NEF"]
+
+
+@pytest.mark.parametrize("mark", ["lens.json", LIST])
+def test_pictures_of_an_earlier_calibration_are_no_photos(tmp_path, image, mark):
+    """Of one that found no lens, there is only the list of files that were written."""
+    (tmp_path / "out" / "lines").mkdir(parents=True)
+    for name in ("a.jpg", "out/lines/0001-a.jpg", "out/model.png"):
+        cv2.imwrite(str(tmp_path / name), image)
+    (tmp_path / "out" / mark).write_text("{}")
+    assert names(find_photos([tmp_path])) == ["a.jpg"]
+    with pytest.raises(ValueError, match="no photographs in the folder"):
+        find_photos([tmp_path / "out"])
 
 
 @pytest.mark.parametrize(
