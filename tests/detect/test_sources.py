@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from zoomjax.app.results_folder import LIST
-from zoomjax.detect.sources import as_bytes, find_photos, video_frames
+from zoomjax.detect.sources import Source, as_bytes, find_photos, video_frames
 from zoomjax.io.focal_track import FocalTrack
 from zoomjax.io.video_reader import decode_video
 
-from .._clips import FRAMES, cut_off, focal, picture, write_clip
+from .._clips import FRAMES, cut_off, focal, picture, write_clip, write_frames
 from .._exif import exif
 
 
@@ -239,6 +239,27 @@ def test_frames_are_spread_where_their_number_is_not_announced(clip, tmp_path):
 
 def test_more_frames_than_there_are_are_all_frames(clip):
     assert len(list(video_frames(clip, 30.0, 1000))) == FRAMES
+
+
+@pytest.mark.parametrize(
+    ("focal", "number", "told"),
+    [
+        *((focal, 3, "focal must be a finite number above 0") for focal in (0, -30.0, np.nan)),
+        *((30.0, number, "number must be an integer of at least 1") for number in (0, -1)),
+    ],
+)
+def test_frames_of_no_focal_length_or_number_are_refused(tmp_path, focal, number, told):
+    """Focal lengths of -30 and NaN were those of the frames; of 0 frames the video was called cut off."""
+    clip = write_frames(tmp_path / "a.mkv", np.zeros((2, 48, 64, 3), np.uint8))
+    with pytest.raises(ValueError, match=f"Argument {told}"):
+        list(video_frames(clip, focal, number))
+    assert len(list(video_frames(clip, 30.0, 10**30))) == 2
+
+
+@pytest.mark.parametrize("focal", [0.0, -30.0, np.nan])
+def test_an_image_of_no_focal_length_is_refused(focal):
+    with pytest.raises(ValueError, match="Argument focal must be a finite number above 0"):
+        Source("a.jpg", None, np.zeros((4, 6), np.uint8), focal)
 
 
 def test_a_video_that_ends_early_gives_the_frames_before_that(clip, tmp_path):

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from .._core.checks import check_above, checked_integer
 from .._core.text import listed, plain
 from ..io.focal_track import FocalTrack
 from ..io.photo import SUFFIXES, metadata_focal, open_photo, read_photo
@@ -57,6 +58,8 @@ class Source:
             raise ValueError("Either argument path or image must be given, the file or its pixels.")
         if self.image is not None and not isinstance(self.image, np.ndarray):
             raise ValueError(f"Argument image must be an array, but it is {type(self.image).__name__}.")
+        if self.focal is not None:
+            check_above(0, focal=self.focal)
 
     @property
     def file(self) -> str:
@@ -239,7 +242,8 @@ def video_frames(
 
     Raises:
         FileNotFoundError: there is no such video.
-        ValueError: it cannot be read, or the track does not reach over it.
+        ValueError: it cannot be read, the track does not reach over it, or `number` or a focal length is
+            not positive.
 
     Warns:
         UserWarning: the video ends early, being cut off or damaged; the frames before that are used. Or the
@@ -247,10 +251,14 @@ def video_frames(
     """
     from ..io.video_reader import decode_video
 
+    number = checked_integer("number", number, 1)
+    if not isinstance(focal, FocalTrack):
+        check_above(0, focal=focal)
     stem = Path(path).stem
     with decode_video(path) as (announced, frames):
         # From the first to the last; where not even the length is known, the first ones.
-        wanted = set(np.linspace(0, (announced or number) - 1, number).round().astype(int).tolist())
+        there = announced or number
+        wanted = set(np.linspace(0, there - 1, min(number, there)).round().astype(int).tolist())
         last, time, some = -1, 0.0, False
         for last, time, image in frames:
             if last not in wanted:
