@@ -88,6 +88,8 @@ def test_photos_of_other_focal_lengths_than_those_used_are_told(lens, tmp_path):
     for of in (lens, in_px):
         (told,) = taken_at_others(of, photos, lambda photo: 50.0)
         assert "24.0-0.jpg is of 24 mm and 70.0-0.jpg is of 70 mm, and the focal length used is 50" in told
+        assert ("leave it out: then the EXIF data count" in told) == (of is lens)  # they are in mm
+        assert ("give a table with that of each photo: the lens counts in px" in told) == (of is in_px)
         assert taken_at_others(of, photos, own) == []
         assert taken_at_others(of, [bare(tmp_path / "none.jpg")], lambda photo: 50.0) == []
     # One factor for all: in px, focused near, of equal view on film, or wrong.

@@ -202,9 +202,12 @@ def taken_at_others(lens: ZoomLens, photos: Iterable[Path], focal_of: Callable[[
     pair = (low,) if len(ratio) == 1 else (low, high)
     told = [f"{plain(photo.name)} is of {found[photo].focal:.4g} mm" for photo in pair]
     counts = dict.fromkeys(f"{used[photo]:.4g}" for photo in pair)
+    advice = "leave it out: then the EXIF data count"
+    if lens.focal_unit == "px":
+        advice = "give a table with that of each photo: the lens counts in px"
     return [
         f"By their EXIF data {' and '.join(told)}, and the focal length used is {' and '.join(counts)} "
-        f"{lens.focal_unit}. Check --focal, or leave it out: then the EXIF data count."
+        f"{lens.focal_unit}. Check --focal, or {advice}."
     ]
 
 
