@@ -647,6 +647,26 @@ def test_a_mistake_is_one_sentence_and_status_2(case, told_of_mistakes, wrong_fi
     assert not list(wrong_files.glob("out*"))
 
 
+def test_empty_names_are_not_the_working_folder(tmp_path):
+    """Of a variable of the shell that is not set: all photos there would be used, or results put there."""
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((40, 60), np.uint8))
+    scenes.nikkor_18_200((60, 40)).save(tmp_path / "lens.json")
+    commands = [
+        *(
+            ["undistort", "lens.json", given, "--focal", 30, "-o", out]
+            for given, out in (("", "b"), ("a.png", ""))
+        ),
+        *(["calibrate", *given, "-o", out] for given, out in ((["", "a.png"], "b"), (["a.png"], ""))),
+        *(["export", given, "--to", "lensfun", "-o", out] for given, out in (("", "b"), ("lens.json", ""))),
+        ["import", "", "-o", "b"],
+        ["demo", "--output="],
+    ]
+    for status, told in one_after_another(tmp_path, commands):
+        assert status == 2
+        assert "is empty, as a variable of the shell that is not set" in told
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "lens.json"]
+
+
 def test_a_mistake_is_told_on_stderr(wrong_files):
     arguments, hint = next(iter(WRONG.values()))
     done = zoomjax("calibrate", *arguments, "-o", "out", cwd=wrong_files)

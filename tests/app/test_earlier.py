@@ -98,16 +98,62 @@ def test_uncertain_focal_lengths_that_are_those_of_other_lines_are_told(results)
     [
         lambda folder, s: (folder / "summary.json").unlink(),
         lambda folder, s: (folder / "lens.json").unlink(),
-        lambda folder, s: (folder / "summary.json").write_text("[1]"),
-        lambda folder, s: (folder / "summary.json").write_text("{"),
-        lambda folder, s: (folder / "summary.json").write_text(json.dumps(s | {"images": [1, 2, 3]})),
-        lambda folder, s: (folder / "summary.json").write_text(json.dumps(s | {"centre": None})),
     ],
 )
-def test_nothing_is_known_of_what_is_not_there_or_not_so(results, change):
+def test_nothing_is_known_of_what_is_not_there(results, change):
     folder, lines, summary = results
     change(folder, summary)
     assert earlier_of([folder / "lines.npz"], lines) == Earlier()
+
+
+def with_sigma(summary, sigma):
+    return summary | {"images": [image | {"focal_sigma": sigma} for image in summary["images"]]}
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        lambda s: [1],
+        lambda s: {},
+        lambda s: s | {"images": [1, 2, 3]},
+        lambda s: s | {"images": s["images"][:2]},
+        lambda s: s | {"centre": None},
+        lambda s: with_sigma(s, np.nan),
+        lambda s: with_sigma(s, -0.5),
+        lambda s: with_sigma(s, "0,5"),
+        lambda s: {
+            "centre": {"how": "image"},
+            "earlier": {"focal_sigma": [-1, 0, 0], "shared": None, "centre": False, "flat": False},
+            "per_frame": [{"focal": image["focal"]} for image in s["images"]],
+        },
+    ],
+)
+def test_of_a_summary_that_is_damaged_it_is_told_that_focal_lengths_count_as_exact(results, damaged):
+    """They may have been uncertain: bands would be too narrow without a word."""
+    folder, lines, summary = results
+    (folder / "summary.json").write_text(json.dumps(damaged(summary)))
+    known = earlier_of([folder / "lines.npz"], lines)
+    assert known.sigma is None or not known.sigma.any()
+    assert [(of.about, of.verdict) for of in known.findings()][-1] == ("focal lengths", "doubtful")
+    (folder / "summary.json").write_text("{")
+    assert earlier_of([folder / "lines.npz"], lines).lost
+
+
+def test_of_exact_focal_lengths_of_other_lines_it_is_told_too(results):
+    """A summary put beside other lines says nothing of those."""
+    folder, lines, summary = results
+    exact = with_sigma(summary, None)
+    exact["images"][1]["focal"] = 25.0
+    (folder / "summary.json").write_text(json.dumps(exact))
+    assert earlier_of([folder / "lines.npz"], lines).lost
+
+
+def test_lines_whose_lens_cannot_be_read_are_refused(results):
+    """It may say that the focal length is not known: the number in its place would be taken for one."""
+    folder, lines, _ = results
+    (folder / "lens.json").write_text("{")
+    with pytest.raises(ValueError, match=r"lens\.json cannot be read.*move lines\.npz to another folder"):
+        earlier_of([folder / "lines.npz"], lines)
 
 
 def test_focal_lengths_of_other_lines_are_not_taken(results):

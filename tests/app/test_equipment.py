@@ -56,7 +56,7 @@ def test_what_photos_do_not_agree_on_is_left_out(lens, tmp_path):
 
 def test_photos_of_another_lens_than_the_one_they_are_corrected_by_are_told(lens, tmp_path):
     photos = [photo(tmp_path / "a.jpg"), photo(tmp_path / "b.jpg", lens="24-105"), bare(tmp_path / "c.jpg")]
-    assert taken_otherwise(lens, photos) == []  # nothing is known of the lens
+    assert taken_otherwise(lens, photos[::2]) == []  # nothing is known of the lens
     known = dataclasses.replace(lens, about={"lens": "18-200"})
     (told,) = taken_otherwise(known, photos)
     assert "that of 18-200, and by their EXIF data 1 of 3 photos" in told
@@ -88,6 +88,8 @@ def test_photos_of_other_focal_lengths_than_those_used_are_told(lens, tmp_path):
     for of in (lens, in_px):
         (told,) = taken_at_others(of, photos, lambda photo: 50.0)
         assert "24.0-0.jpg is of 24 mm and 70.0-0.jpg is of 70 mm, and the focal length used is 50" in told
+        assert ("leave it out: then the EXIF data count" in told) == (of is lens)  # they are in mm
+        assert ("give a table with that of each photo: the lens counts in px" in told) == (of is in_px)
         assert taken_at_others(of, photos, own) == []
         assert taken_at_others(of, [bare(tmp_path / "none.jpg")], lambda photo: 50.0) == []
     # One factor for all: in px, focused near, of equal view on film, or wrong.
@@ -127,6 +129,21 @@ def test_photos_of_another_camera_than_that_of_a_lens_without_a_name_are_told(le
     assert (
         taken_otherwise(dataclasses.replace(known, about={"camera": "a", "lens": "18-200"}), photos) == []
     )
+
+
+def test_photos_of_several_lenses_are_told_where_a_lens_has_no_name(lens, tmp_path):
+    """It is of one of them at most."""
+    photos = [photo(tmp_path / f"{number}.jpg", lens=name) for number, name in enumerate("aab")]
+    (told,) = taken_otherwise(lens, photos)
+    assert told.startswith("By their EXIF data the photos were taken with 2 lenses, a (2), b (1), and are")
+    assert taken_otherwise(lens, photos[:2]) == []
+    (told,) = taken_otherwise(dataclasses.replace(lens, about={"lens": "a"}), photos)
+    assert told.startswith("The lens is that of a, and")
+    one, two = (photo(tmp_path / f"{body}.jpg", "", body, lens="") for body in ("D300", "X100"))
+    (told,) = taken_otherwise(lens, [one, two])
+    assert "taken with 2 cameras, D300 (1), X100 (1), and are corrected as of one" in told
+    (told,) = taken_otherwise(dataclasses.replace(lens, about={"camera": "D300"}), [one, two])
+    assert told.startswith("The lens is that of the camera D300")
 
 
 def test_names_of_the_database_are_not_those_of_exif_data(tmp_path):

@@ -110,3 +110,38 @@ def test_all_of_images_one_pixel_wide(size):
     assert np.isfinite(framing.origin).all()
     shown = zj.undistort_image(np.full(size[::-1], 9, np.uint8), d, keep="all")
     assert (shown[0] if isinstance(shown, tuple) else shown).shape == size[::-1]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("scale", 0, "scale must be finite and positive"),
+        ("scale", -1.0, "scale must be finite and positive"),
+        ("scale", np.nan, "scale must be finite and positive"),
+        ("scale", "1", "scale must hold real numbers"),
+        ("scale", (1, 1), r"scale must have shape \(\)"),
+        ("origin", 0, "origin must have shape"),
+        ("origin", (1,), "origin must have shape"),
+        ("origin", (0, 0, 0), "origin must have shape"),
+        ("origin", (np.nan, 0), "origin must be finite"),
+        ("origin", ("a", "b"), "origin must hold real numbers"),
+        ("size", 64, "size must be two positive integers"),
+        ("size", (0, 48), "size must be two positive integers"),
+        ("size", ("64", "48"), "size must be two positive integers"),
+        ("image_size", (64, -48), "image_size must be two positive integers"),
+    ],
+)
+def test_what_is_no_window_is_refused(name, value, told):
+    """A scale of 0 gave a black image, -1 one that is turned, an origin (1,) another part: no word."""
+    given = {"scale": 1.0, "origin": [0, 1], "size": [64, 48]}
+    assert zj.Framing(**given).size == (64, 48)
+    with pytest.raises(ValueError, match=f"Argument {told}"):
+        zj.Framing(**given | {name: value})
+
+
+def test_an_image_beyond_all_memory_is_refused():
+    """XLA ended the process."""
+    distortion = zj.Distortion(np.array([0.1]), np.array([31.5, 23.5]), np.array(40.0))
+    framing = zj.Framing(1.0, (0, 0), (10**9, 10**9))
+    with pytest.raises(ValueError, match="Argument framing must show an image that fits into memory"):
+        zj.warp_image(jnp.zeros((48, 64)), distortion, framing=framing)

@@ -132,6 +132,15 @@ def test_sound_that_the_container_does_not_take(clip, tmp_path):
     assert only(tmp_path)
 
 
+def test_of_joined_recordings_it_is_told_that_times_begin_again(tmp_path):
+    """It was told as sound that no container takes, with the advice to choose the one that was chosen."""
+    part = write_clip(tmp_path / "part.ts", 6).read_bytes()
+    (tmp_path / "in.ts").write_bytes(part + part)
+    with pytest.raises(ValueError, match="times begin again, give them new ones first"):
+        undistort_video(tmp_path / "in.ts", tmp_path / "out.mkv", lens=lens(), focal=20.0)
+    assert only(tmp_path, "part.ts", "in.ts")
+
+
 def test_a_framing_of_one_s_own_and_odd_sizes(tmp_path):
     source = write_clip(tmp_path / "in.mkv", 3, encoder="ffv1", sound=False)
     framing = zj.correct.frame_output(lens(), SIZE, keep="all", size=(201, 99))

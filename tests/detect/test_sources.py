@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from zoomjax.detect.sources import as_bytes, find_photos, video_frames
+from zoomjax.app.results_folder import LIST
+from zoomjax.detect.sources import Source, as_bytes, find_photos, video_frames
 from zoomjax.io.focal_track import FocalTrack
 from zoomjax.io.video_reader import decode_video
 
-from .._clips import FRAMES, cut_off, focal, picture, write_clip
+from .._clips import FRAMES, cut_off, focal, picture, write_clip, write_frames
 from .._exif import exif
 
 
@@ -100,7 +101,21 @@ def test_of_a_raw_file_and_the_photo_made_from_it_the_photo_is_used(tmp_path, im
     cv2.imwrite(str(tmp_path / "a.jpg"), image)
     for name in ("a.NEF", "b.NEF"):
         (tmp_path / name).write_bytes(b"as a camera writes it")
-    assert names(find_photos([tmp_path])) == ["a.jpg", "b.NEF"]
+    told = r"one file is left out: a\.NEF, as a photo of that name counts for each\.$"
+    with pytest.warns(UserWarning, match=told):
+        assert names(find_photos([tmp_path])) == ["a.jpg", "b.NEF"]
+
+
+@pytest.mark.parametrize("mark", ["lens.json", LIST])
+def test_pictures_of_an_earlier_calibration_are_no_photos(tmp_path, image, mark):
+    """Of one that found no lens, there is only the list of files that were written."""
+    (tmp_path / "out" / "lines").mkdir(parents=True)
+    for name in ("a.jpg", "out/lines/0001-a.jpg", "out/model.png"):
+        cv2.imwrite(str(tmp_path / name), image)
+    (tmp_path / "out" / mark).write_text("{}")
+    assert names(find_photos([tmp_path])) == ["a.jpg"]
+    with pytest.raises(ValueError, match="no photographs in the folder"):
+        find_photos([tmp_path / "out"])
 
 
 @pytest.mark.parametrize(
@@ -224,6 +239,27 @@ def test_frames_are_spread_where_their_number_is_not_announced(clip, tmp_path):
 
 def test_more_frames_than_there_are_are_all_frames(clip):
     assert len(list(video_frames(clip, 30.0, 1000))) == FRAMES
+
+
+@pytest.mark.parametrize(
+    ("focal", "number", "told"),
+    [
+        *((focal, 3, "focal must be a finite number above 0") for focal in (0, -30.0, np.nan)),
+        *((30.0, number, "number must be an integer of at least 1") for number in (0, -1)),
+    ],
+)
+def test_frames_of_no_focal_length_or_number_are_refused(tmp_path, focal, number, told):
+    """Focal lengths of -30 and NaN were those of the frames; of 0 frames the video was called cut off."""
+    clip = write_frames(tmp_path / "a.mkv", np.zeros((2, 48, 64, 3), np.uint8))
+    with pytest.raises(ValueError, match=f"Argument {told}"):
+        list(video_frames(clip, focal, number))
+    assert len(list(video_frames(clip, 30.0, 10**30))) == 2
+
+
+@pytest.mark.parametrize("focal", [0.0, -30.0, np.nan])
+def test_an_image_of_no_focal_length_is_refused(focal):
+    with pytest.raises(ValueError, match="Argument focal must be a finite number above 0"):
+        Source("a.jpg", None, np.zeros((4, 6), np.uint8), focal)
 
 
 def test_a_video_that_ends_early_gives_the_frames_before_that(clip, tmp_path):

@@ -56,6 +56,16 @@ def test_response_is_that_of_fits_at_other_focal_lengths(sweep, zoom):
         np.testing.assert_allclose(response[:, frame], expected, atol=1e-4 * np.max(np.abs(expected)))
 
 
+def test_a_sigma_beyond_all_numbers_makes_no_band_narrow(sweep):
+    """Its square overflowed, and bands were NaN, which the verdict of the command took for 0."""
+    fit, points = zj.fit_zoom(sweep), np.array([[0.0, 0.0], [700.0, 500.0]])
+    wide = zj.fit.with_focal_sigma(fit, sweep, focal_sigma=1e30)
+    for sigma in (1e155, 1e300):
+        wider = zj.fit.with_focal_sigma(fit, sweep, focal_sigma=sigma)
+        std = zj.displacement_std(wider, points, focal=30.0)
+        assert (std > zj.displacement_std(wide, points, focal=30.0)).all()
+
+
 @pytest.mark.slow
 def test_covariance_grows_by_the_response(sweep):
     fit = zj.fit_zoom(sweep)

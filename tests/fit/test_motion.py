@@ -440,6 +440,9 @@ def test_lines_of_something_else_are_refused(noisy, lines, path):
     for wrong in (np.array([0.5]), np.array([0, 1]), np.array([FRAMES]), np.array([-1])):
         with pytest.raises((ValueError, TypeError), match="line_frames"):
             fit_motion(noisy.tracks, lines=few, line_frames=wrong)
+    two = Lines.from_ragged(lines.to_ragged()[:2], [0, 1], path[0][:2], image_size=SIZE)
+    with pytest.raises(ValueError, match="each frame of the tracks once, but 3 is there 2 times"):
+        fit_motion(noisy.tracks, lines=two, line_frames=np.array([3, 3]))
     with pytest.raises(ValueError, match="line_frames is for argument lines"):
         fit_motion(noisy.tracks, line_frames=np.arange(FRAMES))
     with pytest.raises(ValueError, match="given a BrownConrady"):

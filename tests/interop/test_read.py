@@ -392,6 +392,16 @@ LENSFUN = """<lensdatabase version="1">
 </lensdatabase>"""
 
 
+def test_a_larger_sensor_than_that_of_a_lensfun_file_is_refused(tmp_path):
+    """As of the library: beyond the corners of the calibration its polynomials are extrapolated."""
+    (tmp_path / "a.xml").write_text(LENSFUN)
+    told = r"on a sensor of crop factor 1\.6, and images of crop factor 0\.8 show more than that"
+    with pytest.raises(ValueError, match=told):
+        zj.interop.read(tmp_path / "a.xml", image_size=(600, 400), name="two", crop=0.8)
+    found = zj.interop.read(tmp_path / "a.xml", image_size=(600, 400), name="two", crop=1.59)
+    assert found.lens.about["crop_factor"] == 1.59
+
+
 @pytest.mark.parametrize(
     ("name", "focal", "crop"), [("One", 24.0, None), ("two", 10.0, None), ("One", 35.0, 2.0)]
 )

@@ -98,6 +98,27 @@ def test_pixels_that_are_not_square_are_said(work, tmp_path):
         WORKS[work](path)
 
 
+def joined(path, aspects=(1, 1)):
+    """Two clips one after the other, the second of which begins again at 0 s."""
+    content = b""
+    for number, aspect in enumerate(aspects):
+        part = path.with_name(f"{number}.ts")
+        write(part, aspect=aspect)
+        content += part.read_bytes()
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize("aspect", [Fraction(1), Fraction(4, 3)])
+def test_pixels_that_change_their_shape_are_said(aspect, tmp_path, recwarn):
+    """As where a broadcast goes over to another programme; a file that is written has one shape."""
+    with decode_video(joined(tmp_path / "in.ts", (Fraction(1), aspect))) as (_, frames):
+        assert len(list(frames)) == 2 * FRAMES
+    told = [str(warning.message) for warning in recwarn if "change their shape" in str(warning.message)]
+    assert len(told) == (aspect != 1)
+    assert all("from 1:1 to 4:3: split the video there" in one for one in told)
+
+
 def between_keys(path, before=6):
     """A clip of a broadcast, cut anywhere: its first frames have no key frame, and are no pictures."""
     write(path.with_name("whole.ts"), number=2 * FRAMES, g="10", keyint_min="10", sc_threshold="0")

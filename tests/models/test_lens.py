@@ -221,6 +221,12 @@ def test_beyond_the_range_is_nan_where_nobody_can_be_warned(truth):
         truth.undistort(points, -35.0)
 
 
+@pytest.mark.parametrize("low", [0.0, -5.0, np.nan, np.inf])
+def test_a_wider_range_is_of_focal_lengths(truth, low):
+    with pytest.raises(ValueError, match="Argument low must be a finite number above 0"):
+        truth.extended(low, 200.0)
+
+
 def test_numpy_points_at_another_focal_length_compile_nothing(truth, compilations, rng):
     truth.undistort(rng.uniform(0, 600, (3, 2)), 35.0)
     compilations()

@@ -193,6 +193,18 @@ def test_lines_through_the_centre_determine_nothing(lens, lines):
     assert found.sentence == "Not determined: the lines do not determine the correction."
 
 
+def test_a_covariance_that_is_not_known_is_not_one_of_zero(lines):
+    small = zj.compress(lines)
+    fit = zj.fit_zoom(small)
+    unknown = eqx.tree_at(lambda fit: fit.covariance, fit, np.full_like(fit.covariance, np.nan))
+    found = assess(lines, unknown, compressed=small)
+    assert found.evidence.std == np.inf
+    assert about(found)["bands"] == "not determined"
+    failed = eqx.tree_at(lambda fit: fit.lens.zoom.parameters, fit, replace_fn=lambda p: p * np.nan)
+    with pytest.raises(ValueError, match="parameters must be finite"):
+        assess(lines, failed, compressed=small)
+
+
 def test_the_summary_is_plain(lines):
     found = assessed(lines)
     infinite = dataclasses.replace(found, evidence=dataclasses.replace(found.evidence, std=np.inf))

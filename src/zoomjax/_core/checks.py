@@ -11,15 +11,20 @@ from numpy.typing import ArrayLike
 from .arrays import numeric
 from .fields import refuse_masked
 
+MOST_TERMS = 64
+"""Coefficients of a polynomial in r^2 beyond which its powers are rounding, and its triangles memory."""
 
-def checked_integer(name: str, value: Any, least: int) -> int:
-    """An integer of at least `least`, NumPy's kinds included, as Python's."""
+
+def checked_integer(name: str, value: Any, least: int, most: int | None = None) -> int:
+    """An integer of at least `least`, and perhaps at most another, NumPy's kinds included, as Python's."""
     try:
         number = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
         number = None
     if number is None or number < least:
         raise ValueError(f"Argument {name} must be an integer of at least {least}, but it is {value!r}.")
+    if most is not None and number > most:
+        raise ValueError(f"Argument {name} must be at most {most}, but it is {value!r}.")
     return number
 
 
@@ -49,16 +54,22 @@ def _is_finite(value: Any) -> bool:
         return False
 
 
+LARGEST = 2**31
+"""px: from here on no format has images, and no array indices."""
+
+
 def checked_size(size: Any, name: str = "image_size") -> tuple[int, int]:
     """(width, height) px."""
     try:
         if isinstance(size, str | bytes | bytearray):
             raise TypeError
         width, height = (math.nan if isinstance(side, str | bytes | bool) else float(side) for side in size)
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         width = height = math.nan
     if not all(math.isfinite(side) and side == int(side) and side >= 1 for side in (width, height)):
         raise ValueError(f"Argument {name} must be two positive integers (w, h), but it is {size!r}.")
+    if max(width, height) >= LARGEST:
+        raise ValueError(f"Argument {name} must be below 2^31 px, as of any image, but it is {size!r}.")
     return int(width), int(height)
 
 
@@ -76,6 +87,8 @@ def checked_centre(centre: Any, size: tuple[int, int]) -> np.ndarray:
     middle = real_numbers(centre)
     if middle is None or middle.shape != (2,) or not np.isfinite(middle).all():
         raise ValueError(f"Argument centre must be two finite numbers, but it is {centre!r}.")
+    if np.abs(middle).max() >= LARGEST:
+        raise ValueError(f"Argument centre must be in px, below 2^31, but it is {centre!r}.")
     return middle
 
 

@@ -1,4 +1,4 @@
-"""The help of commands: without the types of flags and arguments, which say less than their names."""
+"""What all commands share: help without the types of flags and arguments, and no empty names of files."""
 
 from typing import Any
 
@@ -6,7 +6,32 @@ from typer.core import TyperCommand
 
 
 class PlainCommand(TyperCommand):
-    """A command whose help names no Python types."""
+    """A command whose help names no Python types, and whose arguments and output are not empty.
+
+    An empty path is the working folder to `pathlib`: of a variable of the shell that is not set, all photos
+    there would be used, or results written among them.
+    """
+
+    def parse_args(self, ctx: Any, args: Any) -> Any:
+        """Parse the words after the command.
+
+        Raises:
+            ValueError: an argument, or the output, is empty.
+        """
+        given: dict[str, Any] = {}
+        if not ctx.resilient_parsing:  # which completes words
+            given, _, _ = self.make_parser(ctx).parse_args(list(args))
+        for parameter in super().get_params(ctx):
+            of: Any = parameter
+            path = of.name == "output" or (of.param_type_name == "argument" and of.name != "search")
+            value = given.get(of.name)
+            if path and "" in (value if isinstance(value, list | tuple) else [value]):
+                name = "--output" if of.name == "output" else "An argument"
+                raise ValueError(
+                    f"{name} is empty, as a variable of the shell that is not set: name a file or a "
+                    "folder, or . for this one."
+                )
+        return super().parse_args(ctx, args)
 
     def get_params(self, ctx: Any) -> Any:
         """The parameters, with nothing to be shown in the place of such types."""

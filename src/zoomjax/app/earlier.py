@@ -13,6 +13,7 @@ import numpy as np
 
 from ..lines.lines import Lines
 from ..lines.npz import load_lines
+from ..models.lens import load_lens
 from ..trust.assessment import Finding
 
 
@@ -24,7 +25,7 @@ class Earlier(NamedTuple):
         shared: for each frame a number, the same for those of one focal length; None if none share one.
         centre: whether the centre was fitted.
         flat: whether the lines are those of a flat board in the place of a bent one.
-        lost: whether focal lengths are uncertain of which it is not known by how much.
+        lost: whether focal lengths may be uncertain of which it is not known by how much.
     """
 
     sigma: np.ndarray | None = None
@@ -61,8 +62,8 @@ class Earlier(NamedTuple):
                 Finding(
                     "focal lengths",
                     "doubtful",
-                    "the focal lengths of some lines are uncertain, but the summary beside them is of "
-                    "others, and they count as exact.",
+                    "how uncertain the focal lengths of some lines are is not known, as the summary beside "
+                    "them is damaged, or of others: they count as exact.",
                     "Give their standard deviation (--focal-sigma), or calibrate from the photos again.",
                 )
             )
@@ -80,7 +81,12 @@ def earlier_of(files: Sequence[Path], lines: Lines) -> Earlier:
     """What the summaries beside files of lines know of them; the frames of the files follow each other.
 
     Focal lengths of files without a summary are exact, as they are where there is none at all.
+
+    Raises:
+        ValueError: the lens beside a file cannot be read, which tells whether a focal length is known.
     """
+    for file in filter(is_of_results, files):
+        _check_lens(file)
     parts = [_of_file(file) for file in files]
     if all(part is None for part in parts):
         return Earlier()
@@ -93,7 +99,7 @@ def earlier_of(files: Sequence[Path], lines: Lines) -> Earlier:
     focal = np.asarray(lines.focal, float)
     given = np.concatenate([part.focal for part in known])
     if told.size != focal.size or not np.allclose(given, focal[told], rtol=1e-6):
-        return Earlier(centre=centre, flat=flat, lost=any(part.lost or part.sigma.any() for part in known))
+        return Earlier(centre=centre, flat=flat, lost=True)
     sigma, shared = np.zeros(focal.size), np.arange(focal.size)
     sigma[told] = np.concatenate([part.sigma for part in known])
     starts = np.cumsum([0, *sizes])
@@ -115,12 +121,27 @@ class _Part(NamedTuple):
     lost: bool
 
 
-def _of_file(file: Path) -> _Part | None:
-    """None if there is no summary, or one of another version, or changed by hand."""
+def _check_lens(file: Path) -> None:
+    """Check that the lens beside a file of lines can be read."""
     try:
-        return None if (summary := _summary(file)) is None else _of_summary(summary)
-    except (AttributeError, KeyError, TypeError, ValueError):
+        load_lens(file.with_name("lens.json"))
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f"{file} is of a folder of results whose lens.json cannot be read, and so it is not known what "
+            f"its focal lengths are. {error} Mend it, or move {file.name} to another folder."
+        ) from error
+
+
+def _of_file(file: Path) -> _Part | None:
+    """None without a summary. Of one that is damaged, or of another version, focal lengths are lost."""
+    if not is_of_results(file):
         return None
+    try:
+        return _of_summary(json.loads(file.with_name("summary.json").read_text()))
+    except (AttributeError, KeyError, OSError, TypeError, ValueError):
+        focal = np.asarray(load_lines(file).focal, float)
+        number = len(focal)
+        return _Part(focal, np.zeros(number), np.arange(number), centre=False, flat=False, lost=True)
 
 
 def _of_summary(summary: dict[str, Any]) -> _Part:
@@ -135,17 +156,21 @@ def _of_summary(summary: dict[str, Any]) -> _Part:
             bool(before["flat"]),
             before.get("lost", False),
         )
-        if sigma.shape != focal.shape or shared.shape != focal.shape:
+        good = np.isfinite(sigma) & (sigma >= 0)
+        if sigma.shape != focal.shape or shared.shape != focal.shape or not good.all():
             sigma, shared, lost = np.zeros(len(focal)), np.arange(len(focal)), True
         return _Part(focal, sigma, _by_first(shared), fitted, flat, bool(lost))
     images = summary["images"]
+    sigma = np.array([float(image["focal_sigma"] or 0) for image in images])
+    if not (np.isfinite(sigma) & (sigma >= 0)).all():
+        raise ValueError
     shared = np.arange(len(images))
     for number, group in enumerate(summary.get("focal_groups") or ()):
         there = [i for i, image in enumerate(images) if image["name"] in group["names"]]
         shared[there] = len(images) + number
     return _Part(
         np.array([float(image["focal"]) for image in images]),
-        np.array([float(image["focal_sigma"] or 0) for image in images]),
+        sigma,
         _by_first(shared),
         centre,
         bool((summary.get("board") or {}).get("flat_lines")),
@@ -161,14 +186,3 @@ def _by_first(shared: np.ndarray) -> np.ndarray:
 
 def _frames(file: Path) -> int:
     return len(load_lines(file).focal)
-
-
-def _summary(file: Path) -> dict[str, Any] | None:
-    """The summary of the results that a file of lines is one of; None if it is of none."""
-    if not is_of_results(file):
-        return None
-    try:
-        found = json.loads(file.with_name("summary.json").read_text())
-    except (OSError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None

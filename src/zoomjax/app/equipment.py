@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._core.text import plain
+from .._core.text import listed, plain
 from ..interop.matching import crop_factor
 from ..io.equipment import FILM, Equipment, read_equipment
 from ..io.metadata import Metadata
@@ -160,8 +160,8 @@ def equipment_of(photo: Path) -> Equipment:
 def taken_otherwise(lens: ZoomLens, photos: Iterable[Path]) -> list[str]:
     """That EXIF data say that photos were not taken as those of a lens, in sentences.
 
-    That is another lens, or where it has no name another body; another part of the sensor; another zoom
-    than the one of a lens whose focal length is not known.
+    That is another lens, or where it has no name several lenses or another body; another part of the
+    sensor; another zoom than the one of a lens whose focal length is not known.
     """
     found = [equipment_of(photo) for photo in photos]
     told, own = [], lens.about.get("lens")
@@ -172,7 +172,7 @@ def taken_otherwise(lens: ZoomLens, photos: Iterable[Path]) -> list[str]:
             f"The lens is that of {own}, and by their EXIF data {others.total()} of {len(found)} photos "
             f"were taken with another one ({plain(name)})."
         )
-    told += _parts_taken(lens, found) + _bodies_taken(lens, found)
+    told += _parts_taken(lens, found) + (_bodies_taken(lens, found) or ([] if named else _several(found)))
     focal = [one.focal for one in found if one.focal]
     if lens.about.get("focal") == UNKNOWN and focal and max(focal) > _SAME_ZOOM * min(focal):
         told.append(
@@ -202,14 +202,31 @@ def taken_at_others(lens: ZoomLens, photos: Iterable[Path], focal_of: Callable[[
     pair = (low,) if len(ratio) == 1 else (low, high)
     told = [f"{plain(photo.name)} is of {found[photo].focal:.4g} mm" for photo in pair]
     counts = dict.fromkeys(f"{used[photo]:.4g}" for photo in pair)
+    advice = "leave it out: then the EXIF data count"
+    if lens.focal_unit == "px":
+        advice = "give a table with that of each photo: the lens counts in px"
     return [
         f"By their EXIF data {' and '.join(told)}, and the focal length used is {' and '.join(counts)} "
-        f"{lens.focal_unit}. Check --focal, or leave it out: then the EXIF data count."
+        f"{lens.focal_unit}. Check --focal, or {advice}."
     ]
 
 
 def _off(ratio: float) -> float:
     return max(ratio, 1 / ratio)
+
+
+def _several(found: Sequence[Equipment]) -> list[str]:
+    """That photos were taken with several lenses, or cameras if they name no lens: one at most is right."""
+    kind, taken = "lenses", Counter(one.lens for one in found if one.lens)
+    if not taken:
+        kind, taken = "cameras", Counter(_camera(one) for one in found if one.camera)
+    if len(taken) < 2:
+        return []
+    names = listed((f"{plain(name)} ({number})" for name, number in taken.most_common()), 3)
+    return [
+        f"By their EXIF data the photos were taken with {len(taken)} {kind}, {names}, and are corrected as "
+        "of one: correct those of each by themselves."
+    ]
 
 
 _OTHER_ZOOM = 1.1

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.checks import checked_size
+from .._core.fields import check_finite, check_positive, check_shapes, host_numbers
 from .._core.types import Point, Points, Scalar, of_known_values
 from ..models.distortion import Distortion
 from ..models.lens import ZoomLens
@@ -48,10 +49,18 @@ class Framing(eqx.Module):
         [0.5, 0.5]
     """
 
-    scale: Scalar
-    origin: Point
-    size: tuple[int, int] = eqx.field(static=True)
-    image_size: tuple[int, int] | None = eqx.field(static=True, default=None)
+    scale: Scalar = eqx.field(converter=host_numbers("scale"))
+    origin: Point = eqx.field(converter=host_numbers("origin"))
+    size: tuple[int, int] = eqx.field(static=True, converter=lambda size: checked_size(size, "size"))
+    image_size: tuple[int, int] | None = eqx.field(
+        static=True, default=None, converter=lambda size: None if size is None else checked_size(size)
+    )
+
+    def __check_init__(self):
+        """Check that it is a window: what has no scale, or a negative one, shows nothing, or mirrors."""
+        check_shapes({"scale": (self.scale, ()), "origin": (self.origin, (2,))})
+        check_positive("scale", self.scale)
+        check_finite("origin", self.origin)
 
     def corrected(self, pixels: Points) -> Float[Array, "*batch 2"]:
         """The corrected points, px, that output pixels show."""

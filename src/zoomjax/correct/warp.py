@@ -101,6 +101,10 @@ def warp_image(
     checked_distortion(distortion)
     if framing is not None:
         check_framing(framing, (width, height), "framing")
+        if framing.size[0] * framing.size[1] > _MOST_PIXELS:  # XLA ends the process where numbers overflow
+            raise ValueError(
+                f"Argument framing must show an image that fits into memory, but it is {framing.size} px."
+            )
     if framing is None or framing.image_size is not None:
         check_image_size(distortion, (width, height))
     return _warped(image, distortion, framing, interpolation, border_value)
@@ -116,6 +120,8 @@ def _check_border(value, dtype):
         if not limits.min <= float(value) <= limits.max:
             raise ValueError(f"Argument border_value must be a value of {dtype}, but it is {value!r}.")
 
+
+_MOST_PIXELS = 2**36
 
 _LARGE = 1000
 """Border values beyond which pixels that do not mix the border in are sampled without it."""

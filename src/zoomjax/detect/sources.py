@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from .._core.checks import check_above, checked_integer
 from .._core.text import listed, plain
 from ..io.focal_track import FocalTrack
 from ..io.photo import SUFFIXES, metadata_focal, open_photo, read_photo
@@ -27,7 +28,10 @@ _NOT_READ = (".gif", ".jp2", ".j2k", ".jxl", ".psd", ".exr", ".hdr", ".tga")
 """Of pictures in formats that are not read."""
 
 RESULTS = ("lines", "model.png", "before-after.jpg", "motion.png", "panorama.jpg")
-"""What a calibration puts beside its ``lens.json`` that might be taken for photographs."""
+"""What a calibration puts into its folder that might be taken for photographs."""
+
+_OF_RESULTS = ("lens.json", ".zoomjax.json")
+"""What such a folder has: where photos determine no lens, the list of what was written alone."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +58,8 @@ class Source:
             raise ValueError("Either argument path or image must be given, the file or its pixels.")
         if self.image is not None and not isinstance(self.image, np.ndarray):
             raise ValueError(f"Argument image must be an array, but it is {type(self.image).__name__}.")
+        if self.focal is not None:
+            check_above(0, focal=self.focal)
 
     @property
     def file(self) -> str:
@@ -141,15 +147,24 @@ def twice(again: dict[Path, Path]) -> str:
 
 
 def left_out(folder: Path, used: Sequence[str] = SUFFIXES) -> str:
-    """A sentence about videos and pictures in a folder with other suffixes; empty if there are none."""
+    """Sentences about videos and pictures in a folder with other suffixes, and developed RAW files.
+
+    Empty if there are none.
+    """
     suffixes = {*VIDEO_SUFFIXES, *SUFFIXES, *_NOT_READ}.difference(used)
-    others = files_within(folder, sorted(suffixes))
-    if not others:
-        return ""
-    names = listed((plain(str(path.relative_to(folder))) for path in others), 3)
-    number = "one file is" if len(others) == 1 else f"{len(others)} files are"
-    give = " Give videos by name." if any(path.suffix.lower() in VIDEO_SUFFIXES for path in others) else ""
-    return f"In the folder {plain(str(folder))}, {number} left out: {names}.{give}"
+    told, others = [], files_within(folder, sorted(suffixes))
+    if others:
+        videos = any(path.suffix.lower() in VIDEO_SUFFIXES for path in others)
+        told.append(_left_out(folder, others, ".") + " Give videos by name." * videos)
+    if raws := _developed(_all_within(folder, used)):
+        told.append(_left_out(folder, sorted(raws), ", as a photo of that name counts for each."))
+    return " ".join(told)
+
+
+def _left_out(folder: Path, files: Sequence[Path], why: str) -> str:
+    names = listed((plain(str(path.relative_to(folder))) for path in files), 3)
+    number = "one file is" if len(files) == 1 else f"{len(files)} files are"
+    return f"In the folder {plain(str(folder))}, {number} left out: {names}{why}"
 
 
 def _expanded(given: str) -> list[Path]:
@@ -182,8 +197,15 @@ def files_within(folder: Path, suffixes: Sequence[str]) -> list[Path]:
 
     Of a RAW file beside a photo of the same name, the photo is meant: it was developed from it.
     """
-    results = {lens.with_name(name) for lens in folder.rglob("lens.json") for name in RESULTS}
-    found = sorted(
+    found = _all_within(folder, suffixes)
+    developed = _developed(found)
+    return [path for path in found if path not in developed]
+
+
+def _all_within(folder: Path, suffixes: Sequence[str]) -> list[Path]:
+    """As `files_within`, with RAW files that were developed."""
+    results = {mark.with_name(name) for of in _OF_RESULTS for mark in folder.rglob(of) for name in RESULTS}
+    return sorted(
         path
         for path in folder.rglob("*")
         if path.suffix.lower() in suffixes
@@ -191,12 +213,13 @@ def files_within(folder: Path, suffixes: Sequence[str]) -> list[Path]:
         and not any(part.startswith(".") for part in path.relative_to(folder).parts)
         and not results.intersection((path, *path.parents))
     )
-    developed = {path.with_suffix("") for path in found if path.suffix.lower() not in RAW_SUFFIXES}
-    return [
-        path
-        for path in found
-        if path.suffix.lower() not in RAW_SUFFIXES or path.with_suffix("") not in developed
-    ]
+
+
+def _developed(found: Sequence[Path]) -> set[Path]:
+    """RAW files beside a photo of the same name."""
+    photos = {path.with_suffix("") for path in found if path.suffix.lower() not in RAW_SUFFIXES}
+    raws = (path for path in found if path.suffix.lower() in RAW_SUFFIXES)
+    return {path for path in raws if path.with_suffix("") in photos}
 
 
 def _names(paths: list[Path]) -> list[str]:
@@ -219,7 +242,8 @@ def video_frames(
 
     Raises:
         FileNotFoundError: there is no such video.
-        ValueError: it cannot be read, or the track does not reach over it.
+        ValueError: it cannot be read, the track does not reach over it, or `number` or a focal length is
+            not positive.
 
     Warns:
         UserWarning: the video ends early, being cut off or damaged; the frames before that are used. Or the
@@ -227,10 +251,14 @@ def video_frames(
     """
     from ..io.video_reader import decode_video
 
+    number = checked_integer("number", number, 1)
+    if not isinstance(focal, FocalTrack):
+        check_above(0, focal=focal)
     stem = Path(path).stem
     with decode_video(path) as (announced, frames):
         # From the first to the last; where not even the length is known, the first ones.
-        wanted = set(np.linspace(0, (announced or number) - 1, number).round().astype(int).tolist())
+        there = announced or number
+        wanted = set(np.linspace(0, there - 1, min(number, there)).round().astype(int).tolist())
         last, time, some = -1, 0.0, False
         for last, time, image in frames:
             if last not in wanted:

@@ -278,6 +278,12 @@ def _ready_lines(given, padded_frames, distortion_model, size):
             f"Argument line_frames must say which of the {tracks.frames} frames of the tracks each of the "
             f"{len(lines.focal)} frames of the lines is, and it does not."
         )
+    if np.unique(frames).size < frames.size:
+        twice = np.flatnonzero(np.bincount(frames) > 1)[0]
+        raise ValueError(
+            f"Argument line_frames must name each frame of the tracks once, but {twice} is there "
+            f"{np.sum(frames == twice)} times: lines of one frame are one frame of the lines."
+        )
     middle = (np.array(tracks.image_size) - 1) / 2
     terms = distortion_model.expansion_terms(size)
     small = compress_any_centre(lines.about(middle), terms) if isinstance(lines, Lines) else lines

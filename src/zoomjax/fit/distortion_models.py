@@ -1,7 +1,7 @@
 """Lines for a distortion model other than the radial polynomial."""
 
 from .._core.arguments import kinds_checked
-from .._core.checks import checked_integer
+from .._core.checks import MOST_TERMS, checked_integer
 from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines, compress
 from ..lines.lines import Lines
@@ -52,7 +52,8 @@ def compress_for(
         >>> fit_zoom(small, zoom=PolynomialZoom(degree=0), terms=1).lens.distortion_model
         Division()
     """
-    problem, terms = with_distortion_model(lines, distortion_model), checked_integer("terms", terms, 1)
+    terms = checked_integer("terms", terms, 1, MOST_TERMS)
+    problem = with_distortion_model(lines, distortion_model)
     return problem.compressed(terms) if isinstance(problem, Problem) else compress(lines, terms)
 
 

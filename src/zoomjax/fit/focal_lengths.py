@@ -163,7 +163,11 @@ def checked_sigma(focal_sigma: Any, focal: Focal) -> Float[AnyArray, "frame"]:
     focal = jnp.asarray(focal)
     if focal_sigma is None:
         raise ValueError(f"Argument focal_sigma must be a number or one a frame, but it is None. {UNKNOWN}")
-    sigma = jnp.asarray(real_argument("focal_sigma", focal_sigma), focal.dtype)
+    given = real_argument("focal_sigma", focal_sigma)
+    if not traced(given):  # beyond any lens, and variances do not overflow
+        most = float(jnp.finfo(focal.dtype).max) ** 0.25
+        given = np.where(np.isinf(given), given, np.minimum(given, most))
+    sigma = jnp.asarray(given, focal.dtype)
     if sigma.shape not in ((), focal.shape):
         raise ValueError(
             f"Argument focal_sigma must hold one number, or one for each of the {focal.shape[0]} frames, "

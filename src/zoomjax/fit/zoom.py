@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
-from .._core.checks import real_numbers
+from .._core.checks import LARGEST, real_numbers
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines, SomeLines
 from ..lines.buckets import bucketed
@@ -136,7 +136,7 @@ def given_centre(
     if isinstance(centre, str) and centre == "image":
         return (np.array(image_size) - 1) / 2
     told = real_numbers(centre)
-    if told is None or told.shape != (2,) or not np.isfinite(told).all():
+    if told is None or told.shape != (2,) or not (np.abs(told) < LARGEST).all():
         raise ValueError(
             f'Argument centre must be "fit", "image" or two coordinates in px, but it is {centre!r}.'
         )

@@ -28,7 +28,7 @@ from .._core.text import plain
 from ..io.equipment import FILM
 from ._forms import AbstractForm, Form, minimax
 from .base import Contents, Export, Import, InterpolatedFormat, Node, not_alike, refuse_others
-from .radial_table import SPARE, RadialTable
+from .radial_table import LARGER, SPARE, RadialTable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,6 +178,11 @@ class Lensfun(InterpolatedFormat):
         crop = float(lens.findtext("cropfactor", "1"))
         if not 0 < crop < math.inf:
             raise ValueError("its crop factor is not a positive number")
+        if job.crop is not None and job.crop * LARGER < crop:
+            raise ValueError(
+                f"it was calibrated on a sensor of crop factor {crop:g}, and images of crop factor "
+                f"{job.crop:g} show more than that: it has no data there"
+            )
         aspect = float(Fraction(*map(float_fraction, lens.findtext("aspect-ratio", "3:2").split(":"))))
         unit = (
             math.hypot(*(side - 1 for side in size)) / 2 * (job.crop or crop) / crop / math.hypot(aspect, 1)

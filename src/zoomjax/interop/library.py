@@ -13,10 +13,7 @@ from .._core.checks import checked_size
 from ..io.equipment import FILM
 from ..models.lens import ZoomLens
 from .database import LensTable, one_named, version
-from .radial_table import MODELS, SPARE, RadialTable, TableFit, zoom_of_table
-
-_LARGER = 1.02
-"""How much larger than the sensor of the table that of the image may be: crop factors are rounded, too."""
+from .radial_table import LARGER, MODELS, SPARE, RadialTable, TableFit, zoom_of_table
 
 
 def library_lens(
@@ -82,7 +79,7 @@ def table_for(found: list[LensTable], crop: float | int | None) -> LensTable:
     """
     if crop is None:
         return min(found, key=lambda table: table.crop_factor)
-    covering = [table for table in found if table.crop_factor <= crop * _LARGER]
+    covering = [table for table in found if table.crop_factor <= crop * LARGER]
     if not covering:
         least = min(table.crop_factor for table in found)
         raise ValueError(

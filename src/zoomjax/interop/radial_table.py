@@ -29,6 +29,9 @@ from ._minimax import RADII, Targets, fit, largest_distance, powers, targets
 
 MODELS = ("auto", "smooth", "table")
 
+LARGER = 1.02
+"""How much larger than the sensor of a table that of the image may be: crop factors are rounded, too."""
+
 SPARE = 1.02
 """How far beyond the ends a focal length may be: those in databases and in EXIF data are rounded."""
 

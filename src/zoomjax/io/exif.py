@@ -16,6 +16,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from .._core.arguments import check_kind
 from .._core.checks import check_above
+from .bigtiff import is_bigtiff, usual_tags
 
 File = io.BytesIO | io.BufferedReader
 """What is read, at its beginning."""
@@ -84,11 +85,14 @@ def parse_exif(file: File, offset: int | None = None) -> Image.Exif | None:
 
     An offset leads to another page than the first.
     """
-    exif = Image.Exif()
+    exif, head = Image.Exif(), file.read(16)
+    file.seek(0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of damage, which does not matter unless the focal length is gone
         try:
-            if offset is None:
+            if is_bigtiff(head):
+                exif.load_from_fp(io.BytesIO(usual_tags(file.read(), offset)))
+            elif offset is None:
                 exif.load_from_fp(file)
             else:
                 _load_page(exif, file, offset)
@@ -102,7 +106,7 @@ def parse_exif(file: File, offset: int | None = None) -> Image.Exif | None:
 def _load_page(exif: Image.Exif, file: File, offset: int) -> None:
     """Load what a TIFF file has at an offset, in the file's own order of bytes."""
     head = file.read(8)
-    exif.endian, exif.bigtiff = ("<" if head[:2] == b"II" else ">"), head[2:3] == b"+" or head[3:4] == b"+"
+    exif.endian = "<" if head[:2] == b"II" else ">"
     exif.load_from_fp(file, offset)
 
 

@@ -10,6 +10,7 @@ import os
 import struct
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +166,7 @@ def decoded_items(
     packets, the earliest first, are those of frames.
     """
     packets, avi, steps = input_.demux([video, *others]), _is_avi(input_), list[int]()
-    early, begun = list[int](), False
+    early, begun, shape = list[int](), False, None
     ordered = avi or input_.format.name == "mxf"
     while report.corrupt < _MOST_ERRORS:
         step, before = None, False
@@ -209,7 +210,21 @@ def decoded_items(
             if steps:
                 frame.pts = heapq.heappop(steps)
             report.corrupt += bool(frame.is_corrupt)
+            now = video.codec_context.sample_aspect_ratio or shape
+            if shape and now != shape:
+                _warn_of_shape(frame, shape, now)
+            shape = now
             yield frame
+
+
+def _warn_of_shape(frame: Any, shape: Any, now: Any) -> None:
+    """Warn that pixels change their shape, as of broadcasts: a file that is written has the first one."""
+    (a, b), (c, d) = (Fraction(of).as_integer_ratio() for of in (shape, now))
+    warnings.warn(
+        f"Pixels of the video change their shape at {frame.time or 0:.3f} s, from {a}:{b} to {c}:{d}: "
+        "split the video there. All are taken as square, and results have the first shape.",
+        stacklevel=3,
+    )
 
 
 def _is_avi(input_: Any) -> bool:

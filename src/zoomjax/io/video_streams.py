@@ -162,8 +162,9 @@ def mux(output: Any, named: Path, packets: Any) -> None:
         output.mux(packets)
     except av.error.ArgumentError as error:  # and no full disk
         raise ValueError(
-            f"A {named.suffix} file does not take these pictures or this sound ({error.strerror}). Choose "
-            f".mkv, or {_ANEW}"
+            f"A {named.suffix} file does not take these pictures or this sound ({error.strerror}). Where "
+            "recordings were joined and times begin again, give them new ones first: ffmpeg -i SOURCE -c "
+            f"copy NEW.mkv. Else choose .mkv, or {_ANEW}"
         ) from error
 
 

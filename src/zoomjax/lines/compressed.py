@@ -33,7 +33,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from .._core.arguments import kinds_checked
-from .._core.checks import checked_integer
+from .._core.checks import MOST_TERMS, checked_integer
 from .._core.products import EXACT
 from .._core.programs import program
 from .._core.types import Centres, traced
@@ -142,7 +142,7 @@ def compress(lines: Lines, terms: int = 2) -> CompressedLines:
         (2, 7, 7)
     """
     return CompressedLines(
-        triangle=triangles_of(lines, _columns, checked_integer("terms", terms, 1)),
+        triangle=triangles_of(lines, _columns, checked_integer("terms", terms, 1, MOST_TERMS)),
         **header_of(lines),
     )
 

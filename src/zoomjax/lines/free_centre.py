@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from .._core.arguments import kinds_checked
 from .._core.arrays import as_jax
-from .._core.checks import checked_integer
+from .._core.checks import MOST_TERMS, checked_integer
 from .._core.products import EXACT
 from .._core.types import Centres, traced
 from .base import header_of
@@ -159,7 +159,7 @@ def compress_any_centre(lines: Lines, terms: int = 2) -> AnyCentreLines:
         ((2, 21, 21), (2, 7, 7))
     """
     return AnyCentreLines(
-        triangle=_triangles(lines, checked_integer("terms", terms, 1)),
+        triangle=_triangles(lines, checked_integer("terms", terms, 1, MOST_TERMS)),
         **header_of(lines),
     )
 

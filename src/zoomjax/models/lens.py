@@ -16,7 +16,7 @@ from jaxtyping import Float, Num, ScalarLike
 
 from .._core.arguments import check_kind, kinds_checked
 from .._core.arrays import aligned
-from .._core.checks import checked_size, checked_unit
+from .._core.checks import check_above, checked_size, checked_unit
 from .._core.fields import check_finite, check_positive, check_range, check_shapes, numbers
 from .._core.files import whole_file
 from .._core.pixels import check_pitch
@@ -188,6 +188,7 @@ class ZoomLens(eqx.Module):
 
         The distortion is not validated beyond the fitted range; check it with `certify`.
         """
+        check_above(0, low=low, high=high)
         return dataclasses.replace(self, focal_range=np.array([low, high], float))
 
     def _mapped(self, method, points, focal, focus):

@@ -379,4 +379,4 @@ def _of_one_frame(of: Evidence, each: float) -> Iterator[Finding]:
 
 
 def _px(value: float) -> str:
-    return f"{value:.2g}" if value < 100 else f"{value:.0f}"
+    return f"{value:.0f}" if 100 <= value < 1e6 else f"{value:.2g}"

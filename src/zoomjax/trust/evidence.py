@@ -26,6 +26,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
+from .._core.fields import check_finite
 from .._core.programs import light_program
 from .._core.types import of_known_values
 from ..fit.distortion_models import compress_for
@@ -142,8 +143,9 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
         compressed: the same lines compressed for the fit's distortion model, if they are at hand.
 
     Raises:
-        ValueError: no line is usable; the lines are not those of the fit, being of another image size, unit
-            or number of frames; or `compressed` are others.
+        ValueError: no line is usable; the lens has parameters that are not finite, as of a fit that failed;
+            the lines are not those of the fit, being of another image size, unit or number of frames; or
+            `compressed` are others.
 
     Example:
         >>> from zoomjax import compress, fit_zoom, scenes
@@ -154,6 +156,8 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     """
     check_lines_of(fit, lines)
     lens = fit.lens
+    for values in jax.tree.leaves(lens.zoom.parameters):
+        check_finite("fit.lens.zoom.parameters", values)
     placed: Any = placed_as(lens, lines)
     if compressed is None:
         terms = number_of_coefficients(lens.zoom)
@@ -171,7 +175,9 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     focals = 1 / np.linspace(1 / low, 1 / high, _FOCALS)
     raster = jnp.asarray(_raster(lens), dtype)
     moved, rows = map(np.asarray, _derivatives(lens, raster, jnp.asarray(focals, dtype)))
+    displaced = np.linalg.norm(moved, axis=-1)
     std = np.asarray(displacement_std(fit, _raster(lens)[None], focal=focals[:, None]))
+    std = np.where(np.isnan(std) & ~np.isnan(displaced), np.inf, std)  # of a covariance that is not known
     pulled = _normal_terms(compressed, lens.zoom)
     bent = bending(lines, fit, weight, pulled[0])
     zero = jax.device_put(np.zeros((len(lines.focal), number_of_coefficients(lens.zoom)), dtype))
@@ -188,7 +194,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
         rms=float(fit.rms),
         rms_uncorrected=float(np.sqrt(np.nanmean(before))),
         noise=noise(measured_as(placed, compressed), lens, np.flatnonzero(weight)),
-        displacement=float(np.max(_over_image(np.linalg.norm(moved, axis=-1)))),
+        displacement=float(np.max(_over_image(displaced))),
         std=float(np.max(_over_image(std))),
         bent=bent.moved,
         bent_std=bent.std,
