@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from zoomjax.app.overlay import colour, draw_lines
+from zoomjax.app.overlay import colour, draw_lines, for_picture
+from zoomjax.detect.sources import shrunk
 
 LINE = np.stack([np.full(80, 30.0), np.arange(10.0, 90.0)], axis=-1)
 
@@ -92,3 +93,16 @@ def test_large_images_are_made_smaller_with_their_lines(shape):
 def test_an_image_without_lines_is_only_dimmed():
     picture = draw_lines(np.full((20, 30), 100, np.uint8), [], [])
     assert (picture == 55).all()
+
+
+@pytest.mark.parametrize("size", [(1424, 2144), (1424, 2143), (500, 300), (2848, 4288, 3), (4096, 1024)])
+def test_pictures_are_as_large_as_asked_and_show_the_same(size):
+    tall, wide = size[:2]
+    rows, columns = np.indices((tall, wide))
+    image = np.rint(120 + 100 * np.sin(rows / tall * 9) * np.cos(columns / wide * 7)).astype(np.uint8)
+    image = np.stack([image] * size[2], axis=-1) if len(size) > 2 else image
+    picture, scale = for_picture(image, 600)
+    plain, expected = shrunk(image, 600)
+    assert scale == pytest.approx(expected, rel=1e-12)
+    assert picture.shape == plain.shape
+    assert np.abs(picture.astype(int) - plain).max() <= 2

@@ -23,6 +23,20 @@ _APART = 16.0
 _WHITE, _BLACK = (255, 255, 255), (0, 0, 0)
 
 
+def for_picture(image: UInt8[np.ndarray, "..."], longest: int) -> tuple[UInt8[np.ndarray, "..."], float]:
+    """As `shrunk`, in half of the time where both sides can be divided by a whole number first.
+
+    Means of whole pixels are quick; what is left to do, by less than half, needs none.
+    """
+    tall, wide = image.shape[:2]
+    whole = next((by for by in range(max(tall, wide) // longest, 1, -1) if not (tall % by or wide % by)), 1)
+    if whole == 1:
+        return shrunk(image, longest)
+    image = cv2.resize(image, (wide // whole, tall // whole), interpolation=cv2.INTER_AREA)
+    scale = longest / max(image.shape[:2])
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR), scale / whole
+
+
 def draw_lines(
     image: UInt8[np.ndarray, "height width *channels"],
     lines: Sequence[np.ndarray],
@@ -49,7 +63,7 @@ def draw_lines(
     Returns:
         At most 2000 px a side, and the legend.
     """
-    picture, scale = shrunk(image, _LONGEST)
+    picture, scale = for_picture(image, _LONGEST)
     if picture.ndim == 2:
         picture = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
     picture = cv2.LUT(np.ascontiguousarray(picture[..., :3]), (np.arange(256) * dim).astype(np.uint8))

@@ -14,10 +14,9 @@ from jaxtyping import UInt8
 from ..correct.framing import Framing, frame_output
 from ..correct.image import checked_image, position_map
 from ..correct.sampler import border_values, remap
-from ..detect.sources import shrunk
 from ..models.distortion import Distortion
 from .choice import colour_limit
-from .overlay import draw_lines
+from .overlay import draw_lines, for_picture
 
 if TYPE_CHECKING:
     from ..detect.batch import Detection
@@ -88,7 +87,7 @@ def pictures_of(images: "Photos", frame: int, image: UInt8[np.ndarray, "..."]) -
     lines = images.used[frame].lines
     named = members[np.argsort(-np.where(rejected, 0, rms), kind="stable")[:_CROP]]
     labels = {int(np.flatnonzero(members == line)[0]): str(line) for line in named}
-    small, scale = shrunk(image, _WIDE)
+    small, scale = for_picture(image, _WIDE)
     look = {"rejected": rejected.tolist(), "rms": rms, "labels": labels, "limit": colour_limit(calibration)}
     before = draw_lines(small, [_at(line, scale) for line in lines], **look)
     focal = float(np.asarray(calibration.lines.focal)[frame])
@@ -106,7 +105,7 @@ def pictures_of(images: "Photos", frame: int, image: UInt8[np.ndarray, "..."]) -
 
 def before_after(image: UInt8[np.ndarray, "..."], distortion: Distortion) -> tuple[bytes, bytes]:
     """A small picture of an image, and one of its correction, as JPEG."""
-    small, _ = shrunk(image, _WIDE)
+    small, _ = for_picture(image, _WIDE)
     return _jpeg(small), _jpeg(_corrected(small, _resized(distortion, image, small))[0])
 
 
@@ -131,7 +130,7 @@ def _crop(image: np.ndarray, line: np.ndarray) -> bytes:
         int(np.clip(round(float(at)) - half, 0, max(side - 2 * half, 0)))
         for at, side in zip(middle, image.shape[1::-1], strict=True)
     )
-    part, scale = shrunk(np.ascontiguousarray(image[y : y + 2 * half, x : x + 2 * half]), _CROP_SIDE)
+    part, scale = for_picture(np.ascontiguousarray(image[y : y + 2 * half, x : x + 2 * half]), _CROP_SIDE)
     return _jpeg(draw_lines(part, [_at(line - [x, y], scale)], [False], dim=1.0))
 
 

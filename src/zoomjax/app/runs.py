@@ -119,6 +119,7 @@ def calibrate_images(
             stage("Making the report")
             from .report import report
 
+            done.verdicts()  # threads that draw would take turns with its many small steps
             drawn = beside.enter_context(drawing(done, folder / "lines"))
             page = report(done.calibration, done, pictures=drawn.pictures(), run=what_is_run(title, done))
         with progress_bar("Drawing the lines and writing the results", quiet=quiet) as progress:
