@@ -9,6 +9,7 @@ frame, keeps the framing of a corrected video constant while zooming.
 """
 
 from collections.abc import Iterable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -33,6 +34,12 @@ _SPARE = 1e-4
 """By how much more "valid" enlarges: next to a fold, little in the corrected image is much in the other."""
 
 
+def _size(size: Any, name: str) -> tuple[int, int]:
+    """A size; those of `jax.export`, which are known when the program runs, as they are."""
+    unknown = isinstance(size, tuple) and any(hasattr(side, "__jax_array__") for side in size)
+    return size if unknown else checked_size(size, name)
+
+
 class Framing(eqx.Module):
     """The window on the corrected plane that an output image shows.
 
@@ -51,9 +58,11 @@ class Framing(eqx.Module):
 
     scale: Scalar = eqx.field(converter=host_numbers("scale"))
     origin: Point = eqx.field(converter=host_numbers("origin"))
-    size: tuple[int, int] = eqx.field(static=True, converter=lambda size: checked_size(size, "size"))
+    size: tuple[int, int] = eqx.field(static=True, converter=lambda size: _size(size, "size"))
     image_size: tuple[int, int] | None = eqx.field(
-        static=True, default=None, converter=lambda size: None if size is None else checked_size(size)
+        static=True,
+        default=None,
+        converter=lambda size: None if size is None else _size(size, "image_size"),
     )
 
     def __check_init__(self):
