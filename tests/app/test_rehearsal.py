@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from zoomjax import scenes
+from zoomjax.app import rehearsal
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.rehearsal import Part, rehearsing
 
@@ -26,6 +27,11 @@ from zoomjax.app._jax import set_up_jax
 def part():
     return Part(load_lines(sys.argv[1]), WantedModel(), "fit", np.zeros(6), None)
 """
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("ZOOMJAX_CACHE", str(tmp_path / "cache"))
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +58,23 @@ def test_a_rehearsal_is_begun_once_and_ends_with_the_block(lines):
 
 def test_none_is_begun_where_it_is_not_wanted(lines):
     with rehearsing(False) as begin:
+        begin(Part(lines, WantedModel(), "fit", np.zeros(6), None))
+        assert not multiprocessing.active_children()
+
+
+def test_none_is_begun_where_programs_cannot_be_kept(lines, monkeypatch):
+    monkeypatch.setattr(rehearsal, "can_keep", lambda: False)
+    with rehearsing(True) as begin:
+        begin(Part(lines, WantedModel(), "fit", np.zeros(6), None))
+        assert not multiprocessing.active_children()
+
+
+def test_a_calibration_goes_on_where_no_process_can_begin(lines, monkeypatch):
+    def start(_):
+        raise RuntimeError("no process")
+
+    monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start)
+    with rehearsing(True) as begin:
         begin(Part(lines, WantedModel(), "fit", np.zeros(6), None))
         assert not multiprocessing.active_children()
 

@@ -29,7 +29,7 @@ def programs_ahead(occasion: str) -> Iterator[bool]:
     The thread ends with the block, and they are noted if it ends well.
 
     Yields:
-        Whether programs are kept, and none are known of such an occasion: they are all to be compiled.
+        Whether none are known of such an occasion, and those of this time will be noted.
     """
     kept = store()
     if kept.folder is None:

@@ -95,7 +95,7 @@ def keep_programs(folder: Path | None) -> None:
 def kept(function: Call, settings: tuple, args: tuple, kwargs: dict) -> Call | None:
     """A function without arguments that does what a program does with these; None where it is not kept."""
     folder, calls = _STORE.folder, _STORE.calls
-    if folder is None or not _can_keep():
+    if folder is None or not can_keep():
         return None
     leaves, tree = jax.tree.flatten((args, kwargs))
     arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
@@ -122,7 +122,7 @@ def _can_export() -> bool:
     return True
 
 
-def _can_keep() -> bool:
+def can_keep() -> bool:
     """Whether a program of this process is that of another: on one processor, with nothing between."""
     mesh = getattr(jax.sharding, "get_abstract_mesh", None)
     return (

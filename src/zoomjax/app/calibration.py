@@ -1,4 +1,4 @@
-"""A whole calibration: from lines to the fits, the key figures and a folder of results.
+"""What a calibration found: the fits, the key figures, and a folder of results.
 
 The command line runs this. It prints nothing; plots are made by `plot`.
 """

@@ -15,7 +15,7 @@ _FOCALS = (32, 128)
 
 
 def distortion_at(lens: ZoomLens, focal: Iterable[float]) -> Distortion:
-    """The distortion at all focal lengths, the first axis, in NumPy's arrays."""
+    """The distortion at focal lengths, one or more, along the first axis, in NumPy's arrays."""
     focal = np.asarray(list(focal), float)
     both = at_focal(lens, padded_to(focal, bucket(len(focal), _FOCALS)))
     k, centre, scale = (np.asarray(of) for of in (both.coefficients, both.centre, both.scale))
@@ -55,7 +55,6 @@ def outward(lens: ZoomLens, points: np.ndarray, focal: Iterable[float]) -> np.nd
 
     The centre is that at the focal length, if it moves along the zoom.
     """
-
     every = distortion_at(lens, focal)
     points = np.broadcast_to(points, (len(every.coefficients), *np.shape(points)))
     centre = np.asarray(every.centre).reshape(-1, *[1] * (points.ndim - 2), 2)

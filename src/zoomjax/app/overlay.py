@@ -24,7 +24,7 @@ _WHITE, _BLACK = (255, 255, 255), (0, 0, 0)
 
 
 def for_picture(image: UInt8[np.ndarray, "..."], longest: int) -> tuple[UInt8[np.ndarray, "..."], float]:
-    """As `shrunk`, in half of the time where both sides can be divided by a whole number first.
+    """As `shrunk`, faster where both sides can be divided by a whole number first.
 
     Means of whole pixels are quick; what is left to do, by less than half, needs none.
     """

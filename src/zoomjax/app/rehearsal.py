@@ -1,9 +1,10 @@
 """What comes last in a first calibration, done by another process while this one does what comes first.
 
-A first calibration compiles for most of its time, on one core. With nothing kept from an earlier run, that
-process takes the lines as soon as they are known, and does the later steps with the model that is tried
-first. What it compiles is kept, and found by this process when it gets there. Mostly that is what it needs;
-where not, nothing but the other core was used.
+A first calibration compiles for most of its time, on one core. Where no earlier one of such photos was
+noted, that process takes the lines as soon as they are known, and does the later steps with the model that
+is tried first, a radial polynomial about the centre where the search begins. What it compiles is kept, and
+found by this process when it gets there. Mostly that is what it needs; where not, another core and some
+hundred megabytes were used in vain.
 """
 
 import contextlib
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .._core.kept import can_keep
 from ..lines.lines import Lines
 from ._jax import set_up_jax
 from .model_choice import WantedCentre, WantedModel, one_centre
@@ -49,17 +51,22 @@ def rehearsing(wanted: bool) -> Iterator[Callable[[Part], None]]:
     begun: list[BaseProcess] = []
 
     def begin(part: Part) -> None:
-        if not wanted or begun:
+        if not wanted or begun or not can_keep():
             return
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         process = context.Process(target=rehearse, args=(theirs,), daemon=True)
-        with contextlib.suppress(OSError), _interrupts_held():
-            process.start()
-            begun.append(process)
-            # It first reads its modules; a pipe does not hold all lines.
-            threading.Thread(target=_send, args=(ours, part), daemon=True).start()
-        theirs.close()
+        try:
+            with _interrupts_held():
+                process.start()
+        except Exception:  # a calibration does without
+            ours.close()
+            return
+        finally:
+            theirs.close()
+        begun.append(process)
+        # It first reads its modules; a pipe does not hold all lines.
+        threading.Thread(target=_send, args=(ours, part), daemon=True).start()
 
     try:
         yield begin
@@ -71,7 +78,7 @@ def rehearsing(wanted: bool) -> Iterator[Callable[[Part], None]]:
 
 
 def _send(connection: Connection, part: Part) -> None:
-    with contextlib.suppress(OSError), connection:
+    with contextlib.suppress(Exception), connection:  # that process has ended, say
         connection.send(part)
 
 

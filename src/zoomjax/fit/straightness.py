@@ -8,8 +8,9 @@ from jaxtyping import Array, Float
 from .._core.arguments import kinds_checked
 from .._core.arrays import as_jax
 from .._core.fields import real_argument
-from .._core.types import AnyArray, traced
+from .._core.types import AnyArray
 from ..lines.base import AbstractLines
+from ..lines.buckets import is_here
 from ..models.lens import ZoomLens
 from .energy import frame_coefficients, frame_energy
 from .problem import about_own_centre
@@ -55,4 +56,4 @@ def frame_rms(
             (lines.focal.shape[0], lines.distortion_model.num_coefficients(1)), lines.focal.dtype
         )
     squares = frame_energy(lines, as_jax(real_argument("lens", lens)))
-    return jnp.sqrt(squares) if traced(squares) else as_jax(np.sqrt(np.asarray(squares)))
+    return as_jax(np.sqrt(np.asarray(squares))) if is_here(squares) else jnp.sqrt(squares)

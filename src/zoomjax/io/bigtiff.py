@@ -34,10 +34,9 @@ def usual_tags(content: bytes, offset: int | None = None) -> bytes:
         struct.error: it is damaged or cut off.
     """
     order = "<" if content[:2] == b"II" else ">"
-    if offset is None:
-        [offset] = struct.unpack_from(f"{order}Q", content, 8)
+    first: int = struct.unpack_from(f"{order}Q", content, 8)[0] if offset is None else offset
     reader = _Reader(content, order)
-    return content[:2] + struct.pack(f"{order}HI", 42, 8) + reader.folder(offset, 8, 0)
+    return content[:2] + struct.pack(f"{order}HI", 42, 8) + reader.folder(first, 8, 0)
 
 
 class _Reader:

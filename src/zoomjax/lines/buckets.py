@@ -175,12 +175,12 @@ def _paddable(lines):
                 return False
         elif not field.metadata.get("static", False):
             arrays = [leaf for leaf in jax.tree.leaves(value) if eqx.is_array_like(leaf)]
-            if arrays and (field.name not in known or not all(map(_here, arrays))):
+            if arrays and (field.name not in known or not all(map(is_here, arrays))):
                 return False
     return True
 
 
-def _here(array):
+def is_here(array: Any) -> bool:
     """Whether an array is known, on one processor, and of moderate size."""
     if isinstance(array, np.ndarray):
         return array.size <= _MOST
