@@ -1,5 +1,6 @@
 """Checks of input, in one place: each returns the value in its plain form, or raises an error."""
 
+import inspect
 import math
 import operator
 import warnings
@@ -227,3 +228,15 @@ def real_numbers(values: Any) -> np.ndarray | None:
     if array.dtype.kind in "iu":  # not spans of time, which are integers to NumPy
         return array.astype(np.float64)
     return array.astype(np.float64) if array.size == 0 else None
+
+
+def warn_caller(message: str) -> None:
+    """A warning that names the line that called this package, by whichever of its functions."""
+    level, frame = 1, inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] in _INNER:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, stacklevel=level)
+
+
+_INNER = (__name__.split(".")[0], "contextlib", "functools", "jaxtyping", "beartype", "equinox")
+"""Where frames between a caller and a warning are from: the package, and what wraps its functions."""

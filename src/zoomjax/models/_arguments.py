@@ -1,6 +1,5 @@
 """What distortions are made of and act on: shapes, and values where they are known."""
 
-import warnings
 from typing import Any
 
 import jax
@@ -8,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._core.arguments import check_kind
+from .._core.checks import warn_caller
 from .._core.fields import check_finite, check_positive, refuse_masked
 from .._core.types import traced
 from .distortion_model import AbstractDistortionModel
@@ -58,7 +58,7 @@ def as_focal(focal: Any) -> Any:
     raise ValueError(f"Argument focal must be a number or an array, but it is {focal!r}.")
 
 
-def check_focus(focus: Any, fitted: Any, *, stacklevel: int) -> None:
+def check_focus(focus: Any, fitted: Any) -> None:
     """Warn where a focus is outside of the range `fitted`, where both are known: in another unit, say.
 
     Raises:
@@ -71,10 +71,9 @@ def check_focus(focus: Any, fitted: Any, *, stacklevel: int) -> None:
         raise ValueError(f"Argument focus must be finite, but it is {values[~np.isfinite(values)][0]}.")
     slack = 1e-6 * max(abs(low), abs(high))
     if outside := values[(values < low - slack) | (values > high + slack)].tolist():
-        warnings.warn(
+        warn_caller(
             f"The focus {outside[0]:g} is not within the range on which the lens was fitted, {low:g} to "
-            f"{high:g}, in the unit of its lines: beyond it the distortion of its end is taken.",
-            stacklevel=stacklevel,
+            f"{high:g}, in the unit of its lines: beyond it the distortion of its end is taken."
         )
 
 

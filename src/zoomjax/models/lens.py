@@ -205,7 +205,7 @@ class ZoomLens(eqx.Module):
     def _checked(self, focal, focus, stacklevel):
         """Focal lengths as an array; these and the focus are looked at where they are known."""
         self.check_range(focal := as_focal(focal), stacklevel=stacklevel)
-        check_focus(focus, self.focus_range, stacklevel=stacklevel)
+        check_focus(focus, self.focus_range)
         return focal
 
     def _distortion(self, focal, focus, within=False):
@@ -242,7 +242,7 @@ class ZoomLens(eqx.Module):
             raise TypeError(
                 f"A {type(self.zoom).__name__} does not depend on the focus: use the lens as it is."
             )
-        check_focus(focus, self.focus_range, stacklevel=3)
+        check_focus(focus, self.focus_range)
         return dataclasses.replace(self, zoom=self.zoom.at_focus(focus), focus_range=None)
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -5,16 +5,14 @@ these are near the middle of the image, and half its diagonal, which reveals an 
 """
 
 import dataclasses
-import inspect
 import math
-import warnings
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from .._core.arguments import kinds_checked
-from .._core.checks import checked_size
+from .._core.checks import checked_size, warn_caller
 from .._core.programs import light_program
 from .._core.types import traced
 from ._known_sizes import known_size
@@ -61,7 +59,7 @@ def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
     if lens.focal_unit == "px":
         own = about.setdefault(WIDTH_OF_FOCALS, float(old_width))
         stays = f" Its focal lengths stay those in px of images {own:g} px wide."
-    _warn_caller(
+    warn_caller(
         f"The lens is for images of {old_width} x {old_height} px, and this one has {width} x {height}: "
         f"its distortion is scaled to them.{stays}"
     )
@@ -71,18 +69,6 @@ def lens_for_size(lens: ZoomLens, image_size: tuple[int, int]) -> ZoomLens:
     return dataclasses.replace(
         lens, centre=(centre + 0.5) * ratio - 0.5, image_size=size, pixel_pitch=pitch, about=about
     )
-
-
-def _warn_caller(message: str) -> None:
-    """A warning that names the line that called this package, by whichever of its functions."""
-    level, frame = 1, inspect.currentframe()
-    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] in _INNER:
-        level, frame = level + 1, frame.f_back
-    warnings.warn(message, stacklevel=level)
-
-
-_INNER = (__name__.split(".")[0], "contextlib", "functools", "jaxtyping", "beartype")
-"""Where frames between a caller and a warning are from: the package, and what wraps its functions."""
 
 
 def check_aspect(image_size: tuple[int, int], lens_size: tuple[int, int]) -> None:
