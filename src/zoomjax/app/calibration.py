@@ -1,6 +1,6 @@
 """What a calibration found: the fits, the key figures, and a folder of results.
 
-The command line runs this. It prints nothing; plots are made by `plot`.
+It prints nothing; plots are made by `plot`.
 """
 
 import dataclasses
