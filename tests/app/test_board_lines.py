@@ -239,7 +239,7 @@ def test_given_deviations_hold_for_focal_lengths_of_the_bundle_adjustment_and_ph
         cv2.imwrite(str(tmp_path / photo.name), np.zeros((8, 8), np.uint8))
     there = [dataclasses.replace(d, file=str(tmp_path / d.name)) for d in used]
     job = ImageJob((tmp_path,), detector="grid", focal="plane", focal_sigma="2%", centre="image")
-    done = _calibrated(job, there, lambda _: None)
+    done = _calibrated(job, there, lambda _: None, lambda _: None)
     assert done.bundle is not None
     assert "does not determine its focal length" in done.unused["4.png"]
     assert [d.name for d in done.used] == [d.name for d in used if d.name != "4.png"]
