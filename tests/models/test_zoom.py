@@ -1,3 +1,5 @@
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -91,6 +93,42 @@ def test_file_keeps_every_digit(model, tmp_path):
 def test_coefficients_are_the_basis_times_the_parameters(model):
     zoom = with_random_parameters(model)
     close(zoom(jnp.asarray(35.0)), zoom.basis(jnp.asarray(35.0)) @ zoom.parameters)
+
+
+KEYED = {
+    **LINEAR,
+    "smooth": zj.models.SmoothZoom(),
+    "of a lens": zj.models.SmoothZoom.for_lens(16.0, 200.0, crop=1.0),
+}
+
+
+@pytest.mark.parametrize("model", KEYED.values(), ids=KEYED)
+def test_settings_of_one_key_prepare_one_model(model):
+    """And those of different models have different keys."""
+    prepared = {}
+    for left in itertools.product([True, False], repeat=len(FOCAL)):
+        focal = np.append(FOCAL, FOCAL[3])[[*left, left[3]]]  # one of them twice
+        try:
+            own = jax.tree.leaves(model.prepare(focal, 2))
+        except ValueError as error:
+            own = [str(error)]
+        first = prepared.setdefault(model.prepared_by(focal), own)
+        assert len(first) == len(own)
+        for one, other in zip(first, own, strict=True):
+            np.testing.assert_array_equal(one, other)
+    assert len(prepared) > 1
+
+
+@pytest.mark.parametrize(
+    "model", [v for v in KEYED.values() if v.elementwise], ids=lambda v: type(v).__name__
+)
+def test_an_elementwise_basis_is_numpys_of_numpy_arrays(model):
+    prepared = model.prepare(jnp.asarray(FOCAL), 2)
+    values = jax.tree.map(np.asarray, prepared).basis(FOCAL)
+    assert isinstance(values, np.ndarray)
+    np.testing.assert_allclose(
+        values, jax.vmap(prepared.basis)(jnp.asarray(FOCAL)).T, rtol=1e-14, atol=1e-14
+    )
 
 
 @every_linear_model

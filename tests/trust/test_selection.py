@@ -483,6 +483,28 @@ def test_the_pass_of_several_coefficients_is_that_of_each(lines, metric):
             np.testing.assert_allclose(several[place], one, rtol=1e-12, atol=1e-9 * np.abs(one).max())
 
 
+@pytest.mark.parametrize("metric", ["corrected", "distorted"])
+def test_a_pass_for_the_gradient_alone_is_that_for_all(lines, metric):
+    measured = zj.fit.in_image(lines) if metric == "distorted" else lines
+    lanes = lanes_of(measured, np.zeros(len(lines.frame), int), np.ones(len(lines.frame)), 3)
+    k = np.random.default_rng(0).normal(0, 0.1, (lanes.frames, 3))
+    whole, part = passed(lanes, k), passed(lanes, k, "gradient")
+    np.testing.assert_array_equal(part.squares, whole.squares)
+    np.testing.assert_array_equal(part.gradient, whole.gradient)
+    assert (part.matrix is None) == (metric == "corrected")  # in the image it comes with the gradient
+
+
+def test_folds_whose_first_steps_keep_a_matrix_end_where_others_do(lines, monkeypatch):
+    kept, best, chosen = compared(lines, POLYNOMIALS)
+    monkeypatch.setattr("zoomjax.trust._linear_folds._KEPT", 0)
+    renewed, *same = compared(lines, POLYNOMIALS)
+    assert same == [best, chosen]
+    for a, b in zip(kept, renewed, strict=True):
+        np.testing.assert_allclose(
+            [a.held_out, a.difference_std], [b.held_out, b.difference_std], rtol=1e-9
+        )
+
+
 def test_lanes_for_fewer_coefficients_are_those_of_the_first(lines):
     measured = zj.fit.in_image(lines)
     of_all, own = np.zeros(len(lines.frame), int), np.ones(len(lines.frame))

@@ -76,4 +76,6 @@ class Model(eqx.Module):
 
     def with_parameters(self, parameters: PyTree) -> "Model":
         """The same with other parameters of the zoom model; None for one that is specified alone."""
+        if parameters is None and self.zoom.parameters is None:
+            return self
         return self.with_zoom(with_parameters(self.zoom, parameters))

@@ -10,6 +10,7 @@ as those that best predict focal lengths that are left out, one of many and all 
 """
 
 import math
+from collections.abc import Hashable
 from typing import ClassVar
 
 import equinox as eqx
@@ -19,6 +20,7 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, ScalarLike
 
+from .._core.arrays import namespace
 from .._core.checks import check_above, checked_integer
 from .._core.fields import check_finite, check_not_negative, check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Focal, Scalar
@@ -101,6 +103,7 @@ class SmoothZoom(AbstractPriorZoom):
         "k_i(f) = sum_j parameters[j][i-1] P_j(2 focal_ref / f - 1), P_j Legendre's polynomials; "
         "the rest is the prior"
     )
+    elementwise: ClassVar[bool] = True
     degree: int = eqx.field(
         static=True, default=6, converter=lambda degree: checked_integer("degree", degree, 3)
     )
@@ -184,15 +187,19 @@ class SmoothZoom(AbstractPriorZoom):
             mean=None if self.mean is None else self.mean.astype(dtype),
         )
 
-    def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:
+    def prepared_by(self, *settings: Float[AnyArray, "frame"]) -> Hashable:
+        """The shortest focal length."""
+        return np.asarray(settings[0]).min(initial=np.inf)
+
+    def basis(self, focal: ScalarLike | Focal) -> Float[AnyArray, "basis ..."]:
         """``P_0, ..., P_degree`` of ``2u - 1``, by Bonnet's recursion."""
         if self.focal_ref is None:
             raise ValueError(UNFITTED)
-        x = jnp.asarray(2 * self.focal_ref / focal - 1)
-        values = [jnp.ones_like(x), x]
+        x = 2 * self.focal_ref / focal - 1
+        values = [x**0, x]
         for j in range(2, self.degree + 1):
             values.append(((2 * j - 1) * x * values[-1] - (j - 1) * values[-2]) / j)
-        return jnp.stack(values)
+        return namespace(x).stack(values)
 
     def basis_pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces:
         """One piece, in 1/f."""

@@ -7,6 +7,7 @@ its basis, and the algebraic estimate applies to it.
 """
 
 import abc
+from collections.abc import Hashable
 from typing import ClassVar, TypeVar
 
 import equinox as eqx
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, ScalarLike
 
-from .._core.arrays import as_jax
+from .._core.arrays import as_jax, namespace
 from .._core.checks import checked_integer
 from .._core.fields import check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Coefficients, Focal, Focus, Scalar, traced
@@ -50,6 +51,16 @@ class AbstractZoom(eqx.Module):
             ValueError: the focal lengths cannot determine the parameters.
         """
 
+    def prepared_by(self, *settings: Float[AnyArray, "frame"]) -> Hashable:
+        """What of the frames' settings `prepare` makes a difference of: equal keys mean equal models.
+
+        Cross-validation prepares a model once for each key. By default all of the settings are the key.
+
+        Args:
+            settings: as the first argument of `prepare`, and where it has one the focus. Values are known.
+        """
+        return tuple(np.asarray(values).tobytes() for values in settings)
+
     @abc.abstractmethod
     def __call__(self, focal: ScalarLike) -> Coefficients:
         """The coefficients at one focal length."""
@@ -64,12 +75,18 @@ class AbstractZoom(eqx.Module):
 
 
 class AbstractLinearZoom(AbstractZoom):
-    """A zoom model that is linear in its parameters: ``k(f) = basis(f) @ parameters``."""
+    """A zoom model that is linear in its parameters: ``k(f) = basis(f) @ parameters``.
 
+    Attributes:
+        elementwise: whether `basis` is also of NumPy arrays of focal lengths, where the model's arrays are
+            NumPy's: the functions' values, (basis, ...). Nothing is compiled for these.
+    """
+
+    elementwise: ClassVar[bool] = False
     parameters: eqx.AbstractVar[Float[AnyArray, "basis terms"] | None]
 
     @abc.abstractmethod
-    def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:
+    def basis(self, focal: ScalarLike) -> Float[AnyArray, "basis ..."]:
         """The values of the basis functions at one focal length."""
 
     def basis_pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces | None:
@@ -119,6 +136,7 @@ def number_of_coefficients(zoom: AbstractZoom) -> int:
 
 def _combined(basis, parameters):
     """``basis @ parameters``; few functions are written out, which XLA fuses with what uses them."""
+    basis = as_jax(basis)
     if basis.shape[0] > _WRITTEN_OUT:
         return jnp.matmul(basis, parameters, precision="highest")
     coefficients = basis[0] * parameters[0]
@@ -193,6 +211,7 @@ class PolynomialZoom(AbstractLinearZoom):
     """
 
     formula: ClassVar[str] = "k_i(f) = sum_j parameters[j][i-1] * (focal_ref / f)^j"
+    elementwise: ClassVar[bool] = True
     degree: int = eqx.field(
         static=True, default=2, converter=lambda degree: checked_integer("degree", degree, 0)
     )
@@ -242,12 +261,17 @@ class PolynomialZoom(AbstractLinearZoom):
             focal_ref=as_jax(focal.min()),
         )
 
-    def basis(self, focal: ScalarLike) -> Float[Array, "basis"]:
+    def prepared_by(self, *settings: Float[AnyArray, "frame"]) -> Hashable:
+        """The shortest focal length, and how many differ, as far as more are needed."""
+        focal = np.asarray(settings[0])
+        return focal.min(initial=np.inf), min(np.unique(focal).size, self.degree + 1)
+
+    def basis(self, focal: ScalarLike | Focal) -> Float[AnyArray, "basis ..."]:
         """``(1, u, ..., u^n)`` with ``u = focal_ref/f``."""
         if self.focal_ref is None:
             raise ValueError(UNFITTED)
         u = self.focal_ref / focal
-        return jnp.stack([u**j for j in range(self.degree + 1)])
+        return namespace(u).stack([u**j for j in range(self.degree + 1)])
 
     def basis_pieces(self, focal_range: Float[AnyArray, "2"]) -> Pieces:
         """One piece, in 1/f."""

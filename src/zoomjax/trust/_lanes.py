@@ -3,7 +3,7 @@
 Small sums over all lines, float64 whatever the lines' dtype: compiling them would take longer.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -35,9 +35,12 @@ class Lanes(NamedTuple):
 
     def cut(self, terms: int) -> "Lanes":
         """The same for the first coefficients alone."""
-        some = slice(terms + 1)
+        some, rows = slice(terms + 1), 2 * terms + 2
+        columns = self.columns[:, some]
+        if not columns[:, :, rows:].any():  # of triangles
+            columns = np.ascontiguousarray(columns[:, :, :rows])
         moments = None if self.moments is None else self.moments[: 2 * terms]
-        return self._replace(columns=self.columns[:, some], gram=self.gram[:, some, some], moments=moments)
+        return self._replace(columns=columns, gram=self.gram[:, some, some], moments=moments)
 
     def total(self, values: np.ndarray) -> np.ndarray:
         """Sums over the lines of each frame that has some."""
@@ -74,10 +77,10 @@ class Pass(NamedTuple):
 
     squares: np.ndarray  # px^2
     gradient: np.ndarray  # half of it, by k1, ..., kN
-    matrix: np.ndarray  # of Gauss and Newton
+    matrix: Any  # of Gauss and Newton, an array; None where it is not wanted
 
 
-def passed(lanes, coefficients):
+def passed(lanes: Lanes, coefficients: np.ndarray, wanted: Literal["all", "gradient"] = "all") -> Pass:
     """One pass over the lines, at coefficients of the frames: (..., frame, N).
 
     With the direction t of a line and its normal n, the residuals are r = n.c and ``sum r (t.c) = 0``. A
@@ -87,25 +90,27 @@ def passed(lanes, coefficients):
     """
     ones = np.ones((*coefficients.shape[:-2], 1, lanes.frames))
     kappa = np.concatenate([ones, np.swapaxes(coefficients, -1, -2)], axis=-2)[..., lanes.frame]
-    (x, y), (xx, xy, yy) = lanes.columns, lanes.gram
-    of_xx, of_xy, of_yy = (np.einsum("ijl,...jl->...il", gram, kappa) for gram in (xx, xy, yy))
-    of_yx = np.einsum("jil,...jl->...il", xy, kappa)
-    sxx, sxy, syy = (np.einsum("...jl,...jl->...l", kappa, one) for one in (of_xx, of_xy, of_yy))
+    x, y = (np.einsum("jrl,...jl->...rl", one, kappa) for one in lanes.columns)
+    sxx, sxy, syy = (np.einsum("...rl,...rl->...l", one, other) for one, other in ((x, x), (x, y), (y, y)))
     angle = np.arctan2(2 * sxy, sxx - syy) / 2
     c, s = np.cos(angle)[..., None, :], np.sin(angle)[..., None, :]
-    across = np.einsum("jrl,...jl->...rl", y, c * kappa) - np.einsum("jrl,...jl->...rl", x, s * kappa)
+    across = c * y - s * x
     squares = np.einsum("...rl,...rl->...l", across, across)
-    on_x, on_y = (np.einsum("jrl,...rl->...jl", one[1:], across) for one in (x, y))
+    on_x, on_y = (np.einsum("jrl,...rl->...jl", one[1:], across) for one in lanes.columns)
+    gradient = c * on_y - s * on_x
+    if wanted == "gradient" and lanes.moments is None:
+        return Pass(squares, gradient, None)
+    (xx, xy, yy), yx = (gram[1:] for gram in lanes.gram), lanes.gram[1].swapaxes(0, 1)[1:]
+    of_xx, of_xy, of_yx, of_yy = (np.einsum("ijl,...jl->...il", gram, kappa) for gram in (xx, xy, yx, yy))
     pull = c * c * of_yx + c * s * (of_yy - of_xx) - s * s * of_xy
-    pull = pull[..., 1:, :]
     length = (c * c)[..., 0, :] * sxx + (2 * c * s)[..., 0, :] * sxy + (s * s)[..., 0, :] * syy
     apart = length - squares
     turn = (c * on_x + s * on_y + pull) / np.where(apart > 0, apart, np.inf)[..., None, :]
-    xx, xy, yy = (gram[1:, 1:] for gram in (xx, xy, yy))
+    xx, xy, yy = (gram[:, 1:] for gram in (xx, xy, yy))
     c2, cs, s2 = (of[..., None, :, :] for of in (c * c, c * s, s * s))
     matrix = c2 * yy - cs * (xy + xy.swapaxes(0, 1)) + s2 * xx
     cross = turn[..., :, None, :] * (pull - turn / 2 * length[..., None, :])[..., None, :, :]
-    found = Pass(squares, c * on_y - s * on_x, matrix - cross - cross.swapaxes(-3, -2))
+    found = Pass(squares, gradient, matrix - cross - cross.swapaxes(-3, -2))
     return found if lanes.moments is None else _in_image(found, lanes.moments, kappa, c, s, turn)
 
 

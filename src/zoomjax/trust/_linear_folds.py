@@ -10,29 +10,27 @@ on its lines.
 Lines measured in the distorted image (`in_image`) have their distances divided by the stretch across the
 line, which depends on the coefficients, too: by way of the line's normal as well.
 
-Once: the compression, and each fold's basis. Per fold and step: one pass over the compressed lines. It is
-NumPy, float64 whatever the lines' dtype: with sums as small as these, compiling would take longer than
-50 folds of 12 models do.
+Once: the compression, each model's basis, and its matrix at the fit of all lines, from which the folds
+start. Per fold and step: a pass over the compressed lines for energy and gradient. It is NumPy, float64
+whatever the lines' dtype: with sums as small as these, compiling would take longer than 50 folds of 12
+models do.
 """
 
 import collections
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-from .._core.programs import light_program
-from ..fit.energy import prior_jacobian, prior_residuals, settings
 from ..fit.image_metric import in_corrected
 from ..lines.base import AbstractLines
-from ..lines.buckets import bucketed_jit, padded_frames, padded_to
 from ..models.model import Model
-from ..models.zoom import AbstractPriorZoom, with_parameters
+from ._designs import Design, Designs
 from ._lanes import Lanes, as_given, lanes_of, passed
 from .folds import Folds, LineErrors
 
 _MOST_STEPS = 40  # of Gauss-Newton: from the fit of all lines it takes 1 to 3, from zero 4 to 8
+_KEPT = 8  # of them from the fit of all lines, by the matrix at the start: such a step costs a third
 
 
 def linear_errors(lines: AbstractLines, models: Sequence[Model], parts: Folds) -> list[LineErrors | str]:
@@ -45,7 +43,7 @@ def linear_errors(lines: AbstractLines, models: Sequence[Model], parts: Folds) -
     counts = (lanes.weight > 0) & ((lanes.fold != folds) | (folds < 0))
     left = np.zeros((len(folds), lanes.frames), bool)
     left[:, lanes.frame[lanes.starts]] = np.logical_or.reduceat(counts, lanes.starts, axis=1)
-    ready = _Designs(small, left)
+    ready = Designs(small, left)
     found: list[LineErrors | str] = [""] * len(models)
     alike = collections.defaultdict(list)
     for place, model in enumerate(models):
@@ -64,120 +62,18 @@ def linear_errors(lines: AbstractLines, models: Sequence[Model], parts: Folds) -
     return found
 
 
-class Design(NamedTuple):
-    """A prepared linear model on the frames: ``k_m = basis_m @ parameters``."""
-
-    basis: np.ndarray  # (frame, basis)
-    project: np.ndarray  # (basis, frame): from coefficients at the frames that are left to parameters
-    precision: np.ndarray  # (parameter, parameter): of the prior, in the unit of eq. 13
-    mean: np.ndarray  # (parameter,): of the prior
-
-
-class _Designs:
-    """Zoom models made ready for the frames that are left: for each row of `left`."""
-
-    def __init__(self, lines: AbstractLines, left: np.ndarray):
-        self._lines = lines
-        self._rows, self._which = np.unique(left, axis=0, return_inverse=True)
-        self._known: dict[Hashable, list[Any]] = {}
-
-    def of(self, model: Model) -> tuple[list[Design | None], str]:
-        """The designs, None where it cannot be made ready, and why the first of these cannot."""
-        ready = self._ready(model.zoom, model.terms)
-        made = [
-            None if isinstance(of, str) else _design(self._lines, model.terms, of[0], left, of[1])
-            for of, left in zip(ready, self._rows, strict=True)
-        ]
-        problems = [of for place in self._which.reshape(-1) if isinstance(of := ready[place], str)]
-        return [made[place] for place in self._which.reshape(-1)], problems[0] if problems else ""
-
-    def _ready(self, zoom, terms):
-        """The models, and the values of their bases at all frames; or why there are none.
-
-        Models without a prior have the same for any number of terms.
-        """
-        leaves, structure = jax.tree.flatten(zoom)
-        own = terms if isinstance(zoom, AbstractPriorZoom) else None
-        key = (structure, own, *((np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in leaves))
-        if key not in self._known:
-            try:
-                given = [np.asarray(values) for values in settings(zoom, self._lines)]
-            except ValueError as error:
-                return [str(error)] * len(self._rows)
-            ready = [_prepared(zoom, terms, given, left) for left in self._rows]
-            bare = [with_parameters(each, None) for each in ready if not isinstance(each, str)]
-            values = iter(_values(bare, given))
-            self._known[key] = [each if isinstance(each, str) else (each, next(values)) for each in ready]
-        return self._known[key]
-
-
-def _prepared(zoom, terms, given, left):
-    """The zoom model made ready for the frames that are left, or why it cannot be."""
-    try:
-        focal, *focus = (values[left] for values in given)
-        return zoom.prepare(focal, terms, *focus)
-    except ValueError as error:
-        return str(error)
-
-
-def _design(lines, terms, zoom, left, values):
-    """Of a model made ready, from the values of its basis at all frames."""
-    size = values.shape[1]
-    precision, mean = np.zeros((size * terms, size * terms)), np.zeros(size * terms)
-    if isinstance(zoom, AbstractPriorZoom):
-        whitener, of_zero = (np.asarray(part, float) for part in _whitener(lines, zoom))
-        precision = whitener.T @ whitener
-        mean = np.linalg.lstsq(whitener, -of_zero, rcond=None)[0]
-    project = np.zeros((size, len(left)))
-    project[:, left] = np.linalg.pinv(values[left])
-    return Design(values, project, precision, mean)
-
-
-def _values(zooms, given):
-    """The values of each model's basis at all frames; of models that differ in numbers alone, at once."""
-    every, alike = [*map(padded_frames, given)], collections.defaultdict(list)
-    for place, zoom in enumerate(zooms):
-        leaves, structure = jax.tree.flatten(zoom)
-        alike[structure, *((np.shape(leaf), np.asarray(leaf).dtype) for leaf in leaves)].append(place)
-    found: list[Any] = [None] * len(zooms)
-    for places in alike.values():
-        number = 1 << max(_FEWEST, (len(places) - 1).bit_length())
-        several = [zooms[place] for place in places]
-        stack = jax.tree.map(lambda *leaves, to=number: padded_to(np.stack(leaves), to), *several)
-        values = np.asarray(_bases(stack, every, number), float)[:, : len(given[0])]
-        for place, own in zip(places, values, strict=False):
-            found[place] = own
-    return found
-
-
-_FEWEST = 5
-"""Models at once, as a power of two: one compiled program for any number up to it."""
-
-
-@light_program
-def _bases(models, settings, number):
-    """Of models without their parameters: one compiled program for any number of terms."""
-    return jax.vmap(lambda model: jax.vmap(model.basis)(*settings), axis_size=number)(models)
-
-
-@bucketed_jit()
-def _whitener(lines, model):
-    """What makes of the flattened parameters what their prior adds to the residuals, px; and of zeros."""
-    return prior_jacobian(lines, model), prior_residuals(lines, model)
-
-
 class _State(NamedTuple):
     """Of each fit: some parameters, the energy there, half its gradient, and its Gauss-Newton matrix.
 
     And how far a unit of each parameter moves the points, px^2, along their lines and across; and the
-    lines' squares.
+    lines' squares. The matrix and what is moved are None where they are those of another state.
     """
 
     parameters: np.ndarray
     energy: np.ndarray
     gradient: np.ndarray
-    matrix: np.ndarray
-    moved: np.ndarray
+    matrix: Any
+    moved: Any
     squares: np.ndarray
 
 
@@ -199,16 +95,16 @@ def cross_validated(lanes: Lanes, models: Sequence[Sequence[Design | None]]) -> 
     """
     most = max(1, _TOGETHER // lanes.fold.size)
     found: list[Validated] = []
-    k, fits = [], []
+    fits, parameters = [], []
     for some in _parted([designs[0] for designs in models], most):
         design, weight = _stacked(some), np.tile(lanes.weight, (len(some), 1))
         start = np.zeros((len(some), design.basis.shape[2], lanes.terms))
-        state, good = _minimised(lanes, weight, design, start)
+        state, good = _minimised(lanes, weight, design, start, passed(lanes, design.basis @ start))
         for own, squares, matrix in zip(some, state.squares, state.matrix, strict=True):
             number, seen = own.mean.size, squares / lanes.counts
             found.append(Validated(seen, np.full(seen.shape, np.nan), matrix[:number, :number], 0))
-        k += list(design.basis @ state.parameters)
         fits += good.tolist()
+        parameters += list(state.parameters)
     there = set(lanes.fold.tolist())
     jobs = [
         (model, fold, design)
@@ -220,14 +116,34 @@ def cross_validated(lanes: Lanes, models: Sequence[Sequence[Design | None]]) -> 
     for some in _parted(jobs, most):
         design = _stacked([design for _, _, design in some])
         out = lanes.fold == np.array([fold for _, fold, _ in some])[:, None]
-        start = design.project @ np.stack([k[model] for model, _, _ in some])
-        state, good = _minimised(lanes, np.where(out, 0, lanes.weight), design, start)
+        weight = np.where(out, 0, lanes.weight)
+        # Folds of one model that are made ready alike start together.
+        place: dict[Any, int] = {}
+        start = np.zeros((len(some), design.basis.shape[2], lanes.terms))
+        for left, (model, _, of) in zip(weight > 0, some, strict=True):
+            if (model, id(of)) not in place:
+                place[model, id(of)] = own = len(place)
+                numbers = _start(of, models[model][0], parameters[model], lanes.frame[left])
+                start[own, : len(numbers)] = numbers
+        where = [place[model, id(of)] for model, _, of in some]
+        first = [where.index(own) for own in range(len(place))]
+        lines = passed(lanes, design.basis[first] @ start[: len(first)])
+        state, good = _minimised(lanes, weight, design, start[where], _of(lines, where), near=_KEPT)
         for (model, _, _), own, squares, fold_fits in zip(some, out, state.squares, good, strict=True):
             if fits[model] and fold_fits:
                 found[model].unseen[own] = (squares / lanes.counts)[own]
             else:
                 bad[model] += 1
     return [of._replace(bad=number) for of, number in zip(found, bad, strict=True)]
+
+
+def _start(design, first, parameters, frame):
+    """The parameters that come nearest to those of the first design, at frames that have lines."""
+    parameters = parameters[: first.basis.shape[1]]
+    if design is first:
+        return parameters
+    left = np.unique(frame)
+    return np.linalg.pinv(design.basis[left]) @ (first.basis[left] @ parameters)
 
 
 def _parted(jobs: Sequence[Any], most: int) -> Iterator[Any]:
@@ -245,7 +161,6 @@ def _stacked(designs: Sequence[Design]) -> Design:
     numbers, fits = max(design.mean.size for design in designs), len(designs)
     stack = Design(
         np.zeros((fits, frames, most)),
-        np.zeros((fits, most, frames)),
         np.zeros((fits, numbers, numbers)),
         np.zeros((fits, numbers)),
     )
@@ -255,11 +170,12 @@ def _stacked(designs: Sequence[Design]) -> Design:
     return stack
 
 
-def _minimised(lanes, weight, design, parameters):
+def _minimised(lanes, weight, design, parameters, lines, near=0):
     """The states of least energy near these parameters, one for each row of weights, and which are ones.
 
-    Levenberg-Marquardt without damping, until a step fails. Directions that the lines do not determine are
-    0 then, and not what lines that are left out have made of them.
+    `lines` are passed at the parameters. Levenberg-Marquardt without damping, until a step fails; the first
+    `near` steps by the matrix at the start. Directions that the lines do not determine are 0 then, and not
+    what lines that are left out have made of them.
     """
     in_frame = lanes.total(weight)
     share = np.zeros((len(weight), lanes.frames))
@@ -268,39 +184,60 @@ def _minimised(lanes, weight, design, parameters):
     share[:, lanes.frame[lanes.starts]] = 1 / np.where(in_frame > 0, in_frame, 1) / counted
     weights = weight * share[:, lanes.frame] / lanes.counts
     eps = np.finfo(float).eps
-    at, damping = _state(lanes, weights, design, parameters), np.zeros(len(weight))
+    at, damping = _state(lanes, weights, design, parameters, lines), np.zeros(len(weight))
+    directions = _directions(at)
     going, good = weight.any(axis=1) & np.isfinite(at.energy), np.zeros(len(weight), bool)
-    for _ in range(_MOST_STEPS):
+    for step in range(_MOST_STEPS):
         if not going.any():
             break
         on = np.flatnonzero(going)
         here, own = _of(at, on), _of(design, on)
-        move, decrease = _move(here, damping[on])
-        there = _state(lanes, weights[on], own, here.parameters + move.reshape(here.parameters.shape))
+        if step > near:
+            directions = _replaced(directions, on, _directions(here))
+        move, decrease = _move(here, _of(directions, on), damping[on])
+        moved = here.parameters + move.reshape(here.parameters.shape)
+        wanted = "gradient" if step < near else "all"
+        there = _state(lanes, weights[on], own, moved, passed(lanes, own.basis @ moved, wanted))
         better = there.energy <= here.energy * (1 + 128 * eps)  # rounding must not reject the last step
         damping[on] = np.where(better, damping[on] / 10, np.maximum(10 * damping[on], 1e-3))
-        for of, new in zip(at, there, strict=True):
-            of[on[better]] = new[better]
+        at = _replaced(at, on[better], _of(there, better))
         arrived = better & (decrease <= 16 * eps * there.energy)
         good[on[arrived]], going[on[arrived]] = True, False
     return _without_undetermined(at, good, lanes, weights, design), good
 
 
 def _of(several, which):
-    """Some of the fits."""
-    return type(several)(*(of[which] for of in several))
+    """Some of the fits; what they do not have stays None."""
+    return type(several)(*(None if of is None else of[which] for of in several))
 
 
-def _move(at, damping):
+def _replaced(several, which, others):
+    """The fits, with some of them replaced in place, as far as the others have what is to replace it."""
+    for of, new in zip(several, others, strict=True):
+        if new is not None:
+            of[which] = new
+    return several
+
+
+class _Directions(NamedTuple):
+    """The units of parameters, eigenvalues and vectors of the matrix in them, and what is determined."""
+
+    size: np.ndarray
+    values: np.ndarray
+    vectors: np.ndarray
+    known: np.ndarray
+
+
+def _move(at, directions, damping):
     """The damped Gauss-Newton steps, and by how much they should lower the energy."""
-    size, values, vectors, known = _directions(at)
+    size, values, vectors, known = directions
     inverse = np.where(known, 1 / np.where(known, values + damping[:, None], 1), 0)
     along = np.einsum("bij,bi->bj", vectors, at.gradient / size)
     return -np.einsum("bij,bj->bi", vectors, inverse * along) / size, np.sum(inverse * along**2, axis=1)
 
 
 def _directions(at):
-    """The units of the parameters, eigenvalues and vectors of the matrix in them, and which are determined.
+    """Of the matrices of these states.
 
     What Gram matrices of lines lose to rounding is a part of what the parameters move, also along the
     lines: of lines through the centre the matrix holds nothing else.
@@ -312,44 +249,52 @@ def _directions(at):
     kept = np.where(told[:, :, None] & told[:, None], at.matrix, 0)
     values, vectors = np.linalg.eigh(kept / size[:, :, None] / size[:, None])
     lost = 4 * eps * np.max(at.moved / size**2, axis=1, where=told, initial=0)
-    return size, values, vectors, values > np.maximum(64 * eps * values[:, -1], lost)[:, None]
+    known = values > np.maximum(64 * eps * values[:, -1], lost)[:, None]
+    return _Directions(size, values, vectors, known)
 
 
 def _without_undetermined(at, good, lanes, weights, design):
     """The states of which nothing is left along directions that the lines do not determine."""
     on = np.flatnonzero(good)
-    here = _of(at, on)
-    size, _, vectors, known = _directions(here)
-    some = ~known.all(axis=1)
+    directions = _directions(_of(at, on))
+    functions = design.basis[on].any(axis=1).sum(axis=1)  # without those of `_stacked`, which are 0
+    some = directions.known.sum(axis=1) < functions * lanes.terms
     if not some.any():
         return at
-    on, here, size, vectors, known = on[some], _of(here, some), size[some], vectors[some], known[some]
-    flat = here.parameters.reshape(len(on), -1)
-    along = np.einsum("bij,bi->bj", vectors, size * flat)
-    left = np.einsum("bij,bj->bi", vectors, np.where(known, along, 0)) / size
-    there = _state(lanes, weights[on], _of(design, on), left.reshape(here.parameters.shape))
-    for of, new in zip(at, there, strict=True):
-        of[on] = new
-    return at
+    on, (size, _, vectors, known) = on[some], _of(directions, some)
+    here, own = _of(at, on), _of(design, on)
+    along = np.einsum("bij,bi->bj", vectors, size * here.parameters.reshape(len(on), -1))
+    flat = np.einsum("bij,bj->bi", vectors, np.where(known, along, 0)) / size
+    left = flat.reshape(here.parameters.shape)
+    there = _state(lanes, weights[on], own, left, passed(lanes, own.basis @ left, "gradient"))
+    return _replaced(at, on, there)
 
 
-def _state(lanes, weights, design, parameters):
-    """The lines' sums, put together as each model's basis says."""
-    lines = passed(lanes, design.basis @ parameters)
+def _state(lanes, weights, design, parameters, lines):
+    """The lines' sums, put together as each model's basis says; a matrix only if the lines have theirs."""
     gradient = lanes.total(weights[:, None] * lines.gradient)
-    matrix = lanes.total(weights[:, None, None] * lines.matrix)
     rows, flat = design.basis[:, lanes.frame[lanes.starts]], parameters.reshape(len(parameters), -1)
     away = flat - design.mean
     pulled = np.einsum("bij,bj->bi", design.precision, away)
-    (fits, frames, size), terms = rows.shape, parameters.shape[2]
-    moved = lanes.total(weights[:, None] * np.einsum("jjl->jl", lanes.gram[0] + lanes.gram[2])[1:])
-    products = (rows[..., :, None] * rows[..., None, :]).reshape(fits, frames, -1)
-    blocks = (matrix.reshape(fits, -1, frames) @ products).reshape(fits, terms, terms, size, size)
+    matrix, moved = (
+        (None, None) if lines.matrix is None else _matrix(lanes, weights, design, rows, lines.matrix)
+    )
     return _State(
         parameters,
         np.einsum("bl,bl->b", weights, lines.squares) + np.einsum("bi,bi->b", away, pulled),
-        (gradient @ rows).swapaxes(1, 2).reshape(fits, -1) + pulled,
-        blocks.transpose(0, 3, 1, 4, 2).reshape(fits, flat.shape[1], -1) + design.precision,
-        (moved @ rows**2).swapaxes(1, 2).reshape(fits, -1),
+        (gradient @ rows).swapaxes(1, 2).reshape(len(flat), -1) + pulled,
+        matrix,
+        moved,
         lines.squares,
     )
+
+
+def _matrix(lanes, weights, design, rows, of_lines):
+    """The Gauss-Newton matrices by the parameters, and how far a unit of each moves the points."""
+    (fits, frames, size), terms = rows.shape, of_lines.shape[1]
+    of_frames = lanes.total(weights[:, None, None] * of_lines)
+    products = (rows[..., :, None] * rows[..., None, :]).reshape(fits, frames, -1)
+    blocks = (of_frames.reshape(fits, -1, frames) @ products).reshape(fits, terms, terms, size, size)
+    matrix = blocks.transpose(0, 3, 1, 4, 2).reshape(fits, size * terms, -1) + design.precision
+    moved = lanes.total(weights[:, None] * np.einsum("jjl->jl", lanes.gram[0] + lanes.gram[2])[1:])
+    return matrix, (moved @ rows**2).swapaxes(1, 2).reshape(fits, -1)

@@ -27,8 +27,9 @@ from ..lines.base import AbstractLines
 from ..lines.compressed import CompressedLines
 from ..models.model import Model
 from ..models.zoom import AbstractLinearZoom, AbstractZoom
+from ._designs import Design
 from ._lanes import Lanes, as_given, lanes_of
-from ._linear_folds import Design, cross_validated, linear_errors
+from ._linear_folds import cross_validated, linear_errors
 from .folds import Folds, HoldOut, LineErrors, folds_of, shares, small_lines
 
 
@@ -104,7 +105,7 @@ def cross_validate_frames(
     parts = folds_of(small, "line", folds, seed)
     lanes = lanes_of(small, parts.fold, parts.weight, terms)
     unseen = np.full(lanes.fold.shape, np.nan)
-    one = Design(np.ones((1, 1)), np.ones((1, 1)), np.zeros((terms, terms)), np.zeros(terms))
+    one = Design(np.ones((1, 1)), np.zeros((terms, terms)), np.zeros(terms))
     for frame in np.unique(lanes.frame):
         own = lanes.frame == frame
         alone = Lanes(

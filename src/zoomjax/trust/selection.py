@@ -13,9 +13,11 @@ simplest of the models whose R is above the best one's by no more than s.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple, get_args
 
+import jax
 import numpy as np
 
 from .._core.arguments import kinds_checked
@@ -268,6 +270,12 @@ def _about_fitted(lines, candidates, how):
 
 def default_candidates(terms: int = _TERMS) -> tuple[Model, ...]:
     """Polynomials of degree 0 to 3 with up to so many coefficients, and `SmoothZoom`."""
+    return _default_candidates(terms, jax.dtypes.canonicalize_dtype(float))  # the prior's
+
+
+@functools.cache
+def _default_candidates(terms, dtype):
+    del dtype
     polynomials = [
         Model(PolynomialZoom(degree=degree), number)
         for number in range(1, terms + 1)
