@@ -28,6 +28,7 @@ from scipy.spatial import KDTree
 
 from ._frame_model import OneFrame
 from ._segments import Fragments, main_direction
+from ._vectors import dot, norm
 
 _POINT_ERROR = 0.25
 """px by which an edge point is off across the edge, its error being alike over some neighbours."""
@@ -153,32 +154,33 @@ def thin_bars(pieces: Fragments) -> np.ndarray:
     """(f, 2), whether an edge with the other side brighter runs beside the first and the last points."""
     if not len(pieces.count):
         return np.zeros((0, 2), bool)
-    steep = np.hypot(*pieces.gradient.T)[:, None]
+    steep = norm(pieces.gradient)[:, None]
     normal = _DIRECTION * pieces.gradient / np.maximum(steep, 1e-9)
     known = np.concatenate([pieces.points, normal], axis=1)[::2]
     inwards = np.minimum(_WITHIN, pieces.count[:, None] - 1)
     rows = np.stack([pieces.start[:, None] + inwards, (pieces.start + pieces.count - 1)[:, None] - inwards])
     asked = np.concatenate([pieces.points[rows], -normal[rows]], axis=-1)
-    far = KDTree(known).query(asked, distance_upper_bound=_BAR)[0]
+    tree = KDTree(known, compact_nodes=False, balanced_tree=False)  # sooner made, and asked once
+    far = tree.query(asked, distance_upper_bound=_BAR)[0]
     return np.isfinite(far).any(axis=-1).T
 
 
 def _units(pieces: Fragments, model: OneFrame, barred: np.ndarray) -> _Units:
     """Each piece as a unit."""
-    piece, count = pieces.piece(), pieces.count[:, None]
+    count = pieces.count[:, None]
     corrected = model.undistort(pieces.points) - model.centre
     straight = Fragments(corrected, pieces.gradient, pieces.start, pieces.count)
     first, last = pieces.start, pieces.start + pieces.count - 1
     mean = straight.sums(corrected) / count
     direction = main_direction(straight, mean)
-    backwards = np.sum((corrected[last] - corrected[first]) * direction, axis=-1) < 0
+    backwards = dot(corrected[last] - corrected[first], direction) < 0
     direction = np.where(backwards[:, None], -direction, direction)
     normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
-    stretch = model.stretch(pieces.points, normal[piece])
+    stretch = model.stretch(pieces.points, pieces.each(normal))
     w, (x, y) = stretch**-2.0, corrected.T
-    sums = straight.sums(
-        np.stack([w, w * x, w * y, w * x * x, w * x * y, w * y * y, np.ones_like(w)], axis=-1)
-    )
+    wx, wy = w * x, w * y
+    moments = [straight.sums(values) for values in (w, wx, wy, wx * x, wx * y, wy * y)]
+    sums = np.stack([*moments, pieces.count], axis=-1)
     ends = np.stack([corrected[first], corrected[last]], axis=1)
     ends -= np.einsum("uec,uc->ue", ends - mean[:, None], normal)[..., None] * normal[:, None]
     tips = np.stack([pieces.points[first], pieces.points[last]], axis=1)
@@ -279,7 +281,8 @@ def _ordered(units: _Units, first: np.ndarray, second: np.ndarray) -> tuple[np.n
     size = units.sums[:, 6]
     swap = (size[second] > size[first]) | ((size[second] == size[first]) & (second < first))
     longer, shorter = np.where(swap, second, first), np.where(swap, first, second)
-    pair = np.unique(longer[longer != shorter] * len(size) + shorter[longer != shorter])
+    pair = np.sort(longer[longer != shorter] * len(size) + shorter[longer != shorter])
+    pair = pair[np.diff(pair, prepend=-1) > 0]
     return pair // len(size), pair % len(size)
 
 
@@ -292,8 +295,7 @@ def _joined(
     miss, keep = _on_line(units, longer, shorter, sigma)
     longer, shorter, miss = longer[keep], shorter[keep], miss[keep]
     origin, way = middle[longer][:, None], _along(normal)[longer][:, None]
-    own = np.sum((units.ends[longer] - origin) * way, axis=-1)
-    other = np.sum((units.ends[shorter] - origin) * way, axis=-1)
+    own, other = dot(units.ends[longer] - origin, way), dot(units.ends[shorter] - origin, way)
     after = other.mean(axis=1) > own.mean(axis=1)
     # The ends that meet: the longer one's, which is its last or first in this direction, and the other's.
     rows = np.arange(len(longer))
@@ -341,12 +343,12 @@ def _predicted(sums: np.ndarray, ends: np.ndarray, stretch: np.ndarray) -> tuple
     middle, normal, _ = _line(sums)
     direction = _along(normal)
     offset = ends - middle[:, None]
-    along = np.einsum("pec,pc->pe", offset, direction)
+    along = dot(offset, direction[:, None])
     w, wx, wy, wxx, wxy, wyy, _ = sums.T
     a, b = direction.T
     extent = a * a * (wxx - wx * wx / w) + 2 * a * b * (wxy - wx * wy / w) + b * b * (wyy - wy * wy / w)
     share = 1 / w[:, None] + along**2 / np.maximum(extent, 1e-9)[:, None]
-    miss = np.einsum("pec,pc->pe", offset, normal) / stretch
+    miss = dot(offset, normal[:, None]) / stretch
     return miss, _POINT_ERROR * np.sqrt(_LIKE * share) / stretch
 
 

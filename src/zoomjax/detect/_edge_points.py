@@ -16,6 +16,8 @@ import dataclasses
 import cv2
 import numpy as np
 
+from ._vectors import norm
+
 _SMOOTHING = 1.0
 """px, standard deviation. With Sobel's own it makes 1.4: noise of 5 levels moves an edge
 of 160 by 0.04 px."""
@@ -88,10 +90,10 @@ def edge_points(grey: np.ndarray) -> EdgePoints:
     ]
     at, shift = (np.concatenate(part) for part in zip(*parts, strict=True))
     gradient = np.stack([slope[at] for slope in flat], axis=-1).astype(np.float32)
-    length = np.hypot(*gradient.T)
+    length = norm(gradient)
     normal = gradient / length[:, None]
     keep = _runs_on(at, flat, normal, length, width, noise)
-    at, shift, normal, length = at[keep], shift[keep], normal[keep], length[keep]
+    at, shift, normal, length = (of.compress(keep, axis=0) for of in (at, shift, normal, length))
     pixel = np.stack([at % width, at // width], axis=-1)
     return EdgePoints(pixel + shift, normal.astype(float), length.astype(float), pixel, (width, height))
 
@@ -134,7 +136,7 @@ def _runs_on(at, flat, normal, length, width: int, noise: float) -> np.ndarray:
         y = np.rint(row + stride * normal[:, 0]).astype(np.intp)
         there = y * width + x
         gx, gy = (slope[there].astype(np.float32) for slope in flat)
-        other = np.hypot(gx, gy)
+        other = np.sqrt(gx * gx + gy * gy)
         keep &= gx * normal[:, 0] + gy * normal[:, 1] > tolerance * other
         keep &= other > _FADE * length - 3 * noise
     return keep

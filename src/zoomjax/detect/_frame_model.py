@@ -11,7 +11,7 @@ in a cloth) are weighted down as a whole.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -102,20 +102,26 @@ class OneFrame:
 
     def undistort(self, points: np.ndarray) -> np.ndarray:
         """Corrected positions of points (..., 2), px."""
-        z = (points - self.centre) / self.scale
-        return self.centre + self.scale * z / self._divisor(np.sum(z * z, axis=-1))[..., None]
+        x, y = self._normalised(points)
+        divisor, (middle_x, middle_y) = self._divisor(x * x + y * y) / self.scale, self.centre
+        return np.stack([middle_x + x / divisor, middle_y + y / divisor], axis=-1)
 
     def stretch(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """(...), by how much the surroundings of points are stretched along normals of corrected lines.
 
         Both are (..., 2): points in the image, unit normals in the corrected one.
         """
-        z = (points - self.centre) / self.scale
-        t = np.sum(z * z, axis=-1)
+        x, y = self._normalised(points)
+        t, on = x * x + y * y, x * normal[..., 0] + y * normal[..., 1]
         divisor = self._divisor(t)
-        growth = -2 * (self.k[0] + 2 * self.k[1] * t) / divisor**2
-        pulled = normal / divisor[..., None] + (growth * np.sum(z * normal, axis=-1))[..., None] * z
-        return np.hypot(pulled[..., 0], pulled[..., 1])
+        growth = -2 * (self.k[0] + 2 * self.k[1] * t) / divisor
+        # |n + growth (z.n) z| / divisor, squared: what of z is along n counts twice.
+        added = growth * on
+        return np.sqrt(np.maximum(1 + added * (2 * on + added * t), 0)) / divisor
+
+    def _normalised(self, points: np.ndarray) -> Iterator[np.ndarray]:
+        """x and y, each (...), from the centre, in half diagonals."""
+        return ((points[..., axis] - self.centre[axis]) / self.scale for axis in (0, 1))
 
     def _divisor(self, t: np.ndarray) -> np.ndarray:
         return np.maximum(1 + t * (self.k[0] + t * self.k[1]), _LEAST_DIVISOR)
@@ -194,14 +200,18 @@ class OneFrame:
 def tangent_ratio(square: np.ndarray) -> np.ndarray:
     """``tan(x) / x`` for squares of x, ``tanh(x) / x`` where they are negative."""
     x = np.sqrt(np.maximum(abs(square), 1e-12))
-    return np.where(square > 0, np.tan(x), np.tanh(x)) / x
+    positive = square > 0
+    if np.all(positive):
+        return np.tan(x) / x
+    return np.where(positive, np.tan(x), np.tanh(x)) / x if np.any(positive) else np.tanh(x) / x
 
 
 def normals(centred: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """(l, 2), the unit normals of the best lines through points (l, s, 2) about their mean."""
     x, y = np.moveaxis(centred, -1, 0)
     w = np.ones(x.shape) if weight is None else weight
-    xx, xy, yy = np.sum(w * x * x, axis=-1), np.sum(w * x * y, axis=-1), np.sum(w * y * y, axis=-1)
+    wx, wy = w * x, w * y
+    xx, xy, yy = (np.einsum("ls,ls->l", one, other) for one, other in ((wx, x), (wx, y), (wy, y)))
     angle = np.arctan2(2 * xy, xx - yy) / 2
     return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
 

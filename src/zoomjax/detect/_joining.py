@@ -12,8 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from .._core.arrays import places
-from ._frame_model import normals
-from ._segments import Fragments, main_direction
+from ._segments import Fragments, in_order, main_direction
 
 _END = 40
 """Points of a fragment that tell its direction at an end: fewer if it is shorter."""
@@ -71,19 +70,16 @@ def joined(pieces: Fragments, radius: float) -> np.ndarray:
 
 
 def border_lines(pieces: Fragments, border: np.ndarray) -> list[np.ndarray]:
-    """The points of each border, in order along it."""
-    if not len(border):
+    """The points of each border, in order along it; pieces of border -1 are on none."""
+    of_pieces = np.argsort(border, kind="stable")
+    of_pieces = of_pieces[border[of_pieces] >= 0]
+    if not len(of_pieces):
         return []
-    label = border[pieces.piece()]
-    order = np.argsort(label, kind="stable")
-    cuts = np.flatnonzero(np.diff(label[order])) + 1
-    return [_sorted(line) for line in np.split(pieces.points[order], cuts)]
-
-
-def _sorted(line: np.ndarray) -> np.ndarray:
-    centred = line - line.mean(axis=0)
-    normal = normals(centred[None])[0]
-    return line[np.argsort(centred @ (normal[1], -normal[0]), kind="stable")]
+    rows = np.repeat(pieces.start[of_pieces], pieces.count[of_pieces]) + places(pieces.count[of_pieces])
+    _, label = np.unique(border[of_pieces], return_inverse=True)
+    count = np.bincount(label, pieces.count[of_pieces]).astype(int)
+    lines = in_order(pieces.taken(rows, count))
+    return np.split(lines.points, lines.start[1:])
 
 
 def _ends(pieces: Fragments) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
@@ -92,7 +88,7 @@ def _ends(pieces: Fragments) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, n
     ends = []
     for start, outwards in ((pieces.start, -1), (pieces.start + pieces.count - size, 1)):
         rows = np.repeat(start, size) + places(size)
-        end = Fragments.of(pieces.points[rows], pieces.gradient[rows], size)
+        end = pieces.taken(rows, size)
         middle = end.sums(end.points) / size[:, None]
         direction = main_direction(end, middle)
         first, last = end.points[end.start], end.points[end.start + size - 1]

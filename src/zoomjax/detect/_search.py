@@ -21,6 +21,7 @@ import numpy as np
 from .._core.arrays import places
 from ._frame_model import tangent_ratio
 from ._segments import Fragments, main_direction
+from ._vectors import cross, dot, norm
 
 _RANGE = (-2.0, 2.1)
 """Candidates, from strong pincushion to more than a fisheye's barrel distortion."""
@@ -59,15 +60,14 @@ def _samples(pieces: Fragments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points on pieces (n, 2), the directions there, and px of edge that each stands for."""
     if not len(pieces.count):
         return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
-    piece = pieces.piece()
     mean = pieces.sums(pieces.points) / pieces.count[:, None]
     along_unit = main_direction(pieces, mean)
-    offset = pieces.points - mean[piece]
-    along = np.einsum("pc,pc->p", offset, along_unit[piece])
     aside = np.stack([-along_unit[:, 1], along_unit[:, 0]], axis=-1)
-    across = np.einsum("pc,pc->p", offset, aside[piece])
+    offset, direction = pieces.points - pieces.each(mean), pieces.each(along_unit)
+    along, across = dot(offset, direction), cross(direction, offset)
     # The best parabola, across = a + b along + c along^2, by its normal equations: one for all pieces.
-    powers = along[:, None] ** np.arange(5)
+    square = along * along
+    powers = np.stack([np.ones_like(along), along, square, square * along, square * square], axis=-1)
     moments = pieces.sums(powers)
     matrix = moments[:, np.add.outer(np.arange(3), np.arange(3))]
     right = pieces.sums(across[:, None] * powers[:, :3])
@@ -84,18 +84,20 @@ def _samples(pieces: Fragments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     a, b, c = bend[owner].T
     point = mean[owner] + t[:, None] * along_unit[owner] + (a + t * (b + t * c))[:, None] * aside[owner]
     direction = along_unit[owner] + (b + 2 * t * c)[:, None] * aside[owner]
-    direction /= np.hypot(*direction.T)[:, None]
+    direction /= norm(direction)[:, None]
     return point, direction, length[owner] / number[owner]
 
 
 def _score(z, direction, weight, square: float) -> float:
     """The sum of the squared votes for a candidate."""
-    t = np.maximum(np.sum(z * z, axis=-1), 1e-9)
+    t = np.maximum(dot(z, z), 1e-9)
     ratio = tangent_ratio(square * t)
     growth = (1 - ratio) / t + square * ratio**2  # of the ratio, by r, over r
-    run = direction * ratio[:, None] + (growth * np.sum(z * direction, axis=-1))[:, None] * z
-    angle = np.arctan2(run[:, 1], run[:, 0]) % np.pi
-    offset = ratio * (z[:, 1] * np.cos(angle) - z[:, 0] * np.sin(angle))
+    pulled = growth * dot(z, direction)
+    (x, y), (u, v) = z.T, (ratio * direction[:, axis] + pulled * z[:, axis] for axis in (0, 1))
+    angle = np.arctan2(v, u)
+    angle = np.where(angle < 0, angle + np.pi, angle)  # of a line, which has no first end
+    offset = ratio * np.where(v < 0, -1, 1) * (u * y - v * x) / np.sqrt(u * u + v * v)
     a = np.sqrt(abs(square)) + 1e-9
     inverse = np.arctan(a * offset) if square > 0 else np.arctanh(np.clip(a * offset, -0.999, 0.999))
     rows, columns = int(np.pi / _CELL[0]), int(2.2 * _HALF_DIAGONAL / _CELL[1])

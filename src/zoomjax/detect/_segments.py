@@ -11,7 +11,9 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from .._core.arrays import places
 from ._edge_points import EdgePoints
+from ._vectors import cross, dot
 
 _NEIGHBOURS = [(dx, 0) for dx in (1, 2)] + [(dx, dy) for dy in (1, 2) for dx in range(-2, 3)]
 """Offsets, px, to half of the neighbours: those in front, when the image is read line by line."""
@@ -53,6 +55,14 @@ class Fragments:
         """(n,), the piece that each point belongs to."""
         return np.repeat(np.arange(len(self.count)), self.count)
 
+    def each(self, values: np.ndarray) -> np.ndarray:
+        """(n, ...), for each point the values (f, ...) of its piece."""
+        return np.repeat(values, self.count, axis=0)
+
+    def taken(self, order: np.ndarray, count: np.ndarray) -> "Fragments":
+        """Pieces of so many of these points each, in this order."""
+        return Fragments.of(self.points.take(order, axis=0), self.gradient.take(order, axis=0), count)
+
     def sums(self, values: np.ndarray) -> np.ndarray:
         """Sums of values (n, ...) over each piece."""
         if not len(self.start):
@@ -62,18 +72,19 @@ class Fragments:
 
 def fragments(edges: EdgePoints) -> Fragments:
     """The gently bent pieces of at least 8 points that the edge points make."""
-    pieces = _ordered(edges.position, edges.normal * edges.slope[:, None], _linked(edges))
+    every = np.array([len(edges.position)])
+    gradient = edges.normal * edges.slope[:, None]
+    pieces = _ordered(Fragments.of(edges.position, gradient, every), _linked(edges))
     straight = []
     for _ in range(_HALVINGS + 1):
         if not len(pieces.start):
             break
         rms, second_half = _straightness(pieces)
-        piece = pieces.piece()
-        crooked = (rms > _CROOKED)[piece]
-        kept = pieces.count[rms <= _CROOKED]
-        straight.append(Fragments.of(pieces.points[~crooked], pieces.gradient[~crooked], kept))
-        half = (2 * piece + second_half)[crooked]
-        pieces = _ordered(pieces.points[crooked], pieces.gradient[crooked], half)
+        crooked = pieces.each(rms > _CROOKED)
+        straight.append(pieces.taken(np.flatnonzero(~crooked), pieces.count[rms <= _CROOKED]))
+        rest = np.flatnonzero(crooked)
+        half = (2 * pieces.piece() + second_half)[rest]
+        pieces = _ordered(pieces.taken(rest, pieces.count[rms > _CROOKED]), half)
     if not straight:
         return pieces
     names = ("points", "gradient", "count")
@@ -93,56 +104,56 @@ def _linked(edges: EdgePoints) -> np.ndarray:
         other = index[at + dy * width + dx]
         first = np.flatnonzero(other >= 0)
         second = other[first]
-        step, n = position[second] - position[first], normal[first]
-        turn = np.einsum("pc,pc->p", n, normal[second])
+        step = position.take(second, axis=0) - position.take(first, axis=0)
+        n = normal.take(first, axis=0)
+        turn = dot(n, normal.take(second, axis=0))
         along = (turn if edges.polar else abs(turn)) > _TURN
-        along &= abs(np.einsum("pc,pc->p", n, step)) < _ASIDE
+        along &= abs(dot(n, step)) < _ASIDE
         pairs.append(np.stack([first[along], second[along]]))
     first, second = np.concatenate(pairs, axis=1)
     graph = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(number, number))
     return connected_components(graph, directed=False)[1]
 
 
-def _ordered(points: np.ndarray, gradient: np.ndarray, label: np.ndarray) -> Fragments:
+def _ordered(points: Fragments, label: np.ndarray) -> Fragments:
     """Pieces by label, each in order along its main direction, without the short ones."""
     count = np.bincount(label)
     long = count >= _LEAST_POINTS
-    kept = long[label]
-    points, gradient, label = points[kept], gradient[kept], (np.cumsum(long) - 1)[label[kept]]
-    order = np.argsort(label, kind="stable")
-    pieces = Fragments.of(points[order], gradient[order], count[long])
+    kept = np.flatnonzero(long[label])
+    return in_order(points.taken(kept[np.argsort(label[kept], kind="stable")], count[long]))
+
+
+def in_order(pieces: Fragments) -> Fragments:
+    """The pieces, the points of each in order along its main direction."""
     if not len(pieces.count):
         return pieces
-    label = label[order]
     mean = pieces.sums(pieces.points) / pieces.count[:, None]
     direction = main_direction(pieces, mean)
-    along = np.einsum("pc,pc->p", pieces.points - mean[label], direction[label])
-    order = np.argsort(label * (2 * np.ptp(along) + 1) + along)  # by label, then along
-    return Fragments.of(pieces.points[order], pieces.gradient[order], pieces.count)
+    along = dot(pieces.points - pieces.each(mean), pieces.each(direction))
+    apart = pieces.piece() * (2 * np.ptp(along) + 1)
+    return pieces.taken(np.argsort(apart + along, kind="stable"), pieces.count)
 
 
 def main_direction(pieces: Fragments, mean: np.ndarray) -> np.ndarray:
     """(f, 2), unit vectors along which the pieces extend most."""
-    x, y = (pieces.points - mean[pieces.piece()]).T
-    xx, xy, yy = pieces.sums(np.stack([x * x, x * y, y * y], axis=-1)).T
+    x, y = (pieces.points[:, axis] - pieces.each(mean[:, axis]) for axis in (0, 1))
+    xx, xy, yy = (pieces.sums(product) for product in (x * x, x * y, y * y))
     angle = np.arctan2(2 * xy, xx - yy) / 2
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def _straightness(pieces: Fragments) -> tuple[np.ndarray, np.ndarray]:
     """RMS of each piece about its best parabola, px, and which points are in its second half."""
-    piece, count = pieces.piece(), pieces.count
+    each, count = pieces.each, pieces.count
     mean = pieces.sums(pieces.points) / count[:, None]
-    direction = main_direction(pieces, mean)[piece]
-    offset = pieces.points - mean[piece]
-    along = np.einsum("pc,pc->p", offset, direction)
-    across = offset[:, 1] * direction[:, 0] - offset[:, 0] * direction[:, 1]
-    along /= np.maximum(pieces.sums(abs(along)) / count, 1e-9)[piece]
+    direction, offset = each(main_direction(pieces, mean)), pieces.points - each(mean)
+    along, across = dot(offset, direction), cross(direction, offset)
+    along /= each(np.maximum(pieces.sums(abs(along)) / count, 1e-9))
     # The main direction has removed the mean and the slope: what is left of a parabola is its even part,
     # made orthogonal to those two.
     square = along**2
-    second, third = pieces.sums(np.stack([square, square * along], axis=-1)).T
-    bend = square - (second / count)[piece] - (third / second)[piece] * along
+    second, third = pieces.sums(square), pieces.sums(square * along)
+    bend = square - each(second / count) - each(third / second) * along
     part = pieces.sums(across * bend) / np.maximum(pieces.sums(bend**2), 1e-9)
-    rms = np.sqrt(pieces.sums((across - part[piece] * bend) ** 2) / count)
-    return rms, np.arange(len(piece)) - pieces.start[piece] >= count[piece] / 2
+    rms = np.sqrt(pieces.sums((across - each(part) * bend) ** 2) / count)
+    return rms, places(count) >= each(count / 2)

@@ -177,7 +177,7 @@ def _long(pieces: Fragments, label: np.ndarray, least: float) -> list[np.ndarray
     np.minimum.at(low, np.tile(label, 2), tips)
     np.maximum.at(high, np.tile(label, 2), tips)
     large = np.hypot(*(high - low).T) >= least
-    lines = border_lines(pieces, np.where(large[label], label, -1))[int(not large[label].all()) :]
+    lines = border_lines(pieces, np.where(large[label], label, -1))
     return sorted((line for line in lines if extent(line) >= least), key=extent, reverse=True)[
         :_MOST_FITTED
     ]
