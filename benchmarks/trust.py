@@ -104,7 +104,7 @@ SCENES = {"5 photos": ((15, 11), 5), "4 photos, few lines": ((4, 3), 4)}
 
 def independent_covariance(small: zj.lines.CompressedLines, fit: zj.ZoomFit):
     """What the covariance would be were points independent."""
-    weighted, jacobian = linearised(small, fit.lens.zoom)
+    weighted, jacobian, *_ = linearised(small, fit.lens.zoom)
     weights = line_weights(small)
     inverse = jnp.linalg.inv(jnp.einsum("lri,lrj->ij", jacobian, jacobian))
     noise = jnp.einsum("l,lri,lrj->ij", weights, jacobian, jacobian)
@@ -114,7 +114,7 @@ def independent_covariance(small: zj.lines.CompressedLines, fit: zj.ZoomFit):
 
 def plain_sandwich(small: zj.lines.CompressedLines, fit: zj.ZoomFit):
     """The textbook's line-by-line sandwich, with its correction L / (L - p)."""
-    weighted, jacobian = linearised(small, fit.lens.zoom)
+    weighted, jacobian, *_ = linearised(small, fit.lens.zoom)
     inverse = jnp.linalg.inv(jnp.einsum("lri,lrj->ij", jacobian, jacobian))
     pull = jnp.einsum("lri,lr->li", jacobian, weighted) @ inverse
     lines, parameters = pull.shape
@@ -429,12 +429,12 @@ def cost(draws: int) -> Table:
     truth = scenes.nikkor_18_200()
     small = zj.compress(scenes.board_lines(truth, scenes.focal_sweep(), noise=0.5))
     fit = zj.fit_zoom(small)
-    weighted, jacobian = eqx.filter_jit(linearised)(small, fit.lens.zoom)
+    linear = eqx.filter_jit(linearised)(small, fit.lens.zoom)
     alone = eqx.filter_jit(parameter_covariance)
     flat, _ = ravel_pytree(fit.lens.zoom.parameters)
     parts: dict[str, tuple] = {
         "`fit_zoom`": (zj.fit_zoom, small),
-        "covariance": (alone, small, fit.lens.zoom, weighted, jacobian),
+        "covariance": (alone, small, fit.lens.zoom, linear),
         "certificate": (zj.models.certify, fit.lens),
         "`fit_robust`": (zj.fit_robust, small),
         "`fit_zoom(in_image(...))`": (zj.fit_zoom, zj.fit.in_image(small)),

@@ -92,7 +92,7 @@ def test_what_photos_err_by_is_counted_once(truth, centre):
     fit = zj.fit_zoom(lines, centre=centre)
     wide = zj.fit.with_focal_sigma(fit, lines, focal_sigma=ROUNDED)
     placed = lines.about(fit.lens.centre)
-    alone, _ = parameter_covariance(placed, fit.lens.zoom, *linearised(placed, fit.lens.zoom), photos=False)
+    alone, _ = parameter_covariance(placed, fit.lens.zoom, linearised(placed, fit.lens.zoom), photos=False)
     response = np.asarray(_response(placed, fit.lens.zoom)) * (ROUNDED / np.asarray(lines.focal))
     corner, at = np.zeros(2), np.array([21.0, 50.0, 120.0])
 

@@ -251,7 +251,7 @@ def _search(lines, start, solver, max_steps):
 @light_program
 def _accepted(lines, start, found):
     """The model found, if its centre is certain enough, or else the start; its centres; and what tells."""
-    covariance, _ = parameter_covariance(lines, found, *linearised(lines, found), extra=2)
+    covariance, _ = parameter_covariance(lines, found, linearised(lines, found), extra=2)
 
     def offsets(parameters):
         centre = with_parameters(found, parameters).parts()[1]

@@ -12,17 +12,19 @@ parameter. So it is shrunk towards the shape for independent points, by an amoun
 docs/trust.md has the measured coverage, and that of alternatives.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
+from .._core.arrays import namespace
+from .._core.types import AnyArray
 from ..lines.base import AbstractLines
-from ..models.zoom import AbstractZoom, with_parameters
+from ..models.zoom import AbstractZoom
 from ._linear import triangle_of
-from .energy import coefficients_by, counted_frames, line_weights, prior_error, prior_jacobian, prior_of
+from .energy import Linearised, counted_frames, line_weights, prior_error, prior_jacobian, prior_of
 
 _ROUNDING = 64
 """Error of the corrected points without noise, in units in the last place of their mean radius."""
@@ -43,15 +45,71 @@ class KnownErrors(NamedTuple):
     covariance: Float[Array, "parameter parameter"]
 
 
+class Told(NamedTuple):
+    """What lines tell of the flattened parameters: all that their covariance is made of.
+
+    Attributes:
+        weighted: the residuals, times the root of their weights.
+        jacobian: their derivatives by the parameters.
+        prior: those of what a prior adds to the residuals.
+        prior_error: the size of one of these, px.
+        weights: of the lines, for each of their points.
+        spare: the number of points beyond two for each line, in weights.
+        frame: of each line.
+        counted: the frames that count.
+        k: the coefficients of the frames.
+        feigned: what noise contributes to ``J^T J``; see `_feigned`.
+    """
+
+    weighted: Float[AnyArray, "line rows"]
+    jacobian: Float[AnyArray, "line rows parameter"]
+    prior: Float[AnyArray, "row parameter"]
+    prior_error: Float[AnyArray, ""]
+    weights: Float[AnyArray, "line"]
+    spare: Float[AnyArray, ""]
+    frame: Int[AnyArray, "line"]
+    counted: Bool[AnyArray, "frame"]
+    k: Float[AnyArray, "frame coefficients"]
+    feigned: tuple[tuple[Any, Any], ...]
+
+
+def told(lines: AbstractLines, zoom: AbstractZoom, linear: Linearised, extra: int = 0) -> Told:
+    """What lines tell of the parameters of a fitted model.
+
+    Args:
+        lines: what was fitted.
+        zoom: the fitted model.
+        linear: `linearised` of both.
+        extra: how many numbers the model gives after the coefficients.
+    """
+    weights, own = line_weights(lines), prior_of(zoom)
+    return Told(
+        linear.weighted,
+        linear.jacobian,
+        prior_jacobian(lines, zoom),
+        jnp.zeros(()) if own is None else prior_error(lines, own),
+        weights,
+        jnp.sum(weights * (lines.counts - 2)),
+        jnp.asarray(lines.frame),
+        counted_frames(lines),
+        linear.k,
+        _feigned(lines, linear, weights, extra),
+    )
+
+
 def parameter_covariance(
     lines: AbstractLines,
     zoom: AbstractZoom,
-    weighted: Float[Array, "line rows"],
-    jacobian: Float[Array, "line rows parameter"],
+    linear: Linearised,
     extra: int = 0,
     photos: bool = True,
     errors: KnownErrors | None = None,
 ) -> tuple[Float[Array, "parameter parameter"], Bool[Array, ""]]:
+    """`covariance_of` what lines tell."""
+    return covariance_of(told(lines, zoom, linear, extra), photos, errors)
+
+
+def covariance_of(known: Told, photos: bool = True, errors: KnownErrors | None = None) -> tuple[Any, Any]:
     """Covariance of the flattened parameters, and whether the lines determine them all.
 
     Were points independent, with errors of one size, it would be the sandwich of the weights w of eq. 13,
@@ -64,66 +122,81 @@ def parameter_covariance(
     through the centre have nothing else there, and would otherwise seem to determine k from their noise.)
 
     Args:
-        lines: what was fitted.
-        zoom: the fitted model.
-        weighted, jacobian: the residuals, times the root of their weights, and their derivatives.
-        extra: how many numbers the model gives after the coefficients.
+        known: what lines tell, of JAX or all of NumPy, which compiles nothing.
         photos: whether lines of one photo may err together.
         errors: what photos are known to err by; in the covariance, too.
     """
-    energy = jnp.sum(weighted**2)
-    weights = line_weights(lines)
-    prior = prior_jacobian(lines, zoom)
-    triangle = triangle_of([jacobian, prior])
+    xp: Any = namespace(*jax.tree.leaves(known))
+    weighted, jacobian, prior, weights = known.weighted, known.jacobian, known.prior, known.weights
+    energy = xp.sum(weighted**2)
+    triangle = _triangle(jacobian, prior)
     # Columns of unit length, so that one threshold serves parameters of any size.
-    size = jnp.linalg.norm(triangle, axis=0)
-    size = jnp.where(size > 0, size, 1)
-    left, values, right = jnp.linalg.svd(triangle / size[None])
-    good = values > 64 * jnp.finfo(values.dtype).eps
-    reciprocal = jnp.where(good, 1 / jnp.where(good, values, 1), 0)
+    size = xp.linalg.norm(triangle, axis=0)
+    size = xp.where(size > 0, size, 1)
+    left, values, right = xp.linalg.svd(triangle / size[None])
+    good = values > 64 * xp.finfo(values.dtype).eps
+    reciprocal = xp.where(good, 1 / xp.where(good, values, 1), 0)
     back = right.T * reciprocal[None]  # to the parameters that change the residuals by one unit
     # Of the directions that change them so, those in which noise would feign more than half of it.
-    by_noise = _feigned(lines, zoom, weights, energy, extra)
-    feigned = sum(jnp.einsum("mip,mij,mjq->pq", rows, noise, rows) for rows, noise in by_noise)
+    feigned = sum(xp.einsum("mip,mij,mjq->pq", rows, noise, rows) for rows, noise in known.feigned)
     feigned = feigned / size[:, None] / size[None]
-    shares, directions = jnp.linalg.eigh(back.T @ feigned @ back)
-    doubtful = jnp.concatenate([back @ directions, right.T], axis=1)
-    doubtful = doubtful / jnp.maximum(jnp.linalg.norm(doubtful, axis=0), jnp.finfo(size.dtype).tiny)[None]
-    unknown = jnp.concatenate([shares >= 0.25, ~good])
-    undetermined = jnp.any(unknown[None] & (jnp.abs(doubtful) > 0.05), axis=1)
+    shares, directions = xp.linalg.eigh(back.T @ feigned @ back)
+    doubtful = xp.concatenate([back @ directions, right.T], axis=1)
+    doubtful = doubtful / xp.maximum(xp.linalg.norm(doubtful, axis=0), xp.finfo(size.dtype).tiny)[None]
+    unknown = xp.concatenate([shares >= 0.25, ~good])
+    undetermined = xp.any(unknown[None] & (xp.abs(doubtful) > 0.05), axis=1)
 
     inverse = back @ left.T / size[:, None]
     jacobian = jacobian @ inverse  # by parameters in which J^T W J, with the prior, is the identity
-    leverage = jnp.einsum("lri,lrj->lij", jacobian, jacobian)
+    leverage = xp.swapaxes(jacobian, 1, 2) @ jacobian
     share = weights[:, None, None] * leverage
-    freedom = jnp.sum(weights * (lines.counts - 2)) - jnp.trace(jnp.sum(share, axis=0))
+    freedom = known.spare - xp.trace(xp.sum(share, axis=0))
     undetermined = undetermined | (freedom <= 0)  # nothing is left over to tell the noise by
     share = energy / _positive(freedom) * share
-    terms = jax.eval_shape(coefficients_by, zoom, lines).shape[1]
-    scores = terms * jnp.sum(weights > 0) - jnp.sum(good)
-    score = jnp.einsum("lri,lr->li", jacobian, weighted)
+    terms = known.k.shape[1]
+    scores = terms * xp.sum(weights > 0) - xp.sum(good)
+    score = xp.einsum("lri,lr->li", jacobian, weighted)
     covariance = of_clusters(score, leverage, share, scores)
     if photos:
-        frames = lines.focal.shape[0]
-        of_photos = [jax.ops.segment_sum(of, lines.frame, frames) for of in (score, leverage, share)]
-        own = [(rows @ inverse, noise) for rows, noise in by_noise]
-        own = sum(jnp.einsum("mip,mij,mjp->m", rows, noise, rows) for rows, noise in own)
-        tells = own < _TELLS * jnp.trace(of_photos[1], axis1=1, axis2=2)
-        free = terms * jnp.sum(tells & counted_frames(lines)) - jnp.sum(good)
-        of_photos = [jnp.where(jnp.expand_dims(tells, range(1, of.ndim)), of, 0) for of in of_photos]
+        of_photos = [_by_photo(of, known) for of in (score, leverage, share)]
+        own = [(rows @ inverse, noise) for rows, noise in known.feigned]
+        own = sum(xp.einsum("mip,mij,mjp->m", rows, noise, rows) for rows, noise in own)
+        tells = own < _TELLS * xp.trace(of_photos[1], axis1=1, axis2=2)
+        free = terms * xp.sum(tells & known.counted) - xp.sum(good)
+        of_photos = [xp.where(xp.expand_dims(tells, tuple(range(1, of.ndim))), of, 0) for of in of_photos]
         if errors is None:
-            errors = KnownErrors(jnp.zeros_like(of_photos[1]), jnp.zeros_like(covariance))
-        left = jnp.einsum("mpq,pi,qi->m", errors.scores, inverse, inverse)
-        known = jnp.sum(jnp.where(tells, left, 0)), triangle @ errors.covariance @ triangle.T
-        covariance = _of_whole_photos(of_photos, covariance, known, free, terms)
+            errors = KnownErrors(xp.zeros_like(of_photos[1]), xp.zeros_like(covariance))
+        left = xp.einsum("mpq,pi,qi->m", errors.scores, inverse, inverse)
+        of_errors = xp.sum(xp.where(tells, left, 0)), triangle @ errors.covariance @ triangle.T
+        covariance = _of_whole_photos(of_photos, covariance, of_errors, free, terms)
     covariance = inverse @ covariance @ inverse.T
-    if (own := prior_of(zoom)) is not None:
+    if len(prior):
         # The prior draws the parameters to its mean: by how much, in the mean over what it expects.
-        half = prior_error(lines, own) * inverse @ (prior @ inverse).T
+        half = known.prior_error * inverse @ (prior @ inverse).T
         covariance = covariance + half @ half.T
     either = undetermined[:, None] | undetermined[None]
-    infinite = jnp.where(jnp.eye(size.shape[0], dtype=bool), jnp.inf, 0)
-    return jnp.where(either, infinite, covariance), ~jnp.any(undetermined)
+    infinite = xp.where(xp.eye(size.shape[0], dtype=bool), xp.inf, 0)
+    return xp.where(either, infinite, covariance), ~xp.any(undetermined)
+
+
+def _triangle(*parts: Any) -> Any:
+    """R of the QR of rows in several arrays; by LAPACK where they are NumPy's, and few."""
+    if namespace(*parts) is jnp:
+        return triangle_of(list(parts))
+    return np.linalg.qr(np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts]), mode="r")
+
+
+def _by_photo(values, known):
+    """The sums over the lines of each photo."""
+    frames = len(known.counted)
+    if namespace(values) is jnp:
+        return jax.ops.segment_sum(values, known.frame, frames)
+    order = np.argsort(known.frame, kind="stable")
+    frame = known.frame[order]
+    starts = np.flatnonzero(np.diff(frame, prepend=-1))
+    sums = np.zeros((frames, *values.shape[1:]), values.dtype)
+    sums[frame[starts]] = np.add.reduceat(values.take(order, axis=0), starts, axis=0)
+    return sums
 
 
 def of_clusters(score, leverage, share, scores):
@@ -140,19 +213,20 @@ def of_clusters(score, leverage, share, scores):
     the number of independent scores less the parameters. Its own uncertainty is added, ``2 max(c, 1)/nu``,
     so that two standard deviations keep their meaning. With none left, A is all that is known.
     """
-    length = jnp.sum(score**2, axis=1)
-    along = jnp.einsum("li,lij,lj->l", score, leverage, score) / _positive(length)
-    kept = jnp.maximum(1 - along, 0.01)  # a line that alone decides a parameter says nothing of its noise
-    score, length = score / jnp.sqrt(kept)[:, None], length / kept
-    total, independent = score.T @ score, jnp.sum(share, axis=0)
-    c = jnp.sum(length) / _positive(jnp.trace(independent))
-    apart = jnp.sum((total - c * independent) ** 2)
-    by_chance = jnp.sum(length**2) - jnp.sum(total**2) / _positive(jnp.sum(length > 0))
-    shrink = jnp.clip(by_chance / _positive(apart), 0, 1)
+    xp = namespace(score)
+    length = xp.sum(score**2, axis=1)
+    along = xp.sum((leverage @ score[..., None])[..., 0] * score, axis=1) / _positive(length)
+    kept = xp.maximum(1 - along, 0.01)  # a line that alone decides a parameter says nothing of its noise
+    score, length = score / xp.sqrt(kept)[:, None], length / kept
+    total, independent = score.T @ score, xp.sum(share, axis=0)
+    c = xp.sum(length) / _positive(xp.trace(independent))
+    apart = xp.sum((total - c * independent) ** 2)
+    by_chance = xp.sum(length**2) - xp.sum(total**2) / _positive(xp.sum(length > 0))
+    shrink = xp.clip(by_chance / _positive(apart), 0, 1)
     shape = shrink * independent + (1 - shrink) * total / _positive(c)
-    nu = jnp.minimum(jnp.trace(independent) ** 2 / _positive(jnp.sum(share**2)), scores)
-    size = c + 2 * jnp.maximum(c, 1) / _positive(nu)
-    return jnp.where((nu > 0) & (c > 0), size * shape, independent)
+    nu = xp.minimum(xp.trace(independent) ** 2 / _positive(xp.sum(share**2)), scores)
+    size = c + 2 * xp.maximum(c, 1) / _positive(nu)
+    return xp.where((nu > 0) & (c > 0), size * shape, independent)
 
 
 def _of_whole_photos(of_photos, by_line, known_errors, free, terms):
@@ -175,43 +249,42 @@ def _of_whole_photos(of_photos, by_line, known_errors, free, terms):
     the model, of their derivatives as well as of their residuals, whose product is then no mean of zero.
     Where the others determine the model by themselves, all that is left over would be in those.
     """
-    score, leverage, share = of_photos
-    length = jnp.sum(score**2, axis=1)
-    own = share * (jnp.trace(by_line) / _positive(jnp.trace(jnp.sum(share, axis=0))))
-    taken = jnp.einsum("mij,mji->", leverage, own)
-    left = jnp.trace(jnp.sum(own, axis=0)) - 2 * taken
-    left = left + jnp.einsum("mij,jk,mki->", leverage, by_line, leverage) + known_errors[0]
-    ratio = jnp.sum(length) / _positive(left)
+    xp, (score, leverage, share) = namespace(*of_photos), of_photos
+    length = xp.sum(score**2, axis=1)
+    own = share * (xp.trace(by_line) / _positive(xp.trace(xp.sum(share, axis=0))))
+    taken = xp.einsum("mij,mji->", leverage, own)
+    left = xp.trace(xp.sum(own, axis=0)) - 2 * taken
+    left = left + xp.einsum("mij,jk,mki->", leverage, by_line, leverage) + known_errors[0]
+    ratio = xp.sum(length) / _positive(left)
     known = (free > 0) & (left > 0) & (ratio > 1)
-    ratio = jnp.where(known, ratio, 1)
+    ratio = xp.where(known, ratio, 1)
     total = score.T @ score
-    total = total * (ratio * jnp.trace(by_line) / _positive(jnp.trace(total)))
-    apart = jnp.sum((total - ratio * by_line) ** 2)
-    by_chance = terms * (jnp.sum(total**2) + jnp.trace(total) ** 2) / _positive(free)
-    shrink = jnp.clip(by_chance / _positive(apart), 0, 1)
+    total = total * (ratio * xp.trace(by_line) / _positive(xp.trace(total)))
+    apart = xp.sum((total - ratio * by_line) ** 2)
+    by_chance = terms * (xp.sum(total**2) + xp.trace(total) ** 2) / _positive(free)
+    shrink = xp.clip(by_chance / _positive(apart), 0, 1)
     shape = shrink * by_line + (1 - shrink) * total / ratio
     enlarged = (ratio + 2 * (ratio - 1) / _positive(free)) * (shape + known_errors[1])
-    return jnp.where(known, enlarged, by_line + known_errors[1])
+    return xp.where(known, enlarged, by_line + known_errors[1])
 
 
 def _positive(value):
     """A divisor: the value, or 1 where it is not positive."""
-    return jnp.where(value > 0, value, 1)
+    return namespace(value).where(value > 0, value, 1)
 
 
-def _feigned(lines, zoom, weights, energy, extra):
+def _feigned(lines, linear, weights, extra):
     """What the points' own noise contributes to ``J^T J`` in the mean, of each frame.
 
     In two parts, of radial and of tangential coefficients: their derivatives by the parameters, and noise.
     """
-    flat, unravel = ravel_pytree(zoom.parameters)
+    own = linear.k.shape[1] - extra
 
-    def coefficients_at(flat):
-        k = coefficients_by(with_parameters(zoom, unravel(flat)), lines)
-        return lines.in_powers(k[:, : k.shape[1] - extra])
+    def along(by_one):
+        return jax.jvp(lines.in_powers, (linear.k[:, :own],), (by_one[:, :own],))
 
-    k, _ = coefficients_at(flat)
-    terms = k.shape[1]
+    (k, _), (by_parameter, tangential) = jax.vmap(along, 2, ((None, None), (2, 2)))(linear.by_parameter)
+    energy, terms = jnp.sum(linear.weighted**2), k.shape[1]
     order = jnp.arange(terms + 1)
     moments = lines.radial_moments(2 * terms)[:, order[:, None] + order[None]] * weights[:, None, None]
     moments = jax.ops.segment_sum(moments, lines.frame, lines.focal.shape[0])
@@ -223,7 +296,6 @@ def _feigned(lines, zoom, weights, energy, extra):
     radius = lines.scale * jnp.sqrt(mean[1, 1] / _positive(mean[0, 0]))
     rounding = _ROUNDING * jnp.finfo(moments.dtype).eps * radius
     variance_in_image = jnp.maximum(variance_in_image, rounding**2)
-    by_parameter, tangential = jax.jacfwd(coefficients_at)(flat)  # (frame, terms, parameter)
     # Decentering moves points by squares of x and y: noise enters its derivative by matrices whose mean
     # square over all directions is 12 r^2.
     decentred = 12 * moments[:, 0, 1, None, None] * jnp.eye(tangential.shape[1])[None]

@@ -9,6 +9,7 @@ and within it every line. The M frames are those that have a line of a weight ab
 """
 
 import abc
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -242,11 +243,17 @@ def by_own_coefficients(
     return jax.vmap(along, out_axes=(None, -1))(directions)
 
 
-def linearised(lines, zoom):
-    """The residuals and their derivatives by the flattened parameters, a row a residual.
+class Linearised(NamedTuple):
+    """The residuals of a zoom model, and how they and the coefficients follow its flattened parameters."""
 
-    Of a line with more rows than these have coefficients, and one, those of its triangle stand for them.
-    """
+    weighted: Float[Array, "line rows"]  # px, times the root of their weights
+    jacobian: Float[Array, "line rows parameter"]
+    k: Float[Array, "frame size"]
+    by_parameter: Float[Array, "frame size parameter"]
+
+
+def linearised(lines: AbstractLines, zoom: AbstractZoom) -> Linearised:
+    """Of a line with more rows than coefficients, and one, those of its triangle stand for them."""
     flat, unravel = ravel_pytree(zoom.parameters)
 
     def coefficients_at(flat):
@@ -258,4 +265,5 @@ def linearised(lines, zoom):
         columns = jnp.concatenate([weighted[:, None], jnp.swapaxes(own, 1, 2)], axis=1)
         triangles = jax.vmap(triangle)(columns)
         weighted, own = triangles[..., 0], triangles[..., 1:]
-    return weighted, jnp.einsum("lrk,lkp->lrp", own, by_parameter[lines.frame], precision=EXACT)
+    jacobian = jnp.einsum("lrk,lkp->lrp", own, by_parameter[lines.frame], precision=EXACT)
+    return Linearised(weighted, jacobian, k, by_parameter)

@@ -237,20 +237,19 @@ def widened_by_focal(lines, zoom, covariance, joint, of_focal, refined=False):
     `refined`, as then the scatter is what is left. A fitted centre is held where it is; its covariance had
     been enlarged by the same factor as that of the parameters.
     """
-    weighted, jacobian = linearised(lines, zoom)
+    linear = linearised(lines, zoom)
     errors = _errors_of_focal(lines, zoom, of_focal)
     errors = errors._replace(scores=jnp.where(refined, 0, errors.scores))
     none = errors._replace(covariance=jnp.zeros_like(errors.covariance))
     before, told, after = (
-        parameter_covariance(lines, zoom, weighted, jacobian, errors=known)[0]
-        for known in (None, none, errors)
+        parameter_covariance(lines, zoom, linear, errors=known)[0] for known in (None, none, errors)
     )
     infinite = jnp.isinf(jnp.diagonal(covariance)) | jnp.isinf(jnp.diagonal(before))
     known = ~(infinite[:, None] | infinite[None])
     own, before, told, after = (jnp.where(known, m, 0) for m in (covariance, before, told, after))
     if joint is None:
         return jnp.where(known, own + (after - before), covariance), None
-    matrix, number = jnp.einsum("lri,lrj->ij", jacobian, jacobian), own.shape[0]
+    matrix, number = jnp.einsum("lri,lrj->ij", linear.jacobian, linear.jacobian), own.shape[0]
     enlarged = jnp.sum(matrix * before)
     part = jnp.minimum(jnp.sum(matrix * told) / jnp.where(enlarged > 0, enlarged, 1), 1)
     wider = jnp.where(known, part * own + after - told, covariance)

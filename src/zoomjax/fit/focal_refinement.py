@@ -47,12 +47,12 @@ _LEAST_NOISE = 1e-3
 
 def _prior_weights(lines, zoom) -> Float[Array, "frame"]:
     """tau of each frame, px^2: see the module."""
-    weighted, jacobian = linearised(lines, zoom)
-    covariance, _ = parameter_covariance(lines, zoom, weighted, jacobian, photos=False)
+    linear = linearised(lines, zoom)
+    covariance, _ = parameter_covariance(lines, zoom, linear, photos=False)
     known = jnp.isfinite(jnp.diagonal(covariance))
     covariance = jnp.where(known[:, None] & known[None], covariance, 0)
     weights, frames = line_weights(lines), lines.focal.shape[0]
-    squares = jnp.einsum("lrp,lrq->lpq", jacobian, jacobian)
+    squares = jnp.einsum("lrp,lrq->lpq", linear.jacobian, linear.jacobian)
     gauss_newton = jnp.sum(squares, axis=0)
     leverage = jnp.einsum("lpq,qp->l", squares, inverse_of(gauss_newton))
     noise = jnp.trace(gauss_newton @ covariance) / jnp.sum(weights * leverage)

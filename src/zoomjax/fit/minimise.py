@@ -10,6 +10,7 @@ import lineax as lx
 import optimistix as optx
 
 from .._core.programs import light_program, program
+from .._core.types import traced
 from ..models.zoom import with_parameters
 from ._least_squares import default_solver
 from .algebraic import algebraic_model, algebraic_start
@@ -17,7 +18,7 @@ from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
 from .energy import coefficients_by, prior_residuals
 from .frame_residuals import frame_residuals
-from .result import described_fit, outcome_of, thrown
+from .result import described_fit, outcome_of, thrown, undescribed_fit, with_covariance
 
 
 def fit_about(lines, model, *, algebraic, solver=None, max_steps=256, invertible=True, throw=True):
@@ -43,7 +44,25 @@ def fit_freely(lines, model, algebraic, solver, max_steps):
 
 def fit_prepared(lines, model, solver, max_steps):
     """The fit of a prepared model from its own parameters, and its outcome."""
-    return described(lines, *minimised(lines, model.zoom, solver, max_steps))
+    return described_once(lines, *minimised(lines, model.zoom, solver, max_steps))
+
+
+def described_once(lines, *ended):
+    """`described`; of few known lines with a covariance by NumPy, so that half as much is compiled."""
+    found = None
+    if not traced((lines, ended)) and len(lines.frame) <= _FEW and _is_here(lines):
+        found = with_covariance(*_undescribed(lines, *ended))
+    return described(lines, *ended) if found is None else found
+
+
+_FEW = 1024
+"""Lines, of which NumPy makes the covariance as soon as a program does."""
+
+
+def _is_here(lines):
+    """Whether all arrays are within reach of this process."""
+    arrays = [leaf for leaf in jax.tree.leaves(lines) if isinstance(leaf, jax.Array)]
+    return all(leaf.is_fully_addressable for leaf in arrays)
 
 
 @light_program
@@ -51,6 +70,9 @@ def described(lines, zoom, result, steps):
     """The fit that ended so, and its outcome: once after the steps."""
     fit = described_fit(lines, zoom, result, steps)
     return fit, outcome_of(fit)
+
+
+_undescribed = light_program(undescribed_fit)
 
 
 def minimise(lines, zoom, solver, max_steps):

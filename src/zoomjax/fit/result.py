@@ -22,7 +22,7 @@ from ..models.invertibility import Certificate, certificate_of
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ..models.zoom import AbstractFocusZoom, AbstractZoom
-from .covariance import parameter_covariance
+from .covariance import covariance_of, parameter_covariance, told
 from .energy import counted_frames, energy_by_frame, linearised
 
 
@@ -176,14 +176,46 @@ class FrameFits(eqx.Module):
 
 def described_fit(lines, zoom, result, steps):
     """A fitted zoom model with its errors, covariance, certificate and status."""
-    weighted, jacobian = linearised(lines, zoom)
-    errors = energy_by_frame(lines, weighted)
-    covariance, determined = parameter_covariance(lines, zoom, weighted, jacobian)
-    lens, rms = lens_of(lines, zoom), jnp.sqrt(jnp.nanmean(errors))
+    linear = linearised(lines, zoom)
+    covariance, determined = parameter_covariance(lines, zoom, linear)
+    return _ended(lines, zoom, result, steps, linear.weighted, covariance)(determined)
+
+
+def undescribed_fit(lines, zoom, result, steps):
+    """The same but for its covariance, of which there is what the lines tell: see `with_covariance`.
+
+    Twice, as if its parameters were determined and as if they were not; each with its outcome.
+    """
+    linear = linearised(lines, zoom)
+    none = jnp.zeros((0, 0), linear.weighted.dtype)
+    of = _ended(lines, zoom, result, steps, linear.weighted, none)
+    fits = [of(jnp.asarray(determined)) for determined in (True, False)]
+    return told(lines, zoom, linear), *((fit, outcome_of(fit)) for fit in fits)
+
+
+def with_covariance(known, determined, undetermined):
+    """The fit of `undescribed_fit` with its covariance, and its outcome; None where a number is none.
+
+    By NumPy: decompositions and products of small matrices, half of what there would be to compile.
+    """
+    known = jax.tree.map(np.asarray, known)
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(known)):
+        return None
+    with np.errstate(all="ignore"):
+        covariance, told_all = covariance_of(known)
+    fit, outcome = determined if told_all else undetermined
+    covariance = as_jax(covariance.astype(known.weighted.dtype))
+    return eqx.tree_at(lambda fit: fit.covariance, fit, covariance), outcome
+
+
+def _ended(lines, zoom, result, steps, weighted, covariance):
+    """The fit, by whether its parameters are determined."""
+    errors, lens = energy_by_frame(lines, weighted), lens_of(lines, zoom)
+    rms = jnp.sqrt(jnp.nanmean(errors))
     certificate = certificate_of(
         zoom, lens.centre, lens.focal_range, lens.image_size, distortion_model=lens.distortion_model
     )
-    return ZoomFit(
+    return lambda determined: ZoomFit(
         lens=lens,
         rms=rms,
         frame_rms=jnp.sqrt(errors),

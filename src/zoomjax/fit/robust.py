@@ -226,7 +226,7 @@ def _reweighted(lines, start, narrowing):
 
     def turn(model, cut):
         weighted = lines.weighted(own * _weights(lines, model, cut))
-        residuals, jacobian = linearised(weighted, model)
+        residuals, jacobian, *_ = linearised(weighted, model)
         flat, unravel = ravel_pytree(model.parameters)
         prior = prior_jacobian(weighted, model)  # a prior's residuals are linear in the parameters
         matrix = jnp.concatenate([jacobian.reshape(-1, flat.size), prior])

@@ -28,7 +28,7 @@ def by_parameters(
 
     And the derivatives of what its prior adds, and half the gradient of the sum of squares of that.
     """
-    weighted, jacobian = linearised(lines, zoom)
+    weighted, jacobian, *_ = linearised(lines, zoom)
     prior = prior_jacobian(lines, zoom)
     pulled = prior_residuals(lines, zoom)
     pull = jnp.zeros(prior.shape[1], prior.dtype) if pulled is None else prior.T @ pulled
