@@ -239,11 +239,13 @@ def widened_by_focal(lines, zoom, covariance, joint, of_focal, refined=False):
     """
     linear = linearised(lines, zoom)
     errors = _errors_of_focal(lines, zoom, of_focal)
-    errors = errors._replace(scores=jnp.where(refined, 0, errors.scores))
-    none = errors._replace(covariance=jnp.zeros_like(errors.covariance))
-    before, told, after = (
-        parameter_covariance(lines, zoom, linear, errors=known)[0] for known in (None, none, errors)
-    )
+    # By nothing, by what they explain alone, and by all.
+    scores, zeros = jnp.where(refined, 0, errors.scores), jax.tree.map(jnp.zeros_like, errors)
+    several = (zeros, zeros._replace(scores=scores), errors._replace(scores=scores))
+    several = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
+    before, told, after = jax.vmap(
+        lambda known: parameter_covariance(lines, zoom, linear, errors=known)[0]
+    )(several)
     infinite = jnp.isinf(jnp.diagonal(covariance)) | jnp.isinf(jnp.diagonal(before))
     known = ~(infinite[:, None] | infinite[None])
     own, before, told, after = (jnp.where(known, m, 0) for m in (covariance, before, told, after))
