@@ -43,9 +43,9 @@ def test_program_gives_what_the_function_gives(make):
 def test_few_numbers_are_not_worth_optimisation():
     few, long = np.zeros(9), np.zeros(programs._ROWS + 1)
     many = np.zeros((2, programs._NUMBERS // 2 + 1))
-    assert programs._few(((few, "name"), {"more": jnp.zeros(())}))
-    assert not programs._few(((few, long), {}))
-    assert not programs._few(((few, many), {}))
+    assert programs.are_few(((few, "name"), {"more": jnp.zeros(())}))
+    assert not programs.are_few(((few, long), {}))
+    assert not programs.are_few(((few, many), {}))
     small, larger = (dict(programs._settings(programs._kind(False, False, few))) for few in (True, False))
     assert small["xla_backend_optimization_level"] == 0
     assert larger["xla_backend_optimization_level"] == 1

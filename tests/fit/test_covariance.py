@@ -8,7 +8,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.fit import minimise
+from zoomjax.fit import covariance
 from zoomjax.fit.covariance import covariance_of, told
 from zoomjax.fit.energy import linearised
 
@@ -32,7 +32,7 @@ def by_program(monkeypatch):
 
     def of(function):
         with monkeypatch.context() as patched:
-            patched.setattr(minimise, "_FEW", 0)
+            patched.setattr(covariance, "are_few", lambda arguments: False)
             return function()
 
     return of
@@ -88,6 +88,21 @@ def test_the_covariance_keeps_the_precision_of_the_lines():
     fit = zj.fit_zoom(single)
     assert fit.covariance.dtype == np.float32
     np.testing.assert_allclose(fit.covariance, zj.fit_zoom(lines_of(0.3)).covariance, rtol=0.05, atol=1e-9)
+
+
+def test_the_covariance_with_a_centre_is_numpys_too(by_program):
+    scene = scenes.board_lines(
+        scenes.nikkor_18_200(), scenes.focal_sweep(4), spacing=300, noise=0.3, seed=3
+    )
+    lines = zj.lines.compress_any_centre(scene)
+
+    def fit():
+        return zj.fit.fit_centre(lines)
+
+    own, other = fit(), by_program(fit)
+    assert (bool(own.determined), bool(other.determined)) == (True, True)
+    np.testing.assert_allclose(own.covariance, other.covariance, rtol=1e-8)
+    np.testing.assert_allclose(own.std, other.std, rtol=1e-8)
 
 
 @pytest.mark.parametrize("name", MODELS)

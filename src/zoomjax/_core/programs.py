@@ -86,7 +86,7 @@ def program(
     def call(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
         if not _at_once():
             return plain(*args, **kwargs)
-        small = (light or (rare and _USE.once)) and _few((args, kwargs))
+        small = (light or (rare and _USE.once)) and are_few((args, kwargs))
         settings = _settings(_kind(optimised, in_steps, small))
         try:
             if (run := kept(function, settings, args, kwargs)) is not None:
@@ -174,8 +174,8 @@ def _with_settings(function, settings):
     return eqx.filter_jit(function, **given)
 
 
-def _few(arguments: Any) -> bool:
-    """Whether arrays are short, and hold few numbers in all."""
+def are_few(arguments: Any) -> bool:
+    """Whether arrays are short, and hold few numbers in all: compiling takes longer than computing."""
     shapes = [leaf.shape for leaf in jax.tree.leaves(arguments) if eqx.is_array(leaf)]
     longest = max((shape[0] for shape in shapes if shape), default=0)
     times = _LARGER if _USE.once else 1

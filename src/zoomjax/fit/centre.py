@@ -35,8 +35,8 @@ from ..models.requirements import check
 from ..models.zoom import AbstractZoom, PolynomialZoom, number_of_coefficients, with_parameters
 from ._least_squares import Solver, default_solver
 from .compression import compressed_as_measured
-from .covariance import parameter_covariance
-from .energy import AbstractJointZoom, counted_frames, linearised
+from .covariance import known_covariance
+from .energy import AbstractJointZoom, counted_frames
 from .minimise import fit_about, minimised
 from .moved_centre import for_any_centre, for_terms
 from .prepare import asked_for, prepared_for, ready_model
@@ -248,11 +248,13 @@ def _search(lines, start, solver, max_steps):
     return _accepted(lines, start, found)
 
 
-@light_program
 def _accepted(lines, start, found):
     """The model found, if its centre is certain enough, or else the start; its centres; and what tells."""
-    covariance, _ = parameter_covariance(lines, found, linearised(lines, found), extra=2)
+    return _certain(lines, start, found, known_covariance(lines, found, extra=2))
 
+
+@light_program
+def _certain(lines, start, found, covariance):
     def offsets(parameters):
         centre = with_parameters(found, parameters).parts()[1]
         return jax.vmap(centre)(lines.focal)

@@ -19,12 +19,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.arrays import namespace
-from .._core.types import AnyArray
+from .._core.arrays import as_jax, namespace
+from .._core.programs import are_few, light_program
+from .._core.types import AnyArray, traced
 from ..lines.base import AbstractLines
 from ..models.zoom import AbstractZoom
 from ._linear import triangle_of
-from .energy import Linearised, counted_frames, line_weights, prior_error, prior_jacobian, prior_of
+from .energy import (
+    Linearised,
+    counted_frames,
+    line_weights,
+    linearised,
+    prior_error,
+    prior_jacobian,
+    prior_of,
+)
 
 _ROUNDING = 64
 """Error of the corrected points without noise, in units in the last place of their mean radius."""
@@ -107,6 +116,44 @@ def parameter_covariance(
 ) -> tuple[Float[Array, "parameter parameter"], Bool[Array, ""]]:
     """`covariance_of` what lines tell."""
     return covariance_of(told(lines, zoom, linear, extra), photos, errors)
+
+
+def known_covariance(lines: AbstractLines, zoom: AbstractZoom, extra: int = 0) -> Any:
+    """`parameter_covariance` without the residuals, and without what is determined."""
+    if are_by_numpy((lines, zoom)) and (found := by_numpy(_told(lines, zoom, extra))) is not None:
+        return found[0]
+    return _covariance(lines, zoom, extra)
+
+
+@light_program
+def _told(lines, zoom, extra):
+    return told(lines, zoom, linearised(lines, zoom), extra)
+
+
+@light_program
+def _covariance(lines, zoom, extra):
+    return parameter_covariance(lines, zoom, linearised(lines, zoom), extra)[0]
+
+
+def are_by_numpy(arguments: Any) -> bool:
+    """Whether the covariance of such lines and models is NumPy's: values are known, at hand, and few.
+
+    Decompositions and products of small matrices are half of what there would be to compile.
+    """
+    if traced(arguments) or not are_few(arguments):
+        return False
+    arrays = [leaf for leaf in jax.tree.leaves(arguments) if isinstance(leaf, jax.Array)]
+    return all(leaf.is_fully_addressable for leaf in arrays)
+
+
+def by_numpy(known: Told) -> tuple[Array, bool] | None:
+    """`covariance_of` what lines tell, by NumPy; None where a number is none."""
+    known = jax.tree.map(np.asarray, known)
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(known)):
+        return None
+    with np.errstate(all="ignore"):
+        covariance, determined = covariance_of(known)
+    return as_jax(covariance.astype(known.weighted.dtype)), bool(determined)
 
 
 def covariance_of(known: Told, photos: bool = True, errors: KnownErrors | None = None) -> tuple[Any, Any]:

@@ -10,12 +10,12 @@ import lineax as lx
 import optimistix as optx
 
 from .._core.programs import light_program, program
-from .._core.types import traced
 from ..models.zoom import with_parameters
 from ._least_squares import default_solver
 from .algebraic import algebraic_model, algebraic_start
 from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
+from .covariance import are_by_numpy
 from .energy import coefficients_by, prior_residuals
 from .frame_residuals import frame_residuals
 from .result import described_fit, outcome_of, thrown, undescribed_fit, with_covariance
@@ -48,21 +48,11 @@ def fit_prepared(lines, model, solver, max_steps):
 
 
 def described_once(lines, *ended):
-    """`described`; of few known lines with a covariance by NumPy, so that half as much is compiled."""
+    """`described`; of few known lines with a covariance by NumPy, so that less is compiled."""
     found = None
-    if not traced((lines, ended)) and len(lines.frame) <= _FEW and _is_here(lines):
+    if are_by_numpy((lines, ended)):
         found = with_covariance(*_undescribed(lines, *ended))
     return described(lines, *ended) if found is None else found
-
-
-_FEW = 1024
-"""Lines, of which NumPy makes the covariance as soon as a program does."""
-
-
-def _is_here(lines):
-    """Whether all arrays are within reach of this process."""
-    arrays = [leaf for leaf in jax.tree.leaves(lines) if isinstance(leaf, jax.Array)]
-    return all(leaf.is_fully_addressable for leaf in arrays)
 
 
 @light_program

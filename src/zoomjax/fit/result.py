@@ -22,7 +22,7 @@ from ..models.invertibility import Certificate, certificate_of
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ..models.zoom import AbstractFocusZoom, AbstractZoom
-from .covariance import covariance_of, parameter_covariance, told
+from .covariance import by_numpy, parameter_covariance, told
 from .energy import counted_frames, energy_by_frame, linearised
 
 
@@ -194,18 +194,11 @@ def undescribed_fit(lines, zoom, result, steps):
 
 
 def with_covariance(known, determined, undetermined):
-    """The fit of `undescribed_fit` with its covariance, and its outcome; None where a number is none.
-
-    By NumPy: decompositions and products of small matrices, half of what there would be to compile.
-    """
-    known = jax.tree.map(np.asarray, known)
-    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(known)):
+    """The fit of `undescribed_fit` with its covariance, by NumPy, and its outcome; None for want of one."""
+    if (found := by_numpy(known)) is None:
         return None
-    with np.errstate(all="ignore"):
-        covariance, told_all = covariance_of(known)
-    fit, outcome = determined if told_all else undetermined
-    covariance = as_jax(covariance.astype(known.weighted.dtype))
-    return eqx.tree_at(lambda fit: fit.covariance, fit, covariance), outcome
+    fit, outcome = determined if found[1] else undetermined
+    return eqx.tree_at(lambda fit: fit.covariance, fit, found[0]), outcome
 
 
 def _ended(lines, zoom, result, steps, weighted, covariance):
