@@ -38,7 +38,9 @@ def photos(tmp_path):
 
 def calibrated(detections):
     model = WantedModel(model="polynomial", degree=0, terms=2)  # nothing is chosen: faster
-    return _calibrated(ImageJob((".",), detector="grid", model=model), detections, lambda _: None, lambda _: None)
+    return _calibrated(
+        ImageJob((".",), detector="grid", model=model), detections, lambda _: None, lambda _: None
+    )
 
 
 @pytest.mark.slow
