@@ -61,7 +61,8 @@ def find_inputs(inputs: Sequence[Path], output: Path) -> Found:
     named = _distinct([(path, names[path]) for path in [*photos, *videos]])
     notes = [twice(again)] if again else []
     used = SUFFIXES if photos else VIDEO_SUFFIXES
-    notes += filter(None, (left_out(folder, used) for folder in inputs if folder.is_dir()))
+    folders, _ = once([path for path in inputs if path.is_dir()])
+    notes += filter(None, (left_out(folder, used) for folder in folders))
     return Found(named[: len(photos)], named[len(photos) :], refused, tuple(notes))
 
 

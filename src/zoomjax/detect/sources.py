@@ -121,10 +121,11 @@ def find_photos(inputs: Iterable[str | os.PathLike[str]]) -> list[Source]:
             or pictures in formats that are not read; they are left out.
     """
     paths: list[Path] = []
+    folders: list[Path] = []
     for given in inputs:
         paths += _expanded(os.fspath(given))
-    paths, again = once(paths)
-    folders = (given for given in map(Path, inputs) if given.is_dir())
+        folders += [Path(given)] * Path(given).is_dir()
+    (paths, again), (folders, _) = once(paths), once(folders)
     for note in (*([twice(again)] if again else []), *filter(None, map(left_out, folders))):
         warnings.warn(note, stacklevel=2)
     return [Source(name, path) for name, path in zip(_names(paths), paths, strict=True)]
