@@ -247,8 +247,8 @@ def video_frames(
             not positive.
 
     Warns:
-        UserWarning: the video ends early, being cut off or damaged; the frames before that are used. Or the
-            track goes on after the video's end.
+        UserWarning: the video ends early, being cut off or damaged; the frames before that are used. Frames
+            on the way are damaged. Or the track goes on after the video's end.
     """
     from ..io.video_reader import decode_video
 
@@ -260,8 +260,9 @@ def video_frames(
         # From the first to the last; where not even the length is known, the first ones.
         there = announced or number
         wanted = set(np.linspace(0, there - 1, min(number, there)).round().astype(int).tolist())
-        last, time, some = -1, 0.0, False
+        last, time, some, decoded = -1, 0.0, False, 0
         for last, time, image in frames:
+            decoded += 1
             if last not in wanted:
                 continue
             at = focal.at(last, time) if isinstance(focal, FocalTrack) else float(focal)
@@ -273,6 +274,12 @@ def video_frames(
             raise ValueError(
                 f"Cannot read {os.fspath(path)}: of {announced} frames none of the {len(wanted)} wanted "
                 "can be decoded. It is cut off or damaged."
+            )
+        if damaged := last + 1 - decoded:
+            warnings.warn(
+                f"{damaged} of {last + 1} frames of {os.fspath(path)} cannot be decoded, as their data are "
+                "damaged. The others are used.",
+                stacklevel=2,
             )
         if last + 1 < 0.98 * announced - 2:  # lengths are rounded
             warnings.warn(
