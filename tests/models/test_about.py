@@ -45,6 +45,18 @@ def test_a_file_with_wrong_ones_is_refused(change, tmp_path):
         zj.load_lens(path)
 
 
+def test_entries_that_are_not_known_are_told(tmp_path):
+    """They were gone without a word when the lens was saved again."""
+    path = tmp_path / "lens.json"
+    lens().save(path)
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content | {"camera": {"sensor": 36}, "zoom": content["zoom"] | {"note": 1}}))
+    with pytest.warns(
+        UserWarning, match=r"lens\.json has entries .* not know: camera, zoom\.note\. They do"
+    ):
+        assert zj.load_lens(path).about == {}
+
+
 @pytest.mark.parametrize("name", ["crop_factor", "digital_zoom", "width_of_focal_px"])
 @pytest.mark.parametrize("value", ["1.5", "", 0, -1.5])
 def test_what_is_computed_with_must_be_a_positive_number(name, value, tmp_path):
