@@ -206,6 +206,11 @@ def test_coefficients_are_trained():
             "shape of the lens's own",
             lambda: zt.undistort(points(torch.float32), distortion(), coefficients=torch.zeros(3)),
         ),
+        (
+            ValueError,
+            "Argument border_value must be one number, but it is True",
+            lambda: zt.warp_image(torch.zeros(1, 5, 6), distortion(), border_value=True),
+        ),
         (ValueError, "channels, height, width", lambda: zt.warp_image(torch.zeros(5, 6), distortion())),
         (
             ValueError,

@@ -107,6 +107,8 @@ def warp_image(
         )
     if focal is not None and np.shape(focal) != ():
         raise ValueError("Argument focal must be one focal length for all images.")
+    if isinstance(border_value, bool):
+        raise ValueError(f"Argument border_value must be one number, but it is {border_value!r}.")
     options = (framing, interpolation, float(border_value))
     return _called(_warped, options, image, lens, focal, coefficients)
 

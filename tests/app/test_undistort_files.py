@@ -164,6 +164,10 @@ WRONG = {
         ["a.jpg", "--focal", "."],
         "cannot read focal lengths where there is a folder",
     ),
+    "a source of a calibration": (
+        ["a.jpg", "--focal", "same"],
+        "but it is 'same', by which a calibration finds focal lengths. Leave it out",
+    ),
     "negative": (["zoom.mp4", "--focal", "-3"], "--focal must be a positive"),
     "two videos": (["zoom.mp4", "copy.mp4", "--focal", "30"], "of 2 videos must be a folder"),
     "both kinds": (["zoom.mp4", "a.jpg"], "not both"),

@@ -59,6 +59,12 @@ def test_videos_beside_photos_are_said(folder):
     assert done.notes == (
         f"In the folder {folder / 'in'}, one file is left out: zoom.mp4. Give videos by name.",
     )
+    (folder / "link").symlink_to("in")
+    twice = undistort_files(job(folder, "in", "in", "link", out="twice")).notes
+    assert [note.split(",")[0] for note in twice] == [
+        f"{folder / 'in/a.jpg'} is given twice",
+        f"In the folder {folder / 'in'}",
+    ]
 
 
 def test_what_is_not_there_is_said_so(folder):

@@ -109,6 +109,35 @@ def test_boolean_masks_and_strided_views(rng):
     )
 
 
+@pytest.mark.parametrize("value", [True, np.True_, [True, False, True], "9", "white", None, 1j])
+@pytest.mark.parametrize("function", ["undistort_image", "redistort_image"])
+@pytest.mark.usefixtures("unchecked")
+def test_a_border_value_that_is_no_number_is_refused(function, value):
+    """True counted as 1, and "9" as 9."""
+    image = np.zeros((4, 6, 3), np.uint8)
+    with pytest.raises(
+        ValueError, match="Argument border_value must be one number, or one for each of the 3"
+    ):
+        getattr(zj if function == "undistort_image" else zj.correct, function)(
+            image, TINY, border_value=value
+        )
+
+
+@pytest.mark.parametrize("focal", [1e-300, 1e-100])
+@pytest.mark.parametrize("function", ["undistort_image", "redistort_image"])
+def test_coefficients_that_overflow_are_refused(function, focal):
+    """As of focal lengths next to zero: the error was LAPACK's, or the image was black."""
+    lens = zj.scenes.nikkor_18_200(SIZE).extended(1e-300, 100.0)
+    call = getattr(zj if function == "undistort_image" else zj.correct, function)
+    with pytest.raises(ValueError, match="No image can be corrected with coefficients of"):
+        call(np.full((108, 192), 9, np.uint8), lens, focal=focal)
+
+
+def test_a_border_value_of_a_mask_may_be_a_truth():
+    result = zj.undistort_image(np.zeros((108, 192), bool), BARREL, keep="all", border_value=True)
+    assert result.any()
+
+
 def test_against_an_opencv_camera(rng):
     """OpenCV's forward model is the polynomial of our `undistort`, its iterated inverse our `distort`."""
     k1, k2 = 0.12, -0.05

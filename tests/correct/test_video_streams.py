@@ -83,6 +83,74 @@ def test_what_a_container_does_not_hold_is_said(tmp_path):
     assert done.not_kept == ("subtitles (srt, eng)", "the attachment font.ttf", "chapters (2)")
 
 
+def spoken(path, tracks):
+    """A video with silent sound of these languages, titles and marks."""
+    with av.open(str(path), "w") as out:
+        video = out.add_stream("libx264", rate=25)
+        video.width, video.height = SIZE
+        video.pix_fmt, video.disposition = "yuv420p", av.stream.Disposition.default
+        sounds = []
+        for tags, marks in tracks:
+            sounds.append(sound := out.add_stream("aac", rate=48000))
+            sound.metadata.update(tags)
+            sound.disposition = marks
+        for number in range(4):
+            grey = av.VideoFrame.from_ndarray(np.resize(picture(number), SIZE[::-1]), "gray")
+            frame = grey.reformat(format="yuv420p")
+            frame.pts, frame.time_base = number, Fraction(1, 25)
+            out.mux(video.encode(frame))
+        out.mux(video.encode(None))
+        for sound in sounds:
+            silence = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
+            silence.sample_rate, silence.pts, silence.time_base = 48000, 0, Fraction(1, 48000)
+            out.mux(sound.encode(silence))
+            out.mux(sound.encode(None))
+    return path
+
+
+def told(path):
+    with av.open(str(path)) as made:
+        return [
+            (int(stream.disposition), stream.metadata.get("language"), stream.metadata.get("title"))
+            for stream in made.streams
+        ]
+
+
+def test_languages_and_marks_of_sound_go_over_or_are_said(tmp_path):
+    """The pictures of .mkv files lost their mark, and .mov ones languages, without a word."""
+    marks = av.stream.Disposition
+    tracks = [
+        ({"language": "tlh"}, marks(0)),
+        ({"language": "eng"}, marks.default),
+        ({"language": "de", "title": "Talk"}, marks.comment),
+    ]
+    source = spoken(tmp_path / "in.mkv", tracks)
+    assert told(source) == [
+        (1, None, None),
+        (0, "tlh", None),
+        (1, "eng", None),
+        (8, "de", "Talk"),
+    ]
+    lost = {
+        ".mkv": (),
+        ".mp4": ("the language and the title of the sound (aac, de)",),
+        ".mov": (
+            "the language of the sound (aac, tlh)",
+            "the language and the title and the mark comment of the sound (aac, de)",
+        ),
+        ".ts": (
+            "the mark default of the sound (aac, eng)",
+            "the language and the title and the mark comment of the sound (aac, de)",
+        ),
+    }
+    for suffix, names in lost.items():
+        done = undistort_video(source, tmp_path / f"out{suffix}", lens=lens(), focal=20.0)
+        assert done.not_kept == names
+    assert told(tmp_path / "out.mkv") == told(source)
+    alone = spoken(tmp_path / "one.mkv", [({"language": "eng"}, marks.default)])
+    assert undistort_video(alone, tmp_path / "one.ts", lens=lens(), focal=20.0).not_kept == ()
+
+
 APPLE = {f"com.apple.quicktime.{name}": name for name in ("make", "model", "location.ISO6709")}
 
 

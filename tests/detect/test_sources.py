@@ -52,6 +52,10 @@ def test_videos_and_unread_pictures_of_a_folder_are_said(tmp_path, image):
         UserWarning, match=r"2 files are left out: \\x1bd\.mp4, sub/c\.GIF\. Give videos by name"
     ):
         find_photos([tmp_path])
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        find_photos(iter([tmp_path, str(tmp_path)]))
+    assert ["is given twice" in str(one.message) for one in told] == [True, False]
 
 
 def test_patterns_are_expanded(tmp_path, image):

@@ -123,6 +123,7 @@ def test_of_several_tables_the_nearest_sensor_counts():
     [
         ({"model": "spline"}, "model must be one of auto, smooth, table"),
         ({"crop": 0}, "crop must be a positive number"),
+        ({"crop": 1e4}, r"No images of \d+ x \d+ px have a crop factor of 10000: it means pixels of"),
         ({"image_size": (0, 5)}, "image_size must be two positive integers"),
     ],
 )

@@ -1,5 +1,6 @@
 """Arguments of `write` and `read`: what is refused, by name, before a file is looked at or made."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -49,6 +50,18 @@ def test_facts_about_the_camera_are_no_options(tmp_path):
     lens = LENSES["landscape"]()
     zj.interop.write(lens, tmp_path / "a.pfb", focal=24, pixel_pitch=PITCH)
     zj.interop.read(tmp_path / "a.pfb", focal=24, image_size=lens.image_size)
+
+
+def test_a_pitch_that_contradicts_the_lens_s_is_told(tmp_path):
+    """It was written without a word."""
+    lens = dataclasses.replace(LENSES["landscape"](), pixel_pitch=PITCH)
+    for same in (None, PITCH, PITCH * 1.005):
+        zj.interop.write(lens, tmp_path / "a.xml", format="lensfun", pixel_pitch=same, overwrite=True)
+    with pytest.warns(UserWarning, match=r"lens is 0\.0367 mm, and 0\.055 mm is given: leave argument"):
+        zj.interop.write(lens, tmp_path / "b.xml", format="lensfun", pixel_pitch=0.055)
+    assert zj.interop.read(
+        tmp_path / "b.xml", image_size=lens.image_size
+    ).lens.pixel_pitch == pytest.approx(0.055, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ["pftrack", "discorpy", "nuke"])

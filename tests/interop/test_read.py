@@ -402,6 +402,14 @@ def test_a_larger_sensor_than_that_of_a_lensfun_file_is_refused(tmp_path):
     assert found.lens.about["crop_factor"] == 1.59
 
 
+def test_a_crop_factor_of_no_camera_is_refused(tmp_path):
+    """The lens had next to no distortion, that of the very middle, without a word of it."""
+    (tmp_path / "a.xml").write_text(LENSFUN)
+    told = "Cannot read a lensfun lens .*: No images of 6000 x 4000 px have a crop factor of 1000: it means"
+    with pytest.raises(ValueError, match=told):
+        zj.interop.read(tmp_path / "a.xml", image_size=(6000, 4000), name="two", crop=1000)
+
+
 @pytest.mark.parametrize(
     ("name", "focal", "crop"), [("One", 24.0, None), ("two", 10.0, None), ("One", 35.0, 2.0)]
 )

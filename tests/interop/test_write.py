@@ -1,5 +1,6 @@
 """Lenses in other tools' formats, read by those tools: at the focal lengths written, and between."""
 
+import dataclasses
 import itertools
 import json
 
@@ -153,7 +154,24 @@ def test_opentrackio_is_named_for_unreal_where_it_takes_the_lens(tmp_path):
     assert better in said(LENSES["landscape"](), tmp_path, format="unreal", focal=[18, 200])[1]
     seven = zj.interop.library_lens("Canon EF 24-70mm f/2.8L II USM", image_size=(600, 400), model="table")
     assert seven(35.0).coefficients.shape[-1] > 3
+    seven = dataclasses.replace(seven, pixel_pitch=None)
     assert better not in said(seven, tmp_path, format="unreal", focal=[24, 70])[1]
+
+
+@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("gap", [1e-6, 4e-9, 1e-13])
+def test_focal_lengths_that_digits_do_not_tell_apart_are_written_apart(name, gap, tmp_path):
+    """The errors were those of reading it again, as that zip() got lists of unlike lengths."""
+    k = np.array([[0.01], [0.01], [0.011], [0.011]])
+    zoom = zj.models.TableZoom(inverse=False, parameters=k, knots=np.array([20.0, 35.0, 35.0 + gap, 80.0]))
+    lens = zj.ZoomLens(zoom, np.array([319.5, 239.5]), np.array([20.0, 80.0]), (640, 480))
+    report = zj.interop.write(lens, tmp_path / "a", format=name, pixel_pitch=PITCH, tolerance=0.5)
+    assert report.worst <= 0.5
+    for focal in (20.0, 34.99, 35.01, 80.0):
+        assert error(name, tmp_path / "a", lens, focal) < 0.5 + MARGIN
+    narrow = dataclasses.replace(lens, focal_range=np.array([35.0, 35.0 + min(gap, 1e-8)]))
+    report = zj.interop.write(narrow, tmp_path / "b", format=name, pixel_pitch=PITCH, tolerance=0.5)
+    assert report.focal == (35.0,)
 
 
 def test_samples_of_opentrackio_are_of_its_schema(lens, tmp_path):

@@ -87,6 +87,24 @@ def test_other_programs_find_them(tmp_path, image, suffix):
             assert opened.text["Comment"] == "a comment"
 
 
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".webp"])
+@pytest.mark.parametrize("metadata", [FULL, Metadata()])
+def test_colours_under_transparent_pixels_stay(tmp_path, rng, suffix, metadata):
+    """WebP files had others there, of which nothing was said."""
+    image = rng.integers(0, 256, (40, 60, 4)).astype(np.uint8)
+    image[:20, :, 3] = 0
+    write(path := tmp_path / f"a{suffix}", image, metadata)
+    ((found, told),) = read_pages(path).pages
+    np.testing.assert_array_equal(found, image)
+    assert (told.xmp, told.icc) == (metadata.xmp, metadata.icc)
+    assert read_focal(path) == (35.0 if metadata.exif else None)
+
+
+def test_a_webp_file_with_transparency_that_is_too_large_is_refused():
+    with pytest.raises(ValueError, match=r"it cannot be written as \.webp"):
+        encoded_photo([(np.zeros((1, 20_000, 4), np.uint8), Metadata())], ".webp")
+
+
 def test_what_pillow_writes_is_read(tmp_path, image):
     picture = Image.fromarray(image)
     picture.save(

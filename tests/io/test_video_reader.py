@@ -232,6 +232,44 @@ def test_frames_of_tracks_that_are_not_those_of_the_file_are_said(tmp_path):
         assert [number for number, _, _ in frames] == [*range(5), *range(7, FRAMES)]
 
 
+def overwritten(path, places):
+    """The same file with frames of which nothing but the beginning is left."""
+    data = bytearray(path.read_bytes())
+    with av.open(str(path)) as given:
+        taken = [(packet.pos, packet.size) for packet in given.demux(video=0) if packet.size]
+    for place in places:
+        start, size = taken[place]
+        data[start + 8 : start + size] = b"\xff" * (size - 8)
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".mkv", ".mp4"])
+def test_a_group_of_frames_that_decoders_leave_out_in_silence_is_said(suffix, tmp_path):
+    """Of MPEG-2 and HEVC: frames after it had the numbers of earlier ones, or the file was to end early."""
+    path = overwritten(write(tmp_path / f"in{suffix}", "mpeg2video", g="5", bf="0"), range(5, 10))
+    with decode_video(path) as (_, frames):
+        numbers = [number for number, _, _ in frames]
+    assert numbers == [*range(5), *range(10, FRAMES)]
+    told = rf"5 of 20 frames of .*in{suffix} cannot be decoded"
+    with pytest.warns(UserWarning, match=rf"{told} \(their data are damaged\): 15 were written\.$"):
+        done = zj.undistort_video(path, tmp_path / "out.mkv", lens=lens(), focal=20.0)
+    assert (done.frames, done.lost) == (15, 5)
+    with pytest.warns(UserWarning, match=rf"{told}, as their data are damaged\. The others are used"):
+        assert len(list(video_frames(path, 20.0, FRAMES))) == 15
+    with pytest.warns(UserWarning, match=rf"{told}: the tracks number"):
+        track_video(path)
+
+
+def test_frames_of_avi_that_decoders_leave_out_in_silence_are_counted(tmp_path):
+    """It tells no times of frames, so that those after them are taken for earlier ones."""
+    path = overwritten(write(tmp_path / "in.avi", "mpeg2video", g="5", bf="0"), range(5, 10))
+    told = r"5 of 20 frames .* damaged\): 15 were written, and those after them count as earlier ones"
+    with pytest.warns(UserWarning, match=told):
+        done = zj.undistort_video(path, tmp_path / "out.mkv", lens=lens(), focal=20.0)
+    assert (done.frames, done.lost) == (15, 5)
+
+
 def box(name, content):
     """A box of MP4 or MOV."""
     return struct.pack(">I4s", 8 + len(content), name) + content

@@ -45,6 +45,34 @@ def test_columns_in_any_order_rows_interleaved_frames_numbered_freely(tmp_path):
     np.testing.assert_array_equal(lines.to_ragged()[1], [[1, 1], [2, 2], [3, 4]])
 
 
+def bent(y, first=0, last=600):
+    x = np.arange(first, last, 10.0)
+    return np.stack([x, y + 5e-5 * (x - 320) ** 2], axis=1)  # by 5 px
+
+
+@pytest.mark.parametrize(
+    ("parts", "two"),
+    [
+        ([(4, bent(50)), (5, bent(200)), (4, bent(100))], True),
+        ([(4, bent(50)), (5, bent(200)), (4, bent(50)[:, ::-1] * 0.7)], True),
+        ([(4, bent(50, 0, 300)), (5, bent(200)), (4, bent(50, 300))], False),
+        ([(4, bent(50, 0, 100)), (5, bent(200)), (4, bent(50, 500))], False),
+        (
+            [(4 + i % 2, [p]) for pair in zip(bent(50), bent(90), strict=True) for i, p in enumerate(pair)],
+            False,
+        ),
+        ([(4, bent(50)), (4, bent(60))], False),  # nothing tells that another one begins
+    ],
+)
+def test_a_number_of_two_lines_is_told(parts, two, tmp_path, recwarn):
+    """They were one line without a word."""
+    rows = [f"7,{number},{x:.2f},{y:.2f}" for number, points in parts for x, y in points]
+    path = write(tmp_path / "lines.csv", "\n".join(["frame,line,x,y", *rows]))
+    read_lines_csv(path, image_size=SIZE, focal=35.0)
+    told = "line 4 of frame 7, in parts from the rows 2 and 122 on, do not lie on one line. If"
+    assert [told in str(one.message) for one in recwarn] == [True] * two
+
+
 def test_focal_lengths_as_a_sequence_count_frames_from_zero(tmp_path):
     rows = [f"{m},0,{i},{i * i}" for m in (0, 1) for i in range(4)]
     path = write(tmp_path / "lines.csv", "\n".join(["frame,line,x,y", *rows]))

@@ -45,6 +45,30 @@ def test_a_file_with_wrong_ones_is_refused(change, tmp_path):
         zj.load_lens(path)
 
 
+def test_entries_that_are_not_known_are_told(tmp_path):
+    """They were gone without a word when the lens was saved again."""
+    path = tmp_path / "lens.json"
+    lens().save(path)
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content | {"camera": {"sensor": 36}, "zoom": content["zoom"] | {"note": 1}}))
+    with pytest.warns(
+        UserWarning, match=r"lens\.json has entries .* not know: camera, zoom\.note\. They do"
+    ):
+        assert zj.load_lens(path).about == {}
+
+
+@pytest.mark.parametrize("name", ["crop_factor", "digital_zoom", "width_of_focal_px"])
+@pytest.mark.parametrize("value", ["1.5", "", 0, -1.5])
+def test_what_is_computed_with_must_be_a_positive_number(name, value, tmp_path):
+    path = tmp_path / "lens.json"
+    lens().save(path)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"about": {name: value}}))
+    with pytest.raises(
+        ValueError, match=f"lens.json: Argument about must hold a positive number as {name}"
+    ):
+        zj.load_lens(path)
+
+
 @pytest.mark.parametrize("pitch", [0, -1.0, np.nan, np.inf, True, "0.01", [1, 2]])
 def test_a_wrong_pitch_is_refused(pitch):
     with pytest.raises(ValueError, match="pixel_pitch must be the width of a pixel"):

@@ -190,6 +190,16 @@ def test_points_beyond_the_fold_have_no_corrected_position(folding):
     np.testing.assert_allclose(jax.grad(total)(d.coefficients), alone, rtol=1e-12)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_points_so_far_away_that_powers_overflow_have_no_inverse(dtype):
+    d = distortion([0.1, 0.02], dtype)
+    far = np.full(2, np.sqrt(np.finfo(dtype).max) * SCALE, dtype)
+    for points in (far, jnp.asarray(far)):
+        assert np.isnan(d.distort(points)).all()
+        assert not d.has_inverse(points)
+    assert not np.asarray(jax.jacrev(d.distort)(jnp.asarray(far))).any()
+
+
 def test_points_that_are_not_finite_have_no_inverse(quadratic):
     points = jnp.array([[jnp.nan, 0.0], [jnp.inf, 0.0]])
     assert not quadratic.has_inverse(points).any()

@@ -7,6 +7,21 @@ from zoomjax import scenes
 
 FOCAL = np.array([24.0, 50.0])
 
+
+def seeded(seed):
+    """Calls that take a seed, each with this one."""
+    return {
+        "motion_lines": lambda lens: scenes.motion_lines(lens, FOCAL, seed=seed),
+        "broadcast_lines": lambda lens: scenes.broadcast_lines(lens, FOCAL, seed=seed),
+        "board_lines": lambda lens: scenes.board_lines(lens, FOCAL, seed=seed),
+        "board_photo": lambda lens: scenes.board_photo(lens, 24.0, noise=0, seed=seed),
+        "leaves": lambda lens: scenes.leaves((64, 48), seed=seed),
+        "pan_and_zoom": lambda lens: scenes.pan_and_zoom(lens, 3, seed=seed),
+        "motion_tracks": lambda lens: scenes.motion_tracks(lens, *scenes.pan_and_zoom(lens, 3), seed=seed),
+        "motion_clip": lambda lens: scenes.motion_clip(lens, *scenes.pan_and_zoom(lens, 3), seed=seed),
+    }
+
+
 WRONG = {
     "motion_lines spacing 0": (lambda lens: scenes.motion_lines(lens, FOCAL, spacing=0), "spacing"),
     "motion_lines spacing -5": (lambda lens: scenes.motion_lines(lens, FOCAL, spacing=-5), "spacing"),
@@ -39,6 +54,27 @@ WRONG = {
         lambda lens: scenes.motion_clip(lens, *scenes.pan_and_zoom(lens, 3), moving=0.9),
         "moving",
     ),
+    "motion_lines noise True": (lambda lens: scenes.motion_lines(lens, FOCAL, noise=True), "noise"),
+    "motion_lines spacing np.True_": (
+        lambda lens: scenes.motion_lines(lens, FOCAL, spacing=np.True_),
+        "spacing",
+    ),
+    "board_photo blur True": (lambda lens: scenes.board_photo(lens, 24.0, blur=True), "blur"),
+    "board_photo levels": (lambda lens: scenes.board_photo(lens, 24.0, levels=(False, 215)), "levels"),
+    "pan_and_zoom tilt": (lambda lens: scenes.pan_and_zoom(lens, 3, tilt=True), "tilt"),
+    "motion_tracks pupil": (
+        lambda lens: scenes.motion_tracks(lens, *scenes.pan_and_zoom(lens, 3), pupil=True),
+        "pupil",
+    ),
+    "motion_clip density": (
+        lambda lens: scenes.motion_clip(lens, *scenes.pan_and_zoom(lens, 3), density=True),
+        "density",
+    ),
+    **{
+        f"{name} seed {seed!r}": (call, "seed")
+        for seed in (-1, 1.5, "1", True)
+        for name, call in seeded(seed).items()
+    },
 }
 
 

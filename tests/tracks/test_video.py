@@ -171,6 +171,19 @@ def test_repeated_frames_break_nothing(plain, tmp_path):
     assert np.mean(np.asarray(tracks.mask).sum(1)) > 0.8 * np.mean(np.asarray(once.mask).sum(1))
 
 
+def test_a_clip_that_is_joined_to_its_copy_is_told(plain, tmp_path):
+    """It counted as twice as many frames, which made standard deviations smaller."""
+    frames = plain[1][:8]
+    told = r"8 of 16 frames show to the last bit what earlier ones do.* leave them out"
+    with pytest.warns(UserWarning, match=f"In argument frames {told}"):
+        track_frames([*frames, *frames])
+    path = write_frames(tmp_path / "in.mkv", [*frames, *frames], encoder="ffv1")
+    with pytest.warns(UserWarning, match=rf"in\.mkv {told}"):
+        track_video(path)
+    track_frames([*frames, *[np.zeros_like(frames[0])] * 3, frames[0]])  # one alone may come again
+    track_frames([image for image in frames for _ in range(2)])  # as conversions of the rate repeat them
+
+
 def test_fades_and_black_frames_may_have_no_tracks(plain):
     fade = np.concatenate([np.linspace(1, 0, 6), np.zeros(3), np.linspace(0, 1, 6)])
     frames = [(share * frame).astype(np.uint8) for share, frame in zip(fade, plain[1], strict=False)]

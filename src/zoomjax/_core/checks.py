@@ -50,7 +50,7 @@ def check_between(low: float | int, high: float | int, **values: Any) -> None:
 
 def _is_finite(value: Any) -> bool:
     try:
-        return not isinstance(value, str | bytes) and math.isfinite(value)
+        return not isinstance(value, str | bytes | bool | np.bool_) and math.isfinite(value)
     except TypeError:
         return False
 

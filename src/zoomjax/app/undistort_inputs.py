@@ -25,6 +25,9 @@ _TARGETS = {
 }
 """Suffixes of the results of files whose format can only be read."""
 
+_OF_CALIBRATION = ("exif", "board", "plane", "pitch", "same", "motion")
+"""Sources of focal lengths that ``zoomjax calibrate`` knows by name, and a correction does not."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Found:
@@ -61,7 +64,8 @@ def find_inputs(inputs: Sequence[Path], output: Path) -> Found:
     named = _distinct([(path, names[path]) for path in [*photos, *videos]])
     notes = [twice(again)] if again else []
     used = SUFFIXES if photos else VIDEO_SUFFIXES
-    notes += filter(None, (left_out(folder, used) for folder in inputs if folder.is_dir()))
+    folders, _ = once([path for path in inputs if path.is_dir()])
+    notes += filter(None, (left_out(folder, used) for folder in folders))
     return Found(named[: len(photos)], named[len(photos) :], refused, tuple(notes))
 
 
@@ -203,6 +207,12 @@ def focal_number(text: str) -> float | None:
     """
     number = plain_number(text)
     there = text.strip() and Path(text).exists()  # an empty path is the present folder
+    if text in _OF_CALIBRATION and not there:
+        raise ValueError(
+            f"Argument focal must be a positive number or a CSV file, but it is {text!r}, by which a "
+            "calibration finds focal lengths. Leave it out for those in the EXIF data of photos, and for a "
+            "lens of one zoom whose focal length is not known."
+        )
     if number is None and not there and not text.lower().endswith(".csv"):
         raise ValueError(
             "Argument focal must be a positive number, with a decimal point, or a CSV file, "

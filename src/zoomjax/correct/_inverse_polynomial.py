@@ -29,6 +29,9 @@ _TRIALS = ((8, 0), (16, 2))
 photographic lenses (benchmarks/results/correct.md has its error). Near a fold the inverse has a
 square-root singularity that no polynomial follows: there the steps help."""
 
+_MOST = float(np.finfo(np.float32).max) ** 0.5
+"""Coefficients beyond which their products overflow in float32, so that nothing is seen."""
+
 
 @dataclasses.dataclass(frozen=True)
 class RadialInverse:
@@ -105,11 +108,19 @@ def fold_radius(distortion: Distortion) -> float:
     `Distortion.monotone_radius` is for tracing, in JAX's precision and on its device. Here eigenvalues from
     NumPy do: in float64 whatever JAX's setting, with nothing to compile, once for each frame of a video.
     (For radial models only.)
+
+    Raises:
+        ValueError: coefficients are not finite, or so large that powers of them overflow in float32.
     """
-    distortion_model = distortion.distortion_model
+    distortion_model, k = distortion.distortion_model, np.asarray(distortion.coefficients, float)
+    if not (abs(k) <= _MOST).all():
+        raise ValueError(
+            f"No image can be corrected with coefficients of {k.tolist()}. Check the focal length: it must "
+            "be near those that the lens was fitted to, in the lens's unit."
+        )
     if not isinstance(distortion_model, AbstractRadial):
         return float(distortion.monotone_radius)
-    return float(distortion.scale) * _fold(distortion_model, np.asarray(distortion.coefficients, float))
+    return float(distortion.scale) * _fold(distortion_model, k)
 
 
 def _horner(powers, x):

@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
+from .._core.checks import real_numbers
+
 INTERPOLATION = {
     "nearest": cv2.INTER_NEAREST,
     "linear": cv2.INTER_LINEAR,
@@ -162,7 +164,10 @@ def border_values(value: float | int | Sequence[float | int], channels: int, dty
     Raises:
         ValueError: there are neither one nor as many as channels, or the dtype cannot hold them.
     """
-    given = np.atleast_1d(np.asarray(value, np.float64))
+    if dtype.kind == "b" and isinstance(value, bool | np.bool_):
+        value = int(value)
+    numbers = real_numbers(value)
+    given = np.empty(0) if numbers is None else np.atleast_1d(numbers).astype(np.float64)
     if given.ndim != 1 or given.size not in (1, channels):
         raise ValueError(
             f"Argument border_value must be one number, or one for each of the {channels} channels, "

@@ -26,6 +26,7 @@ from ..io.video_reader import (
     Report,
     decoded_items,
     frames_expected,
+    frames_reached,
     frames_shown,
     numbered,
     opened_video,
@@ -200,12 +201,14 @@ def _convert(
                     items, part, target, input_, video, how.encoder, how.options, along, report, progress
                 )
         report.announced = frames_expected(input_, video, report)
-    missing = report.announced - report.written if report.announced else 0
-    lost = max(report.corrupt + report.skipped, missing)
+    lost = max(report.corrupt + report.skipped, report.announced - report.written)
     if lost > report.skipped:
+        at_end = frames_reached(report) < report.announced and not report.left
+        why = "the file ends early, or is damaged at its end" if at_end else "their data are damaged"
+        later = ", and those after them count as earlier ones" if report.left else ""
         warnings.warn(
             f"{lost} of {max(report.announced, report.written)} frames of {os.fspath(source)} cannot "
-            f"be decoded ({report.error or 'the file ends early'}): {report.written} were written.",
+            f"be decoded ({report.error or why}): {report.written} were written{later}.",
             stacklevel=3,
         )
     else:

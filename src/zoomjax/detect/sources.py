@@ -121,10 +121,11 @@ def find_photos(inputs: Iterable[str | os.PathLike[str]]) -> list[Source]:
             or pictures in formats that are not read; they are left out.
     """
     paths: list[Path] = []
+    folders: list[Path] = []
     for given in inputs:
         paths += _expanded(os.fspath(given))
-    paths, again = once(paths)
-    folders = (given for given in map(Path, inputs) if given.is_dir())
+        folders += [Path(given)] * Path(given).is_dir()
+    (paths, again), (folders, _) = once(paths), once(folders)
     for note in (*([twice(again)] if again else []), *filter(None, map(left_out, folders))):
         warnings.warn(note, stacklevel=2)
     return [Source(name, path) for name, path in zip(_names(paths), paths, strict=True)]
@@ -246,8 +247,8 @@ def video_frames(
             not positive.
 
     Warns:
-        UserWarning: the video ends early, being cut off or damaged; the frames before that are used. Or the
-            track goes on after the video's end.
+        UserWarning: the video ends early, being cut off or damaged; the frames before that are used. Frames
+            on the way are damaged. Or the track goes on after the video's end.
     """
     from ..io.video_reader import decode_video
 
@@ -259,8 +260,9 @@ def video_frames(
         # From the first to the last; where not even the length is known, the first ones.
         there = announced or number
         wanted = set(np.linspace(0, there - 1, min(number, there)).round().astype(int).tolist())
-        last, time, some = -1, 0.0, False
+        last, time, some, decoded = -1, 0.0, False, 0
         for last, time, image in frames:
+            decoded += 1
             if last not in wanted:
                 continue
             at = focal.at(last, time) if isinstance(focal, FocalTrack) else float(focal)
@@ -272,6 +274,12 @@ def video_frames(
             raise ValueError(
                 f"Cannot read {os.fspath(path)}: of {announced} frames none of the {len(wanted)} wanted "
                 "can be decoded. It is cut off or damaged."
+            )
+        if damaged := last + 1 - decoded:
+            warnings.warn(
+                f"{damaged} of {last + 1} frames of {os.fspath(path)} cannot be decoded, as their data are "
+                "damaged. The others are used.",
+                stacklevel=2,
             )
         if last + 1 < 0.98 * announced - 2:  # lengths are rounded
             warnings.warn(

@@ -1,5 +1,6 @@
 """Checks of the arguments of `write` and `read`, before a file is looked at."""
 
+import dataclasses
 import math
 import warnings
 from collections import Counter
@@ -7,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from .._core.checks import real_numbers
+from .._core.checks import real_numbers, warn_caller
 from ..io.focal_track import FocalTrack
-from ..models.about import RELATIVE
+from ..models.about import RELATIVE, WIDTH_OF_FOCALS
 from ..models.brown_conrady import BrownConrady
 from ..models.distortion_model import AbstractDistortionModel, checked_terms
 from ..models.division import Division
@@ -49,6 +50,34 @@ def warn_of_relative(lens: ZoomLens) -> None:
             "what is written. Calibrate again with a known focal length if their scale matters.",
             stacklevel=4,
         )
+
+
+def labelled(lens: ZoomLens, focal: Any) -> ZoomLens:
+    """A lens whose focal length nobody knew, with the one that is told now."""
+    told = () if focal is None else positives("focal", focal)
+    if len(told) != 1:
+        raise ValueError(
+            "Argument focal must be given, the one focal length of the lens: its photo did not have it."
+        )
+    about = {name: fact for name, fact in lens.about.items() if name not in ("focal", WIDTH_OF_FOCALS)}
+    return dataclasses.replace(lens, focal_range=np.full(2, told[0]), about=about)
+
+
+_SAME_PITCH = 0.01
+"""Share by which widths of a pixel may differ and count as one: they are written with a few digits."""
+
+
+def pitch_of(lens: ZoomLens, given: Any) -> float | None:
+    """The width of a pixel that is given, mm, or the lens's own; a contradiction is told."""
+    if given is None:
+        return lens.pixel_pitch
+    pitch, own = positive("pixel_pitch", given), lens.pixel_pitch
+    if own is not None and max(pitch, own) > (1 + _SAME_PITCH) * min(pitch, own):
+        warn_caller(
+            f"The pixel pitch of this lens is {own:.4g} mm, and {pitch:.4g} mm is given: leave argument "
+            "pixel_pitch out if the lens is right."
+        )
+    return pitch
 
 
 def positive(name: str, value: Any) -> float:

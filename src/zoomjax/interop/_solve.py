@@ -38,6 +38,9 @@ _IDLE, _GAIN, _ENOUGH = 2, 0.95, 17
 _APART = 1.001
 """Ratio of focal lengths that are told apart."""
 
+_WRITTEN = 1 + 2e-8
+"""Ratio of focal lengths that differ where they are written with nine digits."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Solution:
@@ -57,7 +60,7 @@ def solve(fmt: NodeFormat, job: Export) -> Solution:
     """The nodes of a file, by the best of the format's formulas: the first within the tolerance."""
     low, high = np.asarray(job.lens.focal_range, float) if job.focal is None else (0, 0)
     focal = np.array(job.focal) if job.focal is not None else np.geomspace(low, high, _FEW)
-    if low == high and job.focal is None:
+    if high <= low * _WRITTEN and job.focal is None:
         focal = focal[:1]
     maker = min(_makers(fmt, focal, job), key=lambda made: made[1])[0]
     if not isinstance(fmt, InterpolatedFormat) or len(focal) == 1:
@@ -87,9 +90,14 @@ def _places(fmt: InterpolatedFormat, lens: ZoomLens, low: float, high: float) ->
         own = np.asarray(zoom.knots, float)
         own = 1 / own if zoom.inverse else own
         own = np.unique([low, *own[(own > low * _APART) & (own < high / _APART)], high])
+        for place in range(1, len(own) - 1):
+            own[place] = max(own[place], own[place - 1] * _WRITTEN)
         while len(own) <= most:
             yield own
-            own = np.sort(np.concatenate([own, (own[1:] + own[:-1]) / 2]))
+            wide = own[1:] > own[:-1] * _APART
+            if not wide.any():
+                break
+            own = np.sort(np.concatenate([own, (own[1:] + own[:-1])[wide] / 2]))
     for number in _NUMBERS:
         yield fmt.spread(low, high, number)
 

@@ -28,7 +28,7 @@ from .._core.text import plain
 from ..io.equipment import FILM
 from ._forms import AbstractForm, Form, minimax
 from .base import Contents, Export, Import, InterpolatedFormat, Node, not_alike, refuse_others
-from .radial_table import LARGER, SPARE, RadialTable
+from .radial_table import LARGER, SPARE, RadialTable, pitch_by_crop
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,6 +183,8 @@ class Lensfun(InterpolatedFormat):
                 f"it was calibrated on a sensor of crop factor {crop:g}, and images of crop factor "
                 f"{job.crop:g} show more than that: it has no data there"
             )
+        if job.crop is not None:
+            pitch_by_crop(job.crop, size)  # which is refused; the file's own is told of
         aspect = float(Fraction(*map(float_fraction, lens.findtext("aspect-ratio", "3:2").split(":"))))
         unit = (
             math.hypot(*(side - 1 for side in size)) / 2 * (job.crop or crop) / crop / math.hypot(aspect, 1)

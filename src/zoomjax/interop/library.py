@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.checks import checked_size
-from ..io.equipment import FILM
 from ..models.lens import ZoomLens
 from .database import LensTable, one_named, version
-from .radial_table import LARGER, MODELS, SPARE, RadialTable, TableFit, zoom_of_table
+from .radial_table import LARGER, MODELS, SPARE, RadialTable, TableFit, pitch_by_crop, zoom_of_table
 
 
 def library_lens(
@@ -43,7 +42,7 @@ def library_lens(
     Raises:
         ImportError: lensfunpy is not installed.
         ValueError: no lens has this name, or several have; its tables are for smaller sensors only; or
-            the model asked for is not invertible.
+            the model asked for is not invertible; or no camera has images of this size and crop factor.
 
     Example:
         >>> lens = library_lens("nikkor 18-200mm f/3.5-5.6g if-ed ii", image_size=(4288, 2848))
@@ -103,7 +102,7 @@ def _lens(
         centre=jnp.asarray(centre),
         focal_range=jnp.asarray(_range(table)),
         image_size=size,
-        pixel_pitch=FILM / (crop * math.hypot(*size)),
+        pixel_pitch=pitch_by_crop(crop, size),
         about={
             "lens": table.name,
             "maker": table.maker,

@@ -21,6 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .._core.pixels import pitch_problem
+from ..io.equipment import FILM
 from ..models.invertibility import certificate_of
 from ..models.smooth import SmoothZoom
 from ..models.tables import TableZoom
@@ -52,6 +54,15 @@ _BEYOND = 3
 
 _KNOTS = 64
 """Certificates are compiled for multiples of so many."""
+
+
+def pitch_by_crop(crop: float, size: tuple[int, int]) -> float:
+    """mm from one pixel to the next in images of a crop factor; ValueError where no camera has them."""
+    pitch = FILM / (crop * math.hypot(*size))
+    if (problem := pitch_problem(pitch, size)) is not None:
+        width, height = size
+        raise ValueError(f"No images of {width} x {height} px have a crop factor of {crop:g}: {problem}.")
+    return pitch
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,13 +15,22 @@ from .._core.checks import checked_size
 from .._core.files import refuse_existing, whole_file, whole_folder
 from .._core.pixels import check_pitch
 from ..io.focal_track import FocalTrack
-from ..models.about import UNKNOWN, WIDTH_OF_FOCALS
+from ..models.about import UNKNOWN
 from ..models.distortion_model import AbstractDistortionModel
 from ..models.lens import ZoomLens
 from ..models.requirements import check
 from ..models.zoom import AbstractLinearZoom
 from ._lens import UnsuitedError, lens_of
-from ._options import check_model, check_options, focal_lengths, positive, positives, warn_of_relative
+from ._options import (
+    check_model,
+    check_options,
+    focal_lengths,
+    labelled,
+    pitch_of,
+    positive,
+    positives,
+    warn_of_relative,
+)
 from ._solve import Solution, error_written, solve
 from .base import (
     CONVENTION,
@@ -122,6 +131,9 @@ def write(
     Returns:
         How far what was written is from the lens.
 
+    Warns:
+        UserWarning: `pixel_pitch` contradicts the lens's own.
+
     Raises:
         OSError: the file cannot be written; nothing is left of it.
         ValueError: an argument is missing, wrong or without effect on the format, or the lens folds over
@@ -140,12 +152,12 @@ def write(
     check_options(fmt, {"tolerance": tolerance, "convention": convention})
     check("interop.write", zoom=lens.zoom)
     if lens.about.get("focal") == UNKNOWN:
-        lens = _labelled(lens, focal)
+        lens = labelled(lens, focal)
     warn_of_relative(lens)
     job = Export(
         lens,
         *focal_lengths(fmt, lens, focal, track),
-        pixel_pitch=lens.pixel_pitch if pixel_pitch is None else positive("pixel_pitch", pixel_pitch),
+        pixel_pitch=pitch_of(lens, pixel_pitch),
         tolerance=TOLERANCE if tolerance is None else positive("tolerance", tolerance),
         convention=convention or CONVENTION,
     )
@@ -181,17 +193,6 @@ def write(
         (*fmt.notes(found.nodes, job), *_shortfall(fmt, found, job), *others),
         files,
     )
-
-
-def _labelled(lens: ZoomLens, focal: Any) -> ZoomLens:
-    """A lens whose focal length nobody knew, with the one that is told now."""
-    told = () if focal is None else positives("focal", focal)
-    if len(told) != 1:
-        raise ValueError(
-            "Argument focal must be given, the one focal length of the lens: its photo did not have it."
-        )
-    about = {name: fact for name, fact in lens.about.items() if name not in ("focal", WIDTH_OF_FOCALS)}
-    return dataclasses.replace(lens, focal_range=np.full(2, told[0]), about=about)
 
 
 def _write_nodes(fmt: NodeFormat, nodes: list[Node], job: Export, files: list[Path]) -> float:

@@ -13,6 +13,7 @@ from .jpeg import with_segments
 from .metadata import NAMES, Metadata, missing
 from .png import with_chunks
 from .tiff import encode_tiff, is_big
+from .webp import encode_transparent_webp
 
 FORMATS = {  # suffix: bits a sample, and numbers of channels, that the format holds
     **dict.fromkeys([".jpg", ".jpeg"], ((8,), (1, 3))),
@@ -113,6 +114,8 @@ def _chunks_lost(kind: str, metadata: Metadata) -> list[str]:
 
 
 def _webp(image: np.ndarray, metadata: Metadata) -> bytes:
+    if image.shape[2] == 4:
+        return encode_transparent_webp(image, metadata)
     known = (
         (cv2.IMAGE_METADATA_EXIF, metadata.exif),
         (cv2.IMAGE_METADATA_XMP, metadata.xmp),

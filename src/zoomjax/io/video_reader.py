@@ -23,6 +23,9 @@ from .video_hdr import side_data
 _MOST_ERRORS = 1000
 """Of one file: a demuxer may fail for ever."""
 
+_HOLE = 1.5
+"""Steps between frames, in units of the one before, from which some may be missing."""
+
 INTERLACED = (
     "The video is interlaced: each frame holds two moments in alternate rows, which are taken for one. "
     "Deinterlace it first."
@@ -64,13 +67,15 @@ def decode_video(
 @dataclasses.dataclass
 class Report:
     """What happened on the way, in threads: counts of frames, where packets end, s, and what the first
-    frame carries. Those that are skipped are before the first that can be decoded alone."""
+    frame carries. Those that are skipped are before the first that can be decoded alone, and those that are
+    left have a step in an AVI file and no picture."""
 
     announced: int
     written: int = 0
     skipped: int = 0
     corrupt: int = 0
     failed: int = 0
+    left: int = 0
     error: str = ""
     side: dict[str, bytes] | None = None
     first: Any = None
@@ -173,6 +178,7 @@ def decoded_items(
         try:
             packet = next(packets, None)
             if packet is None:
+                report.left = len(steps)
                 return
             if packet.pts is not None:
                 end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
@@ -245,17 +251,18 @@ def _is_whole_avi(source: str | os.PathLike[str]) -> bool:
 
 
 def frames_expected(input_: Any, video: Any, report: Report) -> int:
-    """How many frames a file that was read to its end should hold, as far as it tells; 0 if it does not.
+    """How many frames a file that was read to its end should hold, as far as it tells.
 
     AVI also counts chunks without content, which show the last frame again. Matroska tells its length in
     seconds alone, and the length of all is that of the longest stream.
     """
     rate = float(video.average_rate or video.guessed_rate or 25)
+    seen = max(report.written, frames_reached(report)) + report.left
     if report.announced:
         whole = _is_avi(input_) and round(report.reached * rate) >= report.announced
-        return report.written if whole else report.announced
+        return seen if whole else report.announced
     if input_.format.name != "matroska,webm":
-        return 0
+        return seen
     told = video.metadata.get("DURATION")
     try:
         hours, minutes, seconds = (float(part) for part in told.split(":"))
@@ -264,7 +271,12 @@ def frames_expected(input_: Any, video: Any, report: Report) -> int:
         length = (input_.duration or 0) / av.time_base if len(input_.streams) == 1 else 0.0
     missing = length - report.end
     cut_off = missing > 0.02 * length + 1 / rate
-    return report.written + round(missing * rate) if cut_off else 0
+    return seen + round(missing * rate) if cut_off else seen
+
+
+def frames_reached(report: Report) -> int:
+    """How many frames there are up to the last that was decoded, with those that were not."""
+    return report.last[0] + 1 + report.skipped
 
 
 def numbered(
@@ -273,9 +285,11 @@ def numbered(
     """Each frame with its number and time since the first, s, NaN if unknown; other packets as they are.
 
     Frames are counted from the first that can be decoded, where a clip begins between key frames. Once
-    others did not decode, time stamps tell the numbers.
+    others did not decode, time stamps tell the numbers; and after a hole, as decoders leave out frames of
+    damaged data without a word.
     """
     number, first, stamps, fields = 0, None, None, False
+    before, usual = None, math.inf  # time stamp, and the step to it
     for item in items:
         if not isinstance(item, av.VideoFrame):
             yield item, -1, math.nan
@@ -286,9 +300,13 @@ def numbered(
         if item.interlaced_frame and not fields:
             fields = True
             warnings.warn(INTERLACED, stacklevel=2)
-        if report.failed and item.pts is not None:
+        step = math.nan if item.pts is None or before is None else item.pts - before
+        if item.pts is not None and (report.failed or step > _HOLE * usual):
             stamps = _frame_numbers(source) if stamps is None else stamps
-            number = stamps.get(item.pts, number + report.skipped) - report.skipped
+            number = max(number, stamps.get(item.pts, number + report.skipped) - report.skipped)
+        elif step > 0:
+            usual = step
+        before = item.pts
         yield item, number, math.nan if item.time is None else item.time - first
         number += 1
 

@@ -182,6 +182,33 @@ def lost_tags(path: Path, tags: Mapping[str, str]) -> list[str]:
     return [f"the tag{'s' * (len(lost) > 1)} {', '.join(map(plain, lost))}"] if lost else []
 
 
+def lost_of_tracks(path: Path, sources: Sequence[Any]) -> list[str]:
+    """What sound and subtitles of a finished file no longer tell of themselves, an entry for each."""
+    lost = []
+    with open_container(path) as made:
+        for kind in ("audio", "subtitle"):
+            before = [stream for stream in sources if stream.type == kind]
+            after = [stream for stream in made.streams if stream.type == kind]
+            for old, new in zip(before, after, strict=False):
+                names = [
+                    name for name in ("language", "title") if _tells(old, name) and not _tells(new, name)
+                ]
+                marks = [
+                    mark.name
+                    for mark in av.stream.Disposition
+                    if old.disposition & mark and not new.disposition & mark
+                ]
+                if len(before) == 1 and "default" in marks:  # with or without it is the one that is played
+                    marks.remove("default")
+                names += [f"mark {name}" for name in marks if name]
+                lost += [f"the {' and the '.join(names)} of the {_name(old)}"] if names else []
+    return lost
+
+
+def _tells(stream: Any, name: str) -> bool:
+    return stream.metadata.get(name, "und") not in ("", "und")
+
+
 def starts(output: Any, named: Path, copied: Sequence[Any]) -> None:
     """Write the head of a container.
 

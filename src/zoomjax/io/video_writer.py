@@ -14,7 +14,7 @@ import numpy as np
 
 from .pyav import av, open_container
 from .video_hdr import with_hdr
-from .video_streams import CONTAINER, Carried, lost_tags, mux, put, starts, tag_options
+from .video_streams import CONTAINER, Carried, lost_of_tracks, lost_tags, mux, put, starts, tag_options
 
 _ENCODER = {
     "h264": "libx264",
@@ -133,7 +133,7 @@ class FrameWriter(contextlib.AbstractContextManager):
         self._last: int | None = None
         self._moved = 0
         self._encodes = self._limits = False
-        self._path, self._like = path, like
+        self._path, self._like, self._along = path, like, along.streams
         self._tags = {key: value for key, value in input_.metadata.items() if key.lower() not in _OWN_TAGS}
         container = CONTAINER[named.suffix.lower()]
         self._output = open_container(
@@ -216,7 +216,7 @@ class FrameWriter(contextlib.AbstractContextManager):
             with contextlib.nullcontext() if kind is None else contextlib.suppress(Exception):
                 self._output.close()
         if kind is None:
-            self.not_kept += lost_tags(self._path, self._tags)
+            self.not_kept += [*lost_tags(self._path, self._tags), *lost_of_tracks(self._path, self._along)]
             if self._like.orientation is not None and _is_upright(self._path):
                 self.not_kept.append("the orientation: players show it as it is stored")
 
@@ -283,6 +283,7 @@ class FrameWriter(contextlib.AbstractContextManager):
             context.codec_tag = "hvc1"  # the tag that Apple's players ask for
         tags = {k: v for k, v in source.metadata.items() if k.lower() not in (*_OWN_TAGS, _ALPHA_TAG)}
         stream.metadata.update(tags)
+        stream.disposition = source.disposition
         return stream
 
     def _tells_range(self, encoder: str) -> bool:

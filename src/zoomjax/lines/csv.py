@@ -12,7 +12,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from .._core.arguments import kinds_checked
+from .._core.checks import warn_caller
 from .._core.files import whole_file
+from .._core.text import listed
 from ..io.text_table import read_text_table
 from .lines import Lines
 
@@ -33,6 +35,9 @@ def read_lines_csv(
         focal: focal length by frame number, if the file has no column ``focal``; a sequence counts
             frames from 0, a number is that of all frames.
         focal_unit: "mm" or "px".
+
+    Warns:
+        UserWarning: the points of a line come in parts that do not lie on one.
 
     Raises:
         ValueError: a column is missing, a value is not a number, a frame has no focal length, focal lengths
@@ -81,7 +86,9 @@ def read_lines_csv(
 
     order = np.lexsort((line, index))  # stable: points keep the order of their rows
     starts = np.flatnonzero(np.diff(index[order]) | np.diff(line[order])) + 1
-    points = np.stack([columns["x"], columns["y"]], axis=1)[order]
+    points = np.stack([columns["x"], columns["y"]], axis=1)
+    _warn_of_two_in_one(frame, line, points, table.rows)
+    points = points[order]
     try:
         return Lines.from_ragged(
             np.split(points, starts),
@@ -92,6 +99,53 @@ def read_lines_csv(
         )
     except ValueError as error:
         raise table.error(str(error)) from error
+
+
+_OFF, _BENT = 3.0, 4.0
+"""How far parts of two lines are off a common one, at least: px, and in units of what the longest part is,
+if it were bent like this over the whole length."""
+
+_NOISE = 0.1
+"""px: parts are no straighter than that."""
+
+
+def _warn_of_two_in_one(frame, line, points, rows) -> None:
+    """Warn of a number that seems to stand for two lines of a frame, whose rows come apart."""
+    begins = np.flatnonzero(np.diff(frame, prepend=frame[:1] - 1) | np.diff(line, prepend=line[:1] - 1))
+    parts = np.split(points, begins[1:])
+    names = list(zip(frame[begins].tolist(), line[begins].tolist(), strict=True))
+    if len(set(names)) == len(names):
+        return
+    told: dict[tuple[int, int], list[int]] = {}
+    for place, name in enumerate(names):
+        told.setdefault(name, []).append(place)
+    bad = [name for name, places in told.items() if _are_two([parts[place] for place in places])]
+    if bad:
+        (one, number), more = bad[0], f", and {len(bad) - 1} more are like it" if len(bad) > 1 else ""
+        where = listed((str(rows[begins[place]]) for place in told[bad[0]]), 3, " and ")
+        warn_caller(
+            f"The points of line {number} of frame {one}, in parts from the rows {where} on, do not lie on "
+            f"one line{more}. If they are several lines, give each a number of its own."
+        )
+
+
+def _are_two(parts: list[np.ndarray]) -> bool:
+    """Whether parts of three points or more are each straighter than all of them together can be."""
+    if len(parts) < 2 or min(map(len, parts)) < 3:
+        return False
+    (off, length), (own, longest) = (
+        _bend(np.concatenate(parts)),
+        max(map(_bend, parts), key=lambda one: one[1]),
+    )
+    bent = max(own, _NOISE) * (length / max(longest, _NOISE)) ** 2
+    return off > max(_OFF, _BENT * bent)
+
+
+def _bend(points: np.ndarray) -> tuple[float, float]:
+    """How far points are from their line, at most, and how long it is, px."""
+    away = points - points.mean(axis=0)
+    along, across = (away @ np.linalg.svd(away, full_matrices=False)[2].T).T
+    return float(np.abs(across).max()), float(np.ptp(along))
 
 
 @kinds_checked

@@ -10,6 +10,9 @@ USUAL = ("camera", "lens", "crop_factor", "digital_zoom", "source", "focal")
 WIDTH_OF_FOCALS = "width_of_focal_px"
 """Where focal lengths in px are of images of another size than the lens's, the width of those, px."""
 
+_POSITIVE = ("crop_factor", "digital_zoom", WIDTH_OF_FOCALS)
+"""Names of what is computed with: words there would not count."""
+
 UNKNOWN = "not known"
 """What ``about["focal"]`` says of a lens of one focal length that nobody knows: its number is arbitrary."""
 
@@ -56,12 +59,10 @@ def checked_about(value: Any) -> About:
         raise ValueError(
             f"Argument about must be a dictionary of words and finite numbers by name, but it is {value!r}."
         )
-    if WIDTH_OF_FOCALS in value:
-        width = value[WIDTH_OF_FOCALS]
-        if isinstance(width, str) or width <= 0:
-            raise ValueError(
-                f"Argument about must hold a positive number as {WIDTH_OF_FOCALS}, but it is {width!r}."
-            )
+    for name in _POSITIVE:
+        number = value.get(name, 1)
+        if isinstance(number, str) or number <= 0:
+            raise ValueError(f"Argument about must hold a positive number as {name}, but it is {number!r}.")
     return About(value)
 
 

@@ -92,8 +92,9 @@ class Distortion(eqx.Module):
         """Distort corrected `points`: the exact inverse of `undistort`.
 
         Iterated until the residual is at the level of rounding errors. Where there is no inverse within the
-        monotone radius the result is NaN, its derivatives are zero, and `has_inverse` is False. Elsewhere
-        derivatives are given by the implicit function theorem.
+        monotone radius the result is NaN, its derivatives are zero, and `has_inverse` is False; so it is of
+        points so far away that powers of radii overflow. Elsewhere derivatives are given by the implicit
+        function theorem.
         """
         return self._mapped("distort", points)
 

@@ -37,6 +37,7 @@ from .registry import (
     distortion_model_name,
     once,
     refuse_misspelled,
+    warn_of_unknown,
     zoom_from,
 )
 from .zoom import AbstractFocusZoom, AbstractZoom
@@ -348,6 +349,9 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
 
     User-defined models must be registered first, by the module that defines them (`register_model`).
 
+    Warns:
+        UserWarning: the file has entries that are not known, as of another program; they do not count.
+
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: the file does not describe a lens, or is of a later version; the message names it.
@@ -377,6 +381,7 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
         )
         if not math.isclose(content["scale"], lens.scale, rel_tol=1e-6):
             raise ValueError("its scale is not half the diagonal of its image_size")
+        warn_of_unknown(content, (*_ENTRIES, *_OPTIONAL, "format", "version"), os.fspath(path))
         return lens
     except FileNotFoundError:
         raise

@@ -17,6 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._core.checks import warn_caller
+from .._core.text import listed, plain
 from .brown_conrady import BrownConrady
 from .distortion_model import AbstractDistortionModel
 from .division import Division
@@ -152,6 +154,21 @@ def refuse_misspelled(content: dict[str, Any], known: Iterable[str], optional: I
     for name in content.keys() - {*known, *optional}:
         for meant in difflib.get_close_matches(name.lower(), missing, n=1, cutoff=0.75):
             raise ValueError(f"its {name!r} would not count: {meant!r} is what it is called")
+
+
+def warn_of_unknown(content: dict[str, Any], known: Iterable[str], path: str) -> None:
+    """Warn of entries of a lens file, and of its zoom models, that nothing reads."""
+    found = [name for name in content if name not in known]
+    for part in ("zoom", "shift"):
+        if part in content:
+            model = _class_named(content[part]["model"], _ZOOMS, "zoom model")
+            fields = {*_RESERVED, *(field.name for field in dataclasses.fields(model))}
+            found += [f"{part}.{name}" for name in content[part] if name not in fields]
+    if found:
+        warn_caller(
+            f"{path} has entries that this zoomjax does not know: {plain(listed(found, 5))}. They do not "
+            "count, and are gone when the lens is saved. Words and numbers by name stay in its 'about'."
+        )
 
 
 def described(model: AbstractZoom) -> dict[str, Any]:

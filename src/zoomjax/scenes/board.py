@@ -120,6 +120,7 @@ def board_lines(
     focal = checked_focal(focal).astype(np.asarray(focal).dtype)
     check_above(0, spacing=spacing)
     check_between(0, math.inf, noise=noise, imperfection=imperfection)
+    seed = checked_integer("seed", seed, 0)
     board = StripedBoard.before(lens) if board is None else board
     rng = np.random.default_rng(seed)
     own = np.random.default_rng((seed, 1))  # so that bends leave the noise as it is
@@ -264,6 +265,9 @@ def board_photo(
     check_above(0, focal=focal)
     check_between(0, math.inf, blur=blur, noise=noise)
     check_between(0, 1, vignetting=vignetting)
+    seed = checked_integer("seed", seed, 0)
+    for level in levels:
+        check_between(0, math.inf, levels=level)
     board = StripedBoard.before(lens) if board is None else board
     dtype = lens.centre.dtype
     photo = np.asarray(

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .._core.checks import check_above, check_between, checked_focal
+from .._core.checks import check_above, check_between, checked_focal, checked_integer
 from .._core.types import AnyArray
 from ..focal.pitch import PITCH_LINES
 from ..lines.lines import Lines
@@ -70,7 +70,7 @@ def broadcast_lines(
     focal = checked_focal(focal)
     check_above(0, spacing=spacing)
     check_between(0, math.inf, noise=noise)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(checked_integer("seed", seed, 0))
     dtype = np.asarray(lens.centre).dtype
     points: list[np.ndarray] = []
     frame: list[int] = []

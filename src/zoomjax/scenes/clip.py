@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from .._core.checks import check_between, checked_focal, checked_integer, checked_size
+from .._core.checks import check_above, check_between, checked_focal, checked_integer, checked_size
 from ..correct.sampler import remap
 from ..models.lens import ZoomLens
 from .motion import camera_between
@@ -173,14 +173,16 @@ def motion_clip(
     check_between(0, math.inf, noise=noise)
     check_between(0, 0.6, moving=moving)
     check_between(-1, 1, shutter=shutter)
+    seed = checked_integer("seed", seed, 0)
     texture = leaves(seed=seed) if texture is None else texture
-    density = float(np.max(focal)) if density is None else float(density)
+    density = float(np.max(focal)) if density is None else density
+    check_above(0, density=density)
     return MotionClip(
         lens,
         np.asarray(focal, np.float64),
         np.asarray(rotation, np.float64),
         texture,
-        density,
+        float(density),
         float(noise),
         float(moving),
         float(shutter),
@@ -197,7 +199,7 @@ def leaves(size: tuple[int, int] = (2048, 1024), *, seed: int = 0) -> UInt8[np.n
         size: (width, height) px.
         seed: of everything random.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(checked_integer("seed", seed, 0))
     width, height = size = checked_size(size, "size")
     image = np.full((height, width, 3), 110, np.uint8)
     radius, share = min(size) // 4, 1.5

@@ -56,7 +56,7 @@ def pan_and_zoom(
     t = np.linspace(0, 1, frames)
     begins = np.array([0.0, 0.0, 0.7])
     if seed is not None:
-        begins = np.random.default_rng(seed).uniform(0, 2 * np.pi, 3)
+        begins = np.random.default_rng(checked_integer("seed", seed, 0)).uniform(0, 2 * np.pi, 3)
     # One turn in 150 frames, however many there are.
     zooms, pans, tilts = (2 * np.pi * np.outer([1, 1.3, 2.1], t * max(frames / 150, 1)).T + begins).T
     low, high = np.log(np.asarray(lens.focal_range))
@@ -106,7 +106,8 @@ def motion_tracks(
     check_between(0, math.inf, noise=noise, drift=drift)
     check_between(0, 1, moving=moving)
     check_between(-1, 1, shutter=shutter)
-    rng = np.random.default_rng(seed)
+    check_between(-math.inf, math.inf, pupil=pupil)
+    rng = np.random.default_rng(checked_integer("seed", seed, 0))
     corner = np.array(lens.image_size) - 1
     seen_at = _Seen(lens, camera_between(focal, rotation), float(pupil), float(shutter))
     scene, last, speed, walk = np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2))
@@ -171,7 +172,7 @@ def motion_lines(
     checked_integer("number", number, 1)
     check_above(0, spacing=spacing)
     check_between(0, math.inf, noise=noise)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(checked_integer("seed", seed, 0))
     corner = np.array(lens.image_size) - 1
     points: list[np.ndarray] = []
     for f in focal:

@@ -71,7 +71,7 @@ def find_again(
     looked = set(originals(tracks)[::every].tolist())  # in none twice
     kept: _Kept | None = None
     more: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(checked_integer("seed", seed, 0))
     with decode_video(clip) as (_, items):
         for frame, (_, _, image) in enumerate(items):
             begun = np.flatnonzero((first == frame) & (counts >= _VIEWS))

@@ -9,6 +9,7 @@ Captions and logos stay in their place while the camera moves: such tracks are l
 across a cut. Memory holds two frames and the places of all points, whatever the clip's length.
 """
 
+import hashlib
 import os
 import warnings
 from collections.abc import Callable, Iterable
@@ -24,6 +25,12 @@ from ._fields import Fields
 from ._follow import Follower
 from .repeats import counted_once
 from .tracks import Tracks
+
+_SOME = 8
+"""One pixel of so many in each direction tells frames apart: all have noise, or move."""
+
+_SHARE_AGAIN = 0.1
+"""Of the frames, from which on it is said that they come again: fewer change little."""
 
 _FEWEST = 4
 """Views of a frame that say anything: it has a focal length and three angles."""
@@ -59,7 +66,8 @@ def track_video(
 
     Warns:
         UserWarning: the clip is interlaced, its pixels are not square, it is one of several in its file, or
-            some of its frames do not decode: frames of the tracks are numbered without these.
+            some of its frames do not decode: frames of the tracks are numbered without these. Or many of
+            its frames show what earlier ones do, and would count twice.
     """
     with decode_video(clip) as (announced, items):
         numbers = []
@@ -71,7 +79,7 @@ def track_video(
                 progress(len(numbers), announced)
 
         try:
-            tracks, has_fields = _followed(images(), most, life)
+            tracks, has_fields, again = _followed(images(), most, life)
         except ValueError as error:
             raise ValueError(f"Cannot track points in {os.fspath(clip)}: {error}") from error
     if lost := numbers[-1] + 1 - len(numbers):
@@ -80,6 +88,8 @@ def track_video(
             "frames without them.",
             stacklevel=2,
         )
+    if again:
+        warnings.warn(f"In {os.fspath(clip)} {again}", stacklevel=2)
     if has_fields and not says_interlaced(clip):  # which is warned of
         warnings.warn(INTERLACED, stacklevel=2)
     return tracks
@@ -100,18 +110,20 @@ def track_frames(
             can be followed.
 
     Warns:
-        UserWarning: frames are interlaced.
+        UserWarning: frames are interlaced, or many of them show what earlier ones do.
     """
-    tracks, has_fields = _followed(frames, most, life)
+    tracks, has_fields, again = _followed(frames, most, life)
+    if again:
+        warnings.warn(f"In argument frames {again}", stacklevel=2)
     if has_fields:
         warnings.warn(INTERLACED, stacklevel=2)
     return tracks
 
 
-def _followed(frames, most, life) -> tuple[Tracks, bool]:
-    """The tracks, and whether frames are woven of fields."""
+def _followed(frames, most, life) -> tuple[Tracks, bool, str]:
+    """The tracks, whether frames are woven of fields, and a sentence about those that come again."""
     most, life = checked_integer("most", most, _FEWEST), checked_integer("life", life, 2)
-    follower, fields = None, Fields()
+    follower, fields, seen = None, Fields(), _Seen()
     for image in frames:
         grey = grey_frame(image)
         size = (grey.shape[1], grey.shape[0])
@@ -120,6 +132,7 @@ def _followed(frames, most, life) -> tuple[Tracks, bool]:
             raise ValueError(f"Frames of {follower.size} and of {size} px follow each other.")
         follower.add(grey)
         fields.add(follower.frame, grey, *follower.moves)
+        seen.add(grey)
     number = 0 if follower is None else follower.frame + 1
     if follower is None or number < 2:
         raise ValueError("It has fewer than two frames.")
@@ -130,7 +143,34 @@ def _followed(frames, most, life) -> tuple[Tracks, bool]:
             "what stays in its place."
         )
     tracks = Tracks.from_arrays(track, frame, points, image_size=follower.size, frames=number)
-    return counted_once(tracks), fields.found
+    return counted_once(tracks), fields.found, seen.sentence(number)
+
+
+class _Seen:
+    """Counts frames that show to the last bit what earlier ones do, as where a clip is joined to its copy.
+
+    Those that repeat the one before, and those of one colour, do not count.
+    """
+
+    def __init__(self):
+        self._known: set[bytes] = set()
+        self._last = b""
+        self._again = 0
+
+    def add(self, grey: np.ndarray) -> None:
+        some = np.ascontiguousarray(grey[::_SOME, ::_SOME])
+        shown = hashlib.blake2b(some.tobytes(), digest_size=16).digest()
+        self._again += shown in self._known and shown != self._last and some.min() < some.max()
+        self._known.add(shown)
+        self._last = shown
+
+    def sentence(self, number: int) -> str:
+        if self._again < max(_SHARE_AGAIN * number, 2):
+            return ""
+        return (
+            f"{self._again} of {number} frames show to the last bit what earlier ones do, as where a clip "
+            "is joined to its copy. They count again, as if they were seen anew: leave them out."
+        )
 
 
 def _enough(track, frame, points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
