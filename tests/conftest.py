@@ -21,9 +21,6 @@ from zoomjax._core.programs import use_once
 
 SEED = 2012
 
-LAST_BITS = 0 if jax.default_backend() == "cpu" else 1e-13
-"""Of numbers that are to be the same. A GPU adds up lines in any order, another one in each run."""
-
 # What the command line compiles, and finds in images, is kept between the tests of all workers, and not
 # beyond them. Workers inherit the folder.
 if "PYTEST_XDIST_WORKER" not in os.environ:
@@ -43,6 +40,9 @@ FLAGS = [
     *(["--xla_cpu_max_isa=AVX"] if platform.machine() in ("x86_64", "AMD64") else []),
 ]
 os.environ.setdefault("XLA_FLAGS", " ".join(FLAGS))
+
+LAST_BITS = 0 if jax.default_backend() == "cpu" else 1e-13
+"""Of numbers that are to be the same. A GPU adds up lines in any order, another one in each run."""
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
