@@ -116,3 +116,19 @@ def test_photos_count_together_or_not_in_both(name):
         other, also = covariance_of(jax.tree.map(np.asarray, known), photos)
         assert (bool(whole), bool(also)) == (True, True)
         np.testing.assert_allclose(other, one, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(3, 5), (5, 5), (70, 5), (1000, 5), (200, 30)])
+def test_the_triangle_of_blocks_is_that_of_all_rows(rows, columns):
+    table = np.random.default_rng(0).normal(size=(rows, 2, columns))
+    found = covariance._triangle(table, np.ones((1, columns)))
+    whole = np.concatenate([table.reshape(-1, columns), np.ones((1, columns))])
+    assert found.shape == (columns, columns)
+    np.testing.assert_allclose(found.T @ found, whole.T @ whole, rtol=1e-12, atol=1e-12)
+
+
+def test_the_covariance_is_where_the_lines_are():
+    other = jax.devices()[-1]
+    lines = jax.device_put(lines_of(0.3), other)
+    fit = zj.fit_zoom(lines)
+    assert fit.covariance.devices() == fit.rms.devices() == {other}

@@ -11,7 +11,10 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.trust._lanes import lanes_of, passed
+from zoomjax.models import AbstractZoom, Model
+from zoomjax.trust import _linear_folds
+from zoomjax.trust._lanes import lanes_of, passed, passed_for_gradient
+from zoomjax.trust._linear_folds import linear_errors
 from zoomjax.trust.comparison import compare, compare_errors
 from zoomjax.trust.cross_validation import (
     _errors_by_fits,
@@ -483,26 +486,68 @@ def test_the_pass_of_several_coefficients_is_that_of_each(lines, metric):
             np.testing.assert_allclose(several[place], one, rtol=1e-12, atol=1e-9 * np.abs(one).max())
 
 
-@pytest.mark.parametrize("metric", ["corrected", "distorted"])
-def test_a_pass_for_the_gradient_alone_is_that_for_all(lines, metric):
-    measured = zj.fit.in_image(lines) if metric == "distorted" else lines
-    lanes = lanes_of(measured, np.zeros(len(lines.frame), int), np.ones(len(lines.frame)), 3)
+def test_a_pass_for_the_gradient_alone_is_that_for_all(lines):
+    lanes = lanes_of(lines, np.zeros(len(lines.frame), int), np.ones(len(lines.frame)), 3)
     k = np.random.default_rng(0).normal(0, 0.1, (lanes.frames, 3))
-    whole, part = passed(lanes, k), passed(lanes, k, "gradient")
+    whole, part = passed(lanes, k), passed_for_gradient(lanes, k)
     np.testing.assert_array_equal(part.squares, whole.squares)
     np.testing.assert_array_equal(part.gradient, whole.gradient)
-    assert (part.matrix is None) == (metric == "corrected")  # in the image it comes with the gradient
+    assert part.matrix is None
 
 
-def test_folds_whose_first_steps_keep_a_matrix_end_where_others_do(lines, monkeypatch):
+def test_folds_that_keep_a_matrix_end_where_others_do(lines, monkeypatch):
     kept, best, chosen = compared(lines, POLYNOMIALS)
-    monkeypatch.setattr("zoomjax.trust._linear_folds._KEPT", 0)
+    minimised = _linear_folds._minimised
+    monkeypatch.setattr(_linear_folds, "_minimised", lambda *of, keep=False: minimised(*of))
     renewed, *same = compared(lines, POLYNOMIALS)
     assert same == [best, chosen]
     for a, b in zip(kept, renewed, strict=True):
         np.testing.assert_allclose(
             [a.held_out, a.difference_std], [b.held_out, b.difference_std], rtol=1e-9
         )
+
+
+def test_a_fold_of_which_no_step_is_left_after_one_that_fails():
+    """All lines are near the centre, and say so little that a kept step of the last fold fails."""
+    rng, focal, along = np.random.default_rng(1), np.linspace(18, 200, 7), np.linspace(-1, 1, 20)
+    points = []
+    for f in np.repeat(focal, 5):
+        turn, off = rng.uniform(0, np.pi), rng.uniform(-5, 5)
+        c, s = np.cos(turn), np.sin(turn)
+        z = np.stack([off * s + 200 * along * c, -off * c + 200 * along * s], axis=-1) / 400
+        z = z * (1 + (2 / f - 0.1) * (z**2).sum(axis=1, keepdims=True))
+        points.append(400 * z + [319.5, 239.5] + 0.3 * rng.standard_normal(z.shape))
+    near = zj.Lines.from_ragged(points, np.repeat(np.arange(7), 5), focal, image_size=(640, 480))
+    models = [Model(zj.PolynomialZoom(degree=degree), 3) for degree in range(6)]
+    selection = zj.select_model(zj.compress(near, terms=3), models, hold_out="frame")
+    assert all(np.isfinite(v.held_out) or v.problem for v in selection.compared)
+
+
+class AboutTheLongest(zj.PolynomialZoom):
+    """A child of a model, made ready otherwise, and a basis that only JAX can take."""
+
+    def prepare(self, focal, terms):
+        about = super().prepare(focal, terms)
+        return AboutTheLongest(self.degree, about.parameters, jnp.asarray(np.max(focal)))
+
+    def basis(self, focal):
+        u = self.focal_ref / jnp.asarray(focal)
+        return jnp.stack([jnp.where(u < 1, u**j, 0.9 * u**j) for j in range(self.degree + 1)])
+
+
+class SaysSo(AboutTheLongest):
+    """The same, with all settings as the key."""
+
+    def prepared_by(self, *settings):
+        return AbstractZoom.prepared_by(self, *settings)
+
+
+def test_a_child_of_a_model_is_made_ready_for_each_part_by_itself(lines):
+    parts = folds_of(lines, "frame", None, 0)
+    models = [Model(kind(degree=1), 2) for kind in (AboutTheLongest, SaysSo, zj.PolynomialZoom)]
+    child, same, parent = linear_errors(lines, models, parts)
+    np.testing.assert_array_equal(child.unseen, same.unseen)
+    assert np.abs(child.unseen / parent.unseen - 1).max() > 0.01
 
 
 def test_lanes_for_fewer_coefficients_are_those_of_the_first(lines):

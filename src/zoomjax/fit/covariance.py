@@ -120,7 +120,7 @@ def parameter_covariance(
 
 def known_covariance(lines: AbstractLines, zoom: AbstractZoom, extra: int = 0) -> Any:
     """`parameter_covariance` without the residuals, and without what is determined."""
-    if are_by_numpy((lines, zoom)) and (found := by_numpy(_told(lines, zoom, extra))) is not None:
+    if are_by_numpy(lines, zoom) and (found := by_numpy(_told(lines, zoom, extra))) is not None:
         return found[0]
     return _covariance(lines, zoom, extra)
 
@@ -135,15 +135,21 @@ def _covariance(lines, zoom, extra):
     return parameter_covariance(lines, zoom, linearised(lines, zoom), extra)[0]
 
 
-def are_by_numpy(arguments: Any) -> bool:
-    """Whether the covariance of such lines and models is NumPy's: values are known, at hand, and few.
+_MOST_PARAMETERS = 24
+"""Of a model whose covariance is NumPy's: products of three matrices take their cube."""
+
+
+def are_by_numpy(lines: AbstractLines, zoom: AbstractZoom) -> bool:
+    """Whether the covariance is NumPy's: values are known, on the device that results are on, and few.
 
     Decompositions and products of small matrices are half of what there would be to compile.
     """
-    if traced(arguments) or not are_few(arguments):
+    if traced((lines, zoom)) or not are_few((lines, zoom)):
         return False
-    arrays = [leaf for leaf in jax.tree.leaves(arguments) if isinstance(leaf, jax.Array)]
-    return all(leaf.is_fully_addressable for leaf in arrays)
+    number = sum(np.size(leaf) for leaf in jax.tree.leaves(zoom.parameters))
+    arrays = [leaf for leaf in jax.tree.leaves((lines, zoom)) if isinstance(leaf, jax.Array)]
+    usual = {jax.devices()[0]}
+    return number <= _MOST_PARAMETERS and all(leaf.devices() == usual for leaf in arrays)
 
 
 def by_numpy(known: Told) -> tuple[Array, bool] | None:
@@ -151,8 +157,11 @@ def by_numpy(known: Told) -> tuple[Array, bool] | None:
     known = jax.tree.map(np.asarray, known)
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(known)):
         return None
-    with np.errstate(all="ignore"):
-        covariance, determined = covariance_of(known)
+    try:
+        with np.errstate(all="ignore"):
+            covariance, determined = covariance_of(known)
+    except np.linalg.LinAlgError:
+        return None
     return as_jax(covariance.astype(known.weighted.dtype)), bool(determined)
 
 
@@ -211,10 +220,10 @@ def covariance_of(known: Told, photos: bool = True, errors: KnownErrors | None =
         tells = own < _TELLS * xp.trace(of_photos[1], axis1=1, axis2=2)
         free = terms * xp.sum(tells & known.counted) - xp.sum(good)
         of_photos = [xp.where(xp.expand_dims(tells, tuple(range(1, of.ndim))), of, 0) for of in of_photos]
-        if errors is None:
-            errors = KnownErrors(xp.zeros_like(of_photos[1]), xp.zeros_like(covariance))
-        left = xp.einsum("mpq,pi,qi->m", errors.scores, inverse, inverse)
-        of_errors = xp.sum(xp.where(tells, left, 0)), triangle @ errors.covariance @ triangle.T
+        of_errors = 0, xp.zeros_like(covariance)
+        if errors is not None:
+            left = xp.trace(inverse.T @ errors.scores @ inverse, axis1=1, axis2=2)
+            of_errors = xp.sum(xp.where(tells, left, 0)), triangle @ errors.covariance @ triangle.T
         covariance = _of_whole_photos(of_photos, covariance, of_errors, free, terms)
     covariance = inverse @ covariance @ inverse.T
     if len(prior):
@@ -227,10 +236,20 @@ def covariance_of(known: Told, photos: bool = True, errors: KnownErrors | None =
 
 
 def _triangle(*parts: Any) -> Any:
-    """R of the QR of rows in several arrays; by LAPACK where they are NumPy's, and few."""
+    """R of the QR of rows in several arrays.
+
+    NumPy's in blocks, and then of their triangles: LAPACK starts threads for a long table, and waits for
+    them where other processes are busy.
+    """
     if namespace(*parts) is jnp:
         return triangle_of(list(parts))
-    return np.linalg.qr(np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts]), mode="r")
+    rows, columns = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts]), parts[0].shape[-1]
+    while len(rows) != columns:
+        block = min(max(4 * columns, 64), max(len(rows), columns))
+        padded = np.pad(rows, ((0, -len(rows) % block), (0, 0)))
+        triangles: Any = np.linalg.qr(padded.reshape(-1, block, columns), mode="r")
+        rows = triangles.reshape(-1, columns)
+    return rows
 
 
 def _by_photo(values, known):
@@ -301,7 +320,7 @@ def _of_whole_photos(of_photos, by_line, known_errors, free, terms):
     own = share * (xp.trace(by_line) / _positive(xp.trace(xp.sum(share, axis=0))))
     taken = xp.einsum("mij,mji->", leverage, own)
     left = xp.trace(xp.sum(own, axis=0)) - 2 * taken
-    left = left + xp.einsum("mij,jk,mki->", leverage, by_line, leverage) + known_errors[0]
+    left = left + xp.sum(leverage @ by_line * xp.swapaxes(leverage, 1, 2)) + known_errors[0]
     ratio = xp.sum(length) / _positive(left)
     known = (free > 0) & (left > 0) & (ratio > 1)
     ratio = xp.where(known, ratio, 1)

@@ -10,6 +10,7 @@ import lineax as lx
 import optimistix as optx
 
 from .._core.programs import light_program, program
+from .._core.types import traced
 from ..models.zoom import with_parameters
 from ._least_squares import default_solver
 from .algebraic import algebraic_model, algebraic_start
@@ -50,7 +51,7 @@ def fit_prepared(lines, model, solver, max_steps):
 def described_once(lines, *ended):
     """`described`; of few known lines with a covariance by NumPy, so that less is compiled."""
     found = None
-    if are_by_numpy((lines, ended)):
+    if not traced(ended) and are_by_numpy(lines, ended[0]):
         found = with_covariance(*_undescribed(lines, *ended))
     return described(lines, *ended) if found is None else found
 

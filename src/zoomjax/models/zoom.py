@@ -52,9 +52,10 @@ class AbstractZoom(eqx.Module):
         """
 
     def prepared_by(self, *settings: Float[AnyArray, "frame"]) -> Hashable:
-        """What of the frames' settings `prepare` makes a difference of: equal keys mean equal models.
+        """A key of what `prepare` uses of the frames' settings: equal keys, equal models.
 
-        Cross-validation prepares a model once for each key. By default all of the settings are the key.
+        Cross-validation prepares a model once for each key. By default all of the settings are the key, and
+        so they are for a class that defines `prepare` without this.
 
         Args:
             settings: as the first argument of `prepare`, and where it has one the focus. Values are known.
@@ -78,8 +79,8 @@ class AbstractLinearZoom(AbstractZoom):
     """A zoom model that is linear in its parameters: ``k(f) = basis(f) @ parameters``.
 
     Attributes:
-        elementwise: whether `basis` is also of NumPy arrays of focal lengths, where the model's arrays are
-            NumPy's: the functions' values, (basis, ...). Nothing is compiled for these.
+        elementwise: whether `basis` also takes NumPy arrays of focal lengths, and returns one of NumPy,
+            (basis, ...), if the model's arrays are NumPy's. Nothing is then compiled for cross-validation.
     """
 
     elementwise: ClassVar[bool] = False

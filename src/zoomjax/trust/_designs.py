@@ -5,6 +5,7 @@ ready alike, of whatever frames, is looked at once.
 """
 
 import collections
+import functools
 from collections.abc import Hashable
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from ..fit.energy import prior_jacobian, prior_residuals, settings
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_jit, padded_frames, padded_to
 from ..models.model import Model
-from ..models.zoom import AbstractPriorZoom, with_parameters
+from ..models.zoom import AbstractPriorZoom, AbstractZoom, with_parameters
 
 
 class Design(NamedTuple):
@@ -61,7 +62,9 @@ class Designs:
             except ValueError as error:
                 return [None] * len(self._left), {None: str(error)}
             parts = [[values[left] for values in given] for left in self._left]
-            key_of = zoom.prepared_by  # of a module a method costs more than the call
+            # A class that is made ready otherwise than its parent has no key from there.
+            own = zoom if _of_one_class(zoom, "prepare", "prepared_by") else None
+            key_of = functools.partial(AbstractZoom.prepared_by, zoom) if own is None else own.prepared_by
             keys = [key_of(*of) for of in parts]
             models: dict[Hashable, Any] = {}
             for key, of in zip(keys, parts, strict=True):
@@ -96,14 +99,19 @@ def _design(lines, terms, zoom, values):
 
 def _values(zooms, given):
     """The values of each model's basis at all frames: (frame, basis)."""
-    if zooms and zooms[0].elementwise:
+    if zooms and zooms[0].elementwise and _of_one_class(zooms[0], "basis", "elementwise"):
         focal, *more = (values.astype(float) for values in given)
         return [jax.tree.map(_in_double, zoom).basis(focal, *more).T for zoom in zooms]
     return _compiled_values([with_parameters(zoom, None) for zoom in zooms], given)
 
 
 def _in_double(leaf):
-    return np.asarray(leaf, float)
+    return np.asarray(leaf, float if np.issubdtype(leaf.dtype, np.floating) else None)
+
+
+def _of_one_class(model, *names):
+    """Whether a class defines all of these itself, and none of them is of another of its ancestors."""
+    return len({next(cls for cls in type(model).__mro__ if name in vars(cls)) for name in names}) == 1
 
 
 def _compiled_values(zooms, given):

@@ -3,17 +3,16 @@
 To the energy of eq. 13 a line adds only by way of the coefficients of its frame, so that one pass over the
 lines at coefficients ``k_m`` gives each frame's share of the normal equations, N x N numbers, whatever the
 zoom model; its own basis then makes ``sum_m B_m^T H_m B_m`` of them. Every fold starts from the fit of
-all lines, where one to three damped Gauss-Newton steps are enough, and there is no covariance and no
-certificate. Nothing is approximated: a fold's model is the one that `fit_zoom` (``invertible=False``) finds
-on its lines.
+all lines, where few Gauss-Newton steps are enough, and there is no covariance and no certificate. Nothing
+is approximated: a fold's model is the one that `fit_zoom` (``invertible=False``) finds on its lines.
 
 Lines measured in the distorted image (`in_image`) have their distances divided by the stretch across the
 line, which depends on the coefficients, too: by way of the line's normal as well.
 
-Once: the compression, each model's basis, and its matrix at the fit of all lines, from which the folds
-start. Per fold and step: a pass over the compressed lines for energy and gradient. It is NumPy, float64
-whatever the lines' dtype: with sums as small as these, compiling would take longer than 50 folds of 12
-models do.
+Once: the compression, each model's basis, and a pass over the compressed lines at the fit of all lines, of
+which each fold has the matrix of its own. Per fold and step: a pass, in the corrected image for energy and
+gradient alone as long as the matrix at the start serves. It is NumPy, float64 whatever the lines' dtype:
+with sums as small as these, compiling would take longer than 50 folds of 12 models do.
 """
 
 import collections
@@ -26,11 +25,11 @@ from ..fit.image_metric import in_corrected
 from ..lines.base import AbstractLines
 from ..models.model import Model
 from ._designs import Design, Designs
-from ._lanes import Lanes, as_given, lanes_of, passed
+from ._lanes import Lanes, as_given, lanes_of, passed, passed_for_gradient
 from .folds import Folds, LineErrors
 
 _MOST_STEPS = 40  # of Gauss-Newton: from the fit of all lines it takes 1 to 3, from zero 4 to 8
-_KEPT = 8  # of them from the fit of all lines, by the matrix at the start: such a step costs a third
+_MOST_KEPT = 8  # more, by the matrix at the start: such a step costs a third
 
 
 def linear_errors(lines: AbstractLines, models: Sequence[Model], parts: Folds) -> list[LineErrors | str]:
@@ -128,7 +127,7 @@ def cross_validated(lanes: Lanes, models: Sequence[Sequence[Design | None]]) -> 
         where = [place[model, id(of)] for model, _, of in some]
         first = [where.index(own) for own in range(len(place))]
         lines = passed(lanes, design.basis[first] @ start[: len(first)])
-        state, good = _minimised(lanes, weight, design, start[where], _of(lines, where), near=_KEPT)
+        state, good = _minimised(lanes, weight, design, start[where], _of(lines, where), keep=True)
         for (model, _, _), own, squares, fold_fits in zip(some, out, state.squares, good, strict=True):
             if fits[model] and fold_fits:
                 found[model].unseen[own] = (squares / lanes.counts)[own]
@@ -170,12 +169,12 @@ def _stacked(designs: Sequence[Design]) -> Design:
     return stack
 
 
-def _minimised(lanes, weight, design, parameters, lines, near=0):
+def _minimised(lanes, weight, design, parameters, lines, keep=False):
     """The states of least energy near these parameters, one for each row of weights, and which are ones.
 
-    `lines` are passed at the parameters. Levenberg-Marquardt without damping, until a step fails; the first
-    `near` steps by the matrix at the start. Directions that the lines do not determine are 0 then, and not
-    what lines that are left out have made of them.
+    `lines` are passed at the parameters. Levenberg-Marquardt without damping, until a step fails; at first,
+    if it is to `keep` it, by the matrix at the parameters, as long as no step fails. Directions that the
+    lines do not determine are 0 then, and not what lines that are left out have made of them.
     """
     in_frame = lanes.total(weight)
     share = np.zeros((len(weight), lanes.frames))
@@ -187,23 +186,31 @@ def _minimised(lanes, weight, design, parameters, lines, near=0):
     at, damping = _state(lanes, weights, design, parameters, lines), np.zeros(len(weight))
     directions = _directions(at)
     going, good = weight.any(axis=1) & np.isfinite(at.energy), np.zeros(len(weight), bool)
-    for step in range(_MOST_STEPS):
-        if not going.any():
-            break
-        on = np.flatnonzero(going)
-        here, own = _of(at, on), _of(design, on)
-        if step > near:
-            directions = _replaced(directions, on, _directions(here))
+    keep = keep and lanes.moments is None  # in the image the gradient comes with the matrix
+
+    def state(on, parameters, of=passed):
+        own = _of(design, on)
+        return _state(lanes, weights[on], own, parameters, of(lanes, own.basis @ parameters))
+
+    step, most = 0, _MOST_STEPS + _MOST_KEPT * keep
+    while len(on := np.flatnonzero(going)) and step < most:
+        here = _of(at, on)
         move, decrease = _move(here, _of(directions, on), damping[on])
         moved = here.parameters + move.reshape(here.parameters.shape)
-        wanted = "gradient" if step < near else "all"
-        there = _state(lanes, weights[on], own, moved, passed(lanes, own.basis @ moved, wanted))
+        there = state(on, moved, passed_for_gradient if keep else passed)
         better = there.energy <= here.energy * (1 + 128 * eps)  # rounding must not reject the last step
         damping[on] = np.where(better, damping[on] / 10, np.maximum(10 * damping[on], 1e-3))
-        at = _replaced(at, on[better], _of(there, better))
+        _replace(at, on[better], _of(there, better))
         arrived = better & (decrease <= 16 * eps * there.energy)
         good[on[arrived]], going[on[arrived]] = True, False
-    return _without_undetermined(at, good, lanes, weights, design), good
+        on, step = np.flatnonzero(going), step + 1
+        if keep and len(on) and (step == _MOST_KEPT or not better.all()):
+            keep, damping[on] = False, 0
+            _replace(at, on, state(on, at.parameters[on]))
+        if not keep:
+            _replace(directions, on, _directions(_of(at, on)))
+    _forget_undetermined(at, good, design, state)
+    return at, good
 
 
 def _of(several, which):
@@ -211,12 +218,11 @@ def _of(several, which):
     return type(several)(*(None if of is None else of[which] for of in several))
 
 
-def _replaced(several, which, others):
-    """The fits, with some of them replaced in place, as far as the others have what is to replace it."""
+def _replace(several, which, others):
+    """Put others in the place of some of the fits, in what the others have."""
     for of, new in zip(several, others, strict=True):
         if new is not None:
             of[which] = new
-    return several
 
 
 class _Directions(NamedTuple):
@@ -253,21 +259,20 @@ def _directions(at):
     return _Directions(size, values, vectors, known)
 
 
-def _without_undetermined(at, good, lanes, weights, design):
-    """The states of which nothing is left along directions that the lines do not determine."""
+def _forget_undetermined(at, good, design, state):
+    """Leave nothing along directions that the lines do not determine, in states that are good."""
     on = np.flatnonzero(good)
-    directions = _directions(_of(at, on))
-    functions = design.basis[on].any(axis=1).sum(axis=1)  # without those of `_stacked`, which are 0
-    some = directions.known.sum(axis=1) < functions * lanes.terms
-    if not some.any():
-        return at
-    on, (size, _, vectors, known) = on[some], _of(directions, some)
-    here, own = _of(at, on), _of(design, on)
+    # `_stacked` has added functions that are 0, which are no parameters.
+    there = np.repeat(design.basis[on].any(axis=1), at.parameters.shape[2], axis=1)
+    there |= np.diagonal(design.precision[on], axis1=1, axis2=2) > 0
+    on = on[_directions(_of(at, on)).known.sum(axis=1) < there.sum(axis=1)]
+    if not len(on):
+        return
+    here = state(on, at.parameters[on])  # with its own matrix
+    size, _, vectors, known = _directions(here)
     along = np.einsum("bij,bi->bj", vectors, size * here.parameters.reshape(len(on), -1))
     flat = np.einsum("bij,bj->bi", vectors, np.where(known, along, 0)) / size
-    left = flat.reshape(here.parameters.shape)
-    there = _state(lanes, weights[on], own, left, passed(lanes, own.basis @ left, "gradient"))
-    return _replaced(at, on, there)
+    _replace(at, on, state(on, flat.reshape(here.parameters.shape)))
 
 
 def _state(lanes, weights, design, parameters, lines):

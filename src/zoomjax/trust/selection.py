@@ -270,12 +270,17 @@ def _about_fitted(lines, candidates, how):
 
 def default_candidates(terms: int = _TERMS) -> tuple[Model, ...]:
     """Polynomials of degree 0 to 3 with up to so many coefficients, and `SmoothZoom`."""
-    return _default_candidates(terms, jax.dtypes.canonicalize_dtype(float))  # the prior's
+    return _candidates_in(terms, jax.dtypes.canonicalize_dtype(float))
 
 
 @functools.cache
-def _default_candidates(terms, dtype):
-    del dtype
+def _candidates_in(terms, dtype):
+    """The same where the prior's arrays have this dtype, JAX's default: made once."""
+    with jax.ensure_compile_time_eval():
+        return _made_candidates(terms)
+
+
+def _made_candidates(terms):
     polynomials = [
         Model(PolynomialZoom(degree=degree), number)
         for number in range(1, terms + 1)
