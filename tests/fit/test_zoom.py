@@ -404,7 +404,7 @@ def test_frames_whose_lines_determine_nothing_say_so(lens):
     fits = zj.fit_frames(zj.compress(mixed))
     np.testing.assert_array_equal(fits.result == RESULTS.undetermined, [True, False, False])
     np.testing.assert_array_equal(np.isinf(fits.covariance[:, 0, 0]), [True, False, False])
-    assert [message[:22] for message in fits.messages()] == ["The lines do not deter", "", ""]
+    assert [message[:23] for message in fits.messages()] == ["The points do not deter", "", ""]
 
 
 def test_good_fits_are_successful(fit, full_fit, frame_fits):
