@@ -138,7 +138,7 @@ def test_fits_come_near_the_bound(lens, scene):
     for alike in (jnp.ones_like(small.counts), small.counts):  # lines, or points, of a frame
         lines = zj.fit.in_image(small.weighted(alike))
         weights = line_weights(lines)
-        _, jacobian = eqx.filter_jit(linearised)(lines, lens.zoom)
+        _, jacobian, *_ = eqx.filter_jit(linearised)(lines, lens.zoom)
         inverse = jnp.linalg.inv(jnp.einsum("lri,lrj->ij", jacobian, jacobian))
         covariance = inverse @ jnp.einsum("l,lri,lrj->ij", weights, jacobian, jacobian) @ inverse
         ratio = jnp.linalg.eigvals(jnp.linalg.solve(bound, covariance)).real
