@@ -68,6 +68,13 @@ def check_fits(lines: zj.Lines, plain: zj.lines.CompressedLines) -> None:
         assert found["all-reduce"] <= 400, found  # sums of parameters and frames, of 12,800 points
 
 
+def check_device(plain: zj.lines.CompressedLines) -> None:
+    """All of a fit is where the lines are, its covariance too, which is NumPy's on the usual device."""
+    last = jax.devices()[-1]
+    fit = zj.fit_zoom(jax.device_put(plain, last), zoom=zj.PolynomialZoom(1))
+    assert fit.covariance.devices() == fit.rms.devices() == {last}
+
+
 def main() -> None:
     assert len(jax.devices()) == 4
     lines = scene()
@@ -103,6 +110,7 @@ def main() -> None:
                 assert set(sums) == {"all-reduce"}, sums
                 assert sums["all-reduce"] <= 2 * FRAMES, sums  # of each frame an error and a weight
     check_fits(lines, plain)
+    check_device(plain)
     distortion = scenes.nikkor_18_200()(35.0)
     points = jnp.asarray(np.random.default_rng(2).uniform(0, 400, (5000, 2)))
 

@@ -125,10 +125,3 @@ def test_the_triangle_of_blocks_is_that_of_all_rows(rows, columns):
     whole = np.concatenate([table.reshape(-1, columns), np.ones((1, columns))])
     assert found.shape == (columns, columns)
     np.testing.assert_allclose(found.T @ found, whole.T @ whole, rtol=1e-12, atol=1e-12)
-
-
-def test_the_covariance_is_where_the_lines_are():
-    other = jax.devices()[-1]
-    lines = jax.device_put(lines_of(0.3), other)
-    fit = zj.fit_zoom(lines)
-    assert fit.covariance.devices() == fit.rms.devices() == {other}

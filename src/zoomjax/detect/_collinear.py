@@ -28,7 +28,7 @@ from scipy.spatial import KDTree
 
 from ._frame_model import OneFrame
 from ._segments import Fragments, main_direction
-from ._vectors import dot, norm
+from ._vectors import cross, dot, norm
 
 _POINT_ERROR = 0.25
 """px by which an edge point is off across the edge, its error being alike over some neighbours."""
@@ -186,7 +186,7 @@ def _units(pieces: Fragments, model: OneFrame, barred: np.ndarray) -> _Units:
     tips = np.stack([pieces.points[first], pieces.points[last]], axis=1)
     chord = tips[:, 1] - tips[:, 0]
     gradient = pieces.sums(pieces.gradient) / count
-    side = np.sign(chord[:, 0] * gradient[:, 1] - chord[:, 1] * gradient[:, 0])
+    side = np.sign(cross(chord, gradient))
     contrast = np.log(np.maximum(np.hypot(*gradient.T), 1e-9))
     inside = np.minimum(tips, np.subtract(model.image_size, 1) - tips).min(axis=-1)
     return _Units(

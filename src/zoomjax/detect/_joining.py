@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from .._core.arrays import places
 from ._segments import Fragments, in_order, main_direction
+from ._vectors import cross, dot
 
 _END = 40
 """Points of a fragment that tell its direction at an end: fewer if it is shorter."""
@@ -102,5 +103,4 @@ def _ends(pieces: Fragments) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, n
 
 def _angle(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """From one vector to another, rad."""
-    cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
-    return np.arctan2(cross, np.einsum("...c,...c->...", first, second))
+    return np.arctan2(cross(first, second), dot(first, second))

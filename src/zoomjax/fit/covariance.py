@@ -10,6 +10,8 @@ sandwich ``H^-1 (sum_l g_l g_l^T) H^-1``. That estimate alone is too uncertain, 
 parameter. So it is shrunk towards the shape for independent points, by an amount given by its own scatter
 (Ledoit and Wolf 2004). The same is then done for whole photos, whose lines may err together.
 docs/trust.md has the measured coverage, and that of alternatives.
+
+The formulas are NumPy's and JAX's alike: of few lines at hand NumPy makes it, which compiles nothing.
 """
 
 from typing import Any, NamedTuple

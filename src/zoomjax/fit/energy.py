@@ -253,7 +253,10 @@ class Linearised(NamedTuple):
 
 
 def linearised(lines: AbstractLines, zoom: AbstractZoom) -> Linearised:
-    """Of a line with more rows than coefficients, and one, those of its triangle stand for them."""
+    """The residuals and their derivatives by the flattened parameters, a row a residual.
+
+    Of a line with more rows than coefficients, and one, those of its triangle stand for them.
+    """
     flat, unravel = ravel_pytree(zoom.parameters)
 
     def coefficients_at(flat):
