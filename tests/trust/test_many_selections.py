@@ -1,5 +1,8 @@
 """Models chosen for many lenses: each as by itself."""
 
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+
 import jax
 import numpy as np
 import pytest
@@ -62,3 +65,44 @@ def test_a_data_set_that_cannot_be_compared_is_named(sets):
     nothing = sets[1].weighted(np.zeros(len(sets[1].frame)))
     with pytest.raises(ValueError, match=r"^Data set 1: "):
         select_many([sets[0], nothing], CANDIDATES)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    """A process, as of any executor."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as made:
+        yield made
+
+
+@pytest.mark.parametrize("how", [{}, pytest.param(LINES | {"centre": "fit"}, marks=pytest.mark.slow)])
+def test_an_executor_selects_the_same_of_the_candidates_here(boards, pool, how):
+    any_centre = [zj.lines.compress_any_centre(lines) for lines in boards[2:]]
+    models = [zj.models.Model(zoom, 2) for zoom in CANDIDATES[1:]]
+    there = select_many(any_centre, models, executor=pool, **how)
+    for got, here in zip(there, select_many(any_centre, models, **how), strict=True):
+        assert str(got) == str(here)
+        assert got.chosen is here.chosen
+        assert got.best is here.best
+        assert [of.candidate for of in got.compared] == models
+        for a, b in zip(jax.tree.leaves(got.fit), jax.tree.leaves(here.fit), strict=True):
+            assert type(a) is type(b)
+            np.testing.assert_array_equal(a, b)
+
+
+def test_candidates_by_default_serve_an_executor(sets, pool):
+    (got,) = select_many(sets[1:2], executor=pool)
+    assert_same(got, zj.select_model(sets[1]))
+
+
+def test_a_data_set_is_named_by_an_executor(sets, pool):
+    nothing = sets[1].weighted(np.zeros(len(sets[1].frame)))
+    with pytest.raises(ValueError, match=r"^Data set 1: "):
+        select_many([sets[0], nothing], CANDIDATES, executor=pool)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_wrong_candidates_and_executors_are_refused(sets, pool):
+    with pytest.raises(TypeError, match="must be a list of zoom models"):
+        select_many(sets, CANDIDATES[0], executor=pool)
+    with pytest.raises(TypeError, match=r"Argument executor must be an executor of concurrent\.futures"):
+        select_many(sets, CANDIDATES, executor=2)

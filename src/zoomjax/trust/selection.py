@@ -15,7 +15,7 @@ simplest of the models whose R is above the best one's by no more than s.
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import jax
 import numpy as np
@@ -34,7 +34,7 @@ from ..models.requirements import check
 from ..models.smooth import SmoothZoom
 from ..models.zoom import AbstractZoom, PolynomialZoom
 from .comparison import TIE, ComparedModel, Rule, compare
-from .folds import Folds, HoldOut, folds_of, small_lines
+from .folds import HoldOut, folds_of, small_lines
 
 _TERMS = 3  # of the default candidates, at most
 _DEGREES = 4
@@ -201,20 +201,21 @@ def select_model(
     return choice.with_fit(fit_zoom(choice.lines, zoom=choice.chosen))
 
 
-class Choice(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Choice:
     """A selection before the model chosen is fitted: its fields, and the lines to fit it to."""
 
     chosen: Model
     best: Model
     compared: tuple[ComparedModel, ...]
-    parts: Folds
+    hold_out: HoldOut
+    folds: int
     rule: Rule
     lines: AbstractLines
 
     def with_fit(self, fit: ZoomFit) -> Selection:
         """The selection."""
-        hold_out, folds = self.parts.hold_out, self.parts.number
-        return Selection(self.chosen, self.best, fit, self.compared, hold_out, folds, self.rule)
+        return Selection(self.chosen, self.best, fit, self.compared, self.hold_out, self.folds, self.rule)
 
 
 def choice_of(
@@ -227,20 +228,9 @@ def choice_of(
     rule: Rule,
 ) -> Choice:
     """The model chosen, of lines about the centre that they have; see `select_model`."""
-    if isinstance(candidates, AbstractZoom | Model):
-        raise TypeError(
-            "Argument candidates must be a list of zoom models, [first, second], not one of them."
-        )
-    plain = in_corrected(lines)
-    if candidates is None:
-        most = min(_TERMS, plain.terms) if isinstance(plain, CompressedLines) else _TERMS
-        models = default_candidates(most)
-    else:
-        models = tuple(c if isinstance(c, Model) else Model(c) for c in candidates)
+    plain, models = in_corrected(lines), candidates_of(lines, candidates)
     if rule not in get_args(Rule):
         raise ValueError(f'Argument rule must be "one standard error" or "least", but it is {rule!r}.')
-    if not models:
-        raise ValueError("Argument candidates must hold one or more zoom models, but it is empty.")
     own = plain.terms if isinstance(plain, CompressedLines) else max(c.terms for c in models)
     small = small_lines(plain, own)
     forms = {
@@ -249,7 +239,32 @@ def choice_of(
     }
     parts = folds_of(small, hold_out, folds, seed)
     compared, best, chosen = compare(small, models, parts, forms, rule)
-    return Choice(chosen, best, compared, parts, rule, forms[chosen.distortion_model])
+    fitted = forms[chosen.distortion_model]
+    return Choice(chosen, best, compared, parts.hold_out, parts.number, rule, fitted)
+
+
+def candidates_of(
+    lines: AbstractLines, candidates: Sequence[AbstractZoom | Model] | None
+) -> tuple[Model, ...]:
+    """The models that an argument names, or the default ones, as many as the lines are compressed for.
+
+    Raises:
+        TypeError: it is one model.
+        ValueError: it is empty.
+    """
+    if isinstance(candidates, AbstractZoom | Model):
+        raise TypeError(
+            "Argument candidates must be a list of zoom models, [first, second], not one of them."
+        )
+    if candidates is None:
+        plain = in_corrected(lines)
+        return default_candidates(
+            min(_TERMS, plain.terms) if isinstance(plain, CompressedLines) else _TERMS
+        )
+    models = tuple(c if isinstance(c, Model) else Model(c) for c in candidates)
+    if not models:
+        raise ValueError("Argument candidates must hold one or more zoom models, but it is empty.")
+    return models
 
 
 def _about_fitted(lines, candidates, how):
