@@ -4,13 +4,18 @@ The fit of one frame is a zoom polynomial of degree 0 on the lines of that frame
 `zoom` is used, under `vmap` over the frames.
 """
 
+import functools
+import operator
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .._core.arguments import kinds_checked
 from .._core.programs import light_program, program, rare_program
 from ..lines.base import AbstractLines
-from ..lines.buckets import bucketed_frames
+from ..lines.buckets import bucketed_frames, padded_frames
 from ..lines.lines import Lines
 from ..models.distortion_model import AbstractDistortionModel
 from ..models.zoom import PolynomialZoom
@@ -19,10 +24,20 @@ from .algebraic import algebraic_parameters, algebraic_start
 from .centre import fit_frame_centres
 from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
+from .covariance import are_by_numpy, by_numpy
 from .minimise import minimise
 from .prepare import asked_for, ready_model
 from .problem import data_of
-from .result import FrameFits, collected, described_fit, each_of_given, is_invertible, outcome_of, thrown
+from .result import (
+    FrameFits,
+    collected,
+    described_fit,
+    each_of_given,
+    is_invertible,
+    outcome_of,
+    thrown,
+    undescribed_fit,
+)
 from .zoom import CentreArgument, about_centre, is_to_be_fitted
 
 
@@ -70,7 +85,28 @@ def _fit_frames(lines, start, frames, model, solver, max_steps):
     """The fits of all frames, whether invertible or not, and their outcome."""
     parameters = None if start is None else _starts(start, frames, model)
     minima = _minima(lines, frames, model, parameters, solver, max_steps)
-    return _described(lines, frames, model, *minima)
+    found, few = None, len(frames.there) <= _MOST_FRAMES
+    if few and are_by_numpy((lines, frames, minima), minima[0].size // len(frames.there)):
+        found = _by_numpy(lines, frames, model, minima)
+    return _described(lines, frames, model, *minima) if found is None else found
+
+
+_MOST_FRAMES = 32
+"""Frames whose covariances are NumPy's, one after the other."""
+
+
+def _by_numpy(lines, frames, model, minima):
+    """`_described` with covariances by NumPy, so that less is compiled; None for want of one."""
+    known, either = _undescribed(lines, frames, model, *minima)
+    known = jax.tree.map(np.asarray, known)
+    each = [
+        by_numpy(jax.tree.map(operator.itemgetter(m), known), photos=False)
+        for m in np.flatnonzero(frames.there)
+    ]
+    if None in each:
+        return None
+    covariance, determined = (padded_frames(np.stack(of)) for of in zip(*each, strict=True))
+    return _collected(lines, frames, either, covariance, determined)
 
 
 @light_program
@@ -98,13 +134,39 @@ def _minima(lines, frames, model, parameters, solver, max_steps):
 
 
 @light_program
-def _described(lines, frames, model, parameters, result, steps):
-    def describe(frame, parameters, result, steps):
-        return described_fit(
-            frame, ready_model(frame, model).with_parameters(parameters).zoom, result, steps
-        )
+def _described(lines, frames, model, *minima):
+    """The fits that ended so, and their outcome."""
+    return _with_outcome(
+        lines, frames, _over_frames(_of_model(described_fit, model), lines, frames, *minima)
+    )
 
-    fits = _over_frames(describe, lines, frames, parameters, result, steps)
+
+@light_program
+def _undescribed(lines, frames, model, *minima):
+    """What the lines of each frame tell, and its fit, as if it were determined and as if it were not."""
+    known, *fits = _over_frames(_of_model(undescribed_fit, model), lines, frames, *minima)
+    return known, [fit for fit, _ in fits]
+
+
+@light_program
+def _collected(lines, frames, either, covariance, determined):
+    """The fits of `_undescribed` with their covariances, and their outcome."""
+    fits = jax.vmap(lambda so, *fits: jax.tree.map(functools.partial(jnp.where, so), *fits))(
+        determined, *either
+    )
+    return _with_outcome(lines, frames, eqx.tree_at(lambda fit: fit.covariance, fits, covariance))
+
+
+def _of_model(describe, model):
+    """A description of the fit of one frame, from its parameters."""
+
+    def of_frame(frame, parameters, result, steps):
+        return describe(frame, ready_model(frame, model).with_parameters(parameters).zoom, result, steps)
+
+    return of_frame
+
+
+def _with_outcome(lines, frames, fits):
     each = collected(lines, fits, frames.there)
     return each, outcome_of(each)
 
@@ -115,12 +177,13 @@ def _over_frames(function, lines, frames, *rows):
     Small compressed frames are taken side by side; the points themselves one frame at a time, for side by
     side they would all be in memory at once, padded to the fullest frame.
     """
-    batch = 1 if isinstance(data_of(lines), Lines) else len(frames.chosen)
 
     def one(frame):
-        return function(lines.take(*frame[0]), *frame[1])
+        chosen, rows = frame
+        return function(lines.take(*chosen), *rows)
 
-    return jax.lax.map(one, ((frames.chosen, frames.present), rows), batch_size=batch)
+    each = (frames.chosen, frames.present), rows
+    return jax.lax.map(one, each) if isinstance(data_of(lines), Lines) else jax.vmap(one)(each)
 
 
 @program
