@@ -8,7 +8,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.fit import covariance, frames
+from zoomjax.fit import covariance
 from zoomjax.fit.covariance import covariance_of, told
 from zoomjax.fit.energy import linearised
 
@@ -53,36 +53,6 @@ def test_numpy_and_a_program_give_the_same_covariance(name, noise, by_program):
     apart = eqx.tree_at(lambda fit: fit.covariance, own, other.covariance)
     for one, another in zip(jax.tree.leaves(apart), jax.tree.leaves(other), strict=True):
         np.testing.assert_allclose(one, another, rtol=1e-13, atol=1e-15)
-
-
-def test_of_single_frames_too(by_program, monkeypatch):
-    rng, t = np.random.default_rng(0), np.linspace(-300, 300, 50)[:, None]
-    away = [[t, 0 * t + y + 1e-4 * t**2] for y in (-200, 100, 150)]
-    through_centre = [[t * np.cos(a), t * np.sin(a)] for a in (0.2, 1.3, 2.0)]
-    noisy = [np.hstack(line) + rng.normal(0, 0.3, (50, 2)) + 320 for line in away + through_centre]
-    scene = zj.Lines.from_ragged(noisy, [0, 0, 0, 1, 1, 1], [24, 70], image_size=(641, 641))
-
-    def fit():
-        return zj.fit_frames(zj.compress(scene), invertible=False)
-
-    other = by_program(fit)
-    monkeypatch.delattr(frames, "_described")  # the program is not used
-    own = fit()
-    assert np.isinf(own.covariance).any(axis=(1, 2)).tolist() == [False, True]
-    assert jax.tree.structure(own) == jax.tree.structure(other)
-    for one, another in zip(jax.tree.leaves(own), jax.tree.leaves(other), strict=True):
-        np.testing.assert_allclose(one, another, rtol=1e-9, atol=1e-15)
-
-
-def test_a_frame_of_numbers_that_are_none_ends_as_in_a_program(by_program):
-    lines = lines_of(0.3)
-    spoiled = eqx.tree_at(lambda lines: lines.triangle, lines, lines.triangle.at[3, 1, 1].set(jnp.nan))
-
-    def fit():
-        return zj.fit_frames(spoiled, throw=False)
-
-    for one, another in zip(jax.tree.leaves(fit()), jax.tree.leaves(by_program(fit)), strict=True):
-        np.testing.assert_allclose(one, another, rtol=1e-9, atol=1e-15)
 
 
 def test_what_lines_do_not_determine_is_so_for_both(by_program):

@@ -122,9 +122,8 @@ def parameter_covariance(
 
 def known_covariance(lines: AbstractLines, zoom: AbstractZoom, extra: int = 0) -> Any:
     """`parameter_covariance` without the residuals, and without what is determined."""
-    few = are_by_numpy((lines, zoom), number_of_parameters(zoom))
-    if few and (found := by_numpy(_told(lines, zoom, extra))) is not None:
-        return as_jax(found[0])
+    if are_by_numpy(lines, zoom) and (found := by_numpy(_told(lines, zoom, extra))) is not None:
+        return found[0]
     return _covariance(lines, zoom, extra)
 
 
@@ -142,35 +141,30 @@ _MOST_PARAMETERS = 24
 """Of a model whose covariance is NumPy's: products of three matrices take their cube."""
 
 
-def are_by_numpy(values: Any, parameters: int) -> bool:
-    """Whether the covariance of so many parameters is NumPy's.
+def are_by_numpy(lines: AbstractLines, zoom: AbstractZoom) -> bool:
+    """Whether the covariance is NumPy's: values are known, on the device that results are on, and few.
 
-    The values that it is made of are known, on the device that results are on, and few. Decompositions and
-    products of small matrices are half of what there would be to compile.
+    Decompositions and products of small matrices are half of what there would be to compile.
     """
-    if traced(values) or not are_few(values):
+    if traced((lines, zoom)) or not are_few((lines, zoom)):
         return False
-    arrays = [leaf for leaf in jax.tree.leaves(values) if isinstance(leaf, jax.Array)]
+    number = sum(np.size(leaf) for leaf in jax.tree.leaves(zoom.parameters))
+    arrays = [leaf for leaf in jax.tree.leaves((lines, zoom)) if isinstance(leaf, jax.Array)]
     usual = {jax.devices()[0]}
-    return parameters <= _MOST_PARAMETERS and all(leaf.devices() == usual for leaf in arrays)
+    return number <= _MOST_PARAMETERS and all(leaf.devices() == usual for leaf in arrays)
 
 
-def number_of_parameters(zoom: AbstractZoom) -> int:
-    """How many numbers the parameters of a model are."""
-    return sum(np.size(leaf) for leaf in jax.tree.leaves(zoom.parameters))
-
-
-def by_numpy(known: Told, *, photos: bool = True) -> tuple[np.ndarray, bool] | None:
+def by_numpy(known: Told) -> tuple[Array, bool] | None:
     """`covariance_of` what lines tell, by NumPy; None where a number is none."""
     known = jax.tree.map(np.asarray, known)
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(known)):
         return None
     try:
         with np.errstate(all="ignore"):
-            covariance, determined = covariance_of(known, photos)
+            covariance, determined = covariance_of(known)
     except np.linalg.LinAlgError:
         return None
-    return covariance.astype(known.weighted.dtype), bool(determined)
+    return as_jax(covariance.astype(known.weighted.dtype)), bool(determined)
 
 
 def covariance_of(known: Told, photos: bool = True, errors: KnownErrors | None = None) -> tuple[Any, Any]:

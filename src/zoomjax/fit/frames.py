@@ -1,21 +1,16 @@
 """Separate fits of each frame (eq. 3 and 6).
 
 The fit of one frame is a zoom polynomial of degree 0 on the lines of that frame, so that the solver of
-`zoom` is used, under `vmap` over the frames.
+`zoom` is used, frame after frame.
 """
 
-import functools
-import operator
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from .._core.arguments import kinds_checked
 from .._core.programs import light_program, program, rare_program
 from ..lines.base import AbstractLines
-from ..lines.buckets import bucketed_frames, padded_frames
+from ..lines.buckets import bucketed_frames
 from ..lines.lines import Lines
 from ..models.distortion_model import AbstractDistortionModel
 from ..models.zoom import PolynomialZoom
@@ -24,20 +19,10 @@ from .algebraic import algebraic_parameters, algebraic_start
 from .centre import fit_frame_centres
 from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
-from .covariance import are_by_numpy, by_numpy
 from .minimise import minimise
 from .prepare import asked_for, ready_model
 from .problem import data_of
-from .result import (
-    FrameFits,
-    collected,
-    described_fit,
-    each_of_given,
-    is_invertible,
-    outcome_of,
-    thrown,
-    undescribed_fit,
-)
+from .result import FrameFits, collected, described_fit, each_of_given, is_invertible, outcome_of, thrown
 from .zoom import CentreArgument, about_centre, is_to_be_fitted
 
 
@@ -85,39 +70,17 @@ def _fit_frames(lines, start, frames, model, solver, max_steps):
     """The fits of all frames, whether invertible or not, and their outcome."""
     parameters = None if start is None else _starts(start, frames, model)
     minima = _minima(lines, frames, model, parameters, solver, max_steps)
-    found, few = None, len(frames.there) <= _MOST_FRAMES
-    if few and are_by_numpy((lines, frames, minima), minima[0].size // len(frames.there)):
-        found = _by_numpy(lines, frames, model, minima)
-    return _described(lines, frames, model, *minima) if found is None else found
-
-
-_MOST_FRAMES = 32
-"""Frames whose covariances are NumPy's, one after the other."""
-
-
-def _by_numpy(lines, frames, model, minima):
-    """`_described` with covariances by NumPy, so that less is compiled; None for want of one."""
-    known, either = _undescribed(lines, frames, model, *minima)
-    known = jax.tree.map(np.asarray, known)
-    each = [
-        by_numpy(jax.tree.map(operator.itemgetter(m), known), photos=False)
-        for m in np.flatnonzero(frames.there)
-    ]
-    if None in each:
-        return None
-    covariance, determined = (padded_frames(np.stack(of)) for of in zip(*each, strict=True))
-    return _collected(lines, frames, either, covariance, determined)
+    return _described(lines, frames, model, *minima)
 
 
 @light_program
 def _starts(lines, frames, model):
     """The parameters that each frame's algebraic estimate gives."""
 
-    def start(chosen, present):
-        frame = lines.take(chosen, present)
+    def start(frame):
         return algebraic_parameters(frame, ready_model(frame, model))
 
-    return jax.vmap(start)(frames.chosen, frames.present)
+    return _over_frames(start, lines, frames)
 
 
 @rare_program
@@ -134,39 +97,13 @@ def _minima(lines, frames, model, parameters, solver, max_steps):
 
 
 @light_program
-def _described(lines, frames, model, *minima):
-    """The fits that ended so, and their outcome."""
-    return _with_outcome(
-        lines, frames, _over_frames(_of_model(described_fit, model), lines, frames, *minima)
-    )
+def _described(lines, frames, model, parameters, result, steps):
+    def describe(frame, parameters, result, steps):
+        return described_fit(
+            frame, ready_model(frame, model).with_parameters(parameters).zoom, result, steps
+        )
 
-
-@light_program
-def _undescribed(lines, frames, model, *minima):
-    """What the lines of each frame tell, and its fit, as if it were determined and as if it were not."""
-    known, *fits = _over_frames(_of_model(undescribed_fit, model), lines, frames, *minima)
-    return known, [fit for fit, _ in fits]
-
-
-@light_program
-def _collected(lines, frames, either, covariance, determined):
-    """The fits of `_undescribed` with their covariances, and their outcome."""
-    fits = jax.vmap(lambda so, *fits: jax.tree.map(functools.partial(jnp.where, so), *fits))(
-        determined, *either
-    )
-    return _with_outcome(lines, frames, eqx.tree_at(lambda fit: fit.covariance, fits, covariance))
-
-
-def _of_model(describe, model):
-    """A description of the fit of one frame, from its parameters."""
-
-    def of_frame(frame, parameters, result, steps):
-        return describe(frame, ready_model(frame, model).with_parameters(parameters).zoom, result, steps)
-
-    return of_frame
-
-
-def _with_outcome(lines, frames, fits):
+    fits = _over_frames(describe, lines, frames, parameters, result, steps)
     each = collected(lines, fits, frames.there)
     return each, outcome_of(each)
 
@@ -174,8 +111,9 @@ def _with_outcome(lines, frames, fits):
 def _over_frames(function, lines, frames, *rows):
     """A function of the lines of a frame, and of what there is of it, for all frames.
 
-    Small compressed frames are taken side by side; the points themselves one frame at a time, for side by
-    side they would all be in memory at once, padded to the fullest frame.
+    On a CPU one after the other: side by side, under ``vmap``, they take twice as long to compile and no
+    less to run, as the solver goes on until the last frame is done. The points themselves so on any device,
+    for side by side they would all be in memory at once, padded to the fullest frame.
     """
 
     def one(frame):
@@ -183,21 +121,19 @@ def _over_frames(function, lines, frames, *rows):
         return function(lines.take(*chosen), *rows)
 
     each = (frames.chosen, frames.present), rows
-    return jax.lax.map(one, each) if isinstance(data_of(lines), Lines) else jax.vmap(one)(each)
+    in_turn = jax.default_backend() == "cpu" or isinstance(data_of(lines), Lines)
+    return jax.lax.map(one, each) if in_turn else jax.vmap(one)(each)
 
 
 @program
 def _refit_frames(lines, frames, model, free):
     """Each frame's fit, refitted to be invertible where it is not."""
 
-    def fit(chosen, present, result, coefficients):
-        frame = lines.take(chosen, present)
+    def fit(frame, result, coefficients):
         constant = ready_model(frame, model).with_parameters(coefficients[None])
         own = described_fit(frame, constant.zoom, result, jnp.asarray(0))
-        other, _ = refit_zoom(frame, own)
-        keep = is_invertible(own)
-        return jax.tree.map(lambda own, other: jnp.where(keep, own, other), own, other)
+        return jax.lax.cond(is_invertible(own), lambda: own, lambda: refit_zoom(frame, own)[0])
 
-    fits = jax.vmap(fit)(frames.chosen, frames.present, free.result, free.coefficients)
+    fits = _over_frames(fit, lines, frames, free.result, free.coefficients)
     each = collected(lines, fits, frames.there)
     return each, outcome_of(each)

@@ -10,12 +10,13 @@ import lineax as lx
 import optimistix as optx
 
 from .._core.programs import light_program, program
+from .._core.types import traced
 from ..models.zoom import with_parameters
 from ._least_squares import default_solver
 from .algebraic import algebraic_model, algebraic_start
 from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
-from .covariance import are_by_numpy, number_of_parameters
+from .covariance import are_by_numpy
 from .energy import coefficients_by, prior_residuals
 from .frame_residuals import frame_residuals
 from .result import described_fit, outcome_of, thrown, undescribed_fit, with_covariance
@@ -50,7 +51,7 @@ def fit_prepared(lines, model, solver, max_steps):
 def described_once(lines, *ended):
     """`described`; of few known lines with a covariance by NumPy, so that less is compiled."""
     found = None
-    if are_by_numpy((lines, ended), number_of_parameters(ended[0])):
+    if not traced(ended) and are_by_numpy(lines, ended[0]):
         found = with_covariance(*_undescribed(lines, *ended))
     return described(lines, *ended) if found is None else found
 

@@ -187,8 +187,7 @@ def undescribed_fit(lines, zoom, result, steps):
     Twice, as if its parameters were determined and as if they were not; each with its outcome.
     """
     linear = linearised(lines, zoom)
-    parameters = linear.jacobian.shape[-1]
-    none = jnp.full((parameters, parameters), jnp.nan, linear.weighted.dtype)
+    none = jnp.zeros((0, 0), linear.weighted.dtype)
     of = _ended(lines, zoom, result, steps, linear.weighted, none)
     fits = [of(jnp.asarray(determined)) for determined in (True, False)]
     return told(lines, zoom, linear), *((fit, outcome_of(fit)) for fit in fits)
@@ -199,7 +198,7 @@ def with_covariance(known, determined, undetermined):
     if (found := by_numpy(known)) is None:
         return None
     fit, outcome = determined if found[1] else undetermined
-    return eqx.tree_at(lambda fit: fit.covariance, fit, as_jax(found[0])), outcome
+    return eqx.tree_at(lambda fit: fit.covariance, fit, found[0]), outcome
 
 
 def _ended(lines, zoom, result, steps, weighted, covariance):
