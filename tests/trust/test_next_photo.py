@@ -166,3 +166,14 @@ def test_candidates_are_in_their_part_of_the_image():
 def test_without_lines_that_count_nothing_is_suggested(fit, small):
     with pytest.raises(ValueError, match="must have a usable line"):
         zj.suggest_next(fit, small.weighted(np.zeros(len(small.frame))))
+
+
+def test_lines_that_say_nothing_at_all_want_any_photo():
+    t = np.linspace(-200, 200, 40)
+    cross = [320 + np.stack([t * along, t * (1 - along)], axis=-1) for along in (0, 1)]
+    lines = zj.Lines.from_ragged(2 * cross, [0, 0, 1, 1], [24, 50], image_size=(641, 641))
+    fit = zj.fit_zoom(lines, zoom=zj.PolynomialZoom(1), throw=False)
+    suggestion = zj.suggest_next(fit, lines)
+    assert np.isinf(suggestion.before)
+    assert np.isfinite(suggestion.table).all()
+    assert "would determine the lens best" in suggestion.sentence

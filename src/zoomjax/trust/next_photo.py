@@ -11,7 +11,7 @@ be compared there too. The cost is one small Jacobian per candidate; nothing is 
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -143,11 +143,12 @@ def suggest_next(
     candidates = jnp.asarray(candidate_lines(fit.lens.image_size, length), dtype)
     grid = jnp.asarray(focals, dtype)
     known = _known(lines, fit.lens.zoom, weights, counts)
-    now, table = _bands(known, fit.lens, candidates, grid, jnp.asarray(number), jnp.asarray(points_each))
+    told = _derivatives(fit.lens, candidates, grid)
     points = _image_grid(fit.lens.image_size).astype(dtype)[:, None]
     before = np.asarray(displacement_std(fit, points, focal=grid))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        before = float(_average(before, np))
+    with np.errstate(all="ignore"):
+        before = float(_average(before.ravel()))
+        now, table = _bands(known, *map(np.asarray, told), number * points_each)
     # What was measured of the noise is in `before`; how a photo changes it is the ratio.
     table = np.nan_to_num(np.asarray(table, np.float64), nan=np.inf)  # what rounding alone is left of
     if np.isfinite(before) and float(now) > 0:
@@ -228,11 +229,11 @@ class _Known(NamedTuple):
         points, frames: how many count.
     """
 
-    information: Any
-    noise: Any
-    variance: Any
-    points: Any
-    frames: Any
+    information: np.ndarray
+    noise: np.ndarray
+    variance: float
+    points: float
+    frames: int
 
 
 def _known(lines, zoom, weights, counts) -> _Known:
@@ -240,80 +241,76 @@ def _known(lines, zoom, weights, counts) -> _Known:
     information = np.einsum("lri,lrj->lij", jacobian, jacobian)
     freedom = np.sum(weights * (counts - 2))
     counted = weights > 0
-    of = _Known(
+    return _Known(
         information.sum(axis=0),
         np.einsum("l,lij->ij", weights, information),
         np.sum(weighted**2) / (freedom if freedom > 0 else 1),
         counts[counted].sum(),
         np.unique(np.asarray(lines.frame)[counted]).size,
     )
-    return jax.tree.map(lambda value: jnp.asarray(value, jacobian.dtype), of)
 
 
-@light_program
-def _bands(known, lens, candidates, focals, number, counts):
-    """The mean standard deviation of the displacement now, and with each candidate.
+def _bands(known, rows, squared, counts):
+    """The mean standard deviation of the displacement now, and with each candidate, of so many points.
 
-    For independent points, and candidates with so many lines of so many points.
+    For independent points; `rows` and `squared` are those of `_derivatives`. A frame more has the weight of
+    one in eq. 13, and its lines and points equal shares.
     """
     information, noise, variance, points_counted, frames = known
-    zoom = lens.zoom
-    flat, unravel = ravel_pytree(zoom.parameters)
-    rows = _displacement_rows(lens, flat, unravel, focals)
+    eps, tiny = np.finfo(rows.dtype).eps, np.finfo(rows.dtype).tiny
+    eye = np.eye(rows.shape[-1], dtype=rows.dtype)
 
     def typical(information, noise):
         """Of the estimate with the prior: a variance of 1 for each parameter, weighed as a point is."""
-        ridge = variance / points_counted
-        eps = jnp.finfo(flat.dtype).eps
-        rounding = 64 * eps * jnp.trace(information)
-        ridge = jnp.maximum(ridge, rounding)  # lines without noise would leave nothing
-        eye = jnp.eye(flat.size, dtype=flat.dtype)
-        inverse = jnp.linalg.inv(information + ridge * eye)
-        covariance = inverse @ (variance * noise + ridge**2 * eye) @ inverse.T
-        squares = jnp.einsum("ndp,pq,ndq->n", rows, covariance, rows)
-        return _average(jnp.sqrt(jnp.maximum(squares, eps * jnp.max(squares))))  # or rounding is negative
+        rounding = 64 * eps * np.trace(information, axis1=-2, axis2=-1) + tiny
+        ridge = np.maximum(variance / points_counted, rounding)  # lines without noise would leave nothing
+        ridge = ridge[..., None, None] * eye
+        inverse = np.linalg.inv(information + ridge)
+        covariance = inverse @ (variance * noise + ridge**2) @ inverse.swapaxes(-1, -2)
+        squares = np.einsum("ndp,...pq,ndq->...n", rows, covariance, rows, optimize=True)
+        least = eps * np.max(squares, axis=-1, keepdims=True)  # or rounding is negative
+        return _average(np.sqrt(np.maximum(squares, least)))
 
-    def of_line(points, focal):
-        """Mean over a line's points of the squared derivatives of their residuals."""
-
-        def residuals(flat):
-            other = eqx.tree_at(lambda lens: lens.zoom, lens, with_parameters(zoom, unravel(flat)))
-            corrected = at_focal(other, focal).undistort(points)
-            return line_residuals(corrected - jnp.mean(corrected, axis=0)[None])
-
-        derivative = jax.jacfwd(residuals)(flat)
-        return derivative.T @ derivative / points.shape[0]
-
-    def with_photo(points, focal):
-        """A frame more: eq. 13 gives it the weight of one, and its lines and points equal shares."""
-        squared = jnp.mean(jax.vmap(of_line, (0, None))(points, focal), axis=0)
-        old, new = frames / (frames + 1), 1 / (frames + 1)
-        more_noise = new**2 / (number * counts) * squared
-        return typical(old * information + new * squared, old**2 * noise + more_noise)
-
-    over = jax.vmap(jax.vmap(jax.vmap(with_photo, (0, None)), (0, None)), (None, 0))
-    return typical(information, noise), over(candidates, focals)
+    old, new = frames / (frames + 1), 1 / (frames + 1)
+    with_photo = typical(old * information + new * squared, old**2 * noise + new**2 / counts * squared)
+    return typical(information, noise), with_photo
 
 
-def _displacement_rows(lens, flat, unravel, focals):
-    """Derivatives by the parameters of where points all over the image go, at all focal lengths."""
-    points = _image_grid(lens.image_size).astype(flat.dtype)
+@light_program
+def _derivatives(lens, candidates, focals):
+    """Derivatives by the parameters of where points all over the image go, at all focal lengths: (n, 2, p).
 
-    def corrected(flat, focal):
+    And for each focal length and candidate the mean over its points of the squared derivatives of their
+    residuals, (p, p).
+    """
+    flat, unravel = ravel_pytree(lens.zoom.parameters)
+    everywhere = _image_grid(lens.image_size).astype(flat.dtype)
+
+    def corrected(flat, points, focal):
         zoom = with_parameters(lens.zoom, unravel(flat))
         return at_focal(eqx.tree_at(lambda lens: lens.zoom, lens, zoom), focal).undistort(points)
 
-    rows = jax.vmap(jax.jacfwd(corrected), (None, 0))(flat, focals)
-    return rows.reshape(-1, 2, flat.size)
+    def residuals(flat, points, focal):
+        line = corrected(flat, points, focal)
+        return line_residuals(line - jnp.mean(line, axis=0)[None])
+
+    def of_candidate(lines, focal):
+        each = jax.vmap(jax.jacfwd(residuals), (None, 0, None))(flat, lines, focal)
+        each = each.reshape(-1, flat.size)
+        return each.T @ each / each.shape[0]
+
+    rows = jax.vmap(jax.jacfwd(corrected), (None, None, 0))(flat, everywhere, focals)
+    over = jax.vmap(jax.vmap(jax.vmap(of_candidate, (0, None)), (0, None)), (None, 0))
+    return rows.reshape(-1, 2, flat.size), over(candidates, focals)
 
 
-def _average(stds, xp: Any = jnp):
-    """The geometric mean.
+def _average(stds):
+    """The geometric mean, over the last axis.
 
     The largest, or the plain mean, is that of the worst focal length; a photo elsewhere then gains nothing,
     and one there as much wherever its lines are, for the next worst is left.
     """
-    return xp.exp(xp.mean(xp.log(stds)))
+    return np.exp(np.mean(np.log(stds), axis=-1))
 
 
 def _image_grid(image_size):
