@@ -4,6 +4,7 @@ import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -74,7 +75,14 @@ def pool():
         yield made
 
 
-@pytest.mark.parametrize("how", [{}, pytest.param(LINES | {"centre": "fit"}, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"centre": jnp.array([2141.123456789, 1420.987654321])},
+        pytest.param(LINES | {"centre": "fit"}, marks=pytest.mark.slow),
+    ],
+    ids=["given", "fitted"],
+)
 def test_an_executor_selects_the_same_of_the_candidates_here(boards, pool, how):
     any_centre = [zj.lines.compress_any_centre(lines) for lines in boards[2:]]
     models = [zj.models.Model(zoom, 2) for zoom in CANDIDATES[1:]]

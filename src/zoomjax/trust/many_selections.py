@@ -106,7 +106,7 @@ def _by_executor(executor, sets, candidates, centre, how) -> Iterator[Choice | S
     for number, one in enumerate(sets):
         with of_set(number):
             models.append(candidates_of(about_centre(one, own), candidates))
-    task = functools.partial(_in_a_task, candidates=sent(candidates), centre=centre, how=how)
+    task = functools.partial(_in_a_task, given=sent((candidates, centre)), how=how)
     parts = ((first, sent(sets[first : first + _IN_A_TASK])) for first in range(0, len(sets), _IN_A_TASK))
     with contextlib.closing(in_order(executor, task, parts)) as done:
         for one in done:
@@ -116,10 +116,10 @@ def _by_executor(executor, sets, candidates, centre, how) -> Iterator[Choice | S
                 yield _unpacked(back, models[number])
 
 
-def _in_a_task(part, *, candidates, centre, how):
+def _in_a_task(part, *, given, how):
     """`_each` of some of the data sets, for the way back."""
     first, sets = part
-    return [_packed(found) for found in _each(arrived(sets), first, arrived(candidates), centre, how)]
+    return [_packed(found) for found in _each(arrived(sets), first, *arrived(given), how)]
 
 
 def _packed(found):
