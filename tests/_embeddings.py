@@ -437,7 +437,7 @@ LEFT_OUT = {
             ),
             *("write_lines_csv", "undistort_image", "undistort_photo", "undistort_video"),
             *("redistort_image", "redistort_photo", "redistort_video", "read", "write", "formats"),
-            *("find_lenses", "lens_names", "library_lens", "match_lens", "stream"),
+            *("find_lenses", "lens_names", "library_lens", "match_lens", "stream", "local_copies"),
         ),
         FILES,
     ),

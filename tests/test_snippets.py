@@ -64,6 +64,7 @@ IN_CI = sorted(
 ON_A_CLUSTER = sorted(line for line in OURS if "--cluster" in line)
 OTHERS = sorted(OURS - set(IN_CI) - set(ON_A_CLUSTER))
 ADDRESS = "tcp://192.168.0.5:8786"  # of a scheduler, as pages have it
+ELSEWHERE = "s3://bucket", "https://example.org"  # where pages have files
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +84,7 @@ def given(tmp_path_factory):
         (folder / place).mkdir()
         shutil.copy(folder / name, (folder / place / "clip").with_suffix(Path(name).suffix))
     shutil.copytree(folder / "photos", folder / "shoot" / "day1")
+    shutil.make_archive(str(folder / "photos"), "zip", folder, "photos")
     with Image.open(photos[0]) as photo:
         photo.save(folder / "plate.tif", exif=photo.getexif())
     write_clip(folder / "turning.mp4", turning_frames())
@@ -254,15 +256,17 @@ def ran(lines, given, folders):
     The shell takes the commands apart; one process runs them all.
     """
     jobs = {}
-    for line in lines:
-        folder = folders.mktemp("command") / "work"
+    for named in lines:
+        line, folder = named, folders.mktemp("command") / "work"
         shutil.copytree(given, folder, copy_function=os.link)
+        for place in ELSEWHERE:
+            line = line.replace(place, folder.as_uri())
         apart = subprocess.run(
             ["sh", "-c", f"printf '%s\\n' {line}"], cwd=folder, capture_output=True, text=True, check=True
         )
         words = apart.stdout.splitlines()
         shutil.rmtree(folder / words[words.index("-o") + 1], ignore_errors=True)
-        jobs[line] = str(folder), words
+        jobs[named] = str(folder), words
     done = subprocess.run(
         [sys.executable, "-c", SEVERAL],
         input=json.dumps(list(jobs.values())),

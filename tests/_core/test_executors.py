@@ -1,5 +1,6 @@
 """Workers of an executor that see other files than the machine that the work comes from."""
 
+import dataclasses
 import itertools
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,6 +13,7 @@ import zoomjax as zj
 from zoomjax._core import executors
 from zoomjax.app.undistort_files import Job, undistort_files
 from zoomjax.detect import detect, find_photos
+from zoomjax.io import local_copies
 from zoomjax.scenes import nikkor_18_200
 
 SIZE = (300, 200)
@@ -118,3 +120,39 @@ def test_what_is_there_of_an_earlier_run_is_no_result(job, away, tmp_path):
         done = undistort_files(job, executor=executor)
     assert old.read_bytes() == content
     assert "must be one that workers share" in next(iter(done.skipped.values()))
+
+
+def lose(item):
+    """A copy, which is on the disk of the machine that the work comes from alone."""
+    Path(getattr(item, "source", None) or getattr(item, "path", item)).unlink()
+
+
+def test_a_worker_that_does_not_see_a_copy_makes_its_own(photos, away):
+    pytest.importorskip("fsspec")
+    expected = list(detect(find_photos([photos]), zj.EdgeDetector()))
+    with local_copies([f"file://{photos.as_posix()}"]) as copies:
+        sources = find_photos(copies)
+        with Elsewhere(before=lose) as executor:
+            found = list(detect(sources, zj.EdgeDetector(), executor=executor))
+        assert not sources[0].path.exists()  # which the worker has removed for the next one
+    assert [d.problem for d in found] == [d.problem for d in expected]
+    for one, other in zip(found, expected, strict=True):
+        assert len(one.lines) == len(other.lines) > 0
+        np.testing.assert_array_equal(np.concatenate(one.lines), np.concatenate(other.lines))
+    assert len(list(photos.iterdir())) == 2
+
+
+def test_a_worker_corrects_a_copy_of_its_own(photos, job, away, tmp_path):
+    pytest.importorskip("fsspec")
+    here = undistort_files(dataclasses.replace(job, output=tmp_path / "here"))
+    with (
+        local_copies([f"file://{photos.as_posix()}"]) as copies,
+        Elsewhere(before=lose) as executor,
+    ):
+        there = undistort_files(
+            dataclasses.replace(job, inputs=tuple(map(Path, copies))), executor=executor
+        )
+    assert not there.skipped
+    assert len(here.files) == len(there.files) == 2
+    for (_, one), (_, other) in zip(here.files, there.files, strict=True):
+        np.testing.assert_array_equal(cv2.imread(str(one)), cv2.imread(str(other)))

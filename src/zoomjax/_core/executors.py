@@ -15,11 +15,12 @@ import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import numpy as np
 
+from .copies import Origin, have_copy, origin_of
 from .text import reason
 
 _MOST_AHEAD = 4096
@@ -77,7 +78,8 @@ def in_order(
         items: taken as they are handed over, at most some thousands ahead.
         size: bytes that an item takes until it is done.
         there: makes of an item what the task is given: whole paths, as workers are in other folders.
-        file: what the task reads, if it is a file: a worker where it has another size does not run it.
+        file: what the task reads, if it is a file: a worker where it has another size does not run it, and
+            one that does not see it makes a copy, if it is one (`copies`).
 
     Raises:
         RuntimeError: the executor gave up, as a process pool does when one of its processes dies.
@@ -122,20 +124,32 @@ def in_order(
             future.cancel()
 
 
-def _seen(file: str | os.PathLike[str] | None) -> tuple[str, int] | None:
-    """A file's path, and its size as it is here; None where there is none."""
+class _Seen(NamedTuple):
+    """A file's whole path, its size as it is here, and where it is from if it is a copy."""
+
+    path: str
+    size: int
+    origin: Origin | None
+
+
+def _seen(file: str | os.PathLike[str] | None) -> _Seen | None:
+    """None where there is no file."""
     with contextlib.suppress(OSError):
-        return None if file is None else (os.path.abspath(file), os.stat(file).st_size)
+        return (
+            None if file is None else _Seen(os.path.abspath(file), os.stat(file).st_size, origin_of(file))
+        )
     return None
 
 
-def _check_same(file: tuple[str, int] | None) -> None:
+def _check_same(file: _Seen | None) -> None:
     """In a worker: raise ValueError where a file has another size than where the work comes from."""
-    found = file and _seen(file[0])
-    if file and found and found != file:
+    if file and file.origin:
+        have_copy(file.path, file.origin)
+    found = file and _seen(file.path)
+    if file and found and found.size != file.size:
         raise ValueError(
-            f"the worker on {platform.node()} sees another file {file[0]}, of {found[1]} bytes instead of "
-            f"{file[1]}: workers must see the same files"
+            f"the worker on {platform.node()} sees another file {file.path}, of {found.size} bytes instead "
+            f"of {file.size}: workers must see the same files"
         )
 
 
@@ -185,7 +199,7 @@ def _away(
     wide: bool,
     item: Any,
     *,
-    file: tuple[str, int] | None,
+    file: _Seen | None,
 ) -> tuple[Any, list[tuple[str, type[Warning]]]]:
     """In a worker: the result of a task, and its warnings, where nobody would see them."""
     with _float64(wide):

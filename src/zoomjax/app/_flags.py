@@ -4,6 +4,8 @@ import re
 from collections.abc import Collection, Sequence
 from typing import Any
 
+from .._core.copies import by_url
+
 FLAGS = {
     name: f"--{name.replace('_', '-')}"
     for name in (
@@ -36,14 +38,14 @@ _OTHER_WAY = re.compile(rf",? or [^.,;:()]*\(argument ({'|'.join(FLAGS)})\)")
 
 
 def with_flags(message: str, options: Collection[str] | None = None) -> str:
-    """A message of the library with the command line's names for arguments.
+    """A message of the library with the command line's names for arguments, and URLs for copies of files.
 
     Of the command's `options`, where they are known, for which it leaves out other ways by options that the
     command does not have.
     """
     if options is not None:
         message = _OTHER_WAY.sub(lambda way: way[0] if FLAGS[way[1]] in options else "", message)
-    return _ARGUMENT.sub(lambda found: FLAGS[found[1]], message)
+    return by_url(_ARGUMENT.sub(lambda found: FLAGS[found[1]], message))
 
 
 def options_of(command: Any, words: Sequence[str]) -> set[str] | None:

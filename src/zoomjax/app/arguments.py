@@ -208,14 +208,30 @@ def centre_of(text: str) -> Literal["fit", "moving", "image"] | tuple[float, flo
     return x, y
 
 
-def split_lens(inputs: list[Path]) -> tuple[Path, tuple[Path, ...]]:
+def at_hand(context: typer.Context, inputs: list[str], *, quiet: bool) -> list[str]:
+    """The inputs; in place of URLs, copies that are there until the command ends."""
+    from .._core.copies import is_url
+
+    if not any(map(is_url, inputs)):
+        return inputs
+    from ..detect.sources import MARKS, VIDEO_SUFFIXES
+    from ..io.local_copies import local_copies
+    from ..io.photo import SUFFIXES
+    from .console import progress_bar
+
+    with progress_bar("Copying", quiet=quiet) as progress:
+        kinds = SUFFIXES, VIDEO_SUFFIXES
+        return context.with_resource(local_copies(inputs, kinds=kinds, besides=MARKS, progress=progress))
+
+
+def split_lens(inputs: list[str]) -> tuple[Path, tuple[Path, ...]]:
     """The file of the lens, which comes first, and what to correct."""
     if len(inputs) < 2:
         raise ValueError(
             "Give the lens and then what to correct: lens.json photos/*.jpg. Without a lens of your own, "
             "--lens auto takes that of the EXIF data."
         )
-    return lens_file(inputs[0]), tuple(inputs[1:])
+    return lens_file(Path(inputs[0])), tuple(map(Path, inputs[1:]))
 
 
 def lens_file(given: Path) -> Path:

@@ -1,7 +1,6 @@
 """The commands and their options.
 
-Commands import what they need when they run, so that ``--help`` does not wait for JAX. They compute in
-float64.
+Commands import what they need when they run: ``--help`` does not wait for JAX. They compute in float64.
 """
 
 import dataclasses
@@ -22,6 +21,7 @@ from .arguments import (
     ModelName,
     Overwrite,
     Terms,
+    at_hand,
     board_of,
     centre_of,
     number_of_cores,
@@ -159,9 +159,9 @@ def calibrate(
         list[str],
         typer.Argument(
             metavar="INPUT...",
-            help="Photos, folders or patterns such as shots/*.jpg; or one video; or files of lines: "
-            "lines.npz, or CSV files with the columns frame,line,x,y[,focal]; or a folder of results, "
-            "whose lines are fitted again.",
+            help="Photos, folders or patterns such as shots/*.jpg, or URLs; or one video; or files "
+            "of lines: lines.npz, or CSV files with the columns frame,line,x,y[,focal]; or a folder of "
+            "results, whose lines are fitted again.",
         ),
     ],
     output: ResultsFolder,
@@ -235,7 +235,7 @@ def calibrate(
     removed; its lines.npz, tracks.npz and track.csv stay until they are
     written again.
     """
-    inputs = [str(results_of(path) or path) for path in inputs]
+    inputs = [str(results_of(path) or path) for path in at_hand(context, inputs, quiet=quiet)]
     of_lines = any(path.lower().endswith((".npz", ".csv")) for path in inputs)
     if not (of_lines or dry_run or cluster):
         import_ahead(DETECTION)
@@ -347,12 +347,13 @@ def calibrate(
 
 @app.command(epilog=UNDISTORT_EXAMPLES)
 def undistort(
+    context: typer.Context,
     inputs: Annotated[
-        list[Path],
+        list[str],
         typer.Argument(
             metavar="[lens.json] INPUT...",
             help="The lens written by zoomjax calibrate, or the folder of its results, unless --lens is "
-            "given; photos or videos, folders of them, or patterns.",
+            "given; photos or videos, folders of them, patterns, or URLs of these.",
         ),
     ],
     output: FileOrFolder,
@@ -380,7 +381,8 @@ def undistort(
     from .cluster import cluster_executor
     from .undistort_files import Job, undistort_files
 
-    file, files = split_lens(inputs) if lens is None else (None, tuple(inputs))
+    inputs = at_hand(context, inputs, quiet=quiet)
+    file, files = split_lens(inputs) if lens is None else (None, tuple(map(Path, inputs)))
     job = Job(file, files, output, focal, keep, interpolation, border, hold, overwrite)
     job = dataclasses.replace(job, redistort=redistort, again=again, resume=resume, dry_run=dry_run)
     with (

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._core.copies import shown_url
 from .._core.text import listed
 from .cluster import cluster_executor
 from .console import REPORT, progress_bar, stages
@@ -134,7 +135,7 @@ def what_is_run(title: str, images: "ImageCalibration | None" = None) -> "Run":
 
     now = datetime.datetime.now().astimezone()
     rows = [
-        ("Command", shlex.join(["zoomjax", *sys.argv[1:]])),
+        ("Command", shlex.join(["zoomjax", *map(shown_url, sys.argv[1:])])),
         ("In the folder", os.getcwd()),
         ("Date", now.strftime("%Y-%m-%d %H:%M %Z")),
     ]

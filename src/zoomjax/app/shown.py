@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from .._core.copies import by_url
 from .._core.text import plain
 from ._flags import with_flags
 from .console import show_calibration, show_frames, show_images, show_verdict, tell, tell_written
@@ -75,12 +76,13 @@ class Shown:
 
 def show_outcome(done: "Outcome", *, quiet: bool, as_json: bool) -> None:
     """Print what ``zoomjax undistort`` has done: on stdout results, on stderr what was skipped."""
-    skipped = {path: with_flags(reason) for path, reason in done.skipped.items()}
+    skipped = {by_url(path): with_flags(reason) for path, reason in done.skipped.items()}
+    notes = [*map(by_url, done.notes)]
     if as_json:
-        files = [{"source": str(source), "target": str(target)} for source, target in done.files]
-        print(json.dumps({"files": files, "skipped": skipped, "notes": done.notes}, indent=2))
+        files = [{"source": by_url(str(source)), "target": str(target)} for source, target in done.files]
+        print(json.dumps({"files": files, "skipped": skipped, "notes": notes}, indent=2))
         return
-    for told in () if quiet else filter(None, (*done.sentence.split("\n"), *done.notes)):
+    for told in () if quiet else filter(None, (*done.sentence.split("\n"), *notes)):
         print(plain(told))
     for path, reason in skipped.items():
         print(plain(f"Skipped {path}: {reason}"), file=sys.stderr)

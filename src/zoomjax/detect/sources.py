@@ -30,7 +30,7 @@ _NOT_READ = (".gif", ".jp2", ".j2k", ".jxl", ".psd", ".exr", ".hdr", ".tga")
 RESULTS = ("lines", "model.png", "before-after.jpg", "motion.png", "panorama.jpg")
 """What a calibration puts into its folder that might be taken for photographs."""
 
-_OF_RESULTS = ("lens.json", ".zoomjax.json")
+MARKS = ("lens.json", ".zoomjax.json")
 """What such a folder has: where photos determine no lens, the list of what was written alone."""
 
 
@@ -205,7 +205,7 @@ def files_within(folder: Path, suffixes: Sequence[str]) -> list[Path]:
 
 def _all_within(folder: Path, suffixes: Sequence[str]) -> list[Path]:
     """As `files_within`, with RAW files that were developed."""
-    results = {mark.with_name(name) for of in _OF_RESULTS for mark in folder.rglob(of) for name in RESULTS}
+    results = {mark.with_name(name) for of in MARKS for mark in folder.rglob(of) for name in RESULTS}
     return sorted(
         path
         for path in folder.rglob("*")

@@ -8,6 +8,7 @@ from .focal_table import FocalTable as FocalTable
 from .focal_table import read_focal_table as read_focal_table
 from .focal_track import FocalTrack as FocalTrack
 from .focal_track import read_focal_track as read_focal_track
+from .local_copies import local_copies as local_copies
 from .photo import read_photo as read_photo
 from .text_table import TextTable as TextTable
 from .text_table import read_text_table as read_text_table
