@@ -30,6 +30,9 @@ _DATA = {"mpegts": ("klv", "timed_id3", "scte_35"), "mov": ("klv",)}
 _TRANSPORT = ("dvbsub", "dvb_subtitle", "dvb_teletext", "libzvbi_teletextdec")
 """Subtitles of transport streams, of which FFmpeg takes any, and makes data of the others."""
 
+_HEARD = ("aac", "aac_latm", "ac3", "dts", "eac3", "mp1", "mp2", "mp3", "opus", "s302m", "truehd")
+"""Sound of transport streams, of which the same is true: nobody hears the others."""
+
 _APPLES = "com.apple.quicktime."
 """How keys begin by which phones tell place and camera."""
 
@@ -139,6 +142,7 @@ def put(output: Any, what: Carried, named: Path) -> dict[int, Any]:
 
 def _copied(output: Any, source: Any, named: Path) -> Any:
     try:
+        _check_heard(source, named)
         stream = output.add_stream_from_template(source)
     except ValueError as error:
         raise ValueError(
@@ -149,6 +153,14 @@ def _copied(output: Any, source: Any, named: Path) -> Any:
     if source.type != "data":
         stream.disposition = source.disposition
     return stream
+
+
+def _check_heard(source: Any, named: Path) -> None:
+    """Raise ValueError for sound that FFmpeg would write to a container as data of no known kind."""
+    if source.type == "audio" and CONTAINER[named.suffix.lower()] == "mpegts":
+        codec = source.codec_context.codec.canonical_name
+        if codec not in _HEARD:
+            raise ValueError(f"a transport stream has no number for {codec}")
 
 
 def mux(output: Any, named: Path, packets: Any) -> None:
