@@ -168,6 +168,22 @@ def test_sound_of_transport_streams_is_heard_or_refused(codec, tmp_path):
         assert not target.exists()
 
 
+@pytest.mark.parametrize("encoder", ["ffv1", "libvpx-vp9", "png", "mpeg4"])
+def test_pictures_of_transport_streams_are_seen_or_refused(encoder, tmp_path):
+    """As of sound, FFmpeg makes data of them: the result had no pictures, without a word."""
+    source, target = clip(tmp_path / "in.mkv"), tmp_path / "out.ts"
+    if encoder == "mpeg4":
+        undistort_video(source, target, lens=lens(), focal=20.0, encoder=encoder)
+        with decode_video(target) as (_, frames):
+            assert len(list(frames)) == 4
+    else:
+        with pytest.raises(
+            ValueError, match=r"to a \.ts file.*leave out argument encoder, or choose \.mkv"
+        ):
+            undistort_video(source, target, lens=lens(), focal=20.0, encoder=encoder)
+        assert not target.exists()
+
+
 APPLE = {f"com.apple.quicktime.{name}": name for name in ("make", "model", "location.ISO6709")}
 
 

@@ -33,6 +33,9 @@ _TRANSPORT = ("dvbsub", "dvb_subtitle", "dvb_teletext", "libzvbi_teletextdec")
 _HEARD = ("aac", "aac_latm", "ac3", "dts", "eac3", "mp1", "mp2", "mp3", "opus", "s302m", "truehd")
 """Sound of transport streams, of which the same is true: nobody hears the others."""
 
+_SEEN = ("h264", "hevc", "vvc", "mpeg1video", "mpeg2video", "mpeg4", "mjpeg", "dnxhd", "jpeg2000")
+"""Their pictures, of which nobody sees others."""
+
 _APPLES = "com.apple.quicktime."
 """How keys begin by which phones tell place and camera."""
 
@@ -227,6 +230,12 @@ def starts(output: Any, named: Path, copied: Sequence[Any]) -> None:
     Raises:
         ValueError: the container does not take these streams.
     """
+    pictures = output.streams.video[0].codec_context.codec.canonical_name
+    if output.format.name == "mpegts" and pictures not in _SEEN:
+        raise ValueError(
+            f"Cannot write {pictures} to a {named.suffix} file, in which no player finds these pictures: "
+            "leave out argument encoder, or choose .mkv."
+        )
     try:
         output.start_encoding()
     except (ValueError, av.error.FFmpegError) as error:
