@@ -83,7 +83,7 @@ def test_what_a_container_does_not_hold_is_said(tmp_path):
     assert done.not_kept == ("subtitles (srt, eng)", "the attachment font.ttf", "chapters (2)")
 
 
-def spoken(path, tracks, codec="aac"):
+def spoken(path, tracks, codec="aac", late=0.0):
     """A video with silent sound of these languages, titles and marks."""
     with av.open(str(path), "w") as out:
         video = out.add_stream("libx264", rate=25)
@@ -102,7 +102,8 @@ def spoken(path, tracks, codec="aac"):
         out.mux(video.encode(None))
         for sound in sounds:
             silence = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
-            silence.sample_rate, silence.pts, silence.time_base = 48000, 0, Fraction(1, 48000)
+            silence.sample_rate, silence.time_base = 48000, Fraction(1, 48000)
+            silence.pts = round(late * 48000)
             out.mux(sound.encode(silence))
             out.mux(sound.encode(None))
     return path
@@ -182,6 +183,21 @@ def test_pictures_of_transport_streams_are_seen_or_refused(encoder, tmp_path):
         ):
             undistort_video(source, target, lens=lens(), focal=20.0, encoder=encoder)
         assert not target.exists()
+
+
+@pytest.mark.parametrize("late", [0.05, 1.5])
+def test_sound_that_begins_late_is_not_for_avi(late, tmp_path):
+    """As of a broadcast, whose times do not begin at 0: it was ahead of the pictures, without a word."""
+    target = tmp_path / "out.avi"
+    source = spoken(tmp_path / "in.mkv", [({}, av.stream.Disposition.default)], "pcm_s16le", late)
+    if late < 0.1:
+        undistort_video(source, target, lens=lens(), focal=20.0)
+        return
+    with pytest.raises(
+        ValueError, match=r"begins at 1\.50 s, which a \.avi file does not hold.*Choose \.mkv"
+    ):
+        undistort_video(source, target, lens=lens(), focal=20.0)
+    assert not target.exists()
 
 
 APPLE = {f"com.apple.quicktime.{name}": name for name in ("make", "model", "location.ISO6709")}

@@ -36,6 +36,9 @@ _HEARD = ("aac", "aac_latm", "ac3", "dts", "eac3", "mp1", "mp2", "mp3", "opus", 
 _SEEN = ("h264", "hevc", "vvc", "mpeg1video", "mpeg2video", "mpeg4", "mjpeg", "dnxhd", "jpeg2000")
 """Their pictures, of which nobody sees others."""
 
+_AT_ONCE = 0.1
+"""s after time 0, at which players of AVI begin the sound, by which it may begin late."""
+
 _APPLES = "com.apple.quicktime."
 """How keys begin by which phones tell place and camera."""
 
@@ -144,6 +147,12 @@ def put(output: Any, what: Carried, named: Path) -> dict[int, Any]:
 
 
 def _copied(output: Any, source: Any, named: Path) -> Any:
+    late = float((source.start_time or 0) * source.time_base) if source.type == "audio" else 0.0
+    if output.format.name == "avi" and late > _AT_ONCE:
+        raise ValueError(
+            f"The {_name(source)} begins at {late:.2f} s, which a {named.suffix} file does not hold: it "
+            "would be ahead of the pictures. Choose .mkv."
+        )
     try:
         _check_heard(source, named)
         stream = output.add_stream_from_template(source)
