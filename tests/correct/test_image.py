@@ -109,7 +109,9 @@ def test_boolean_masks_and_strided_views(rng):
     )
 
 
-@pytest.mark.parametrize("value", [True, np.True_, [True, False, True], "9", "white", None, 1j])
+@pytest.mark.parametrize(
+    "value", [True, np.True_, [True, False, True], [1, True, 0], "9", "white", None, 1j]
+)
 @pytest.mark.parametrize("function", ["undistort_image", "redistort_image"])
 @pytest.mark.usefixtures("unchecked")
 def test_a_border_value_that_is_no_number_is_refused(function, value):
