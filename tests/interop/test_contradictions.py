@@ -234,3 +234,16 @@ def test_focal_lengths_that_are_not_those_of_a_file_are_refused(name, tmp_path):
         zj.interop.read(tmp_path / "a", format=name, focal=rounded[: len(focal)])
     with pytest.raises(ValueError, match=r"its focal length is 24 mm, and argument focal has 50 mm there"):
         zj.interop.read(tmp_path / "a", format=name, focal=[50.0, 35.0, 24.0][: len(focal)])
+
+
+@pytest.mark.parametrize("name", ["discorpy", "kalibr"])
+def test_focal_lengths_in_another_order_than_files_that_are_named_by_them_are_refused(name, tmp_path):
+    """Files are read in the order of their names, and not in that in which they were written."""
+    lens, focal = LENSES["landscape"](), [50.0, 24.0, 35.0]
+    zj.interop.write(lens, tmp_path / "a", format=name, focal=focal, pixel_pitch=PITCH)
+    size = lens.image_size if name == "discorpy" else None
+    zj.interop.read(tmp_path / "a", format=name, focal=sorted(focal), image_size=size)
+    with pytest.raises(
+        ValueError, match=r"order of the files, which their names say, 24, 35, 50, but it is"
+    ):
+        zj.interop.read(tmp_path / "a", format=name, focal=focal, image_size=size)
