@@ -224,7 +224,7 @@ def test_a_profile_of_cameras_with_other_sensors_is_refused(tmp_path):
         zj.interop.read(tmp_path / "a.lcp")
 
 
-@pytest.mark.parametrize("name", ["opencv", "nerfstudio", "gyroflow"])
+@pytest.mark.parametrize("name", ["opencv", "nerfstudio"])
 def test_focal_lengths_that_are_not_those_of_a_file_are_refused(name, tmp_path):
     """As those of another order: each entry got the focal length of another one, without a word."""
     lens = LENSES["landscape"]()

@@ -145,8 +145,6 @@ def contents(
     if job.focal is not None:
         if len(job.focal) != len(nodes):
             raise ValueError(f"argument focal must hold {len(nodes)} focal lengths, one for each camera")
-        if mm and px is not None:
-            refuse_other_focals([node.focal for node in nodes], job)
         nodes = [dataclasses.replace(n, focal=f) for n, f in zip(nodes, job.focal, strict=True)]
         mm = job.focal_unit == "mm"
         if px is not None and not mm:
@@ -157,9 +155,9 @@ def contents(
     return Contents(tuple(nodes), size, "mm" if mm else "px", notes, pixel_pitch=pitch)
 
 
-def refuse_other_focals(told: Iterable[float], job: Import) -> None:
+def refuse_other_focals(nodes: Iterable[Node], job: Import) -> None:
     """Raise ValueError where argument focal has other mm than a file, whose order may be another one."""
-    for own, given in zip(told, job.focal or (), strict=False):
+    for own, given in zip((node.focal for node in nodes), job.focal or (), strict=False):
         if job.focal_unit == "mm" and abs(given - own) > _ROUNDED * own:
             raise ValueError(
                 f"its focal length is {own:g} mm, and argument focal has {given:g} mm there: leave that out"
