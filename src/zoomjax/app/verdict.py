@@ -295,7 +295,7 @@ def _changed(photos: Sequence[Metadata]) -> Iterable[Finding]:
 
 def _of_pages(photos: Iterable[Path]) -> Iterable[Finding]:
     """Files of several photos, of which one was used: a remark, as they do no harm."""
-    several = []
+    several: list[str] = []
     for photo in photos:
         with contextlib.suppress(OSError, ValueError):
             several += [photo.name] * (photo.suffix.lower() in (".tif", ".tiff") and count_pages(photo) > 1)
