@@ -470,6 +470,7 @@ def test_large_integers_stay_within_their_type(dtype):
 
 
 @pytest.mark.parametrize("dtype", ["int64", "uint64", ">i8"])
+@pytest.mark.usefixtures("unchecked")
 def test_integers_that_jax_cuts_off_are_refused(dtype):
     """Without float64 those of 64 bits become those of 32, whatever is in them."""
     d = zj.Distortion(np.array([0.0]), np.array([11.5, 7.5]), np.array(14.0))
