@@ -73,6 +73,7 @@ LINES_ALIKE = {  # of both kinds of lines
     "zero focal": ({"focal": np.array([0.0, 70.0])}, r"focal\[0\] is 0"),
     "NaN focal": ({"focal": [24.0, np.nan]}, r"focal\[1\] is nan"),
     "one number for focal": ({"focal": 24.0}, r"focal must have shape \(frame,\), but its shape is \(\)"),
+    "a boolean among focals": ({"focal": [24.0, True]}, "focal must hold real numbers"),
     "focal in words": ({"focal": ["a", "b"]}, "focal must hold real numbers"),
     "complex focal": (
         {"focal": np.array([1j, 2])},

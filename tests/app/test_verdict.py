@@ -52,6 +52,17 @@ def test_photos_of_one_lens_say_nothing(tmp_path):
     assert findings_of_photos(photos, SIZE) == []
 
 
+def test_of_files_of_several_pages_it_is_said_that_the_first_is_used(tmp_path):
+    """Of a stack of photos all but one were left out without a word; previews are none."""
+    page = Image.new("L", SIZE)
+    for name, size in (("stack.tif", SIZE), ("preview.tif", (SIZE[0] // 8, SIZE[1] // 8))):
+        page.save(tmp_path / name, save_all=True, append_images=[Image.new("L", size)])
+    page.save(tmp_path / "one.tif")
+    names = ("stack.tif", "preview.tif", "one.tif", "missing.tif")
+    (found,) = findings_of_photos([tmp_path / name for name in names], SIZE)
+    assert (found.verdict, found.found) == ("good", "of the pages of stack.tif the first alone was used.")
+
+
 def test_photos_that_were_changed_before_are_doubtful(tmp_path):
     xmp = b'<x:xmpmeta><a crs:LensProfileEnable="1" crs:AlreadyApplied="True"/></x:xmpmeta>'
     for number in range(3):

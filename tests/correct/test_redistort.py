@@ -68,7 +68,9 @@ def test_mistakes_are_sentences():
     framing = zj.correct.frame_output(lens(), SIZE, keep="grow")
     cases = {
         "its framing": lambda: redistort_image(small, lens(), focal=20.0, keep=framing),
-        "with which it was corrected": lambda: redistort_image(small, lens(), focal=20.0, keep="grow"),
+        'made with "grow" of an image of 320 x 192 px. Give': lambda: redistort_image(
+            small, lens(), focal=20.0, keep="grow"
+        ),
         "needs a lens": lambda: redistort_image(small, lens((160, 96))(20.0), keep="grow"),
         "focal must be given": lambda: redistort_image(small, lens((160, 96))),
         "must be left out": lambda: redistort_image(small, lens((160, 96))(20.0), focal=20.0),

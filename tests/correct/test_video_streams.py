@@ -83,7 +83,7 @@ def test_what_a_container_does_not_hold_is_said(tmp_path):
     assert done.not_kept == ("subtitles (srt, eng)", "the attachment font.ttf", "chapters (2)")
 
 
-def spoken(path, tracks):
+def spoken(path, tracks, codec="aac", late=0.0):
     """A video with silent sound of these languages, titles and marks."""
     with av.open(str(path), "w") as out:
         video = out.add_stream("libx264", rate=25)
@@ -91,7 +91,7 @@ def spoken(path, tracks):
         video.pix_fmt, video.disposition = "yuv420p", av.stream.Disposition.default
         sounds = []
         for tags, marks in tracks:
-            sounds.append(sound := out.add_stream("aac", rate=48000))
+            sounds.append(sound := out.add_stream(codec, rate=48000))
             sound.metadata.update(tags)
             sound.disposition = marks
         for number in range(4):
@@ -102,7 +102,8 @@ def spoken(path, tracks):
         out.mux(video.encode(None))
         for sound in sounds:
             silence = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
-            silence.sample_rate, silence.pts, silence.time_base = 48000, 0, Fraction(1, 48000)
+            silence.sample_rate, silence.time_base = 48000, Fraction(1, 48000)
+            silence.pts = round(late * 48000)
             out.mux(sound.encode(silence))
             out.mux(sound.encode(None))
     return path
@@ -149,6 +150,54 @@ def test_languages_and_marks_of_sound_go_over_or_are_said(tmp_path):
     assert told(tmp_path / "out.mkv") == told(source)
     alone = spoken(tmp_path / "one.mkv", [({"language": "eng"}, marks.default)])
     assert undistort_video(alone, tmp_path / "one.ts", lens=lens(), focal=20.0).not_kept == ()
+
+
+@pytest.mark.parametrize("codec", ["aac", "ac3", "pcm_s16le", "flac"])
+def test_sound_of_transport_streams_is_heard_or_refused(codec, tmp_path):
+    """FFmpeg writes any into them, as data if they have no number for it, and that was called kept."""
+    source = spoken(tmp_path / "in.mkv", [({}, av.stream.Disposition.default)], codec)
+    target = tmp_path / "out.ts"
+    if codec in ("aac", "ac3"):
+        undistort_video(source, target, lens=lens(), focal=20.0)
+        with av.open(str(target)) as made:
+            assert made.streams.audio[0].codec_context.codec.canonical_name == codec
+    else:
+        with pytest.raises(
+            ValueError, match=rf"Cannot keep the sound \({codec}\) in a \.ts file.*, \.mkv, or"
+        ):
+            undistort_video(source, target, lens=lens(), focal=20.0)
+        assert not target.exists()
+
+
+@pytest.mark.parametrize("encoder", ["ffv1", "libvpx-vp9", "png", "mpeg4"])
+def test_pictures_of_transport_streams_are_seen_or_refused(encoder, tmp_path):
+    """As of sound, FFmpeg makes data of them: the result had no pictures, without a word."""
+    source, target = clip(tmp_path / "in.mkv"), tmp_path / "out.ts"
+    if encoder == "mpeg4":
+        undistort_video(source, target, lens=lens(), focal=20.0, encoder=encoder)
+        with decode_video(target) as (_, frames):
+            assert len(list(frames)) == 4
+    else:
+        with pytest.raises(
+            ValueError, match=r"to a \.ts file.*leave out argument encoder, or choose \.mkv"
+        ):
+            undistort_video(source, target, lens=lens(), focal=20.0, encoder=encoder)
+        assert not target.exists()
+
+
+@pytest.mark.parametrize("late", [0.05, 1.5])
+def test_sound_that_begins_late_is_not_for_avi(late, tmp_path):
+    """As of a broadcast, whose times do not begin at 0: it was ahead of the pictures, without a word."""
+    target = tmp_path / "out.avi"
+    source = spoken(tmp_path / "in.mkv", [({}, av.stream.Disposition.default)], "pcm_s16le", late)
+    if late < 0.1:
+        undistort_video(source, target, lens=lens(), focal=20.0)
+        return
+    with pytest.raises(
+        ValueError, match=r"begins at 1\.50 s, which a \.avi file does not hold.*Choose \.mkv"
+    ):
+        undistort_video(source, target, lens=lens(), focal=20.0)
+    assert not target.exists()
 
 
 APPLE = {f"com.apple.quicktime.{name}": name for name in ("make", "model", "location.ISO6709")}

@@ -469,6 +469,20 @@ def test_large_integers_stay_within_their_type(dtype):
     assert np.abs(np.asarray(corrected, float) / most - 1).max() < 1e-6
 
 
+@pytest.mark.parametrize("dtype", ["int64", "uint64", ">i8"])
+@pytest.mark.usefixtures("unchecked")
+def test_integers_that_jax_cuts_off_are_refused(dtype):
+    """Without float64 those of 64 bits become those of 32, whatever is in them."""
+    d = zj.Distortion(np.array([0.0]), np.array([11.5, 7.5]), np.array(14.0))
+    jax.config.update("jax_enable_x64", False)
+    try:
+        assert np.all(np.asarray(zj.warp_image(np.full((16, 24), 7, dtype), d)) == 7)
+        with pytest.raises(ValueError, match=r"beyond those of u?int32.*image\.astype\(float\)"):
+            zj.warp_image(np.full((16, 24), 2**40, dtype), d)
+    finally:
+        jax.config.update("jax_enable_x64", True)
+
+
 def test_complex_images_are_refused():
     d = zj.Distortion(jnp.array([0.1]), jnp.array([11.5, 7.5]), jnp.array(14.0))
     with pytest.raises(ValueError, match="must hold real numbers"):

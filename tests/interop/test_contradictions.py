@@ -57,6 +57,8 @@ CASES = {
         "cols: 5, data: [-0.1,0.01,0,0,0]",
         "cols: 6, data: [-0.1,0.01,0,0,0,1]",
     ),
+    "hugin, no number": ("a.pto", PROJECT, "b0.01", "bnan"),
+    "hugin, infinite": ("a.pto", PROJECT, "b0.01", "binf"),
     "nerfstudio, twice": ("a.json", TWO, '"fl_y": 500', '"fl_y": 500, "k1": -0.2'),
     "nerfstudio, size": ("a.json", TWO, '"w": 360', '"w": 360.7'),
     "gyroflow, twice": ("a.json", ENTRIES, '"asymmetrical": true', '"focal_length": 35'),
@@ -84,6 +86,7 @@ CASES = {
     "lcp, size": ("a.lcp", LCP, '"1" stCamera:ImageWidth="600"', '"1" stCamera:ImageWidth="600.5"'),
 }
 TOLD = {
+    **dict.fromkeys(["hugin, no number", "hugin, infinite"], "its distortion is no map"),
     "nerfstudio, twice": "it has 'k1' twice",
     "gyroflow, twice": "it has 'focal_length' twice",
     "opentrackio, twice": "it has 'pinholeFocalLength' twice",
@@ -219,3 +222,28 @@ def test_a_profile_of_cameras_with_other_sensors_is_refused(tmp_path):
     (tmp_path / "a.lcp").write_text(LCP.replace(entry, both))
     with pytest.raises(ValueError, match=r"cameras of other sensors, SensorFormatFactor 1, 1\.5"):
         zj.interop.read(tmp_path / "a.lcp")
+
+
+@pytest.mark.parametrize("name", ["opencv", "nerfstudio"])
+def test_focal_lengths_that_are_not_those_of_a_file_are_refused(name, tmp_path):
+    """As those of another order: each entry got the focal length of another one, without a word."""
+    lens = LENSES["landscape"]()
+    focal = [24.0, 35.0, 50.0] if name != "opencv" else [24.0]
+    zj.interop.write(lens, tmp_path / "a", format=name, focal=focal, pixel_pitch=PITCH)
+    for rounded in ([24.0, 35.0, 50.0], [24.4, 35.2, 49.0]):
+        zj.interop.read(tmp_path / "a", format=name, focal=rounded[: len(focal)])
+    with pytest.raises(ValueError, match=r"its focal length is 24 mm, and argument focal has 50 mm there"):
+        zj.interop.read(tmp_path / "a", format=name, focal=[50.0, 35.0, 24.0][: len(focal)])
+
+
+@pytest.mark.parametrize("name", ["discorpy", "kalibr"])
+def test_focal_lengths_in_another_order_than_files_that_are_named_by_them_are_refused(name, tmp_path):
+    """Files are read in the order of their names, and not in that in which they were written."""
+    lens, focal = LENSES["landscape"](), [50.0, 24.0, 35.0]
+    zj.interop.write(lens, tmp_path / "a", format=name, focal=focal, pixel_pitch=PITCH)
+    size = lens.image_size if name == "discorpy" else None
+    zj.interop.read(tmp_path / "a", format=name, focal=sorted(focal), image_size=size)
+    with pytest.raises(
+        ValueError, match=r"order of the files, which their names say, 24, 35, 50, but it is"
+    ):
+        zj.interop.read(tmp_path / "a", format=name, focal=focal, image_size=size)

@@ -210,6 +210,34 @@ def test_the_shape_of_pixels_that_the_container_alone_tells_stays(tmp_path):
         assert made.streams.video[0].sample_aspect_ratio == Fraction(4, 3)
 
 
+def with_loss(path):
+    """A broadcast of which the packets of one group of frames did not arrive."""
+    write(path, number=2 * FRAMES, g="10", bf="0")
+    data = path.read_bytes()
+    packets = [data[start : start + 188] for start in range(0, len(data), 188)]
+    own = [i for i, packet in enumerate(packets) if (packet[1] & 0x1F, packet[2]) == (1, 0)]
+    begins = [i for i in own if packets[i][1] & 0x40]
+    gone = {i for i in own if begins[10] <= i < begins[20]}
+    gone -= {max(gone)} if len(gone) % 16 == 0 else set()  # packets are counted up to 15
+    path.write_bytes(b"".join(packet for i, packet in enumerate(packets) if i not in gone))
+    return path
+
+
+@pytest.mark.parametrize("work", WORKS)
+def test_packets_that_were_lost_are_said(work, tmp_path):
+    """Frames after them took the focal lengths of earlier ones, without a word."""
+    path = with_loss(tmp_path / "in.ts")
+    with pytest.warns(UserWarning, match=r"lost after 0\.267 s, and perhaps later.* focal lengths by time"):
+        WORKS[work](path)
+
+
+def test_packets_that_were_lost_are_said_by_segments(tmp_path):
+    path = with_loss(tmp_path / "in.ts")
+    with ThreadPoolExecutor(1) as executor, pytest.warns(UserWarning, match="Packets of the video") as told:
+        zj.undistort_video(path, tmp_path / "out.mp4", lens=lens(), focal=20.0, executor=executor)
+    assert len([each for each in told if "were lost" in str(each.message)]) == 1
+
+
 def test_fields_that_begin_later_are_said(tmp_path):
     """Of a broadcast some parts may be of fields, and others of frames."""
     parts = [
@@ -218,9 +246,12 @@ def test_fields_that_begin_later_are_said(tmp_path):
     ]
     path = tmp_path / "in.ts"
     path.write_bytes(b"".join(part.read_bytes() for part in parts))
-    with pytest.warns(UserWarning, match=r"interlaced.* Deinterlace it first") as warned:
+    with (
+        pytest.warns(UserWarning, match="unless recordings were joined"),
+        pytest.warns(UserWarning, match=r"interlaced.* Deinterlace it first") as warned,
+    ):
         zj.undistort_video(path, tmp_path / "out.mp4", lens=lens(), focal=20.0)
-    assert len(warned) == 1
+    assert sum("interlaced" in str(each.message) for each in warned) == 1
 
 
 def test_frames_of_tracks_that_are_not_those_of_the_file_are_said(tmp_path):

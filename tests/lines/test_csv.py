@@ -61,7 +61,8 @@ def bent(y, first=0, last=600):
             [(4 + i % 2, [p]) for pair in zip(bent(50), bent(90), strict=True) for i, p in enumerate(pair)],
             False,
         ),
-        ([(4, bent(50)), (4, bent(60))], False),  # nothing tells that another one begins
+        ([(4, bent(50, 0, 100)), (4, bent(50, 400))], False),  # a part is hidden
+        ([(4, bent(50)), (4, bent(60)[::-1])], False),  # nothing tells that another one begins
     ],
 )
 def test_a_number_of_two_lines_is_told(parts, two, tmp_path, recwarn):
@@ -71,6 +72,16 @@ def test_a_number_of_two_lines_is_told(parts, two, tmp_path, recwarn):
     read_lines_csv(path, image_size=SIZE, focal=35.0)
     told = "line 4 of frame 7, in parts from the rows 2 and 122 on, do not lie on one line. If"
     assert [told in str(one.message) for one in recwarn] == [True] * two
+
+
+def test_a_number_of_two_lines_without_others_between_is_told(tmp_path):
+    """The second one begins far from where the first one ends."""
+    rows = [f"7,4,{x},{y}" for place in (50, 100) for x, y in bent(place)]
+    path = write(tmp_path / "lines.csv", "\n".join(["frame,line,x,y", *rows]))
+    with pytest.warns(
+        UserWarning, match="line 4 of frame 7, in parts from the rows 2 and 62 on, do not lie"
+    ):
+        read_lines_csv(path, image_size=SIZE, focal=35.0)
 
 
 def test_focal_lengths_as_a_sequence_count_frames_from_zero(tmp_path):

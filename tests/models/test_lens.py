@@ -360,7 +360,7 @@ def test_an_optional_entry_that_is_misspelled_is_refused(within, wrong, meant, c
 
 @pytest.mark.parametrize("name", ["centre", "focal_range"])
 def test_numbers_of_a_file_are_no_words_and_no_booleans(name, content, tmp_path):
-    for values in (["1", "2"], [True, True], [1, None]):
+    for values in (["1", "2"], [True, True], [1, None], [True, 2.5]):
         with pytest.raises(ValueError, match=f"numbers of its '{name}'"):
             load(content | {name: values}, tmp_path)
 

@@ -26,6 +26,13 @@ def as_array(value: Any) -> Any:
     return value
 
 
+def mixes_booleans(values: Any) -> bool:
+    """Whether lists hold booleans among numbers, of which NumPy makes numbers."""
+    if not isinstance(values, list | tuple):
+        return False
+    return len({isinstance(leaf, bool | np.bool_) for leaf in jax.tree.leaves(values)}) > 1
+
+
 def aligned(*parts: tuple[Any, int]) -> list[Any]:
     """Arrays with as many leading axes of length 1 as make them broadcast without a change of rank.
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import numeric
+from .arrays import mixes_booleans, numeric
 from .fields import refuse_masked
 
 MOST_TERMS = 64
@@ -217,7 +217,7 @@ def _has_three_distinct(line: np.ndarray) -> bool:
 
 def real_numbers(values: Any) -> np.ndarray | None:
     """Real numbers as an array, half precision widened; None if they are something else, or masked."""
-    if isinstance(values, np.ma.MaskedArray):
+    if isinstance(values, np.ma.MaskedArray) or mixes_booleans(values):
         return None
     try:
         array = np.asarray(values)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from .arrays import numeric
+from .arrays import mixes_booleans, numeric
 
 _FEW = 2**16
 """Elements of a JAX array up to which its values are looked at: more would be waited for."""
@@ -99,6 +99,8 @@ def _array(value: Any, make: Callable[[Any], Any]) -> Any:
     """An array of numbers and lists of them; None of anything else."""
     leaves = jax.tree.leaves(value)
     if not all(isinstance(leaf, int | float | complex) or hasattr(leaf, "dtype") for leaf in leaves):
+        return None
+    if mixes_booleans(value):
         return None
     try:
         return make(value)

@@ -1,5 +1,6 @@
 """The verdict on a calibration from photos: that of the fit, and what the photos say about themselves."""
 
+import contextlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from ..detect.batch import Detection
 from ..detect.bend import bends_apart
 from ..io.equipment import Equipment
 from ..io.metadata import Metadata, squeezed, straightened_by
+from ..io.photo import count_pages
 from ..trust.assessment import Finding, Verdict
 from ..trust.evidence import NEGLIGIBLE
 from .calibration import Calibration
@@ -37,7 +39,8 @@ def findings_of_photos(photos: Iterable[Path], image_size: tuple[int, int]) -> l
 
     That is different bodies or lenses; sizes of other shapes, of which what is left was cropped; parts of
     the sensor of different size; distortion that a program has corrected; pixels that are not square.
-    Photos that say nothing of it, or that cannot be read any more, count for nothing.
+    And what was left out of files of several pages. Photos that say nothing of it, or that cannot be read
+    any more, count for nothing.
     """
     photos = list(photos)
     bodies, lenses, sizes = Counter[str](), Counter[str](), Counter[tuple[int, int]]()
@@ -49,7 +52,7 @@ def findings_of_photos(photos: Iterable[Path], image_size: tuple[int, int]) -> l
             sizes[max(found.written), min(found.written)] += 1
     of_camera = [*_mixed("lenses", lenses), *_mixed("cameras", bodies), *_reshaped(sizes)]
     of_camera += _of_other_parts(equipment, image_size)
-    return [*of_camera, *_changed([metadata_of(photo) for photo in photos])]
+    return [*of_camera, *_changed([metadata_of(photo) for photo in photos]), *_of_pages(photos)]
 
 
 def findings_of_sizes(left_out: int, used: int) -> list[Finding]:
@@ -287,6 +290,21 @@ def _changed(photos: Sequence[Metadata]) -> Iterable[Finding]:
             "the stored image.",
             "Scale the photos to square pixels first.",
             cause=True,
+        )
+
+
+def _of_pages(photos: Iterable[Path]) -> Iterable[Finding]:
+    """Files of several photos, of which one was used: a remark, as they do no harm."""
+    several: list[str] = []
+    for photo in photos:
+        with contextlib.suppress(OSError, ValueError):
+            several += [photo.name] * (photo.suffix.lower() in (".tif", ".tiff") and count_pages(photo) > 1)
+    if several:
+        yield Finding(
+            "further pages",
+            "good",
+            f"of the pages of {listed(map(plain, several), _MOST)} the first alone was used.",
+            "Save each page as a photo of its own, with its focal length.",
         )
 
 

@@ -25,7 +25,7 @@ import cv2
 from .._core.executors import arrived, checked_executor, in_order, is_away, sent
 from ..io.focal_track import FocalTrack
 from ..io.pyav import av
-from ..io.video_reader import Report, opened_video, picture_stream
+from ..io.video_reader import Report, opened_video, picture_stream, warn_of_loss
 from ..io.video_streams import Carried
 from ..io.video_writer import FirstFrame, FrameWriter, Picture
 from ..models.lens import ZoomLens
@@ -105,6 +105,7 @@ def cut(source: str | os.PathLike[str], others: Sequence[int], report: Report) -
                 report.reached = max(report.reached, end)
                 if packet.is_discard:
                     continue
+                warn_of_loss(packet, report)
                 stamps.append(packet.pts)
                 sizes.append((packet.pts, packet.size))
                 if packet.is_keyframe:

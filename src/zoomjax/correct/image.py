@@ -68,7 +68,9 @@ def undistort_image(
             without a counterpart because the lens folds.
 
     Returns:
-        The dtype and channels of the image. Positions are those of `Distortion.distort` to 0.01 px.
+        The dtype and channels of the image. Positions are those of `Distortion.distort` to 0.01 px; with
+        "linear", OpenCV rounds them to 1/32 px for float64 and integers of 32 bits. Give float32 where
+        that counts.
 
     Raises:
         ValueError: an argument is not one of the above, channels are first, a side is longer than 32766 px,

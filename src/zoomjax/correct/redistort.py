@@ -111,11 +111,14 @@ def check_framed(framing: Framing, size: tuple[int, int]) -> None:
     Raises:
         ValueError: it has another.
     """
-    if framing.size != size:
-        raise ValueError(
-            f"The corrected image has {size[0]} x {size[1]} px, but its framing {framing.size[0]} x "
-            f"{framing.size[1]} px. Give the keep, and the focal lengths, with which it was corrected."
-        )
+    if framing.size == size:
+        return
+    (width, height), of = framing.size, framing.image_size
+    grown = "" if of in (None, framing.size) else f', made with "grow" of an image of {of[0]} x {of[1]} px'
+    raise ValueError(
+        f"The corrected image has {size[0]} x {size[1]} px, but its framing {width} x {height} px{grown}. "
+        "Give the keep, and the focal lengths, with which it was corrected."
+    )
 
 
 def redistortion_map(

@@ -22,10 +22,15 @@ BORDER = {
     "reflect": cv2.BORDER_REFLECT_101,
 }
 
-WORKING = {"bool": "uint8", "int8": "int16", "int32": "float64", "uint32": "float64", "float16": "float32"}
-"""What `cv2.remap` does not know is computed in a type that holds all of its values."""
+WORKING = {
+    "bool": "uint8",
+    **dict.fromkeys(["int8", "int16", "float16"], "float32"),
+    **dict.fromkeys(["int32", "uint32"], "float64"),
+}
+"""What `cv2.remap` does not know is computed in a type that holds all of its values; and so are integers of
+16 bits with a sign, for which it rounds positions to 1/32 px, as for float64."""
 
-KNOWN = ("uint8", "uint16", "int16", "float32", "float64")
+KNOWN = ("uint8", "uint16", "float32", "float64")
 
 _STRIP = 2**18
 """Pixels that are converted together: they stay in the cache."""

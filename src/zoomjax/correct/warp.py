@@ -80,7 +80,11 @@ def warp_image(
             f"Argument image must be an array, but it is a {type(image).__name__}: jnp.asarray(image)."
         )
     if isinstance(image, np.ndarray) and image.dtype.kind in "fiu" and image.dtype.char != "g":
-        image = jnp.asarray(np.asarray(image, image.dtype.newbyteorder("=")))  # JAX takes no others
+        given, image = (
+            image,
+            jnp.asarray(np.asarray(image, image.dtype.newbyteorder("="))),
+        )  # as JAX takes it
+        _check_kept(given, image.dtype)
     if image.ndim < 2 or 0 in image.shape:
         raise ValueError(
             f"Argument image must have shape (height, width, ...) with pixels, but it is {image.shape}."
@@ -108,6 +112,18 @@ def warp_image(
     if framing is None or framing.image_size is not None:
         check_image_size(distortion, (width, height))
     return _warped(image, distortion, framing, interpolation, border_value)
+
+
+def _check_kept(image, dtype):
+    """Raise ValueError where JAX, without float64, cuts integers of 64 bits to others."""
+    if image.dtype.itemsize == dtype.itemsize or image.dtype.kind == "f" or not image.size:
+        return
+    limits = np.iinfo(dtype)
+    if image.min() < limits.min or image.max() > limits.max:
+        raise ValueError(
+            f"Argument image holds integers beyond those of {dtype}, which JAX makes of them without "
+            "float64: image.astype(float)."
+        )
 
 
 def _check_border(value, dtype):

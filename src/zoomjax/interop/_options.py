@@ -4,11 +4,14 @@ import dataclasses
 import math
 import warnings
 from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .._core.checks import real_numbers, warn_caller
+from .._core.text import listed
 from ..io.focal_track import FocalTrack
 from ..models.about import RELATIVE, WIDTH_OF_FOCALS
 from ..models.brown_conrady import BrownConrady
@@ -106,6 +109,19 @@ def positives(name: str, values: Any) -> tuple[float, ...]:
     if found.ndim != 1 or not (np.isfinite(found) & (found > 0)).all() or not found.size:
         raise ValueError(f"Argument {name} must hold positive numbers, but it is {values!r}.")
     return tuple(found.tolist())
+
+
+def check_order(files: Sequence[Path], focal: Sequence[float] | None) -> None:
+    """Raise ValueError where files are named by the focal lengths that are given, in another order."""
+    try:
+        named = [float(file.stem) for file in files]
+    except ValueError:
+        return
+    if focal is not None and named != list(focal) and sorted(named) == sorted(focal):
+        raise ValueError(
+            "Argument focal must be in the order of the files, which their names say, "
+            f"{listed((f'{value:g}' for value in named), 4)}, but it is {list(focal)}."
+        )
 
 
 def focal_lengths(

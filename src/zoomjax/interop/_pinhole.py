@@ -7,6 +7,7 @@ distortion. Files order the coefficients k1 k2 p1 p2 k3 k4 k5 k6, and count pixe
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,10 @@ _SAME = 0.01
 
 _ALIKE = 1e-4
 """The same without a word."""
+
+
+_ROUNDED = 0.03
+"""Share by which focal lengths engraved on a lens may differ from those of a file."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,6 +153,15 @@ def contents(
     if mm and px is not None and not any(node.focal_px for node in nodes):
         pitch, notes = pitch_of([node.focal for node in nodes], px)
     return Contents(tuple(nodes), size, "mm" if mm else "px", notes, pixel_pitch=pitch)
+
+
+def refuse_other_focals(nodes: Iterable[Node], job: Import) -> None:
+    """Raise ValueError where argument focal has other mm than a file, whose order may be another one."""
+    for own, given in zip((node.focal for node in nodes), job.focal or (), strict=False):
+        if job.focal_unit == "mm" and abs(given - own) > _ROUNDED * own:
+            raise ValueError(
+                f"its focal length is {own:g} mm, and argument focal has {given:g} mm there: leave that out"
+            )
 
 
 def pitch_of(mm: list[float], px: list[float]) -> tuple[float | None, tuple[str, ...]]:

@@ -23,8 +23,8 @@ _FORM = PtLens()
 _NONE = ("g", "t")
 """Shear, which zoomjax has no model of."""
 
-_WORD = re.compile(r"([A-Za-z]+)(=?)(\"[^\"]*\"|[-+.\d]\S*)")
-"""A name and its value, or = and the number of the image that has it."""
+_WORD = re.compile(r"([A-Za-z]+)(=?)(\"[^\"]*\"|[-+.\d]\S*|(?:nan|inf)\b)")
+"""A name and its value, which may be none of a number, or = and the number of the image that has it."""
 
 
 class Hugin(NodeFormat):

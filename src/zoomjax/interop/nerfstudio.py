@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ._documents import load_json
-from ._pinhole import Pinhole, contents, focal_px, formula, node_of, pinhole
+from ._pinhole import Pinhole, contents, focal_px, formula, node_of, pinhole, refuse_other_focals
 from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text, refuse_others
 
 _MODELS = ("OPENCV", "RADIAL", "SIMPLE_RADIAL", "PINHOLE", "SIMPLE_PINHOLE")
@@ -82,6 +82,8 @@ class Nerfstudio(NodeFormat):
             units.add(mm)
         if len(units) > 1 and job.focal is None:
             raise ValueError("some of its focal lengths are in mm and some in px: give argument focal")
+        if units == {True}:
+            refuse_other_focals(nodes, job)
         found = contents(nodes, one_size(sizes), job, px=px, mm=units == {True})
         note = (f"Frames have other values of {', '.join(overruled)} than the top, which count.",)
         return dataclasses.replace(found, notes=(*found.notes, *note * bool(overruled)))

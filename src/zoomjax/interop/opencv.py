@@ -15,6 +15,7 @@ from ._pinhole import (
     matrix_rows,
     numbers,
     pinhole,
+    refuse_other_focals,
 )
 from .base import Contents, Export, Import, Node, NodeFormat, one_size, refuse_others
 
@@ -69,6 +70,8 @@ class OpenCV(NodeFormat):
             units.add("mm" if mm else "px")
         if len(units) > 1 and job.focal is None:
             raise ValueError("some of its focal lengths are in mm and some in px: give argument focal")
+        if units == {"mm"}:
+            refuse_other_focals(nodes, job)
         return contents(nodes, one_size(sizes), job, px=px, mm=units == {"mm"})
 
 

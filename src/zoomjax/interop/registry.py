@@ -24,6 +24,7 @@ from ._lens import UnsuitedError, lens_of
 from ._options import (
     check_model,
     check_options,
+    check_order,
     focal_lengths,
     labelled,
     pitch_of,
@@ -258,6 +259,7 @@ def read(
     given = {"focal": focal, "focal_unit": focal_unit, "crop": crop, "name": name}
     given |= {"direction": direction, "convention": convention}
     check_options(fmt, given)
+    check_order(paths, told)
     job = Import(
         path,
         tuple(paths),

@@ -24,7 +24,7 @@ from .metadata import Metadata
 from .photo_writer import FORMATS, MAKER_NOTES
 from .png import png_metadata, transparent_grey
 from .raw import RAW_SUFFIXES, decode_raw, raw_metadata, raw_size
-from .tiff import CMYK, read_tiff, tiff_metadata, tiff_size
+from .tiff import CMYK, read_tiff, tiff_metadata, tiff_pages, tiff_size
 from .webp import webp_metadata
 
 SUFFIXES = (*FORMATS, *HEIC_SUFFIXES, *RAW_SUFFIXES)
@@ -94,6 +94,14 @@ def read_metadata(source: str | os.PathLike[str]) -> Metadata:
             return raw_metadata(content)
         kind = announced_format(content)
         return _METADATA[kind](content) if kind in _METADATA else Metadata()
+
+
+def count_pages(source: str | os.PathLike[str]) -> int:
+    """How many pages as large as the first a TIFF file has; 1 for others. It raises as `read_focal`."""
+    path = Path(source)
+    with _named(path), open_photo(path) as file:
+        content = file.read(_MOST_BYTES)
+        return tiff_pages(content) if announced_format(content) == "TIFF" else 1
 
 
 def read_photo(source: str | os.PathLike[str]) -> tuple[np.ndarray, Metadata]:

@@ -85,6 +85,13 @@ def tiff_size(content: bytes) -> int:
         return sum(int(np.prod(file.pages[number].shape[:2])) for number in range(_number(file)))
 
 
+def tiff_pages(content: bytes) -> int:
+    """The number of pages that are as large as the first, as previews are not; raises as `read_tiff`."""
+    with _opened(content) as file:
+        shapes = [file.pages[number].shape for number in range(_number(file))]
+        return shapes.count(shapes[0]) if shapes else 0
+
+
 def _opened(content: bytes) -> tifffile.TiffFile:
     try:
         return tifffile.TiffFile(io.BytesIO(content))

@@ -68,7 +68,7 @@ def decode_video(
 class Report:
     """What happened on the way, in threads: counts of frames, where packets end, s, and what the first
     frame carries. Those that are skipped are before the first that can be decoded alone, and those that are
-    left have a step in an AVI file and no picture."""
+    left have a step in an AVI file and no picture. It is torn where packets were lost."""
 
     announced: int
     written: int = 0
@@ -76,6 +76,7 @@ class Report:
     corrupt: int = 0
     failed: int = 0
     left: int = 0
+    torn: bool = False
     error: str = ""
     side: dict[str, bytes] | None = None
     first: Any = None
@@ -189,6 +190,7 @@ def decoded_items(
                 if packet.dts is not None:
                     yield packet
                 continue
+            warn_of_loss(packet, report)
             step = (packet.dts if avi else packet.pts) if ordered else None
             if step is not None:
                 heapq.heappush(steps, step)
@@ -229,6 +231,21 @@ def _warn_of_shape(frame: Any, shape: Any, now: Any) -> None:
     warnings.warn(
         f"Pixels of the video change their shape at {frame.time or 0:.3f} s, from {a}:{b} to {c}:{d}: "
         "split the video there. All are taken as square, and results have the first shape.",
+        stacklevel=3,
+    )
+
+
+def warn_of_loss(packet: Any, report: Report) -> None:
+    """Warn, once, of a transport stream whose count of packets jumps before this one."""
+    stream = packet.stream
+    if report.torn or not packet.is_corrupt or stream.container.format.name != "mpegts":
+        return
+    report.torn, stamp = True, packet.pts or packet.dts or 0
+    time = float((stamp - (stream.start_time or 0)) * stream.time_base)
+    warnings.warn(
+        f"Packets of the video were lost after {time:.3f} s, and perhaps later, unless recordings were "
+        "joined there: frames are missing or damaged, and those after them count as earlier ones. Give "
+        "focal lengths by time, which stay right, and not by frame.",
         stacklevel=3,
     )
 

@@ -30,6 +30,15 @@ _DATA = {"mpegts": ("klv", "timed_id3", "scte_35"), "mov": ("klv",)}
 _TRANSPORT = ("dvbsub", "dvb_subtitle", "dvb_teletext", "libzvbi_teletextdec")
 """Subtitles of transport streams, of which FFmpeg takes any, and makes data of the others."""
 
+_HEARD = ("aac", "aac_latm", "ac3", "dts", "eac3", "mp1", "mp2", "mp3", "opus", "s302m", "truehd")
+"""Sound of transport streams, of which the same is true: nobody hears the others."""
+
+_SEEN = ("h264", "hevc", "vvc", "mpeg1video", "mpeg2video", "mpeg4", "mjpeg", "dnxhd", "jpeg2000")
+"""Their pictures, of which nobody sees others."""
+
+_AT_ONCE = 0.1
+"""s after time 0, at which players of AVI begin the sound, by which it may begin late."""
+
 _APPLES = "com.apple.quicktime."
 """How keys begin by which phones tell place and camera."""
 
@@ -138,7 +147,14 @@ def put(output: Any, what: Carried, named: Path) -> dict[int, Any]:
 
 
 def _copied(output: Any, source: Any, named: Path) -> Any:
+    late = float((source.start_time or 0) * source.time_base) if source.type == "audio" else 0.0
+    if output.format.name == "avi" and late > _AT_ONCE:
+        raise ValueError(
+            f"The {_name(source)} begins at {late:.2f} s, which a {named.suffix} file does not hold: it "
+            "would be ahead of the pictures. Choose .mkv."
+        )
     try:
+        _check_heard(source, named)
         stream = output.add_stream_from_template(source)
     except ValueError as error:
         raise ValueError(
@@ -149,6 +165,14 @@ def _copied(output: Any, source: Any, named: Path) -> Any:
     if source.type != "data":
         stream.disposition = source.disposition
     return stream
+
+
+def _check_heard(source: Any, named: Path) -> None:
+    """Raise ValueError for sound that FFmpeg would write to a container as data of no known kind."""
+    if source.type == "audio" and CONTAINER[named.suffix.lower()] == "mpegts":
+        codec = source.codec_context.codec.canonical_name
+        if codec not in _HEARD:
+            raise ValueError(f"a transport stream has no number for {codec}")
 
 
 def mux(output: Any, named: Path, packets: Any) -> None:
@@ -215,6 +239,12 @@ def starts(output: Any, named: Path, copied: Sequence[Any]) -> None:
     Raises:
         ValueError: the container does not take these streams.
     """
+    pictures = output.streams.video[0].codec_context.codec.canonical_name
+    if output.format.name == "mpegts" and pictures not in _SEEN:
+        raise ValueError(
+            f"Cannot write {pictures} to a {named.suffix} file, in which no player finds these pictures: "
+            "leave out argument encoder, or choose .mkv."
+        )
     try:
         output.start_encoding()
     except (ValueError, av.error.FFmpegError) as error:

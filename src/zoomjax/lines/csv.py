@@ -105,13 +105,17 @@ _OFF, _BENT = 3.0, 4.0
 """How far parts of two lines are off a common one, at least: px, and in units of what the longest part is,
 if it were bent like this over the whole length."""
 
+_JUMP = 5.0
+"""Mean steps from one point to the next, from which another line may begin."""
+
 _NOISE = 0.1
 """px: parts are no straighter than that."""
 
 
 def _warn_of_two_in_one(frame, line, points, rows) -> None:
-    """Warn of a number that seems to stand for two lines of a frame, whose rows come apart."""
+    """Warn of a number that seems to stand for two lines of a frame, whose rows or points come apart."""
     begins = np.flatnonzero(np.diff(frame, prepend=frame[:1] - 1) | np.diff(line, prepend=line[:1] - 1))
+    begins = np.sort(np.concatenate([begins, _jumps(points, begins)]))
     parts = np.split(points, begins[1:])
     names = list(zip(frame[begins].tolist(), line[begins].tolist(), strict=True))
     if len(set(names)) == len(names):
@@ -127,6 +131,19 @@ def _warn_of_two_in_one(frame, line, points, rows) -> None:
             f"The points of line {number} of frame {one}, in parts from the rows {where} on, do not lie on "
             f"one line{more}. If they are several lines, give each a number of its own."
         )
+
+
+def _jumps(points: np.ndarray, begins: np.ndarray) -> np.ndarray:
+    """Where the longest step between points is far longer than the others of these rows."""
+    if not len(points):
+        return begins[:0]
+    step = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
+    step[begins] = 0
+    longest, number = np.maximum.reduceat(step, begins), np.diff(begins, append=len(points))
+    others = (np.add.reduceat(step, begins) - longest) / number
+    far = np.flatnonzero(longest > _JUMP * others)
+    places = [begins[i] + step[begins[i] : begins[i] + number[i]].argmax() for i in far]
+    return np.array(places, begins.dtype)
 
 
 def _are_two(parts: list[np.ndarray]) -> bool:

@@ -340,7 +340,7 @@ def _bent(operands):
 
 
 def _pair(content, name):
-    return array_of(name, np.asarray(content[name]), (2,)).astype(float)
+    return array_of(name, content[name], (2,)).astype(float)
 
 
 @kinds_checked

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._core.arrays import mixes_booleans
 from .._core.checks import warn_caller
 from .._core.text import listed, plain
 from .brown_conrady import BrownConrady
@@ -263,7 +264,7 @@ def _fixed(value: Any) -> Any:
 
 def array_of(name: str, value: Any, shape: tuple[int, ...] | None = None) -> jax.Array:
     """The array of a file's entry, floats in JAX's own dtype for them; ValueError where it is none."""
-    array = np.asarray(value)
+    array = np.asarray(None if mixes_booleans(value) else value)
     if array.dtype.kind in "iuf" and (shape is None or array.shape == shape) and array.size:
         dtype = jnp.result_type(float if array.dtype.kind == "f" else int)
         largest = jnp.finfo(dtype).max if array.dtype.kind == "f" else jnp.iinfo(dtype).max
