@@ -143,7 +143,8 @@ def page(results: dict) -> str:
             f"{results['lenses']} zooms of the lensfun database, {results['frames']:,} focal lengths and "
             f"{results['lines']:,} lines in all, {results['largest']:,} of them of one lens. Seconds of "
             "the second call, as the first compiles; and in it the time of the processor for each lens, of "
-            "this process alone.",
+            "this process alone. Rows are of different days, on some of which the machine was half as "
+            "fast: compare with the loop of the same row.",
             "",
             *table(
                 ["", "at once", "a loop", "at once, a lens", "a loop, a lens", "largest difference"],
