@@ -112,14 +112,15 @@ def _by_executor(executor, sets, candidates, centre, how) -> Iterator[Choice | S
         for one in done:
             if one.error is not None:
                 raise one.error
+            assert one.result is not None
             for number, back in enumerate(arrived(one.result), one.item[0]):
                 yield _unpacked(back, models[number])
 
 
 def _in_a_task(part, *, given, how):
     """`_each` of some of the data sets, for the way back."""
-    first, sets = part
-    return [_packed(found) for found in _each(arrived(sets), first, *arrived(given), how)]
+    (first, sets), (candidates, centre) = part, arrived(given)
+    return [_packed(found) for found in _each(arrived(sets), first, candidates, centre, how)]
 
 
 def _packed(found):

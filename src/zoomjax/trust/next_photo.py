@@ -143,12 +143,12 @@ def suggest_next(
     candidates = jnp.asarray(candidate_lines(fit.lens.image_size, length), dtype)
     grid = jnp.asarray(focals, dtype)
     known = _known(lines, fit.lens.zoom, weights, counts)
-    told = _derivatives(fit.lens, candidates, grid)
+    rows, squared = map(np.asarray, _derivatives(fit.lens, candidates, grid))
     points = _image_grid(fit.lens.image_size).astype(dtype)[:, None]
     before = np.asarray(displacement_std(fit, points, focal=grid))
     with np.errstate(all="ignore"):
         before = float(_average(before.ravel()))
-        now, table = _bands(known, *map(np.asarray, told), number * points_each)
+        now, table = _bands(known, rows, squared, number * points_each)
     # What was measured of the noise is in `before`; how a photo changes it is the ratio.
     table = np.nan_to_num(np.asarray(table, np.float64), nan=np.inf)  # what rounding alone is left of
     if np.isfinite(before) and float(now) > 0:
