@@ -86,3 +86,5 @@ def test_messages_name_urls(monkeypatch, tmp_path):
     copies.name_by_url(tmp_path / "0", "ftp://me:secret@host/shots")
     assert by_url(f"Cannot read {tmp_path / '0'}/a.jpg.") == "Cannot read ftp://host/shots/a.jpg."
     assert by_url("Cannot read a.jpg.") == "Cannot read a.jpg."
+    copies.name_by_url(tmp_path / "01", "s3://bucket")  # which begins as the other
+    assert by_url(f"{tmp_path / '01'}/b.jpg") == "s3://bucket/b.jpg"

@@ -53,7 +53,7 @@ def name_by_url(folder: Path, url: str) -> None:
 def by_url(text: str) -> str:
     """A text with the URLs of copies in the place of their paths."""
     for folder, url in _NAMES.items():
-        text = text.replace(folder, url)
+        text = re.sub(rf"{re.escape(folder)}(?!\w)", lambda _, url=url: url, text)
     return text
 
 

@@ -143,8 +143,6 @@ def _seen(file: str | os.PathLike[str] | None) -> _Seen | None:
 
 def _check_same(file: _Seen | None) -> None:
     """In a worker: raise ValueError where a file has another size than where the work comes from."""
-    if file and file.origin:
-        have_copy(file.path, file.origin)
     found = file and _seen(file.path)
     if file and found and found.size != file.size:
         raise ValueError(
@@ -205,6 +203,8 @@ def _away(
     with _float64(wide):
         if _here() == home:
             return task(item), []
+        if file and file.origin:
+            have_copy(file.path, file.origin)
         _check_same(file)
         _own.away, _own.told = True, []
         _listen()
