@@ -80,10 +80,8 @@ def warp_image(
             f"Argument image must be an array, but it is a {type(image).__name__}: jnp.asarray(image)."
         )
     if isinstance(image, np.ndarray) and image.dtype.kind in "fiu" and image.dtype.char != "g":
-        given, image = (
-            image,
-            jnp.asarray(np.asarray(image, image.dtype.newbyteorder("="))),
-        )  # as JAX takes it
+        given = np.asarray(image, image.dtype.newbyteorder("="))  # JAX takes no other order of bytes
+        image = jnp.asarray(given)
         _check_kept(given, image.dtype)
     if image.ndim < 2 or 0 in image.shape:
         raise ValueError(
