@@ -87,11 +87,9 @@ def read_lines_csv(
     order = np.lexsort((line, index))  # stable: points keep the order of their rows
     starts = np.flatnonzero(np.diff(index[order]) | np.diff(line[order])) + 1
     points = np.stack([columns["x"], columns["y"]], axis=1)
-    _warn_of_two_in_one(frame, line, points, table.rows)
-    points = points[order]
     try:
-        return Lines.from_ragged(
-            np.split(points, starts),
+        lines = Lines.from_ragged(
+            np.split(points[order], starts),
             index[order][np.concatenate([[0], starts])],
             focals,
             image_size=image_size,
@@ -99,6 +97,8 @@ def read_lines_csv(
         )
     except ValueError as error:
         raise table.error(str(error)) from error
+    _warn_of_two_in_one(frame, line, np.clip(points, -_OUTMOST, _OUTMOST), table.rows)
+    return lines
 
 
 _OFF, _BENT = 3.0, 4.0
@@ -110,6 +110,9 @@ _JUMP = 5.0
 
 _NOISE = 0.1
 """px: parts are no straighter than that."""
+
+_OUTMOST = 1e9
+"""px: points farther out are moved there, so that no square of a distance overflows."""
 
 
 def _warn_of_two_in_one(frame, line, points, rows) -> None:
