@@ -192,7 +192,9 @@ def triangles_of(lines: Lines, columns: Callable[..., Array], terms: int) -> Flo
     sharding = None if traced(lines) else _sharding_of_lines(lines)
     if sharding is not None:
         return _reduce_sharded(lines, sharding, columns, terms)
-    if traced(lines) or jax.default_backend() != "cpu":
+    if jax.default_backend() != "cpu":
+        return _reduce_whole(lines, columns, terms)
+    if traced(lines):
         return _reduce_run(lines, np.asarray(0), lines.points.shape[0], columns, terms)
     return jax.device_put(_reduce_in_threads(bucketed(lines), columns, terms)[: lines.points.shape[0]])
 
@@ -216,15 +218,36 @@ def _reduce_sharded(lines, sharding, columns, terms):
 @eqx.filter_jit
 def _reduce_shards(points, mask, centre, scale, columns, terms, sharding):
     def own(points, mask, centre):
-        def reduce_one(line):
-            one, there = line
-            return _reduce_line(one, there, centre, scale, columns, terms)
-
-        return jax.lax.map(reduce_one, (points, mask), batch_size=_lines_at_once(points.shape[1]))
+        return _reduce_lines(points, mask, centre, scale, columns, terms)
 
     over, whole = sharding.spec, PartitionSpec()
     spread = jax.shard_map(own, mesh=sharding.mesh, in_specs=(over, over, whole), out_specs=over)
     return spread(points, mask, centre)
+
+
+@program
+def _reduce_whole(lines, columns, terms):
+    points, mask, centre = map(jnp.asarray, (lines.points, lines.mask, lines.centre))
+    return _reduce_lines(points, mask, centre, lines.scale, columns, terms)
+
+
+def _reduce_lines(points, mask, centre, scale, columns, terms):
+    """Triangles of all lines, on the device where they are."""
+
+    def reduce_one(line):
+        points, mask = line
+        return _reduce_line(points, mask, centre, scale, columns, terms)
+
+    def by_xla(points, mask, centre):
+        return jax.lax.map(reduce_one, (points, mask), batch_size=_lines_at_once(points.shape[1]))
+
+    if jax.default_backend() == "gpu" and columns is _columns:
+        from . import kernel
+
+        if kernel.has_kernel(terms):
+            by_kernel = partial(kernel.triangles, scale=scale, terms=terms)
+            return jax.lax.platform_dependent(points, mask, centre, cuda=by_kernel, default=by_xla)
+    return by_xla(points, mask, centre)
 
 
 def _reduce_in_threads(lines, columns, terms):
@@ -269,8 +292,7 @@ def _reduce_run(lines, start, size, columns, terms):
         )
         return _reduce_line(points, mask, lines.centre, lines.scale, columns, terms)
 
-    at_once = _lines_at_once(lines.points.shape[1])
-    return jax.lax.map(reduce_one, start + jnp.arange(size), batch_size=at_once)
+    return jax.lax.map(reduce_one, start + jnp.arange(size))
 
 
 def _lines_at_once(points):

@@ -14,6 +14,7 @@ def triangle(columns: Float[Array, "rows point"]) -> Float[Array, "rows rows"]:
     """R of the transposed argument, by modified Gram-Schmidt.
 
     On a CPU by runs of points, whose triangles are then reduced together; elsewhere of all points at once.
+    `kernel` does the runs on a GPU, for the columns of a fixed centre.
     """
     if jax.default_backend() != "cpu":
         return _orthogonalise_apart(list(columns))
@@ -36,10 +37,15 @@ def _triangle_jvp(primals, tangents):
     """
     [columns], [columns_dot] = primals, tangents
     r = triangle(columns)
+    return r, tangent_of(r, columns, columns_dot)
+
+
+def tangent_of(r, columns, columns_dot):
+    """The tangent of R, of the columns and theirs."""
     kept = jnp.diagonal(r) > 0
     regular = r + jnp.diag(jnp.where(kept, 0, 1).astype(r.dtype))
     q = jax.scipy.linalg.solve_triangular(regular, columns, trans="T")
-    return r, jnp.matmul(jnp.where(kept[:, None], q, 0), columns_dot.T, precision=EXACT)
+    return jnp.matmul(jnp.where(kept[:, None], q, 0), columns_dot.T, precision=EXACT)
 
 
 _INDEPENDENT = 8
@@ -58,7 +64,7 @@ def _orthogonalise(columns):
     removed = jnp.zeros(size, columns.dtype)  # the squared norm of what was taken from each column
     for done in range(size):
         products = jnp.matmul(columns, columns[0], precision=EXACT)
-        inverse = _inverse_norm(products[0], removed[0])
+        inverse = inverse_norm(products[0], removed[0])
         row = products * inverse
         rows.append(jnp.pad(row, (done, 0)))
         removed = removed[1:] + row[1:] ** 2
@@ -79,7 +85,7 @@ def _orthogonalise_apart(columns):
     for done in range(size):
         first, *rest = columns
         products = jnp.stack([jnp.sum(first * column) for column in columns])
-        inverse = _inverse_norm(products[0], removed[0])
+        inverse = inverse_norm(products[0], removed[0])
         row = products * inverse
         rows.append(jnp.pad(row, (done, 0)))
         removed = removed[1:] + row[1:] ** 2
@@ -88,8 +94,8 @@ def _orthogonalise_apart(columns):
     return jnp.stack(rows)
 
 
-def _inverse_norm(squared, removed):
+def inverse_norm(squared, removed):
     """The inverse norm of a column; zero if rounding is all that is left of it."""
-    least = (_INDEPENDENT * jnp.finfo(squared.dtype).eps) ** 2
+    least = (_INDEPENDENT * float(jnp.finfo(squared.dtype).eps)) ** 2
     independent = squared > least * removed
     return jnp.where(independent, 1 / jnp.where(independent, jnp.sqrt(squared), 1), 0)
