@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import zoomjax as zj
-from zoomjax.lines import reduction
+from zoomjax.lines import compressed, reduction
 
 from ..conftest import moved
 
@@ -91,6 +91,30 @@ def test_columns_apart_as_on_a_gpu_give_the_same_triangle(dtype, rng):
 
 def apart(columns):
     return reduction._orthogonalise_apart(list(columns))
+
+
+@pytest.mark.parametrize("one", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("other", [jax.jacfwd, jax.jacrev])
+def test_second_and_third_derivatives_are_those_of_the_columns_products(one, other, rng):
+    """The tangents of R are full matrices, from which the next ones are made."""
+    t = np.linspace(-0.4, 0.6, 40)
+    z = jnp.asarray(np.stack([t, 0.1 + 0.3 * t]) + 1e-3 * rng.standard_normal((2, 40)))
+
+    def products(of, move):
+        moved = z + move[:2, None] + jnp.sin(7 * z + move[2]) * move[2]
+        columns = compressed._columns(moved, jnp.ones(40), 2)
+        r = of(columns)
+        return jnp.matmul(r, jnp.ones(7)) @ jnp.matmul(r, jnp.arange(7.0))
+
+    def exact(columns):
+        return columns.T  # of which the products are those of R
+
+    at = jnp.asarray([0.02, -0.03, 0.0])
+    for derivative in (one(other(products, 1), 1), jax.jacfwd(one(other(products, 1), 1), 1)):
+        expected = derivative(exact, at)
+        np.testing.assert_allclose(
+            derivative(reduction.triangle, at), expected, atol=1e-7 * jnp.max(jnp.abs(expected))
+        )
 
 
 def test_straight_lines_stay_straight_to_rounding():

@@ -87,6 +87,23 @@ def test_derivatives_by_points_and_centre(rng):
     np.testing.assert_allclose(of(reduced), of(by_compress), rtol=1e-11)
 
 
+def test_it_maps_and_has_gradients_and_second_derivatives(rng):
+    points, mask, centre = data(rng, 40)
+    many = jnp.stack([points, points[::-1]]), jnp.stack([mask, mask[::-1]])
+    both = jax.vmap(lambda points, mask: reduced(points, mask, centre))(*many)
+    np.testing.assert_allclose(both[1], both[0, ::-1], atol=1e-13)
+
+    def scatter(triangles):
+        def total(centre):
+            r = triangles(points[:1], mask[:1], centre)[0, 1:, 1:]
+            return jnp.sum(jnp.matmul(r.T, r))
+
+        return jax.grad(total)(centre), jax.hessian(total)(centre)
+
+    for one, other in zip(scatter(reduced), scatter(by_compress), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9)
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_it_compiles_for_cuda_as_far_as_that_needs_no_gpu(dtype, rng, monkeypatch):
     arrays = data(rng, dtype=dtype)

@@ -13,7 +13,8 @@ memory can be compressed in chunks of points.
 R is found by modified Gram-Schmidt, not by way of the Gram matrix ``R^T R``, although sums of monomials
 would give that in one read of the points. Squaring the condition number would lose small residuals, in
 float32 those of most lines, and would save no time (benchmarks/results/gram.md): on a CPU Gram-Schmidt
-works on a run of a thousand points at a time, whose columns stay in the fastest cache. Its floor is near
+works on a run of a thousand points at a time, whose columns stay in the fastest cache, and on a GPU on
+some hundred, in registers (`kernel`). Its floor is near
 the dtype's own: 2e-14 of half the image diagonal in float64, 2e-6 in float32
 (benchmarks/reliability_core.py searches for lines that break it).
 
@@ -130,9 +131,10 @@ def compress(lines: Lines, terms: int = 2) -> CompressedLines:
         terms: the largest number N of coefficients to be fitted. Fewer can be fitted, too.
 
     Returns:
-        The compressed lines, differentiable with respect to points and centre. If `lines.points` is sharded
-        over its line axis (`jax.sharding.NamedSharding`), so is the result, and no points are exchanged.
-        (Inside ``jit`` the sharding is not known, and points are gathered: compress outside of it.)
+        The compressed lines, differentiable with respect to points and centre: once, and more often unless
+        a line is exactly straight. If `lines.points` is sharded over its line axis
+        (`jax.sharding.NamedSharding`), so is the result, and no points are exchanged. (Inside ``jit`` the
+        sharding is not known, and points are gathered: compress outside of it.)
 
     Example:
         >>> import numpy as np
@@ -221,7 +223,10 @@ def _reduce_shards(points, mask, centre, scale, columns, terms, sharding):
         return _reduce_lines(points, mask, centre, scale, columns, terms)
 
     over, whole = sharding.spec, PartitionSpec()
-    spread = jax.shard_map(own, mesh=sharding.mesh, in_specs=(over, over, whole), out_specs=over)
+    # Of a kernel JAX does not know that its result varies as the points do, unless it need not check that.
+    spread = jax.shard_map(
+        own, mesh=sharding.mesh, in_specs=(over, over, whole), out_specs=over, check_vma=False
+    )
     return spread(points, mask, centre)
 
 

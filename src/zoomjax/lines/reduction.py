@@ -44,7 +44,14 @@ def tangent_of(r, columns, columns_dot):
     """The tangent of R, of the columns and theirs."""
     kept = jnp.diagonal(r) > 0
     regular = r + jnp.diag(jnp.where(kept, 0, 1).astype(r.dtype))
-    q = jax.scipy.linalg.solve_triangular(regular, columns, trans="T")
+    # Tangents of R, as made here, are full matrices. Of these the derivative of a triangular solve would
+    # take the upper triangle alone, and second derivatives of ``R^T R`` would be wrong.
+    q = jax.lax.custom_linear_solve(
+        lambda q: jnp.matmul(regular.T, q, precision=EXACT),
+        columns,
+        lambda _, right: jax.scipy.linalg.solve_triangular(regular, right, trans="T"),
+        lambda _, right: jax.scipy.linalg.solve_triangular(regular, right),
+    )
     return jnp.matmul(jnp.where(kept[:, None], q, 0), columns_dot.T, precision=EXACT)
 
 
