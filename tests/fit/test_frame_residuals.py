@@ -100,6 +100,22 @@ def test_derivatives_by_the_points_are_those_of_all_residuals(ragged):
     close(*(eqx.filter_jit(gradient(of))(ragged.points) for of in (frame_residuals, weighted_distances)))
 
 
+def test_third_derivatives_are_those_of_all_residuals(ragged):
+    """By the points and the coefficients: the second ones of a fit."""
+
+    def bend(residuals):
+        def of(share):
+            points = ragged.points + 0.1 * jnp.sin(ragged.points + share)
+            return energy_of(residuals)(moved(ragged, points), K * (1 + share))
+
+        slopes = [of]
+        for derivative in (jax.grad, jax.jacfwd, jax.jacrev):
+            slopes.append(derivative(slopes[-1]))
+        return eqx.filter_jit(lambda share: [slope(share) for slope in slopes])(0.1)
+
+    close(bend(frame_residuals), bend(weighted_distances))
+
+
 def test_straight_lines_have_the_derivatives_of_small_residuals():
     """Of no residuals there is no direction; the Gauss-Newton matrix and the Hessian are there."""
     t = np.linspace(0, 1, 20)[:, None]

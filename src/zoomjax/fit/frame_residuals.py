@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.products import EXACT
 from ..lines.base import AbstractLines
+from ..lines.reduction import orthonormal
 from .energy import by_own_coefficients
 
 
@@ -76,16 +77,8 @@ def _triangles_change(frames, values, changes):
     """``dR = Q^T dA`` with Q held fixed: right for every function of ``R^T R``, as that of `triangle`."""
     table, frame = values
     triangles = triangles_by_frame(table, frame, frames)
-    units = jax.vmap(_units)(triangles[frame], jnp.swapaxes(table, 1, 2))
+    units = jax.vmap(orthonormal)(triangles[frame], jnp.swapaxes(table, 1, 2))
     return triangles, _sums("lcr,lrd->lcd", units, changes[0], frame, frames)
-
-
-def _units(triangle, columns):
-    """The rows of Q that belong to a line; zeros for columns that are dependent."""
-    missing = jnp.diagonal(triangle) == 0
-    regular = triangle + jnp.diag(missing.astype(triangle.dtype))
-    units = jax.scipy.linalg.solve_triangular(regular, columns, trans="T")
-    return jnp.where(missing[:, None], 0, units)
 
 
 def _sums(product, first, second, frame, frames):

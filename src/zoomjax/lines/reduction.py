@@ -42,17 +42,26 @@ def _triangle_jvp(primals, tangents):
 
 def tangent_of(r, columns, columns_dot):
     """The tangent of R, of the columns and theirs."""
-    kept = jnp.diagonal(r) > 0
+    return jnp.matmul(orthonormal(r, columns), columns_dot.T, precision=EXACT)
+
+
+def orthonormal(
+    r: Float[Array, "rows rows"], columns: Float[Array, "rows point"]
+) -> Float[Array, "rows point"]:
+    """The columns of Q, as rows; zero where R's are.
+
+    Tangents of R are full matrices here. Of these the derivative of a triangular solve would take the upper
+    triangle alone, and second derivatives of ``R^T R`` would be wrong.
+    """
+    kept = jnp.diagonal(r) != 0
     regular = r + jnp.diag(jnp.where(kept, 0, 1).astype(r.dtype))
-    # Tangents of R, as made here, are full matrices. Of these the derivative of a triangular solve would
-    # take the upper triangle alone, and second derivatives of ``R^T R`` would be wrong.
     q = jax.lax.custom_linear_solve(
         lambda q: jnp.matmul(regular.T, q, precision=EXACT),
         columns,
         lambda _, right: jax.scipy.linalg.solve_triangular(regular, right, trans="T"),
         lambda _, right: jax.scipy.linalg.solve_triangular(regular, right),
     )
-    return jnp.matmul(jnp.where(kept[:, None], q, 0), columns_dot.T, precision=EXACT)
+    return jnp.where(kept[:, None], q, 0)
 
 
 _INDEPENDENT = 8
