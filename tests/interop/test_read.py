@@ -139,6 +139,8 @@ def test_focal_lengths_of_nuke_are_those_of_the_node(tmp_path):
     (tmp_path / "b.nk").write_text(text.replace(" {\n", " {\n tde4_focal_length_cm 2.4\n"))
     with pytest.raises(ValueError, match="give argument focal, 2 of them"):
         zj.interop.read(tmp_path / "b.nk", image_size=(360, 240))
+    notes = zj.interop.read(tmp_path / "b.nk", image_size=(360, 240), focal=[24.0, 35.0]).report.notes
+    assert any("not those of its keys: those of argument focal count" in note for note in notes)
 
 
 def test_nukes_own_node_is_read(tmp_path):
