@@ -23,6 +23,7 @@ from ..models.zoom import AbstractLinearZoom
 from ._lens import UnsuitedError, lens_of
 from ._options import (
     check_model,
+    check_name,
     check_options,
     check_order,
     focal_lengths,
@@ -165,11 +166,7 @@ def write(
     check_pitch(job.pixel_pitch, lens.image_size)
     folder = isinstance(fmt, FolderFormat)
     several = folder or (fmt.zoom == "one" and job.focal is not None and len(job.focal) > 1)
-    if several and path.suffix.lower() in fmt.suffixes:
-        raise ValueError(
-            f"The format {fmt.name} is several files here, and {path} is to be their folder: give a name "
-            f"without {path.suffix}."
-        )
+    check_name(fmt, path, several=several, known=_suffixes())
     files = tuple(path / name for name in fmt.file_names(job)) if several else (path,)
     refuse_existing(list(files), overwrite=overwrite)
     others = _others(path, files) if several else ()
@@ -306,6 +303,10 @@ def named(name: str) -> Format:
     raise ValueError(f"Argument format must be one of {_names(FORMATS)}, but it is {name!r}.")
 
 
+def _suffixes() -> set[str]:
+    return {suffix for fmt in FORMATS for suffix in fmt.suffixes}
+
+
 def _names(formats: Iterable[Format]) -> str:
     return ", ".join(fmt.name for fmt in formats)
 
@@ -343,7 +344,7 @@ def _files(path: Path) -> list[Path]:
         if not path.is_file():
             raise FileNotFoundError(2, "No such file", str(path))
         return [path]
-    known = {suffix for fmt in FORMATS for suffix in fmt.suffixes}
+    known = _suffixes()
     found = [file for file in path.iterdir() if file.is_file() and file.suffix.lower() in known]
     if len({file.suffix.lower() for file in found}) != 1:
         raise ValueError(
