@@ -180,12 +180,19 @@ def usable_lines(arrays: list[np.ndarray], frames: np.ndarray, number_of_frames:
     return np.flatnonzero(usable)
 
 
-def warn_of_points_outside(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -> None:
-    """Points far outside of the image mean a wrong image size, and with it a wrong centre and scale."""
+def points_beyond(
+    points: np.ndarray, mask: np.ndarray, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """By how many px points are outside of the image, and which by more than noise takes them."""
     beyond = np.max(
         np.maximum(-points, points - (np.array(size) - 1)), axis=-1, where=mask[..., None], initial=0
     )
-    outside = beyond > 0.01 * max(size)  # noise alone takes a few points some px out
+    return beyond, beyond > 0.01 * max(size)  # noise alone takes a few points some px out
+
+
+def warn_of_points_outside(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -> None:
+    """Points far outside of the image mean a wrong image size, and with it a wrong centre and scale."""
+    beyond, outside = points_beyond(points, mask, size)
     if outside.any():
         warnings.warn(
             f"{np.sum(outside):,} of {np.sum(mask):,} points lie outside of the image of {size[0]} x "
