@@ -250,6 +250,15 @@ def test_range_is_checked_of_many_focal_lengths(lens):
         lens.check_range(np.array([low, -1.0]))
 
 
+def test_a_centre_outside_of_the_image_is_told(content, tmp_path):
+    """As a fit tells it: a slip in the file moved all that the lens corrects, without a word."""
+    (tmp_path / "lens.json").write_text(json.dumps(content | {"centre": [-600.0, 300.0]}))
+    with pytest.warns(
+        UserWarning, match=r"lens\.json: the centre of distortion, \(-600, 300\) px, is outside"
+    ):
+        zj.load_lens(tmp_path / "lens.json")
+
+
 @pytest.mark.parametrize(("spoil", "message"), SPOILED.values(), ids=SPOILED)
 def test_file_that_is_no_lens_raises_and_is_named(spoil, message, content, tmp_path):
     with pytest.raises(ValueError, match=message) as caught:

@@ -201,6 +201,16 @@ def warn_of_points_outside(points: np.ndarray, mask: np.ndarray, size: tuple[int
         )
 
 
+def centre_problem(centre: np.ndarray, size: tuple[int, int]) -> str | None:
+    """That a centre of distortion, px, is outside of the image, which mostly is a mistake; None if not."""
+    if not ((centre < -0.5) | (centre > np.array(size) - 0.5)).any():
+        return None
+    return (
+        f"The centre of distortion, ({centre[0]:g}, {centre[1]:g}) px, is outside of the image of "
+        f"{size[0]} x {size[1]} px. That is right for a crop of a larger image alone."
+    )
+
+
 def warn_of_units(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -> None:
     """Lines that all lie within two px mean that coordinates are in units of the image's size."""
     across, down = np.ptp(points[mask], axis=0) if mask.any() else (np.inf, np.inf)

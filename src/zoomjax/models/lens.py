@@ -16,7 +16,7 @@ from jaxtyping import Float, Num, ScalarLike
 
 from .._core.arguments import check_kind, kinds_checked
 from .._core.arrays import aligned
-from .._core.checks import check_above, checked_size, checked_unit
+from .._core.checks import centre_problem, check_above, checked_size, checked_unit, warn_caller
 from .._core.fields import FOCALS, check_finite, check_focal, check_range, check_shapes, numbers
 from .._core.files import whole_file
 from .._core.pixels import check_pitch
@@ -351,7 +351,8 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
     User-defined models must be registered first, by the module that defines them (`register_model`).
 
     Warns:
-        UserWarning: the file has entries that are not known, as of another program; they do not count.
+        UserWarning: the file has entries that are not known, as of another program; they do not count. The
+            centre is outside of the image.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -382,6 +383,9 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
         )
         if not math.isclose(content["scale"], lens.scale, rel_tol=1e-6):
             raise ValueError("its scale is not half the diagonal of its image_size")
+        problem = centre_problem(np.asarray(lens.centre), lens.image_size)
+        if problem and lens.shift is None:
+            warn_caller(f"{os.fspath(path)}: {problem[0].lower()}{problem[1:]}")
         warn_of_unknown(content, (*_ENTRIES, *_OPTIONAL, "format", "version"), os.fspath(path))
         return lens
     except FileNotFoundError:
