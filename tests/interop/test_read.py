@@ -279,6 +279,21 @@ def test_black_in_a_map_shows_nothing(direction, tmp_path):
     )
 
 
+@pytest.mark.parametrize("what", ["encoded", "constant"])
+def test_a_picture_that_is_no_map_is_refused(what, tmp_path):
+    """With an error of half of the image it was a lens: of a map saved in sRGB, or a grey picture."""
+    lens = LENSES["portrait"]()
+    zj.interop.write(lens, tmp_path / "m", format="stmap", focal=24)
+    path = tmp_path / "m" / "undistort.24.exr"
+    with OpenEXR.File(str(path)) as file:
+        header, pixels = dict(file.header()), file.channels()["RGB"].pixels.copy()
+    pixels = np.clip(pixels, 0, 1) ** np.float32(1 / 2.2) if what == "encoded" else 0 * pixels + 0.5
+    with OpenEXR.File(header, {"RGB": pixels.astype(np.float32)}) as file:
+        file.write(str(path))
+    with pytest.raises(ValueError, match=r"px off: red and green must be positions from 0 to 1|folds over"):
+        zj.interop.read(path)
+
+
 @pytest.mark.parametrize("foreign", [False, True])
 def test_an_argument_that_contradicts_a_map_is_refused(foreign, tmp_path):
     lens = LENSES["portrait"]()

@@ -33,6 +33,7 @@ from ._options import (
     positives,
     warn_of_relative,
 )
+from ._seen import check_near
 from ._solve import Solution, error_written, solve
 from .base import (
     CONVENTION,
@@ -278,6 +279,7 @@ def read(
             if isinstance(node, Node) and not np.isfinite([*node.theta, *node.centre]).all():
                 raise ValueError(f"its coefficients or centre at {node.focal:g} are not finite numbers")
         made = lens_of(possible(contents), zoom, terms, distortion_model)
+        check_near(made.at_nodes, contents)
     except (FileNotFoundError, UnsuitedError):
         raise
     except _DAMAGED as error:
