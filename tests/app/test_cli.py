@@ -544,6 +544,10 @@ WRONG = {
     "options for another kind": (["lines.npz", "--image-size", "640x480"], "for CSV files"),
     "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),
     "a degree of another model": (["lines.npz", "--model", "spline", "--degree", "1"], "for polynomials"),
+    "lines beside photos": (
+        ["photos", "lines.npz", "--detector", "edges"],
+        "--detector has no effect for lines.npz, which contains lines: leave it out",
+    ),
     "an empty model": (["lines.npz", "--model", ""], "--model must be one of auto, polynomial"),
     "no such model": (["lines.npz", "--model", "best"], "--model must be one of auto, polynomial"),
     "a centre that is none": (["lines.npz", "--centre", "middle"], "fit, moving, image, or X,Y"),
