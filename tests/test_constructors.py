@@ -70,6 +70,7 @@ LINES_ALIKE = {  # of both kinds of lines
         {"focal": [24.0, -70.0]},
         r"finite and positive, but focal\[1\] is -70",
     ),
+    "absurd focal": ({"focal": [24.0, 1e-300]}, r"from 1e-30 to 1e\+30 mm or px, but focal\[1\] is 1e-300"),
     "zero focal": ({"focal": np.array([0.0, 70.0])}, r"focal\[0\] is 0"),
     "NaN focal": ({"focal": [24.0, np.nan]}, r"focal\[1\] is nan"),
     "one number for focal": ({"focal": 24.0}, r"focal must have shape \(frame,\), but its shape is \(\)"),

@@ -544,6 +544,10 @@ WRONG = {
     "options for another kind": (["lines.npz", "--image-size", "640x480"], "for CSV files"),
     "too few focal lengths": (["lines.npz", "--degree", "5"], "6 or more distinct focal lengths"),
     "a degree of another model": (["lines.npz", "--model", "spline", "--degree", "1"], "for polynomials"),
+    "lines beside photos": (
+        ["photos", "lines.npz", "--detector", "edges"],
+        "--detector has no effect for lines.npz, which contains lines: leave it out",
+    ),
     "an empty model": (["lines.npz", "--model", ""], "--model must be one of auto, polynomial"),
     "no such model": (["lines.npz", "--model", "best"], "--model must be one of auto, polynomial"),
     "a centre that is none": (["lines.npz", "--centre", "middle"], "fit, moving, image, or X,Y"),
@@ -664,6 +668,25 @@ def test_empty_names_are_not_the_working_folder(tmp_path):
     for status, told in one_after_another(tmp_path, commands):
         assert status == 2
         assert "is empty, as a variable of the shell that is not set" in told
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "lens.json"]
+
+
+def test_a_url_is_no_name_of_a_file_here(tmp_path):
+    """Results went to the folder s3: here, and it was called what had been given."""
+    scenes.nikkor_18_200((60, 40)).save(tmp_path / "lens.json")
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((40, 60), np.uint8))
+    commands = [
+        ["undistort", "lens.json", "a.png", "--focal", 30, "-o", "s3://key:secret@bucket/out"],
+        ["undistort", "lens.json", "a.png", "--focal", "s3://b/f.csv", "-o", "b"],
+        ["calibrate", "a.png", "--focal", "file:///f.csv", "-o", "b"],
+        ["export", "s3://b/lens.json", "--to", "lensfun", "-o", "b.xml"],
+        ["import", "https://host/a.xml", "-o", "b"],
+    ]
+    names = ["--output is 's3://bucket/out'", "--focal", "--focal", "An argument", "An argument"]
+    for name, (status, told) in zip(names, one_after_another(tmp_path, commands), strict=True):
+        assert status == 2
+        assert name in told
+        assert "but files are meant here, not URLs: copy" in " ".join(told.split())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "lens.json"]
 
 

@@ -125,11 +125,12 @@ def test_a_border_value_that_is_no_number_is_refused(function, value):
         )
 
 
-@pytest.mark.parametrize("focal", [1e-300, 1e-100])
+@pytest.mark.parametrize("focal", [1e-30, 1e-6])
 @pytest.mark.parametrize("function", ["undistort_image", "redistort_image"])
 def test_coefficients_that_overflow_are_refused(function, focal):
     """As of focal lengths next to zero: the error was LAPACK's, or the image was black."""
-    lens = zj.scenes.nikkor_18_200(SIZE).extended(1e-300, 100.0)
+    lens = zj.scenes.nikkor_18_200(SIZE).extended(1e-30, 100.0)
+    lens = eqx.tree_at(lambda of: of.zoom.parameters, lens, 1e300 * np.asarray(lens.zoom.parameters))
     call = getattr(zj if function == "undistort_image" else zj.correct, function)
     with pytest.raises(ValueError, match="No image can be corrected with coefficients of"):
         call(np.full((108, 192), 9, np.uint8), lens, focal=focal)

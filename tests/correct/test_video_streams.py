@@ -200,6 +200,79 @@ def test_sound_that_begins_late_is_not_for_avi(late, tmp_path):
     assert not target.exists()
 
 
+def sounding(path, codec):
+    """A video with two seconds of a tone, and when the last packet of it begins."""
+    with av.open(str(path), "w") as out:
+        video = out.add_stream("mpeg4", rate=25)
+        (video.width, video.height), video.pix_fmt = SIZE, "yuv420p"
+        sound = out.add_stream(codec, rate=44100, layout="stereo")
+        grey = av.VideoFrame.from_ndarray(np.resize(picture(0), SIZE[::-1]), "gray")
+        out.mux([*video.encode(grey.reformat(format="yuv420p")), *video.encode(None)])
+        resampled = av.AudioResampler(sound.format, sound.layout, 44100, sound.frame_size or 1024)
+        tone = np.sin(np.arange(88200) / 9)[None].astype(np.float32)
+        frame = av.AudioFrame.from_ndarray(tone, "fltp", "mono")
+        frame.sample_rate, frame.pts = 44100, 0
+        for part in resampled.resample(frame):
+            out.mux(sound.encode(part))
+        out.mux(sound.encode(None))
+    return path, packets(path, "audio")[-1][0]
+
+
+@pytest.mark.parametrize(
+    ("codec", "before", "advice"),
+    [
+        ("ac3", ".avi", None),
+        ("aac", ".avi", None),
+        ("mp2", ".mkv", None),
+        ("eac3", ".mkv", r"Choose \.mkv, or give the sound another format first: ffmpeg"),
+        ("adpcm_ms", ".avi", r"\. Give the sound another format first: ffmpeg"),
+    ],
+)
+def test_sound_keeps_its_times_in_avi_or_is_refused(codec, before, advice, tmp_path):
+    """FFmpeg copied AC-3 and AAC of AVI files so that seconds passed in tenths, and ADPCM in minutes."""
+    source, end = sounding(tmp_path / f"in{before}", codec)
+    assert 1.8 < end < 2.1
+    if advice is None:
+        undistort_video(source, tmp_path / "out.avi", lens=lens(), focal=20.0)
+        assert packets(tmp_path / "out.avi", "audio")[-1][0] == pytest.approx(end, abs=0.05)
+        return
+    with pytest.raises(ValueError, match=rf"Cannot keep the sound \({codec}\) in a \.avi file.*{advice}"):
+        undistort_video(source, tmp_path / "out.avi", lens=lens(), focal=20.0)
+    assert not (tmp_path / "out.avi").exists()
+
+
+def test_a_suffix_that_was_chosen_is_not_advised(tmp_path):
+    source, _ = sounding(tmp_path / "in.avi", "adpcm_ms")
+    with pytest.raises(ValueError, match=r"in a \.mkv file\. Choose the suffix of the source, or give the"):
+        undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=20.0)
+
+
+def test_what_is_new_to_pyav_in_a_frame_is_said(tmp_path):
+    """EXIF data of TIFF pictures: the error was "31 is not a valid Type"."""
+    source = clip(tmp_path / "in.mov", encoder="tiff", pixels="rgb24")
+    done = undistort_video(source, tmp_path / "out.mov", lens=lens(), focal=20.0)
+    with decode_video(tmp_path / "out.mov") as (_, frames):
+        assert len(list(frames)) == 4
+    with av.open(str(source)) as container:
+        frame = next(container.decode(video=0))
+        try:
+            assert len(frame.side_data) >= 0
+        except ValueError:
+            assert "what its pictures hold beside the pixels" in done.not_kept
+
+    class Turned:
+        """A frame of which as little can be read, and that players turn."""
+
+        rotation = -90
+
+        @property
+        def side_data(self):
+            raise ValueError("31 is not a valid Type")
+
+    with pytest.raises(ValueError, match="Players turn this video, and PyAV cannot read how"):
+        side_data(Turned(), None)
+
+
 APPLE = {f"com.apple.quicktime.{name}": name for name in ("make", "model", "location.ISO6709")}
 
 

@@ -224,16 +224,40 @@ def test_a_profile_of_cameras_with_other_sensors_is_refused(tmp_path):
         zj.interop.read(tmp_path / "a.lcp")
 
 
-@pytest.mark.parametrize("name", ["opencv", "nerfstudio"])
+@pytest.mark.parametrize("name", ["opencv", "nerfstudio", "nuke", "gyroflow"])
 def test_focal_lengths_that_are_not_those_of_a_file_are_refused(name, tmp_path):
     """As those of another order: each entry got the focal length of another one, without a word."""
     lens = LENSES["landscape"]()
     focal = [24.0, 35.0, 50.0] if name != "opencv" else [24.0]
     zj.interop.write(lens, tmp_path / "a", format=name, focal=focal, pixel_pitch=PITCH)
+    more: dict[str, Any] = {"format": name, "image_size": lens.image_size if name == "nuke" else None}
     for rounded in ([24.0, 35.0, 50.0], [24.4, 35.2, 49.0]):
-        zj.interop.read(tmp_path / "a", format=name, focal=rounded[: len(focal)])
+        zj.interop.read(tmp_path / "a", focal=rounded[: len(focal)], **more)
     with pytest.raises(ValueError, match=r"its focal length is 24 mm, and argument focal has 50 mm there"):
-        zj.interop.read(tmp_path / "a", format=name, focal=[50.0, 35.0, 24.0][: len(focal)])
+        zj.interop.read(tmp_path / "a", focal=[50.0, 35.0, 24.0][: len(focal)], **more)
+
+
+def test_focal_lengths_in_px_that_are_not_those_of_a_node_are_refused(tmp_path):
+    lens = LENSES["landscape"]()
+    zj.interop.write(lens, tmp_path / "a.nk", focal=[24.0, 50.0], pixel_pitch=PITCH)
+    more: dict[str, Any] = {"focal_unit": "px", "image_size": lens.image_size}
+    zj.interop.read(tmp_path / "a.nk", focal=[24 / PITCH, 50 / PITCH], **more)
+    with pytest.raises(
+        ValueError, match=r"its focal length is 653\.9\d+ px, and argument focal has 24 px there"
+    ):
+        zj.interop.read(tmp_path / "a.nk", focal=[24.0, 50.0], **more)
+
+
+def test_a_sensor_that_is_not_that_of_the_focal_lengths_is_said(tmp_path):
+    lens, focal = LENSES["landscape"](), np.array([24.0, 35.0, 50.0])
+    zj.interop.write(lens, tmp_path / "a.ulens", focal=focal, pixel_pitch=PITCH)
+    number = len(zj.interop.read(tmp_path / "a.ulens").report.focal)
+    assert number == len(focal)
+    for factor, said in ((1.01, 0), (1.5, 1)):
+        notes = zj.interop.read(tmp_path / "a.ulens", focal=factor * focal).report.notes
+        assert (
+            sum("its sensor is 35.23 mm wide, and the file says 23.49 mm" in note for note in notes) == said
+        )
 
 
 @pytest.mark.parametrize("name", ["discorpy", "kalibr"])

@@ -139,6 +139,8 @@ def test_focal_lengths_of_nuke_are_those_of_the_node(tmp_path):
     (tmp_path / "b.nk").write_text(text.replace(" {\n", " {\n tde4_focal_length_cm 2.4\n"))
     with pytest.raises(ValueError, match="give argument focal, 2 of them"):
         zj.interop.read(tmp_path / "b.nk", image_size=(360, 240))
+    notes = zj.interop.read(tmp_path / "b.nk", image_size=(360, 240), focal=[24.0, 35.0]).report.notes
+    assert any("not those of its keys: those of argument focal count" in note for note in notes)
 
 
 def test_nukes_own_node_is_read(tmp_path):
@@ -275,6 +277,21 @@ def test_black_in_a_map_shows_nothing(direction, tmp_path):
     assert np.asarray(black.lens(24.0).coefficients) == pytest.approx(
         np.asarray(whole.lens(24.0).coefficients), abs=1e-4
     )
+
+
+@pytest.mark.parametrize("what", ["encoded", "constant"])
+def test_a_picture_that_is_no_map_is_refused(what, tmp_path):
+    """With an error of half of the image it was a lens: of a map saved in sRGB, or a grey picture."""
+    lens = LENSES["portrait"]()
+    zj.interop.write(lens, tmp_path / "m", format="stmap", focal=24)
+    path = tmp_path / "m" / "undistort.24.exr"
+    with OpenEXR.File(str(path)) as file:
+        header, pixels = dict(file.header()), file.channels()["RGB"].pixels.copy()
+    pixels = np.clip(pixels, 0, 1) ** np.float32(1 / 2.2) if what == "encoded" else 0 * pixels + 0.5
+    with OpenEXR.File(header, {"RGB": pixels.astype(np.float32)}) as file:
+        file.write(str(path))
+    with pytest.raises(ValueError, match=r"px off: red and green must be positions from 0 to 1|folds over"):
+        zj.interop.read(path)
 
 
 @pytest.mark.parametrize("foreign", [False, True])

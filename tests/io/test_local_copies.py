@@ -161,3 +161,15 @@ def test_without_fsspec_it_is_said_what_to_install(monkeypatch):
     wanted = r'URLs need fsspec: pip install "zoomjax\[cluster\]"'
     with pytest.raises(ImportError, match=wanted), local_copies(["memory://shots"]):
         pass
+
+
+def test_files_that_would_have_one_name_are_refused(tmp_path):
+    """The last one was taken for both, without a word."""
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("b.jpg", "one")
+        archive.writestr("../b.jpg", "another")
+    with (
+        pytest.raises(OSError, match=r"b\.jpg and .*b\.jpg would have one name here, b\.jpg: give the URL"),
+        local_copies([f"zip://::{tmp_path}/a.zip"]),
+    ):
+        pass

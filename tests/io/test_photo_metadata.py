@@ -14,7 +14,7 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from zoomjax.io.equipment import read_equipment
 from zoomjax.io.metadata import Metadata, geometry_of, marked, squeezed, straightened_by, work_of
-from zoomjax.io.photo import read_focal, read_metadata, read_pages, read_photo
+from zoomjax.io.photo import read_focal, read_metadata, read_pages, read_photo, read_size
 from zoomjax.io.photo_writer import encoded_photo
 
 from .._exif import exif
@@ -274,6 +274,14 @@ def test_raw_is_developed_with_all_its_bits(tmp_path, image):
     assert metadata.xmp == XMP
     grey = [cv2.GaussianBlur(each.astype(float).mean(2), (0, 0), 2) for each in (found, image)]
     assert np.corrcoef(grey[0].ravel(), grey[1].ravel())[0, 1] > 0.95
+    for name, more, size in (
+        ("active", (50829, 4, 4, (10, 20, 190, 280), True), (260, 180)),  # the header says 300 x 200
+        ("wide", (50718, 5, 2, (2, 1, 1, 1), True), (600, 200)),
+        ("high", (50718, 5, 2, (1, 1, 2, 1), True), (300, 400)),
+    ):
+        path = tmp_path / f"{name}.dng"
+        tifffile.imwrite(path, bayer(image), photometric=32803, metadata=None, extratags=[*tags, more])
+        assert read_size(path) == read_photo(path)[0].shape[1::-1] == size
     (tmp_path / "b.dng").write_bytes((tmp_path / "a.dng").read_bytes()[:90])
     with pytest.raises(ValueError, match="damaged, or LibRaw does not know this camera"):
         read_photo(tmp_path / "b.dng")

@@ -123,6 +123,10 @@ SPOILED = {
         lambda c: c | {"focal_range": [-1.0, 3.0]},
         "must be finite and positive",
     ),
+    "range of no lens": (
+        lambda c: c | {"focal_range": [1e-300, 3.0]},
+        r"from 1e-30 to 1e\+30 mm or px, but focal_range\[0\] is 1e-300",
+    ),
     "zero reference": (
         lambda c: c | {"zoom": c["zoom"] | {"focal_ref": 0.0}},
         "must be finite and positive",
@@ -240,8 +244,19 @@ def test_range_is_checked_of_many_focal_lengths(lens):
     lens.check_range(np.array([low, high]))
     with pytest.warns(UserWarning, match=r"Focal lengths from 10 to 160 px are not all within"):
         lens.check_range(np.array([low / 2, low, high * 2]))
+    with pytest.raises(ValueError, match=r"positive number, 1e-30 to 1e\+30 mm or px, but it is 1e\+300"):
+        lens(1e300)
     with pytest.raises(ValueError, match="positive number, but it is -1"):
         lens.check_range(np.array([low, -1.0]))
+
+
+def test_a_centre_outside_of_the_image_is_told(content, tmp_path):
+    """As a fit tells it: a slip in the file moved all that the lens corrects, without a word."""
+    (tmp_path / "lens.json").write_text(json.dumps(content | {"centre": [-600.0, 300.0]}))
+    with pytest.warns(
+        UserWarning, match=r"lens\.json: the centre of distortion, \(-600, 300\) px, is outside"
+    ):
+        zj.load_lens(tmp_path / "lens.json")
 
 
 @pytest.mark.parametrize(("spoil", "message"), SPOILED.values(), ids=SPOILED)

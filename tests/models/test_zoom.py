@@ -272,6 +272,9 @@ def test_a_model_takes_one_focal_length_and_says_so(model):
     for none in (-3.0, 0.0, np.nan, jnp.array(-3.0)):
         with pytest.raises(ValueError, match="focal must be finite and positive"):
             zoom(none)
+    for absurd in (5e-324, 1e-300, 1e300):
+        with pytest.raises(ValueError, match=r"focal must be from 1e-30 to 1e\+30 mm or px"):
+            zoom(absurd)
 
 
 @pytest.mark.usefixtures("unchecked")

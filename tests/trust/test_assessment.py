@@ -239,3 +239,16 @@ def test_the_real_zoom_camera_is_doubtful(data):
     found = assessed(read_zoomcam(data / "zoomcam"))
     assert found.verdict == "doubtful"
     assert about(found) == {"bands": "doubtful", "halves by directions": "good"}
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+def test_points_outside_of_the_image_are_not_good(lines, weighted):
+    """As of a table of lines whose columns x and y are exchanged: the centre is another one then."""
+    small = zj.compress(lines)
+    fit = zj.fit_zoom(small)
+    points = np.where(np.asarray(lines.frame)[:, None, None] == 0, lines.points + 1e3, lines.points)
+    weight = np.where(np.asarray(lines.frame) == 0, float(weighted), 1.0)
+    off = dataclasses.replace(lines, points=points, weight=weight)
+    outside = [finding for finding in assess(off, fit, compressed=small).findings if finding.cause]
+    assert [finding.about for finding in outside] == ["points outside"] * weighted
+    assert all("of the points lie outside of the image of 1072 x 712 px" in f.found for f in outside)

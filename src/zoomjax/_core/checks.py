@@ -180,18 +180,35 @@ def usable_lines(arrays: list[np.ndarray], frames: np.ndarray, number_of_frames:
     return np.flatnonzero(usable)
 
 
-def warn_of_points_outside(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -> None:
-    """Points far outside of the image mean a wrong image size, and with it a wrong centre and scale."""
+def points_beyond(
+    points: np.ndarray, mask: np.ndarray, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """By how many px points are outside of the image, and which by more than noise takes them."""
     beyond = np.max(
         np.maximum(-points, points - (np.array(size) - 1)), axis=-1, where=mask[..., None], initial=0
     )
-    outside = beyond > 0.01 * max(size)  # noise alone takes a few points some px out
+    return beyond, beyond > 0.01 * max(size)  # noise alone takes a few points some px out
+
+
+def warn_of_points_outside(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -> None:
+    """Points far outside of the image mean a wrong image size, and with it a wrong centre and scale."""
+    beyond, outside = points_beyond(points, mask, size)
     if outside.any():
         warnings.warn(
             f"{np.sum(outside):,} of {np.sum(mask):,} points lie outside of the image of {size[0]} x "
             f"{size[1]} px, by up to {np.max(beyond):.3g} px. Is image_size (width, height) right?",
             stacklevel=3,
         )
+
+
+def centre_problem(centre: np.ndarray, size: tuple[int, int]) -> str | None:
+    """That a centre of distortion, px, is outside of the image, which mostly is a mistake; None if not."""
+    if not ((centre < -0.5) | (centre > np.array(size) - 0.5)).any():
+        return None
+    return (
+        f"The centre of distortion, ({centre[0]:g}, {centre[1]:g}) px, is outside of the image of "
+        f"{size[0]} x {size[1]} px. That is right for a crop of a larger image alone."
+    )
 
 
 def warn_of_units(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -> None:

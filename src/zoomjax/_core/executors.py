@@ -9,8 +9,10 @@ import collections
 import contextlib
 import dataclasses
 import functools
+import hashlib
 import os
 import platform
+import stat
 import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable
@@ -25,6 +27,9 @@ from .text import reason
 
 _MOST_AHEAD = 4096
 """Tasks that are handed over before the first of them is done: some for each of a thousand workers."""
+
+_END = 2**16
+"""Bytes at both ends of a file by which it is known."""
 
 _MOST_BYTES = 2**29
 """What these hold together: pixels of a clip that is decoded here, or packets that come back."""
@@ -78,7 +83,8 @@ def in_order(
         items: taken as they are handed over, at most some thousands ahead.
         size: bytes that an item takes until it is done.
         there: makes of an item what the task is given: whole paths, as workers are in other folders.
-        file: what the task reads, if it is a file: a worker where it has another size does not run it, and
+        file: what the task reads, if it is a file: a worker where it has another size, or others of the
+            bytes at its ends, does not run it, and
             one that does not see it makes a copy, if it is one (`copies`).
 
     Raises:
@@ -125,29 +131,47 @@ def in_order(
 
 
 class _Seen(NamedTuple):
-    """A file's whole path, its size as it is here, and where it is from if it is a copy."""
+    """A file's whole path, its size and its ends as they are here, and where it is from if it is a copy."""
 
     path: str
     size: int
+    ends: bytes
     origin: Origin | None
 
 
 def _seen(file: str | os.PathLike[str] | None) -> _Seen | None:
     """None where there is no file."""
     with contextlib.suppress(OSError):
-        return (
-            None if file is None else _Seen(os.path.abspath(file), os.stat(file).st_size, origin_of(file))
-        )
+        if file is not None:
+            size, ends = _size_and_ends(file)
+            return _Seen(os.path.abspath(file), size, ends, origin_of(file))
     return None
 
 
+def _size_and_ends(file: str | os.PathLike[str]) -> tuple[int, bytes]:
+    """The size of a file, and a checksum of its first and last bytes; of a pipe nothing is read."""
+    found = os.stat(file)
+    if not stat.S_ISREG(found.st_mode):
+        return found.st_size, b""
+    with open(file, "rb") as content:
+        ends = content.read(_END)
+        content.seek(max(found.st_size - _END, 0))
+        ends += content.read(_END)
+    return found.st_size, hashlib.blake2b(ends, digest_size=16).digest()
+
+
 def _check_same(file: _Seen | None) -> None:
-    """In a worker: raise ValueError where a file has another size than where the work comes from."""
+    """In a worker: raise ValueError where a file is another one than where the work comes from."""
     found = file and _seen(file.path)
     if file and found and found.size != file.size:
         raise ValueError(
             f"the worker on {platform.node()} sees another file {file.path}, of {found.size} bytes instead "
             f"of {file.size}: workers must see the same files"
+        )
+    if file and found and found.ends != file.ends:
+        raise ValueError(
+            f"the worker on {platform.node()} sees another file {file.path}, of the same size: workers "
+            "must see the same files"
         )
 
 

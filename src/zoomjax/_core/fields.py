@@ -173,6 +173,18 @@ def check_positive(name: str, value: Any) -> None:
         _check_each(name, values, np.isfinite(values) & (values > 0), "finite and positive")
 
 
+FOCALS = (1e-30, 1e30)
+"""Focal lengths of any lens in any unit: powers of others are beyond all numbers."""
+
+
+def check_focal(name: str, value: Any) -> None:
+    """Raise ValueError where values are no focal lengths."""
+    if (values := known(value)) is not None:
+        check_positive(name, values)
+        low, high = FOCALS
+        _check_each(name, values, (values >= low) & (values <= high), f"from {low:g} to {high:g} mm or px")
+
+
 def check_not_negative(name: str, value: Any) -> None:
     """Raise ValueError where values are not finite or below zero."""
     if (values := known(value)) is not None:

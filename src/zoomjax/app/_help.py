@@ -4,6 +4,11 @@ from typing import Any
 
 from typer.core import TyperCommand
 
+from .._core.copies import is_url, shown_url
+
+_NO_FILES = ("inputs", "cluster", "search", "name")
+"""Parameters that take URLs, or words that are not of files."""
+
 
 class PlainCommand(TyperCommand):
     """A command whose help names no Python types, and whose arguments and output are not empty.
@@ -16,7 +21,8 @@ class PlainCommand(TyperCommand):
         """Parse the words after the command.
 
         Raises:
-            ValueError: an argument, or the output, is empty.
+            ValueError: an argument, or the output, is empty; or there is a URL where a file is meant, which
+                would be one of that name here.
         """
         given: dict[str, Any] = {}
         if not ctx.resilient_parsing:  # which completes words
@@ -25,8 +31,20 @@ class PlainCommand(TyperCommand):
             of: Any = parameter
             path = of.name == "output" or (of.param_type_name == "argument" and of.name != "search")
             value = given.get(of.name)
-            if path and "" in (value if isinstance(value, list | tuple) else [value]):
-                name = "--output" if of.name == "output" else "An argument"
+            values = value if isinstance(value, list | tuple) else [value]
+            name = "--output" if of.name == "output" else "An argument"
+            for url in values if of.name not in _NO_FILES else ():
+                if isinstance(url, str) and is_url(url):
+                    name = max(of.opts, key=len) if of.param_type_name == "option" else name
+                    raise ValueError(
+                        f"{name} is {shown_url(url)!r}, but files are meant here, not URLs: "
+                        + (
+                            "copy the results there afterwards."
+                            if of.name == "output"
+                            else "copy it first."
+                        )
+                    )
+            if path and "" in values:
                 raise ValueError(
                     f"{name} is empty, as a variable of the shell that is not set: name a file or a "
                     "folder, or . for this one."

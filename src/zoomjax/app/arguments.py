@@ -177,6 +177,9 @@ def _read_lines(path: Path, focal: str | None, image_size: str | None, focal_uni
 
 def _focal_of_lines(path: Path, focal: str | None) -> "dict[int, float] | float | None":
     """The focal lengths of a CSV of lines: by frame, or one of all frames, as of photos."""
+    import numpy as np
+
+    from .._core.fields import check_focal
     from ..io.text_table import plain_number
     from ..lines.csv import read_focal_csv
 
@@ -190,6 +193,7 @@ def _focal_of_lines(path: Path, focal: str | None) -> "dict[int, float] | float 
             f"--focal for {path} must be a CSV file with the columns frame,focal, or one focal length of "
             f"all frames: a positive number, or same if it is not known; but it is {focal!r}."
         )
+    check_focal("focal", np.asarray(number))
     return number
 
 

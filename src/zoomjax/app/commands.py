@@ -236,7 +236,7 @@ def calibrate(
     written again.
     """
     inputs = [str(results_of(path) or path) for path in at_hand(context, inputs, quiet=quiet)]
-    of_lines = any(path.lower().endswith((".npz", ".csv")) for path in inputs)
+    of_lines = [path for path in inputs if path.lower().endswith((".npz", ".csv"))]
     if not (of_lines or dry_run or cluster):
         import_ahead(DETECTION)
     set_up_jax()
@@ -250,7 +250,7 @@ def calibrate(
     if focal == "same":
         refuse_idle(context, ("focal_sigma",), "with --focal same, for f is not known")
     if of_lines:
-        refuse_idle(context, IDLE_FOR_LINES, f"for {inputs[0]}, which contains lines")
+        refuse_idle(context, IDLE_FOR_LINES, f"for {of_lines[0]}, which contains lines")
         from .calibration import FILES
         from .results_folder import OF_A_LENS, results_folder
 

@@ -14,7 +14,7 @@ from ..fit.motion import MotionFit
 from ..fit.result import RESULTS
 from ..models.lens import ZoomLens
 from ..tracks.tracks import Tracks
-from ..trust.assessment import NEGLIGIBLE, VERDICTS, Finding
+from ..trust.assessment import NEGLIGIBLE, VERDICTS, Finding, findings_outside
 from ..trust.evidence import UNSEEN_PX
 from .frame_findings import BLIND, of_blind, of_dissolves, of_repeated
 
@@ -75,6 +75,7 @@ def findings_of_motion(
         *of_dissolves(tracks, follows(fit, tracks), np.asarray(fit.shot), numbers),
         *of_repeated(tracks),
         *of_blind(fit, numbers),
+        *findings_outside(np.asarray(tracks.points), np.asarray(tracks.mask), tracks.image_size),
     ]
     return sorted(found, key=lambda of: -VERDICTS.index(of.verdict))
 

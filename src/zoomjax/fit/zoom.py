@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
-from .._core.checks import LARGEST, real_numbers
+from .._core.checks import LARGEST, centre_problem, real_numbers
 from .._core.types import AnyArray
 from ..lines.base import AbstractLines, SomeLines
 from ..lines.buckets import bucketed
@@ -140,11 +140,6 @@ def given_centre(
         raise ValueError(
             f'Argument centre must be "fit", "image" or two coordinates in px, but it is {centre!r}.'
         )
-    if ((told < -0.5) | (told > np.array(image_size) - 0.5)).any():
-        width, height = image_size
-        warnings.warn(
-            f"The centre of distortion, ({told[0]:g}, {told[1]:g}) px, is outside of the image of "
-            f"{width} x {height} px. That is right for a crop of a larger image alone.",
-            stacklevel=stacklevel,
-        )
+    if problem := centre_problem(told, image_size):
+        warnings.warn(problem, stacklevel=stacklevel)
     return told.astype(float)

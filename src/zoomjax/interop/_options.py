@@ -4,7 +4,7 @@ import dataclasses
 import math
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,28 @@ def check_options(fmt: Format, given: dict[str, Any]) -> None:
             raise ValueError(
                 f"Argument {name} must be one of {', '.join(_CHOICES[name])}, but it is {value!r}."
             )
+
+
+def check_name(fmt: Format, path: Path, *, several: bool, known: Collection[str]) -> None:
+    """Raise ValueError where a folder is named as a file of the format, or a file as one of another format.
+
+    Args:
+        fmt: the format.
+        path: the name.
+        several: whether it is of a folder.
+        known: suffixes of all formats.
+    """
+    suffix = path.suffix.lower()
+    if several and suffix in fmt.suffixes:
+        raise ValueError(
+            f"The format {fmt.name} is several files here, and {path} is to be their folder: give a name "
+            f"without {path.suffix}."
+        )
+    if not several and suffix in known and suffix not in fmt.suffixes:
+        raise ValueError(
+            f"The format {fmt.name} is no {suffix} file, and as {path} nothing would recognise it: give a "
+            f"name that ends in {fmt.suffixes[0]}."
+        )
 
 
 def warn_of_relative(lens: ZoomLens) -> None:

@@ -27,7 +27,7 @@ _ALIKE = 1e-4
 """The same without a word."""
 
 
-_ROUNDED = 0.03
+ROUNDED = 0.03
 """Share by which focal lengths engraved on a lens may differ from those of a file."""
 
 
@@ -155,12 +155,17 @@ def contents(
     return Contents(tuple(nodes), size, "mm" if mm else "px", notes, pixel_pitch=pitch)
 
 
-def refuse_other_focals(nodes: Iterable[Node], job: Import) -> None:
-    """Raise ValueError where argument focal has other mm than a file, whose order may be another one."""
-    for own, given in zip((node.focal for node in nodes), job.focal or (), strict=False):
-        if job.focal_unit == "mm" and abs(given - own) > _ROUNDED * own:
+def refuse_other_focals(own: Iterable[float], job: Import, *, pitch: float | None = None) -> None:
+    """Raise ValueError where argument focal has other focal lengths than a file, which says them in mm.
+
+    The order of the file may be another one. Those in px are compared where it says the width of a pixel.
+    """
+    unit, one = job.focal_unit, 1.0 if job.focal_unit == "mm" else pitch
+    for mm, given in zip(own, job.focal or (), strict=False):
+        if one is not None and abs(given * one - mm) > ROUNDED * mm:
             raise ValueError(
-                f"its focal length is {own:g} mm, and argument focal has {given:g} mm there: leave that out"
+                f"its focal length is {mm / one:g} {unit}, and argument focal has {given:g} {unit} there: "
+                "leave that out"
             )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..models.distortion import Distortion
 from ._samples import Pairs, pairs_of
-from .base import Node, Sampled
+from .base import Contents, Node, Sampled
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,6 +104,20 @@ def distance(distortion: Distortion, seen: Seen, scale: float) -> float:
         other = np.hypot(*(back - distorted).T)
         far = np.where(np.isfinite(other), other, far)
     return float(far.max() * scale) if np.isfinite(far).all() else np.inf
+
+
+_NEAR = 0.02
+"""Of the diagonal, by which a lens may be off maps that are of one."""
+
+
+def check_near(at_nodes: float, contents: Contents) -> None:
+    """Raise ValueError where maps are those of no lens, as of pictures that are no STMaps."""
+    most = _NEAR * math.hypot(*contents.image_size)
+    if at_nodes > most and any(isinstance(node, Sampled) for node in contents.nodes):
+        raise ValueError(
+            f"the lens that is nearest to it is {at_nodes:.3g} px off: red and green must be positions "
+            "from 0 to 1, without a colour space applied, as they are in 32-bit floats"
+        )
 
 
 def once(nodes: tuple[Node | Sampled, ...]) -> tuple[list[Node | Sampled], list[Node | Sampled]]:

@@ -188,9 +188,12 @@ def error_written(fmt: Format, nodes: list[Node], job: Export, files: list[Path]
     ends: dict[AbstractForm, dict[float, Pairs]] = {}
     worst = 0.0
     for file, part in zip(files, parts, strict=True):
-        told = tuple(node.focal for node in part)
+        of = tuple(node.focal for node in part)
+        told = (
+            of if job.pixel_pitch is None else tuple(float(job.focal_mm(f)) for f in of)
+        )  # in mm, if known
         found = fmt.read(Import(file, (file,), job.lens.image_size, told)).nodes
-        for node, f in zip(found, told, strict=True):
+        for node, f in zip(found, of, strict=True):
             assert isinstance(node, Node)
             if node.form not in ends:
                 all_of_them = _from_to(node.form, list(exact.values()), np.array(focal), job)

@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 
 from ._documents import load_json
-from ._pinhole import Pinholes, contents, formula, from_opencv, matrix_rows, pinhole
+from ._pinhole import (
+    Pinholes,
+    contents,
+    formula,
+    from_opencv,
+    matrix_rows,
+    pinhole,
+    refuse_other_focals,
+)
 from .base import Contents, Export, Import, Node, one_size, read_text, refuse_others
 
 _MOST = 8
@@ -93,6 +101,8 @@ class Gyroflow(Pinholes):
             numbers.append(np.concatenate([matrix.ravel(), k[:_MOST], np.zeros(max(0, _MOST - len(k)))]))
             sizes.append(size)
         size = one_size(sizes)
+        if mm:
+            refuse_other_focals([node.focal for node in nodes], job)
         found = contents(nodes, size, job, px=[float(row[0]) for row in numbers], mm=mm)
         at = {node.focal: row for node, row in zip(found.nodes[::-1], numbers[::-1], strict=True)}
         return dataclasses.replace(found, between=_linear(at, size) if entries else None)

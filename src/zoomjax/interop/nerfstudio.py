@@ -83,7 +83,7 @@ class Nerfstudio(NodeFormat):
         if len(units) > 1 and job.focal is None:
             raise ValueError("some of its focal lengths are in mm and some in px: give argument focal")
         if units == {True}:
-            refuse_other_focals(nodes, job)
+            refuse_other_focals([node.focal for node in nodes], job)
         found = contents(nodes, one_size(sizes), job, px=px, mm=units == {True})
         note = (f"Frames have other values of {', '.join(overruled)} than the top, which count.",)
         return dataclasses.replace(found, notes=(*found.notes, *note * bool(overruled)))

@@ -15,6 +15,7 @@ from ..models.brown_conrady import BrownConrady
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ._forms import Form
+from ._pinhole import refuse_other_focals
 from .base import IN_PX, Contents, Export, Import, Node, NodeFormat, read_text, refuse_others
 
 _DEGREE_4 = Form(2, tangential=True, corrects=True)
@@ -96,16 +97,24 @@ class Nuke(NodeFormat):
         if any(len(keys) > 1 and sorted(keys) != frames for keys in curves):
             raise ValueError("its curves have keys at different frames")
         values = _at_frames(curves, frames)
+        pitch = (
+            10 * float(knobs["tde4_filmback_width_cm"]) / size[0] if kind == _NODE else None
+        )  # 10 mm in a cm
+        own = None
+        if focal is not None and sorted(focal) == frames:
+            own = [10 * focal[frame] for frame in frames]
+            refuse_other_focals(own, job, pitch=pitch)
         if job.focal is not None and len(job.focal) == len(frames):
             told, unit = job.focal, job.focal_unit
-        elif job.focal is None and focal is not None and sorted(focal) == frames:
-            told, unit = [10 * focal[frame] for frame in frames], "mm"  # 10 mm in a cm
+        elif job.focal is None and own is not None:
+            told, unit = own, "mm"
         else:
             raise ValueError(
                 f"it holds no focal lengths: give argument focal, {len(frames)} of them{IN_PX}"
             )
+        if focal is not None and own is None:
+            notes += ("Its focal lengths are not those of its keys: those of argument focal count.",)
         nodes = [Node(f, form, row[:-2], row[-2:]) for f, row in zip(told, values, strict=True)]
-        pitch = 10 * float(knobs["tde4_filmback_width_cm"]) / size[0] if kind == _NODE else None
         return Contents(tuple(nodes), size, unit, notes, pixel_pitch=pitch)
 
 

@@ -71,7 +71,7 @@ class OpenCV(NodeFormat):
         if len(units) > 1 and job.focal is None:
             raise ValueError("some of its focal lengths are in mm and some in px: give argument focal")
         if units == {"mm"}:
-            refuse_other_focals(nodes, job)
+            refuse_other_focals([node.focal for node in nodes], job)
         return contents(nodes, one_size(sizes), job, px=px, mm=units == {"mm"})
 
 

@@ -23,6 +23,7 @@ from ..models.zoom import AbstractLinearZoom
 from ._lens import UnsuitedError, lens_of
 from ._options import (
     check_model,
+    check_name,
     check_options,
     check_order,
     focal_lengths,
@@ -32,6 +33,7 @@ from ._options import (
     positives,
     warn_of_relative,
 )
+from ._seen import check_near
 from ._solve import Solution, error_written, solve
 from .base import (
     CONVENTION,
@@ -165,11 +167,7 @@ def write(
     check_pitch(job.pixel_pitch, lens.image_size)
     folder = isinstance(fmt, FolderFormat)
     several = folder or (fmt.zoom == "one" and job.focal is not None and len(job.focal) > 1)
-    if several and path.suffix.lower() in fmt.suffixes:
-        raise ValueError(
-            f"The format {fmt.name} is several files here, and {path} is to be their folder: give a name "
-            f"without {path.suffix}."
-        )
+    check_name(fmt, path, several=several, known=_suffixes())
     files = tuple(path / name for name in fmt.file_names(job)) if several else (path,)
     refuse_existing(list(files), overwrite=overwrite)
     others = _others(path, files) if several else ()
@@ -281,6 +279,7 @@ def read(
             if isinstance(node, Node) and not np.isfinite([*node.theta, *node.centre]).all():
                 raise ValueError(f"its coefficients or centre at {node.focal:g} are not finite numbers")
         made = lens_of(possible(contents), zoom, terms, distortion_model)
+        check_near(made.at_nodes, contents)
     except (FileNotFoundError, UnsuitedError):
         raise
     except _DAMAGED as error:
@@ -304,6 +303,10 @@ def named(name: str) -> Format:
         if fmt.name == name:
             return fmt
     raise ValueError(f"Argument format must be one of {_names(FORMATS)}, but it is {name!r}.")
+
+
+def _suffixes() -> set[str]:
+    return {suffix for fmt in FORMATS for suffix in fmt.suffixes}
 
 
 def _names(formats: Iterable[Format]) -> str:
@@ -343,7 +346,7 @@ def _files(path: Path) -> list[Path]:
         if not path.is_file():
             raise FileNotFoundError(2, "No such file", str(path))
         return [path]
-    known = {suffix for fmt in FORMATS for suffix in fmt.suffixes}
+    known = _suffixes()
     found = [file for file in path.iterdir() if file.is_file() and file.suffix.lower() in known]
     if len({file.suffix.lower() for file in found}) != 1:
         raise ValueError(

@@ -11,7 +11,7 @@ import json
 import numpy as np
 
 from ._documents import load_json
-from ._pinhole import Pinhole, Pinholes, contents, focal_px, formula, node_of, pinhole
+from ._pinhole import ROUNDED, Pinhole, Pinholes, contents, focal_px, formula, node_of, pinhole
 from ._samples import distortions
 from ._solve import same
 from .base import Contents, Export, Import, Node, read_text, refuse_others
@@ -133,6 +133,11 @@ class Unreal(Pinholes):
         if mm and width is not None:
             pitch = None if notes else width / size[0]
             found = dataclasses.replace(found, pixel_pitch=pitch, notes=(*found.notes, *notes))
+        elif width is not None and found.pixel_pitch is not None:
+            other = found.pixel_pitch * size[0]
+            told = f"By argument focal its sensor is {other:.4g} mm wide, and the file says {width:.4g} mm."
+            off = abs(other / width - 1) > ROUNDED
+            found = dataclasses.replace(found, notes=(*found.notes, *[told] * off))
         return found if job.focal is not None else dataclasses.replace(found, between=between)
 
 

@@ -46,7 +46,7 @@ def local_copies(
     Raises:
         ImportError: fsspec is not installed, or the package that it needs for such a URL.
         FileNotFoundError: a URL names nothing.
-        OSError: it cannot be read. Of several files, all of them.
+        OSError: it cannot be read. Of several files, all of them; or two of them would have one name here.
 
     Warns:
         UserWarning: a file cannot be copied; it is left out.
@@ -99,7 +99,15 @@ def _planned(
     fixed = list(itertools.takewhile(lambda part: not glob.has_magic(part), _parts(place)))
     top = folder / (fixed[-1] if fixed else "all")
     name_by_url(top, _without(url, len(_parts(place)) - len(fixed)))
-    return str(top), {top.joinpath(*_parts(one)[len(fixed) :]): Origin(system, one) for one in chosen}
+    own = dict[Path, Origin]()
+    for one in chosen:
+        other = own.setdefault(path := top.joinpath(*_parts(one)[len(fixed) :]), Origin(system, one)).place
+        if other != one:
+            raise OSError(
+                f"{shown_url(other)} and {shown_url(one)} would have one name here, {path.name}: give the "
+                "URL of each by itself."
+            )
+    return str(top), own
 
 
 def _without(url: str, number: int) -> str:

@@ -76,7 +76,10 @@ def read_size(source: str | os.PathLike[str]) -> tuple[int, int]:
     """Read a photo's width and height, px, from its header. It raises as `read_focal`."""
     path = Path(source)
     with _named(path), open_photo(path) as file:
-        _, width, height = announced_size(file.read(_MOST_BYTES))
+        content = file.read(_MOST_BYTES)
+        if path.suffix.lower() in RAW_SUFFIXES:  # whose header begins with a small picture
+            return raw_size(content)
+        _, width, height = announced_size(content)
     return width, height
 
 

@@ -27,7 +27,10 @@ def raw_size(content: bytes) -> tuple[int, int]:
         ValueError: rawpy is not installed, or cannot read it.
     """
     with _opened(content) as raw:
-        return int(raw.sizes.width), int(raw.sizes.height)
+        width, height, aspect = raw.sizes.width, raw.sizes.height, raw.sizes.pixel_aspect
+        if aspect < 1:  # LibRaw makes pixels square
+            return int(width), int(height / aspect + 0.5)
+        return int(width * aspect + 0.5), int(height)
 
 
 def raw_metadata(content: bytes) -> Metadata:

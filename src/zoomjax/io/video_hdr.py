@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 _MASTERING, _LIGHT = "MASTERING_DISPLAY_METADATA", "CONTENT_LIGHT_LEVEL"
+_UNREAD = "UNREAD"
 
 _OTHERS = {
     "DYNAMIC_HDR_PLUS": "HDR10+ metadata",
@@ -19,6 +20,7 @@ _OTHERS = {
     "ICC_PROFILE": "the colour profile",
     "SPHERICAL": "the spherical projection",
     "STEREO3D": "the stereoscopic arrangement",
+    _UNREAD: "what its pictures hold beside the pixels",
 }
 """What frames carry that an encoder gets no sight of, and how messages call it."""
 
@@ -26,13 +28,29 @@ _PARAMETERS = {"libx265": "x265-params", "libx264": "x264-params", "libsvtav1": 
 """Options of the encoders that write these metadata."""
 
 
+def beside(frame: Any) -> Any:
+    """What a frame tells beside the pixels; None if PyAV has no name for a part of it, and reads nothing.
+
+    Raises:
+        ValueError: so it is, and players turn the pictures.
+    """
+    try:
+        return frame.side_data
+    except ValueError as error:  # "31 is not a valid Type": EXIF data of TIFF pictures, in PyAV 18
+        if getattr(frame, "rotation", 0) == 0:
+            return None
+        raise ValueError(
+            "Players turn this video, and PyAV cannot read how: its pictures hold data that are new to it. "
+            "Give them another format first: ffmpeg -noautorotate -i SOURCE -c:v ffv1 -c:a copy NEW.mkv."
+        ) from error
+
+
 def side_data(frame: Any, context: Any) -> dict[str, bytes]:
     """What a frame and its decoder tell beside the pixels, by FFmpeg's names."""
-    stream = getattr(context, "decoded_side_data", {})  # where newer FFmpegs tell some things alone
-    items = (frame.side_data[index] for index in range(len(frame.side_data)))
-    return {kind.name: bytes(value) for kind, value in stream.items()} | {
-        item.type.name: bytes(item) for item in items
-    }
+    found = {kind.name: bytes(value) for kind, value in getattr(context, "decoded_side_data", {}).items()}
+    if (own := beside(frame)) is None:  # newer FFmpegs have told some things already
+        return found | {_UNREAD: b""}
+    return found | {item.type.name: bytes(item) for item in (own[index] for index in range(len(own)))}
 
 
 def with_hdr(

@@ -5,6 +5,7 @@ Sound, subtitles and data go over packet by packet; chapters, attachments and ti
 
 import dataclasses
 import io
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ _HEARD = ("aac", "aac_latm", "ac3", "dts", "eac3", "mp1", "mp2", "mp3", "opus", 
 _SEEN = ("h264", "hevc", "vvc", "mpeg1video", "mpeg2video", "mpeg4", "mjpeg", "dnxhd", "jpeg2000")
 """Their pictures, of which nobody sees others."""
 
+_SECONDS, _OFF = 10.0, 0.05
 _AT_ONCE = 0.1
 """s after time 0, at which players of AVI begin the sound, by which it may begin late."""
 
@@ -106,12 +108,74 @@ def _holds(container: str, stream: Any) -> bool:
         return False
     if container in ("mpegts", "mxf"):
         return container == "mpegts" and stream.codec_context.name in _TRANSPORT
+    return _takes(container, stream)
+
+
+def _takes(container: str, stream: Any) -> bool:
+    """Whether a container has a name for the codec of a stream."""
     with av.open(io.BytesIO(), "w", format=container) as scratch:
         try:
             scratch.add_stream_from_template(stream)
         except ValueError:
             return False
     return True
+
+
+def _first_seconds(container: str, source: Any, template: Any) -> tuple[io.BytesIO, list[float]] | None:
+    """Packets of sound in a container, in a stream like the template, and their times; None if refused."""
+    scratch, times = io.BytesIO(), list[float]()
+    with open_container(source.container.name) as again, av.open(scratch, "w", format=container) as made:
+        stream = made.add_stream_from_template(template)
+        for packet in again.demux(again.streams[source.index]):
+            if packet.pts is None or packet.dts is None:
+                continue
+            times.append(float(packet.pts * packet.time_base))
+            packet.stream = stream
+            try:
+                made.mux(packet)
+            except av.error.ArgumentError:  # two packets of one time
+                return None
+            if times[-1] - times[0] > _SECONDS:
+                break
+    scratch.seek(0)
+    return scratch, times
+
+
+def _keeps_times(container: str, source: Any, template: Any) -> bool:
+    """Whether sound keeps its times in a container, in a stream like the template, as far as is looked at.
+
+    AVI holds no times, but how long a packet or a byte lasts, which FFmpeg writes wrong for some codecs.
+    """
+    if (found := _first_seconds(container, source, template)) is None:
+        return False
+    scratch, before = found
+    if len(before) < 2:
+        return True
+    with av.open(scratch, "r") as back:
+        after = [float(p.pts * p.time_base) for p in back.demux(audio=0) if p.pts is not None]
+    longest = max(later - earlier for earlier, later in itertools.pairwise(before))
+    return abs((after[-1] - after[0]) - (before[-1] - before[0])) < _OFF + longest
+
+
+def _for_avi(source: Any, named: Path) -> Any:
+    """A stream by which AVI keeps the times of sound: its own, or that of an AVI file as Matroska has it.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if _keeps_times("avi", source, source):
+        return source
+    matroska = _takes("matroska", source)
+    found = None
+    if matroska and source.container.format.name == "avi":
+        found = _first_seconds("matroska", source, source)
+    if found is not None and _keeps_times("avi", source, like := av.open(found[0], "r").streams.audio[0]):
+        return like
+    raise ValueError(
+        f"Cannot keep the {_name(source)} in a {named.suffix} file: FFmpeg writes its lengths wrong there, "
+        "so that it would be faster or slower than the pictures. "
+        + (f"Choose .mkv, or {_ANEW}" if matroska else f"{_ANEW[0].upper()}{_ANEW[1:]}")
+    )
 
 
 _KINDS = {"audio": "sound", "subtitle": "subtitles", "data": "data", "video": "a further picture"}
@@ -153,13 +217,15 @@ def _copied(output: Any, source: Any, named: Path) -> Any:
             f"The {_name(source)} begins at {late:.2f} s, which a {named.suffix} file does not hold: it "
             "would be ahead of the pictures. Choose .mkv."
         )
+    avi = output.format.name == "avi" and source.type == "audio" and _takes("avi", source)
+    like = _for_avi(source, named) if avi else source
     try:
         _check_heard(source, named)
-        stream = output.add_stream_from_template(source)
+        stream = output.add_stream_from_template(like)
     except ValueError as error:
         raise ValueError(
             f"Cannot keep the {_name(source)} in a {named.suffix} file. Choose the suffix of the source, "
-            f".mkv, or {_ANEW}"
+            f"{'.mkv, ' * (named.suffix.lower() != '.mkv')}or {_ANEW}"
         ) from error
     stream.metadata.update(source.metadata)
     if source.type != "data":

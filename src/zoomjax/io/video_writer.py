@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .pyav import av, open_container
-from .video_hdr import with_hdr
+from .video_hdr import beside, with_hdr
 from .video_streams import CONTAINER, Carried, lost_of_tracks, lost_tags, mux, put, starts, tag_options
 
 _ENCODER = {
@@ -364,7 +364,7 @@ def first_frame(frame: Any, side: dict[str, bytes] | None) -> FirstFrame:
 
 def display_matrix(frame: Any) -> list[int] | None:
     """How players turn and mirror this frame: FFmpeg's nine fixed-point numbers; None if they do not."""
-    matrix = frame.side_data.get(av.sidedata.sidedata.Type.DISPLAYMATRIX)
+    matrix = (beside(frame) or {}).get(av.sidedata.sidedata.Type.DISPLAYMATRIX)
     return None if matrix is None else np.frombuffer(matrix, "<i4").tolist()
 
 

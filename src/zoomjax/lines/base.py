@@ -21,9 +21,9 @@ from .._core.checks import (
 )
 from .._core.fields import (
     check_finite,
+    check_focal,
     check_indices,
     check_not_negative,
-    check_positive,
     check_shapes,
     refuse_masked,
 )
@@ -71,7 +71,7 @@ class AbstractLines(eqx.Module):
                 "centre": (self.centre, (2,)),
             }
         )
-        check_positive("focal", self.focal)
+        check_focal("focal", self.focal)
         check_finite("focus", self.focus)
         check_finite("centre", self.centre)
         check_not_negative("weight", self.weight)

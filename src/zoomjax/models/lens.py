@@ -16,8 +16,8 @@ from jaxtyping import Float, Num, ScalarLike
 
 from .._core.arguments import check_kind, kinds_checked
 from .._core.arrays import aligned
-from .._core.checks import check_above, checked_size, checked_unit
-from .._core.fields import check_finite, check_positive, check_range, check_shapes, numbers
+from .._core.checks import centre_problem, check_above, checked_size, checked_unit, warn_caller
+from .._core.fields import FOCALS, check_finite, check_focal, check_range, check_shapes, numbers
 from .._core.files import whole_file
 from .._core.pixels import check_pitch
 from .._core.programs import light_program
@@ -109,7 +109,7 @@ class ZoomLens(eqx.Module):
         check_finite("centre", self.centre)
         if self.pixel_pitch is not None:
             check_pitch(self.pixel_pitch, self.image_size)
-        check_positive("focal_range", self.focal_range)
+        check_focal("focal_range", self.focal_range)
         check_range("focal_range", self.focal_range)
         check_range("focus_range", self.focus_range)
         one = getattr(self.centre, "ndim", 0) == 1  # or it is a batch of lenses, or stands in for one
@@ -297,9 +297,10 @@ class ZoomLens(eqx.Module):
         if not values.size:
             return
         least, most = float(values.min()), float(values.max())  # NaN if one is: two passes are quick
-        if not (least > 0 and np.isfinite(most)):
-            bad = ~(np.isfinite(values) & (values > 0))
-            raise ValueError(f"Argument focal must be a positive number, but it is {values[bad][0]}.")
+        if not (least >= FOCALS[0] and most <= FOCALS[1]):
+            bad = values[~((values >= FOCALS[0]) & (values <= FOCALS[1]))][0]
+            told = f", {FOCALS[0]:g} to {FOCALS[1]:g} mm or px" if 0 < bad < np.inf else ""
+            raise ValueError(f"Argument focal must be a positive number{told}, but it is {bad}.")
         if least < low - _SLACK * least or most > high + _SLACK * most:
             outside = f"The focal length {least:g} {self.focal_unit} is not"
             if values.size > 1:
@@ -350,7 +351,8 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
     User-defined models must be registered first, by the module that defines them (`register_model`).
 
     Warns:
-        UserWarning: the file has entries that are not known, as of another program; they do not count.
+        UserWarning: the file has entries that are not known, as of another program; they do not count. The
+            centre is outside of the image.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -381,6 +383,9 @@ def load_lens(path: str | os.PathLike[str]) -> ZoomLens:
         )
         if not math.isclose(content["scale"], lens.scale, rel_tol=1e-6):
             raise ValueError("its scale is not half the diagonal of its image_size")
+        problem = centre_problem(np.asarray(lens.centre), lens.image_size)
+        if problem and lens.shift is None:
+            warn_caller(f"{os.fspath(path)}: {problem[0].lower()}{problem[1:]}")
         warn_of_unknown(content, (*_ENTRIES, *_OPTIONAL, "format", "version"), os.fspath(path))
         return lens
     except FileNotFoundError:

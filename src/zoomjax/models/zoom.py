@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PyTree, ScalarLike
 
 from .._core.arrays import as_jax, namespace
 from .._core.checks import checked_integer
-from .._core.fields import check_positive, check_shapes, numbers
+from .._core.fields import check_focal, check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Coefficients, Focal, Focus, Scalar, traced
 from ._bernstein import Pieces, power_controls
 from .distortion_model import AbstractDistortionModel, checked_terms
@@ -124,7 +124,7 @@ def one_focal(focal: ScalarLike) -> ScalarLike:
             "Argument focal must be one focal length; jax.vmap(zoom)(focal) takes several, and so does a "
             f"lens, but its shape is {np.shape(focal)}."
         )
-    check_positive("focal", focal if hasattr(focal, "dtype") else np.asarray(focal, float))
+    check_focal("focal", focal if hasattr(focal, "dtype") else np.asarray(focal, float))
     return focal
 
 

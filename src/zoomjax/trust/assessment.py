@@ -21,7 +21,9 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.arguments import kinds_checked
+from .._core.checks import points_beyond
 from .._core.types import of_known_values
+from ..fit.own_weights import own_weights
 from ..fit.result import RESULTS, ZoomFit, is_status
 from ..lines.base import AbstractLines
 from ..lines.lines import Lines
@@ -40,6 +42,7 @@ _DOUBTFUL, _UNDETERMINED = 0.1, 0.5  # errors, in displacements
 _BEYOND_NOISE = 3.0  # how many times farther apart halves are than by chance
 _UNPREDICTED = 1.5  # how many times the RMS of frames left out may exceed that of their own fits
 _REJECTED = 1 / 3  # of the lines
+_OUTSIDE = 0.01  # of the points
 _FEW_LINES = 4  # per frame
 _BENT_PX, _BENT = 0.4, 3.5e-4
 """How uncertain a good lens may be beyond a homography: px, a part of the diagonal, whichever is larger."""
@@ -162,11 +165,13 @@ def assess(
         )
     found = evidence(lines, fit, compressed=compressed)
     places = zoom_places(focals_there(lines))
+    counting = np.asarray(lines.mask) & (own_weights(lines) > 0)[:, None]
     findings = [
         *_of_bands(found, fit, len(places)),
         *_of_halves(found),
         *_of_lines(found),
         *_of_vanishing(found),
+        *findings_outside(np.asarray(lines.points), counting, lines.image_size),
     ]
     findings += _of_places(found, fit, places)
     if rms_held_out is not None and rms_frames_held_out is not None:
@@ -175,6 +180,16 @@ def assess(
         findings += _of_one_frame(found, float(np.nansum(rms_frames_held_out)))
         findings += _of_frames(found, np.where(np.isin(focal, focals_there(lines)), focal, np.nan), *both)
     return Assessment((), found).joined_by(findings)
+
+
+def findings_outside(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -> list[Finding]:
+    """That points, (x, y) last, lie outside of the image: its size is wrong, so centre and scale are."""
+    share = points_beyond(points, mask, size)[1].sum() / max(mask.sum(), 1)
+    if share <= _OUTSIDE:
+        return []
+    found = f"{share:.0%} of the points lie outside of the image of {size[0]} x {size[1]} px."
+    advice = "Check the size of the images, width first, and that x and y of the points are not exchanged."
+    return [Finding("points outside", "doubtful", found, advice, cause=True)]
 
 
 def _judged(error: float, of: Evidence) -> Verdict:
