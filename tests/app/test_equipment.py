@@ -248,7 +248,7 @@ def test_a_lens_beside_lines_that_is_not_theirs_says_nothing(lens, tmp_path):
     known = dataclasses.replace(lens, about=FACTS, pixel_pitch=PITCH)
     wide = dataclasses.replace(known, focal_range=np.array([24.0, 70.0]))
     in_px = dataclasses.replace(known, focal_unit="px")
-    small = dataclasses.replace(known, image_size=(300, 200))
+    small = dataclasses.replace(known, image_size=(300, 200), centre=np.array([150.0, 100.0]))
     (tmp_path / "none").mkdir()
     for files in (
         [results(tmp_path / "imported", known, summary=False)],
