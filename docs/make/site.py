@@ -72,7 +72,8 @@ def gather(work: Path) -> None:
         _tutorial(notebook, pages / "notebooks")
     for name, text in api_pages().items():
         _write(pages / "api" / name, text)
-    _write(pages / "assets" / "iframe-worker.js", (Path(__file__).parent / "iframe-worker.js").read_text())
+    for name in ("iframe-worker.js", "tables.css"):
+        _write(pages / "assets" / name, (Path(__file__).parent / name).read_text())
     for page in pages.rglob("*.md"):
         page.write_text(linked(page.read_text()))
     shutil.copy(ROOT / "zensical.toml", work / "zensical.toml")
