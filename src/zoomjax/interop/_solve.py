@@ -189,9 +189,8 @@ def error_written(fmt: Format, nodes: list[Node], job: Export, files: list[Path]
     worst = 0.0
     for file, part in zip(files, parts, strict=True):
         of = tuple(node.focal for node in part)
-        told = (
-            of if job.pixel_pitch is None else tuple(float(job.focal_mm(f)) for f in of)
-        )  # in mm, if known
+        # In mm, where these are known.
+        told = of if job.pixel_pitch is None else tuple(float(job.focal_mm(f)) for f in of)
         found = fmt.read(Import(file, (file,), job.lens.image_size, told)).nodes
         for node, f in zip(found, of, strict=True):
             assert isinstance(node, Node)

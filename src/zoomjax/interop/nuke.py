@@ -97,9 +97,9 @@ class Nuke(NodeFormat):
         if any(len(keys) > 1 and sorted(keys) != frames for keys in curves):
             raise ValueError("its curves have keys at different frames")
         values = _at_frames(curves, frames)
-        pitch = (
-            10 * float(knobs["tde4_filmback_width_cm"]) / size[0] if kind == _NODE else None
-        )  # 10 mm in a cm
+        pitch = None
+        if kind == _NODE:
+            pitch = 10 * float(knobs["tde4_filmback_width_cm"]) / size[0]  # 10 mm in a cm
         own = None
         if focal is not None and sorted(focal) == frames:
             own = [10 * focal[frame] for frame in frames]

@@ -38,6 +38,8 @@ _SEEN = ("h264", "hevc", "vvc", "mpeg1video", "mpeg2video", "mpeg4", "mjpeg", "d
 """Their pictures, of which nobody sees others."""
 
 _SECONDS, _OFF = 10.0, 0.05
+"""s of sound that are looked at for its times, and by how much the length of these may be off."""
+
 _AT_ONCE = 0.1
 """s after time 0, at which players of AVI begin the sound, by which it may begin late."""
 
