@@ -1,5 +1,6 @@
 """What goes along with the pictures, in files of FFmpeg's encoders: copied where it can be, else said."""
 
+import re
 import struct
 import warnings
 from fractions import Fraction
@@ -229,15 +230,22 @@ def sounding(path, codec):
     ],
 )
 def test_sound_keeps_its_times_in_avi_or_is_refused(codec, before, advice, tmp_path):
-    """FFmpeg copied AC-3 and AAC of AVI files so that seconds passed in tenths, and ADPCM in minutes."""
+    """FFmpeg copied AC-3 and AAC of AVI files so that seconds passed in tenths, and ADPCM in minutes.
+
+    What some FFmpeg does wrong another may do right, as PyAV 19's with ADPCM.
+    """
     source, end = sounding(tmp_path / f"in{before}", codec)
     assert 1.8 < end < 2.1
-    if advice is None:
+    refused = None
+    try:
         undistort_video(source, tmp_path / "out.avi", lens=lens(), focal=20.0)
+    except ValueError as error:
+        refused = str(error)
+    if refused is None:
         assert packets(tmp_path / "out.avi", "audio")[-1][0] == pytest.approx(end, abs=0.05)
         return
-    with pytest.raises(ValueError, match=rf"Cannot keep the sound \({codec}\) in a \.avi file.*{advice}"):
-        undistort_video(source, tmp_path / "out.avi", lens=lens(), focal=20.0)
+    assert advice is not None, refused
+    assert re.search(rf"Cannot keep the sound \({codec}\) in a \.avi file.*{advice}", refused)
     assert not (tmp_path / "out.avi").exists()
 
 
