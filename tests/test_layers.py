@@ -32,7 +32,7 @@ LIBRARIES = {
     "correct": {"cv2"},
     "detect": {"cv2"},
     "io": {"cv2", "av", "PIL", "pillow_heif", "rawpy", "tifffile"},
-    "interop": {"OpenEXR", "lensfunpy", "yaml"},
+    "interop": {"OpenEXR", "cv2", "lensfunpy", "yaml"},
     "torch": {"torch"},
     "tracks": {"cv2"},
 }

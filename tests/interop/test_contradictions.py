@@ -31,6 +31,18 @@ MODEL = (
     "{'lensmodel': 'LENSMODEL_OPENCV4', 'intrinsics': [500, 500, 180, 120, -0.1, 0, 0, 0], "
     "'extrinsics': [0, 0, 0, 0, 0, 0], 'imagersize': [360, 240]}"
 )
+XML = (
+    "<?xml version='1.0'?><opencv_storage><image_width>360</image_width><image_height>240</image_height>"
+    "<camera_matrix type_id='opencv-matrix'><rows>3</rows><cols>3</cols><dt>d</dt><data>500. 0. 180. 0. "
+    "500. 120. 0. 0. 1.</data></camera_matrix><distortion_coefficients type_id='opencv-matrix'>"
+    "<rows>1</rows><cols>5</cols><dt>d</dt><data>-0.1 0.01 0. 0. 0.</data></distortion_coefficients>"
+    "</opencv_storage>"
+)
+JSON = (
+    '{"image_width": 360, "image_height": 240, "camera_matrix": {"type_id": "opencv-matrix", "rows": 3, '
+    '"cols": 3, "dt": "d", "data": [500, 0, 180, 0, 500, 120, 0, 0, 1]}, "distortion_coefficients": '
+    '{"type_id": "opencv-matrix", "rows": 1, "cols": 5, "dt": "d", "data": [-0.1, 0.01, 0, 0, 0]}}'
+)
 PROJECT = '# hugin project file\np f0 w360 h240 v50\ni w360 h240 f0 r0 p0 v50 a0 b0.01 c0 d0 e0 n"a.jpg"\n'
 CASES = {
     "gyroflow, focal": (
@@ -71,6 +83,15 @@ CASES = {
     ),
     "opentrackio, size": ("a.jsonl", SAMPLE, '"width": 360', '"width": 360.7'),
     "opencv, twice": ("a.yaml", YAML.replace("@", ""), "   dt: d", "   rows: 3"),
+    "opencv, twice in XML": (
+        "a.xml",
+        XML,
+        "<image_width>",
+        "<image_height>240</image_height><image_width>",
+    ),
+    "opencv, matrix in XML": ("a.xml", XML, "500. 0. 180.", "500. 0."),
+    "opencv, twice in JSON": ("a.json", JSON, '"dt": "d", "data": [-0.1', '"rows": 1, "data": [-0.1'),
+    "opencv, matrix in JSON": ("a.json", JSON, "500, 0, 180", "500, 0"),
     "opencv, size": ("a.yaml", YAML.replace("@", ""), "image_height: 240", "image_height: 0"),
     "ros, twice": ("a.yaml", INFO, "image_height: 240", "image_height: 240\ndistortion_model: plumb_bob"),
     "kalibr, twice": (
@@ -90,7 +111,8 @@ TOLD = {
     "nerfstudio, twice": "it has 'k1' twice",
     "gyroflow, twice": "it has 'focal_length' twice",
     "opentrackio, twice": "it has 'pinholeFocalLength' twice",
-    "opencv, twice": "it has 'rows' twice",
+    **dict.fromkeys(["opencv, twice", "opencv, twice in JSON"], "it has 'rows' twice"),
+    "opencv, twice in XML": "it has 'image_height' twice",
     "ros, twice": "it has 'distortion_model' twice",
     "kalibr, twice": "it has 'cam0' twice",
     "mrcal, twice": "it has 'intrinsics' twice",
@@ -108,7 +130,10 @@ TOLD = {
     "nerfstudio, model": "its camera model 'OPENCV_FISHEYE'",
     "nerfstudio, fisheye": "its is_fisheye is True",
     "nerfstudio, angle": "its camera_angle_x is that of f = 372.6.. px, and its fl_x is 500",
-    "opencv, matrix": "a matrix of 3 x 3 has 8 numbers",
+    **dict.fromkeys(
+        ["opencv, matrix", "opencv, matrix in XML", "opencv, matrix in JSON"],
+        "a matrix of 3 x 3 has 8 numbers",
+    ),
     "ros, coefficients": "a matrix of 1 x 5 has 4 numbers",
     "ros, model": "more coefficients than the five of its model, plumb_bob",
 }

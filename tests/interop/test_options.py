@@ -196,7 +196,12 @@ def test_a_folder_has_no_name_of_a_file(name, path, focal, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "path", "end"),
-    [("opencv", "x.json", ".yaml"), ("gyroflow", "x.yaml", ".json"), ("ros", "x.XML", ".yaml")],
+    [
+        ("opencv", "x.exr", ".yaml"),
+        ("mrcal", "x.json", ".cameramodel"),
+        ("gyroflow", "x.yaml", ".json"),
+        ("ros", "x.XML", ".yaml"),
+    ],
 )
 def test_a_file_has_no_name_of_another_format(name, path, end, tmp_path):
     """YAML under the name x.json was no lens for `read`, which goes by the name first."""

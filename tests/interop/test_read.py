@@ -94,6 +94,30 @@ def test_frames_before_the_first_are_before_it(name, tmp_path):
     ]
 
 
+@pytest.mark.parametrize("suffix", [".yaml", ".xml", ".json"])
+def test_opencvs_files_are_read_in_all_three_languages(suffix, tmp_path):
+    """XML is that of its own sample of calibration, and capitals of the sample's first versions."""
+    size, matrix = (640, 480), np.array([[657.0, 0, 319.5], [0, 657, 239.5], [0, 0, 1]])
+    k = np.array([[-0.4], [0.5], [0], [0], [-0.57]])
+    for number, names in enumerate(
+        (
+            ("image_width", "image_height", "camera_matrix", "distortion_coefficients"),
+            ("image_Width", "image_Height", "Camera_Matrix", "Distortion_Coefficients"),
+        )
+    ):
+        path = tmp_path / f"{number}{suffix}"
+        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        file.write("calibration_Time", "Sun 29 Nov")
+        for name, value in zip(names, [*size, matrix, k], strict=True):
+            file.write(name, value)
+        file.release()
+        back = zj.interop.read(path, zoom=TableZoom())
+        assert (back.report.format, back.lens.image_size, back.lens.focal_unit) == ("opencv", size, "px")
+        points = shown(back.lens)
+        corrected = np.asarray(back.lens(657.0).undistort(points))
+        assert project(matrix, k, corrected) == pytest.approx(points, abs=back.report.worst + 1e-6)
+
+
 @pytest.mark.parametrize("name", ["nuke", "opentrackio", "pftrack"])
 def test_our_own_formula_comes_back_exactly(name, written):
     lens, found = written

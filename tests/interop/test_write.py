@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 
+import cv2
 import jsonschema
 import numpy as np
 import OpenEXR
@@ -270,6 +271,23 @@ def test_maps_cover_the_corrected_image(tmp_path):
 def test_maps_without_overscan_say_nothing_of_it(tmp_path):
     lens = polynomial([[-0.01]], (640, 480), (319.5, 239.5))
     assert not zj.interop.write(lens, tmp_path / "maps", format="stmap", focal=18).notes
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".yml", ".xml", ".json", ""])
+def test_opencvs_files_are_of_the_language_of_their_suffix(suffix, tmp_path):
+    """And YAML where there is none. The first line of YAML is that which old versions of OpenCV need."""
+    lens = LENSES["landscape"]()
+    path = tmp_path / f"camera{suffix}"
+    zj.interop.write(lens, path, format="opencv", focal=24, pixel_pitch=PITCH)
+    start = {".xml": "<?xml", ".json": "{"}.get(suffix, "%YAML:1.0\n---\n")
+    text = path.read_text()
+    assert text.startswith(start)
+    whole = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    first = tmp_path / "first.yaml"
+    zj.interop.write(lens, first, format="opencv", focal=24, pixel_pitch=PITCH, overwrite=True)
+    like = cv2.FileStorage(str(first), cv2.FILE_STORAGE_READ)
+    for name in ("camera_matrix", "distortion_coefficients"):
+        assert np.array_equal(whole.getNode(name).mat(), like.getNode(name).mat())
 
 
 def test_a_track_is_an_entry_for_each_frame(tmp_path):

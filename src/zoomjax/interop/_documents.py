@@ -1,7 +1,8 @@
-"""JSON and YAML of other tools, no name given twice in them: readers differ in which of two they take."""
+"""JSON, YAML and XML of other tools, no name twice in them: readers differ in which of two they take."""
 
 import json
 import re
+import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
@@ -38,3 +39,25 @@ def load_yaml(path: Path) -> Any:
     if not isinstance(found, dict):
         raise ValueError("it is no table of names and values")
     return found
+
+
+def load_opencv(path: Path) -> dict[str, Any]:
+    """What ``cv2.FileStorage`` wrote as YAML, XML or JSON; names in lower case.
+
+    Programs that follow OpenCV's first samples write them with capitals.
+    """
+    text = read_text(path).lstrip()
+    if text.startswith("<"):
+        found = once([(value.tag, _value_of_xml(value)) for value in ET.fromstring(text)])
+    else:
+        found = load_json(text) if text.startswith("{") else load_yaml(path)
+    return once([(str(name).lower(), value) for name, value in found.items()])
+
+
+def _value_of_xml(element: ET.Element) -> Any:
+    """A word, or a matrix as in OpenCV's YAML."""
+    if element.get("type_id") != "opencv-matrix":
+        return (element.text or "").strip().strip('"')
+    return once(
+        [(part.tag, (part.text or "").split() if part.tag == "data" else part.text) for part in element]
+    )

@@ -125,6 +125,7 @@ class Export:
         pixel_pitch: mm from one pixel to the next; None if not known.
         tolerance: error between focal lengths that more of them must keep, px.
         convention: of pixel positions, for STMaps.
+        suffix: of the file's name, for formats of several.
     """
 
     lens: ZoomLens
@@ -133,6 +134,7 @@ class Export:
     pixel_pitch: float | None = None
     tolerance: float = TOLERANCE
     convention: str = CONVENTION
+    suffix: str = ""
 
     @property
     def stems(self) -> list[str]:

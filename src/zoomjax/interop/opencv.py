@@ -1,29 +1,22 @@
-"""OpenCV's YAML files, as ``cv2.FileStorage`` writes them: one focal length each.
+"""OpenCV's files of ``cv2.FileStorage``, YAML, XML or JSON by their names: one focal length each.
 
 The rational model with eight coefficients, which follows an inverse polynomial best. `cv2.projectPoints`
 and `cv2.initUndistortRectifyMap` then do as the lens; `cv2.undistortPoints` stops after five iterations.
 """
 
+import re
+
 import numpy as np
 
-from ._documents import load_yaml
-from ._pinhole import (
-    contents,
-    data_of,
-    formula,
-    from_opencv,
-    matrix_rows,
-    numbers,
-    pinhole,
-    refuse_other_focals,
-)
+from ._documents import load_opencv
+from ._pinhole import contents, data_of, formula, from_opencv, matrix_rows, pinhole, refuse_other_focals
 from .base import Contents, Export, Import, Node, NodeFormat, one_size, refuse_others
 
 
 class OpenCV(NodeFormat):
-    """OpenCV's calibration as YAML: camera_matrix and distortion_coefficients."""
+    """OpenCV's calibration: camera_matrix and distortion_coefficients."""
 
-    name, tools, suffixes = "opencv", "OpenCV", (".yaml", ".yml")
+    name, tools, suffixes = "opencv", "OpenCV", (".yaml", ".yml", ".xml", ".json")
 
     def forms(self, lens):
         """Rational, three over three."""
@@ -31,21 +24,20 @@ class OpenCV(NodeFormat):
 
     def text(self, nodes: list[Node], job: Export) -> str:
         """One camera."""
+        import cv2
+
         camera = pinhole(nodes[0], job)
         width, height = job.lens.image_size
-        return "\n".join(
-            [
-                "%YAML:1.0",
-                "---",
-                f"image_width: {width}",
-                f"image_height: {height}",
-                f"focal_length: {camera.focal!r}",
-                f"focal_unit: {job.lens.focal_unit}",
-                *_matrix("camera_matrix", 3, 3, matrix_rows(camera)),
-                *_matrix("distortion_coefficients", 1, 8, camera.coefficients),
-                "",
-            ]
-        )
+        suffix = job.suffix if job.suffix in self.suffixes else self.suffixes[0]
+        file = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+        file.write("image_width", width)
+        file.write("image_height", height)
+        file.write("focal_length", camera.focal)
+        file.write("focal_unit", job.lens.focal_unit)
+        file.write("camera_matrix", np.array(matrix_rows(camera)))
+        file.write("distortion_coefficients", np.array([camera.coefficients]))
+        # Until its version 5 OpenCV wrote YAML with this first line, and all versions read it.
+        return re.sub(r"\A%YAML 1\.\d", "%YAML:1.0", file.releaseAndGetString())
 
     def recognises(self, head: str) -> bool:
         """By the type of its matrices."""
@@ -55,7 +47,7 @@ class OpenCV(NodeFormat):
         """One file or several; focal lengths in px, or in the unit that zoomjax wrote beside them."""
         nodes, sizes, px, units = [], [], [], set()
         for path in job.paths:
-            table = load_yaml(path)
+            table = load_opencv(path)
             refuse_others(table, {"fisheye_model": 0})
             size = job.size(
                 (table["image_width"], table["image_height"]) if "image_width" in table else None
@@ -73,13 +65,3 @@ class OpenCV(NodeFormat):
         if units == {"mm"}:
             refuse_other_focals([node.focal for node in nodes], job)
         return contents(nodes, one_size(sizes), job, px=px, mm=units == {"mm"})
-
-
-def _matrix(name: str, rows: int, columns: int, values: object) -> list[str]:
-    return [
-        f"{name}: !!opencv-matrix",
-        f"   rows: {rows}",
-        f"   cols: {columns}",
-        "   dt: d",
-        f"   data: [ {numbers(values)} ]",
-    ]

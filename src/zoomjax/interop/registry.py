@@ -163,10 +163,10 @@ def write(
         pixel_pitch=pitch_of(lens, pixel_pitch),
         tolerance=TOLERANCE if tolerance is None else positive("tolerance", tolerance),
         convention=convention or CONVENTION,
+        suffix=path.suffix.lower(),
     )
     check_pitch(job.pixel_pitch, lens.image_size)
-    folder = isinstance(fmt, FolderFormat)
-    several = folder or (fmt.zoom == "one" and job.focal is not None and len(job.focal) > 1)
+    several = isinstance(fmt, FolderFormat) or (fmt.zoom == "one" and len(job.focal or ()) > 1)
     check_name(fmt, path, several=several, known=_suffixes())
     files = tuple(path / name for name in fmt.file_names(job)) if several else (path,)
     refuse_existing(list(files), overwrite=overwrite)
