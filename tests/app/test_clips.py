@@ -573,6 +573,7 @@ def test_motion_is_tried_where_nothing_else_is_given():
         ("darker", "doubtful", "12 of 36 frames show nothing"),
         ("middle", "not determined", "moves a corner of the image by up to"),
         ("wrong f", "doubtful", "px is given"),
+        ("x for y", "doubtful", "of the points lie outside of the image of 640 x 360 px"),
     ],
 )
 def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
@@ -594,6 +595,10 @@ def test_what_the_clip_cannot_tell_is_said(tmp_path, kind, verdict, finding):
     )
     options = {"views": 80, "life": 15, "noise": 0.1} | more
     tracks = motion_tracks(lens(), focal, rotation, **options).tracks
+    if kind == "x for y":
+        track, frame, points = tracks.views()
+        with pytest.warns(UserWarning, match="points lie outside"):
+            tracks = Tracks.from_arrays(track, frame, points[:, ::-1], image_size=SIZE, frames=FRAMES)
     if kind in ("dark", "darker", "middle"):
         track, frame, points = tracks.views()
         seen = {
