@@ -29,7 +29,7 @@ lines = zj.compress(zj.Lines.from_ragged(bent, frame, [50, 70, 100], image_size=
 zj.fit_zoom(lines, terms=1)
 zj.fit_robust(lines, terms=1)
 print(sum("cache_misses" in name for name in missed), sum("cache_hits" in name for name in missed))
-print(len({"minimise", "described", "_reweighted"} & set(traced)))
+print(len({"minimise", "fit_without_covariance", "_reweighted"} & set(traced)))
 """
 
 

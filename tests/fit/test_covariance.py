@@ -9,7 +9,7 @@ import pytest
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.fit import covariance
-from zoomjax.fit.covariance import covariance_of, told
+from zoomjax.fit.covariance import covariance_of, covariance_terms
 from zoomjax.fit.energy import linearised
 
 MODELS = {
@@ -110,7 +110,7 @@ def test_photos_count_together_or_not_in_both(name):
     zoom, terms = MODELS[name]
     lines = lines_of(0.3, terms)
     fitted = zj.fit_zoom(lines, zoom=zoom, terms=terms).lens.zoom
-    known = told(lines, fitted, linearised(lines, fitted))
+    known = covariance_terms(lines, fitted, linearised(lines, fitted))
     for photos in (True, False):
         one, whole = covariance_of(known, photos)
         other, also = covariance_of(jax.tree.map(np.asarray, known), photos)

@@ -56,7 +56,7 @@ class KnownErrors(NamedTuple):
     covariance: Float[Array, "parameter parameter"]
 
 
-class Told(NamedTuple):
+class CovarianceTerms(NamedTuple):
     """What lines tell of the flattened parameters: all that their covariance is made of.
 
     Attributes:
@@ -84,7 +84,9 @@ class Told(NamedTuple):
     feigned: tuple[tuple[Any, Any], ...]
 
 
-def told(lines: AbstractLines, zoom: AbstractZoom, linear: Linearised, extra: int = 0) -> Told:
+def covariance_terms(
+    lines: AbstractLines, zoom: AbstractZoom, linear: Linearised, extra: int = 0
+) -> CovarianceTerms:
     """What lines tell of the parameters of a fitted model.
 
     Args:
@@ -94,7 +96,7 @@ def told(lines: AbstractLines, zoom: AbstractZoom, linear: Linearised, extra: in
         extra: how many numbers the model gives after the coefficients.
     """
     weights, own = line_weights(lines), prior_of(zoom)
-    return Told(
+    return CovarianceTerms(
         linear.weighted,
         linear.jacobian,
         prior_jacobian(lines, zoom),
@@ -117,19 +119,19 @@ def parameter_covariance(
     errors: KnownErrors | None = None,
 ) -> tuple[Float[Array, "parameter parameter"], Bool[Array, ""]]:
     """`covariance_of` what lines tell."""
-    return covariance_of(told(lines, zoom, linear, extra), photos, errors)
+    return covariance_of(covariance_terms(lines, zoom, linear, extra), photos, errors)
 
 
 def known_covariance(lines: AbstractLines, zoom: AbstractZoom, extra: int = 0) -> Any:
     """`parameter_covariance` without the residuals, and without what is determined."""
-    if are_by_numpy(lines, zoom) and (found := by_numpy(_told(lines, zoom, extra))) is not None:
+    if are_by_numpy(lines, zoom) and (found := by_numpy(_covariance_terms(lines, zoom, extra))) is not None:
         return found[0]
     return _covariance(lines, zoom, extra)
 
 
 @light_program
-def _told(lines, zoom, extra):
-    return told(lines, zoom, linearised(lines, zoom), extra)
+def _covariance_terms(lines, zoom, extra):
+    return covariance_terms(lines, zoom, linearised(lines, zoom), extra)
 
 
 @light_program
@@ -154,7 +156,7 @@ def are_by_numpy(lines: AbstractLines, zoom: AbstractZoom) -> bool:
     return number <= _MOST_PARAMETERS and all(leaf.devices() == usual for leaf in arrays)
 
 
-def by_numpy(known: Told) -> tuple[Array, bool] | None:
+def by_numpy(known: CovarianceTerms) -> tuple[Array, bool] | None:
     """`covariance_of` what lines tell, by NumPy; None where a number is none."""
     known = jax.tree.map(np.asarray, known)
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(known)):
@@ -167,7 +169,9 @@ def by_numpy(known: Told) -> tuple[Array, bool] | None:
     return as_jax(covariance.astype(known.weighted.dtype)), bool(determined)
 
 
-def covariance_of(known: Told, photos: bool = True, errors: KnownErrors | None = None) -> tuple[Any, Any]:
+def covariance_of(
+    known: CovarianceTerms, photos: bool = True, errors: KnownErrors | None = None
+) -> tuple[Any, Any]:
     """Covariance of the flattened parameters, and whether the lines determine them all.
 
     Were points independent, with errors of one size, it would be the sandwich of the weights w of eq. 13,

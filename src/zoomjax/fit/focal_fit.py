@@ -17,7 +17,7 @@ from ..lines.buckets import bucketed
 from ..models.model import Model
 from ..models.zoom import AbstractZoom
 from .energy import counted_frames
-from .focal_lengths import UNKNOWN, Sigma, at_focal_lengths, checked_sigma, with_covariance
+from .focal_lengths import UNKNOWN, Sigma, at_focal_lengths, checked_sigma, with_covariances
 from .focal_refinement import MOST_STEPS, posterior, refined
 from .prepare import asked_for
 from .problem import about_own_centre
@@ -126,7 +126,7 @@ def fit_focal(
     std, covariance, joint, determined = posterior(
         moved, fit.lens.zoom, fit.covariance, fit.joint, sigma, given, kept
     )
-    fit = with_covariance(_judged(fit, reached, determined), covariance, joint)
+    fit = with_covariances(_judged(fit, reached, determined), covariance, joint)
     return FocalFit(
         fit=fit.result.error_if(fit, failed(fit.result)) if throw and traced(reached) else fit,
         focal=focal,

@@ -75,7 +75,7 @@ def with_focal_sigma(
     sigma, together = _checked_errors(fit, lines, focal_sigma, shared)
     lines = placed_as(fit.lens, lines)
     own = (fit.lens.zoom, fit.covariance, fit.joint)
-    return with_covariance(fit, *_widened_by(lines, *own, sigma, together))
+    return with_covariances(fit, *_widened_by(lines, *own, sigma, together))
 
 
 def effects_of_focal(
@@ -133,7 +133,7 @@ def of_equal_focal(focal: Focal, shared: Int[AnyArray, "frame"] | None = None) -
     return number
 
 
-def with_covariance(fit, covariance, joint):
+def with_covariances(fit, covariance, joint):
     """A fit with other covariances: of the parameters, and of these with the centre."""
     return eqx.tree_at(
         lambda fit: (fit.covariance, fit.joint), fit, (covariance, joint), is_leaf=lambda leaf: leaf is None

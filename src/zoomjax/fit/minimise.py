@@ -19,7 +19,7 @@ from .constrained import or_else, refit_zoom
 from .covariance import are_by_numpy
 from .energy import coefficients_by, prior_residuals
 from .frame_residuals import frame_residuals
-from .result import described_fit, outcome_of, thrown, undescribed_fit, with_covariance
+from .result import described_fit, fit_without_covariance, outcome_of, thrown, with_covariance
 
 
 def fit_about(lines, model, *, algebraic, solver=None, max_steps=256, invertible=True, throw=True):
@@ -45,25 +45,28 @@ def fit_freely(lines, model, algebraic, solver, max_steps):
 
 def fit_prepared(lines, model, solver, max_steps):
     """The fit of a prepared model from its own parameters, and its outcome."""
-    return described_once(lines, *minimised(lines, model.zoom, solver, max_steps))
+    return described(lines, *minimised(lines, model.zoom, solver, max_steps))
 
 
-def described_once(lines, *ended):
-    """`described`; of few known lines with a covariance by NumPy, so that less is compiled."""
-    found = None
+def described(lines, *ended):
+    """The fit that ended so, and its outcome: once after the steps.
+
+    Of few known lines the covariance is NumPy's, so that less is compiled.
+    """
     if not traced(ended) and are_by_numpy(lines, ended[0]):
-        found = with_covariance(*_undescribed(lines, *ended))
-    return described(lines, *ended) if found is None else found
+        found = with_covariance(*_without_covariance(lines, *ended))
+        if found is not None:
+            return found
+    return _described_by_jax(lines, *ended)
 
 
 @light_program
-def described(lines, zoom, result, steps):
-    """The fit that ended so, and its outcome: once after the steps."""
+def _described_by_jax(lines, zoom, result, steps):
     fit = described_fit(lines, zoom, result, steps)
     return fit, outcome_of(fit)
 
 
-_undescribed = light_program(undescribed_fit)
+_without_covariance = light_program(fit_without_covariance)
 
 
 def minimise(lines, zoom, solver, max_steps):

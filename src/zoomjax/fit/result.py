@@ -22,7 +22,7 @@ from ..models.invertibility import Certificate, certificate_of
 from ..models.lens import ZoomLens
 from ..models.polynomial import RadialPolynomial
 from ..models.zoom import AbstractFocusZoom, AbstractZoom
-from .covariance import by_numpy, parameter_covariance, told
+from .covariance import by_numpy, covariance_terms, parameter_covariance
 from .energy import counted_frames, energy_by_frame, linearised
 
 
@@ -181,8 +181,8 @@ def described_fit(lines, zoom, result, steps):
     return _ended(lines, zoom, result, steps, linear.weighted, covariance)(determined)
 
 
-def undescribed_fit(lines, zoom, result, steps):
-    """The same but for its covariance, of which there is what the lines tell: see `with_covariance`.
+def fit_without_covariance(lines, zoom, result, steps):
+    """The same without its covariance, beside the terms that it is made of: see `with_covariance`.
 
     Twice, as if its parameters were determined and as if they were not; each with its outcome.
     """
@@ -190,11 +190,11 @@ def undescribed_fit(lines, zoom, result, steps):
     none = jnp.zeros((0, 0), linear.weighted.dtype)
     of = _ended(lines, zoom, result, steps, linear.weighted, none)
     fits = [of(jnp.asarray(determined)) for determined in (True, False)]
-    return told(lines, zoom, linear), *((fit, outcome_of(fit)) for fit in fits)
+    return covariance_terms(lines, zoom, linear), *((fit, outcome_of(fit)) for fit in fits)
 
 
 def with_covariance(known, determined, undetermined):
-    """The fit of `undescribed_fit` with its covariance, by NumPy, and its outcome; None for want of one."""
+    """`fit_without_covariance` with a covariance by NumPy, and its outcome; None where there is none."""
     if (found := by_numpy(known)) is None:
         return None
     fit, outcome = determined if found[1] else undetermined
