@@ -154,7 +154,8 @@ def fit_motion_with_lines(name):
     fit_motion(name)
     row = ROWS[name]
     given = motion.Given(tracks(), any_centre_lines(), None, None, None)
-    return _motion_problem._ready_lines(given, row.distortion, row.distortion.num_coefficients(row.terms))
+    size = row.distortion.num_coefficients(row.terms)
+    return _motion_problem._ready_lines(given, given.tracks.frames, row.distortion, size)
 
 
 def fit_boards(name):
