@@ -1,6 +1,7 @@
 """What all tests share: float64, strict ranks, one seed, and small scenes with exact truth."""
 
 import gc
+import math
 import os
 import platform
 import tempfile
@@ -66,8 +67,16 @@ def pytest_itemcollected(item):
 
 
 def pytest_collection_modifyitems(items):
-    """Slow tests last, so that quick ones are not kept waiting and `SECONDS` leaves out slow ones alone."""
+    """Slow tests last, so that quick ones are not kept waiting and `SECONDS` leaves out slow ones alone.
+
+    Where it does, the first is another each time, or the last ones would never run.
+    """
     items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+    slow = [item for item in items if item.get_closest_marker("slow")]
+    if slow and math.isfinite(SECONDS):
+        run = os.environ.get("PYTEST_XDIST_TESTRUNUID", "0")  # one number for all workers
+        first = int(run, 16) % len(slow)
+        items[-len(slow) :] = slow[first:] + slow[:first]
     gc.collect()
     gc.freeze()  # what was imported stays
 
