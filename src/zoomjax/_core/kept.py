@@ -99,7 +99,7 @@ def kept(function: Call, settings: tuple, args: tuple, kwargs: dict) -> Call | N
         return None
     leaves, tree = jax.tree.flatten((args, kwargs))
     arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
-    key = (function, settings, tree, tuple(map(_kind, leaves)), _context())
+    key = (function, settings, tree, tuple(map(_kind, leaves)), context())
     try:
         call = calls.get(key, _looked_up)
     except TypeError:  # something cannot be hashed
@@ -222,7 +222,7 @@ def _kind(leaf: Any) -> tuple[Hashable, ...]:
     return leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)
 
 
-def _context() -> tuple:
+def context() -> tuple:
     """What else tells how programs are traced."""
     settings = (getattr(jax.config, name, None) for name in _SETTINGS)
     return *settings, os.environ.get("EQX_ON_ERROR")
@@ -239,7 +239,7 @@ def _name(function, given, arrays) -> str:
     if (versions := _versions()) is None:
         raise UnknownError("the text of the package")
     kinds = [[*map(str, _kind(array))] for array in arrays]
-    about = [wrapped_name(function), structure, kinds, [*map(str, _context())], versions]
+    about = [wrapped_name(function), structure, kinds, [*map(str, context())], versions]
     return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 
 

@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
@@ -21,8 +21,10 @@ import jax.core
 import jax.extend.core
 from jax.core import eval_context
 
-from .kept import kept
+from .beside import compile_beside, wait_for
+from .kept import can_keep, context, kept, store
 from .products import exact_products
+from .types import traced
 
 _PLAINLY = {
     "xla_cpu_use_fusion_emitters": False,
@@ -81,16 +83,20 @@ def program(
     """
     plain = eqx.filter_jit(function)
 
+    def settings_for(args: Any, kwargs: Any) -> tuple[tuple[str, Any], ...]:
+        small = (light or (rare and _USE.once)) and are_few((args, kwargs))
+        return _settings(_kind(optimised, in_steps, small))
+
     @functools.wraps(function)
     @exact_products
     def call(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
         if not _at_once():
             return plain(*args, **kwargs)
-        small = (light or (rare and _USE.once)) and are_few((args, kwargs))
-        settings = _settings(_kind(optimised, in_steps, small))
+        settings = settings_for(args, kwargs)
         try:
             if (run := kept(function, settings, args, kwargs)) is not None:
                 return run()
+            wait_for(function)
             return (_with_settings(function, settings) if settings else plain)(*args, **kwargs)
         except jax.errors.JaxRuntimeError as error:
             unknown = {name for name, _ in settings if f"No such compile option: '{name}'" in str(error)}
@@ -100,7 +106,55 @@ def program(
             _settings.cache_clear()
             return call(*args, **kwargs)
 
+    @exact_products
+    def lower(*args: Any) -> Any:
+        settings = settings_for(args, {})
+        jitted: Any = _with_settings(function, settings) if settings else plain
+        return jitted.lower(*args)
+
+    _LOWERED[call] = function, lower
     return call
+
+
+_LOWERED: dict[Any, tuple[Any, Any]] = {}
+"""Of programs, what they are made of, and what lowers them."""
+
+
+def begin(*programs: tuple[Callable[..., Any], tuple[Any, ...]]) -> None:
+    """Compile programs in threads that this one will soon call, the first time that it does.
+
+    It does nothing inside of ``jit``, where there is one core, and where programs are kept on disk.
+
+    Args:
+        programs: each with its arguments, or with others of the same shapes and types.
+    """
+    leaves, tree = jax.tree.flatten(programs)
+    if traced(leaves) or not (_at_once() and can_keep()) or store().folder or os.cpu_count() == 1:
+        return
+    settings = context()
+    given = (tree, settings, *((of.shape, of.dtype) if eqx.is_array(of) else of for of in leaves))
+    try:
+        if given in _GIVEN:
+            return
+    except TypeError:  # something cannot be hashed, and the call will say so
+        return
+    if len(_GIVEN) >= _MOST_GIVEN:
+        _GIVEN.clear()
+    _GIVEN.add(given)
+
+    def lowering(call, args):
+        def lower():  # which has settings of its own thread
+            return _LOWERED[call][1](*args) if context() == settings else None
+
+        return _LOWERED[call][0], lower
+
+    compile_beside([lowering(*each) for each in programs])
+
+
+_GIVEN: set[Hashable] = set()
+"""What `begin` was given before, but for the numbers."""
+
+_MOST_GIVEN = 1000
 
 
 def use_once(once: bool = True) -> None:

@@ -6,9 +6,10 @@ The fit of one frame is a zoom polynomial of degree 0 on the lines of that frame
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .._core.arguments import kinds_checked
-from .._core.programs import light_program, program, rare_program
+from .._core.programs import begin, light_program, program, rare_program
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_frames
 from ..lines.lines import Lines
@@ -19,7 +20,7 @@ from .algebraic import algebraic_parameters, algebraic_start
 from .centre import fit_frame_centres
 from .compression import compressed_as_measured
 from .constrained import or_else, refit_zoom
-from .minimise import minimise
+from .minimise import ended_like, minimise
 from .prepare import asked_for, ready_model
 from .problem import data_of
 from .result import FrameFits, collected, described_fit, each_of_given, is_invertible, outcome_of, thrown
@@ -68,6 +69,13 @@ def fit_frames(
 
 def _fit_frames(lines, start, frames, model, solver, max_steps):
     """The fits of all frames, whether invertible or not, and their outcome."""
+    number = len(frames.chosen)
+    like = np.zeros((number, 1, model.num_coefficients), lines.focal.dtype)
+    ended = jax.tree.map(lambda of: np.zeros(number, of.dtype), ended_like(None)[1:])
+    begin(
+        (_described, (lines, frames, model, like, *ended)),
+        (_minima, (lines, frames, model, None if start is None else like, solver, max_steps)),
+    )
     parameters = None if start is None else _starts(start, frames, model)
     minima = _minima(lines, frames, model, parameters, solver, max_steps)
     return _described(lines, frames, model, *minima)

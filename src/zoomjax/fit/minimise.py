@@ -7,9 +7,10 @@ the certificate; per iteration one pass over the lines' rows, of which the solve
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 import optimistix as optx
 
-from .._core.programs import light_program, program
+from .._core.programs import begin, light_program, program
 from .._core.types import traced
 from ..models.zoom import with_parameters
 from ._least_squares import default_solver
@@ -38,9 +39,20 @@ def fit_about(lines, model, *, algebraic, solver=None, max_steps=256, invertible
 
 def fit_freely(lines, model, algebraic, solver, max_steps):
     """The fit that `fit_about` begins with, whether invertible or not, and its outcome."""
+    if not traced((lines, model)):
+        after = _without_covariance if are_by_numpy(lines, model.zoom) else _described_by_jax
+        begin(
+            (minimised, (lines, model.zoom, solver, max_steps)),
+            (after, (lines, *ended_like(model.zoom))),
+        )
     if algebraic and (start := algebraic_start(lines, model)) is not None:
         model = algebraic_model(start, model)
     return fit_prepared(lines, model, solver, max_steps)
+
+
+def ended_like(zoom):
+    """What `minimise` of such a model gives, but for its numbers."""
+    return zoom, optx.RESULTS.successful, np.zeros((), int)
 
 
 def fit_prepared(lines, model, solver, max_steps):
