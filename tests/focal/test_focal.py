@@ -92,6 +92,17 @@ def test_a_board_may_be_turned_in_its_plane_and_moved(truth):
     assert from_board(corrected, board @ turn.T + 300).focal == pytest.approx(60)
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_board_may_be_given_with_y_upwards(truth, compiled):
+    """No turn brings it to its image: f was that of the side by which it is longer, 12 in place of 60."""
+    corrected, _, board = photographed(truth, 60.0)
+    call = jax.jit(from_board) if compiled else from_board
+    straight, mirrored = (call(corrected, board * side) for side in (np.array([1, 1]), np.array([1, -1])))
+    np.testing.assert_allclose(mirrored.focal, 60, rtol=1e-12)
+    assert mirrored.rms < 1e-9
+    np.testing.assert_allclose(mirrored.std, straight.std, atol=1e-9)
+
+
 def test_standard_deviation_from_a_board_is_that_of_sampled_noise(truth, rng):
     corrected, _, board = photographed(truth, 60.0)
     chosen = rng.choice(len(board), 12, replace=False)
