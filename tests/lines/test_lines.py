@@ -136,6 +136,15 @@ def test_grids_of_another_shape_raise():
         zj.Lines.from_grids(np.zeros((2, 3, 4, 2)), np.array([0]), np.array([24.0]), image_size=SIZE)
 
 
+@pytest.mark.parametrize("name", ["corners", "frame"])
+@pytest.mark.usefixtures("unchecked")
+def test_masks_of_grids_are_not_lost(name):
+    given = {"corners": np.random.default_rng(0).uniform(0, 5, (1, 3, 3, 2)), "frame": np.array([0])}
+    given[name] = np.ma.masked_array(given[name], given[name] > 1)
+    with pytest.raises(ValueError, match=f"Argument {name} is a masked array"):
+        zj.Lines.from_grids(given["corners"], given["frame"], np.array([24.0]), image_size=(6, 6))
+
+
 def test_by_frame_lists_the_lines_of_each_frame(ragged):
     chosen, present = ragged.by_frame()
     assert chosen.shape == present.shape == (3, 4)

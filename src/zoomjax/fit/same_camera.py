@@ -8,6 +8,8 @@ import numpy as np
 
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_jit, of_frames
+from ..models.about import WIDTH_OF_FOCALS
+from ..models.camera import px_of_focal_px
 from ..models.lens import ZoomLens
 from ..tracks.tracks import Tracks
 from .distortion_models import with_distortion_model
@@ -19,7 +21,8 @@ def check_camera(lens: ZoomLens, lines: AbstractLines) -> None:
     """Refuse lines of another camera than the lens's.
 
     Raises:
-        ValueError: the lens is for images of another size or focal lengths in another unit.
+        ValueError: the lens is for images of another size or focal lengths in another unit, or in px of
+            images of another size.
     """
     if lens.image_size != lines.image_size:
         raise ValueError(
@@ -30,6 +33,12 @@ def check_camera(lens: ZoomLens, lines: AbstractLines) -> None:
         raise ValueError(
             f"The lens takes focal lengths in {lens.focal_unit}, but those of the lines are in "
             f"{lines.focal_unit}."
+        )
+    if lens.focal_unit == "px" and px_of_focal_px(lens) != 1:
+        raise ValueError(
+            "The lens was scaled by lens_for_size, and takes focal lengths in px of the images before, "
+            f"{lens.about[WIDTH_OF_FOCALS]:g} px wide, but those of the lines are of images "
+            f"{lines.image_size[0]} px wide: give the lens as it was, and lines of such images."
         )
 
 

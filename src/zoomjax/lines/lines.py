@@ -30,7 +30,15 @@ from .._core.checks import (
     warn_of_points_outside,
     warn_of_units,
 )
-from .._core.fields import booleans, check_present, check_shapes, integers, known, numbers
+from .._core.fields import (
+    booleans,
+    check_present,
+    check_shapes,
+    integers,
+    known,
+    numbers,
+    refuse_masked,
+)
 from .._core.files import whole_file
 from .._core.products import EXACT
 from .._core.steps import packed
@@ -184,6 +192,8 @@ class Lines(AbstractLines):
                 length may share a frame: eq. 3 then averages over all their lines.
             focal, image_size, focal_unit: as for `from_ragged`, whose errors also apply.
         """
+        for name, values in {"corners": corners, "frame": frame}.items():
+            refuse_masked(name, values)
         corners = np.asarray(corners)
         if corners.ndim != 4 or corners.shape[-1] != 2:
             raise ValueError(
