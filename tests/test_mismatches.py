@@ -131,6 +131,50 @@ def test_evidence_takes_the_same_lines_compressed_however_and_no_others(photos):
             zj.trust.evidence(lines, fit, compressed=zj.compress(_other(lines, other)))
 
 
+def test_evidence_refuses_lines_compressed_with_other_weights_or_for_another_fit(photos):
+    """Halves, rejected lines and the RMS without correction came from these, and all else from the fit."""
+    lines, fit = photos
+    weight = np.linspace(0, 1, len(lines.frame))
+    weighted = lines.weighted(weight)
+    centre = np.asarray(lines.centre)
+    others = {
+        "numbers of points or weights": (lines, zj.compress(weighted)),
+        "points or weights": (weighted, zj.compress(lines)),
+        "about the centre of distortion of the fit": (lines, zj.compress(lines.about(centre + 5))),
+        "for the distortion model of the fit, RadialPolynomial, but they are for Division": (
+            lines,
+            zj.fit.compress_for(lines, zj.models.Division()),
+        ),
+    }
+    for message, (given, compressed) in others.items():
+        with pytest.raises(ValueError, match=message):
+            zj.trust.evidence(given, fit, compressed=compressed)
+    own, twice = (zj.trust.evidence(weighted, fit, compressed=of) for of in (None, zj.compress(weighted)))
+    assert own.rejected == twice.rejected == 1
+
+
+def test_lenses_scaled_to_other_images_are_not_asked_for_the_pixels_of_those():
+    """Focal lengths in px stay those of the lens's first images: twice as long ones found another zoom."""
+    zoom = zj.PolynomialZoom(1, jnp.array([[0.0], [0.05]]), jnp.array(400.0))
+    lens = zj.ZoomLens(zoom, jnp.array([159.5, 119.5]), jnp.array([400.0, 1600.0]), (320, 240), "px")
+    whole = zj.ZoomLens(zoom, jnp.array([319.5, 239.5]), jnp.array([400.0, 1600.0]), (640, 480), "px")
+    with pytest.warns(UserWarning, match="distortion is scaled"):
+        double = zj.models.lens_for_size(lens, (640, 480))
+    lines = scenes.motion_lines(whole, np.array([500.0, 900.0]))
+    calls = {
+        "frame_rms": lambda: zj.frame_rms(lines, double),
+        "cramer_rao": lambda: zj.trust.cramer_rao(double, lines, std=0.3),
+        "displacement_bound": lambda: zj.trust.displacement_bound(double, lines, std=0.3),
+        "vanishing_points": lambda: zj.trust.vanishing_points(lines, double),
+    }
+    for call in calls.values():
+        with pytest.raises(ValueError, match=r"scaled by lens_for_size.* 320 px wide"):
+            call()
+    with pytest.raises(ValueError, match="px of the same images"):
+        zj.trust.displacement_rms(whole, double)
+    assert zj.trust.displacement_rms(double, double) == 0
+
+
 @pytest.mark.parametrize("given", [(np.ones(3), np.ones(9)), (np.ones(9), None), (None, np.ones(9))])
 def test_held_out_errors_are_one_a_frame_and_both(given, photos, unchecked):
     held_out, each = given

@@ -1,8 +1,10 @@
 """Plots: what is drawn is what was fitted."""
 
+import dataclasses
 import io
 import itertools
 
+import equinox as eqx
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
@@ -12,7 +14,7 @@ from matplotlib.figure import Figure
 import zoomjax as zj
 from zoomjax import scenes
 from zoomjax.app.coverage import plot_coverage, plot_radius
-from zoomjax.app.plot import plot_distortion, plot_model, plot_residues, save_plot
+from zoomjax.app.plot import plot_distortion, plot_model, plot_primitives, plot_residues, save_plot
 
 
 @pytest.mark.parametrize("kind", ["svg", "png"])
@@ -179,3 +181,21 @@ def test_labels_of_focal_lengths_do_not_overlap(focal):
     boxes.sort(key=lambda box: box.x0)
     assert len(boxes) >= 2
     assert all(one.x1 + 2 < other.x0 for one, other in itertools.pairwise(boxes))
+
+
+def test_plots_of_what_does_not_belong_together_are_refused():
+    """A model of k1 alone was drawn as k2 beside frames that have both, a lens about the wrong middle."""
+    lens = scenes.nikkor_18_200((320, 214))
+    lines = scenes.board_lines(lens, scenes.focal_sweep(4), spacing=60, noise=0.1)
+    small = zj.compress(lines)
+    fit, each = zj.fit_zoom(small, terms=1), zj.fit_frames(small, terms=1)
+    others = {
+        "coefficients": zj.fit_frames(small, terms=2),
+        "distortion model": dataclasses.replace(each, distortion_model=zj.models.Division()),
+        "frames": eqx.tree_at(lambda of: of.coefficients, each, each.coefficients[:3]),
+    }
+    for what, other in others.items():
+        with pytest.raises(ValueError, match=f"{what} is"):
+            plot_model(fit, other, small)
+    with pytest.raises(ValueError, match="images of size"):
+        plot_primitives(lines, scenes.nikkor_18_200((640, 428)), [0])

@@ -92,6 +92,17 @@ def test_a_board_may_be_turned_in_its_plane_and_moved(truth):
     assert from_board(corrected, board @ turn.T + 300).focal == pytest.approx(60)
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_board_may_be_given_with_y_upwards(truth, compiled):
+    """No turn brings it to its image: f was that of the side by which it is longer, 12 in place of 60."""
+    corrected, _, board = photographed(truth, 60.0)
+    call = jax.jit(from_board) if compiled else from_board
+    straight, mirrored = (call(corrected, board * side) for side in (np.array([1, 1]), np.array([1, -1])))
+    np.testing.assert_allclose(mirrored.focal, 60, rtol=1e-12)
+    assert mirrored.rms < 1e-9
+    np.testing.assert_allclose(mirrored.std, straight.std, atol=1e-9)
+
+
 def test_standard_deviation_from_a_board_is_that_of_sampled_noise(truth, rng):
     corrected, _, board = photographed(truth, 60.0)
     chosen = rng.choice(len(board), 12, replace=False)
@@ -494,3 +505,35 @@ def test_focal_lengths_of_a_real_zoom_camera_are_those_of_opencv(zoomcam, zoom):
         [board] * len(pictures), pictures, (1280, 720), guess, None, flags=flags
     )
     assert together.focal == pytest.approx(matrix[0, 0], rel=0.01)
+
+
+KNOWN_LINES = np.array([[[0, 0], [5, 0]], [[0, 3], [5, 3]], [[0, 0], [0, 3]], [[5, 0], [5, 3.0]]])
+
+
+@pytest.mark.parametrize("principal", [[640.0], 640.0, [640.0, 350.0, 1.0], [np.nan, 350.0]], ids=str)
+@pytest.mark.usefixtures("unchecked")
+def test_a_principal_point_is_one_point(principal):
+    """One number was taken for x and y."""
+    positions = np.zeros((4, 3, 2))
+    calls = {
+        "planes": lambda: zj.focal.focal_from_planes(views(900.0), PLANE, principal=principal),
+        "lines": lambda: zj.focal.focal_from_lines(positions, KNOWN_LINES, principal=principal),
+        "pitch": lambda: zj.focal.focal_from_pitch({"Middle line": np.ones((3, 2))}, principal=principal),
+        "names": lambda: zj.focal.name_pitch_lines([], principal=principal, image_size=(1280, 720)),
+    }
+    for call in calls.values():
+        with pytest.raises(ValueError, match="Argument principal must be"):
+            call()
+
+
+@pytest.mark.parametrize("entry", [0.5, 2])
+@pytest.mark.usefixtures("unchecked")
+def test_a_mask_holds_booleans(entry):
+    """Numbers were weights of points, or how often they count."""
+    mask = np.full((3, len(PLANE)), entry)
+    with pytest.raises(ValueError, match="Argument mask must hold booleans"):
+        zj.focal.focal_from_planes(views(900.0), PLANE, principal=PRINCIPAL, mask=mask)
+    with pytest.raises(ValueError, match="Argument mask must hold booleans"):
+        zj.focal.focal_from_lines(
+            np.zeros((4, 3, 2)), KNOWN_LINES, principal=PRINCIPAL, mask=np.full((4, 3), entry)
+        )

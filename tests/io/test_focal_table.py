@@ -1,7 +1,9 @@
 """CSV files with the focal lengths of images."""
 
+import numpy as np
 import pytest
 
+import zoomjax as zj
 from zoomjax.io.focal_table import read_focal_table
 
 
@@ -107,3 +109,15 @@ def test_of_two_rows_that_fit_the_one_with_more_folders_counts(tmp_path):
 def test_a_name_in_quotes_may_begin_with_a_hash_or_hold_separators(tmp_path):
     read = table(tmp_path, 'image,focal\n"#1.jpg",24\n#1.jpg,25\n"a, b.jpg",70\n')
     assert (read.need("#1.jpg"), read.need("a, b.jpg")) == (24, 70)
+
+
+@pytest.mark.parametrize("focal", [-24.0, 0.0, np.nan, np.inf])
+def test_a_table_made_by_hand_holds_focal_lengths(focal):
+    with pytest.raises(ValueError, match=r"Argument focals\['a.png'\] must be a finite number above 0"):
+        zj.io.FocalTable({"a.png": focal})
+
+
+@pytest.mark.parametrize("sigma", [-0.3, np.nan])
+def test_a_table_made_by_hand_holds_standard_deviations(sigma):
+    with pytest.raises(ValueError, match=r"Argument sigmas\['a.png'\] must be a number of at least 0"):
+        zj.io.FocalTable({"a.png": 24.0}, sigmas={"a.png": sigma})

@@ -136,6 +136,15 @@ def test_grids_of_another_shape_raise():
         zj.Lines.from_grids(np.zeros((2, 3, 4, 2)), np.array([0]), np.array([24.0]), image_size=SIZE)
 
 
+@pytest.mark.parametrize("name", ["corners", "frame"])
+@pytest.mark.usefixtures("unchecked")
+def test_masks_of_grids_are_not_lost(name):
+    given = {"corners": np.random.default_rng(0).uniform(0, 5, (1, 3, 3, 2)), "frame": np.array([0])}
+    given[name] = np.ma.masked_array(given[name], given[name] > 1)
+    with pytest.raises(ValueError, match=f"Argument {name} is a masked array"):
+        zj.Lines.from_grids(given["corners"], given["frame"], np.array([24.0]), image_size=(6, 6))
+
+
 def test_by_frame_lists_the_lines_of_each_frame(ragged):
     chosen, present = ragged.by_frame()
     assert chosen.shape == present.shape == (3, 4)
@@ -407,3 +416,33 @@ def test_whole_steps_are_saved_small_and_whole(dtype, tmp_path):
     assert_same(back, lines)
     share = (tmp_path / "small.npz").stat().st_size / (tmp_path / "large.npz").stat().st_size
     assert share < (0.25 if dtype is np.float64 else 0.5)
+
+
+@pytest.mark.parametrize("form", ["points", "compressed", "any centre"])
+@pytest.mark.usefixtures("unchecked")
+def test_coefficients_of_some_of_the_frames_are_refused(noisy, form):
+    """The last row was taken for the frames that were missing."""
+    make = {"points": lambda x: x, "compressed": zj.compress, "any centre": zj.lines.compress_any_centre}
+    lines, frames = make[form](noisy), len(noisy.focal)
+    for rows in (np.zeros((frames - 1, 4)), np.zeros((frames + 1, 4)), np.zeros(frames)):
+        with pytest.raises(ValueError, match=f"a row for each of the {frames} frames"):
+            lines.corrected(jnp.asarray(rows))
+
+
+@pytest.mark.parametrize("centre", [(1, 2), (1, 2, 3), (-1, 2), (0, 2)], ids=str)
+@pytest.mark.usefixtures("unchecked")
+def test_centres_of_some_of_the_frames_are_refused(noisy, centre):
+    frames = len(noisy.focal)
+    shape = (frames + centre[0], 2) if centre[0] < 1 else centre
+    if centre == (0, 2):
+        assert noisy.about(np.ones(shape)).centre.tolist() == [1, 1]
+        return
+    with pytest.raises(ValueError, match=f"Argument centre must have shape .*{frames}, 2"):
+        noisy.about(np.ones(shape))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_centre_that_is_no_place_is_refused(noisy):
+    for centre in (np.array([np.nan, 3.0]), None, np.ma.masked_array([1.0, 2.0], [0, 1])):
+        with pytest.raises(ValueError, match="Argument centre"):
+            noisy.about(centre)

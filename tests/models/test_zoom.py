@@ -249,6 +249,29 @@ def test_a_crossover_beside_zeros_and_tiny_coefficients(k1, crossover):
     assert found == pytest.approx(crossover, rel=1e-12)
 
 
+def test_frames_without_a_fit_are_no_crossover():
+    k1 = np.array([-0.1, np.nan, -0.05, 0.05])
+    found = zj.models.barrel_crossover(np.array([20.0, 25.0, 40.0, 80.0]), k1)
+    assert found == pytest.approx(160 / 3, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("focal", "k1", "name"),
+    [
+        ([20.0, 40.0, 80.0], [0.3, -0.1, 0.1, 0.2], "k1"),
+        ([20.0, 40.0, 80.0], [[-0.1], [0.1], [0.2]], "k1"),
+        ([20.0, 40.0, 80.0], [-0.1, np.inf, 0.1], "k1"),
+        ([20.0, 40.0, 80.0], np.ma.masked_array([-0.1, 0.1, 0.2], [0, 1, 0]), "k1"),
+        ([-20.0, -40.0, -80.0], [-0.1, 0.1, 0.1], "focal"),
+        ([0.0, 40.0, 80.0], [-0.1, 0.1, 0.1], "focal"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_a_crossover_of_what_are_not_frames_is_refused(focal, k1, name):
+    with pytest.raises(ValueError, match=f"Argument {name} must"):
+        zj.models.barrel_crossover(np.array(focal), k1)
+
+
 def test_zeros_are_no_crossover():
     with pytest.raises(ValueError, match="one sign"):
         zj.models.barrel_crossover(np.array([20.0, 40.0, 80.0]), np.array([0.0, 0.1, 0.1]))

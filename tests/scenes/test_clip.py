@@ -96,3 +96,12 @@ def test_leaves_have_edges_of_all_sizes():
     assert len(np.unique(texture)) > 100
     steps = abs(np.diff(texture[..., 0].astype(int), axis=1)) > 8
     assert 0.02 < steps.mean() < 0.5
+
+
+@pytest.mark.parametrize("frame", [-1, 4])
+def test_frames_that_a_clip_does_not_have_are_refused(frame):
+    """The camera stays where it is beyond the ends: another frame's rays were those of the last one."""
+    made, points = clip(4), np.array([[20.0, 10.0]])
+    for of in (made.rays, made.is_moving, made.points):
+        with pytest.raises(IndexError, match=f"There is no frame {frame}: the frames are 0 to 3"):
+            of(frame, np.array([[0.0, 0.0, 1.0]]) if of == made.points else points)

@@ -249,6 +249,7 @@ def test_points_outside_of_the_image_are_not_good(lines, weighted):
     points = np.where(np.asarray(lines.frame)[:, None, None] == 0, lines.points + 1e3, lines.points)
     weight = np.where(np.asarray(lines.frame) == 0, float(weighted), 1.0)
     off = dataclasses.replace(lines, points=points, weight=weight)
-    outside = [finding for finding in assess(off, fit, compressed=small).findings if finding.cause]
+    found = assess(off, fit, compressed=small.weighted(weight))
+    outside = [finding for finding in found.findings if finding.cause]
     assert [finding.about for finding in outside] == ["points outside"] * weighted
     assert all("of the points lie outside of the image of 1072 x 712 px" in f.found for f in outside)

@@ -15,6 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..fit.centre import FrameCentres
 from ..fit.result import FrameFits, ZoomFit
+from ..fit.same_camera import check_alike, check_camera, check_lines_of
 from ..lines.base import AbstractLines
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
@@ -62,8 +63,13 @@ def plot_model(zoom: ZoomFit, each: FrameFits, lines: AbstractLines) -> Figure:
         zoom: the fitted zoom model.
         each: the frames fitted by themselves.
         lines: what both were fitted to; only its focal lengths are used.
+
+    Raises:
+        ValueError: both are not of these frames, with the same coefficients of the same distortion model.
     """
     lens = zoom.lens
+    check_lines_of(zoom, lines)
+    check_alike(zoom, each)
     terms = each.coefficients.shape[1]
     orders = lens.distortion_model.orders(terms)
     to_pixel = lens.scale ** (-1.0 * orders)
@@ -150,8 +156,9 @@ def plot_residues(
 def plot_primitives(lines: Lines, lens: ZoomLens, frames: Sequence[int]) -> Figure:
     """Plot the points of some frames, distorted and corrected (Figures 5 and 6). One row per frame.
 
-    The outline is the border of the image, which the correction bends.
+    The outline is the border of the image, which the correction bends. A lens for others is refused.
     """
+    check_camera(lens, lines)
     figure = Figure(figsize=(9, 3.1 * len(frames)), layout="constrained")
     width, height = lines.image_size
     border = np.concatenate(

@@ -21,7 +21,7 @@ from .._core.fields import real_argument
 from .._core.products import EXACT
 from .._core.programs import light_program
 from .._core.types import AnyArray
-from ..lines.base import AbstractLines
+from ..lines.base import AbstractLines, check_rows
 from ..lines.best_line import line_residuals
 from ..lines.buckets import bucketed_jit, of_frames, of_lines
 from ..lines.reduction import triangle
@@ -85,11 +85,7 @@ def weighted_distances(
     lines: AbstractLines, coefficients: Float[Array, "frame terms"]
 ) -> Float[Array, "line rows"]:
     """The same; of lines for any centre by coefficients that end with the centre's offset."""
-    if coefficients.shape[0] != lines.focal.shape[0]:
-        raise ValueError(
-            f"Argument coefficients must have a row for each of the {lines.focal.shape[0]} frames, but its "
-            f"shape is {coefficients.shape}."
-        )
+    check_rows(coefficients, lines.focal)
     weights = line_weights(lines)
     counted = weights > 0  # the root has no derivative at 0
     roots = jnp.where(counted, jnp.sqrt(jnp.where(counted, weights, 1)), 0)

@@ -27,8 +27,8 @@ def focal_from_board(
 
     Args:
         points: corrected positions in the image, px, at least 3.
-        board: the same points on the board, mm, x to the right and y downwards as seen by the camera; its
-            position and rotation in its plane do not matter.
+        board: the same points on the board, mm. Its position and rotation in its plane do not matter, nor
+            whether y goes up or down: of the two that fits better is taken.
         distance: from the projection plane to the board, mm, > 0: eq. 14's d.
         pixel_pitch: side of a pixel on the sensor, mm. 1 is for points measured in mm.
 
@@ -63,6 +63,8 @@ def focal_from_board(
     # A similarity is one complex factor: its absolute value is px in the image per mm on the board.
     seen, known = _complex(points), _complex(board)
     seen, known = seen - jnp.mean(seen), known - jnp.mean(known)
+    mirrored = abs(jnp.sum(known * seen)) > abs(jnp.sum(jnp.conj(known) * seen))
+    known = jnp.where(mirrored, jnp.conj(known), known)
     spread = jnp.sum(abs(known) ** 2)
     positive = (jnp.asarray(distance) > 0) & (jnp.asarray(pixel_pitch) > 0) & (spread > 0)
     spread = eqx.error_if(

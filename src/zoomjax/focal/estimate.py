@@ -3,10 +3,11 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.arrays import as_jax
-from .._core.fields import numbers
+from .._core.fields import booleans, check_finite, numbers
 from .homography import matrix_of
 
 _WEIGHINGS = 5
@@ -92,6 +93,21 @@ def _inverse_square(entries, root, counted):
 def as_points_of(name: str, points) -> jax.Array:
     """Points, or lists of them, as an array; ValueError if they hold something else."""
     return as_jax(numbers(name)(points))
+
+
+def check_principal(principal) -> None:
+    """One principal point, x and y; ValueError of anything else, which would be taken for both or all."""
+    if np.shape(principal) != (2,):
+        raise ValueError(
+            f"Argument principal must be two numbers, x and y, px, but its shape is {np.shape(principal)}."
+        )
+    check_finite("principal", principal)
+
+
+def as_mask(mask, shape: tuple[int, ...]) -> jax.Array:
+    """Which points are valid, as an array of booleans; all if it is None."""
+    mask = np.ones(shape, bool) if mask is None else booleans("mask")(mask)
+    return as_jax(mask) if isinstance(mask, np.ndarray) else mask
 
 
 def check_pairs(points: tuple[int, ...], plane: tuple[int, ...], *, fewest: int) -> None:

@@ -16,7 +16,7 @@ from .._core.checks import checked_size
 from .._core.fields import refuse_masked
 from .._core.types import AnyArray
 from ._markings import find_markings
-from .estimate import FocalEstimate
+from .estimate import FocalEstimate, check_principal
 from .plane import focal_from_lines
 
 _LENGTH, _WIDTH = 105.0, 68.0
@@ -67,7 +67,8 @@ def focal_from_pitch(
         includes neither errors of the size of the pitch nor of the principal point.
 
     Raises:
-        ValueError: none of the names is known, or positions are not finite (n, 2) arrays.
+        ValueError: none of the names is known, positions are not finite (n, 2) arrays, or `principal` is
+            not one point.
 
     Example:
         >>> import numpy as np
@@ -118,7 +119,7 @@ def name_pitch_lines(
         other focal lengths explain them as well.
 
     Raises:
-        ValueError: positions are not finite (n, 2) arrays.
+        ValueError: positions are not finite (n, 2) arrays, or `principal` is not one point.
 
     Example:
         >>> import numpy as np
@@ -134,6 +135,7 @@ def name_pitch_lines(
     """
     refuse_masked("principal", principal)
     principal, size = np.asarray(principal, float), np.array(checked_size(image_size))
+    check_principal(principal)
     unit = float(np.hypot(*size)) / 2
     points = [_positions(f"line {number}", line) for number, line in enumerate(lines)]
     points = [line for line in points if len(line) > 1 and np.ptp(line, axis=0).any()]

@@ -23,11 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Num
 
-from .._core.arrays import as_jax
 from .._core.products import exact_products
 from .._core.programs import light_program
 from .._core.types import AnyArray, traced
-from .estimate import FocalEstimate, as_points_of, check_pairs, estimate_of
+from .estimate import FocalEstimate, as_mask, as_points_of, check_pairs, check_principal, estimate_of
 from .homography import homography, homography_from_lines
 
 
@@ -55,7 +54,8 @@ def focal_from_planes(
         an infinite standard deviation.
 
     Raises:
-        ValueError: shapes differ, or a view has fewer than 5 points.
+        ValueError: shapes differ, a view has fewer than 5 points, `mask` does not hold booleans, or
+            `principal` is not one point.
 
     References:
         Z. Zhang, "A flexible new technique for camera calibration", IEEE PAMI 22 (2000), section 3.1.
@@ -80,7 +80,8 @@ def focal_from_planes(
     else:
         check_pairs(points.shape[1:], plane.shape, fewest=5)
         plane = jnp.broadcast_to(plane, points.shape)
-    mask = as_jax(np.ones(points.shape[:2], bool)) if mask is None else jnp.asarray(mask)
+    mask, principal = as_mask(mask, points.shape[:2]), as_points_of("principal", principal)
+    check_principal(principal)
     if mask.shape != points.shape[:2]:
         raise ValueError(
             f"Argument mask must have shape (view, point), here {points.shape[:2]}, but its shape is "
@@ -93,7 +94,7 @@ def focal_from_planes(
             raise ValueError(
                 f"Views in argument mask must have at least 5 valid points, or none, but one has {few[0]}."
             )
-    return _focal_from_planes(points, plane, mask, as_points_of("principal", principal))
+    return _focal_from_planes(points, plane, mask, principal)
 
 
 def focal_from_lines(
@@ -121,7 +122,7 @@ def focal_from_lines(
         homography takes 4 lines with 2 points each, no 3 of the lines parallel or through one point.
 
     Raises:
-        ValueError: shapes differ.
+        ValueError: shapes differ, `mask` does not hold booleans, or `principal` is not one point.
 
     References:
         Z. Zhang, "A flexible new technique for camera calibration", IEEE PAMI 22 (2000), section 3.1.
@@ -136,14 +137,14 @@ def focal_from_lines(
         800.0
     """
     points, lines = as_points_of("points", points), as_points_of("lines", lines)
-    if mask is None:
-        mask = jnp.ones(points.shape[:2], bool)
+    mask, principal = as_mask(mask, points.shape[:2]), as_points_of("principal", principal)
+    check_principal(principal)
     if points.ndim != 3 or points.shape != (*mask.shape, 2) or lines.shape != (len(points), 2, 2):
         raise ValueError(
             "Arguments points, mask and lines must have shapes (line, point, 2), (line, point) and "
             f"(line, 2, 2), but their shapes are {points.shape}, {mask.shape} and {lines.shape}."
         )
-    return _focal_from_lines(points, jnp.asarray(mask), lines, as_points_of("principal", principal))
+    return _focal_from_lines(points, mask, lines, principal)
 
 
 @light_program

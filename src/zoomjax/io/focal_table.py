@@ -7,6 +7,7 @@ from pathlib import PurePath
 
 import numpy as np
 
+from .._core.checks import check_above
 from .text_table import read_text_table
 
 
@@ -15,6 +16,9 @@ class FocalTable:
 
     An image is looked up by its name with as many of its folders as the table gives: ``3x/board.png`` or,
     where that is unique, ``board.png``. If several rows fit, the one with most folders is used.
+
+    Raises:
+        ValueError: a focal length is not a positive number, or a standard deviation not one of at least 0.
     """
 
     def __init__(
@@ -23,6 +27,13 @@ class FocalTable:
         path: str | os.PathLike[str] = "the table",
         sigmas: dict[str, float] | None = None,
     ):
+        for name, focal in focals.items():
+            check_above(0, **{f"focals[{name!r}]": focal})
+        for name, sigma in (sigmas or {}).items():
+            if not sigma >= 0:
+                raise ValueError(
+                    f"Argument sigmas[{name!r}] must be a number of at least 0, but it is {sigma!r}."
+                )
         self._focals, self._sigmas = focals, sigmas or {}
         self._path = os.fspath(path)
 

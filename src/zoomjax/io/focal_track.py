@@ -34,7 +34,12 @@ class FocalTrack:
     hold: bool = False
 
     def __post_init__(self):
-        """Check the samples, which may be lists."""
+        """Check the samples, which may be lists, and that the rest are truth values: any word would be."""
+        for name in ("by_time", "hold"):
+            if not isinstance(getattr(self, name), bool | np.bool_):
+                raise ValueError(
+                    f"Argument {name} must be True or False, but it is {getattr(self, name)!r}."
+                )
         for name in ("position", "focal"):
             if (values := real_numbers(getattr(self, name))) is None:
                 raise ValueError(f"Argument {name} must hold numbers, but it is {getattr(self, name)!r}.")

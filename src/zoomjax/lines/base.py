@@ -189,6 +189,15 @@ class AbstractLines(eqx.Module):
         return chosen, slot < size[:, None]
 
 
+def check_rows(coefficients: Float[Array, "..."], focal: Focal) -> None:
+    """Refuse coefficients that are not of all frames: JAX takes the last row for those that are missing."""
+    if coefficients.ndim != 2 or coefficients.shape[0] != focal.shape[0]:
+        raise ValueError(
+            f"Argument coefficients must have a row for each of the {focal.shape[0]} frames, but its "
+            f"shape is {coefficients.shape}."
+        )
+
+
 def header_of(lines: AbstractLines) -> dict[str, Any]:
     """All that lines are beside their points: what another form of the same lines takes over."""
     names = ("frame", "focal", "centre", "image_size", "focal_unit", "number", "weight", "focus")

@@ -38,7 +38,7 @@ from .._core.checks import MOST_TERMS, checked_integer
 from .._core.products import EXACT
 from .._core.programs import program
 from .._core.types import Centres, traced
-from .base import header_of
+from .base import check_rows, header_of
 from .buckets import bucketed
 from .lines import Lines
 from .reduction import triangle
@@ -86,6 +86,7 @@ class CompressedLines(AbstractTriangles):
         Raises:
             ValueError: there are more coefficients than the lines were compressed for.
         """
+        check_rows(coefficients, self.focal)
         self.check_terms(coefficients.shape[1])
         return self.scale * jax.vmap(_combine)(self.triangle, coefficients[self.frame])
 

@@ -25,7 +25,7 @@ from .._core.arrays import as_jax
 from .._core.checks import MOST_TERMS, checked_integer
 from .._core.products import EXACT
 from .._core.types import Centres, traced
-from .base import header_of
+from .base import check_rows, header_of
 from .buckets import bucketed_jit, of_lines
 from .compressed import CompressedLines, moments_of, triangles_of
 from .lines import Lines
@@ -95,9 +95,11 @@ class AnyCentreLines(AbstractTriangles):
 
     def _moved_points(self, coefficients):
         """The corrected point by monomials, of each frame: its lines share it."""
+        check_rows(coefficients, self.focal)
         return jax.vmap(lambda k: _corrected_point(self.terms, k[:-2], k[-2:]))(coefficients)
 
     def _decentred_points(self, k, tangential):
+        check_rows(k, self.focal)
         return jax.vmap(lambda k, p: _decentred_point(self.terms, k, p))(k, tangential)
 
     def _rows(self, points):

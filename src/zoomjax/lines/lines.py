@@ -30,13 +30,23 @@ from .._core.checks import (
     warn_of_points_outside,
     warn_of_units,
 )
-from .._core.fields import booleans, check_present, check_shapes, integers, known, numbers
+from .._core.fields import (
+    booleans,
+    check_finite,
+    check_present,
+    check_shapes,
+    integers,
+    known,
+    numbers,
+    real_argument,
+    refuse_masked,
+)
 from .._core.files import whole_file
 from .._core.products import EXACT
 from .._core.steps import packed
 from .._core.types import AnyArray, Centres, Focal, Focus, FrameIndex, LineNumber, LineWeight, Mask, Point
 from ..models.distortion_model import AbstractDistortionModel
-from .base import AbstractLines, one_frame
+from .base import AbstractLines, check_rows, one_frame
 
 FORMAT, VERSION = "zoomjax.lines", 2
 
@@ -184,6 +194,8 @@ class Lines(AbstractLines):
                 length may share a frame: eq. 3 then averages over all their lines.
             focal, image_size, focal_unit: as for `from_ragged`, whose errors also apply.
         """
+        for name, values in {"corners": corners, "frame": frame}.items():
+            refuse_masked(name, values)
         corners = np.asarray(corners)
         if corners.ndim != 4 or corners.shape[-1] != 2:
             raise ValueError(
@@ -271,8 +283,18 @@ class Lines(AbstractLines):
         """The same lines about another centre of distortion, px: that of all frames, or of each frame.
 
         In the latter case points are moved, frame by frame, so that one centre, the mean, serves all.
+
+        Raises:
+            ValueError: it is neither, or not finite.
         """
-        centre = jnp.asarray(centre, jnp.asarray(self.centre).dtype)
+        centre = jnp.asarray(real_argument("centre", centre), jnp.asarray(self.centre).dtype)
+        frames = self.focal.shape[0]
+        if centre.shape not in ((2,), (frames, 2)):
+            raise ValueError(
+                f"Argument centre must have shape (2,), or ({frames}, 2) with one for each frame, but its "
+                f"shape is {centre.shape}."
+            )
+        check_finite("centre", centre)
         if centre.ndim == 1:
             return eqx.tree_at(lambda lines: lines.centre, self, centre)
         mean = jnp.mean(centre, axis=0)
@@ -292,6 +314,7 @@ def corrected_points(
     lines: Lines, distortion_model: AbstractDistortionModel, coefficients: Float[Array, "frame size"]
 ) -> Float[Array, "line point 2"]:
     """Points of each line, corrected with the `coefficients` of its frame, about their mean, px."""
+    check_rows(coefficients, lines.focal)
     points, mask, k = jnp.asarray(lines.points), jnp.asarray(lines.mask), coefficients[lines.frame]
     correct = jax.vmap(_correct_line, in_axes=(0, 0, 0, None, None, None))
     return correct(points, mask, k, lines.centre, lines.scale, distortion_model)

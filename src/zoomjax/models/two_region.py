@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, ScalarLike
 
+from .._core.checks import checked_focal, real_numbers
 from .._core.fields import check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Focal, Scalar, of_known_values, traced
 from ._bernstein import Pieces
@@ -100,15 +101,24 @@ def barrel_crossover(focal: Focal, k1: Float[AnyArray, "frame"]) -> float:
     Args:
         focal: focal length of each frame.
         k1: first coefficient of the separate fit of each frame, ``fit_frames(lines).coefficients[:, 0]``.
+            Frames of which it is NaN, as of those without lines, do not count.
 
     Returns:
         The zero of k1, interpolated linearly in 1/f; the one of shortest focal length if there are several.
 
     Raises:
-        ValueError: k1 does not change its sign.
+        ValueError: k1 does not change its sign, or is not one number a frame, NaN or finite; or a focal
+            length is not positive.
     """
-    order = np.argsort(1 / np.asarray(focal))[::-1]
-    inverse, value = 1 / np.asarray(focal)[order], np.asarray(k1)[order]
+    focals, first = checked_focal(focal), real_numbers(k1)
+    if first is None or first.shape != focals.shape or np.isinf(first).any():
+        raise ValueError(
+            f"Argument k1 must hold one number for each of the {len(focals)} frames, finite or NaN, but it "
+            f"is {k1!r}. Of a fit it is fit_frames(lines).coefficients[:, 0]."
+        )
+    focals, first = focals[~np.isnan(first)], first[~np.isnan(first)]
+    order = np.argsort(focals, kind="stable")
+    inverse, value = 1 / focals[order], first[order]
     signed = np.flatnonzero(value)  # beside zeros
     changes = np.flatnonzero(np.diff(np.sign(value[signed])))
     if not changes.size:

@@ -18,8 +18,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, ScalarLike, UInt8
 
 from .._core.checks import check_above, check_between, checked_focal, checked_integer, checked_size
-from .._core.types import AnyArray
+from .._core.fields import check_not_negative, real_argument
+from .._core.types import AnyArray, traced
 from ..lines.lines import Lines
+from ..models.camera import px_of_focal_px
 from ..models.distortion import Distortion
 from ..models.distortion_model import AbstractRadial
 from ..models.lens import ZoomLens
@@ -72,9 +74,32 @@ class StripedBoard:
         """The paper's board, for a camera whose images have the size of the lens's."""
         return cls(pixel_pitch=_SENSOR[0] / lens.image_size[0])
 
+    def __post_init__(self):
+        """Check that it has stripes, and that lengths are some."""
+        for number in self.stripes:
+            checked_integer("stripes", number, 1)
+        for side in self.size:
+            check_above(0, size=side)
+        check_above(0, distance=self.distance, pixel_pitch=self.pixel_pitch)
+
     def magnification(self, focal: float) -> float:
-        """Pixels per mm on the board: eq. 7, ``r_c / R = f / (d - f)``."""
+        """Pixels per mm on the board: eq. 7, ``r_c / R = f / (d - f)``, f in mm.
+
+        Raises:
+            ValueError: the focal length is known and not positive, or not below the distance.
+        """
+        if not traced(focal) and not ((np.asarray(focal) > 0) & (np.asarray(focal) < self.distance)).all():
+            raise ValueError(
+                f"Argument focal must be in mm, above 0 and below the distance of the board, "
+                f"{self.distance:g} mm, but it is {focal}."
+            )
         return focal / (self.distance - focal) / self.pixel_pitch
+
+    def seen_by(self, lens: ZoomLens, focal: float) -> float:
+        """The magnification at a focal length of a lens, in its own unit."""
+        if lens.focal_unit == "px":
+            focal = focal * px_of_focal_px(lens) * self.pixel_pitch
+        return self.magnification(focal)
 
     def edges(self, axis: int) -> np.ndarray:
         """Positions, mm from the middle, of both edges of the stripes that are counted along an axis."""
@@ -105,7 +130,7 @@ def board_lines(
 
     Args:
         lens: the true lens; its dtype is the result's.
-        focal: focal lengths, one image each.
+        focal: focal lengths in the lens's unit, one image each.
         board: the board and the camera's pixels; by default the paper's, whatever the image size.
         spacing: distance between neighbouring points of a line, px. 12 gives about the paper's number of
             points, 0.8 million; 1, about an edge point a pixel, gives 10 million.
@@ -130,7 +155,7 @@ def board_lines(
     points: list[np.ndarray] = []
     frame: list[int] = []
     for index, f in enumerate(focal):
-        magnification = board.magnification(float(f))
+        magnification = board.seen_by(lens, float(f))
         for axis in (0, 1):
             place = along / magnification / board.size[1 - axis]  # from -1/2 to 1/2 along the board
             seen, inside = _seen(
@@ -178,7 +203,14 @@ def with_noise(
         std: standard deviation, px, of each coordinate of each point: one for all lines, or one per line.
         correlation: correlation of the error of a point with that of the next on its line, from 0 to less
             than 1. With 0.8 an edge of many points is as certain as from a ninth of them if independent.
+
+    Raises:
+        ValueError: `std` or `correlation` are known, and not as above.
     """
+    std = real_argument("std", std)
+    check_not_negative("std", std)
+    if not traced(correlation):
+        check_between(0, float(np.nextafter(1, 0)), correlation=correlation)
     fresh = jax.random.normal(key, lines.points.shape, jnp.asarray(lines.points).dtype)
     correlation = jnp.asarray(correlation, fresh.dtype)
     share = jnp.sqrt(1 - correlation**2)
@@ -249,7 +281,7 @@ def board_photo(
 
     Args:
         lens: the true lens; its dtype is that of the computation, its image size the photograph's.
-        focal: the focal length.
+        focal: the focal length, in the lens's unit.
         board: the board and the camera's pixels; by default the paper's, whatever the image size.
         blur: standard deviation, px, of the Gaussian blur of the optics; at most an eighth of a stripe, for
             each border is blurred separately.
@@ -274,7 +306,7 @@ def board_photo(
         _expose(
             lens(float(focal)),
             (jnp.asarray(board.edges(0), dtype), jnp.asarray(board.edges(1), dtype)),
-            jnp.asarray(board.magnification(float(focal)), dtype),
+            jnp.asarray(board.seen_by(lens, float(focal)), dtype),
             jnp.asarray(max(blur, 1e-6), dtype),
             jnp.asarray([*levels, vignetting], dtype),
             lens.image_size,

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, UInt8
 from .._core.checks import check_above, check_between, checked_focal, checked_integer, checked_size
 from ..correct.sampler import remap
 from ..models.lens import ZoomLens
-from .motion import camera_between
+from .motion import camera_between, check_in_px
 
 _SIDE, _PHASES = 0.11, 32
 """Of the cells that moving things stay in: radians, and after how many all repeats."""
@@ -84,7 +84,12 @@ class MotionClip:
             yield image
 
     def rays(self, frame: int, points: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point 3"]:
-        """The rays of the scene, of length 1, that points of a frame show, px."""
+        """The rays of the scene, of length 1, that points of a frame show, px.
+
+        Raises:
+            IndexError: there is no such frame; so for `points` and `is_moving`.
+        """
+        self._check(frame)
         focal, rotation = self._camera(self._time(frame, points[:, 1]))
         ahead = _each(_ahead, self.lens, focal, points)
         rays = np.einsum("pji,pj->pi", rotation, ahead)
@@ -92,6 +97,7 @@ class MotionClip:
 
     def points(self, frame: int, rays: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point 2"]:
         """Where a frame shows rays, px: perhaps outside of it; NaN behind the camera."""
+        self._check(frame)
         time, seen = np.full(len(rays), float(frame)), np.empty((len(rays), 2))
         for _ in range(8 if self.shutter else 1):  # the row tells the time, and the time the row
             focal, rotation = self._camera(time)
@@ -117,6 +123,11 @@ class MotionClip:
             ],
             axis=0,
         )
+
+    def _check(self, frame: int) -> None:
+        """Refuse a frame that there is not: a camera stays where it is beyond the ends of a clip."""
+        if not 0 <= frame < len(self.focal):
+            raise IndexError(f"There is no frame {frame}: the frames are 0 to {len(self.focal) - 1}.")
 
     def _time(self, frame: int, y: np.ndarray) -> np.ndarray:
         """When rows are seen, in frames."""
@@ -168,6 +179,7 @@ def motion_clip(
     Returns:
         What renders the frames, one after the other, and tells where they show what.
     """
+    check_in_px(lens)
     checked_focal(focal)
     checked_integer("samples", samples, 1)
     check_between(0, math.inf, noise=noise)

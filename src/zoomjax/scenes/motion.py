@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from .._core.arguments import check_kind
 from .._core.checks import check_above, check_between, checked_focal, checked_integer
 from ..lines.lines import Lines
+from ..models.camera import px_of_focal_px
 from ..models.lens import ZoomLens
 from ..tracks.tracks import Tracks
 
@@ -34,6 +35,26 @@ class MotionScene(NamedTuple):
     moving: Bool[np.ndarray, "track"]
 
 
+def check_in_px(lens: ZoomLens) -> None:
+    """Refuse a lens whose focal lengths are not in px of its own images.
+
+    Raises:
+        TypeError: it is no lens.
+        ValueError: they are in mm, or in px of other images.
+    """
+    check_kind("lens", lens, (ZoomLens,))
+    if lens.focal_unit != "px":
+        raise ValueError(
+            f"Argument lens must have its focal lengths in px, but they are in {lens.focal_unit}: make one "
+            "with focal lengths over the pixel pitch."
+        )
+    if px_of_focal_px(lens) != 1:
+        raise ValueError(
+            "Argument lens must have its focal lengths in px of its own images, but it was scaled to "
+            f"{lens.image_size[0]} x {lens.image_size[1]} px by lens_for_size: give it as it was before."
+        )
+
+
 def pan_and_zoom(
     lens: ZoomLens,
     frames: int = 150,
@@ -50,7 +71,7 @@ def pan_and_zoom(
         pan, tilt: angles from end to end, degrees.
         seed: of where the camera begins its to and fro; by default always the same.
     """
-    check_kind("lens", lens, (ZoomLens,))
+    check_in_px(lens)
     checked_integer("frames", frames, 1)
     check_between(-math.inf, math.inf, pan=pan, tilt=tilt)
     t = np.linspace(0, 1, frames)
@@ -99,7 +120,11 @@ def motion_tracks(
         shutter: time from the first row to the last, in frames: 0 is a global shutter.
         distance: of the scene's points, m.
         seed: of everything random.
+
+    Raises:
+        ValueError: focal lengths of the lens are in mm, or an argument is not one of the above.
     """
+    check_in_px(lens)
     checked_focal(focal)
     checked_integer("views", views, 1)
     check_between(1, math.inf, life=life)

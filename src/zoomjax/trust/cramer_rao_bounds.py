@@ -31,6 +31,7 @@ from .._core.types import AnyArray, traced
 from ..fit.same_camera import check_camera
 from ..lines.best_line import line_normal
 from ..lines.lines import Lines
+from ..models.camera import px_of_focal_px
 from ..models.lens import ZoomLens
 from ..models.requirements import check
 from ..models.sizes import at_focal
@@ -142,7 +143,7 @@ def displacement_rms(lens: ZoomLens, other: ZoomLens) -> Float[Array, ""]:
 
     Raises:
         ValueError: the lenses are for images of different sizes, or their focal lengths have different
-            units.
+            units, or are px of images of different sizes.
 
     Example:
         >>> from zoomjax import scenes
@@ -157,6 +158,11 @@ def displacement_rms(lens: ZoomLens, other: ZoomLens) -> Float[Array, ""]:
                 f"Argument other must have the {name} of the first lens, {own}, but it has {others}."
                 + (" lens_for_size gives a lens for another size." if name == "image_size" else "")
             )
+    if lens.focal_unit == "px" and px_of_focal_px(lens) != px_of_focal_px(other):
+        raise ValueError(
+            "Argument other must have focal lengths in px of the same images, but one of the lenses was "
+            "scaled by lens_for_size, which leaves them as they were: scale both, or none."
+        )
     return _displacement_rms(lens, other)
 
 

@@ -39,11 +39,12 @@ from ..fit.energy import (
 )
 from ..fit.image_metric import measured_as
 from ..fit.own_weights import counts_of, own_weights
-from ..fit.problem import about_own_centre, data_of
+from ..fit.problem import data_of
 from ..fit.result import ZoomFit
 from ..fit.same_camera import check_lines_of, placed_as
 from ..lines.base import AbstractLines
 from ..lines.buckets import bucketed_jit, of_lines
+from ..lines.free_centre import AnyCentreLines
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
@@ -63,6 +64,7 @@ _LEAST_SHARE = 0.2  # of the lines, that each direction needs
 _SCATTER = 2.7  # noises, by which lines that are not straight exceed it
 _STRAIGHT = 0.01  # px: no line of a photo is straighter
 _SINGULAR = 1e-10  # eigenvalues, of the largest
+_ALIKE, _SAME_CENTRE = 1e-5, 1e-2  # weights, of each; px
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +147,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     Raises:
         ValueError: no line is usable; the lens has parameters that are not finite, as of a fit that failed;
             the lines are not those of the fit, being of another image size, unit or number of frames; or
-            `compressed` are others.
+            `compressed` are others, of other weights, about another centre or for another distortion model.
 
     Example:
         >>> from zoomjax import compress, fit_zoom, scenes
@@ -163,7 +165,7 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
         terms = number_of_coefficients(lens.zoom)
         points = data_of(placed)
         compressed = compress_for(points, lens.distortion_model, terms=terms)
-    compressed = _same_lines(lines, compressed)
+    compressed = _same_lines(lines, compressed, lens, placed)
     weight = own_weights(compressed)
     if not weight.any():
         raise ValueError(
@@ -205,24 +207,47 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
     )
 
 
-def _same_lines(lines: Lines, compressed: AbstractLines) -> AbstractLines:
-    """The compressed lines about their centre.
+def _same_lines(
+    lines: Lines, compressed: AbstractLines, lens: ZoomLens, placed: AbstractLines
+) -> AbstractLines:
+    """The compressed lines about the centre of the fit, where `placed`, not compressed, are.
 
     Raises:
-        ValueError: they are not the lines.
+        ValueError: they are not the lines, or compressed about another centre or for another model.
     """
+    own, others = (
+        own_weights(of) / max(own_weights(of).max(initial=0), 1e-300) for of in (lines, compressed)
+    )
     same = (
         compressed.image_size == lines.image_size
         and compressed.focal_unit == lines.focal_unit
         and np.array_equal(compressed.frame, lines.frame)
         and np.array_equal(counts_of(compressed), counts_of(lines))
+        and np.allclose(own, others, rtol=_ALIKE, atol=0)
     )
     if not same:
         raise ValueError(
-            "Argument compressed must be the same lines, compressed, but images, frames or numbers of "
-            "points differ: leave it out."
+            "Argument compressed must be the same lines, compressed, but images, frames, numbers of points "
+            "or weights differ: leave it out."
         )
-    return about_own_centre(compressed)
+    model, wanted = (type(of.distortion_model).__name__ for of in (compressed, placed))
+    if model != wanted:
+        raise ValueError(
+            f"Argument compressed must be lines for the distortion model of the fit, {wanted}, but they "
+            f"are for {model}: leave it out, or give compress_for(lines, fit.lens.distortion_model)."
+        )
+    if isinstance(data_of(compressed), AnyCentreLines):
+        return placed_as(lens, compressed)
+    if not np.allclose(compressed.centre, placed.centre, rtol=0, atol=_SAME_CENTRE):
+        raise ValueError(
+            "Argument compressed must be lines about the centre of distortion of the fit, "
+            f"{_place(placed)} px, but they are about {_place(compressed)} px: leave it out."
+        )
+    return compressed
+
+
+def _place(lines: AbstractLines) -> str:
+    return "({:.6g}, {:.6g})".format(*np.asarray(lines.centre))
 
 
 def _halves(
