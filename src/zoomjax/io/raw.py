@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .exif import exif_in_srgb
 from .metadata import Metadata
 from .tiff import tiff_metadata
 
@@ -41,7 +42,7 @@ def raw_metadata(content: bytes) -> Metadata:
     if content[:2] not in (b"II", b"MM"):
         return Metadata()
     metadata, _ = tiff_metadata(content)
-    return Metadata(exif=metadata.exif, xmp=metadata.xmp, iptc=metadata.iptc)
+    return Metadata(exif=exif_in_srgb(metadata.exif), xmp=metadata.xmp, iptc=metadata.iptc)
 
 
 def decode_raw(content: bytes) -> tuple[np.ndarray, Metadata]:
