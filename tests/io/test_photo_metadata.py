@@ -28,6 +28,7 @@ from zoomjax.io.metadata import (
 )
 from zoomjax.io.photo import read_focal, read_metadata, read_pages, read_photo, read_size
 from zoomjax.io.photo_writer import encoded_photo
+from zoomjax.io.raw import raw_metadata
 
 from .._exif import exif
 
@@ -263,23 +264,25 @@ def bayer(image):
     return mosaic
 
 
+MATRIX = np.array([[1, 1], [0, 1], [0, 1], [0, 1], [1, 1], [0, 1], [0, 1], [0, 1], [1, 1]], np.int32)
+TAGS = [
+    (271, 2, 0, "Ruler", True),
+    (272, 2, 0, "Ruler One", True),
+    (50706, 1, 4, (1, 4, 0, 0), True),  # a DNG file
+    (50708, 2, 0, "Ruler One", True),
+    (33421, 3, 2, (2, 2), True),
+    (33422, 1, 4, (0, 1, 1, 2), True),
+    (50717, 4, 1, 4095, True),
+    (50721, 10, 9, MATRIX.ravel().tolist(), True),
+    (50778, 3, 1, 21, True),
+    (700, 1, len(XMP), XMP, True),
+]
+
+
 def test_raw_is_developed_with_all_its_bits(tmp_path, image):
     pytest.importorskip("rawpy")
     image = np.repeat(cv2.resize(image, (300, 200)).mean(2, keepdims=True), 3, axis=2).astype(np.uint8)
-    matrix = np.array([[1, 1], [0, 1], [0, 1], [0, 1], [1, 1], [0, 1], [0, 1], [0, 1], [1, 1]], np.int32)
-    tags = [
-        (271, 2, 0, "Ruler", True),
-        (272, 2, 0, "Ruler One", True),
-        (50706, 1, 4, (1, 4, 0, 0), True),  # a DNG file
-        (50708, 2, 0, "Ruler One", True),
-        (33421, 3, 2, (2, 2), True),
-        (33422, 1, 4, (0, 1, 1, 2), True),
-        (50717, 4, 1, 4095, True),
-        (50721, 10, 9, matrix.ravel().tolist(), True),
-        (50778, 3, 1, 21, True),
-        (700, 1, len(XMP), XMP, True),
-    ]
-    tifffile.imwrite(tmp_path / "a.dng", bayer(image), photometric=32803, metadata=None, extratags=tags)
+    tifffile.imwrite(tmp_path / "a.dng", bayer(image), photometric=32803, metadata=None, extratags=TAGS)
     found, metadata = read_photo(tmp_path / "a.dng")
     assert found.dtype == np.uint16
     assert found.shape == (200, 300, 3)
@@ -292,7 +295,7 @@ def test_raw_is_developed_with_all_its_bits(tmp_path, image):
         ("high", (50718, 5, 2, (1, 1, 2, 1), True), (300, 400)),
     ):
         path = tmp_path / f"{name}.dng"
-        tifffile.imwrite(path, bayer(image), photometric=32803, metadata=None, extratags=[*tags, more])
+        tifffile.imwrite(path, bayer(image), photometric=32803, metadata=None, extratags=[*TAGS, more])
         assert read_size(path) == read_photo(path)[0].shape[1::-1] == size
     (tmp_path / "b.dng").write_bytes((tmp_path / "a.dng").read_bytes()[:90])
     with pytest.raises(ValueError, match="damaged, or LibRaw does not know this camera"):
@@ -412,6 +415,42 @@ def test_the_size_in_metadata_is_that_of_the_result(order):
     assert with_size(same, (61, 40), (70, 44)) == same  # of another image
     assert with_size(same, (60, 40), (60, 40)) == same
     assert exif_with_size(block[:30], (60, 40), (70, 44)) == block[:30]
+
+
+def like_tiff(begins):
+    """A file that is TIFF but for its first four bytes, as those of Olympus and Panasonic."""
+    order = "<" if begins.startswith(b"II") else ">"
+    return begins + exif(order=order)[4:]
+
+
+def like_fuji():
+    """A JPEG file behind a header of Fujifilm's."""
+    image = np.zeros((16, 16, 3), np.uint8)
+    content, _ = encoded_photo([(image, Metadata(exif=exif(), xmp=XMP))], ".jpg")
+    return b"FUJIFILMCCD-RAW ".ljust(84, b"0") + struct.pack(">2I", 100, len(content)) + bytes(8) + content
+
+
+@pytest.mark.parametrize(
+    "content",
+    [*map(like_tiff, (b"IIRO", b"IIRS", b"IIU\0", b"MMOR", b"II*\0")), like_fuji()],
+)
+def test_exif_data_of_raw_files_are_found(tmp_path, content):
+    (tmp_path / "a.orf").write_bytes(content)
+    assert read_focal(tmp_path / "a.orf") == 35
+    for end in range(0, 120, 7):
+        raw_metadata(content[:end])  # damaged: nothing is raised
+
+
+def test_what_is_not_read_of_a_raw_file_is_named(tmp_path, image):
+    pytest.importorskip("rawpy")
+    raw = tmp_path / "a.dng"
+    tifffile.imwrite(raw, bayer(np.repeat(image, 5, 0)), photometric=32803, metadata=None, extratags=TAGS)
+    assert read_pages(raw).others == ()
+    content = raw.read_bytes()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("zoomjax.io.raw.raw_metadata", lambda content: Metadata())
+        assert read_pages(raw).others == ("EXIF data and XMP, which are not read of such files",)
+    assert raw.read_bytes() == content
 
 
 def test_a_raw_photo_that_is_developed_to_srgb_says_so():
