@@ -148,7 +148,7 @@ def test_a_file_that_may_not_grow_is_told(folder):
     before = contents(folder)
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))"
     done = zoomjax("calibrate", "lines.npz", "-o", "out", cwd=folder, first=limit)
-    assert "File too large" in is_a_sentence(done)
+    assert is_a_sentence(done) == "Error: File too large: out"
     assert contents(folder) == before
 
 
@@ -177,7 +177,7 @@ def test_a_full_disk_is_told(folder, mounted):
     (disk / "mine").write_bytes(bytes(200_000))
     before = contents(folder)
     told = is_a_sentence(zoomjax("calibrate", "lines.npz", "-o", "disk/out", cwd=folder))
-    assert "No space left on device" in told
+    assert told == "Error: No space left on device: disk/out"
     assert contents(folder) == before
     assert not (disk / "out").exists()
 

@@ -2,7 +2,10 @@
 
 import os
 import signal
+import socket
 import subprocess
+import sys
+import threading
 
 import numpy as np
 import pytest
@@ -148,6 +151,39 @@ def test_a_scheduler_that_does_not_answer_is_one_sentence(address, photos, tmp_p
         "it prints when it starts, such as tcp://192.168.0.5:8786.\n"
     )
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("says", [b"", b"SSH-2.0-OpenSSH_9.2\r\n", b"\1\0"])
+def test_what_is_no_scheduler_is_not_waited_for(says, monkeypatch):
+    monkeypatch.setattr(module, "_SECONDS", 1)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        answers = threading.Thread(target=lambda: (opened := server.accept()[0]).sendall(says) or opened)
+        answers.start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(ConnectionError, match="no scheduler of Dask answers there"):
+            module.cluster_executor(address, quiet=True).__enter__()
+        answers.join()
+
+
+@pytest.mark.parametrize("scheme", ["tls", "ucx", "xyz"])
+def test_a_way_that_dask_does_not_take_is_one_sentence(address, scheme):
+    with pytest.raises(ConnectionError, match="no scheduler of Dask answers there"):
+        module.cluster_executor(address.replace("tcp", scheme), quiet=True).__enter__()
+
+
+def looked_at(photos, address):
+    with cluster_executor(address, quiet=True) as executor:
+        return list(detect(find_photos([photos]), EdgeDetector(), executor=executor))
+
+
+def test_a_scheduler_that_goes_away_is_one_sentence(photos, capfd):
+    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
+    with subprocess.Popen([*command, "--no-dashboard"], stderr=subprocess.PIPE, text=True) as scheduler:
+        address = next(line.split()[-1] for line in scheduler.stderr or () if "Scheduler at:" in line)
+        threading.Timer(3, scheduler.kill).start()  # without workers, nothing is done before
+        with pytest.raises(ConnectionError, match=f"The scheduler of Dask at {address} has gone away"):
+            looked_at(photos, address)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_options_without_effect_are_refused(photos, tmp_path):

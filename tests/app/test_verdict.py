@@ -9,6 +9,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from zoomjax import compress
 from zoomjax.app.calibrating import calibrate
+from zoomjax.app.focal_sources import Focals
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.plane_focals import FocalGroup
 from zoomjax.app.verdict import (
@@ -156,16 +157,34 @@ def test_two_lenses_are_to_be_parted_before_another_photo_is_taken(noisy, tmp_pa
     assert not mixed.summary()["next_photo"]["enough"]
 
 
+def sharing(*groups):
+    return Focals({}, "px", "homographies of the grid", "", groups=groups)
+
+
+def test_a_standard_deviation_far_below_what_the_photos_give_is_doubtful():
+    own = {"a": 10.0, "b": 30.0, "c": 50.0}
+    found = Focals(dict.fromkeys(own, 1000.0), "px", "homographies of the grid", "", own)
+    assert findings_of_focals(found) == []
+    for given, doubtful in ((1.0, True), (0.0, True), (20.0, False), (100.0, False)):
+        told = findings_of_focals(found.deviating_by(dict.fromkeys(own, given)))
+        assert [one.verdict for one in told] == ["doubtful"] * doubtful
+    assert "given as 1 px, in place of 30 px, in the middle of 3 photos (homographies of the grid)" in (
+        findings_of_focals(found.deviating_by(dict.fromkeys(own, 1.0)))[0].found
+    )
+    exact = dataclasses.replace(found, deviation={})
+    assert findings_of_focals(exact.deviating_by(dict.fromkeys(own, 0.0))) == []
+
+
 def test_photos_that_disagree_about_a_shared_focal_length_are_doubtful():
     agree = FocalGroup(("a", "b"), 1000.0, 10.0, (990.0, 1010.0))
     near = FocalGroup(("c", "d"), 2000.0, 90.0, (1800.0, 2100.0), agree=False)
     far = FocalGroup(("e", "f", "g"), 3000.0, 400.0, (1500.0, 4000.0), agree=False)
-    assert findings_of_focals([agree, FocalGroup(("h", "i"), 1.0, 0.1)], "px") == []
-    [one] = findings_of_focals([agree, near], "px")
+    assert findings_of_focals(sharing(agree, FocalGroup(("h", "i"), 1.0, 0.1))) == []
+    [one] = findings_of_focals(sharing(agree, near))
     assert (one.verdict, one.cause) == ("doubtful", True)
     assert one.found == near.sentence("px")
     assert "1,800 to 2,100 px" in one.found
-    [both] = findings_of_focals([agree, near, far], "px")
+    [both] = findings_of_focals(sharing(agree, near, far))
     assert both.found == far.sentence("px") + " Another group disagrees, too."
 
 

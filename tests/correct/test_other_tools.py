@@ -86,7 +86,7 @@ def photo(path, rng):
         (".tif", ".tif", {}),
         (".webp", ".webp", {}),
         # There, properties of the file turn the picture, and here are none.
-        (".avif", ".avif", {"IFD0:Orientation": None}),
+        (".avif", ".avif", {"IFD0:Orientation": 1}),
         (".heic", ".jpg", {"IFD0:Orientation": 1}),
         (".jpg", ".tif", {}),
         (".tif", ".jpg", {}),

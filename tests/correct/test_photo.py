@@ -229,11 +229,38 @@ def test_what_is_corrected_is_not_corrected_twice(tmp_path, rng, suffix):
 
 
 def test_what_another_program_has_corrected_is_told_of(tmp_path, rng):
-    xmp = b'<x:xmpmeta><a crs:LensProfileEnable="1" crs:AlreadyApplied="True"/></x:xmpmeta>'
+    xmp = b'<rdf:RDF><a crs:LensProfileEnable="1" crs:AlreadyApplied="True"/></rdf:RDF>'
     Image.fromarray(picture(rng)).save(tmp_path / "in.jpg", xmp=xmp)
     with pytest.warns(UserWarning, match=r"in\.jpg says that Adobe's lens correction has .* twice"):
         zj.undistort_photo(tmp_path / "in.jpg", tmp_path / "out.jpg", lens=lens(), focal=20.0)
     zj.correct.redistort_photo(tmp_path / "in.jpg", tmp_path / "back.jpg", lens=lens(), focal=20.0)
+
+
+def test_adobe_is_not_left_to_correct_once_more_and_sizes_are_those_of_the_result(tmp_path, rng):
+    xmp = (
+        b'<rdf:RDF><a crs:LensProfileEnable="1" exif:PixelXDimension="%d" exif:PixelYDimension="%d"/>'
+        b"</rdf:RDF>"
+    )
+    image = picture(rng)
+    height, width = image.shape[:2]
+    given = Image.Exif()
+    given[ExifTags.IFD.Exif] = {ExifTags.Base.ExifImageWidth: width, ExifTags.Base.ExifImageHeight: height}
+    Image.fromarray(image).save(tmp_path / "in.jpg", xmp=xmp % (width, height), exif=given)
+    with pytest.warns(UserWarning, match=r"Not kept of .*: the order to Adobe's programs"):
+        zj.undistort_photo(tmp_path / "in.jpg", tmp_path / "out.jpg", lens=lens(), focal=35.0, keep="grow")
+    corrected, metadata = read_photo(tmp_path / "out.jpg")
+    assert corrected.shape[1] > width
+    with Image.open(tmp_path / "out.jpg") as opened:
+        own = opened.getexif().get_ifd(ExifTags.IFD.Exif)
+    size = (own[ExifTags.Base.ExifImageWidth], own[ExifTags.Base.ExifImageHeight])
+    assert size == corrected.shape[1::-1]
+    assert xmp.replace(b'"1"', b'"0"').removesuffix(b"</rdf:RDF>") % size in metadata.xmp
+
+
+def test_a_damaged_packet_is_named(tmp_path, rng):
+    Image.fromarray(picture(rng)).save(tmp_path / "in.jpg", xmp=b"<x:xmpmeta><rdf:RDF><a dc:source=")
+    with pytest.warns(UserWarning, match="Not kept of .*: XMP, which is damaged"):
+        zj.undistort_photo(tmp_path / "in.jpg", tmp_path / "out.jpg", lens=lens(), focal=35.0)
 
 
 @pytest.mark.parametrize("keep", ["same", "all", "valid", "grow"])

@@ -58,6 +58,28 @@ def test_videos_and_unread_pictures_of_a_folder_are_said(tmp_path, image):
     assert ["is given twice" in str(one.message) for one in told] == [True, False]
 
 
+def test_links_to_nowhere_and_to_other_folders_are_told_of(tmp_path, image):
+    """As in a repository of git-annex of which not all is there."""
+    for name in ("in/a.png", "in/day/b.png", "apart/c.png", "bare/notes.txt"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(tmp_path / name), image) if name.endswith("png") else (tmp_path / name).touch()
+    found = ["a.png", "b.png"]
+    for name, to in (("around", ".."), ("itself", "."), ("within", "day"), ("bare", "../bare")):
+        (tmp_path / "in" / name).symlink_to(to)
+    (tmp_path / "in" / "notes").symlink_to("nowhere")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert names(find_photos([tmp_path / "in"])) == found
+    (tmp_path / "in" / "day" / "gone.jpg").symlink_to("nowhere.jpg")
+    with pytest.warns(UserWarning, match=r"is left out: day/gone\.jpg, as links to nowhere"):
+        assert names(find_photos([tmp_path / "in"])) == found
+    (tmp_path / "in" / "more").symlink_to("../apart")
+    with pytest.warns(UserWarning, match=r"left out: more, as links to other folders\. Give these, too\.$"):
+        assert names(find_photos([tmp_path / "in"])) == found
+    with pytest.warns(UserWarning, match="left out"):
+        assert names(find_photos([tmp_path / "in", tmp_path / "in" / "more"])) == [*found, "c.png"]
+
+
 def test_patterns_are_expanded(tmp_path, image):
     for name in ("a.png", "b.png", "c.jpg"):
         cv2.imwrite(str(tmp_path / name), image)

@@ -15,6 +15,8 @@ from zoomjax.io.exif import parse_exif
 from zoomjax.io.photo import read_focal, read_metadata, read_photo
 from zoomjax.models import PolynomialZoom, ZoomLens
 
+XMP = b"<rdf:RDF></rdf:RDF>"
+
 STANDS_FOR_EXIF = 34664  # tifffile writes no folder of EXIF data
 
 
@@ -23,7 +25,7 @@ def written(path, order, orientation=6, pages=1):
     tags = [
         (ExifTags.Base.Orientation, 3, 1, orientation, True),
         (ExifTags.Base.Make, 2, 6, b"Maker\0", True),
-        (700, 1, 6, b"<xmp/>", True),
+        (700, 1, len(XMP), XMP, True),
         (34675, 7, 9, b"a profile", True),
         (STANDS_FOR_EXIF, 16, 1, 1, True),
     ]
@@ -49,7 +51,7 @@ def test_the_metadata_are_read(tmp_path, order):
     assert read_focal(photo) == 35
     assert read_equipment(photo).maker == "Maker"
     found = read_metadata(photo)
-    assert (found.xmp, found.icc) == (b"<xmp/>", b"a profile")
+    assert (found.xmp, found.icc) == (XMP, b"a profile")
     assert parse_exif(io.BytesIO(found.exif))[ExifTags.Base.Make] == "Maker"
 
 

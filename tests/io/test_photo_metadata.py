@@ -13,9 +13,22 @@ from PIL import ExifTags, Image, IptcImagePlugin, PngImagePlugin
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from zoomjax.io.equipment import read_equipment
-from zoomjax.io.metadata import Metadata, geometry_of, marked, squeezed, straightened_by, work_of
+from zoomjax.io.exif import exif_in_srgb, exif_with_orientation, exif_with_size, parse_exif
+from zoomjax.io.metadata import (
+    Metadata,
+    framing_of,
+    geometry_of,
+    has_no_place,
+    marked,
+    not_corrected_again,
+    squeezed,
+    straightened_by,
+    with_size,
+    work_of,
+)
 from zoomjax.io.photo import read_focal, read_metadata, read_pages, read_photo, read_size
 from zoomjax.io.photo_writer import encoded_photo
+from zoomjax.io.raw import raw_metadata
 
 from .._exif import exif
 
@@ -251,23 +264,25 @@ def bayer(image):
     return mosaic
 
 
+MATRIX = np.array([[1, 1], [0, 1], [0, 1], [0, 1], [1, 1], [0, 1], [0, 1], [0, 1], [1, 1]], np.int32)
+TAGS = [
+    (271, 2, 0, "Ruler", True),
+    (272, 2, 0, "Ruler One", True),
+    (50706, 1, 4, (1, 4, 0, 0), True),  # a DNG file
+    (50708, 2, 0, "Ruler One", True),
+    (33421, 3, 2, (2, 2), True),
+    (33422, 1, 4, (0, 1, 1, 2), True),
+    (50717, 4, 1, 4095, True),
+    (50721, 10, 9, MATRIX.ravel().tolist(), True),
+    (50778, 3, 1, 21, True),
+    (700, 1, len(XMP), XMP, True),
+]
+
+
 def test_raw_is_developed_with_all_its_bits(tmp_path, image):
     pytest.importorskip("rawpy")
     image = np.repeat(cv2.resize(image, (300, 200)).mean(2, keepdims=True), 3, axis=2).astype(np.uint8)
-    matrix = np.array([[1, 1], [0, 1], [0, 1], [0, 1], [1, 1], [0, 1], [0, 1], [0, 1], [1, 1]], np.int32)
-    tags = [
-        (271, 2, 0, "Ruler", True),
-        (272, 2, 0, "Ruler One", True),
-        (50706, 1, 4, (1, 4, 0, 0), True),  # a DNG file
-        (50708, 2, 0, "Ruler One", True),
-        (33421, 3, 2, (2, 2), True),
-        (33422, 1, 4, (0, 1, 1, 2), True),
-        (50717, 4, 1, 4095, True),
-        (50721, 10, 9, matrix.ravel().tolist(), True),
-        (50778, 3, 1, 21, True),
-        (700, 1, len(XMP), XMP, True),
-    ]
-    tifffile.imwrite(tmp_path / "a.dng", bayer(image), photometric=32803, metadata=None, extratags=tags)
+    tifffile.imwrite(tmp_path / "a.dng", bayer(image), photometric=32803, metadata=None, extratags=TAGS)
     found, metadata = read_photo(tmp_path / "a.dng")
     assert found.dtype == np.uint16
     assert found.shape == (200, 300, 3)
@@ -280,7 +295,7 @@ def test_raw_is_developed_with_all_its_bits(tmp_path, image):
         ("high", (50718, 5, 2, (1, 1, 2, 1), True), (300, 400)),
     ):
         path = tmp_path / f"{name}.dng"
-        tifffile.imwrite(path, bayer(image), photometric=32803, metadata=None, extratags=[*tags, more])
+        tifffile.imwrite(path, bayer(image), photometric=32803, metadata=None, extratags=[*TAGS, more])
         assert read_size(path) == read_photo(path)[0].shape[1::-1] == size
     (tmp_path / "b.dng").write_bytes((tmp_path / "a.dng").read_bytes()[:90])
     with pytest.raises(ValueError, match="damaged, or LibRaw does not know this camera"):
@@ -306,6 +321,193 @@ def test_the_mark_tells_the_work():
     assert work_of(marked(once, "distorted")) == ""
     assert work_of(Metadata(xmp=XMP)) is None
     assert geometry_of(once) == "undistorted"
+
+
+def exiftool(path, *options):
+    told = subprocess.run(["exiftool", *options, str(path)], check=True, capture_output=True)
+    return told.stdout.decode()
+
+
+@pytest.mark.skipif(shutil.which("exiftool") is None, reason="Needs exiftool.")
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
+def test_the_mark_is_found_where_another_program_has_written_the_packet_again(tmp_path, image, suffix):
+    framing = (0.5, -1.25, 3.0)
+    write(tmp_path / f"a{suffix}", image, marked(Metadata(xmp=XMP), "undistorted", "12ab", framing))
+    exiftool(tmp_path / f"a{suffix}", "-q", "-overwrite_original", "-XMP-xmp:Rating=5")
+    found = read_metadata(tmp_path / f"a{suffix}")
+    assert b"<zoomjax:Geometry>" in found.xmp
+    assert (geometry_of(found), work_of(found), framing_of(found)) == ("undistorted", "12ab", framing)
+    back = marked(found, "distorted", "34cd")
+    assert (geometry_of(back), work_of(back), framing_of(back)) == ("distorted", "34cd", None)
+    assert back.xmp.count(b"zoomjax:Geometry") == 1
+    assert b"<xmp:Rating>5</xmp:Rating>" in back.xmp
+    assert b"a ruler" in back.xmp
+
+
+def test_what_shares_a_description_with_the_mark_is_kept():
+    """Adobe's library, which many programs use, puts all into the attributes of one."""
+    shared = packet(
+        b'<rdf:Description rdf:about="" xmlns:xmp="http://ns.adobe.com/xap/1.0/"\n xmlns:zoomjax="'
+        b'https://zoomjax.invalid/ns/1.0/"\n xmp:Rating="5"\n zoomjax:Version="0.1.0"\n zoomjax:Geometry='
+        b"'undistorted'/>"
+    )
+    assert geometry_of(Metadata(xmp=shared)) == "undistorted"
+    back = marked(Metadata(xmp=shared), "distorted")
+    assert geometry_of(back) == "distorted"
+    assert b'xmp:Rating="5"' in back.xmp
+    assert b"a ruler" in back.xmp
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be"])
+def test_a_packet_of_another_encoding_or_prefix_is_kept(encoding):
+    once = marked(Metadata(xmp=XMP.decode().encode(encoding)), "undistorted")
+    assert once == marked(Metadata(xmp=XMP), "undistorted")
+    other = marked(
+        Metadata(xmp=XMP.replace(b"rdf:", b"r:").replace(b"xmlns:rdf", b"xmlns:r")), "undistorted"
+    )
+    assert b'dc:source="a ruler"' in other.xmp
+    assert geometry_of(other) == "undistorted"
+    assert has_no_place(Metadata(xmp=XMP[:-40]))
+    assert not has_no_place(Metadata(xmp=XMP))
+    assert not has_no_place(Metadata())
+
+
+def orders(inside):
+    return not_corrected_again(Metadata(xmp=packet(inside))).xmp
+
+
+def test_what_adobe_is_still_to_do_is_not_done_after_a_correction():
+    asked = b'<a crs:LensProfileEnable="1" crs:LensManualDistortionAmount="-12" crs:Exposure2012="0.5"/>'
+    told = orders(asked)
+    assert (
+        b'<a crs:LensProfileEnable="0" crs:LensManualDistortionAmount="0" crs:Exposure2012="0.5"/>' in told
+    )
+    lines = (
+        b"<crs:LensProfileEnable>1</crs:LensProfileEnable>\n <crs:LensProfileName>A</crs:LensProfileName>"
+    )
+    assert lines.replace(b">1<", b">0<") in orders(lines)
+    for other in (
+        b'<a crs:LensProfileEnable="1" crs:AlreadyApplied="True"/>',
+        b'<a crs:LensProfileEnable="0"/>',
+        b"",
+    ):
+        assert orders(other) == packet(other)
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_the_size_in_metadata_is_that_of_the_result(order):
+    given = Image.Exif()
+    given.endian = order
+    given[ExifTags.Base.ImageWidth], given[ExifTags.Base.ImageLength] = 40, 60  # turned
+    given[ExifTags.IFD.Exif] = {ExifTags.Base.ExifImageWidth: 60, ExifTags.Base.ExifImageHeight: 40}
+    block = given.tobytes().removeprefix(b"Exif\0\0")
+    xmp = packet(
+        b'<a tiff:ImageWidth="60" tiff:ImageLength="40"/><exif:PixelXDimension>60</exif:PixelXDimension>'
+        b"<exif:PixelYDimension>40</exif:PixelYDimension>"
+    )
+    found = with_size(Metadata(exif=block, xmp=xmp), (60, 40), (70, 44))
+    exif = parse_exif(io.BytesIO(found.exif))
+    assert (exif[ExifTags.Base.ImageWidth], exif[ExifTags.Base.ImageLength]) == (44, 70)
+    own = exif.get_ifd(ExifTags.IFD.Exif)
+    assert (own[ExifTags.Base.ExifImageWidth], own[ExifTags.Base.ExifImageHeight]) == (70, 44)
+    assert found.xmp == xmp.replace(b"60", b"70").replace(b"40", b"44")
+    same = Metadata(exif=block, xmp=xmp)
+    assert with_size(same, (61, 40), (70, 44)) == same  # of another image
+    assert with_size(same, (60, 40), (60, 40)) == same
+    assert exif_with_size(block[:30], (60, 40), (70, 44)) == block[:30]
+
+
+def like_tiff(begins):
+    """A file that is TIFF but for its first four bytes, as those of Olympus and Panasonic."""
+    order = "<" if begins.startswith(b"II") else ">"
+    return begins + exif(order=order)[4:]
+
+
+def like_fuji():
+    """A JPEG file behind a header of Fujifilm's."""
+    image = np.zeros((16, 16, 3), np.uint8)
+    content, _ = encoded_photo([(image, Metadata(exif=exif(), xmp=XMP))], ".jpg")
+    return b"FUJIFILMCCD-RAW ".ljust(84, b"0") + struct.pack(">2I", 100, len(content)) + bytes(8) + content
+
+
+@pytest.mark.parametrize(
+    "content",
+    [*map(like_tiff, (b"IIRO", b"IIRS", b"IIU\0", b"MMOR", b"II*\0")), like_fuji()],
+)
+def test_exif_data_of_raw_files_are_found(tmp_path, content):
+    (tmp_path / "a.orf").write_bytes(content)
+    assert read_focal(tmp_path / "a.orf") == 35
+    for end in range(0, 120, 7):
+        raw_metadata(content[:end])  # damaged: nothing is raised
+
+
+def test_what_is_not_read_of_a_raw_file_is_named(tmp_path, image):
+    pytest.importorskip("rawpy")
+    raw = tmp_path / "a.dng"
+    tifffile.imwrite(raw, bayer(np.repeat(image, 5, 0)), photometric=32803, metadata=None, extratags=TAGS)
+    assert read_pages(raw).others == ()
+    content = raw.read_bytes()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("zoomjax.io.raw.raw_metadata", lambda content: Metadata())
+        assert read_pages(raw).others == ("EXIF data and XMP, which are not read of such files",)
+    assert raw.read_bytes() == content
+
+
+def test_a_raw_photo_that_is_developed_to_srgb_says_so():
+    given = Image.Exif()
+    given[ExifTags.IFD.Exif] = {
+        ExifTags.Base.ColorSpace: 65535,
+        ExifTags.Base.FocalLength: 35.0,
+        ExifTags.IFD.Interop: {1: "R03"},
+    }
+    block = given.tobytes().removeprefix(b"Exif\0\0")
+    own = parse_exif(io.BytesIO(exif_in_srgb(block))).get_ifd(ExifTags.IFD.Exif)
+    assert own == {ExifTags.Base.ColorSpace: 1, ExifTags.Base.FocalLength: 35.0}
+    assert exif_in_srgb(exif()) == exif()
+
+
+TEXTS = {
+    "-IFD0:Artist": "J\u00f6rg M\u00fcller",
+    "-ExifIFD:OwnerName": "\u0160\u00e1rka",
+    "-ExifIFD:LensModel": "18\u2013200 mm",
+    "-GPS:GPSMapDatum": "B\u00e4rn",
+    "-IFD0:XPTitle": "\u00fcber",
+    "-IFD0:DocumentName": "Stra\u00dfe",
+    "-IFD0:Rating": "4",
+    "-InteropIFD:InteropIndex": "R98",
+}
+
+
+@pytest.mark.skipif(shutil.which("exiftool") is None, reason="Needs exiftool.")
+@pytest.mark.parametrize("suffix", [".tif", ".avif", ".png", ".webp"])
+def test_texts_of_any_alphabet_are_kept(tmp_path, image, suffix):
+    write(tmp_path / "a.jpg", image, Metadata(exif=exif()))
+    given = [f"{tag}#={text}" for tag, text in TEXTS.items()]
+    exiftool(tmp_path / "a.jpg", "-q", "-overwrite_original", *given)
+    asked = ["-G1", "-s", "-n", *TEXTS]
+    expected = exiftool(tmp_path / "a.jpg", *asked)
+    assert len(expected.splitlines()) == len(TEXTS)
+    write(tmp_path / f"b{suffix}", image, read_metadata(tmp_path / "a.jpg"))
+    assert exiftool(tmp_path / f"b{suffix}", *asked) == expected
+    write(tmp_path / "c.tif", image, read_metadata(tmp_path / f"b{suffix}"))
+    assert exiftool(tmp_path / "c.tif", *asked) == expected
+
+
+def test_an_orientation_that_is_added_leaves_texts_as_they_are():
+    given = Image.Exif()
+    given[ExifTags.Base.Artist] = "J\u00f6rg".encode()
+    block = given.tobytes().removeprefix(b"Exif\0\0")
+    assert "J\u00f6rg".encode() in exif_with_orientation(block, 6)
+
+
+@pytest.mark.parametrize("orientation", [None, 1, 6])
+def test_exif_data_of_avif_files_are_those_that_were_given(tmp_path, image, orientation):
+    block = exif() if orientation is None else exif_with_orientation(exif(), orientation)
+    block += b"a thumbnail"
+    write(tmp_path / "a.avif", image, Metadata(exif=block))
+    found, metadata = read_photo(tmp_path / "a.avif")
+    assert metadata.exif == block
+    assert found.shape == image.shape
 
 
 def test_notes_of_the_maker_are_left_out_of_tiff_files_and_named(tmp_path, image):

@@ -85,7 +85,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise FileExistsError(errno.EEXIST, "cannot write a file in place of a device", str(path))
     _remove_left_once(path.parent.absolute())
     with unfinished(path), removed(lambda: _file_beside(path)) as part:
-        with locked(part):
+        with locked(part), place_named(path):
             yield part
         umask = os.umask(0)
         os.umask(umask)
@@ -107,7 +107,7 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise NotADirectoryError(errno.ENOTDIR, "cannot make a folder where there is a file", str(path))
     _remove_left_once(path.parent.absolute())
     with unfinished(path), removed(lambda: _folder_beside(path)) as part:
-        with locked(part):
+        with locked(part), place_named(path):
             yield part
         path.mkdir(exist_ok=True)
         for file in sorted(part.iterdir()):
@@ -161,6 +161,20 @@ def _told(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise type(error)(error.errno, f"cannot write in the folder {folder}: {error.strerror}") from error
+
+
+@contextlib.contextmanager
+def place_named(path: Path) -> Iterator[None]:
+    """Errors of a full disk name what could not be written: the system does not."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _FULL or TEMPORARY not in str(error.filename or TEMPORARY):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+_FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 
 
 @contextlib.contextmanager

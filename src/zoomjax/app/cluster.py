@@ -10,7 +10,7 @@ import logging
 import socket
 import urllib.parse
 from collections.abc import Iterator
-from concurrent.futures import Executor
+from concurrent.futures import CancelledError, Executor
 from typing import Any
 
 _SECONDS = 10
@@ -26,7 +26,7 @@ def cluster_executor(address: str | None, *, quiet: bool = False) -> Iterator[Ex
 
     Raises:
         ImportError: Dask is not installed here, or this package not where the workers are.
-        ConnectionError: no scheduler answers.
+        ConnectionError: no scheduler answers, or it goes away in the middle.
         ValueError: workers have another version of this package.
     """
     if address is None:
@@ -36,7 +36,22 @@ def cluster_executor(address: str | None, *, quiet: bool = False) -> Iterator[Ex
         workers = _checked_workers(client, address)
         if not quiet:
             _tell(client, address, workers)
-        yield client.get_executor(pure=False)
+        with _told_if_gone(address):
+            yield client.get_executor(pure=False)
+
+
+@contextlib.contextmanager
+def _told_if_gone(address: str) -> Iterator[None]:
+    """A scheduler that goes away in the middle cancels all tasks, of which the work then tells."""
+    try:
+        yield
+    except RuntimeError as error:
+        if not isinstance(error.__cause__, CancelledError):
+            raise
+        raise ConnectionError(
+            f"The scheduler of Dask at {address} has gone away. Start it again, and the command after it: "
+            "detections are cached, and with zoomjax undistort --resume photos that are corrected are left."
+        ) from error
 
 
 def _client(address: str) -> Any:
@@ -44,17 +59,46 @@ def _client(address: str) -> Any:
         import distributed
     except ModuleNotFoundError as error:
         raise ImportError('Argument cluster needs Dask: pip install "zoomjax[cluster]"') from error
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the scheduler sees to workers that die
+    _silence("distributed", "tornado")  # the scheduler sees to workers that die, and the rest is said here
     try:
-        place = urllib.parse.urlsplit(address if "://" in address else f"tcp://{address}")
-        # A client of Dask that is not answered leaves threads and messages behind.
-        socket.create_connection((place.hostname or "", place.port or 0), _SECONDS).close()
+        _check_answer(urllib.parse.urlsplit(address if "://" in address else f"tcp://{address}"))
         return distributed.Client(address, timeout=_SECONDS, set_as_default=False)
-    except (OSError, ValueError, OverflowError) as error:
+    except Exception as error:  # of many kinds, such as of TLS that is not set up
         raise ConnectionError(
             f"Argument cluster is {address!r}, but no scheduler of Dask answers there: give the address "
             "that it prints when it starts, such as tcp://192.168.0.5:8786."
         ) from error
+
+
+def _check_answer(place: urllib.parse.SplitResult) -> None:
+    """Refuse an address where nobody answers, or something else than Dask.
+
+    A client of Dask that is not answered waits without end, or leaves threads and messages behind.
+
+    Raises:
+        OSError, ValueError, OverflowError: nobody answers, or not as Dask does.
+    """
+    with socket.create_connection((place.hostname or "", place.port or 0), _SECONDS) as opened:
+        if place.scheme != "tcp":
+            return
+        opened.settimeout(_SECONDS)
+        begins = b""  # Dask speaks first, the length of what it says before all else
+        while len(begins) < _LENGTH:
+            if not (more := opened.recv(_LENGTH - len(begins))):
+                raise ValueError
+            begins += more
+        if int.from_bytes(begins, "little") > _LONGEST:
+            raise ValueError
+
+
+_LENGTH, _LONGEST = 8, 2**20
+
+
+def _silence(*libraries: str) -> None:
+    """Let loggers of libraries be still, also those of their parts that have a level of their own."""
+    known = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] in libraries]
+    for name in {*libraries, *known}:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def _checked_workers(client: Any, address: str) -> int:

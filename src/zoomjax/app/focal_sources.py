@@ -64,6 +64,7 @@ class Focals:
         known: whether they are: of one zoom alone, one millimetre may stand for what nobody knows.
         one_zoom: whether all images are of one zoom, where nothing says so: True where that is supposed,
             False where they contradict it, None where it is not asked.
+        instead: the standard deviations that given ones took the place of.
     """
 
     focal: dict[str, float]
@@ -74,11 +75,12 @@ class Focals:
     groups: tuple[FocalGroup, ...] = ()
     known: bool = True
     one_zoom: bool | None = None
+    instead: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def deviating_by(self, deviation: dict[str, float]) -> "Focals":
         """The same with other standard deviations."""
         groups = (dataclasses.replace(group, std=deviation[group.names[0]]) for group in self.groups)
-        return dataclasses.replace(self, deviation=deviation, groups=tuple(groups))
+        return dataclasses.replace(self, deviation=deviation, groups=tuple(groups), instead=self.deviation)
 
     def absence(self, detection: Detection) -> str:
         """Why an image has no focal length."""

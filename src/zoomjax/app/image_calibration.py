@@ -368,7 +368,7 @@ def _with_equipment(done: ImageCalibration) -> ImageCalibration:
 
 def _with_findings(done: ImageCalibration) -> ImageCalibration:
     """The same with what the photos and their focal lengths say about themselves in the verdict."""
-    found = findings_of_focals(done.focals.groups, done.focals.unit) + findings_of_edges(done.used)
+    found = findings_of_focals(done.focals) + findings_of_edges(done.used)
     if done.job.video is None:
         found += findings_of_photos([Path(d.file) for d in done.used], done.used[0].image_size)
         others = sum(why.startswith(OTHER_SIZE) for why in done.unused.values())

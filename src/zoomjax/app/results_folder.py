@@ -17,7 +17,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
-from .._core.files import TEMPORARY, locked, remove_left, removed, undisturbed, unfinished
+from .._core.files import TEMPORARY, locked, place_named, remove_left, removed, undisturbed, unfinished
 
 LIST = ".zoomjax.json"
 """The name of the list."""
@@ -67,9 +67,10 @@ def results_folder(
             with removed(lambda: _begun(folder)) as part, locked(part):
                 with locked(folder, wait=True):  # else another process may be changing the list
                     _check(folder, names, overwrite)
-                (part / "new").mkdir()
-                yield part / "new"
-                _publish(part, folder, clears, overwrite)
+                with place_named(folder):
+                    (part / "new").mkdir()
+                    yield part / "new"
+                    _publish(part, folder, clears, overwrite)
         except BaseException:
             with contextlib.suppress(OSError):  # missing or not empty
                 for path in made:

@@ -17,6 +17,7 @@ from ..trust.assessment import Finding, Verdict
 from ..trust.evidence import NEGLIGIBLE
 from .calibration import Calibration
 from .equipment import OTHER_CROP, OTHER_FOCAL, equipment_of, metadata_of
+from .focal_sources import Focals
 from .plane_focals import FocalGroup
 from .tying import APART, bend_at
 
@@ -110,9 +111,41 @@ def findings_of_exif(
     ]
 
 
-def findings_of_focals(groups: Iterable[FocalGroup], unit: str) -> list[Finding]:
-    """What speaks against photos sharing focal lengths: what they give alone, if that is too far apart."""
-    apart = [group for group in groups if not group.agree]
+def findings_of_focals(focals: Focals) -> list[Finding]:
+    """What speaks against focal lengths: what photos that share one give alone, if that is too far apart.
+
+    And standard deviations that were given, if they are far smaller than those that they took the place of.
+    """
+    return [*_apart(focals), *_too_sure(focals)]
+
+
+def _too_sure(focals: Focals) -> list[Finding]:
+    known = [name for name, std in focals.instead.items() if std > 0 and name in focals.deviation]
+    given, own = (
+        np.median([deviation[name] for name in known]) if known else 0.0
+        for deviation in (focals.deviation, focals.instead)
+    )
+    if given * _SURER >= own:
+        return []
+    return [
+        Finding(
+            "focal lengths",
+            "doubtful",
+            f"their standard deviation was given as {given:.3g} {focals.unit}, in place of {own:.3g} "
+            f"{focals.unit}, in the middle of {len(known)} photos ({focals.origin}): bands may be too "
+            "narrow.",
+            "Leave --focal-sigma out.",
+            cause=True,
+        )
+    ]
+
+
+_SURER = 3
+"""Ratio of standard deviations from which one is no other estimate of the same."""
+
+
+def _apart(focals: Focals) -> list[Finding]:
+    apart = [group for group in focals.groups if not group.agree]
     if not apart:
         return []
     worst = max(apart, key=FocalGroup.spread)
@@ -122,7 +155,7 @@ def findings_of_focals(groups: Iterable[FocalGroup], unit: str) -> list[Finding]
         Finding(
             "shared focal lengths",
             "doubtful",
-            worst.sentence(unit) + more,
+            worst.sentence(focals.unit) + more,
             "Check that the photos of a group were taken at one zoom, and that the board is flat.",
             cause=True,
         )

@@ -19,7 +19,16 @@ import numpy as np
 
 from .._core.files import refuse_inputs, whole_file
 from .._core.text import listed
-from ..io.metadata import Metadata, framing_of, geometry_of, marked, straightened_by
+from ..io.metadata import (
+    Metadata,
+    framing_of,
+    geometry_of,
+    has_no_place,
+    marked,
+    not_corrected_again,
+    straightened_by,
+    with_size,
+)
 from ..io.photo import FORMATS, Photo, metadata_focal, open_photo, read_focal, read_metadata, read_pages
 from ..io.photo_writer import check_written, encoded_photo
 from ..models.about import UNKNOWN
@@ -256,17 +265,29 @@ def corrected_photo(
         focal = _known(known, source, correction.lens)
     work = correction.work(source, focal)
     pages: list[tuple[np.ndarray, Metadata]] = []
+    more = ["XMP, which is damaged"] if any(has_no_place(metadata) for _, metadata in photo.pages) else []
     for image, metadata in photo.pages:
         framing, before = correction.framing(image, focal), framing_of(metadata)
         if correction.back and before is not None:
             _check_framing(source, framing, before, image.shape)
-        mark = marked(metadata, correction.geometry, work, None if correction.back else framing)
-        pages.append((correction(image, focal), mark))
+        done = correction(image, focal)
+        told = with_size(metadata, _size(image), _size(done))
+        kept = told if correction.back else not_corrected_again(told)
+        more += [_ADOBE] if kept is not told else []
+        mark = marked(kept, correction.geometry, work, None if correction.back else framing)
+        pages.append((done, mark))
     with _blamed(source):
         content, lost = encoded_photo(pages, suffix)
     mark_alone = not any(metadata.xmp for _, metadata in photo.pages)
     lost = [name for name in lost if not (name == "XMP" and mark_alone)]
-    return content, [*lost, *photo.others]
+    return content, [*lost, *photo.others, *dict.fromkeys(more)]
+
+
+def _size(image: np.ndarray) -> tuple[int, int]:
+    return image.shape[1], image.shape[0]
+
+
+_ADOBE = "the order to Adobe's programs to correct the lens, which would have been done once more"
 
 
 def _check(photo: Photo, source: str | os.PathLike[str], suffix: str, correction: Correction) -> None:

@@ -148,7 +148,8 @@ def twice(again: dict[Path, Path]) -> str:
 
 
 def left_out(folder: Path, used: Sequence[str] = SUFFIXES) -> str:
-    """Sentences about videos and pictures in a folder with other suffixes, and developed RAW files.
+    """Sentences about videos and pictures in a folder with other suffixes, developed RAW files, and links
+    to nowhere and to other folders.
 
     Empty if there are none.
     """
@@ -159,7 +160,28 @@ def left_out(folder: Path, used: Sequence[str] = SUFFIXES) -> str:
         told.append(_left_out(folder, others, ".") + " Give videos by name." * videos)
     if raws := _developed(_all_within(folder, used)):
         told.append(_left_out(folder, sorted(raws), ", as a photo of that name counts for each."))
+    if dead := [path for path in _shown(folder) if path.suffix.lower() in used and _is_nothing(path)]:
+        told.append(_left_out(folder, dead, ", as links to nowhere, or no files."))
+    if linked := [path for path in _shown(folder) if path.is_symlink() and _holds_more(path, folder, used)]:
+        told.append(_left_out(folder, linked, ", as links to other folders. Give these, too."))
     return " ".join(told)
+
+
+def _shown(folder: Path) -> list[Path]:
+    """All that is in a folder and those within it, and not hidden."""
+    found = sorted(folder.rglob("*"))
+    return [path for path in found if not any(of.startswith(".") for of in path.relative_to(folder).parts)]
+
+
+def _is_nothing(path: Path) -> bool:
+    return not (path.is_file() or path.is_dir())
+
+
+def _holds_more(link: Path, folder: Path, used: Sequence[str]) -> bool:
+    """Whether a link leads to a folder of photos, or videos, that is not in this one, nor around it."""
+    there, here = Path(os.path.realpath(link)), Path(os.path.realpath(folder))
+    apart = there.is_dir() and not (there.is_relative_to(here) or here.is_relative_to(there))
+    return apart and bool(files_within(there, used))
 
 
 def _left_out(folder: Path, files: Sequence[Path], why: str) -> str:

@@ -3,6 +3,7 @@
 Both decode pixels as stored. Pillow tells how to turn them in the EXIF data.
 """
 
+import contextlib
 import io
 
 import cv2
@@ -58,11 +59,34 @@ def decode_avif(content: bytes) -> tuple[np.ndarray, Metadata, list[str]]:
 def encode_avif(image: np.ndarray, metadata: Metadata) -> bytes:
     """An AVIF file of 8 bits, colours at full resolution."""
     content = io.BytesIO()
-    blocks = {"exif": metadata.exif, "xmp": metadata.xmp, "icc_profile": metadata.icc}
+    blocks = {"exif": _as_it_is(metadata.exif), "xmp": metadata.xmp, "icc_profile": metadata.icc}
     picture = Image.fromarray(np.ascontiguousarray(image[..., [2, 1, 0, 3][: image.shape[2]]]))
     given = {name: block for name, block in blocks.items() if block}
     picture.save(content, "AVIF", quality=_QUALITY, subsampling="4:4:4", **given)
     return content.getvalue()
+
+
+class _Exif(Image.Exif):
+    """EXIF data of which Pillow takes the orientation, and which it does not write anew.
+
+    It would damage texts that are not ASCII, and lose thumbnails and what is at a certain place.
+    """
+
+    block = b""
+
+    def tobytes(self, offset: int = 8) -> bytes:
+        """The data as they came."""
+        return self.block
+
+
+def _as_it_is(block: bytes) -> bytes | _Exif:
+    if not block:
+        return b""
+    exif = _Exif()
+    exif.block = block
+    with contextlib.suppress(Exception):  # of many kinds where offsets lead nowhere
+        exif.load(block)
+    return exif
 
 
 def _bits(content: bytes) -> int:

@@ -8,7 +8,8 @@ import io
 import math
 import struct
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, MutableMapping
+from typing import Any, NamedTuple
 
 from PIL import ExifTags, Image
 from PIL.JpegImagePlugin import JpegImageFile
@@ -24,7 +25,7 @@ File = io.BytesIO | io.BufferedReader
 _PREFIX = b"Exif\0\0"
 _FINENESS = 10_000  # parts of a mm
 _UNKNOWN = 2**32 - 1  # as numerator
-_SHORT = 3  # the type of whole numbers of 16 bits
+_FORMS = {3: "H", 4: "I"}  # of whole numbers of 16 and 32 bits, by their type
 
 
 def exif_focal(block: bytes) -> float | None:
@@ -53,9 +54,8 @@ def exif_with_orientation(block: bytes, orientation: int) -> bytes:
 
     Data without an orientation are written anew with it, unless it is 1.
     """
-    if place := _orientation_place(block):
-        at, order = place
-        return block[:at] + struct.pack(f"{order}H", orientation) + block[at + 2 :]
+    if place := _place(block, ExifTags.Base.Orientation):
+        return _with_number(block, place, orientation)
     if orientation == 1:
         return block
     exif = parse_exif(io.BytesIO(block)) or Image.Exif()
@@ -63,21 +63,88 @@ def exif_with_orientation(block: bytes, orientation: int) -> bytes:
     return exif.tobytes().removeprefix(_PREFIX)
 
 
-def _orientation_place(block: bytes) -> tuple[int, str] | None:
-    """Where the orientation of EXIF data is, and in which order of bytes; None if they have none."""
+def exif_with_size(block: bytes, before: tuple[int, int], after: tuple[int, int]) -> bytes:
+    """EXIF data with another width and height, px, where they tell these, or both exchanged.
+
+    All else stays byte for byte.
+    """
+    for tags in _SIZES:
+        across, down = (_place(block, tag) for tag in tags)
+        if across is None or down is None:
+            continue
+        told = across.number(block), down.number(block)
+        if told in (before, before[::-1]):
+            wide, high = after if told == before else after[::-1]
+            block = _with_number(_with_number(block, across, wide), down, high)
+    return block
+
+
+def exif_in_srgb(block: bytes) -> bytes:
+    """EXIF data of an image in sRGB: they tell no other colour space, if they tell one."""
+    exif = parse_exif(io.BytesIO(block))
+    own = {} if exif is None else exif.get_ifd(ExifTags.IFD.Exif)
+    if exif is None or own.get(ExifTags.Base.ColorSpace, _SRGB) == _SRGB:
+        return block
+    own[ExifTags.Base.ColorSpace] = _SRGB
+    own.pop(ExifTags.IFD.Interop, None)  # which tells it in another way
+    return exif.tobytes().removeprefix(_PREFIX)
+
+
+_SRGB = 1
+
+_SIZES = (
+    (ExifTags.Base.ImageWidth, ExifTags.Base.ImageLength),
+    (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight),
+)
+"""Tags by which EXIF data tell the size of their image."""
+
+
+class _Place(NamedTuple):
+    """Where EXIF data hold a whole number, and in which form."""
+
+    at: int
+    form: str
+
+    def number(self, block: bytes) -> int:
+        return struct.unpack_from(self.form, block, self.at)[0]
+
+
+def _with_number(block: bytes, place: _Place, number: int) -> bytes:
+    """EXIF data with another number in a place; as they are where it is too large for that."""
+    try:
+        written = struct.pack(place.form, number)
+    except struct.error:
+        return block
+    return block[: place.at] + written + block[place.at + len(written) :]
+
+
+def _place(block: bytes, tag: int) -> _Place | None:
+    """Where a tag's whole number is, in the first folder or that of EXIF's own; None if it has none."""
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(block[:4])
     if order is None:
         return None
     try:
-        [folder] = struct.unpack_from(f"{order}I", block, 4)
-        [number] = struct.unpack_from(f"{order}H", block, folder)
-        for at in range(folder + 2, folder + 2 + 12 * number, 12):
-            if struct.unpack_from(f"{order}HHI", block, at) == (ExifTags.Base.Orientation, _SHORT, 1):
-                struct.unpack_from(f"{order}H", block, at + 8)
-                return at + 8, order
+        [first] = struct.unpack_from(f"{order}I", block, 4)
+        entries = {name: (kind, at) for name, kind, at in _entries(block, first, order)}
+        if tag not in entries and ExifTags.IFD.Exif in entries:
+            [own] = struct.unpack_from(f"{order}I", block, entries[ExifTags.IFD.Exif][1])
+            entries = {name: (kind, at) for name, kind, at in _entries(block, own, order)}
+        kind, at = entries.get(tag, (0, 0))
+        place = _Place(at, order + _FORMS[kind]) if kind in _FORMS else None
+        if place is not None:
+            place.number(block)
     except struct.error:  # damaged or cut off
         return None
-    return None
+    return place
+
+
+def _entries(block: bytes, folder: int, order: str) -> Iterator[tuple[int, int, int]]:
+    """Of each value by itself in a folder: its tag, its type, and where it is if it is short."""
+    [number] = struct.unpack_from(f"{order}H", block, folder)
+    for at in range(folder + 2, folder + 2 + 12 * number, 12):
+        tag, kind, count = struct.unpack_from(f"{order}HHI", block, at)
+        if count == 1:
+            yield tag, kind, at + 8
 
 
 def parse_exif(file: File, offset: int | None = None) -> Image.Exif | None:
@@ -96,11 +163,29 @@ def parse_exif(file: File, offset: int | None = None) -> Image.Exif | None:
                 exif.load_from_fp(file)
             else:
                 _load_page(exif, file, offset)
+            own = exif.get_ifd(ExifTags.IFD.Exif)
+            if ExifTags.IFD.Interop in own:  # else only the place where it was
+                own[ExifTags.IFD.Interop] = dict(exif.get_ifd(ExifTags.IFD.Interop))
             for folder in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):
-                exif.get_ifd(folder)  # read while warnings are caught
+                _keep_texts(exif.get_ifd(folder))  # read while warnings are caught
+            _keep_texts(exif)
         except Exception:  # Pillow raises errors of many kinds where offsets lead nowhere
             return None
     return exif
+
+
+class _Text(str):
+    """A text in EXIF data, whatever its encoding: Pillow reads bytes as Latin 1, and writes ASCII alone."""
+
+    def encode(self, encoding: str = "latin-1", errors: str = "replace") -> bytes:
+        """The bytes that were read."""
+        return super().encode("latin-1", "replace")
+
+
+def _keep_texts(folder: MutableMapping[int, Any]) -> None:
+    for tag, value in list(folder.items()):
+        if isinstance(value, str):
+            folder[tag] = _Text(value)
 
 
 def _load_page(exif: Image.Exif, file: File, offset: int) -> None:

@@ -23,7 +23,7 @@ from .jpeg import is_cmyk, jpeg_metadata
 from .metadata import Metadata
 from .photo_writer import FORMATS, MAKER_NOTES
 from .png import png_metadata, transparent_grey
-from .raw import RAW_SUFFIXES, decode_raw, raw_metadata, raw_size
+from .raw import NOT_READ, RAW_SUFFIXES, decode_raw, raw_metadata, raw_size
 from .tiff import CMYK, read_tiff, tiff_metadata, tiff_pages, tiff_size
 from .webp import webp_metadata
 
@@ -133,7 +133,8 @@ def _read(path: Path, *, most_pages: int) -> Photo:
             raise ValueError("the file is empty")
         if path.suffix.lower() in RAW_SUFFIXES:
             _check_pixels(*raw_size(content))
-            return Photo((decode_raw(content),))
+            page = decode_raw(content)
+            return Photo((page,), () if page[1].exif else (NOT_READ,))
         kind, width, height = announced_size(content)
         _check_pixels(width, height)
         return _DECODERS.get(kind, _plain)(content, most_pages)

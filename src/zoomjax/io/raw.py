@@ -5,12 +5,15 @@ the pixels as stored on the sensor. LibRaw does not correct distortion, nor does
 """
 
 import io
+import struct
 from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
+from .exif import exif_in_srgb
+from .jpeg import jpeg_metadata
 from .metadata import Metadata
 from .tiff import tiff_metadata
 
@@ -34,14 +37,33 @@ def raw_size(content: bytes) -> tuple[int, int]:
 
 
 def raw_metadata(content: bytes) -> Metadata:
-    """EXIF data and XMP, of formats that are TIFF files inside; empty for others.
+    """EXIF data and XMP, of formats that are TIFF files inside or hold a JPEG file; empty for others.
 
     The colour profile is left out: the picture is developed to sRGB.
     """
-    if content[:2] not in (b"II", b"MM"):
+    if content.startswith(_FUJI):
+        start, length = struct.unpack_from(">2I", content.ljust(_FUJI_HEAD, b"\0"), _FUJI_HEAD - 8)
+        metadata, _ = jpeg_metadata(content[start : start + length])
+    elif content[:4] in _LIKE_TIFF:
+        metadata, _ = tiff_metadata(_LIKE_TIFF[content[:4]] + content[4:])
+    elif content[:2] in (b"II", b"MM"):
+        metadata, _ = tiff_metadata(content)
+    else:
         return Metadata()
-    metadata, _ = tiff_metadata(content)
-    return Metadata(exif=metadata.exif, xmp=metadata.xmp, iptc=metadata.iptc)
+    return Metadata(exif=exif_in_srgb(metadata.exif), xmp=metadata.xmp, iptc=metadata.iptc)
+
+
+NOT_READ = "EXIF data and XMP, which are not read of such files"
+"""How messages call what a RAW file may hold where nothing was found."""
+
+_LIKE_TIFF = {
+    **dict.fromkeys((b"IIRO", b"IIRS", b"IIU\0"), b"II*\0"),
+    b"MMOR": b"MM\0*",
+}
+"""What files of Olympus and Panasonic begin with, and what it is in TIFF files."""
+
+_FUJI, _FUJI_HEAD = b"FUJIFILMCCD-RAW", 92
+"""What files of Fujifilm begin with; at the end of it stands where a JPEG file is, and its length."""
 
 
 def decode_raw(content: bytes) -> tuple[np.ndarray, Metadata]:

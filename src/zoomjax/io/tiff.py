@@ -24,10 +24,16 @@ _BASE, _FOLDERS = ExifTags.Base, (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)
 
 _TEXTS = (
     *(_BASE.ImageDescription, _BASE.Make, _BASE.Model, _BASE.Software, _BASE.DateTime, _BASE.Artist),
-    *(_BASE.HostComputer, _BASE.Copyright),
+    *(_BASE.HostComputer, _BASE.Copyright, _BASE.DocumentName, _BASE.PageName, _BASE.ProcessingSoftware),
 )
+_OF_WINDOWS = {
+    **dict.fromkeys((_BASE.Rating, _BASE.RatingPercent), 3),
+    **dict.fromkeys((_BASE.XPTitle, _BASE.XPComment, _BASE.XPAuthor, _BASE.XPKeywords, _BASE.XPSubject), 1),
+}
+"""What Windows lets users write into photos, and the type of each tag: a number, or bytes of UTF-16."""
+
 _RESOLUTION = (_BASE.XResolution, _BASE.YResolution, _BASE.ResolutionUnit)
-_DESCRIBING = (*_TEXTS, *_RESOLUTION, _BASE.Orientation, *_FOLDERS)
+_DESCRIBING = (*_TEXTS, *_OF_WINDOWS, *_RESOLUTION, _BASE.Orientation, *_FOLDERS)
 """Tags that tell of the photograph, and not of how its pixels are stored."""
 
 _OTHERS = (("xmp", 700, 1), ("icc", 34675, 7), ("iptc", 34377, 7))
@@ -231,8 +237,6 @@ def tiff_metadata(content: bytes, page: Any = None) -> tuple[Metadata, int]:
     dpi = _dpi(exif)
     for tag in set(exif) - set(_DESCRIBING):
         del exif[tag]
-    for tag in set(_TEXTS) & set(exif):
-        exif[tag] = _bytes(exif[tag])  # else Pillow writes ASCII alone
     orientation = orientation_of(exif)
     fields["exif"] = exif.tobytes().removeprefix(b"Exif\0\0") if len(exif) else b""
     if iptc:
@@ -318,6 +322,10 @@ def _append(
     exif = parse_exif(io.BytesIO(metadata.exif)) or Image.Exif()
     blocks = {name: getattr(metadata, name) for name, _, _ in _OTHERS}
     tags: list[Any] = [(tag, 2, 0, _bytes(exif[tag]), True) for tag in _TEXTS if tag in exif]
+    for tag, kind in _OF_WINDOWS.items():
+        value: Any = exif.get(tag)
+        if isinstance(value, bytes | int) and isinstance(value, bytes) == (kind == 1):
+            tags.append((tag, kind, len(value) if isinstance(value, bytes) else 1, value, True))
     tags += [(tag, kind, len(blocks[of]), blocks[of], True) for of, tag, kind in _OTHERS if blocks[of]]
     if iptc := _iptc_of(metadata.iptc):
         tags.append((_IPTC, 7, len(iptc), iptc, True))
