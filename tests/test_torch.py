@@ -152,8 +152,15 @@ def test_no_inverse_is_nan_with_a_gradient_of_zero():
     assert given.grad[1].tolist() == [0, 0]
 
 
-def test_beyond_the_focal_range_is_nan():
-    assert torch.isnan(zt.undistort(points(torch.float32), lens(), 300.0)).all()
+def test_beyond_the_focal_range_is_nan_and_said():
+    for focal in (300.0, torch.tensor([30.0, 300.0], requires_grad=True)):
+        with pytest.warns(UserWarning, match="300 mm (is|are) not .*, 20 to 80 mm"):
+            moved = zt.undistort(points(torch.float32), lens(), focal)
+        assert torch.isnan(moved[:, 1]).all()
+    with pytest.warns(UserWarning, match="20 to 80 mm"):
+        zt.warp_image(torch.zeros(1, 40, 60), lens(), 300.0)
+    with pytest.raises(ValueError, match="must be a positive number, but it is -3"):
+        zt.undistort(points(torch.float32), lens(), -3.0)
     assert torch.isfinite(zt.undistort(points(torch.float32), lens().extended(20.0, 400.0), 300.0)).all()
 
 

@@ -60,9 +60,14 @@ def undistort(
         A tensor of the points' dtype and device; NaN beyond the lens's focal range (see
         `ZoomLens.extended`). First derivatives exist; for second ones use JAX.
 
+    Warns:
+        UserWarning: a focal length, not in a GPU's memory, is outside of that range. `distort` and
+            `warp_image` warn of it, too.
+
     Raises:
         TypeError: the points are not a tensor of float32 or float64, or the lens has the wrong type.
-        ValueError: a lens is given without a focal length, or a distortion with one.
+        ValueError: a lens is given without a focal length, or a distortion with one, or a focal length is
+            not positive.
     """
     return _mapped("undistort", points, lens, focal, coefficients)
 
@@ -110,6 +115,7 @@ def warp_image(
     if isinstance(border_value, bool):
         raise ValueError(f"Argument border_value must be one number, but it is {border_value!r}.")
     options = (framing, interpolation, float(border_value))
+    _check_range(lens, focal, 4)
     return _called(_warped, options, image, lens, focal, coefficients)
 
 
@@ -130,7 +136,16 @@ def _own(lens):
 
 def _mapped(method, points, lens, focal, coefficients):
     _check_tensor("points", points)
+    _check_range(lens, focal, 5)
     return _called(_moved, method, points, lens, focal, coefficients)
+
+
+def _check_range(lens, focal, stacklevel):
+    """Check focal lengths of a lens but on a GPU, whose values would have to be waited for."""
+    if isinstance(lens, ZoomLens) and focal is not None:
+        values = torch.as_tensor(focal).detach()
+        if values.device.type == "cpu":
+            lens.check_range(values.numpy(), stacklevel=stacklevel)
 
 
 def _moved(method, points, lens, focal):
