@@ -71,7 +71,7 @@ def _triangle_rows(lines, terms):
 
 def _rows(lines, size):
     """The same of any distortion model, to first order in its coefficients."""
-    none = jnp.zeros((lines.frame.shape[0], size), jnp.asarray(lines.focal).dtype)
+    none = jnp.zeros((lines.focal.shape[0], size), jnp.asarray(lines.focal).dtype)
 
     def along(direction):
         return jax.jvp(lines.corrected, (none,), (jnp.broadcast_to(direction[None], none.shape),))
