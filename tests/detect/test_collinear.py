@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from zoomjax.detect._collinear import _checked, _units, collinear, thin_bars
+from zoomjax.detect._collinear import _checked, collinear, thin_bars
 from zoomjax.detect._edge_points import edge_points
 from zoomjax.detect._frame_model import OneFrame
 from zoomjax.detect._joining import border_lines
 from zoomjax.detect._segments import Fragments, fragments
+from zoomjax.detect._units import units_of
 
 SIZE = (1200, 800)
 STRAIGHT = OneFrame.of_values(SIZE, (0.0, 0.0, 0.0, 0.0))
@@ -135,7 +136,7 @@ def kept(*pieces):
     points = [piece.points() for piece in pieces]
     gradient = np.tile([0.0, 100.0], (sum(map(len, points)), 1))
     made = Fragments.of(np.concatenate(points), gradient, np.array([len(p) for p in points]))
-    units = _units(made, STRAIGHT, thin_bars(made))
+    units = units_of(made, STRAIGHT, thin_bars(made))
     return (_checked(units, np.zeros(len(pieces), int), EXACT) >= 0).tolist()
 
 

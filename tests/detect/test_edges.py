@@ -7,6 +7,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.detect._edge_points import _slope
 
 SIZE = (2144, 1424)
 
@@ -231,3 +232,10 @@ def test_the_rows_and_columns_of_real_boards_are_found_whole(data):
                     best = max(best, np.ptp(u[on]) / t[-1])
             cover.append(best)
     assert np.mean(np.array(cover) > 0.85) > 0.9
+
+
+def test_slopes_are_those_of_sobel(rng):
+    """To the last digit: fractions for weights are only another way through OpenCV."""
+    image = rng.integers(0, 256, (57, 83), np.uint8)
+    for order in ((1, 0), (0, 1)):
+        np.testing.assert_array_equal(_slope(image, *order), cv2.Sobel(image, cv2.CV_16S, *order, ksize=5))

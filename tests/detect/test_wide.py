@@ -77,6 +77,31 @@ def test_stretch_is_the_gradient_of_the_corrected_offset():
     np.testing.assert_allclose(model.stretch(points, normal), np.hypot(*slope), rtol=1e-6)
 
 
+def test_slopes_are_the_derivatives_of_the_errors():
+    """Of lines that are nearly straight, to which derivatives of the stretch add nothing."""
+    model = OneFrame(SIZE, (-0.4, 0.05), (0.02, -0.03))
+    rng = np.random.default_rng(2)
+    middle, angle = rng.uniform((120, 80), (360, 240), (6, 2)), rng.uniform(0, np.pi, 6)
+    way = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    straight = middle[:, None] + np.linspace(-110, 110, 24)[:, None] * way[:, None]
+    points = straight.copy()
+    for _ in range(200):
+        points += (straight - model.undistort(points)) / 2
+    points += rng.normal(0, 1e-2, points.shape)
+    seen = model._seen(points)
+    slopes = model._slopes(points, seen)
+    for column, unit in enumerate(np.eye(4)):
+        after, before = (
+            OneFrame.of_values(SIZE, tuple(model.values + step * unit)).errors(points)
+            for step in (1e-5, -1e-5)
+        )
+        # The sign of a normal is arbitrary.
+        after, before = (
+            np.sign(np.sum(each * seen.error, axis=1))[:, None] * each for each in (after, before)
+        )
+        np.testing.assert_allclose((after - before) / 2e-5, slopes[..., column], atol=0.2)
+
+
 def test_the_model_is_fitted_to_bent_lines_but_not_to_arcs():
     """A fisheye about a centre that is not the image's, and two circles."""
     true = OneFrame(SIZE, (-0.45, -0.08), (0.03, -0.02))

@@ -14,9 +14,6 @@ All pieces are corrected. Two of them join, end to end, when
 
 What has joined is taken for pieces, and joins again: first with ends nearby, then with any. At last each
 piece is left out of its line in turn, and stays only if the rest predicts it.
-
-A line is known by sums over its points (weights, first and second moments) that add up when pieces join,
-with weights that make distances px of the image.
 """
 
 import dataclasses
@@ -27,8 +24,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from ._frame_model import OneFrame
-from ._segments import Fragments, main_direction
-from ._vectors import cross, dot, norm
+from ._segments import Fragments
+from ._units import Lines, Units, along_of, merged, units_of
+from ._vectors import dot, norm
 
 _POINT_ERROR = 0.25
 """px by which an edge point is off across the edge, its error being alike over some neighbours."""
@@ -81,45 +79,12 @@ _OVERLAP = 4.0
 _ROUNDS = (24, 24, 24, 0, 0, 0)
 """In each round, the number of ends looked at for each end; 0: all of the `_MOST` longest units."""
 
-_MARGIN = 8.0
-"""px from the image's edge within which an edge leaves the image: nearer there are no edge points."""
-
 _CHECKS = 12
 """So many pieces of a line may go one by one; then all that are still off."""
 
 _MOST = 1200
 _LEAST = 10.0
 """px: shorter units join no line across more than their neighbourhood."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Units:
-    """What joins: pieces, or lines of pieces. Corrected positions are from the centre of distortion.
-
-    Attributes:
-        sums: (u, 7), of the weights w, of w x, w y, w xx, w xy, w yy, and of ones, over corrected points.
-        ends: (u, 2, 2), the first and the last point on the unit's line, corrected.
-        tips: (u, 2, 2), the first and the last point in the image.
-        stretch: (u, 2), there, across the unit.
-        bright: (u, 2), 1 if the side of larger angles is brighter at that end, seen from the first to the
-            last; or -1.
-        contrast: (u, 2), logarithm of the slope of the grey levels.
-        length: (u,), px in the image.
-        leaves: (u, 2), whether the edge leaves the image there.
-        flips: (u,), whether the brighter side changes within.
-        barred: (u, 2), whether the edge is one of a thin bar there.
-    """
-
-    sums: np.ndarray
-    ends: np.ndarray
-    tips: np.ndarray
-    stretch: np.ndarray
-    bright: np.ndarray
-    contrast: np.ndarray
-    length: np.ndarray
-    leaves: np.ndarray
-    flips: np.ndarray
-    barred: np.ndarray
 
 
 def collinear(pieces: Fragments, model: OneFrame, sigma: float, barred: np.ndarray) -> np.ndarray:
@@ -133,14 +98,13 @@ def collinear(pieces: Fragments, model: OneFrame, sigma: float, barred: np.ndarr
     """
     if not len(pieces.count):
         return np.zeros(0, int)
-    units = _units(pieces, model, barred)
-    _, _, roughness = _line(units.sums)
-    straight = np.flatnonzero(roughness < max(2 * sigma, _ROUGH))
-    units = _Units(*(getattr(units, field.name)[straight] for field in dataclasses.fields(_Units)))
+    units = units_of(pieces, model, barred)
+    straight = np.flatnonzero(Lines.of(units.sums).roughness < max(2 * sigma, _ROUGH))
+    units = Units(*(getattr(units, field.name)[straight] for field in dataclasses.fields(Units)))
     group = np.arange(len(straight))
     long = max(_LONG_GAP[0] * min(model.image_size), _LONG_GAP[1])
     for nearest in _ROUNDS:
-        whole = _merged(units, group)
+        whole = merged(units, group)
         pairs = _neighbours(whole, nearest) if nearest else _aligned(whole, sigma)
         group = _joined(whole, *_ordered(whole, *pairs), sigma, long)[group]
     label = np.full(len(pieces.count), -1)
@@ -160,113 +124,29 @@ def thin_bars(pieces: Fragments) -> np.ndarray:
     inwards = np.minimum(_WITHIN, pieces.count[:, None] - 1)
     rows = np.stack([pieces.start[:, None] + inwards, (pieces.start + pieces.count - 1)[:, None] - inwards])
     asked = np.concatenate([pieces.points[rows], -normal[rows]], axis=-1)
-    tree = KDTree(known, compact_nodes=False, balanced_tree=False)  # sooner made, and asked once
-    far = tree.query(asked, distance_upper_bound=_BAR)[0]
+    far = _tree(known).query(asked, distance_upper_bound=_BAR)[0]
     return np.isfinite(far).any(axis=-1).T
 
 
-def _units(pieces: Fragments, model: OneFrame, barred: np.ndarray) -> _Units:
-    """Each piece as a unit."""
-    count = pieces.count[:, None]
-    corrected = model.undistort(pieces.points) - model.centre
-    straight = Fragments(corrected, pieces.gradient, pieces.start, pieces.count)
-    first, last = pieces.start, pieces.start + pieces.count - 1
-    mean = straight.sums(corrected) / count
-    direction = main_direction(straight, mean)
-    backwards = dot(corrected[last] - corrected[first], direction) < 0
-    direction = np.where(backwards[:, None], -direction, direction)
-    normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
-    stretch = model.stretch(pieces.points, pieces.each(normal))
-    w, (x, y) = stretch**-2.0, corrected.T
-    wx, wy = w * x, w * y
-    moments = [straight.sums(values) for values in (w, wx, wy, wx * x, wx * y, wy * y)]
-    sums = np.stack([*moments, pieces.count], axis=-1)
-    ends = np.stack([corrected[first], corrected[last]], axis=1)
-    ends -= np.einsum("uec,uc->ue", ends - mean[:, None], normal)[..., None] * normal[:, None]
-    tips = np.stack([pieces.points[first], pieces.points[last]], axis=1)
-    chord = tips[:, 1] - tips[:, 0]
-    gradient = pieces.sums(pieces.gradient) / count
-    side = np.sign(cross(chord, gradient))
-    contrast = np.log(np.maximum(np.hypot(*gradient.T), 1e-9))
-    inside = np.minimum(tips, np.subtract(model.image_size, 1) - tips).min(axis=-1)
-    return _Units(
-        sums,
-        ends,
-        tips,
-        np.stack([stretch[first], stretch[last]], axis=-1),
-        np.stack([side, side], axis=-1),
-        np.stack([contrast, contrast], axis=-1),
-        np.hypot(*chord.T),
-        inside < _MARGIN,
-        np.zeros(len(pieces.count), bool),
-        barred,
-    )
+def _tree(points: np.ndarray) -> KDTree:
+    """Of points that are asked for once: soon made."""
+    return KDTree(points, compact_nodes=False, balanced_tree=False)
 
 
-def _line(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Middle (..., 2), unit normal (..., 2) and roughness, px of the image, of the best lines from sums."""
-    w, wx, wy, wxx, wxy, wyy, n = np.moveaxis(sums, -1, 0)
-    x, y = wx / w, wy / w
-    xx, xy, yy = wxx - x * wx, wxy - x * wy, wyy - y * wy
-    angle = np.arctan2(2 * xy, xx - yy) / 2
-    least = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
-    normal = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
-    return np.stack([x, y], axis=-1), normal, np.sqrt(np.maximum(least, 0) / n)
-
-
-def _along(normal: np.ndarray) -> np.ndarray:
-    """Unit vectors (..., 2) along lines, from their normals."""
-    return np.stack([normal[..., 1], -normal[..., 0]], axis=-1)
-
-
-def _merged(units: _Units, group: np.ndarray) -> _Units:
-    """The units of each group as one."""
-    number = int(group.max(initial=-1)) + 1
-    sums = np.zeros((number, 7))
-    np.add.at(sums, group, units.sums)
-    middle, normal, _ = _line(sums)
-    along = np.einsum("uec,uc->ue", units.ends - middle[group, None], _along(normal)[group])
-    place = along.ravel()
-    order = np.lexsort((place, np.repeat(group, 2)))
-    cuts = np.flatnonzero(np.diff(np.repeat(group, 2)[order], prepend=-1))
-    picked = np.stack([order[cuts], order[np.append(cuts[1:], len(order)) - 1]], axis=-1)
-    unit, end = picked // 2, picked % 2  # (number, 2): at the first and the last place
-    forwards = np.where(along[unit, 1] > along[unit, 0], 1, -1)
-    tips = units.tips[unit, end]
-    side = units.bright * np.sign(along[:, 1] - along[:, 0])[:, None]
-    least, most = np.ones(number), -np.ones(number)
-    np.minimum.at(least, group, side.min(axis=1))
-    np.maximum.at(most, group, side.max(axis=1))
-    flips = least < most
-    np.logical_or.at(flips, group, units.flips)
-    return _Units(
-        sums,
-        middle[:, None] + place[picked][..., None] * _along(normal)[:, None],
-        tips,
-        units.stretch[unit, end],
-        units.bright[unit, end] * forwards,
-        units.contrast[unit, end],
-        np.hypot(*(tips[:, 1] - tips[:, 0]).T),
-        units.leaves[unit, end],
-        flips,
-        units.barred[unit, end],
-    )
-
-
-def _neighbours(units: _Units, number: int) -> tuple[np.ndarray, np.ndarray]:
+def _neighbours(units: Units, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of units of which ends are near."""
     tips = units.tips.reshape(-1, 2)
     if len(tips) < 4:
         return np.zeros(0, int), np.zeros(0, int)
-    other = np.asarray(KDTree(tips).query(tips, min(number, len(tips)))[1])
+    other = np.asarray(_tree(tips).query(tips, min(number, len(tips)))[1])
     return np.repeat(np.arange(len(tips)) // 2, other.shape[1]), other.ravel() // 2
 
 
-def _aligned(units: _Units, sigma: float) -> tuple[np.ndarray, np.ndarray]:
+def _aligned(units: Units, sigma: float) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of the longest units of which one lies, roughly, on the other's line."""
     chosen = np.argsort(-units.length, kind="stable")[:_MOST]
     chosen = chosen[units.length[chosen] >= _LEAST]
-    middle, normal, _ = _line(units.sums[chosen])
+    middle, normal, *_ = Lines.of(units.sums[chosen])
     offset, within = np.sum(normal * middle, axis=-1)[:, None], _SIGMAS * np.hypot(3 * sigma + 0.5, 0.5)
     near = [
         abs(normal @ units.ends[chosen, end].T - offset) < within * units.stretch[chosen, end]
@@ -276,7 +156,7 @@ def _aligned(units: _Units, sigma: float) -> tuple[np.ndarray, np.ndarray]:
     return chosen[first], chosen[second]
 
 
-def _ordered(units: _Units, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _ordered(units: Units, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Each pair once, the unit with more points first."""
     size = units.sums[:, 6]
     swap = (size[second] > size[first]) | ((size[second] == size[first]) & (second < first))
@@ -287,14 +167,14 @@ def _ordered(units: _Units, first: np.ndarray, second: np.ndarray) -> tuple[np.n
 
 
 def _joined(
-    units: _Units, longer: np.ndarray, shorter: np.ndarray, sigma: float, long_gap: float
+    units: Units, longer: np.ndarray, shorter: np.ndarray, sigma: float, long_gap: float
 ) -> np.ndarray:
     """(u,), the number of the line of each unit, after the pairs that may join have done so."""
     number = len(units.length)
-    middle, normal, _ = _line(units.sums)
-    miss, keep = _on_line(units, longer, shorter, sigma)
+    lines = Lines.of(units.sums)
+    miss, keep = _on_line(units, lines, longer, shorter, sigma)
     longer, shorter, miss = longer[keep], shorter[keep], miss[keep]
-    origin, way = middle[longer][:, None], _along(normal)[longer][:, None]
+    origin, way = lines.middle[longer][:, None], along_of(lines.normal)[longer][:, None]
     own, other = dot(units.ends[longer] - origin, way), dot(units.ends[shorter] - origin, way)
     after = other.mean(axis=1) > own.mean(axis=1)
     # The ends that meet: the longer one's, which is its last or first in this direction, and the other's.
@@ -323,10 +203,10 @@ def _joined(
 
 
 def _on_line(
-    units: _Units, longer: np.ndarray, shorter: np.ndarray, sigma: float
+    units: Units, lines: Lines, longer: np.ndarray, shorter: np.ndarray, sigma: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """How far the shorter units' ends (p, 2) are off the longer ones' lines; whether they are on them."""
-    miss, predicted = _predicted(units.sums[longer], units.ends[shorter], units.stretch[shorter])
+    miss, predicted = _predicted(lines.taken(longer), units.ends[shorter], units.stretch[shorter])
     # The error of a line's end is twice that of its middle.
     own = 2 * _POINT_ERROR * np.sqrt(_LIKE / units.sums[shorter, 6])
     limit = np.minimum(predicted, 2 * sigma + 0.5)
@@ -338,17 +218,12 @@ def _on_line(
     return miss, np.all(abs(miss) < allowed, axis=1) & turned
 
 
-def _predicted(sums: np.ndarray, ends: np.ndarray, stretch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _predicted(lines: Lines, ends: np.ndarray, stretch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances (p, 2) of ends (p, 2, 2) from lines, and the lines' uncertainty there, px of the image."""
-    middle, normal, _ = _line(sums)
-    direction = _along(normal)
-    offset = ends - middle[:, None]
-    along = dot(offset, direction[:, None])
-    w, wx, wy, wxx, wxy, wyy, _ = sums.T
-    a, b = direction.T
-    extent = a * a * (wxx - wx * wx / w) + 2 * a * b * (wxy - wx * wy / w) + b * b * (wyy - wy * wy / w)
-    share = 1 / w[:, None] + along**2 / np.maximum(extent, 1e-9)[:, None]
-    miss = dot(offset, normal[:, None]) / stretch
+    offset = ends - lines.middle[:, None]
+    along = dot(offset, along_of(lines.normal)[:, None])
+    share = 1 / lines.weight[:, None] + along**2 / np.maximum(lines.spread, 1e-9)[:, None]
+    miss = dot(offset, lines.normal[:, None]) / stretch
     return miss, _POINT_ERROR * np.sqrt(_LIKE * share) / stretch
 
 
@@ -360,7 +235,7 @@ def _mutual(first: np.ndarray, second: np.ndarray, gap: np.ndarray, number: int)
     return (gap <= least[first]) & (gap <= least[second])
 
 
-def _checked(units: _Units, group: np.ndarray, sigma: float) -> np.ndarray:
+def _checked(units: Units, group: np.ndarray, sigma: float) -> np.ndarray:
     """The groups, and -1 for units that the rest of their group does not predict.
 
     Of each group the unit that is off by most of its tolerances goes, and the others that are off are
@@ -385,13 +260,13 @@ def _checked(units: _Units, group: np.ndarray, sigma: float) -> np.ndarray:
     return group
 
 
-def _excess(units: _Units, total: np.ndarray, some: np.ndarray, sigma: float) -> np.ndarray:
+def _excess(units: Units, total: np.ndarray, some: np.ndarray, sigma: float) -> np.ndarray:
     """By how many tolerances units are off what the rest predicts; 0 where that is less than the unit."""
     sums = units.sums[some]
     rest = total - sums
     several = rest[:, 6] > sums[:, 6]
     rest = np.where(several[:, None], rest, total)
-    miss, predicted = _predicted(rest, units.ends[some], units.stretch[some])
+    miss, predicted = _predicted(Lines.of(rest), units.ends[some], units.stretch[some])
     own = 2 * _POINT_ERROR * np.sqrt(_LIKE / sums[:, 6])
     allowed = _SIGMAS * np.sqrt(sigma**2 + predicted**2 + own[:, None] ** 2) + _BLOOM
     return np.where(several, np.max(abs(miss) / allowed, axis=1), 0.0)

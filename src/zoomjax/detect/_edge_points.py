@@ -70,7 +70,7 @@ def edge_points(grey: np.ndarray) -> EdgePoints:
     """All edge points of a grey image (height, width), uint8, but those near corners and crossings."""
     height, width = grey.shape
     smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTHING, borderType=cv2.BORDER_REPLICATE)
-    slopes = [cv2.Sobel(smooth, cv2.CV_16S, *order, ksize=_APERTURE) for order in ((1, 0), (0, 1))]
+    slopes = [_slope(smooth, *order) for order in ((1, 0), (0, 1))]
     steep = [cv2.convertScaleAbs(slope, alpha=_TO_BYTE) for slope in slopes]
     strength = cv2.max(*steep)
     noise = _noise(slopes)
@@ -80,13 +80,10 @@ def edge_points(grey: np.ndarray) -> EdgePoints:
         side[:] = 0
     candidates = np.flatnonzero(strong.view(bool))
     flat = [slope.ravel() for slope in slopes]
-    magnitude = [byte.ravel()[candidates] for byte in steep]
+    level = np.less(*(byte.ravel().take(candidates) for byte in steep))
     parts = [
-        _maxima(candidates[rows], flat[axis], axis, step)
-        for rows, axis, step in (
-            (magnitude[0] >= magnitude[1], 0, 1),
-            (magnitude[0] < magnitude[1], 1, width),
-        )
+        _maxima(candidates.compress(rows), flat[axis], axis, step)
+        for rows, axis, step in ((~level, 0, 1), (level, 1, width))
     ]
     at, shift = (np.concatenate(part) for part in zip(*parts, strict=True))
     gradient = np.stack([slope[at] for slope in flat], axis=-1).astype(np.float32)
@@ -96,6 +93,13 @@ def edge_points(grey: np.ndarray) -> EdgePoints:
     at, shift, normal, length = (of.compress(keep, axis=0) for of in (at, shift, normal, length))
     pixel = np.stack([at % width, at // width], axis=-1)
     return EdgePoints(pixel + shift, normal.astype(float), length.astype(float), pixel, (width, height))
+
+
+def _slope(smooth: np.ndarray, across: int, down: int) -> np.ndarray:
+    """Sobel's filter, int16. With fractions for weights, which make the same integers, OpenCV takes vectors
+    of the processor, and a third of the time of `cv2.Sobel`."""
+    row, column = cv2.getDerivKernels(across, down, _APERTURE, ktype=cv2.CV_32F)
+    return cv2.sepFilter2D(smooth, cv2.CV_16S, row / 4, column * 4)
 
 
 def _noise(slopes: list[np.ndarray]) -> float:
@@ -114,10 +118,10 @@ def _maxima(at: np.ndarray, slope: np.ndarray, axis: int, step: int) -> tuple[np
 
     `step` leads from a pixel to the next one along the axis, in the flat array of slopes.
     """
-    middle = slope[at].astype(np.int32)
+    middle, before, after = (slope.take(at + side) for side in (0, -step, step))
     sign = np.sign(middle)
-    middle *= sign
-    before, after = (slope[at + side] * sign for side in (-step, step))
+    for each in (middle, before, after):
+        each *= sign
     peak = (middle > before) & (middle >= after) & (before > 0) & (after > 0)
     at = at[peak]
     low, mid, high = (np.log(value[peak].astype(float)) for value in (before, middle, after))

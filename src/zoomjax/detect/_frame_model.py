@@ -12,8 +12,11 @@ in a cloth) are weighted down as a whole.
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
+
+from ._vectors import dot
 
 _PRIOR = np.array([1.0, 0.3, 0.05, 0.05])
 """Standard deviations of k1 and k2 about the start, and of the centre, in scales, before lines are seen."""
@@ -134,38 +137,39 @@ class OneFrame:
         """
         if not lines:
             return self
-        chosen = [line[np.linspace(0, len(line) - 1, samples).round().astype(int)] for line in lines]
-        points, length = np.stack(chosen), np.array([extent(line) for line in lines])
+        points, length = samples_of(lines, samples), np.array([extent(line) for line in lines])
         start = model = self
         certain = (_TIED if self.tied else _PRIOR) ** -2.0
         damping = 1e-3
-        error = model.errors(points)
-        weight = _weights(error, length)
-        loss = model._loss(error, weight, start)
+        seen = model._seen(points)
+        weight = _weights(seen.error, length)
+        loss = model._loss(seen.error, weight, start)
         for _ in range(_STEPS):
-            slope = model._slopes(points, error)
+            slope = model._slopes(points, seen)
             apart = model._values() - start._prior_mean()
             hessian = np.einsum("l,lsk,lsj->kj", weight, slope, slope) + np.diag(certain)
-            gradient = np.einsum("l,lsk,ls->k", weight, slope, error) + apart * certain
+            gradient = np.einsum("l,lsk,ls->k", weight, slope, seen.error) + apart * certain
             step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
             other = model._at(model._values() - step)
-            new_error = other.errors(points)
-            new_loss = other._loss(new_error, weight, start)
+            new = other._seen(points)
+            new_loss = other._loss(new.error, weight, start)
             if not new_loss < loss or 1 + sum(other.k) <= _LEAST_DIVISOR:
                 damping *= 10
                 continue
-            model, error, damping = other, new_error, damping / 5
-            weight = _weights(error, length)
-            loss = model._loss(error, weight, start)
+            model, seen, damping = other, new, damping / 5
+            weight = _weights(seen.error, length)
+            loss = model._loss(seen.error, weight, start)
         return model
 
     def errors(self, points: np.ndarray) -> np.ndarray:
         """(l, s), distances of points (l, s, 2) to the best lines, to first order px of the image."""
+        return self._seen(points).error
+
+    def _seen(self, points: np.ndarray) -> "_Seen":
         corrected = self.undistort(points)
         # The first line is good enough for the stretch along its normal only.
         _, _, stretch = self._lines(points, corrected, np.ones(points.shape[:-1]))
-        centred, normal, stretch = self._lines(points, corrected, stretch**-2.0)
-        return np.einsum("lsc,lc->ls", centred, normal) / stretch
+        return _Seen(*self._lines(points, corrected, stretch**-2.0))
 
     def _lines(self, points: np.ndarray, corrected: np.ndarray, weight: np.ndarray):
         """Corrected points about the mean of their line, its normals, and the stretch along these."""
@@ -174,13 +178,28 @@ class OneFrame:
         normal = normals(centred, weight)
         return centred, normal, self.stretch(points, np.broadcast_to(normal[:, None], points.shape))
 
-    def _slopes(self, points: np.ndarray, error: np.ndarray) -> np.ndarray:
-        """(l, s, 4), derivatives of the errors by the model's values."""
-        values, step = self._values(), 1e-5
-        moved = [self._at(values + step * unit).errors(points) for unit in np.eye(4)]
-        # The sign of a normal is arbitrary: that which is nearer is the same line's.
-        flipped = [np.where(np.sum(m * error, axis=1) < 0, -1, 1)[:, None] * m for m in moved]
-        return np.stack([(m - error) / step for m in flipped], axis=-1)
+    def _slopes(self, points: np.ndarray, seen: "_Seen") -> np.ndarray:
+        """(l, s, 4), derivatives of the errors by the model's values, lines being the best ones for each.
+
+        Lines take up the share of the derivatives that is along those by their offset and angle (Kaufman
+        1975). That of the stretch is left out: it multiplies errors, which are small.
+        """
+        x, y = self._normalised(points)
+        t = x * x + y * y
+        divisor = self._divisor(t)
+        outwards = x * seen.normal[:, :1] + y * seen.normal[:, 1:]
+        pulled = np.where(divisor > _LEAST_DIVISOR, outwards / divisor**2, 0.0)
+        growth = 2 * (self.k[0] + 2 * self.k[1] * t) * pulled
+        by_shift = (
+            growth * z - normal[:, None] / divisor for z, normal in zip((x, y), seen.normal.T, strict=True)
+        )
+        moved = np.stack([-t * pulled, -t * t * pulled, *by_shift], axis=-1) * self.scale
+        along = seen.centred[..., 0] * seen.normal[:, 1:] - seen.centred[..., 1] * seen.normal[:, :1]
+        slope = moved / seen.stretch[..., None]
+        for column in (1 / seen.stretch, along / seen.stretch):
+            unit = column / np.sqrt(np.sum(column**2, axis=1))[:, None]
+            slope = slope - unit[..., None] * np.einsum("ls,lsk->lk", unit, slope)[:, None]
+        return slope
 
     def _values(self) -> np.ndarray:
         return np.array(self.values)
@@ -195,6 +214,25 @@ class OneFrame:
     def _loss(self, error: np.ndarray, weight: np.ndarray, start: "OneFrame") -> float:
         prior = (self._values() - start._prior_mean()) / (_TIED if start.tied else _PRIOR)
         return float(np.sum(weight[:, None] * error**2) + np.sum(prior**2))
+
+
+class _Seen(NamedTuple):
+    """Points (l, s, 2) under a model.
+
+    Attributes:
+        centred: (l, s, 2), corrected, about the mean of their line.
+        normal: (l, 2), of the best lines.
+        stretch: (l, s), along these.
+    """
+
+    centred: np.ndarray
+    normal: np.ndarray
+    stretch: np.ndarray
+
+    @property
+    def error(self) -> np.ndarray:
+        """(l, s), distances to the lines, to first order px of the image."""
+        return dot(self.centred, self.normal[:, None]) / self.stretch
 
 
 def tangent_ratio(square: np.ndarray) -> np.ndarray:
@@ -214,6 +252,13 @@ def normals(centred: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray
     xx, xy, yy = (np.einsum("ls,ls->l", one, other) for one, other in ((wx, x), (wx, y), (wy, y)))
     angle = np.arctan2(2 * xy, xx - yy) / 2
     return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+
+
+def samples_of(lines: Sequence[np.ndarray], number: int) -> np.ndarray:
+    """(l, number, 2), so many of the points of each line (n, 2), from its first to its last."""
+    count = np.array([len(line) for line in lines])
+    within = np.rint(np.arange(number) * ((count - 1) / (number - 1))[:, None]).astype(int)
+    return np.concatenate(lines).take((np.cumsum(count) - count)[:, None] + within, axis=0)
 
 
 def extent(line: np.ndarray) -> float:

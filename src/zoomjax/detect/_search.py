@@ -36,6 +36,9 @@ facade apart, and take it for more bent than it is."""
 _HALF_DIAGONAL = 700
 """px, of the image for which cells are given: others in proportion."""
 
+_CELLS = int(np.pi / _CELL[0]), int(2.2 * _HALF_DIAGONAL / _CELL[1])
+"""How many there are, by orientation and by offset."""
+
 _SAMPLE = 8.0
 """px along a piece from one vote to the next; more where there are more than `_MOST` of them."""
 
@@ -52,7 +55,15 @@ def likely_angle(pieces: Fragments, image_size: tuple[int, int]) -> float:
     middle, scale = (np.array(image_size) - 1) / 2, np.hypot(*image_size) / 2
     z = (point - middle) / scale
     candidates = _STEP * np.arange(round(_RANGE[0] / _STEP), round(_RANGE[1] / _STEP) + 1)
-    scores = [_score(z, direction, weight, float(square)) for square in candidates]
+    t, pull, weight = np.maximum(dot(z, z), 1e-9), dot(z, direction), weight.astype(np.float32)
+    votes, smooth = np.zeros((2, *_CELLS), np.float32)
+    scores = []
+    for square in candidates:
+        cell = _cells(z, direction, t, pull, float(square))
+        np.add.at(votes.reshape(-1), cell, weight)
+        cv2.GaussianBlur(votes, (3, 3), 0.8, dst=smooth)
+        scores.append(cv2.norm(smooth, cv2.NORM_L2SQR))
+        votes.reshape(-1)[cell] = 0
     return float(candidates[int(np.argmax(scores))])
 
 
@@ -88,21 +99,21 @@ def _samples(pieces: Fragments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return point, direction, length[owner] / number[owner]
 
 
-def _score(z, direction, weight, square: float) -> float:
-    """The sum of the squared votes for a candidate."""
-    t = np.maximum(dot(z, z), 1e-9)
+def _cells(z, direction, t, pull, square: float) -> np.ndarray:
+    """Where samples vote for a candidate, in the flat array of cells.
+
+    t and `pull` are z.z and z.direction, which are alike for all candidates.
+    """
     ratio = tangent_ratio(square * t)
     growth = (1 - ratio) / t + square * ratio**2  # of the ratio, by r, over r
-    pulled = growth * dot(z, direction)
+    pulled = growth * pull
     (x, y), (u, v) = z.T, (ratio * direction[:, axis] + pulled * z[:, axis] for axis in (0, 1))
     angle = np.arctan2(v, u)
     angle = np.where(angle < 0, angle + np.pi, angle)  # of a line, which has no first end
     offset = ratio * np.where(v < 0, -1, 1) * (u * y - v * x) / np.sqrt(u * u + v * v)
     a = np.sqrt(abs(square)) + 1e-9
     inverse = np.arctan(a * offset) if square > 0 else np.arctanh(np.clip(a * offset, -0.999, 0.999))
-    rows, columns = int(np.pi / _CELL[0]), int(2.2 * _HALF_DIAGONAL / _CELL[1])
+    rows, columns = _CELLS
     row = (angle / np.pi * rows).astype(int) % rows
     column = np.clip((inverse / a / 2.2 + 0.5) * columns, 0, columns - 1e-6).astype(int)
-    votes = np.bincount(row * columns + column, weight, minlength=rows * columns)
-    smooth = cv2.GaussianBlur(votes.reshape(rows, columns).astype(np.float32), (3, 3), 0.8)
-    return float(np.sum(smooth**2))
+    return row * columns + column

@@ -101,15 +101,15 @@ def _linked(edges: EdgePoints) -> np.ndarray:
     position, normal = edges.position.astype(np.float32), edges.normal.astype(np.float32)
     pairs = []
     for dx, dy in _NEIGHBOURS:
-        other = index[at + dy * width + dx]
+        other = index.take(at + (dy * width + dx))
         first = np.flatnonzero(other >= 0)
-        second = other[first]
+        second = other.take(first)
         step = position.take(second, axis=0) - position.take(first, axis=0)
         n = normal.take(first, axis=0)
         turn = dot(n, normal.take(second, axis=0))
         along = (turn if edges.polar else abs(turn)) > _TURN
         along &= abs(dot(n, step)) < _ASIDE
-        pairs.append(np.stack([first[along], second[along]]))
+        pairs.append(np.stack([first.compress(along), second.compress(along)]))
     first, second = np.concatenate(pairs, axis=1)
     graph = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(number, number))
     return connected_components(graph, directed=False)[1]

@@ -16,7 +16,7 @@ import numpy as np
 from .._core.fields import refuse_masked_image
 from ._collinear import collinear, thin_bars
 from ._edge_points import edge_points
-from ._frame_model import OneFrame, extent
+from ._frame_model import OneFrame, extent, samples_of
 from ._joining import border_lines
 from ._search import likely_angle
 from ._segments import Fragments, fragments
@@ -136,16 +136,12 @@ class EdgeDetector(AbstractDetector):
             most = 1.0 if bend is None else _TIED  # lines of arcs are no measure of a model that is known
             sigma = float(np.clip(2 * np.median(_rms(long, model)), _EXACT, most))
         lines = border_lines(pieces, label)
-        good = np.array([self._is_seen(line, min(size)) for line in lines], bool)
+        least, cover = self.least_length * min(size), self.least_cover
+        good = np.array([_is_seen(line, least, cover) for line in lines], bool)
         seen = [line for line, keep in zip(lines, good, strict=True) if keep]
         good[good] = _rms(seen, model) <= _ROUGHEST * max(sigma, 0.25)
         found = _found(pieces, label, lines, good, min(size))
         return dataclasses.replace(found, bend=model.values)
-
-    def _is_seen(self, line: np.ndarray, side: int) -> bool:
-        """Whether a line is long and visible enough."""
-        long = extent(line) >= self.least_length * side
-        return bool(long and len(line) >= self.least_cover * np.max(abs(line[-1] - line[0])))
 
 
 def as_grey(image: np.ndarray) -> np.ndarray:
@@ -183,6 +179,11 @@ def _long(pieces: Fragments, label: np.ndarray, least: float) -> list[np.ndarray
     ]
 
 
+def _is_seen(line: np.ndarray, least: float, cover: float) -> bool:
+    """Whether a line is `least` px long, and a share of `cover` of it visible."""
+    return bool(extent(line) >= least and len(line) >= cover * np.max(abs(line[-1] - line[0])))
+
+
 def _found(
     pieces: Fragments, label: np.ndarray, lines: Sequence[np.ndarray], good: np.ndarray, side: int
 ) -> Edges:
@@ -202,5 +203,4 @@ def _rms(lines: Sequence[np.ndarray], model: OneFrame) -> np.ndarray:
     """(l,), px of the image about the best line, of all lines at once."""
     if not lines:
         return np.zeros(0)
-    some = [line[np.linspace(0, len(line) - 1, 64).round().astype(int)] for line in lines]
-    return np.sqrt(np.mean(model.errors(np.stack(some)) ** 2, axis=1))
+    return np.sqrt(np.mean(model.errors(samples_of(lines, 64)) ** 2, axis=1))
