@@ -339,7 +339,7 @@ def aims(r: dict) -> list[tuple[str, str]]:
     """What is measured, and the verdict on it."""
     ms = r["speed"]["ms"]
     rows = [
-        (f"12 MP: EdgeDetector / GaussianBlur and Canny, {name}", verdict(ratio, 12))
+        (f"12 MP: EdgeDetector / GaussianBlur and Canny, {name}", verdict(ratio, 10))
         for name, ratio in r["speed"]["ratio"].items()
     ]
     if (name := "1080p: PitchDetector, one thread") in ms:
