@@ -7,7 +7,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.detect._edge_points import _slope
+from zoomjax.detect._edge_points import _quantile, _slope
 
 SIZE = (2144, 1424)
 
@@ -239,3 +239,10 @@ def test_slopes_are_those_of_sobel(rng):
     image = rng.integers(0, 256, (57, 83), np.uint8)
     for order in ((1, 0), (0, 1)):
         np.testing.assert_array_equal(_slope(image, *order), cv2.Sobel(image, cv2.CV_16S, *order, ksize=5))
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.995])
+def test_quantiles_are_those_of_numpy(rng, share):
+    for size in (70, 71, 1000):
+        levels = rng.integers(0, 400, size, np.int16)
+        assert _quantile(levels, share) == pytest.approx(np.quantile(levels, share), rel=1e-12)

@@ -76,8 +76,11 @@ _CONTRAST = 4.0
 _OVERLAP = 4.0
 """px by which the ends of neighbours may pass each other."""
 
-_ROUNDS = (24, 24, 24, 0, 0, 0)
-"""In each round, the number of ends looked at for each end; 0: all of the `_MOST` longest units."""
+_ROUNDS = (24, 0)
+"""The number of ends looked at for each end; 0: all of the `_MOST` longest units."""
+
+_REPEATS = 3
+"""Of each round, at most: until nothing joins."""
 
 _CHECKS = 12
 """So many pieces of a line may go one by one; then all that are still off."""
@@ -104,9 +107,13 @@ def collinear(pieces: Fragments, model: OneFrame, sigma: float, barred: np.ndarr
     group = np.arange(len(straight))
     long = max(_LONG_GAP[0] * min(model.image_size), _LONG_GAP[1])
     for nearest in _ROUNDS:
-        whole = merged(units, group)
-        pairs = _neighbours(whole, nearest) if nearest else _aligned(whole, sigma)
-        group = _joined(whole, *_ordered(whole, *pairs), sigma, long)[group]
+        for _ in range(_REPEATS):
+            whole = merged(units, group)
+            pairs = _neighbours(whole, nearest) if nearest else _aligned(whole, sigma)
+            line = _joined(whole, *_ordered(whole, *pairs), sigma, long)
+            group = line[group]
+            if len(line) == line.max(initial=-1) + 1:  # each by itself
+                break
     label = np.full(len(pieces.count), -1)
     label[straight] = _checked(units, group, sigma)
     alone = label < 0

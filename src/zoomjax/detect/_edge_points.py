@@ -86,7 +86,7 @@ def edge_points(grey: np.ndarray) -> EdgePoints:
         for rows, axis, step in ((~level, 0, 1), (level, 1, width))
     ]
     at, shift = (np.concatenate(part) for part in zip(*parts, strict=True))
-    gradient = np.stack([slope[at] for slope in flat], axis=-1).astype(np.float32)
+    gradient = np.stack([slope.take(at) for slope in flat], axis=-1).astype(np.float32)
     length = norm(gradient)
     normal = gradient / length[:, None]
     keep = _runs_on(at, flat, normal, length, width, noise)
@@ -105,12 +105,20 @@ def _slope(smooth: np.ndarray, across: int, down: int) -> np.ndarray:
 def _noise(slopes: list[np.ndarray]) -> float:
     """Standard deviation of the slopes in flat parts, by their lower quartile: few edges are as flat."""
     thin = np.concatenate([np.abs(slope[::5, ::7]).ravel() for slope in slopes])
-    return float(np.quantile(thin, 0.25)) / 0.3186
+    return _quantile(thin, 0.25) / 0.3186
 
 
 def _least_slope(strength: np.ndarray, noise: float) -> float:
-    strong = float(np.quantile(strength[::5, ::7], 0.995)) / _TO_BYTE
+    strong = _quantile(strength[::5, ::7].ravel(), 0.995) / _TO_BYTE
     return max(_FLOOR, _NOISE_LEVELS * noise, _OF_STRONGEST * strong)
+
+
+def _quantile(levels: np.ndarray, share: float) -> float:
+    """As `np.quantile` of small whole numbers, but counted, which is sooner done than sorting."""
+    up_to = np.cumsum(np.bincount(levels))
+    place = share * (len(levels) - 1)
+    below, above = np.searchsorted(up_to, (int(place), int(place) + 1), side="right")
+    return float(below + (place - int(place)) * (above - below))
 
 
 def _maxima(at: np.ndarray, slope: np.ndarray, axis: int, step: int) -> tuple[np.ndarray, np.ndarray]:
@@ -139,7 +147,7 @@ def _runs_on(at, flat, normal, length, width: int, noise: float) -> np.ndarray:
         x = np.rint(column - stride * normal[:, 1]).astype(np.intp)
         y = np.rint(row + stride * normal[:, 0]).astype(np.intp)
         there = y * width + x
-        gx, gy = (slope[there].astype(np.float32) for slope in flat)
+        gx, gy = (slope.take(there).astype(np.float32) for slope in flat)
         other = np.sqrt(gx * gx + gy * gy)
         keep &= gx * normal[:, 0] + gy * normal[:, 1] > tolerance * other
         keep &= other > _FADE * length - 3 * noise

@@ -169,7 +169,7 @@ class OneFrame:
         corrected = self.undistort(points)
         # The first line is good enough for the stretch along its normal only.
         _, _, stretch = self._lines(points, corrected, np.ones(points.shape[:-1]))
-        return _Seen(*self._lines(points, corrected, stretch**-2.0))
+        return _Seen(*self._lines(points, corrected, 1 / stretch**2))
 
     def _lines(self, points: np.ndarray, corrected: np.ndarray, weight: np.ndarray):
         """Corrected points about the mean of their line, its normals, and the stretch along these."""

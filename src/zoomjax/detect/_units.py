@@ -93,7 +93,7 @@ def units_of(pieces: Fragments, model: OneFrame, barred: np.ndarray) -> Units:
     direction = np.where(backwards[:, None], -direction, direction)
     normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
     stretch = model.stretch(pieces.points, pieces.each(normal))
-    w, (x, y) = stretch**-2.0, corrected.T
+    w, (x, y) = 1 / stretch**2, corrected.T
     wx, wy = w * x, w * y
     moments = [straight.sums(values) for values in (w, wx, wy, wx * x, wx * y, wy * y)]
     sums = np.stack([*moments, pieces.count], axis=-1)
