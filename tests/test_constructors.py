@@ -230,7 +230,7 @@ def test_a_prior_that_is_none(unchecked):
         zj.SmoothZoom(error=-1.0)
     with pytest.raises(ValueError, match=r"beyond must be finite, but beyond\[0, 0\] is nan"):
         zj.SmoothZoom(beyond=np.full((2, 2), np.nan))
-    with pytest.raises(ValueError, match="inverse must be True or False"):
+    with pytest.raises(TypeError, match="inverse must be True or False"):
         zj.models.TableZoom(inverse="f")
 
 

@@ -10,7 +10,7 @@ import pytest
 import zoomjax as zj
 from zoomjax._core.arguments import _kinds
 
-from .._public import FUNCTIONS
+from .._public import FUNCTIONS, PUBLIC
 
 pytestmark = pytest.mark.usefixtures("unchecked")
 
@@ -166,3 +166,35 @@ def test_lists_are_points_and_focal_lengths(fit):
     np.testing.assert_allclose(
         zj.displacement_std(fit, [0.0, 0.0], focal=[30.0, 50.0]), expected, rtol=1e-12
     )
+
+
+def _flags():
+    """Public functions and methods with truth values among their arguments, and the names of these."""
+    for name, thing in PUBLIC.items():
+        of_class = inspect.getmembers(thing, inspect.isroutine) if inspect.isclass(thing) else ()
+        # What writes into folders is looked at by `results_folder`.
+        members = [
+            (f"{name}.{own}", method) for own, method in of_class if own[0] != "_" and own != "write"
+        ]
+        for label, function in members if inspect.isclass(thing) else [(name, thing)]:
+            if not getattr(function, "__module__", "").startswith("zoomjax"):
+                continue
+            for flag, parameter in inspect.signature(function).parameters.items():
+                if parameter.annotation is bool or isinstance(parameter.default, bool):
+                    yield pytest.param(function, flag, id=f"{label} {flag}")
+
+
+@pytest.mark.parametrize(("function", "flag"), [*_flags()])
+@pytest.mark.parametrize("value", ["no", None, 0])
+def test_truth_values_are_no_words(function, flag, value):
+    """Any word is true: overwrite="no" replaced files."""
+    with pytest.raises(TypeError, match=f"Argument {flag} must be True or False, but it is {value!r}"):
+        function(**{flag: value})
+
+
+def test_flags_are_found():
+    assert len([*_flags()]) > 20
+
+
+def test_truth_values_of_numpy_are_true_or_false(small):
+    assert zj.fit_zoom(small, invertible=np.True_, throw=np.bool_(False)).result is not None

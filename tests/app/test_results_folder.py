@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from zoomjax.app.image_job import ImageJob
 from zoomjax.app.results_folder import LIST, results_folder
 
 OLD = {"lens.json": "old lens", "lines/0001-a.jpg": "old a", "lines/0002-b.jpg": "old b"}
@@ -368,3 +369,21 @@ def test_a_folder_that_cannot_be_written_is_told(tmp_path):
     (tmp_path / "link").symlink_to("nowhere")
     with pytest.raises(OSError, match="Cannot write in the folder"), results_folder(tmp_path / "link"):
         pytest.fail("the work began")
+
+
+@pytest.mark.parametrize("value", ["no", None, 0])
+@pytest.mark.usefixtures("unchecked")
+def test_whether_to_overwrite_is_no_word(tmp_path, value):
+    (tmp_path / "lens.json").write_text("the user's")
+    with (
+        pytest.raises(TypeError, match=f"overwrite must be True or False, but it is {value!r}"),
+        results_folder(tmp_path, ["lens.json"], overwrite=value),
+    ):
+        pytest.fail("the work began")
+    assert (tmp_path / "lens.json").read_text() == "the user's"
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_whether_photos_are_tied_is_no_word():
+    with pytest.raises(TypeError, match="tied must be True or False, but it is 'no'"):
+        ImageJob(("a.jpg",), tied="no")  # pyright: ignore[reportArgumentType]

@@ -147,5 +147,5 @@ def test_keys_and_short_gaps_are_tracks_as_they_are(tmp_path, text):
 @pytest.mark.usefixtures("unchecked")
 def test_what_positions_are_is_said_by_truth_values(name, value):
     """Any word was true: of by_time="frame" frame numbers were seconds."""
-    with pytest.raises(ValueError, match=f"Argument {name} must be True or False"):
+    with pytest.raises(TypeError, match=f"Argument {name} must be True or False"):
         zj.io.FocalTrack(np.array([0.0, 9.0]), np.array([20.0, 80.0]), **{name: value})

@@ -1,7 +1,7 @@
 """Type checks of arguments, with error messages that say what to pass.
 
-`kinds_checked` reads a function's annotations of our own classes, of solvers and of paths, and checks its
-arguments before anything else, of which none may be a masked array: one place for all functions.
+`kinds_checked` reads a function's annotations of our own classes, of solvers, of paths and of `bool`, and
+checks its arguments before anything else, of which none may be a masked array: one place for all functions.
 """
 
 import functools
@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
+import numpy as np
 
 from .fields import refuse_masked
 
@@ -88,6 +89,12 @@ def check_kind(name: str, value: Any, kinds: tuple[type, ...]) -> None:
     raise TypeError(f"Argument {name} must be {wanted}, but {what}{f': {instead}' if instead else ''}.")
 
 
+def check_flag(name: str, value: Any) -> None:
+    """Raise TypeError where a value is neither true nor false: any word is true, "no" too."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"Argument {name} must be True or False, but it is {value!r}.")
+
+
 def kinds_checked(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """The function, which looks at the kinds of its arguments first, and refuses masked arrays."""
     parameters = inspect.signature(function).parameters
@@ -96,10 +103,18 @@ def kinds_checked(function: Callable[Parameters, Result]) -> Callable[Parameters
         for place, (name, parameter) in enumerate(parameters.items())
         if (kinds := _kinds(parameter.annotation))
     }
-    assert wanted, f"{function} takes nothing to check"
+    flags = {
+        name: place
+        for place, (name, parameter) in enumerate(parameters.items())
+        if parameter.annotation is bool
+    }
+    assert wanted or flags, f"{function} takes nothing to check"
 
     @functools.wraps(function)
     def checked(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        for name, place in flags.items():
+            if place < len(args) or name in kwargs:
+                check_flag(name, args[place] if place < len(args) else kwargs[name])
         for name, (place, kinds, default) in wanted.items():
             value = args[place] if place < len(args) else kwargs.get(name, default)
             if not isinstance(value, kinds) and value is not inspect.Parameter.empty:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from .._core.arguments import kinds_checked
 from ..fit.energy import line_squares
 from ..fit.focal_lengths import of_equal_focal, with_focal_sigma
 from ..fit.image_metric import in_image
@@ -22,6 +23,7 @@ from .fitting import Fitted, Metric, algebraic_rms, fitted, left_out
 from .model_choice import WantedCentre, WantedModel
 
 
+@kinds_checked
 def calibrate(
     lines: Lines,
     *,

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from .._core.arguments import kinds_checked
 from .._core.text import percentages, span
 from .._core.types import AnyArray
 from ..fit.result import RESULTS, FrameFits, ZoomFit, is_status
@@ -305,6 +306,7 @@ class Calibration:
         with results_folder(folder, names, clears=OF_A_LENS, overwrite=overwrite) as part:
             self.make(part, about, pages)
 
+    @kinds_checked
     def make(
         self,
         folder: str | os.PathLike[str],

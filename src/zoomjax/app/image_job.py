@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .._core.arguments import check_flag
 from .._core.text import numbered_name
 from ..detect.batch import DETECTORS
 from ..detect.sources import VIDEO_SUFFIXES, Source, find_photos, video_frames
@@ -64,8 +65,10 @@ class ImageJob:
 
         Raises:
             FileNotFoundError: there is no such CSV file.
+            TypeError: `tied` is neither True nor False.
             ValueError: a name is unknown, or a file has the wrong type.
         """
+        check_flag("tied", self.tied)
         if self.detector not in DETECTORS:
             raise ValueError(
                 f"Argument detector must be one of {', '.join(DETECTORS)}, but it is {self.detector!r}."

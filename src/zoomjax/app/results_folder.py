@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
+from .._core.arguments import check_flag
 from .._core.files import TEMPORARY, locked, place_named, remove_left, removed, undisturbed, unfinished
 
 LIST = ".zoomjax.json"
@@ -58,8 +59,10 @@ def results_folder(
 
     Raises:
         FileExistsError: such a file exists and `overwrite` is False; or a folder has the name of a file.
+        TypeError: `overwrite` is neither True nor False.
         OSError: the folder cannot be created or written; the message names it.
     """
+    check_flag("overwrite", overwrite)
     folder = Path(folder)
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     with unfinished(folder):

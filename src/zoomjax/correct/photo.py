@@ -17,6 +17,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from .._core.arguments import kinds_checked
 from .._core.files import refuse_inputs, whole_file
 from .._core.text import listed
 from ..io.metadata import (
@@ -108,6 +109,7 @@ class Correction:
         )
 
 
+@kinds_checked
 def undistort_photo(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
@@ -146,6 +148,7 @@ def undistort_photo(
     _convert(source, target, focal, correction)
 
 
+@kinds_checked
 def redistort_photo(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],

@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._core.arguments import kinds_checked
 from .._core.programs import program
 from .._core.types import of_known_values
 from ..lines.base import AbstractLines
@@ -87,6 +88,7 @@ def many(
 ) -> list[RobustFit]: ...
 
 
+@kinds_checked
 @of_known_values
 def many(
     lines: Sequence[AbstractLines],

@@ -21,6 +21,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from .._core.arguments import kinds_checked
+
 _ASPECTS = (3 / 2, 4 / 3, 16 / 9, 1.0, 5 / 4)
 """Of sensors that lenses were calibrated on; the first where nothing tells."""
 
@@ -98,6 +100,7 @@ def lens_names() -> list[str]:
     return sorted({table.name for table in tables()}, key=str.casefold)
 
 
+@kinds_checked
 def find_lenses(search: str = "", *, zooms: bool = False) -> list[LensTable]:
     """Find lenses by words of their names.
 

@@ -9,6 +9,7 @@ import warnings
 
 import numpy as np
 
+from .._core.arguments import check_flag, kinds_checked
 from .._core.checks import real_numbers
 from .text_table import read_text_table
 
@@ -36,10 +37,7 @@ class FocalTrack:
     def __post_init__(self):
         """Check the samples, which may be lists, and that the rest are truth values: any word would be."""
         for name in ("by_time", "hold"):
-            if not isinstance(getattr(self, name), bool | np.bool_):
-                raise ValueError(
-                    f"Argument {name} must be True or False, but it is {getattr(self, name)!r}."
-                )
+            check_flag(name, getattr(self, name))
         for name in ("position", "focal"):
             if (values := real_numbers(getattr(self, name))) is None:
                 raise ValueError(f"Argument {name} must hold numbers, but it is {getattr(self, name)!r}.")
@@ -104,6 +102,7 @@ class FocalTrack:
             )
 
 
+@kinds_checked
 def read_focal_track(path: str | os.PathLike[str], *, hold: bool = False) -> FocalTrack:
     """Read a track from a CSV file with a header, ``time,focal`` (seconds) or ``frame,focal`` (from 0).
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from .._core.arguments import check_kind
+from .._core.arguments import check_kind, kinds_checked
 from .._core.arrays import held_as_given
 from .._core.checks import (
     checked_centre,
@@ -105,6 +105,7 @@ class Lines(AbstractLines):
                 )
 
     @classmethod
+    @kinds_checked
     def from_ragged(
         cls,
         points: Iterable[ArrayLike],

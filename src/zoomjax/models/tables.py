@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, ScalarLike
 
+from .._core.arguments import check_flag
 from .._core.fields import check_increasing, check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Focal
 from ._bernstein import Pieces
@@ -48,8 +49,7 @@ class TableZoom(AbstractLinearZoom):
 
     def __check_init__(self):
         """Check the entries: a row of parameters for each of the knots, which increase."""
-        if not isinstance(self.inverse, bool):
-            raise ValueError(f"Argument inverse must be True or False, but it is {self.inverse!r}.")
+        check_flag("inverse", self.inverse)
         entries = "entries" if self.number is None else self.number
         check_shapes(
             {"knots": (self.knots, (entries,)), "parameters": (self.parameters, (entries, "terms"))}

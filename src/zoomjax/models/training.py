@@ -10,11 +10,13 @@ import equinox as eqx
 import jax
 from jaxtyping import PyTree
 
+from .._core.arguments import kinds_checked
 from .distortion import Distortion
 from .lens import ZoomLens
 from .zoom import AbstractZoom, with_parameters
 
 
+@kinds_checked
 def trainable(tree: PyTree, *, centre: bool = False) -> PyTree:
     """Mark the trainable arrays of a lens: a filter for `equinox.partition`.
 

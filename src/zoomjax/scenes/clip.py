@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from .._core.arguments import kinds_checked
 from .._core.checks import check_above, check_between, checked_focal, checked_integer, checked_size
 from ..correct.sampler import remap
 from ..models.lens import ZoomLens
@@ -147,6 +148,7 @@ class MotionClip:
         return shift, cell, side, 0.41 * self.texture.shape[1]
 
 
+@kinds_checked
 def motion_clip(
     lens: ZoomLens,
     focal: Float[np.ndarray, "frame"],

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from .._core.arguments import check_kind
+from .._core.arguments import check_kind, kinds_checked
 from .._core.checks import check_above, check_between, checked_focal, checked_integer
 from ..lines.lines import Lines
 from ..models.camera import px_of_focal_px
@@ -88,6 +88,7 @@ def pan_and_zoom(
     return focal, np.stack([_rotation(a, b) for a, b in zip(across, up, strict=True)])
 
 
+@kinds_checked
 def motion_tracks(
     lens: ZoomLens,
     focal: Float[np.ndarray, "frame"],
