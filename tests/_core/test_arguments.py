@@ -171,7 +171,7 @@ def test_lists_are_points_and_focal_lengths(fit):
 def _flags():
     """Public functions and methods with truth values among their arguments, and the names of these."""
     for name, thing in PUBLIC.items():
-        of_class = inspect.getmembers(thing, inspect.isroutine) if inspect.isclass(thing) else ()
+        of_class = inspect.getmembers(thing, callable) if inspect.isclass(thing) else ()
         # What writes into folders is looked at by `results_folder`.
         members = [
             (f"{name}.{own}", method) for own, method in of_class if own[0] != "_" and own != "write"
