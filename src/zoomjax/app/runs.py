@@ -52,7 +52,7 @@ def calibrate_lines(
     their centre was fitted, it is fitted again from the middle of the image.
     """
     from .calibrating import calibrate
-    from .earlier import earlier_of
+    from .earlier import earlier_of, findings_of_counted_again
     from .equipment import with_earlier, without_focal
     from .focal_sources import focal_sigmas
     from .relative import findings_of_relative
@@ -75,7 +75,9 @@ def calibrate_lines(
         stage=stage,
     )
     lens = with_earlier(calibration.fit.lens, files)
-    assessment = calibration.assessment.joined_by([*known.findings(), *findings_of_relative(lens)])
+    found = [*known.findings(), *findings_of_relative(lens)]
+    found += findings_of_counted_again(files, calibration.rejected)
+    assessment = calibration.assessment.joined_by(found)
     zoom = dataclasses.replace(calibration.fit, lens=lens if focal_known else without_focal(lens))
     calibration = dataclasses.replace(calibration, assessment=assessment, fit=zoom)
     stage("Writing the results")
