@@ -314,9 +314,11 @@ def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()
     if len(notable) > _MOST_NOTABLE:
         say(f"{len(notable) - _MOST_NOTABLE} more photos that are not good are listed in summary.json.")
     tell(done.warnings())
-    print()
-    say(f"Check the detected lines, drawn over each image, in {plain(str(folder / 'lines'))}.")
-    tell_written(folder, ["lines/", *also])
+    if drawn := sum(map(bool, done.overlays())):
+        over = "each image" if drawn == len(done.used) else f"{drawn} of {len(done.used)} images"
+        print()
+        say(f"Check the detected lines, drawn over {over}, in {plain(str(folder / 'lines'))}.")
+    tell_written(folder, [*["lines/"] * bool(drawn), *also])
 
 
 def say(text: str) -> None:
