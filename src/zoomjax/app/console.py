@@ -190,7 +190,8 @@ def show_calibration(
             cells.append(f"{rms_over_frames(frames / scale):.4f}")
         table.add_row(*cells)
     console.print(table)
-    console.print(f"{calibration.held_out}\n", highlight=False)
+    console.print(" ".join(filter(None, (calibration.held_out, calibration.weighting))), highlight=False)
+    console.print()
     if calibration.selection:
         show_choice(calibration.selection)
     if summary["distortion_model"] != "RadialPolynomial":
