@@ -234,6 +234,9 @@ def test_bands_of_another_fit_have_them_and_of_one_after_that(results):
     again, _ = fitted()
     assert again.focal_sigma.tolist() == SIGMA
     assert again.corner == first.corner
-    exact, _ = fitted("0")
+    exact, summary = fitted("0")
+    [told] = [found["found"] for found in summary["findings"] if "was given as" in found["found"]]
+    assert "as 0 mm, in place of 0.5 mm, in the middle of 3 frames (the fit before this one)" in told
+    assert summary["verdict"] != "good"
     assert exact.focal_sigma.tolist() == [0, 0, 0]
     assert all(there[2] < of[2] for there, of in zip(exact.corner, first.corner, strict=True))

@@ -57,6 +57,7 @@ def calibrate_lines(
     from .focal_sources import focal_sigmas
     from .relative import findings_of_relative
     from .report import report
+    from .verdict import findings_of_surer
 
     known = earlier_of(files, lines)
     if known.centre and centre in ("fit", "moving"):
@@ -64,6 +65,8 @@ def calibrate_lines(
     sigma = focal_sigmas("0" if focal_sigma is None else focal_sigma, lines.focal)
     if focal_sigma is None and known.sigma is not None:
         sigma = known.sigma
+    before = np.zeros(len(sigma)) if known.sigma is None else known.sigma
+    surer = findings_of_surer(sigma, before, unit=lines.focal_unit, of="frames (the fit before this one)")
     known = known._replace(sigma=sigma, lost=known.lost and focal_sigma is None)
     calibration = calibrate(
         lines,
@@ -75,7 +78,7 @@ def calibrate_lines(
         stage=stage,
     )
     lens = with_earlier(calibration.fit.lens, files)
-    found = [*known.findings(), *findings_of_relative(lens)]
+    found = [*known.findings(), *findings_of_relative(lens), *surer]
     found += findings_of_counted_again(files, calibration.rejected)
     assessment = calibration.assessment.joined_by(found)
     zoom = dataclasses.replace(calibration.fit, lens=lens if focal_known else without_focal(lens))
