@@ -240,3 +240,10 @@ def test_bands_of_another_fit_have_them_and_of_one_after_that(results):
     assert summary["verdict"] != "good"
     assert exact.focal_sigma.tolist() == [0, 0, 0]
     assert all(there[2] < of[2] for there, of in zip(exact.corner, first.corner, strict=True))
+    again, summary = fitted()  # what was measured is not lost
+    assert again.focal_sigma.tolist() == SIGMA
+    assert not [found for found in summary["findings"] if "was given as" in found["found"]]
+    wider, _ = fitted("1")
+    assert wider.focal_sigma.tolist() == [1, 1, 1]
+    again, _ = fitted()
+    assert again.focal_sigma.tolist() == [1, 1, 2]

@@ -85,7 +85,8 @@ def calibrate_lines(
     calibration = dataclasses.replace(calibration, assessment=assessment, fit=zoom)
     stage("Writing the results")
     pages = {REPORT: report(calibration, run=what_is_run(title_of(list(map(str, files)))))}
-    about = {"earlier": known.about()}
+    kept = np.maximum(sigma, before)  # a smaller one that is given is for this fit: what was measured stays
+    about = {"earlier": known._replace(sigma=kept).about()}
     calibration.make(folder, about=about, pages=pages, lines="lines.npz" in names)
     return calibration
 
