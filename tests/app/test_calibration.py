@@ -32,6 +32,28 @@ def calibration():
     return calibrate(lines, **GIVEN)
 
 
+def test_what_weights_of_lines_do_to_the_rms_is_said(calibration):
+    assert calibration.weighting == ""
+    summary, rms = calibration.summary(), float(calibration.fit.rms)
+    assert summary["rms_zoom_equal_weights"] == pytest.approx(rms, rel=1e-6)
+    weight = np.ones(len(calibration.lines.frame))
+    weight[::3], weight[1] = 0.05, 0  # as of lines that a robust fit trusts little, and of one rejected
+    lines = calibration.lines.weighted(weight)
+    points = np.array(lines.points)
+    points[::3] += np.random.default_rng(0).normal(0, 3, points[::3].shape)
+    found = calibrate(dataclasses.replace(lines, points=points), **GIVEN)
+    squares = [
+        np.mean(found.line_rms[(np.asarray(lines.frame) == frame) & (weight > 0)] ** 2)
+        for frame in range(5)
+    ]
+    equal = float(np.sqrt(np.mean(squares)))
+    assert equal > 1.5 * float(found.fit.rms)
+    assert found.summary()["rms_zoom_equal_weights"] == pytest.approx(equal)
+    told = f"weighed the same, that of the zoom polynomial would be {equal:.4f} px."
+    assert found.weighting.endswith(told)
+    assert told in report(found)
+
+
 @pytest.mark.slow
 def test_stages_are_told(calibration):
     told = []

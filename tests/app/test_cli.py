@@ -207,6 +207,7 @@ def test_lines_are_fitted_again_where_they_are(calibrated, tmp_path):
     assert again.returncode == 0, again.stderr
     other = zoomjax("calibrate", folder, "-o", tmp_path / "new", *FORCED)
     assert other.returncode == 0, other.stderr
+    assert "count again: 0, 7." in " ".join(other.stdout.split())
     assert json.loads((tmp_path / "new" / "summary.json").read_text())["parameters"] == old["parameters"]
 
 
@@ -534,6 +535,10 @@ WRONG = {
     "no such option": (["a.jpg", "--detect", "edges"], "Error: No such option: --detect"),
     "a line that is none": (["lines.npz", "--exclude", "1,x"], "--exclude must be numbers of lines"),
     "a line that is not there": (["lines.npz", "--exclude", "9999"], "There is no line 9999"),
+    "a line of several files": (
+        ["lines.npz", "more.npz", "--exclude", "3"],
+        "--exclude is for one file of",
+    ),
     "lines of images": (["a.jpg", "--exclude", "3"], "--exclude is for a file of lines"),
     "two files": (["lines.npz", "./lines.npz"], "lines.npz is given twice"),
     "a copy of a file": (["lines.npz", "copy.npz"], "copy.npz holds a frame of lines.npz again, 0 here"),

@@ -8,7 +8,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
-from zoomjax.app.earlier import Earlier, earlier_of
+from zoomjax.app.earlier import Earlier, earlier_of, findings_of_counted_again
 from zoomjax.app.model_choice import WantedModel
 from zoomjax.app.runs import calibrate_lines
 
@@ -46,6 +46,25 @@ def test_deviations_groups_centre_and_board_are_those_of_the_summary(how, result
     assert known.shared[0] == known.shared[1] != known.shared[2]
     assert known.centre
     assert [finding.verdict for finding in known.findings()] == ["doubtful"]
+
+
+def test_lines_that_count_again_are_said(results):
+    folder, lines, summary = results
+    file, number = folder / "lines.npz", len(lines.frame)
+    before = {"lines": number, "rejected": [{"line": line} for line in (2, 5, 9)]}
+    (folder / "summary.json").write_text(json.dumps(summary | before))
+    rejected = np.arange(number) == 5
+    [found] = findings_of_counted_again([file], rejected)
+    assert found.verdict == "good"
+    assert found.found == "2 lines that the fit before this one left out count again: 2, 9."
+    [found] = findings_of_counted_again([file, file], np.tile(rejected, 2))
+    assert f"2, 9, {number + 2}, {number + 9}." in found.found
+    [found] = findings_of_counted_again([file], np.isin(np.arange(number), (2, 5)))
+    assert found.found == "a line that the fit before this one left out counts again: 9."
+    assert findings_of_counted_again([file], np.isin(np.arange(number), (2, 5, 9))) == []
+    for other in ({}, before | {"lines": number + 1}, before | {"rejected": [{"line": number}]}):
+        (folder / "summary.json").write_text(json.dumps(summary | other))
+        assert findings_of_counted_again([file], rejected) == []
 
 
 def test_several_folders_are_put_together(results):
@@ -215,6 +234,16 @@ def test_bands_of_another_fit_have_them_and_of_one_after_that(results):
     again, _ = fitted()
     assert again.focal_sigma.tolist() == SIGMA
     assert again.corner == first.corner
-    exact, _ = fitted("0")
+    exact, summary = fitted("0")
+    [told] = [found["found"] for found in summary["findings"] if "was given as" in found["found"]]
+    assert "as 0 mm, in place of 0.5 mm, in the middle of 3 frames (the fit before this one)" in told
+    assert summary["verdict"] != "good"
     assert exact.focal_sigma.tolist() == [0, 0, 0]
     assert all(there[2] < of[2] for there, of in zip(exact.corner, first.corner, strict=True))
+    again, summary = fitted()  # what was measured is not lost
+    assert again.focal_sigma.tolist() == SIGMA
+    assert not [found for found in summary["findings"] if "was given as" in found["found"]]
+    wider, _ = fitted("1")
+    assert wider.focal_sigma.tolist() == [1, 1, 1]
+    again, _ = fitted()
+    assert again.focal_sigma.tolist() == [1, 1, 2]

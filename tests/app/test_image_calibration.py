@@ -189,7 +189,7 @@ def test_under_the_slider_is_the_nearest_photo_before_and_after(done, tmp_path):
     assert seen == {0, 1, 2}
 
 
-def test_of_many_photos_some_are_drawn(done, monkeypatch):
+def test_of_many_photos_some_are_drawn(done, monkeypatch, capsys):
     monkeypatch.setattr("zoomjax.app.image_calibration.MOST_OVERLAYS", 3)
     drawn = [bool(name) for name in done.overlays()]
     assert sum(drawn) == 3
@@ -198,6 +198,11 @@ def test_of_many_photos_some_are_drawn(done, monkeypatch):
     assert all(every.overlays())
     none = dataclasses.replace(done, job=dataclasses.replace(done.job, overlays="none"))
     assert not any(none.overlays())
+    for of, told in ((done, "over 3 of 5 images"), (every, "over each image"), (none, "")):
+        show_images(of, Path("out"))
+        shown = " ".join(capsys.readouterr().out.split())
+        assert told in shown
+        assert ("Check the detected lines" in shown) == ("lines/" in shown) == bool(told)
     page = report(done.calibration, done)
     assert page.count('href="lines/') == 3
 

@@ -22,8 +22,8 @@ def photos(tmp_path):
     for name in ("a.png", "b.png"):
         cv2.imwrite(str(folder / name), np.full((60, 100), 90, np.uint8))
     job = ImageJob((str(folder),), detector="edges", focal="24")
-    names = [source.name for source in job.sources()[0]]
-    return job, [Detection(name, lines=LINES, unexplained=0.9) for name in names]
+    found = {"image_size": (100, 60), "lines": LINES, "unexplained": 0.9}
+    return job, [Detection(source.name, source.file, **found) for source in job.sources()[0]]
 
 
 def raised(photos, images=None):
@@ -54,6 +54,14 @@ def test_lines_and_verdict_are_kept(photos, tmp_path):
     assert [image["lines"] for image in summary["images"]] == [1, 1]
     assert summary["unused"] == {"c.png": "it is cut off"}
     assert not (out / "lens.json").exists()
+
+
+def test_a_photo_that_is_gone_is_drawn_black(photos, tmp_path):
+    job, used = photos
+    (tmp_path / "photos" / "a.png").unlink()
+    raised((job, used)).keep(tmp_path / "out", overwrite=False)
+    first, second = (cv2.imread(str(path)) for path in sorted((tmp_path / "out" / "lines").iterdir()))
+    assert first[:20].max() < 20 < second[:20].min()
 
 
 def test_an_earlier_lens_and_what_belongs_to_it_stay(photos, tmp_path):

@@ -96,6 +96,31 @@ def test_a_dry_run_says_what_would_be_written(folder):
     assert not [*folder.glob("planned*")]
 
 
+def test_results_of_an_earlier_run_in_place_of_those_of_skipped_files_are_said(folder, tmp_path):
+    photos = tuple(folder / name for name in ("a.jpg", "b.jpg"))
+    job = Job(folder / "lens.json", photos, tmp_path / "out", focal="30")
+    assert not undistort_files(job).skipped
+    before = (tmp_path / "out/a.jpg").read_bytes()
+    again = dataclasses.replace(job, focal=str(folder / "table.csv"), overwrite=True)
+    told = [undistort_files(dataclasses.replace(again, dry_run=dry)).skipped for dry in (True, False)]
+    for skipped in told:
+        [(source, why)] = skipped.items()
+        assert source == str(photos[0])
+        assert why.endswith(f". What is in {tmp_path / 'out/a.jpg'} is of an earlier run.")
+    assert (tmp_path / "out/a.jpg").read_bytes() == before
+    [why] = undistort_files(dataclasses.replace(again, output=tmp_path / "other")).skipped.values()
+    assert "earlier run" not in why
+
+    clips = tuple(tmp_path / name for name in ("a.mp4", "b.mp4"))
+    write_clip(clips[0])
+    clips[1].write_bytes(b"")
+    (tmp_path / "videos").mkdir()
+    (tmp_path / "videos/b.mp4").write_bytes(b"of another day")
+    job = dataclasses.replace(job, inputs=clips, output=tmp_path / "videos", overwrite=True)
+    [why] = undistort_files(job).skipped.values()
+    assert why.endswith(f"What is in {tmp_path / 'videos/b.mp4'} is of an earlier run.")
+
+
 @pytest.mark.slow
 def test_results_as_json_and_in_silence(folder):
     done = run(folder, "a.jpg", "b.jpg", "picture.gif", "-o", "json", "--json")

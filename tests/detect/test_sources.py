@@ -1,6 +1,7 @@
 """Photographs of every kind, folders, patterns, and the frames of a video."""
 
 import contextlib
+import os
 import warnings
 
 import av
@@ -324,3 +325,24 @@ def test_results_of_a_clip_are_no_photographs(tmp_path):
     for name in ("lens.json", "motion.png", "panorama.jpg", "a.jpg"):
         (tmp_path / name).touch()
     assert [source.name for source in find_photos([str(tmp_path)])] == ["a.jpg"]
+
+
+def test_folders_that_cannot_be_read_are_said(tmp_path, monkeypatch):
+    """As those of another user, which patterns of names pass over."""
+    for name in ("a.png", "closed/b.png", "closed too/c.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "link").symlink_to("closed")
+    scandir = os.scandir
+
+    def scanned(folder="."):
+        if "closed" in os.path.realpath(folder):
+            raise PermissionError(13, "Permission denied", str(folder))
+        return scandir(folder)
+
+    monkeypatch.setattr(os, "scandir", scanned)
+    told = r"3 folders are left out: closed, closed too, link: what is in there cannot be read\.$"
+    with pytest.warns(UserWarning, match=told):
+        assert [source.name for source in find_photos([tmp_path])] == ["a.png"]
+    with pytest.raises(PermissionError, match="closed"):
+        find_photos([tmp_path / "closed"])

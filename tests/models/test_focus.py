@@ -62,6 +62,18 @@ def test_at_a_knot_of_the_focus_it_is_the_spline_of_its_row(model):
             np.testing.assert_allclose(model(f, focus), spline(jnp.asarray(f)), rtol=1e-12)
 
 
+def test_a_curvature_of_other_knots_is_refused(model, tmp_path):
+    lens = zj.ZoomLens(model, [319.5, 239.5], [18.0, 200.0], (640, 480), focus_range=[0.0, 2.5])
+    lens.save(tmp_path / "lens.json")
+    content = json.loads((tmp_path / "lens.json").read_text())
+    for name in ("knots", "focus_knots"):
+        changed = json.loads(json.dumps(content))
+        changed["zoom"][name][1] *= 1.02  # by hand
+        (tmp_path / "lens.json").write_text(json.dumps(changed))
+        with pytest.raises(ValueError, match="curvature must be that of the natural spline"):
+            zj.load_lens(tmp_path / "lens.json")
+
+
 def test_at_one_focus_it_is_a_spline_in_one_over_f(model):
     for focus in (-1.0, 0.0, 0.7, 9.0):
         for f in (15.0, 30.0, 250.0):

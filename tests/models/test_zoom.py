@@ -206,6 +206,18 @@ def test_a_spline_is_the_natural_one_of_scipy(number):
         np.testing.assert_allclose(zoom(jnp.asarray(f)), spline(1 / f), rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_spline_whose_curvature_is_of_other_knots_is_refused(dtype):
+    zoom = with_random_parameters(zj.models.SplineZoom())
+    own = jnp.asarray(zoom.curvature, dtype)
+    zj.models.SplineZoom(None, zoom.parameters, jnp.asarray(zoom.knots, dtype), own)
+    moved = jnp.asarray(zoom.knots, dtype).at[2].multiply(1.02)
+    with pytest.raises(ValueError, match="curvature must be that of the natural spline through its knots"):
+        zj.models.SplineZoom(None, zoom.parameters, moved, own)
+    with pytest.raises(ValueError, match="curvature must be that of the natural spline through its knots"):
+        zj.models.SplineZoom(None, zoom.parameters, zoom.knots, own.at[1, 1].multiply(-1))
+
+
 def test_a_spline_goes_on_straight_beyond_its_ends():
     zoom = with_random_parameters(zj.models.SplineZoom())
     inside, end, outside = (np.asarray(zoom(jnp.asarray(1 / (1 / 18 + d)))) for d in (-1e-7, 0.0, 0.01))

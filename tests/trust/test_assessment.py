@@ -63,10 +63,26 @@ def through(lens, lines, bend):
 def test_a_flat_board_is_good(lines):
     found = assessed(lines)
     assert (found.verdict, found.findings) == ("good", ())
-    assert found.sentence.startswith("Good: the correction moves points by 2")
+    assert found.sentence.startswith("Good: the correction moves points by 17 px")
     assert found.evidence.noise == pytest.approx(NOISE, rel=0.05)
     assert [halves.parting for halves in found.evidence.halves] == ["lines", "frames", "directions"]
     assert all(halves.excess < 4 for halves in found.evidence.halves)
+
+
+def test_the_displacement_is_the_mean_over_all_pixels(lines):
+    fit = zj.fit_zoom(zj.compress(lines))
+    found = evidence(lines, fit)
+    x, y = np.meshgrid(*map(np.arange, SIZE))
+    points = np.stack([x, y], axis=-1)[::4, ::4].reshape(-1, 2) + 1.5
+    low, high = (float(f) for f in fit.lens.focal_range)
+    moved, std = [], []
+    for f in (low, 2 / (1 / low + 1 / high), high):
+        moved.append(np.sum((np.asarray(fit.lens(f).undistort(points)) - points) ** 2, axis=-1))
+        std.append(np.asarray(zj.displacement_std(fit, points, focal=f)) ** 2)
+    assert found.displacement == pytest.approx(np.sqrt(np.mean(moved, axis=1).max()), rel=0.01)
+    assert found.std == pytest.approx(np.sqrt(np.mean(std, axis=1).max()), rel=0.03)
+    assert found.raster_displacement > 1.1 * found.displacement  # which the border dominates
+    assert found.raster_std > found.std
 
 
 @pytest.mark.slow

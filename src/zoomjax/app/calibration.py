@@ -37,6 +37,11 @@ from .results_folder import OF_A_LENS, results_folder
 FILES = ("lens.json", "lines.npz", "summary.json", "model.png")
 """What `Calibration.write` writes."""
 
+_LITTLE = 0.01
+"""Share of the RMS that weights may change without a word."""
+
+_NAMES = {"corrected": "corrected photo", "one for all frames": "model"}
+
 _ENOUGH = NEGLIGIBLE / 5
 """Standard deviation of the displacement, in diagonals, below which no further photo is needed."""
 
@@ -176,6 +181,27 @@ class Calibration:
             "Held out: each frame, under the model of the others; frame by frame, each tenth of its lines."
         )
 
+    @property
+    def rms_equal(self) -> float:
+        """RMS under the zoom model, px, if all lines that count weighed the same."""
+        kept, frame = ~self.rejected, np.asarray(self.lines.frame)
+        square, number = (
+            np.bincount(frame[kept], of, len(self.rms_uncorrected))
+            for of in (self.line_rms[kept] ** 2, None)
+        )
+        return rms_over_frames(np.sqrt(square / np.where(number > 0, number, np.nan)))
+
+    @property
+    def weighting(self) -> str:
+        """What the weights of lines do to the RMS values, in sentences; empty where that is little."""
+        if abs(self.rms_equal - float(self.fit.rms)) <= _LITTLE * float(self.fit.rms):
+            return ""
+        name = _NAMES.get(self.kind, self.kind)
+        return (
+            "Lines have weights in these values, the lower the more they stand out from the others. If all "
+            f"that are not rejected weighed the same, that of the {name} would be {self.rms_equal:.4f} px."
+        )
+
     def warnings(self, names: Sequence[str] | None = None) -> list[str]:
         """User-facing warnings about the zoom model, and about frames without a good fit.
 
@@ -222,6 +248,7 @@ class Calibration:
                 "rms_algebraic": None if (of := self.rms_algebraic) is None else rms_over_frames(of),
                 "rms_frames": float(self.frames.rms),
                 "rms_zoom": float(self.fit.rms),
+                "rms_zoom_equal_weights": finite([self.rms_equal])[0],
                 "rms_held_out": finite([rms_over_frames(self.rms_held_out)])[0],
                 "rms_frames_held_out": finite([rms_over_frames(self.rms_frames_held_out)])[0],
                 "frames": len(self.rms_uncorrected),

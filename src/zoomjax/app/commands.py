@@ -255,18 +255,17 @@ def calibrate(
         from .results_folder import OF_A_LENS, results_folder
 
         files = [Path(path) for path in inputs]
+        out = excluded(exclude, files)
         names = [name for name in FILES if not refits(files, output / name)]
         refuse_inputs([output / name for name in names], inputs)
         results = results_folder(output, [*names, REPORT], clears=OF_A_LENS, overwrite=overwrite)
         if dry_run:
             lines = read_lines(files, focal, image_size, focal_unit, focal_sigma)
             check_centre(about, [lines.image_size])
-            return tell_plan(lines_plan(lines, excluded(exclude), focal_known=focal != "same"), output)
+            return tell_plan(lines_plan(lines, out, focal_known=focal != "same"), output)
         with results as folder, stages(quiet=quiet) as stage:
             stage("Reading the lines")
-            lines = without(
-                read_lines(files, focal, image_size, focal_unit, focal_sigma), excluded(exclude)
-            )
+            lines = without(read_lines(files, focal, image_size, focal_unit, focal_sigma), out)
             calibration = calibrate_lines(
                 lines,
                 folder,

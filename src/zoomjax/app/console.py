@@ -190,7 +190,8 @@ def show_calibration(
             cells.append(f"{rms_over_frames(frames / scale):.4f}")
         table.add_row(*cells)
     console.print(table)
-    console.print(f"{calibration.held_out}\n", highlight=False)
+    console.print(" ".join(filter(None, (calibration.held_out, calibration.weighting))), highlight=False)
+    console.print()
     if calibration.selection:
         show_choice(calibration.selection)
     if summary["distortion_model"] != "RadialPolynomial":
@@ -314,9 +315,11 @@ def show_images(done: "ImageCalibration", folder: Path, also: Sequence[str] = ()
     if len(notable) > _MOST_NOTABLE:
         say(f"{len(notable) - _MOST_NOTABLE} more photos that are not good are listed in summary.json.")
     tell(done.warnings())
-    print()
-    say(f"Check the detected lines, drawn over each image, in {plain(str(folder / 'lines'))}.")
-    tell_written(folder, ["lines/", *also])
+    if drawn := sum(map(bool, done.overlays())):
+        over = "each image" if drawn == len(done.used) else f"{drawn} of {len(done.used)} images"
+        print()
+        say(f"Check the detected lines, drawn over {over}, in {plain(str(folder / 'lines'))}.")
+    tell_written(folder, [*["lines/"] * bool(drawn), *also])
 
 
 def say(text: str) -> None:

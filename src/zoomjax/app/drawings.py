@@ -14,6 +14,7 @@ import numpy as np
 
 from ..detect.sources import Source
 from .choice import chosen_frames, colour_limit
+from .meanwhile import image_of
 from .overlay import draw_lines
 from .pictures import MOST, Photos, Pictures, pictures_of
 
@@ -51,9 +52,10 @@ def drawing(images: Photos, folder: Path, most: int = MOST) -> Iterator[Drawn]:
     overlays = dict(zip((one.name for one in images.used), images.overlays(), strict=True))
     targets = {name: folder / target for name, target in overlays.items() if target}
     chosen = {images.used[frame].name for frame in chosen_frames(images.calibration, most)}
-    frames = {one.name: frame for frame, one in enumerate(images.used) if one.name in {*targets, *chosen}}
+    shown = [(frame, of) for frame, of in enumerate(images.used) if of.name in {*targets, *chosen}]
+    frames = {of.name: frame for frame, of in shown}
     draw = functools.partial(_drawn, images, images.members(), frames, targets, chosen)
-    sources = (source for source in images.job.sources()[0] if source.name in frames)
+    sources = images.job.again(of for _, of in shown)
     with ThreadPoolExecutor(max(1, images.job.workers)) as pool:
         made = map(draw, sources) if images.job.video is not None else pool.map(draw, sources)
         try:
@@ -71,7 +73,8 @@ def _drawn(
     source: Source,
 ) -> Pictures | None:
     """Draw the lines of one photo, write the picture, and make the small ones."""
-    image, frame = source.read()[0], frames[source.name]
+    frame = frames[source.name]
+    image = image_of(source, images.used[frame].image_size, images.states.get(source.name))
     if target := targets.get(source.name):
         write_overlay(
             target,

@@ -4,6 +4,7 @@ A file of lines holds points and focal lengths, and the centre that was found. H
 lengths are, which of them are shared, and whether the lines are those of a flat board, is in the summary.
 """
 
+import contextlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .._core.text import listed
 from ..lines.lines import Lines
 from ..lines.npz import load_lines
 from ..models.lens import load_lens
@@ -108,6 +110,45 @@ def earlier_of(files: Sequence[Path], lines: Lines) -> Earlier:
             shared[start : start + len(part.focal)] = start + part.shared
     together = np.unique(shared).size < shared.size
     return Earlier(sigma, shared if together else None, centre, flat, any(part.lost for part in known))
+
+
+def findings_of_counted_again(files: Sequence[Path], rejected: np.ndarray) -> list[Finding]:
+    """That lines count that the fits beside their files left out: a remark, for it may be what is wanted.
+
+    Args:
+        files: of lines, which follow each other.
+        rejected: which of them do not count now.
+    """
+    if not any(map(is_of_results, files)):
+        return []
+    before = np.concatenate([_left_out(file) for file in files])
+    again = [str(line) for line in np.flatnonzero(before & ~rejected).tolist()]
+    if not again:
+        return []
+    one = len(again) == 1
+    return [
+        Finding(
+            "lines left out before",
+            "good",
+            f"{'a line' if one else f'{len(again)} lines'} that the fit before this one left out "
+            f"count{'s' * one} again: {listed(again, _MOST)}.",
+            f"To leave {'it' if one else 'them'} out, add {'it' if one else 'them'} to --exclude.",
+        )
+    ]
+
+
+_MOST = 20
+
+
+def _left_out(file: Path) -> np.ndarray:
+    """Which lines of a file the fit beside it left out; none, where there is no summary of that."""
+    out = np.zeros(len(load_lines(file).frame), bool)
+    if is_of_results(file):
+        with contextlib.suppress(AttributeError, IndexError, KeyError, OSError, TypeError, ValueError):
+            summary = json.loads(file.with_name("summary.json").read_text())
+            lines = [int(one["line"]) for one in summary["rejected"]]
+            out[lines if summary["lines"] == len(out) else []] = True
+    return out
 
 
 class _Part(NamedTuple):

@@ -25,8 +25,8 @@ from .drawings import drawing
 from .equipment import KnownLens, known_lens, with_equipment, without_focal
 from .focal_sources import GRID, MEASURED, Focals, choose_focals, focal_sigmas, known_focals, lines_of
 from .image_job import ImageJob, overlay_name
+from .meanwhile import State, findings_of_changed, states_of
 from .model_choice import one_centre
-from .plane_focals import Sharing
 from .rehearsal import Part
 from .results_folder import OF_A_LENS, results_folder
 from .turned import findings_of_turned
@@ -69,6 +69,7 @@ class ImageCalibration:
         board_note: why there is none, or what would make it better; empty if nothing.
         tied: the names of the images in which lines were found again under the lens of all images.
         lens: what the prior of the zoom model knows of the lens; None if nothing.
+        states: of the files of photos before the work began.
     """
 
     job: ImageJob
@@ -81,6 +82,7 @@ class ImageCalibration:
     board_note: str = ""
     tied: tuple[str, ...] = ()
     lens: KnownLens | None = None
+    states: Mapping[str, State | None] = dataclasses.field(default_factory=dict)
 
     def members(self) -> list[np.ndarray]:
         """For each used image, the numbers of its lines among those of the calibration."""
@@ -221,19 +223,21 @@ def calibrate_images(
         RuntimeError: the lines do not determine the model.
     """
     sources, total = job.sources()
+    states = states_of(sources) if job.video is None else {}
     detections = _detected(job, sources, lambda done: progress(done, total), executor)
     done = _calibrated(job, detections, stage, begun)
     known = _disagreeing(done, detections) if job.tied and job.detector == "edges" else {}
-    if not known:
-        return done
-    stage("Finding lines again under the lens of all photos")
-    detections, replaced = tied(
-        detections, known, lambda known: _detected(job, _bent(job, known), lambda _: None, executor)
-    )
-    if not replaced:
-        return done
-    done = _calibrated(job, detections, stage, begun)
-    return dataclasses.replace(done, tied=tuple(replaced))
+    if known:
+        stage("Finding lines again under the lens of all photos")
+        detections, replaced = tied(
+            detections,
+            known,
+            lambda known: _detected(job, _bent(job, detections, known), lambda _: None, executor),
+        )
+        if replaced:
+            done = dataclasses.replace(_calibrated(job, detections, stage, begun), tied=tuple(replaced))
+    changed = findings_of_changed(done.used, states)
+    return dataclasses.replace(_joined(done, changed), states=states)
 
 
 def _detected(
@@ -256,11 +260,10 @@ def _detected(
     return detections
 
 
-def _bent(job: ImageJob, known: dict[str, Bend]) -> Iterable[Source]:
+def _bent(job: ImageJob, detections: Sequence[Detection], known: dict[str, Bend]) -> Iterable[Source]:
     """Some of the images, with what is known of how bent they are."""
-    for source in job.sources()[0]:
-        if source.name in known:
-            yield dataclasses.replace(source, bend=known[source.name])
+    for source in job.again(d for d in detections if d.name in known):
+        yield dataclasses.replace(source, bend=known[source.name])
 
 
 def _disagreeing(done: ImageCalibration, detections: Sequence[Detection]) -> dict[str, Bend]:
@@ -291,7 +294,7 @@ def _calibrated(
         source = "board"
     if source is None and job.detector == "pitch" and not job.board and not any(d.focal for d in usable):
         source = "pitch"
-    focals = choose_focals(usable, source, unit=job.focal_unit, board=job.board, sharing=_sharing(job))
+    focals = choose_focals(usable, source, unit=job.focal_unit, board=job.board, sharing=job.sharing)
     made = None
     if job.detector == "grid":
         stage("Fitting the shape of the board")
@@ -336,14 +339,6 @@ def _having(detections: Sequence[Detection], focals: Focals) -> tuple[Detection,
     return tuple(d for d in detections if d.name in focals.focal)
 
 
-def _sharing(job: ImageJob) -> Sharing | None:
-    """Which images share a focal length."""
-    if job.shared_focal is None:
-        return None
-    text = job.focal_sigma
-    return Sharing(job.shared_focal, None if text is None else lambda focal: focal_sigmas(text, focal))
-
-
 def _shared(used: Sequence[Detection], focals: Focals) -> np.ndarray | None:
     """For each image a number, the same for those that share a focal length; None if none do."""
     if not focals.groups:
@@ -376,9 +371,14 @@ def _with_findings(done: ImageCalibration) -> ImageCalibration:
         found += findings_of_turned(
             done.calibration.lines, done.calibration.fit.lens, [d.name for d in done.used]
         )
-    assessment = done.calibration.assessment.joined_by(found)
+    done = _joined(done, found)
     options = sharing_options(done.used, done.focals, done.job.other_sharing)
-    assessment = assessment.joined_by(findings_of_own_focals(options, assessment.verdict))
+    return _joined(done, findings_of_own_focals(options, done.calibration.assessment.verdict))
+
+
+def _joined(done: ImageCalibration, found: Sequence[Finding]) -> ImageCalibration:
+    """The same with more findings."""
+    assessment = done.calibration.assessment.joined_by(found)
     calibration = dataclasses.replace(done.calibration, assessment=assessment)
     return dataclasses.replace(done, calibration=calibration)
 

@@ -2,14 +2,14 @@
 
 import dataclasses
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from .._core.arguments import check_flag
 from .._core.text import numbered_name
-from ..detect.batch import DETECTORS
+from ..detect.batch import DETECTORS, Detection
 from ..detect.sources import VIDEO_SUFFIXES, Source, find_photos, video_frames
 from ..io.focal_track import FocalTrack, read_focal_track
 from ..io.photo import read_focal
@@ -18,7 +18,7 @@ from .board_focals import Board
 from .calibration import FILES
 from .focal_sources import MEASURED, check_source, focal_sigmas, refuse_sigma_column
 from .model_choice import WantedCentre, WantedModel
-from .plane_focals import SHARED_BY
+from .plane_focals import SHARED_BY, Sharing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,6 +110,14 @@ class ImageJob:
             )
 
     @property
+    def sharing(self) -> Sharing | None:
+        """Which images share a focal length, if that is asked for."""
+        if self.shared_focal is None:
+            return None
+        text = self.focal_sigma
+        return Sharing(self.shared_focal, None if text is None else lambda focal: focal_sigmas(text, focal))
+
+    @property
     def other_sharing(self) -> tuple[str, ...]:
         """Ways by which images could share a focal length, where none is asked for."""
         if self.shared_focal is not None:
@@ -135,6 +143,13 @@ class ImageJob:
             photos = find_photos(self.inputs)
             return photos, len(photos)
         return video_frames(self.video, self._track(), self.frames), self.frames
+
+    def again(self, detections: Iterable[Detection]) -> Iterator[Source]:
+        """The images of some detections, under the same names, whatever is in their folders by now."""
+        if self.video is None:
+            return (Source(of.name, Path(of.file)) for of in detections)
+        names = {of.name for of in detections}
+        return (source for source in self.sources()[0] if source.name in names)
 
     def results(self) -> list[str]:
         """Names of the files that `ImageCalibration.write` writes, as far as known in advance."""

@@ -171,7 +171,7 @@ def undistort_by_library(
         files += outcome.files
         written, done = written + outcome.written, done + len(paths)
     outcome = Outcome("\n".join(sentences), skipped, written, tuple(notes), tuple(files))
-    return with_refused(outcome, found)
+    return with_refused(outcome, found, targets)
 
 
 def _by_lens(photos: list[Path], name: str | None) -> tuple[list["_Group"], dict[str, str]]:

@@ -1,6 +1,6 @@
 """Options of the command line that commands share, and the examples in their help."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -367,12 +367,17 @@ def detector_for(context: typer.Context, detector: Detector, focal: str | None) 
     return "pitch" if focal == "pitch" and not given else detector
 
 
-def excluded(given: list[str] | None) -> list[int]:
-    """Line numbers from the option.
+def excluded(given: list[str] | None, files: Sequence[Path]) -> list[int]:
+    """Line numbers from the option, for files of lines.
 
     Raises:
-        ValueError: one is not a whole number of at least 0.
+        ValueError: one is not a whole number of at least 0; or there are several files.
     """
+    if given and len(files) > 1:
+        raise ValueError(
+            "--exclude is for one file of lines: of several, overlays and reports number the lines of each "
+            "by itself. Calibrate them together, and then the results of that, with --exclude."
+        )
     words = [word.strip() for text in given or () for word in text.split(",")]
     for word in words:
         if not (word.isascii() and word.isdigit()):

@@ -5,6 +5,7 @@ Each is a JPEG of some tens of kB.
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import cv2
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from ..detect.batch import Detection
     from .calibration import Calibration
     from .image_job import ImageJob
+    from .meanwhile import State
 
 MOST = 12
 """Photos shown: the page stays small enough to be sent by mail."""
@@ -50,6 +52,11 @@ class Photos(Protocol):
     @property
     def used(self) -> "tuple[Detection, ...]":
         """The photos used."""
+        ...
+
+    @property
+    def states(self) -> "Mapping[str, State | None]":
+        """Of the files of photos before the work began."""
         ...
 
     def members(self) -> list[np.ndarray]:

@@ -190,6 +190,7 @@ def _straightness(calibration: Calibration) -> dict[str, Any]:
             for name, value in ((name, rms_over_frames(frames)) for name, frames in calibration.rows())
         ],
         "unit": f"px of the {'distorted' if calibration.in_image else 'corrected'} image",
+        "weighting": calibration.weighting,
         "choice": chosen
         and {"title": chosen.title, "columns": COLUMNS, "rows": chosen.rows(), "why": chosen.why},
         "plot": embedded_plot(figure, f"Residual RMS of each frame{along}", class_="box plot"),

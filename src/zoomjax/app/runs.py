@@ -52,11 +52,12 @@ def calibrate_lines(
     their centre was fitted, it is fitted again from the middle of the image.
     """
     from .calibrating import calibrate
-    from .earlier import earlier_of
+    from .earlier import earlier_of, findings_of_counted_again
     from .equipment import with_earlier, without_focal
     from .focal_sources import focal_sigmas
     from .relative import findings_of_relative
     from .report import report
+    from .verdict import findings_of_surer
 
     known = earlier_of(files, lines)
     if known.centre and centre in ("fit", "moving"):
@@ -64,6 +65,8 @@ def calibrate_lines(
     sigma = focal_sigmas("0" if focal_sigma is None else focal_sigma, lines.focal)
     if focal_sigma is None and known.sigma is not None:
         sigma = known.sigma
+    before = np.zeros(len(sigma)) if known.sigma is None else known.sigma
+    surer = findings_of_surer(sigma, before, unit=lines.focal_unit, of="frames (the fit before this one)")
     known = known._replace(sigma=sigma, lost=known.lost and focal_sigma is None)
     calibration = calibrate(
         lines,
@@ -75,12 +78,15 @@ def calibrate_lines(
         stage=stage,
     )
     lens = with_earlier(calibration.fit.lens, files)
-    assessment = calibration.assessment.joined_by([*known.findings(), *findings_of_relative(lens)])
+    found = [*known.findings(), *findings_of_relative(lens), *surer]
+    found += findings_of_counted_again(files, calibration.rejected)
+    assessment = calibration.assessment.joined_by(found)
     zoom = dataclasses.replace(calibration.fit, lens=lens if focal_known else without_focal(lens))
     calibration = dataclasses.replace(calibration, assessment=assessment, fit=zoom)
     stage("Writing the results")
     pages = {REPORT: report(calibration, run=what_is_run(title_of(list(map(str, files)))))}
-    about = {"earlier": known.about()}
+    kept = np.maximum(sigma, before)  # a smaller one that is given is for this fit: what was measured stays
+    about = {"earlier": known._replace(sigma=kept).about()}
     calibration.make(folder, about=about, pages=pages, lines="lines.npz" in names)
     return calibration
 

@@ -12,6 +12,7 @@ import cv2
 
 from ..detect.batch import Detection
 from .image_job import ImageJob, overlay_name
+from .meanwhile import image_of
 from .overlay import draw_lines
 from .results_folder import OF_A_LENS, results_folder
 
@@ -74,13 +75,14 @@ class Undetermined(ValueError):
         }
 
     def _draw(self, folder: Path, names: Mapping[str, str]) -> None:
-        found = {of.name: of.lines for of in self.used}
-        for source in self.job.sources()[0]:
-            if source.name not in names:
-                continue
-            lines, name = found[source.name], names[source.name]
+        found = {of.name: of for of in self.used if of.name in names}
+        for source in self.job.again(found.values()):
+            of, name = found[source.name], names[source.name]
+            lines = of.lines
             labels = {line: str(line) for line in range(len(lines))}
-            picture = draw_lines(source.read()[0], lines, [False] * len(lines), labels=labels)
+            picture = draw_lines(
+                image_of(source, of.image_size), lines, [False] * len(lines), labels=labels
+            )
             done, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
             assert done
             (folder / name).write_bytes(content.tobytes())

@@ -23,7 +23,7 @@ from ._photos import BAD_FILE, SAME, CommonFraming, corrected_photos
 from .equipment import taken_at_others, taken_otherwise
 from .plans import files_plan
 from .relative import warn_of_relative
-from .undistort_inputs import Found, find_inputs, focal_number, targets_of
+from .undistort_inputs import Found, find_inputs, focal_number, targets_of, told_of_earlier
 
 if TYPE_CHECKING:
     from ..correct.video import CorrectedVideo
@@ -110,7 +110,7 @@ def undistort_files(
     files = found.videos or found.photos
     targets = targets_of(files, job.output, job.inputs)
     done = work(job, lens, [path for path, _ in files], targets, progress, executor)
-    return with_refused(done, found)
+    return with_refused(done, found, targets)
 
 
 def photos_or_videos(job: Job) -> Found:
@@ -128,9 +128,11 @@ def photos_or_videos(job: Job) -> Found:
     return found
 
 
-def with_refused(done: Outcome, found: Found) -> Outcome:
-    """An outcome, with what was left out beforehand."""
-    skipped = {**{str(path): reason for path, reason in found.refused.items()}, **done.skipped}
+def with_refused(done: Outcome, found: Found, targets: Sequence[Path]) -> Outcome:
+    """An outcome, with what was left out beforehand, and what is there in place of missing results."""
+    sources = [path for path, _ in (*found.photos, *found.videos)]
+    skipped = {str(path): why for path, why in found.refused.items()}
+    skipped |= told_of_earlier(done.skipped, sources, targets)
     return dataclasses.replace(done, skipped=skipped, notes=(*found.notes, *done.notes))
 
 
@@ -256,10 +258,8 @@ def undistort_photos(
     corrected = [source for source in given if source not in skipped]
     before += () if job.focal is None else tuple(taken_at_others(lens, corrected, focal_of))
     notes = (*_losses(lost), *_unmarked(unmarked), *before)
-    sentence, files = (
-        _counted(written, len(sources), earlier, job, "photo"),
-        _made(sources, targets, skipped),
-    )
+    sentence = _counted(written, len(sources), earlier, job, "photo")
+    files = _made(sources, targets, skipped)
     return Outcome(sentence, bad, written + earlier, notes, files)
 
 

@@ -6,7 +6,7 @@ import glob
 import mimetypes
 import os
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..detect.sources import VIDEO_SUFFIXES, files_within, left_out, once, twice
@@ -192,6 +192,19 @@ def targets_of(found: Sequence[tuple[Path, Path]], output: Path, inputs: Sequenc
     if is_photo and output.suffix.lower() not in FORMATS:
         raise ValueError(f"The output must end in one of {', '.join(FORMATS)}, but it is {output}.")
     return [output]
+
+
+def told_of_earlier(
+    skipped: Mapping[str, str], sources: Sequence[Path], targets: Sequence[Path]
+) -> dict[str, str]:
+    """Why files are skipped, by path, and where a result of an earlier run is in the place of theirs."""
+    there = {str(source): path for source, path in zip(sources, targets, strict=True) if path.exists()}
+    return {
+        source: f"{why.rstrip('.')}. What is in {there[source]} is of an earlier run."
+        if source in there
+        else why
+        for source, why in skipped.items()
+    }
 
 
 def _is_media(path: Path) -> bool:

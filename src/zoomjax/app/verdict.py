@@ -120,20 +120,32 @@ def findings_of_focals(focals: Focals) -> list[Finding]:
 
 
 def _too_sure(focals: Focals) -> list[Finding]:
-    known = [name for name, std in focals.instead.items() if std > 0 and name in focals.deviation]
+    names = [name for name in focals.instead if name in focals.deviation]
     given, own = (
-        np.median([deviation[name] for name in known]) if known else 0.0
-        for deviation in (focals.deviation, focals.instead)
+        np.array([deviation[name] for name in names]) for deviation in (focals.deviation, focals.instead)
     )
-    if given * _SURER >= own:
+    return findings_of_surer(given, own, unit=focals.unit, of=f"photos ({focals.origin})")
+
+
+def findings_of_surer(given: np.ndarray, own: np.ndarray, *, unit: str, of: str) -> list[Finding]:
+    """That standard deviations of focal lengths are given that are far smaller than those known before.
+
+    Args:
+        given: the standard deviations.
+        own: those that they took the place of.
+        unit: of both.
+        of: what they are of, in words.
+    """
+    known = own > 0
+    middle, before = (float(np.median(std[known])) if known.any() else 0.0 for std in (given, own))
+    if middle * _SURER >= before:
         return []
     return [
         Finding(
             "focal lengths",
             "doubtful",
-            f"their standard deviation was given as {given:.3g} {focals.unit}, in place of {own:.3g} "
-            f"{focals.unit}, in the middle of {len(known)} photos ({focals.origin}): bands may be too "
-            "narrow.",
+            f"their standard deviation was given as {middle:.3g} {unit}, in place of {before:.3g} {unit}, "
+            f"in the middle of {known.sum()} {of}: bands may be too narrow.",
             "Leave --focal-sigma out.",
             cause=True,
         )

@@ -148,8 +148,8 @@ def twice(again: dict[Path, Path]) -> str:
 
 
 def left_out(folder: Path, used: Sequence[str] = SUFFIXES) -> str:
-    """Sentences about videos and pictures in a folder with other suffixes, developed RAW files, and links
-    to nowhere and to other folders.
+    """Sentences about videos and pictures in a folder with other suffixes, developed RAW files, links to
+    nowhere and to other folders, and folders that cannot be read.
 
     Empty if there are none.
     """
@@ -164,6 +164,8 @@ def left_out(folder: Path, used: Sequence[str] = SUFFIXES) -> str:
         told.append(_left_out(folder, dead, ", as links to nowhere, or no files."))
     if linked := [path for path in _shown(folder) if path.is_symlink() and _holds_more(path, folder, used)]:
         told.append(_left_out(folder, linked, ", as links to other folders. Give these, too."))
+    if closed := [path for path in _shown(folder) if path.is_dir() and not _is_open(path)]:
+        told.append(_left_out(folder, closed, ": what is in there cannot be read.", "folder"))
     return " ".join(told)
 
 
@@ -181,12 +183,21 @@ def _holds_more(link: Path, folder: Path, used: Sequence[str]) -> bool:
     """Whether a link leads to a folder of photos, or videos, that is not in this one, nor around it."""
     there, here = Path(os.path.realpath(link)), Path(os.path.realpath(folder))
     apart = there.is_dir() and not (there.is_relative_to(here) or here.is_relative_to(there))
-    return apart and bool(files_within(there, used))
+    return apart and _is_open(there) and bool(files_within(there, used))
 
 
-def _left_out(folder: Path, files: Sequence[Path], why: str) -> str:
+def _is_open(folder: Path) -> bool:
+    """Whether what is in a folder can be listed."""
+    try:
+        with os.scandir(folder):
+            return True
+    except OSError:
+        return False
+
+
+def _left_out(folder: Path, files: Sequence[Path], why: str, kind: str = "file") -> str:
     names = listed((plain(str(path.relative_to(folder))) for path in files), 3)
-    number = "one file is" if len(files) == 1 else f"{len(files)} files are"
+    number = f"one {kind} is" if len(files) == 1 else f"{len(files)} {kind}s are"
     return f"In the folder {plain(str(folder))}, {number} left out: {names}{why}"
 
 
@@ -226,7 +237,13 @@ def files_within(folder: Path, suffixes: Sequence[str]) -> list[Path]:
 
 
 def _all_within(folder: Path, suffixes: Sequence[str]) -> list[Path]:
-    """As `files_within`, with RAW files that were developed."""
+    """As `files_within`, with RAW files that were developed.
+
+    Raises:
+        OSError: the folder itself cannot be read.
+    """
+    with os.scandir(folder):  # which patterns of names pass over
+        pass
     results = {mark.with_name(name) for of in MARKS for mark in folder.rglob(of) for name in RESULTS}
     return sorted(
         path

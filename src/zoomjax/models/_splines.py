@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.arrays import as_jax
+from .._core.fields import check_finite, known
 from .._core.types import AnyArray, traced
 
 
@@ -71,11 +72,15 @@ def natural_controls(
 
 def natural_curvature(knots: Float[AnyArray, "basis"]) -> Float[Array, "basis basis"]:
     """The matrix from values at the knots to the natural spline's second derivatives there."""
-    xp: Any = jnp if traced(knots) else np  # known ones compile nothing
+    return as_jax(_curvature(knots, jnp if traced(knots) else np))  # known ones compile nothing
+
+
+def _curvature(knots: Any, xp: Any) -> Any:
+    """The same, by NumPy or JAX."""
     knots = xp.asarray(knots)
     size, width = knots.shape[0], xp.diff(knots)
     if size < 3:
-        return as_jax(np.zeros((size, size), knots.dtype))
+        return np.zeros((size, size), knots.dtype)
 
     def banded(*diagonals):
         one, two, three = (np.eye(size - 2, size, k, dtype=knots.dtype) for k in range(3))
@@ -84,4 +89,22 @@ def natural_curvature(knots: Float[AnyArray, "basis"]) -> Float[Array, "basis ba
     first, last = width[:-1], width[1:]
     system = banded(first / 6, (first + last) / 3, last / 6)
     second = banded(1 / first, -1 / first - 1 / last, 1 / last)
-    return as_jax(xp.pad(xp.linalg.solve(system[:, 1:-1], second), ((1, 1), (0, 0))))
+    return xp.pad(xp.linalg.solve(system[:, 1:-1], second), ((1, 1), (0, 0)))
+
+
+def check_curvature(name: str, curvature: Any, knots: Any) -> None:
+    """Raise ValueError where a matrix is not the `natural_curvature` of known knots, as of others."""
+    check_finite(name, curvature)
+    given, places = known(curvature), known(knots)
+    if given is None or places is None or places.ndim != 1:
+        return
+    own = _curvature(places, np)
+    if np.max(np.abs(given - own), initial=0) > _APART * np.max(np.abs(own), initial=0):
+        raise ValueError(
+            f"Argument {name} must be that of the natural spline through its knots, but it is of others: "
+            "leave both out, and fit or prepare the model."
+        )
+
+
+_APART = 1e-3
+"""Share by which curvatures may be apart, by rounding to float32."""

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float, ScalarLike
 
 from .._core.checks import checked_integer
-from .._core.fields import check_finite, check_increasing, check_positive, check_shapes, numbers
+from .._core.fields import check_increasing, check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Focal, Focus, traced
 from ._bernstein import Pieces, cut
-from ._splines import natural_basis, natural_controls, natural_curvature, spread
+from ._splines import check_curvature, natural_basis, natural_controls, natural_curvature, spread
 from .spline import SplineZoom
 from .zoom import UNFITTED, AbstractFocusZoom
 
@@ -86,8 +86,8 @@ class FocusSplineZoom(AbstractFocusZoom):
         check_positive("knots", self.knots)
         check_increasing("knots", self.knots)
         check_increasing("focus_knots", self.focus_knots)
-        check_finite("curvature", self.curvature)
-        check_finite("focus_curvature", self.focus_curvature)
+        check_curvature("curvature", self.curvature, self.knots)
+        check_curvature("focus_curvature", self.focus_curvature, self.focus_knots)
 
     def prepare(self, focal: Focal, terms: int, focus: Focus | None = None) -> "FocusSplineZoom":
         """A spline of zeros, its knots spread over what is there."""

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, ScalarLike
 
-from .._core.fields import check_finite, check_increasing, check_positive, check_shapes, numbers
+from .._core.fields import check_increasing, check_positive, check_shapes, numbers
 from .._core.types import AnyArray, Focal
 from ._bernstein import Pieces
 from ._prepared import check_knots, checked_number, prepared, zero_parameters
-from ._splines import natural_basis, natural_controls, natural_curvature, spread
+from ._splines import check_curvature, natural_basis, natural_controls, natural_curvature, spread
 from .zoom import AbstractLinearZoom
 
 
@@ -52,7 +52,7 @@ class SplineZoom(AbstractLinearZoom):
         )
         check_positive("knots", self.knots)
         check_increasing("knots", self.knots)
-        check_finite("curvature", self.curvature)
+        check_curvature("curvature", self.curvature, self.knots)
 
     def prepare(self, focal: Focal, terms: int) -> "SplineZoom":
         """A spline of zeros, its knots at focal lengths that are there."""

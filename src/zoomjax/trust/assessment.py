@@ -196,9 +196,9 @@ def _judged(error: float, of: Evidence) -> Verdict:
     """What an error of the displacement, px, allows."""
     if not np.isfinite(error):
         return "not determined"
-    if error <= NEGLIGIBLE * of.diagonal or error <= _DOUBTFUL * of.displacement:
+    if error <= NEGLIGIBLE * of.diagonal or error <= _DOUBTFUL * of.raster_displacement:
         return "good"
-    return "doubtful" if error <= _UNDETERMINED * of.displacement else "not determined"
+    return "doubtful" if error <= _UNDETERMINED * of.raster_displacement else "not determined"
 
 
 def _is_bent(of: Evidence) -> bool:
@@ -222,7 +222,7 @@ def _of_bands(of: Evidence, fit: ZoomFit, places: int) -> Iterator[Finding]:
         )
     if not np.isfinite([of.std, of.bent_std]).all():
         yield Finding("bands", "not determined", "the lines do not determine the correction.", more)
-    elif of.frames > 1 and (verdict := _judged(of.std, of)) != "good":
+    elif of.frames > 1 and (verdict := _judged(of.raster_std, of)) != "good":
         found = (
             f"the correction moves points by {_px(of.displacement)} px (RMS), but is uncertain by "
             f"{_px(of.std)} px."
@@ -321,7 +321,7 @@ def _of_vanishing(of: Evidence) -> Iterator[Finding]:
     other = of.vanishing
     if not abs(other.factor - 1) > max(_UNPARALLEL, _SURE * other.std):
         return
-    if _judged(abs(other.factor - 1) * of.displacement, of) == "good":
+    if _judged(abs(other.factor - 1) * of.raster_displacement, of) == "good":
         return
     yield Finding(
         "vanishing points",

@@ -101,6 +101,8 @@ class Evidence:
         displacement: how far the correction moves points, RMS over the image, where that is largest.
         std: standard deviation of the displacement, as in the bands, averaged likewise, where that is
             largest.
+        raster_displacement, raster_std: the same over points up to the image's border, which count alike,
+            and so those at the border more than by their area: what errors are judged by.
         bent: how far the correction moves points beyond a homography of the corrected image, px of the
             image, RMS over it, at the frame's focal length where `bent_std` is largest.
         bent_std: the standard deviation of that, or what the centre of distortion would change about which
@@ -121,6 +123,8 @@ class Evidence:
     noise: float
     displacement: float
     std: float
+    raster_displacement: float
+    raster_std: float
     bent: float
     bent_std: float
     to_centre: float
@@ -196,8 +200,10 @@ def evidence(lines: Lines, fit: ZoomFit, *, compressed: AbstractLines | None = N
         rms=float(fit.rms),
         rms_uncorrected=float(np.sqrt(np.nanmean(before))),
         noise=noise(measured_as(placed, compressed), lens, np.flatnonzero(weight)),
-        displacement=float(np.max(_over_image(displaced))),
-        std=float(np.max(_over_image(std))),
+        displacement=float(np.max(_over_image(displaced, _areas()))),
+        std=float(np.max(_over_image(std, _areas()))),
+        raster_displacement=float(np.max(_over_image(displaced))),
+        raster_std=float(np.max(_over_image(std))),
         bent=bent.moved,
         bent_std=bent.std,
         to_centre=bent.to_centre,
@@ -371,7 +377,16 @@ def _spread(rows: np.ndarray, covariance: np.ndarray) -> Float[np.ndarray, "foca
     return _over_image(np.sqrt(np.maximum(variance, 0)))
 
 
-def _over_image(lengths: np.ndarray) -> Float[np.ndarray, "focal"]:
-    """RMS over the image; points beyond a fold have no length and are left out."""
-    known = np.where(np.isnan(lengths), 0, lengths)
-    return np.sqrt((known**2).sum(axis=1) / np.maximum((~np.isnan(lengths)).sum(axis=1), 1))
+def _over_image(lengths: np.ndarray, weight: np.ndarray | float = 1.0) -> Float[np.ndarray, "focal"]:
+    """RMS over the image, of points of equal or of these weights; points beyond a fold have no length and
+    are left out."""
+    there = ~np.isnan(lengths)
+    squares = np.where(there, lengths, 0) ** 2
+    return np.sqrt((squares * weight).sum(axis=1) / np.maximum((there * weight).sum(axis=1), 1))
+
+
+def _areas() -> np.ndarray:
+    """Weights of the raster's points for a mean over the image's area: Simpson's rule."""
+    side = np.resize([2.0, 4.0], _GRID)
+    side[[0, -1]] = 1
+    return np.outer(side, side).ravel()
