@@ -8,14 +8,20 @@ until one is left.
 
 import re
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.experimental import pallas
-from jax.experimental.pallas import triton
 from jaxtyping import Array, Bool, Float
 
 from .reduction import inverse_norm, tangent_of
+
+triton: Any
+try:
+    from jax.experimental.pallas import triton
+except ImportError:  # JAX 0.12 says that a later one will not have it
+    triton = None
 
 _RUN = 256
 """Points that a warp holds: 8 a thread. Twice as many columns of them would not fit into its registers."""
@@ -29,7 +35,7 @@ def has_kernel(terms: int) -> bool:
     """Whether there is a kernel for so many terms on JAX's default device."""
     capability = getattr(jax.devices()[0], "compute_capability", "")
     known = re.fullmatch(r"\d+\.\d+", str(capability)) and float(capability) >= _LEAST_CAPABILITY
-    # Before JAX 0.7 these were called differently.
+    # Before JAX 0.7 these were called differently. Without Triton there are none.
     return (
         bool(known)
         and terms <= _MOST_TERMS
