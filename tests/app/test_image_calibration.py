@@ -505,3 +505,9 @@ def test_when_no_image_can_be_used_the_reason_is_told(tmp_path):
     (tmp_path / "c.png").write_bytes(b"")
     with pytest.raises(ValueError, match=r"a\.png: no lines.*c\.png: .*empty"):
         calibrate_images(ImageJob((tmp_path,)))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_whether_photos_are_tied_is_no_word():
+    with pytest.raises(TypeError, match="tied must be True or False, but it is 'no'"):
+        ImageJob(("a.jpg",), tied="no")  # pyright: ignore[reportArgumentType]

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 
-from zoomjax.app.image_job import ImageJob
 from zoomjax.app.results_folder import LIST, results_folder
 
 OLD = {"lens.json": "old lens", "lines/0001-a.jpg": "old a", "lines/0002-b.jpg": "old b"}
@@ -381,9 +380,3 @@ def test_whether_to_overwrite_is_no_word(tmp_path, value):
     ):
         pytest.fail("the work began")
     assert (tmp_path / "lens.json").read_text() == "the user's"
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_whether_photos_are_tied_is_no_word():
-    with pytest.raises(TypeError, match="tied must be True or False, but it is 'no'"):
-        ImageJob(("a.jpg",), tied="no")  # pyright: ignore[reportArgumentType]
