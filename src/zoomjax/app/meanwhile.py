@@ -4,6 +4,7 @@ Each is read when its lines are searched for, and again for its EXIF data, and t
 Minutes lie between.
 """
 
+import contextlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -60,10 +61,9 @@ def image_of(source: Source, size: tuple[int, int], state: State | None = None) 
         size: of the image in which they were found, px.
         state: of the file before that, if it is known.
     """
-    same = source.path is None or state is None or _state(source.path) == state
-    try:
-        image = source.read()[0] if same else None
-    except (OSError, ValueError):
-        image = None
-    known = image is not None and image.shape[1::-1] == tuple(size)
-    return image if known else np.zeros(size[::-1], np.uint8)
+    if source.path is None or state is None or _state(source.path) == state:
+        with contextlib.suppress(OSError, ValueError):
+            image = source.read()[0]
+            if image.shape[1::-1] == tuple(size):
+                return image
+    return np.zeros(size[::-1], np.uint8)
