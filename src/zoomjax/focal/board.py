@@ -63,8 +63,7 @@ def focal_from_board(
     # A similarity is one complex factor: its absolute value is px in the image per mm on the board.
     seen, known = _complex(points), _complex(board)
     seen, known = seen - jnp.mean(seen), known - jnp.mean(known)
-    mirrored = abs(jnp.sum(known * seen)) > abs(jnp.sum(jnp.conj(known) * seen))
-    known = jnp.where(mirrored, jnp.conj(known), known)
+    # The error depends on the board alone: `shard_map` takes none that differs from device to device.
     spread = jnp.sum(abs(known) ** 2)
     positive = (jnp.asarray(distance) > 0) & (jnp.asarray(pixel_pitch) > 0) & (spread > 0)
     spread = eqx.error_if(
@@ -72,6 +71,8 @@ def focal_from_board(
         ~positive,
         "Arguments distance and pixel_pitch must be positive, and the points of board must differ.",
     )
+    mirrored = abs(jnp.sum(known * seen)) > abs(jnp.sum(jnp.conj(known) * seen))
+    known = jnp.where(mirrored, jnp.conj(known), known)
     factor = jnp.sum(jnp.conj(known) * seen) / spread
     squares = jnp.sum(abs(seen - factor * known) ** 2)
     ratio = abs(factor) * pixel_pitch  # r_c / R
