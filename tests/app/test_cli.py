@@ -408,6 +408,10 @@ def test_a_dry_run_writes_nothing(calibrated, tmp_path):
     assert "3 photos, by the detector edges:" in done.stdout
     assert "20.56 mm" in done.stdout
     assert not (tmp_path / "out").exists()
+    told = zoomjax("calibrate", "shots", "-o", "out", "--dry-run", "--json", cwd=tmp_path)
+    plan = json.loads(told.stdout)
+    assert plan["plan"] == [line.strip() for line in done.stdout.splitlines()[:-1]]
+    assert plan["output"] == "out"
     done = zoomjax("calibrate", calibrated[0] / "lines.npz", "-o", tmp_path / "o", "--dry-run")
     assert "lines in 5 frames, f = 20.56 to 127.36 mm" in done.stdout
     assert not (tmp_path / "o").exists()

@@ -525,6 +525,8 @@ def test_a_clip_that_does_not_move_is_refused(clip, tmp_path):
 def test_a_dry_run_writes_nothing(clip):
     done = zoomjax("calibrate", clip.name, "-o", "dry", "--dry-run", cwd=clip.parent)
     assert "Nothing was written" in done.stdout
+    told = zoomjax("calibrate", clip.name, "-o", "dry", "--dry-run", "--json", cwd=clip.parent)
+    assert json.loads(told.stdout) == {"plan": done.stdout.splitlines()[:1], "output": "dry"}
     assert not (clip.parent / "dry").exists()
 
 

@@ -160,7 +160,8 @@ def calibrate_clip(job: ClipJob, show: Shown, *, dry_run: bool) -> None:
             )
         if job.measured:
             besides += f", whose {job.measured} tells f"
-        tell_plan([f"Focal lengths and lens from how {plain(str(clip))} moves{besides}."], job.output)
+        plan = f"Focal lengths and lens from how {plain(str(clip))} moves{besides}."
+        tell_plan([plan], job.output, as_json=show.as_json)
         return
     if job.by_default and not (show.quiet or show.as_json):
         found = f"they and the lens are found from how {plain(str(clip))} moves"

@@ -262,7 +262,8 @@ def calibrate(
         if dry_run:
             lines = read_lines(files, focal, image_size, focal_unit, focal_sigma)
             check_centre(about, [lines.image_size])
-            return tell_plan(lines_plan(lines, out, focal_known=focal != "same"), output)
+            plan = lines_plan(lines, out, focal_known=focal != "same")
+            return tell_plan(plan, output, as_json=as_json)
         with results as folder, stages(quiet=quiet) as stage:
             stage("Reading the lines")
             lines = without(read_lines(files, focal, image_size, focal_unit, focal_sigma), out)
@@ -332,7 +333,7 @@ def calibrate(
     refuse_to_replace(job, output)
     if dry_run:
         check_centre(about, photo_sizes(job))
-        return tell_plan(images_plan(job), output)
+        return tell_plan(images_plan(job), output, as_json=as_json)
     names = [*job.results(), REPORT]
     from .undetermined import Undetermined
 

@@ -38,7 +38,11 @@ Verbose = Annotated[
 ]
 AsJson = Annotated[
     bool,
-    typer.Option("--json", help="Print summary.json instead of the tables.", rich_help_panel=OUTPUT),
+    typer.Option(
+        "--json",
+        help="Print summary.json instead of the tables; with --dry-run, the plan.",
+        rich_help_panel=OUTPUT,
+    ),
 ]
 DryRun = Annotated[
     bool,

@@ -1,6 +1,7 @@
 """What a command would do (``--dry-run``), and lines left out by hand (``--exclude``)."""
 
 import contextlib
+import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -137,8 +138,11 @@ def files_plan(files: Sequence[str], earlier: int) -> str:
     return "\n".join([head, *files[:_LISTED], *more])
 
 
-def tell_plan(told: Sequence[str], output: Path) -> None:
-    """Print a plan."""
+def tell_plan(told: Sequence[str], output: Path, *, as_json: bool) -> None:
+    """Print a plan, as text or for scripts."""
+    if as_json:
+        print(json.dumps({"plan": [line.strip() for line in told], "output": str(output)}, indent=2))
+        return
     print("\n".join(told))
     print(f"Results would be written to {plain(str(output))}. Nothing was written.")
 
