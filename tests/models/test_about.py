@@ -88,6 +88,17 @@ def test_a_pitch_in_another_unit_is_refused(pitch, tmp_path):
         zj.load_lens(tmp_path / "lens.json")
 
 
+@pytest.mark.parametrize("word", ["relatve", "Relative", "unknown", 50.0])
+def test_a_misspelt_word_for_focal_lengths_is_refused(word, tmp_path):
+    with pytest.raises(ValueError, match="'not known' or 'relative' as focal"):
+        lens(about={"focal": word})
+    path = tmp_path / "lens.json"
+    lens(about={"focal": "relative"}).save(path)
+    path.write_text(path.read_text().replace('"relative"', json.dumps(word)))
+    with pytest.raises(ValueError, match=r"lens.json: .* as focal"):
+        zj.load_lens(path)
+
+
 @pytest.mark.parametrize("about", ["NIKON", {1: "a"}, {"crop": np.nan}, {"crop": None}, {"tele": True}])
 def test_wrong_facts_are_refused(about):
     with pytest.raises(ValueError, match="about must be a dictionary of words and finite numbers"):

@@ -63,6 +63,11 @@ def checked_about(value: Any) -> About:
         number = value.get(name, 1)
         if isinstance(number, str) or number <= 0:
             raise ValueError(f"Argument about must hold a positive number as {name}, but it is {number!r}.")
+    if value.get("focal", UNKNOWN) not in (UNKNOWN, RELATIVE):
+        raise ValueError(
+            f"Argument about must hold {UNKNOWN!r} or {RELATIVE!r} as focal, or no focal at all, but it is "
+            f"{value['focal']!r}."
+        )
     return About(value)
 
 
