@@ -100,6 +100,14 @@ def test_results_in_the_folder_itself_are_no_inputs(folder):
     assert files(folder / "in/out") == ["a.jpg", "day/a.jpg", "day/b.png"]
 
 
+@pytest.mark.parametrize("out", ["in", "in/.", "."])
+def test_a_folder_that_is_the_output_is_refused_by_name(out, folder):
+    before = files(folder)
+    with pytest.raises(ValueError, match=r"in are in the output folder .*: give another folder"):
+        undistort_files(job(folder, "in", out=out))
+    assert files(folder) == before
+
+
 def test_a_new_suffix_does_not_make_two_results_one(folder):
     """The photo of a phone, which becomes a PNG file, beside a picture of that name."""
     heif = pytest.importorskip("pillow_heif")

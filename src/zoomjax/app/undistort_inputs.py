@@ -100,11 +100,17 @@ def _until_magic(parts: Sequence[str]) -> list[str]:
 
 
 def _within(folder: Path, output: Path) -> list[Path]:
-    mine = output.resolve()
+    mine, own = output.resolve(), 0
     for suffixes in (SUFFIXES, VIDEO_SUFFIXES):
         found = files_within(folder, suffixes)
-        if found := [path for path in found if mine not in path.resolve().parents]:
-            return found
+        if outside := [path for path in found if mine not in path.resolve().parents]:
+            return outside
+        own += len(found)
+    if own:
+        raise ValueError(
+            f"All photos and videos of {folder} are in the output folder {output}, which is left out: "
+            "give another folder with --output."
+        )
     raise ValueError(f"There are no photos and no videos in the folder {folder}.")
 
 
