@@ -5,6 +5,8 @@ Both decode pixels as stored. Pillow tells how to turn them in the EXIF data.
 
 import contextlib
 import io
+import warnings
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
@@ -18,6 +20,14 @@ _QUALITY = 95
 
 _DEEP, _TWELVE = 0x40, 0x20
 """Flags in the third byte of an AV1 configuration: more than 8 bits, and 12 instead of 10."""
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Pillow warns of damaged EXIF data, many times a file: they do not matter unless f is gone."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 def avif_size(content: bytes) -> tuple[int, int]:
@@ -34,6 +44,7 @@ def avif_metadata(content: bytes) -> Metadata:
     return metadata_in(_opened(content).info)
 
 
+@_quiet()
 def decode_avif(content: bytes) -> tuple[np.ndarray, Metadata, list[str]]:
     """The pixels as stored, as OpenCV has them, metadata, and what else there is. Raises as `avif_size`."""
     picture = _opened(content)
@@ -56,6 +67,7 @@ def decode_avif(content: bytes) -> tuple[np.ndarray, Metadata, list[str]]:
     return np.ascontiguousarray(image), metadata_in(picture.info), more
 
 
+@_quiet()
 def encode_avif(image: np.ndarray, metadata: Metadata) -> bytes:
     """An AVIF file of 8 bits, colours at full resolution."""
     content = io.BytesIO()
@@ -96,6 +108,7 @@ def _bits(content: bytes) -> int:
     return 8 if not flags & _DEEP else 12 if flags & _TWELVE else 10
 
 
+@_quiet()
 def _opened(content: bytes) -> Image.Image:
     if not features.check("avif"):
         raise ValueError("this Pillow was built without AVIF: install a newer one")
