@@ -83,6 +83,23 @@ def refused(source, target):
     return ""
 
 
+@pytest.mark.parametrize("block", [b"no EXIF data", b"II*\0", b"xx" + exif(), exif()[:30]])
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_exif_data_are_kept_or_said_to_be_lost(suffix, block, tmp_path):
+    image = np.full((*SIZE[::-1], 3), 99, np.uint8)
+    (tmp_path / "in.jpg").write_bytes(encoded_photo([(image, Metadata(exif=block))], ".jpg")[0])
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        zj.undistort_photo(tmp_path / "in.jpg", tmp_path / f"out{suffix}", lens=lens(), focal=35.0)
+    [(_, metadata)] = read_pages(tmp_path / f"out{suffix}").pages
+    said = [str(each.message).partition("file: ")[2] for each in told]
+    if suffix in (".jpg", ".png", ".webp") or (block[:2] == b"II" and len(block) > 8):
+        assert metadata.exif.startswith(block[:20] if suffix != ".tif" else b"II*\0")
+        assert said == []
+    else:
+        assert said == ["EXIF data, which are damaged."]
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_what_is_sound_is_kept_and_what_is_lost_is_said(suffix, tmp_path):
     source, target, read = tmp_path / f"in{suffix}", tmp_path / f"out{suffix}", 0
@@ -110,6 +127,7 @@ def test_what_is_sound_is_kept_and_what_is_lost_is_said(suffix, tmp_path):
             assert is_sound(has.xmp) or not is_sound(had.xmp)
             assert has.icc == had.icc or "the colour profile" in said
             assert exif_focal(has.exif) == exif_focal(had.exif) or "EXIF" in said
+            assert has.exif or not had.exif or "EXIF" in said
             assert has.iptc == had.iptc or "IPTC" in said
             assert has.comment == had.comment or b"\0" in had.comment or "the comment" in said
         read += 1

@@ -86,6 +86,10 @@ class _Exif(Image.Exif):
 
     block = b""
 
+    def __bool__(self) -> bool:
+        """Whether there are any, though Pillow may read nothing of them."""
+        return bool(self.block)
+
     def tobytes(self, offset: int = 8) -> bytes:
         """The data as they came."""
         return self.block

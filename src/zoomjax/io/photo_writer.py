@@ -68,6 +68,9 @@ def encoded_photo(pages: Pages, suffix: str) -> tuple[bytes, list[str]]:
     """
     check_written(pages, suffix)
     kind = suffix.lower()
+    if kind in (".tif", ".tiff", ".avif") and any(_without_header(metadata.exif) for _, metadata in pages):
+        content, lost = encoded_photo(_with_readable_exif(pages), suffix)
+        return content, [f"{NAMES['exif']}, which are damaged", *lost]
     if kind in (".tif", ".tiff"):
         lost = ["the camera's data in EXIF"] if is_big(pages) else []
         if any(_MAKER_NOTES.search(metadata.exif) for _, metadata in pages):
@@ -82,6 +85,18 @@ def encoded_photo(pages: Pages, suffix: str) -> tuple[bytes, list[str]]:
         metadata, lost = dataclasses.replace(metadata, icc=b""), [NAMES["icc"]]
     content, others = _encoded(kind, image, metadata)
     return content, [*lost, *others, *_chunks_lost(kind, metadata)]
+
+
+def _without_header(exif: bytes) -> bool:
+    """Whether EXIF data are none that a file can hold in another form than as they are."""
+    return bool(exif) and (exif[:4] not in (b"II*\0", b"MM\0*") or len(exif) < 8)
+
+
+def _with_readable_exif(pages: Pages) -> Pages:
+    return [
+        (image, dataclasses.replace(metadata, exif=b"") if _without_header(metadata.exif) else metadata)
+        for image, metadata in pages
+    ]
 
 
 def _encoded(kind: str, image: np.ndarray, metadata: Metadata) -> tuple[bytes, list[str]]:
