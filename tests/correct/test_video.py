@@ -1,6 +1,7 @@
 """Zooming clips, corrected: straight edges, times, colours, sound, and everything that can be wrong."""
 
 import os
+import struct
 import subprocess
 import sys
 import threading
@@ -18,7 +19,7 @@ from zoomjax.io.pyav import open_container
 from zoomjax.io.video_reader import decode_video
 from zoomjax.io.video_writer import display_matrix
 
-from .._clips import FRAMES, SIZE, bend, focal, lens, luma, picture, write_clip
+from .._clips import FRAMES, SIZE, bend, focal, lens, luma, picture, write_clip, write_frames
 
 TRACK = zj.io.FocalTrack(np.array([0.0, FRAMES - 1]), np.array([20.0, 80.0]), by_time=False)
 
@@ -289,6 +290,57 @@ def test_a_cut_off_matroska_file_is_said(tmp_path, sound):
         done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=TRACK)
     assert 20 <= done.frames + done.lost <= 28
     assert done.lost >= 8
+
+
+def test_a_matroska_file_whose_pictures_end_before_its_sound_is_said(tmp_path):
+    """Its sound tells nothing of where pictures should end."""
+    source, cut = write_clip(tmp_path / "in.mkv", encoder="ffv1"), tmp_path / "cut.mkv"
+    with av.open(str(source)) as given, av.open(str(cut), "w") as out:
+        into = {stream.index: out.add_stream_from_template(stream) for stream in given.streams}
+        number = 0
+        for packet in given.demux():
+            number += packet.stream.type == "video"
+            if packet.dts is not None and (packet.stream.type == "audio" or number <= 16):
+                packet.stream = into[packet.stream.index]
+                out.mux(packet)
+    content = cut.read_bytes()
+    with av.open(str(cut)) as container:
+        told = container.streams.video[0].metadata["DURATION"].encode()
+    with av.open(str(source)) as container:
+        whole = container.streams.video[0].metadata["DURATION"].encode()
+    assert told != whole
+    cut.write_bytes(content.replace(told, whole))
+    with pytest.warns(UserWarning, match=r"\d of 2\d frames of .*cut\.mkv cannot be decoded .*ends early"):
+        done = undistort_video(cut, tmp_path / "out.mkv", lens=lens(), focal=TRACK)
+    assert done.frames == 16
+    assert 7 <= done.lost <= 9
+
+
+def test_a_last_frame_that_does_not_decode_is_said(tmp_path):
+    """Matroska tells no number of frames, and the decoder of FFV1 nothing of those that it leaves out."""
+    source = write_clip(tmp_path / "in.mkv", encoder="ffv1", sound=False)
+    with av.open(str(source)) as container:
+        last = [bytes(p) for p in container.demux(video=0) if p.size][-1]
+    source.write_bytes(source.read_bytes().replace(last, last[:-8] + b"\xff" * 8))
+    with pytest.warns(UserWarning, match=rf"1 of {FRAMES} frames of .*in\.mkv cannot be decoded"):
+        done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=TRACK)
+    assert (done.frames, done.lost) == (FRAMES - 1, 1)
+
+
+def test_an_avi_file_with_a_damaged_index_is_said_to_end_early(tmp_path):
+    """Its header tells how many frames there should be, and the index tells of fewer than there are."""
+    source = write_frames(
+        tmp_path / "in.avi", [np.dstack([picture(n)] * 3) for n in range(8)], encoder="mpeg4"
+    )
+    content = source.read_bytes()
+    index = content.rindex(b"idx1")
+    last = content.rindex(b"00dc", 0, index)
+    one = content[index + 8 : index + 24]  # the entry of the first frame
+    rest = content[8:last] + b"idx1" + struct.pack("<I", len(one)) + one
+    source.write_bytes(content[:4] + struct.pack("<I", len(rest)) + rest)
+    with pytest.warns(UserWarning, match=r"1 of 8 frames of .*in\.avi cannot be decoded .*ends early"):
+        done = undistort_video(source, tmp_path / "out.avi", lens=lens(), focal=30.0)
+    assert (done.frames, done.lost) == (7, 1)
 
 
 def test_last_frames_that_do_not_decode_are_counted(tmp_path):

@@ -98,10 +98,9 @@ def cut(source: str | os.PathLike[str], others: Sequence[int], report: Report) -
                     if packet.stream is video and packet.size:
                         return []
                     continue
-                end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
-                report.end = max(report.end, end)
                 if packet.stream is not video:
                     continue
+                end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
                 report.reached = max(report.reached, end)
                 if packet.is_discard:
                     continue

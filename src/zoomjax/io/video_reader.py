@@ -23,6 +23,9 @@ from .video_hdr import side_data
 _MOST_ERRORS = 1000
 """Of one file: a demuxer may fail for ever."""
 
+_NOT_A_FIELD = 0.75
+"""Steps after the last frame at which there was another one: fields of a frame are half a step apart."""
+
 _HOLE = 1.5
 """Steps between frames, in units of the one before, from which some may be missing."""
 
@@ -66,9 +69,10 @@ def decode_video(
 
 @dataclasses.dataclass
 class Report:
-    """What happened on the way, in threads: counts of frames, where packets end, s, and what the first
-    frame carries. Those that are skipped are before the first that can be decoded alone, and those that are
-    left have a step in an AVI file and no picture. It is torn where packets were lost."""
+    """What happened on the way, in threads: counts of frames; where packets of pictures end, and when the
+    last of these and the last frame are, s; and what the first frame carries. Those that are skipped are
+    before the first that can be decoded alone, and those that are left have a step in an AVI file and no
+    picture. It is torn where packets were lost."""
 
     announced: int
     written: int = 0
@@ -81,8 +85,9 @@ class Report:
     side: dict[str, bytes] | None = None
     first: Any = None
     last: tuple[int, float] = (-1, math.nan)
-    end: float = 0.0
     reached: float = 0.0
+    last_packet: float = -math.inf
+    last_frame: float = -math.inf
 
 
 def opened_video(source: str | os.PathLike[str]) -> Any:
@@ -181,15 +186,15 @@ def decoded_items(
             if packet is None:
                 report.left = len(steps)
                 return
-            if packet.pts is not None:
-                end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
-                report.end = max(report.end, end)
-                if packet.stream is video:
-                    report.reached = max(report.reached, end)
             if packet.stream is not video:
                 if packet.dts is not None:
                     yield packet
                 continue
+            if packet.pts is not None:
+                end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
+                report.reached = max(report.reached, end)
+                if not packet.is_discard:
+                    report.last_packet = max(report.last_packet, float(packet.pts * packet.time_base))
             warn_of_loss(packet, report)
             step = (packet.dts if avi else packet.pts) if ordered else None
             if step is not None:
@@ -218,6 +223,8 @@ def decoded_items(
             if steps:
                 frame.pts = heapq.heappop(steps)
             report.corrupt += bool(frame.is_corrupt)
+            if frame.time is not None:
+                report.last_frame = max(report.last_frame, frame.time)
             now = video.codec_context.sample_aspect_ratio or shape
             if shape and now != shape:
                 _warn_of_shape(frame, shape, now)
@@ -270,14 +277,19 @@ def _is_whole_avi(source: str | os.PathLike[str]) -> bool:
 def frames_expected(input_: Any, video: Any, report: Report) -> int:
     """How many frames a file that was read to its end should hold, as far as it tells.
 
-    AVI also counts chunks without content, which show the last frame again. Matroska tells its length in
-    seconds alone, and the length of all is that of the longest stream.
+    AVI also counts chunks without content, which show the last frame again; an index of fewer frames than
+    there are is damaged. Matroska tells its length in seconds alone, and the length of all is that of the
+    longest stream.
     """
     rate = float(video.average_rate or video.guessed_rate or 25)
     seen = max(report.written, frames_reached(report)) + report.left
     if report.announced:
-        whole = _is_avi(input_) and round(report.reached * rate) >= report.announced
-        return seen if whole else report.announced
+        announced = video.frames if _is_avi(input_) and report.announced < seen else report.announced
+        whole = _is_avi(input_) and round(report.reached * rate) >= announced
+        return seen if whole else announced
+    after = (report.last_packet - report.last_frame) * rate
+    if after > _NOT_A_FIELD and math.isfinite(after):
+        seen += round(after)
     if input_.format.name != "matroska,webm":
         return seen
     told = video.metadata.get("DURATION")
@@ -286,7 +298,7 @@ def frames_expected(input_: Any, video: Any, report: Report) -> int:
         length = 3600 * hours + 60 * minutes + seconds
     except (AttributeError, ValueError):
         length = (input_.duration or 0) / av.time_base if len(input_.streams) == 1 else 0.0
-    missing = length - report.end
+    missing = length - report.reached
     cut_off = missing > 0.02 * length + 1 / rate
     return seen + round(missing * rate) if cut_off else seen
 
