@@ -1,5 +1,7 @@
 """Bands: what they say is what repeated noise does, and the delta method's own derivatives."""
 
+import warnings
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -138,6 +140,34 @@ def test_std_of_anything_covers_the_inverse(fit):
     covariance = zj.trust.displacement_covariance(fit, seen, focal=30.0)
     back = jnp.linalg.inv(jax.jacfwd(distortion.undistort)(seen))
     np.testing.assert_allclose(std, jnp.sqrt(jnp.diag(back @ covariance @ back.T)), rtol=1e-9)
+
+
+def test_std_of_steps_is_not_known(fit):
+    """Rounding, argmax and squares of what is estimated as 0 have a derivative of 0, and change."""
+
+    def one(lens):
+        return lens.zoom(30.0)[0]
+
+    estimate = one(fit.lens)
+    with pytest.warns(UserWarning, match="derivative is 0, as that of rounding") as told:
+        std = zj.trust.std_of(
+            fit,
+            lambda lens: {
+                "rounded": jnp.round(1e6 * one(lens)),
+                "sound": one(lens),
+                "squared": (one(lens) - estimate) ** 2,
+                "constant": jnp.array(lens.image_size, float),
+                "still": lens(30.0).undistort(lens.centre),
+            },
+        )
+    assert told[0].filename == __file__
+    assert np.isnan([std["rounded"], std["squared"]]).all()
+    np.testing.assert_allclose(std["sound"], zj.trust.coefficient_std(fit, 30.0)[0])
+    np.testing.assert_array_equal(std["constant"], 0)
+    np.testing.assert_array_equal(std["still"], 0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        zj.trust.std_of(fit, one)
 
 
 @pytest.mark.parametrize(

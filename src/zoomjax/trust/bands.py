@@ -14,6 +14,7 @@ Each call computes one derivative with respect to each parameter; nothing is fit
 import functools
 import inspect
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
@@ -21,21 +22,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, Num, PyTree, ScalarLike
 
 from .._core.arguments import kinds_checked
 from .._core.arrays import as_jax
+from .._core.checks import warn_caller
 from .._core.fields import check_positive, real_argument
 from .._core.products import exact_products
 from .._core.programs import light_program, used_once
-from .._core.types import AnyArray, Coefficients, Focal, Points, traced
+from .._core.types import AnyArray, Points, traced
 from ..fit.result import ZoomFit
 from ..lines.buckets import bucket, padded_to
 from ..models.lens import ZoomLens
 from ..models.sizes import at_focal
-from ..models.zoom import AbstractZoom, with_parameters
+from ._uncertain import uncertain
 
 _SIZES = (16, 512, 8192)
 """Numbers of points that functions of points are compiled for; larger ones are four to each doubling."""
@@ -118,7 +119,12 @@ def std_of(fit: ZoomFit, function: Callable[[ZoomLens], PyTree]) -> PyTree:
 
     Returns:
         What `function` returns, each number replaced by its standard deviation: infinite where it depends
-        on a parameter that the lines do not determine, NaN where the number itself is not finite.
+        on a parameter that the lines do not determine, NaN where the number itself is not finite, or
+        changes though its derivative is 0.
+
+    Warns:
+        UserWarning: a number changes with the lens though its derivative is 0, as that of ``jnp.round`` or
+            ``jnp.argmax``. Under ``jit`` its standard deviation is 0.
 
     Example:
         >>> import jax.numpy as jnp, numpy as np
@@ -131,71 +137,44 @@ def std_of(fit: ZoomFit, function: Callable[[ZoomLens], PyTree]) -> PyTree:
         >>> std_of(fit, lambda lens: lens(50.0).distort(pixel)).shape
         (2,)
     """
-    flat, lens_at, covariance = _uncertain(fit)
+    flat, lens_at, covariance = uncertain(fit)
     derivatives, values = _derivatives(lambda flat: function(lens_at(flat)), flat)
+    known = jax.tree.map(jnp.isfinite, values)
+    if not traced((derivatives, values, covariance)):
+        known = _continuous(lambda flat: function(lens_at(flat)), flat, covariance, derivatives, values)
     return jax.tree.map(
-        lambda rows, value: jnp.where(jnp.isfinite(value), _root(_variance(covariance, rows)), jnp.nan),
+        lambda rows, known: jnp.where(known, _root(_variance(covariance, rows)), jnp.nan),
         derivatives,
-        values,
+        known,
     )
+
+
+def _continuous(function, flat, covariance, derivatives, values):
+    """Which values are numbers, and do not change within 3 deviations where all derivatives are 0."""
+    still = jax.tree.map(lambda rows: (rows == 0).all(-1), derivatives)
+    known = jax.tree.map(jnp.isfinite, values)
+    if not any(leaf.any() for leaf in jax.tree.leaves(still)):
+        return known
+    variances = jnp.diag(covariance)
+    step = 3 * jnp.sqrt(jnp.where(jnp.isfinite(variances), variances, 0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # said before
+        others = [function(flat + step), function(flat - step)]
+    moved = jax.tree.map(
+        lambda still, at, *others: still & (sum(abs(other - at) for other in others) > 1e-6 * abs(at)),
+        *(still, values, *others),
+    )
+    if any(leaf.any() for leaf in jax.tree.leaves(moved)):
+        warn_caller(
+            "A result of argument function changes with the lens, but its derivative is 0, as that of "
+            "rounding, argmax and comparisons: its standard deviation is not known."
+        )
+    return jax.tree.map(lambda known, moved: known & ~moved, known, moved)
 
 
 def _derivatives(function, flat):
     """By all that is uncertain, and the values: where those are NaN, derivatives of zero say nothing."""
     return jax.jacfwd(lambda flat: (found := function(flat), found), has_aux=True)(flat)
-
-
-class _OffZoom(AbstractZoom):
-    """A zoom model off by the same coefficients at every focal length; it may have one more of them."""
-
-    zoom: AbstractZoom
-    parameters: Float[Array, "coefficients"]
-
-    def prepare(self, focal: Focal, terms: int) -> "_OffZoom":
-        return _OffZoom(zoom=self.zoom.prepare(focal, terms), parameters=jnp.zeros(terms))
-
-    def __call__(self, *settings: ScalarLike) -> Coefficients:
-        k = self.zoom(*settings)
-        return self.parameters.at[: len(k)].add(k)
-
-
-def _uncertain(fit):
-    """What of a lens is uncertain, flattened; the lens that other such numbers make; their covariance.
-
-    These are the parameters of the zoom model; after them the centre, if it was fitted; and then what the
-    coefficients are off the model, 0 in the lens, if the misfit was estimated; and what they and the centre
-    are off, if the centre may be elsewhere.
-    """
-    lens, covariance = fit.lens, fit.covariance
-    centre = off = elsewhere = None
-    if fit.joint is not None:
-        covariance = fit.joint
-        centre = lens.centre / lens.scale if lens.shift is None else lens.shift.parameters
-    if fit.misfit is not None:
-        covariance = jax.scipy.linalg.block_diag(covariance, fit.misfit)
-        off = jnp.zeros(fit.misfit.shape[0], covariance.dtype)
-    if fit.off_centre is not None:
-        covariance = jax.scipy.linalg.block_diag(covariance, fit.off_centre)
-        elsewhere = jnp.zeros(fit.off_centre.shape[0], covariance.dtype)
-    flat, unravel = ravel_pytree((lens.zoom.parameters, centre, off, elsewhere))
-
-    def lens_at(flat):
-        parameters, centre, off, elsewhere = unravel(flat)
-        if elsewhere is not None:
-            more = elsewhere[:-2]
-            off = more if off is None else off.at[: more.size].add(more)
-        zoom = with_parameters(lens.zoom, parameters)
-        zoom = zoom if off is None else _OffZoom(zoom=zoom, parameters=off)
-        moved = eqx.tree_at(lambda lens: lens.zoom, lens, zoom)
-        if centre is not None and lens.shift is None:
-            moved = eqx.tree_at(lambda lens: lens.centre, moved, lens.scale * centre)
-        elif centre is not None:
-            moved = eqx.tree_at(lambda lens: lens.shift, moved, with_parameters(lens.shift, centre))
-        if elsewhere is None:
-            return moved
-        return eqx.tree_at(lambda lens: lens.centre, moved, moved.centre + lens.scale * elsewhere[-2:])
-
-    return flat, lens_at, covariance
 
 
 @kinds_checked
@@ -307,7 +286,7 @@ def displacement_band(
         offset = point - fit.lens.centre_at(f).astype(point.dtype)
         squared = offset @ offset
         outward = offset / jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 1)
-        variance = _variance(_uncertain(fit)[2], outward @ _point_rows(fit, point, f))
+        variance = _variance(uncertain(fit)[2], outward @ _point_rows(fit, point, f))
         middle = (at_focal(fit.lens, f).undistort(point) - point) @ outward
         half = quantile.astype(point.dtype) * _root(variance)
         return jnp.stack([middle - half, middle + half])
@@ -334,7 +313,7 @@ def _each_point(function, result, fit, points, focal):
 
 def _point_rows(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 parameter"]:
     """Derivatives of one corrected point by all that is uncertain."""
-    flat, lens_at, _ = _uncertain(fit)
+    flat, lens_at, _ = uncertain(fit)
     rows, place = _derivatives(lambda flat: at_focal(lens_at(flat), f).undistort(point), flat)
     return jnp.where(jnp.isfinite(place)[:, None], rows, jnp.nan)
 
@@ -346,7 +325,7 @@ def _positive(focal):
 
 def _point_covariance(fit: ZoomFit, point: Any, f: Any) -> Float[Array, "2 2"]:
     """Of one corrected point."""
-    rows, (_, _, own) = _point_rows(fit, point, f), _uncertain(fit)
+    rows, (_, _, own) = _point_rows(fit, point, f), uncertain(fit)
     variance = _variance(own, rows)
     covariance = rows @ _finite(own) @ rows.T
     unknown = jnp.any(jnp.isinf(variance))
