@@ -11,7 +11,7 @@ import pytest
 import zoomjax as zj
 from zoomjax.correct import _segments
 from zoomjax.correct.video import redistort_video, undistort_video
-from zoomjax.io.video_reader import Report
+from zoomjax.io.video_report import Report
 
 from .._clips import FRAMES, SIZE, TICK, lens, luma, picture, write_clip, write_frames
 

@@ -316,6 +316,44 @@ def test_a_matroska_file_whose_pictures_end_before_its_sound_is_said(tmp_path):
     assert 7 <= done.lost <= 9
 
 
+@pytest.mark.parametrize(
+    ("suffix", "share", "options"),
+    [
+        (".mp4", 0.7, {"movflags": "frag_keyframe+empty_moov"}),  # which tells no number of frames
+        (".mov", 0.99, {"movflags": "faststart"}),  # where sound alone is missing
+        (".mkv", 0.99, {}),
+        (".flv", 0.7, {}),
+        (".mxf", 0.7, {}),
+    ],
+)
+def test_a_file_that_is_cut_off_is_said_whatever_its_format(suffix, share, options, tmp_path):
+    """Unless its format has no end, as transport streams. Whole files are not said to be cut off."""
+    source, encoder = tmp_path / f"in{suffix}", "mpeg2video" if suffix == ".mxf" else "libx264"
+    with av.open(str(source), "w", options=options) as out:
+        video = out.add_stream(encoder, rate=25, options={"g": "6"})
+        video.width, video.height, video.pix_fmt = *SIZE, "yuv420p"
+        sound = out.add_stream("pcm_s16le" if suffix == ".mxf" else "aac", rate=48000)
+        sound.layout = "mono"
+        noise = np.random.default_rng(0).integers(-3000, 3000, (FRAMES, 1, 1920)).astype(np.int16)
+        for number, samples in enumerate(noise):
+            frame = av.VideoFrame.from_ndarray(picture(number), "gray").reformat(format="yuv420p")
+            frame.pts = number
+            out.mux(video.encode(frame))
+            heard = av.AudioFrame.from_ndarray(samples, format="s16", layout="mono")
+            heard.sample_rate, heard.pts = 48000, 1920 * number
+            out.mux(sound.encode(heard))
+        out.mux([*video.encode(None), *sound.encode(None)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert undistort_video(source, tmp_path / "whole.mkv", lens=lens(), focal=30.0).frames == FRAMES
+    content = source.read_bytes()
+    source.write_bytes(content[: int(share * len(content))])
+    with pytest.warns(UserWarning, match=r"is cut off at its end: \d+ frames|\d+ of 2\d frames of") as told:
+        done = undistort_video(source, tmp_path / "out.mkv", lens=lens(), focal=30.0)
+    assert len(told) == 1
+    assert abs(done.frames + done.lost - FRAMES) <= 1 or suffix == ".mp4"
+
+
 def test_a_last_frame_that_does_not_decode_is_said(tmp_path):
     """Matroska tells no number of frames, and the decoder of FFV1 nothing of those that it leaves out."""
     source = write_clip(tmp_path / "in.mkv", encoder="ffv1", sound=False)

@@ -25,7 +25,8 @@ import cv2
 from .._core.executors import arrived, checked_executor, in_order, is_away, sent
 from ..io.focal_track import FocalTrack
 from ..io.pyav import av
-from ..io.video_reader import Report, opened_video, picture_stream, warn_of_loss
+from ..io.video_reader import opened_video, picture_stream, warn_of_loss
+from ..io.video_report import Report
 from ..io.video_streams import Carried
 from ..io.video_writer import FirstFrame, FrameWriter, Picture
 from ..models.lens import ZoomLens
@@ -87,6 +88,7 @@ def cut(source: str | os.PathLike[str], others: Sequence[int], report: Report) -
     stamps: list[int] = []
     keys: list[int] = []
     sizes: list[tuple[int, int]] = []
+    report.streams = 1 + len(others)
     with opened_video(source) as input_:
         video = picture_stream(input_)
         if input_.format.name == "avi":  # which has times of decoding alone
@@ -98,10 +100,9 @@ def cut(source: str | os.PathLike[str], others: Sequence[int], report: Report) -
                     if packet.stream is video and packet.size:
                         return []
                     continue
+                report.note(packet, pictures=packet.stream is video)
                 if packet.stream is not video:
                     continue
-                end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
-                report.reached = max(report.reached, end)
                 if packet.is_discard:
                     continue
                 warn_of_loss(packet, report)

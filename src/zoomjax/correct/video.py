@@ -23,16 +23,14 @@ from .._core.files import refuse_inputs, whole_file
 from ..io.focal_track import FocalTrack
 from ..io.pyav import av
 from ..io.video_reader import (
-    Report,
     decoded_items,
-    frames_expected,
-    frames_reached,
     frames_shown,
     numbered,
     opened_video,
     picture_stream,
     warn_of_pixels,
 )
+from ..io.video_report import Report, frames_expected, frames_reached, is_cut_off
 from ..io.video_streams import CONTAINER, Carried, carried
 from ..io.video_writer import FrameWriter, Picture, first_frame
 from ..models.lens import ZoomLens
@@ -200,7 +198,7 @@ def _convert(
                 writer = _write(
                     items, part, target, input_, video, how.encoder, how.options, along, report, progress
                 )
-        report.announced = frames_expected(input_, video, report)
+        report.announced, kind = frames_expected(source, input_, video, report), input_.format.name
     lost = max(report.corrupt + report.skipped, report.announced - report.written)
     if lost > report.skipped:
         at_end = frames_reached(report) < report.announced and not report.left
@@ -212,6 +210,12 @@ def _convert(
             stacklevel=3,
         )
     else:
+        if is_cut_off(source, kind):
+            warnings.warn(
+                f"{os.fspath(source)} is cut off at its end: {report.written} frames were written, and "
+                "sound or further frames may be missing.",
+                stacklevel=3,
+            )
         track.warn_if_longer(*report.last, stacklevel=3)
     return CorrectedVideo(
         report.written, lost, float(framing.scale), tuple(writer.kept), tuple(writer.not_kept)

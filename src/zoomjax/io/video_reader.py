@@ -1,13 +1,11 @@
 """Video decoded frame by frame, with PyAV."""
 
 import contextlib
-import dataclasses
 import functools
 import heapq
 import itertools
 import math
 import os
-import struct
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from fractions import Fraction
@@ -19,12 +17,10 @@ import numpy as np
 from .pyav import av, open_container
 from .video_crop import shown_size
 from .video_hdr import side_data
+from .video_report import Report, is_avi, is_cut_off
 
 _MOST_ERRORS = 1000
 """Of one file: a demuxer may fail for ever."""
-
-_NOT_A_FIELD = 0.75
-"""Steps after the last frame at which there was another one: fields of a frame are half a step apart."""
 
 _HOLE = 1.5
 """Steps between frames, in units of the one before, from which some may be missing."""
@@ -65,29 +61,6 @@ def decode_video(
                 yield number, time, functools.partial(item.to_ndarray, format="bgr24")
 
         yield (report.announced or _counted(source)) - report.skipped, frames()
-
-
-@dataclasses.dataclass
-class Report:
-    """What happened on the way, in threads: counts of frames; where packets of pictures end, and when the
-    last of these and the last frame are, s; and what the first frame carries. Those that are skipped are
-    before the first that can be decoded alone, and those that are left have a step in an AVI file and no
-    picture. It is torn where packets were lost."""
-
-    announced: int
-    written: int = 0
-    skipped: int = 0
-    corrupt: int = 0
-    failed: int = 0
-    left: int = 0
-    torn: bool = False
-    error: str = ""
-    side: dict[str, bytes] | None = None
-    first: Any = None
-    last: tuple[int, float] = (-1, math.nan)
-    reached: float = 0.0
-    last_packet: float = -math.inf
-    last_frame: float = -math.inf
 
 
 def opened_video(source: str | os.PathLike[str]) -> Any:
@@ -146,8 +119,10 @@ def frames_shown(source: str | os.PathLike[str], video: Any) -> int:
     Of a clip that was cut without encoding it anew, an edit list leaves out frames that are still there.
     AVI also counts chunks without content, which the index leaves out; a file that is cut off has none.
     """
-    if _is_avi(video.container):
-        indexed = sum(entry.size > 0 for entry in video.index_entries) if _is_whole_avi(source) else 0
+    if is_avi(video.container):
+        indexed = (
+            sum(entry.size > 0 for entry in video.index_entries) if not is_cut_off(source, "avi") else 0
+        )
         return indexed or video.frames
     if not (video.frames and video.duration and video.average_rate):
         return video.frames
@@ -159,7 +134,7 @@ def _frame_numbers(source: str | os.PathLike[str]) -> dict[int, int]:
     """The numbers of all frames by their time stamps, also of those that do not decode: by reading."""
     stamps = set()
     with opened_video(source) as input_, contextlib.suppress(av.error.FFmpegError):
-        avi = _is_avi(input_)
+        avi = is_avi(input_)
         for packet in input_.demux(picture_stream(input_)):
             stamp = packet.dts if avi else packet.pts
             if stamp is not None and not packet.is_discard:
@@ -176,7 +151,8 @@ def decoded_items(
     index of the order in which frames are shown. Decoded frames come in that order, so the times of
     packets, the earliest first, are those of frames.
     """
-    packets, avi, steps = input_.demux([video, *others]), _is_avi(input_), list[int]()
+    packets, avi, steps = input_.demux([video, *others]), is_avi(input_), list[int]()
+    report.streams = 1 + len(others)
     early, begun, shape = list[int](), False, None
     ordered = avi or input_.format.name == "mxf"
     while report.corrupt < _MOST_ERRORS:
@@ -186,15 +162,11 @@ def decoded_items(
             if packet is None:
                 report.left = len(steps)
                 return
+            report.note(packet, pictures=packet.stream is video)
             if packet.stream is not video:
                 if packet.dts is not None:
                     yield packet
                 continue
-            if packet.pts is not None:
-                end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
-                report.reached = max(report.reached, end)
-                if not packet.is_discard:
-                    report.last_packet = max(report.last_packet, float(packet.pts * packet.time_base))
             warn_of_loss(packet, report)
             step = (packet.dts if avi else packet.pts) if ordered else None
             if step is not None:
@@ -255,57 +227,6 @@ def warn_of_loss(packet: Any, report: Report) -> None:
         "focal lengths by time, which stay right, and not by frame.",
         stacklevel=3,
     )
-
-
-def _is_avi(input_: Any) -> bool:
-    return input_.format.name == "avi"
-
-
-def _is_whole_avi(source: str | os.PathLike[str]) -> bool:
-    """Whether the parts of an AVI file end where it does, or before."""
-    length, place = os.path.getsize(source), 0
-    with open(source, "rb") as file:
-        while place + 8 <= length:
-            file.seek(place)
-            name, size = struct.unpack("<4sI", file.read(8))
-            if name != b"RIFF":
-                break
-            place += 8 + size + size % 2
-    return 0 < place <= length + 1
-
-
-def frames_expected(input_: Any, video: Any, report: Report) -> int:
-    """How many frames a file that was read to its end should hold, as far as it tells.
-
-    AVI also counts chunks without content, which show the last frame again; an index of fewer frames than
-    there are is damaged. Matroska tells its length in seconds alone, and the length of all is that of the
-    longest stream.
-    """
-    rate = float(video.average_rate or video.guessed_rate or 25)
-    seen = max(report.written, frames_reached(report)) + report.left
-    if report.announced:
-        announced = video.frames if _is_avi(input_) and report.announced < seen else report.announced
-        whole = _is_avi(input_) and round(report.reached * rate) >= announced
-        return seen if whole else announced
-    after = (report.last_packet - report.last_frame) * rate
-    if after > _NOT_A_FIELD and math.isfinite(after):
-        seen += round(after)
-    if input_.format.name != "matroska,webm":
-        return seen
-    told = video.metadata.get("DURATION")
-    try:
-        hours, minutes, seconds = (float(part) for part in told.split(":"))
-        length = 3600 * hours + 60 * minutes + seconds
-    except (AttributeError, ValueError):
-        length = (input_.duration or 0) / av.time_base if len(input_.streams) == 1 else 0.0
-    missing = length - report.reached
-    cut_off = missing > 0.02 * length + 1 / rate
-    return seen + round(missing * rate) if cut_off else seen
-
-
-def frames_reached(report: Report) -> int:
-    """How many frames there are up to the last that was decoded, with those that were not."""
-    return report.last[0] + 1 + report.skipped
 
 
 def numbered(
