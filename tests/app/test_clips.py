@@ -14,6 +14,7 @@ import pytest
 
 import zoomjax as zj
 from zoomjax import scenes
+from zoomjax.app.arguments import results_of
 from zoomjax.app.clips import ClipJob, wants_motion
 from zoomjax.app.heard import heard
 from zoomjax.app.known_focals import known_focals
@@ -646,3 +647,17 @@ def test_things_that_move_and_pass_for_noise_are_told(tmp_path, seed):
     assert done.following() > 0.6
     assert any("may be on things that move" in str(finding) for finding in done.findings)
     assert done.verdict != "good"
+
+
+def test_results_of_a_clip_without_lines_are_refused_as_such(tmp_path):
+    for name in ("lens.json", "summary.json", "tracks.npz", "track.csv", "panorama.jpg", "motion.png"):
+        (tmp_path / name).touch()
+    with pytest.raises(ValueError, match=r"results of a clip without lines, .* with --lines"):
+        results_of(str(tmp_path))
+    photo = tmp_path / "a.jpg"
+    photo.touch()
+    assert results_of(str(tmp_path)) is None
+    assert results_of(str(tmp_path / "*.jpg")) is None
+    assert results_of(str(photo)) is None
+    (tmp_path / "lines.npz").touch()
+    assert results_of(str(tmp_path)) == tmp_path / "lines.npz"

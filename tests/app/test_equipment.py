@@ -108,6 +108,15 @@ def test_photos_that_show_another_part_of_the_sensor_are_told(lens, tmp_path):
     (told,) = taken_otherwise(known, photos)
     assert "of crop factor 1.5, and by their EXIF data 1 of 2 photos are of 1:" in told
     assert taken_otherwise(known, photos[:1]) == taken_otherwise(lens, photos) == []
+    width, height = SIZE
+    whole, part = (
+        of_a_zoom(tmp_path / f"{shown}.jpg", ExifImageWidth=shown, ExifImageHeight=height)
+        for shown in (width, width * 4 // 3)
+    )
+    (told,) = taken_otherwise(known, [whole, part])
+    assert f"1 of 2 photos were cropped, as the camera wrote another shape ({width * 4 // 3} x" in told
+    assert taken_otherwise(lens, [whole, part]) == []  # its own may have been
+    assert (with_equipment(lens, [part]).about, with_equipment(lens, [part]).pixel_pitch) == ({}, None)
     zoomed = of_a_zoom(tmp_path / "c.jpg", DigitalZoomRatio=IFDRational(2, 1))
     for of in (known, lens):
         (told,) = taken_otherwise(of, [photos[0], zoomed])

@@ -91,3 +91,15 @@ def test_a_photo_with_digital_zoom_has_no_crop_factor():
     for lens in (None, "FE 24-70mm f/2.8 GM"):
         with pytest.raises(ValueError, match="digital zoom of 2: which part of the sensor it shows is not"):
             match_lens(photo, SIZE, lens=lens)
+
+
+def test_a_photo_that_was_cropped_has_no_crop_factor_either():
+    """That of its body, or of equal view on film, is of what the camera wrote."""
+    photo = Equipment("SONY", "ILCE-7M3", "FE 24-70mm F2.8 GM", 35.0, crop=1.0, written=(6000, 4000))
+    assert match_lens(photo, (3000, 2000)).crop == crop_factor(photo, (2000, 3000)) == 1.0
+    for lens in (None, "FE 24-70mm f/2.8 GM"):
+        with pytest.raises(
+            ValueError, match=r"has 3000 x 3000 px, and .* wrote 6000 x 4000: it was cropped"
+        ):
+            match_lens(photo, (3000, 3000), lens=lens)
+    assert crop_factor(photo, (3000, 3000)) is None

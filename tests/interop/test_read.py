@@ -398,6 +398,8 @@ def test_a_project_of_hugin_may_link_one_image_to_another(tmp_path):
         ("f0 v40", "f3 v40", "its projection is number 3, and only 0, rectilinear, is read"),
         ("g=0", "g1.5", "it has shear"),
         ("v40", "v180", "its field of view must be between 0 and 180 degrees, but it is 180"),
+        (' n"b.jpg"', "", "an image line has no name, n, as where the file was cut off"),
+        ('n"b.jpg"\n', 'n"b.j', "an image line has no name, n, as where the file was cut off"),
         ("w600 h400 f0 v40", "w400 h600 f0 v40", "images of one size, and it has 2"),
         ("b-0.01", "b1.5", "the factor at the centre is not positive"),
     ],
@@ -407,6 +409,25 @@ def test_a_project_of_hugin_that_is_no_lens_is_refused(old, new, message, tmp_pa
     (tmp_path / "a.pto").write_text(HUGIN.replace(old, new))
     with pytest.raises(ValueError, match=message):
         zj.interop.read(tmp_path / "a.pto")
+
+
+@pytest.mark.parametrize("name", ["colmap", "pftrack", "discorpy"])
+def test_a_last_number_that_may_be_cut_off_is_told(name, tmp_path):
+    lens = LENSES["landscape"]()
+    given = {"image_size": lens.image_size} if name == "discorpy" else {}
+    pitch = {"pixel_pitch": PITCH} if name == "colmap" else {}
+    given |= {"focal": 24.0} if name != "colmap" else {}
+    [path] = zj.interop.write(lens, tmp_path / "a", format=name, focal=24.0, **pitch).files
+    assert "has no end" not in str(zj.interop.read(path, format=name, **given).report)
+    path.write_text(path.read_text()[:-1])
+    report = zj.interop.read(path, format=name, **given).report
+    assert f"The last line of {path} has no end" in str(report)
+    if name == "colmap":
+        path.write_text(path.read_text().rsplit(" ", 2)[0])
+        with pytest.raises(
+            ValueError, match="FULL_OPENCV has 12 parameters, but a line has 10: it may be cut"
+        ):
+            zj.interop.read(path, format=name)
 
 
 @pytest.mark.parametrize(("distortion_model", "most"), [(Division(), 0.2), (BrownConrady(), 0.1)])

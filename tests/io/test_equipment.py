@@ -64,8 +64,23 @@ def test_a_smaller_copy_has_wider_pixels_and_an_upright_one_the_same():
 
 
 def test_the_pitch_of_a_part_of_the_image_is_not_known():
-    found = exif_equipment(block(**plane(25.4 / PITCH, 2)))
-    assert found.pixel_pitch((SIZE[0], SIZE[1] // 2)) is None
+    half = (SIZE[0], SIZE[1] // 2)
+    film = {"FocalLengthIn35mmFilm": round(35 * CROP), **FOCAL}
+    for more in ({}, film):
+        found = exif_equipment(block(**plane(25.4 / PITCH, 2), **more))
+        assert found.cropped(half)
+        assert found.pixel_pitch(half) is None
+        for whole in (SIZE, SIZE[::-1], (53, 35), (53, 36), (4256, 2848)):
+            assert not found.cropped(whole)
+            assert found.pixel_pitch(whole) is not None
+    assert not exif_equipment(block(**film)).cropped(half)  # nothing says so
+
+
+def test_of_a_raw_photo_the_shape_of_a_picture_beside_it_says_nothing(tmp_path):
+    content = block(**plane(25.4 / PITCH, 2, size=(SIZE[0], SIZE[1] // 2)), **FOCAL)
+    for name, cropped in (("a.tif", True), ("a.dng", False)):
+        Image.fromarray(np.zeros((8, 12, 3), np.uint8)).save(tmp_path / name, "TIFF", exif=content)
+        assert read_equipment(tmp_path / name).cropped(SIZE) == cropped
 
 
 def test_equal_view_on_film_gives_the_pitch_to_its_rounding():

@@ -139,9 +139,28 @@ def _refuse_frames_again(inputs: list[Path], parts: "list[Lines]") -> None:
 
 
 def results_of(path: str) -> Path | None:
-    """The lines of a folder of results; None if it is something else."""
-    lines = Path(path) / "lines.npz"
-    return lines if lines.is_file() and (Path(path) / "lens.json").is_file() else None
+    """The lines of a folder of results; None if it is something else.
+
+    Raises:
+        ValueError: the results are those of a clip without lines, and the folder has no other pictures.
+    """
+    folder = Path(path)
+    lines, has = folder / "lines.npz", {one.name for one in folder.glob("*")}
+    if not {"lens.json", "tracks.npz", "track.csv"} <= has or lines.is_file():
+        return lines if lines.is_file() and (folder / "lens.json").is_file() else None
+    if not has <= _OF_A_CLIP:
+        return None  # photos may be among them
+    raise ValueError(
+        f"{path} holds the results of a clip without lines, so there is nothing to fit again: calibrate "
+        "the clip itself, with --lines if straight lines in its frames are to count, too."
+    )
+
+
+_OF_A_CLIP = {
+    *("lens.json", "summary.json", "report.html", "tracks.npz", "track.csv", "motion.png", "panorama.jpg"),
+    ".zoomjax.json",
+}
+"""What a calibration from a clip without lines leaves in its folder."""
 
 
 def refits(inputs: list[Path], target: Path) -> bool:

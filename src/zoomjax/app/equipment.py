@@ -248,6 +248,14 @@ def _parts_taken(lens: ZoomLens, found: Sequence[Equipment]) -> list[str]:
                 f"{len(found)} photos were taken with {_span(others)}: they show another part of what it "
                 "does, and are corrected wrongly."
             )
+    parts = [one for one in found if one.cropped(lens.image_size)]
+    if isinstance(own, int | float) and parts:  # the lens's own photos were not
+        width, height = parts[0].written or lens.image_size
+        told.append(
+            f"By their EXIF data {len(parts)} of {len(found)} photos were cropped, as the camera wrote "
+            f"another shape ({width} x {height} px): they show another part of what the lens does, and are "
+            "corrected wrongly."
+        )
     crops = [crop for one in found if (crop := one.crop_factor(lens.image_size)) is not None]
     if isinstance(own, int | float) and (
         others := [crop for crop in crops if _apart(crop, own, OTHER_CROP)]

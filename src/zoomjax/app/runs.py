@@ -49,7 +49,8 @@ def calibrate_lines(
 
     Where `focal_known` is false, a number stands for the one focal length of all lines. Of lines in a
     folder of results the summary tells how uncertain focal lengths are, unless that is given; and where
-    their centre was fitted, it is fitted again from the middle of the image.
+    their centre was fitted, it is fitted again from the middle of the image. What it says against the
+    photos or the clip stays.
     """
     from .calibrating import calibrate
     from .earlier import earlier_of, findings_of_counted_again
@@ -57,6 +58,7 @@ def calibrate_lines(
     from .focal_sources import focal_sigmas
     from .relative import findings_of_relative
     from .report import report
+    from .said_before import findings_before, findings_of_lenses
     from .verdict import findings_of_surer
 
     known = earlier_of(files, lines)
@@ -80,6 +82,7 @@ def calibrate_lines(
     lens = with_earlier(calibration.fit.lens, files)
     found = [*known.findings(), *findings_of_relative(lens), *surer]
     found += findings_of_counted_again(files, calibration.rejected)
+    found += [*findings_of_lenses(files), *findings_before(files, given_sigma=focal_sigma is not None)]
     assessment = calibration.assessment.joined_by(found)
     zoom = dataclasses.replace(calibration.fit, lens=lens if focal_known else without_focal(lens))
     calibration = dataclasses.replace(calibration, assessment=assessment, fit=zoom)

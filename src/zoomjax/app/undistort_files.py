@@ -254,8 +254,8 @@ def undistort_photos(
         path for path in targets if path not in {target for _, target in todo} and _holds_none(path)
     ]
     given = [source for source, _ in wanted]
-    before = () if job.redistort else (*corrected_before(given), *taken_otherwise(lens, given))
     corrected = [source for source in given if source not in skipped]
+    before = () if job.redistort else (*corrected_before(given), *taken_otherwise(lens, corrected))
     before += () if job.focal is None else tuple(taken_at_others(lens, corrected, focal_of))
     notes = (*_losses(lost), *_unmarked(unmarked), *before)
     sentence = _counted(written, len(sources), earlier, job, "photo")

@@ -1,4 +1,7 @@
-"""JSON, YAML and XML of other tools, no name twice in them: readers differ in which of two they take."""
+"""JSON, YAML, XML and lines of other tools.
+
+No name is twice in them: readers differ in which of two they take.
+"""
 
 import json
 import re
@@ -8,6 +11,17 @@ from typing import Any
 
 from ..models.registry import once
 from .base import read_text
+
+
+def lines_of(path: Path) -> tuple[list[str], tuple[str, ...]]:
+    """The lines of a text whose lines end with numbers; with a note, if the last one may be cut off."""
+    text = read_text(path)
+    whole = text.endswith("\n") or not text
+    note = (
+        f"The last line of {path} has no end: if the file was cut off there, its last number is another. "
+        "Compare it with the original."
+    )
+    return text.splitlines(), () if whole else (note,)
 
 
 def load_json(text: str) -> Any:

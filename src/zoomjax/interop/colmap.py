@@ -4,13 +4,16 @@ FULL_OPENCV, the rational model; for a division model of one term SIMPLE_DIVISIO
 Principal points count from the corner of the top-left pixel, half a pixel more than ours.
 """
 
+import dataclasses
+
 import numpy as np
 
 from ..models.division import Division
 from ..models.lens import ZoomLens
+from ._documents import lines_of
 from ._forms import Form
 from ._pinhole import Pinhole, contents, focal_px, formula, node_of, pinhole
-from .base import Contents, Export, Import, Node, NodeFormat, one_size, read_text
+from .base import Contents, Export, Import, Node, NodeFormat, one_size
 
 _ORDER = {
     "SIMPLE_PINHOLE": "f cx cy",
@@ -61,17 +64,24 @@ class COLMAP(NodeFormat):
     def read(self, job: Import) -> Contents:
         """All cameras, of one image size."""
         nodes, sizes = [], []
-        for line in read_text(job.paths[0]).splitlines():
+        lines, notes = lines_of(job.paths[0])
+        for line in lines:
             if not line.strip() or line.lstrip().startswith("#"):
                 continue
             _, model, width, height, *words = line.split()
             if model not in _ORDER:
                 raise ValueError(f"its camera model {model} is not one of {', '.join(_ORDER)}")
-            values = dict(zip(_ORDER[model].split(), map(float, words), strict=True))
+            names = _ORDER[model].split()
+            if len(words) != len(names):
+                raise ValueError(
+                    f"its camera model {model} has {len(names)} parameters, but a line has {len(words)}: "
+                    "it may be cut off"
+                )
+            values = dict(zip(names, map(float, words), strict=True))
             size = job.size((width, height))
             nodes.append(_node(model, values, size))
             sizes.append(size)
-        return contents(nodes, one_size(sizes), job)
+        return dataclasses.replace(contents(nodes, one_size(sizes), job), notes=notes)
 
 
 def _at_some(lens: ZoomLens) -> np.ndarray:

@@ -12,9 +12,10 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from ._documents import lines_of
 from ._forms import AbstractForm, minimax
 from ._pinhole import contents
-from .base import IN_PX, Contents, Export, Import, Node, NodeFormat, read_text
+from .base import IN_PX, Contents, Export, Import, Node, NodeFormat
 
 _TERMS = 6
 """Written: those of discorpy's own examples, and one more."""
@@ -83,9 +84,10 @@ class Discorpy(NodeFormat):
             raise ValueError(
                 f"it holds no focal length: give argument focal, {len(job.paths)} of them{IN_PX}"
             )
-        nodes, size = [], job.size()
+        nodes, size, notes = [], job.size(), ()
         for path, focal in zip(job.paths, job.focal, strict=True):
-            lines = [line for line in read_text(path).splitlines() if line.strip()]
+            told, note = lines_of(path)
+            lines, notes = [line for line in told if line.strip()], notes + note
             names, values = zip(*(line.split("=") for line in lines), strict=True)
             terms = len(lines) - 2
             if [n.strip() for n in names] != ["xcenter", "ycenter", *(f"factor{i}" for i in range(terms))]:
@@ -96,4 +98,4 @@ class Discorpy(NodeFormat):
             form = Powers(terms)
             theta = form.rescaled(numbers[2:], math.hypot(*size) / 2)
             nodes.append(Node(focal, form, theta, numbers[:2]))
-        return contents(nodes, size, job, mm=True)
+        return dataclasses.replace(contents(nodes, size, job, mm=True), notes=notes)

@@ -54,6 +54,8 @@ class Hugin(NodeFormat):
         images: list[dict[str, str]] = []
         for line in lines:
             words = _WORD.findall(line[2:])
+            if not any(name == "n" for name, _, _ in words):
+                raise ValueError("an image line has no name, n, as where the file was cut off")
             images.append(
                 once([(name, images[int(value)][name] if same else value) for name, same, value in words])
             )

@@ -52,7 +52,7 @@ def match_lens(equipment: Equipment, image_size: tuple[int, int], *, lens: str |
     Raises:
         ImportError: lensfunpy is not installed.
         ValueError: no lens fits, or several do, which the message names; or the crop factor is not known,
-            as after digital zoom.
+            as after digital zoom, or of a photo that was cropped.
 
     Example:
         >>> from zoomjax.io import Equipment
@@ -66,6 +66,13 @@ def match_lens(equipment: Equipment, image_size: tuple[int, int], *, lens: str |
             f"The photo was taken with a digital zoom of {equipment.digital_zoom:.3g}: which part of the "
             "sensor it shows is not known. Make the lens with the crop factor of what it shows, by "
             "library_lens or zoomjax lens, and give that."
+        )
+    if equipment.written is not None and equipment.cropped(image_size):
+        width, height = equipment.written
+        raise ValueError(
+            f"The photo has {image_size[0]} x {image_size[1]} px, and by its EXIF data the camera wrote "
+            f"{width} x {height}: it was cropped, and which part of the sensor it shows is not known. Give "
+            "the photo as the camera stored it."
         )
     body = _body(equipment, image_size)
     crop = _crop(body, equipment, image_size)
@@ -81,9 +88,10 @@ def match_lens(equipment: Equipment, image_size: tuple[int, int], *, lens: str |
 def crop_factor(equipment: Equipment, image_size: tuple[int, int]) -> float | None:
     """The crop factor of a photo: by its EXIF data, else of its body in the database; None if not known.
 
-    Without lensfunpy it is that of the EXIF data. After digital zoom it is not known.
+    Without lensfunpy it is that of the EXIF data. After digital zoom it is not known, nor is that of a
+    photo that was cropped.
     """
-    if equipment.enlarged:
+    if equipment.enlarged or equipment.cropped(image_size):
         return None
     if (told := equipment.crop_factor(image_size)) is not None:
         return told

@@ -7,8 +7,9 @@ fraction of the image's size, y up, counted from pixel centres. Without a track 
 
 import numpy as np
 
+from ._documents import lines_of
 from ._forms import Form
-from .base import IN_PX, Contents, Export, Import, Node, NodeFormat, read_text, refuse_others
+from .base import IN_PX, Contents, Export, Import, Node, NodeFormat, refuse_others
 
 _FORM = Form(2, corrects=True)
 _UNIT = np.sqrt(2)
@@ -43,8 +44,8 @@ class PFTrack(NodeFormat):
 
     def read(self, job: Import) -> Contents:
         """All keys; focal lengths are those of argument focal, one for each."""
-        text = read_text(job.paths[0])
-        lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+        told, notes = lines_of(job.paths[0])
+        lines = [line.strip() for line in told if line.strip() and not line.startswith("#")]
         width, height, aspect = int(lines[0]), int(lines[1]), float(lines[2])
         told = {"pixel aspect": aspect, "model": lines[5], "squeeze": float(lines[6])}
         refuse_others(told, {"pixel aspect": 1, "model": "High Order", "squeeze": 1})
@@ -64,4 +65,4 @@ class PFTrack(NodeFormat):
             )
             for focal, row in zip(job.focal, values, strict=True)
         ]
-        return Contents(tuple(nodes), size, job.focal_unit)
+        return Contents(tuple(nodes), size, job.focal_unit, notes)

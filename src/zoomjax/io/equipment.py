@@ -4,19 +4,22 @@ The width of a pixel has two sources. The resolution of the focal plane, in pixe
 camera wrote, is the more exact. The focal length of equal view on film of 36 x 24 mm is rounded to whole
 mm. Where both are there and differ by more than a fifth, the first is taken for a mistake of the camera.
 A photo with digital zoom shows a part of the sensor, and makers do not agree on whether the two tell of
-that: then the width of a pixel is not known.
+that; one that was cropped shows a part, too, and neither tells which. Then the width of a pixel is not
+known.
 """
 
 import dataclasses
 import io
 import math
 import os
+from pathlib import Path
 from typing import Any
 
 from PIL import ExifTags
 
 from .exif import parse_exif
 from .photo import read_exif
+from .raw import RAW_SUFFIXES
 
 FILM = math.hypot(36, 24)
 """Diagonal of the film that crop factors refer to, mm."""
@@ -29,6 +32,8 @@ _LEAST, _MOST = 0.2, 30.0
 """Crop factors that there are: from plates to the smallest phones."""
 _ENLARGED = 1.02
 """Digital zoom from which it is more than rounding."""
+_RESHAPED = 0.01
+"""Difference of height over width from which an image has another shape."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +45,7 @@ class Equipment:
         lens: the lens; empty if not known.
         focal: focal length, mm.
         plane_pitch: mm from pixel to pixel in the image as the camera wrote it.
-        written: width and height px of that image.
+        written: width and height px of that image; None if they are not known, as of RAW photos.
         crop: crop factor, from the focal length of equal view on film.
         zoom_range: the ends of the lens's own range, mm; None if they are not known, or one.
         digital_zoom: by how much a part of the image was enlarged; 1 if it was not, or nothing is said.
@@ -61,12 +66,20 @@ class Equipment:
         """Whether there was digital zoom: the image shows less than its lens and sensor would."""
         return self.digital_zoom > _ENLARGED
 
+    def cropped(self, image_size: tuple[int, int]) -> bool:
+        """Whether an image of this size has another shape than the camera wrote: it is a part of that."""
+        if self.written is None:
+            return False
+        here, written = sorted(image_size), sorted(self.written)
+        most = _RESHAPED + 1 / here[1]  # small copies are rounded to whole pixels
+        return abs(here[0] / here[1] - written[0] / written[1]) > most
+
     def crop_factor(self, image_size: tuple[int, int]) -> float | None:
         """Crop factor of an image of this size: the diagonal of film over that of the sensor shown.
 
-        None if it is not known, as after digital zoom.
+        None if it is not known, as after digital zoom, or of a photo that was cropped.
         """
-        if self.enlarged:
+        if self.enlarged or self.cropped(image_size):
             return None
         direct = self._direct(image_size)
         if direct is not None and self.crop is not None:
@@ -79,14 +92,10 @@ class Equipment:
         return None if crop is None else FILM / (crop * math.hypot(*image_size))
 
     def _direct(self, image_size: tuple[int, int]) -> float | None:
-        """The crop factor by the resolution of the focal plane; None for a part of what was written."""
+        """The crop factor by the resolution of the focal plane."""
         if self.plane_pitch is None:
             return None
-        here = sorted(image_size)
-        written = sorted(self.written or image_size)
-        if abs(here[0] * written[1] - here[1] * written[0]) > 0.01 * here[1] * written[1]:
-            return None
-        crop = FILM / (self.plane_pitch * math.hypot(*written))
+        crop = FILM / (self.plane_pitch * math.hypot(*(self.written or image_size)))
         return crop if _LEAST < crop < _MOST else None
 
 
@@ -99,7 +108,10 @@ def read_equipment(source: str | os.PathLike[str]) -> Equipment:
         ValueError: it is not a photo or not a regular file, or has more than 4 GB.
     """
     block = read_exif(source)
-    return Equipment() if block is None else exif_equipment(block)
+    found = Equipment() if block is None else exif_equipment(block)
+    if Path(source).suffix.lower() in RAW_SUFFIXES:  # which may tell the shape of a JPEG beside the whole
+        return dataclasses.replace(found, written=None)
+    return found
 
 
 def exif_equipment(block: bytes) -> Equipment:
