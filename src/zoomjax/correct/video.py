@@ -30,7 +30,7 @@ from ..io.video_reader import (
     picture_stream,
     warn_of_pixels,
 )
-from ..io.video_report import Report, frames_expected, frames_reached, is_cut_off
+from ..io.video_report import Report, lost_frames
 from ..io.video_streams import CONTAINER, Carried, carried
 from ..io.video_writer import FrameWriter, Picture, first_frame
 from ..models.lens import ZoomLens
@@ -198,24 +198,10 @@ def _convert(
                 writer = _write(
                     items, part, target, input_, video, how.encoder, how.options, along, report, progress
                 )
-        report.announced, kind = frames_expected(source, input_, video, report), input_.format.name
-    lost = max(report.corrupt + report.skipped, report.announced - report.written)
-    if lost > report.skipped:
-        at_end = frames_reached(report) < report.announced and not report.left
-        why = "the file ends early, or is damaged at its end" if at_end else "their data are damaged"
-        later = ", and those after them count as earlier ones" if report.left else ""
-        warnings.warn(
-            f"{lost} of {max(report.announced, report.written)} frames of {os.fspath(source)} cannot "
-            f"be decoded ({report.error or why}): {report.written} were written{later}.",
-            stacklevel=3,
-        )
-    else:
-        if is_cut_off(source, kind):
-            warnings.warn(
-                f"{os.fspath(source)} is cut off at its end: {report.written} frames were written, and "
-                "sound or further frames may be missing.",
-                stacklevel=3,
-            )
+        lost, told = lost_frames(source, input_, video, report)
+    if told:
+        warnings.warn(told, stacklevel=3)
+    if lost <= report.skipped:
         track.warn_if_longer(*report.last, stacklevel=3)
     return CorrectedVideo(
         report.written, lost, float(framing.scale), tuple(writer.kept), tuple(writer.not_kept)

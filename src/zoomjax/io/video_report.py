@@ -100,6 +100,25 @@ def frames_expected(source: str | os.PathLike[str], input_: Any, video: Any, rep
     return seen + round(missing) if missing > sure else seen
 
 
+def lost_frames(source: str | os.PathLike[str], input_: Any, video: Any, report: Report) -> tuple[int, str]:
+    """How many frames of a file that was read to its end are lost, and what to say of it; else empty."""
+    report.announced, name = frames_expected(source, input_, video, report), os.fspath(source)
+    lost = max(report.corrupt + report.skipped, report.announced - report.written)
+    if lost > report.skipped:
+        at_end = frames_reached(report) < report.announced and not report.left
+        why = "the file ends early, or is damaged at its end" if at_end else "their data are damaged"
+        later = ", and those after them count as earlier ones" if report.left else ""
+        return lost, (
+            f"{lost} of {max(report.announced, report.written)} frames of {name} cannot be decoded "
+            f"({report.error or why}): {report.written} were written{later}."
+        )
+    cut_off = (
+        f"{name} is cut off at its end: {report.written} frames were written, and sound or further frames "
+        "may be missing."
+    )
+    return lost, cut_off * is_cut_off(source, input_.format.name)
+
+
 def _seconds_missing(input_: Any, video: Any, report: Report) -> float:
     """How much shorter what was read is than the file tells; 0 where it does not.
 
