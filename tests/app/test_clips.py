@@ -127,6 +127,7 @@ def test_its_summary_has_the_entries_of_that_of_photos(calibrated, tmp_path):
     of_lines_alone = {
         *("evidence", "rms_algebraic", "rms_frames", "rms_held_out", "rms_frames_held_out"),
         *("rejected_lines", "rejected", "points", "frames_without_a_model", "next_photo", "earlier"),
+        "rms_zoom_equal_weights",
     }
     assert others.keys() - summary.keys() == of_lines_alone
     for name in others.keys() & summary.keys() - {"line_noise"}:

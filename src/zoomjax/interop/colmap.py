@@ -81,7 +81,8 @@ class COLMAP(NodeFormat):
             size = job.size((width, height))
             nodes.append(_node(model, values, size))
             sizes.append(size)
-        return dataclasses.replace(contents(nodes, one_size(sizes), job), notes=notes)
+        found = contents(nodes, one_size(sizes), job)
+        return dataclasses.replace(found, notes=(*found.notes, *notes))
 
 
 def _at_some(lens: ZoomLens) -> np.ndarray:

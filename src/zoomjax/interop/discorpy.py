@@ -98,4 +98,5 @@ class Discorpy(NodeFormat):
             form = Powers(terms)
             theta = form.rescaled(numbers[2:], math.hypot(*size) / 2)
             nodes.append(Node(focal, form, theta, numbers[:2]))
-        return dataclasses.replace(contents(nodes, size, job, mm=True), notes=notes)
+        found = contents(nodes, size, job, mm=True)
+        return dataclasses.replace(found, notes=(*found.notes, *notes))
