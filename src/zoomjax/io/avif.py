@@ -6,7 +6,7 @@ Both decode pixels as stored. Pillow tells how to turn them in the EXIF data.
 import contextlib
 import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import cv2
 import numpy as np
@@ -23,7 +23,7 @@ _DEEP, _TWELVE = 0x40, 0x20
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def _quiet() -> Generator[None, None, None]:
     """Pillow warns of damaged EXIF data, many times a file: they do not matter unless f is gone."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
