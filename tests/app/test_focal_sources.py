@@ -192,11 +192,14 @@ def test_oblique_views_of_a_grid_give_focal_lengths():
     """Their distortion is not known: it is found first. Tilts about one axis are plane rotations."""
     tilts = ((0.5, 0.0), (0.0, 0.6), (-0.6, 0.0))
     detections = [d for focal in (1000.0, 1500.0, 2200.0) for d in oblique(focal, tilts)]
-    found = choose_focals(detections)
+    found = choose_focals(detections, "plane")
     assert (found.unit, found.origin) == ("px", "homographies of the grid")
     for name, focal in found.focal.items():
         assert focal == pytest.approx(float(name.split("-")[0]), rel=2e-3)
     assert len(found.focal) == len(detections)
+    supposed = choose_focals(detections)  # to be of one zoom, until a calibration finds otherwise
+    assert supposed.one_zoom
+    assert len(set(supposed.focal.values())) == 1
 
 
 @pytest.mark.slow
