@@ -120,9 +120,8 @@ def frames_shown(source: str | os.PathLike[str], video: Any) -> int:
     AVI also counts chunks without content, which the index leaves out; a file that is cut off has none.
     """
     if is_avi(video.container):
-        indexed = (
-            sum(entry.size > 0 for entry in video.index_entries) if not is_cut_off(source, "avi") else 0
-        )
+        whole = not is_cut_off(source, "avi")
+        indexed = sum(entry.size > 0 for entry in video.index_entries) if whole else 0
         return indexed or video.frames
     if not (video.frames and video.duration and video.average_rate):
         return video.frames
