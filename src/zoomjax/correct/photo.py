@@ -311,7 +311,7 @@ def _blamed(source: str | os.PathLike[str]) -> Generator[None, None, None]:
     try:
         yield
     except ValueError as error:
-        raise ValueError(f"Cannot write {os.fspath(source)}: {error}.") from error
+        raise ValueError(f"Cannot write the result of {os.fspath(source)}: {error}.") from error
 
 
 def photo_focal(source: str | os.PathLike[str], lens: ZoomLens) -> float:
