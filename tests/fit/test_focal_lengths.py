@@ -11,7 +11,7 @@ from zoomjax import scenes
 from zoomjax.fit import focal_fit
 from zoomjax.fit.covariance import parameter_covariance
 from zoomjax.fit.energy import linearised
-from zoomjax.fit.focal_lengths import _response, of_equal_focal
+from zoomjax.fit.focal_lengths import _response, checked_sigma, of_equal_focal
 from zoomjax.lines import compress_any_centre
 from zoomjax.models.zoom import with_parameters
 
@@ -64,6 +64,13 @@ def test_a_sigma_beyond_all_numbers_makes_no_band_narrow(sweep):
         wider = zj.fit.with_focal_sigma(fit, sweep, focal_sigma=sigma)
         std = zj.displacement_std(wider, points, focal=30.0)
         assert (std > zj.displacement_std(wide, points, focal=30.0)).all()
+
+
+def test_a_sigma_of_single_precision_is_read_beside_focal_lengths_of_double(sweep):
+    """The bound for double precision overflowed where single held it, with NumPy's warning."""
+    given = np.linspace(0.1, 0.9, 10, dtype=np.float32)
+    sigma = checked_sigma(given, np.asarray(sweep.focal, np.float64))
+    np.testing.assert_array_equal(sigma, given)
 
 
 @pytest.mark.slow

@@ -166,6 +166,7 @@ def checked_sigma(focal_sigma: Any, focal: Focal) -> Float[AnyArray, "frame"]:
     given = real_argument("focal_sigma", focal_sigma)
     if not traced(given):  # beyond any lens, and variances do not overflow
         most = float(jnp.finfo(focal.dtype).max) ** 0.25
+        given = np.asarray(given, float)
         given = np.where(np.isinf(given), given, np.minimum(given, most))
     sigma = jnp.asarray(given, focal.dtype)
     if sigma.shape not in ((), focal.shape):
