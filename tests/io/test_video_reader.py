@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import re
 import struct
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
@@ -238,6 +239,32 @@ def test_packets_that_were_lost_are_said_by_segments(tmp_path):
     assert len([each for each in told if "were lost" in str(each.message)]) == 1
 
 
+@pytest.mark.parametrize("suffix", [".ts", ".mpg"])
+def test_times_that_jump_back_are_said(suffix, tmp_path, recwarn):
+    """Of joined recordings a track by time gave the second one the focal lengths of the first."""
+    part = write(tmp_path / f"part{suffix}", "mpeg2video", number=6).read_bytes()
+    path = tmp_path / f"in{suffix}"
+    path.write_bytes(part + part)
+    with decode_video(path) as (_, frames):
+        assert len(list(frames)) == 12
+    told = [str(each.message) for each in recwarn if "jump back" in str(each.message)]
+    assert len(told) == 1
+    assert re.search(r"from 0\.1\d\d s to 0\.000 s, at frame 6, .* ffmpeg -fflags \+genpts", told[0])
+
+
+def test_times_that_jump_back_are_said_by_segments(tmp_path):
+    part = write(tmp_path / "part.ts", "mpeg2video", number=6).read_bytes()
+    (tmp_path / "in.ts").write_bytes(part + part)
+    with (
+        ThreadPoolExecutor(1) as executor,
+        pytest.warns(UserWarning, match="unless recordings were joined"),
+        pytest.warns(UserWarning, match="jump back"),
+    ):
+        zj.undistort_video(
+            tmp_path / "in.ts", tmp_path / "out.mkv", lens=lens(), focal=20.0, executor=executor
+        )
+
+
 def test_fields_that_begin_later_are_said(tmp_path):
     """Of a broadcast some parts may be of fields, and others of frames."""
     parts = [
@@ -248,6 +275,7 @@ def test_fields_that_begin_later_are_said(tmp_path):
     path.write_bytes(b"".join(part.read_bytes() for part in parts))
     with (
         pytest.warns(UserWarning, match="unless recordings were joined"),
+        pytest.warns(UserWarning, match="jump back"),
         pytest.warns(UserWarning, match=r"interlaced.* Deinterlace it first") as warned,
     ):
         zj.undistort_video(path, tmp_path / "out.mp4", lens=lens(), focal=20.0)

@@ -31,6 +31,9 @@ INTERLACED = (
 )
 """What is wrong with a video of fields, and what to do."""
 
+NEW_TIMES = "ffmpeg -fflags +genpts -i SOURCE -c copy NEW.mkv"
+"""What gives joined recordings times that go on, also where packets of pictures have none."""
+
 
 @contextlib.contextmanager
 def decode_video(
@@ -223,7 +226,7 @@ def warn_of_loss(packet: Any, report: Report) -> None:
     warnings.warn(
         f"Packets of the video were lost after {time:.3f} s, and perhaps later, unless recordings were "
         "joined there: frames are missing or damaged, and those after them count as earlier ones. Give "
-        "focal lengths by time, which stay right, and not by frame.",
+        "focal lengths by time, which stay right where times go on, and not by frame.",
         stacklevel=3,
     )
 
@@ -235,9 +238,9 @@ def numbered(
 
     Frames are counted from the first that can be decoded, where a clip begins between key frames. Once
     others did not decode, time stamps tell the numbers; and after a hole, as decoders leave out frames of
-    damaged data without a word.
+    damaged data without a word. It is said where times jump back.
     """
-    number, first, stamps, fields = 0, None, None, False
+    number, first, stamps, fields, back = 0, None, None, False, False
     before, usual = None, math.inf  # time stamp, and the step to it
     for item in items:
         if not isinstance(item, av.VideoFrame):
@@ -255,9 +258,21 @@ def numbered(
             number = max(number, stamps.get(item.pts, number + report.skipped) - report.skipped)
         elif step > 0:
             usual = step
+        elif -step > _HOLE * usual and not back:
+            back = True
+            _warn_of_jump(number, before * item.time_base - first, item.time - first)
         before = item.pts
         yield item, number, math.nan if item.time is None else item.time - first
         number += 1
+
+
+def _warn_of_jump(number: int, before: float, time: float) -> None:
+    warnings.warn(
+        f"Times of the video jump back from {float(before):.3f} s to {time:.3f} s, at frame {number}, as "
+        "where recordings were joined: a focal track by time is wrong from there on, and a corrected video "
+        f"shows the frames after it too early. Give it new times first: {NEW_TIMES}",
+        stacklevel=3,
+    )
 
 
 def _warn_of_skipped(number: int) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 from .._core.text import plain
 from .pyav import av, open_container
+from .video_reader import NEW_TIMES
 
 CONTAINER = {
     ".mp4": "mp4",
@@ -255,8 +256,8 @@ def mux(output: Any, named: Path, packets: Any) -> None:
     except av.error.ArgumentError as error:  # and no full disk
         raise ValueError(
             f"A {named.suffix} file does not take these pictures or this sound ({error.strerror}). Where "
-            "recordings were joined and times begin again, give them new ones first: ffmpeg -i SOURCE -c "
-            f"copy NEW.mkv. Else choose .mkv, or {_ANEW}"
+            f"recordings were joined and times begin again, give them new ones first: {NEW_TIMES}. Else "
+            f"choose .mkv, or {_ANEW}"
         ) from error
 
 
