@@ -12,7 +12,7 @@ import tifffile
 from PIL import ExifTags, Image, IptcImagePlugin, PngImagePlugin
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-from zoomjax.io.equipment import read_equipment
+from zoomjax.io.equipment import exif_equipment, read_equipment
 from zoomjax.io.exif import exif_in_srgb, exif_with_orientation, exif_with_size, parse_exif
 from zoomjax.io.metadata import (
     Metadata,
@@ -430,14 +430,52 @@ def like_fuji():
     return b"FUJIFILMCCD-RAW ".ljust(84, b"0") + struct.pack(">2I", 100, len(content)) + bytes(8) + content
 
 
+def box(name, *content):
+    return struct.pack(">I4s", 8 + len(b"".join(content)), name) + b"".join(content)
+
+
+def like_canon():
+    """Boxes, of which some hold a folder of EXIF data each, as a TIFF file, and one XMP."""
+    camera, own, place = Image.Exif(), Image.Exif(), Image.Exif()
+    camera[ExifTags.Base.Make], camera[ExifTags.Base.Orientation] = "Canon", 6
+    own[ExifTags.Base.FocalLength], own[ExifTags.Base.LensModel] = 35.0, "RF24-105mm F4 L IS USM"
+    place[ExifTags.GPS.GPSLatitudeRef] = "N"
+    parts = [
+        box(name, folder.tobytes().removeprefix(b"Exif\0\0"))
+        for name, folder in ((b"CMT1", camera), (b"CMT2", own), (b"CMT3", Image.Exif()), (b"CMT4", place))
+    ]
+    own_box = box(b"uuid", bytes.fromhex("85c0b687820f11e08111f4ce462b6a48"), box(b"CNCV", b"0"), *parts)
+    xmp = box(b"uuid", bytes.fromhex("be7acfcb97a942e89c71999491e3afac"), XMP)
+    return box(b"ftyp", b"crx \0\0\0\1crx isom") + box(b"moov", own_box, box(b"mvhd", bytes(40))) + xmp
+
+
+def like_minolta():
+    blocks = [(b"\0PRD", bytes(24)), (b"\0TTW", exif(order=">")), (b"\0WBG", bytes(12))]
+    every = b"".join(struct.pack(">4sI", name, len(of)) + of for name, of in blocks)
+    return struct.pack(">4sI", b"\0MRM", len(every)) + every
+
+
+def test_exif_data_in_boxes_are_put_together():
+    """Of Canon's newer files the lens, the orientation and the place were lost, and XMP."""
+    found = raw_metadata(like_canon())
+    exif = parse_exif(io.BytesIO(found.exif))
+    assert (exif[ExifTags.Base.Make], exif[ExifTags.Base.Orientation]) == ("Canon", 6)
+    assert exif.get_ifd(ExifTags.IFD.GPSInfo)[ExifTags.GPS.GPSLatitudeRef] == "N"
+    assert exif_equipment(found.exif).lens == "RF24-105mm F4 L IS USM"
+    assert found.xmp == XMP
+
+
 @pytest.mark.parametrize(
     "content",
-    [*map(like_tiff, (b"IIRO", b"IIRS", b"IIU\0", b"MMOR", b"II*\0")), like_fuji()],
+    [
+        *map(like_tiff, (b"IIRO", b"IIRS", b"IIU\0", b"MMOR", b"II*\0")),
+        *(like_fuji(), like_canon(), like_minolta()),
+    ],
 )
 def test_exif_data_of_raw_files_are_found(tmp_path, content):
     (tmp_path / "a.orf").write_bytes(content)
     assert read_focal(tmp_path / "a.orf") == 35
-    for end in range(0, 120, 7):
+    for end in range(0, min(len(content), 600), 7):
         raw_metadata(content[:end])  # damaged: nothing is raised
 
 

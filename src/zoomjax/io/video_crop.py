@@ -8,6 +8,8 @@ from collections.abc import Generator
 from io import BufferedIOBase
 from pathlib import Path
 
+from .boxes import boxes
+
 _PATH = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
 _ENTRY = 8 + 78
 """Bytes before the boxes of a picture's description: its own head, and what has a fixed length."""
@@ -39,19 +41,6 @@ def shown_size(path: Path, size: tuple[int, int]) -> tuple[int, int] | None:
     )
 
 
-def _boxes(file: BufferedIOBase, end: int) -> Generator[tuple[bytes, int], None, None]:
-    """Name and end of each box up to a place; the file is where its content begins."""
-    while (start := file.tell()) + 8 <= end:
-        length, name = struct.unpack(">I4s", file.read(8))
-        if length == 1:
-            (length,) = struct.unpack(">Q", file.read(8))
-        stop = end if length == 0 else start + length
-        if stop < file.tell() or stop > end:
-            return
-        yield name, stop
-        file.seek(stop)
-
-
 def _length(file: BufferedIOBase) -> int:
     here = file.tell()
     length = file.seek(0, 2)
@@ -61,7 +50,7 @@ def _length(file: BufferedIOBase) -> int:
 
 def _of_mov(file: BufferedIOBase) -> tuple[int, int] | None:
     def inside(end: int, path: tuple[bytes, ...]) -> tuple[int, int] | None:
-        for name, stop in _boxes(file, end):
+        for name, stop in boxes(file, end):
             if name != path[0]:
                 continue
             found = _of_description(file, stop) if len(path) == 1 else inside(stop, path[1:])
