@@ -1,8 +1,11 @@
-"""Nothing is printed by compiled code meanwhile, and everything afterwards."""
+"""What compiled code prints meanwhile is dropped, or heard, and is printed again afterwards."""
 
 import os
+import re
+import subprocess
+import sys
 
-from zoomjax._core.quiet import silent
+from zoomjax._core.quiet import heard, silent
 
 
 def test_compiled_code_is_silent(capfd):
@@ -15,3 +18,21 @@ def test_compiled_code_is_silent(capfd):
     told = capfd.readouterr()
     assert told.out == "heard\n"
     assert told.err == "heard, too\n"
+
+
+def test_lines_of_compiled_code_are_heard_and_others_passed_on(capfd):
+    with heard(re.compile(rb"from C|more")) as lines:
+        os.write(2, b"from C: damage\nof another thread\n")
+        os.write(2, b"more\n")
+    assert lines == ["from C: damage", "more"]
+    os.write(2, b"afterwards\n")
+    assert capfd.readouterr().err == "of another thread\nafterwards\n"
+
+
+def test_nothing_is_heard_where_stderr_is_closed():
+    code = (
+        "import os, re; from zoomjax._core.quiet import heard; os.close(2)\n"
+        "with heard(re.compile(b'')) as lines: pass\nprint(lines)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, check=True, text=True)
+    assert done.stdout == "[]\n"

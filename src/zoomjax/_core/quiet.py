@@ -1,11 +1,13 @@
-"""Silence of libraries that print from compiled code, to the process's streams or to Python's."""
+"""Libraries that print from compiled code, to the process's streams or to Python's: silent, or heard."""
 
 import contextlib
 import io
 import os
+import re
 import sys
+import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 
 _LOCK = threading.Lock()
 
@@ -28,3 +30,33 @@ def silent() -> Iterator[None]:
                 os.dup2(nowhere.fileno(), number)
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             yield
+
+
+@contextlib.contextmanager
+def heard(ours: re.Pattern[bytes]) -> Generator[list[str], None, None]:
+    """Lines that compiled code prints on stderr meanwhile and that begin like ours; there when it ends.
+
+    They are not printed then. Others are, such as those of other threads.
+    """
+    lines: list[str] = []
+    with _LOCK, contextlib.ExitStack() as stack:
+        try:
+            kept = os.dup(2)
+        except OSError:  # it is closed
+            yield lines
+            return
+        stack.callback(os.close, kept)
+        file = stack.enter_context(tempfile.TemporaryFile())
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            sys.stderr.flush()
+        os.dup2(file.fileno(), 2)
+        try:
+            yield lines
+        finally:
+            os.dup2(kept, 2)
+            file.seek(0)
+            for line in file.read().splitlines(keepends=True):
+                if ours.match(line):
+                    lines.append(line.decode("utf-8", "replace").strip())
+                else:
+                    os.write(2, line)

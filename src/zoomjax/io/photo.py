@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from .avif import avif_metadata, decode_avif
+from .decoders import by_opencv
 from .exif import exif_focal, find_exif
 from .headers import announced_format, announced_size, jpeg_segments
 from .heic import HEIC_SUFFIXES, decode_heic, heic_metadata, heic_pictures
@@ -273,13 +274,7 @@ _METADATA: dict[str, Callable[[bytes], Metadata]] = {
 
 
 def _decoded(content: bytes) -> np.ndarray:
-    flags = cv2.IMREAD_UNCHANGED
-    try:
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    except cv2.error as error:
-        if error.code == cv2.Error.StsNoMem:
-            raise MemoryError from error
-        raise ValueError(f"OpenCV cannot decode it ({error.err})") from error
+    image = by_opencv(cv2.imdecode, content)
     if image is None:
         raise ValueError("it is damaged, or of an unknown format")
     return image

@@ -17,6 +17,7 @@ import tifffile
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
+from .decoders import by_opencv
 from .exif import parse_exif
 from .metadata import Metadata
 
@@ -215,13 +216,7 @@ def _white_up(image: np.ndarray, page: Any) -> np.ndarray:
 
 
 def _by_opencv(content: bytes, number: int) -> np.ndarray:
-    data = np.frombuffer(content, np.uint8)
-    try:
-        _, found = cv2.imdecodemulti(data, cv2.IMREAD_UNCHANGED, range=(number, number + 1))
-    except cv2.error as error:
-        if error.code == cv2.Error.StsNoMem:
-            raise MemoryError from error
-        raise ValueError(f"OpenCV cannot decode it ({error.err})") from error
+    _, found = by_opencv(cv2.imdecodemulti, content, range=(number, number + 1))
     if not found:
         raise ValueError("it is damaged, or of an unknown format")
     return np.asarray(found[0])
