@@ -433,6 +433,15 @@ def test_focal_lengths_that_help_are_refined(rounded, refined):
     assert (refined.focal != rounded.focal).all()
 
 
+def test_rounding_does_not_keep_focal_lengths(truth):
+    """Without one of three frames the model goes through the other two, wherever their f is."""
+    for seed in range(8):
+        lines = zj.compress(
+            scenes.board_lines(truth, scenes.focal_sweep(3), spacing=150.0, noise=0.1, seed=seed)
+        )
+        assert not zj.fit.fit_focal(lines, 0.5, zoom=zj.PolynomialZoom(1), terms=1, throw=False).kept
+
+
 def test_one_that_nobody_knows_is_found_where_others_are_kept(truth):
     exact = np.linspace(50.0, 55.0, 20)
     lines = zj.compress(scenes.board_lines(truth, exact, spacing=150.0, noise=0.5))

@@ -135,17 +135,19 @@ def refined(lines, zoom, sigma):
     sigmas = jnp.repeat(jnp.stack([fixed, sigma]), number, axis=0)
     focal, flat, steps, reached, error = jax.lax.map(run, (left_out, sigmas))
     before, after = jnp.sum(error.reshape(2, number, -1)[:, 1:], axis=1)
-    kept = _worse(after - before, counted_frames(lines) & known)
+    kept = _worse(before, after, counted_frames(lines) & known)
     chosen = jnp.where(kept, 0, number)
     return focal[chosen], with_parameters(zoom, unravel(flat[chosen])), steps[chosen], reached[chosen], kept
 
 
-def _worse(difference, counted):
-    """Whether the frames' errors have grown by more than one standard error of their sum."""
-    number = jnp.sum(counted)
+def _worse(before, after, counted):
+    """Whether the frames' errors have grown by more than one standard error of their sum, and rounding."""
+    number, difference = jnp.sum(counted), after - before
     total = jnp.sum(difference)
+    rounding = jnp.sqrt(jnp.finfo(before.dtype).eps) * jnp.sum(before)
     off = jnp.where(counted, difference - total / jnp.maximum(number, 1), 0)
-    return total > jnp.sqrt(number / jnp.maximum(number - 1, 1) * jnp.sum(off**2))
+    error = jnp.sqrt(number / jnp.maximum(number - 1, 1) * jnp.sum(off**2))
+    return total > jnp.maximum(error, rounding)
 
 
 def _folds(lines):
