@@ -217,6 +217,20 @@ def test_the_simplest_within_one_standard_error_is_chosen(selection):
     assert selection.chosen is min(good, key=lambda v: v.parameters).candidate
 
 
+@pytest.mark.parametrize("rule", ["one standard error", "least"])
+def test_of_candidates_that_are_the_same_the_first_is_chosen(rule, truth):
+    """Rounding chose among a straight line in 1/f and its two ends, from data set to data set."""
+    ways = [zj.PolynomialZoom(1), zj.models.SplineZoom(2)]
+    for seed in range(4):
+        lines = zj.compress(
+            scenes.board_lines(truth, scenes.focal_sweep(4), spacing=150.0, noise=0.1, seed=seed)
+        )
+        for candidates in (ways, ways[::-1]):
+            found = zj.select_model(lines, candidates, hold_out="line", rule=rule)
+            assert found.compared[0].candidate is found.chosen
+            assert found.best is found.chosen
+
+
 @pytest.mark.parametrize(("worse", "chosen"), [(1.02, (0, 1)), (1.0003, (0, 0))])
 def test_least_error_is_a_rule_of_its_own(worse, chosen, lines, rng):
     """The one with fewer numbers is worse on average, though not on every focal length."""

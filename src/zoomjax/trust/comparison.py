@@ -98,19 +98,29 @@ def compare_errors(candidates, errors, parts, rule):
     if not unseen:
         reasons = {e if isinstance(e, str) else e.problem for e in errors}
         raise ValueError(f"No candidate can be compared. {' '.join(sorted(reasons))}")
-    best = min(unseen, key=lambda i: weight @ unseen[i])
+    best = min(unseen, key=lambda i: _in_digits(weight @ unseen[i]))
     compared = [
         _figures(candidate, judged, unseen.get(i), unseen[best], weight, by_unit)
         for i, (candidate, judged) in enumerate(zip(candidates, errors, strict=True))
     ]
     within = [v for v in compared if not v.problem and v.difference <= _allowed(v, rule)]
-    chosen = min(within, key=lambda v: (round(v.parameters, 6), v.held_out)).candidate
+    chosen = min(within, key=lambda v: (round(v.parameters, 6), _in_digits(v.held_out))).candidate
     return tuple(compared), candidates[best], chosen
 
 
 def _allowed(each, rule):
     """By how much a candidate may be above the best to be chosen."""
-    return each.difference_std if rule == "one standard error" else TIE * each.held_out
+    least = _ROUNDING * each.held_out
+    return max(each.difference_std, least) if rule == "one standard error" else TIE * each.held_out
+
+
+_ROUNDING = 1e-9
+"""Part of the error by which candidates differ that give the same coefficients at all frames."""
+
+
+def _in_digits(error):
+    """An error without its last digits, which are rounding: of equal ones the first candidate is taken."""
+    return float(f"{error:.9g}")
 
 
 def _figures(candidate, judged, unseen, best, weight, by_unit):
