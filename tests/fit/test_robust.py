@@ -112,6 +112,18 @@ def test_a_scene_without_noise_keeps_its_lines(truth):
     assert displacement_rms(robust.fit.lens, truth, [20.56, 60.0, 127.36]) < 1e-6
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("compressed", [False, True])
+def test_rounding_rejects_no_line(truth, dtype, compressed):
+    """A quarter of exact lines was called not straight in the scene."""
+    exact = scenes.board_lines(truth, scenes.focal_sweep(4), spacing=20)
+    bent, arcs = with_arcs(exact, 0.02, sagitta=(1, 2), outward=True)
+    for given, wrong in ((exact, []), (bent, arcs)):
+        lines = jax.tree.map(lambda leaf: leaf.astype(dtype) if leaf.dtype.kind == "f" else leaf, given)
+        robust = zj.fit_robust(zj.compress(lines) if compressed else lines, throw=False)
+        assert sorted(robust.rejected) == list(wrong)
+
+
 def test_own_weights_are_kept_as_factors(board):
     own = np.where(np.arange(len(board.frame)) % 3 == 0, 0.5, 1.0)
     robust = zj.fit_robust(zj.compress(board).weighted(own))

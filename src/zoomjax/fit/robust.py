@@ -7,7 +7,8 @@ to their line, m its median over the lines, and s its spread, the weight of a li
     v = (1 - t^2)^2,  t = (r - m) / (c s),    but 1 for r < m, and 0 for t > 1.
 
 The spread is that of the better half, 1.48 times the median of m - r there, for the bad lines are all in
-the other; to it is added m / sqrt(2 (n - 2)), by which a line of n points may be rough by chance.
+the other; to it is added m / sqrt(2 (n - 2)), by which a line of n points may be rough by chance, and what
+coordinates are rounded by.
 
 Weights and fit are found in turns (iteratively reweighted least squares, a Gauss-Newton step a turn), from
 a wide c that narrows to `_CUT`, so that good lines that the first, unweighted fit misjudges are not lost;
@@ -50,6 +51,7 @@ _NARROWING = (np.inf, 24.0, 16.0, 10.0, *(_CUT,) * 4)  # c of each turn
 _NEAR = (_CUT,) * len(_NARROWING)  # the same from a start that is to be kept: one compiled program
 _CENTRES = 2  # how often weights and a centre that is fitted are found in turn, at most
 _LEAST_SPREAD = 0.02  # of m: lines of thousands of points, or without noise, are all alike
+_ROUNDING = 8  # times eps and the scale: exact lines of synthetic scenes seemed so far from straight
 
 
 class RobustFit(eqx.Module):
@@ -244,7 +246,8 @@ def _weights(lines, model, cut):
     better = (line_rms <= median) & _counted(lines)
     spread = 1.4826 * _median(median - line_rms, better)
     chance = median / jnp.sqrt(2 * jnp.maximum(lines.counts - 2, 1))
-    spread = jnp.sqrt(jnp.maximum(spread, _LEAST_SPREAD * median) ** 2 + chance**2)
+    rounding = _ROUNDING * jnp.finfo(line_rms.dtype).eps * lines.scale
+    spread = jnp.sqrt(jnp.maximum(spread, _LEAST_SPREAD * median) ** 2 + chance**2 + rounding**2)
     # 1/cut is 0 in the first turn: by an infinite cut the derivative would be 0 times infinity.
     excess = (1 / cut) * jnp.maximum(line_rms - median, 0) / jnp.where(spread > 0, spread, 1)
     return jnp.where((excess < 1) & (lines.counts > 2), (1 - excess**2) ** 2, 0)
