@@ -106,8 +106,12 @@ def test_what_could_not_be_read_is_not_saved(tmp_path):
     short = dataclasses.replace(
         lines, mask=np.asarray(lines.mask) & ([[True], [False]] | (np.arange(5) < 2))
     )
-    with pytest.raises(ValueError, match="1 of 2 frames have no line of three points"):
-        short.save(tmp_path / "lines.npz")
+    coincident = dataclasses.replace(
+        lines, points=np.where(np.array([True, False])[:, None, None], 7.0, np.asarray(lines.points))
+    )
+    for bad in (short, coincident):
+        with pytest.raises(ValueError, match="1 of 2 frames have no line of three distinct points"):
+            bad.save(tmp_path / "lines.npz")
     assert list(tmp_path.iterdir()) == []
 
 
