@@ -8,6 +8,7 @@ column ``focal``, the same in all rows of a frame, or from a second file with th
 import csv
 import os
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -69,10 +70,9 @@ def read_lines_csv(
     else:
         if isinstance(focal, Mapping):
             known = dict(focal)
-        elif hasattr(focal, "index") and hasattr(
-            focal, "to_dict"
-        ):  # a column of pandas, with its own labels
-            known = focal.to_dict()
+        elif hasattr(focal, "index") and hasattr(focal, "to_dict"):  # a column of pandas
+            column: Any = focal
+            known = column.to_dict()
         else:
             given = np.asarray(focal, float)
             known = dict(enumerate(given)) if given.ndim else dict.fromkeys(frames.tolist(), given)
