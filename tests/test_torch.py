@@ -221,6 +221,11 @@ def test_coefficients_are_trained():
         (ValueError, "channels, height, width", lambda: zt.warp_image(torch.zeros(5, 6), distortion())),
         (
             ValueError,
+            "for images of another size",
+            lambda: zt.warp_image(torch.zeros(3, 480, 640), distortion()),
+        ),
+        (
+            ValueError,
             "one focal length",
             lambda: zt.warp_image(torch.zeros(2, 1, 5, 6), lens(), torch.tensor([20.0, 30.0])),
         ),

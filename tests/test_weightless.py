@@ -92,6 +92,19 @@ def test_the_reference_and_the_knots_of_models(board, zoom, wrong):
     np.testing.assert_allclose(std, expected, rtol=1e-4)
 
 
+@pytest.mark.parametrize("zoom", [zj.SmoothZoom(), zj.models.TableZoom()], ids=["smooth", "table"])
+@pytest.mark.parametrize("left", [0, 2], ids=["no points", "two points"])
+def test_a_frame_of_which_no_line_has_three_points(board, zoom, left):
+    """As chunks have them: its focal length was the reference, and a knot that nothing determines."""
+    frame = np.asarray(board.frame)
+    points = [line[:left] if of == 0 else line for line, of in zip(board.to_ragged(), frame, strict=True)]
+    chunk = zj.Lines.from_ragged(points, frame, board.focal, image_size=board.image_size, chunk=True)
+    weighted = board.weighted((frame != 0) * 1.0)
+    one, other = (zj.fit_zoom(zj.compress(lines), zoom=zoom) for lines in (chunk, weighted))
+    assert one.result == other.result == zj.RESULTS.successful
+    np.testing.assert_allclose(one.lens(50.0).coefficients, other.lens(50.0).coefficients, rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_the_reference_of_a_centre_that_moves(board):
     points, frame = board.to_ragged(), np.asarray(board.frame)

@@ -28,6 +28,7 @@ from .correct.framing import Framing
 from .correct.warp import warp_image as _warp_image
 from .models.distortion import Distortion
 from .models.lens import ZoomLens
+from .models.sizes import check_image_size
 from .models.zoom import with_parameters
 
 try:
@@ -116,6 +117,9 @@ def warp_image(
         raise ValueError(f"Argument border_value must be one number, but it is {border_value!r}.")
     options = (framing, interpolation, float(border_value))
     _check_range(lens, focal, 4)
+    if isinstance(lens, Distortion) and (framing is None or framing.image_size is not None):
+        height, width = image.shape[-2:]
+        check_image_size(lens, (width, height))  # which is traced further on, and not known there
     return _called(_warped, options, image, lens, focal, coefficients)
 
 

@@ -537,3 +537,22 @@ def test_a_mask_holds_booleans(entry):
         zj.focal.focal_from_lines(
             np.zeros((4, 3, 2)), KNOWN_LINES, principal=PRINCIPAL, mask=np.full((4, 3), entry)
         )
+
+
+def test_gradients_by_views_with_masked_points_that_are_not_numbers():
+    """As detectors give corners that are not seen: one of them made all derivatives NaN."""
+    images = views(900.0)
+    mask = np.ones(images.shape[:2], bool)
+    mask[0, [3, 7]] = mask[2] = False
+
+    def focal(points, plane, principal):
+        return zj.focal.focal_from_planes(points, plane, principal=principal, mask=mask)[0].focal
+
+    def gradients(fill):
+        points = np.where(mask[..., None], images, fill)
+        plane = np.where(mask[..., None], np.broadcast_to(PLANE, images.shape), fill)
+        return jax.grad(focal, argnums=(0, 1, 2))(*map(jnp.asarray, (points, plane, PRINCIPAL)))
+
+    for found, expected in zip(gradients(np.nan), gradients(0.0), strict=True):
+        assert np.abs(expected).max() > 0
+        np.testing.assert_array_equal(found, expected)

@@ -181,3 +181,26 @@ def test_what_has_no_column_is_refused(changed, what, tmp_path):
     with pytest.raises(ValueError, match=rf"has {what}.*save the lines as \.npz"):
         write_lines_csv(changed(lines_of(np.float64)), tmp_path / "lines.csv")
     assert not (tmp_path / "lines.csv").exists()
+
+
+class Column:
+    """What of a column of pandas is needed: values, and labels of their own."""
+
+    def __init__(self, values, index):
+        self.values, self.index = values, index
+
+    def __array__(self, dtype=None, copy=None):
+        return np.asarray(self.values, dtype)
+
+    def to_dict(self):
+        return dict(zip(self.index, self.values, strict=True))
+
+
+def test_focal_lengths_of_a_column_go_by_its_index(tmp_path, unchecked):
+    """They went by their order, whatever frames the index named."""
+    rows = "".join(f"{frame},0,{x},{x * x}\n" for frame in (0, 1, 2) for x in (1, 2, 3))
+    path = write(tmp_path / "lines.csv", "frame,line,x,y\n" + rows)
+    lines = read_lines_csv(path, image_size=SIZE, focal=Column([70.0, 24.0, 35.0], [2, 0, 1]))
+    assert lines.focal.tolist() == [24, 35, 70]
+    with pytest.raises(ValueError, match="no focal length for 1 of its 3 frames"):
+        read_lines_csv(path, image_size=SIZE, focal=Column([70.0, 24.0, 35.0], [2, 0, 5]))

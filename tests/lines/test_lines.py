@@ -106,8 +106,12 @@ def test_what_could_not_be_read_is_not_saved(tmp_path):
     short = dataclasses.replace(
         lines, mask=np.asarray(lines.mask) & ([[True], [False]] | (np.arange(5) < 2))
     )
-    with pytest.raises(ValueError, match="1 of 2 frames have no line of three points"):
-        short.save(tmp_path / "lines.npz")
+    coincident = dataclasses.replace(
+        lines, points=np.where(np.array([True, False])[:, None, None], 7.0, np.asarray(lines.points))
+    )
+    for bad in (short, coincident):
+        with pytest.raises(ValueError, match="1 of 2 frames have no line of three distinct points"):
+            bad.save(tmp_path / "lines.npz")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -446,3 +450,18 @@ def test_a_centre_that_is_no_place_is_refused(noisy):
     for centre in (np.array([np.nan, 3.0]), None, np.ma.masked_array([1.0, 2.0], [0, 1])):
         with pytest.raises(ValueError, match="Argument centre"):
             noisy.about(centre)
+
+
+@pytest.mark.parametrize("size", [1e-60, 1e60])
+def test_weights_beyond_single_precision_count_beside_others_of_their_frame(size):
+    """They became 0, and with them their frame counted nothing; or were refused as infinite."""
+    row = ROW.astype(np.float32)
+    lines = make(points=(row, row + 1, row + 2), frame=(0, 0, 1), image_size=(8, 6))
+    weights = lines.weighted([size, size / 4, 1.0]).weight
+    assert weights.dtype == np.float32
+    np.testing.assert_allclose(weights, [1, 0.25, 1], rtol=1e-6)
+    np.testing.assert_array_equal(lines.weighted([3.0, 0.5, 0.0]).weight, [3, 0.5, 0])
+    with pytest.raises(ValueError, match="finite numbers of at least 0"):
+        lines.weighted([size, np.inf, 1.0])
+    with pytest.raises(ValueError, match="finite numbers of at least 0"):
+        lines.weighted([size, -size, 1.0])

@@ -433,3 +433,16 @@ def test_the_residual_is_two_last_digits_of_the_radius(case, dtype, truth, rng):
         corrected = found * (factor if case == "paper's" else 1 / factor)[:, None]
         missed = np.hypot(*(corrected - exact).T)
         assert np.max(missed / np.spacing(np.hypot(*exact.T).astype(dtype))) <= 2
+
+
+def test_an_empty_list_has_no_points():
+    """As of a frame in which nothing was found."""
+    d = zj.Distortion([0.1], [319.5, 239.5], 400.0)
+    for found in (d.undistort([]), d.distort([]), d.undistort(np.zeros((0, 2)))):
+        assert found.shape == (0, 2)
+    assert d.has_inverse([]).shape == (0,)
+    camera = zj.Camera(zj.scenes.nikkor_18_200(), pixel_pitch=0.0055)
+    assert camera.rays([], 50.0)[0].shape == (0, 3)
+    assert camera.project([], 50.0)[0].shape == (0, 2)
+    with pytest.raises(ValueError, match="must have shape"):
+        d.undistort([[]])

@@ -205,3 +205,39 @@ def test_a_missing_focus_says_what_to_do(small, seen, model, truth):
             zj.Lines.from_ragged([row], [0], [20], image_size=(10, 4), focus=bad)
     lines = zj.Lines.from_ragged([row], [0], [20], image_size=(10, 4), focus=[0.5])
     assert lines.focus.tolist() == [0.5]
+
+
+@pytest.mark.parametrize("focus", [[0.2, 0.9], np.array([0.2, 0.9]), jnp.array([0.2])], ids=str)
+def test_several_focuses_are_not_added_up(model, focus, unchecked):
+    """The coefficients at all of them, summed, were given as those at one."""
+    lens = zj.ZoomLens(model, jnp.zeros(2), jnp.array([18.0, 200.0]), (640, 428), focus_range=[0.0, 2.5])
+    for ask in (
+        model.at_focus,
+        lens.at_focus,
+        lambda focus: model(35.0, focus),
+        lambda focus: model.basis(35.0, focus),
+    ):
+        with pytest.raises(ValueError, match="focus must be one number here"):
+            ask(focus)
+    each = jax.vmap(lambda focus: model(35.0, focus))(jnp.asarray(focus))
+    np.testing.assert_allclose(each[0], model(35.0, 0.2))
+    np.testing.assert_allclose(lens(35.0, focus).coefficients, each)
+
+
+@pytest.mark.parametrize("focus", ["near", True, [0.2, None]], ids=str)
+def test_a_focus_that_is_no_number_is_refused(model, focus, unchecked):
+    lens = zj.ZoomLens(model, jnp.zeros(2), jnp.array([18.0, 200.0]), (640, 428), focus_range=[0.0, 2.5])
+    with pytest.raises(ValueError, match="Argument focus must be"):
+        lens(35.0, focus)
+
+
+def test_focuses_are_as_many_as_focal_lengths_and_points(model):
+    lens = zj.ZoomLens(model, jnp.zeros(2), jnp.array([18.0, 200.0]), (640, 428), focus_range=[0.0, 2.5])
+    with pytest.raises(ValueError, match=r"Argument focus must have .* are \(2,\) and \(3,\)"):
+        lens([20.0, 30.0, 40.0], [0.0, 1.0])
+    with pytest.raises(ValueError, match=r"with that of focus is \(2,\)"):
+        lens.undistort(np.zeros((3, 2)), 20.0, [0.0, 1.0])
+    points = np.array([[1.0, 2.0], [300.0, 20.0]])
+    found = lens.undistort(points, 20.0, [0.0, 1.0])
+    for point, focus, one in zip(points, [0.0, 1.0], found, strict=True):
+        np.testing.assert_allclose(one, lens.undistort(point, 20.0, focus))

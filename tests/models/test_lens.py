@@ -384,3 +384,40 @@ def test_numbers_of_a_file_are_no_words_and_no_booleans(name, content, tmp_path)
 def test_an_image_size_is_two_numbers(size, content, tmp_path):
     with pytest.raises(ValueError, match="image_size must be two positive integers"):
         load(content | {"image_size": size}, tmp_path)
+
+
+def test_where_a_centre_moves_to_is_asked_of_focal_lengths(lens, unchecked):
+    """Its model went on beyond the range, and below 0, without a word."""
+    moving = dataclasses.replace(
+        lens, shift=zj.PolynomialZoom(1, jnp.array([[0.0, 0.0], [0.1, 0.0]]), 20.0)
+    )
+    with pytest.warns(UserWarning, match="not within the range"):
+        moving.centre_at(5.0)
+    for focal in (-5.0, [20.0, -40.0], np.nan):
+        with pytest.raises(ValueError, match="positive number"):
+            moving.centre_at(focal)
+    with pytest.raises(ValueError, match="Argument focal must be a number"):
+        moving.centre_at("40")
+    np.testing.assert_allclose(moving.centre_at([20, 40]), [[359.5, 239.5], [339.5, 239.5]])
+    np.testing.assert_allclose(moving.centre_at(40), moving(40.0).centre)
+    camera = zj.Camera(moving)
+    with pytest.warns(UserWarning, match="not within the range") as told:
+        camera.rays(np.zeros((1, 2)), 90.0)
+    assert len(told) == 1
+
+
+def test_several_lenses_in_one_say_so(lens, tmp_path):
+    """They were saved to a file that cannot be read, and called with a TypeError about lists."""
+    other = eqx.tree_at(lambda lens: lens.zoom.parameters, lens, 2 * lens.zoom.parameters)
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), lens, other)
+    for ask in (
+        lambda: both(40.0),
+        lambda: both.undistort(np.zeros((2, 2)), 40.0),
+        lambda: both.distort(jnp.zeros((2, 2)), jnp.array([30.0, 40.0])),
+        lambda: both.save(tmp_path / "both.json"),
+    ):
+        with pytest.raises(ValueError, match="2 lenses in one"):
+            ask()
+    assert not list(tmp_path.glob("both*"))
+    found = jax.vmap(lambda lens: lens(40.0).coefficients)(both)
+    np.testing.assert_allclose(found, [lens(40.0).coefficients, other(40.0).coefficients])

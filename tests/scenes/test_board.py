@@ -197,3 +197,13 @@ def test_photo_shows_its_edges_where_the_lines_say(truth):
 def test_focal_lengths_at_which_the_lens_folds_everywhere_are_refused():
     with pytest.raises(ValueError, match="Argument focal must be within the range of the lens, but at 200"):
         scenes.board_lines(scenes.nikkor_18_200(), np.array([60.0, 200.0]), spacing=99)
+
+
+@pytest.mark.parametrize("centre", [[200.0, 150.0], [400.0, 320.0]], ids=str)
+def test_edges_reach_the_corners_farthest_from_a_centre_off_the_middle(centre):
+    """They ended as far from the centre as the first corner is."""
+    zoom = zj.PolynomialZoom(0, jnp.array([[0.05]]), jnp.array(20.0))
+    lens = zj.ZoomLens(zoom, jnp.array(centre), jnp.array([20.0, 80.0]), (640, 480))
+    lines = scenes.board_lines(lens, np.array([30.0]), spacing=5)
+    longest = np.array([np.ptp(line, axis=0) for line in lines.to_ragged()]).max(axis=0)
+    assert (longest > np.array([639, 479]) - 12).all()

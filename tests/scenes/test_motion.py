@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zoomjax import PolynomialZoom, ZoomLens
-from zoomjax.scenes import motion_tracks, pan_and_zoom
+from zoomjax import PolynomialZoom, ZoomLens, frame_rms
+from zoomjax.scenes import motion_lines, motion_tracks, pan_and_zoom
 
 SIZE = (640, 360)
 
@@ -67,3 +67,16 @@ def test_points_of_a_map_are_the_same_track_when_they_come_back(lens):
         distortion = lens(float(focal[moment]))
         straight = np.asarray(distortion.centre) + focal[moment] * ahead[:2] / ahead[2]
         np.testing.assert_allclose(distortion.undistort(point), straight, atol=1e-8)
+
+
+@pytest.mark.parametrize("k", [0.3, -0.05, -0.6], ids=["bends out of the image", "bends inwards", "folds"])
+def test_lines_are_straight_in_the_scene_up_to_the_border(k):
+    """What a strong lens bends out of the image lay on its border; and a fold was a NaN made an integer."""
+    zoom = PolynomialZoom(0, jnp.array([[k]]), jnp.array(500.0))
+    lens = ZoomLens(zoom, jnp.array([319.5, 239.5]), jnp.array([500.0, 800.0]), (640, 480), "px")
+    lines = motion_lines(lens, np.array([500.0, 700.0]), number=1000)
+    assert np.bincount(lines.frame).tolist() == [1000, 1000]
+    np.testing.assert_allclose(frame_rms(lines, lens), 0, atol=1e-9)
+    points = np.asarray(lines.points)[np.asarray(lines.mask)]
+    assert (points > -1e-5).all()
+    assert (points < np.array([639, 479]) + 1e-5).all()

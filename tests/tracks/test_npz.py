@@ -1,5 +1,6 @@
 """Tracks in ``.npz`` files: what is saved comes back, and what else a file may hold is refused."""
 
+import dataclasses
 import warnings
 import zipfile
 
@@ -34,6 +35,15 @@ def test_what_is_saved_is_loaded(dtype, tmp_path):
     tracks = make(dtype)
     tracks.save(tmp_path / "tracks.npz")
     assert_same(load_tracks(tmp_path / "tracks.npz"), tracks)
+
+
+def test_tracks_of_one_number_are_not_saved(tmp_path):
+    """The file could not be read."""
+    tracks = make()
+    alike = dataclasses.replace(tracks, number=np.zeros_like(tracks.number))
+    with pytest.raises(ValueError, match="tracks have the number 0"):
+        alike.save(tmp_path / "tracks.npz")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -171,6 +171,20 @@ def test_std_of_steps_is_not_known(fit):
 
 
 @pytest.mark.parametrize(
+    ("function", "kind"),
+    [
+        (lambda lens: lens(30.0).has_inverse(np.zeros(2)), "bool"),
+        (lambda lens: {"most": jnp.argmax(lens(30.0).coefficients)}, "int64"),
+    ],
+    ids=["booleans", "integers"],
+)
+def test_std_of_what_is_no_real_number_is_refused(fit, function, kind):
+    """It ended with "a bytes-like object is required, not 'int'"."""
+    with pytest.raises(ValueError, match=f"must return real numbers, .* returns {kind}"):
+        zj.trust.std_of(fit, function)
+
+
+@pytest.mark.parametrize(
     "zoom", [zj.models.TableZoom(number=3), zj.models.SplineZoom(number=3), zj.models.PowerZoom()]
 )
 def test_bands_of_every_zoom_model(zoom, small):

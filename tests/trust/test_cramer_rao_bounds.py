@@ -177,3 +177,17 @@ def test_lenses_for_different_images_are_not_compared():
         zj.trust.displacement_rms(lens, scenes.nikkor_18_200((640, 427)))
     with pytest.raises(ValueError, match="must have the focal_unit of the first lens, mm"):
         zj.trust.displacement_rms(lens, dataclasses.replace(lens, focal_unit="px"))
+
+
+def test_lines_beyond_the_range_of_the_lens_are_told_and_count(lens, scene):
+    """The bound was infinite, as if they determined nothing, without a word."""
+    narrow = lens.extended(30.0, 100.0)
+    for bound in (zj.trust.cramer_rao, zj.trust.displacement_bound):
+        with pytest.warns(UserWarning, match="not all within the range"):
+            found = bound(narrow, scene, std=0.5)
+        assert np.isfinite(found).all()
+    np.testing.assert_allclose(
+        np.diag(zj.trust.cramer_rao(lens, scene, std=0.5)),
+        np.diag(zj.trust.cramer_rao(lens.extended(1.0, 900.0), scene, std=0.5)),
+        rtol=1e-9,
+    )

@@ -162,7 +162,7 @@ def checked_frames(frame: ArrayLike, lines: int, frames: int) -> np.ndarray:
 
 def usable_lines(arrays: list[np.ndarray], frames: np.ndarray, number_of_frames: int) -> np.ndarray:
     """Positions of the lines with 3 or more distinct points, of which every frame must have one."""
-    usable = np.array([_has_three_distinct(line) for line in arrays], bool)
+    usable = np.array([has_three_distinct(line) for line in arrays], bool)
     if not usable.any():
         raise ValueError(f"No usable line: none of the {len(arrays)} lines has 3 or more distinct points.")
     if not usable.all():
@@ -222,7 +222,8 @@ def warn_of_units(points: np.ndarray, mask: np.ndarray, size: tuple[int, int]) -
         )
 
 
-def _has_three_distinct(line: np.ndarray) -> bool:
+def has_three_distinct(line: np.ndarray) -> bool:
+    """Whether points, (n, 2), are at three places or more."""
     if len(line) < 3:
         return False
     from_first = (line != line[0]).any(axis=1)

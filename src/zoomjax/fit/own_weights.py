@@ -33,8 +33,11 @@ def counts_of(lines: AbstractLines) -> Float[np.ndarray, "line"]:
 
 
 def frames_that_count(lines: AbstractLines) -> Bool[np.ndarray, "frame"] | None:
-    """The frames of which a line counts. None where all do, or none, or nobody can tell here and now."""
-    if lines.weight is None or not all(map(_here, jax.tree.leaves(lines))):
+    """The frames of which a line counts: of three points or more, and of a weight above 0.
+
+    None where all do, or none, or nobody can tell here and now.
+    """
+    if not all(map(_here, jax.tree.leaves(lines))):
         return None
     counted = np.zeros(len(lines.focal), bool)
     counted[np.asarray(lines.frame)[own_weights(lines) > 0]] = True

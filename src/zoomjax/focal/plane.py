@@ -151,6 +151,8 @@ def focal_from_lines(
 @exact_products
 def _focal_from_planes(points, plane, mask, principal):
     counted = jnp.any(mask, axis=1)
+    # Beforehand: a NaN in a quotient would be one in all derivatives.
+    points, plane = (jnp.where(mask[..., None], of, 0) for of in (points, plane))
     # Views without points see what any camera can: a circle, so that their homographies are harmless.
     angle = 2 * jnp.pi * jnp.arange(points.shape[1], dtype=points.dtype) / points.shape[1]
     circle = jnp.broadcast_to(jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1), points.shape)
@@ -158,7 +160,6 @@ def _focal_from_planes(points, plane, mask, principal):
 
     def centred(points):
         """About the mean of each view's valid points, and 0 in place of the others."""
-        points = jnp.where(mask[..., None], points, 0)
         number = jnp.maximum(jnp.sum(present, axis=1), 1)[:, None, None]
         mean = jnp.sum(points, axis=1, keepdims=True) / number
         return jnp.where(mask[..., None], points - mean, 0)

@@ -160,6 +160,7 @@ class AbstractLines(eqx.Module):
             given = np.asarray(weight)
             if given.dtype.kind not in "biuf":
                 raise ValueError(f"Argument weight must hold real numbers, but its dtype is {given.dtype}.")
+            given = self._in_range_of(given, dtype)
             values = jax.device_put(given.astype(dtype))  # unlike jnp.asarray this compiles nothing
         if values.shape != self.frame.shape:
             raise ValueError(
@@ -169,6 +170,16 @@ class AbstractLines(eqx.Module):
         if not traced(values) and not (np.isfinite(values) & (np.asarray(values) >= 0)).all():
             raise ValueError("Argument weight must hold finite numbers of at least 0, but it does not.")
         return eqx.tree_at(lambda lines: lines.weight, self, values, is_leaf=lambda leaf: leaf is None)
+
+    def _in_range_of(self, weight, dtype):
+        """Weights divided by the largest of their frame where they are beyond the numbers of a dtype."""
+        limits, size = jnp.finfo(dtype), np.abs(weight.astype(float))
+        beyond = (size > float(limits.max)) | ((size < float(limits.tiny)) & (size > 0))
+        if not beyond.any() or weight.shape != self.frame.shape or traced(self.frame):
+            return weight
+        frame, largest = np.asarray(self.frame), np.zeros(self.focal.shape[0])
+        np.maximum.at(largest, frame, np.where(np.isfinite(size), size, 0))
+        return weight / np.where(largest > 0, largest, 1)[frame]
 
     def by_frame(self) -> tuple[Int[AnyArray, "frame some"], Bool[AnyArray, "frame some"]]:
         """For each frame the indices of its lines, padded to the largest frame, and a mask of real entries.

@@ -8,6 +8,7 @@ column ``focal``, the same in all rows of a frame, or from a second file with th
 import csv
 import os
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,8 @@ def read_lines_csv(
         path: a file that `zoomjax.io.text_table` can read; columns in any order, others are ignored.
         image_size: (width, height) px.
         focal: focal length by frame number, if the file has no column ``focal``; a sequence counts
-            frames from 0, a number is that of all frames.
+            frames from 0, a column of pandas has their numbers as its index, and a number is that of all
+            frames.
         focal_unit: "mm" or "px".
 
     Warns:
@@ -68,6 +70,9 @@ def read_lines_csv(
     else:
         if isinstance(focal, Mapping):
             known = dict(focal)
+        elif hasattr(focal, "index") and hasattr(focal, "to_dict"):  # a column of pandas
+            column: Any = focal
+            known = column.to_dict()
         else:
             given = np.asarray(focal, float)
             known = dict(enumerate(given)) if given.ndim else dict.fromkeys(frames.tolist(), given)

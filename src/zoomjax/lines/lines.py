@@ -26,6 +26,7 @@ from .._core.checks import (
     checked_points,
     checked_size,
     checked_unit,
+    has_three_distinct,
     usable_lines,
     warn_of_points_outside,
     warn_of_units,
@@ -232,15 +233,16 @@ class Lines(AbstractLines):
 
         Raises:
             OSError: the file cannot be written; nothing is left of it.
-            ValueError: a frame has no line of three points, without which the file could not be read.
+            ValueError: a frame has no line of three distinct points, without which the file could not be
+                read.
         """
         check_kind("path", path, (str, os.PathLike))
         there = np.zeros(len(self.focal), bool)
-        there[np.asarray(self.frame)[np.asarray(self.mask).sum(1) > 2]] = True
+        there[np.asarray(self.frame)[[has_three_distinct(line) for line in self.to_ragged()]]] = True
         if not (there.size and there.all()):
             raise ValueError(
-                f"{np.sum(~there)} of {there.size} frames have no line of three points or more: leave them "
-                "out before the lines are saved."
+                f"{np.sum(~there)} of {there.size} frames have no line of three distinct points: leave "
+                "them out before the lines are saved."
             )
         optional: dict[str, Any] = {"weight": self.weight, "focus": self.focus, "number": self.number}
         fields: dict[str, Any] = {

@@ -1,5 +1,6 @@
 """What distortions are made of and act on: shapes, and values where they are known."""
 
+import warnings
 from typing import Any
 
 import jax
@@ -8,9 +9,12 @@ import numpy as np
 
 from .._core.arguments import check_kind
 from .._core.checks import warn_caller
-from .._core.fields import check_finite, check_positive, refuse_masked
+from .._core.fields import FOCALS, check_finite, check_positive, refuse_masked
 from .._core.types import traced
 from .distortion_model import AbstractDistortionModel
+
+SLACK = 5e-4
+"""Share of a focal length by which it may be beyond the range: the end itself, written with four digits."""
 
 _NAN = "give an array with NaN in place of what is masked, .filled(np.nan)"
 
@@ -28,6 +32,8 @@ def as_points(points: Any, size: int = 2) -> Any:
             points = np.asarray(points)
         except (TypeError, ValueError) as error:
             raise ValueError(f"Argument points must be an array of shape {shape}: {error}.") from error
+        if points.shape == (0,):  # an empty list, as of a frame in which nothing was found
+            points = points.reshape(0, size)
     if points.shape[-1:] != (size,):
         raise ValueError(f"Argument points must have shape {shape}, but its shape is {points.shape}.")
     real = jnp.issubdtype(points.dtype, jnp.integer) or jnp.issubdtype(points.dtype, jnp.floating)
@@ -38,33 +44,36 @@ def as_points(points: Any, size: int = 2) -> Any:
     return points.astype(np.float32) if points.dtype.itemsize < 4 else points
 
 
-def as_focal(focal: Any) -> Any:
-    """Focal lengths as an array of floats.
+def as_focal(focal: Any, name: str = "focal") -> Any:
+    """Focal lengths, or what else there is of them, as an array of floats.
 
     Raises:
         ValueError: they are not numbers.
     """
     if isinstance(focal, jax.Array):
         if not jnp.issubdtype(focal.dtype, jnp.integer) and not jnp.issubdtype(focal.dtype, jnp.floating):
-            raise ValueError(f"Argument focal must hold real numbers, but its dtype is {focal.dtype}.")
+            raise ValueError(f"Argument {name} must hold real numbers, but its dtype is {focal.dtype}.")
         return focal
-    refuse_masked("focal", focal, _NAN)
+    refuse_masked(name, focal, _NAN)
     try:
         array = np.asarray(focal)
         if array.dtype.kind in "iufO":
             return array.astype(float)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"Argument focal must be a number or an array, but it is {focal!r}.") from error
-    raise ValueError(f"Argument focal must be a number or an array, but it is {focal!r}.")
+        raise ValueError(f"Argument {name} must be a number or an array, but it is {focal!r}.") from error
+    raise ValueError(f"Argument {name} must be a number or an array, but it is {focal!r}.")
 
 
 def check_focus(focus: Any, fitted: Any) -> None:
     """Warn where a focus is outside of the range `fitted`, where both are known: in another unit, say.
 
     Raises:
-        ValueError: it is not finite.
+        ValueError: it is not finite, or no number.
     """
-    if focus is None or fitted is None or traced((focus, fitted)):
+    if focus is None or traced(focus):
+        return
+    focus = as_focal(focus, "focus")
+    if fitted is None or traced(fitted):
         return
     values, (low, high) = np.ravel(np.asarray(focus, float)), np.asarray(fitted, float).tolist()
     if not np.isfinite(values).all():
@@ -77,14 +86,62 @@ def check_focus(focus: Any, fitted: Any) -> None:
         )
 
 
-def check_broadcast(points: tuple[Any, ...], focal: tuple[Any, ...]) -> None:
-    """Raise ValueError where there are neither as many focal lengths as points nor one for many."""
+def check_range_of(focal: Any, focal_range: Any, unit: str, *, stacklevel: int) -> None:
+    """Warn of known focal lengths outside of a range, and refuse those that are none.
+
+    By NumPy alone: under ``jit`` even an operation of JAX on known arrays is traced.
+    """
+    low, high = np.asarray(focal_range, np.float64).tolist()
+    values = np.ravel(np.asarray(focal))
+    if not values.size:
+        return
+    least, most = float(values.min()), float(values.max())  # NaN if one is: two passes are quick
+    if not (least >= FOCALS[0] and most <= FOCALS[1]):
+        bad = values[~((values >= FOCALS[0]) & (values <= FOCALS[1]))][0]
+        told = f", {FOCALS[0]:g} to {FOCALS[1]:g} mm or px" if 0 < bad < np.inf else ""
+        raise ValueError(f"Argument focal must be a positive number{told}, but it is {bad}.")
+    if least < low - SLACK * least or most > high + SLACK * most:
+        outside = f"The focal length {least:g} {unit} is not"
+        if values.size > 1:
+            outside = f"Focal lengths from {least:g} to {most:g} {unit} are not all"
+        warnings.warn(
+            f"{outside} within the range on which the lens was fitted, {low:g} to {high:g} "
+            f"{unit}: beyond it the distortion is extrapolated.",
+            stacklevel=stacklevel + 1,
+        )
+
+
+def check_one_lens(centre: Any) -> None:
+    """Raise ValueError for several lenses in one, as `jax.vmap` and ``jax.tree.map(jnp.stack)`` make."""
+    if np.ndim(centre) > 1:
+        raise ValueError(
+            f"These are {np.shape(centre)[0]} lenses in one: call them by jax.vmap(lambda lens: lens(f))"
+            "(lenses), and save each by itself, jax.tree.map(lambda leaf: leaf[0], lenses) the first."
+        )
+
+
+def check_settings(points: tuple[Any, ...], focal: Any, focus: Any) -> None:
+    """Raise ValueError where there are neither as many of each as of the others nor one for many.
+
+    Args:
+        points: the leading shape of the points.
+        focal: focal lengths.
+        focus: focuses, of which there is a pair with a focal length for each distortion; or None.
+    """
+    shapes = np.shape(focal), np.shape(focus)
     try:
-        jnp.broadcast_shapes(points, focal)
+        both = jnp.broadcast_shapes(*shapes)
+    except ValueError as error:
+        raise ValueError(
+            "Argument focus must have a shape that broadcasts with that of focal, one for all or one for "
+            f"each, but their shapes are {shapes[1]} and {shapes[0]}."
+        ) from error
+    try:
+        jnp.broadcast_shapes(points, both)
     except ValueError as error:
         raise ValueError(
             f"Argument focal must have a shape that broadcasts with that of the points, {points}, one for "
-            f"all or one for each, but its shape is {focal}."
+            f"all or one for each, but its shape{' with that of focus' * bool(shapes[1])} is {both}."
         ) from error
 
 

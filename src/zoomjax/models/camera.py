@@ -132,7 +132,7 @@ class Camera(eqx.Module):
         principal = self.principal
         if principal is None:
             moves = self.lens.shift is not None
-            principal = self.lens.centre_at(focal) if moves else self.lens.centre
+            principal = self.lens._centre_at(focal) if moves else self.lens.centre
         principal = _as(principal, points)
         length = _as(focal, points)
         if self.lens.focal_unit == "mm":

@@ -18,7 +18,7 @@ from .._core.types import AnyArray, Focal, Focus, traced
 from ._bernstein import Pieces, cut
 from ._splines import check_curvature, natural_basis, natural_controls, natural_curvature, spread
 from .spline import SplineZoom
-from .zoom import UNFITTED, AbstractFocusZoom
+from .zoom import UNFITTED, AbstractFocusZoom, one_focus
 
 _CELLS = 8
 """Into which the certificate cuts every interval of the focus: its controls are then near to values."""
@@ -113,8 +113,6 @@ class FocusSplineZoom(AbstractFocusZoom):
 
     def basis(self, focal: ScalarLike, focus: ScalarLike | None = None) -> Float[Array, "basis"]:
         """Products of the cardinal splines in 1/f and in the focus."""
-        if focus is None:
-            raise ValueError(_NO_FOCUS)
         return jnp.kron(self._in_zoom().basis(focal), self._in_focus(focus))
 
     def at_focus(self, focus: ScalarLike) -> SplineZoom:
@@ -157,7 +155,9 @@ class FocusSplineZoom(AbstractFocusZoom):
     def _in_zoom(self) -> SplineZoom:
         return SplineZoom(number=self.number, knots=_prepared(self.knots), curvature=self.curvature)
 
-    def _in_focus(self, focus: ScalarLike) -> Float[Array, "focuses"]:
+    def _in_focus(self, focus: ScalarLike | None) -> Float[Array, "focuses"]:
+        if one_focus(focus) is None:
+            raise ValueError(_NO_FOCUS)
         knots = _prepared(self.focus_knots)
         end = jnp.clip(jnp.asarray(focus, knots.dtype), knots[0], knots[-1])
         return natural_basis(knots, _prepared(self.focus_curvature), end)

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import math
 import os
-import warnings
 from collections.abc import Mapping
 
 import equinox as eqx
@@ -17,12 +16,21 @@ from jaxtyping import Float, Num, ScalarLike
 from .._core.arguments import check_kind, kinds_checked
 from .._core.arrays import aligned
 from .._core.checks import centre_problem, check_above, checked_size, checked_unit, warn_caller
-from .._core.fields import FOCALS, check_finite, check_focal, check_range, check_shapes, numbers
+from .._core.fields import check_finite, check_focal, check_range, check_shapes, numbers
 from .._core.files import whole_file
 from .._core.pixels import check_pitch
 from .._core.programs import light_program
 from .._core.types import AnyArray, FocalLike, Point, Points, traced
-from ._arguments import as_focal, as_points, check_broadcast, check_focus, check_terms
+from ._arguments import (
+    SLACK,
+    as_focal,
+    as_points,
+    check_focus,
+    check_one_lens,
+    check_range_of,
+    check_settings,
+    check_terms,
+)
 from ._known_number import known_number
 from ._known_sizes import with_known_size
 from .about import About, checked_about, checked_pitch
@@ -40,16 +48,13 @@ from .registry import (
     warn_of_unknown,
     zoom_from,
 )
-from .zoom import AbstractFocusZoom, AbstractZoom
+from .zoom import AbstractFocusZoom, AbstractZoom, one_focus
 
 _FORMAT, _VERSION = "zoomjax.lens", 3
 _UNREADABLE = ValueError, TypeError, KeyError, AttributeError, ArithmeticError, RecursionError, OSError
 
 _ENTRIES = ("image_size", "centre", "scale", "focal_unit", "focal_range", "radial", "zoom", "shift_meaning")
 _OPTIONAL = ("distortion_model", "family", "focus_range", "shift", "pixel_pitch", "about")
-
-_SLACK = 5e-4
-"""Share of a focal length by which it may be beyond the range: the end itself, written with four digits."""
 
 
 class ZoomLens(eqx.Module):
@@ -194,8 +199,7 @@ class ZoomLens(eqx.Module):
 
     def _mapped(self, method, points, focal, focus):
         points = as_points(points)
-        focal = self._checked(focal, focus, stacklevel=5)
-        check_broadcast(points.shape[:-1], focal.shape)
+        focal = self._checked(focal, focus, stacklevel=5, points=points.shape[:-1])
         if isinstance(points, np.ndarray) and not traced((self, focal, focus)):
             d = self._distortion(focal, focus)
             return mapped(method, d.distortion_model, points, d.coefficients, d.centre, d.scale)
@@ -203,10 +207,12 @@ class ZoomLens(eqx.Module):
         operands = (self, jnp.asarray(focal, points.dtype), focus, traced((self, focal)))
         return compiled(method, _bent, points, operands)
 
-    def _checked(self, focal, focus, stacklevel):
+    def _checked(self, focal, focus, stacklevel, points=()):
         """Focal lengths as an array; these and the focus are looked at where they are known."""
+        check_one_lens(self.centre)
         self.check_range(focal := as_focal(focal), stacklevel=stacklevel)
         check_focus(focus, self.focus_range)
+        check_settings(points, focal, focus if isinstance(self.zoom, AbstractFocusZoom) else None)
         return focal
 
     def _distortion(self, focal, focus, within=False):
@@ -214,19 +220,27 @@ class ZoomLens(eqx.Module):
         dtype = jnp.asarray(self.centre).dtype
         focal = jnp.asarray(focal, dtype)
         low, high = jnp.moveaxis(jnp.asarray(self.focal_range, dtype), -1, 0)
-        inside = (focal >= low * (1 - _SLACK)) & (focal <= high * (1 + _SLACK))
+        inside = (focal >= low * (1 - SLACK)) & (focal <= high * (1 + SLACK))
         if within:  # at a focal length that is: a NaN in `focal` would be one in all derivatives
             focal = jnp.where(inside, focal, high)
         k = _at(self.zoom, focal, focus, dtype)
         if within:
             k = jnp.where(inside[..., None], k, jnp.nan)
-        return Distortion(k, self.centre_at(focal), jnp.asarray(self.scale, dtype), self.distortion_model)
+        return Distortion(k, self._centre_at(focal), jnp.asarray(self.scale, dtype), self.distortion_model)
 
     def centre_at(self, focal: FocalLike) -> Float[AnyArray, "*focal 2"]:
         """The centre of distortion at focal lengths, px.
 
-        Where it does not move along the zoom it is `centre`, one for all.
+        Where it does not move along the zoom it is `centre`, one for all. Warns and raises as a call does.
         """
+        focal = as_focal(focal)
+        if self.shift is not None:
+            check_one_lens(self.centre)
+            self.check_range(focal)
+        return self._centre_at(focal)
+
+    def _centre_at(self, focal):
+        """The same, whatever the focal lengths."""
         centre = jnp.asarray(self.centre)
         if self.shift is None:
             return centre
@@ -243,7 +257,7 @@ class ZoomLens(eqx.Module):
             raise TypeError(
                 f"A {type(self.zoom).__name__} does not depend on the focus: use the lens as it is."
             )
-        check_focus(focus, self.focus_range)
+        check_focus(one_focus(focus), self.focus_range)
         return dataclasses.replace(self, zoom=self.zoom.at_focus(focus), focus_range=None)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -252,8 +266,10 @@ class ZoomLens(eqx.Module):
         Raises:
             TypeError: the class of the zoom model or the distortion model is not registered
                 (`register_model`), or has fields that a file cannot hold.
+            ValueError: these are several lenses in one, as `jax.vmap` makes.
         """
         check_kind("path", path, (str, os.PathLike))
+        check_one_lens(self.centre)
         polynomial = isinstance(self.distortion_model, RadialPolynomial)
         content = {
             "format": _FORMAT,
@@ -291,25 +307,7 @@ class ZoomLens(eqx.Module):
         """
         if traced((self, focal)):
             return
-        # By NumPy alone: under ``jit`` even an operation of JAX on known arrays is traced.
-        low, high = np.asarray(self.focal_range, np.float64).tolist()
-        values = np.ravel(np.asarray(focal))
-        if not values.size:
-            return
-        least, most = float(values.min()), float(values.max())  # NaN if one is: two passes are quick
-        if not (least >= FOCALS[0] and most <= FOCALS[1]):
-            bad = values[~((values >= FOCALS[0]) & (values <= FOCALS[1]))][0]
-            told = f", {FOCALS[0]:g} to {FOCALS[1]:g} mm or px" if 0 < bad < np.inf else ""
-            raise ValueError(f"Argument focal must be a positive number{told}, but it is {bad}.")
-        if least < low - _SLACK * least or most > high + _SLACK * most:
-            outside = f"The focal length {least:g} {self.focal_unit} is not"
-            if values.size > 1:
-                outside = f"Focal lengths from {least:g} to {most:g} {self.focal_unit} are not all"
-            warnings.warn(
-                f"{outside} within the range on which the lens was fitted, {low:g} to {high:g} "
-                f"{self.focal_unit}: beyond it the distortion is extrapolated.",
-                stacklevel=stacklevel + 1,
-            )
+        check_range_of(focal, self.focal_range, self.focal_unit, stacklevel=stacklevel + 1)
 
 
 def _at(zoom, focal, focus, dtype):

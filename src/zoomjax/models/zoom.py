@@ -128,6 +128,16 @@ def one_focal(focal: ScalarLike) -> ScalarLike:
     return focal
 
 
+def one_focus(focus: ScalarLike | None) -> ScalarLike | None:
+    """A focus as it is, if it is one number, or None: of several a model would add up the coefficients."""
+    if isinstance(focus, list | tuple) or np.ndim(focus) != 0:
+        raise ValueError(
+            "Argument focus must be one number here, but its shape is "
+            f"{np.shape(focus)}: lens(focal, focus) takes several, and so does jax.vmap."
+        )
+    return focus
+
+
 def number_of_coefficients(zoom: AbstractZoom) -> int:
     """How many coefficients a fitted zoom model gives at one focal length; nothing is computed."""
     one = jax.ShapeDtypeStruct((), jnp.result_type(float))
@@ -191,9 +201,10 @@ class AbstractFocusZoom(AbstractLinearZoom):
         """The coefficients at one focal length and focus.
 
         Raises:
-            ValueError: the focus is missing, or the focal length is not one positive number.
+            ValueError: the focus is missing or not one number, or the focal length is not one positive
+                number.
         """
-        return _combined(self.basis(one_focal(focal), focus), _fitted(self))
+        return _combined(self.basis(one_focal(focal), one_focus(focus)), _fitted(self))
 
 
 class PolynomialZoom(AbstractLinearZoom):

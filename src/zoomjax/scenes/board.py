@@ -248,19 +248,23 @@ def _seen(
 
 def _reach(lens: ZoomLens, focal: np.ndarray) -> float:
     """How far, px, corrected images extend from the centre at any of the focal lengths."""
-
-    def corner(f):
-        distortion = lens(f)
-        to_fold = distortion.monotone_radius / jnp.linalg.norm(lens.centre)
-        return distortion.undistort(lens.centre * (1 - jnp.minimum(1, to_fold)))
-
-    reach = np.linalg.norm(np.asarray(jax.vmap(corner)(jnp.asarray(focal)) - lens.centre[None]), axis=-1)
+    reach = np.asarray(jax.vmap(lambda f: farthest(lens(f), lens.image_size))(jnp.asarray(focal)))
     if not np.isfinite(reach).all():
         beyond = focal[~np.isfinite(reach)][0]
         raise ValueError(
             f"Argument focal must be within the range of the lens, but at {beyond:g} it folds everywhere."
         )
     return float(reach.max())
+
+
+def farthest(distortion: Distortion, image_size: tuple[int, int]) -> Float[Array, ""]:
+    """How far, px, a corrected image extends from the centre: to a corner, or the fold on the way to it."""
+    centre = jnp.asarray(distortion.centre)
+    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * (np.array(image_size) - 1)
+    away = jnp.asarray(corners, centre.dtype) - centre[None]
+    radius = jnp.linalg.norm(away, axis=1, keepdims=True)
+    away = away * jnp.minimum(1, distortion.monotone_radius / jnp.where(radius > 0, radius, 1))
+    return jnp.max(jnp.linalg.norm(distortion.undistort(centre[None] + away) - centre[None], axis=1))
 
 
 def board_photo(

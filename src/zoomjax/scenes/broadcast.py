@@ -19,6 +19,7 @@ from ..focal.pitch import PITCH_LINES
 from ..lines.lines import Lines
 from ..models.lens import ZoomLens
 from ..models.zoom import PolynomialZoom
+from .board import farthest
 
 _PIXELS = np.array(  # section 5.2: rows are powers of 1/f, columns k1 (px^-2) and k2 (px^-4)
     [[2.65e-8, 1.99e-14], [-8.88e-6, 3.07e-12], [2.86e-4, -1.04e-10]]
@@ -76,8 +77,10 @@ def broadcast_lines(
     frame: list[int] = []
     last = np.array(lens.image_size) - 1
     for index, f in enumerate(focal):
-        straight = _straight(lens, float(f), spacing)
-        seen = np.asarray(lens(float(f)).distort(jnp.asarray(straight, dtype)))
+        distortion = lens(float(f))
+        reach = np.fmax(1.2 * lens.scale, float(farthest(distortion, lens.image_size)))
+        straight = _straight(lens, float(f), spacing, reach)
+        seen = np.asarray(distortion.distort(jnp.asarray(straight, dtype)))
         for line in seen:
             line = line[np.all((line >= 0) & (line <= last), axis=1)]
             if len(line) > 2 and np.hypot(*(line[-1] - line[0])) >= lens.image_size[1] / 10:
@@ -88,13 +91,17 @@ def broadcast_lines(
     )
 
 
-def _straight(lens: ZoomLens, focal: float, spacing: float | int) -> Float[np.ndarray, "line point 2"]:
-    """Points of all markings in the corrected image, px, evenly spaced; NaN where there are none."""
+def _straight(
+    lens: ZoomLens, focal: float, spacing: float | int, reach: float
+) -> Float[np.ndarray, "line point 2"]:
+    """Points of all markings in the corrected image, up to so far from its centre, px, evenly spaced.
+
+    NaN where there are none.
+    """
     low, high = (float(end) for end in lens.focal_range)
     zoomed = (1 / low - 1 / focal) / (1 / low - 1 / high)
     rotation = _looking(_WIDE + zoomed * (_LONG - _WIDE) - _CAMERA)
     pixels = focal / _SENSOR * lens.image_size[0]
-    reach = 1.2 * lens.scale  # corrected images reach beyond the distorted one
     steps = spacing * np.arange(2 * reach // spacing + 1)
     lines = np.full((len(PITCH_LINES), len(steps), 2), np.nan)
     for line, ends in zip(lines, PITCH_LINES.values(), strict=True):

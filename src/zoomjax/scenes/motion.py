@@ -187,7 +187,7 @@ def motion_lines(
     """Straight lines in any direction at each focal length, as a detector would give them.
 
     Args:
-        lens: the true lens.
+        lens: the true lens. Lines end at its fold, and where it bends them out of the image.
         focal: focal lengths, a frame each.
         number: of lines in each frame.
         spacing: distance between neighbouring points of a line, px.
@@ -198,16 +198,23 @@ def motion_lines(
     checked_integer("number", number, 1)
     check_above(0, spacing=spacing)
     check_between(0, math.inf, noise=noise)
-    rng = np.random.default_rng(checked_integer("seed", seed, 0))
+    seed = checked_integer("seed", seed, 0)
+    rng, again = np.random.default_rng(seed), np.random.default_rng((seed, 1))
     corner = np.array(lens.image_size) - 1
     points: list[np.ndarray] = []
     for f in focal:
         distortion = lens(float(f))
-        first, last = np.asarray(distortion.undistort(rng.uniform(0, corner, (2, number, 2))))
-        for a, b in zip(first, last, strict=True):
-            along = np.linspace(0, 1, 3 + int(np.linalg.norm(b - a) / spacing))[:, None]
-            seen = np.asarray(distortion.distort(a + along * (b - a)))
-            points.append(np.clip(seen + noise * rng.standard_normal(seen.shape), 0, corner))
+        lines = _straight(distortion, rng.uniform(0, corner, (2, number, 2)), spacing, corner)
+        for _ in range(_TRIES):
+            bent = [place for place, line in enumerate(lines) if len(line) < 3]  # out of the image
+            if not bent:
+                break
+            new = _straight(distortion, again.uniform(0, corner, (2, len(bent), 2)), spacing, corner)
+            for place, line in zip(bent, new, strict=True):
+                lines[place] = line
+        if min(map(len, lines)) < 3:
+            raise ValueError(f"Argument lens shows no lines at {f:g}: it folds nearly everywhere.")
+        points += [seen + noise * rng.standard_normal(seen.shape) for seen in lines]
     return Lines.from_ragged(
         points,
         np.repeat(np.arange(len(focal)), number),
@@ -215,6 +222,30 @@ def motion_lines(
         image_size=lens.image_size,
         focal_unit=lens.focal_unit,
     )
+
+
+def _straight(distortion, ends, spacing, corner):
+    """Points of the image that are straight in the scene, for each line from one end to the other, px.
+
+    Ends, (2, line, 2), beyond the fold are moved to it. What bends out of the image is left out.
+    """
+    centre = np.asarray(distortion.centre, float)
+    away = ends - centre
+    radius = np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-9)
+    ends = centre + away * np.minimum(1, _BEFORE_FOLD * float(distortion.monotone_radius) / radius)
+    first, last = np.asarray(distortion.undistort(ends))
+    number = 3 + (np.linalg.norm(last - first, axis=1) / spacing).astype(int)
+    along = [np.linspace(0, 1, n)[:, None] for n in number.tolist()]
+    straight = [a + share * (b - a) for a, share, b in zip(first, along, last, strict=True)]
+    seen = np.asarray(distortion.distort(np.concatenate(straight)))
+    inside = ((seen >= -_ROUNDING) & (seen <= corner + _ROUNDING)).all(axis=1)
+    ends = np.cumsum(number)[:-1]
+    return [line[there] for line, there in zip(np.split(seen, ends), np.split(inside, ends), strict=True)]
+
+
+_TRIES = 100
+_BEFORE_FOLD, _ROUNDING = 0.99, 1e-6
+"""Of the radius of a fold, up to which lines go; px by which their ends may round out of the image."""
 
 
 def camera_between(

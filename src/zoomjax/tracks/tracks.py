@@ -185,8 +185,18 @@ class Tracks(eqx.Module):
         return None if self.weight is None else np.asarray(self.weight)[np.asarray(self.mask)]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write all fields, in their dtypes, to a ``.npz`` file that `load_tracks` reads."""
+        """Write all fields, in their dtypes, to a ``.npz`` file that `load_tracks` reads.
+
+        Raises:
+            ValueError: tracks have one number, by which the file tells them apart.
+        """
         check_kind("path", path, (str, os.PathLike))
+        names, count = np.unique(np.asarray(self.number), return_counts=True)
+        if (count > 1).any():
+            raise ValueError(
+                f"{count.max()} tracks have the number {names[count.argmax()]}, by which a file tells them "
+                "apart: give each its own before they are saved."
+            )
         _, frame, points = self.views()
         weight = self.view_weights()
         optional: dict[str, Any] = {} if weight is None else {"weight": weight}

@@ -122,9 +122,12 @@ def std_of(fit: ZoomFit, function: Callable[[ZoomLens], PyTree]) -> PyTree:
         on a parameter that the lines do not determine, NaN where the number itself is not finite, or
         changes though its derivative is 0.
 
+    Raises:
+        ValueError: `function` returns integers or booleans, as `jnp.argmax` and `has_inverse` do.
+
     Warns:
         UserWarning: a number changes with the lens though its derivative is 0, as that of ``jnp.round`` or
-            ``jnp.argmax``. Under ``jit`` its standard deviation is 0.
+            a comparison. Under ``jit`` its standard deviation is 0.
 
     Example:
         >>> import jax.numpy as jnp, numpy as np
@@ -174,7 +177,18 @@ def _continuous(function, flat, covariance, derivatives, values):
 
 def _derivatives(function, flat):
     """By all that is uncertain, and the values: where those are NaN, derivatives of zero say nothing."""
-    return jax.jacfwd(lambda flat: (found := function(flat), found), has_aux=True)(flat)
+
+    def both(flat):
+        found = function(flat)
+        for leaf in jax.tree.leaves(found):
+            if jnp.result_type(leaf).kind not in "fV":  # bfloat16 is of kind V
+                raise ValueError(
+                    "Argument function must return real numbers, as others have no standard deviation, but "
+                    f"it returns {jnp.result_type(leaf)}."
+                )
+        return found, found
+
+    return jax.jacfwd(both, has_aux=True)(flat)
 
 
 @kinds_checked

@@ -61,15 +61,17 @@ def cramer_rao(
         ValueError: `std` is not positive and finite, or not one number or one a line; or the lines are from
             images of another size, or have focal lengths in another unit.
 
+    Warns:
+        UserWarning: lines at focal lengths outside of the range of the lens, which is extrapolated to them.
+
     Example:
         >>> from zoomjax import scenes
         >>> lens, focal = scenes.nikkor_18_200(), scenes.focal_sweep(3)
         >>> cramer_rao(lens, scenes.board_lines(lens, focal, spacing=99.0), std=0.5).shape
         (6, 6)
     """
-    check_camera(lens, lines)
-    check("cramer_rao", zoom=lens.zoom)
-    return _cramer_rao(lens, lines, _checked_std(std, lines))
+    std = _checked(lens, lines, std)
+    return _cramer_rao(lens, lines, std)
 
 
 @light_program
@@ -114,9 +116,8 @@ def displacement_bound(
         >>> bool(displacement_bound(lens, lines, std=0.5) < 0.3)
         True
     """
-    check_camera(lens, lines)
-    check("cramer_rao", zoom=lens.zoom)
-    return _displacement_bound(lens, lines, _checked_std(std, lines))
+    std = _checked(lens, lines, std)
+    return _displacement_bound(lens, lines, std)
 
 
 @light_program
@@ -175,8 +176,11 @@ def _displacement_rms(lens, other):
     return jnp.sqrt(jnp.sum(weight * jnp.sum(apart**2, axis=-1)))
 
 
-def _checked_std(std, lines):
-    """Standard deviations of points, positive and finite."""
+def _checked(lens, lines, std):
+    """Standard deviations of points, positive and finite, of lines that are the lens's."""
+    check_camera(lens, lines)
+    check("cramer_rao", zoom=lens.zoom)
+    lens.check_range(lines.focal, stacklevel=4)
     std = jnp.asarray(real_argument("std", std))
     if std.shape not in ((), lines.frame.shape):
         raise ValueError(
@@ -213,7 +217,7 @@ def _derivatives(lens, points, mask, focal, std):
     flat, unravel = ravel_pytree(lens.zoom.parameters)
 
     def corrected(flat, point):
-        return _with(lens, unravel(flat))(focal).undistort(point)
+        return at_focal(_with(lens, unravel(flat)), focal).undistort(point)
 
     there = mask.astype(points.dtype)
     seen = jnp.where(mask[:, None], points, lens.centre)

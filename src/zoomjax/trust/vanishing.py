@@ -138,7 +138,7 @@ def _straight(scatter: Float[np.ndarray, "line 2 2"]) -> tuple[np.ndarray, np.nd
 def _corrected(points: list[np.ndarray], lens: ZoomLens, focal: float) -> _Photo | None:
     """The longest lines of a photo; None if there are too few."""
     distortion = at_focal(lens, np.asarray(focal))  # an array: a number would be one more program
-    centre = np.asarray(lens.centre_at(focal), float)
+    centre = np.asarray(distortion.centre, float)
     every = np.concatenate(points).astype(float)
     moved = (np.asarray(distortion.undistort(every), float) - every) / lens.scale
     both = np.stack([(every - centre) / lens.scale, moved], axis=1)
